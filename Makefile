@@ -1,0 +1,70 @@
+# Everything runs in .venv, which the first target that needs it makes.
+# Another interpreter:   make test PYTHON=python3.12
+# Other pytest options:  make test PYTEST_ARGS="-m slow"
+
+VENV := .venv
+BIN := $(VENV)/bin
+IS_NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
+# The first of these that runs and is new enough; a recursive variable, so only looked for when .venv is made.
+PYTHON = $(shell for python in python3 python3.13 python3.12 python3.11; do \
+	if $$python -c '$(IS_NEW_ENOUGH)' 2>/dev/null; then echo $$python; break; fi; done)
+PYTEST_ARGS =
+INSTALL = $(BIN)/python -m pip install --constraint constraints.txt
+PACKAGE := pyproject.toml constraints.txt
+
+.PHONY: help demo test check format docs clean
+
+help:
+	@echo "make demo     install dano and show a first simulation"
+	@echo "make test     install everything and run the tests"
+	@echo "make check    lint, format check, import layers, types"
+	@echo "make format   apply the formatter and the safe lint fixes"
+	@echo "make docs     build the documentation into site/"
+	@echo "make clean    remove .venv, caches and build products"
+
+demo: $(VENV)/.demo
+	$(BIN)/dano demo
+
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+check: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/basedpyright
+
+format: $(VENV)/.dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+docs: $(VENV)/.docs
+	$(BIN)/mkdocs build --strict
+
+clean:
+	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+
+# Each stamp is touched last, so an interrupted installation is taken up again.
+$(VENV)/.pip:
+	@python="$(PYTHON)"; \
+	if ! "$${python:-python3}" -c '$(IS_NEW_ENOUGH)' 2>/dev/null; then \
+		echo "dano needs Python 3.11 or newer, but $${python:-python3} is" \
+			"$$("$${python:-python3}" --version 2>/dev/null || echo 'not there')." >&2; \
+		echo "Install one, or name it: make $(MAKECMDGOALS) PYTHON=/path/to/python3.11" >&2; \
+		exit 1; \
+	fi; \
+	"$$python" -m venv $(VENV)
+	$(BIN)/python -m pip install --upgrade pip
+	@touch $@
+
+$(VENV)/.demo: $(VENV)/.pip $(PACKAGE)
+	$(INSTALL) --editable '.[view]'
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.pip $(PACKAGE)
+	$(INSTALL) --editable '.[dev,view,mesh,mujoco]'
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.pip $(PACKAGE)
+	$(INSTALL) --editable '.[docs]'
+	@touch $@

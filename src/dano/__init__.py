@@ -1,0 +1,48 @@
+"""Simulate what robots see: neural density fields as rigid bodies, without a mesh in between."""
+
+from dano.maths import Pose as Pose  # isort: skip
+from dano.fields import (
+    AbstractField as AbstractField,
+    AbstractShape as AbstractShape,
+    Box as Box,
+    Capsule as Capsule,
+    Cylinder as Cylinder,
+    Ellipsoid as Ellipsoid,
+    GridField as GridField,
+    HalfSpace as HalfSpace,
+    Posed as Posed,
+    Sphere as Sphere,
+    Union as Union,
+)
+from dano.objects import (
+    ContactSamples as ContactSamples,
+    MassProperties as MassProperties,
+    NeuralObject as NeuralObject,
+)
+from dano.contact import (
+    AbstractContactLaw as AbstractContactLaw,
+    CentroidLaw as CentroidLaw,
+    Collider as Collider,
+    ContactParams as ContactParams,
+    overlap as overlap,
+    Patch as Patch,
+)
+from dano.scene import (
+    Body as Body,
+    Contact as Contact,
+    Control as Control,
+    Scene as Scene,
+    State as State,
+    Trajectory as Trajectory,
+)
+from dano.engine import (
+    AbstractEngine as AbstractEngine,
+    contact_patches as contact_patches,
+    contact_wrenches as contact_wrenches,
+    linearize as linearize,
+    simulate as simulate,
+    step as step,
+    VariationalEngine as VariationalEngine,
+)
+
+__version__ = "0.1.0"

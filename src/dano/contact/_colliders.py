@@ -1,0 +1,153 @@
+"""What a contact sees of a body: samples to be tested, a field to be queried, and where both are."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+from scipy import ndimage
+
+from dano.fields import AbstractField, GridField
+from dano.maths import Pose, floating, safe_norm
+
+
+# Samples per block. Fewer make the culling finer, more make each pass over a block fatter; 64 measured best.
+BLOCK = 64
+
+
+class SampleSet(eqx.Module):
+    """Weighted contact samples in the field frame, in the layout the overlap kernels want.
+
+    Samples are ordered so that each run of `BLOCK` is compact in space; the last run is filled up with copies of
+    weight zero.
+
+    Attributes:
+        points: Homogeneous coordinates (x, y, z, 1) [m, F], shape (4, n); rows are contiguous.
+        weights: φ_i / Σφ, shape (n,); they sum to one.
+        centers: Centre of each block [m, F], shape (n / BLOCK, 3).
+        radii: Radius of each block about its centre [m], shape (n / BLOCK,).
+    """
+
+    points: Float[Array, "4 n"]
+    weights: Float[Array, " n"]
+    centers: Float[Array, "blocks 3"]
+    radii: Float[Array, " blocks"]
+
+    @classmethod
+    def create(cls, points: Float[ArrayLike, "n 3"], density: Float[ArrayLike, " n"]) -> "SampleSet":
+        """Order the samples in space and normalise their weights, on the host.
+
+        Args:
+            points: Sample positions [m, F].
+            density: Density φ ≥ 0 of each sample [arbitrary unit]; not all zero.
+        """
+        x, phi = np.asarray(points, dtype=np.float64), np.asarray(density, dtype=np.float64)
+        order = _spatial_order(x)
+        missing = -len(order) % BLOCK
+        weights = np.concatenate([phi[order] / phi.sum(), np.zeros(missing)])
+        x = np.concatenate([x[order], np.repeat(x[order[-1:]], missing, axis=0)])
+        blocks = x.reshape(-1, BLOCK, 3)
+        centers = 0.5 * (blocks.min(axis=1) + blocks.max(axis=1))
+        radii = np.linalg.norm(blocks - centers[:, None], axis=-1).max(axis=1)
+        homogeneous = np.concatenate([x.T, np.ones((1, len(x)))])
+        return cls(floating(homogeneous), floating(weights), floating(centers), floating(radii))
+
+
+class Support(eqx.Module):
+    """Distance to where a grid's density is not zero, rounded down: tells which blocks of samples can be skipped.
+
+    Attributes:
+        distance: Lower bound on the distance [m] to the support from any point whose nearest node this is,
+            shape (nx, ny, nz).
+        origin: First node [m, F], shape (3,).
+        spacing: Distance between nodes [m], shape (3,).
+    """
+
+    distance: Float[Array, "nx ny nz"]
+    origin: Float[Array, "3"]
+    spacing: Float[Array, "3"]
+
+    @classmethod
+    def create(cls, field: GridField) -> "Support":
+        """Build the map on the host from the grid's non-zero values."""
+        spacing = np.broadcast_to(np.asarray(field.spacing, dtype=np.float64), (3,))
+        reach = _REACH[field.interpolation]
+        dilation = int(reach)
+        # A border makes room for the reach of the outermost nodes, so that the map's edge is outside the support.
+        border = dilation + 2
+        occupied = np.pad(np.asarray(field.values) > 0, border)
+        grown = ndimage.binary_dilation(occupied, np.ones((3, 3, 3), bool), iterations=dilation)
+        distance = np.asarray(ndimage.distance_transform_edt(~grown, sampling=spacing))
+        # Half a cell from a point to its nearest node, and what the reach exceeds whole cells by.
+        slack = (0.5 + reach - dilation) * np.linalg.norm(spacing)
+        origin = np.asarray(field.origin, dtype=np.float64) - border * spacing
+        return cls(floating(np.maximum(distance - slack, 0.0)), floating(origin), floating(spacing))
+
+    def lower_bound(self, x: Float[Array, "3 n"]) -> Float[Array, " n"]:
+        """Lower bound on the distance [m] from points [m, F] to the support; zero inside it."""
+        last = jnp.asarray(self.distance.shape, x.dtype)[:, None] - 1
+        position = (x - self.origin[:, None]) / self.spacing[:, None]
+        inside = jnp.clip(position, 0, last)
+        index = jnp.round(inside).astype(jnp.int32)
+        # From outside the map, the way to its edge comes first; beyond the edge lies nothing nearer.
+        walk = safe_norm((position - inside) * self.spacing[:, None], axis=0)
+        return jnp.maximum(self.distance[index[0], index[1], index[2]], walk)
+
+
+# How many cells a node's B-spline reaches to each side.
+_REACH = {"linear": 1.0, "quadratic": 1.5, "cubic": 2.0}
+
+
+class Collider(eqx.Module):
+    """One side of a contact at its current pose.
+
+    Attributes:
+        samples: Contact samples tested against the other side's field, or None for a primitive.
+        field: Density field queried by the other side's samples, or None if the object has none.
+        support: Culling map of the field, or None to query it everywhere.
+        density_scale: Multiplies the field's density to make it dimensionless (1 for a shape's occupancy).
+        mass: Mass [kg] that the sample weights sum to.
+        rotation: Field frame → world, shape (3, 3).
+        origin: Origin of the field frame [m, W], shape (3,).
+    """
+
+    samples: SampleSet | None
+    field: AbstractField | None
+    support: Support | None
+    density_scale: Float[Array, ""]
+    mass: Float[Array, ""]
+    rotation: Float[Array, "3 3"]
+    origin: Float[Array, "3"]
+
+    def __init__(
+        self,
+        field: AbstractField | None = None,
+        samples: SampleSet | None = None,
+        *,
+        support: Support | None = None,
+        density_scale: ArrayLike = 1.0,
+        mass: ArrayLike = 1.0,
+        pose: Pose | None = None,
+        rotation: Array | None = None,
+        origin: Array | None = None,
+    ):
+        """Build a collider from its parts; give either `pose` or both `rotation` and `origin` (default: identity)."""
+        pose = Pose() if pose is None else pose
+        self.samples, self.field, self.support = samples, field, support
+        self.density_scale, self.mass = floating(density_scale), floating(mass)
+        self.rotation = pose.matrix if rotation is None else rotation
+        self.origin = pose.position if origin is None else origin
+
+
+def _spatial_order(points: np.ndarray) -> np.ndarray:
+    """Permutation that makes each run of `BLOCK` points compact: recursive splits along the longest extent."""
+
+    def split(index: np.ndarray) -> list[np.ndarray]:
+        if len(index) <= BLOCK:
+            return [index]
+        x = points[index]
+        axis = int(np.argmax(x.max(axis=0) - x.min(axis=0)))
+        left = BLOCK * ((len(index) // BLOCK + 1) // 2)
+        part = np.argsort(x[:, axis], kind="stable")
+        return split(index[part[:left]]) + split(index[part[left:]])
+
+    return np.concatenate(split(np.arange(len(points))))

@@ -1,0 +1,12 @@
+"""Engines: from a scene and a state to the next one, and everything built on that."""
+
+from dano.engine._rollout import (
+    AbstractEngine as AbstractEngine,
+    contact_patches as contact_patches,
+    contact_wrenches as contact_wrenches,
+    linearize as linearize,
+    simulate as simulate,
+    step as step,
+    VariationalEngine as VariationalEngine,
+)
+from dano.engine._variational import Report as Report

@@ -1,0 +1,290 @@
+"""The verbs: one step, many steps, a step's linearisation, the forces of a step."""
+
+import abc
+import math
+import warnings
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.contact import Patch
+from dano.engine import _variational
+from dano.engine._variational import Report
+from dano.maths import is_traced, quat_conjugate, quat_multiply, safe_norm
+from dano.scene import Control, Scene, State, Trajectory
+
+Policy = Callable[[State, Float[Array, ""]], Control]
+
+# From here on reverse mode recomputes segments instead of keeping every step's residuals.
+CHECKPOINT_FROM = 2000
+
+
+class AbstractEngine(eqx.Module):
+    """Advances the state of a scene."""
+
+    @abc.abstractmethod
+    def step(self, scene: Scene, state: State, control: Control | None) -> tuple[State, Report]:
+        """One timestep; the report says whether the step's equations were solved."""
+
+
+class VariationalEngine(AbstractEngine):
+    """The variational integrator with an implicit solve per step (see `dano.engine._variational`).
+
+    Attributes:
+        max_iterations: Newton and line search passes after which a step is reported as not converged.
+    """
+
+    max_iterations: int = eqx.field(static=True, default=50)
+
+    def __check_init__(self):
+        """Raise a ValueError unless `max_iterations` is at least one."""
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations must be ≥ 1, got {self.max_iterations}")
+
+    def step(self, scene: Scene, state: State, control: Control | None) -> tuple[State, Report]:
+        """See `AbstractEngine.step`."""
+        return _variational.step(scene, state, control, self.max_iterations)
+
+
+def step(scene: Scene, state: State, control: Control | None = None, *, engine: AbstractEngine | None = None) -> State:
+    """Advance a scene by one timestep.
+
+    Args:
+        scene: The scene.
+        state: State of all bodies.
+        control: Forces and torques on the bodies during the step; default none.
+        engine: Default `VariationalEngine()`.
+
+    Returns:
+        The state one timestep later. A step that did not converge raises a RuntimeWarning (outside of `jax.jit`).
+
+    Raises:
+        ValueError: If the state or control does not fit the scene.
+    """
+    scene.check_state(state)
+    _check_control(scene, control, ())
+    following, report = _jitted_step(engine or VariationalEngine(), scene, state, control)
+    _say_unconverged(report.converged, report.residual)
+    return following
+
+
+def simulate(
+    scene: Scene,
+    state: State,
+    n_steps: int | None = None,
+    *,
+    controls: Control | Policy | None = None,
+    engine: AbstractEngine | None = None,
+    checkpoint_every: int | None = None,
+) -> Trajectory:
+    """Roll a scene out.
+
+    Compiled on first use for each scene structure and number of steps; differentiable in forward and reverse mode
+    with respect to every array in `scene`, `state` and `controls`, and batched by `jax.vmap`.
+
+    Args:
+        scene: The scene.
+        state: Initial state.
+        n_steps: Number of steps; may be left out if `controls` are arrays.
+        controls: Forces and torques for each step, leaves of shape (n_steps, n_bodies, 3), or a function of
+            (state, time [s]) that returns the control of a step. Row t acts on the step from t to t + 1.
+        engine: Default `VariationalEngine()`.
+        checkpoint_every: In reverse mode, keep only every so many states and recompute the steps between; default:
+            everything is kept up to 2000 steps (a few hundred numbers each), the square root of their number beyond.
+
+    Returns:
+        The trajectory. Steps that did not converge are marked in it and raise a RuntimeWarning (outside of `jax.jit`).
+
+    Raises:
+        ValueError: If the state or controls do not fit the scene, or `n_steps` is missing, < 1 or contradicts them.
+    """
+    scene.check_state(state)
+    if controls is not None and not callable(controls):
+        rows = int(controls.force.shape[0]) if controls.force.ndim == 3 else -1
+        if n_steps is None:
+            n_steps = rows
+        _check_control(scene, controls, (n_steps,))
+    if n_steps is None or n_steps < 1:
+        raise ValueError(f"n_steps must be ≥ 1, got {n_steps}")
+    if checkpoint_every is not None and checkpoint_every < 1:
+        raise ValueError(f"checkpoint_every must be ≥ 1, got {checkpoint_every}")
+    if checkpoint_every is None and n_steps > CHECKPOINT_FROM:
+        checkpoint_every = math.isqrt(n_steps)
+    states, report = _jitted_rollout(engine or VariationalEngine(), scene, state, controls, n_steps, checkpoint_every)
+    _say_unconverged(report.converged, report.residual)
+    times = scene.timestep * jnp.arange(n_steps + 1, dtype=scene.timestep.dtype)
+    return Trajectory(times, states, report.residual, report.iterations, report.converged, scene.names)
+
+
+def linearize(
+    scene: Scene, state: State, control: Control | None = None, *, engine: AbstractEngine | None = None
+) -> tuple[Float[Array, "n n"], Float[Array, "n m"]]:
+    """Linearise a step: δz⁺ = A δz + B δu.
+
+    Coordinates of a body are (position [m, W], rotation vector [rad, B], velocity [m/s, W], omega [rad/s, B]), those
+    of its control (force [N, W], torque [N m, W]); bodies that move are stacked in the scene's order. A rotation
+    vector θ stands for q ⊗ exp(θ).
+
+    Returns:
+        A, shape (12 k, 12 k), and B, shape (12 k, 6 k), for k bodies that move.
+
+    Raises:
+        ValueError: If the state or control does not fit the scene.
+    """
+    scene.check_state(state)
+    _check_control(scene, control, ())
+    return _jitted_linearize(engine or VariationalEngine(), scene, state, control)
+
+
+def contact_wrenches(scene: Scene, states: State) -> Float[Array, "steps contacts 6"]:
+    """Contact forces along a trajectory.
+
+    Args:
+        scene: The scene.
+        states: Consecutive states, leaves of shape (n_steps + 1, n_bodies, ·), as in `Trajectory.states`.
+
+    Returns:
+        Force [N] and torque about the centroid [N m] on the first body of each contact [W], for each step.
+
+    Raises:
+        ValueError: If the states do not fit the scene or the scene has no contacts.
+    """
+    scene.check_state(states)
+    if not scene.contacts:
+        raise ValueError("scene must have at least one contact, got none")
+    return _jitted_wrenches(scene, states)
+
+
+def contact_patches(scene: Scene, states: State) -> tuple[Patch, ...]:
+    """Overlap (ψ, χ, n) of each contact at each state, in the order of `scene.contacts`.
+
+    Args:
+        scene: The scene.
+        states: States with any leading axis, leaves of shape (n, n_bodies, ·).
+
+    Raises:
+        ValueError: If the states do not fit the scene.
+    """
+    scene.check_state(states)
+    return _jitted_patches(scene, states)
+
+
+@eqx.filter_jit
+def _jitted_step(engine, scene, state, control):
+    return engine.step(scene, state, control)
+
+
+@eqx.filter_jit
+def _jitted_rollout(engine, scene, state, controls, n_steps, segment):
+    def advance(state, inputs):
+        index, control = inputs
+        if callable(controls):
+            control = controls(state, scene.timestep * index)
+        following, report = engine.step(scene, state, control)
+        return following, (following, report)
+
+    def scan(state, inputs):
+        return jax.lax.scan(advance, state, inputs)
+
+    steps = jnp.arange(n_steps, dtype=scene.timestep.dtype), None if callable(controls) else controls
+    if segment is None or segment >= n_steps:
+        _, (states, report) = scan(state, steps)
+    else:
+        whole = n_steps - n_steps % segment
+        head = jax.tree.map(lambda x: x[:whole].reshape(-1, segment, *x.shape[1:]), steps)
+        last, (states, report) = jax.lax.scan(jax.checkpoint(scan), state, head)
+        states, report = jax.tree.map(lambda x: x.reshape(whole, *x.shape[2:]), (states, report))
+        if whole < n_steps:
+            _, tail = scan(last, jax.tree.map(lambda x: x[whole:], steps))
+            states, report = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), (states, report), tail)
+    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, states)
+    return states, report
+
+
+@eqx.filter_jit
+def _jitted_linearize(engine, scene, state, control):
+    rows = np.array([i for i, body in enumerate(scene.bodies) if not body.fixed])
+    if control is None:
+        control = Control(jnp.zeros_like(state.position), jnp.zeros_like(state.position))
+    nominal, _ = engine.step(scene, state, control)
+
+    def perturbed(change, input_change):
+        moved = _retract(state, rows, change)
+        force = control.force.at[rows].add(input_change[:, :3])
+        torque = control.torque.at[rows].add(input_change[:, 3:])
+        following, _ = engine.step(scene, moved, Control(force, torque))
+        return _difference(nominal, following, rows)
+
+    n = len(rows)
+    zero = jnp.zeros((n, 12), state.position.dtype), jnp.zeros((n, 6), state.position.dtype)
+    a, b = jax.jacfwd(perturbed, argnums=(0, 1))(*zero)
+    return a.reshape(12 * n, 12 * n), b.reshape(12 * n, 6 * n)
+
+
+def _retract(state: State, rows: np.ndarray, change: Float[Array, "k 12"]) -> State:
+    half = 0.5 * change[:, 3:6]
+    angle = safe_norm(half)[:, None]
+    turn = jnp.concatenate([jnp.cos(angle), half * jnp.sinc(angle / jnp.pi)], axis=1)
+    return State(
+        state.position.at[rows].add(change[:, :3]),
+        state.orientation.at[rows].set(quat_multiply(state.orientation[rows], turn)),
+        state.velocity.at[rows].add(change[:, 6:9]),
+        state.omega.at[rows].add(change[:, 9:]),
+    )
+
+
+def _difference(nominal: State, state: State, rows: np.ndarray) -> Float[Array, "k 12"]:
+    """Change of state to first order, in the coordinates of `linearize`."""
+    relative = quat_multiply(quat_conjugate(nominal.orientation[rows]), state.orientation[rows])
+    return jnp.concatenate(
+        [
+            state.position[rows] - nominal.position[rows],
+            2 * relative[:, 1:],
+            state.velocity[rows] - nominal.velocity[rows],
+            state.omega[rows] - nominal.omega[rows],
+        ],
+        axis=1,
+    )
+
+
+@eqx.filter_jit
+def _jitted_wrenches(scene, states):
+    before = jax.tree.map(lambda x: x[:-1], states)
+    after = jax.tree.map(lambda x: x[1:], states)
+    return jax.lax.map(lambda pair: _variational.wrenches(scene, *pair), (before, after))
+
+
+@eqx.filter_jit
+def _jitted_patches(scene, states):
+    return jax.lax.map(lambda state: _variational.patches(scene, state), states)
+
+
+def _check_control(scene: Scene, control: Control | None, leading: tuple[int, ...]) -> None:
+    if control is None:
+        return
+    expected = (*leading, len(scene.bodies), 3)
+    for name in ("force", "torque"):
+        value = getattr(control, name)
+        if value.shape != expected:
+            raise ValueError(f"control.{name} must have shape {expected}, got {value.shape}")
+        if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
+            raise ValueError(f"control.{name} must be finite")
+
+
+def _say_unconverged(converged, residual) -> None:
+    if is_traced(converged) or bool(jnp.all(converged)):
+        return
+    failed = np.flatnonzero(~np.atleast_1d(np.asarray(converged)))
+    worst = float(np.nanmax(np.atleast_1d(np.asarray(residual))[failed], initial=0.0))
+    warnings.warn(
+        f"{len(failed)} of {np.size(converged)} steps did not converge, first step {failed[0]}, "
+        f"largest residual {worst:.3g} m/s; try a smaller timestep, damper or smoothing",
+        RuntimeWarning,
+        stacklevel=3,
+    )
+
+

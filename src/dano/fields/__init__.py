@@ -1,0 +1,27 @@
+"""Fields: what occupies space. Densities of any kind, shapes, grids, meshes, and readers for them."""
+
+from dano.fields._bake import bake as bake, Baked as Baked, BakeError as BakeError
+from dano.fields._base import AbstractField as AbstractField
+from dano.fields._callable import CallableField as CallableField
+from dano.fields._compose import (
+    Posed as Posed,
+    PosedField as PosedField,
+    PosedShape as PosedShape,
+    Union as Union,
+    UnionField as UnionField,
+    UnionShape as UnionShape,
+)
+from dano.fields._grid import DensityMoments as DensityMoments, GridField as GridField
+from dano.fields._io import load_field as load_field, save_field as save_field
+from dano.fields._shapes import (
+    AbstractShape as AbstractShape,
+    Box as Box,
+    Capsule as Capsule,
+    Cylinder as Cylinder,
+    Ellipsoid as Ellipsoid,
+    HalfSpace as HalfSpace,
+    occupancy as occupancy,
+    SolidMoments as SolidMoments,
+    Sphere as Sphere,
+)
+from dano.fields._signed_distance import mesh_field as mesh_field, SignedDistanceGrid as SignedDistanceGrid

@@ -1,0 +1,234 @@
+"""Fields made of fields: placed by a pose, or joined."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from dano.fields._base import AbstractField, check_order, Jet
+from dano.fields._shapes import AbstractShape, checked_edge, SolidMoments
+from dano.maths import Pose
+
+
+def Posed(field: AbstractField, pose: Pose) -> "PosedShape | PosedField":  # noqa: N802 - reads as a constructor
+    """`field` moved by `pose`, which maps the frame of `field` into the new one.
+
+    Returns:
+        A `PosedShape` if `field` is a shape (signed distance, moments and edge are carried over), else a
+        `PosedField`.
+
+    Raises:
+        ValueError: If `field` is not a field or `pose` is not a `Pose`.
+    """
+    if not isinstance(field, AbstractField):
+        raise ValueError(f"field must be a dano field (an AbstractField), got {type(field).__name__}")
+    if not isinstance(pose, Pose):
+        raise ValueError(f"pose must be a dano.maths.Pose, got {type(pose).__name__}")
+    return PosedShape(field, pose) if isinstance(field, AbstractShape) else PosedField(field, pose)
+
+
+def Union(*fields: AbstractField, edge: ArrayLike | None = None) -> "UnionShape | UnionField":  # noqa: N802
+    """The union of several fields.
+
+    Args:
+        fields: At least one field, all in the same frame.
+        edge: Width [m] of the smooth edge of a union of shapes; None takes the largest width its parts state,
+            and 0.5 % of the union's size if none states one.
+
+    Returns:
+        A `UnionShape` (least signed distance) if all are shapes, else a `UnionField` (largest density).
+
+    Raises:
+        ValueError: If there is no field, one of them is not a field, or `edge` is negative or given for
+            fields that have none.
+    """
+    if not fields:
+        raise ValueError("fields must hold at least one field, got none")
+    for index, field in enumerate(fields):
+        if not isinstance(field, AbstractField):
+            raise ValueError(
+                f"fields[{index}] must be a dano field (an AbstractField), got {type(field).__name__}"
+            )
+    if not all(isinstance(field, AbstractShape) for field in fields):
+        if edge is not None:
+            raise ValueError(
+                f"edge applies to a union of shapes only, got {edge} for {[type(f).__name__ for f in fields]}"
+            )
+        return UnionField(fields)
+    stated = [field.edge for field in fields if field.edge is not None]
+    if edge is None and stated:
+        return UnionShape(fields, jnp.max(jnp.stack(stated)))
+    return UnionShape(fields, checked_edge(edge))
+
+
+def posed_bounds(bounds: Float[Array, "2 3"], pose: Pose) -> Float[Array, "2 3"]:
+    """Axis-aligned box [m] around a moved axis-aligned box; infinite everywhere if an edge is."""
+    finite = jnp.isfinite(bounds)
+    safe = jnp.where(finite, bounds, 0)
+    matrix = pose.matrix.astype(bounds.dtype)
+    centre = matrix @ (0.5 * (safe[0] + safe[1])) + pose.position.astype(bounds.dtype)
+    reach = jnp.abs(matrix) @ (0.5 * (safe[1] - safe[0]))
+    infinite = jnp.stack([jnp.full_like(reach, -jnp.inf), jnp.full_like(reach, jnp.inf)])
+    return jnp.where(jnp.all(finite), jnp.stack([centre - reach, centre + reach]), infinite)
+
+
+def _to_inner(pose: Pose, x: Float[Array, "3"]) -> Float[Array, "3"]:
+    return pose.matrix.astype(x.dtype).T @ (x - pose.position.astype(x.dtype))
+
+
+def _posed_jet(jet_of: Callable[[Array, int], Jet], pose: Pose, x: Float[Array, "3 n"], order: int) -> Jet:
+    """Jet of a moved function through the (possibly fast) jet of the inner one: ∇ ↦ R ∇, ∇∇ ↦ R ∇∇ Rᵀ."""
+    check_order(order)
+    matrix = pose.matrix.astype(x.dtype)
+    jet = jet_of(matrix.T @ (x - pose.position.astype(x.dtype)[:, None]), order)
+    if order == 0:
+        return jet
+    value, gradient, *hessian = jet
+    rotated = tuple(jnp.einsum("ia,abn,jb->ijn", matrix, h, matrix) for h in hessian)
+    return value, matrix @ gradient, *rotated
+
+
+class PosedField(AbstractField):
+    """A field moved by a pose; see `Posed`.
+
+    Attributes:
+        field: The field, in its own frame.
+        pose: Maps the frame of `field` into the frame of this field.
+    """
+
+    field: AbstractField
+    pose: Pose
+
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """Axis-aligned box [m] around the moved bounds of the inner field."""
+        return posed_bounds(self.field.bounds, self.pose)
+
+    def density(self, x: Float[Array, "3"]) -> Float[Array, ""]:
+        """Density of the inner field at the point that the pose maps to `x` [m]."""
+        return self.field.density(_to_inner(self.pose, x))
+
+    def outward(self, x: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Outward direction of the inner field, turned with it."""
+        return self.pose.matrix.astype(x.dtype) @ self.field.outward(_to_inner(self.pose, x))
+
+    def jet(self, x: Float[Array, "3 n"], order: int) -> Jet:
+        """See `AbstractField.jet`."""
+        return _posed_jet(self.field.jet, self.pose, x, order)
+
+
+class PosedShape(AbstractShape):
+    """A shape moved by a pose; see `Posed`.
+
+    Attributes:
+        shape: The shape, in its own frame.
+        pose: Maps the frame of `shape` into the frame of this shape.
+    """
+
+    shape: AbstractShape
+    pose: Pose
+
+    @property
+    def edge(self) -> Float[Array, ""] | None:
+        """The edge width [m] that the inner shape states."""
+        return self.shape.edge
+
+    @property
+    def size(self) -> Float[Array, ""]:
+        """Size of the inner shape [m], so that turning a shape does not change its smooth edge."""
+        return self.shape.size
+
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """Axis-aligned box [m] around the moved bounds of the inner shape."""
+        return posed_bounds(self.shape.bounds, self.pose)
+
+    def sdf(self, x: Float[Array, "3"]) -> Float[Array, ""]:
+        """Signed distance [m] of the inner shape at the point that the pose maps to `x` [m]."""
+        return self.shape.sdf(_to_inner(self.pose, x))
+
+    def outward(self, x: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Outward direction of the inner shape, turned with it."""
+        return self.pose.matrix.astype(x.dtype) @ self.shape.outward(_to_inner(self.pose, x))
+
+    def sdf_jet(self, x: Float[Array, "3 n"], order: int) -> Jet:
+        """See `AbstractShape.sdf_jet`."""
+        return _posed_jet(self.shape.sdf_jet, self.pose, x, order)
+
+    def solid_moments(self) -> SolidMoments | None:
+        """Moments of the inner shape, moved: V, R c + p, R S Rᵀ."""
+        moments = self.shape.solid_moments()
+        if moments is None:
+            return None
+        matrix = self.pose.matrix.astype(moments.centroid.dtype)
+        centroid = matrix @ moments.centroid + self.pose.position.astype(moments.centroid.dtype)
+        return SolidMoments(moments.volume, centroid, matrix @ moments.second_moment @ matrix.T)
+
+
+def _joined_bounds(fields: tuple[AbstractField, ...]) -> Float[Array, "2 3"]:
+    bounds = jnp.stack([field.bounds for field in fields])
+    return jnp.stack([jnp.min(bounds[:, 0], axis=0), jnp.max(bounds[:, 1], axis=0)])
+
+
+class UnionField(AbstractField):
+    """The largest density of several fields; see `Union`.
+
+    Attributes:
+        fields: The parts, all in the frame of this field.
+    """
+
+    fields: tuple[AbstractField, ...]
+
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """Box [m] around the bounds of all parts."""
+        return _joined_bounds(self.fields)
+
+    def density(self, x: Float[Array, "3"]) -> Float[Array, ""]:
+        """Largest density of the parts at `x` [m, F]."""
+        return jnp.max(jnp.stack([field.density(x) for field in self.fields]))
+
+    def outward(self, x: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Outward direction of the densest part at `x` [m, F]."""
+        densest = jnp.argmax(jnp.stack([field.density(x) for field in self.fields]))
+        return jnp.stack([field.outward(x) for field in self.fields])[densest]
+
+    def jet(self, x: Float[Array, "3 n"], order: int) -> Jet:
+        """See `AbstractField.jet`: the jet of the densest part at each point."""
+        check_order(order)
+        jets = [field.jet(x, order) for field in self.fields]
+        if order == 0:
+            return jnp.max(jnp.stack(jets), axis=0)
+        densest = jnp.argmax(jnp.stack([jet[0] for jet in jets]), axis=0)
+
+        def choose(*parts: Array) -> Array:
+            stacked = jnp.stack(parts)
+            index = jnp.broadcast_to(densest, (1, *stacked.shape[1:]))
+            return jnp.take_along_axis(stacked, index, axis=0)[0]
+
+        return jax.tree.map(choose, *jets)
+
+
+class UnionShape(AbstractShape):
+    """The union of several shapes; see `Union`.
+
+    Attributes:
+        shapes: The parts, all in the frame of this shape.
+    """
+
+    shapes: tuple[AbstractShape, ...]
+    edge: Float[Array, ""] | None
+
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """Box [m] around the bounds of all parts."""
+        return _joined_bounds(self.shapes)
+
+    def sdf(self, x: Float[Array, "3"]) -> Float[Array, ""]:
+        """Least signed distance [m] of the parts: exact outside, at most the depth inside."""
+        return jnp.min(jnp.stack([shape.sdf(x) for shape in self.shapes]))
+
+    def solid_moments(self) -> None:
+        """None: parts may overlap, so their moments do not add."""
+        return None

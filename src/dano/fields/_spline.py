@@ -1,0 +1,207 @@
+"""Uniform B-splines in three dimensions: values and derivatives of many points, fast on a CPU and on a GPU.
+
+s(u) = Σ c[i, j, k] β(u₀ − i) β(u₁ − j) β(u₂ − k), with β the centred B-spline of degree 1, 2 or 3 and u in
+index units.
+
+What decides the speed (10,000 random points of a 64³ quadratic grid, value and gradient, one core):
+27 scalar gathers take 2.5 ms, nine gathers of three neighbours 1.6 ms, one gather of a 3×3×3 block per point
+1.5 ms, the same in chunks that stay in the cache and contracted one axis at a time 0.6 ms. Automatic
+differentiation in reverse through the gathers costs ten to thirty times that, so the derivative rule below
+evaluates the next derivative order instead.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float, Int
+
+DEGREES = {"linear": 1, "quadratic": 2, "cubic": 3}
+"""Degree of the spline of each kind of interpolation."""
+
+CHUNK = 1024
+"""Most points evaluated at once on a CPU: 27 values of each still fit into a core's cache."""
+
+# How far β of a degree reaches from its node, in index units, is (degree + 1)/2. Points are clamped to where
+# all nodes of their stencil lie in the zero border, which is `border(degree)` nodes wide.
+_LOWEST = {1: -2, 2: -2, 3: -3}
+
+
+def border(degree: int) -> int:
+    """Width in nodes of the border that coefficients passed to `spline_jet` carry on every side."""
+    return degree + 1
+
+
+def degree_of(interpolation: str) -> int:
+    """Spline degree of a kind of interpolation.
+
+    Raises:
+        ValueError: If the name is not known.
+    """
+    if interpolation not in DEGREES:
+        raise ValueError(f"interpolation must be one of {sorted(DEGREES)}, got {interpolation!r}")
+    return DEGREES[interpolation]
+
+
+def multi_indices(order: int) -> list[tuple[int, int, int]]:
+    """Derivative orders per axis of each row of `spline_jet`: s, x, y, z, xx, xy, xz, yy, yz, zz, xxx etc."""
+    return [
+        (a, b, total - a - b)
+        for total in range(order + 1)
+        for a in range(total, -1, -1)
+        for b in range(total - a, -1, -1)
+    ]
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
+def spline_jet(
+    coefficients: Float[Array, "nx ny nz"], u: Float[Array, "3 n"], degree: int, order: int
+) -> Float[Array, "rows n"]:
+    """Derivatives up to `order` of a spline at many points.
+
+    Args:
+        coefficients: c, with a border of `border(degree)` nodes on every side.
+        u: Points in index units, (0, 0, 0) at the first node inside the border. Points beyond the border's
+            inner half are moved onto it, where a zero border gives zero.
+        degree: 1, 2 or 3.
+        order: Highest total derivative order.
+
+    Returns:
+        One row per derivative, in the order of `multi_indices`, in index units and in the dtype of `u`.
+    """
+    n_points = u.shape[1]
+    # Chunks only pay where a cache is small; an accelerator wants all points at once.
+    if n_points <= CHUNK or jax.default_backend() != "cpu":
+        return _rows(coefficients, u, degree, order)
+    n_chunks = -(-n_points // CHUNK)
+    chunk = -(-n_points // n_chunks)
+    padded = jnp.pad(u, ((0, 0), (0, n_chunks * chunk - n_points)))
+    pieces = padded.reshape(3, n_chunks, chunk).transpose(1, 0, 2)
+    rows = lax.map(lambda piece: _rows(coefficients, piece, degree, order), pieces)
+    return rows.transpose(1, 0, 2).reshape(rows.shape[1], -1)[:, :n_points]
+
+
+@functools.partial(spline_jet.defjvp, symbolic_zeros=True)
+def _spline_jet_jvp(
+    degree: int, order: int, primals: tuple[Array, Array], tangents: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """Next-order derivatives times du, plus the spline of dc (splines are linear in coefficients)."""
+    coefficients, u = primals
+    dcoefficients, du = tangents
+    indices, next_indices = multi_indices(order), multi_indices(order + 1)
+    # Third derivatives are asked for only by derivatives of Hessians; those may go through the gathers.
+    jet = _rows if order >= 2 else spline_jet
+    higher = jet(coefficients, u, degree, order if isinstance(du, SymbolicZero) else order + 1)
+    rows = higher[: len(indices)]
+    tangent = jnp.zeros_like(rows)
+    if not isinstance(du, SymbolicZero):
+        lookup = {index: row for row, index in enumerate(next_indices)}
+        along = [
+            jnp.asarray([lookup[_raised(index, axis)] for index in indices], dtype=jnp.int32)
+            for axis in range(3)
+        ]
+        tangent = sum((higher[along[axis]] * du[axis][None] for axis in range(3)), tangent)
+    if not isinstance(dcoefficients, SymbolicZero):
+        # Not the custom rule, and not in chunks: this one must be transposable, into one scatter.
+        tangent = tangent + _rows(dcoefficients, u, degree, order)
+    return rows, tangent
+
+
+def _raised(index: tuple[int, int, int], axis: int) -> tuple[int, int, int]:
+    a, b, c = (order + (position == axis) for position, order in enumerate(index))
+    return a, b, c
+
+
+def _rows(
+    coefficients: Float[Array, "nx ny nz"], u: Float[Array, "3 n"], degree: int, order: int
+) -> Float[Array, "rows n"]:
+    """`spline_jet` of all points at once: gather a block per point, then contract it along z, y and x."""
+    base, weights = _stencil(coefficients.shape, u, degree, order)
+    block = _gather_blocks(coefficients, base, degree + 1).astype(u.dtype)
+    taps = range(degree + 1)
+    if order == 0:
+        # Point by point in one loop: for a cubic, XLA would otherwise work the weights out anew for each of
+        # 16 rows.
+        w = weights[0]
+        rows = [[sum(block[i, j, q] * w[q][2] for q in taps) * w[j][1] * w[i][0] for j in taps] for i in taps]
+        return sum(sum(row) for row in rows)[None]
+    along_z = [sum(block[:, :, q] * weights[c][q][2][None, None] for q in taps) for c in range(order + 1)]
+    along_y = {
+        (b, c): sum(along_z[c][:, q] * weights[b][q][1][None] for q in taps)
+        for c in range(order + 1)
+        for b in range(order + 1 - c)
+    }
+    return jnp.stack(
+        [sum(along_y[b, c][q] * weights[a][q][0] for q in taps) for a, b, c in multi_indices(order)]
+    )
+
+
+def _stencil(
+    shape: tuple[int, ...], u: Float[Array, "3 n"], degree: int, order: int
+) -> tuple[Int[Array, "3 n"], list[list[Array]]]:
+    """First node of each point's stencil, and its weights as ``weights[derivative][tap]`` of shape (3, n)."""
+    lowest = _LOWEST[degree]
+    n_border = border(degree)
+    # Highest base node whose stencil still lies in the array; it is in the border, as `lowest` is.
+    shift = 0 if degree == 1 else 1
+    highest = np.asarray([size - n_border - 1 - degree + shift for size in shape], dtype=np.int32)
+    upper = jnp.asarray(highest[:, None], u.dtype)
+    u = jnp.minimum(jnp.maximum(u, jnp.asarray(lowest, u.dtype)), jnp.broadcast_to(upper, u.shape))
+    node = jnp.floor(u + 0.5) if degree == 2 else jnp.floor(u)
+    # A NaN point must give NaN, not an address: the integer is clamped once more, after the conversion.
+    base = jnp.clip(node.astype(jnp.int32), lowest, jnp.broadcast_to(jnp.asarray(highest[:, None]), u.shape))
+    return base + jnp.int32(n_border - shift), _weights(u - node, degree, order)
+
+
+def _weights(f: Float[Array, "3 n"], degree: int, order: int) -> list[list[Array]]:
+    """Weights of the stencil's nodes and their derivatives, at f past the base (quadratic: nearest) node."""
+    one = jnp.ones_like(f)
+    zero = jnp.zeros_like(f)
+    g = 1 - f
+    if degree == 1:
+        table = [[g, f], [-one, one]]
+    elif degree == 2:
+        table = [
+            [0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2],
+            [f - 0.5, -2 * f, f + 0.5],
+            [one, -2 * one, one],
+        ]
+    else:
+        table = [
+            [g**3 / 6, 2 / 3 - f * f * (1 - 0.5 * f), 2 / 3 - g * g * (1 - 0.5 * g), f**3 / 6],
+            [-0.5 * g * g, f * (1.5 * f - 2), g * (2 - 1.5 * g), 0.5 * f * f],
+            [g, 3 * f - 2, 3 * g - 2, f],
+            [-one, 3 * one, -3 * one, one],
+        ]
+    while len(table) <= order:
+        table.append([zero] * (degree + 1))
+    return table
+
+
+def _gather_blocks(
+    coefficients: Float[Array, "nx ny nz"], base: Int[Array, "3 n"], taps: int
+) -> Float[Array, "taps taps taps n"]:
+    dimensions = lax.GatherDimensionNumbers(
+        offset_dims=(0, 1, 2), collapsed_slice_dims=(), start_index_map=(0, 1, 2)
+    )
+    return lax.gather(
+        coefficients, base.T, dimensions, (taps, taps, taps), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS
+    )
+
+
+def interpolating_coefficients(samples: np.ndarray, degree: int) -> np.ndarray:
+    """Coefficients whose spline passes through `samples`, on the host.
+
+    `samples` must already extend far enough beyond the region of interest: the filter decays by a factor of
+    about 6 (quadratic) or 4 (cubic) per node from the ends, where it assumes a mirror.
+    """
+    if degree == 1:
+        return samples
+    from scipy import ndimage
+
+    return ndimage.spline_filter(samples.astype(np.float64), order=degree, mode="mirror").astype(
+        samples.dtype
+    )

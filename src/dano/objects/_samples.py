@@ -1,0 +1,239 @@
+"""Contact samples: where an object feels contact, drawn evenly between two densities."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+from scipy import ndimage
+
+from dano.fields import AbstractField, AbstractShape, GridField
+from dano.maths import floating
+from dano.objects._mass import cells, checked_density, Density, evaluate
+
+# Candidates per sample that the even selection chooses from, and random draws per candidate before giving up.
+CANDIDATES = 4
+DRAWS = 400
+
+
+class ContactSamples(eqx.Module):
+    """Points that feel contact, in the field frame.
+
+    Attributes:
+        points: Positions [m, F], shape (n, 3).
+        density: φ at each [scale of the field], shape (n,).
+        normals: Unit outward normals −∇φ/|∇φ| [F], shape (n, 3).
+    """
+
+    points: Float[Array, "n 3"]
+    density: Float[Array, " n"]
+    normals: Float[Array, "n 3"]
+
+
+class Lattice(eqx.Module):
+    """Density on the corners of a grid of cells (host arrays).
+
+    Attributes:
+        values: φ at the corners, shape (nx + 1, ny + 1, nz + 1).
+        origin: First corner [m, F], shape (3,).
+        side: Sides of a cell [m], shape (3,).
+    """
+
+    values: np.ndarray
+    origin: np.ndarray
+    side: np.ndarray
+
+    @classmethod
+    def create(cls, density: Density, bounds: Float[Array, "2 3"], resolution: int) -> "Lattice":
+        """Evaluate a density on a lattice over its bounds.
+
+        Raises:
+            ValueError: If it is negative, not finite, or zero everywhere.
+        """
+        count, side = cells(bounds, resolution)
+        origin = np.asarray(bounds[0], dtype=np.float64)
+        corners = np.stack(np.meshgrid(*(np.arange(n + 1) for n in count), indexing="ij"), axis=-1).reshape(-1, 3)
+        values = evaluate(density, origin + corners * side).reshape(tuple(count + 1))
+        if values.max() <= 0:
+            raise ValueError(f"field must have a positive density somewhere, got none at {values.size} points")
+        return cls(values, origin, side)
+
+    def nearest(self, points: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Index of the lattice point nearest to each point (n, 3) [m, F]."""
+        index = np.rint((points - self.origin) / self.side).astype(int)
+        return tuple(np.clip(index, 0, np.array(self.values.shape) - 1).T)
+
+
+class Region(eqx.Module):
+    """Which part of space an object occupies (host arrays on a lattice).
+
+    Attributes:
+        lattice: The lattice that the masks live on.
+        occupied: {φ ≥ level}, without what is not connected to the largest part unless floaters were kept.
+        cavity: Empty lattice points enclosed by `occupied`.
+        level: The density that bounds it.
+    """
+
+    lattice: Lattice
+    occupied: np.ndarray
+    cavity: np.ndarray
+    level: float
+
+    @classmethod
+    def create(cls, lattice: Lattice, level: float, *, floaters: bool) -> "Region":
+        """Threshold, keep the largest connected part, find what it encloses.
+
+        Raises:
+            ValueError: If nothing reaches the level.
+        """
+        occupied = lattice.values >= max(level, np.finfo(float).tiny)
+        labels, parts = ndimage.label(occupied, np.ones((3, 3, 3)))
+        if parts == 0:
+            raise ValueError(f"density_range must start below the field's largest density {lattice.values.max():.6g}, "
+                             f"got {level:.6g}")
+        if not floaters:
+            mass = ndimage.sum_labels(lattice.values, labels, np.arange(1, parts + 1))
+            occupied = labels == 1 + int(np.argmax(mass))
+        cavity = ndimage.binary_fill_holes(occupied) & ~occupied
+        return cls(lattice, occupied, cavity, float(level))
+
+    def near(self, cells_away: int) -> np.ndarray:
+        """Lattice points within some cells of the occupied region."""
+        return ndimage.binary_dilation(self.occupied, np.ones((3, 3, 3)), iterations=cells_away)
+
+    def outer(self) -> np.ndarray:
+        """Lattice points near the region and nearer to the outside than to an enclosed cavity."""
+        if not self.cavity.any():
+            return self.near(1)
+        to_cavity = ndimage.distance_transform_edt(~self.cavity, sampling=self.lattice.side)
+        outside = ~(self.occupied | self.cavity)
+        to_outside = ndimage.distance_transform_edt(~outside, sampling=self.lattice.side)
+        return self.near(1) & (to_outside < to_cavity)
+
+    def solid(self, density: Density, level: float) -> Density:
+        """Mean occupied density inside the filled region, zero outside; sharp at the level, not at lattice points."""
+        mean = float(self.lattice.values[self.occupied].mean())
+        inside = jnp.asarray(ndimage.binary_erosion(self.occupied | self.cavity, np.ones((3, 3, 3))))
+        near = jnp.asarray(self.near(1))
+        origin, side = jnp.asarray(self.lattice.origin), jnp.asarray(self.lattice.side)
+        last = jnp.asarray(self.lattice.values.shape) - 1
+
+        def filled(x: Float[Array, "3"]) -> Float[Array, ""]:
+            index = jnp.clip(jnp.round((x - origin.astype(x.dtype)) / side.astype(x.dtype)).astype(int), 0, last)
+            i, j, k = index
+            solid = inside[i, j, k] | (near[i, j, k] & (density(x) >= level))
+            return jnp.where(solid, mean, 0).astype(x.dtype)
+
+        return filled
+
+
+def surface_range(values: np.ndarray) -> tuple[float, float]:
+    """Two densities around a field's own surface, from its values on a lattice.
+
+    The plateau is the density at which half of the mass has been counted, which neither empty space nor a thin haze
+    moves. The surface lies where the density is between a quarter and three quarters of it.
+    """
+    positive = np.sort(values[values > 0].ravel())
+    plateau = positive[np.searchsorted(np.cumsum(positive), 0.5 * positive.sum())]
+    return 0.25 * float(plateau), 0.75 * float(plateau)
+
+
+def draw_samples(
+    density: Density, lattice: Lattice, region: Region, low: float, high: float, n: int, key: PRNGKeyArray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw `n` points with density in [low, high], spread evenly over the outer side of a region.
+
+    Returns:
+        Points (n, 3) [m, F], all different, and their densities (n,).
+
+    Raises:
+        ValueError: If no point was found between the two densities.
+    """
+    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    allowed = region.outer()
+    corner = np.stack([lattice.values[tuple(slice(o, o + m - 1) for o, m in zip(offset, lattice.values.shape, strict=True))]
+                       for offset in np.ndindex(2, 2, 2)])
+    usable = np.stack([allowed[tuple(slice(o, o + m - 1) for o, m in zip(offset, allowed.shape, strict=True))]
+                       for offset in np.ndindex(2, 2, 2)]).any(axis=0)
+    candidates = np.argwhere((corner.min(axis=0) <= high) & (corner.max(axis=0) >= low) & usable)
+    wanted, drawn = CANDIDATES * n, 0
+    points, values = np.zeros((0, 3)), np.zeros(0)
+    while len(candidates) and len(points) < wanted and drawn < DRAWS * wanted:
+        cell = candidates[random.integers(len(candidates), size=max(wanted, 1 << 16))]
+        x = lattice.origin + (cell + random.random(cell.shape)) * lattice.side
+        phi = evaluate(density, x)
+        keep = (phi >= low) & (phi <= high) & allowed[lattice.nearest(x)]
+        points, values = np.concatenate([points, x[keep]]), np.concatenate([values, phi[keep]])
+        drawn += len(x)
+    if len(points) < n:
+        raise ValueError(
+            f"density_range ({low:.6g}, {high:.6g}) must contain at least n_samples = {n} points of the object, found "
+            f"{len(points)} in {drawn} draws; the field's densities reach {lattice.values.max():.6g}"
+        )
+    chosen = _farthest_points(points[:wanted], n)
+    return points[chosen], values[chosen]
+
+
+def surface_samples(shape: AbstractShape, n: int, key: PRNGKeyArray | None = None) -> ContactSamples:
+    """Even contact samples inside the smooth edge of a shape.
+
+    Args:
+        shape: Bounded shape.
+        n: Number of samples.
+        key: Random key; default `jax.random.key(0)`.
+
+    Raises:
+        ValueError: If the shape is unbounded.
+    """
+    density = checked_density(shape)
+    lattice = Lattice.create(density, shape.bounds, 48)
+    low, high = surface_range(lattice.values)
+    region = Region.create(lattice, low, floaters=True)
+    points, values = draw_samples(density, lattice, region, low, high, n, jax.random.key(0) if key is None else key)
+    return ContactSamples(floating(points), floating(values), floating(outward_normals(shape, points, region)))
+
+
+def _farthest_points(points: np.ndarray, n: int) -> np.ndarray:
+    """Indices of `n` points, each the one farthest from all chosen before: even, and reaching every edge and corner."""
+    chosen = np.empty(n, dtype=int)
+    chosen[0] = int(np.argmax(((points - points.mean(axis=0)) ** 2).sum(axis=1)))
+    x, y, z = np.ascontiguousarray(points.T)
+    nearest = np.full(len(points), np.inf)
+    for i in range(1, n):
+        p = chosen[i - 1]
+        np.minimum(nearest, (x - x[p]) ** 2 + (y - y[p]) ** 2 + (z - z[p]) ** 2, out=nearest)
+        chosen[i] = int(np.argmax(nearest))
+    return chosen
+
+
+def outward_normals(field: AbstractField, points: np.ndarray, region: Region) -> np.ndarray:
+    """−∇φ/|∇φ| at points (n, 3); where the density is flat, away from the region's middle."""
+    normals = np.asarray(_normals(field, jnp.asarray(points)))
+    occupied = np.argwhere(region.occupied)
+    middle = region.lattice.origin + occupied.mean(axis=0) * region.lattice.side
+    away = points - middle
+    away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    flat = np.linalg.norm(normals, axis=1, keepdims=True) < 0.5
+    return np.where(flat, away, normals)
+
+
+@eqx.filter_jit
+def _normals(field, points):
+    return jax.lax.map(field.normal, points, batch_size=4096)
+
+
+def contact_grid(field: AbstractField, region: Region, resolution: int) -> tuple[GridField, float]:
+    """The field as a grid without floaters and haze, and the relative error of baking it (0 for a grid)."""
+    if isinstance(field, GridField):
+        grid, error = field, 0.0
+    else:
+        from dano.fields import bake
+        grid, bake_error = bake(field, resolution)
+        error = bake_error.rms
+    count = np.array(grid.values.shape)
+    spacing = np.broadcast_to(np.asarray(grid.spacing, dtype=np.float64), (3,))
+    nodes = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), axis=-1).reshape(-1, 3)
+    # Two cells beyond the region the wall has faded; what is left there belongs to something else.
+    near = region.near(2)[region.lattice.nearest(np.asarray(grid.origin) + nodes * spacing)].reshape(tuple(count))
+    values = jnp.where(jnp.asarray(near), grid.values, 0)
+    return GridField(values, grid.origin, grid.spacing, interpolation="quadratic"), error

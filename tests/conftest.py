@@ -1,0 +1,24 @@
+"""Settings and data shared by all tests."""
+
+import os
+from pathlib import Path
+
+import jax
+import pytest
+
+# The library follows its inputs' dtype. Tests compare in float64 and let no silent cast or broadcast pass.
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def reference_data() -> Path:
+    """Folder of the paper's stored trajectories and fields, which are not ours to redistribute."""
+    default = REPOSITORY.parent / "shared" / "reference" / "data"
+    folder = Path(os.environ.get("DANO_REFERENCE_DATA", default))
+    if not folder.is_dir():
+        pytest.skip(f"no reference data in {folder}: set DANO_REFERENCE_DATA to the folder that holds it")
+    return folder

@@ -1,0 +1,31 @@
+"""Importing dano has no side effects and stays light."""
+
+import json
+import subprocess
+import sys
+
+PROGRAM = """
+import json, sys, time
+import jax, jax.numpy
+before = {name: getattr(jax.config, name) for name in dir(jax.config) if name.startswith("jax_")}
+begin = time.process_time()
+import dano
+seconds = time.process_time() - begin
+changed = [name for name, value in before.items() if getattr(jax.config, name) != value]
+print(json.dumps({"seconds": seconds, "changed": changed, "modules": sorted(sys.modules)}))
+"""
+OPTIONAL = {"PIL", "av", "igl", "imageio", "matplotlib", "mujoco", "skimage", "torch", "trimesh", "viser"}
+
+
+def import_in_new_process() -> dict:
+    answer = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
+    return json.loads(answer.stdout)
+
+
+def test_import_is_light_and_changes_nothing():
+    report = import_in_new_process()
+    assert report["changed"] == []
+    assert OPTIONAL.isdisjoint(report["modules"])
+    # The first import of an installation also compiles bytecode: what counts is the second.
+    seconds = min(report["seconds"], import_in_new_process()["seconds"])
+    assert seconds < 1.0, f"import dano took {seconds:.2f} s of processor time beyond JAX"
