@@ -1,6 +1,8 @@
 """Every Python block of the README and of the guides runs as written, with JAX as a user finds it."""
 
+import ast
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +16,8 @@ PROGRAMS = {
     for page in [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
     if (program := "\n".join(grab_code_blocks(page.read_text(encoding="utf-8"), lang="python")))
 }
+# Of the command line, the commands are what is public.
+PACKAGES = [p for p in sorted((REPOSITORY / "src" / "dano").glob("*/__init__.py")) if p.parent.name != "cli"]
 
 
 @pytest.mark.parametrize("page", PROGRAMS)
@@ -23,3 +27,17 @@ def test_python_blocks_run(page: str, tmp_path: Path):
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY / "src")}
     answer = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert answer.returncode == 0, answer.stderr
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.parent.name)
+def test_every_public_name_is_documented(package: Path):
+    exported = {
+        alias.name
+        for statement in ast.parse(package.read_text(encoding="utf-8")).body
+        if isinstance(statement, ast.ImportFrom)
+        for alias in statement.names
+        if alias.asname == alias.name
+    }
+    page = REPOSITORY / "docs" / "api" / f"{package.parent.name}.md"
+    documented = set(re.findall(r"^ {8}- (\w+)$", page.read_text(encoding="utf-8"), re.MULTILINE))
+    assert documented == exported

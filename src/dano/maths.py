@@ -4,11 +4,17 @@ A quaternion is an array whose last axis holds (w, x, y, z). It rotates body-fra
 Every function broadcasts over leading axes unless its signature says otherwise.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
+
+Numbers = ArrayLike | Sequence[Any]
+"""What constructors take for an array: an array, a number, or (nested) lists and tuples of numbers."""
 
 
 def safe_norm(x: Float[Array, "*batch n"], axis: int = -1) -> Float[Array, "*batch"]:
@@ -101,7 +107,7 @@ def quat_normalize(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
     return safe_normalize(q)
 
 
-def quat_from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Float[Array, "4"]:
+def quat_from_axis_angle(axis: Numbers, angle: Numbers) -> Float[Array, "4"]:
     """Quaternion of a rotation by `angle` [rad] about `axis` (3,), which need not be normalised."""
     axis = safe_normalize(jnp.asarray(axis, dtype=jnp.result_type(float)))
     half = 0.5 * jnp.asarray(angle, dtype=axis.dtype)
@@ -125,7 +131,7 @@ class Pose(eqx.Module):
     position: Float[Array, "3"]
     orientation: Float[Array, "4"]
 
-    def __init__(self, position: ArrayLike = (0.0, 0.0, 0.0), orientation: ArrayLike = (1.0, 0.0, 0.0, 0.0)):
+    def __init__(self, position: Numbers = (0.0, 0.0, 0.0), orientation: Numbers = (1.0, 0.0, 0.0, 0.0)):
         """Build a pose; the orientation is normalised.
 
         Raises:
@@ -162,7 +168,7 @@ def is_traced(*values: object) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
-def checked_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+def checked_array(name: str, value: Numbers, shape: tuple[int, ...]) -> Array:
     """`value` as a floating array of `shape`; NumPy rules for the dtype, finite unless traced.
 
     Raises:
@@ -176,7 +182,7 @@ def checked_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def checked_quaternion(name: str, value: ArrayLike) -> Array:
+def checked_quaternion(name: str, value: Numbers) -> Array:
     """`value` as a unit quaternion wxyz.
 
     Raises:
@@ -188,7 +194,7 @@ def checked_quaternion(name: str, value: ArrayLike) -> Array:
     return quat_normalize(array)
 
 
-def floating(value: ArrayLike) -> Array:
+def floating(value: Numbers) -> Array:
     """`value` as a floating JAX array: floating arrays keep their dtype, everything else takes JAX's default."""
     dtype = getattr(value, "dtype", None)
     if dtype is not None and jnp.issubdtype(dtype, jnp.floating):

@@ -7,12 +7,12 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from dano.archive import read_archive, write_archive
 from dano.contact import AbstractContactLaw, CentroidLaw, Collider, ContactParams, non_negative, SampleSet, Support
 from dano.fields import AbstractField, AbstractShape, HalfSpace, PosedShape, Sphere
-from dano.maths import checked_array, checked_quaternion, floating, is_traced, quat_to_matrix
+from dano.maths import checked_array, checked_quaternion, floating, is_traced, Numbers, quat_to_matrix
 from dano.objects import checked_inertia, MassProperties, NeuralObject, surface_samples
 
 # Edge width of a primitive relative to the size of what touches it: 0.5 % made gradients and rest right, 0.1 % did not.
@@ -57,11 +57,11 @@ class Body(eqx.Module):
         name: str,
         geometry: NeuralObject | AbstractField,
         *,
-        mass: ArrayLike | None = None,
-        inertia: ArrayLike | None = None,
-        com: ArrayLike | None = None,
-        mass_scale: ArrayLike = 1.0,
-        com_offset: ArrayLike = (0.0, 0.0, 0.0),
+        mass: Numbers | None = None,
+        inertia: Numbers | None = None,
+        com: Numbers | None = None,
+        mass_scale: Numbers = 1.0,
+        com_offset: Numbers = (0.0, 0.0, 0.0),
         fixed: bool = False,
     ):
         """A body from a neural object (which brings its mass) or from a shape (homogeneous, of the given mass).
@@ -174,7 +174,7 @@ class Contact(eqx.Module):
         b: str,
         params: ContactParams | None = None,
         law: AbstractContactLaw | None = None,
-        edge: ArrayLike | None = None,
+        edge: Numbers | None = None,
     ):
         """A contact with default parameters and the paper's law unless given otherwise.
 
@@ -236,8 +236,12 @@ class Trajectory(eqx.Module):
     converged: Bool[Array, " steps"]
     names: tuple[str, ...] = eqx.field(static=True)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str], *, source: str | None = None) -> None:
         """Write the trajectory to an .npz file, replacing an existing one only when complete.
+
+        Args:
+            path: The file.
+            source: Text kept in the file as member `source`: where the trajectory comes from.
 
         Raises:
             ValueError: If `path` is a directory or its parent does not exist.
@@ -251,6 +255,7 @@ class Trajectory(eqx.Module):
                 "times": np.asarray(self.times),
                 **{name: np.asarray(getattr(self.states, name)) for name in _STATE_SHAPES},
                 **{name: np.asarray(getattr(self, name)) for name in ("residuals", "iterations", "converged")},
+                **({} if source is None else {"source": np.array(source)}),
             },
         )
 
@@ -298,8 +303,8 @@ class Scene(eqx.Module):
         bodies: Sequence[Body],
         contacts: Sequence[Contact] = (),
         *,
-        timestep: ArrayLike = 0.01,
-        gravity: ArrayLike = (0.0, 0.0, -9.81),
+        timestep: Numbers = 0.01,
+        gravity: Numbers = (0.0, 0.0, -9.81),
     ) -> "Scene":
         """Check the parts against each other and resolve defaults that depend on both bodies of a contact.
 
@@ -377,7 +382,7 @@ class Scene(eqx.Module):
         """
         return self.contacts[self.contact_index(a, b)].params
 
-    def replace_contact(self, a: str, b: str, **changes: ArrayLike) -> "Scene":
+    def replace_contact(self, a: str, b: str, **changes: Numbers) -> "Scene":
         """The scene with some parameters of one contact changed, e.g. ``sliding_friction=0.3``.
 
         Raises:
@@ -392,7 +397,7 @@ class Scene(eqx.Module):
         values = [_as_leaf(non_negative(name, changes[name]), getattr(self.contacts[i].params, name)) for name in names]
         return eqx.tree_at(lambda s: [getattr(s.contacts[i].params, name) for name in names], self, values)
 
-    def replace_body(self, name: str, **changes: ArrayLike) -> "Scene":
+    def replace_body(self, name: str, **changes: Numbers) -> "Scene":
         """The scene with some of a body's `mass, inertia, com, mass_scale, com_offset` changed.
 
         Raises:
@@ -415,7 +420,7 @@ class Scene(eqx.Module):
                 checked_inertia(key, value)
         return eqx.tree_at(lambda s: [getattr(s.bodies[i], key) for key in keys], self, values)
 
-    def initial_state(self, **bodies: dict[str, ArrayLike]) -> State:
+    def initial_state(self, **bodies: dict[str, Numbers]) -> State:
         """A state: bodies by keyword, each a dict of `position, orientation, velocity, omega`; the rest at the origin.
 
         Orientations are normalised.
@@ -464,7 +469,7 @@ class Scene(eqx.Module):
                     f"state.omega must be below 2/timestep = {limit:.6g} rad/s, got {fastest:.6g}; take a smaller timestep"
                 )
 
-    def control(self, **bodies: dict[str, ArrayLike]) -> Control:
+    def control(self, **bodies: dict[str, Numbers]) -> Control:
         """Control for one step: bodies by keyword, each a dict of `force` [N, W] and `torque` [N m, W].
 
         Raises:

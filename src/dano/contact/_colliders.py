@@ -3,11 +3,11 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 from scipy import ndimage
 
 from dano.fields import AbstractField, GridField
-from dano.maths import Pose, floating, safe_norm
+from dano.maths import floating, Numbers, Pose, safe_norm
 
 
 # Samples per block. Fewer make the culling finer, more make each pass over a block fatter; 64 measured best.
@@ -33,7 +33,7 @@ class SampleSet(eqx.Module):
     radii: Float[Array, " blocks"]
 
     @classmethod
-    def create(cls, points: Float[ArrayLike, "n 3"], density: Float[ArrayLike, " n"]) -> "SampleSet":
+    def create(cls, points: Numbers, density: Numbers) -> "SampleSet":
         """Order the samples in space and normalise their weights, on the host.
 
         Args:
@@ -124,8 +124,8 @@ class Collider(eqx.Module):
         samples: SampleSet | None = None,
         *,
         support: Support | None = None,
-        density_scale: ArrayLike = 1.0,
-        mass: ArrayLike = 1.0,
+        density_scale: Numbers = 1.0,
+        mass: Numbers = 1.0,
         pose: Pose | None = None,
         rotation: Array | None = None,
         origin: Array | None = None,

@@ -9,10 +9,10 @@ import abc
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from dano.contact._overlap import Patch
-from dano.maths import floating, is_traced, safe_norm
+from dano.maths import floating, is_traced, Numbers, safe_norm
 
 
 class ContactParams(eqx.Module):
@@ -41,14 +41,14 @@ class ContactParams(eqx.Module):
     def __init__(
         self,
         *,
-        spring: ArrayLike = 3e4,
-        damper: ArrayLike = 3e5,
-        sliding_friction: ArrayLike = 0.2,
-        sliding_drag: ArrayLike = 0.1,
-        torsional_friction: ArrayLike = 0.01,
-        torsional_drag: ArrayLike = 0.0,
-        rolling_friction: ArrayLike = 0.01,
-        rolling_drag: ArrayLike = 0.0,
+        spring: Numbers = 3e4,
+        damper: Numbers = 3e5,
+        sliding_friction: Numbers = 0.2,
+        sliding_drag: Numbers = 0.1,
+        torsional_friction: Numbers = 0.01,
+        torsional_drag: Numbers = 0.0,
+        rolling_friction: Numbers = 0.01,
+        rolling_drag: Numbers = 0.0,
     ):
         """Defaults are those of the paper's implementation.
 
@@ -102,7 +102,7 @@ class CentroidLaw(AbstractContactLaw):
     regularizer: Float[Array, ""]
     adhesive: bool = eqx.field(static=True)
 
-    def __init__(self, *, smoothing: ArrayLike = 30.0, regularizer: ArrayLike = 1e-3, adhesive: bool = False):
+    def __init__(self, *, smoothing: Numbers = 30.0, regularizer: Numbers = 1e-3, adhesive: bool = False):
         """See the class.
 
         Raises:
@@ -163,7 +163,7 @@ class CentroidLaw(AbstractContactLaw):
         return force, derivative
 
 
-def non_negative(name: str, value: ArrayLike) -> Float[Array, ""]:
+def non_negative(name: str, value: Numbers) -> Float[Array, ""]:
     """`value` as a finite scalar ≥ 0.
 
     Raises:

@@ -35,19 +35,26 @@ class VariationalEngine(AbstractEngine):
     """The variational integrator with an implicit solve per step (see `dano.engine._variational`).
 
     Attributes:
+        tolerance: A step is solved when no component of its residual, divided by mass or inertia, exceeds this times
+            (1 + its largest velocity) [m/s, rad/s]; default: the dtype's resolution to the power 3/4 (2e-12, 6e-6).
         max_iterations: Newton and line search passes after which a step is reported as not converged.
     """
 
+    tolerance: float | None = eqx.field(static=True, default=None)
     max_iterations: int = eqx.field(static=True, default=50)
 
     def __check_init__(self):
-        """Raise a ValueError unless `max_iterations` is at least one."""
+        """Raise a ValueError unless both options are positive."""
+        if self.tolerance is not None and not self.tolerance > 0:
+            raise ValueError(f"tolerance must be > 0, got {self.tolerance}")
         if self.max_iterations < 1:
             raise ValueError(f"max_iterations must be ≥ 1, got {self.max_iterations}")
 
     def step(self, scene: Scene, state: State, control: Control | None) -> tuple[State, Report]:
         """See `AbstractEngine.step`."""
-        return _variational.step(scene, state, control, self.max_iterations)
+        return _variational.step(
+            scene, state, control, _variational.SolverOptions(self.tolerance, self.max_iterations)
+        )
 
 
 def step(scene: Scene, state: State, control: Control | None = None, *, engine: AbstractEngine | None = None) -> State:

@@ -34,6 +34,13 @@ class Report(NamedTuple):
     converged: Bool[Array, ""]
 
 
+class SolverOptions(NamedTuple):
+    """When a step's Newton solve stops: see `VariationalEngine`."""
+
+    tolerance: float | None = None
+    max_iterations: int = 50
+
+
 class _Problem(eqx.Module):
     """Everything the residual of a step depends on, except the unknown velocities.
 
@@ -66,14 +73,14 @@ class _Pairs(NamedTuple):
     of_contact: tuple[tuple[int, int], ...]
 
 
-def step(scene: Scene, state: State, control: Control | None, max_iterations: int) -> tuple[State, Report]:
+def step(scene: Scene, state: State, control: Control | None, options: SolverOptions) -> tuple[State, Report]:
     """Advance all bodies by one timestep. See `dano.step`."""
     pairs = _structure(scene)
     if not pairs.moving:
         return state, Report(jnp.zeros((), state.position.dtype), jnp.asarray(0), jnp.asarray(True))
     problem = _problem(scene, state, control, pairs)
     start = _rows(jnp.concatenate([state.velocity, state.omega], axis=1), pairs.moving)
-    velocities, report = _solve(problem, start, pairs, max_iterations)
+    velocities, report = _solve(problem, start, pairs, options)
     return _advance(state, velocities, scene.timestep, pairs), report
 
 
@@ -258,7 +265,7 @@ class _Iterate(eqx.Module):
     iteration: Int[Array, ""]
 
 
-def _newton(problem: _Problem, start: Float[Array, "m 6"], pairs: _Pairs, max_iterations: int):
+def _newton(problem: _Problem, start: Float[Array, "m 6"], pairs: _Pairs, options: SolverOptions):
     """Newton with a halving line search on the residual in velocity units.
 
     A loop pass evaluates residual and Jacobian once. If the residual did not fall, the pass is a line search step:
@@ -266,14 +273,14 @@ def _newton(problem: _Problem, start: Float[Array, "m 6"], pairs: _Pairs, max_it
     """
     scale = _to_velocity(problem)
     # Rounding in R is relative to the momenta in it; asking for less would never end.
-    floor = jnp.finfo(start.dtype).eps ** 0.75
-    tolerance = floor * (1 + jnp.max(jnp.abs(scale * problem.impulse.ravel())))
+    relative = float(jnp.finfo(start.dtype).eps) ** 0.75 if options.tolerance is None else options.tolerance
+    tolerance = relative * (1 + jnp.max(jnp.abs(scale * problem.impulse.ravel())))
 
     def error(residual):
         return jnp.max(jnp.abs(scale * residual))
 
     def unfinished(it: _Iterate):
-        return (it.iteration < max_iterations) & ~(error(it.residual) <= tolerance)
+        return (it.iteration < options.max_iterations) & ~(error(it.residual) <= tolerance)
 
     def advance(it: _Iterate):
         move = solve_small(it.jacobian, -it.residual[:, None]).reshape(it.velocities.shape)
@@ -309,18 +316,18 @@ def _to_velocity(problem: _Problem) -> Float[Array, " n"]:
     return per_body.ravel()
 
 
-def _solve(problem: _Problem, start: Float[Array, "m 6"], pairs: _Pairs, max_iterations: int):
+def _solve(problem: _Problem, start: Float[Array, "m 6"], pairs: _Pairs, options: SolverOptions):
     """Root of the residual, with the derivative that the implicit function theorem gives it."""
 
     @eqx.filter_custom_jvp
     def root(problem, start):
-        velocities, _, report = _newton(problem, start, pairs, max_iterations)
+        velocities, _, report = _newton(problem, start, pairs, options)
         return velocities, report
 
     @root.def_jvp
     def _(primals, tangents):
         problem, start = primals
-        velocities, jacobian, report = _newton(problem, start, pairs, max_iterations)
+        velocities, jacobian, report = _newton(problem, start, pairs, options)
         d_problem = tangents[0]
         perturbed = jax.tree.map(lambda t: t is not None, d_problem, is_leaf=lambda t: t is None)
         dynamic, static = eqx.partition(problem, perturbed)

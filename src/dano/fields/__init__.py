@@ -11,6 +11,7 @@ from dano.fields._compose import (
     UnionField as UnionField,
     UnionShape as UnionShape,
 )
+from dano.fields._ellipsoid import Ellipsoid as Ellipsoid
 from dano.fields._grid import DensityMoments as DensityMoments, GridField as GridField
 from dano.fields._io import load_field as load_field, save_field as save_field
 from dano.fields._shapes import (
@@ -18,7 +19,6 @@ from dano.fields._shapes import (
     Box as Box,
     Capsule as Capsule,
     Cylinder as Cylinder,
-    Ellipsoid as Ellipsoid,
     HalfSpace as HalfSpace,
     occupancy as occupancy,
     SolidMoments as SolidMoments,

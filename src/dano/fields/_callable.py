@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from dano.fields._base import AbstractField, check_order, Jet, vmapped_jet
-from dano.maths import floating, is_traced
+from dano.maths import floating, is_traced, Numbers
 
 Framework = Literal["jax", "numpy", "torch"]
 
@@ -46,7 +46,7 @@ class CallableField(AbstractField):
     def __init__(
         self,
         function: Callable,
-        bounds: ArrayLike,
+        bounds: Numbers,
         framework: Framework | None = None,
         *,
         step: float | None = None,
@@ -131,7 +131,7 @@ class CallableField(AbstractField):
         return jnp.where(inside, jnp.where(value < 0, 0, value), 0)
 
 
-def checked_bounds(bounds: ArrayLike) -> Float[Array, "2 3"]:
+def checked_bounds(bounds: Numbers) -> Float[Array, "2 3"]:
     """`bounds` as a floating array; entries may be infinite.
 
     Raises:
@@ -169,7 +169,7 @@ class _HostFunction:
     def __hash__(self) -> int:
         return hash(self.parts)
 
-    def jet(self, order: int, x: Array) -> tuple[np.ndarray, ...]:
+    def jet(self, order: int, x: ArrayLike) -> tuple[np.ndarray, ...]:
         """φ and its derivatives up to `order` at points (..., 3): shapes (...), (..., 3), (..., 3, 3)."""
         function, framework, step = self.parts
         x = np.asarray(x)

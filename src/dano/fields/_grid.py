@@ -5,11 +5,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from dano.fields._base import AbstractField, check_order, Jet
 from dano.fields._spline import border, degree_of, interpolating_coefficients, multi_indices, spline_jet
-from dano.maths import checked_array, floating, is_traced
+from dano.maths import checked_array, floating, is_traced, Numbers
 
 
 class DensityMoments(NamedTuple):
@@ -47,9 +47,7 @@ class GridField(AbstractField):
     spacing: Float[Array, "3"]
     interpolation: str = eqx.field(static=True)
 
-    def __init__(
-        self, values: ArrayLike, origin: ArrayLike, spacing: ArrayLike, interpolation: str = "quadratic"
-    ):
+    def __init__(self, values: Numbers, origin: Numbers, spacing: Numbers, interpolation: str = "quadratic"):
         """Build a grid field; node (i, j, k) lies at origin + spacing · (i, j, k).
 
         Args:
@@ -71,7 +69,7 @@ class GridField(AbstractField):
 
     @classmethod
     def interpolating(
-        cls, samples: ArrayLike, origin: ArrayLike, spacing: ArrayLike, interpolation: str = "quadratic"
+        cls, samples: Numbers, origin: Numbers, spacing: Numbers, interpolation: str = "quadratic"
     ) -> "GridField":
         """A grid field that passes through `samples`, as far as φ ≥ 0 allows it.
 
@@ -97,7 +95,7 @@ class GridField(AbstractField):
         padded = interpolating_coefficients(np.pad(array, 16), degree)[16:-16, 16:-16, 16:-16]
         return cls(np.maximum(padded, 0).astype(array.dtype), origin, spacing, interpolation)
 
-    def with_values(self, values: ArrayLike) -> "GridField":
+    def with_values(self, values: Numbers) -> "GridField":
         """This grid with other values, also under `jax.jit` and `jax.grad`; use it to train them."""
         return GridField(values, self.origin, self.spacing, self.interpolation)
 
@@ -147,9 +145,9 @@ class GridField(AbstractField):
         ∫ β = 1 and ∫ u² β = (degree + 1)/12, so the moments of the spline are sums over its coefficients.
         """
         values = self.values
-        dtype = jnp.promote_types(values.dtype, self.spacing.dtype)
+        # Sums over many nodes: in the precision of the coordinates, whatever the values are stored in.
+        dtype, spacing = self.spacing.dtype, self.spacing
         values = values.astype(dtype)
-        spacing = self.spacing.astype(dtype)
         axes = [jnp.arange(n, dtype=dtype) * spacing[axis] for axis, n in enumerate(self.shape)]
         total = jnp.sum(values)
         sums = [jnp.sum(values, axis=tuple({0, 1, 2} - {axis})) for axis in range(3)]
@@ -187,7 +185,7 @@ def scaled_jet(rows: Float[Array, "rows n"], spacing: Float[Array, "3"], order: 
     return rows[0], gradient, jnp.stack([jnp.stack(row) for row in hessian])
 
 
-def checked_values(values: ArrayLike, name: str = "values") -> Array:
+def checked_values(values: Numbers, name: str = "values") -> Array:
     """`values` as a floating array of densities on a grid.
 
     Raises:
@@ -218,7 +216,7 @@ def checked_values(values: ArrayLike, name: str = "values") -> Array:
     return array
 
 
-def checked_spacing(spacing: ArrayLike) -> Float[Array, "3"]:
+def checked_spacing(spacing: Numbers) -> Float[Array, "3"]:
     """`spacing` as an array (3,).
 
     Raises:

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import ArrayLike
 
 from dano.fields._base import AbstractField
 from dano.fields._grid import checked_spacing, GridField
 from dano.fields._signed_distance import mesh_field
+from dano.maths import Numbers
 
 _MESHES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")
 
@@ -132,8 +132,8 @@ def _grid_from_npz(path: Path, prefix: str, interpolation: str | None, expected:
 
 def _load_npy(
     path: Path,
-    spacing: ArrayLike | None = None,
-    origin: ArrayLike | None = None,
+    spacing: Numbers | None = None,
+    origin: Numbers | None = None,
     interpolation: str = "quadratic",
 ) -> GridField:
     try:

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from dano.fields._base import AbstractField, check_order, Jet, vmapped_jet
-from dano.maths import checked_array, is_traced, safe_norm, safe_normalize
+from dano.fields._base import AbstractField, check_order, column_norm, Jet, vmapped_jet
+from dano.maths import checked_array, is_traced, Numbers, safe_normalize
 
 DEFAULT_EDGE = 0.005
 """Edge width of a shape that states none, as a fraction of its size.
@@ -138,7 +138,7 @@ def checked_edge(edge: ArrayLike | None) -> Float[Array, ""] | None:
     return array
 
 
-def positive(name: str, value: ArrayLike, shape: tuple[int, ...] = ()) -> Array:
+def positive(name: str, value: Numbers, shape: tuple[int, ...] = ()) -> Array:
     """`value` as a floating array of `shape` with positive entries.
 
     Raises:
@@ -161,7 +161,7 @@ def column(parameter: Float[Array, "3"], x: Float[Array, "3 *batch"]) -> Float[A
     return parameter.astype(x.dtype).reshape((3,) + (1,) * (x.ndim - 1))
 
 
-class _AbstractPrimitive(AbstractShape):
+class AbstractPrimitive(AbstractShape):
     """A shape whose `sdf` also takes a batch of points, one a column.
 
     Batches then stay structure-of-arrays, which a CPU evaluates several times faster than points of three
@@ -184,7 +184,7 @@ class _AbstractPrimitive(AbstractShape):
         return value, pull(jnp.ones_like(value))[0]
 
 
-class _AbstractCentred(_AbstractPrimitive):
+class AbstractCentred(AbstractPrimitive):
     """A primitive centred at the origin and symmetric under reflection of each axis."""
 
     @property
@@ -206,7 +206,7 @@ class _AbstractCentred(_AbstractPrimitive):
         return SolidMoments(volume, jnp.zeros_like(diagonal), jnp.diag(diagonal))
 
 
-class HalfSpace(_AbstractPrimitive):
+class HalfSpace(AbstractPrimitive):
     """Everything below a plane: {x : normal·x ≤ offset}.
 
     Attributes:
@@ -219,7 +219,7 @@ class HalfSpace(_AbstractPrimitive):
     edge: Float[Array, ""] | None
 
     def __init__(
-        self, normal: ArrayLike = (0.0, 0.0, 1.0), offset: ArrayLike = 0.0, *, edge: ArrayLike | None = None
+        self, normal: Numbers = (0.0, 0.0, 1.0), offset: ArrayLike = 0.0, *, edge: ArrayLike | None = None
     ):
         """Build a half-space; `normal` is normalised.
 
@@ -252,7 +252,7 @@ class HalfSpace(_AbstractPrimitive):
         return None
 
 
-class Sphere(_AbstractCentred):
+class Sphere(AbstractCentred):
     """A ball.
 
     Attributes:
@@ -277,7 +277,7 @@ class Sphere(_AbstractCentred):
 
     def sdf(self, x: Float[Array, "3 *batch"]) -> Float[Array, "*batch"]:
         """Signed distance [m] (exact)."""
-        return safe_norm(x, axis=0) - self.radius.astype(x.dtype)
+        return column_norm(x) - self.radius.astype(x.dtype)
 
     def outward(self, x: Float[Array, "3"]) -> Float[Array, "3"]:
         """The position itself: points far from the centre weigh more."""
@@ -289,7 +289,7 @@ class Sphere(_AbstractCentred):
         return self._moments(volume, jnp.broadcast_to(volume * self.radius**2 / 5, (3,)))
 
 
-class Box(_AbstractCentred):
+class Box(AbstractCentred):
     """A box, its edges and corners rounded with a given radius.
 
     Attributes:
@@ -301,7 +301,7 @@ class Box(_AbstractCentred):
     rounding: Float[Array, ""]
     edge: Float[Array, ""] | None
 
-    def __init__(self, half_extents: ArrayLike, rounding: ArrayLike = 0.0, *, edge: ArrayLike | None = None):
+    def __init__(self, half_extents: Numbers, rounding: ArrayLike = 0.0, *, edge: ArrayLike | None = None):
         """Build a box centred at the origin.
 
         Raises:
@@ -353,7 +353,7 @@ class Box(_AbstractCentred):
         return self._moments(8 * product + jnp.sum(slabs) + jnp.sum(cylinders) + octants, diagonal)
 
 
-class Capsule(_AbstractCentred):
+class Capsule(AbstractCentred):
     """A cylinder along z with hemispherical caps.
 
     Attributes:
@@ -381,7 +381,7 @@ class Capsule(_AbstractCentred):
 
     def sdf(self, x: Float[Array, "3 *batch"]) -> Float[Array, "*batch"]:
         """Signed distance [m] (exact)."""
-        return safe_norm(self.outward(x), axis=0) - self.radius.astype(x.dtype)
+        return column_norm(self.outward(x)) - self.radius.astype(x.dtype)
 
     def outward(self, x: Float[Array, "3 *batch"]) -> Float[Array, "3 *batch"]:
         """Vector from the closest point of the axis segment."""
@@ -397,7 +397,7 @@ class Capsule(_AbstractCentred):
         return self._moments(cylinder + ball, jnp.stack([across, across, along]))
 
 
-class Cylinder(_AbstractCentred):
+class Cylinder(AbstractCentred):
     """A solid cylinder along z with flat ends.
 
     Attributes:
@@ -425,7 +425,7 @@ class Cylinder(_AbstractCentred):
 
     def sdf(self, x: Float[Array, "3 *batch"]) -> Float[Array, "*batch"]:
         """Signed distance [m] (exact)."""
-        across = safe_norm(x[:2], axis=0) - self.radius.astype(x.dtype)
+        across = column_norm(x[:2]) - self.radius.astype(x.dtype)
         along = jnp.abs(x[2]) - self.half_length.astype(x.dtype)
         return _corner_distance(jnp.stack([across, along]))
 
@@ -437,91 +437,8 @@ class Cylinder(_AbstractCentred):
         return self._moments(volume, jnp.stack([across, across, volume * h**2 / 3]))
 
 
-class Ellipsoid(_AbstractCentred):
-    """A solid ellipsoid with its axes along x, y, z.
-
-    Attributes:
-        semi_axes: Semi-axes [m], shape (3,).
-    """
-
-    semi_axes: Float[Array, "3"]
-    edge: Float[Array, ""] | None
-
-    def __init__(self, semi_axes: ArrayLike, *, edge: ArrayLike | None = None):
-        """Build an ellipsoid centred at the origin.
-
-        Raises:
-            ValueError: If a semi-axis is not positive or `edge` is negative.
-        """
-        self.semi_axes = positive("semi_axes", semi_axes, (3,))
-        self.edge = checked_edge(edge)
-
-    @property
-    def _half_extents(self) -> Float[Array, "3"]:
-        return self.semi_axes
-
-    def sdf(self, x: Float[Array, "3 *batch"]) -> Float[Array, "*batch"]:
-        """Signed distance [m], exact up to rounding (below 1e-12 of the size in float64).
-
-        The closest surface point is y with x − y = t (y/a²), hence y = a² x/(t + a²) and sdf = t |x/(t +
-        a²)|.
-        """
-        semi_axes = column(self.semi_axes, x)
-        # Kept off the symmetry planes, on which the closest point of an inner point is not unique.
-        x = jnp.maximum(jnp.abs(x), 4 * jnp.finfo(x.dtype).eps * semi_axes)
-        shift = jnp.min(semi_axes**2)
-        s = _ellipsoid_root(x, semi_axes)
-        return (s - shift) * safe_norm(x / (s[None] + (semi_axes**2 - shift)), axis=0)
-
-    def outward(self, x: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Gradient of the quadratic form, x / a² [1/m]."""
-        return x / self.semi_axes.astype(x.dtype) ** 2
-
-    def solid_moments(self) -> SolidMoments:
-        """V = 4/3 π a b c and ∫ x² = V a²/5."""
-        volume = 4 / 3 * math.pi * jnp.prod(self.semi_axes)
-        return self._moments(volume, volume * self.semi_axes**2 / 5)
-
-
 def _corner_distance(excess: Float[Array, "k *batch"]) -> Float[Array, "*batch"]:
     """Signed distance of a corner region from how far a point lies beyond each of its faces."""
     largest = jnp.max(excess, axis=0)
     # `where`, not `minimum`: on a face both arguments tie and autodiff would return half the gradient.
-    return safe_norm(jnp.maximum(excess, 0), axis=0) + jnp.where(largest <= 0, largest, 0)
-
-
-@jax.custom_jvp
-def _ellipsoid_root(
-    x: Float[Array, "3 *batch"], semi_axes: Float[Array, "3 *ones"]
-) -> Float[Array, "*batch"]:
-    """Root s > 0 of F(s) = Σ (aᵢ xᵢ / (s + aᵢ² − m))² − 1 for xᵢ > 0, with m = min aᵢ² and s = t + m.
-
-    F falls and is convex. Started where its largest term is 1 (so 0 ≤ F ≤ 2), Newton climbs to the root
-    monotonically and doubles its digits; eight steps reach rounding in float64 for axis ratios up to 1000.
-    """
-    ax = semi_axes * x
-    gap = semi_axes**2 - jnp.min(semi_axes**2)
-    lowest = jnp.max(ax - gap, axis=0)
-
-    def newton(_: int, s: Array) -> Array:
-        inverse = 1 / (s[None] + gap)
-        term = (ax * inverse) ** 2
-        slope = 2 * jnp.sum(term * inverse, axis=0)
-        return jnp.maximum(s + (jnp.sum(term, axis=0) - 1) / slope, lowest)
-
-    return jax.lax.fori_loop(0, 8, newton, lowest)
-
-
-@_ellipsoid_root.defjvp
-def _ellipsoid_root_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Implicit function theorem: ds = −(∂F/∂x dx + ∂F/∂a da) / (∂F/∂s)."""
-    x, semi_axes = primals
-    dx, da = tangents
-    s = _ellipsoid_root(x, semi_axes)
-    smallest = jnp.argmin(semi_axes, axis=0)[None]
-    dsquare = 2 * semi_axes * da
-    dgap = dsquare - jnp.take_along_axis(dsquare, smallest, axis=0)
-    denominator = s[None] + (semi_axes**2 - jnp.min(semi_axes**2))
-    ratio = semi_axes * x / denominator
-    change = ratio * ((semi_axes * dx + da * x) - ratio * dgap) / denominator
-    return s, jnp.sum(change, axis=0) / jnp.sum(ratio**2 / denominator, axis=0)
+    return column_norm(jnp.maximum(excess, 0)) + jnp.where(largest <= 0, largest, 0)

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from dano.fields._base import check_order, Jet
+from dano.fields._base import check_order, column_norm, Jet
 from dano.fields._grid import checked_spacing, scaled_jet
 from dano.fields._shapes import AbstractShape, checked_edge, SolidMoments
 from dano.fields._spline import border, degree_of, interpolating_coefficients, spline_jet
-from dano.maths import checked_array, floating, is_traced, safe_norm
+from dano.maths import checked_array, floating, is_traced, Numbers
 
 if TYPE_CHECKING:
     import trimesh
@@ -48,9 +48,9 @@ class SignedDistanceGrid(AbstractShape):
 
     def __init__(
         self,
-        distances: ArrayLike,
-        origin: ArrayLike,
-        spacing: ArrayLike,
+        distances: Numbers,
+        origin: Numbers,
+        spacing: Numbers,
         interpolation: str = "quadratic",
         *,
         edge: ArrayLike | None = None,
@@ -112,7 +112,7 @@ class SignedDistanceGrid(AbstractShape):
         """Signed distance [m] at `x` [m, F], as accurate as its interpolation."""
         closest, beyond, _ = self._split(x[:, None])
         rows = spline_jet(self.coefficients, closest, degree_of(self.interpolation), 0)
-        return rows[0, 0] + safe_norm(beyond[:, 0])
+        return rows[0, 0] + column_norm(beyond)[0]
 
     def sdf_jet(self, x: Float[Array, "3 n"], order: int) -> Jet:
         """See `AbstractShape.sdf_jet`; closed forms, as fast as a `GridField`."""
@@ -120,7 +120,7 @@ class SignedDistanceGrid(AbstractShape):
         closest, beyond, inside = self._split(x)
         rows = spline_jet(self.coefficients, closest, degree_of(self.interpolation), order)
         jet = scaled_jet(rows, self.spacing.astype(x.dtype), order)
-        distance = safe_norm(beyond, axis=0)
+        distance = column_norm(beyond)
         if order == 0:
             return jet + distance
         value, gradient, *hessian = jet
@@ -139,7 +139,7 @@ class SignedDistanceGrid(AbstractShape):
         return self.moments
 
 
-def _checked_distances(distances: ArrayLike) -> np.ndarray:
+def _checked_distances(distances: Numbers) -> np.ndarray:
     if is_traced(distances):
         raise ValueError("distances must be concrete: spline coefficients are found on the host")
     host = np.asarray(floating(distances))

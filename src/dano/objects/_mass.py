@@ -6,10 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from dano.fields import AbstractField
-from dano.maths import checked_array, is_traced
+from dano.fields import AbstractField, GridField
+from dano.maths import checked_array, is_traced, Numbers
 
 Density = Callable[[Float[Array, "3"]], Float[Array, ""]]
 Progress = Callable[[str, float], None]
@@ -39,13 +39,13 @@ class MassProperties(eqx.Module):
 
     def __init__(
         self,
-        mass: ArrayLike,
-        com: ArrayLike,
-        inertia: ArrayLike,
+        mass: Numbers,
+        com: Numbers,
+        inertia: Numbers,
         *,
-        mass_error: ArrayLike = 0.0,
-        com_error: ArrayLike = (0.0, 0.0, 0.0),
-        inertia_error: ArrayLike = ((0.0,) * 3,) * 3,
+        mass_error: Numbers = 0.0,
+        com_error: Numbers = (0.0, 0.0, 0.0),
+        inertia_error: Numbers = ((0.0,) * 3,) * 3,
     ):
         """Errors default to zero: exact values.
 
@@ -74,7 +74,7 @@ class MassProperties(eqx.Module):
     ) -> "MassProperties":
         """Integrate a density: m = α∫φ dx, c = α∫φ x dx / m, J = α∫φ (|r|² I − r rᵀ) dx (paper: eq:mass to eq:inertia).
 
-        Stratified Monte Carlo: two random points in each cell of a grid over the field's bounds. Their differences
+        A grid is integrated exactly. Everything else by stratified Monte Carlo: two random points in each cell of a grid over the field's bounds. Their differences
         give the variance, from which the standard errors follow by linearisation.
 
         Args:
@@ -93,10 +93,16 @@ class MassProperties(eqx.Module):
                 a number is out of range.
         """
         density = checked_density(field)
+        if isinstance(field, GridField):
+            check_scale(mass_scale, mass)
+            moments = field.moments()
+            total = mass_scale * float(moments.integral) if mass is None else mass
+            second = np.asarray(moments.second_moment) * (total / float(moments.integral))
+            return cls(total, moments.centroid, np.trace(second) * np.eye(3) - second)
         return integrate(density, field.bounds, mass_scale, mass, resolution, key, progress)
 
 
-def checked_inertia(name: str, value: ArrayLike) -> Float[Array, "3 3"]:
+def checked_inertia(name: str, value: Numbers) -> Float[Array, "3 3"]:
     """`value` as a symmetric positive definite 3×3 tensor.
 
     Raises:
@@ -161,10 +167,7 @@ def cells(bounds: Float[Array, "2 3"], resolution: int) -> tuple[np.ndarray, np.
 
 def integrate(density, bounds, mass_scale, mass, resolution, key, progress) -> MassProperties:
     """See `MassProperties.from_field`; `density` is a function of one point."""
-    if not mass_scale > 0:
-        raise ValueError(f"mass_scale must be > 0, got {mass_scale}")
-    if mass is not None and not mass > 0:
-        raise ValueError(f"mass must be > 0 kg, got {mass}")
+    check_scale(mass_scale, mass)
     count, side = cells(bounds, resolution)
     low = np.asarray(bounds[0], dtype=np.float64)
     center = low + 0.5 * count * side
@@ -184,21 +187,15 @@ def integrate(density, bounds, mass_scale, mass, resolution, key, progress) -> M
     volume = float(np.prod(side))
     if sums[0] <= 0:
         raise ValueError(f"field must have a positive density somewhere, got none in {total} cells")
-    scale = mass_scale * volume
-    if mass is not None:
-        scale = mass / sums[0]
-    estimate, covariance = scale * sums, scale**2 * squares
-    jacobian = _numerical_jacobian(_properties, estimate)
+    covariance = volume**2 * squares
+    raw = volume * sums
+
+    def properties(moments: np.ndarray) -> np.ndarray:
+        scale = mass_scale if mass is None else mass / moments[0]
+        return _properties(scale * moments)
+
+    value, jacobian = properties(raw), _numerical_jacobian(properties, raw)
     error = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian), 0.0))
-    value = _properties(estimate)
-    if mass is not None:
-        # The total is given; what remains uncertain is its distribution, to which the tensor's scale belongs.
-        relative = np.concatenate([[0.0], estimate[1:] / estimate[0]])
-        to_shape = np.eye(10) / estimate[0]
-        to_shape[:, 0] = -relative / estimate[0]
-        to_shape[0] = 0.0
-        jacobian = _numerical_jacobian(_properties, np.concatenate([[mass], mass * relative[1:]])) @ (mass * to_shape)
-        error = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian), 0.0))
     return MassProperties(
         value[0],
         value[1:4] + center,
@@ -207,6 +204,14 @@ def integrate(density, bounds, mass_scale, mass, resolution, key, progress) -> M
         com_error=error[1:4],
         inertia_error=error[4:].reshape(3, 3),
     )
+
+
+def check_scale(mass_scale: float, mass: float | None) -> None:
+    """Raise a ValueError unless the given mass or mass scale is positive and finite."""
+    if not (mass_scale > 0 and np.isfinite(mass_scale)):
+        raise ValueError(f"mass_scale must be finite and > 0, got {mass_scale}")
+    if mass is not None and not (mass > 0 and np.isfinite(mass)):
+        raise ValueError(f"mass must be finite and > 0 kg, got {mass}")
 
 
 def _moments(density: np.ndarray, x: np.ndarray) -> np.ndarray:

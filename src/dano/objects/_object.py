@@ -7,13 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.archive import read_archive, write_archive
 from dano.fields import AbstractField, GridField
-from dano.maths import checked_array, floating, is_traced
+from dano.maths import checked_array, floating, is_traced, Numbers
 from dano.objects._mass import MassProperties, Progress, checked_density, integrate
-from dano.objects._samples import ContactSamples, Lattice, Region, contact_grid, draw_samples, outward_normals, surface_range
+from dano.objects._samples import ContactSamples, Lattice, Region, contact_grid, draw_samples, outward_normals, surface_level, surface_range
 
 MassModel = Literal["density", "solid"]
 FORMAT, VERSION = "dano-object", 1
@@ -61,7 +61,8 @@ class NeuralObject(eqx.Module):
             density_range: Densities between which the samples are drawn; default: around the field's own surface
                 (`surface_range`).
             mass_model: "density": mass density is α φ, as in the paper. "solid": the same mean density everywhere
-                inside the largest connected part of {φ ≥ lower density}, its cavities filled, floaters dropped.
+                inside the largest connected part of {φ ≥ half the plateau density}, its cavities filled, floaters
+                dropped.
             mass_scale: α [kg per unit of density and m³].
             mass: If given, the total mass [kg]; replaces `mass_scale`.
             resolution: Cells along the longest axis for mass integrals, sampling and baking.
@@ -92,8 +93,13 @@ class NeuralObject(eqx.Module):
             progress("samples", 0.0)
         points, values = draw_samples(density, lattice, body, low, high, n_samples, sampling_key)
         samples = ContactSamples(floating(points), floating(values), floating(outward_normals(field, points, body)))
-        integrand = density if mass_model == "density" else body.solid(density, low)
-        properties = integrate(integrand, field.bounds, mass_scale, mass, resolution, mass_key, progress)
+        if mass_model == "density":
+            properties = MassProperties.from_field(
+                field, mass_scale=mass_scale, mass=mass, resolution=resolution, key=mass_key, progress=progress
+            )
+        else:
+            solid = Region.create(lattice, surface_level(lattice.values), floaters=False).solid(density)
+            properties = integrate(solid, field.bounds, mass_scale, mass, resolution, mass_key, progress)
         grid, error = contact_grid(field, body, resolution)
         if progress is not None:
             progress("done", 1.0)
@@ -103,12 +109,12 @@ class NeuralObject(eqx.Module):
     def from_samples(
         cls,
         *,
-        points: Float[ArrayLike, "n 3"],
-        density: Float[ArrayLike, " n"],
-        mass: ArrayLike,
-        com: ArrayLike,
-        inertia: ArrayLike,
-        normals: Float[ArrayLike, "n 3"] | None = None,
+        points: Numbers,
+        density: Numbers,
+        mass: Numbers,
+        com: Numbers,
+        inertia: Numbers,
+        normals: Numbers | None = None,
         field: GridField | None = None,
     ) -> "NeuralObject":
         """Build an object from explicit samples in the field frame.

@@ -110,7 +110,7 @@ class Region(eqx.Module):
         to_outside = ndimage.distance_transform_edt(~outside, sampling=self.lattice.side)
         return self.near(1) & (to_outside < to_cavity)
 
-    def solid(self, density: Density, level: float) -> Density:
+    def solid(self, density: Density) -> Density:
         """Mean occupied density inside the filled region, zero outside; sharp at the level, not at lattice points."""
         mean = float(self.lattice.values[self.occupied].mean())
         inside = jnp.asarray(ndimage.binary_erosion(self.occupied | self.cavity, np.ones((3, 3, 3))))
@@ -121,21 +121,26 @@ class Region(eqx.Module):
         def filled(x: Float[Array, "3"]) -> Float[Array, ""]:
             index = jnp.clip(jnp.round((x - origin.astype(x.dtype)) / side.astype(x.dtype)).astype(int), 0, last)
             i, j, k = index
-            solid = inside[i, j, k] | (near[i, j, k] & (density(x) >= level))
+            solid = inside[i, j, k] | (near[i, j, k] & (density(x) >= self.level))
             return jnp.where(solid, mean, 0).astype(x.dtype)
 
         return filled
 
 
-def surface_range(values: np.ndarray) -> tuple[float, float]:
-    """Two densities around a field's own surface, from its values on a lattice.
-
-    The plateau is the density at which half of the mass has been counted, which neither empty space nor a thin haze
-    moves. The surface lies where the density is between a quarter and three quarters of it.
-    """
+def plateau(values: np.ndarray) -> float:
+    """Density at which half of the mass has been counted: neither empty space nor a thin haze moves it."""
     positive = np.sort(values[values > 0].ravel())
-    plateau = positive[np.searchsorted(np.cumsum(positive), 0.5 * positive.sum())]
-    return 0.25 * float(plateau), 0.75 * float(plateau)
+    return float(positive[np.searchsorted(np.cumsum(positive), 0.5 * positive.sum())])
+
+
+def surface_level(values: np.ndarray) -> float:
+    """The density of a field's own surface, half of its plateau, from its values on a lattice."""
+    return 0.5 * plateau(values)
+
+
+def surface_range(values: np.ndarray) -> tuple[float, float]:
+    """Two densities around a field's own surface: a quarter and three quarters of its plateau."""
+    return 0.25 * plateau(values), 0.75 * plateau(values)
 
 
 def draw_samples(

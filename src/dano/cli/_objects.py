@@ -1,0 +1,131 @@
+"""`dano build` and `dano inspect`."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dano.cli._console import numbers, Progress, put, put_json, say
+from dano.cli._outputs import check_output, missing_for_pictures
+from dano.fields import load_field
+from dano.objects import MassModel, NeuralObject
+from dano.scene_file import build_object
+
+
+def build(
+    field: Path,
+    output: Path,
+    *,
+    samples: int,
+    density_range: tuple[float, float] | None,
+    mass_model: MassModel,
+    mass_scale: float | None,
+    mass: float | None,
+    resolution: int,
+    length: float | None,
+    floaters: bool,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """See `dano build --help`."""
+    if mass is not None and mass_scale is not None:
+        raise ValueError(f"give either --mass or --mass-scale, got {mass} and {mass_scale}")
+    check_output(output, field)
+    progress = Progress()
+    progress("reading the field", 0.0)
+    made = build_object(
+        load_field(field),
+        n_samples=samples,
+        density_range=density_range,
+        mass_model=mass_model,
+        mass_scale=1.0 if mass_scale is None else mass_scale,
+        mass=mass,
+        resolution=resolution,
+        length=length,
+        floaters=floaters,
+        seed=seed,
+        progress=progress,
+    )
+    progress.close()
+    made.save(output)
+    report = describe(made, output)
+    if as_json:
+        put_json(report)
+        return
+    print_object(report)
+    put()
+    put(f"wrote {output}; `dano inspect {output}` draws it, `dano simulate {output} -o RUN.npz` drops it")
+
+
+def inspect(path: Path, *, png: Path | None, draw: bool, as_json: bool) -> None:
+    """See `dano inspect --help`."""
+    picture = (png or path.with_suffix(".png")) if draw else None
+    if picture is not None:
+        check_output(picture, path, suffix=".png")
+        if missing := missing_for_pictures(video=False):
+            if png is not None:
+                raise ImportError(missing)
+            say(f"warning: not drawn, {missing}")
+            picture = None
+    made = NeuralObject.load(path)
+    report = describe(made, path)
+    if picture is not None:
+        from dano.report import draw_object
+
+        draw_object(made, picture, title=path.stem)
+        report["picture"] = str(picture)
+    if as_json:
+        put_json(report)
+        return
+    print_object(report)
+    if picture is not None:
+        put()
+        put(f"drawn in {picture}")
+
+
+def describe(made: NeuralObject, path: Path) -> dict[str, Any]:
+    """An object in numbers and lists, in SI units."""
+    mass = made.mass
+    moments, axes = np.linalg.eigh(np.asarray(mass.inertia))
+    points = np.asarray(made.samples.points)
+    return {
+        "file": str(path),
+        "mass": float(mass.mass),
+        "mass_error": float(mass.mass_error),
+        "com": np.asarray(mass.com).tolist(),
+        "com_error": np.asarray(mass.com_error).tolist(),
+        "inertia": np.asarray(mass.inertia).tolist(),
+        "inertia_error": np.asarray(mass.inertia_error).tolist(),
+        "principal_inertias": moments.tolist(),
+        "principal_axes": axes.T.tolist(),
+        "size": made.size,
+        "extents": np.ptp(points, axis=0).tolist(),
+        "samples": len(points),
+        "density_range": np.asarray(made.density_range).tolist(),
+        "mass_model": made.mass_model,
+        "grid": None if made.grid is None else list(made.grid.shape),
+        "bake_error": float(made.bake_error),
+    }
+
+
+def print_object(report: dict[str, Any]) -> None:
+    """Print what `describe` found."""
+    grid = report["grid"]
+    put(f"object              {report['file']}")
+    put(f"mass                {report['mass']:.6g} ± {report['mass_error']:.1g} kg ({report['mass_model']})")
+    put(f"centre of mass      {numbers(report['com'])} ± {max(report['com_error']):.1g} m")
+    for i, row in enumerate(report["inertia"]):
+        label = "inertia about it" if i == 0 else ""
+        error = f" ± {max(map(max, report['inertia_error'])):.1g} kg m²" if i == 0 else ""
+        put(f"{label:<19} {numbers(row)}{error}")
+    put(f"principal inertias  {numbers(report['principal_inertias'])} kg m²")
+    for i, axis in enumerate(report["principal_axes"]):
+        put(f"{'about the axes' if i == 0 else '':<19} {numbers(axis)}")
+    put(f"extents             {numbers(report['extents'])} m")
+    low, high = report["density_range"]
+    put(f"contact samples     {report['samples']}, density {low:.4g} to {high:.4g}")
+    if grid is None:
+        put("density grid        none: meets shapes only")
+    else:
+        size = " × ".join(map(str, grid))
+        put(f"density grid        {size} nodes, baking error {100 * report['bake_error']:.2g} %")

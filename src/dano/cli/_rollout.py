@@ -1,0 +1,161 @@
+"""A rollout with progress and timing, and what it came to in numbers."""
+
+import math
+import time
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dano.cli._console import Progress, put, say
+from dano.engine import contact_wrenches, simulate
+from dano.scene import Scene, State, Trajectory
+from dano.scene_file import SceneFile
+
+# A rollout is run in so many pieces: progress can be shown, and an interrupt is heard, between two of them.
+PIECES = 20
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A trajectory and the time [s] that it took to compile and to run."""
+
+    trajectory: Trajectory
+    compile_seconds: float
+    run_seconds: float
+
+
+def roll_out(loaded: SceneFile, progress: Progress) -> Rollout:
+    """Simulate a scene file."""
+    length = math.ceil(loaded.n_steps / PIECES)
+    n_pieces = math.ceil(loaded.n_steps / length)
+    h = float(loaded.scene.timestep)
+    progress("compiling the simulation", 0.0)
+    warm_up = _piece(loaded, loaded.state, 0.0, length)[1]
+    state, pieces, seconds = loaded.state, [], []
+    for i in range(n_pieces):
+        # The last piece may run past the end: all have one length, so that only one program is compiled.
+        piece, took = _piece(loaded, state, i * length * h, length)
+        state = jax.tree.map(lambda x: x[-1], piece.states)
+        pieces.append(piece)
+        seconds.append(took)
+        progress("simulating", (i + 1) / n_pieces)
+    progress.close()
+    share = loaded.n_steps / (n_pieces * length)
+    return Rollout(_joined(pieces, loaded), max(0.0, warm_up - seconds[0]), share * sum(seconds))
+
+
+def _piece(loaded: SceneFile, state: State, start: float, n_steps: int) -> tuple[Trajectory, float]:
+    controls = None if loaded.controls is None else loaded.controls.starting_at(start)
+    began = time.perf_counter()
+    with warnings.catch_warnings():
+        # Steps that did not converge are marked in the trajectory and reported at the end, all together.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        piece = simulate(loaded.scene, state, n_steps, controls=controls)
+    jax.block_until_ready(piece.states)
+    return piece, time.perf_counter() - began
+
+
+def _joined(pieces: list[Trajectory], loaded: SceneFile) -> Trajectory:
+    n = loaded.n_steps
+    first = jax.tree.map(lambda x: x[:1], pieces[0].states)
+    rest = [jax.tree.map(lambda x: x[1:], piece.states) for piece in pieces]
+    states = jax.tree.map(lambda *parts: jnp.concatenate(parts)[: n + 1], first, *rest)
+    steps = (
+        jnp.concatenate([getattr(piece, name) for piece in pieces])[:n]
+        for name in ("residuals", "iterations", "converged")
+    )
+    times = loaded.scene.timestep * jnp.arange(n + 1, dtype=loaded.scene.timestep.dtype)
+    return Trajectory(times, states, *steps, loaded.scene.names)
+
+
+def describe(rollout: Rollout, scene: Scene) -> dict[str, Any]:
+    """A rollout in numbers and lists, in SI units."""
+    trajectory = rollout.trajectory
+    failed = np.flatnonzero(~np.asarray(trajectory.converged))
+    last = {name: np.asarray(getattr(trajectory.states, name)[-1]) for name in State.__dataclass_fields__}
+    return {
+        "steps": len(trajectory.converged),
+        "timestep": float(scene.timestep),
+        "duration": float(trajectory.times[-1]),
+        "compile_seconds": rollout.compile_seconds,
+        "run_seconds": rollout.run_seconds,
+        "unconverged_steps": len(failed),
+        "first_unconverged_step": int(failed[0]) if len(failed) else None,
+        "largest_residual": float(np.max(np.asarray(trajectory.residuals))),
+        "bodies": [
+            {
+                "name": body.name,
+                "fixed": body.fixed,
+                **{key: value[i].tolist() for key, value in last.items()},
+            }
+            for i, body in enumerate(scene.bodies)
+        ],
+        "contacts": _contacts(trajectory, scene),
+    }
+
+
+def _contacts(trajectory: Trajectory, scene: Scene) -> list[dict[str, Any]]:
+    """When the bodies of each pair touched, and how hard."""
+    if not scene.contacts or not np.all([np.isfinite(x).all() for x in jax.tree.leaves(trajectory.states)]):
+        return [{"a": contact.a, "b": contact.b} for contact in scene.contacts]
+    force = np.linalg.norm(np.asarray(contact_wrenches(scene, trajectory.states))[:, :, :3], axis=-1)
+    rows = []
+    for contact, history in zip(scene.contacts, force.T, strict=True):
+        touching = np.flatnonzero(history)
+        rows.append(
+            {
+                "a": contact.a,
+                "b": contact.b,
+                "first_touch": float(trajectory.times[touching[0]]) if len(touching) else None,
+                "steps_in_contact": len(touching),
+                "largest_force": float(history.max()),
+                "last_force": float(history[-1]),
+            }
+        )
+    return rows
+
+
+def print_rollout(report: dict[str, Any]) -> None:
+    """Print what `describe` found."""
+    per_step = 1e6 * report["run_seconds"] / report["steps"]
+    put(f"{report['steps']} steps of {report['timestep']:.4g} s: {report['duration']:.4g} s simulated")
+    put(
+        f"compiled in {report['compile_seconds']:.1f} s, ran in {report['run_seconds']:.2f} s "
+        f"({per_step:.0f} µs a step)"
+    )
+    put(f"steps that did not converge: {report['unconverged_steps']}")
+    put()
+    put("at the end     position [m]                orientation wxyz               speed [m/s]  spin [rad/s]")
+    for body in report["bodies"]:
+        if body["fixed"]:
+            continue
+        position = " ".join(f"{x:8.4f}" for x in body["position"])
+        orientation = " ".join(f"{x:7.4f}" for x in body["orientation"])
+        speed, spin = math.hypot(*body["velocity"]), math.hypot(*body["omega"])
+        put(f"{body['name']:<12.12} {position}   {orientation}   {speed:9.4f}  {spin:12.4f}")
+    rows = [row for row in report["contacts"] if row.get("steps_in_contact")]
+    if not rows:
+        return
+    put()
+    put("contact                    first touch [s]   share of steps   largest force [N]   at the end [N]")
+    for row in rows:
+        pair, share = f"{row['a']} – {row['b']}", 100 * row["steps_in_contact"] / report["steps"]
+        put(
+            f"{pair:<26.26} {row['first_touch']:15.3f} {share:14.0f} % {row['largest_force']:19.4g} "
+            f"{row['last_force']:16.4g}"
+        )
+
+
+def warn_unconverged(report: dict[str, Any]) -> None:
+    """Say on stderr that a result is not to be trusted, if so."""
+    if report["unconverged_steps"]:
+        first = report["first_unconverged_step"]
+        say(
+            f"warning: {report['unconverged_steps']} of {report['steps']} steps did not converge, first step {first} "
+            f"(t = {first * report['timestep']:.4g} s), largest residual {report['largest_residual']:.3g} m/s; "
+            "try a smaller --timestep"
+        )

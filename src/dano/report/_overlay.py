@@ -1,0 +1,64 @@
+"""Contact points and forces drawn over pictures."""
+
+import numpy as np
+from jaxtyping import UInt8
+
+from dano.report._stage import Touches
+from dano.vision import Camera
+
+_DOT = (24, 26, 30)
+_ARROW = (214, 40, 57)
+# Drawn this many times larger and then reduced: Pillow's lines are not smooth.
+_FINE = 3
+
+
+def draw_touches(
+    picture: UInt8[np.ndarray, "height width 3"], camera: Camera, touched: Touches, frame: int, length: float
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The picture with a dot and a force arrow at every contact of one frame.
+
+    Args:
+        picture: sRGB.
+        camera: From where it was taken.
+        touched: Contacts of all frames.
+        frame: Which frame.
+        length: Length [m] of the arrow of a usual force.
+    """
+    from PIL import Image, ImageDraw
+
+    rows = np.flatnonzero(touched.shares[frame] > 0.02)
+    if len(rows) == 0:
+        return picture
+    force = touched.forces[frame, rows]
+    direction = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
+    tails = touched.points[frame, rows]
+    # Towards the upper side, so that the arrow is not under the floor.
+    direction = np.where(direction[:, 2:] < -0.05, -direction, direction)
+    heads = tails + length * touched.shares[frame, rows, None] * direction
+    ends = [camera.project(tails)[:, :2], camera.project(heads)[:, :2]]
+    layer = Image.new("L", (camera.width * _FINE, camera.height * _FINE), 0)
+    dots = Image.new("L", layer.size, 0)
+    for tail, head in zip(*ends, strict=True):
+        if np.all(np.isfinite([tail, head])):
+            _arrow(ImageDraw.Draw(layer), tail * _FINE, head * _FINE, camera.height * _FINE / 400)
+            radius = 2.6 * camera.height * _FINE / 400
+            box = [*(tail * _FINE - radius), *(tail * _FINE + radius)]
+            ImageDraw.Draw(dots).ellipse(box, fill=255)
+    result = Image.fromarray(picture)
+    for mask, colour in ((layer, _ARROW), (dots, _DOT)):
+        result.paste(colour, mask=mask.resize(result.size, Image.Resampling.BOX))
+    return np.asarray(result)
+
+
+def _arrow(draw, tail: np.ndarray, head: np.ndarray, scale: float) -> None:
+    """A line with a filled head, in pixels of the fine layer."""
+    along = head - tail
+    size = float(np.linalg.norm(along))
+    if size < 1e-6:
+        return
+    along = along / size
+    across = np.array([-along[1], along[0]])
+    tip = min(7.0 * scale, 0.6 * size)
+    neck = head - tip * along
+    draw.line([*tail, *neck], fill=255, width=max(int(round(2.0 * scale)), 1))
+    draw.polygon([tuple(head), tuple(neck + 0.45 * tip * across), tuple(neck - 0.45 * tip * across)], fill=255)

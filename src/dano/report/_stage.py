@@ -1,0 +1,157 @@
+"""Scenes as pictures see them: drawable items, their poses over time, a camera that keeps all in view, forces."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from dano.engine import contact_patches, contact_wrenches
+from dano.maths import Pose
+from dano.scene import Body, Scene, Trajectory
+from dano.vision import Camera, Item, PALETTE
+
+
+class Stage(NamedTuple):
+    """What of a scene is drawn.
+
+    Attributes:
+        items: One per drawable body, at the identity.
+        rows: Index of the body of each item.
+        offsets: Centre of mass in the field frame [m, F] of each item.
+    """
+
+    items: list[Item]
+    rows: list[int]
+    offsets: list[np.ndarray]
+
+    def posed(self, position: Float[np.ndarray, "bodies 3"], orientation: Float[np.ndarray, "bodies 4"]) -> list[Item]:
+        """The items where the bodies are."""
+        placed = []
+        for item, row, com in zip(self.items, self.rows, self.offsets, strict=True):
+            rotation = matrix(orientation[row])
+            pose = eqx.tree_at(
+                lambda p: (p.position, p.orientation), item.pose, (position[row] - rotation @ com, orientation[row])
+            )
+            placed.append(item.at(pose))
+        return placed
+
+
+def stage(scene: Scene, colours: dict[str, str] | None = None) -> Stage:
+    """Make the bodies of a scene ready for drawing; bodies without a field or shape are left out.
+
+    Raises:
+        ValueError: If a colour is none or names no body, or nothing can be drawn.
+    """
+    colours = {} if colours is None else colours
+    for name in colours:
+        scene.index(name)
+    items, rows, offsets, used = [], [], [], 0
+    for row, body in enumerate(scene.bodies):
+        if body.field is None:
+            continue
+        given = colours.get(body.name)
+        items.append(Item(body.field, Pose(), PALETTE[used % len(PALETTE)] if given is None else given, level=level_of(body)))
+        rows.append(row)
+        offsets.append(np.asarray(body.com + body.com_offset, dtype=np.float64))
+        used += items[-1].plane is None
+    if not items:
+        raise ValueError(f"scene must hold a body with a field or a shape, got {list(scene.names)} without any")
+    return Stage(items, rows, offsets)
+
+
+def level_of(body: Body) -> float | None:
+    """Density at which the surface of a neural object is drawn; None for a shape."""
+    return None if body.object is None else object_level(np.asarray(body.object.density_range, dtype=np.float64))
+
+
+def object_level(density_range: np.ndarray) -> float:
+    """Where in a range of densities the eye sees the surface: low in it, for that is where contact begins."""
+    low, high = float(density_range[0]), float(density_range[1])
+    return low ** 0.75 * high**0.25 if low > 0 else 0.1 * high
+
+
+def matrix(orientation: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation matrix of a unit quaternion, on the host."""
+    w, x, y, z = orientation
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * (w * cross + cross @ cross)
+
+
+def camera_for(
+    scene: Scene, drawn: Stage, trajectory: Trajectory, width: int, height: int
+) -> Camera:
+    """A camera that sees every bounded body all the time, looking down a little, across the main direction of motion."""
+    position = np.asarray(trajectory.states.position, dtype=np.float64)
+    orientation = np.asarray(trajectory.states.orientation, dtype=np.float64)
+    steps = np.unique(np.linspace(0, len(position) - 1, 60).astype(int))
+    centres, radii, moving = [], [], []
+    for item, row, com in zip(drawn.items, drawn.rows, drawn.offsets, strict=True):
+        if item.plane is not None:
+            continue
+        for step in steps[:1] if scene.bodies[row].fixed else steps:
+            centres.append(position[step, row] + matrix(orientation[step, row]) @ (item.centre - com))
+            # The ball around a box is larger than what is seen of it.
+            radii.append(0.8 * item.radius)
+        if not scene.bodies[row].fixed:
+            moving.append(position[steps, row, :2])
+    if not centres:
+        return Camera((3.0, -8.0, 4.0), width=width, height=height)
+    right = _main_direction(np.array(centres), moving)
+    # Seen a little from the side, motion along the screen still shows depth.
+    ahead = np.array([-right[1], right[0]])
+    ahead = 0.94 * ahead + 0.34 * right
+    direction = (*(ahead / np.linalg.norm(ahead)), -0.36)
+    centres, radii = np.array(centres), np.array(radii)
+    if all(item.plane is None for item in drawn.items):
+        return Camera.framing(centres, radii, direction=direction, width=width, height=height)
+    # The floor below them belongs to the picture, since shadows and contacts are there.
+    return Camera.framing(centres, radii, direction=direction, width=width, height=height, margin=0.08)
+
+
+def _main_direction(centres: np.ndarray, moving: list[np.ndarray]) -> np.ndarray:
+    """Horizontal unit vector that shall run to the right of the picture."""
+    flat = np.concatenate([path - path.mean(axis=0) for path in moving]) if moving else np.zeros((1, 2))
+    if np.abs(flat).max() < 0.2 * np.ptp(centres[:, :2], axis=0).max(initial=0.0):
+        flat = centres[:, :2] - centres[:, :2].mean(axis=0)
+    if np.abs(flat).max() < 1e-9:
+        return np.array([1.0, 0.0])
+    _, _, axes = np.linalg.svd(flat, full_matrices=False)
+    right = axes[0]
+    travel = sum((path[-1] - path[0] for path in moving), np.zeros(2)) @ right
+    if abs(travel) > 1e-6 * np.abs(flat).max():
+        return right if travel > 0 else -right
+    return right if right[0] >= 0 else -right
+
+
+class Touches(NamedTuple):
+    """Contact forces at the times of frames.
+
+    Attributes:
+        points: Centroids of the overlaps [m, W], (frames, contacts, 3).
+        forces: On the first body of each contact [N, W], (frames, contacts, 3).
+        shares: Force over the largest of the trajectory, (frames, contacts); zero where nothing touches.
+    """
+
+    points: Float[np.ndarray, "frames contacts 3"]
+    forces: Float[np.ndarray, "frames contacts 3"]
+    shares: Float[np.ndarray, "frames contacts"]
+
+
+def touches(scene: Scene, trajectory: Trajectory, times: Float[np.ndarray, " frames"]) -> Touches | None:
+    """Contact points and forces of the steps that the given times fall into; None if the scene has no contacts."""
+    if not scene.contacts:
+        return None
+    wrenches = np.asarray(contact_wrenches(scene, trajectory.states), dtype=np.float64)
+    patches = contact_patches(scene, trajectory.states)
+    known = np.asarray(trajectory.times, dtype=np.float64)
+    step = np.clip(np.searchsorted(known, times, side="right") - 1, 0, len(known) - 2)
+    points = np.stack([np.asarray(patch.centroid, dtype=np.float64) for patch in patches], axis=1)[step]
+    overlap = np.stack([np.asarray(patch.overlap, dtype=np.float64) for patch in patches], axis=1)[step]
+    forces = wrenches[step, :, :3]
+    size = np.linalg.norm(forces, axis=-1)
+    # A landing is a hundred times the weight; what matters to the eye is the usual force, so the rest is clipped.
+    usual = float(np.quantile(size[size > 1e-9], 0.8)) if np.any(size > 1e-9) else 1.0
+    shares = np.where((overlap > 0) & np.isfinite(points).all(axis=-1), np.clip(size / usual, 0, 2.5), 0.0)
+    return Touches(points, forces, shares)
+

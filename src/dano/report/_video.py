@@ -1,0 +1,166 @@
+"""Videos and picture strips of trajectories."""
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from jaxtyping import UInt8
+
+from dano.archive import checked_output, replacing
+from dano.report._overlay import draw_touches
+from dano.report._resample import frame_times, poses_at
+from dano.report._stage import camera_for, stage, touches
+from dano.scene import Scene, Trajectory
+from dano.vision import Camera, render
+
+Progress = Callable[[str, float], None]
+
+_STRIP_MOMENTS = 6
+
+
+def render_trajectory(
+    scene: Scene,
+    trajectory: Trajectory,
+    path: str | os.PathLike[str] | None,
+    *,
+    fps: int = 30,
+    size: tuple[int, int] = (640, 400),
+    slow_motion: float = 1.0,
+    contact_points: bool = True,
+    strip: str | os.PathLike[str] | None = None,
+    camera: Camera | None = None,
+    colours: dict[str, str] | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Film a trajectory: an MP4 video (H.264), a strip of still pictures, or both.
+
+    Files are written beside their place and renamed when complete: a failed or interrupted run leaves none.
+
+    Args:
+        scene: The scene.
+        trajectory: What happened in it; poses between its steps are interpolated.
+        path: The video, ending in .mp4; None for none.
+        fps: Frames per second of the video.
+        size: Width and height [pixels], even numbers.
+        slow_motion: How many times slower than life the video plays.
+        contact_points: Whether to draw where bodies touch, and the contact force as an arrow.
+        strip: A PNG with some moments of the motion, from left to right; None for none.
+        camera: From where; default: chosen such that all bodies stay in view. Replaces `size`.
+        colours: "#rrggbb" by body name, for those that shall have a certain one.
+        progress: Called with a description and the share done.
+
+    Raises:
+        ValueError: If the trajectory is not one of this scene, a number is out of range, or an output path is a
+            directory, lies in none, or has another ending.
+        ImportError: If av or pillow is missing.
+    """
+    outputs = _checked(scene, trajectory, path, strip, size if camera is None else (camera.width, camera.height))
+    times = frame_times(trajectory, fps, slow_motion)
+    drawn = stage(scene, colours)
+    camera = camera_for(scene, drawn, trajectory, *size) if camera is None else camera
+    touched = touches(scene, trajectory, times) if contact_points else None
+    length = 0.55 * float(np.median([item.radius for item in drawn.items if item.plane is None] or [1.0]))
+    position, orientation = poses_at(trajectory, times)
+
+    def picture(frame: int) -> UInt8[np.ndarray, "height width 3"]:
+        image = render(drawn.posed(position[frame], orientation[frame]), camera, floor=False)
+        return image if touched is None else draw_touches(image, camera, touched, frame, length)
+
+    moments = np.unique(np.linspace(0, len(times) - 1, _STRIP_MOMENTS).round().astype(int))
+    frames = range(len(times)) if outputs[0] is not None else moments.tolist()
+    kept = []
+    with contextlib.ExitStack() as stack:
+        add = None
+        if outputs[0] is not None:
+            add = stack.enter_context(_encoder(stack.enter_context(replacing(outputs[0])), fps, camera))
+        for count, frame in enumerate(frames):
+            image = picture(frame)
+            if add is not None:
+                add(image)
+            if outputs[1] is not None and frame in moments:
+                kept.append(image)
+            if progress is not None:
+                progress("drawing", (count + 1) / len(frames))
+    if outputs[1] is not None:
+        write_png(outputs[1], _side_by_side(kept))
+
+
+def _checked(scene, trajectory, path, strip, size) -> tuple[Path | None, Path | None]:
+    """Output paths, after checks that need no work."""
+    if path is None and strip is None:
+        raise ValueError("path or strip must be given, got None for both")
+    if tuple(trajectory.names) != tuple(scene.names):
+        raise ValueError(f"trajectory must be one of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}")
+    if len(trajectory.times) < 2:
+        raise ValueError(f"trajectory must have at least one step, got {len(trajectory.times)} states")
+    if not np.all(np.isfinite(np.asarray(trajectory.states.position))):
+        raise ValueError("trajectory must be finite, got positions that are NaN or infinite")
+    if min(size) < 16 or any(n != int(n) or n % 2 for n in size):
+        raise ValueError(f"size must be two even numbers of at least 16 pixels (video codecs need them even), got {size}")
+    checked = []
+    for name, output, suffix in (("path", path, ".mp4"), ("strip", strip, ".png")):
+        if output is not None and Path(output).suffix.lower() != suffix:
+            raise ValueError(f"{name} must end in {suffix}, got {output}")
+        checked.append(None if output is None else checked_output(output))
+    if path is not None:
+        require("av")
+    require("PIL", "pillow")
+    return checked[0], checked[1]
+
+
+@contextlib.contextmanager
+def _encoder(file: BinaryIO, fps: int, camera: Camera) -> Iterator[Callable[[np.ndarray], None]]:
+    """A function that appends pictures to an MP4 file."""
+    av = require("av")
+    with av.open(file, mode="w", format="mp4") as container:
+        codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
+        options = {"crf": "18", "preset": "medium"} if codec == "libx264" else {"qscale": "3"}
+        stream = container.add_stream(codec, rate=int(fps), options=options)
+        stream.width, stream.height = camera.width, camera.height
+        # The only pixel format that every player and browser shows.
+        stream.pix_fmt = "yuv420p"
+
+        def add(image: np.ndarray) -> None:
+            for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")):
+                container.mux(packet)
+
+        yield add
+        for packet in stream.encode():
+            container.mux(packet)
+
+
+def _side_by_side(images: list[np.ndarray]) -> np.ndarray:
+    """Pictures from left to right, three a row, with a thin white line between them."""
+    per_row = 3 if len(images) > 3 else len(images)
+    height, width, _ = images[0].shape
+    n_rows = -(-len(images) // per_row)
+    gap = max(2, height // 100)
+    sheet = np.full((n_rows * (height + gap) - gap, per_row * (width + gap) - gap, 3), 255, dtype=np.uint8)
+    for i, image in enumerate(images):
+        top, left = (i // per_row) * (height + gap), (i % per_row) * (width + gap)
+        sheet[top : top + height, left : left + width] = image
+    return sheet
+
+
+def write_png(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
+    """Write an image, whole or not at all."""
+    picture = require("PIL.Image", "pillow").fromarray(image)
+    with replacing(path) as file:
+        picture.save(file, format="PNG", optimize=True)
+
+
+def require(module: str, package: str | None = None) -> Any:
+    """Import an optional package.
+
+    Raises:
+        ImportError: If it is missing; names the extra that brings it.
+    """
+    import importlib
+
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(f"this needs {package or module}: pip install 'dano[view]'") from error

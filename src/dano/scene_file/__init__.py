@@ -1,0 +1,23 @@
+"""Scene files: bodies, contacts, initial state and controls written in TOML.
+
+A run remembers the text of the scene that it came from, so that it can be looked at again: see `save_run`.
+"""
+
+from dano.scene_file._objects import (
+    ASSETS as ASSETS,
+    build_asset as build_asset,
+    build_object as build_object,
+    Progress as Progress,
+)
+from dano.scene_file._reading import (
+    load_scene as load_scene,
+    parse_scene as parse_scene,
+    SceneFile as SceneFile,
+)
+from dano.scene_file._runs import (
+    drop_scene as drop_scene,
+    load_run as load_run,
+    Run as Run,
+    save_run as save_run,
+)
+from dano.scene_file._schedule import Schedule as Schedule

@@ -1,0 +1,101 @@
+"""Neural objects from fields with the options of scene files and the command line, and the shipped ones."""
+
+import math
+from collections.abc import Callable
+from importlib.resources import as_file, files
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from dano.fields import AbstractField, GridField, load_field
+from dano.objects import MassModel, NeuralObject
+
+Progress = Callable[[str, float], None]
+
+ASSETS = {"bunny": 1.0, "soap": 0.15}
+"""Shipped objects and their masses [kg]."""
+
+_built: dict[tuple[str, str], NeuralObject] = {}
+
+
+def build_object(
+    field: AbstractField,
+    *,
+    n_samples: int = 5000,
+    density_range: tuple[float, float] | None = None,
+    mass_model: MassModel = "solid",
+    mass_scale: float = 1.0,
+    mass: float | None = None,
+    resolution: int = 96,
+    length: float | None = None,
+    floaters: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> NeuralObject:
+    """`NeuralObject.from_field` with the options of the command line.
+
+    Args:
+        field: Density with finite bounds.
+        n_samples: See `NeuralObject.from_field`, as for all that is not described here.
+        density_range: See there.
+        mass_model: See there, but "solid" unless asked otherwise: it is right for most fields learned from
+            images.
+        mass_scale: See there.
+        mass: See there.
+        resolution: See there.
+        length: Longest extent that the object shall have [m]: the field is scaled about its origin. Fields
+            learned from images seldom know their scale.
+        floaters: See there.
+        seed: Of the random samples.
+        progress: See there.
+
+    Raises:
+        ValueError: As `NeuralObject.from_field`, or if `length` is not positive or the field is no grid.
+    """
+    options: dict[str, Any] = {
+        "density_range": density_range,
+        "floaters": floaters,
+        "key": jax.random.key(seed),
+    }
+    if length is not None:
+        if not (math.isfinite(length) and length > 0):
+            raise ValueError(f"length must be finite and > 0 m, got {length}")
+        if not isinstance(field, GridField):
+            raise ValueError(
+                f"length applies to a density grid, got {type(field).__name__}: scale it when loading"
+            )
+        # A coarse object tells how much of the grid is object, to half a per cent.
+        coarse = NeuralObject.from_field(field, n_samples=1000, resolution=64, **options)
+        share = length / coarse.size
+        field = GridField(field.values, field.origin * share, field.spacing * share, field.interpolation)
+    return NeuralObject.from_field(
+        field,
+        n_samples=n_samples,
+        mass_model=mass_model,
+        mass_scale=mass_scale,
+        mass=mass,
+        resolution=resolution,
+        progress=progress,
+        **options,
+    )
+
+
+def build_asset(name: str, *, progress: Progress | None = None) -> NeuralObject:
+    """A shipped object, built from its density grid on first use in a process (some seconds).
+
+    Args:
+        name: "bunny" (12 cm, 1 kg) or "soap" (9 × 6 × 3 cm, 0.15 kg).
+        progress: Called with a description and the share done.
+
+    Raises:
+        ValueError: If there is no such object.
+    """
+    if name not in ASSETS:
+        raise ValueError(f"asset must be one of {list(ASSETS)}, got {name!r}")
+    # Objects follow the precision that JAX is set to, which may change within a process.
+    key = (name, jnp.result_type(float).name)
+    if key not in _built:
+        with as_file(files("dano") / "assets" / f"{name}.npz") as path:
+            _built[key] = build_object(load_field(path), mass=ASSETS[name], progress=progress)
+    return _built[key]

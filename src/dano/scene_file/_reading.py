@@ -1,0 +1,256 @@
+"""Reading scene files. Their keys are described in docs/scenes.md."""
+
+import itertools
+import json
+import math
+import os
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast, get_args
+
+from dano.archive import checked_input
+from dano.contact import CentroidLaw, ContactParams
+from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSpace, load_field, Posed, Sphere
+from dano.maths import Pose
+from dano.objects import MassModel, NeuralObject
+from dano.scene import Body, Contact, Scene, State
+from dano.scene_file._objects import build_asset, build_object, Progress
+from dano.scene_file._schedule import read_schedule, Schedule
+from dano.scene_file._table import located, Table
+
+SHAPES: dict[str, tuple[type[AbstractShape], dict[str, int]]] = {
+    "half_space": (HalfSpace, {"normal": 3, "offset": 1}),
+    "sphere": (Sphere, {"radius": 1}),
+    "box": (Box, {"half_extents": 3, "rounding": 1}),
+    "capsule": (Capsule, {"radius": 1, "half_length": 1}),
+    "cylinder": (Cylinder, {"radius": 1, "half_length": 1}),
+    "ellipsoid": (Ellipsoid, {"semi_axes": 3}),
+}
+"""Shapes by name, with the count of numbers that each of their parameters takes."""
+
+_REQUIRED = {"radius", "half_extents", "half_length", "semi_axes"}
+_STATE = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
+_GEOMETRY = ("object", "field", "asset", "shape")
+_BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE)
+_BUILD = ("samples", "density_range", "mass_model", "mass_scale", "resolution", "length", "seed", "floaters")
+_PARAMS = tuple(ContactParams.__dataclass_fields__)
+_LAW = ("law", "smoothing", "regularizer", "adhesive")
+_TOP = ("timestep", "gravity", "duration", "n_steps", "bodies", "contacts", "default_contact", "controls")
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """What a scene file says.
+
+    Attributes:
+        scene: The scene.
+        state: Its initial state.
+        n_steps: Number of steps to simulate.
+        controls: Forces and torques over time, or None.
+        path: Where the file is, or would be: names in it are relative to its folder.
+        text: The file's text.
+    """
+
+    scene: Scene
+    state: State
+    n_steps: int
+    controls: Schedule | None
+    path: Path
+    text: str
+
+
+def load_scene(
+    path: str | os.PathLike[str],
+    *,
+    timestep: float | None = None,
+    n_steps: int | None = None,
+    progress: Progress | None = None,
+) -> SceneFile:
+    """Read a scene file (TOML; its keys are described in docs/scenes.md).
+
+    Args:
+        path: The file. Names of other files in it are relative to its folder.
+        timestep: Replaces the file's [s]; a `duration` in the file stays.
+        n_steps: Replaces the file's `n_steps` or `duration`.
+        progress: Called with a description and the share done while fields become objects.
+
+    Raises:
+        ValueError: If the file, or one that it names, is missing or broken, a key is unknown or of the wrong
+            type, or the scene is not valid; the message names the file and the table.
+    """
+    source = checked_input(path)
+    try:
+        text = source.read_bytes().decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{source} must be a TOML scene file, got one that is not text") from error
+    return parse_scene(text, source, timestep=timestep, n_steps=n_steps, progress=progress)
+
+
+def parse_scene(
+    text: str,
+    path: Path,
+    *,
+    timestep: float | None = None,
+    n_steps: int | None = None,
+    progress: Progress | None = None,
+) -> SceneFile:
+    """Read the text of a scene file; `path` is where it would be, which need not exist. See `load_scene`.
+
+    Raises:
+        ValueError: As `load_scene`.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path} must be a TOML scene file: {error}") from error
+    top = Table(str(path), data, _TOP)
+    h = top.number("timestep", 0.01) if timestep is None else timestep
+    if not (math.isfinite(h) and h > 0):
+        raise ValueError(f"{path}: timestep must be finite and > 0 s, got {h}")
+    steps = _steps(top, h) if n_steps is None else n_steps
+    if steps < 1:
+        raise ValueError(f"{path}: n_steps must be ≥ 1, got {steps}")
+    gravity = top.vector("gravity", 3, (0.0, 0.0, -9.81))
+    tables = top.tables("bodies")
+    if not tables:
+        raise ValueError(f"{path}: needs at least one [[bodies]] table")
+
+    built: dict[object, NeuralObject] = {}
+    rows = [Table(f"{path}: [[bodies]] {i + 1}", table, None) for i, table in enumerate(tables)]
+    bodies = [_body(row, path.parent, built, progress) for row in rows]
+    contacts = _contacts(top, bodies)
+    with located(str(path)):
+        scene = Scene.create(bodies, contacts, timestep=h, gravity=gravity)
+        start = {row["name"]: {key: row[key] for key in _STATE if key in row} for row in tables}
+        state = scene.initial_state(**start)
+    return SceneFile(scene, state, steps, read_schedule(top, scene), path, text)
+
+
+def _steps(top: Table, timestep: float) -> int:
+    if ("duration" in top) == ("n_steps" in top):
+        raise ValueError(f"{top.where}: needs either duration [s] or n_steps")
+    if "n_steps" in top:
+        return top.integer("n_steps", 0)
+    duration = top.number("duration")
+    if duration <= 0:
+        raise top.wrong("duration", "> 0 s")
+    return max(1, round(duration / timestep))
+
+
+def _body(row: Table, folder: Path, built: dict[object, NeuralObject], progress: Progress | None) -> Body:
+    name = row.word("name")
+    row.where += f" ({name!r})"
+    kinds = [key for key in _GEOMETRY if key in row]
+    if len(kinds) != 1:
+        row.only((*_BODY, "build", "pose", "edge", *_shape_keys()))
+        raise ValueError(f"{row.where}: needs exactly one of {', '.join(_GEOMETRY)}, got {kinds or 'none'}")
+    options: dict[str, Any] = {"fixed": row.boolean("fixed", False)}
+    for key in ("mass", "mass_scale"):
+        if key in row:
+            options[key] = row.number(key)
+    for key, n in _STATE.items():
+        if key in row:
+            row.vector(key, n)
+    with located(row.where):
+        if kinds == ["shape"]:
+            return Body(name, _shape(row), **options)
+        row.only((*_BODY, "build") if kinds == ["field"] else _BODY)
+        return Body(name, _object(row, kinds[0], folder, built, progress), **options)
+
+
+def _shape_keys() -> list[str]:
+    return sorted({key for _, parameters in SHAPES.values() for key in parameters})
+
+
+def _shape(row: Table) -> AbstractShape:
+    kind = row.word("shape", list(SHAPES))
+    make, parameters = SHAPES[kind]
+    row.only((*_BODY, *parameters, "edge", "pose"))
+    if missing := [key for key in parameters if key in _REQUIRED and key not in row]:
+        raise ValueError(f"a {kind} needs {', '.join(missing)} [m]")
+    given: dict[str, Any] = {
+        key: row.number(key) if n == 1 else row.vector(key, n) for key, n in parameters.items() if key in row
+    }
+    if "edge" in row:
+        given["edge"] = row.number("edge")
+    shape = make(**given)
+    if "pose" not in row:
+        return shape
+    pose = row.table("pose", ("position", "orientation"))
+    where = Pose(pose.vector("position", 3, (0.0,) * 3), pose.vector("orientation", 4, (1.0, 0.0, 0.0, 0.0)))
+    return cast(AbstractShape, Posed(shape, where))
+
+
+def _object(
+    row: Table, kind: str, folder: Path, built: dict[object, NeuralObject], progress: Progress | None
+) -> NeuralObject:
+    """The neural object of a body; bodies that say the same share one."""
+    name = row.word(kind)
+    if kind == "asset":
+        return build_asset(name, progress=progress)
+    path = folder / Path(name).expanduser()
+    build = row.table("build", _BUILD)
+    key = (kind, path, json.dumps(build.data, sort_keys=True))
+    if key not in built:
+        built[key] = NeuralObject.load(path) if kind == "object" else _from_field_file(path, build, progress)
+    return built[key]
+
+
+def _from_field_file(path: Path, build: Table, progress: Progress | None) -> NeuralObject:
+    options: dict[str, Any] = {"n_samples": build.integer("samples", 5000), "seed": build.integer("seed", 0)}
+    options["resolution"] = build.integer("resolution", 96)
+    options["floaters"] = build.boolean("floaters", False)
+    options["mass_model"] = build.word("mass_model", get_args(MassModel), "solid")
+    options |= {key: build.number(key) for key in ("mass_scale", "length") if key in build}
+    if "density_range" in build:
+        options["density_range"] = build.vector("density_range", 2)
+    return build_object(load_field(path), progress=progress, **options)
+
+
+def _contacts(top: Table, bodies: Sequence[Body]) -> list[Contact]:
+    valid = (*_PARAMS, *_LAW, "edge")
+    default = top.table("default_contact", valid)
+    default.where = f"{top.where}: [default_contact]"
+    if top.data.get("contacts", "all") == "all":
+        pairs = [
+            (a.name, b.name)
+            for a, b in itertools.combinations(bodies, 2)
+            if a.name != b.name and _can_touch(a, b)
+        ]
+        rows = [{"a": a, "b": b} for a, b in pairs]
+    elif isinstance(top.data["contacts"], str):
+        raise top.wrong("contacts", "'all' or written as [[contacts]] tables")
+    else:
+        rows = top.tables("contacts")
+    contacts = []
+    for i, row in enumerate(rows):
+        table = Table(f"{top.where}: [[contacts]] {i + 1}", {**default.data, **row}, ("a", "b", *valid))
+        a, b = table.word("a"), table.word("b")
+        table.where += f" ({a!r}, {b!r})"
+        with located(table.where if row.keys() - {"a", "b"} else default.where):
+            contacts.append(_contact(table, a, b, [body.name for body in bodies]))
+    return contacts
+
+
+def _can_touch(a: Body, b: Body) -> bool:
+    """Whether `Scene.create` would accept a contact between two bodies."""
+    if a.fixed and b.fixed:
+        return False
+    if a.object is not None and b.object is not None:
+        return a.object.grid is not None or b.object.grid is not None
+    return math.isfinite(a.size) or math.isfinite(b.size)
+
+
+def _contact(table: Table, a: str, b: str, names: Sequence[str]) -> Contact:
+    for name in (a, b):
+        if name not in names:
+            raise ValueError(f"a contact must name bodies of the scene {list(names)}, got {name!r}")
+    table.word("law", ("centroid",), "centroid")
+    params = ContactParams(**{key: table.number(key) for key in _PARAMS if key in table})
+    law = CentroidLaw(
+        adhesive=table.boolean("adhesive", False),
+        **{key: table.number(key) for key in ("smoothing", "regularizer") if key in table},
+    )
+    return Contact(a, b, params, law, edge=table.number("edge") if "edge" in table else None)

@@ -1,0 +1,109 @@
+"""Saved runs that remember their scene, and the scene of an object that is simply dropped."""
+
+import json
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dano.archive import checked_input, read_archive
+from dano.maths import Pose
+from dano.objects import NeuralObject
+from dano.scene import Scene, Trajectory
+from dano.scene_file._objects import Progress
+from dano.scene_file._reading import parse_scene, SceneFile
+from dano.scene_file._table import located
+
+SHARP_ENOUGH = 1000.0
+"""Smoothing [s/m] of the friction in `drop_scene`: on a slope it creeps by about a millimetre a second."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A saved trajectory and the scene that it came from."""
+
+    trajectory: Trajectory
+    scene: Scene
+
+
+def drop_scene(object_path: str | os.PathLike[str]) -> str:
+    """Text of a scene in which an object falls, slightly tilted, from 0.3 of its size onto a floor.
+
+    The text names the object by its absolute path. Friction moments follow the object's size.
+
+    Raises:
+        ValueError: If the file is not a neural object.
+    """
+    path = checked_input(object_path).resolve()
+    made = NeuralObject.load(path)
+    size = made.size
+    tilt = np.array([math.cos(0.06), 0.8 * math.sin(0.06), 0.6 * math.sin(0.06), 0.0])
+    lowest = _lowest_point(made, tilt)
+    # Long enough to fall, rock and come to rest, whatever the size: times go with √(size / g).
+    timestep = float(f"{min(0.005, 0.05 * math.sqrt(size / 9.81)):.1g}")
+    duration = max(1.0, 20 * math.sqrt(size / 9.81))
+    return f"""timestep = {timestep}
+duration = {duration:.3g}
+
+[default_contact]
+sliding_friction = 0.3
+rolling_friction = {0.005 * size:.3g}
+torsional_friction = {0.005 * size:.3g}
+smoothing = {SHARP_ENOUGH}
+
+[[bodies]]
+name = "object"
+object = {json.dumps(str(path), ensure_ascii=False)}
+position = [0.0, 0.0, {0.3 * size - lowest:.6g}]
+orientation = {[round(float(x), 6) for x in tilt]}
+
+[[bodies]]
+name = "floor"
+shape = "half_space"
+fixed = true
+"""
+
+
+def save_run(path: str | os.PathLike[str], trajectory: Trajectory, scene_file: SceneFile) -> None:
+    """Write a trajectory with the text of its scene, so that `load_run` can bring both back.
+
+    Raises:
+        ValueError: If `path` is a directory or its parent does not exist.
+    """
+    source = {"scene": scene_file.text, "path": str(scene_file.path.resolve())}
+    trajectory.save(path, source=json.dumps(source))
+
+
+def load_run(path: str | os.PathLike[str], *, progress: Progress | None = None) -> Run:
+    """Read what `save_run` wrote; the objects that the scene names must still be where they were.
+
+    Raises:
+        ValueError: If the file is missing, truncated, not a dano trajectory, or was saved without its scene.
+    """
+    trajectory = Trajectory.load(path)
+    data = read_archive(path, "dano-trajectory", 1)
+    if "source" not in data:
+        raise ValueError(
+            f"{path} must be a run that `dano simulate` saved: this one does not say which scene it is of"
+        )
+    try:
+        source = json.loads(str(data["source"]))
+        text, origin = str(source["scene"]), Path(source["path"])
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not a valid run: its scene is not readable") from error
+    with located(f"{path}: the scene of this run cannot be built"):
+        scene = parse_scene(text, origin, progress=progress).scene
+    if scene.names != trajectory.names:
+        raise ValueError(
+            f"{path} is not a valid run: its bodies {trajectory.names} are not its scene's {scene.names}"
+        )
+    return Run(trajectory, scene)
+
+
+def _lowest_point(made: NeuralObject, orientation: np.ndarray) -> float:
+    """Height [m] of an object's lowest sample below or above its centre of mass, turned by a quaternion."""
+    pose = Pose(orientation=orientation)
+    points = np.asarray(made.samples.points) - np.asarray(made.mass.com)
+    return float((points @ np.asarray(pose.matrix)[2]).min())

@@ -1,0 +1,88 @@
+"""TOML tables read key by key, with complaints that say where."""
+
+import contextlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, cast
+
+
+class Table:
+    """A TOML table that is read key by key; every complaint names the file and the table.
+
+    Attributes:
+        where: File and table, for messages.
+        data: Keys and values.
+    """
+
+    def __init__(self, where: str, data: Mapping[str, Any], valid: Sequence[str] | None):
+        self.where, self.data = where, data
+        if valid is not None:
+            self.only(valid)
+
+    def only(self, valid: Sequence[str]) -> None:
+        for key in self.data:
+            if key not in valid:
+                raise ValueError(f"{self.where}: unknown key {key!r}; valid keys are {', '.join(valid)}")
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.data
+
+    def wrong(self, key: str, expected: str) -> ValueError:
+        return ValueError(f"{self.where}: {key} must be {expected}, got {self.data.get(key)!r}")
+
+    def number(self, key: str, default: float | None = None) -> float:
+        value = self.data.get(key, default)
+        if not is_number(value):
+            raise self.wrong(key, "a finite number")
+        return float(cast(float, value))
+
+    def integer(self, key: str, default: int) -> int:
+        value = self.data.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise self.wrong(key, "a whole number")
+        return value
+
+    def boolean(self, key: str, default: bool) -> bool:
+        value = self.data.get(key, default)
+        if not isinstance(value, bool):
+            raise self.wrong(key, "true or false")
+        return value
+
+    def vector(self, key: str, n: int, default: tuple[float, ...] | None = None) -> tuple[float, ...]:
+        value = self.data.get(key, default)
+        if not isinstance(value, (list, tuple)) or len(value) != n or not all(map(is_number, value)):
+            raise self.wrong(key, f"a list of {n} finite numbers")
+        return tuple(float(x) for x in value)
+
+    def word(self, key: str, choices: Sequence[str] | None = None, default: str | None = None) -> str:
+        value = self.data.get(key, default)
+        if choices is not None and value not in choices:
+            raise self.wrong(key, "one of " + ", ".join(map(repr, choices)))
+        if not isinstance(value, str) or not value:
+            raise self.wrong(key, "a non-empty string")
+        return value
+
+    def table(self, key: str, valid: Sequence[str]) -> "Table":
+        value = self.data.get(key, {})
+        if not isinstance(value, dict):
+            raise self.wrong(key, "a table")
+        return Table(f"{self.where}: {key}", value, valid)
+
+    def tables(self, key: str) -> list[dict[str, Any]]:
+        value = self.data.get(key, [])
+        if not isinstance(value, list) or not all(isinstance(row, dict) for row in value):
+            raise self.wrong(key, f"written as [[{key}]] tables")
+        return value
+
+
+def is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+@contextlib.contextmanager
+def located(where: str) -> Iterator[None]:
+    """Put the place in front of the library's own complaints."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error

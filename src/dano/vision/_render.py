@@ -1,0 +1,304 @@
+"""Pictures of solids and media on a floor, by ray marching on the CPU.
+
+A picture is made in passes over arrays of rays: planes in closed form, solids by sphere tracing, the light each
+visible point receives, shading, media in front. Rays that cannot meet an item are sorted out on the host by its
+bounding ball, so that the compiled kernels see little else than hits. One ray a pixel first; four more where
+neighbouring pixels differ, which smooths every kind of edge at a small part of the cost of doing so everywhere.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import ArrayLike, Int, UInt8
+from scipy import ndimage
+
+from dano.maths import checked_array
+from dano.vision._camera import Camera
+from dano.vision._item import checked_colour, Item, placement
+from dano.vision._rays import CHUNK, first_hit, received_light, transmitted
+from dano.vision._shade import backdrop, floor_tint, Look, shade, to_srgb
+
+# Half the angular width of the lamp [rad]: shadows are crisp where things touch and soft a length away.
+_LAMP = 0.07
+# Colour difference [1/255] between neighbours from which a pixel is worth four more rays.
+_ROUGH = 10
+# Most pixels refined in one go; bounds the memory of large pictures.
+_AT_ONCE = 1 << 17
+# Where they go in a pixel: a rotated grid, on which no edge direction catches two of them at once.
+_WITHIN = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
+
+
+class _Empty(NamedTuple):
+    """The picture before anything stands in it; the same for all frames of a video.
+
+    Attributes:
+        order: Pixel of each ray, (n,).
+        directions: Unit directions of the rays (3, n).
+        depth: Distance to a plane (n,), infinite if there is none.
+        which: Index of that plane or −1 (n,).
+        colour: Linear (3, n).
+        picture: The same as sRGB (pixels, 3), in the order of pixels.
+    """
+
+    order: np.ndarray
+    directions: np.ndarray
+    depth: np.ndarray
+    which: np.ndarray
+    colour: np.ndarray
+    picture: np.ndarray
+
+
+class _View:
+    """One picture in the making: what is in it, and where the light comes from (host only)."""
+
+    def __init__(self, items: Sequence[Item], camera: Camera, look: Look, floor: bool | float):
+        self.origin = camera.position.astype(np.float32)
+        self.look = look
+        self.planes = [(item.plane, item.colour) for item in items if item.plane is not None]
+        self.solids = [item for item in items if item.shape is not None and item.plane is None]
+        self.media = [item for item in items if item.medium is not None]
+        if floor is not False and not self.planes:
+            self.planes = [(np.array([0.0, 0.0, 1.0, 0.0 if floor is True else float(floor)]), None)]
+        balls = [item.placed_ball for item in self.solids + self.media]
+        self.radii = np.array([radius for _, radius in balls], dtype=np.float32)
+        self.centres = np.array([centre for centre, _ in balls], dtype=np.float32).reshape(-1, 3)
+        self.frames = [tuple(x.astype(np.float32) for x in placement(item.pose)) for item in self.solids + self.media]
+
+
+def render(
+    items: Sequence[Item],
+    camera: Camera,
+    *,
+    floor: bool | float = True,
+    light: ArrayLike | None = None,
+    background: str | ArrayLike | None = None,
+    antialias: bool = True,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw a picture.
+
+    Args:
+        items: What is in it. Half-spaces are drawn as floors with a checker.
+        camera: From where.
+        floor: Whether to put a floor at z = 0 if `items` holds no half-space; a number is its height [m].
+        light: Direction towards the lamp [W]; default: over the viewer's left shoulder.
+        background: sRGB of the horizon, "#rrggbb" or three numbers in [0, 1]; default: a light grey.
+        antialias: Whether to smooth edges.
+
+    Returns:
+        sRGB image, shape (height, width, 3).
+
+    Raises:
+        ValueError: If an item is not an `Item`, the light is zero, or a colour is none.
+    """
+    for i, item in enumerate(items):
+        if not isinstance(item, Item):
+            raise ValueError(f"items[{i}] must be an Item (a field made ready for drawing), got {type(item).__name__}")
+    view = _View(items, camera, _look(camera, light, background), floor)
+    empty = _empty(view, camera)
+    colour, touched = _radiance(view, empty.directions, empty.depth, empty.which, empty.colour)
+    picture = empty.picture.copy()
+    picture[empty.order[touched]] = to_srgb(colour[:, touched].T)
+    if antialias and len(touched):
+        edges = _edges(picture, empty.order[touched], camera.width, camera.height)
+        for start in range(0, len(edges), _AT_ONCE):
+            part = edges[start : start + _AT_ONCE]
+            points = np.stack([part % camera.width, part // camera.width], axis=1)[:, None] + 0.5 + _WITHIN
+            directions = camera.directions(points.reshape(-1, 2)).T.astype(np.float32)
+            colour, _ = _radiance(view, directions, *_background(view, directions))
+            # Averaged after the transfer curve: before it, bright pixels would eat into dark edges.
+            picture[part] = np.rint(to_srgb(colour.T).reshape(-1, 4, 3).mean(axis=1)).astype(np.uint8)
+    return picture.reshape(camera.height, camera.width, 3)
+
+
+def _look(camera: Camera, light: ArrayLike | None, background: str | ArrayLike | None) -> Look:
+    right, up, forward = camera.axes
+    if light is None:
+        ahead = np.array([forward[0], forward[1], 0.0])
+        length = np.linalg.norm(ahead)
+        ahead = ahead / length if length > 1e-6 else up
+        towards = -0.75 * right - 0.35 * ahead + np.array([0.0, 0.0, 1.15])
+    else:
+        towards = np.asarray(checked_array("light", light, (3,)), dtype=np.float64)
+        if not np.linalg.norm(towards) > 0:
+            raise ValueError("light must be a direction other than zero, got (0, 0, 0)")
+    horizon = checked_colour("#eef0f2" if background is None else background)
+    distance = float(np.linalg.norm(camera.look_at - camera.position))
+    return Look.create(towards, horizon, camera.look_at, distance, camera.pixel_angle)
+
+
+@functools.lru_cache(maxsize=8)
+def _tiles(width: int, height: int) -> Int[np.ndarray, " pixels"]:
+    """Pixel indices ordered by small tiles, so that rays that are traced together see similar things."""
+    y, x = np.mgrid[:height, :width]
+    return np.argsort(((y // 16) * (width // 16 + 1) + x // 16).ravel(), kind="stable")
+
+
+_kept: dict[tuple, _Empty] = {}
+
+
+def _empty(view: _View, camera: Camera) -> _Empty:
+    """The empty picture, kept from the last call if camera, floor and light are the same."""
+    numbers = [camera.position, camera.look_at, camera.vertical_fov, *view.look]
+    for plane, tint in view.planes:
+        numbers += [plane, () if tint is None else tint]
+    key = (camera.width, camera.height, *(np.asarray(x, dtype=np.float64).tobytes() for x in numbers))
+    if key not in _kept:
+        order = _tiles(camera.width, camera.height)
+        points = np.stack([order % camera.width, order // camera.width], axis=1) + 0.5
+        directions = np.ascontiguousarray(camera.directions(points).T, dtype=np.float32)
+        depth, which, colour = _background(view, directions)
+        picture = np.empty((len(order), 3), dtype=np.uint8)
+        picture[order] = to_srgb(colour.T)
+        # One is enough: pictures come in series from one camera.
+        _kept.clear()
+        _kept[key] = _Empty(order, directions, depth, which, colour, picture)
+    return _kept[key]
+
+
+def _background(view, d):
+    """Distance, index and linear colour of planes and sky along rays, before anything casts a shadow."""
+    n = d.shape[1]
+    depth, which = np.full(n, np.inf, dtype=np.float32), np.full(n, -1, dtype=np.int32)
+    colour = backdrop(view.look, d)
+    for j, (plane, _) in enumerate(view.planes):
+        normal = plane[:3].astype(np.float32)
+        height, fall = normal @ view.origin - np.float32(plane[3]), -(normal @ d)
+        if height > 0:  # From below, a floor would hide everything.
+            t = np.where(fall > 1e-6, height / np.maximum(fall, 1e-6), np.float32(np.inf))
+            nearer = t < depth
+            depth[nearer], which[nearer] = t[nearer], j
+    hit = np.flatnonzero(which >= 0)
+    one = np.ones(len(hit), dtype=np.float32)
+    normals = np.zeros((3, len(hit)), dtype=np.float32)
+    colour[:, hit] = _lit(view, d[:, hit], depth[hit], which[hit], normals, one, one)
+    return depth, which, colour
+
+
+def _edges(picture, touched, width: int, height: int) -> Int[np.ndarray, " edges"]:
+    """Pixels that differ from one of their neighbours, in and next to those where something stands."""
+    near = np.zeros((height, width), dtype=bool)
+    near.ravel()[touched] = True
+    top, bottom = np.flatnonzero(near.any(axis=1))[[0, -1]]
+    left, right = np.flatnonzero(near.any(axis=0))[[0, -1]]
+    window = slice(max(top - 1, 0), bottom + 2), slice(max(left - 1, 0), right + 2)
+    values = picture.reshape(height, width, 3)[window].astype(np.int16)
+    near = ndimage.binary_dilation(near[window])
+    rough = np.zeros(near.shape, dtype=bool)
+    across = np.abs(np.diff(values, axis=1)).max(axis=2) > _ROUGH
+    down = np.abs(np.diff(values, axis=0)).max(axis=2) > _ROUGH
+    rough[:, 1:] |= across
+    rough[:, :-1] |= across
+    rough[1:] |= down
+    rough[:-1] |= down
+    y, x = np.nonzero(rough & near)
+    return (y + window[0].start) * width + x + window[1].start
+
+
+def _radiance(view, d, depth, which, colour):
+    """Linear colour (3, n) that arrives along rays, and which of them see anything but the empty surroundings."""
+    depth, which, colour = depth.copy(), which.copy(), colour.copy()
+    normals = np.zeros((3, d.shape[1]), dtype=np.float32)
+    pixel = np.float32(view.look.pixel)
+    for i, item in enumerate(view.solids):
+        index = _towards_ball(view.centres[i] - view.origin, view.radii[i], d)
+        arrays = (np.broadcast_to(view.origin[:, None], (3, len(index))), d[:, index], depth[index])
+        t, normal = _in_chunks(lambda o, r, far, i=i, s=item: first_hit(s.shape, *view.frames[i], o, r, far, pixel), arrays)
+        nearer = t < depth[index]
+        index = index[nearer]
+        depth[index], which[index], normals[:, index] = t[nearer], len(view.planes) + i, normal[:, nearer]
+    for j, (plane, _) in enumerate(view.planes):
+        normals[:, which == j] = plane[:3].astype(np.float32)[:, None]
+    hit = np.flatnonzero(which >= 0)
+    lamp, ambient = _light_at(view, view.origin[:, None] + depth[hit] * d[:, hit], normals[:, hit], which[hit])
+    changed = (which[hit] >= len(view.planes)) | (lamp < 1) | (ambient < 1)
+    hit, lamp, ambient = hit[changed], lamp[changed], ambient[changed]
+    colour[:, hit] = _lit(view, d[:, hit], depth[hit], which[hit], normals[:, hit], lamp, ambient)
+    touched = [hit]
+    for i, item in enumerate(view.media):
+        touched.append(_lay_over(view, len(view.solids) + i, item, d, depth, colour))
+    return colour, np.unique(np.concatenate(touched)) if view.media else hit
+
+
+def _lit(view, d, depth, which, normals, lamp, ambient):
+    """Colour of the points at the ends of rays."""
+    points = view.origin[:, None] + depth * d
+    albedo = np.empty_like(d)
+    fade = np.zeros_like(depth)
+    for j, (plane, tint) in enumerate(view.planes):
+        own = np.flatnonzero(which == j)
+        normals[:, own] = plane[:3].astype(np.float32)[:, None]
+        albedo[:, own], fade[own] = floor_tint(view.look, plane, tint, points[:, own], d[:, own], depth[own])
+    for i, item in enumerate(view.solids):
+        albedo[:, which == len(view.planes) + i] = (item.colour.astype(np.float32) ** 2.2)[:, None]
+    return shade(view.look, albedo, normals, d, lamp, ambient, which < len(view.planes), fade)
+
+
+def _light_at(view, points, normals, kind):
+    """Shares of lamp light and of ambient light that all solids and planes leave to points."""
+    light = view.look.light
+    lamp = np.ones(points.shape[1], dtype=np.float32)
+    ambient = np.ones_like(lamp)
+    near_focus = np.sum((points - view.look.focus[:, None]) ** 2, axis=0) < view.look.fade_end**2
+    faces_lamp = light @ normals > 0
+    for i, item in enumerate(view.solids):
+        radius = view.radii[i]
+        reach = np.float32(0.35 * radius)
+        to_centre = view.centres[i][:, None] - points
+        ahead = light @ to_centre
+        square = np.einsum("in,in->n", to_centre, to_centre)
+        aside = square - ahead * ahead
+        shadowed = faces_lamp & (ahead > -radius) & (aside < (radius + _LAMP * np.maximum(ahead, 0)) ** 2)
+        index = np.flatnonzero(near_focus & (shadowed | (square < (radius + reach) ** 2)))
+        spread = np.float32(_LAMP)
+        direct, around = _in_chunks(
+            lambda p, n, i=i, s=item, r=reach: received_light(s.shape, *view.frames[i], p, n, light, spread, r),
+            (points[:, index], normals[:, index]),
+        )
+        lamp[index] *= direct
+        ambient[index] *= around
+    for plane, _ in view.planes if view.solids else ():
+        index = np.flatnonzero(kind >= len(view.planes))
+        reach = np.float32(0.5 * np.median(view.radii))
+        height = plane[:3].astype(np.float32) @ points[:, index] - np.float32(plane[3])
+        downwards = 0.5 - 0.5 * (plane[:3].astype(np.float32) @ normals[:, index])
+        ambient[index] *= 1 - 0.65 * downwards * np.clip(1 - height / reach, 0, 1) ** 2
+    return lamp, ambient
+
+
+def _lay_over(view, i, item, d, depth, colour):
+    """Blend a medium over what lies behind it, in place; the indices of its rays."""
+    index = _towards_ball(view.centres[i] - view.origin, view.radii[i], d)
+    arrays = (np.broadcast_to(view.origin[:, None], (3, len(index))), d[:, index], depth[index])
+    scale = np.float32(item.density_scale)
+    opacity, _, normal = _in_chunks(lambda o, r, far: transmitted(item.medium, scale, *view.frames[i], o, r, far), arrays)
+    albedo = np.broadcast_to((item.colour.astype(np.float32) ** 2.2)[:, None], (3, len(index)))
+    one, no = np.ones(len(index), dtype=np.float32), np.zeros(len(index), dtype=bool)
+    own = shade(view.look, albedo, normal, d[:, index], one, one, no, 0 * one)
+    colour[:, index] += opacity * (own - colour[:, index])
+    return index
+
+
+def _towards_ball(to_centre: np.ndarray, radius: float, d: np.ndarray) -> np.ndarray:
+    """Indices of the rays that meet a ball."""
+    square = float(to_centre @ to_centre)
+    if square <= radius**2:
+        return np.arange(d.shape[1])
+    along = to_centre @ d
+    return np.flatnonzero(along > np.sqrt(square - radius**2))
+
+
+def _in_chunks(kernel: Callable, arrays: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    """Apply a kernel of `CHUNK` rays to any number of them; all arrays have the rays as their last axis."""
+    n = arrays[0].shape[-1]
+    starts = range(0, max(n, 1), CHUNK)
+    parts = []
+    for start in starts:
+        piece = [array[..., start : start + CHUNK] for array in arrays]
+        short = CHUNK - piece[0].shape[-1]
+        if short:
+            # Zeros make rays of no length that end at once.
+            piece = [np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, short)]) for array in piece]
+        parts.append(kernel(*piece))
+    return tuple(np.concatenate([np.asarray(x) for x in column], axis=-1)[..., :n] for column in zip(*parts, strict=True))
