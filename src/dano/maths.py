@@ -17,7 +17,7 @@ Numbers = ArrayLike | Sequence[Any]
 """What constructors take for an array: an array, a number, or (nested) lists and tuples of numbers."""
 
 
-def safe_norm(x: Float[Array, "*batch n"], axis: int = -1) -> Float[Array, "*batch"]:
+def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
     """Euclidean norm whose derivative at zero is zero instead of NaN."""
     squared = jnp.sum(x * x, axis=axis)
     # The untaken branch must be safe too: 0 · ∞ in the chain rule would be NaN.
@@ -25,7 +25,7 @@ def safe_norm(x: Float[Array, "*batch n"], axis: int = -1) -> Float[Array, "*bat
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
 
 
-def safe_normalize(x: Float[Array, "*batch n"], axis: int = -1) -> Float[Array, "*batch n"]:
+def safe_normalize(x: Float[Array, "*shape"], axis: int = -1) -> Float[Array, "*shape"]:
     """Unit vector along `x`; the zero vector where `x` is zero."""
     norm = jnp.expand_dims(safe_norm(x, axis), axis)
     return x / jnp.where(norm > 0, norm, 1)

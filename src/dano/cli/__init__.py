@@ -6,7 +6,9 @@ from collections.abc import Sequence
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run a command; exits with code 2 after a one-line message if the input is wrong, with 130 if interrupted.
+    """Run a command.
+
+    Exits with code 2 after a one-line message if the input is wrong, with 130 if interrupted.
 
     Args:
         argv: Arguments without the program's name; default those of the process.

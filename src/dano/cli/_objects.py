@@ -112,7 +112,8 @@ def print_object(report: dict[str, Any]) -> None:
     """Print what `describe` found."""
     grid = report["grid"]
     put(f"object              {report['file']}")
-    put(f"mass                {report['mass']:.6g} ± {report['mass_error']:.1g} kg ({report['mass_model']})")
+    error = f" ± {report['mass_error']:.1g}" if report["mass_error"] else ""
+    put(f"mass                {report['mass']:.6g}{error} kg ({report['mass_model']})")
     put(f"centre of mass      {numbers(report['com'])} ± {max(report['com_error']):.1g} m")
     for i, row in enumerate(report["inertia"]):
         label = "inertia about it" if i == 0 else ""

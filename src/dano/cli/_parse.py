@@ -54,11 +54,12 @@ def build(
     """Make a neural object of a density field: mass, centre of mass, inertia, contact samples.
 
     Args:
-        field: Density grid (.npz with values, origin, spacing), voxels (.npy), mesh (.obj, .stl, …) or object (.dano).
+        field: Density grid (.npz with values, origin, spacing), voxels (.npy), mesh (.obj, .stl, …) or object
+            (.dano).
         output: Where to write the object, usually *.dano.
         samples: Number of contact samples.
         density_range: Lower and upper density of the samples; default: around the field's own surface.
-        mass_model: solid: uniform inside the surface, hollow cores filled. density: proportional to the field.
+        mass_model: solid: uniform inside the surface, hollow cores filled. density: as dense as the field.
         mass_scale: Mass per unit of density and cubic metre [kg]; default 1.
         mass: Total mass [kg], instead of the mass scale.
         resolution: Cells along the longest axis for mass integrals and sampling.
@@ -161,8 +162,8 @@ def demo(
     """Build the shipped objects, simulate a scene of them, and draw everything.
 
     Args:
-        name: drop: a bunny, a bar of soap and a ball fall. collision: a ball hits two bunnies. all: both, but the
-            second only if the first left time within two minutes.
+        name: drop: a bunny, a bar of soap and a ball fall. collision: a ball hits two bunnies. all: both, but
+            the second only if the first left time within two minutes.
         output: Folder for everything that is written.
         json: Print one JSON object instead of text.
     """

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from dano.cli._console import Progress, put, say
 from dano.engine import contact_wrenches, simulate
@@ -64,12 +65,14 @@ def _joined(pieces: list[Trajectory], loaded: SceneFile) -> Trajectory:
     first = jax.tree.map(lambda x: x[:1], pieces[0].states)
     rest = [jax.tree.map(lambda x: x[1:], piece.states) for piece in pieces]
     states = jax.tree.map(lambda *parts: jnp.concatenate(parts)[: n + 1], first, *rest)
-    steps = (
-        jnp.concatenate([getattr(piece, name) for piece in pieces])[:n]
-        for name in ("residuals", "iterations", "converged")
-    )
+
+    def steps(name: str) -> Array:
+        return jnp.concatenate([getattr(piece, name) for piece in pieces])[:n]
+
     times = loaded.scene.timestep * jnp.arange(n + 1, dtype=loaded.scene.timestep.dtype)
-    return Trajectory(times, states, *steps, loaded.scene.names)
+    return Trajectory(
+        times, states, steps("residuals"), steps("iterations"), steps("converged"), loaded.scene.names
+    )
 
 
 def describe(rollout: Rollout, scene: Scene) -> dict[str, Any]:
@@ -153,9 +156,9 @@ def print_rollout(report: dict[str, Any]) -> None:
 def warn_unconverged(report: dict[str, Any]) -> None:
     """Say on stderr that a result is not to be trusted, if so."""
     if report["unconverged_steps"]:
-        first = report["first_unconverged_step"]
+        count, first = report["unconverged_steps"], report["first_unconverged_step"]
         say(
-            f"warning: {report['unconverged_steps']} of {report['steps']} steps did not converge, first step {first} "
-            f"(t = {first * report['timestep']:.4g} s), largest residual {report['largest_residual']:.3g} m/s; "
-            "try a smaller --timestep"
+            f"warning: {count} of {report['steps']} steps did not converge, first step {first} "
+            f"(t = {first * report['timestep']:.4g} s), largest residual {report['largest_residual']:.3g} "
+            "m/s; try a smaller --timestep"
         )

@@ -80,9 +80,8 @@ def demo(name: str, folder: Path, *, as_json: bool) -> None:
     if as_json:
         put_json({"folder": str(folder), "seconds": seconds, "scenes": reports})
     else:
-        put(
-            f"took {seconds:.0f} s; change {folder / next(iter(reports))}.toml and run it with `dano simulate`"
-        )
+        first = folder / f"{next(iter(reports))}.toml"
+        put(f"took {seconds:.0f} s; change {first} and run it with `dano simulate`")
 
 
 def _demo_scene(name: str, folder: Path, *, draw: bool, quiet: bool) -> dict[str, Any]:

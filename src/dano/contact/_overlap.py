@@ -49,6 +49,7 @@ _NEGLIGIBLE = 1e-12
 _HARD = 1e-30
 
 
+@eqx.filter_jit
 def overlap(a: Collider, b: Collider) -> Patch:
     """Expected interpenetration of two colliders.
 

@@ -50,11 +50,12 @@ def stage(scene: Scene, colours: dict[str, str] | None = None) -> Stage:
     for row, body in enumerate(scene.bodies):
         if body.field is None:
             continue
-        given = colours.get(body.name)
-        items.append(Item(body.field, Pose(), PALETTE[used % len(PALETTE)] if given is None else given, level=level_of(body)))
+        plane = body.shape is not None and not np.isfinite(body.size)
+        colour = colours.get(body.name, None if plane else PALETTE[used % len(PALETTE)])
+        items.append(Item(body.field, Pose(), colour, level=level_of(body)))
         rows.append(row)
         offsets.append(np.asarray(body.com + body.com_offset, dtype=np.float64))
-        used += items[-1].plane is None
+        used += not plane
     if not items:
         raise ValueError(f"scene must hold a body with a field or a shape, got {list(scene.names)} without any")
     return Stage(items, rows, offsets)
@@ -85,28 +86,25 @@ def camera_for(
     position = np.asarray(trajectory.states.position, dtype=np.float64)
     orientation = np.asarray(trajectory.states.orientation, dtype=np.float64)
     steps = np.unique(np.linspace(0, len(position) - 1, 60).astype(int))
-    centres, radii, moving = [], [], []
+    centres, moving = [], []
     for item, row, com in zip(drawn.items, drawn.rows, drawn.offsets, strict=True):
         if item.plane is not None:
             continue
+        lower, upper = np.asarray(item.shape.bounds, dtype=np.float64)
+        corners = np.where(np.array(list(np.ndindex(2, 2, 2))) == 1, upper, lower)
         for step in steps[:1] if scene.bodies[row].fixed else steps:
-            centres.append(position[step, row] + matrix(orientation[step, row]) @ (item.centre - com))
-            # The ball around a box is larger than what is seen of it.
-            radii.append(0.8 * item.radius)
+            centres.append(position[step, row] + (corners - com) @ matrix(orientation[step, row]).T)
         if not scene.bodies[row].fixed:
             moving.append(position[steps, row, :2])
     if not centres:
         return Camera((3.0, -8.0, 4.0), width=width, height=height)
-    right = _main_direction(np.array(centres), moving)
+    centres = np.concatenate(centres)
+    right = _main_direction(centres, moving)
     # Seen a little from the side, motion along the screen still shows depth.
     ahead = np.array([-right[1], right[0]])
     ahead = 0.94 * ahead + 0.34 * right
     direction = (*(ahead / np.linalg.norm(ahead)), -0.36)
-    centres, radii = np.array(centres), np.array(radii)
-    if all(item.plane is None for item in drawn.items):
-        return Camera.framing(centres, radii, direction=direction, width=width, height=height)
-    # The floor below them belongs to the picture, since shadows and contacts are there.
-    return Camera.framing(centres, radii, direction=direction, width=width, height=height, margin=0.08)
+    return Camera.framing(centres, np.zeros(len(centres)), direction=direction, width=width, height=height)
 
 
 def _main_direction(centres: np.ndarray, moving: list[np.ndarray]) -> np.ndarray:

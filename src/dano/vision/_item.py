@@ -44,7 +44,7 @@ class Item(eqx.Module):
         self,
         field: AbstractField,
         pose: Pose | None = None,
-        colour: str | ArrayLike = PALETTE[0],
+        colour: str | ArrayLike | None = None,
         *,
         level: float | None = None,
         density_scale: float | None = None,
@@ -54,7 +54,7 @@ class Item(eqx.Module):
         Args:
             field: A shape, which is drawn as it is, or a density.
             pose: Field frame → world; default the identity.
-            colour: "#rrggbb" or three numbers in [0, 1].
+            colour: "#rrggbb" or three numbers in [0, 1]; default: the first of `PALETTE`, white for a half-space.
             level: Density at which the surface of a solid lies; default: half the median of what the field holds.
             density_scale: If given, the field is no solid but a medium with extinction density_scale · φ [1/m].
 
@@ -70,7 +70,6 @@ class Item(eqx.Module):
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be positive and finite, got {value}")
         self.pose = Pose() if pose is None else pose
-        self.colour = checked_colour(colour)
         self.density_scale = 0.0 if density_scale is None else float(density_scale)
         self.shape = self.medium = None
         if density_scale is not None:
@@ -83,6 +82,9 @@ class Item(eqx.Module):
         bounded = bool(np.all(np.isfinite([lower, upper])))
         self.centre = 0.5 * (lower + upper) if bounded else np.zeros(3)
         self.radius = 0.5 * float(np.linalg.norm(upper - lower)) if bounded else float("inf")
+        if colour is None:
+            colour = PALETTE[0] if self.plane is None else "#ffffff"
+        self.colour = checked_colour(colour)
         if not bounded and self.plane is None:
             raise ValueError(f"field must have finite bounds or be a half-space, got {type(field).__name__}")
 

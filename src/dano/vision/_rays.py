@@ -5,18 +5,21 @@ in float32. They are compiled once per type of field and serve every picture, po
 """
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from dano.fields import AbstractShape, GridField
 
 CHUNK = 2048
 """Rays per call: few enough that one slow ray does not hold many up, enough to make a call worth while."""
 
-_MOST_STEPS = 96
-_SHADOW_STEPS = 40
+MISSED, HIT, ON_ITS_WAY = np.int32(0), np.int32(1), np.int32(2)
+"""What has become of a ray."""
+
 _MEDIUM_STEPS = 128
 
 # Heights above a point, as shares of the reach, at which its surroundings are probed, and their weights.
@@ -45,117 +48,152 @@ def _unit(vectors: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
     return vectors * jax.lax.rsqrt(jnp.maximum(jnp.sum(vectors * vectors, axis=0), 1e-24))[None]
 
 
+class Placed(NamedTuple):
+    """A shape somewhere.
+
+    Attributes:
+        shape: Signed distance, bounded, in float32.
+        rotation: Field frame → world (3, 3).
+        position: Of the field frame [m, W] (3,).
+    """
+
+    shape: AbstractShape
+    rotation: Float[ArrayLike, "3 3"]
+    position: Float[ArrayLike, "3"]
+
+
 @jax.jit
-def first_hit(
-    shape: AbstractShape,
-    rotation: Float[Array, "3 3"],
-    position: Float[Array, "3"],
+def march(
+    placed: Placed,
     origins: Float[Array, "3 n"],
     directions: Float[Array, "3 n"],
     limit: Float[Array, " n"],
+    start: Float[Array, " n"],
     pixel: Float[Array, ""],
-) -> tuple[Float[Array, " n"], Float[Array, "3 n"]]:
-    """Sphere tracing.
+    n_steps: Int[Array, ""],
+) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
+    """Some steps of sphere tracing.
 
     Args:
-        shape: Signed distance, bounded.
-        rotation: Field frame → world.
-        position: Of the field frame [m, W].
+        placed: What may be hit.
         origins: Starts of the rays [m, W].
         directions: Their unit directions [W].
         limit: Length [m] beyond which a ray is not followed; 0 for rays that only fill the chunk.
+        start: How far each ray has come before [m].
         pixel: Angle between neighbouring rays [rad].
+        n_steps: Most steps to take.
 
     Returns:
-        Distances to the surface [m], infinite for rays that miss, and unit normals [W].
+        How far each ray has come [m], and whether it missed (0), hit (1) or is on its way (2).
     """
+    shape, rotation, position = placed
     o, d = _local(rotation, position, origins, directions)
     bounds = shape.bounds
     size = jnp.max(bounds[1] - bounds[0])
     enter, leave = _interval(bounds, o, d, jnp.zeros_like(limit))
     leave = jnp.minimum(leave, limit)
 
-    def distance(t: Array) -> Array:
-        return shape.sdf_jet(o + t[None] * d, 0)
+    def unfinished(carry: tuple[Array, Array, Array]) -> Bool[Array, ""]:
+        _, state, i = carry
+        return jnp.any(state == ON_ITS_WAY) & (i < n_steps)
 
-    def unfinished(carry: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
-        _, _, live, i = carry
-        return jnp.any(live) & (i < _MOST_STEPS)
-
-    def advance(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        t, hit, live, i = carry
-        s = distance(t)
+    def advance(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        t, state, i = carry
+        s = shape.sdf_jet(o + t[None] * d, 0)
+        live = state == ON_ITS_WAY
         # A third of a pixel, but not below what float32 resolves.
         near = s < jnp.maximum(0.3 * pixel * t, 1e-5 * size)
         t = jnp.where(live, t + _CAUTION * s, t)
-        hit = hit | (live & near)
-        return t, hit, live & ~near & (t < leave), i + 1
+        state = jnp.where(live & near, HIT, jnp.where(live & (t >= leave), MISSED, state))
+        return t, state, i + 1
 
-    start = (enter, jnp.zeros_like(enter, dtype=bool), enter < leave, jnp.int32(0))
-    t, hit, _, _ = jax.lax.while_loop(unfinished, advance, start)
-    _, gradient = shape.sdf_jet(o + t[None] * d, 1)
-    return jnp.where(hit, t, jnp.inf), rotation @ _unit(gradient)
+    t = jnp.maximum(enter, start)
+    state = jnp.where(t < leave, ON_ITS_WAY, MISSED)
+    t, state, _ = jax.lax.while_loop(unfinished, advance, (t, state, jnp.int32(0)))
+    return t, state
 
 
 @jax.jit
-def received_light(
-    shape: AbstractShape,
-    rotation: Float[Array, "3 3"],
-    position: Float[Array, "3"],
-    points: Float[Array, "3 n"],
-    normals: Float[Array, "3 n"],
-    light: Float[Array, "3"],
-    spread: Float[Array, ""],
-    reach: Float[Array, ""],
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Light that one shape leaves to points: direct, from a lamp of some width, and from all around.
+def normals_at(placed: Placed, points: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    """Unit normals [W] of a shape at points [m, W] of its surface."""
+    shape, rotation, position = placed
+    _, gradient = shape.sdf_jet(rotation.T @ (points - position[:, None]), 1)
+    return rotation @ _unit(gradient)
+
+
+@jax.jit
+def ambient_light(
+    placed: Placed, points: Float[Array, "3 n"], normals: Float[Array, "3 n"], reach: Float[Array, ""]
+) -> Float[Array, " n"]:
+    """Share in [0, 1] of the light from all around that a shape leaves to points.
 
     Args:
-        shape: Signed distance.
-        rotation: Field frame → world.
-        position: Of the field frame [m, W].
+        placed: What stands in the way.
         points: [m, W].
         normals: Unit normals of the surfaces that the points lie on [W].
-        light: Unit direction towards the lamp [W].
-        spread: Half the lamp's angular width [rad].
         reach: How far around a point the shape darkens it [m].
-
-    Returns:
-        Shares of lamp light and of ambient light in [0, 1].
     """
-    # Start a little above the surface, or it would shadow itself by rounding.
-    bias = 0.02 * reach
-    o, d = _local(rotation, position, points + bias * normals, jnp.broadcast_to(light[:, None], points.shape))
-    n = rotation.T @ normals
+    shape, rotation, position = placed
+    o, n = _local(rotation, position, points, normals)
     # All heights in one call: each call is compiled anew.
     heights = reach * jnp.asarray(_HEIGHTS, jnp.float32)
     probes = o[:, None] + heights[None, :, None] * n[:, None]
     above = shape.sdf_jet(probes.reshape(3, -1), 0).reshape(len(_HEIGHTS), -1)
     covered = jnp.clip(1 - above / heights[:, None], 0, 1.3)
-    ambient = jnp.asarray(_WEIGHTS, jnp.float32) @ covered
+    return jnp.clip(1 - jnp.asarray(_WEIGHTS, jnp.float32) @ covered, 0.12, 1)
+
+
+@jax.jit
+def march_to_lamp(
+    placed: Placed,
+    points: Float[Array, "3 n"],
+    start: Float[Array, " n"],
+    seen: Float[Array, " n"],
+    light: Float[Array, "3"],
+    spread: Float[Array, ""],
+    bias: Float[Array, ""],
+    n_steps: Int[Array, ""],
+) -> tuple[Float[Array, " n"], Float[Array, " n"], Int[Array, " n"]]:
+    """Some steps from points towards a lamp of some width.
+
+    The lamp's disc, at distance t of radius spread · t, is covered up to the height s of the ray above the shape, so
+    the least s / (spread · t), between −1 (dark) and 1 (clear), says how much of it is seen.
+
+    Args:
+        placed: What stands in the way.
+        points: [m, W], a little above the surface they belong to.
+        start: How far the way has been followed before [m].
+        seen: Least height ratio until there; below −1 for points that only fill the chunk.
+        light: Unit direction towards the lamp [W].
+        spread: Half the lamp's angular width [rad].
+        bias: Least step [m].
+        n_steps: Most steps to take.
+
+    Returns:
+        How far each way has been followed [m], least height ratio, and state (0 done, 2 on its way).
+    """
+    shape, rotation, position = placed
+    o, d = _local(rotation, position, points, jnp.broadcast_to(light[:, None], points.shape))
     bounds = shape.bounds
-    middle = jnp.clip(0.5 * (bounds[0] + bounds[1]), -1e6, 1e6)
-    ahead = jnp.maximum(jnp.sum((middle[:, None] - o) * d, axis=0), 0)
+    ahead = jnp.maximum(jnp.sum((0.5 * (bounds[0] + bounds[1])[:, None] - o) * d, axis=0), 0)
     enter, leave = _interval(bounds, o, d, spread * ahead + 2 * bias)
-    first = jnp.maximum(enter, bias)
 
     def unfinished(carry: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
-        _, _, live, i = carry
-        return jnp.any(live) & (i < _SHADOW_STEPS)
+        _, _, state, i = carry
+        return jnp.any(state == ON_ITS_WAY) & (i < n_steps)
 
     def advance(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        t, seen, live, i = carry
+        t, seen, state, i = carry
         s = shape.sdf_jet(o + t[None] * d, 0)
-        # The lamp's disc, at distance t of radius spread · t, is covered up to the height s of the ray above ground.
+        live = state == ON_ITS_WAY
         seen = jnp.where(live, jnp.minimum(seen, s / (spread * t)), seen)
-        t = jnp.where(live, t + jnp.maximum(0.7 * jnp.abs(s), bias), t)
-        return t, seen, live & (t < leave) & (seen > -1), i + 1
+        t = jnp.where(live, t + jnp.maximum(0.7 * jnp.abs(s), bias + 0.1 * spread * t), t)
+        return t, seen, jnp.where(live & ((t >= leave) | (seen <= -1)), MISSED, state), i + 1
 
-    start = (first, jnp.ones_like(first), first < leave, jnp.int32(0))
-    _, seen, _, _ = jax.lax.while_loop(unfinished, advance, start)
-    seen = jnp.clip(seen, -1, 1)
-    # Share of the lamp's disc above a straight edge, nearly: the cubic with zero slope at both ends.
-    return 0.25 * (1 + seen) ** 2 * (2 - seen), jnp.clip(1 - ambient, 0.12, 1)
+    t = jnp.maximum(jnp.maximum(enter, bias), start)
+    state = jnp.where((t < leave) & (seen > -1), ON_ITS_WAY, MISSED)
+    t, seen, state, _ = jax.lax.while_loop(unfinished, advance, (t, seen, state, jnp.int32(0)))
+    return t, seen, state
 
 
 @functools.partial(jax.jit, static_argnames="n_steps")

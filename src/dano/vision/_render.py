@@ -17,11 +17,23 @@ from scipy import ndimage
 from dano.maths import checked_array
 from dano.vision._camera import Camera
 from dano.vision._item import checked_colour, Item, placement
-from dano.vision._rays import CHUNK, first_hit, received_light, transmitted
+from dano.vision._rays import (
+    ambient_light,
+    CHUNK,
+    HIT,
+    march,
+    march_to_lamp,
+    normals_at,
+    ON_ITS_WAY,
+    Placed,
+    transmitted,
+)
 from dano.vision._shade import backdrop, floor_tint, Look, shade, to_srgb
 
 # Half the angular width of the lamp [rad]: shadows are crisp where things touch and soft a length away.
 _LAMP = 0.07
+# Steps along rays, after each number of which those that have ended are sorted out.
+_STEPS = (10, 16, 70)
 # Colour difference [1/255] between neighbours from which a pixel is worth four more rays.
 _ROUGH = 10
 # Most pixels refined in one go; bounds the memory of large pictures.
@@ -60,7 +72,7 @@ class _View:
         self.solids = [item for item in items if item.shape is not None and item.plane is None]
         self.media = [item for item in items if item.medium is not None]
         if floor is not False and not self.planes:
-            self.planes = [(np.array([0.0, 0.0, 1.0, 0.0 if floor is True else float(floor)]), None)]
+            self.planes = [(np.array([0.0, 0.0, 1.0, 0.0 if floor is True else float(floor)]), np.ones(3))]
         balls = [item.placed_ball for item in self.solids + self.media]
         self.radii = np.array([radius for _, radius in balls], dtype=np.float32)
         self.centres = np.array([centre for centre, _ in balls], dtype=np.float32).reshape(-1, 3)
@@ -142,7 +154,7 @@ def _empty(view: _View, camera: Camera) -> _Empty:
     """The empty picture, kept from the last call if camera, floor and light are the same."""
     numbers = [camera.position, camera.look_at, camera.vertical_fov, *view.look]
     for plane, tint in view.planes:
-        numbers += [plane, () if tint is None else tint]
+        numbers += [plane, tint]
     key = (camera.width, camera.height, *(np.asarray(x, dtype=np.float64).tobytes() for x in numbers))
     if key not in _kept:
         order = _tiles(camera.width, camera.height)
@@ -200,14 +212,16 @@ def _radiance(view, d, depth, which, colour):
     """Linear colour (3, n) that arrives along rays, and which of them see anything but the empty surroundings."""
     depth, which, colour = depth.copy(), which.copy(), colour.copy()
     normals = np.zeros((3, d.shape[1]), dtype=np.float32)
-    pixel = np.float32(view.look.pixel)
+    pixel, hits = np.float32(view.look.pixel), []
     for i, item in enumerate(view.solids):
         index = _towards_ball(view.centres[i] - view.origin, view.radii[i], d)
-        arrays = (np.broadcast_to(view.origin[:, None], (3, len(index))), d[:, index], depth[index])
-        t, normal = _in_chunks(lambda o, r, far, i=i, s=item: first_hit(s.shape, *view.frames[i], o, r, far, pixel), arrays)
-        nearer = t < depth[index]
-        index = index[nearer]
-        depth[index], which[index], normals[:, index] = t[nearer], len(view.planes) + i, normal[:, nearer]
+        placed = Placed(item.shape, *view.frames[i])
+        index, t = _first_hits(placed, view.origin, d, depth, index, pixel)
+        depth[index], which[index] = t, len(view.planes) + i
+        hits.append((index, placed))
+    for index, placed in hits:
+        points = view.origin[:, None] + depth[index] * d[:, index]
+        (normals[:, index],) = _in_chunks(lambda p, placed=placed: (normals_at(placed, p),), (points,))
     for j, (plane, _) in enumerate(view.planes):
         normals[:, which == j] = plane[:3].astype(np.float32)[:, None]
     hit = np.flatnonzero(which >= 0)
@@ -235,6 +249,41 @@ def _lit(view, d, depth, which, normals, lamp, ambient):
     return shade(view.look, albedo, normals, d, lamp, ambient, which < len(view.planes), fade)
 
 
+def _first_hits(placed, origin, d, limit, index, pixel):
+    """Which of the rays `index` hit a shape within their limits, and where along them."""
+    t = np.zeros(d.shape[1], dtype=np.float32)
+    found = []
+    # After a few steps only rays that graze the surface are left: they go on among themselves.
+    for n_steps in _STEPS:
+        arrays = (np.broadcast_to(origin[:, None], (3, len(index))), d[:, index], limit[index], t[index])
+        ahead, state = _in_chunks(lambda o, r, far, s, n=n_steps: march(placed, o, r, far, s, pixel, np.int32(n)), arrays)
+        t[index] = ahead
+        found.append(index[state == HIT])
+        index = index[state == ON_ITS_WAY]
+        if len(index) == 0:
+            break
+    hit = np.concatenate(found)
+    nearer = t[hit] < limit[hit]
+    return hit[nearer], t[hit][nearer]
+
+
+def _lamp_share(placed, points, light, bias):
+    """Share of the lamp's light that a shape leaves to points (n,)."""
+    n = points.shape[1]
+    t, seen, index = np.zeros(n, dtype=np.float32), np.ones(n, dtype=np.float32), np.arange(n)
+    for n_steps in _STEPS:
+        arrays = (points[:, index], t[index], seen[index])
+        t[index], seen[index], state = _in_chunks(
+            lambda p, s, k, n=n_steps: march_to_lamp(placed, p, s, k, light, np.float32(_LAMP), bias, np.int32(n)), arrays
+        )
+        index = index[state == ON_ITS_WAY]
+        if len(index) == 0:
+            break
+    seen = np.clip(seen, -1, 1)
+    # Share of the lamp's disc above a straight edge, nearly: the cubic with zero slope at both ends.
+    return 0.25 * (1 + seen) ** 2 * (2 - seen)
+
+
 def _light_at(view, points, normals, kind):
     """Shares of lamp light and of ambient light that all solids and planes leave to points."""
     light = view.look.light
@@ -243,20 +292,20 @@ def _light_at(view, points, normals, kind):
     near_focus = np.sum((points - view.look.focus[:, None]) ** 2, axis=0) < view.look.fade_end**2
     faces_lamp = light @ normals > 0
     for i, item in enumerate(view.solids):
-        radius = view.radii[i]
+        radius, placed = view.radii[i], Placed(item.shape, *view.frames[i])
         reach = np.float32(0.35 * radius)
+        bias = np.float32(0.02) * reach
         to_centre = view.centres[i][:, None] - points
         ahead = light @ to_centre
         square = np.einsum("in,in->n", to_centre, to_centre)
         aside = square - ahead * ahead
         shadowed = faces_lamp & (ahead > -radius) & (aside < (radius + _LAMP * np.maximum(ahead, 0)) ** 2)
-        index = np.flatnonzero(near_focus & (shadowed | (square < (radius + reach) ** 2)))
-        spread = np.float32(_LAMP)
-        direct, around = _in_chunks(
-            lambda p, n, i=i, s=item, r=reach: received_light(s.shape, *view.frames[i], p, n, light, spread, r),
-            (points[:, index], normals[:, index]),
-        )
-        lamp[index] *= direct
+        index = np.flatnonzero(near_focus & shadowed)
+        # From a little above the surface, or it would shadow itself by rounding.
+        lamp[index] *= _lamp_share(placed, points[:, index] + bias * normals[:, index], light, bias)
+        index = np.flatnonzero(near_focus & (square < (radius + reach) ** 2))
+        arrays = points[:, index], normals[:, index]
+        (around,) = _in_chunks(lambda p, n, placed=placed, reach=reach: (ambient_light(placed, p, n, reach),), arrays)
         ambient[index] *= around
     for plane, _ in view.planes if view.solids else ():
         index = np.flatnonzero(kind >= len(view.planes))

@@ -65,7 +65,7 @@ def floor_tint(look, plane, tint, points, d, t) -> tuple[np.ndarray, np.ndarray]
         width = np.float32(look.pixel / look.tile) * t * (np.abs(axis @ d) / cosine + 1) + np.float32(1e-6)
         low, high = (np.abs(_fraction((u + shift * width) * np.float32(0.5)) - 0.5) for shift in (-0.5, 0.5))
         pattern = pattern * np.clip(2 * (low - high) / width, -1, 1)
-    base = _FLOOR if tint is None else np.float32(0.75) * _FLOOR + np.float32(0.25) * _FLOOR * tint.astype(np.float32)
+    base = _FLOOR * (np.float32(0.4) + np.float32(0.6) * tint.astype(np.float32) ** np.float32(2.2))
     mix = 0.5 * (1 + pattern)
     albedo = base[:, None] * (1 - (1 - _DARKER_TILE) * mix)
     distance = np.sqrt(np.sum((points - look.focus[:, None]) ** 2, axis=0))

@@ -1,0 +1,193 @@
+"""Each command on a small object."""
+
+import json
+import shutil
+from importlib.resources import files
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dano
+from dano.cli import _rollout, _scenes
+from dano.scene_file import _objects as shipped, load_run, load_scene
+
+
+def test_help_without_arguments(run):
+    answer = run()
+    assert answer.code == 0
+    for command in ("build", "inspect", "simulate", "view", "demo"):
+        assert command in answer.out
+        assert run(command, "--help").code == 0
+    assert dano.__version__ in run("--version").out
+    assert run("nonsense").code == 2
+
+
+def test_build_writes_an_object(run, field, tmp_path):
+    path = tmp_path / "egg.dano"
+    options = ("--samples", 150, "--resolution", 20, "--length", 0.24, "--mass", 0.5)
+    answer = run("build", field, "-o", path, *options, "--json")
+    assert answer.code == 0
+    assert answer.err == ""
+    report = json.loads(answer.out)
+    made = dano.NeuralObject.load(path)
+    assert report["samples"] == len(made.samples.points) == 150
+    assert report["mass"] == pytest.approx(0.5)
+    a, b, c = 0.5 * np.array(report["extents"])
+    np.testing.assert_allclose((a, b, c), (0.12, 0.10, 0.08), rtol=0.05)
+    inertias = 0.5 / 5 * np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2])
+    np.testing.assert_allclose(report["principal_inertias"], inertias, rtol=0.05)
+
+
+def test_build_of_another_mass_model_and_range(run, field, tmp_path):
+    path = tmp_path / "egg.dano"
+    options = ("--samples", 100, "--resolution", 16, "--density-range", 40, 60, "--mass-model", "density")
+    answer = run("build", field, "-o", path, *options, "--mass-scale", 2)
+    assert answer.code == 0
+    assert "centre of mass" in answer.out
+    made = dano.NeuralObject.load(path)
+    assert made.mass_model == "density"
+    assert 40 <= float(made.samples.density.min()) <= float(made.samples.density.max()) <= 60
+    with np.load(field) as data:
+        assert float(made.mass.mass) == pytest.approx(2 * data["values"].sum() * 1e-6, rel=0.02)
+
+
+def test_inspect_prints_and_draws(run, egg, tmp_path):
+    copy = Path(shutil.copy(egg, tmp_path))
+    answer = run("inspect", copy)
+    assert answer.code == 0
+    assert "principal inertias" in answer.out
+    assert copy.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    report = json.loads(run("inspect", copy, "--json", "--no-png").out)
+    assert report["mass"] == pytest.approx(0.5)
+    assert "picture" not in report
+
+
+def test_simulate_a_scene(run, scene, tmp_path):
+    out = tmp_path / "run.npz"
+    answer = run("simulate", scene, "-o", out, "--json")
+    assert answer.code == 0
+    assert answer.err == ""
+    report = json.loads(answer.out)
+    loaded = load_run(out)
+    direct = dano.simulate(loaded.scene, load_scene(scene).state, 40)
+    # In pieces or at once: the same steps.
+    for name in ("position", "orientation", "velocity", "omega"):
+        pieces = getattr(loaded.trajectory.states, name)
+        np.testing.assert_allclose(pieces[:41], getattr(direct.states, name), atol=1e-12)
+        np.testing.assert_array_equal(report["bodies"][0][name], pieces[-1, 0])
+    np.testing.assert_allclose(loaded.trajectory.times, 0.005 * np.arange(401), atol=1e-12)
+    np.testing.assert_array_equal(loaded.trajectory.iterations[:40], direct.iterations)
+    assert report["unconverged_steps"] == 0
+    assert report["compile_seconds"] >= 0
+    (contact,) = report["contacts"]
+    # At the end the floor carries the weight.
+    assert contact["last_force"] == pytest.approx(0.5 * 9.81, rel=0.05)
+
+
+def test_simulate_options(run, scene, tmp_path):
+    out = tmp_path / "run.npz"
+    answer = run("simulate", scene, "-o", out, "--steps", 397, "--timestep", 0.002)
+    assert answer.code == 0
+    assert "steps that did not converge: 0" in answer.out
+    np.testing.assert_allclose(dano.Trajectory.load(out).times, 0.002 * np.arange(398), atol=1e-12)
+
+
+def test_simulate_an_object_drops_it(run, egg, tmp_path):
+    out = tmp_path / "run.npz"
+    report = json.loads(run("simulate", egg, "-o", out, "--steps", 400, "--json").out)
+    body = report["bodies"][0]
+    assert np.linalg.norm(body["velocity"]) < 0.02
+    # It fell from 0.3 of its size and lies on its flattest side, 4 cm below the middle.
+    first = dano.Trajectory.load(out).states.position[0, 0, 2]
+    assert first == pytest.approx(0.04 + 0.3 * dano.NeuralObject.load(egg).size, abs=0.006)
+    assert body["position"][2] == pytest.approx(0.04, abs=0.004)
+
+
+def test_simulate_draws(run, scene, tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(
+        "dano.report.render_trajectory", lambda *given, **options: calls.append((given, options))
+    )
+    paths = [tmp_path / name for name in ("run.npz", "run.mp4", "run.png")]
+    assert run("simulate", scene, "-o", paths[0], "--video", paths[1], "--strip", paths[2]).code == 0
+    ((_, trajectory, video), options) = calls[0]
+    assert trajectory.names == ("egg", "floor")
+    assert (video, options["strip"]) == (paths[1], paths[2])
+
+
+def test_unconverged_steps_are_said(run, scene, tmp_path, monkeypatch):
+    def failing(*given, **options):
+        piece = dano.simulate(*given, **options)
+        return dano.Trajectory(
+            piece.times, piece.states, piece.residuals + 1, piece.iterations, ~piece.converged, piece.names
+        )
+
+    monkeypatch.setattr(_rollout, "simulate", failing)
+    answer = run("simulate", scene, "-o", tmp_path / "run.npz", "--json")
+    assert answer.code == 0
+    assert json.loads(answer.out)["unconverged_steps"] == 400
+    assert "warning: 400 of 400 steps did not converge, first step 0" in answer.err
+
+
+def test_interrupt_leaves_nothing(run, scene, tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_rollout, "simulate", interrupted)
+    before = sorted(tmp_path.iterdir())
+    answer = run("simulate", scene, "-o", tmp_path / "run.npz")
+    assert answer.code == 130
+    assert "Traceback" not in answer.err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_view_shows_the_run(run, scene, tmp_path, monkeypatch):
+    out = tmp_path / "run.npz"
+    assert run("simulate", scene, "-o", out).code == 0
+    # The run holds its scene: the file may go, the object it names may not.
+    scene.unlink()
+    seen = []
+    monkeypatch.setattr("dano.report.view", lambda *given, **options: seen.append((given, options)))
+    assert run("view", out, "--port", 9000).code == 0
+    ((shown, trajectory), options) = seen[0]
+    assert shown.names == trajectory.names == ("egg", "floor")
+    assert options == {"port": 9000}
+
+
+@pytest.fixture
+def small_assets(egg, monkeypatch):
+    """The shipped objects, replaced by one that is quick to simulate."""
+    made = dano.NeuralObject.load(egg)
+    precision = jnp.result_type(float).name
+    monkeypatch.setattr(shipped, "_built", {(name, precision): made for name in shipped.ASSETS})
+
+
+def test_demo(run, scene, egg, tmp_path, monkeypatch, small_assets):
+    text = scene.read_text(encoding="utf-8").replace(f'object = "{egg}"', 'asset = "bunny"')
+    (tmp_path / "scenes").mkdir()
+    for name in _scenes.SCENES:
+        (tmp_path / "scenes" / f"{name}.toml").write_text(text, encoding="utf-8")
+    monkeypatch.setattr(_scenes, "files", lambda _: tmp_path)
+    monkeypatch.setattr(_scenes, "SECONDS_FOR_ONE", 0.0)
+    drawn = []
+    monkeypatch.setattr("dano.report.draw_object", lambda *given, **_: drawn.append(given[1].name))
+    monkeypatch.setattr("dano.report.render_trajectory", lambda *given, **_: drawn.append(given[2].name))
+    folder = tmp_path / "demo"
+    answer = run("demo", "-o", folder, "--json")
+    assert answer.code == 0
+    # No time was left for the second scene.
+    assert "dano demo collision" in answer.err
+    assert list(json.loads(answer.out)["scenes"]) == ["drop"]
+    assert drawn == ["bunny.png", "drop.mp4"]
+    assert {path.name for path in folder.iterdir()} == {"drop.toml", "drop.npz", "drop.json", "bunny.dano"}
+    assert "== collision ==" in run("demo", "collision", "-o", folder).out
+
+
+def test_shipped_scenes_load(small_assets):
+    names = {path.name for path in (files("dano") / "scenes").iterdir() if path.name.endswith(".toml")}
+    assert names == {f"{name}.toml" for name in _scenes.SCENES}
+    for name in names:
+        loaded = load_scene(str(files("dano") / "scenes" / name))
+        assert len(loaded.scene.contacts) == 6

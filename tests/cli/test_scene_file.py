@@ -1,0 +1,256 @@
+"""What a scene file may say."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dano
+from dano.scene_file import build_asset, load_run, load_scene, parse_scene
+
+
+def test_defaults_and_all_pairs(scene):
+    text = scene.read_text(encoding="utf-8").split("[[contacts]]")[0]
+    text += """
+[default_contact]
+rolling_friction = 0.002
+smoothing = 500
+
+[[bodies]]
+name = "ball"
+shape = "sphere"
+radius = 0.05
+mass = 2
+velocity = [1, 0, 0]
+
+[[bodies]]
+name = "wall"
+shape = "half_space"
+normal = [1.0, 0.0, 0.0]
+offset = -1.0
+fixed = true
+"""
+    loaded = parse_scene(text, scene)
+    pairs = [(contact.a, contact.b) for contact in loaded.scene.contacts]
+    assert pairs == [("egg", "floor"), ("egg", "ball"), ("egg", "wall"), ("floor", "ball"), ("ball", "wall")]
+    for contact in loaded.scene.contacts:
+        assert float(contact.params.rolling_friction) == 0.002
+        assert float(contact.params.spring) == float(dano.ContactParams().spring)
+        assert float(contact.law.smoothing) == 500
+    assert loaded.n_steps == 400
+    assert loaded.controls is None
+    np.testing.assert_allclose(loaded.scene.gravity, (0, 0, -9.81))
+    np.testing.assert_allclose(loaded.state.velocity[2], (1, 0, 0))
+    np.testing.assert_allclose(loaded.state.omega[0], (0, 0, 1))
+
+
+SHAPES = {
+    'shape = "box"\nhalf_extents = [0.1, 0.2, 0.3]\nrounding = 0.01': dano.Box((0.1, 0.2, 0.3), 0.01),
+    'shape = "capsule"\nradius = 0.1\nhalf_length = 0.2\nedge = 0.001': dano.Capsule(0.1, 0.2, edge=0.001),
+    'shape = "cylinder"\nradius = 0.1\nhalf_length = 0.2': dano.Cylinder(0.1, 0.2),
+    'shape = "ellipsoid"\nsemi_axes = [0.1, 0.2, 0.3]': dano.Ellipsoid((0.1, 0.2, 0.3)),
+    'shape = "sphere"\nradius = 0.1\npose = {position = [0.0, 0.1, 0.0], orientation = [1, 0, 0, 1]}': dano.Posed(
+        dano.Sphere(0.1), dano.Pose((0, 0.1, 0), (1, 0, 0, 1))
+    ),
+}
+
+
+@pytest.mark.parametrize("text", SHAPES, ids=lambda text: text.split('"')[1])
+def test_shapes(text, tmp_path):
+    loaded = parse_scene(f'n_steps = 1\n[[bodies]]\nname = "it"\nmass = 1.5\n{text}\n', tmp_path / "s.toml")
+    shape, expected = loaded.scene.body("it").shape, SHAPES[text]
+    assert type(shape) is type(expected)
+    for x in (jnp.array([0.05, 0.1, 0.15]), jnp.array([0.1, -0.05, 0.0])):
+        assert float(shape.sdf(x)) == pytest.approx(float(expected.sdf(x)), abs=1e-12)
+    assert float(shape.edge_width) == float(expected.edge_width)
+    assert float(loaded.scene.body("it").mass) == 1.5
+
+
+def test_field_is_built_and_shared(field, tmp_path):
+    body = f'field = "{field.name}"\nmass = 0.3\nbuild = {{samples = 100, resolution = 16, length = 0.2}}'
+    text = (
+        f'duration = 0.5\n[[bodies]]\nname = "a"\n{body}\n[[bodies]]\nname = "b"\n{body}\nmass_scale = 2.0\n'
+    )
+    loaded = parse_scene(text, field.parent / "scene.toml")
+    a, b = loaded.scene.bodies
+    assert a.object is b.object
+    assert a.size == pytest.approx(0.2, rel=0.03)
+    assert (float(a.mass), float(b.mass * b.mass_scale)) == (pytest.approx(0.3), pytest.approx(0.6))
+    assert loaded.n_steps == 50
+
+
+def test_controls_push_and_pull(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        """
+timestep = 0.01
+n_steps = 100
+gravity = [0.0, 0.0, 0.0]
+[[bodies]]
+name = "pushed"
+shape = "sphere"
+radius = 0.1
+mass = 2.0
+[[bodies]]
+name = "pulled"
+shape = "box"
+half_extents = [0.1, 0.1, 0.1]
+mass = 1.0
+position = [1.0, 0.0, 0.0]
+[[controls]]
+body = "pushed"
+force = [4.0, 0.0, 0.0]
+torque = [0.0, 0.0, 0.008]
+from = 0.1
+to = 0.35
+[[controls]]
+body = "pulled"
+target = [1.0, 0.5, 0.0]
+stiffness = 100.0
+damping = 20.0
+""",
+        encoding="utf-8",
+    )
+    loaded = load_scene(path)
+    assert loaded.scene.contacts[0].a == "pushed"
+    run = dano.simulate(loaded.scene, loaded.state, loaded.n_steps, controls=loaded.controls)
+    # Impulse over mass: 4 N for 0.25 s on 2 kg, 0.008 N m on 2/5 m r² = 0.008 kg m².
+    np.testing.assert_allclose(run.states.velocity[-1, 0], (0.5, 0, 0), atol=1e-9)
+    np.testing.assert_allclose(run.states.omega[-1, 0], (0, 0, 0.25), atol=1e-3)
+    np.testing.assert_allclose(run.states.velocity[10, 0], 0, atol=1e-12)
+    assert float(run.states.velocity[11, 0, 0]) > 0
+    # A critically damped spring of 10 rad/s, which moves at most as far as asked.
+    assert float(run.states.position[-1, 1, 1]) == pytest.approx(0.5, abs=5e-3)
+    # The second half alone, told when it begins, goes on as the whole did.
+    middle = dano.State(*(x[20] for x in (run.states.position, run.states.orientation, *_velocities(run))))
+    rest = dano.simulate(loaded.scene, middle, 100, controls=loaded.controls.starting_at(0.2))
+    np.testing.assert_allclose(rest.states.position[80], run.states.position[100], atol=1e-10)
+
+
+def _velocities(run):
+    return run.states.velocity, run.states.omega
+
+
+def test_assets_are_real(monkeypatch):
+    soap = build_asset("soap")
+    assert build_asset("soap") is soap
+    np.testing.assert_allclose(np.ptp(soap.samples.points, axis=0), (0.09, 0.06, 0.03), atol=0.003)
+    # A bar of uniform density weighs m/12 (b² + c²) about its long axis; rounded edges take 5 %.
+    assert float(soap.mass.mass) == pytest.approx(0.15)
+    expected = 0.15 / 12 * np.array([0.06**2 + 0.03**2, 0.09**2 + 0.03**2, 0.09**2 + 0.06**2])
+    np.testing.assert_allclose(np.diag(soap.mass.inertia), expected, rtol=0.1)
+
+
+BODY = '[[bodies]]\nname = "ball"\nshape = "sphere"\nradius = 0.1\nmass = 1.0\n'
+FLOOR = '[[bodies]]\nname = "floor"\nshape = "half_space"\nfixed = true\n'
+BAD = {
+    "no TOML": ("n_steps = ", "must be a TOML scene file"),
+    "unknown key": ("n_steps = 1\nspeed = 2\n" + BODY, "unknown key 'speed'; valid keys are timestep"),
+    "no length": (BODY, "either duration [s] or n_steps"),
+    "both lengths": ("n_steps = 1\nduration = 1.0\n" + BODY, "either duration [s] or n_steps"),
+    "zero steps": ("n_steps = 0\n" + BODY, "n_steps must be ≥ 1, got 0"),
+    "negative timestep": (
+        "n_steps = 1\ntimestep = -0.1\n" + BODY,
+        "timestep must be finite and > 0 s, got -0.1",
+    ),
+    "wrong type": ('n_steps = "many"\n' + BODY, "n_steps must be a whole number, got 'many'"),
+    "no body": ("n_steps = 1\n", "at least one [[bodies]] table"),
+    "nameless body": (
+        'n_steps = 1\n[[bodies]]\nshape = "sphere"\n',
+        "[[bodies]] 1: name must be a non-empty string",
+    ),
+    "unknown body key": (
+        "n_steps = 1\n" + BODY + "radus = 1\n",
+        "[[bodies]] 1 ('ball'): unknown key 'radus'",
+    ),
+    "unknown shape": (
+        'n_steps = 1\n[[bodies]]\nname = "x"\nshape = "cone"\n',
+        "shape must be one of 'half_space'",
+    ),
+    "shape without size": (
+        'n_steps = 1\n[[bodies]]\nname = "x"\nshape = "box"\n',
+        "a box needs half_extents",
+    ),
+    "two geometries": (
+        "n_steps = 1\n" + BODY + 'asset = "soap"\n',
+        "needs exactly one of object, field, asset",
+    ),
+    "no geometry": ('n_steps = 1\n[[bodies]]\nname = "x"\n', "needs exactly one of object, field, asset"),
+    "unknown asset": (
+        'n_steps = 1\n[[bodies]]\nname = "x"\nasset = "cow"\n',
+        "asset must be one of ['bunny', 'soap']",
+    ),
+    "no mass": ("n_steps = 1\n" + BODY.replace("mass = 1.0\n", ""), "mass of body 'ball' must be given"),
+    "two names": ("n_steps = 1\n" + BODY + BODY, "bodies must have different names, got 'ball' 2 times"),
+    "infinite position": (
+        "n_steps = 1\n" + BODY + "position = [inf, 0, 0]\n",
+        "position must be a list of 3 finite",
+    ),
+    "zero quaternion": (
+        "n_steps = 1\n" + BODY + "orientation = [0, 0, 0, 0]\n",
+        "must be a non-zero quaternion",
+    ),
+    "fast spin": ("n_steps = 1\n" + BODY + "omega = [0, 0, 200]\n", "state.omega must be below 2/timestep"),
+    "short vector": (
+        "n_steps = 1\n" + BODY + "velocity = [1, 2]\n",
+        "velocity must be a list of 3 finite numbers",
+    ),
+    "unknown body in contact": (
+        "n_steps = 1\n" + BODY + '[[contacts]]\na = "ball"\nb = "flor"\n',
+        "[[contacts]] 1 ('ball', 'flor'): a contact must name bodies of the scene ['ball'], got 'flor'",
+    ),
+    "negative friction": (
+        "n_steps = 1\n" + BODY + FLOOR + '[[contacts]]\na = "ball"\nb = "floor"\nsliding_friction = -0.2\n',
+        "[[contacts]] 1 ('ball', 'floor'): sliding_friction must be finite and ≥ 0, got -0.2",
+    ),
+    "negative default friction": (
+        "n_steps = 1\n" + BODY + FLOOR + "[default_contact]\nspring = -1.0\n",
+        "[default_contact]: spring must be finite and ≥ 0",
+    ),
+    "unknown law": (
+        "n_steps = 1\n" + BODY + FLOOR + '[[contacts]]\na = "ball"\nb = "floor"\nlaw = "glue"\n',
+        "law must be one of 'centroid', got 'glue'",
+    ),
+    "unknown body in control": ("n_steps = 1\n" + BODY + '[[controls]]\nbody = "bal"\n', "got 'bal'"),
+    "control of a fixed body": (
+        "n_steps = 1\n" + BODY + FLOOR + '[[controls]]\nbody = "floor"\n',
+        "fixed 'floor'",
+    ),
+    "control that ends first": (
+        "n_steps = 1\n" + BODY + '[[controls]]\nbody = "ball"\nfrom = 2\nto = 1\n',
+        "from and to must satisfy",
+    ),
+    "target without spring": (
+        "n_steps = 1\n" + BODY + '[[controls]]\nbody = "ball"\ntarget = [0, 0, 0]\n',
+        "target [m] and stiffness [N/m] must be given together",
+    ),
+    "missing object": ('n_steps = 1\n[[bodies]]\nname = "x"\nobject = "no.dano"\n', "no.dano"),
+    "missing field": ('n_steps = 1\n[[bodies]]\nname = "x"\nfield = "no.npz"\n', "no.npz"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_scene_files(case, tmp_path, run):
+    text, message = BAD[case]
+    path = tmp_path / "scene.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError) as caught:
+        load_scene(path)
+    assert str(caught.value).startswith(str(path))
+    assert message in str(caught.value)
+    answer = run("simulate", path, "-o", tmp_path / "run.npz")
+    assert answer.code == 2
+    assert answer.out == ""
+    assert answer.err.startswith(f"dano: error: {path}")
+    assert answer.err.count("\n") == 1
+    assert message in answer.err
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_run_without_its_scene(tmp_path):
+    path = tmp_path / "run.npz"
+    zeros = jnp.zeros((2, 1, 3))
+    states = dano.State(zeros, jnp.zeros((2, 1, 4)), zeros, zeros)
+    steps = jnp.zeros(1), jnp.zeros(1, int), jnp.zeros(1, bool)
+    dano.Trajectory(jnp.zeros(2), states, *steps, ("x",)).save(path)
+    with pytest.raises(ValueError, match="does not say which scene"):
+        load_run(path)

@@ -1,0 +1,178 @@
+"""Files: what is written is read back, and what cannot be read says why."""
+
+import os
+import pickle
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dano.fields import GridField, load_field, save_field, SignedDistanceGrid, Sphere
+
+VALUES = np.random.default_rng(0).random((6, 5, 7))
+
+
+def field(kind="quadratic"):
+    return GridField(VALUES, (0.1, -0.2, 0.3), (0.1, 0.2, 0.15), kind)
+
+
+@pytest.mark.parametrize("kind", ["linear", "quadratic", "cubic"])
+def test_grids_round_trip(kind, tmp_path):
+    path = tmp_path / "grid.npz"
+    save_field(field(kind), path)
+    again = load_field(path)
+    assert again.interpolation == kind
+    np.testing.assert_array_equal(again.values, VALUES)
+    np.testing.assert_array_equal(again.bounds, field(kind).bounds)
+    assert load_field(str(path), interpolation="linear").interpolation == "linear"
+    assert os.listdir(tmp_path) == ["grid.npz"]
+
+
+def test_extra_members_are_ignored(tmp_path):
+    np.savez(tmp_path / "grid.npz", values=VALUES, origin=np.zeros(3), spacing=0.1, note="anything")
+    np.testing.assert_array_equal(load_field(tmp_path / "grid.npz").spacing, [0.1] * 3)
+
+
+def test_the_grid_of_an_object_is_read(tmp_path):
+    path = tmp_path / "object.dano"
+    with open(path, "wb") as file:
+        np.savez(file, grid_values=VALUES, grid_origin=np.zeros(3), grid_spacing=0.1, mass=1.0)
+    np.testing.assert_array_equal(load_field(path).values, VALUES)
+    with open(path, "wb") as file:
+        np.savez(file, mass=1.0)
+    with pytest.raises(
+        ValueError, match=r"object.dano: expected a neural object with a stored grid.*no grid_values"
+    ):
+        load_field(path)
+
+
+@pytest.mark.parametrize("dtype", [bool, np.uint8, np.float32])
+def test_voxels_are_centred_with_unit_size_unless_told(dtype, tmp_path):
+    path = tmp_path / "voxels.npy"
+    voxels = (VALUES > 0.5).astype(dtype)
+    np.save(path, voxels)
+    loaded = load_field(path)
+    np.testing.assert_allclose(loaded.spacing, 1 / 7)
+    np.testing.assert_allclose(loaded.origin, -(np.array(VALUES.shape) - 1) / 14)
+    np.testing.assert_array_equal(loaded.values, voxels.astype(float))
+    assert jnp.issubdtype(loaded.values.dtype, jnp.floating)
+    placed = load_field(path, spacing=0.1, origin=(1.0, 2.0, 3.0), interpolation="linear")
+    np.testing.assert_allclose(placed.origin, [1, 2, 3])
+    np.testing.assert_allclose(placed.spacing, 0.1)
+
+
+def test_meshes_become_signed_distances(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    pytest.importorskip("igl")
+    for suffix in ("obj", "ply", "off", "glb"):
+        path = tmp_path / f"box.{suffix}"
+        trimesh.creation.box((0.2, 0.3, 0.4)).export(path)
+        loaded = load_field(path, resolution=16, edge=0.02)
+        assert isinstance(loaded, SignedDistanceGrid)
+        np.testing.assert_allclose(loaded.solid_moments().volume, 0.024, rtol=1e-5)
+
+
+def corrupt(path, kind):
+    """Write a bad file of each kind under `path`."""
+    if kind == "truncated":
+        np.savez(path, values=VALUES, origin=np.zeros(3), spacing=0.1)
+        path.write_bytes(path.read_bytes()[:500])
+    elif kind == "damaged":
+        np.savez_compressed(path, values=VALUES, origin=np.zeros(3), spacing=0.1)
+        data = bytearray(path.read_bytes())
+        data[200:260] = bytes(60)
+        path.write_bytes(data)
+    elif kind == "text":
+        path.write_text("values: 1, 2, 3\n")
+    elif kind == "empty":
+        path.write_bytes(b"")
+    elif kind == "pickle":
+        path.write_bytes(pickle.dumps({"values": VALUES}))
+    elif kind == "pickled member":
+        np.savez(path, values=np.array([{"a": 1}], dtype=object), origin=np.zeros(3), spacing=0.1)
+    elif kind == "single array":
+        with open(path, "wb") as file:
+            np.save(file, VALUES)
+    elif kind == "missing member":
+        np.savez(path, values=VALUES, spacing=0.1)
+    elif kind == "negative":
+        np.savez(path, values=-VALUES, origin=np.zeros(3), spacing=0.1)
+    elif kind == "bad origin":
+        np.savez(path, values=VALUES, origin=np.zeros(2), spacing=0.1)
+
+
+@pytest.mark.parametrize(
+    "kind, message",
+    {
+        "truncated": "expected a grid: values",
+        "damaged": "expected a grid: values",
+        "text": "expected a grid: values",
+        "empty": "expected a grid: values",
+        "pickle": "pickled objects, which are never loaded",
+        "pickled member": "pickled objects, which are never loaded",
+        "single array": "single array, not a zip",
+        "missing member": r"no origin, only \['values', 'spacing'\]",
+        "negative": "values must be densities ≥ 0",
+        "bad origin": r"origin must have shape \(3,\)",
+        "absent": "no such file",
+    }.items(),
+)
+def test_bad_grids_name_the_file_and_what_was_expected(kind, message, tmp_path):
+    path = tmp_path / "grid.npz"
+    corrupt(path, kind)
+    with pytest.raises(ValueError, match=rf"grid.npz: .*{message}"):
+        load_field(path)
+
+
+@pytest.mark.parametrize("kind", ["truncated", "text", "pickle", "flat", "objects", "complex"])
+def test_bad_voxels(kind, tmp_path):
+    path = tmp_path / "voxels.npy"
+    arrays = {"flat": VALUES[0], "objects": np.array([[[{}]]], dtype=object), "complex": VALUES + 1j}
+    if kind in arrays:
+        np.save(path, arrays[kind])
+    elif kind == "truncated":
+        np.save(path, VALUES)
+        path.write_bytes(path.read_bytes()[:-40])
+    else:
+        corrupt(path, kind)
+    with pytest.raises(ValueError, match=r"voxels.npy: expected voxels"):
+        load_field(path)
+
+
+def test_unknown_kinds_options_and_folders(tmp_path):
+    with pytest.raises(ValueError, match=r"field.txt: unknown kind of field '.txt'; expected one of .npz"):
+        load_field(tmp_path / "field.txt")
+    (tmp_path / "folder.npz").mkdir()
+    with pytest.raises(ValueError, match="folder.npz: is a folder"):
+        load_field(tmp_path / "folder.npz")
+    save_field(field(), tmp_path / "grid.npz")
+    with pytest.raises(ValueError, match=r"unknown options \['resolution'\] .* it takes \['interpolation'\]"):
+        load_field(tmp_path / "grid.npz", resolution=3)
+
+
+def test_saving_refuses_bad_places_and_never_destroys(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="must end in .npz"):
+        save_field(field(), tmp_path / "grid.npy")
+    with pytest.raises(ValueError, match="existing folder"):
+        save_field(field(), tmp_path / "none" / "grid.npz")
+    (tmp_path / "folder.npz").mkdir()
+    with pytest.raises(ValueError, match="must be a file, got the folder"):
+        save_field(field(), tmp_path / "folder.npz")
+    path = tmp_path / "grid.npz"
+    save_field(field(), path)
+    before = path.read_bytes()
+
+    def full_disk(file, **arrays):
+        file.write(b"half")
+        raise OSError("no space left")
+
+    monkeypatch.setattr(np, "savez_compressed", full_disk)
+    with pytest.raises(OSError, match="no space"):
+        save_field(field("linear"), path)
+    assert path.read_bytes() == before
+    assert sorted(os.listdir(tmp_path)) == ["folder.npz", "grid.npz"]
+
+
+def test_shapes_are_not_saved_as_grids(tmp_path):
+    with pytest.raises((ValueError, TypeError), match="(bake it first|GridField)"):
+        save_field(Sphere(0.1), tmp_path / "ball.npz")

@@ -1,0 +1,144 @@
+"""Shapes from sampled distances and from meshes, against closed forms."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dano.fields import Box, mesh_field, SignedDistanceGrid, Sphere
+
+N = 2000
+evaluate = eqx.filter_jit(
+    lambda shape, x: {
+        "sdf": [shape.sdf_jet(x, order) for order in range(3)],
+        "jet": [shape.jet(x, order) for order in range(3)],
+        "one": (jax.vmap(shape.sdf, in_axes=1)(x), jax.vmap(jax.grad(shape.sdf), in_axes=1, out_axes=1)(x)),
+    }
+)
+
+
+def ball_samples(n=24, half=0.3, radius=0.2):
+    axis = np.linspace(-half, half, n)
+    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    return np.linalg.norm(nodes, axis=-1) - radius, (-half,) * 3, axis[1] - axis[0]
+
+
+@pytest.mark.parametrize("kind, tolerance", [("linear", 3e-3), ("quadratic", 3e-4), ("cubic", 3e-4)])
+def test_sampled_ball_is_the_ball(kind, tolerance):
+    ball = SignedDistanceGrid(*ball_samples(), kind, edge=0.05)
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(3, N))
+    x *= rng.uniform(0.1, 0.29, N) / np.linalg.norm(x, axis=0)
+    result = evaluate(ball, jnp.asarray(x))
+    truth = evaluate(Sphere(0.2, edge=0.05), jnp.asarray(x))
+    np.testing.assert_allclose(result["sdf"][0], truth["sdf"][0], atol=tolerance)
+    np.testing.assert_allclose(result["sdf"][1][1], truth["sdf"][1][1], atol=60 * tolerance)
+    np.testing.assert_allclose(result["jet"][0], truth["jet"][0], atol=30 * tolerance)
+    assert ball.solid_moments() is None
+
+
+def test_distance_grows_outside_of_the_grid_and_derivatives_are_consistent():
+    ball = SignedDistanceGrid(*ball_samples(), edge=0.05)
+    x = jnp.asarray(np.random.default_rng(1).uniform(-0.8, 0.8, (3, N)))
+    result = evaluate(ball, x)
+    radius = np.linalg.norm(x, axis=0)
+    outside = np.max(np.abs(x), axis=0) > 0.3
+    sdf = np.asarray(result["sdf"][0])
+    assert np.all(sdf[outside] > radius[outside] - 0.2 - 1e-3)  # never below the true distance
+    assert np.all(sdf[outside] < 1.5 * radius[outside])
+    for kind in ("sdf", "jet"):
+        value, (_, gradient), (_, gradient_2, hessian) = result[kind]
+        np.testing.assert_allclose(gradient, gradient_2, atol=1e-12)
+        for i in range(3):
+            shift = 1e-6 * jnp.eye(3)[:, [i]]
+            plus, minus = evaluate(ball, x + shift)[kind][1], evaluate(ball, x - shift)[kind][1]
+            difference = [(p - m) / 2e-6 for p, m in zip(plus, minus, strict=True)]
+            np.testing.assert_allclose(difference[0], gradient[i], atol=1e-4)
+            # The gradient kinks on the border of the grid and the second derivative jumps between cells.
+            assert np.mean(np.abs(difference[1] - hessian[i]) > 1e-2) < 2e-3
+    np.testing.assert_allclose(result["one"][0], sdf, atol=1e-14)
+    np.testing.assert_allclose(result["one"][1], result["sdf"][1][1], atol=1e-12)
+
+
+def test_bounds_enclose_the_solid_to_a_cell():
+    distances, origin, spacing = ball_samples()
+    ball = SignedDistanceGrid(distances, origin, spacing, edge=0.05)
+    lower, upper = np.asarray(ball.bounds)
+    assert np.all(np.abs(lower + 0.225) < 2 * spacing) and np.all(lower < -0.224)
+    assert np.all(np.abs(upper - 0.225) < 2 * spacing) and np.all(upper > 0.224)
+    x = jnp.asarray(np.random.default_rng(2).uniform(-0.8, 0.8, (3, N)))
+    outside = np.any((x < lower[:, None]) | (x > upper[:, None]), axis=0)
+    assert not np.any(evaluate(ball, x)["jet"][0][outside])
+
+
+def test_bad_distances():
+    distances, origin, spacing = ball_samples()
+    for message, values in {
+        "negative somewhere": distances + 1,
+        "positive on the border": distances - 0.2,
+        "shape": distances[0],
+        "finite": distances * np.inf,
+    }.items():
+        with pytest.raises(ValueError, match=f"distances must .*{message}"):
+            SignedDistanceGrid(values, origin, spacing)
+
+
+@pytest.fixture(scope="module")
+def trimesh():
+    pytest.importorskip("igl")
+    return pytest.importorskip("trimesh")
+
+
+def test_meshed_ball_and_box_are_the_closed_forms(trimesh):
+    rng = np.random.default_rng(0)
+    for mesh, shape in (
+        (trimesh.creation.icosphere(4, 0.2), Sphere(0.2, edge=0.01)),
+        (trimesh.creation.box((0.2, 0.3, 0.4)), Box((0.1, 0.15, 0.2), edge=0.01)),
+    ):
+        field = mesh_field(mesh, 48, edge=0.01)
+        size = float(shape.size)
+        for got, want in zip(field.solid_moments(), shape.solid_moments(), strict=True):
+            np.testing.assert_allclose(got, want, rtol=5e-3, atol=1e-12)
+        lower, upper = np.asarray(shape.bounds)
+        x = jnp.asarray(lower[:, None] + (upper - lower)[:, None] * rng.random((3, 40_000)))
+        truth = shape.sdf_jet(x, 0)
+        error = field.sdf_jet(x, 0) - truth
+        surface = jnp.abs(truth) < 0.02 * size
+        assert jnp.sqrt(jnp.mean(error[surface] ** 2)) < 1e-3 * size
+        assert jnp.max(jnp.abs(error[surface])) < 5e-3 * size
+        occupied = jnp.mean(field.jet(x, 0)) / jnp.mean(shape.jet(x, 0))
+        assert abs(occupied - 1) < 5e-3
+
+
+def test_meshes_are_read_scaled_and_repaired(trimesh, tmp_path):
+    """A box in millimetres with faces turned inside out, at an offset; its volume and place in metres."""
+    box = trimesh.creation.box((200, 300, 400))
+    box.apply_translation((100, 0, 0))
+    box.invert()
+    path = tmp_path / "box.stl"
+    box.export(path)
+    field = mesh_field(path, 24, scale=1e-3)
+    volume, centroid, second = field.solid_moments()
+    np.testing.assert_allclose(volume, 0.024, rtol=1e-5)
+    np.testing.assert_allclose(centroid, [0.1, 0, 0], atol=1e-7)
+    np.testing.assert_allclose(np.diag(second), 0.024 * np.array([0.2, 0.3, 0.4]) ** 2 / 12, rtol=1e-5)
+    assert field.sdf(jnp.asarray([0.1, 0.0, 0.0])) == pytest.approx(-0.1, abs=0.01)
+    assert field.sdf(jnp.asarray([0.25, 0.0, 0.0])) == pytest.approx(0.05, abs=0.01)
+
+
+def test_meshes_that_enclose_nothing_are_refused(trimesh, tmp_path):
+    box = trimesh.creation.box((0.2, 0.3, 0.4))
+    box.update_faces(np.arange(len(box.faces)) > 0)
+    with pytest.raises(ValueError, match="mesh must be watertight .* got 3 edges"):
+        mesh_field(box)
+    garbage = tmp_path / "garbage.obj"
+    garbage.write_text("this is no mesh\n")
+    with pytest.raises(ValueError, match="garbage.obj"):
+        mesh_field(garbage)
+    with pytest.raises(ValueError, match="none.obj: no such file"):
+        mesh_field(tmp_path / "none.obj")
+    with pytest.raises(ValueError, match="resolution must lie between 8 and 512"):
+        mesh_field(box, 4)
+    with pytest.raises(ValueError, match="scale must be positive"):
+        mesh_field(box, scale=0.0)
