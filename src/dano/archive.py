@@ -44,7 +44,9 @@ def checked_output(path: str | os.PathLike[str]) -> Path:
     if target.is_dir():
         raise ValueError(f"output path must be a file, got the directory {target}")
     if not target.parent.is_dir():
-        raise ValueError(f"output path must be in an existing directory, got {target} in missing {target.parent}")
+        raise ValueError(
+            f"output path must be in an existing directory, got {target} in missing {target.parent}"
+        )
     return target
 
 

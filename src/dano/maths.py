@@ -190,7 +190,9 @@ def checked_quaternion(name: str, value: Numbers) -> Array:
     """
     array = checked_array(name, value, (4,))
     if not is_traced(array) and float(np.linalg.norm(np.asarray(array))) < 1e-12:
-        raise ValueError(f"{name} must be a non-zero quaternion (w, x, y, z), got {np.asarray(array).tolist()}")
+        raise ValueError(
+            f"{name} must be a non-zero quaternion (w, x, y, z), got {np.asarray(array).tolist()}"
+        )
     return quat_normalize(array)
 
 

@@ -10,7 +10,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.archive import read_archive, write_archive
-from dano.contact import AbstractContactLaw, CentroidLaw, Collider, ContactParams, non_negative, SampleSet, Support
+from dano.contact import (
+    AbstractContactLaw,
+    CentroidLaw,
+    Collider,
+    ContactParams,
+    non_negative,
+    SampleSet,
+    Support,
+)
 from dano.fields import AbstractField, AbstractShape, HalfSpace, PosedShape, Sphere
 from dano.maths import checked_array, checked_quaternion, floating, is_traced, Numbers, quat_to_matrix
 from dano.objects import checked_inertia, MassProperties, NeuralObject, surface_samples
@@ -103,7 +111,9 @@ class Body(eqx.Module):
             )
         if properties is None:
             if not self.fixed:
-                raise ValueError(f"mass of body {name!r} must be given: a shape that moves has none of its own")
+                raise ValueError(
+                    f"mass of body {name!r} must be given: a shape that moves has none of its own"
+                )
             properties = MassProperties(1.0, (0.0, 0.0, 0.0), np.eye(3))
         share = 1.0
         if mass is not None:
@@ -113,7 +123,9 @@ class Body(eqx.Module):
             share = mass / properties.mass
         self.mass = properties.mass if mass is None else mass
         self.inertia = (
-            properties.inertia * share if inertia is None else checked_inertia(f"inertia of body {name!r}", inertia)
+            properties.inertia * share
+            if inertia is None
+            else checked_inertia(f"inertia of body {name!r}", inertia)
         )
         self.com = properties.com if com is None else checked_array(f"com of body {name!r}", com, (3,))
         self.mass_scale = checked_array(f"mass_scale of body {name!r}", mass_scale, ())
@@ -254,7 +266,9 @@ class Trajectory(eqx.Module):
                 "names": np.array(self.names),
                 "times": np.asarray(self.times),
                 **{name: np.asarray(getattr(self.states, name)) for name in _STATE_SHAPES},
-                **{name: np.asarray(getattr(self, name)) for name in ("residuals", "iterations", "converged")},
+                **{
+                    name: np.asarray(getattr(self, name)) for name in ("residuals", "iterations", "converged")
+                },
                 **({} if source is None else {"source": np.array(source)}),
             },
         )
@@ -328,7 +342,9 @@ class Scene(eqx.Module):
                 if name not in names:
                     raise ValueError(f"contact must name bodies of the scene {names}, got {name!r}")
             if frozenset((contact.a, contact.b)) in seen:
-                raise ValueError(f"contacts must join each pair once, got ({contact.a!r}, {contact.b!r}) twice")
+                raise ValueError(
+                    f"contacts must join each pair once, got ({contact.a!r}, {contact.b!r}) twice"
+                )
             seen.add(frozenset((contact.a, contact.b)))
         by_name = dict(zip(names, bodies, strict=True))
         needs_samples: set[str] = set()
@@ -394,7 +410,10 @@ class Scene(eqx.Module):
             if name not in valid:
                 raise ValueError(f"contact parameter must be one of {valid}, got {name!r}")
         names = list(changes)
-        values = [_as_leaf(non_negative(name, changes[name]), getattr(self.contacts[i].params, name)) for name in names]
+        values = [
+            _as_leaf(non_negative(name, changes[name]), getattr(self.contacts[i].params, name))
+            for name in names
+        ]
         return eqx.tree_at(lambda s: [getattr(s.contacts[i].params, name) for name in names], self, values)
 
     def replace_body(self, name: str, **changes: Numbers) -> "Scene":
@@ -410,7 +429,10 @@ class Scene(eqx.Module):
                 raise ValueError(f"body property must be one of {valid}, got {key!r}")
         keys = list(changes)
         values = [
-            _as_leaf(checked_array(key, changes[key], getattr(self.bodies[i], key).shape), getattr(self.bodies[i], key))
+            _as_leaf(
+                checked_array(key, changes[key], getattr(self.bodies[i], key).shape),
+                getattr(self.bodies[i], key),
+            )
             for key in keys
         ]
         for key, value in zip(keys, values, strict=True):
@@ -432,7 +454,12 @@ class Scene(eqx.Module):
         rows: dict[str, list[Array]] = {name: [] for name in _STATE_SHAPES}
         for name in bodies:
             self.index(name)
-        default = {"position": (0.0,) * 3, "orientation": (1.0, 0.0, 0.0, 0.0), "velocity": (0.0,) * 3, "omega": (0.0,) * 3}
+        default = {
+            "position": (0.0,) * 3,
+            "orientation": (1.0, 0.0, 0.0, 0.0),
+            "velocity": (0.0,) * 3,
+            "omega": (0.0,) * 3,
+        }
         for name in self.names:
             given = bodies.get(name, {})
             for key in given:
@@ -455,7 +482,9 @@ class Scene(eqx.Module):
         for key, size in _STATE_SHAPES.items():
             value = getattr(state, key)
             if value.shape[-2:] != (len(self.bodies), size):
-                raise ValueError(f"state.{key} must have shape (…, {len(self.bodies)}, {size}), got {value.shape}")
+                raise ValueError(
+                    f"state.{key} must have shape (…, {len(self.bodies)}, {size}), got {value.shape}"
+                )
             if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
                 raise ValueError(f"state.{key} must be finite, got {np.asarray(value).tolist()}")
         if not is_traced(state.orientation):
@@ -463,7 +492,10 @@ class Scene(eqx.Module):
             if np.any(np.abs(norms - 1) > 1e-3):
                 raise ValueError(f"state.orientation must hold unit quaternions, got norms {norms.tolist()}")
         if not is_traced(state.omega, self.timestep):
-            fastest, limit = float(np.linalg.norm(np.asarray(state.omega), axis=-1).max()), 2 / float(self.timestep)
+            fastest, limit = (
+                float(np.linalg.norm(np.asarray(state.omega), axis=-1).max()),
+                2 / float(self.timestep),
+            )
             if fastest >= limit:
                 raise ValueError(
                     f"state.omega must be below 2/timestep = {limit:.6g} rad/s, got {fastest:.6g}; take a smaller timestep"
@@ -500,7 +532,10 @@ def colliders(scene: Scene, contact: Contact, state: State) -> tuple[Collider, C
             # Against a neural object a primitive has no samples of its own (paper: the sum runs over the object's).
             samples = side.samples if other.object is None else None
             side = eqx.tree_at(
-                lambda c: (c.field, c.samples), side, (_shape_with_edge(body.shape, contact.edge), samples), is_leaf=_none
+                lambda c: (c.field, c.samples),
+                side,
+                (_shape_with_edge(body.shape, contact.edge), samples),
+                is_leaf=_none,
             )
         sides.append(side)
     return sides[0], sides[1]
@@ -538,11 +573,15 @@ def _check_pair(a: Body, b: Body) -> set[str]:
         ValueError: If the pair cannot overlap.
     """
     if a.fixed and b.fixed:
-        raise ValueError(f"contact must join at least one body that moves, got fixed {a.name!r} and {b.name!r}")
+        raise ValueError(
+            f"contact must join at least one body that moves, got fixed {a.name!r} and {b.name!r}"
+        )
     if a.object is not None and b.object is not None:
         if a.object.grid is None and b.object.grid is None:
-            raise ValueError(f"contact between {a.name!r} and {b.name!r} needs a density grid on one side: give "
-                             "NeuralObject.from_samples a field")
+            raise ValueError(
+                f"contact between {a.name!r} and {b.name!r} needs a density grid on one side: give "
+                "NeuralObject.from_samples a field"
+            )
         return set()
     if a.object is not None or b.object is not None:
         return set()

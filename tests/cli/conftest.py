@@ -53,7 +53,7 @@ def run(capsys) -> Callable[..., Answer]:
 def egg(field, tmp_path_factory) -> Path:
     """The object; tests copy it or name it, and never write to it."""
     path = tmp_path_factory.mktemp("objects") / "egg.dano"
-    main(["build", str(field), "-o", str(path), "--samples", "150", "--resolution", "20", "--mass", "0.5"])
+    main(["build", str(field), "-o", str(path), "--samples", "800", "--resolution", "20", "--mass", "0.5"])
     return path
 
 
@@ -66,7 +66,7 @@ def scene(egg, tmp_path) -> Path:
 
 
 SCENE = """
-timestep = 0.005
+timestep = 0.002
 n_steps = 400
 
 [[bodies]]

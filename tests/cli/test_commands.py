@@ -36,6 +36,8 @@ def test_build_writes_an_object(run, field, tmp_path):
     assert report["mass"] == pytest.approx(0.5)
     a, b, c = 0.5 * np.array(report["extents"])
     np.testing.assert_allclose((a, b, c), (0.12, 0.10, 0.08), rtol=0.05)
+    # The outermost samples lie at a quarter of the plateau, the surface at half of it: 6.6 and 6 cells away.
+    a, b, c = np.array([0.12, 0.10, 0.08]) * 6 / 6.6
     inertias = 0.5 / 5 * np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2])
     np.testing.assert_allclose(report["principal_inertias"], inertias, rtol=0.05)
 
@@ -77,7 +79,7 @@ def test_simulate_a_scene(run, scene, tmp_path):
         pieces = getattr(loaded.trajectory.states, name)
         np.testing.assert_allclose(pieces[:41], getattr(direct.states, name), atol=1e-12)
         np.testing.assert_array_equal(report["bodies"][0][name], pieces[-1, 0])
-    np.testing.assert_allclose(loaded.trajectory.times, 0.005 * np.arange(401), atol=1e-12)
+    np.testing.assert_allclose(loaded.trajectory.times, 0.002 * np.arange(401), atol=1e-12)
     np.testing.assert_array_equal(loaded.trajectory.iterations[:40], direct.iterations)
     assert report["unconverged_steps"] == 0
     assert report["compile_seconds"] >= 0
@@ -88,17 +90,17 @@ def test_simulate_a_scene(run, scene, tmp_path):
 
 def test_simulate_options(run, scene, tmp_path):
     out = tmp_path / "run.npz"
-    answer = run("simulate", scene, "-o", out, "--steps", 397, "--timestep", 0.002)
+    answer = run("simulate", scene, "-o", out, "--steps", 397, "--timestep", 0.001)
     assert answer.code == 0
     assert "steps that did not converge: 0" in answer.out
-    np.testing.assert_allclose(dano.Trajectory.load(out).times, 0.002 * np.arange(398), atol=1e-12)
+    np.testing.assert_allclose(dano.Trajectory.load(out).times, 0.001 * np.arange(398), atol=1e-12)
 
 
 def test_simulate_an_object_drops_it(run, egg, tmp_path):
     out = tmp_path / "run.npz"
     report = json.loads(run("simulate", egg, "-o", out, "--steps", 400, "--json").out)
     body = report["bodies"][0]
-    assert np.linalg.norm(body["velocity"]) < 0.02
+    assert np.linalg.norm(body["velocity"]) < 0.05
     # It fell from 0.3 of its size and lies on its flattest side, 4 cm below the middle.
     first = dano.Trajectory.load(out).states.position[0, 0, 2]
     assert first == pytest.approx(0.04 + 0.3 * dano.NeuralObject.load(egg).size, abs=0.006)

@@ -72,7 +72,11 @@ def overlap(a: Collider, b: Collider) -> Patch:
     if isinstance(a.field, HalfSpace) and isinstance(b.field, Sphere):
         patch = _cap(b, a)
         return Patch(patch.overlap, patch.centroid, -patch.normal)
-    sides = [(s, t, sign) for s, t, sign in ((a, b, 1), (b, a, -1)) if s.samples is not None and t.field is not None]
+    sides = [
+        (s, t, sign)
+        for s, t, sign in ((a, b, 1), (b, a, -1))
+        if s.samples is not None and t.field is not None
+    ]
     if not sides:
         raise ValueError(
             "overlap needs contact samples on one side and a density field on the other, got "
@@ -92,7 +96,9 @@ def overlap(a: Collider, b: Collider) -> Patch:
     touching = psi > _NEGLIGIBLE * mass
     centroid = weighted[:3] / jnp.where(touching, psi, 1)
     return Patch(
-        jnp.where(touching, psi, 0), jnp.where(touching, centroid, 0), safe_normalize(jnp.where(touching, normal, 0))
+        jnp.where(touching, psi, 0),
+        jnp.where(touching, centroid, 0),
+        safe_normalize(jnp.where(touching, normal, 0)),
     )
 
 
@@ -141,7 +147,9 @@ def _planar_jvp(primals, tangents):
     plane, points, weights = primals
     if tangents[1] is not None or tangents[2] is not None:
         # Rarely asked for (the samples themselves move): autodiff of the sums as they stand.
-        tangents = tuple(jnp.zeros_like(p) if t is None else t for p, t in zip(primals, tangents, strict=True))
+        tangents = tuple(
+            jnp.zeros_like(p) if t is None else t for p, t in zip(primals, tangents, strict=True)
+        )
         return jax.jvp(_planar_moments, primals, tangents)
     # dS = M dplane with the symmetric 4×4 moment matrix of the samples in the smoothing band.
     distance = plane @ points
@@ -238,10 +246,14 @@ def _grid_sums(to_field, field: GridField, points, weights, *, derivative: bool)
     if not derivative:
         density, gradient = field.jet(x, 1)
         weighted = weights * density
-        return jnp.concatenate([contract(weighted, points), -contract(gradient, weighted)]), jnp.zeros((0,), x.dtype)
+        return jnp.concatenate([contract(weighted, points), -contract(gradient, weighted)]), jnp.zeros(
+            (0,), x.dtype
+        )
     density, gradient, hessian = field.jet(x, 2)
     value = jnp.concatenate([density[None], -density[None] * gradient])
-    jacobian = jnp.concatenate([gradient[None], -(gradient[:, None] * gradient[None] + density[None, None] * hessian)])
+    jacobian = jnp.concatenate(
+        [gradient[None], -(gradient[:, None] * gradient[None] + density[None, None] * hessian)]
+    )
     return _accumulate(value, jacobian, points, weights)
 
 

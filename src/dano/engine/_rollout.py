@@ -57,7 +57,9 @@ class VariationalEngine(AbstractEngine):
         )
 
 
-def step(scene: Scene, state: State, control: Control | None = None, *, engine: AbstractEngine | None = None) -> State:
+def step(
+    scene: Scene, state: State, control: Control | None = None, *, engine: AbstractEngine | None = None
+) -> State:
     """Advance a scene by one timestep.
 
     Args:
@@ -121,7 +123,9 @@ def simulate(
         raise ValueError(f"checkpoint_every must be ≥ 1, got {checkpoint_every}")
     if checkpoint_every is None and n_steps > CHECKPOINT_FROM:
         checkpoint_every = math.isqrt(n_steps)
-    states, report = _jitted_rollout(engine or VariationalEngine(), scene, state, controls, n_steps, checkpoint_every)
+    states, report = _jitted_rollout(
+        engine or VariationalEngine(), scene, state, controls, n_steps, checkpoint_every
+    )
     _say_unconverged(report.converged, report.residual)
     times = scene.timestep * jnp.arange(n_steps + 1, dtype=scene.timestep.dtype)
     return Trajectory(times, states, report.residual, report.iterations, report.converged, scene.names)
@@ -293,5 +297,3 @@ def _say_unconverged(converged, residual) -> None:
         RuntimeWarning,
         stacklevel=3,
     )
-
-

@@ -116,7 +116,11 @@ def _grouped(function, items: list):
 
     def kind(item):
         dynamic, static = eqx.partition(item, eqx.is_array)
-        return jax.tree.structure(item), tuple((x.shape, x.dtype) for x in jax.tree.leaves(dynamic)), str(static)
+        return (
+            jax.tree.structure(item),
+            tuple((x.shape, x.dtype) for x in jax.tree.leaves(dynamic)),
+            str(static),
+        )
 
     groups: dict[object, list[int]] = {}
     for i, item in enumerate(items):
@@ -227,7 +231,8 @@ def _contact_wrenches(velocities: Float[Array, "m 6"], problem: _Problem, pairs:
 
     twists = [twist(maps, joined) for maps, joined in zip(problem.maps, pairs.of_contact, strict=True)]
     items = list(zip(problem.laws, problem.patches, problem.params, twists, strict=True))
-    return _grouped(lambda item: item[0].wrench(*item[1:]), items)
+    # Without the barrier XLA recomputes a law inside each of the many small products that read it.
+    return jax.lax.optimization_barrier(_grouped(lambda item: item[0].wrench(*item[1:]), items))
 
 
 def _residual(velocities: Float[Array, "m 6"], problem: _Problem, pairs: _Pairs):
@@ -245,7 +250,7 @@ def _residual(velocities: Float[Array, "m 6"], problem: _Problem, pairs: _Pairs)
             if i < 0:
                 continue
             residual[i] = residual[i] - h * matvec(row.T, wrench)
-            half = h * matmul(row.T, slope)
+            half = jax.lax.optimization_barrier(h * matmul(row.T, slope))
             for column, j in zip(maps, joined, strict=True):
                 if j >= 0:
                     block = matmul(half, column)
@@ -280,13 +285,13 @@ def _newton(problem: _Problem, start: Float[Array, "m 6"], pairs: _Pairs, option
         return jnp.max(jnp.abs(scale * residual))
 
     def unfinished(it: _Iterate):
-        return (it.iteration < options.max_iterations) & ~(error(it.residual) <= tolerance)
+        return (it.iteration < options.max_iterations) & ((it.iteration < 0) | ~(error(it.residual) <= tolerance))
 
     def advance(it: _Iterate):
         move = solve_small(it.jacobian, -it.residual[:, None]).reshape(it.velocities.shape)
         tried = it.velocities + it.length * move
         residual, jacobian = _residual(tried, problem, pairs)
-        better = jnp.sum((scale * residual) ** 2) < jnp.sum((scale * it.residual) ** 2)
+        better = (it.iteration < 0) | (jnp.sum((scale * residual) ** 2) < jnp.sum((scale * it.residual) ** 2))
         pick = lambda new, old: jnp.where(better, new, old)  # noqa: E731
         return _Iterate(
             pick(tried, it.velocities),
@@ -296,8 +301,11 @@ def _newton(problem: _Problem, start: Float[Array, "m 6"], pairs: _Pairs, option
             it.iteration + 1,
         )
 
-    residual, jacobian = _residual(start, problem, pairs)
-    first = _Iterate(start, residual, jacobian, jnp.ones((), start.dtype), jnp.asarray(0))
+    # Pass −1 moves nowhere and only evaluates, so that the residual is compiled once.
+    n = start.size
+    first = _Iterate(
+        start, jnp.ones(n, start.dtype), jnp.eye(n, dtype=start.dtype), jnp.zeros((), start.dtype), jnp.asarray(-1)
+    )
     last = jax.lax.while_loop(unfinished, advance, first)
     remaining = error(last.residual)
     return last.velocities, last.jacobian, Report(remaining, last.iteration, remaining <= tolerance)
@@ -385,6 +393,8 @@ def _rows(x: Float[Array, "n k"], rows: tuple[int, ...]) -> Float[Array, "m k"]:
     return jnp.stack([x[i] for i in rows])
 
 
-def _with_rows(x: Float[Array, "n k"], new: Float[Array, "m k"], rows: tuple[int, ...]) -> Float[Array, "n k"]:
+def _with_rows(
+    x: Float[Array, "n k"], new: Float[Array, "m k"], rows: tuple[int, ...]
+) -> Float[Array, "n k"]:
     """The array with some rows replaced."""
     return jnp.stack([new[rows.index(i)] if i in rows else x[i] for i in range(x.shape[0])])

@@ -66,7 +66,8 @@ def _ellipsoid_root(
 
     F falls and is convex, and its root lies between the largest aᵢ xᵢ − (aᵢ² − m) and |a x|. Newton climbs
     from the left without overshooting and doubles its digits once it is near; before, it only grows s by
-    half a step, so five bisections of log s bring it near first. Accurate to rounding for axis ratios up to 1000.
+    half a step, so five bisections of log s bring it near first. Accurate to rounding for axis ratios up to
+    1000.
     """
     # Axis by axis, which XLA compiles to one loop over the points: 2.7 times faster than sums over rows.
     ax = list(semi_axes * x)

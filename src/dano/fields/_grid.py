@@ -71,11 +71,12 @@ class GridField(AbstractField):
     def interpolating(
         cls, samples: Numbers, origin: Numbers, spacing: Numbers, interpolation: str = "quadratic"
     ) -> "GridField":
-        """A grid field that passes through `samples`, as far as φ ≥ 0 allows it.
+        """A grid field that passes through `samples` where they are smooth.
 
-        The spline coefficients are found by recursive filtering on the host. Where the samples jump, some
-        come out negative; they are set to zero, so that the density stays non-negative and misses those
-        samples a little.
+        The spline coefficients are found by recursive filtering on the host. Where the samples jump to zero
+        the filter rings, and some coefficients come out negative. Around those the samples themselves are the
+        coefficients, as in the constructor: the density stays non-negative, does not overshoot and keeps its
+        integral, but misses those samples.
 
         Args:
             samples: Densities ≥ 0 at the nodes, shape (nx, ny, nz).
@@ -89,11 +90,16 @@ class GridField(AbstractField):
         degree = degree_of(interpolation)
         if is_traced(samples):
             raise ValueError("samples must be concrete: interpolation coefficients are found on the host")
+        from scipy.ndimage import maximum_filter
+
         array = np.asarray(checked_values(samples, "samples"))
         # Zeros all around: outside of the grid the density is zero, and the mirror at the ends is far enough
         # to be lost.
-        padded = interpolating_coefficients(np.pad(array, 16), degree)[16:-16, 16:-16, 16:-16]
-        return cls(np.maximum(padded, 0).astype(array.dtype), origin, spacing, interpolation)
+        coefficients = interpolating_coefficients(np.pad(array, 16), degree)[16:-16, 16:-16, 16:-16]
+        # Tails below a thousandth of the largest density are cut; more is ringing, gone after three nodes.
+        rings = maximum_filter(coefficients < -1e-3 * array.max(), size=7)
+        values = np.where(rings, array, np.maximum(coefficients, 0))
+        return cls(values.astype(array.dtype), origin, spacing, interpolation)
 
     def with_values(self, values: Numbers) -> "GridField":
         """This grid with other values, also under `jax.jit` and `jax.grad`; use it to train them."""

@@ -114,7 +114,8 @@ def _grid_from_npz(path: Path, prefix: str, interpolation: str | None, expected:
     names = [prefix + name for name in ("values", "origin", "spacing")]
     optional = prefix + "interpolation"
     try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+        with open(path, "rb") as file:
+            archive = np.load(file, allow_pickle=False)
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise ValueError("it is a single array, not a zip of arrays")
             if missing := [name for name in names if name not in archive.files]:

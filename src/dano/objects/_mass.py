@@ -114,7 +114,9 @@ def checked_inertia(name: str, value: Numbers) -> Float[Array, "3 3"]:
         if not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-6 * np.abs(matrix).max()):
             raise ValueError(f"{name} must be symmetric, got {matrix.tolist()}")
         if np.linalg.eigvalsh(matrix).min() <= 0:
-            raise ValueError(f"{name} must be positive definite, got eigenvalues {np.linalg.eigvalsh(matrix).tolist()}")
+            raise ValueError(
+                f"{name} must be positive definite, got eigenvalues {np.linalg.eigvalsh(matrix).tolist()}"
+            )
     return inertia
 
 
@@ -144,8 +146,10 @@ def evaluate(density: Density, points: np.ndarray) -> np.ndarray:
         padded = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)])
         out[start : start + len(part)] = np.asarray(_batched(density, jnp.asarray(padded)))[: len(part)]
     if not np.all(np.isfinite(out)):
-        raise ValueError(f"field must have finite densities, got {out[~np.isfinite(out)][0]} "
-                         f"at {points[~np.isfinite(out)][0].tolist()}")
+        raise ValueError(
+            f"field must have finite densities, got {out[~np.isfinite(out)][0]} "
+            f"at {points[~np.isfinite(out)][0].tolist()}"
+        )
     if out.size and out.min() < 0:
         raise ValueError(f"field must have densities ≥ 0, got {out.min()} at {points[out.argmin()].tolist()}")
     return out

@@ -13,7 +13,16 @@ from dano.archive import read_archive, write_archive
 from dano.fields import AbstractField, GridField
 from dano.maths import checked_array, floating, is_traced, Numbers
 from dano.objects._mass import MassProperties, Progress, checked_density, integrate
-from dano.objects._samples import ContactSamples, Lattice, Region, contact_grid, draw_samples, outward_normals, surface_level, surface_range
+from dano.objects._samples import (
+    ContactSamples,
+    Lattice,
+    Region,
+    contact_grid,
+    draw_samples,
+    outward_normals,
+    surface_level,
+    surface_range,
+)
 
 MassModel = Literal["density", "solid"]
 FORMAT, VERSION = "dano-object", 1
@@ -92,10 +101,17 @@ class NeuralObject(eqx.Module):
         if progress is not None:
             progress("samples", 0.0)
         points, values = draw_samples(density, lattice, body, low, high, n_samples, sampling_key)
-        samples = ContactSamples(floating(points), floating(values), floating(outward_normals(field, points, body)))
+        samples = ContactSamples(
+            floating(points), floating(values), floating(outward_normals(field, points, body))
+        )
         if mass_model == "density":
             properties = MassProperties.from_field(
-                field, mass_scale=mass_scale, mass=mass, resolution=resolution, key=mass_key, progress=progress
+                field,
+                mass_scale=mass_scale,
+                mass=mass,
+                resolution=resolution,
+                key=mass_key,
+                progress=progress,
             )
         else:
             solid = Region.create(lattice, surface_level(lattice.values), floaters=False).solid(density)
@@ -103,7 +119,9 @@ class NeuralObject(eqx.Module):
         grid, error = contact_grid(field, body, resolution)
         if progress is not None:
             progress("done", 1.0)
-        return cls(samples, properties, grid, floating((float(low), float(high))), floating(error), mass_model)
+        return cls(
+            samples, properties, grid, floating((float(low), float(high))), floating(error), mass_model
+        )
 
     @classmethod
     def from_samples(
@@ -137,8 +155,10 @@ class NeuralObject(eqx.Module):
         points = checked_array("points", points, points.shape)
         density = checked_array("density", density, (points.shape[0],))
         if not is_traced(density) and (float(density.min()) < 0 or float(density.max()) <= 0):
-            raise ValueError("density must be ≥ 0 and not all zero, got values in "
-                             f"[{float(density.min())}, {float(density.max())}]")
+            raise ValueError(
+                "density must be ≥ 0 and not all zero, got values in "
+                f"[{float(density.min())}, {float(density.max())}]"
+            )
         properties = MassProperties(mass, com, inertia)
         if normals is None:
             outward = np.asarray(points) - np.asarray(properties.com)

@@ -52,10 +52,14 @@ class Lattice(eqx.Module):
         """
         count, side = cells(bounds, resolution)
         origin = np.asarray(bounds[0], dtype=np.float64)
-        corners = np.stack(np.meshgrid(*(np.arange(n + 1) for n in count), indexing="ij"), axis=-1).reshape(-1, 3)
+        corners = np.stack(np.meshgrid(*(np.arange(n + 1) for n in count), indexing="ij"), axis=-1).reshape(
+            -1, 3
+        )
         values = evaluate(density, origin + corners * side).reshape(tuple(count + 1))
         if values.max() <= 0:
-            raise ValueError(f"field must have a positive density somewhere, got none at {values.size} points")
+            raise ValueError(
+                f"field must have a positive density somewhere, got none at {values.size} points"
+            )
         return cls(values, origin, side)
 
     def nearest(self, points: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -89,8 +93,10 @@ class Region(eqx.Module):
         occupied = lattice.values >= max(level, np.finfo(float).tiny)
         labels, parts = ndimage.label(occupied, np.ones((3, 3, 3)))
         if parts == 0:
-            raise ValueError(f"density_range must start below the field's largest density {lattice.values.max():.6g}, "
-                             f"got {level:.6g}")
+            raise ValueError(
+                f"density_range must start below the field's largest density {lattice.values.max():.6g}, "
+                f"got {level:.6g}"
+            )
         if not floaters:
             mass = ndimage.sum_labels(lattice.values, labels, np.arange(1, parts + 1))
             occupied = labels == 1 + int(np.argmax(mass))
@@ -119,7 +125,9 @@ class Region(eqx.Module):
         last = jnp.asarray(self.lattice.values.shape) - 1
 
         def filled(x: Float[Array, "3"]) -> Float[Array, ""]:
-            index = jnp.clip(jnp.round((x - origin.astype(x.dtype)) / side.astype(x.dtype)).astype(int), 0, last)
+            index = jnp.clip(
+                jnp.round((x - origin.astype(x.dtype)) / side.astype(x.dtype)).astype(int), 0, last
+            )
             i, j, k = index
             solid = inside[i, j, k] | (near[i, j, k] & (density(x) >= self.level))
             return jnp.where(solid, mean, 0).astype(x.dtype)
@@ -156,10 +164,20 @@ def draw_samples(
     """
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     allowed = region.outer()
-    corner = np.stack([lattice.values[tuple(slice(o, o + m - 1) for o, m in zip(offset, lattice.values.shape, strict=True))]
-                       for offset in np.ndindex(2, 2, 2)])
-    usable = np.stack([allowed[tuple(slice(o, o + m - 1) for o, m in zip(offset, allowed.shape, strict=True))]
-                       for offset in np.ndindex(2, 2, 2)]).any(axis=0)
+    corner = np.stack(
+        [
+            lattice.values[
+                tuple(slice(o, o + m - 1) for o, m in zip(offset, lattice.values.shape, strict=True))
+            ]
+            for offset in np.ndindex(2, 2, 2)
+        ]
+    )
+    usable = np.stack(
+        [
+            allowed[tuple(slice(o, o + m - 1) for o, m in zip(offset, allowed.shape, strict=True))]
+            for offset in np.ndindex(2, 2, 2)
+        ]
+    ).any(axis=0)
     candidates = np.argwhere((corner.min(axis=0) <= high) & (corner.max(axis=0) >= low) & usable)
     wanted, drawn = CANDIDATES * n, 0
     points, values = np.zeros((0, 3)), np.zeros(0)
@@ -194,8 +212,12 @@ def surface_samples(shape: AbstractShape, n: int, key: PRNGKeyArray | None = Non
     lattice = Lattice.create(density, shape.bounds, 48)
     low, high = surface_range(lattice.values)
     region = Region.create(lattice, low, floaters=True)
-    points, values = draw_samples(density, lattice, region, low, high, n, jax.random.key(0) if key is None else key)
-    return ContactSamples(floating(points), floating(values), floating(outward_normals(shape, points, region)))
+    points, values = draw_samples(
+        density, lattice, region, low, high, n, jax.random.key(0) if key is None else key
+    )
+    return ContactSamples(
+        floating(points), floating(values), floating(outward_normals(shape, points, region))
+    )
 
 
 def _farthest_points(points: np.ndarray, n: int) -> np.ndarray:
@@ -233,12 +255,15 @@ def contact_grid(field: AbstractField, region: Region, resolution: int) -> tuple
         grid, error = field, 0.0
     else:
         from dano.fields import bake
+
         grid, bake_error = bake(field, resolution)
         error = bake_error.rms
     count = np.array(grid.values.shape)
     spacing = np.broadcast_to(np.asarray(grid.spacing, dtype=np.float64), (3,))
     nodes = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), axis=-1).reshape(-1, 3)
     # Two cells beyond the region the wall has faded; what is left there belongs to something else.
-    near = region.near(2)[region.lattice.nearest(np.asarray(grid.origin) + nodes * spacing)].reshape(tuple(count))
+    near = region.near(2)[region.lattice.nearest(np.asarray(grid.origin) + nodes * spacing)].reshape(
+        tuple(count)
+    )
     values = jnp.where(jnp.asarray(near), grid.values, 0)
     return GridField(values, grid.origin, grid.spacing, interpolation="quadratic"), error

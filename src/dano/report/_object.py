@@ -4,6 +4,8 @@ import math
 import os
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
@@ -22,9 +24,10 @@ _FAINT = "#8a9199"
 def draw_object(obj: NeuralObject, path: str | os.PathLike[str], *, title: str | None = None) -> None:
     """Draw a figure that shows whether an object came out right.
 
-    The solid with its centre of mass and principal axes; the contact samples coloured by their normals, from two
-    sides; the density in three planes through the centre of mass, with the densities between which samples lie; a
-    table of mass properties and their standard errors.
+    The solid with its centre of mass and principal axes; the contact samples coloured by their normals,
+    from two
+    sides; the density in three planes through the centre of mass, with the densities between which samples
+    lie; a table of mass properties and their standard errors.
 
     Args:
         obj: The object.
@@ -47,7 +50,14 @@ def draw_object(obj: NeuralObject, path: str | os.PathLike[str], *, title: str |
     figure = Figure(figsize=(13.6, 8.4), dpi=110, facecolor="white")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(
-        2, 12, left=0.035, right=0.985, top=0.905 if title else 0.955, bottom=0.06, hspace=0.2, wspace=0.75,
+        2,
+        12,
+        left=0.035,
+        right=0.985,
+        top=0.905 if title else 0.955,
+        bottom=0.06,
+        hspace=0.2,
+        wspace=0.75,
         height_ratios=(1.12, 1),
     )
     _solid(figure.add_subplot(grid[0, :5]), obj)
@@ -78,14 +88,19 @@ def _view(obj: NeuralObject, azimuth: float, width: int, height: int) -> tuple[C
     radius = float(np.linalg.norm(points - centre, axis=1).max())
     direction = (math.sin(azimuth + 0.45), math.cos(azimuth + 0.45), -0.42)
     camera = Camera.framing(
-        points, np.full(len(points), 0.04 * radius), direction=direction, width=width, height=height, vertical_fov=0.5
+        points,
+        np.full(len(points), 0.04 * radius),
+        direction=direction,
+        width=width,
+        height=height,
+        vertical_fov=0.5,
     )
     return camera, radius
 
 
 def _solid(axes: Any, obj: NeuralObject) -> None:
     """The rendered solid with its principal axes."""
-    width, height = 1040, 860
+    width, height = 780, 645
     camera, radius = _view(obj, 0.0, width, height)
     _heading(axes, "Solid, centre of mass, principal axes" if obj.grid else "No density stored: samples only")
     if obj.grid is None:
@@ -101,9 +116,20 @@ def _solid(axes: Any, obj: NeuralObject) -> None:
         ends = camera.project(np.stack([com, com + 0.75 * radius * directions[:, k]]))[:, :2]
         away = (ends[1] - ends[0]) / max(float(np.linalg.norm(ends[1] - ends[0])), 1e-9)
         axes.annotate(
-            "", ends[1], ends[0], arrowprops={"arrowstyle": "-|>", "color": _AXES[k], "lw": 2.2, "shrinkA": 0, "shrinkB": 0}
+            "",
+            ends[1],
+            ends[0],
+            arrowprops={"arrowstyle": "-|>", "color": _AXES[k], "lw": 2.2, "shrinkA": 0, "shrinkB": 0},
         )
-        axes.text(*(ends[1] + 34 * away), f"J{'₁₂₃'[k]}", color=_AXES[k], ha="center", va="center", fontsize=11, fontweight="bold")
+        axes.text(
+            *(ends[1] + 26 * away),
+            f"J{'₁₂₃'[k]}",
+            color=_AXES[k],
+            ha="center",
+            va="center",
+            fontsize=11,
+            fontweight="bold",
+        )
     spot = camera.project(com[None])[0, :2]
     axes.plot(*spot, "o", ms=9, mfc="white", mec=_INK, mew=2)
     axes.set_xlim(0, width)
@@ -142,7 +168,9 @@ def normal_colours(normals: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"
 def _normal_key(axes: Any) -> None:
     """Which colour means which direction."""
     directions = np.concatenate([np.eye(3), -np.eye(3)])
-    for i, (name, colour) in enumerate(zip(("+x", "+y", "+z", "−x", "−y", "−z"), normal_colours(directions), strict=True)):
+    for i, (name, colour) in enumerate(
+        zip(("+x", "+y", "+z", "−x", "−y", "−z"), normal_colours(directions), strict=True)
+    ):
         axes.plot(0.2, 0.72 - 0.09 * i, "o", ms=11, mfc=colour / 255, mec="none")
         axes.text(0.42, 0.72 - 0.09 * i, name, va="center", fontsize=10, color=_INK)
     axes.text(0.05, 0.82, "normal", fontsize=10, color=_FAINT)
@@ -170,9 +198,12 @@ def _slice(axes: Any, obj: NeuralObject, plane: tuple[int, int]) -> None:
         x, y = np.meshgrid(np.linspace(*extent[:2], 240), np.linspace(*extent[2:], 240))
         query = np.empty((3, x.size))
         query[a], query[b], query[fixed] = x.ravel(), y.ravel(), com[fixed]
-        density = np.asarray(obj.grid.jet(np.asarray(query, dtype=np.asarray(obj.grid.spacing).dtype), 0)).reshape(x.shape)
+        points_there = jnp.asarray(query, obj.grid.spacing.dtype)
+        density = np.asarray(_densities(obj.grid, points_there)).reshape(x.shape)
         _density_picture(axes, density, extent, np.asarray(obj.density_range, dtype=np.float64))
-        axes.contour(x, y, density, levels=_levels(obj, density), colors=("#d62839", "#f2a541"), linewidths=1.1)
+        axes.contour(
+            x, y, density, levels=_levels(obj, density), colors=("#d62839", "#f2a541"), linewidths=1.1
+        )
     axes.plot(com[a], com[b], "o", ms=6, mfc="white", mec=_INK, mew=1.5)
     axes.set_xlim(*extent[:2])
     axes.set_ylim(*extent[2:])
@@ -182,12 +213,24 @@ def _slice(axes: Any, obj: NeuralObject, plane: tuple[int, int]) -> None:
         spine.set_color("#d5d9dd")
 
 
+@eqx.filter_jit
+def _densities(grid, points):
+    return grid.jet(points, 0)
+
+
 def _density_picture(axes: Any, density: np.ndarray, extent: list[float], limits: np.ndarray) -> None:
     """Densities as greys, on a scale that shows the haze around an object as well as its inside."""
     from matplotlib.colors import PowerNorm
 
     top = max(float(np.quantile(density, 0.995)), float(limits[1]), 1e-12)
-    axes.imshow(density, extent=extent, origin="lower", cmap="Greys", norm=PowerNorm(0.5, 0, 1.25 * top), interpolation="bilinear")
+    axes.imshow(
+        density,
+        extent=extent,
+        origin="lower",
+        cmap="Greys",
+        norm=PowerNorm(0.5, 0, 1.25 * top),
+        interpolation="bilinear",
+    )
 
 
 def _levels(obj: NeuralObject, density: np.ndarray) -> list[float]:
@@ -203,9 +246,18 @@ def _table(axes: Any, obj: NeuralObject) -> None:
     error = np.asarray(mass.inertia_error, dtype=np.float64)
     rows = [("mass", with_error(float(mass.mass), float(mass.mass_error)), "kg", _INK)]
     for k in range(3):
-        rows.append((f"centre of mass {'xyz'[k]}", with_error(float(mass.com[k]), float(mass.com_error[k])), "m", _INK))
+        rows.append(
+            (
+                f"centre of mass {'xyz'[k]}",
+                with_error(float(mass.com[k]), float(mass.com_error[k])),
+                "m",
+                _INK,
+            )
+        )
     for k in range(3):
-        rows.append((f"J{'₁₂₃'[k]}", with_error(float(moments[k]), float(error.diagonal().max())), "kg m²", _AXES[k]))
+        rows.append(
+            (f"J{'₁₂₃'[k]}", with_error(float(moments[k]), float(error.diagonal().max())), "kg m²", _AXES[k])
+        )
     low, high = (float(x) for x in np.asarray(obj.density_range))
     rows += [
         ("mass model", obj.mass_model, "", _INK),

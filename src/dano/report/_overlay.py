@@ -61,4 +61,6 @@ def _arrow(draw, tail: np.ndarray, head: np.ndarray, scale: float) -> None:
     tip = min(7.0 * scale, 0.6 * size)
     neck = head - tip * along
     draw.line([*tail, *neck], fill=255, width=max(int(round(2.0 * scale)), 1))
-    draw.polygon([tuple(head), tuple(neck + 0.45 * tip * across), tuple(neck - 0.45 * tip * across)], fill=255)
+    draw.polygon(
+        [tuple(head), tuple(neck + 0.45 * tip * across), tuple(neck - 0.45 * tip * across)], fill=255
+    )

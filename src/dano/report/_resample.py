@@ -6,7 +6,9 @@ from jaxtyping import Float
 from dano.scene import Trajectory
 
 
-def frame_times(trajectory: Trajectory, fps: float, slow_motion: float) -> Float[np.ndarray, " frames"]:
+def frame_times(
+    trajectory: Trajectory, fps: int | float, slow_motion: int | float
+) -> Float[np.ndarray, " frames"]:
     """Simulation time [s] of each frame of a video that plays `slow_motion` times slower than life.
 
     Raises:

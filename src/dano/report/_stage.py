@@ -25,13 +25,17 @@ class Stage(NamedTuple):
     rows: list[int]
     offsets: list[np.ndarray]
 
-    def posed(self, position: Float[np.ndarray, "bodies 3"], orientation: Float[np.ndarray, "bodies 4"]) -> list[Item]:
+    def posed(
+        self, position: Float[np.ndarray, "bodies 3"], orientation: Float[np.ndarray, "bodies 4"]
+    ) -> list[Item]:
         """The items where the bodies are."""
         placed = []
         for item, row, com in zip(self.items, self.rows, self.offsets, strict=True):
             rotation = matrix(orientation[row])
             pose = eqx.tree_at(
-                lambda p: (p.position, p.orientation), item.pose, (position[row] - rotation @ com, orientation[row])
+                lambda p: (p.position, p.orientation),
+                item.pose,
+                (position[row] - rotation @ com, orientation[row]),
             )
             placed.append(item.at(pose))
         return placed
@@ -57,19 +61,23 @@ def stage(scene: Scene, colours: dict[str, str] | None = None) -> Stage:
         offsets.append(np.asarray(body.com + body.com_offset, dtype=np.float64))
         used += not plane
     if not items:
-        raise ValueError(f"scene must hold a body with a field or a shape, got {list(scene.names)} without any")
+        raise ValueError(
+            f"scene must hold a body with a field or a shape, got {list(scene.names)} without any"
+        )
     return Stage(items, rows, offsets)
 
 
 def level_of(body: Body) -> float | None:
     """Density at which the surface of a neural object is drawn; None for a shape."""
-    return None if body.object is None else object_level(np.asarray(body.object.density_range, dtype=np.float64))
+    return (
+        None if body.object is None else object_level(np.asarray(body.object.density_range, dtype=np.float64))
+    )
 
 
 def object_level(density_range: np.ndarray) -> float:
     """Where in a range of densities the eye sees the surface: low in it, for that is where contact begins."""
     low, high = float(density_range[0]), float(density_range[1])
-    return low ** 0.75 * high**0.25 if low > 0 else 0.1 * high
+    return low**0.75 * high**0.25 if low > 0 else 0.1 * high
 
 
 def matrix(orientation: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
@@ -79,9 +87,7 @@ def matrix(orientation: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
     return np.eye(3) + 2 * (w * cross + cross @ cross)
 
 
-def camera_for(
-    scene: Scene, drawn: Stage, trajectory: Trajectory, width: int, height: int
-) -> Camera:
+def camera_for(scene: Scene, drawn: Stage, trajectory: Trajectory, width: int, height: int) -> Camera:
     """A camera that sees every bounded body all the time, looking down a little, across the main direction of motion."""
     position = np.asarray(trajectory.states.position, dtype=np.float64)
     orientation = np.asarray(trajectory.states.orientation, dtype=np.float64)
@@ -148,8 +154,8 @@ def touches(scene: Scene, trajectory: Trajectory, times: Float[np.ndarray, " fra
     overlap = np.stack([np.asarray(patch.overlap, dtype=np.float64) for patch in patches], axis=1)[step]
     forces = wrenches[step, :, :3]
     size = np.linalg.norm(forces, axis=-1)
-    # A landing is a hundred times the weight; what matters to the eye is the usual force, so the rest is clipped.
+    # A landing is a hundred times the weight; what matters to the eye is the usual force, so the rest is
+    # clipped.
     usual = float(np.quantile(size[size > 1e-9], 0.8)) if np.any(size > 1e-9) else 1.0
     shares = np.where((overlap > 0) & np.isfinite(points).all(axis=-1), np.clip(size / usual, 0, 2.5), 0.0)
     return Touches(points, forces, shares)
-

@@ -28,7 +28,7 @@ def render_trajectory(
     *,
     fps: int = 30,
     size: tuple[int, int] = (640, 400),
-    slow_motion: float = 1.0,
+    slow_motion: int | float = 1.0,
     contact_points: bool = True,
     strip: str | os.PathLike[str] | None = None,
     camera: Camera | None = None,
@@ -53,11 +53,13 @@ def render_trajectory(
         progress: Called with a description and the share done.
 
     Raises:
-        ValueError: If the trajectory is not one of this scene, a number is out of range, or an output path is a
-            directory, lies in none, or has another ending.
+        ValueError: If the trajectory is not one of this scene, a number is out of range, or an output path
+            is a directory, lies in none, or has another ending.
         ImportError: If av or pillow is missing.
     """
-    outputs = _checked(scene, trajectory, path, strip, size if camera is None else (camera.width, camera.height))
+    outputs = _checked(
+        scene, trajectory, path, strip, size if camera is None else (camera.width, camera.height)
+    )
     times = frame_times(trajectory, fps, slow_motion)
     drawn = stage(scene, colours)
     camera = camera_for(scene, drawn, trajectory, *size) if camera is None else camera
@@ -93,13 +95,17 @@ def _checked(scene, trajectory, path, strip, size) -> tuple[Path | None, Path | 
     if path is None and strip is None:
         raise ValueError("path or strip must be given, got None for both")
     if tuple(trajectory.names) != tuple(scene.names):
-        raise ValueError(f"trajectory must be one of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}")
+        raise ValueError(
+            f"trajectory must be one of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
+        )
     if len(trajectory.times) < 2:
         raise ValueError(f"trajectory must have at least one step, got {len(trajectory.times)} states")
     if not np.all(np.isfinite(np.asarray(trajectory.states.position))):
         raise ValueError("trajectory must be finite, got positions that are NaN or infinite")
     if min(size) < 16 or any(n != int(n) or n % 2 for n in size):
-        raise ValueError(f"size must be two even numbers of at least 16 pixels (video codecs need them even), got {size}")
+        raise ValueError(
+            f"size must be two even numbers of at least 16 pixels (video codecs need them even), got {size}"
+        )
     checked = []
     for name, output, suffix in (("path", path, ".mp4"), ("strip", strip, ".png")):
         if output is not None and Path(output).suffix.lower() != suffix:

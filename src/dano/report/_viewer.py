@@ -5,6 +5,8 @@ import threading
 import time
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, PosedShape, Sphere
@@ -67,7 +69,9 @@ class Viewer:
 
     def _controls(self) -> None:
         gui, times = self._server.gui, np.asarray(self._trajectory.times, dtype=np.float64)
-        self._slider = gui.add_slider("time [s]", float(times[0]), float(times[-1]), float(times[1] - times[0]), float(times[0]))
+        self._slider = gui.add_slider(
+            "time [s]", float(times[0]), float(times[-1]), float(times[1] - times[0]), float(times[0])
+        )
         self._playing = gui.add_checkbox("play", True)
         self._speed = gui.add_slider("speed", 0.05, 2.0, 0.05, 1.0)
         self._loop = gui.add_checkbox("repeat", True)
@@ -101,11 +105,18 @@ class Viewer:
         if self._touched is None or not self._contacts.value:
             return
         times = np.asarray(self._trajectory.times)
-        ends = _arrow_ends(self._touched, int(np.searchsorted(times, self._time, side="right") - 1), self._length)
+        ends = _arrow_ends(
+            self._touched, int(np.searchsorted(times, self._time, side="right") - 1), self._length
+        )
         if len(ends):
             thick = 0.03 * self._length
             self._arrows = self._server.scene.add_arrows(
-                "/forces", ends.astype(np.float32), (214, 40, 57), shaft_radius=thick, head_radius=2.5 * thick, head_length=6 * thick
+                "/forces",
+                ends.astype(np.float32),
+                (214, 40, 57),
+                shaft_radius=thick,
+                head_radius=2.5 * thick,
+                head_length=6 * thick,
             )
 
     def _play(self) -> None:
@@ -137,7 +148,9 @@ class Viewer:
         self.stop()
 
 
-def view(scene: Scene, trajectory: Trajectory, *, port: int = 8080, host: str = "127.0.0.1", block: bool = True) -> Viewer:
+def view(
+    scene: Scene, trajectory: Trajectory, *, port: int = 8080, host: str = "127.0.0.1", block: bool = True
+) -> Viewer:
     """Show a trajectory in the browser: neural objects as their contact samples, shapes as meshes.
 
     Args:
@@ -155,11 +168,15 @@ def view(scene: Scene, trajectory: Trajectory, *, port: int = 8080, host: str = 
         ImportError: If viser is missing.
     """
     if tuple(trajectory.names) != tuple(scene.names):
-        raise ValueError(f"trajectory must be one of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}")
+        raise ValueError(
+            f"trajectory must be one of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
+        )
     if not 0 < int(port) < 65536:
         raise ValueError(f"port must lie in 1 … 65535, got {port}")
     viser = require("viser")
-    viewer = Viewer(viser.ViserServer(host=host, port=int(port), label="dano", verbose=False), scene, trajectory)
+    viewer = Viewer(
+        viser.ViserServer(host=host, port=int(port), label="dano", verbose=False), scene, trajectory
+    )
     if block:
         print(f"viewer at {viewer.url} (Ctrl-C ends it)", flush=True)
         viewer.wait()
@@ -187,8 +204,16 @@ def _add_floor(server: Any, name: str, plane: np.ndarray, size: float) -> Any:
     w = 1 + normal[2]
     quaternion = np.array([w, -normal[1], normal[0], 0.0]) if w > 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
     return server.scene.add_grid(
-        name, width=size, height=size, plane="xy", cell_size=size / 40, section_size=size / 8, plane_color=(240, 241, 243),
-        plane_opacity=1.0, wxyz=quaternion / np.linalg.norm(quaternion), position=plane[3] * normal,
+        name,
+        width=size,
+        height=size,
+        plane="xy",
+        cell_size=size / 40,
+        section_size=size / 8,
+        plane_color=(240, 241, 243),
+        plane_opacity=1.0,
+        wxyz=quaternion / np.linalg.norm(quaternion),
+        position=plane[3] * normal,
     )
 
 
@@ -199,10 +224,14 @@ def _add_body(server: Any, name: str, body: Body, colour: np.ndarray) -> Any:
         points = np.asarray(body.object.samples.points, dtype=np.float32)
         colours = normal_colours(np.asarray(body.object.samples.normals, dtype=np.float64))
         spacing = 1.3 * body.size / np.sqrt(len(points))
-        server.scene.add_point_cloud(f"{name}/samples", points, colours, point_size=spacing, point_shape="circle", precision="float32")
+        server.scene.add_point_cloud(
+            f"{name}/samples", points, colours, point_size=spacing, point_shape="circle", precision="float32"
+        )
         return frame
     vertices, faces = surface_mesh(body.shape)
-    server.scene.add_mesh_simple(f"{name}/shape", vertices, faces, color=tuple(int(c) for c in colour), side="double")
+    server.scene.add_mesh_simple(
+        f"{name}/shape", vertices, faces, color=tuple(int(c) for c in colour), side="double"
+    )
     return frame
 
 
@@ -215,7 +244,9 @@ def surface_mesh(shape: AbstractShape, n: int = 48) -> tuple[np.ndarray, np.ndar
         vertices, faces = surface_mesh(shape.shape, n)
         rotation, position = placement(shape.pose)
         return (vertices @ rotation.T + position).astype(np.float32), faces
-    directions, faces = _cube_sphere(n if isinstance(shape, Sphere | Ellipsoid | Capsule | Cylinder | Box) else 2 * n)
+    directions, faces = _cube_sphere(
+        n if isinstance(shape, Sphere | Ellipsoid | Capsule | Cylinder | Box) else 2 * n
+    )
     bounds = np.asarray(shape.bounds, dtype=np.float64)
     centre, half = bounds.mean(axis=0), 0.5 * (bounds[1] - bounds[0])
     if isinstance(shape, Ellipsoid | Capsule | Cylinder | Box):
@@ -227,10 +258,15 @@ def surface_mesh(shape: AbstractShape, n: int = 48) -> tuple[np.ndarray, np.ndar
     low, high = np.zeros(len(directions)), np.full(len(directions), float(np.linalg.norm(half)))
     for _ in range(24):
         middle = 0.5 * (low + high)
-        points = np.asarray(centre + middle[:, None] * directions, dtype=bounds.dtype).T
-        inside = np.asarray(shape.sdf_jet(points, 0)) <= 0
+        points = jnp.asarray((centre + middle[:, None] * directions).T, shape.bounds.dtype)
+        inside = np.asarray(_signed_distances(shape, points)) <= 0
         low, high = np.where(inside, middle, low), np.where(inside, high, middle)
     return (centre + low[:, None] * directions).astype(np.float32), faces
+
+
+@eqx.filter_jit
+def _signed_distances(shape, points):
+    return shape.sdf_jet(points, 0)
 
 
 def _cube_sphere(n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -213,7 +213,8 @@ def _contacts(top: Table, bodies: Sequence[Body]) -> list[Contact]:
     valid = (*_PARAMS, *_LAW, "edge")
     default = top.table("default_contact", valid)
     default.where = f"{top.where}: [default_contact]"
-    if top.data.get("contacts", "all") == "all":
+    all_pairs = top.data.get("contacts", "all") == "all"
+    if all_pairs:
         pairs = [
             (a.name, b.name)
             for a, b in itertools.combinations(bodies, 2)
@@ -229,7 +230,7 @@ def _contacts(top: Table, bodies: Sequence[Body]) -> list[Contact]:
         table = Table(f"{top.where}: [[contacts]] {i + 1}", {**default.data, **row}, ("a", "b", *valid))
         a, b = table.word("a"), table.word("b")
         table.where += f" ({a!r}, {b!r})"
-        with located(table.where if row.keys() - {"a", "b"} else default.where):
+        with located(default.where if all_pairs else table.where):
             contacts.append(_contact(table, a, b, [body.name for body in bodies]))
     return contacts
 

@@ -42,7 +42,7 @@ def drop_scene(object_path: str | os.PathLike[str]) -> str:
     tilt = np.array([math.cos(0.06), 0.8 * math.sin(0.06), 0.6 * math.sin(0.06), 0.0])
     lowest = _lowest_point(made, tilt)
     # Long enough to fall, rock and come to rest, whatever the size: times go with √(size / g).
-    timestep = float(f"{min(0.005, 0.05 * math.sqrt(size / 9.81)):.1g}")
+    timestep = float(f"{min(0.005, 0.02 * math.sqrt(size / 9.81)):.1g}")
     duration = max(1.0, 20 * math.sqrt(size / 9.81))
     return f"""timestep = {timestep}
 duration = {duration:.3g}

@@ -4,9 +4,9 @@ import math
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
 
-from dano.maths import checked_array, is_traced
+from dano.maths import checked_array, is_traced, Numbers
 
 
 class Camera(eqx.Module):
@@ -30,10 +30,10 @@ class Camera(eqx.Module):
 
     def __init__(
         self,
-        position: ArrayLike,
-        look_at: ArrayLike = (0.0, 0.0, 0.0),
+        position: Numbers,
+        look_at: Numbers = (0.0, 0.0, 0.0),
         *,
-        vertical_fov: float = 0.6,
+        vertical_fov: int | float = 0.6,
         width: int = 640,
         height: int = 400,
     ):
@@ -86,7 +86,9 @@ class Camera(eqx.Module):
         local = (np.asarray(points, dtype=np.float64) - self.position) @ self.axes.T
         depth = np.where(local[:, 2] > 0, local[:, 2], np.nan)
         scale = 1 / (depth * self.pixel_angle)
-        return np.stack([0.5 * self.width + local[:, 0] * scale, 0.5 * self.height - local[:, 1] * scale, depth], axis=1)
+        return np.stack(
+            [0.5 * self.width + local[:, 0] * scale, 0.5 * self.height - local[:, 1] * scale, depth], axis=1
+        )
 
     @classmethod
     def framing(
@@ -94,11 +96,11 @@ class Camera(eqx.Module):
         centres: Float[np.ndarray, "n 3"],
         radii: Float[np.ndarray, " n"],
         *,
-        direction: ArrayLike = (0.35, 0.85, -0.38),
-        vertical_fov: float = 0.6,
+        direction: Numbers = (0.35, 0.85, -0.38),
+        vertical_fov: int | float = 0.6,
         width: int = 640,
         height: int = 400,
-        margin: float = 0.06,
+        margin: int | float = 0.06,
     ) -> "Camera":
         """The nearest camera of a given viewing direction that sees all of some balls.
 
@@ -128,7 +130,9 @@ class Camera(eqx.Module):
         depth = min(place[0][1], place[1][1])
         position = np.array([place[0][0], place[1][0], depth]) @ axes
         distance = max(float(np.mean(z)) - depth, float(np.max(radii)), 1e-9)
-        return cls(position, position + distance * axes[2], vertical_fov=vertical_fov, width=width, height=height)
+        return cls(
+            position, position + distance * axes[2], vertical_fov=vertical_fov, width=width, height=height
+        )
 
 
 def view_axes(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -4,16 +4,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
 from scipy import ndimage, spatial
 
-from dano.fields import AbstractField, AbstractShape, bake, GridField, HalfSpace, PosedShape, SignedDistanceGrid
-from dano.maths import checked_array, Pose
+from dano.fields import (
+    AbstractField,
+    AbstractShape,
+    bake,
+    GridField,
+    HalfSpace,
+    PosedShape,
+    SignedDistanceGrid,
+)
+from dano.maths import checked_array, Numbers, Pose
 
 PALETTE = ("#e07a3f", "#3d7ea6", "#5f9e6e", "#c9a227", "#8d6cab", "#c8553d", "#4aa3a2", "#7a8450")
 """Colours given to objects that state none: matte, told apart also by the colour-blind through their lightness."""
 
-# Nodes along the longest side of the signed distance of a density: finer than a pixel needs at usual image sizes.
+# Nodes along the longest side of the signed distance of a density: finer than a pixel needs at usual image
+# sizes.
 _MOST_NODES = 112
 _BAKE_NODES = 96
 
@@ -22,8 +31,8 @@ class Item(eqx.Module):
     """A field, where it is, and how it looks.
 
     Attributes:
-        shape: What is drawn of a solid, in float32: the field itself if it is a shape, else the signed distance of
-            its level surface; None if the field is drawn as a translucent medium.
+        shape: What is drawn of a solid, in float32: the field itself if it is a shape, else the signed
+            distance of its level surface; None if the field is drawn as a translucent medium.
         medium: The density that is drawn as a translucent medium, in float32, else None.
         pose: Field frame → world.
         colour: sRGB in [0, 1], shape (3,).
@@ -44,28 +53,33 @@ class Item(eqx.Module):
         self,
         field: AbstractField,
         pose: Pose | None = None,
-        colour: str | ArrayLike | None = None,
+        colour: str | Numbers | None = None,
         *,
-        level: float | None = None,
-        density_scale: float | None = None,
+        level: int | float | None = None,
+        density_scale: int | float | None = None,
     ):
         """Make a field ready for drawing; what takes time happens here and not per picture.
 
         Args:
             field: A shape, which is drawn as it is, or a density.
             pose: Field frame → world; default the identity.
-            colour: "#rrggbb" or three numbers in [0, 1]; default: the first of `PALETTE`, white for a half-space.
-            level: Density at which the surface of a solid lies; default: half the median of what the field holds.
-            density_scale: If given, the field is no solid but a medium with extinction density_scale · φ [1/m].
+            colour: "#rrggbb" or three numbers in [0, 1]; default: the first of `PALETTE`, white for a
+                half-space.
+            level: Density at which the surface of a solid lies; default: half the median of what the field
+                holds.
+            density_scale: If given, the field is no solid but a medium with extinction density_scale · φ
+                [1/m].
 
         Raises:
-            ValueError: If the field is unbounded and no half-space, it nowhere reaches `level`, both `level` and
-                `density_scale` are given, or a number is out of range.
+            ValueError: If the field is unbounded and no half-space, it nowhere reaches `level`, both
+                `level` and `density_scale` are given, or a number is out of range.
         """
         if not isinstance(field, AbstractField):
             raise ValueError(f"field must be a dano field (an AbstractField), got {type(field).__name__}")
         if level is not None and density_scale is not None:
-            raise ValueError(f"level (a solid) excludes density_scale (a medium), got {level} and {density_scale}")
+            raise ValueError(
+                f"level (a solid) excludes density_scale (a medium), got {level} and {density_scale}"
+            )
         for name, value in (("level", level), ("density_scale", density_scale)):
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be positive and finite, got {value}")
@@ -118,7 +132,7 @@ def placement(pose: Pose) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
     return np.eye(3) + 2 * (w * cross + cross @ cross), np.asarray(pose.position, dtype=np.float64)
 
 
-def checked_colour(colour: str | ArrayLike) -> Float[np.ndarray, "3"]:
+def checked_colour(colour: str | Numbers) -> Float[np.ndarray, "3"]:
     """A colour as sRGB in [0, 1].
 
     Raises:
@@ -139,12 +153,13 @@ def checked_colour(colour: str | ArrayLike) -> Float[np.ndarray, "3"]:
     return value
 
 
-def level_surface(field: GridField, level: float | None = None) -> SignedDistanceGrid:
+def level_surface(field: GridField, level: int | float | None = None) -> SignedDistanceGrid:
     """The solid {φ ≥ level} of a grid as a signed distance, smooth enough to be shaded.
 
-    The density φ/(φ + level), which is ½ on the surface and blind to how dense the inside is, is blurred by less
-    than a cell; where it crosses ½ along the edges of the grid lie points of the surface, with normals. A node's
-    distance is that to the tangent plane of the nearest of them if it is near, else that to the point.
+    The density φ/(φ + level), which is ½ on the surface and blind to how dense the inside is, is blurred
+    by less
+    than a cell; where it crosses ½ along the edges of the grid lie points of the surface, with normals. A
+    node's distance is that to the tangent plane of the nearest of them if it is near, else that to the point.
 
     Args:
         field: The density.
@@ -171,13 +186,18 @@ def level_surface(field: GridField, level: float | None = None) -> SignedDistanc
         factor = _MOST_NODES / max(share.shape)
         target = np.maximum(np.ceil(np.array(share.shape) * factor).astype(int), 8)
         step = (np.array(share.shape) - 1) / (target - 1)
-        share = ndimage.zoom(ndimage.gaussian_filter(share, 0.4 * step), target / np.array(share.shape), order=1)
+        share = ndimage.zoom(
+            ndimage.gaussian_filter(share, 0.4 * step), target / np.array(share.shape), order=1
+        )
         spacing = spacing * step
     share = ndimage.gaussian_filter(share, 0.8)
     # A thin wall may not survive the blur; the surface then moves to where half of the peak is left.
-    middle = min(0.5, 0.5 * float(share.max()))
+    peak = float(share.max())
+    middle = 0.5 if peak > 0.5 else 0.5 * peak
     distance = _distances(share, middle, spacing)
-    return SignedDistanceGrid(distance.astype(np.float32), origin.astype(np.float32), spacing.astype(np.float32), edge=0.0)
+    return SignedDistanceGrid(
+        distance.astype(np.float32), origin.astype(np.float32), spacing.astype(np.float32), edge=0.0
+    )
 
 
 def _distances(share: np.ndarray, middle: float, spacing: np.ndarray) -> np.ndarray:
@@ -195,7 +215,6 @@ def _distances(share: np.ndarray, middle: float, spacing: np.ndarray) -> np.ndar
     surface = np.concatenate(points) * spacing
     outward = -np.concatenate(normals) / spacing
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
-    nodes = np.stack(np.meshgrid(*(np.arange(n) for n in share.shape), indexing="ij"), axis=-1).reshape(-1, 3) * spacing
     occupied = share >= middle
     # Far from the surface a distance good to a cell is enough to skip empty space, and much cheaper.
     outside = ndimage.distance_transform_edt(~occupied, sampling=spacing)
@@ -226,8 +245,8 @@ def _without_moments(shape: AbstractShape) -> AbstractShape:
 
 
 def _single(module: eqx.Module) -> eqx.Module:
-    return _as(module, jnp.float32)
+    return _as(module, np.dtype(np.float32))
 
 
-def _as(module: eqx.Module, dtype: jnp.dtype) -> eqx.Module:
+def _as(module: eqx.Module, dtype: np.dtype) -> eqx.Module:
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), module)

@@ -1,6 +1,7 @@
 """Compiled kernels: where rays meet a solid, what a medium lets through, what light a point receives.
 
-All of them take one field, where it is, and a fixed number of rays in structure-of-arrays layout (one a column),
+All of them take one field, where it is, and a fixed number of rays in structure-of-arrays layout (one a
+column),
 in float32. They are compiled once per type of field and serve every picture, pose and image size after that.
 """
 
@@ -31,7 +32,10 @@ _CAUTION = 0.95
 
 
 def _interval(
-    bounds: Float[Array, "2 3"], origins: Float[Array, "3 n"], directions: Float[Array, "3 n"], grow: Float[Array, " n"]
+    bounds: Float[Array, "2 3"],
+    origins: Float[Array, "3 n"],
+    directions: Float[Array, "3 n"],
+    grow: Float[Array, " n"],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Where rays enter and leave a box grown by `grow`; enter > leave for rays that miss it."""
     tiny = jnp.where(jnp.abs(directions) < 1e-9, jnp.float32(1e-9), directions)
@@ -101,8 +105,8 @@ def march(
         t, state, i = carry
         s = shape.sdf_jet(o + t[None] * d, 0)
         live = state == ON_ITS_WAY
-        # A third of a pixel, but not below what float32 resolves.
-        near = s < jnp.maximum(0.3 * pixel * t, 1e-5 * size)
+        # A tenth of a pixel, by which silhouettes grow, but not below what float32 resolves.
+        near = s < jnp.maximum(0.1 * pixel * t, 1e-5 * size)
         t = jnp.where(live, t + _CAUTION * s, t)
         state = jnp.where(live & near, HIT, jnp.where(live & (t >= leave), MISSED, state))
         return t, state, i + 1
@@ -156,14 +160,14 @@ def march_to_lamp(
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Int[Array, " n"]]:
     """Some steps from points towards a lamp of some width.
 
-    The lamp's disc, at distance t of radius spread · t, is covered up to the height s of the ray above the shape, so
-    the least s / (spread · t), between −1 (dark) and 1 (clear), says how much of it is seen.
+    The lamp's disc, at distance t of radius spread · t, is covered up to the height s of the ray above the
+    shape, so the least s / (spread · t), between −1 (dark) and 1 (clear), says how much of it is seen.
 
     Args:
         placed: What stands in the way.
         points: [m, W], a little above the surface they belong to.
         start: How far the way has been followed before [m].
-        seen: Least height ratio until there; below −1 for points that only fill the chunk.
+        seen: Least height ratio until there.
         light: Unit direction towards the lamp [W].
         spread: Half the lamp's angular width [rad].
         bias: Least step [m].

@@ -1,9 +1,11 @@
 """Pictures of solids and media on a floor, by ray marching on the CPU.
 
-A picture is made in passes over arrays of rays: planes in closed form, solids by sphere tracing, the light each
-visible point receives, shading, media in front. Rays that cannot meet an item are sorted out on the host by its
+A picture is made in passes over arrays of rays: planes in closed form, solids by sphere tracing, the light
+each visible point receives, shading, media in front. Rays that cannot meet an item are sorted out on the host
+by its
 bounding ball, so that the compiled kernels see little else than hits. One ray a pixel first; four more where
-neighbouring pixels differ, which smooths every kind of edge at a small part of the cost of doing so everywhere.
+neighbouring pixels differ, which smooths every kind of edge at a small part of the cost of doing so
+everywhere.
 """
 
 import functools
@@ -11,10 +13,10 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import ArrayLike, Int, UInt8
+from jaxtyping import Int, UInt8
 from scipy import ndimage
 
-from dano.maths import checked_array
+from dano.maths import checked_array, Numbers
 from dano.vision._camera import Camera
 from dano.vision._item import checked_colour, Item, placement
 from dano.vision._rays import (
@@ -65,7 +67,7 @@ class _Empty(NamedTuple):
 class _View:
     """One picture in the making: what is in it, and where the light comes from (host only)."""
 
-    def __init__(self, items: Sequence[Item], camera: Camera, look: Look, floor: bool | float):
+    def __init__(self, items: Sequence[Item], camera: Camera, look: Look, floor: bool | int | float):
         self.origin = camera.position.astype(np.float32)
         self.look = look
         self.planes = [(item.plane, item.colour) for item in items if item.plane is not None]
@@ -76,16 +78,18 @@ class _View:
         balls = [item.placed_ball for item in self.solids + self.media]
         self.radii = np.array([radius for _, radius in balls], dtype=np.float32)
         self.centres = np.array([centre for centre, _ in balls], dtype=np.float32).reshape(-1, 3)
-        self.frames = [tuple(x.astype(np.float32) for x in placement(item.pose)) for item in self.solids + self.media]
+        self.frames = [
+            tuple(x.astype(np.float32) for x in placement(item.pose)) for item in self.solids + self.media
+        ]
 
 
 def render(
     items: Sequence[Item],
     camera: Camera,
     *,
-    floor: bool | float = True,
-    light: ArrayLike | None = None,
-    background: str | ArrayLike | None = None,
+    floor: bool | int | float = True,
+    light: Numbers | None = None,
+    background: str | Numbers | None = None,
     antialias: bool = True,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Draw a picture.
@@ -106,7 +110,9 @@ def render(
     """
     for i, item in enumerate(items):
         if not isinstance(item, Item):
-            raise ValueError(f"items[{i}] must be an Item (a field made ready for drawing), got {type(item).__name__}")
+            raise ValueError(
+                f"items[{i}] must be an Item (a field made ready for drawing), got {type(item).__name__}"
+            )
     view = _View(items, camera, _look(camera, light, background), floor)
     empty = _empty(view, camera)
     colour, touched = _radiance(view, empty.directions, empty.depth, empty.which, empty.colour)
@@ -124,7 +130,7 @@ def render(
     return picture.reshape(camera.height, camera.width, 3)
 
 
-def _look(camera: Camera, light: ArrayLike | None, background: str | ArrayLike | None) -> Look:
+def _look(camera: Camera, light: Numbers | None, background: str | Numbers | None) -> Look:
     right, up, forward = camera.axes
     if light is None:
         ahead = np.array([forward[0], forward[1], 0.0])
@@ -209,7 +215,7 @@ def _edges(picture, touched, width: int, height: int) -> Int[np.ndarray, " edges
 
 
 def _radiance(view, d, depth, which, colour):
-    """Linear colour (3, n) that arrives along rays, and which of them see anything but the empty surroundings."""
+    """Linear colour (3, n) that arrives along rays, and which of them see more than empty surroundings."""
     depth, which, colour = depth.copy(), which.copy(), colour.copy()
     normals = np.zeros((3, d.shape[1]), dtype=np.float32)
     pixel, hits = np.float32(view.look.pixel), []
@@ -225,7 +231,9 @@ def _radiance(view, d, depth, which, colour):
     for j, (plane, _) in enumerate(view.planes):
         normals[:, which == j] = plane[:3].astype(np.float32)[:, None]
     hit = np.flatnonzero(which >= 0)
-    lamp, ambient = _light_at(view, view.origin[:, None] + depth[hit] * d[:, hit], normals[:, hit], which[hit])
+    lamp, ambient = _light_at(
+        view, view.origin[:, None] + depth[hit] * d[:, hit], normals[:, hit], which[hit]
+    )
     changed = (which[hit] >= len(view.planes)) | (lamp < 1) | (ambient < 1)
     hit, lamp, ambient = hit[changed], lamp[changed], ambient[changed]
     colour[:, hit] = _lit(view, d[:, hit], depth[hit], which[hit], normals[:, hit], lamp, ambient)
@@ -256,7 +264,9 @@ def _first_hits(placed, origin, d, limit, index, pixel):
     # After a few steps only rays that graze the surface are left: they go on among themselves.
     for n_steps in _STEPS:
         arrays = (np.broadcast_to(origin[:, None], (3, len(index))), d[:, index], limit[index], t[index])
-        ahead, state = _in_chunks(lambda o, r, far, s, n=n_steps: march(placed, o, r, far, s, pixel, np.int32(n)), arrays)
+        ahead, state = _in_chunks(
+            lambda o, r, far, s, n=n_steps: march(placed, o, r, far, s, pixel, np.int32(n)), arrays
+        )
         t[index] = ahead
         found.append(index[state == HIT])
         index = index[state == ON_ITS_WAY]
@@ -274,7 +284,10 @@ def _lamp_share(placed, points, light, bias):
     for n_steps in _STEPS:
         arrays = (points[:, index], t[index], seen[index])
         t[index], seen[index], state = _in_chunks(
-            lambda p, s, k, n=n_steps: march_to_lamp(placed, p, s, k, light, np.float32(_LAMP), bias, np.int32(n)), arrays
+            lambda p, s, k, n=n_steps: march_to_lamp(
+                placed, p, s, k, light, np.float32(_LAMP), bias, np.int32(n)
+            ),
+            arrays,
         )
         index = index[state == ON_ITS_WAY]
         if len(index) == 0:
@@ -305,7 +318,9 @@ def _light_at(view, points, normals, kind):
         lamp[index] *= _lamp_share(placed, points[:, index] + bias * normals[:, index], light, bias)
         index = np.flatnonzero(near_focus & (square < (radius + reach) ** 2))
         arrays = points[:, index], normals[:, index]
-        (around,) = _in_chunks(lambda p, n, placed=placed, reach=reach: (ambient_light(placed, p, n, reach),), arrays)
+        (around,) = _in_chunks(
+            lambda p, n, placed=placed, reach=reach: (ambient_light(placed, p, n, reach),), arrays
+        )
         ambient[index] *= around
     for plane, _ in view.planes if view.solids else ():
         index = np.flatnonzero(kind >= len(view.planes))
@@ -321,7 +336,9 @@ def _lay_over(view, i, item, d, depth, colour):
     index = _towards_ball(view.centres[i] - view.origin, view.radii[i], d)
     arrays = (np.broadcast_to(view.origin[:, None], (3, len(index))), d[:, index], depth[index])
     scale = np.float32(item.density_scale)
-    opacity, _, normal = _in_chunks(lambda o, r, far: transmitted(item.medium, scale, *view.frames[i], o, r, far), arrays)
+    opacity, _, normal = _in_chunks(
+        lambda o, r, far: transmitted(item.medium, scale, *view.frames[i], o, r, far), arrays
+    )
     albedo = np.broadcast_to((item.colour.astype(np.float32) ** 2.2)[:, None], (3, len(index)))
     one, no = np.ones(len(index), dtype=np.float32), np.zeros(len(index), dtype=bool)
     own = shade(view.look, albedo, normal, d[:, index], one, one, no, 0 * one)
@@ -329,7 +346,7 @@ def _lay_over(view, i, item, d, depth, colour):
     return index
 
 
-def _towards_ball(to_centre: np.ndarray, radius: float, d: np.ndarray) -> np.ndarray:
+def _towards_ball(to_centre: np.ndarray, radius: np.floating, d: np.ndarray) -> np.ndarray:
     """Indices of the rays that meet a ball."""
     square = float(to_centre @ to_centre)
     if square <= radius**2:
@@ -350,4 +367,7 @@ def _in_chunks(kernel: Callable, arrays: tuple[np.ndarray, ...]) -> tuple[np.nda
             # Zeros make rays of no length that end at once.
             piece = [np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, short)]) for array in piece]
         parts.append(kernel(*piece))
-    return tuple(np.concatenate([np.asarray(x) for x in column], axis=-1)[..., :n] for column in zip(*parts, strict=True))
+    return tuple(
+        np.concatenate([np.asarray(x) for x in column], axis=-1)[..., :n]
+        for column in zip(*parts, strict=True)
+    )

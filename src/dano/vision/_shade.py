@@ -42,7 +42,15 @@ class Look(NamedTuple):
         wish = distance / 7
         decade = 10.0 ** np.floor(np.log10(wish))
         tile = decade * max(m for m in (1, 2, 5) if m * decade <= wish * 1.001)
-        return cls(light, (horizon**2.2).astype(np.float32), focus.astype(np.float32), 0.7 * distance, 3.2 * distance, tile, pixel)
+        return cls(
+            light,
+            (horizon**2.2).astype(np.float32),
+            focus.astype(np.float32),
+            0.7 * distance,
+            3.2 * distance,
+            tile,
+            pixel,
+        )
 
 
 def backdrop(look: Look, d: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
@@ -52,7 +60,7 @@ def backdrop(look: Look, d: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"
 
 
 def floor_tint(look, plane, tint, points, d, t) -> tuple[np.ndarray, np.ndarray]:
-    """Albedo (3, n) of a checkered plane, its squares averaged over each pixel's footprint, and its fading (n,)."""
+    """Albedo (3, n) of a checkered plane, averaged over each pixel's footprint, and its fading (n,)."""
     normal = plane[:3].astype(np.float32)
     first = np.cross(normal, (0.0, 1.0, 0.0) if abs(normal[1]) < 0.9 else (1.0, 0.0, 0.0)).astype(np.float32)
     first /= np.linalg.norm(first)

@@ -1,0 +1,150 @@
+"""Bad fields, files and options: one line on stderr, code 2, and nothing written or destroyed."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ORIGIN, SPACING = np.zeros(3), np.asarray(0.01)
+
+
+def write_field(path: Path, values: np.ndarray) -> Path:
+    np.savez(path, values=values, origin=ORIGIN, spacing=SPACING)
+    return path
+
+
+def ball() -> np.ndarray:
+    x = np.stack(np.meshgrid(*(np.arange(10) - 4.5,) * 3, indexing="ij"), axis=-1)
+    return 100.0 * (np.linalg.norm(x, axis=-1) < 3.5)
+
+
+def spoilt(value: float) -> np.ndarray:
+    values = ball()
+    values[5, 5, 5] = value
+    return values
+
+
+FIELDS = {
+    "NaN": (spoilt(np.nan), (), "finite"),
+    "infinite": (spoilt(np.inf), (), "finite"),
+    "negative": (spoilt(-1.0), (), "≥ 0"),
+    "empty": (np.zeros((10, 10, 10)), (), "zero"),
+    "flat": (np.zeros((10, 10)), (), "(nx, ny, nz)"),
+    "range above": (ball(), ("--density-range", "1e5", "2e5"), "density_range"),
+    "range reversed": (ball(), ("--density-range", "60", "40"), "density_range"),
+    "no samples": (ball(), ("--samples", "0"), "n_samples must be ≥ 1"),
+    "coarse": (ball(), ("--resolution", "1"), "resolution must be ≥ 4"),
+    "no mass": (ball(), ("--mass", "0"), "> 0 kg, got 0"),
+    "mass twice": (ball(), ("--mass", "1", "--mass-scale", "1"), "--mass"),
+    "no length": (ball(), ("--length", "-1"), "length must be finite and > 0"),
+}
+
+
+def assert_refused(answer, message: str, folder: Path, files: dict[str, bytes]) -> None:
+    assert answer.code == 2
+    assert answer.out == ""
+    assert answer.err.startswith("dano: error: ")
+    assert answer.err.count("\n") == 1
+    assert message in answer.err
+    assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == files
+
+
+@pytest.mark.parametrize("case", FIELDS)
+def test_bad_fields(case, run, tmp_path):
+    values, options, message = FIELDS[case]
+    path = write_field(tmp_path / "field.npz", values)
+    # What stands there already must survive.
+    (tmp_path / "out.dano").write_bytes(b"precious")
+    files = {"field.npz": path.read_bytes(), "out.dano": b"precious"}
+    answer = run(
+        "build", path, "-o", tmp_path / "out.dano", "--resolution", "10", "--samples", "50", *options
+    )
+    assert_refused(answer, message, tmp_path, files)
+
+
+@pytest.mark.parametrize("command", ["build", "inspect", "simulate", "view"])
+@pytest.mark.parametrize("kind", ["missing", "folder", "truncated", "foreign", "bare", "pickled"])
+def test_bad_input_files(command, kind, run, egg, tmp_path):
+    source = (
+        tmp_path / {"build": "in.npz", "inspect": "in.dano", "simulate": "in.dano", "view": "in.npz"}[command]
+    )
+    if kind == "folder":
+        source.mkdir()
+    elif kind == "truncated":
+        source.write_bytes(egg.read_bytes()[:3000])
+    elif kind == "foreign":
+        source.write_bytes(b"PK\x03\x04 not really a zip of arrays")
+    elif kind == "bare":
+        np.save(tmp_path / "bare.npy", np.arange(3))
+        (tmp_path / "bare.npy").rename(source)
+    elif kind == "pickled":
+        with open(source, "wb") as file:
+            np.savez(file, format=np.array({"a": 1}, dtype=object), values=np.array([None]))
+    files = {} if kind in ("missing", "folder") else {source.name: source.read_bytes()}
+    out = [] if command in ("inspect", "view") else ["-o", tmp_path / "out.npz"]
+    assert_refused(run(command, source, *out), source.name, tmp_path, files)
+
+
+def test_one_kind_for_another(run, egg, field, scene, tmp_path):
+    for command, source in (("inspect", field), ("view", egg), ("view", field)):
+        answer = run(command, source)
+        assert answer.code == 2
+        assert source.name in answer.err
+    for source in (field, egg.with_suffix(".toml")):
+        answer = run("simulate", source, "-o", tmp_path / "run.npz")
+        assert answer.code == 2
+        assert source.name in answer.err
+    assert list(tmp_path.iterdir()) == [scene]
+
+
+def test_bad_outputs(run, egg, field, scene, tmp_path):
+    copy = Path(shutil.copy(field, tmp_path / "field.npz"))
+    (tmp_path / "folder").mkdir()
+    files = {path.name: path.read_bytes() for path in (copy, scene)}
+    bad = {
+        tmp_path / "folder": "must be a file",
+        tmp_path / "nowhere" / "out": "existing directory",
+        copy: "must not be the input",
+    }
+    for output, message in bad.items():
+        assert_refused(run("build", copy, "-o", output), message, tmp_path, files)
+    for output, message in list(bad.items())[:2]:
+        assert_refused(run("simulate", scene, "-o", output), message, tmp_path, files)
+        assert_refused(run("inspect", egg, "--png", output), message, tmp_path, files)
+    for option, name, message in (
+        ("--video", "run.gif", "must end in .mp4"),
+        ("--strip", "run.jpg", "must end in .png"),
+        ("--video", "folder", "must be a file"),
+    ):
+        answer = run("simulate", scene, "-o", tmp_path / "run.npz", option, tmp_path / name)
+        assert_refused(answer, message, tmp_path, files)
+    assert_refused(run("demo", "-o", copy), "must be a folder", tmp_path, files)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--steps", "0"), "n_steps must be ≥ 1, got 0"),
+        (("--timestep", "0"), "timestep must be finite and > 0 s, got 0.0"),
+        (("--timestep", "nan"), "timestep must be finite and > 0 s, got nan"),
+        (("--timestep", "2.5"), "state.omega must be below 2/timestep"),
+        (("--slow-motion", "0"), "slow_motion must be > 0, got 0.0"),
+    ],
+)
+def test_bad_options(options, message, run, scene, tmp_path):
+    files = {scene.name: scene.read_bytes()}
+    answer = run("simulate", scene, "-o", tmp_path / "run.npz", *options)
+    assert_refused(answer, message, tmp_path, files)
+
+
+def test_pictures_without_their_packages(run, egg, scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("dano.cli._outputs.find_spec", lambda name: None)
+    files = {scene.name: scene.read_bytes()}
+    answer = run("simulate", scene, "-o", tmp_path / "run.npz", "--video", tmp_path / "run.mp4")
+    assert_refused(answer, "pip install 'dano[view]'", tmp_path, files)
+    assert_refused(run("inspect", egg, "--png", tmp_path / "a.png"), "dano[view]", tmp_path, files)
+    # Not asked for, not missed.
+    answer = run("inspect", egg)
+    assert answer.code == 0
+    assert "warning: not drawn" in answer.err

@@ -1,0 +1,174 @@
+import socket
+import urllib.request
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dano
+from dano.report import draw_object, render_trajectory, view
+from dano.report._object import with_error
+from dano.report._resample import frame_times, poses_at, slerp
+
+av = pytest.importorskip("av")
+Image = pytest.importorskip("PIL.Image")
+
+SIZE = (96, 64)
+
+
+@pytest.fixture(scope="module")
+def run() -> tuple[dano.Scene, dano.Trajectory]:
+    """A ball that rolls over a floor, by hand: 0.5 s in steps of 10 ms."""
+    scene = dano.Scene.create(
+        bodies=[
+            dano.Body("ball", dano.Sphere(0.2), mass=1.0),
+            dano.Body("floor", dano.HalfSpace(), fixed=True),
+        ],
+        contacts=[dano.Contact("ball", "floor")],
+        timestep=0.01,
+    )
+    times = 0.01 * jnp.arange(51.0)
+    position = jnp.zeros((51, 2, 3)).at[:, 0, 0].set(2 * times - 0.5).at[:, 0, 2].set(0.199)
+    orientation = jnp.zeros((51, 2, 4)).at[:, :, 0].set(1.0)
+    angle = 10 * times
+    orientation = orientation.at[:, 0, 0].set(jnp.cos(angle / 2)).at[:, 0, 2].set(jnp.sin(angle / 2))
+    velocity = jnp.zeros((51, 2, 3)).at[:, 0, 0].set(2.0)
+    omega = jnp.zeros((51, 2, 3)).at[:, 0, 1].set(10.0)
+    states = dano.State(position, orientation, velocity, omega)
+    ones = jnp.ones(50)
+    return scene, dano.Trajectory(times, states, 0 * ones, ones.astype(int), ones > 0, scene.names)
+
+
+@pytest.fixture(scope="module")
+def cube() -> dano.NeuralObject:
+    rng = np.random.default_rng(0)
+    values = np.zeros((12, 12, 12))
+    values[3:9, 3:9, 3:9] = 40.0
+    field = dano.GridField(values, (-0.11, -0.11, -0.11), 0.02)
+    normals = rng.normal(size=(200, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = 0.05 * normals / np.abs(normals).max(axis=1, keepdims=True)
+    return dano.NeuralObject.from_samples(
+        points=points,
+        density=rng.uniform(1, 30, 200),
+        normals=normals,
+        mass=0.3,
+        com=(0, 0, 0),
+        inertia=np.diag([1e-3, 2e-3, 2.5e-3]),
+        field=field,
+    )
+
+
+def test_video_has_every_frame_and_moves(run, tmp_path):
+    path, strip, told = tmp_path / "run.mp4", tmp_path / "run.png", []
+    render_trajectory(
+        *run, path, fps=20, size=SIZE, slow_motion=1.5, strip=strip, progress=lambda *x: told.append(x)
+    )
+    with av.open(path) as container:
+        stream = container.streams.video[0]
+        assert (stream.width, stream.height, stream.pix_fmt) == (*SIZE, "yuv420p")
+        frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(stream)]
+    assert len(frames) == 16  # 0.5 s · 1.5 · 20 Hz, and the first
+    # The orange ball moves to the right of the picture and its contact arrow with it.
+    columns = [
+        np.mean(np.nonzero((f[..., 0] - f[..., 2]) > 60)[1]) for f in (frames[0], frames[7], frames[-1])
+    ]
+    assert columns[0] + 10 < columns[1] < columns[2] - 10
+    assert told[-1] == ("drawing", 1.0)
+    with Image.open(strip) as sheet:
+        assert sheet.width >= 3 * SIZE[0] and sheet.height >= 2 * SIZE[1]
+    assert sorted(tmp_path.iterdir()) == [path, strip]
+
+
+def test_an_interrupted_video_leaves_what_was_there(run, tmp_path):
+    path = tmp_path / "run.mp4"
+    path.write_bytes(b"old")
+
+    def interrupt(_: str, share: float) -> None:
+        if share > 0.3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render_trajectory(*run, path, fps=10, size=SIZE, contact_points=False, progress=interrupt)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("missing/run.mp4", {}, "existing directory"),
+        ("run.avi", {}, "must end in .mp4"),
+        ("run.mp4", {"size": (95, 64)}, "even"),
+        ("run.mp4", {"fps": 0}, "fps must be positive"),
+        ("run.mp4", {"slow_motion": -1.0}, "slow_motion must be positive"),
+        ("run.mp4", {"colours": {"cat": "#000000"}}, "body must be one of"),
+        (None, {}, "path or strip"),
+    ],
+)
+def test_bad_videos_are_refused(run, tmp_path, name, options, message):
+    with pytest.raises(ValueError, match=message):
+        render_trajectory(*run, None if name is None else tmp_path / name, **{"size": SIZE} | options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_frames_fall_between_steps(run):
+    _, trajectory = run
+    times = frame_times(trajectory, 30, 1.0)
+    position, orientation = poses_at(trajectory, times)
+    np.testing.assert_allclose(position[:, 0, 0], 2 * times - 0.5, atol=1e-12)
+    expected = np.stack([np.cos(5 * times), 0 * times, np.sin(5 * times), 0 * times], axis=1)
+    np.testing.assert_allclose(orientation[:, 0], expected, atol=1e-12)
+    # The shorter way, also when the two quaternions have opposite signs.
+    np.testing.assert_allclose(slerp(expected[1], -expected[2], np.array([0.0])), expected[1], atol=1e-12)
+
+
+def test_object_figure_is_a_picture(cube, tmp_path):
+    path = tmp_path / "cube.png"
+    draw_object(cube, path, title="cube")
+    with Image.open(path) as picture:
+        assert picture.size == (1496, 924)
+        pixels = np.asarray(picture.convert("RGB"))
+    assert 0.1 < np.mean((pixels < 250).any(axis=2)) < 0.9
+    with pytest.raises(ValueError, match="must end in .png"):
+        draw_object(cube, tmp_path / "cube.jpg")
+    with pytest.raises(ValueError, match="existing directory"):
+        draw_object(cube, tmp_path / "missing" / "cube.png")
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [(0.42131, 0.0007, "0.42131 ± 0.00070"), (12.3456, 0.2, "12.35 ± 0.20"), (2.5, 0.0, "2.5")],
+)
+def test_numbers_have_as_many_digits_as_their_error_allows(value, error, text):
+    assert with_error(value, error) == text
+
+
+def test_viewer_serves_a_page_and_stops(run):
+    pytest.importorskip("viser")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    viewer = view(*run, port=port, block=False)
+    try:
+        with urllib.request.urlopen(viewer.url, timeout=10) as answer:
+            assert answer.status == 200
+    finally:
+        viewer.stop()
+    viewer.stop()
+    with pytest.raises(OSError):
+        urllib.request.urlopen(viewer.url, timeout=2)
+    with pytest.raises(ValueError, match="port must lie"):
+        view(*run, port=0)
+
+
+def test_meshes_of_shapes_lie_on_their_surface():
+    from dano.report._viewer import surface_mesh
+
+    for shape in (dano.Box((0.3, 0.2, 0.1)), dano.Capsule(0.1, 0.3), dano.Sphere(0.2)):
+        vertices, faces = surface_mesh(shape)
+        distance = np.asarray(shape.sdf_jet(jnp.asarray(vertices.T, dtype=jnp.float64), 0))
+        assert np.abs(distance).max() < 1e-5
+        # Closed and outward: the volume is that of the solid, less what flat triangles cut off.
+        volume = np.sum(np.linalg.det(vertices[faces].astype(np.float64))) / 6
+        assert volume == pytest.approx(float(shape.solid_moments().volume), rel=0.03)

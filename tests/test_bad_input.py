@@ -1,0 +1,183 @@
+"""Bad input through the Python interface: an error before any work starts, which names what is wrong."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dano
+from dano.fields import load_field, save_field
+
+FLOOR = dano.Body("floor", dano.HalfSpace(), fixed=True)
+
+
+def ball(name: str = "ball") -> dano.Body:
+    return dano.Body(name, dano.Sphere(0.1), mass=1.0)
+
+
+def scene() -> dano.Scene:
+    return dano.Scene.create([ball(), FLOOR], [dano.Contact("ball", "floor")], timestep=0.01)
+
+
+def grid(value: float | None = None) -> dano.GridField:
+    values = np.zeros((8, 8, 8))
+    values[2:6, 2:6, 2:6] = 50.0
+    if value is not None:
+        values[3, 3, 3] = value
+    return dano.GridField(values, (0.0, 0.0, 0.0), 0.01)
+
+
+def built(field: dano.AbstractField, **options) -> dano.NeuralObject:
+    return dano.NeuralObject.from_field(field, **{"n_samples": 50, "resolution": 8, **options})
+
+
+class Spoilt(dano.AbstractField):
+    """A density that is wrong somewhere, as a user's own function may be."""
+
+    value: float
+
+    @property
+    def bounds(self):
+        return jnp.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+
+    def density(self, x):
+        return jnp.where(jnp.sum(x * x) < 0.5, self.value, 1.0)
+
+
+class Nothing(Spoilt):
+    """Empty space."""
+
+    def density(self, x):
+        return jnp.zeros_like(x[0])
+
+
+def state(**changes) -> dano.State:
+    return scene().initial_state(ball=changes)
+
+
+def with_state(name: str, value: float) -> dano.State:
+    good = state()
+    return jax.tree.map(lambda x: jnp.full_like(x, value) if x is getattr(good, name) else x, good)
+
+
+CASES = {
+    "NaN on a grid": (lambda: grid(np.nan), "finite"),
+    "negative on a grid": (lambda: grid(-1.0), "≥ 0"),
+    "empty grid": (lambda: dano.GridField(np.zeros((4, 4, 4)), (0.0, 0.0, 0.0), 0.1), "zero"),
+    "NaN density": (lambda: built(Spoilt(float("nan"))), "finite densities, got nan"),
+    "negative density": (lambda: built(Spoilt(-2.0)), "densities ≥ 0, got -2.0"),
+    "empty field": (lambda: built(Nothing(0.0)), "positive density somewhere"),
+    "no sample": (lambda: built(grid(), density_range=(60.0, 70.0)), "density_range"),
+    "range reversed": (lambda: built(grid(), density_range=(2.0, 1.0)), "0 ≤ low < high, got (2.0, 1.0)"),
+    "unbounded field": (lambda: built(dano.HalfSpace()), "finite bounds"),
+    "body without mass": (lambda: dano.Body("x", dano.Sphere(0.1)), "mass of body 'x' must be given"),
+    "field as body": (lambda: dano.Body("x", grid(), mass=1.0), "NeuralObject.from_field"),
+    "negative friction": (lambda: dano.ContactParams(sliding_friction=-0.2), "sliding_friction"),
+    "infinite spring": (lambda: dano.ContactParams(spring=float("inf")), "spring must be finite"),
+    "unknown body": (
+        lambda: dano.Scene.create([ball(), FLOOR], [dano.Contact("ball", "flor")]),
+        "['ball', 'floor'], got 'flor'",
+    ),
+    "two names": (lambda: dano.Scene.create([ball(), ball()]), "different names, got 'ball' 2 times"),
+    "pair twice": (
+        lambda: dano.Scene.create(
+            [ball(), FLOOR], [dano.Contact("ball", "floor"), dano.Contact("floor", "ball")]
+        ),
+        "each pair once",
+    ),
+    "no timestep": (lambda: dano.Scene.create([ball()], timestep=0.0), "timestep must be"),
+    "infinite position": (lambda: state(position=(0.0, np.inf, 0.0)), "position of 'ball' must be finite"),
+    "NaN velocity": (lambda: state(velocity=(np.nan, 0.0, 0.0)), "velocity of 'ball' must be finite"),
+    "zero quaternion": (lambda: state(orientation=(0.0, 0.0, 0.0, 0.0)), "non-zero quaternion"),
+    "fast spin": (lambda: state(omega=(0.0, 201.0, 0.0)), "below 2/timestep = 200 rad/s, got 201"),
+    "unknown quantity": (lambda: state(speed=(0.0, 0.0, 0.0)), "got 'speed'"),
+    "simulate NaN": (lambda: dano.simulate(scene(), with_state("velocity", np.nan), 3), "state.velocity"),
+    "step NaN": (lambda: dano.step(scene(), with_state("position", np.inf)), "state.position must be finite"),
+    "simulate fast spin": (lambda: dano.simulate(scene(), with_state("omega", 150.0), 3), "2/timestep"),
+    "no steps": (lambda: dano.simulate(scene(), state(), 0), "n_steps must be ≥ 1, got 0"),
+    "replaced friction": (
+        lambda: scene().replace_contact("ball", "floor", sliding_friction=-1.0),
+        "≥ 0, got -1.0",
+    ),
+    "replaced pair": (lambda: scene().replace_contact("ball", "wall", spring=1.0), "('ball', 'wall')"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_values(case):
+    act, message = CASES[case]
+    with pytest.raises(ValueError) as caught:
+        act()
+    assert message in str(caught.value)
+
+
+READERS = {"field.npz": load_field, "object.dano": dano.NeuralObject.load, "run.npz": dano.Trajectory.load}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_bad_files(name, tmp_path):
+    good = {"field.npz": lambda path: save_field(grid(), path), "object.dano": built(grid()).save}
+    good["run.npz"] = dano.simulate(scene(), state(), 3).save
+    path = tmp_path / name
+    with pytest.raises(ValueError, match=name):
+        READERS[name](path)
+    path.mkdir()
+    with pytest.raises(ValueError, match=name):
+        READERS[name](path)
+    path.rmdir()
+    good[name](path)
+    READERS[name](path)
+    whole = path.read_bytes()
+    for share in (0.02, 0.5, 0.99):
+        path.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(ValueError, match=name):
+            READERS[name](path)
+    # A spoilt byte in each part of the file: refused, or without effect, but never another error.
+    for place in np.linspace(10, len(whole) - 10, 23).astype(int):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x5A]) + whole[place + 1 :])
+        try:
+            READERS[name](path)
+        except ValueError as error:
+            assert name in str(error)
+    for other in READERS:
+        if other != name:
+            good[other](tmp_path / "other.npz")
+            path.write_bytes((tmp_path / "other.npz").read_bytes())
+            with pytest.raises(ValueError, match=name):
+                READERS[name](path)
+    np.save(tmp_path / "bare.npy", np.arange(3))
+    path.write_bytes((tmp_path / "bare.npy").read_bytes())
+    with pytest.raises(ValueError, match=name):
+        READERS[name](path)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_directory_as_output(name, tmp_path):
+    save = {
+        "field.npz": lambda path: save_field(grid(), path),
+        "object.dano": lambda path: built(grid()).save(path),
+        "run.npz": lambda path: dano.simulate(scene(), state(), 3).save(path),
+    }[name]
+    (tmp_path / name).mkdir()
+    with pytest.raises(ValueError, match=name):
+        save(tmp_path / name)
+    with pytest.raises(ValueError, match="nowhere"):
+        save(tmp_path / "nowhere" / name)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "object.dano"
+    made = built(grid())
+    made.save(path)
+    before = path.read_bytes()
+
+    def full_disk(file, **_):
+        file.write(b"half")
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full_disk)
+    with pytest.raises(OSError, match="no space"):
+        made.save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,73 @@
+"""Every example runs, and its numbers obey physics."""
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def run(name: str) -> dict:
+    return runpy.run_path(str(EXAMPLES / f"{name}.py"))["main"](quick=True)
+
+
+def test_every_example_is_tested():
+    tested = {name.removeprefix("test_") for name in globals() if name.startswith("test_")}
+    assert {path.stem[3:] for path in EXAMPLES.glob("*.py")} <= tested
+
+
+def test_drop():
+    answer = run("01_drop")
+    assert answer["unconverged_steps"] == 0
+    # At rest the floor carries the weight; on the way there it stopped the fall.
+    assert answer["carried_weight"] == pytest.approx(1, abs=0.02)
+    assert answer["largest_force"] > 3 * 9.81
+    assert answer["speed"] < 0.01
+    assert 0.02 < answer["height"] < 0.08
+
+
+def test_gradient_of_a_slide():
+    answer = run("02_gradient_of_a_slide")
+    assert answer["forward"] == pytest.approx(answer["reverse"], rel=1e-8)
+    assert answer["reverse"] == pytest.approx(answer["difference"], rel=0.1)
+    # Coulomb's point mass does not rock on its feet.
+    assert answer["distance"] == pytest.approx(answer["coulomb_distance"], rel=0.1)
+    assert answer["reverse"] == pytest.approx(answer["coulomb_slope"], rel=0.3)
+
+
+def test_two_bunnies():
+    answer = run("03_two_bunnies")
+    assert answer["unconverged_steps"] == 0
+    assert answer["steps_in_contact"] > 5
+    assert answer["exchanged_momentum"] > 0.3
+    assert answer["linear_drift"] < 1e-10
+    assert answer["angular_drift"] < 1e-10
+
+
+def test_own_field():
+    answer = run("04_own_field")
+    assert answer["unconverged_steps"] == 0
+    assert answer["bake_error_rms"] < 0.05
+    assert abs(answer["bake_error_mass"]) < 0.002
+    assert answer["inertia_error"] < 0.005
+    assert answer["com_offset"] < 1e-5
+    assert answer["height_at_rest"] == pytest.approx(0.02, abs=0.002)
+
+
+def test_batch_of_rollouts():
+    answer = run("05_batch_of_rollouts")
+    assert answer["converged"]
+    distances = np.array(answer["distances"])
+    assert np.all(np.diff(distances) < 0)
+    np.testing.assert_allclose(distances, 0.5**2 / (2 * np.array(answer["frictions"]) * 9.81), rtol=0.1)
+
+
+def test_linearize_and_control():
+    answer = run("06_linearize_and_control")
+    assert answer["unconverged_steps"] == 0
+    assert answer["largest_eigenvalue"] < 1
+    assert answer["largest_offset"] > 0.01
+    assert answer["final_offset"] < 1e-3
+    assert answer["final_spin"] < 0.01

@@ -1,0 +1,133 @@
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dano import Box, GridField, HalfSpace, Pose, Sphere
+from dano.vision import Camera, Item, level_surface, render
+from dano.vision._rays import CHUNK, Placed, transmitted
+from dano.vision._render import _first_hits
+
+EYE = np.eye(3, dtype=np.float32)
+ZERO = np.zeros(3, dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def ball() -> Item:
+    return Item(Sphere(0.4), Pose(), "#ff0000")
+
+
+def test_silhouette_of_a_sphere_has_the_projected_area(ball):
+    camera = Camera((0.0, -2.0, 0.0), vertical_fov=0.6, width=120, height=100)
+    # A ball of radius r at distance d fills a cone of half angle asin(r/d).
+    radius = math.tan(math.asin(0.4 / 2.0)) / camera.pixel_angle
+    empty = render([], camera, floor=False)
+    crisp = (render([ball], camera, floor=False, antialias=False) != empty).any(axis=2)
+    assert crisp.sum() == pytest.approx(math.pi * radius**2, rel=0.008)
+    # Smoothing changes pixels on the edge only.
+    smooth = (render([ball], camera, floor=False) != empty).any(axis=2)
+    assert 0 < (smooth & ~crisp).sum() < 4 * math.pi * radius
+
+
+def test_rays_meet_a_box_where_the_slabs_do():
+    rng = np.random.default_rng(0)
+    angle, half = 0.7, np.array([0.5, 0.3, 0.2])
+    item = Item(Box(half), Pose((0.1, 0.2, 0.3), (math.cos(angle / 2), 0, 0, math.sin(angle / 2))))
+    rotation = np.array(
+        [[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]]
+    )
+    origin = np.array([-1.5, -2.0, 1.2])
+    towards = np.array([0.1, 0.2, 0.3]) + rng.uniform(-0.8, 0.8, (3000, 3)) - origin
+    d = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    o, local = (origin - [0.1, 0.2, 0.3]) @ rotation, d @ rotation
+    near, far = np.sort(np.stack([(-half - o) / local, (half - o) / local]), axis=0)
+    enter, leave = near.max(axis=1), far.min(axis=1)
+    placed = Placed(item.shape, rotation.astype(np.float32), np.array([0.1, 0.2, 0.3], dtype=np.float32))
+    everywhere, index = np.full(3000, np.inf, dtype=np.float32), np.arange(3000)
+    hit, t = _first_hits(
+        placed, origin.astype(np.float32), d.T.astype(np.float32), everywhere, index, np.float32(1e-4)
+    )
+    assert set(hit) == set(np.flatnonzero(enter < leave - 2e-3)) | (
+        set(hit) & set(np.flatnonzero(enter < leave + 1e-3))
+    )
+    np.testing.assert_allclose(t, enter[hit], atol=1e-3)
+
+
+def test_a_slab_lets_through_what_beer_and_lambert_say():
+    # 4 nodes of 2.0 at a distance of 0.1 m: ∫φ dz = 0.8 in the middle, whatever the spline does at the faces.
+    field = GridField(np.full((9, 9, 4), 2.0, dtype=np.float32), (-0.4, -0.4, -0.15), np.float32(0.1))
+    start = np.zeros((3, CHUNK), dtype=np.float32)
+    start[2] = -1.0
+    up = np.zeros_like(start)
+    up[2] = 1.0
+    far = np.full(CHUNK, np.inf, dtype=np.float32)
+    item = Item(field, density_scale=1.5)
+    opacity, depth, normal = transmitted(
+        item.medium, *(jnp.asarray(x) for x in (np.float32(1.5), EYE, ZERO, start, up, far))
+    )
+    assert float(opacity[0]) == pytest.approx(1 - math.exp(-1.5 * 0.8), rel=1e-3)
+    assert 0.7 < float(depth[0]) < 1.0
+    np.testing.assert_allclose(np.asarray(normal[:, 0]), (0, 0, -1), atol=1e-3)
+    picture = render([item], Camera((0, 0, 3), width=32, height=32), floor=False)
+    assert picture[16, 16].astype(int).sum() < picture[0, 0].astype(int).sum() - 60
+
+
+def test_the_shadow_lies_opposite_to_the_lamp():
+    light = np.array([1.0, 0.3, 1.5])
+    item = Item(Sphere(0.2), Pose((0.0, 0.0, 0.5)))
+    camera = Camera((0.0, -2.5, 4.0), (0.0, 0.0, 0.0), width=160, height=120)
+    bare, shadowed = (render(items, camera, light=light).astype(int).sum(axis=2) for items in ([], [item]))
+    spot = np.array([[-0.5 / 1.5 * 1.0, -0.5 / 1.5 * 0.3, 0.0], [0.5 / 1.5 * 1.0, 0.5 / 1.5 * 0.3, 0.0]])
+    (x, y), (x_other, y_other) = camera.project(spot)[:, :2].astype(int)
+    assert shadowed[y, x] < 0.8 * bare[y, x]
+    assert shadowed[y_other, x_other] == pytest.approx(bare[y_other, x_other], abs=12)
+
+
+def test_level_surface_of_a_smooth_density_is_where_the_density_says():
+    line = np.linspace(-1, 1, 41)
+    x, y, z = np.meshgrid(line, line, line, indexing="ij")
+    values = 100 * np.exp(-6 * (x**2 + y**2 + z**2))
+    radius = math.sqrt(math.log(100 / 20.0) / 6)
+    surface = level_surface(GridField(values, (-1, -1, -1), 0.05), 20.0)
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(3, 200))
+    points *= radius / np.linalg.norm(points, axis=0)
+    points = jnp.asarray(np.concatenate([points, np.zeros((3, 1))], axis=1), jnp.float32)
+    distance = np.asarray(jax.jit(lambda x: surface.sdf_jet(x, 0))(points))
+    assert np.abs(distance[:-1]).max() < 0.2 * 0.05
+    assert distance[-1] < -0.8 * radius
+
+
+def test_haze_below_the_level_is_not_drawn(ball):
+    values = np.full((12, 12, 12), 0.5)
+    values[4:8, 4:8, 4:8] = 50.0
+    item = Item(GridField(values, (-0.55, -0.55, -0.55), 0.1), level=5.0)
+    # Up to a corner of the block, √3 · 0.2 m away, and one cell of smoothing.
+    assert item.radius < 0.6
+    with pytest.raises(ValueError, match="level must be at most"):
+        Item(GridField(values, (0, 0, 0), 0.1), level=1e3)
+
+
+def test_planes_are_known_wherever_they_are_put():
+    half = math.sqrt(0.5)
+    plane = Item(HalfSpace((0, 0, 1), 0.2), Pose((1.0, 2.0, 3.0), (half, half, 0, 0))).plane
+    # Turned by 90° about x: z becomes −y; the plane passes 0.2 above the new origin along it.
+    np.testing.assert_allclose(plane, (0, -1, 0, 0.2 - 2.0), atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Item(Sphere(0.1), colour="red"), "colour must be"),
+        (lambda: Item(Sphere(0.1), colour=(2, 0, 0)), "colour must have"),
+        (lambda: Item(Sphere(0.1), level=1.0, density_scale=1.0), "excludes"),
+        (lambda: Item(Sphere(0.1), level=-1.0), "level must be positive"),
+        (lambda: Item(HalfSpace(), density_scale=1.0), "finite bounds"),
+        (lambda: render([], Camera((1, 0, 0)), light=(0, 0, 0)), "light must be"),
+    ],
+)
+def test_bad_pictures_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
