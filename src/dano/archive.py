@@ -4,6 +4,7 @@ import contextlib
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
@@ -87,11 +88,13 @@ def read_archive(path: str | os.PathLike[str], form: str, version: int) -> dict[
     """
     source = checked_input(path)
     try:
-        with np.load(source, allow_pickle=False) as archive:
+        # Opened here, because NumPy leaves its own handle open when the content turns out to be foreign.
+        with open(source, "rb") as file:
+            archive = np.load(file, allow_pickle=False)
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise ValueError("it holds one bare array")
             data = {name: archive[name] for name in archive.files}
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, KeyError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError, NotImplementedError) as error:
         raise ValueError(f"{source} is not a readable {form} file: {error}") from error
     found = str(data.get("format", "of no stated format"))
     if found != form:

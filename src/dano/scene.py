@@ -442,7 +442,7 @@ class Scene(eqx.Module):
                 checked_inertia(key, value)
         return eqx.tree_at(lambda s: [getattr(s.bodies[i], key) for key in keys], self, values)
 
-    def initial_state(self, **bodies: dict[str, Numbers]) -> State:
+    def initial_state(self, /, **bodies: dict[str, Numbers]) -> State:
         """A state: bodies by keyword, each a dict of `position, orientation, velocity, omega`; the rest at the origin.
 
         Orientations are normalised.
@@ -501,7 +501,7 @@ class Scene(eqx.Module):
                     f"state.omega must be below 2/timestep = {limit:.6g} rad/s, got {fastest:.6g}; take a smaller timestep"
                 )
 
-    def control(self, **bodies: dict[str, Numbers]) -> Control:
+    def control(self, /, **bodies: dict[str, Numbers]) -> Control:
         """Control for one step: bodies by keyword, each a dict of `force` [N, W] and `torque` [N m, W].
 
         Raises:

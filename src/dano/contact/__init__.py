@@ -7,4 +7,4 @@ from dano.contact._laws import (
     ContactParams as ContactParams,
     non_negative as non_negative,
 )
-from dano.contact._overlap import Patch as Patch, overlap as overlap
+from dano.contact._overlap import KEPT as KEPT, overlap as overlap, Patch as Patch

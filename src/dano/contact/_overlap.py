@@ -13,6 +13,7 @@ samples, so that neither autodiff mode ever stores anything of the size of the s
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from dano.contact._colliders import BLOCK, Collider, SampleSet, Support
@@ -41,6 +42,9 @@ class _Side(eqx.Module):
     moments: Float[Array, "4"]
     direction: Float[Array, "3"]
 
+
+# Name of the values that reverse mode keeps instead of computing them again: results of passes over samples, of solves.
+KEPT = "kept"
 
 # Below this share of a body's mass an overlap counts as none: ψ² must not underflow where χ = S/ψ is differentiated.
 _NEGLIGIBLE = 1e-12
@@ -154,8 +158,8 @@ def _planar_jvp(primals, tangents):
     # dS = M dplane with the symmetric 4×4 moment matrix of the samples in the smoothing band.
     distance = plane @ points
     phi, slope = jax.jvp(lambda s: occupancy(s, 1.0), (distance,), (jnp.ones_like(distance),))
-    matrix = second_moments(weights * slope, points)
-    return contract(weights * phi, points), matvec(matrix, tangents[0])
+    moments, matrix = _keep(contract(weights * phi, points), second_moments(weights * slope, points))
+    return moments, matvec(matrix, tangents[0])
 
 
 def _planar_moments(plane, points, weights):
@@ -174,7 +178,7 @@ def _dense_jvp(primals, tangents):
     d_to_field, d_field, _, _ = tangents
     x = _transform(to_field, points)
     value, jacobian = jax.vmap(_value_and_jacobian, (None, 1), -1)(field, x)
-    sums, derivative = _accumulate(value, jacobian, points, weights)
+    sums, derivative = _keep(*_accumulate(value, jacobian, points, weights))
     tangent = jnp.zeros_like(sums)
     if d_to_field is not None:
         tangent = tangent + jnp.einsum("kab,ab->k", derivative, d_to_field)
@@ -218,7 +222,7 @@ def _culled(to_field, field, samples, support):
 
 @_culled.def_jvp
 def _culled_jvp(primals, tangents):
-    sums, derivative = _culled_sums(*primals, derivative=True)
+    sums, derivative = _keep(*_culled_sums(*primals, derivative=True))
     d_to_field = tangents[0]
     if d_to_field is None:
         return sums, jnp.zeros_like(sums)
@@ -265,6 +269,11 @@ def _accumulate(value, jacobian, points, weights):
     of_moments = jnp.stack([second_moments(weighted[0, a], points) for a in range(3)], axis=1)
     of_direction = jnp.stack([jnp.stack([contract(row, points) for row in rows]) for rows in weighted[1:]])
     return sums, jnp.concatenate([of_moments, of_direction])
+
+
+def _keep(*values: Array) -> tuple[Array, ...]:
+    """Mark what a rollout's reverse mode keeps of a step: everything else is cheap to compute again."""
+    return tuple(checkpoint_name(value, KEPT) for value in values)
 
 
 def _transform(to_field: Float[Array, "3 4"], points: Float[Array, "4 n"]) -> Float[Array, "3 n"]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.contact import Patch
+from dano.contact import KEPT, Patch
 from dano.engine import _variational
 from dano.engine._variational import Report
 from dano.maths import is_traced, quat_conjugate, quat_multiply, safe_norm
@@ -198,8 +198,12 @@ def _jitted_rollout(engine, scene, state, controls, n_steps, segment):
         following, report = engine.step(scene, state, control)
         return following, (following, report)
 
+    # Reverse mode keeps the few numbers that are dear and computes the rest of a step again: storing every
+    # intermediate of every step costs more time than computing it, and ten times the memory.
+    step = jax.checkpoint(advance, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(KEPT))
+
     def scan(state, inputs):
-        return jax.lax.scan(advance, state, inputs)
+        return jax.lax.scan(step, state, inputs)
 
     steps = jnp.arange(n_steps, dtype=scene.timestep.dtype), None if callable(controls) else controls
     if segment is None or segment >= n_steps:

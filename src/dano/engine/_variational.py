@@ -18,9 +18,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.contact import AbstractContactLaw, ContactParams, overlap, Patch
+from dano.contact import AbstractContactLaw, ContactParams, KEPT, overlap, Patch
 from dano.contact._small import matmul, matvec
 from dano.maths import quat_multiply, quat_to_matrix, skew
 from dano.scene import colliders, Control, Scene, State
@@ -342,10 +343,11 @@ def _solve(problem: _Problem, start: Float[Array, "m 6"], pairs: _Pairs, options
         d_report = jax.tree.map(lambda _: None, report)
         if not jax.tree.leaves(d_problem):
             return (velocities, report), (jnp.zeros_like(velocities), d_report)
-        of_problem = lambda p: _residual(velocities, eqx.combine(p, static), pairs)[0]  # noqa: E731
-        _, change = jax.jvp(of_problem, (dynamic,), (d_problem,))
         # The inverse, not a solve: the tangent must be linear in `change` for reverse mode to transpose it.
         inverse = solve_small(jacobian, jnp.eye(jacobian.shape[0], dtype=jacobian.dtype))
+        velocities, inverse = (checkpoint_name(value, KEPT) for value in (velocities, inverse))
+        of_problem = lambda p: _residual(velocities, eqx.combine(p, static), pairs)[0]  # noqa: E731
+        _, change = jax.jvp(of_problem, (dynamic,), (d_problem,))
         tangent = -matvec(inverse, change).reshape(velocities.shape)
         return (velocities, report), (tangent, d_report)
 
@@ -358,18 +360,29 @@ _UNROLLED = 12
 
 
 def solve_small(matrix: Float[Array, "n n"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """Solution of a small dense system with k right-hand sides; Gauss–Jordan without row exchanges up to 12 unknowns, LAPACK beyond.
+    """Solution of a small dense system with k right-hand sides; n is a multiple of three.
 
-    The matrices here are inertia plus dissipation: their symmetric part is positive, so pivots stay away from zero.
+    Up to 12 unknowns by Gauss–Jordan elimination with 3×3 pivots (a body's translation, its rotation) and without
+    exchanges, LAPACK beyond. The matrices here are inertia plus dissipation: their symmetric part is positive, so
+    pivots stay away from singular.
     """
     n = matrix.shape[0]
     if n > _UNROLLED:
         return jnp.linalg.solve(matrix, right)
     augmented = jnp.concatenate([matrix, right], axis=1)
-    for i in range(n):
-        factor = jnp.where(np.arange(n) == i, 0, augmented[:, i] / augmented[i, i])
-        augmented = augmented - factor[:, None] * augmented[i][None]
-    return augmented[:, n:] / jnp.diagonal(augmented)[:, None]
+    for start in range(0, n, 3):
+        rows = slice(start, start + 3)
+        pivot_rows = matmul(_inverse3(augmented[rows, rows]), augmented[rows])
+        factor = jnp.where((np.arange(n) // 3 == start // 3)[:, None], 0, augmented[:, rows])
+        reduced = augmented - matmul(factor, pivot_rows)
+        augmented = jnp.concatenate([reduced[:start], pivot_rows, reduced[start + 3 :]])
+    return augmented[:, n:]
+
+
+def _inverse3(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Inverse of a 3×3 matrix by cofactors."""
+    rows = jnp.stack([jnp.cross(m[:, 1], m[:, 2]), jnp.cross(m[:, 2], m[:, 0]), jnp.cross(m[:, 0], m[:, 1])])
+    return rows / jnp.sum(m[:, 0] * rows[0])
 
 
 def _advance(state: State, velocities: Float[Array, "m 6"], h: Float[Array, ""], pairs: _Pairs) -> State:

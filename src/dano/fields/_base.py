@@ -3,6 +3,7 @@
 import abc
 import functools
 from collections.abc import Callable
+from typing import Any, TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -11,12 +12,16 @@ from jaxtyping import Array, Float
 
 from dano.maths import safe_normalize
 
-Jet = (
-    Float[Array, " n"]
-    | tuple[Float[Array, " n"], Float[Array, "3 n"]]
-    | tuple[Float[Array, " n"], Float[Array, "3 n"], Float[Array, "3 3 n"]]
-)
-"""φ, (φ, ∇φ) or (φ, ∇φ, ∇∇φ) of n points, structure-of-arrays: the points are the last axis."""
+if TYPE_CHECKING:
+    # The length of a jet depends on the value of `order`; types follow it only with overloads in every class.
+    Jet = Any
+else:
+    Jet = (
+        Float[Array, " n"]
+        | tuple[Float[Array, " n"], Float[Array, "3 n"]]
+        | tuple[Float[Array, " n"], Float[Array, "3 n"], Float[Array, "3 3 n"]]
+    )
+    """φ, (φ, ∇φ) or (φ, ∇φ, ∇∇φ) of n points, structure-of-arrays: the points are the last axis."""
 
 
 def unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:

@@ -38,7 +38,7 @@ class CallableField(AbstractField):
     """
 
     module: Any
-    function: Callable | None = eqx.field(static=True)
+    function: Any = eqx.field(static=True)
     box: Float[Array, "2 3"]
     framework: Framework = eqx.field(static=True)
     step: float = eqx.field(static=True)
@@ -116,11 +116,14 @@ class CallableField(AbstractField):
 
     @property
     def _host(self) -> "_HostFunction":
-        return _HostFunction(self.function, self.framework, self.step)
+        return _HostFunction(self._call, self.framework, self.step)
+
+    @property
+    def _call(self) -> Callable:
+        return self.module if self.function is None else self.function
 
     def _traced(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        function = self.function if self.module is None else self.module
-        return self._masked(points, function(points).astype(points.dtype))
+        return self._masked(points, self._call(points).astype(points.dtype))
 
     def _masked(
         self, points: Float[Array, "*batch 3"], value: Float[Array, "*batch"]

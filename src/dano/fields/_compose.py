@@ -1,6 +1,7 @@
 """Fields made of fields: placed by a pose, or joined."""
 
 from collections.abc import Callable
+from typing import overload
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,10 @@ from dano.fields._shapes import AbstractShape, checked_edge, SolidMoments
 from dano.maths import Pose
 
 
+@overload
+def Posed(field: AbstractShape, pose: Pose) -> "PosedShape": ...
+@overload
+def Posed(field: AbstractField, pose: Pose) -> "PosedShape | PosedField": ...
 def Posed(field: AbstractField, pose: Pose) -> "PosedShape | PosedField":  # noqa: N802 - reads as a constructor
     """`field` moved by `pose`, which maps the frame of `field` into the new one.
 
@@ -25,9 +30,17 @@ def Posed(field: AbstractField, pose: Pose) -> "PosedShape | PosedField":  # noq
         raise ValueError(f"field must be a dano field (an AbstractField), got {type(field).__name__}")
     if not isinstance(pose, Pose):
         raise ValueError(f"pose must be a dano.maths.Pose, got {type(pose).__name__}")
-    return PosedShape(field, pose) if isinstance(field, AbstractShape) else PosedField(field, pose)
+    return (
+        PosedShape(shape=field, pose=pose)
+        if isinstance(field, AbstractShape)
+        else PosedField(field=field, pose=pose)
+    )
 
 
+@overload
+def Union(*fields: AbstractShape, edge: ArrayLike | None = None) -> "UnionShape": ...
+@overload
+def Union(*fields: AbstractField, edge: ArrayLike | None = None) -> "UnionShape | UnionField": ...
 def Union(*fields: AbstractField, edge: ArrayLike | None = None) -> "UnionShape | UnionField":  # noqa: N802
     """The union of several fields.
 
@@ -50,16 +63,16 @@ def Union(*fields: AbstractField, edge: ArrayLike | None = None) -> "UnionShape 
             raise ValueError(
                 f"fields[{index}] must be a dano field (an AbstractField), got {type(field).__name__}"
             )
-    if not all(isinstance(field, AbstractShape) for field in fields):
+    shapes = tuple(field for field in fields if isinstance(field, AbstractShape))
+    if len(shapes) < len(fields):
         if edge is not None:
-            raise ValueError(
-                f"edge applies to a union of shapes only, got {edge} for {[type(f).__name__ for f in fields]}"
-            )
-        return UnionField(fields)
-    stated = [field.edge for field in fields if field.edge is not None]
+            kinds = [type(field).__name__ for field in fields]
+            raise ValueError(f"edge applies to a union of shapes only, got {edge} for {kinds}")
+        return UnionField(fields=fields)
+    stated = [shape.edge for shape in shapes if shape.edge is not None]
     if edge is None and stated:
-        return UnionShape(fields, jnp.max(jnp.stack(stated)))
-    return UnionShape(fields, checked_edge(edge))
+        return UnionShape(shapes=shapes, edge=jnp.max(jnp.stack(stated)))
+    return UnionShape(shapes=shapes, edge=checked_edge(edge))
 
 
 def posed_bounds(bounds: Float[Array, "2 3"], pose: Pose) -> Float[Array, "2 3"]:
@@ -129,8 +142,13 @@ class PosedShape(AbstractShape):
     shape: AbstractShape
     pose: Pose
 
+    def __init__(self, shape: AbstractShape, pose: Pose):
+        """Build a moved shape."""
+        self.shape = shape
+        self.pose = pose
+
     @property
-    def edge(self) -> Float[Array, ""] | None:
+    def edge(self) -> Float[Array, ""] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The edge width [m] that the inner shape states."""
         return self.shape.edge
 

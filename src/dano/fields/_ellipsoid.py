@@ -80,7 +80,7 @@ def _ellipsoid_root(
     def bisect(_: ArrayLike, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bracket
         middle = jnp.sqrt(low * high)
-        _, (a, b, c) = terms(middle)
+        a, b, c = terms(middle)[1]
         is_low = a + b + c >= 1
         return jnp.where(is_low, middle, low), jnp.where(is_low, high, middle)
 

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from dano.fields._base import AbstractField
 from dano.fields._grid import checked_spacing, GridField
-from dano.fields._signed_distance import mesh_field
+from dano.fields._signed_distance import mesh_field, SignedDistanceGrid
 from dano.maths import Numbers
 
 _MESHES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")
@@ -20,7 +19,7 @@ _BROKEN = (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile
 """What NumPy and zipfile raise for files that are truncated, foreign, encrypted or hold pickled objects."""
 
 
-def load_field(path: str | Path, **options: Any) -> AbstractField:
+def load_field(path: str | Path, **options: Any) -> GridField | SignedDistanceGrid:
     """Read a field from a file; nothing is ever unpickled.
 
     - `.npz`: `values` (nx, ny, nz), `origin` (3,) and `spacing`; option `interpolation`.
@@ -43,7 +42,7 @@ def load_field(path: str | Path, **options: Any) -> AbstractField:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    readers: dict[str, tuple[Callable[..., AbstractField], tuple[str, ...]]] = {
+    readers: dict[str, tuple[Callable[..., GridField | SignedDistanceGrid], tuple[str, ...]]] = {
         ".npz": (_load_npz, ("interpolation",)),
         ".npy": (_load_npy, ("spacing", "origin", "interpolation")),
         ".dano": (_load_object, ("interpolation",)),
@@ -83,7 +82,7 @@ def save_field(field: GridField, path: str | Path) -> None:
         raise ValueError(f"path must be a file, got the folder {path}")
     if not path.parent.is_dir():
         raise ValueError(f"path must lie in an existing folder, but {path.parent} does not exist")
-    arrays = {
+    arrays: dict[str, Any] = {
         "values": np.asarray(field.values),
         "origin": np.asarray(field.origin),
         "spacing": np.asarray(field.spacing),

@@ -11,6 +11,7 @@ evaluates the next derivative order instead.
 """
 
 import functools
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -127,17 +128,23 @@ def _rows(
         # One expression a point: in stages, XLA works the weights out anew for each of 16 rows, three times
         # slower. (Under `vmap`, which comes here point by point, it is the other way round.)
         w = weights[0]
-        rows = [[sum(block[i, j, q] * w[q][2] for q in taps) * w[j][1] * w[i][0] for j in taps] for i in taps]
-        return sum(sum(row) for row in rows)[None]
-    along_z = [sum(block[:, :, q] * weights[c][q][2][None, None] for q in taps) for c in range(order + 1)]
+        rows = [
+            [_total(block[i, j, q] * w[q][2] for q in taps) * w[j][1] * w[i][0] for j in taps] for i in taps
+        ]
+        return _total(_total(row) for row in rows)[None]
+    along_z = [_total(block[:, :, q] * weights[c][q][2][None, None] for q in taps) for c in range(order + 1)]
     along_y = {
-        (b, c): sum(along_z[c][:, q] * weights[b][q][1][None] for q in taps)
+        (b, c): _total(along_z[c][:, q] * weights[b][q][1][None] for q in taps)
         for c in range(order + 1)
         for b in range(order + 1 - c)
     }
     return jnp.stack(
-        [sum(along_y[b, c][q] * weights[a][q][0] for q in taps) for a, b, c in multi_indices(order)]
+        [_total(along_y[b, c][q] * weights[a][q][0] for q in taps) for a, b, c in multi_indices(order)]
     )
+
+
+def _total(terms: Iterable[Array]) -> Array:
+    return functools.reduce(jnp.add, terms)
 
 
 def _stencil(

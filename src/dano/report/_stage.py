@@ -1,4 +1,4 @@
-"""Scenes as pictures see them: drawable items, their poses over time, a camera that keeps all in view, forces."""
+"""Scenes as pictures see them: drawable items, their poses, a camera that keeps all in view, forces."""
 
 from typing import NamedTuple
 
@@ -88,7 +88,7 @@ def matrix(orientation: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
 
 
 def camera_for(scene: Scene, drawn: Stage, trajectory: Trajectory, width: int, height: int) -> Camera:
-    """A camera that sees every bounded body all the time, looking down a little, across the main direction of motion."""
+    """A camera that sees every bounded body all the time, from across the main direction of motion."""
     position = np.asarray(trajectory.states.position, dtype=np.float64)
     orientation = np.asarray(trajectory.states.orientation, dtype=np.float64)
     steps = np.unique(np.linspace(0, len(position) - 1, 60).astype(int))
@@ -143,7 +143,7 @@ class Touches(NamedTuple):
 
 
 def touches(scene: Scene, trajectory: Trajectory, times: Float[np.ndarray, " frames"]) -> Touches | None:
-    """Contact points and forces of the steps that the given times fall into; None if the scene has no contacts."""
+    """Contact points and forces of the steps that the times fall into; None without contacts in the scene."""
     if not scene.contacts:
         return None
     wrenches = np.asarray(contact_wrenches(scene, trajectory.states), dtype=np.float64)

@@ -96,7 +96,7 @@ def _checked(scene, trajectory, path, strip, size) -> tuple[Path | None, Path | 
         raise ValueError("path or strip must be given, got None for both")
     if tuple(trajectory.names) != tuple(scene.names):
         raise ValueError(
-            f"trajectory must be one of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
+            f"trajectory must be of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
         )
     if len(trajectory.times) < 2:
         raise ValueError(f"trajectory must have at least one step, got {len(trajectory.times)} states")

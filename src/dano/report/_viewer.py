@@ -169,7 +169,7 @@ def view(
     """
     if tuple(trajectory.names) != tuple(scene.names):
         raise ValueError(
-            f"trajectory must be one of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
+            f"trajectory must be of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
         )
     if not 0 < int(port) < 65536:
         raise ValueError(f"port must lie in 1 … 65535, got {port}")

@@ -66,7 +66,7 @@ class Camera(eqx.Module):
         return 2 * math.tan(0.5 * self.vertical_fov) / self.height
 
     def directions(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-        """Unit directions [W] of the rays through image coordinates (x to the right, y downwards) [pixels]."""
+        """Unit directions [W] of rays through image coordinates (x to the right, y downwards) [pixels]."""
         right, up, forward = self.axes
         x = (pixels[:, :1] - 0.5 * self.width) * self.pixel_angle
         y = (0.5 * self.height - pixels[:, 1:]) * self.pixel_angle

@@ -19,7 +19,7 @@ from dano.fields import (
 from dano.maths import checked_array, Numbers, Pose
 
 PALETTE = ("#e07a3f", "#3d7ea6", "#5f9e6e", "#c9a227", "#8d6cab", "#c8553d", "#4aa3a2", "#7a8450")
-"""Colours given to objects that state none: matte, told apart also by the colour-blind through their lightness."""
+"""Colours for objects that state none, matte and different from each other in lightness too."""
 
 # Nodes along the longest side of the signed distance of a density: finer than a pixel needs at usual image
 # sizes.
@@ -157,9 +157,9 @@ def level_surface(field: GridField, level: int | float | None = None) -> SignedD
     """The solid {φ ≥ level} of a grid as a signed distance, smooth enough to be shaded.
 
     The density φ/(φ + level), which is ½ on the surface and blind to how dense the inside is, is blurred
-    by less
-    than a cell; where it crosses ½ along the edges of the grid lie points of the surface, with normals. A
-    node's distance is that to the tangent plane of the nearest of them if it is near, else that to the point.
+    by less than a cell; where it crosses ½ along the edges of the grid lie points of the surface, with
+    normals. A node's distance is that to the tangent plane of the nearest of them if it is near, else that
+    to the point.
 
     Args:
         field: The density.

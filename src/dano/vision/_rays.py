@@ -1,8 +1,8 @@
 """Compiled kernels: where rays meet a solid, what a medium lets through, what light a point receives.
 
 All of them take one field, where it is, and a fixed number of rays in structure-of-arrays layout (one a
-column),
-in float32. They are compiled once per type of field and serve every picture, pose and image size after that.
+column), in float32. They are compiled once per type of field and serve every picture, pose and image size
+after that.
 """
 
 import functools

@@ -1,11 +1,10 @@
 """Pictures of solids and media on a floor, by ray marching on the CPU.
 
 A picture is made in passes over arrays of rays: planes in closed form, solids by sphere tracing, the light
-each visible point receives, shading, media in front. Rays that cannot meet an item are sorted out on the host
-by its
-bounding ball, so that the compiled kernels see little else than hits. One ray a pixel first; four more where
-neighbouring pixels differ, which smooths every kind of edge at a small part of the cost of doing so
-everywhere.
+each visible point receives, shading, media in front. Rays that cannot meet an item are sorted out on the
+host by its bounding ball, so that the compiled kernels see little else than hits. One ray a pixel first; four
+more where neighbouring pixels differ, which smooths every kind of edge at a small part of the cost of doing
+so everywhere.
 """
 
 import functools
