@@ -62,7 +62,7 @@ def quat_multiply(p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]) ->
 
 def quat_conjugate(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
     """Inverse rotation of a unit quaternion."""
-    return q * jnp.asarray([1, -1, -1, -1], q.dtype)
+    return jnp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
 def quat_to_matrix(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 3 3"]:

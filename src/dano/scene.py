@@ -20,7 +20,7 @@ from dano.contact import (
     Support,
 )
 from dano.fields import AbstractField, AbstractShape, HalfSpace, PosedShape, Sphere
-from dano.maths import checked_array, checked_quaternion, floating, is_traced, Numbers, quat_to_matrix
+from dano.maths import checked_array, checked_quaternion, floating, is_traced, Numbers
 from dano.objects import checked_inertia, MassProperties, NeuralObject, surface_samples
 
 # Edge width of a primitive relative to the size of what touches it: 0.5 % made gradients and rest right, 0.1 % did not.
@@ -147,9 +147,8 @@ class Body(eqx.Module):
         """What other bodies' samples query: the shape, or the object's grid."""
         return self.shape if self.object is None else self.object.grid
 
-    def collider(self, position: Float[Array, "3"], orientation: Float[Array, "4"]) -> Collider:
-        """The body as seen by a contact, with its centre of mass at `position` [m, W]."""
-        rotation = quat_to_matrix(orientation)
+    def collider(self, position: Float[Array, "3"], rotation: Float[Array, "3 3"]) -> Collider:
+        """The body as seen by a contact, with its centre of mass at `position` [m, W] and axes `rotation` (B → W)."""
         com = self.com + self.com_offset
         origin = position - sum(rotation[:, i] * com[i] for i in range(3))
         return Collider(
@@ -521,13 +520,15 @@ class Scene(eqx.Module):
         return Control(jnp.stack(rows["force"]), jnp.stack(rows["torque"]))
 
 
-def colliders(scene: Scene, contact: Contact, state: State) -> tuple[Collider, Collider]:
-    """Both sides of a contact at a state, as `dano.overlap` takes them."""
+def colliders(
+    scene: Scene, contact: Contact, positions: Float[Array, "n 3"], rotations: Sequence[Float[Array, "3 3"]]
+) -> tuple[Collider, Collider]:
+    """Both sides of a contact, as `dano.overlap` takes them, with all bodies at given positions and rotations."""
     a, b = (scene.body(name) for name in (contact.a, contact.b))
     sides = []
     for body, other in ((a, b), (b, a)):
         i = scene.index(body.name)
-        side = body.collider(state.position[i], state.orientation[i])
+        side = body.collider(positions[i], rotations[i])
         if body.shape is not None:
             # Against a neural object a primitive has no samples of its own (paper: the sum runs over the object's).
             samples = side.samples if other.object is None else None
@@ -588,10 +589,8 @@ def _check_pair(a: Body, b: Body) -> set[str]:
     kinds = {type(a.shape), type(b.shape)}
     if kinds == {Sphere, HalfSpace}:
         return set()
-    finite = {body.name for body in (a, b) if np.isfinite(body.size)}
-    if not finite:
-        raise ValueError(f"contact must involve a bounded body, got {a.name!r} and {b.name!r}")
-    return finite
+    # A fixed shape has no mass that its samples could carry; the moving side's samples find it.
+    return {body.name for body in (a, b) if not body.fixed}
 
 
 def _with_samples(body: Body) -> Body:

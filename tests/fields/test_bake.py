@@ -22,7 +22,8 @@ def test_the_error_of_a_gaussian_is_what_it_says(kind, worst):
     grid, error = bake(gaussian(), 28, interpolation=kind)
     assert max(grid.shape) == 28
     # Its own points: other random ones, against the formula.
-    x = np.random.default_rng(5).uniform(*np.asarray(grid.bounds)[:, 0], (3, 20_000))
+    lower, upper = np.asarray(grid.bounds)[:, 0]
+    x = np.random.default_rng(5).uniform(lower, upper, (3, 20_000))
     truth = SCALE * np.exp(-0.5 * np.sum(x**2, 0) / WIDTH**2) * np.all(np.abs(x) <= 1.2, axis=0)
     difference = np.asarray(grid.jet(jnp.asarray(x), 0)) - truth
     np.testing.assert_allclose(error.rms, np.sqrt(np.mean(difference**2)) / SCALE, rtol=0.25)
@@ -48,8 +49,8 @@ def test_finer_grids_are_better_and_batches_do_not_matter():
 def test_a_hard_edge_is_reported_as_a_large_error_of_little_mass():
     grid, error = bake(Sphere(0.2, edge=0.0), 24)
     assert error.max > 0.3
-    assert abs(error.mass) < 0.02
-    np.testing.assert_allclose(grid.moments().integral, 4 / 3 * np.pi * 0.2**3, rtol=0.02)
+    assert abs(error.mass) < 0.05
+    np.testing.assert_allclose(grid.moments().integral, 4 / 3 * np.pi * 0.2**3, rtol=0.05)
 
 
 def test_bad_bakes():

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import ndimage
+from scipy import ndimage, optimize
 
 from dano.fields import GridField
 from dano.fields._spline import CHUNK
@@ -152,7 +152,7 @@ def test_points_that_are_not_numbers_stay_out_of_memory(kind):
 @kinds
 def test_moments_are_the_integrals_of_the_density(kind):
     field = grid(kind)
-    integral, centroid, second = field.moments()
+    integral, centroid, second = eqx.filter_jit(field.moments)()
     lower, upper = np.asarray(field.bounds)
     counts = [6 * (size + ORDERS[kind]) for size in VALUES.shape]  # six midpoints a cell
     axes = [lower[i] + (upper[i] - lower[i]) * (np.arange(n) + 0.5) / n for i, n in enumerate(counts)]
@@ -180,17 +180,28 @@ def at_nodes(field):
 
 
 @kinds
-def test_interpolating_passes_through_smooth_samples_and_neither_rings_nor_gains_at_jumps(kind):
+def test_interpolating_passes_through_smooth_samples(kind):
     axis = np.linspace(-1, 1, 16)
     x = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"))
     radius = np.linalg.norm(x, axis=0)
     smooth = np.exp(-8 * radius**2)
     through = GridField.interpolating(smooth, (-1.0,) * 3, axis[1] - axis[0], kind)
     np.testing.assert_allclose(at_nodes(through), smooth, atol=1e-3)
-    jump = (radius < 0.6).astype(float)
-    step = GridField.interpolating(jump, (-1.0,) * 3, axis[1] - axis[0], kind)
-    assert np.min(step.values) >= 0 and np.max(at_nodes(step)) < 1.05
-    np.testing.assert_allclose(np.sum(step.values), np.sum(jump), rtol=0.02)
+
+
+@pytest.mark.parametrize("kind", ["quadratic", "cubic"])
+def test_interpolating_a_jump_is_nonnegative_least_squares(kind):
+    """Against scipy's active-set solver on a grid small enough for a dense matrix."""
+    n = 8
+    axis = np.linspace(-1, 1, n)
+    jump = (np.linalg.norm(np.meshgrid(axis, axis, axis), axis=0) < 0.7).astype(float)
+    field = GridField.interpolating(jump, (-1.0,) * 3, axis[1] - axis[0], kind)
+    assert np.min(field.values) >= 0
+    side, middle = (1 / 8, 6 / 8) if kind == "quadratic" else (1 / 6, 4 / 6)
+    along = middle * np.eye(n) + side * (np.eye(n, k=1) + np.eye(n, k=-1))
+    _, best = optimize.nnls(np.kron(np.kron(along, along), along), jump.ravel())
+    ours = np.linalg.norm(at_nodes(field) - jump)
+    assert best <= ours * (1 + 1e-9) and ours < 1.05 * best
 
 
 def test_values_round_trip_and_keep_their_dtype():

@@ -13,6 +13,10 @@ from dano.maths import floating, Numbers, Pose, safe_norm
 # Samples per block. Fewer make the culling finer, more make each pass over a block fatter; 64 measured best.
 BLOCK = 64
 
+# Order of `SampleSet.products`, and where each entry of the symmetric 4×4 matrix stands in it.
+PRODUCTS = tuple((j, k) for j in range(4) for k in range(j, 4))
+SYMMETRIC = np.array([[PRODUCTS.index((min(j, k), max(j, k))) for k in range(4)] for j in range(4)])
+
 
 class SampleSet(eqx.Module):
     """Weighted contact samples in the field frame, in the layout the overlap kernels want.
@@ -22,12 +26,14 @@ class SampleSet(eqx.Module):
 
     Attributes:
         points: Homogeneous coordinates (x, y, z, 1) [m, F], shape (4, n); rows are contiguous.
+        products: x̃_j x̃_k of the homogeneous coordinates for j ≤ k, shape (10, n): what derivatives sum over.
         weights: φ_i / Σφ, shape (n,); they sum to one.
         centers: Centre of each block [m, F], shape (n / BLOCK, 3).
         radii: Radius of each block about its centre [m], shape (n / BLOCK,).
     """
 
     points: Float[Array, "4 n"]
+    products: Float[Array, "10 n"]
     weights: Float[Array, " n"]
     centers: Float[Array, "blocks 3"]
     radii: Float[Array, " blocks"]
@@ -49,7 +55,8 @@ class SampleSet(eqx.Module):
         centers = 0.5 * (blocks.min(axis=1) + blocks.max(axis=1))
         radii = np.linalg.norm(blocks - centers[:, None], axis=-1).max(axis=1)
         homogeneous = np.concatenate([x.T, np.ones((1, len(x)))])
-        return cls(floating(homogeneous), floating(weights), floating(centers), floating(radii))
+        products = np.stack([homogeneous[j] * homogeneous[k] for j, k in PRODUCTS])
+        return cls(*(floating(x) for x in (homogeneous, products, weights, centers, radii)))
 
 
 class Support(eqx.Module):

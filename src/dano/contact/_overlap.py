@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from dano.contact._colliders import BLOCK, Collider, SampleSet, Support
-from dano.contact._small import contract, matmul, matvec, second_moments
-from dano.fields import AbstractField, GridField, HalfSpace, occupancy, PosedField, PosedShape, Sphere
+from dano.contact._colliders import BLOCK, Collider, SampleSet, Support, SYMMETRIC
+from dano.contact._small import contract, matmul, matvec
+from dano.fields import AbstractField, GridField, HalfSpace, PosedField, PosedShape, Sphere
 from dano.maths import safe_normalize
 
 
@@ -131,72 +131,77 @@ def _dispatch(
         plane = matvec(to_field.T, normal).at[3].add(-field.offset)
         # In units of the edge width, which saves a division per sample; a vanishing width is the hard indicator.
         scaled = plane / jnp.maximum(field.edge_width, _HARD)
-        moments = _planar(scaled, samples.points, samples.weights)
+        moments = _planar(scaled, samples)
         return _Side(moments, normal * moments[3])
     if isinstance(field, GridField) and support is not None:
         sums = _culled(to_field, field, samples, support)
     else:
-        sums = _dense(to_field, field, samples.points, samples.weights)
+        sums = _dense(to_field, field, samples)
     return _Side(sums[:4], sums[4:])
 
 
 @eqx.filter_custom_jvp
-def _planar(plane, points, weights):
+def _planar(plane, samples):
     """Moments Σ w φ x̃ of the samples behind a plane; φ = occupancy(plane · x̃) with a unit edge."""
-    return _planar_moments(plane, points, weights)
+    return _planar_moments(plane, samples)
 
 
 @_planar.def_jvp
 def _planar_jvp(primals, tangents):
-    plane, points, weights = primals
-    if tangents[1] is not None or tangents[2] is not None:
-        # Rarely asked for (the samples themselves move): autodiff of the sums as they stand.
-        tangents = tuple(
-            jnp.zeros_like(p) if t is None else t for p, t in zip(primals, tangents, strict=True)
-        )
-        return jax.jvp(_planar_moments, primals, tangents)
+    plane, samples = primals
+    d_plane, d_samples = tangents
+    if jax.tree.leaves(d_samples):
+        return _by_autodiff(_planar_moments, primals, tangents)
     # dS = M dplane with the symmetric 4×4 moment matrix of the samples in the smoothing band.
-    distance = plane @ points
-    phi, slope = jax.jvp(lambda s: occupancy(s, 1.0), (distance,), (jnp.ones_like(distance),))
-    moments, matrix = _keep(contract(weights * phi, points), second_moments(weights * slope, points))
-    return moments, matvec(matrix, tangents[0])
+    t = _depth(plane, samples)
+    moments = contract(samples.weights * (t * t * (3 - 2 * t)), samples.points)
+    matrix = _symmetric(samples.weights * (-6 * t * (1 - t)), samples.products)
+    moments, matrix = _keep(moments, matrix)
+    return moments, matvec(matrix, d_plane)
 
 
-def _planar_moments(plane, points, weights):
-    return contract(weights * occupancy(plane @ points, 1.0), points)
+def _planar_moments(plane, samples: SampleSet):
+    t = _depth(plane, samples)
+    return contract(samples.weights * (t * t * (3 - 2 * t)), samples.points)
+
+
+def _depth(plane, samples: SampleSet) -> Float[Array, " n"]:
+    """t of the smooth step (`dano.fields.occupancy`) for each sample, in a band of unit width about the plane."""
+    return jnp.clip(0.5 - plane @ samples.points, 0, 1)
+
+
+def _symmetric(weights: Float[Array, " n"], products: Float[Array, "10 n"]) -> Float[Array, "4 4"]:
+    """Σ w x̃ x̃ᵀ: one pass over the ten different products costs half of four over the points."""
+    return contract(weights, products)[SYMMETRIC]
+
+
+def _by_autodiff(function, primals, tangents):
+    """Plain forward derivative, for the arguments that few ever perturb (a grid's values, the samples, a radius)."""
+    perturbed = jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
+    dynamic, static = eqx.partition(primals, perturbed)
+    return jax.jvp(lambda d: function(*eqx.combine(d, static)), (dynamic,), (tangents,))
 
 
 @eqx.filter_custom_jvp
-def _dense(to_field, field, points, weights):
+def _dense(to_field, field, samples):
     """Sums (S, D) over every sample in any differentiable field."""
-    return _dense_sums(to_field, field, points, weights)
+    return _dense_sums(to_field, field, samples)
 
 
 @_dense.def_jvp
 def _dense_jvp(primals, tangents):
-    to_field, field, points, weights = primals
-    d_to_field, d_field, _, _ = tangents
-    x = _transform(to_field, points)
+    to_field, field, samples = primals
+    if jax.tree.leaves(tangents[1:]):
+        return _by_autodiff(_dense_sums, primals, tangents)
+    x = to_field @ samples.points
     value, jacobian = jax.vmap(_value_and_jacobian, (None, 1), -1)(field, x)
-    sums, derivative = _keep(*_accumulate(value, jacobian, points, weights))
-    tangent = jnp.zeros_like(sums)
-    if d_to_field is not None:
-        tangent = tangent + jnp.einsum("kab,ab->k", derivative, d_to_field)
-    perturbed = [leaf is not None for leaf in jax.tree.leaves(d_field, is_leaf=lambda t: t is None)]
-    if any(perturbed):
-        # The field's own parameters (a radius, an edge width): plain autodiff, few users pay for it.
-        dynamic, static = eqx.partition(
-            field, jax.tree.map(lambda t: t is not None, d_field, is_leaf=lambda t: t is None)
-        )
-        of_field = lambda d: _dense_sums(to_field, eqx.combine(d, static), points, weights)  # noqa: E731
-        tangent = tangent + jax.jvp(of_field, (dynamic,), (d_field,))[1]
-    return sums, tangent
+    sums, derivative = _keep(*_accumulate(value, jacobian, samples.points, samples.products, samples.weights))
+    return sums, jnp.einsum("kab,ab->k", derivative, tangents[0])
 
 
-def _dense_sums(to_field, field, points, weights):
-    x = _transform(to_field, points)
-    value = jax.vmap(_features, (None, 1), -1)(field, x)
-    return jnp.concatenate([contract(weights * value[0], points), contract(value[1:], weights)])
+def _dense_sums(to_field, field, samples: SampleSet):
+    value = jax.vmap(_features, (None, 1), -1)(field, to_field @ samples.points)
+    return jnp.concatenate([contract(samples.weights * value[0], samples.points), contract(value[1:], samples.weights)])
 
 
 def _features(field: AbstractField, x: Float[Array, "3"]) -> Float[Array, "4"]:
@@ -222,31 +227,35 @@ def _culled(to_field, field, samples, support):
 
 @_culled.def_jvp
 def _culled_jvp(primals, tangents):
+    if jax.tree.leaves(tangents[1:]):
+        # The map of the support only says what may be skipped: without it the sums are the same.
+        return _by_autodiff(_dense_sums, primals[:3], tangents[:3])
     sums, derivative = _keep(*_culled_sums(*primals, derivative=True))
-    d_to_field = tangents[0]
-    if d_to_field is None:
-        return sums, jnp.zeros_like(sums)
-    return sums, jnp.einsum("kab,ab->k", derivative, d_to_field)
+    return sums, jnp.einsum("kab,ab->k", derivative, tangents[0])
 
 
 def _culled_sums(to_field, field: GridField, samples: SampleSet, support: Support, *, derivative: bool):
-    near = support.lower_bound(_transform(to_field, _homogeneous(samples.centers.T))) <= samples.radii
+    centers = jnp.concatenate([samples.centers.T, jnp.ones_like(samples.centers.T[:1])])
+    near = support.lower_bound(to_field @ centers) <= samples.radii
     (blocks,) = jnp.nonzero(near, size=near.shape[0], fill_value=0)
     zero = jnp.zeros(7, to_field.dtype), jnp.zeros((7, 3, 4) if derivative else (0,), to_field.dtype)
 
     def add_block(i, total):
         start = blocks[i] * BLOCK
-        points = jax.lax.dynamic_slice(samples.points, (jnp.zeros_like(start), start), (4, BLOCK))
-        weights = jax.lax.dynamic_slice(samples.weights, (start,), (BLOCK,))
-        sums, matrix = _grid_sums(to_field, field, points, weights, derivative=derivative)
+
+        def block(x):
+            return jax.lax.dynamic_slice_in_dim(x, start, BLOCK, axis=-1)
+
+        points, products, weights = (block(x) for x in (samples.points, samples.products, samples.weights))
+        sums, matrix = _grid_sums(to_field, field, points, products, weights, derivative=derivative)
         return total[0] + sums, total[1] + matrix
 
     return jax.lax.fori_loop(0, jnp.sum(near), add_block, zero)
 
 
-def _grid_sums(to_field, field: GridField, points, weights, *, derivative: bool):
+def _grid_sums(to_field, field: GridField, points, products, weights, *, derivative: bool):
     """Sums and, if asked, their derivative (7, 3, 4) over some samples; the direction is −∇φ."""
-    x = _transform(to_field, points)
+    x = to_field @ points
     if not derivative:
         density, gradient = field.jet(x, 1)
         weighted = weights * density
@@ -258,15 +267,15 @@ def _grid_sums(to_field, field: GridField, points, weights, *, derivative: bool)
     jacobian = jnp.concatenate(
         [gradient[None], -(gradient[:, None] * gradient[None] + density[None, None] * hessian)]
     )
-    return _accumulate(value, jacobian, points, weights)
+    return _accumulate(value, jacobian, points, products, weights)
 
 
-def _accumulate(value, jacobian, points, weights):
+def _accumulate(value, jacobian, points, products, weights):
     """Sums (7,) and their derivative with respect to the 3×4 transform, from (φ, φd) and its Jacobian per sample."""
     sums = jnp.concatenate([contract(weights * value[0], points), contract(value[1:], weights)])
     weighted = jacobian * weights[None, None]
     # dS_k = Σ w ∂_aφ x̃_k x̃_b dH_ab,   dD_c = Σ w ∂_a(φ d_c) x̃_b dH_ab
-    of_moments = jnp.stack([second_moments(weighted[0, a], points) for a in range(3)], axis=1)
+    of_moments = jnp.stack([_symmetric(weighted[0, a], products) for a in range(3)], axis=1)
     of_direction = jnp.stack([jnp.stack([contract(row, points) for row in rows]) for rows in weighted[1:]])
     return sums, jnp.concatenate([of_moments, of_direction])
 
@@ -274,14 +283,6 @@ def _accumulate(value, jacobian, points, weights):
 def _keep(*values: Array) -> tuple[Array, ...]:
     """Mark what a rollout's reverse mode keeps of a step: everything else is cheap to compute again."""
     return tuple(checkpoint_name(value, KEPT) for value in values)
-
-
-def _transform(to_field: Float[Array, "3 4"], points: Float[Array, "4 n"]) -> Float[Array, "3 n"]:
-    return to_field @ points
-
-
-def _homogeneous(x: Float[Array, "3 n"]) -> Float[Array, "4 n"]:
-    return jnp.concatenate([x, jnp.ones_like(x[:1])])
 
 
 def _cap(ball: Collider, plane: Collider) -> Patch:

@@ -59,8 +59,3 @@ def contract(a: Float[Array, "*m n"], b: Float[Array, "*k n"]) -> Float[Array, "
     slower), and because this order stays fast when `a` gains a batch axis.
     """
     return jax.lax.dot_general(a, b, (((a.ndim - 1,), (b.ndim - 1,)), ((), ())))
-
-
-def second_moments(weights: Float[Array, " n"], points: Float[Array, "k n"]) -> Float[Array, "k k"]:
-    """Σ w x xᵀ of weighted columns, row by row: k matrix–vector products run four times faster than one thin matrix product."""
-    return jnp.stack([contract(weights * row, points) for row in points])

@@ -9,4 +9,4 @@ from dano.engine._rollout import (
     step as step,
     VariationalEngine as VariationalEngine,
 )
-from dano.engine._variational import Report as Report
+from dano.engine._newton import Report as Report

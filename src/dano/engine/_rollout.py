@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from dano.contact import KEPT, Patch
 from dano.engine import _variational
-from dano.engine._variational import Report
+from dano.engine._newton import Report, SolverOptions
 from dano.maths import is_traced, quat_conjugate, quat_multiply, safe_norm
 from dano.scene import Control, Scene, State, Trajectory
 
@@ -53,7 +53,7 @@ class VariationalEngine(AbstractEngine):
     def step(self, scene: Scene, state: State, control: Control | None) -> tuple[State, Report]:
         """See `AbstractEngine.step`."""
         return _variational.step(
-            scene, state, control, _variational.SolverOptions(self.tolerance, self.max_iterations)
+            scene, state, control, SolverOptions(self.tolerance, self.max_iterations)
         )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.fields._base import AbstractField, check_order, Jet
-from dano.fields._spline import border, degree_of, interpolating_coefficients, multi_indices, spline_jet
+from dano.fields._spline import border, degree_of, multi_indices, nonnegative_coefficients, spline_jet
 from dano.maths import checked_array, floating, is_traced, Numbers
 
 
@@ -71,12 +71,11 @@ class GridField(AbstractField):
     def interpolating(
         cls, samples: Numbers, origin: Numbers, spacing: Numbers, interpolation: str = "quadratic"
     ) -> "GridField":
-        """A grid field that passes through `samples` where they are smooth.
+        """A grid field that passes through `samples`, as far as φ ≥ 0 allows it.
 
-        The spline coefficients are found by recursive filtering on the host. Where the samples jump to zero
-        the filter rings, and some coefficients come out negative. Around those the samples themselves are the
-        coefficients, as in the constructor: the density stays non-negative, does not overshoot and keeps its
-        integral, but misses those samples.
+        The coefficients are found on the host: those of the interpolating spline, and where some of these are
+        negative, because the samples jump to zero within a cell or two, the non-negative ones whose spline is
+        closest to the samples in the mean square.
 
         Args:
             samples: Densities ≥ 0 at the nodes, shape (nx, ny, nz).
@@ -90,16 +89,8 @@ class GridField(AbstractField):
         degree = degree_of(interpolation)
         if is_traced(samples):
             raise ValueError("samples must be concrete: interpolation coefficients are found on the host")
-        from scipy.ndimage import maximum_filter
-
         array = np.asarray(checked_values(samples, "samples"))
-        # Zeros all around: outside of the grid the density is zero, and the mirror at the ends is far enough
-        # to be lost.
-        coefficients = interpolating_coefficients(np.pad(array, 16), degree)[16:-16, 16:-16, 16:-16]
-        # Tails below a thousandth of the largest density are cut; more is ringing, gone after three nodes.
-        rings = maximum_filter(coefficients < -1e-3 * array.max(), size=7)
-        values = np.where(rings, array, np.maximum(coefficients, 0))
-        return cls(values.astype(array.dtype), origin, spacing, interpolation)
+        return cls(nonnegative_coefficients(array, degree), origin, spacing, interpolation)
 
     def with_values(self, values: Numbers) -> "GridField":
         """This grid with other values, also under `jax.jit` and `jax.grad`; use it to train them."""
