@@ -161,10 +161,10 @@ def test_unknown_kinds_options_and_folders(tmp_path):
 def test_saving_refuses_bad_places_and_never_destroys(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="must end in .npz"):
         save_field(field(), tmp_path / "grid.npy")
-    with pytest.raises(ValueError, match="existing folder"):
+    with pytest.raises(ValueError, match="existing directory"):
         save_field(field(), tmp_path / "none" / "grid.npz")
     (tmp_path / "folder.npz").mkdir()
-    with pytest.raises(ValueError, match="must be a file, got the folder"):
+    with pytest.raises(ValueError, match="must be a file, got the directory"):
         save_field(field(), tmp_path / "folder.npz")
     path = tmp_path / "grid.npz"
     save_field(field(), path)

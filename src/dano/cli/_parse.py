@@ -159,11 +159,10 @@ def demo(
     output: Annotated[Path, arg(aliases=["-o"])] = Path("dano-demo"),
     json: bool = False,
 ) -> Callable[[], None]:
-    """Build the shipped objects, simulate a scene of them, and draw everything.
+    """Build the shipped objects, simulate scenes of them, and draw everything.
 
     Args:
-        name: drop: a bunny, a bar of soap and a ball fall. collision: a ball hits two bunnies. all: both, but
-            the second only if the first left time within two minutes.
+        name: drop: a bunny, a bar of soap and a ball fall. collision: a ball hits two bunnies. all: both.
         output: Folder for everything that is written.
         json: Print one JSON object instead of text.
     """

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.cli._console import Progress, put, say
-from dano.engine import contact_wrenches, simulate
+from dano.engine import simulate
+from dano.report import contact_history
 from dano.scene import Scene, State, Trajectory
 from dano.scene_file import SceneFile
 
@@ -105,7 +106,7 @@ def _contacts(trajectory: Trajectory, scene: Scene) -> list[dict[str, Any]]:
     """When the bodies of each pair touched, and how hard."""
     if not scene.contacts or not np.all([np.isfinite(x).all() for x in jax.tree.leaves(trajectory.states)]):
         return [{"a": contact.a, "b": contact.b} for contact in scene.contacts]
-    force = np.linalg.norm(np.asarray(contact_wrenches(scene, trajectory.states))[:, :, :3], axis=-1)
+    force = np.linalg.norm(contact_history(scene, trajectory.states).forces, axis=-1)
     rows = []
     for contact, history in zip(scene.contacts, force.T, strict=True):
         touching = np.flatnonzero(history)

@@ -1,7 +1,9 @@
 """`dano simulate`, `dano view` and `dano demo`."""
 
 import json
+import threading
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -11,10 +13,11 @@ from dano.archive import replacing
 from dano.cli import _rollout
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._outputs import check_output, missing_for_pictures
+from dano.objects import NeuralObject
 
 SCENES = ("drop", "collision")
-SECONDS_FOR_ONE = 50.0
-"""If the first scene of the demo took longer, the second might not end within two minutes."""
+DEMO_FPS, DEMO_SIZE = 24, (560, 350)
+"""Coarser than the default: the demo should take a minute on an old laptop, too."""
 
 
 def simulate(
@@ -70,22 +73,35 @@ def demo(name: str, folder: Path, *, as_json: bool) -> None:
     if missing:
         say(f"warning: numbers only, {missing}")
     began = time.monotonic()
-    reports: dict[str, Any] = {}
-    for scene in SCENES if name == "all" else (name,):
-        if reports and time.monotonic() - began > SECONDS_FOR_ONE:
-            say(f"`dano demo {scene}` shows the next scene: the time for one command is used up")
-            break
-        reports[scene] = _demo_scene(scene, folder, draw=missing is None, quiet=as_json)
+    reports: dict[str, dict[str, Any]] = {}
+    with _Artist(draws=missing is None) as artist:
+        for scene in SCENES if name == "all" else (name,):
+            reports[scene] = _demo_scene(scene, folder, artist)
+            if not as_json:
+                put(f"== {scene} ==")
+                _rollout.print_rollout(reports[scene])
+                put()
+            _rollout.warn_unconverged(reports[scene])
+        artist.finish()
+    for scene, report in reports.items():
+        with replacing(folder / f"{scene}.json") as file:
+            file.write(json.dumps(report, indent=2).encode())
     seconds = time.monotonic() - began
     if as_json:
         put_json({"folder": str(folder), "seconds": seconds, "scenes": reports})
-    else:
-        first = folder / f"{next(iter(reports))}.toml"
-        put(f"took {seconds:.0f} s; change {first} and run it with `dano simulate`")
+        return
+    for made in sorted({path for report in reports.values() for path in report["objects"].values()}):
+        drawn = f", drawn in {Path(made).with_suffix('.png')}" if missing is None else ""
+        put(f"object      {made}{drawn}")
+    for report in reports.values():
+        _print_files(report)
+    put()
+    first = next(iter(reports.values()))["scene"]
+    put(f"took {seconds:.0f} s; change {first} and run it with `dano simulate {first} -o RUN.npz`")
 
 
-def _demo_scene(name: str, folder: Path, *, draw: bool, quiet: bool) -> dict[str, Any]:
-    """Write a shipped scene, its objects and its run to a folder."""
+def _demo_scene(name: str, folder: Path, artist: "_Artist") -> dict[str, Any]:
+    """Write a shipped scene, its objects and its run to a folder, and order the pictures."""
     path = folder / f"{name}.toml"
     with replacing(path) as file:
         file.write((files("dano") / "scenes" / path.name).read_bytes())
@@ -93,34 +109,76 @@ def _demo_scene(name: str, folder: Path, *, draw: bool, quiet: bool) -> dict[str
     objects = {}
     for asset in scene_file.ASSETS:
         if f'asset = "{asset}"' in loaded.text:
+            objects[asset] = str(folder / f"{asset}.dano")
             made = scene_file.build_asset(asset)
             made.save(folder / f"{asset}.dano")
-            objects[asset] = str(folder / f"{asset}.dano")
-            if draw:
-                from dano.report import draw_object
-
-                draw_object(made, folder / f"{asset}.png", title=asset)
-    pictures = (path.with_suffix(".mp4"), path.with_suffix(".png")) if draw else (None, None)
-    report = {
-        "scene": str(path),
-        "objects": objects,
-        **_run(loaded, path.with_suffix(".npz"), *pictures, 1.0),
-    }
-    with replacing(path.with_suffix(".json")) as file:
-        file.write(json.dumps(report, indent=2).encode())
-    if not quiet:
-        put(f"== {name} ==")
-        _rollout.print_rollout(report)
-        put()
-        for file_name in objects.values():
-            put(
-                f"object      {file_name}"
-                + (f", drawn in {Path(file_name).with_suffix('.png')}" if draw else "")
-            )
-        _print_files(report)
-        put()
-    _rollout.warn_unconverged(report)
+            artist.draw(made, folder / f"{asset}.png")
+    rollout, report = _simulated(loaded, path.with_suffix(".npz"))
+    report = {"scene": str(path), "objects": objects, **report}
+    report.update(artist.film(loaded, rollout, path.with_suffix(".mp4"), path.with_suffix(".png")))
     return report
+
+
+class _Artist:
+    """Makes the pictures of the demo in a second thread, while the next scene is simulated in the first."""
+
+    def __init__(self, *, draws: bool):
+        self._draws = draws
+        self._thread = ThreadPoolExecutor(1, "dano artist")
+        self._progress = Progress()
+        self._orders: list[Future[None]] = []
+        self._drawn: set[Path] = set()
+        self._watched, self._stopped = threading.Event(), threading.Event()
+
+    def __enter__(self) -> "_Artist":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopped.set()
+        self._thread.shutdown(cancel_futures=True)
+
+    def draw(self, made: NeuralObject, path: Path) -> None:
+        """Order the figure of an object, once."""
+        if self._draws and path not in self._drawn:
+            from dano.report import draw_object
+
+            self._drawn.add(path)
+            self._orders.append(self._thread.submit(draw_object, made, path, title=path.stem))
+
+    def film(
+        self, loaded: scene_file.SceneFile, rollout: _rollout.Rollout, video: Path, strip: Path
+    ) -> dict[str, str]:
+        """Order the film of a run; the paths of what will be there, for the report."""
+        if not self._draws:
+            return {}
+        from dano.report import render_trajectory
+
+        order = self._thread.submit(
+            render_trajectory,
+            loaded.scene,
+            rollout.trajectory,
+            video,
+            strip=strip,
+            fps=DEMO_FPS,
+            size=DEMO_SIZE,
+            progress=self._tell,
+        )
+        self._orders.append(order)
+        return {"video": str(video), "strip": str(strip)}
+
+    def finish(self) -> None:
+        """Wait until everything is drawn."""
+        self._watched.set()
+        for order in self._orders:
+            order.result()
+        self._progress.close()
+
+    def _tell(self, description: str, share: float) -> None:
+        if self._stopped.is_set():
+            raise InterruptedError("the demo was stopped")
+        # Until then the line on the terminal belongs to the simulation.
+        if self._watched.is_set():
+            self._progress(description, share)
 
 
 def _load(path: Path, steps: int | None, timestep: float | None) -> scene_file.SceneFile:
@@ -140,22 +198,30 @@ def _run(
     loaded: scene_file.SceneFile, output: Path, video: Path | None, strip: Path | None, slow_motion: float
 ) -> dict[str, Any]:
     """Simulate, save and draw; what came out in numbers."""
+    rollout, report = _simulated(loaded, output)
+    if video is not None or strip is not None:
+        from dano.report import render_trajectory
+
+        progress = Progress()
+        render_trajectory(
+            loaded.scene, rollout.trajectory, video, strip=strip, slow_motion=slow_motion, progress=progress
+        )
+        progress.close()
+    for key, picture in (("video", video), ("strip", strip)):
+        if picture is not None:
+            report[key] = str(picture)
+    return report
+
+
+def _simulated(loaded: scene_file.SceneFile, output: Path) -> tuple[_rollout.Rollout, dict[str, Any]]:
+    """Simulate and save; the rollout, and what came out in numbers."""
     progress = Progress()
     rollout = _rollout.roll_out(loaded, progress)
     scene_file.save_run(output, rollout.trajectory, loaded)
     progress("contact forces", 0.0)
     report = {**_rollout.describe(rollout, loaded.scene), "run": str(output)}
-    if video is not None or strip is not None:
-        from dano.report import render_trajectory
-
-        render_trajectory(
-            loaded.scene, rollout.trajectory, video, strip=strip, slow_motion=slow_motion, progress=progress
-        )
     progress.close()
-    for key, picture in (("video", video), ("strip", strip)):
-        if picture is not None:
-            report[key] = str(picture)
-    return report
+    return rollout, report
 
 
 def _print_files(report: dict[str, Any]) -> None:

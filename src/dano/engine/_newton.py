@@ -16,7 +16,7 @@ class SolverOptions(NamedTuple):
     """When a step's Newton solve stops: see `VariationalEngine`."""
 
     tolerance: float | None = None
-    max_iterations: int = 50
+    max_iterations: int = 100
 
 
 class Report(NamedTuple):
@@ -25,6 +25,10 @@ class Report(NamedTuple):
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
     converged: Bool[Array, ""]
+
+
+# Length of a step below which the line search accepts it unseen.
+_GIVE_UP = 0.01
 
 
 class _Iterate(eqx.Module):
@@ -46,7 +50,8 @@ def newton(
     """Root of a small system by Newton with a halving line search.
 
     A loop pass evaluates residual and Jacobian once. If the residual did not fall, the pass is a line search step:
-    the point stays and the length halves.
+    the point stays and the length halves. At a kink (contact that just opens or closes) no short step along Newton's
+    direction may help at all; then one is accepted uphill, to come back from the other side.
 
     Args:
         evaluate: Residual and its Jacobian at a point.
@@ -70,7 +75,8 @@ def newton(
         move = solve_small(it.jacobian, -it.residual[:, None])[:, 0]
         tried = it.point + it.length * move
         residual, jacobian = evaluate(tried)
-        better = (it.iteration < 0) | (jnp.sum(residual**2) < jnp.sum(it.residual**2))
+        better = jnp.sum(residual**2) < jnp.sum(it.residual**2)
+        better = better | (it.iteration < 0) | (it.length < _GIVE_UP)
         pick = lambda new, old: jnp.where(better, new, old)  # noqa: E731
         return _Iterate(
             pick(tried, it.point),

@@ -41,7 +41,7 @@ class VariationalEngine(AbstractEngine):
     """
 
     tolerance: float | None = eqx.field(static=True, default=None)
-    max_iterations: int = eqx.field(static=True, default=50)
+    max_iterations: int = eqx.field(static=True, default=100)
 
     def __check_init__(self):
         """Raise a ValueError unless both options are positive."""

@@ -1,6 +1,5 @@
 """Reading fields from files, and writing grids."""
 
-import os
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -9,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dano.archive import write_archive
 from dano.fields._grid import checked_spacing, GridField
 from dano.fields._signed_distance import mesh_field, SignedDistanceGrid
 from dano.maths import Numbers
@@ -78,23 +78,15 @@ def save_field(field: GridField, path: str | Path) -> None:
         raise ValueError(f"field must be a GridField to be saved, got {type(field).__name__}: bake it first")
     if path.suffix.lower() != ".npz":
         raise ValueError(f"path must end in .npz, got {path}")
-    if path.is_dir():
-        raise ValueError(f"path must be a file, got the folder {path}")
-    if not path.parent.is_dir():
-        raise ValueError(f"path must lie in an existing folder, but {path.parent} does not exist")
-    arrays: dict[str, Any] = {
-        "values": np.asarray(field.values),
-        "origin": np.asarray(field.origin),
-        "spacing": np.asarray(field.spacing),
-        "interpolation": np.asarray(field.interpolation),
-    }
-    beside = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with open(beside, "wb") as file:
-            np.savez_compressed(file, **arrays)
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+    write_archive(
+        path,
+        {
+            "values": np.asarray(field.values),
+            "origin": np.asarray(field.origin),
+            "spacing": np.asarray(field.spacing),
+            "interpolation": np.asarray(field.interpolation),
+        },
+    )
 
 
 def _load_npz(path: Path, interpolation: str | None = None) -> GridField:

@@ -177,7 +177,7 @@ def integrate(density, bounds, mass_scale, mass, resolution, key, progress) -> M
     center = low + 0.5 * count * side
     total = int(np.prod(count))
     sums, squares = np.zeros(10), np.zeros((10, 10))
-    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    random = host_random(key)
     for start in range(0, total, BATCH):
         index = np.stack(np.unravel_index(np.arange(start, min(start + BATCH, total)), count), axis=-1)
         pair = [low + (index + random.random(index.shape)) * side - center for _ in range(2)]
@@ -208,6 +208,11 @@ def integrate(density, bounds, mass_scale, mass, resolution, key, progress) -> M
         com_error=error[1:4],
         inertia_error=error[4:].reshape(3, 3),
     )
+
+
+def host_random(key: PRNGKeyArray | None) -> np.random.Generator:
+    """NumPy's generator seeded by a JAX key; `jax.random.key(0)` if there is none."""
+    return np.random.default_rng(np.asarray(jax.random.key_data(jax.random.key(0) if key is None else key)))
 
 
 def check_scale(mass_scale: float, mass: float | None) -> None:

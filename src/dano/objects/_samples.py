@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from dano.fields import AbstractField, AbstractShape, GridField
 from dano.maths import floating
-from dano.objects._mass import cells, checked_density, Density, evaluate
+from dano.objects._mass import cells, checked_density, Density, evaluate, host_random
 
 # Candidates per sample that the even selection chooses from, and random draws per candidate before giving up.
 CANDIDATES = 4
@@ -152,7 +152,7 @@ def surface_range(values: np.ndarray) -> tuple[float, float]:
 
 
 def draw_samples(
-    density: Density, lattice: Lattice, region: Region, low: float, high: float, n: int, key: PRNGKeyArray
+    density: Density, lattice: Lattice, region: Region, low: float, high: float, n: int, key: PRNGKeyArray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw `n` points with density in [low, high], spread evenly over the outer side of a region.
 
@@ -162,7 +162,7 @@ def draw_samples(
     Raises:
         ValueError: If no point was found between the two densities.
     """
-    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    random = host_random(key)
     allowed = region.outer()
     corner = np.stack(
         [

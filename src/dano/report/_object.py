@@ -25,8 +25,7 @@ def draw_object(obj: NeuralObject, path: str | os.PathLike[str], *, title: str |
     """Draw a figure that shows whether an object came out right.
 
     The solid with its centre of mass and principal axes; the contact samples coloured by their normals,
-    from two
-    sides; the density in three planes through the centre of mass, with the densities between which samples
+    from two sides; the density in three planes through the centre of mass, with the densities between which samples
     lie; a table of mass properties and their standard errors.
 
     Args:
@@ -100,7 +99,7 @@ def _view(obj: NeuralObject, azimuth: float, width: int, height: int) -> tuple[C
 
 def _solid(axes: Any, obj: NeuralObject) -> None:
     """The rendered solid with its principal axes."""
-    width, height = 780, 645
+    width, height = 560, 463
     camera, radius = _view(obj, 0.0, width, height)
     _heading(axes, "Solid, centre of mass, principal axes" if obj.grid else "No density stored: samples only")
     if obj.grid is None:
@@ -122,7 +121,7 @@ def _solid(axes: Any, obj: NeuralObject) -> None:
             arrowprops={"arrowstyle": "-|>", "color": _AXES[k], "lw": 2.2, "shrinkA": 0, "shrinkB": 0},
         )
         axes.text(
-            *(ends[1] + 26 * away),
+            *(ends[1] + 19 * away),
             f"J{'₁₂₃'[k]}",
             color=_AXES[k],
             ha="center",
@@ -248,7 +247,7 @@ def _table(axes: Any, obj: NeuralObject) -> None:
     for k in range(3):
         rows.append(
             (
-                f"centre of mass {'xyz'[k]}",
+                f"COM {'xyz'[k]}",
                 with_error(float(mass.com[k]), float(mass.com_error[k])),
                 "m",
                 _INK,

@@ -3,12 +3,14 @@
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from dano.engine import contact_patches, contact_wrenches
 from dano.maths import Pose
-from dano.scene import Body, Scene, Trajectory
+from dano.scene import Body, Scene, State, Trajectory
 from dano.vision import Camera, Item, PALETTE
 
 
@@ -128,6 +130,45 @@ def _main_direction(centres: np.ndarray, moving: list[np.ndarray]) -> np.ndarray
     return right if right[0] >= 0 else -right
 
 
+class ContactHistory(NamedTuple):
+    """What every contact of a scene did in every step of a trajectory.
+
+    Attributes:
+        points: Centroids of the overlaps [m, W] at the starts of the steps, (steps, contacts, 3).
+        overlaps: Overlaps ψ [kg] there, (steps, contacts).
+        forces: On the first body of each contact [N, W], (steps, contacts, 3).
+    """
+
+    points: Float[np.ndarray, "steps contacts 3"]
+    overlaps: Float[np.ndarray, "steps contacts"]
+    forces: Float[np.ndarray, "steps contacts 3"]
+
+
+def contact_history(scene: Scene, states: State) -> ContactHistory:
+    """`contact_wrenches` and `contact_patches` of consecutive states at the price of one compilation.
+
+    Raises:
+        ValueError: If the states do not fit the scene or the scene has no contacts.
+    """
+    arrays = _contacts(scene, states)
+    return ContactHistory(*(np.asarray(array, dtype=np.float64) for array in arrays))
+
+
+@eqx.filter_jit
+def _contacts(scene: Scene, states: State) -> tuple[Array, Array, Array]:
+    def one(step: tuple[State, State]) -> tuple[Array, Array, Array]:
+        start = jax.tree.map(lambda x: x[None], step[0])
+        both = jax.tree.map(lambda x, y: jnp.stack([x, y]), *step)
+        # The wrenches need the same overlaps: the compiler finds that out and keeps one of the two.
+        patches = contact_patches(scene, start)
+        points = jnp.stack([patch.centroid[0] for patch in patches])
+        overlaps = jnp.stack([patch.overlap[0] for patch in patches])
+        return points, overlaps, contact_wrenches(scene, both)[0, :, :3]
+
+    before, after = (jax.tree.map(lambda x, s=s: x[s], states) for s in (slice(-1), slice(1, None)))
+    return jax.lax.map(one, (before, after))
+
+
 class Touches(NamedTuple):
     """Contact forces at the times of frames.
 
@@ -146,13 +187,10 @@ def touches(scene: Scene, trajectory: Trajectory, times: Float[np.ndarray, " fra
     """Contact points and forces of the steps that the times fall into; None without contacts in the scene."""
     if not scene.contacts:
         return None
-    wrenches = np.asarray(contact_wrenches(scene, trajectory.states), dtype=np.float64)
-    patches = contact_patches(scene, trajectory.states)
+    history = contact_history(scene, trajectory.states)
     known = np.asarray(trajectory.times, dtype=np.float64)
     step = np.clip(np.searchsorted(known, times, side="right") - 1, 0, len(known) - 2)
-    points = np.stack([np.asarray(patch.centroid, dtype=np.float64) for patch in patches], axis=1)[step]
-    overlap = np.stack([np.asarray(patch.overlap, dtype=np.float64) for patch in patches], axis=1)[step]
-    forces = wrenches[step, :, :3]
+    points, overlap, forces = (array[step] for array in history)
     size = np.linalg.norm(forces, axis=-1)
     # A landing is a hundred times the weight; what matters to the eye is the usual force, so the rest is
     # clipped.

@@ -161,17 +161,19 @@ def _empty(view: _View, camera: Camera) -> _Empty:
     for plane, tint in view.planes:
         numbers += [plane, tint]
     key = (camera.width, camera.height, *(np.asarray(x, dtype=np.float64).tobytes() for x in numbers))
-    if key not in _kept:
+    kept = _kept.get(key)
+    if kept is None:
         order = _tiles(camera.width, camera.height)
         points = np.stack([order % camera.width, order // camera.width], axis=1) + 0.5
         directions = np.ascontiguousarray(camera.directions(points).T, dtype=np.float32)
         depth, which, colour = _background(view, directions)
         picture = np.empty((len(order), 3), dtype=np.uint8)
         picture[order] = to_srgb(colour.T)
+        kept = _Empty(order, directions, depth, which, colour, picture)
         # One is enough: pictures come in series from one camera.
         _kept.clear()
-        _kept[key] = _Empty(order, directions, depth, which, colour, picture)
-    return _kept[key]
+        _kept[key] = kept
+    return kept
 
 
 def _background(view, d):

@@ -1,0 +1,1 @@
+"""Measurements of dano: `python -m benchmarks.speed` and `python -m benchmarks.paper`."""

@@ -1,0 +1,1 @@
+"""How closely dano reproduces stored rollouts, large-step differences and closed-form mass properties."""

@@ -1,0 +1,60 @@
+"""A call to be timed, and the rows that come of it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from benchmarks._measure import Row, summary, time_in_turn
+
+COMPILE_TARGET = 6.0  # [s]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A call to be timed.
+
+    Attributes:
+        group: Heading in the table.
+        name: Line in the table.
+        call: What to time.
+        count: The time of one call is divided by this: steps, rollouts times steps, …
+        target: For the time, in `unit`.
+        unit: "µs" or "ms".
+        compile_seconds: What its compilation took, or None for what is not compiled.
+        note: See `Row`.
+        base: Name of a case; report the ratio to it too.
+        ratio_target: For that ratio.
+    """
+
+    group: str
+    name: str
+    call: Callable[[], object]
+    count: int = 1
+    target: float | None = None
+    unit: str = "µs"
+    compile_seconds: float | None = None
+    note: str = ""
+    base: str | None = None
+    ratio_target: float | None = None
+
+
+def measure(cases: Sequence[Case], repeats: int) -> list[Row]:
+    """Time all cases in turn."""
+    seconds = time_in_turn({case.name: case.call for case in cases}, repeats)
+    counts = {case.name: case.count for case in cases}
+    rows = []
+    for case in cases:
+        scale = {"µs": 1e6, "ms": 1e3}[case.unit] / case.count
+        value, quartiles = summary(seconds[case.name] * scale)
+        rows.append(
+            Row(case.group, case.name, value, case.unit, case.target, quartiles=quartiles, note=case.note)
+        )
+        if case.base is not None:
+            ratios = seconds[case.name] / case.count / (seconds[case.base] / counts[case.base])
+            value, quartiles = summary(ratios)
+            name = f"{case.name} / forward"
+            rows.append(Row(case.group, name, value, "×", case.ratio_target, quartiles=quartiles))
+    compile_group = "Compilation: trace and compile, CPU time"
+    for case in cases:
+        if case.compile_seconds is not None:
+            rows.append(Row(compile_group, case.name, case.compile_seconds, "s", COMPILE_TARGET))
+    return rows

@@ -1,0 +1,144 @@
+"""From a field to an object: samples, thresholds, mass models, floaters and hollow cores, files."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+import dano
+
+N = 48
+AXIS = np.linspace(-0.6, 0.6, N)
+X = np.stack(np.meshgrid(AXIS, AXIS, AXIS, indexing="ij"), -1)
+
+
+def soft_wall(distance, width=0.05):
+    """Density that rises from 0 to 100 over a wall."""
+    return 100 / (1 + np.exp(np.clip(distance / width * 6, -40, 40)))
+
+
+def ball(center=(0.0, 0.0, 0.0), radius=0.4):
+    return np.linalg.norm(X - np.asarray(center), axis=-1) - radius
+
+
+def grid(values):
+    return dano.GridField(np.where(values < 1e-3, 0, values), (-0.6,) * 3, AXIS[1] - AXIS[0])
+
+
+@pytest.fixture(scope="module")
+def solid_ball():
+    return dano.NeuralObject.from_field(grid(soft_wall(ball())), n_samples=1500, resolution=48)
+
+
+@pytest.fixture(scope="module")
+def messy_ball():
+    """The same ball as a NeRF would have it: hollow core, and a floater in a corner."""
+    hollow = soft_wall(ball()) * (1 - soft_wall(ball(radius=0.2)) / 100)
+    floater = soft_wall(ball((0.5, 0.5, 0.5), 0.05))
+    return grid(hollow + floater)
+
+
+def test_samples_lie_between_the_thresholds_on_the_surface(solid_ball):
+    low, high = np.asarray(solid_ball.density_range)
+    phi = np.asarray(solid_ball.samples.density)
+    assert phi.min() >= low
+    assert phi.max() <= high
+    radius = np.linalg.norm(solid_ball.samples.points, axis=1)
+    assert np.all(np.abs(radius - 0.4) < 0.05)
+    assert len(np.unique(np.asarray(solid_ball.samples.points), axis=0)) == 1500
+
+
+def test_samples_cover_evenly(solid_ball):
+    """Every octant gets its share, and gaps between neighbours are alike: no clumps, no holes."""
+    points = np.asarray(solid_ball.samples.points)
+    octant = (points > 0) @ np.array([1, 2, 4])
+    counts = np.bincount(octant, minlength=8)
+    assert counts.min() > 0.8 * 1500 / 8
+    nearest = cKDTree(points).query(points, k=2)[0][:, 1]
+    assert nearest.std() < 0.25 * nearest.mean()
+    directions = np.random.default_rng(0).normal(size=(2000, 3))
+    on_surface = 0.4 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    holes = cKDTree(points).query(on_surface)[0]
+    assert holes.max() < 3 * nearest.mean()
+
+
+def test_normals_point_outward(solid_ball):
+    points, normals = np.asarray(solid_ball.samples.points), np.asarray(solid_ball.samples.normals)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
+    outward = points / np.linalg.norm(points, axis=1, keepdims=True)
+    assert np.min(np.sum(normals * outward, axis=1)) > 0.95
+
+
+def test_solid_fills_the_core_and_drops_the_floater(messy_ball):
+    options = {"n_samples": 800, "resolution": 48, "mass": 2.0}
+    solid = dano.NeuralObject.from_field(messy_ball, mass_model="solid", **options)
+    inertia = 0.4 * 2.0 * 0.4**2
+    np.testing.assert_allclose(solid.mass.inertia, inertia * np.eye(3), atol=0.02 * inertia)
+    np.testing.assert_allclose(solid.mass.com, 0, atol=2e-3)
+    paper = dano.NeuralObject.from_field(messy_ball, mass_model="density", **options)
+    assert float(paper.mass.inertia[0, 0]) > 1.1 * inertia, "a shell with a floater has more inertia"
+    assert float(jnp.abs(paper.mass.com).max()) > 1e-3
+
+    radius = np.linalg.norm(solid.samples.points, axis=1)
+    assert radius.max() < 0.5, "the floater must not feel contact"
+    assert radius.min() > 0.3, "nor the inside of the core"
+    assert float(solid.grid.density(jnp.array([0.5, 0.5, 0.5]))) == 0.0
+    kept = dano.NeuralObject.from_field(messy_ball, floaters=True, **options)
+    assert np.linalg.norm(kept.samples.points, axis=1).max() > 0.7
+
+
+def test_a_shape_becomes_an_object_by_baking():
+    box = dano.Box((0.1, 0.07, 0.05), rounding=0.01)
+    built = dano.NeuralObject.from_field(box, n_samples=600, mass=1.5, resolution=48)
+    assert 0 < float(built.bake_error) < 0.2
+    sdf = jax.vmap(box.sdf)(built.samples.points)
+    assert float(jnp.abs(sdf).max()) < float(box.edge_width)
+    corners = np.abs(np.asarray(built.samples.points)).max(axis=0)
+    np.testing.assert_allclose(corners, [0.1, 0.07, 0.05], atol=2e-3)
+
+
+def test_same_key_same_object(messy_ball):
+    build = lambda seed: dano.NeuralObject.from_field(  # noqa: E731
+        messy_ball, n_samples=200, resolution=32, key=jax.random.key(seed)
+    )
+    np.testing.assert_array_equal(build(1).samples.points, build(1).samples.points)
+    assert np.any(np.asarray(build(1).samples.points) != np.asarray(build(2).samples.points))
+
+
+def test_save_and_load(solid_ball, tmp_path):
+    path = tmp_path / "ball.dano"
+    solid_ball.save(path)
+    loaded = dano.NeuralObject.load(path)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), solid_ball, loaded)
+    np.testing.assert_array_equal(loaded.samples.points, solid_ball.samples.points)
+    assert loaded.mass_model == solid_ball.mass_model
+    assert [p.name for p in tmp_path.iterdir()] == ["ball.dano"]
+
+
+def test_from_samples_keeps_what_is_given():
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    given = dano.NeuralObject.from_samples(
+        points=points, density=np.ones(50), mass=2.0, com=(0.1, 0, 0), inertia=np.diag([1.0, 2.0, 2.5])
+    )
+    np.testing.assert_array_equal(given.samples.points, points)
+    assert given.grid is None
+    outward = points - np.array([0.1, 0, 0])
+    assert np.all(np.sum(np.asarray(given.samples.normals) * outward, axis=1) > 0)
+
+
+BAD = {
+    "n_samples": ({"n_samples": 0}, "n_samples must be"),
+    "empty range": ({"density_range": (500.0, 600.0)}, "density_range"),
+    "reversed range": ({"density_range": (5.0, 1.0)}, "density_range"),
+    "mass": ({"mass": -1.0}, "mass must be"),
+    "mass scale": ({"mass_scale": 0.0}, "mass_scale must be"),
+    "resolution": ({"resolution": 2}, "resolution must be"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_options(case):
+    options, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
+        dano.NeuralObject.from_field(grid(soft_wall(ball())), **{"n_samples": 50, "resolution": 24, **options})
