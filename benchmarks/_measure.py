@@ -1,7 +1,4 @@
-"""What both benchmarks share: pinning, timing, rows of results, the table and the JSON file.
-
-Nothing here imports JAX at the top: `pin_to_one_core` must run before that.
-"""
+"""What both benchmarks share: timing, rows of results, the table and the JSON file."""
 
 import argparse
 import datetime
@@ -14,7 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import jax
 import numpy as np
+
+import dano
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 VERSIONS_OF = ("jax", "jaxlib", "equinox", "numpy", "scipy", "mujoco")
@@ -64,37 +64,19 @@ def parse_arguments(description: str) -> argparse.Namespace:
     """The options `--json FILE` and `--quick`."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results to this file")
-    parser.add_argument("--quick", action="store_true", help="few repeats: to see that it runs, not to compare")
+    parser.add_argument(
+        "--quick", action="store_true", help="few repeats: to see that it runs, not to compare"
+    )
     return parser.parse_args()
 
 
-def pin_to_one_core() -> None:
-    """Keep this process, and everything that XLA and BLAS start in it, on one core. Call before importing JAX.
-
-    Unpinned, XLA moves work to other threads, and two programs that share a core measure each other.
-    """
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
-    for library in ("OMP", "OPENBLAS", "MKL"):
-        os.environ[f"{library}_NUM_THREADS"] = "1"
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
-
-
-def use_float64() -> None:
-    """Switch JAX to float64 and start its compiler once, so that the first measured compilation is like the others."""
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_enable_compilation_cache", False)
+def warm_up() -> None:
+    """Start JAX's compiler once, so that the first measured compilation is like the others."""
     compiled(lambda x: x @ x, np.eye(3))
 
 
 def compiled(function: Callable, *args) -> tuple[Callable, float]:
     """A function traced and compiled for these arguments, and the CPU time that this took [s]."""
-    import jax
-
     start = time.process_time()
     executable = jax.jit(function).lower(*args).compile()
     return executable, time.process_time() - start
@@ -103,11 +85,9 @@ def compiled(function: Callable, *args) -> tuple[Callable, float]:
 def time_in_turn(calls: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, np.ndarray]:
     """Process CPU times [s] of each call, shape (repeats,).
 
-    The calls take turns, so that a busy moment of the machine touches all of them and ratios of the same round
-    stay fair. Each timed call follows an untimed one, which fills the caches.
+    The calls take turns, so that a busy moment of the machine touches all of them and ratios
+    within a round stay fair. Each timed call follows an untimed one, which fills the caches.
     """
-    import jax
-
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(repeats):
         for name, call in calls.items():
@@ -125,7 +105,7 @@ def summary(values: np.ndarray) -> tuple[float, tuple[float, float]]:
 
 
 def reference_folder() -> Path | None:
-    """Folder of the authors' stored fields and trajectories, which are not ours to redistribute; None if absent."""
+    """Folder of the authors' stored fields and trajectories (not ours to redistribute), or None."""
     default = REPOSITORY.parent / "shared" / "reference" / "data"
     folder = Path(os.environ.get("DANO_REFERENCE_DATA", default))
     return folder if folder.is_dir() else None
@@ -134,7 +114,9 @@ def reference_folder() -> Path | None:
 NO_DATA = "no reference data: set DANO_REFERENCE_DATA to the folder that holds it"
 
 
-def report(name: str, rows: Sequence[Row], settings: dict[str, object], load_before: float, file: Path | None) -> None:
+def report(
+    name: str, rows: Sequence[Row], settings: dict[str, object], load_before: float, file: Path | None
+) -> None:
     """Print the rows as a table and, if a file is given, write them to it as JSON."""
     result = {
         "benchmark": name,
@@ -186,8 +168,6 @@ _VECTORS = {"avx512f": "AVX-512", "avx2": "AVX2", "asimd": "NEON"}
 
 
 def _versions() -> dict[str, str]:
-    import dano
-
     versions = {"python": platform.python_version(), "dano": dano.__version__}
     for package in VERSIONS_OF:
         try:

@@ -1,4 +1,4 @@
-"""The objects that both benchmarks simulate: the shipped bunny, and the authors' where their data is at hand."""
+"""The objects that both benchmarks simulate: the shipped bunny, and the authors' if their data is there."""
 
 from dataclasses import dataclass
 

@@ -1,6 +1,7 @@
 """One compiled program, many frictions: `jax.vmap` over rollouts."""
 
 import time
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from dano.scene_file import build_asset
 SPEED = 0.5
 
 
-def main(quick: bool = False) -> dict[str, list[float] | float]:
+def main(quick: bool = False) -> dict[str, Any]:
     bunny = build_asset("bunny")
     params = dano.ContactParams(sliding_drag=0.0, rolling_friction=1e-3, torsional_friction=1e-3)
     scene = dano.Scene.create(

@@ -36,7 +36,9 @@ def main(quick: bool = False) -> dict[str, float]:
     def regulator(state, time):
         turn = quat_multiply(quat_conjugate(goal.orientation[0]), state.orientation[0])
         rotation = 2 * jnp.sign(turn[0]) * turn[1:]
-        error = jnp.concatenate([state.position[0] - goal.position[0], rotation, state.velocity[0], state.omega[0]])
+        error = jnp.concatenate(
+            [state.position[0] - goal.position[0], rotation, state.velocity[0], state.omega[0]]
+        )
         push = -gain @ error
         return dano.Control(hold.force.at[0].add(push[:3]), hold.torque.at[0].add(push[3:]))
 

@@ -1,4 +1,4 @@
-"""Does the derivative with respect to friction say what happens when friction changes by something one can see?"""
+"""Does the derivative with respect to friction say what happens when friction changes visibly?"""
 
 from typing import NamedTuple
 
@@ -47,7 +47,6 @@ def gradient_rows(subject: Subject, *, quick: bool) -> list[Row]:
             f"largest relative error, step {TINY_STEP:g}",
             float(np.max(np.abs(derivative - tiny) / np.abs(tiny))),
             "",
-            note="steps this small suffer from rounding where the motion is chaotic",
         ),
         Row(group, "steps that did not converge", place.unconverged, "", 0),
     ]
@@ -88,7 +87,9 @@ class _Place:
     def _final(self, friction, velocity, yaw, pushed):
         """Where the bunny is after the rollout [m], and how many steps did not converge."""
         scene = self.scene.replace_contact("bunny", "floor", sliding_friction=friction)
-        turned = quat_multiply(quat_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), yaw), self.rest.orientation[0])
+        turned = quat_multiply(
+            quat_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), yaw), self.rest.orientation[0]
+        )
         near = jnp.array([-0.9, 0.1, 0.245]) * self.length
         root = self.length**0.5
         still = jnp.zeros_like(self.rest.velocity)
@@ -96,7 +97,10 @@ class _Place:
         state = dano.State(
             self.rest.position.at[1].set(jnp.where(pushed, near, self.away)).at[0, :2].set(0.0),
             self.rest.orientation.at[0].set(turned),
-            still.at[0, :2].set(jnp.where(pushed, 0.0, velocity * root)).at[1].set(jnp.where(pushed, ball, 0.0)),
+            still.at[0, :2]
+            .set(jnp.where(pushed, 0.0, velocity * root))
+            .at[1]
+            .set(jnp.where(pushed, ball, 0.0)),
             still,
         )
         run = dano.simulate(scene, state, N_STEPS)

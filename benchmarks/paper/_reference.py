@@ -1,7 +1,7 @@
 """The authors' stored rollouts: their contact points and their constants, state by state and free-running.
 
-Their constants are not dano's: the second-moment matrix in the place of the inertia tensor, friction without the
-factor 2/π, contact that may pull, a hard indicator (docs/theory/paper.md).
+Their constants are not dano's: the second-moment matrix in the place of the inertia tensor, friction without
+the factor 2/π, contact that may pull, a hard indicator (docs/theory/paper.md).
 """
 
 from pathlib import Path

@@ -51,7 +51,7 @@ def measure(cases: Sequence[Case], repeats: int) -> list[Row]:
         if case.base is not None:
             ratios = seconds[case.name] / case.count / (seconds[case.base] / counts[case.base])
             value, quartiles = summary(ratios)
-            name = f"{case.name} / forward"
+            name = f"{case.name} / rollout"
             rows.append(Row(case.group, name, value, "×", case.ratio_target, quartiles=quartiles))
     compile_group = "Compilation: trace and compile, CPU time"
     for case in cases:

@@ -4,13 +4,18 @@ from dano.maths import Pose as Pose  # isort: skip
 from dano.fields import (
     AbstractField as AbstractField,
     AbstractShape as AbstractShape,
+    bake as bake,
     Box as Box,
+    CallableField as CallableField,
     Capsule as Capsule,
     Cylinder as Cylinder,
     Ellipsoid as Ellipsoid,
     GridField as GridField,
     HalfSpace as HalfSpace,
+    load_field as load_field,
+    mesh_field as mesh_field,
     Posed as Posed,
+    save_field as save_field,
     Sphere as Sphere,
     Union as Union,
 )
@@ -44,5 +49,6 @@ from dano.engine import (
     step as step,
     VariationalEngine as VariationalEngine,
 )
+from dano.scene_file import load_scene as load_scene
 
 __version__ = "0.1.0"

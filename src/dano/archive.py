@@ -94,7 +94,15 @@ def read_archive(path: str | os.PathLike[str], form: str, version: int) -> dict[
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise ValueError("it holds one bare array")
             data = {name: archive[name] for name in archive.files}
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError, NotImplementedError) as error:
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        OSError,
+        ValueError,
+        KeyError,
+        NotImplementedError,
+    ) as error:
         raise ValueError(f"{source} is not a readable {form} file: {error}") from error
     found = str(data.get("format", "of no stated format"))
     if found != form:

@@ -1,7 +1,7 @@
 """Quaternions (wxyz), rigid poses and norms that differentiate safely at zero.
 
-A quaternion is an array whose last axis holds (w, x, y, z). It rotates body-frame vectors into the world frame.
-Every function broadcasts over leading axes unless its signature says otherwise.
+A quaternion is an array whose last axis holds (w, x, y, z). It rotates body-frame vectors into the world
+frame. Every function broadcasts over leading axes unless its signature says otherwise.
 """
 
 from collections.abc import Sequence
@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 Numbers = ArrayLike | Sequence[Any]
@@ -81,7 +82,8 @@ def quat_to_matrix(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 3 3"]:
 def quat_from_matrix(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
     """Unit quaternion (w ≥ 0) of a rotation matrix, on the host (Shepperd's method)."""
     m = np.asarray(matrix)
-    # The eigenvector of the largest eigenvalue is stable for every rotation and projects a nearly-orthogonal input.
+    # The eigenvector of the largest eigenvalue is stable for every rotation and projects a nearly-orthogonal
+    # input.
     k = np.array(
         [
             [m[0, 0] + m[1, 1] + m[2, 2], 0, 0, 0],
@@ -165,7 +167,7 @@ class Pose(eqx.Module):
 
 def is_traced(*values: object) -> bool:
     """Whether any leaf is a JAX tracer, on which host-side checks are impossible."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
 def checked_array(name: str, value: Numbers, shape: tuple[int, ...]) -> Array:
@@ -197,7 +199,7 @@ def checked_quaternion(name: str, value: Numbers) -> Array:
 
 
 def floating(value: Numbers) -> Array:
-    """`value` as a floating JAX array: floating arrays keep their dtype, everything else takes JAX's default."""
+    """`value` as a floating JAX array: floating arrays keep their dtype, the rest takes JAX's default."""
     dtype = getattr(value, "dtype", None)
     if dtype is not None and jnp.issubdtype(dtype, jnp.floating):
         return jnp.asarray(value)

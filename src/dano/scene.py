@@ -23,7 +23,8 @@ from dano.fields import AbstractField, AbstractShape, HalfSpace, PosedShape, Sph
 from dano.maths import checked_array, checked_quaternion, floating, is_traced, Numbers
 from dano.objects import checked_inertia, MassProperties, NeuralObject, surface_samples
 
-# Edge width of a primitive relative to the size of what touches it: 0.5 % made gradients and rest right, 0.1 % did not.
+# Edge width of a primitive relative to the size of what touches it: 0.5 % made gradients and rest
+# right, 0.1 % did not.
 EDGE_SHARE = 0.005
 SHAPE_SAMPLES = 2000
 
@@ -37,8 +38,8 @@ class Body(eqx.Module):
         object: Neural object, or None for a shape.
         samples: Contact samples in the layout of the contact kernels, or None for a shape without them.
         support: Culling map of the object's grid.
-        density_scale: Makes the object's density dimensionless in neural–neural contacts: one over the mean density
-            of its samples.
+        density_scale: Makes the object's density dimensionless in neural–neural contacts: one over the mean
+            density of its samples.
         mass: [kg].
         inertia: Tensor about the centre of mass [kg m², B].
         com: Centre of mass in the field frame [m, F].
@@ -72,12 +73,13 @@ class Body(eqx.Module):
         com_offset: Numbers = (0.0, 0.0, 0.0),
         fixed: bool = False,
     ):
-        """A body from a neural object (which brings its mass) or from a shape (homogeneous, of the given mass).
+        """A body from a neural object (which brings its mass) or a shape (homogeneous, of the given mass).
 
         Args:
             name: Unique name.
             geometry: Neural object or shape.
-            mass: [kg]; required for a shape that moves. For a neural object: replaces its mass, inertia in proportion.
+            mass: [kg]; required for a shape that moves. For a neural object: replaces its mass, inertia in
+                proportion.
             inertia: Tensor about the centre of mass [kg m²]; default from the geometry.
             com: Centre of mass [m, F]; default from the geometry.
             mass_scale: Multiplies mass and inertia.
@@ -85,8 +87,8 @@ class Body(eqx.Module):
             fixed: Whether the body never moves; then it needs no mass.
 
         Raises:
-            ValueError: If the name is empty, the geometry is no shape or object, or a mass property is missing or
-                out of range.
+            ValueError: If the name is empty, the geometry is no shape or object, or a mass property is
+                missing or out of range.
         """
         if not isinstance(name, str) or not name:
             raise ValueError(f"name must be a non-empty string, got {name!r}")
@@ -103,11 +105,11 @@ class Body(eqx.Module):
             properties = geometry.mass
         elif isinstance(geometry, AbstractShape):
             self.shape = geometry
-            properties = None if mass is None else _homogeneous(name, geometry, float(mass))
+            properties = None if mass is None else _homogeneous(name, geometry, float(np.asarray(mass)))
         else:
             raise ValueError(
-                f"geometry of body {name!r} must be a NeuralObject or a shape, got {type(geometry).__name__}; "
-                "a field becomes an object by NeuralObject.from_field"
+                f"geometry of body {name!r} must be a NeuralObject or a shape, "
+                f"got {type(geometry).__name__}; a field becomes an object by NeuralObject.from_field"
             )
         if properties is None:
             if not self.fixed:
@@ -148,7 +150,7 @@ class Body(eqx.Module):
         return self.shape if self.object is None else self.object.grid
 
     def collider(self, position: Float[Array, "3"], rotation: Float[Array, "3 3"]) -> Collider:
-        """The body as seen by a contact, with its centre of mass at `position` [m, W] and axes `rotation` (B → W)."""
+        """The body as a contact sees it: centre of mass at `position` [m, W], axes `rotation` (B → W)."""
         com = self.com + self.com_offset
         origin = position - sum(rotation[:, i] * com[i] for i in range(3))
         return Collider(
@@ -234,7 +236,8 @@ class Trajectory(eqx.Module):
     Attributes:
         times: [s], shape (n_steps + 1,).
         states: States, leaves of shape (n_steps + 1, n_bodies, ·); the first entry is the initial state.
-        residuals: Largest remaining momentum error of each step divided by mass or inertia [m/s, rad/s], shape (n_steps,).
+        residuals: Largest remaining momentum error of each step divided by mass or inertia [m/s, rad/s],
+            shape (n_steps,).
         iterations: Newton iterations of each step, shape (n_steps,).
         converged: Whether each step reached the solver's tolerance, shape (n_steps,).
         names: Names of the bodies.
@@ -265,9 +268,7 @@ class Trajectory(eqx.Module):
                 "names": np.array(self.names),
                 "times": np.asarray(self.times),
                 **{name: np.asarray(getattr(self.states, name)) for name in _STATE_SHAPES},
-                **{
-                    name: np.asarray(getattr(self, name)) for name in ("residuals", "iterations", "converged")
-                },
+                **{name: np.asarray(getattr(self, name)) for name in _REPORTED},
                 **({} if source is None else {"source": np.array(source)}),
             },
         )
@@ -281,17 +282,15 @@ class Trajectory(eqx.Module):
         """
         data = read_archive(path, "dano-trajectory", 1)
         try:
+            arrays = {name: jnp.asarray(data[name]) for name in ("times", *_REPORTED)}
             states = State(*(jnp.asarray(data[name]) for name in _STATE_SHAPES))
-            return cls(
-                jnp.asarray(data["times"]),
-                states,
-                *(jnp.asarray(data[name]) for name in ("residuals", "iterations", "converged")),
-                tuple(str(name) for name in data["names"]),
-            )
+            return cls(states=states, names=tuple(str(name) for name in data["names"]), **arrays)
         except KeyError as error:
             raise ValueError(f"{path} is not a valid dano trajectory: it lacks {error}") from error
 
 
+_REPORTED = ("residuals", "iterations", "converged")
+_REPORTED = ("residuals", "iterations", "converged")
 _STATE_SHAPES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 
 
@@ -322,8 +321,8 @@ class Scene(eqx.Module):
         """Check the parts against each other and resolve defaults that depend on both bodies of a contact.
 
         Raises:
-            ValueError: If there is no body, two have one name, a contact names an unknown body, joins two fixed
-                ones or a pair twice, a pair cannot overlap, or a number is out of range.
+            ValueError: If there is no body, two have one name, a contact names an unknown body, joins two
+                fixed ones or a pair twice, a pair cannot overlap, or a number is out of range.
         """
         bodies, contacts = tuple(bodies), tuple(contacts)
         names = [body.name for body in bodies]
@@ -404,7 +403,7 @@ class Scene(eqx.Module):
             ValueError: If there is no such contact or parameter, or a value is out of range.
         """
         i = self.contact_index(a, b)
-        valid = [f for f in ContactParams.__dataclass_fields__]
+        valid = list(ContactParams.__dataclass_fields__)
         for name in changes:
             if name not in valid:
                 raise ValueError(f"contact parameter must be one of {valid}, got {name!r}")
@@ -442,18 +441,18 @@ class Scene(eqx.Module):
         return eqx.tree_at(lambda s: [getattr(s.bodies[i], key) for key in keys], self, values)
 
     def initial_state(self, /, **bodies: dict[str, Numbers]) -> State:
-        """A state: bodies by keyword, each a dict of `position, orientation, velocity, omega`; the rest at the origin.
+        """A state: bodies by keyword, each a dict of `position, orientation, velocity, omega`.
 
-        Orientations are normalised.
+        Bodies that are not named rest at the origin. Orientations are normalised.
 
         Raises:
-            ValueError: If a body or quantity is unknown, a shape is wrong, a number is not finite, a quaternion is
-                zero, or a body spins faster than the timestep resolves (|ω| ≥ 2/h).
+            ValueError: If a body or quantity is unknown, a shape is wrong, a number is not finite, a
+                quaternion is zero, or a body spins faster than the timestep resolves (|ω| ≥ 2/h).
         """
         rows: dict[str, list[Array]] = {name: [] for name in _STATE_SHAPES}
         for name in bodies:
             self.index(name)
-        default = {
+        default: dict[str, Numbers] = {
             "position": (0.0,) * 3,
             "orientation": (1.0, 0.0, 0.0, 0.0),
             "velocity": (0.0,) * 3,
@@ -465,7 +464,7 @@ class Scene(eqx.Module):
                 if key not in _STATE_SHAPES:
                     raise ValueError(f"state of {name!r} must be given by {list(_STATE_SHAPES)}, got {key!r}")
             for key, size in _STATE_SHAPES.items():
-                label, value = f"{key} of {name!r}", given.get(key, default[key])
+                label, value = f"{key} of {name!r}", given[key] if key in given else default[key]
                 check = checked_quaternion(label, value) if size == 4 else checked_array(label, value, (3,))
                 rows[key].append(check.astype(self.timestep.dtype))
         state = State(*(jnp.stack(rows[key]) for key in _STATE_SHAPES))
@@ -476,7 +475,8 @@ class Scene(eqx.Module):
         """Check a concrete state against the scene; traced values pass.
 
         Raises:
-            ValueError: If a shape is wrong, a number is not finite, a quaternion is not of unit length, or |ω| ≥ 2/h.
+            ValueError: If a shape is wrong, a number is not finite, a quaternion is not of unit length, or
+                |ω| ≥ 2/h.
         """
         for key, size in _STATE_SHAPES.items():
             value = getattr(state, key)
@@ -497,7 +497,8 @@ class Scene(eqx.Module):
             )
             if fastest >= limit:
                 raise ValueError(
-                    f"state.omega must be below 2/timestep = {limit:.6g} rad/s, got {fastest:.6g}; take a smaller timestep"
+                    f"state.omega must be below 2/timestep = {limit:.6g} rad/s, got {fastest:.6g}; "
+                    "take a smaller timestep"
                 )
 
     def control(self, /, **bodies: dict[str, Numbers]) -> Control:
@@ -523,14 +524,15 @@ class Scene(eqx.Module):
 def colliders(
     scene: Scene, contact: Contact, positions: Float[Array, "n 3"], rotations: Sequence[Float[Array, "3 3"]]
 ) -> tuple[Collider, Collider]:
-    """Both sides of a contact, as `dano.overlap` takes them, with all bodies at given positions and rotations."""
+    """Both sides of a contact, as `dano.overlap` takes them, with bodies at given positions and rotations."""
     a, b = (scene.body(name) for name in (contact.a, contact.b))
     sides = []
     for body, other in ((a, b), (b, a)):
         i = scene.index(body.name)
         side = body.collider(positions[i], rotations[i])
         if body.shape is not None:
-            # Against a neural object a primitive has no samples of its own (paper: the sum runs over the object's).
+            # Against a neural object a primitive has no samples of its own (paper: the sum runs over the
+            # object's).
             samples = side.samples if other.object is None else None
             side = eqx.tree_at(
                 lambda c: (c.field, c.samples),

@@ -174,19 +174,32 @@ def test_demo(run, scene, egg, tmp_path, monkeypatch, small_assets):
     for name in _scenes.SCENES:
         (tmp_path / "scenes" / f"{name}.toml").write_text(text, encoding="utf-8")
     monkeypatch.setattr(_scenes, "files", lambda _: tmp_path)
-    monkeypatch.setattr(_scenes, "SECONDS_FOR_ONE", 0.0)
     drawn = []
     monkeypatch.setattr("dano.report.draw_object", lambda *given, **_: drawn.append(given[1].name))
     monkeypatch.setattr("dano.report.render_trajectory", lambda *given, **_: drawn.append(given[2].name))
     folder = tmp_path / "demo"
     answer = run("demo", "-o", folder, "--json")
     assert answer.code == 0
-    # No time was left for the second scene.
-    assert "dano demo collision" in answer.err
-    assert list(json.loads(answer.out)["scenes"]) == ["drop"]
-    assert drawn == ["bunny.png", "drop.mp4"]
-    assert {path.name for path in folder.iterdir()} == {"drop.toml", "drop.npz", "drop.json", "bunny.dano"}
+    report = json.loads(answer.out)["scenes"]
+    assert list(report) == list(_scenes.SCENES)
+    # An object of both scenes is drawn once.
+    assert drawn == ["bunny.png", "drop.mp4", "collision.mp4"]
+    written = {f"{name}.{suffix}" for name in _scenes.SCENES for suffix in ("toml", "npz", "json")}
+    assert {path.name for path in folder.iterdir()} == {*written, "bunny.dano"}
+    assert json.loads((folder / "drop.json").read_text(encoding="utf-8")) == report["drop"]
     assert "== collision ==" in run("demo", "collision", "-o", folder).out
+
+
+def test_demo_says_what_its_pictures_lack(run, scene, tmp_path, monkeypatch, small_assets):
+    def failing(*_: object, **__: object) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr("dano.report.draw_object", failing)
+    monkeypatch.setattr("dano.report.render_trajectory", lambda *_, **__: None)
+    monkeypatch.setattr(_rollout, "simulate", lambda given, state, n, **_: dano.simulate(given, state, 2))
+    answer = run("demo", "collision", "-o", tmp_path / "demo")
+    assert answer.code == 2
+    assert "no space left" in answer.err
 
 
 def test_shipped_scenes_load(small_assets):

@@ -37,6 +37,7 @@ fixed = true
     for contact in loaded.scene.contacts:
         assert float(contact.params.rolling_friction) == 0.002
         assert float(contact.params.spring) == float(dano.ContactParams().spring)
+        assert isinstance(contact.law, dano.CentroidLaw)
         assert float(contact.law.smoothing) == 500
     assert loaded.n_steps == 400
     assert loaded.controls is None
@@ -60,7 +61,7 @@ SHAPES = {
 def test_shapes(text, tmp_path):
     loaded = parse_scene(f'n_steps = 1\n[[bodies]]\nname = "it"\nmass = 1.5\n{text}\n', tmp_path / "s.toml")
     shape, expected = loaded.scene.body("it").shape, SHAPES[text]
-    assert type(shape) is type(expected)
+    assert shape is not None and type(shape) is type(expected)
     for x in (jnp.array([0.05, 0.1, 0.15]), jnp.array([0.1, -0.05, 0.0])):
         assert float(shape.sdf(x)) == pytest.approx(float(expected.sdf(x)), abs=1e-12)
     assert float(shape.edge_width) == float(expected.edge_width)
@@ -124,6 +125,7 @@ damping = 20.0
     # A critically damped spring of 10 rad/s, which moves at most as far as asked.
     assert float(run.states.position[-1, 1, 1]) == pytest.approx(0.5, abs=5e-3)
     # The second half alone, told when it begins, goes on as the whole did.
+    assert loaded.controls is not None
     middle = dano.State(*(x[20] for x in (run.states.position, run.states.orientation, *_velocities(run))))
     rest = dano.simulate(loaded.scene, middle, 100, controls=loaded.controls.starting_at(0.2))
     np.testing.assert_allclose(rest.states.position[80], run.states.position[100], atol=1e-10)

@@ -56,7 +56,10 @@ def test_wrench_and_jacobian(twist, adhesive):
     np.testing.assert_allclose(jacobian, by_autodiff, rtol=1e-9, atol=1e-9)
     step = 1e-7 * np.eye(6)
     by_difference = [
-        (law.wrench(PATCH, PARAMS, jnp.asarray(twist + e))[0] - law.wrench(PATCH, PARAMS, jnp.asarray(twist - e))[0])
+        (
+            law.wrench(PATCH, PARAMS, jnp.asarray(twist + e))[0]
+            - law.wrench(PATCH, PARAMS, jnp.asarray(twist - e))[0]
+        )
         / 2e-7
         for e in step
     ]
@@ -65,13 +68,22 @@ def test_wrench_and_jacobian(twist, adhesive):
 
 @pytest.mark.parametrize(
     ("smoothing", "speed", "factor"),
-    [(30, 0.01, 0.169), (30, 0.1, 0.787), (30, 1, 0.978), (8, 0.03, 0.145), (100, 0.003, 0.139), (10, 3, 0.978)],
+    [
+        (30, 0.01, 0.169),
+        (30, 0.1, 0.787),
+        (30, 1, 0.978),
+        (8, 0.03, 0.145),
+        (100, 0.003, 0.139),
+        (10, 3, 0.978),
+    ],
 )
 def test_friction_saturation(smoothing, speed, factor):
-    """Share of Coulomb's friction reached at a sliding speed, as tabulated for the reference implementation."""
+    """Share of Coulomb's friction reached at a sliding speed, tabulated for the reference implementation."""
     params = dano.ContactParams(spring=1.0, damper=0.0, sliding_friction=1.0, sliding_drag=0.0)
     patch = dano.Patch(jnp.asarray(1.0), jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]))
-    wrench, _ = dano.CentroidLaw(smoothing=smoothing).wrench(patch, params, jnp.array([speed, 0, 0, 0, 0, 0.0]))
+    wrench, _ = dano.CentroidLaw(smoothing=smoothing).wrench(
+        patch, params, jnp.array([speed, 0, 0, 0, 0, 0.0])
+    )
     assert -wrench[0] == pytest.approx(factor, abs=6e-4)
 
 
@@ -86,7 +98,9 @@ def test_rest_has_a_finite_jacobian():
     wrench, jacobian = dano.CentroidLaw().wrench(PATCH, PARAMS, jnp.zeros(6))
     np.testing.assert_allclose(wrench, np.concatenate([60.0 * NORMAL, np.zeros(3)]), atol=1e-12)
     assert np.all(np.isfinite(jacobian))
-    assert np.all(np.isfinite(jax.jacrev(lambda t: dano.CentroidLaw().wrench(PATCH, PARAMS, t)[0])(jnp.zeros(6))))
+    assert np.all(
+        np.isfinite(jax.jacrev(lambda t: dano.CentroidLaw().wrench(PATCH, PARAMS, t)[0])(jnp.zeros(6)))
+    )
 
 
 @pytest.mark.parametrize("name", dano.ContactParams.__dataclass_fields__)

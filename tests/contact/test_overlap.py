@@ -98,8 +98,9 @@ def test_ball_on_plane_against_quadrature():
     np.testing.assert_allclose(flipped.normal, [0, 0, -1], atol=1e-12)
 
 
-def brute_force(a, b, samples_a, samples_b, pose_a, pose_b, mass_a, mass_b):
+def brute_force(pair, pose_a, pose_b, mass_a, mass_b):
     """The union sum written out over all samples with plain loops over the two sides."""
+    a, b, samples_a, samples_b = pair
     psi, first, normal = 0.0, np.zeros(3), np.zeros(3)
     for (x, phi), own, other, field, mass, sign in (
         (samples_a, pose_a, pose_b, b, mass_a, 1),
@@ -138,7 +139,7 @@ def test_neural_pair_against_brute_force(pair, centers):
     pose_b = dano.Pose(centers[1], (0.5, -0.3, 0.2, 0.6))
     a, b = posed_pair(pair, pose_a, pose_b)
     patch = dano.overlap(a, b)
-    psi, centroid, normal = brute_force(*pair, pose_a, pose_b, 2.0, 3.0)
+    psi, centroid, normal = brute_force(pair, pose_a, pose_b, 2.0, 3.0)
     assert patch.overlap == pytest.approx(psi, rel=1e-10)
     np.testing.assert_allclose(patch.centroid, centroid, atol=1e-10)
     np.testing.assert_allclose(patch.normal, normal, atol=1e-9)
@@ -174,7 +175,9 @@ def apart_cases(pair):
     }
 
 
-@pytest.mark.parametrize("kind", ["half-space", "sphere", "rounded box", "grid, culled", "grid, every sample"])
+@pytest.mark.parametrize(
+    "kind", ["half-space", "sphere", "rounded box", "grid, culled", "grid, every sample"]
+)
 def test_derivatives_with_respect_to_both_poses(pair, kind):
     """Forward = reverse = central differences for ψ, χ and n, moving either body."""
     other = apart_cases(pair)[kind]
@@ -182,13 +185,14 @@ def test_derivatives_with_respect_to_both_poses(pair, kind):
     weights = jnp.asarray(np.random.default_rng(7).normal(size=7))
 
     def value(change):
-        turn = [jnp.concatenate([jnp.ones(1), 0.5 * change[3:6]]), jnp.concatenate([jnp.ones(1), 0.5 * change[9:]])]
+        turn = [
+            jnp.concatenate([jnp.ones(1), 0.5 * change[3:6]]),
+            jnp.concatenate([jnp.ones(1), 0.5 * change[9:]]),
+        ]
         pose_a = dano.Pose(jnp.array([0.1, 0.05, 0.28]) + change[:3], turn[0])
         pose_b = dano.Pose(change[6:9], quat_multiply(jnp.array([0.9, 0.1, 0.3, 0.1]), turn[1]))
         a = dano.Collider(pair[0], samples, support=support, mass=2.0, pose=pose_a)
-        b = dano.Collider(
-            other.field, other.samples, support=other.support, mass=other.mass, pose=pose_b
-        )
+        b = dano.Collider(other.field, other.samples, support=other.support, mass=other.mass, pose=pose_b)
         patch = dano.overlap(a, b)
         return jnp.dot(weights, jnp.concatenate([patch.overlap[None], patch.centroid, patch.normal]))
 
@@ -207,14 +211,18 @@ def test_derivative_with_respect_to_a_radius():
     samples = cube_samples(12)
 
     def psi(radius):
-        return dano.overlap(dano.Collider(None, samples), dano.Collider(dano.Sphere(radius, edge=0.1))).overlap
+        return dano.overlap(
+            dano.Collider(None, samples), dano.Collider(dano.Sphere(radius, edge=0.1))
+        ).overlap
 
     expected = (psi(0.3 + 1e-6) - psi(0.3 - 1e-6)) / 2e-6
     assert jax.jit(jax.grad(psi))(0.3) == pytest.approx(float(expected), rel=1e-6)
     assert jax.jit(jax.jacfwd(psi))(0.3) == pytest.approx(float(expected), rel=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["half-space", "sphere", "rounded box", "grid, culled", "grid, every sample"])
+@pytest.mark.parametrize(
+    "kind", ["half-space", "sphere", "rounded box", "grid, culled", "grid, every sample"]
+)
 def test_nothing_when_apart(pair, kind):
     """Far apart: zero patch, and derivatives that are zero rather than NaN."""
     other, samples = apart_cases(pair)[kind], SampleSet.create(*pair[2])

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import dano
+from dano.maths import quat_rotate
 
 
 def point_cloud_box(half=(0.1, 0.07, 0.05), mass=1.3, n=8, com=(0.0, 0.0, 0.0)):
@@ -37,4 +38,4 @@ def angular_momentum(states: dano.State, inertia, h):
     s = jnp.sqrt(4 / h**2 - jnp.sum(omega**2, axis=-1, keepdims=True))
     spin = jnp.einsum("ij,...j->...i", inertia, omega)
     body = 0.5 * h * (s * spin - jnp.cross(omega, spin))
-    return dano.maths.quat_rotate(states.orientation, body)
+    return quat_rotate(states.orientation, body)

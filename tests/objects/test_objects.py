@@ -83,6 +83,7 @@ def test_solid_fills_the_core_and_drops_the_floater(messy_ball):
     radius = np.linalg.norm(solid.samples.points, axis=1)
     assert radius.max() < 0.5, "the floater must not feel contact"
     assert radius.min() > 0.3, "nor the inside of the core"
+    assert solid.grid is not None
     assert float(solid.grid.density(jnp.array([0.5, 0.5, 0.5]))) == 0.0
     kept = dano.NeuralObject.from_field(messy_ball, floaters=True, **options)
     assert np.linalg.norm(kept.samples.points, axis=1).max() > 0.7
@@ -141,4 +142,6 @@ BAD = {
 def test_bad_options(case):
     options, message = BAD[case]
     with pytest.raises(ValueError, match=message):
-        dano.NeuralObject.from_field(grid(soft_wall(ball())), **{"n_samples": 50, "resolution": 24, **options})
+        dano.NeuralObject.from_field(
+            grid(soft_wall(ball())), **{"n_samples": 50, "resolution": 24, **options}
+        )

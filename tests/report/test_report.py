@@ -14,10 +14,11 @@ av = pytest.importorskip("av")
 Image = pytest.importorskip("PIL.Image")
 
 SIZE = (96, 64)
+Run = tuple[dano.Scene, dano.Trajectory]
 
 
 @pytest.fixture(scope="module")
-def run() -> tuple[dano.Scene, dano.Trajectory]:
+def run() -> Run:
     """A ball that rolls over a floor, by hand: 0.5 s in steps of 10 ms."""
     scene = dano.Scene.create(
         bodies=[
@@ -59,7 +60,7 @@ def cube() -> dano.NeuralObject:
     )
 
 
-def test_video_has_every_frame_and_moves(run, tmp_path):
+def test_video_has_every_frame_and_moves(run: Run, tmp_path):
     path, strip, told = tmp_path / "run.mp4", tmp_path / "run.png", []
     render_trajectory(
         *run, path, fps=20, size=SIZE, slow_motion=1.5, strip=strip, progress=lambda *x: told.append(x)
@@ -80,7 +81,7 @@ def test_video_has_every_frame_and_moves(run, tmp_path):
     assert sorted(tmp_path.iterdir()) == [path, strip]
 
 
-def test_an_interrupted_video_leaves_what_was_there(run, tmp_path):
+def test_an_interrupted_video_leaves_what_was_there(run: Run, tmp_path):
     path = tmp_path / "run.mp4"
     path.write_bytes(b"old")
 
@@ -106,7 +107,7 @@ def test_an_interrupted_video_leaves_what_was_there(run, tmp_path):
         (None, {}, "path or strip"),
     ],
 )
-def test_bad_videos_are_refused(run, tmp_path, name, options, message):
+def test_bad_videos_are_refused(run: Run, tmp_path, name, options, message):
     with pytest.raises(ValueError, match=message):
         render_trajectory(*run, None if name is None else tmp_path / name, **{"size": SIZE} | options)
     assert not list(tmp_path.iterdir())

@@ -44,7 +44,10 @@ def test_rays_meet_a_box_where_the_slabs_do():
     o, local = (origin - [0.1, 0.2, 0.3]) @ rotation, d @ rotation
     near, far = np.sort(np.stack([(-half - o) / local, (half - o) / local]), axis=0)
     enter, leave = near.max(axis=1), far.min(axis=1)
-    placed = Placed(item.shape, rotation.astype(np.float32), np.array([0.1, 0.2, 0.3], dtype=np.float32))
+    assert item.shape is not None
+    placed = Placed(
+        item.shape, jnp.asarray(rotation, jnp.float32), jnp.array([0.1, 0.2, 0.3], dtype=jnp.float32)
+    )
     everywhere, index = np.full(3000, np.inf, dtype=np.float32), np.arange(3000)
     hit, t = _first_hits(
         placed, origin.astype(np.float32), d.T.astype(np.float32), everywhere, index, np.float32(1e-4)
@@ -114,6 +117,7 @@ def test_planes_are_known_wherever_they_are_put():
     half = math.sqrt(0.5)
     plane = Item(HalfSpace((0, 0, 1), 0.2), Pose((1.0, 2.0, 3.0), (half, half, 0, 0))).plane
     # Turned by 90° about x: z becomes −y; the plane passes 0.2 above the new origin along it.
+    assert plane is not None
     np.testing.assert_allclose(plane, (0, -1, 0, 0.2 - 2.0), atol=1e-7)
 
 

@@ -1,7 +1,7 @@
 """Contact laws: from the overlap of two bodies and their relative motion to a wrench.
 
-A law is a class (what is fixed), its parameters are `ContactParams` (what can be identified). Velocities are the
-unknown end-of-step ones, so a law also returns its Jacobian, in closed form, for the step's Newton solve.
+A law is a class (what is fixed), its parameters are `ContactParams` (what can be identified). Velocities are
+the unknown end-of-step ones, so a law also returns its Jacobian, in closed form, for the step's Newton solve.
 """
 
 import abc
@@ -81,7 +81,8 @@ class AbstractContactLaw(eqx.Module):
                 [rad/s]; both in W.
 
         Returns:
-            (force [N], torque about the centroid [N m]) on the first body [W], shape (6,), and ∂wrench/∂twist.
+            (force [N], torque about the centroid [N m]) on the first body [W], shape (6,), and
+            ∂wrench/∂twist.
         """
 
 
@@ -95,7 +96,8 @@ class CentroidLaw(AbstractContactLaw):
     Attributes:
         smoothing: s [s/m, and s/rad for the moments]; larger is nearer to Coulomb's law and creeps less.
         regularizer: ε [m/s, and rad/s].
-        adhesive: Whether F_n may pull once bodies separate faster than k/d, as the reference implementation does.
+        adhesive: Whether F_n may pull once bodies separate faster than k/d, as the reference implementation
+            does.
     """
 
     smoothing: Float[Array, ""]
@@ -150,7 +152,7 @@ class CentroidLaw(AbstractContactLaw):
         return wrench, jnp.concatenate([upper, lower])
 
     def _resistance(self, u, projection, friction, drag):
-        """μ c(u) − drag u for a velocity u = projection @ u_full, and its derivative with respect to u_full."""
+        """μ c(u) − drag u for a velocity u = projection @ u_full, and its derivative by u_full."""
         speed = safe_norm(u)
         angle = jnp.arctan(self.smoothing * speed) * (2 / jnp.pi)
         reach = self.regularizer + speed

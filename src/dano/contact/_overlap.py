@@ -4,10 +4,10 @@ Both sides contribute the same one-sided sum: the samples of one object weigh th
 
     S = Σ w_i φ(y_i) x̃_i,      D = Σ w_i φ(y_i) d(y_i),      y_i = H x̃_i,
 
-with x̃ = (x, y, z, 1) in the sampled object's frame, H (3×4) the transform into the queried field's frame and d the
-field's outward direction (−∇φ for a learned field, the surface normal of a shape). S holds ψ and ψχ, D the normal.
-Each kernel below evaluates S and D together with their exact derivative with respect to H in one pass over the
-samples, so that neither autodiff mode ever stores anything of the size of the sample set.
+with x̃ = (x, y, z, 1) in the sampled object's frame, H (3×4) the transform into the queried field's frame and
+d the field's outward direction (−∇φ for a learned field, the surface normal of a shape). S holds ψ and ψχ, D
+the normal. Each kernel below evaluates S and D together with their exact derivative with respect to H in one
+pass over the samples, so that neither autodiff mode ever stores anything of the size of the sample set.
 """
 
 import equinox as eqx
@@ -43,10 +43,12 @@ class _Side(eqx.Module):
     direction: Float[Array, "3"]
 
 
-# Name of the values that reverse mode keeps instead of computing them again: results of passes over samples, of solves.
+# Name of the values that reverse mode keeps instead of computing them again: results of passes over samples,
+# of solves.
 KEPT = "kept"
 
-# Below this share of a body's mass an overlap counts as none: ψ² must not underflow where χ = S/ψ is differentiated.
+# Below this share of a body's mass an overlap counts as none: ψ² must not underflow where χ = S/ψ is
+# differentiated.
 _NEGLIGIBLE = 1e-12
 
 # Edge width [m] that stands for zero: far below any distance, far above the smallest float32.
@@ -57,9 +59,9 @@ _HARD = 1e-30
 def overlap(a: Collider, b: Collider) -> Patch:
     """Expected interpenetration of two colliders.
 
-    ψ = Σ w_i φ(x_i) over the samples of either side, χ the ψ-weighted centroid, n the weighted mean of the outward
-    direction of the queried field (paper: eq:integral_volume, eq:integral_centroid; the union sum covers
-    neural–primitive pairs, where one side has no samples, and neural–neural pairs alike).
+    ψ = Σ w_i φ(x_i) over the samples of either side, χ the ψ-weighted centroid, n the weighted mean of the
+    outward direction of the queried field (paper: eq:integral_volume, eq:integral_centroid; the union sum
+    covers neural–primitive pairs, where one side has no samples, and neural–neural pairs alike).
 
     Args:
         a: Collider that the resulting force acts on.
@@ -107,7 +109,7 @@ def overlap(a: Collider, b: Collider) -> Patch:
 
 
 def _one_sided(sampled: Collider, queried: Collider) -> _Side:
-    """Sums over the samples of one collider in the field of the other; ψ per unit of mass and of density scale."""
+    """Sums over the samples of one collider in the field of the other; ψ per unit mass and density scale."""
     samples, field = sampled.samples, queried.field
     assert samples is not None and field is not None
     inverse = queried.rotation.T
@@ -120,7 +122,7 @@ def _one_sided(sampled: Collider, queried: Collider) -> _Side:
 def _dispatch(
     field: AbstractField, samples: SampleSet, to_field: Float[Array, "3 4"], support: Support | None
 ) -> _Side:
-    """Choose the kernel by the kind of field: planar, culled grid, or every sample by autodiff of the field."""
+    """Choose the kernel by the kind of field: planar, culled grid, or every sample by autodiff."""
     if isinstance(field, PosedShape | PosedField):
         inner = field.shape if isinstance(field, PosedShape) else field.field
         shifted = to_field.at[:, 3].add(-field.pose.position)
@@ -129,7 +131,8 @@ def _dispatch(
     if isinstance(field, HalfSpace):
         normal = field.normal_direction
         plane = matvec(to_field.T, normal).at[3].add(-field.offset)
-        # In units of the edge width, which saves a division per sample; a vanishing width is the hard indicator.
+        # In units of the edge width, which saves a division per sample; a vanishing width is the hard
+        # indicator.
         scaled = plane / jnp.maximum(field.edge_width, _HARD)
         moments = _planar(scaled, samples)
         return _Side(moments, normal * moments[3])
@@ -166,7 +169,7 @@ def _planar_moments(plane, samples: SampleSet):
 
 
 def _depth(plane, samples: SampleSet) -> Float[Array, " n"]:
-    """t of the smooth step (`dano.fields.occupancy`) for each sample, in a band of unit width about the plane."""
+    """The t of the smooth step (`dano.fields.occupancy`) of each sample, in a band of unit width."""
     return jnp.clip(0.5 - plane @ samples.points, 0, 1)
 
 
@@ -176,7 +179,7 @@ def _symmetric(weights: Float[Array, " n"], products: Float[Array, "10 n"]) -> F
 
 
 def _by_autodiff(function, primals, tangents):
-    """Plain forward derivative, for the arguments that few ever perturb (a grid's values, the samples, a radius)."""
+    """Plain forward derivative, for arguments that few ever perturb (a grid's values, samples, a radius)."""
     perturbed = jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
     dynamic, static = eqx.partition(primals, perturbed)
     return jax.jvp(lambda d: function(*eqx.combine(d, static)), (dynamic,), (tangents,))
@@ -201,7 +204,9 @@ def _dense_jvp(primals, tangents):
 
 def _dense_sums(to_field, field, samples: SampleSet):
     value = jax.vmap(_features, (None, 1), -1)(field, to_field @ samples.points)
-    return jnp.concatenate([contract(samples.weights * value[0], samples.points), contract(value[1:], samples.weights)])
+    return jnp.concatenate(
+        [contract(samples.weights * value[0], samples.points), contract(value[1:], samples.weights)]
+    )
 
 
 def _features(field: AbstractField, x: Float[Array, "3"]) -> Float[Array, "4"]:
@@ -271,7 +276,7 @@ def _grid_sums(to_field, field: GridField, points, products, weights, *, derivat
 
 
 def _accumulate(value, jacobian, points, products, weights):
-    """Sums (7,) and their derivative with respect to the 3×4 transform, from (φ, φd) and its Jacobian per sample."""
+    """Sums (7,) and their derivative by the 3×4 transform, from (φ, φd) and its Jacobian per sample."""
     sums = jnp.concatenate([contract(weights * value[0], points), contract(value[1:], weights)])
     weighted = jacobian * weights[None, None]
     # dS_k = Σ w ∂_aφ x̃_k x̃_b dH_ab,   dD_c = Σ w ∂_a(φ d_c) x̃_b dH_ab
@@ -288,8 +293,9 @@ def _keep(*values: Array) -> tuple[Array, ...]:
 def _cap(ball: Collider, plane: Collider) -> Patch:
     """Overlap of a homogeneous ball with a half-space in closed form: the spherical cap below the plane.
 
-    With depth h of the lowest point, V = π h² (3r − h) / 3 and the cap's centroid lies 3 (2r − h)² / (4 (3r − h))
-    from the ball's centre. Exact and smooth where sampling would make a ball rattle as it rolls.
+    With depth h of the lowest point, V = π h² (3r − h) / 3 and the cap's centroid lies
+    3 (2r − h)² / (4 (3r − h)) from the ball's centre. Exact and smooth where sampling would make a ball
+    rattle as it rolls.
     """
     sphere, half_space = ball.field, plane.field
     assert isinstance(sphere, Sphere) and isinstance(half_space, HalfSpace)

@@ -1,8 +1,8 @@
 """Products in the forms that XLA's CPU backend runs fast.
 
-Small matrices: as sums of outer products. The backend spends 0.2–2 µs on a dot of a few numbers, and a reduction over a middle axis does not vectorise
-when batched. Written out over the short contracted axis, the same products fuse with what surrounds them: 2–10 times
-faster at these sizes, with and without `vmap`.
+Small matrices: as sums of outer products. The backend spends 0.2–2 µs on a dot of a few numbers, and a
+reduction over a middle axis does not vectorise when batched. Written out over the short contracted axis, the
+same products fuse with what surrounds them: 2–10 times faster at these sizes, with and without `vmap`.
 """
 
 import functools
@@ -20,9 +20,12 @@ def matvec(a: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
 
 @functools.partial(matvec.defjvp, symbolic_zeros=True)
 def _matvec_jvp(primals, tangents):
-    # Tangents as one product and one reduction: their transposes are as short, those of the written-out sum are not.
+    # Tangents as one product and one reduction: their transposes are as short, those of the written-out sum
+    # are not.
     (a, x), (da, dx) = primals, tangents
-    terms = [d for d in (None if _zero(da) else da * x[None], None if _zero(dx) else a * dx[None]) if d is not None]
+    terms = [
+        d for d in (None if _zero(da) else da * x[None], None if _zero(dx) else a * dx[None]) if d is not None
+    ]
     tangent = jnp.sum(sum(terms[1:], terms[0]), axis=1) if terms else jnp.zeros_like(a[:, 0])
     return matvec(a, x), tangent
 
@@ -55,7 +58,7 @@ def _zero(tangent) -> bool:
 def contract(a: Float[Array, "*m n"], b: Float[Array, "*k n"]) -> Float[Array, "..."]:
     """Sum over the last axes of two arrays, ``a @ b.T`` for matrices.
 
-    Written as one contraction because ``@`` with a transposed operand copies it in every step of a scan (three times
-    slower), and because this order stays fast when `a` gains a batch axis.
+    Written as one contraction because ``@`` with a transposed operand copies it in every step of a scan
+    (three times slower), and because this order stays fast when `a` gains a batch axis.
     """
     return jax.lax.dot_general(a, b, (((a.ndim - 1,), (b.ndim - 1,)), ((), ())))

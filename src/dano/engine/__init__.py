@@ -1,5 +1,6 @@
 """Engines: from a scene and a state to the next one, and everything built on that."""
 
+from dano.engine._newton import Report as Report
 from dano.engine._rollout import (
     AbstractEngine as AbstractEngine,
     contact_patches as contact_patches,
@@ -9,4 +10,3 @@ from dano.engine._rollout import (
     step as step,
     VariationalEngine as VariationalEngine,
 )
-from dano.engine._newton import Report as Report

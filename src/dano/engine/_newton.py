@@ -49,9 +49,9 @@ def newton(
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Report]:
     """Root of a small system by Newton with a halving line search.
 
-    A loop pass evaluates residual and Jacobian once. If the residual did not fall, the pass is a line search step:
-    the point stays and the length halves. At a kink (contact that just opens or closes) no short step along Newton's
-    direction may help at all; then one is accepted uphill, to come back from the other side.
+    A loop pass evaluates residual and Jacobian once. If the residual did not fall, the pass is a line search
+    step: the point stays and the length halves. At a kink (contact that just opens or closes) no short step
+    along Newton's direction may help at all; then one is accepted uphill, to come back from the other side.
 
     Args:
         evaluate: Residual and its Jacobian at a point.
@@ -69,7 +69,9 @@ def newton(
         return jnp.max(jnp.abs(residual))
 
     def unfinished(it: _Iterate):
-        return (it.iteration < options.max_iterations) & ((it.iteration < 0) | ~(error(it.residual) <= tolerance))
+        return (it.iteration < options.max_iterations) & (
+            (it.iteration < 0) | ~(error(it.residual) <= tolerance)
+        )
 
     def advance(it: _Iterate):
         move = solve_small(it.jacobian, -it.residual[:, None])[:, 0]
@@ -106,9 +108,9 @@ _UNROLLED = 12
 def solve_small(matrix: Float[Array, "n n"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """Solution of a small dense system with k right-hand sides; n is a multiple of three.
 
-    Up to 12 unknowns by Gauss–Jordan elimination with 3×3 pivots (a body's translation, its rotation) and without
-    exchanges, LAPACK beyond. The matrices here are inertia plus dissipation: their symmetric part is positive, so
-    pivots stay away from singular.
+    Up to 12 unknowns by Gauss–Jordan elimination with 3×3 pivots (a body's translation, its rotation) and
+    without exchanges, LAPACK beyond. The matrices here are inertia plus dissipation: their symmetric part is
+    positive, so pivots stay away from singular.
     """
     n = matrix.shape[0]
     if n > _UNROLLED:

@@ -35,8 +35,9 @@ class VariationalEngine(AbstractEngine):
     """The variational integrator with an implicit solve per step (see `dano.engine._variational`).
 
     Attributes:
-        tolerance: A step is solved when no component of its residual, divided by mass or inertia, exceeds this times
-            (1 + its largest velocity) [m/s, rad/s]; default: the dtype's resolution to the power 3/4 (2e-12, 6e-6).
+        tolerance: A step is solved when no component of its residual, divided by mass or inertia, exceeds
+            this times (1 + its largest velocity) [m/s, rad/s]; default: the dtype's resolution to the power
+            3/4 (2e-12, 6e-6).
         max_iterations: Newton and line search passes after which a step is reported as not converged.
     """
 
@@ -52,9 +53,7 @@ class VariationalEngine(AbstractEngine):
 
     def step(self, scene: Scene, state: State, control: Control | None) -> tuple[State, Report]:
         """See `AbstractEngine.step`."""
-        return _variational.step(
-            scene, state, control, SolverOptions(self.tolerance, self.max_iterations)
-        )
+        return _variational.step(scene, state, control, SolverOptions(self.tolerance, self.max_iterations))
 
 
 def step(
@@ -69,7 +68,8 @@ def step(
         engine: Default `VariationalEngine()`.
 
     Returns:
-        The state one timestep later. A step that did not converge raises a RuntimeWarning (outside of `jax.jit`).
+        The state one timestep later. A step that did not converge raises a RuntimeWarning (outside of
+        `jax.jit`).
 
     Raises:
         ValueError: If the state or control does not fit the scene.
@@ -92,8 +92,8 @@ def simulate(
 ) -> Trajectory:
     """Roll a scene out.
 
-    Compiled on first use for each scene structure and number of steps; differentiable in forward and reverse mode
-    with respect to every array in `scene`, `state` and `controls`, and batched by `jax.vmap`.
+    Compiled on first use for each scene structure and number of steps; differentiable in forward and reverse
+    mode with respect to every array in `scene`, `state` and `controls`, and batched by `jax.vmap`.
 
     Args:
         scene: The scene.
@@ -102,14 +102,17 @@ def simulate(
         controls: Forces and torques for each step, leaves of shape (n_steps, n_bodies, 3), or a function of
             (state, time [s]) that returns the control of a step. Row t acts on the step from t to t + 1.
         engine: Default `VariationalEngine()`.
-        checkpoint_every: In reverse mode, keep only every so many states and recompute the steps between; default:
-            everything is kept up to 2000 steps (a few hundred numbers each), the square root of their number beyond.
+        checkpoint_every: In reverse mode, keep only every so many states and recompute the steps between;
+            default: everything is kept up to 2000 steps (a few hundred numbers each), the square root of
+            their number beyond.
 
     Returns:
-        The trajectory. Steps that did not converge are marked in it and raise a RuntimeWarning (outside of `jax.jit`).
+        The trajectory. Steps that did not converge are marked in it and raise a RuntimeWarning (outside of
+        `jax.jit`).
 
     Raises:
-        ValueError: If the state or controls do not fit the scene, or `n_steps` is missing, < 1 or contradicts them.
+        ValueError: If the state or controls do not fit the scene, or `n_steps` is missing, < 1 or contradicts
+            them.
     """
     scene.check_state(state)
     if controls is not None and not callable(controls):
@@ -136,9 +139,9 @@ def linearize(
 ) -> tuple[Float[Array, "n n"], Float[Array, "n m"]]:
     """Linearise a step: δz⁺ = A δz + B δu.
 
-    Coordinates of a body are (position [m, W], rotation vector [rad, B], velocity [m/s, W], omega [rad/s, B]), those
-    of its control (force [N, W], torque [N m, W]); bodies that move are stacked in the scene's order. A rotation
-    vector θ stands for q ⊗ exp(θ).
+    Coordinates of a body are (position [m, W], rotation vector [rad, B], velocity [m/s, W], omega [rad/s,
+    B]), those of its control (force [N, W], torque [N m, W]); bodies that move are stacked in the scene's
+    order. A rotation vector θ stands for q ⊗ exp(θ).
 
     Returns:
         A, shape (12 k, 12 k), and B, shape (12 k, 6 k), for k bodies that move.
@@ -200,7 +203,9 @@ def _jitted_rollout(engine, scene, state, controls, n_steps, segment):
 
     # Reverse mode keeps the few numbers that are dear and computes the rest of a step again: storing every
     # intermediate of every step costs more time than computing it, and ten times the memory.
-    step = jax.checkpoint(advance, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(KEPT))
+    step = jax.checkpoint(
+        advance, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(KEPT)
+    )
 
     def scan(state, inputs):
         return jax.lax.scan(step, state, inputs)

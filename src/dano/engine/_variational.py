@@ -6,10 +6,11 @@ Unknowns of a step are the end-of-step velocities V⁺ = (v⁺, ω⁺) of all bo
     rotation      P(ω⁺) − P⁻(ω) = h Rᵀτ + impulses (body frame),                    q⁺ = q ⊗ (h/2) (s(ω⁺), ω⁺)
     with          P(ω) = (h/2)(s J ω + ω × Jω),  P⁻(ω) = (h/2)(s J ω − ω × Jω),     s(ω) = √(4/h² − |ω|²)
 
-(Dojo, eq. 5–9.) P(ω⁺) is the body's angular momentum seen from its old orientation, P⁻(ω) the one it came with, so
-free motion conserves momentum to rounding. Geometry is taken at the old configuration, velocities in the contact
-laws are the unknown ones. Each step solves R(V⁺; θ) = 0 by Newton with a line search and is differentiated by the
-implicit function theorem, never through the iterations. R is in velocity units: momenta over mass and mean inertia.
+(Dojo, eq. 5–9.) P(ω⁺) is the body's angular momentum seen from its old orientation, P⁻(ω) the one it came
+with, so free motion conserves momentum to rounding. Geometry is taken at the old configuration, velocities in
+the contact laws are the unknown ones. Each step solves R(V⁺; θ) = 0 by Newton with a line search and is
+differentiated by the implicit function theorem, never through the iterations. R is in velocity units: momenta
+over mass and mean inertia.
 """
 
 from typing import NamedTuple
@@ -36,7 +37,8 @@ class _Problem(eqx.Module):
         rotation: Body → world, shape (m, 3, 3).
         timestep: h [s].
         patches: Overlap of each contact.
-        arms: From the centres of mass of a contact's two bodies to its centroid [m, W]; unused for a fixed body.
+        arms: From the centres of mass of a contact's two bodies to its centroid [m, W]; unused for a fixed
+            body.
         params: Parameters of each contact.
         laws: Law of each contact.
     """
@@ -152,7 +154,10 @@ def _problem(scene: Scene, state: State, control: Control | None, pairs: _Pairs)
         angular = angular + h * jax.vmap(lambda r, t: matvec(r.T, t))(rotation, _rows(control.torque, rows))
     overlaps = _patches(scene, state, rotations)
     arms = tuple(
-        tuple(_arm(patch, state.position[scene.index(name)]) for name in (contact.a, contact.b))
+        (
+            _arm(patch, state.position[scene.index(contact.a)]),
+            _arm(patch, state.position[scene.index(contact.b)]),
+        )
         for contact, patch in zip(scene.contacts, overlaps, strict=True)
     )
     return _Problem(
@@ -173,8 +178,8 @@ def _arm(patch: Patch, position: Float[Array, "3"]) -> Float[Array, "3"]:
     return jnp.where(patch.overlap > 0, patch.centroid - position, 0)
 
 
-# Floor of s(ω)² h²: 0.1 is |ω| = 1.975/h, 162° in one step. Beyond 2/h a step cannot represent the rotation; the root
-# is kept real so that a line search can come back.
+# Floor of s(ω)² h²: 0.1 is |ω| = 1.975/h, 162° in one step. Beyond 2/h a step cannot represent the rotation;
+# the root is kept real so that a line search can come back.
 _SLOWEST = 0.1
 
 
@@ -229,7 +234,9 @@ def _residual(velocities: Float[Array, "m 6"], problem: _Problem, pairs: _Pairs)
     return _to_velocity(problem) * jnp.concatenate(rows), [slope for _, slope in wrenches]
 
 
-def _jacobian(velocities: Float[Array, "m 6"], problem: _Problem, pairs: _Pairs, slopes) -> Float[Array, "n n"]:
+def _jacobian(
+    velocities: Float[Array, "m 6"], problem: _Problem, pairs: _Pairs, slopes
+) -> Float[Array, "n n"]:
     """∂R/∂V⁺, shape (6 m, 6 m), in closed form."""
     h, m = problem.timestep, len(pairs.moving)
     eye, zero = jnp.eye(3, dtype=velocities.dtype), jnp.zeros((3, 3), velocities.dtype)
@@ -316,7 +323,8 @@ def _advance(state: State, velocities: Float[Array, "m 6"], h: Float[Array, ""],
     s = jax.vmap(_half_angle_root, (0, None))(omega, h)[:, None]
     orientation = _rows(state.orientation, pairs.moving)
     turned = quat_multiply(orientation, 0.5 * h * jnp.concatenate([s, omega], axis=1))
-    # Exactly a unit quaternion in exact arithmetic; this removes the rounding that thousands of products gather.
+    # Exactly a unit quaternion in exact arithmetic; this removes the rounding that thousands of products
+    # gather.
     turned = turned * (1.5 - 0.5 * jnp.sum(turned * turned, axis=1, keepdims=True))
     moved = _rows(state.position, pairs.moving) + h * velocity
     return State(
@@ -328,7 +336,7 @@ def _advance(state: State, velocities: Float[Array, "m 6"], h: Float[Array, ""],
 
 
 def _rows(x: Float[Array, "n k"], rows: tuple[int, ...]) -> Float[Array, "m k"]:
-    """Some rows of an array; slices, because gathers and scatters cost XLA's CPU backend a microsecond each."""
+    """Some rows of an array; slices, because a gather or scatter costs XLA's CPU backend a microsecond."""
     return jnp.stack([x[i] for i in rows])
 
 

@@ -72,10 +72,13 @@ class MassProperties(eqx.Module):
         key: PRNGKeyArray | None = None,
         progress: Progress | None = None,
     ) -> "MassProperties":
-        """Integrate a density: m = α∫φ dx, c = α∫φ x dx / m, J = α∫φ (|r|² I − r rᵀ) dx (paper: eq:mass to eq:inertia).
+        """Integrate a density: m = α∫φ dx, c = α∫φ x dx / m, J = α∫φ (|r|² I − r rᵀ) dx.
 
-        A grid is integrated exactly. Everything else by stratified Monte Carlo: two random points in each cell of a grid over the field's bounds. Their differences
-        give the variance, from which the standard errors follow by linearisation.
+        Paper: eq:mass to eq:inertia.
+
+        A grid is integrated exactly. Everything else by stratified Monte Carlo: two random points in each
+        cell of a grid over the field's bounds. Their differences give the variance, from which the standard
+        errors follow by linearisation.
 
         Args:
             field: Density with finite bounds.
@@ -89,8 +92,8 @@ class MassProperties(eqx.Module):
             The mass properties in the field's frame.
 
         Raises:
-            ValueError: If the bounds are not finite, the density is negative, not finite or nowhere positive, or
-                a number is out of range.
+            ValueError: If the bounds are not finite, the density is negative, not finite or nowhere positive,
+                or a number is out of range.
         """
         density = checked_density(field)
         if isinstance(field, GridField):
@@ -161,7 +164,7 @@ def _batched(density, points):
 
 
 def cells(bounds: Float[Array, "2 3"], resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Number of cells (3,) and their sides [m] (3,) for a grid with `resolution` cells along the longest axis."""
+    """Number of cells (3,) and their sides [m] (3,) of a grid of `resolution` cells on the longest axis."""
     if resolution < 4:
         raise ValueError(f"resolution must be ≥ 4, got {resolution}")
     extent = np.asarray(bounds[1] - bounds[0], dtype=np.float64)

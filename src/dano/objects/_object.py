@@ -1,7 +1,7 @@
 """Neural objects: a density field with mass properties and contact samples, saved as one file."""
 
 import os
-from typing import Literal, get_args
+from typing import get_args, Literal
 
 import equinox as eqx
 import jax
@@ -12,14 +12,14 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dano.archive import read_archive, write_archive
 from dano.fields import AbstractField, GridField
 from dano.maths import checked_array, floating, is_traced, Numbers
-from dano.objects._mass import MassProperties, Progress, checked_density, integrate
+from dano.objects._mass import checked_density, integrate, MassProperties, Progress
 from dano.objects._samples import (
-    ContactSamples,
-    Lattice,
-    Region,
     contact_grid,
+    ContactSamples,
     draw_samples,
+    Lattice,
     outward_normals,
+    Region,
     surface_level,
     surface_range,
 )
@@ -34,7 +34,8 @@ class NeuralObject(eqx.Module):
     Attributes:
         samples: Contact samples.
         mass: Mass properties in the field's frame.
-        grid: The field baked for other objects' samples to query, without its floaters; None if there is no field.
+        grid: The field baked for other objects' samples to query, without its floaters; None if there is no
+            field.
         density_range: Lower and upper density between which the samples lie, shape (2,).
         bake_error: Root mean square error of `grid` relative to the field's largest density (0 for a grid).
         mass_model: How density became mass.
@@ -67,11 +68,11 @@ class NeuralObject(eqx.Module):
         Args:
             field: Density with finite bounds.
             n_samples: Number of contact samples.
-            density_range: Densities between which the samples are drawn; default: around the field's own surface
-                (`surface_range`).
-            mass_model: "density": mass density is α φ, as in the paper. "solid": the same mean density everywhere
-                inside the largest connected part of {φ ≥ half the plateau density}, its cavities filled, floaters
-                dropped.
+            density_range: Densities between which the samples are drawn; default: around the field's own
+                surface (`surface_range`).
+            mass_model: "density": mass density is α φ, as in the paper. "solid": the same mean density
+                everywhere inside the largest connected part of {φ ≥ half the plateau density}, its cavities
+                filled, floaters dropped.
             mass_scale: α [kg per unit of density and m³].
             mass: If given, the total mass [kg]; replaces `mass_scale`.
             resolution: Cells along the longest axis for mass integrals, sampling and baking.
@@ -83,8 +84,8 @@ class NeuralObject(eqx.Module):
             The object; its frame is the field's.
 
         Raises:
-            ValueError: If an argument is out of range, the field is empty, has a negative or non-finite density or
-                unbounded support, or no point lies in `density_range`.
+            ValueError: If an argument is out of range, the field is empty, has a negative or non-finite
+                density or unbounded support, or no point lies in `density_range`.
         """
         if mass_model not in get_args(MassModel):
             raise ValueError(f"mass_model must be one of {get_args(MassModel)}, got {mass_model!r}")
@@ -162,7 +163,7 @@ class NeuralObject(eqx.Module):
         properties = MassProperties(mass, com, inertia)
         if normals is None:
             outward = np.asarray(points) - np.asarray(properties.com)
-            normals = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
+            normals = floating(outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12))
         samples = ContactSamples(points, density, checked_array("normals", normals, points.shape))
         bounds = floating((float(density.min()), float(density.max())))
         return cls(samples, properties, field, bounds, floating(0.0), "given")
@@ -173,7 +174,7 @@ class NeuralObject(eqx.Module):
         return float(jnp.max(jnp.ptp(self.samples.points, axis=0)))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the object to one file (a zip of arrays, no pickle), replacing an existing one only when complete.
+        """Write the object to one file (a zip of arrays, no pickle), replacing another only when complete.
 
         Raises:
             ValueError: If `path` is a directory or its parent does not exist.

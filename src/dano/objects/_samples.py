@@ -5,7 +5,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
-from scipy import ndimage
 
 from dano.fields import AbstractField, AbstractShape, GridField
 from dano.maths import floating
@@ -90,6 +89,9 @@ class Region(eqx.Module):
         Raises:
             ValueError: If nothing reaches the level.
         """
+        # Here, as below, not above: `import dano` would take a fifth of a second longer.
+        from scipy import ndimage
+
         occupied = lattice.values >= max(level, np.finfo(float).tiny)
         labels, parts = ndimage.label(occupied, np.ones((3, 3, 3)))
         if parts == 0:
@@ -105,19 +107,25 @@ class Region(eqx.Module):
 
     def near(self, cells_away: int) -> np.ndarray:
         """Lattice points within some cells of the occupied region."""
+        from scipy import ndimage
+
         return ndimage.binary_dilation(self.occupied, np.ones((3, 3, 3)), iterations=cells_away)
 
     def outer(self) -> np.ndarray:
         """Lattice points near the region and nearer to the outside than to an enclosed cavity."""
         if not self.cavity.any():
             return self.near(1)
+        from scipy import ndimage
+
         to_cavity = ndimage.distance_transform_edt(~self.cavity, sampling=self.lattice.side)
         outside = ~(self.occupied | self.cavity)
         to_outside = ndimage.distance_transform_edt(~outside, sampling=self.lattice.side)
         return self.near(1) & (to_outside < to_cavity)
 
     def solid(self, density: Density) -> Density:
-        """Mean occupied density inside the filled region, zero outside; sharp at the level, not at lattice points."""
+        """Mean occupied density inside the filled region, zero outside; sharp at the level."""
+        from scipy import ndimage
+
         mean = float(self.lattice.values[self.occupied].mean())
         inside = jnp.asarray(ndimage.binary_erosion(self.occupied | self.cavity, np.ones((3, 3, 3))))
         near = jnp.asarray(self.near(1))
@@ -147,12 +155,18 @@ def surface_level(values: np.ndarray) -> float:
 
 
 def surface_range(values: np.ndarray) -> tuple[float, float]:
-    """Two densities around a field's own surface: a quarter and three quarters of its plateau."""
-    return 0.25 * plateau(values), 0.75 * plateau(values)
+    """Two densities just inside a field's own surface: half and nine tenths of its plateau."""
+    return 0.5 * plateau(values), 0.9 * plateau(values)
 
 
 def draw_samples(
-    density: Density, lattice: Lattice, region: Region, low: float, high: float, n: int, key: PRNGKeyArray | None
+    density: Density,
+    lattice: Lattice,
+    region: Region,
+    low: float,
+    high: float,
+    n: int,
+    key: PRNGKeyArray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw `n` points with density in [low, high], spread evenly over the outer side of a region.
 
@@ -190,8 +204,9 @@ def draw_samples(
         drawn += len(x)
     if len(points) < n:
         raise ValueError(
-            f"density_range ({low:.6g}, {high:.6g}) must contain at least n_samples = {n} points of the object, found "
-            f"{len(points)} in {drawn} draws; the field's densities reach {lattice.values.max():.6g}"
+            f"density_range ({low:.6g}, {high:.6g}) must contain at least n_samples = {n} points of the "
+            f"object, found {len(points)} in {drawn} draws; "
+            f"the field's densities reach {lattice.values.max():.6g}"
         )
     chosen = _farthest_points(points[:wanted], n)
     return points[chosen], values[chosen]
@@ -221,7 +236,7 @@ def surface_samples(shape: AbstractShape, n: int, key: PRNGKeyArray | None = Non
 
 
 def _farthest_points(points: np.ndarray, n: int) -> np.ndarray:
-    """Indices of `n` points, each the one farthest from all chosen before: even, and reaching every edge and corner."""
+    """Indices of `n` points, each the farthest from all chosen before: even, and reaching every corner."""
     chosen = np.empty(n, dtype=int)
     chosen[0] = int(np.argmax(((points - points.mean(axis=0)) ** 2).sum(axis=1)))
     x, y, z = np.ascontiguousarray(points.T)

@@ -25,8 +25,8 @@ def draw_object(obj: NeuralObject, path: str | os.PathLike[str], *, title: str |
     """Draw a figure that shows whether an object came out right.
 
     The solid with its centre of mass and principal axes; the contact samples coloured by their normals,
-    from two sides; the density in three planes through the centre of mass, with the densities between which samples
-    lie; a table of mass properties and their standard errors.
+    from two sides; the density in three planes through the centre of mass, with the densities between which
+    samples lie; a table of mass properties and their standard errors.
 
     Args:
         obj: The object.
@@ -112,7 +112,7 @@ def _solid(axes: Any, obj: NeuralObject) -> None:
     com = np.asarray(obj.mass.com, dtype=np.float64)
     moments, directions = principal_axes(obj)
     for k in range(3):
-        ends = camera.project(np.stack([com, com + 0.75 * radius * directions[:, k]]))[:, :2]
+        ends = camera.project(np.stack([com, com + 0.65 * radius * directions[:, k]]))[:, :2]
         away = (ends[1] - ends[0]) / max(float(np.linalg.norm(ends[1] - ends[0])), 1e-9)
         axes.annotate(
             "",
@@ -194,7 +194,8 @@ def _slice(axes: Any, obj: NeuralObject, plane: tuple[int, int]) -> None:
         near = np.abs(points[:, fixed] - com[fixed]) < 0.03 * half
         axes.plot(points[near, a], points[near, b], ".", ms=3, color=_INK)
     else:
-        x, y = np.meshgrid(np.linspace(*extent[:2], 240), np.linspace(*extent[2:], 240))
+        left, right, bottom, top = extent
+        x, y = np.meshgrid(np.linspace(left, right, 240), np.linspace(bottom, top, 240))
         query = np.empty((3, x.size))
         query[a], query[b], query[fixed] = x.ravel(), y.ravel(), com[fixed]
         points_there = jnp.asarray(query, obj.grid.spacing.dtype)

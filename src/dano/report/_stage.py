@@ -96,7 +96,7 @@ def camera_for(scene: Scene, drawn: Stage, trajectory: Trajectory, width: int, h
     steps = np.unique(np.linspace(0, len(position) - 1, 60).astype(int))
     centres, moving = [], []
     for item, row, com in zip(drawn.items, drawn.rows, drawn.offsets, strict=True):
-        if item.plane is not None:
+        if item.shape is None or item.plane is not None:
             continue
         lower, upper = np.asarray(item.shape.bounds, dtype=np.float64)
         corners = np.where(np.array(list(np.ndindex(2, 2, 2))) == 1, upper, lower)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, Int, UInt8
 
 from dano.archive import checked_output, replacing
 from dano.report._overlay import draw_touches
@@ -71,7 +71,7 @@ def render_trajectory(
         image = render(drawn.posed(position[frame], orientation[frame]), camera, floor=False)
         return image if touched is None else draw_touches(image, camera, touched, frame, length)
 
-    moments = np.unique(np.linspace(0, len(times) - 1, _STRIP_MOMENTS).round().astype(int))
+    moments = _moments(position, _STRIP_MOMENTS)
     frames = range(len(times)) if outputs[0] is not None else moments.tolist()
     kept = []
     with contextlib.ExitStack() as stack:
@@ -136,6 +136,15 @@ def _encoder(file: BinaryIO, fps: int, camera: Camera) -> Iterator[Callable[[np.
         yield add
         for packet in stream.encode():
             container.mux(packet)
+
+
+def _moments(position: Float[np.ndarray, "frames bodies 3"], n: int) -> Int[np.ndarray, " moments"]:
+    """Frames from the first to the last, closer together where much moves."""
+    travel = np.linalg.norm(np.diff(position, axis=0), axis=-1).sum(axis=1)
+    # A third of the way is time: where everything rests a strip should say so, but not with half of its frames.
+    pace = travel / max(float(travel.mean()), 1e-12) + 0.5
+    way = np.concatenate([[0.0], np.cumsum(pace)])
+    return np.unique(np.interp(np.linspace(0, way[-1], n), way, np.arange(len(way))).round().astype(int))
 
 
 def _side_by_side(images: list[np.ndarray]) -> np.ndarray:

@@ -16,8 +16,7 @@ from dano.report._resample import poses_at
 from dano.report._stage import matrix, Touches, touches
 from dano.report._video import require
 from dano.scene import Body, Scene, Trajectory
-from dano.vision import Item, PALETTE
-from dano.vision._item import checked_colour, placement
+from dano.vision import checked_colour, Item, PALETTE, placement
 
 _TICK = 1 / 30
 
@@ -55,7 +54,7 @@ class Viewer:
         self._server.scene.set_up_direction("+z")
         used = 0
         for i, body in enumerate(scene.bodies):
-            item = None if body.object is not None or body.shape is None else _plane(body)
+            item = None if body.shape is None else _plane(body.shape)
             colour = np.rint(255 * checked_colour(PALETTE[used % len(PALETTE)])).astype(int)
             used += item is None
             name = f"/{i}_{body.name}"
@@ -192,10 +191,10 @@ def _arrow_ends(touched: Touches, step: int, length: float) -> np.ndarray:
     return np.stack([tails, tails + length * touched.shares[step, rows, None] * direction], axis=1)
 
 
-def _plane(body: Body) -> np.ndarray | None:
-    if np.all(np.isfinite(np.asarray(body.shape.bounds))):
+def _plane(shape: AbstractShape) -> np.ndarray | None:
+    if np.all(np.isfinite(np.asarray(shape.bounds))):
         return None
-    return Item(body.shape, Pose()).plane
+    return Item(shape, Pose()).plane
 
 
 def _add_floor(server: Any, name: str, plane: np.ndarray, size: float) -> Any:
@@ -227,11 +226,11 @@ def _add_body(server: Any, name: str, body: Body, colour: np.ndarray) -> Any:
         server.scene.add_point_cloud(
             f"{name}/samples", points, colours, point_size=spacing, point_shape="circle", precision="float32"
         )
-        return frame
-    vertices, faces = surface_mesh(body.shape)
-    server.scene.add_mesh_simple(
-        f"{name}/shape", vertices, faces, color=tuple(int(c) for c in colour), side="double"
-    )
+    elif body.shape is not None:
+        vertices, faces = surface_mesh(body.shape)
+        server.scene.add_mesh_simple(
+            f"{name}/shape", vertices, faces, color=tuple(int(c) for c in colour), side="double"
+        )
     return frame
 
 

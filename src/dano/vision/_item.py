@@ -1,5 +1,7 @@
 """What a picture shows: fields made ready to be drawn, once, and then moved about."""
 
+from typing import TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -25,6 +27,9 @@ PALETTE = ("#e07a3f", "#3d7ea6", "#5f9e6e", "#c9a227", "#8d6cab", "#c8553d", "#4
 # sizes.
 _MOST_NODES = 112
 _BAKE_NODES = 96
+
+
+M = TypeVar("M", bound=eqx.Module)
 
 
 class Item(eqx.Module):
@@ -87,12 +92,12 @@ class Item(eqx.Module):
         self.density_scale = 0.0 if density_scale is None else float(density_scale)
         self.shape = self.medium = None
         if density_scale is not None:
-            self.medium = _single(_grid(field))
+            self.medium = drawn = _single(_grid(field))
         elif isinstance(field, AbstractShape):
-            self.shape = _single(_without_moments(field))
+            self.shape = drawn = _single(_without_moments(field))
         else:
-            self.shape = _single(level_surface(_grid(field), level))
-        lower, upper = np.asarray((self.medium or self.shape).bounds, dtype=np.float64)
+            self.shape = drawn = _single(level_surface(_grid(field), level))
+        lower, upper = np.asarray(drawn.bounds, dtype=np.float64)
         bounded = bool(np.all(np.isfinite([lower, upper])))
         self.centre = 0.5 * (lower + upper) if bounded else np.zeros(3)
         self.radius = 0.5 * float(np.linalg.norm(upper - lower)) if bounded else float("inf")
@@ -202,7 +207,7 @@ def level_surface(field: GridField, level: int | float | None = None) -> SignedD
 
 def _distances(share: np.ndarray, middle: float, spacing: np.ndarray) -> np.ndarray:
     """Signed distances [m] of all nodes to the surface {share = middle}, negative inside."""
-    gradient = np.stack(np.gradient(share), axis=-1)
+    gradient = np.stack([np.gradient(share, axis=axis) for axis in range(3)], axis=-1)
     points, normals = [], []
     for axis in range(3):
         first, second = (np.take(share, range(a, share.shape[axis] - 1 + a), axis) for a in (0, 1))
@@ -219,14 +224,13 @@ def _distances(share: np.ndarray, middle: float, spacing: np.ndarray) -> np.ndar
     # Far from the surface a distance good to a cell is enough to skip empty space, and much cheaper.
     outside = ndimage.distance_transform_edt(~occupied, sampling=spacing)
     within = ndimage.distance_transform_edt(occupied, sampling=spacing)
-    distance = np.maximum(outside + within - 0.5 * float(spacing.max()), 0).ravel()
-    close = np.flatnonzero(distance < 3 * spacing.max())
-    nodes = np.stack(np.unravel_index(close, share.shape), axis=1) * spacing
+    distance = np.maximum(outside + within - 0.5 * float(spacing.max()), 0)
+    close = distance < 3 * spacing.max()
+    nodes = np.argwhere(close) * spacing
     length, nearest = spatial.cKDTree(surface).query(nodes)
     planar = np.abs(np.sum((nodes - surface[nearest]) * outward[nearest], axis=1))
     near = np.clip(2 - length / spacing.max(), 0, 1)
     distance[close] = near * planar + (1 - near) * length
-    distance = distance.reshape(share.shape)
     return np.where(occupied, -distance, distance)
 
 
@@ -244,9 +248,9 @@ def _without_moments(shape: AbstractShape) -> AbstractShape:
     return shape
 
 
-def _single(module: eqx.Module) -> eqx.Module:
+def _single(module: M) -> M:
     return _as(module, np.dtype(np.float32))
 
 
-def _as(module: eqx.Module, dtype: np.dtype) -> eqx.Module:
+def _as(module: M, dtype: np.dtype) -> M:
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), module)

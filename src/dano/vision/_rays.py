@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from dano.fields import AbstractShape, GridField
 
@@ -62,8 +62,8 @@ class Placed(NamedTuple):
     """
 
     shape: AbstractShape
-    rotation: Float[ArrayLike, "3 3"]
-    position: Float[ArrayLike, "3"]
+    rotation: Float[Array, "3 3"]
+    position: Float[Array, "3"]
 
 
 @jax.jit

@@ -11,8 +11,9 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 from scipy import ndimage
 
 from dano.maths import checked_array, Numbers
@@ -77,9 +78,12 @@ class _View:
         balls = [item.placed_ball for item in self.solids + self.media]
         self.radii = np.array([radius for _, radius in balls], dtype=np.float32)
         self.centres = np.array([centre for centre, _ in balls], dtype=np.float32).reshape(-1, 3)
-        self.frames = [
-            tuple(x.astype(np.float32) for x in placement(item.pose)) for item in self.solids + self.media
-        ]
+        self.placed = [Placed(item.shape, *_frame(item)) for item in self.solids if item.shape is not None]
+
+
+def _frame(item: Item) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+    rotation, position = placement(item.pose)
+    return jnp.asarray(rotation, jnp.float32), jnp.asarray(position, jnp.float32)
 
 
 def render(
@@ -220,9 +224,8 @@ def _radiance(view, d, depth, which, colour):
     depth, which, colour = depth.copy(), which.copy(), colour.copy()
     normals = np.zeros((3, d.shape[1]), dtype=np.float32)
     pixel, hits = np.float32(view.look.pixel), []
-    for i, item in enumerate(view.solids):
+    for i, placed in enumerate(view.placed):
         index = _towards_ball(view.centres[i] - view.origin, view.radii[i], d)
-        placed = Placed(item.shape, *view.frames[i])
         index, t = _first_hits(placed, view.origin, d, depth, index, pixel)
         depth[index], which[index] = t, len(view.planes) + i
         hits.append((index, placed))
@@ -305,8 +308,8 @@ def _light_at(view, points, normals, kind):
     ambient = np.ones_like(lamp)
     near_focus = np.sum((points - view.look.focus[:, None]) ** 2, axis=0) < view.look.fade_end**2
     faces_lamp = light @ normals > 0
-    for i, item in enumerate(view.solids):
-        radius, placed = view.radii[i], Placed(item.shape, *view.frames[i])
+    for i, placed in enumerate(view.placed):
+        radius = view.radii[i]
         reach = np.float32(0.35 * radius)
         bias = np.float32(0.02) * reach
         to_centre = view.centres[i][:, None] - points
@@ -336,9 +339,9 @@ def _lay_over(view, i, item, d, depth, colour):
     """Blend a medium over what lies behind it, in place; the indices of its rays."""
     index = _towards_ball(view.centres[i] - view.origin, view.radii[i], d)
     arrays = (np.broadcast_to(view.origin[:, None], (3, len(index))), d[:, index], depth[index])
-    scale = np.float32(item.density_scale)
+    scale, frame = np.float32(item.density_scale), _frame(item)
     opacity, _, normal = _in_chunks(
-        lambda o, r, far: transmitted(item.medium, scale, *view.frames[i], o, r, far), arrays
+        lambda o, r, far: transmitted(item.medium, scale, *frame, o, r, far), arrays
     )
     albedo = np.broadcast_to((item.colour.astype(np.float32) ** 2.2)[:, None], (3, len(index)))
     one, no = np.ones(len(index), dtype=np.float32), np.zeros(len(index), dtype=bool)

@@ -1,0 +1,23 @@
+"""Settings that must stand before NumPy and JAX are imported."""
+
+import os
+
+
+def use_float64_on_cpu() -> None:
+    """Precision and device of both benchmarks."""
+    os.environ["JAX_ENABLE_X64"] = "1"
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "0"  # a warm cache would pass for a fast compiler
+
+
+def pin_to_one_core() -> None:
+    """Keep this process, and everything that XLA and BLAS start in it, on one core.
+
+    Unpinned, XLA moves work to other threads, and two programs that share a core measure each other.
+    """
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ[f"{library}_NUM_THREADS"] = "1"
