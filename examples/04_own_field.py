@@ -18,7 +18,8 @@ def torus(x):
 def main(quick: bool = False) -> dict[str, float]:
     # A function written for NumPy or PyTorch does as well; it must take many points at once.
     field = dano.CallableField(torus, bounds=[(-0.075, -0.075, -0.025), (0.075, 0.075, 0.025)])
-    baked = dano.bake(field, 96)  # a grid: the moments of a grid are exact, and other objects can query it fast
+    # A grid: its moments are exact, and other objects can query it fast.
+    baked = dano.bake(field, 96)
     ring = dano.NeuralObject.from_field(baked.grid, mass=MASS, n_samples=2000, key=jax.random.key(0))
 
     # Homogeneous torus: J_z = m (R² + 3/4 r²), J_x = m (R²/2 + 5/8 r²).

@@ -23,6 +23,8 @@ PACKAGES = [p for p in sorted((REPOSITORY / "src" / "dano").glob("*/__init__.py"
 @pytest.mark.parametrize("page", PROGRAMS)
 def test_python_blocks_run(page: str, tmp_path: Path):
     # One process a page, its blocks joined: a page may change JAX's configuration, as its reader would.
+    # Paths in the README start at the root of the repository.
+    (tmp_path / "src").symlink_to(REPOSITORY / "src")
     command = [sys.executable, "-c", PROGRAMS[page]]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY / "src")}
     answer = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)

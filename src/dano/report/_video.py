@@ -141,7 +141,7 @@ def _encoder(file: BinaryIO, fps: int, camera: Camera) -> Iterator[Callable[[np.
 def _moments(position: Float[np.ndarray, "frames bodies 3"], n: int) -> Int[np.ndarray, " moments"]:
     """Frames from the first to the last, closer together where much moves."""
     travel = np.linalg.norm(np.diff(position, axis=0), axis=-1).sum(axis=1)
-    # A third of the way is time: where everything rests a strip should say so, but not with half of its frames.
+    # A third of the way is time: a strip should say where everything rests, but not in half of its pictures.
     pace = travel / max(float(travel.mean()), 1e-12) + 0.5
     way = np.concatenate([[0.0], np.cumsum(pace)])
     return np.unique(np.interp(np.linspace(0, way[-1], n), way, np.arange(len(way))).round().astype(int))
