@@ -8,7 +8,7 @@ IS_NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
 # The first of these that runs and is new enough; a recursive variable, so only looked for when .venv is made.
 PYTHON = $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	if $$python -c '$(IS_NEW_ENOUGH)' 2>/dev/null; then echo $$python; break; fi; done)
-PYTEST_ARGS =
+PYTEST_ARGS = --numprocesses 2 --dist loadfile
 INSTALL = $(BIN)/python -m pip install --constraint constraints.txt
 PACKAGE := pyproject.toml constraints.txt
 

@@ -7,5 +7,4 @@ from dano.contact._laws import (
     ContactParams as ContactParams,
     non_negative as non_negative,
 )
-from dano.contact._overlap import KEPT as KEPT, overlap as overlap, Patch as Patch
-from dano.contact._small import matmul as matmul, matvec as matvec
+from dano.contact._overlap import overlap as overlap, Patch as Patch

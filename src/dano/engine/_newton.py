@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.contact import matmul
+from dano.contact._small import matmul
 
 
 class SolverOptions(NamedTuple):

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.contact import KEPT, Patch
+from dano.contact import Patch
+from dano.contact._overlap import KEPT
 from dano.engine import _variational
 from dano.engine._newton import Report, SolverOptions
 from dano.maths import is_traced, quat_conjugate, quat_multiply, safe_norm

@@ -21,7 +21,9 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from dano.contact import AbstractContactLaw, ContactParams, KEPT, matmul, matvec, overlap, Patch
+from dano.contact import AbstractContactLaw, ContactParams, overlap, Patch
+from dano.contact._overlap import KEPT
+from dano.contact._small import matmul, matvec
 from dano.engine._newton import newton, Report, solve_small, SolverOptions
 from dano.maths import quat_multiply, quat_to_matrix, skew
 from dano.scene import colliders, Control, Scene, State
