@@ -47,6 +47,9 @@ class _Side(eqx.Module):
 # of solves.
 KEPT = "kept"
 
+# Blocks of samples that one pass through a grid takes: enough to outweigh the cost of starting it.
+_BLOCKS_AT_ONCE = 4
+
 # Below this share of a body's mass an overlap counts as none: ψ² must not underflow where χ = S/ψ is
 # differentiated.
 _NEGLIGIBLE = 1e-12
@@ -242,20 +245,26 @@ def _culled_jvp(primals, tangents):
 def _culled_sums(to_field, field: GridField, samples: SampleSet, support: Support, *, derivative: bool):
     centers = jnp.concatenate([samples.centers.T, jnp.ones_like(samples.centers.T[:1])])
     near = support.lower_bound(to_field @ centers) <= samples.radii
-    (blocks,) = jnp.nonzero(near, size=near.shape[0], fill_value=0)
+    padded = near.shape[0] + -near.shape[0] % _BLOCKS_AT_ONCE
+    (blocks,) = jnp.nonzero(near, size=padded, fill_value=0)
+    count = jnp.sum(near)
     zero = jnp.zeros(7, to_field.dtype), jnp.zeros((7, 3, 4) if derivative else (0,), to_field.dtype)
 
-    def add_block(i, total):
-        start = blocks[i] * BLOCK
+    def add_blocks(i, total):
+        numbers = [i * _BLOCKS_AT_ONCE + k for k in range(_BLOCKS_AT_ONCE)]
 
-        def block(x):
-            return jax.lax.dynamic_slice_in_dim(x, start, BLOCK, axis=-1)
+        def gather(x):
+            return [jax.lax.dynamic_slice_in_dim(x, blocks[n] * BLOCK, BLOCK, axis=-1) for n in numbers]
 
-        points, products, weights = (block(x) for x in (samples.points, samples.products, samples.weights))
+        points, products = (jnp.concatenate(gather(x), axis=1) for x in (samples.points, samples.products))
+        # The last pass may be short: what fills it up weighs nothing.
+        weights = jnp.concatenate(
+            [jnp.where(n < count, w, 0) for n, w in zip(numbers, gather(samples.weights), strict=True)]
+        )
         sums, matrix = _grid_sums(to_field, field, points, products, weights, derivative=derivative)
         return total[0] + sums, total[1] + matrix
 
-    return jax.lax.fori_loop(0, jnp.sum(near), add_block, zero)
+    return jax.lax.fori_loop(0, -(-count // _BLOCKS_AT_ONCE), add_blocks, zero)
 
 
 def _grid_sums(to_field, field: GridField, points, products, weights, *, derivative: bool):

@@ -237,7 +237,7 @@ def _numpy_jet(function: Callable, points: np.ndarray, order: int, step: float) 
 
 def _torch_jet(function: Callable, points: np.ndarray, order: int) -> tuple[np.ndarray, ...]:
     """Values and derivatives by torch's autograd."""
-    import torch
+    import torch  # pyright: ignore[reportMissingImports]
 
     x = _torch_points(function, points)
     if order == 0:
@@ -264,9 +264,10 @@ def _torch_jet(function: Callable, points: np.ndarray, order: int) -> tuple[np.n
 
 def _torch_points(function: Callable, points: np.ndarray) -> Any:
     """Points as a tensor of the dtype and on the device of the function's parameters, if it has any."""
-    import torch
+    import torch  # pyright: ignore[reportMissingImports]
 
-    parameter = next(function.parameters(), None) if isinstance(function, torch.nn.Module) else None
+    parameters = getattr(function, "parameters", None) if isinstance(function, torch.nn.Module) else None
+    parameter = None if parameters is None else next(parameters(), None)
     dtype = torch.get_default_dtype() if parameter is None else parameter.dtype
     return torch.as_tensor(points).to(dtype=dtype, device=None if parameter is None else parameter.device)
 
