@@ -15,7 +15,7 @@ SPEED, FRICTION = 0.7, 0.25
 def main(quick: bool = False) -> dict[str, float]:
     bunny = build_asset("bunny")
     params = dano.ContactParams(
-        sliding_friction=FRICTION, sliding_drag=0.0, rolling_friction=0.0, torsional_friction=0.0
+        sliding_friction=FRICTION, sliding_drag=0.0, rolling_friction=0.001, torsional_friction=0.001
     )
     scene = dano.Scene.create(
         [dano.Body("bunny", bunny), dano.Body("floor", dano.HalfSpace(), fixed=True)],

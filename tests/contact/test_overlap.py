@@ -1,5 +1,6 @@
 """Overlap ψ, χ, n and its derivatives, against closed forms, brute force and differences."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -218,6 +219,32 @@ def test_derivative_with_respect_to_a_radius():
     expected = (psi(0.3 + 1e-6) - psi(0.3 - 1e-6)) / 2e-6
     assert jax.jit(jax.grad(psi))(0.3) == pytest.approx(float(expected), rel=1e-6)
     assert jax.jit(jax.jacfwd(psi))(0.3) == pytest.approx(float(expected), rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["half-space", "sphere", "grid, culled"])
+def test_derivative_with_respect_to_grid_and_samples(pair, kind):
+    """What few perturb, a grid's values and the samples themselves, is not silently constant."""
+    other = apart_cases(pair)[kind]
+    mine = collider(pair[0], pair[2], pose=dano.Pose((0.1, 0.05, 0.28)), mass=2.0)
+
+    def psi(change):
+        samples = eqx.tree_at(
+            lambda s: (s.points, s.weights),
+            mine.samples,
+            (mine.samples.points.at[0].add(change[0]), mine.samples.weights * (1 + change[1])),
+        )
+        them = other
+        if kind == "grid, culled":
+            denser = other.field.coefficients * (1 + change[2])
+            them = eqx.tree_at(lambda c: c.field.coefficients, other, denser)
+        return dano.overlap(eqx.tree_at(lambda c: c.samples, mine, samples), them).overlap
+
+    zero, value = jnp.zeros(3), jax.jit(psi)
+    forward, reverse = jax.jit(jax.jacfwd(psi))(zero), jax.jit(jax.grad(psi))(zero)
+    differences = [(value(zero + 1e-6 * e) - value(zero - 1e-6 * e)) / 2e-6 for e in np.eye(3)]
+    np.testing.assert_allclose(forward, reverse, atol=1e-10)
+    np.testing.assert_allclose(forward, differences, rtol=1e-5, atol=1e-8)
+    assert abs(float(forward[1])) > 1e-3
 
 
 @pytest.mark.parametrize(
