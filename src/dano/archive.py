@@ -88,11 +88,10 @@ def read_archive(path: str | os.PathLike[str], form: str, version: int) -> dict[
     """
     source = checked_input(path)
     try:
+        if not zipfile.is_zipfile(source):
+            raise ValueError("it is no archive of arrays, or cut off")
         # Opened here, because NumPy leaves its own handle open when the content turns out to be foreign.
-        with open(source, "rb") as file:
-            archive = np.load(file, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError("it holds one bare array")
+        with open(source, "rb") as file, np.load(file, allow_pickle=False) as archive:
             data = {name: archive[name] for name in archive.files}
     except (
         zipfile.BadZipFile,
