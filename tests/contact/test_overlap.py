@@ -224,19 +224,17 @@ def test_derivative_with_respect_to_a_radius():
 @pytest.mark.parametrize("kind", ["half-space", "sphere", "grid, culled"])
 def test_derivative_with_respect_to_grid_and_samples(pair, kind):
     """What few perturb, a grid's values and the samples themselves, is not silently constant."""
-    other = apart_cases(pair)[kind]
-    mine = collider(pair[0], pair[2], pose=dano.Pose((0.1, 0.05, 0.28)), mass=2.0)
+    other, grid = apart_cases(pair)[kind], pair[1]
+    given = SampleSet.create(*pair[2])
+    mine = dano.Collider(None, given, pose=dano.Pose((0.1, 0.05, 0.28)), mass=2.0)
 
     def psi(change):
-        samples = eqx.tree_at(
-            lambda s: (s.points, s.weights),
-            mine.samples,
-            (mine.samples.points.at[0].add(change[0]), mine.samples.weights * (1 + change[1])),
-        )
+        moved = given.points.at[0].add(change[0]), given.weights * (1 + change[1])
+        samples = eqx.tree_at(lambda s: (s.points, s.weights), given, moved)
         them = other
         if kind == "grid, culled":
-            denser = other.field.coefficients * (1 + change[2])
-            them = eqx.tree_at(lambda c: c.field.coefficients, other, denser)
+            denser = eqx.tree_at(lambda f: f.coefficients, grid, grid.coefficients * (1 + change[2]))
+            them = eqx.tree_at(lambda c: c.field, other, denser)
         return dano.overlap(eqx.tree_at(lambda c: c.samples, mine, samples), them).overlap
 
     zero, value = jnp.zeros(3), jax.jit(psi)
