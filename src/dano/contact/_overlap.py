@@ -160,14 +160,16 @@ def _planar_jvp(primals, tangents):
         return _by_autodiff(_planar_moments, primals, tangents)
     # dS = M dplane with the symmetric 4×4 moment matrix of the samples in the smoothing band.
     t = _depth(plane, samples)
-    moments = contract(samples.weights * (t * t * (3 - 2 * t)), samples.points)
-    matrix = _symmetric(samples.weights * (-6 * t * (1 - t)), samples.products)
-    moments, matrix = _keep(moments, matrix)
+    slope = -6 * t * (1 - t)
+    moments, matrix = _keep(_moments(t, samples), _symmetric(samples.weights * slope, samples.products))
     return moments, matvec(matrix, d_plane)
 
 
 def _planar_moments(plane, samples: SampleSet):
-    t = _depth(plane, samples)
+    return _moments(_depth(plane, samples), samples)
+
+
+def _moments(t: Float[Array, " n"], samples: SampleSet) -> Float[Array, "4"]:
     return contract(samples.weights * (t * t * (3 - 2 * t)), samples.points)
 
 

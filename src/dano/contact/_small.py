@@ -12,25 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-@functools.partial(jax.custom_jvp)
 def matvec(a: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
     """``a @ x`` for a small matrix."""
-    return sum((a[:, i] * x[i] for i in range(1, a.shape[1])), a[:, 0] * x[0])
+    return matmul(a, x[:, None])[:, 0]
 
 
-@functools.partial(matvec.defjvp, symbolic_zeros=True)
-def _matvec_jvp(primals, tangents):
-    # Tangents as one product and one reduction: their transposes are as short, those of the written-out sum
-    # are not.
-    (a, x), (da, dx) = primals, tangents
-    terms = [
-        d for d in (None if _zero(da) else da * x[None], None if _zero(dx) else a * dx[None]) if d is not None
-    ]
-    tangent = jnp.sum(sum(terms[1:], terms[0]), axis=1) if terms else jnp.zeros_like(a[:, 0])
-    return matvec(a, x), tangent
-
-
-@functools.partial(jax.custom_jvp)
+@jax.custom_jvp
 def matmul(a: Float[Array, "m k"], b: Float[Array, "k n"]) -> Float[Array, "m n"]:
     """``a @ b`` for small matrices."""
     return sum((a[:, i, None] * b[None, i] for i in range(1, a.shape[1])), a[:, 0, None] * b[None, 0])
@@ -38,6 +25,8 @@ def matmul(a: Float[Array, "m k"], b: Float[Array, "k n"]) -> Float[Array, "m n"
 
 @functools.partial(matmul.defjvp, symbolic_zeros=True)
 def _matmul_jvp(primals, tangents):
+    # Tangents as one product and one reduction: their transposes are as short, those of the written-out sum
+    # are not.
     (a, b), (da, db) = primals, tangents
     terms = [
         d
