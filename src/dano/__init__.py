@@ -23,12 +23,14 @@ from dano.objects import (
     ContactSamples as ContactSamples,
     MassProperties as MassProperties,
     NeuralObject as NeuralObject,
+    SurfaceSamples as SurfaceSamples,
 )
 from dano.contact import (
     AbstractContactLaw as AbstractContactLaw,
     CentroidLaw as CentroidLaw,
     Collider as Collider,
     ContactParams as ContactParams,
+    DistributedLaw as DistributedLaw,
     overlap as overlap,
     Patch as Patch,
 )

@@ -45,6 +45,14 @@ def test_sampled_ball_is_the_ball(kind, tolerance):
     assert ball.solid_moments() is None
 
 
+@pytest.mark.parametrize("kind", ["linear", "quadratic", "cubic"])
+def test_distances_are_those_given(kind):
+    samples = np.random.default_rng(0).uniform(0.2, 0.4, size=(5, 6, 7))
+    samples[2, 3, 3] = -0.2
+    shape = SignedDistanceGrid(samples, (0.0, 1.0, 2.0), 0.1, kind)
+    np.testing.assert_allclose(shape.distances, samples, atol=1e-12)
+
+
 def test_distance_grows_outside_of_the_grid_and_derivatives_are_consistent():
     ball = SignedDistanceGrid(*ball_samples(), edge=0.05)
     x = np.random.default_rng(1).uniform(-0.8, 0.8, (3, N))

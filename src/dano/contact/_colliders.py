@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.fields import AbstractField, GridField
+from dano.fields import AbstractField, AbstractShape, GridField
 from dano.maths import floating, Numbers, Pose, safe_norm
 
 # Samples per block. Fewer make the culling finer, more make each pass over a block fatter; 32 measured best.
@@ -38,17 +38,18 @@ class SampleSet(eqx.Module):
     radii: Float[Array, " blocks"]
 
     @classmethod
-    def create(cls, points: Numbers, density: Numbers) -> "SampleSet":
+    def create(cls, points: Numbers, weights: Numbers, *, normalise: bool = True) -> "SampleSet":
         """Order the samples in space and normalise their weights, on the host.
 
         Args:
             points: Sample positions [m, F].
-            density: Density φ ≥ 0 of each sample [arbitrary unit]; not all zero.
+            weights: Density φ ≥ 0 of each sample [arbitrary unit], not all zero; or area [m²].
+            normalise: Whether the weights shall sum to one.
         """
-        x, phi = np.asarray(points, dtype=np.float64), np.asarray(density, dtype=np.float64)
+        x, phi = np.asarray(points, dtype=np.float64), np.asarray(weights, dtype=np.float64)
         order = _spatial_order(x)
         missing = -len(order) % BLOCK
-        weights = np.concatenate([phi[order] / phi.sum(), np.zeros(missing)])
+        weights = np.concatenate([phi[order] / (phi.sum() if normalise else 1), np.zeros(missing)])
         x = np.concatenate([x[order], np.repeat(x[order[-1:]], missing, axis=0)])
         blocks = x.reshape(-1, BLOCK, 3)
         centers = 0.5 * (blocks.min(axis=1) + blocks.max(axis=1))
@@ -119,6 +120,10 @@ class Collider(eqx.Module):
         mass: Mass [kg] that the sample weights sum to.
         rotation: Field frame → world, shape (3, 3).
         origin: Origin of the field frame [m, W], shape (3,).
+        surface: Surface samples weighted by area [m²], for distributed contact.
+        solid: Signed distance that the other side's surface samples query.
+        velocity: Of the point at the origin of the field frame [m/s, W].
+        omega: Angular velocity [rad/s, W].
     """
 
     samples: SampleSet | None
@@ -128,6 +133,10 @@ class Collider(eqx.Module):
     mass: Float[Array, ""]
     rotation: Float[Array, "3 3"]
     origin: Float[Array, "3"]
+    surface: SampleSet | None
+    solid: AbstractShape | None
+    velocity: Float[Array, "3"]
+    omega: Float[Array, "3"]
 
     def __init__(
         self,
@@ -140,6 +149,10 @@ class Collider(eqx.Module):
         pose: Pose | None = None,
         rotation: Array | None = None,
         origin: Array | None = None,
+        surface: SampleSet | None = None,
+        solid: AbstractShape | None = None,
+        velocity: Array | None = None,
+        omega: Array | None = None,
     ):
         """Build a collider; give either `pose` or both `rotation` and `origin` (default: identity)."""
         pose = Pose() if pose is None else pose
@@ -147,6 +160,9 @@ class Collider(eqx.Module):
         self.density_scale, self.mass = floating(density_scale), floating(mass)
         self.rotation = pose.matrix if rotation is None else rotation
         self.origin = pose.position if origin is None else origin
+        self.surface, self.solid = surface, solid
+        self.velocity = jnp.zeros_like(self.origin) if velocity is None else velocity
+        self.omega = jnp.zeros_like(self.origin) if omega is None else omega
 
 
 def _spatial_order(points: np.ndarray) -> np.ndarray:

@@ -1,172 +1,198 @@
-"""Contact laws: from the overlap of two bodies and their relative motion to a wrench.
+"""Contact laws: from the geometry of a contact and the relative motion of two bodies to a wrench.
 
 A law is a class (what is fixed), its parameters are `ContactParams` (what can be identified). Velocities are
 the unknown end-of-step ones, so a law also returns its Jacobian, in closed form, for the step's Newton solve.
 """
 
 import abc
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.contact._overlap import Patch
-from dano.maths import floating, is_traced, Numbers, safe_norm
+from dano.contact._colliders import Collider
+from dano.contact._overlap import overlap, Patch
+from dano.maths import floating, is_traced, Numbers
 
 
 class ContactParams(eqx.Module):
-    """The eight parameters of a contact (paper: Table I). All leaves, all ≥ 0, all scalars.
+    """Parameters of a contact: leaves, scalars ≥ 0. Each law reads its own.
+
+    What is None is chosen by the law of the contact when a scene is created (`AbstractContactLaw.complete`).
 
     Attributes:
-        spring: k, normal acceleration per share of overlapping mass [N/kg].
-        damper: d, its decrease with the separating speed [N s/(m kg)].
-        sliding_friction: Coulomb coefficient μ_s [1].
-        sliding_drag: viscous sliding friction per normal force [s/m].
-        torsional_friction: friction moment about the normal per normal force μ_t [m].
-        torsional_drag: viscous moment about the normal per normal force [m s].
-        rolling_friction: friction moment in the tangent plane per normal force μ_r [m].
-        rolling_drag: viscous moment in the tangent plane per normal force [m s].
+        sliding_friction: Coulomb coefficient μ [1]; both laws.
+        spring: Centroid law (paper: Table I): k, normal force per overlapping mass [N/kg].
+        damper: Centroid law: d, its decrease with the separating speed [N s/(m kg)].
+        sliding_drag: Centroid law: viscous sliding friction per normal force [s/m].
+        torsional_friction: Centroid law: friction moment about the normal per normal force μ_t [m].
+        torsional_drag: Centroid law: viscous moment about the normal per normal force [m s].
+        rolling_friction: Centroid law: friction moment in the tangent plane per normal force μ_r [m].
+        rolling_drag: Centroid law: viscous moment in the tangent plane per normal force [m s].
+        stiffness: Distributed law: pressure per depth [Pa/m].
+        restitution: Distributed law: separating over approaching speed in an impact e ≤ 1 [1].
+        restitution_velocity: Distributed law: speed [m/s] below which impacts lose more than `restitution`
+            says, until at rest the contact is a damped spring.
+        friction_fading: Distributed law: share φ ≤ 1 of the friction coefficient that is lost under high
+            pressure [1].
+        friction_pressure: Distributed law: pressure p₀ at which half of that is lost [Pa].
     """
 
-    spring: Float[Array, ""]
-    damper: Float[Array, ""]
     sliding_friction: Float[Array, ""]
-    sliding_drag: Float[Array, ""]
-    torsional_friction: Float[Array, ""]
-    torsional_drag: Float[Array, ""]
-    rolling_friction: Float[Array, ""]
-    rolling_drag: Float[Array, ""]
+    spring: Float[Array, ""] | None
+    damper: Float[Array, ""] | None
+    sliding_drag: Float[Array, ""] | None
+    torsional_friction: Float[Array, ""] | None
+    torsional_drag: Float[Array, ""] | None
+    rolling_friction: Float[Array, ""] | None
+    rolling_drag: Float[Array, ""] | None
+    stiffness: Float[Array, ""] | None
+    restitution: Float[Array, ""]
+    restitution_velocity: Float[Array, ""] | None
+    friction_fading: Float[Array, ""]
+    friction_pressure: Float[Array, ""]
 
     def __init__(
         self,
         *,
-        spring: Numbers = 3e4,
-        damper: Numbers = 3e5,
         sliding_friction: Numbers = 0.2,
-        sliding_drag: Numbers = 0.1,
-        torsional_friction: Numbers = 0.01,
-        torsional_drag: Numbers = 0.0,
-        rolling_friction: Numbers = 0.01,
-        rolling_drag: Numbers = 0.0,
+        spring: Numbers | None = None,
+        damper: Numbers | None = None,
+        sliding_drag: Numbers | None = None,
+        torsional_friction: Numbers | None = None,
+        torsional_drag: Numbers | None = None,
+        rolling_friction: Numbers | None = None,
+        rolling_drag: Numbers | None = None,
+        stiffness: Numbers | None = None,
+        restitution: Numbers = 0.0,
+        restitution_velocity: Numbers | None = None,
+        friction_fading: Numbers = 0.0,
+        friction_pressure: Numbers = 1000.0,
     ):
-        """Defaults are those of the paper's implementation.
+        """See the class.
 
         Raises:
-            ValueError: If a parameter is negative, not finite or not a scalar.
+            ValueError: If a parameter is negative, not finite or not a scalar, `restitution` or
+                `friction_fading` exceeds 1, or one that is divided by is zero.
         """
-        self.spring = non_negative("spring", spring)
-        self.damper = non_negative("damper", damper)
-        self.sliding_friction = non_negative("sliding_friction", sliding_friction)
-        self.sliding_drag = non_negative("sliding_drag", sliding_drag)
-        self.torsional_friction = non_negative("torsional_friction", torsional_friction)
-        self.torsional_drag = non_negative("torsional_drag", torsional_drag)
-        self.rolling_friction = non_negative("rolling_friction", rolling_friction)
-        self.rolling_drag = non_negative("rolling_drag", rolling_drag)
+        given = locals()
+        for name in self.__dataclass_fields__:
+            value = given[name]
+            setattr(self, name, None if value is None else checked_parameter(name, value))
+
+    def filled(self, **defaults: Numbers) -> "ContactParams":
+        """These parameters with defaults where they are None."""
+        mine = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        missing = {name: value for name, value in defaults.items() if mine[name] is None}
+        return ContactParams(**{**mine, **missing})
+
+
+def checked_parameter(name: str, value: Numbers) -> Float[Array, ""]:
+    """A value for a field of `ContactParams`.
+
+    Raises:
+        ValueError: If there is no such parameter, or the value is out of range.
+    """
+    if name not in ContactParams.__dataclass_fields__:
+        raise ValueError(
+            f"contact parameter must be one of {list(ContactParams.__dataclass_fields__)}, got {name!r}"
+        )
+    array = non_negative(name, value)
+    if is_traced(array):
+        return array
+    if name in ("restitution", "friction_fading") and float(array) > 1:
+        raise ValueError(f"{name} must lie in [0, 1], got {float(array)}")
+    if name in ("stiffness", "restitution_velocity", "friction_pressure") and float(array) == 0:
+        raise ValueError(f"{name} must be > 0, got {float(array)}")
+    return array
+
+
+class Setting(NamedTuple):
+    """What default parameters are derived from.
+
+    Attributes:
+        size: Largest extent of the smaller body [m].
+        gravity: Its magnitude, 9.81 where there is none [m/s²].
+        stiffness: Gives the stiffness [Pa/m] at which either body, set down on a rigid floor in a typical
+            orientation, sinks by at most a share of its size.
+    """
+
+    size: float
+    gravity: Float[Array, ""]
+    stiffness: Callable[[float], Float[Array, ""]]
+
+
+class Softening(NamedTuple):
+    """How much larger than a law's own the stiction velocity is taken while a solver closes in on a root.
+
+    Attributes:
+        held: What is slower than this many stiction velocities counts as sticking …
+        scale: … and is resisted as if the stiction velocity were so many times as large.
+    """
+
+    held: Float[Array, ""] | float = 1.0
+    scale: Float[Array, ""] | float = 1.0
 
 
 class AbstractContactLaw(eqx.Module):
-    """How the overlap of two bodies becomes force."""
+    """How the contact of two bodies becomes force."""
+
+    @property
+    def presses(self) -> bool:
+        """Whether the law needs surface samples and solids rather than shared mass."""
+        return False
+
+    @property
+    def stiction(self) -> bool:
+        """Whether the law has a stiction velocity, which `wrench` softens when asked to."""
+        return False
+
+    def patch(self, a: Collider, b: Collider, timestep: Float[Array, ""]) -> Any:
+        """Geometry of a contact at the current configuration, which a step holds constant: by default `overlap`.
+
+        The result has a `point` [m, W] that twists and wrenches refer to, and says whether the bodies are
+        `touching`.
+        """
+        return overlap(a, b)
+
+    def complete(self, params: ContactParams, setting: Setting) -> ContactParams:
+        """Parameters with this law's defaults in place of None."""
+        return params
+
+    def summary(self, patch: Any) -> Patch:
+        """Overlap, centroid and normal of a contact's geometry, for plots."""
+        return patch
 
     @abc.abstractmethod
     def wrench(
-        self, patch: Patch, params: ContactParams, twist: Float[Array, "6"]
+        self,
+        patch: Any,
+        params: ContactParams,
+        twist: Float[Array, "6"],
+        timestep: Float[Array, ""],
+        softening: Softening = Softening(),
     ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
         """Wrench on the first body and its derivative with respect to the relative twist.
 
         Args:
-            patch: Overlap of the two bodies.
+            patch: Geometry of the contact, from `patch`.
             params: Parameters of this contact.
-            twist: Velocity [m/s] of the first body relative to the second at the centroid, then relative spin
-                [rad/s]; both in W.
+            twist: Velocity [m/s] of the first body relative to the second at `patch.point`, then relative
+                spin [rad/s]; both in W.
+            timestep: h [s].
+            softening: For laws with stiction.
 
         Returns:
-            (force [N], torque about the centroid [N m]) on the first body [W], shape (6,), and
+            (force [N], torque about `patch.point` [N m]) on the first body [W], shape (6,), and
             ∂wrench/∂twist.
         """
 
 
-class CentroidLaw(AbstractContactLaw):
-    """The paper's law: one wrench at the centroid of the overlap.
-
-    F_n = ψ (k − d n·v) n,  F_t = |F_n| (μ_s c(v_t) − drag_s v_t),  τ = |F_n| (μ_t c(w_n) − drag_t w_n
-    + μ_r c(w_t) − drag_r w_t),  with the smoothed Coulomb direction c(u) = −(2/π) atan(s|u|) u / (ε + |u|)
-    (paper: eq:normal_force to eq:rolling_friction; its smoothing as in the authors' implementation).
-
-    Attributes:
-        smoothing: s [s/m, and s/rad for the moments]; larger is nearer to Coulomb's law and creeps less.
-        regularizer: ε [m/s, and rad/s].
-        adhesive: Whether F_n may pull once bodies separate faster than k/d, as the reference implementation
-            does.
-    """
-
-    smoothing: Float[Array, ""]
-    regularizer: Float[Array, ""]
-    adhesive: bool = eqx.field(static=True)
-
-    def __init__(self, *, smoothing: Numbers = 30.0, regularizer: Numbers = 1e-3, adhesive: bool = False):
-        """See the class.
-
-        Raises:
-            ValueError: If `smoothing` or `regularizer` is negative, not finite or not a scalar.
-        """
-        self.smoothing = non_negative("smoothing", smoothing)
-        self.regularizer = non_negative("regularizer", regularizer)
-        if not is_traced(self.regularizer) and float(self.regularizer) == 0.0:
-            raise ValueError("regularizer must be > 0, got 0.0")
-        self.adhesive = bool(adhesive)
-
-    def wrench(self, patch, params, twist):
-        """See `AbstractContactLaw.wrench`."""
-        n, psi = patch.normal, patch.overlap
-        nn = n[:, None] * n[None]
-        tangential = jnp.eye(3, dtype=n.dtype) - nn
-        velocity, spin = twist[:3], twist[3:]
-        v_n, w_n = jnp.sum(n * velocity), jnp.sum(n * spin)
-
-        push = params.spring - params.damper * v_n
-        if self.adhesive:
-            magnitude, slope = psi * jnp.abs(push), -psi * params.damper * jnp.sign(push)
-            direction = n * jnp.sign(push)
-        else:
-            pushing = push > 0
-            magnitude = psi * jnp.where(pushing, push, 0)
-            slope = jnp.where(pushing, -psi * params.damper, 0)
-            direction = n
-
-        slide, d_slide = self._resistance(
-            velocity - n * v_n, tangential, params.sliding_friction, params.sliding_drag
-        )
-        drill, d_drill = self._resistance(n * w_n, nn, params.torsional_friction, params.torsional_drag)
-        roll, d_roll = self._resistance(
-            spin - n * w_n, tangential, params.rolling_friction, params.rolling_drag
-        )
-        per_force, per_moment = direction + slide, drill + roll
-        wrench = magnitude * jnp.concatenate([per_force, per_moment])
-        upper = jnp.concatenate(
-            [slope * per_force[:, None] * n[None] + magnitude * d_slide, jnp.zeros((3, 3), n.dtype)], axis=1
-        )
-        lower = jnp.concatenate(
-            [slope * per_moment[:, None] * n[None], magnitude * (d_drill + d_roll)], axis=1
-        )
-        return wrench, jnp.concatenate([upper, lower])
-
-    def _resistance(self, u, projection, friction, drag):
-        """μ c(u) − drag u for a velocity u = projection @ u_full, and its derivative by u_full."""
-        speed = safe_norm(u)
-        angle = jnp.arctan(self.smoothing * speed) * (2 / jnp.pi)
-        reach = self.regularizer + speed
-        gain = angle / reach
-        gain_slope = ((2 / jnp.pi) * self.smoothing / (1 + (self.smoothing * speed) ** 2) - gain) / reach
-        # c = −gain(|u|) u; the second term of its derivative vanishes with u, so any divisor will do there.
-        along = gain_slope / jnp.where(speed > 0, speed, 1)
-        force = -(friction * gain + drag) * u
-        derivative = -(friction * gain + drag) * projection - friction * along * u[:, None] * u[None]
-        return force, derivative
-
-
 def non_negative(name: str, value: Numbers) -> Float[Array, ""]:
-    """`value` as a finite scalar ≥ 0.
+    """`value` as a scalar ≥ 0.
 
     Raises:
         ValueError: If it is not.
@@ -176,4 +202,16 @@ def non_negative(name: str, value: Numbers) -> Float[Array, ""]:
         raise ValueError(f"{name} must be a scalar, got shape {array.shape}")
     if not is_traced(array) and not (np.isfinite(array) and array >= 0):
         raise ValueError(f"{name} must be finite and ≥ 0, got {float(array)}")
+    return array
+
+
+def positive(name: str, value: Numbers) -> Float[Array, ""]:
+    """`value` as a scalar > 0.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    array = non_negative(name, value)
+    if not is_traced(array) and float(array) == 0.0:
+        raise ValueError(f"{name} must be > 0, got 0.0")
     return array

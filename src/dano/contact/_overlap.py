@@ -13,10 +13,10 @@ pass over the samples, so that neither autodiff mode ever stores anything of the
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from dano.contact._colliders import BLOCK, Collider, SampleSet, Support, SYMMETRIC
+from dano.contact._derivatives import by_autodiff, keep
 from dano.contact._small import contract, matmul, matvec
 from dano.fields import AbstractField, GridField, HalfSpace, PosedField, PosedShape, Sphere
 from dano.maths import safe_normalize
@@ -35,6 +35,16 @@ class Patch(eqx.Module):
     centroid: Float[Array, "3"]
     normal: Float[Array, "3"]
 
+    @property
+    def point(self) -> Float[Array, "3"]:
+        """What twists and wrenches refer to [m, W]: the centroid."""
+        return self.centroid
+
+    @property
+    def touching(self) -> Bool[Array, ""]:
+        """Whether the bodies overlap, so that there is a centroid."""
+        return self.overlap > 0
+
 
 class _Side(eqx.Module):
     """One-sided sums, in the frame of the sampled object (moments) and of the queried field (direction)."""
@@ -42,10 +52,6 @@ class _Side(eqx.Module):
     moments: Float[Array, "4"]
     direction: Float[Array, "3"]
 
-
-# Name of the values that reverse mode keeps instead of computing them again: results of passes over samples,
-# of solves.
-KEPT = "kept"
 
 # Blocks of samples that one pass through a grid takes: enough to outweigh the cost of starting it.
 _BLOCKS_AT_ONCE = 4
@@ -157,11 +163,11 @@ def _planar_jvp(primals, tangents):
     plane, samples = primals
     d_plane, d_samples = tangents
     if jax.tree.leaves(d_samples):
-        return _by_autodiff(_planar_moments, primals, tangents)
+        return by_autodiff(_planar_moments, primals, tangents)
     # dS = M dplane with the symmetric 4×4 moment matrix of the samples in the smoothing band.
     t = _depth(plane, samples)
     slope = -6 * t * (1 - t)
-    moments, matrix = _keep(_moments(t, samples), _symmetric(samples.weights * slope, samples.products))
+    moments, matrix = keep(_moments(t, samples), _symmetric(samples.weights * slope, samples.products))
     return moments, matvec(matrix, d_plane)
 
 
@@ -183,13 +189,6 @@ def _symmetric(weights: Float[Array, " n"], products: Float[Array, "10 n"]) -> F
     return contract(weights, products)[SYMMETRIC]
 
 
-def _by_autodiff(function, primals, tangents):
-    """Plain forward derivative, for arguments that few ever perturb (a grid's values, samples, a radius)."""
-    perturbed = jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
-    dynamic, static = eqx.partition(primals, perturbed)
-    return jax.jvp(lambda d: function(*eqx.combine(d, static)), (dynamic,), (tangents,))
-
-
 @eqx.filter_custom_jvp
 def _dense(to_field, field, samples):
     """Sums (S, D) over every sample in any differentiable field."""
@@ -200,10 +199,10 @@ def _dense(to_field, field, samples):
 def _dense_jvp(primals, tangents):
     to_field, field, samples = primals
     if jax.tree.leaves(tangents[1:]):
-        return _by_autodiff(_dense_sums, primals, tangents)
+        return by_autodiff(_dense_sums, primals, tangents)
     x = to_field @ samples.points
     value, jacobian = jax.vmap(_value_and_jacobian, (None, 1), -1)(field, x)
-    sums, derivative = _keep(*_accumulate(value, jacobian, samples.points, samples.products, samples.weights))
+    sums, derivative = keep(*_accumulate(value, jacobian, samples.points, samples.products, samples.weights))
     return sums, jnp.einsum("kab,ab->k", derivative, tangents[0])
 
 
@@ -239,8 +238,8 @@ def _culled(to_field, field, samples, support):
 def _culled_jvp(primals, tangents):
     if jax.tree.leaves(tangents[1:]):
         # The map of the support only says what may be skipped: without it the sums are the same.
-        return _by_autodiff(_dense_sums, primals[:3], tangents[:3])
-    sums, derivative = _keep(*_culled_sums(*primals, derivative=True))
+        return by_autodiff(_dense_sums, primals[:3], tangents[:3])
+    sums, derivative = keep(*_culled_sums(*primals, derivative=True))
     return sums, jnp.einsum("kab,ab->k", derivative, tangents[0])
 
 
@@ -294,11 +293,6 @@ def _accumulate(value, jacobian, points, products, weights):
     of_moments = jnp.stack([_symmetric(weighted[0, a], products) for a in range(3)], axis=1)
     of_direction = jnp.stack([jnp.stack([contract(row, points) for row in rows]) for rows in weighted[1:]])
     return sums, jnp.concatenate([of_moments, of_direction])
-
-
-def _keep(*values: Array) -> tuple[Array, ...]:
-    """Mark what a rollout's reverse mode keeps of a step: everything else is cheap to compute again."""
-    return tuple(checkpoint_name(value, KEPT) for value in values)
 
 
 def _cap(ball: Collider, plane: Collider) -> Patch:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from dano.contact import Softening
 from dano.contact._small import matmul
 
 
@@ -16,7 +17,7 @@ class SolverOptions(NamedTuple):
     """When a step's Newton solve stops: see `VariationalEngine`."""
 
     tolerance: float | None = None
-    max_iterations: int = 100
+    max_iterations: int = 200
 
 
 class Report(NamedTuple):
@@ -27,78 +28,221 @@ class Report(NamedTuple):
     converged: Bool[Array, ""]
 
 
-# Length of a step below which the line search accepts it unseen.
+# A step is accepted when what the residual does along it fell to this share; when the bracket around the zero
+# of that is narrower than this share of the step, it is accepted as it is.
+_ENOUGH = 0.5
 _GIVE_UP = 0.01
 
+# Softness of friction in the course of a solve with stiction: as it is; if that does not converge, from a
+# thousand times softer downwards; if that does not either, from ten million times (1 m/s at 1e-7 m/s).
+_TIERS = ((1.0,(1.0,)), (1e7,(1e7, 1e6, 1e5, 1e4, 1e3, 1e2, 1e1, 1.0)))
+# Passes after which a level of each tier is left.
+_BUDGETS = (6, 14)
+# Residual to which the levels above one are solved, per stiction velocity of theirs [m/s].
+_SOFT_TOLERANCE = 1e-8
 
-class _Iterate(eqx.Module):
-    """Carry of the Newton loop: the accepted point with its residual, and the length of the next try."""
+
+class _Schedule(NamedTuple):
+    """The levels of all tiers in order (arrays over levels).
+
+    Attributes:
+        scale: Softness.
+        held: Softness of the level before: who sticks, for the predictor.
+        last: Whether the level is the last of its tier, where friction is as it is.
+        restart: First level of the next tier, or −1 in the last.
+        budget: Passes.
+    """
+
+    scale: Float[Array, " levels"]
+    held: Float[Array, " levels"]
+    last: Bool[Array, " levels"]
+    restart: Int[Array, " levels"]
+    budget: Int[Array, " levels"]
+
+    @classmethod
+    def create(cls, tiers, budgets, dtype) -> "_Schedule":
+        scale = np.concatenate([scales for _, scales in tiers])
+        lengths = [len(scales) for _, scales in tiers]
+        ends = np.cumsum(lengths)
+        nexts = np.append(ends[:-1], -1)
+        return cls(
+            jnp.asarray(scale, dtype),
+            jnp.asarray(np.concatenate([[held, *scales[:-1]] for held, scales in tiers]), dtype),
+            jnp.asarray(np.isin(np.arange(len(scale)), ends - 1)),
+            jnp.asarray(np.repeat(nexts, lengths)),
+            jnp.asarray(np.repeat(budgets, lengths)),
+        )
+
+
+# What a pass of the Newton loop does: a step; look where it stands, with the sticking samples of the softer
+# level before; the step from there, which is accepted unseen; look again at the start.
+_STEP, _PREDICT, _FOLLOW = range(3)
+
+
+class _Search(NamedTuple):
+    """A line search: the step, and the zero of its work on the residual, bracketed.
+
+    Attributes:
+        direction: The step from the accepted point.
+        work: Of the residual along it at the accepted point; negative where the step leads downhill.
+        length: Share of the step to try next.
+        low: Share that falls short, and the work there.
+        high: Share that goes too far, and the work there; 0 until one is known.
+    """
+
+    direction: Float[Array, " n"]
+    work: Float[Array, ""]
+    length: Float[Array, ""]
+    low: tuple[Float[Array, ""], Float[Array, ""]]
+    high: tuple[Float[Array, ""], Float[Array, ""]]
+
+    @classmethod
+    def start(cls, direction, work) -> "_Search":
+        zero, one = jnp.zeros_like(work), jnp.ones_like(work)
+        return cls(direction, work, one, (zero, work), (zero, zero))
+
+    def accepts(self, work) -> Bool[Array, ""]:
+        """Whether the point at `length`, where the residual does this work, is good enough."""
+        limit = _ENOUGH * jnp.abs(self.work)
+        bracketed = self.high[0] > 0
+        misses = (work > limit) | (bracketed & (work < -limit)) | jnp.isnan(work)
+        narrow = bracketed & (self.high[0] - self.low[0] < _GIVE_UP)
+        return ~misses | narrow | (self.work >= 0)
+
+    def narrowed(self, work) -> "_Search":
+        """The search after a miss: regula falsi, kept from the ends of the bracket."""
+        far = ~(work < 0)
+        here = self.length, work
+        # The Illinois rule: an end that stays twice counts half, so that both move.
+        low = tuple(jnp.where(far, old, new) for old, new in zip(self.low, here, strict=True))
+        high = tuple(jnp.where(far, new, old) for old, new in zip(self.high, here, strict=True))
+        low = low[0], jnp.where(far, 0.5 * low[1], low[1])
+        high = high[0], jnp.where(far | (self.high[0] == 0), high[1], 0.5 * high[1])
+        share = jnp.clip(-low[1] / (high[1] - low[1]), 0.1, 0.9)
+        share = jnp.where(jnp.isnan(share), 0.1, share)
+        return self._replace(length=low[0] + share * (high[0] - low[0]), low=low, high=high)
+
+
+class _Iterate(NamedTuple):
+    """Carry of the Newton loop: the accepted point with its residual, and what to do next."""
 
     point: Float[Array, " n"]
     residual: Float[Array, " n"]
     jacobian: Float[Array, "n n"]
-    length: Float[Array, ""]
+    search: _Search
     iteration: Int[Array, ""]
+    level: Int[Array, ""]
+    action: Int[Array, ""]
+    budget: Int[Array, ""]
 
 
 def newton(
-    evaluate: Callable[[Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, "n n"]]],
+    evaluate: Callable[[Float[Array, " n"], Softening], tuple[Float[Array, " n"], Float[Array, "n n"]]],
     start: Float[Array, " n"],
+    scale: Float[Array, " n"],
     size: Float[Array, ""],
     options: SolverOptions,
+    *,
+    softens: bool = False,
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Report]:
-    """Root of a small system by Newton with a halving line search.
+    """Root of a small monotone system by Newton with a line search, and with continuation in stiction.
 
-    A loop pass evaluates residual and Jacobian once. If the residual did not fall, the pass is a line search
-    step: the point stays and the length halves. At a kink (contact that just opens or closes) no short step
-    along Newton's direction may help at all; then one is accepted uphill, to come back from the other side.
+    A loop pass evaluates residual and Jacobian once. With mass and contact the residual is nearly the gradient
+    of a convex function with kinks (contact that opens or closes), so a step is as long as its work on the
+    residual takes to vanish, not as long as the residual takes to fall in some norm: at a kink it may have to
+    grow.
+
+    Coulomb friction turns by its full size within a stiction velocity of 1e-7 m/s, which no line search finds.
+    Steps whose friction hardly changes converge at once. For the others the root is followed from soft to hard
+    friction, each level ten times harder than the one before, with a predictor: what stuck at the last level
+    sticks at the next and creeps a tenth as fast, which is exact if nothing begins to slip.
 
     Args:
-        evaluate: Residual and its Jacobian at a point.
+        evaluate: Residual and its Jacobian at a point and a softness of friction.
         start: Where to begin.
+        scale: The residual's factors over the gradient that it would be [1/kg, 1/(kg m²)].
         size: Magnitude of the terms in the residual, to which rounding in it is relative.
         options: When to stop.
+        softens: Whether the residual has stiction.
 
     Returns:
         The last accepted point, the Jacobian there, and the report.
     """
-    relative = float(jnp.finfo(start.dtype).eps) ** 0.75 if options.tolerance is None else options.tolerance
-    tolerance = relative * (1 + size)
+    epsilon = float(jnp.finfo(start.dtype).eps)
+    relative = epsilon**0.75 if options.tolerance is None else options.tolerance
+    tiers, budgets = (_TIERS, _BUDGETS) if softens else (_TIERS[:1], (options.max_iterations + 1,))
+    schedule = _Schedule.create(tiers, budgets, start.dtype)
 
-    def error(residual):
-        return jnp.max(jnp.abs(residual))
+    def error(it: _Iterate):
+        """Largest residual, and to what it must fall: the tolerance, or what rounding allows."""
+        rounding = 16 * epsilon * jnp.max(jnp.sum(jnp.abs(it.jacobian * it.point[None]), axis=1))
+        return jnp.max(jnp.abs(it.residual)), jnp.maximum(relative * (1 + size), rounding)
+
+    def converged(it: _Iterate):
+        remaining, tolerance = error(it)
+        return schedule.last[it.level] & (it.action == _STEP) & (remaining <= tolerance)
 
     def unfinished(it: _Iterate):
-        return (it.iteration < options.max_iterations) & (
-            (it.iteration < 0) | ~(error(it.residual) <= tolerance)
-        )
+        return (it.iteration < options.max_iterations) & ((it.iteration < 0) | ~converged(it))
+
+    def step_from(residual, jacobian):
+        direction = solve_small(jacobian, -residual[:, None])[:, 0]
+        return _Search.start(direction, jnp.sum(direction * residual / scale))
 
     def advance(it: _Iterate):
-        move = solve_small(it.jacobian, -it.residual[:, None])[:, 0]
-        tried = it.point + it.length * move
-        residual, jacobian = evaluate(tried)
-        better = jnp.sum(residual**2) < jnp.sum(it.residual**2)
-        better = better | (it.iteration < 0) | (it.length < _GIVE_UP)
-        pick = lambda new, old: jnp.where(better, new, old)  # noqa: E731
-        return _Iterate(
+        looks = (it.action == _PREDICT) | (it.iteration < 0)
+        tried = it.point + jnp.where(looks, 0, it.search.length) * it.search.direction
+        softness = schedule.scale[it.level]
+        held = jnp.where(it.action == _PREDICT, schedule.held[it.level], softness)
+        residual, jacobian = evaluate(tried, Softening(held, softness))
+        work = jnp.sum(it.search.direction * residual / scale)
+        accept = it.search.accepts(work) | looks | (it.action == _FOLLOW)
+        pick = lambda new, old: jnp.where(accept, new, old)  # noqa: E731
+        after = _Iterate(
             pick(tried, it.point),
             pick(residual, it.residual),
             pick(jacobian, it.jacobian),
-            pick(jnp.ones_like(it.length), it.length / 2),
+            jax.tree.map(pick, step_from(residual, jacobian), it.search.narrowed(work)),
             it.iteration + 1,
+            it.level,
+            jnp.where(it.action == _PREDICT, _FOLLOW, _STEP),
+            it.budget - 1,
+        )
+        return change_level(after) if softens else after
+
+    def change_level(it: _Iterate):
+        remaining, tolerance = error(it)
+        last, steps = schedule.last[it.level], it.action == _STEP
+        enough = jnp.where(last, tolerance, jnp.maximum(tolerance, _SOFT_TOLERANCE * schedule.scale[it.level]))
+        spent = (it.budget <= 0) & (remaining > enough)
+        harder = steps & ~last & ((remaining <= enough) | spent)
+        restart = steps & last & spent & (schedule.restart[it.level] >= 0)
+        level = jnp.where(harder, it.level + 1, jnp.where(restart, schedule.restart[it.level], it.level))
+        return _Iterate(
+            jnp.where(restart, start, it.point),
+            it.residual,
+            it.jacobian,
+            it.search,
+            it.iteration,
+            level,
+            jnp.where(harder | restart, _PREDICT, it.action),
+            jnp.where(harder | restart, schedule.budget[level], it.budget),
         )
 
     # Pass −1 moves nowhere and only evaluates, so that the residual is compiled once.
+    zero = jnp.zeros((), start.dtype)
     first = _Iterate(
         start,
         jnp.ones_like(start),
         jnp.eye(start.size, dtype=start.dtype),
-        jnp.zeros((), start.dtype),
+        _Search.start(jnp.zeros_like(start), zero),
         jnp.asarray(-1),
+        jnp.asarray(0),
+        jnp.asarray(_STEP),
+        schedule.budget[0],
     )
     last = jax.lax.while_loop(unfinished, advance, first)
-    remaining = error(last.residual)
-    return last.point, last.jacobian, Report(remaining, last.iteration, remaining <= tolerance)
+    return last.point, last.jacobian, Report(error(last)[0], last.iteration, converged(last))
 
 
 # Up to here elimination written out beats a LAPACK call (0.3 against 1.3 µs for 6 unknowns).

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.contact import Patch
-from dano.contact._overlap import KEPT
+from dano.contact._derivatives import KEPT
 from dano.engine import _variational
 from dano.engine._newton import Report, SolverOptions
 from dano.maths import is_traced, quat_conjugate, quat_multiply, safe_norm
@@ -43,7 +43,7 @@ class VariationalEngine(AbstractEngine):
     """
 
     tolerance: float | None = eqx.field(static=True, default=None)
-    max_iterations: int = eqx.field(static=True, default=100)
+    max_iterations: int = eqx.field(static=True, default=200)
 
     def __check_init__(self):
         """Raise a ValueError unless both options are positive."""

@@ -13,7 +13,7 @@ differentiated by the implicit function theorem, never through the iterations. R
 over mass and mean inertia.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,8 +21,8 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from dano.contact import AbstractContactLaw, ContactParams, overlap, Patch
-from dano.contact._overlap import KEPT
+from dano.contact import AbstractContactLaw, ContactParams, Patch, Softening
+from dano.contact._derivatives import KEPT
 from dano.contact._small import matmul, matvec
 from dano.engine._newton import newton, Report, solve_small, SolverOptions
 from dano.maths import quat_multiply, quat_to_matrix, skew
@@ -38,9 +38,9 @@ class _Problem(eqx.Module):
         impulse: Momentum before contact: old momentum plus gravity and controls, shape (m, 6), rotation in B.
         rotation: Body → world, shape (m, 3, 3).
         timestep: h [s].
-        patches: Overlap of each contact.
-        arms: From the centres of mass of a contact's two bodies to its centroid [m, W]; unused for a fixed
-            body.
+        patches: Geometry of each contact, as its law sees it.
+        arms: From the centres of mass of a contact's two bodies to the patch's point [m, W]; unused for a
+            fixed body.
         params: Parameters of each contact.
         laws: Law of each contact.
     """
@@ -50,7 +50,7 @@ class _Problem(eqx.Module):
     impulse: Float[Array, "m 6"]
     rotation: Float[Array, "m 3 3"]
     timestep: Float[Array, ""]
-    patches: tuple[Patch, ...]
+    patches: tuple[Any, ...]
     arms: tuple[tuple[Float[Array, "3"], Float[Array, "3"]], ...]
     params: tuple[ContactParams, ...]
     laws: tuple[AbstractContactLaw, ...]
@@ -92,17 +92,24 @@ def wrenches(scene: Scene, state: State, following: State) -> Float[Array, "cont
     pairs = _structure(scene)
     problem = _problem(scene, state, None, pairs)
     velocities = _rows(jnp.concatenate([following.velocity, following.omega], axis=1), pairs.moving)
-    return jnp.stack([f for f, _ in _contact_wrenches(velocities, problem, pairs)])
+    found = _contact_wrenches(velocities, problem, pairs, Softening())
+    rows = []
+    for contact, patch, (wrench, _) in zip(scene.contacts, problem.patches, found, strict=True):
+        centroid = contact.law.summary(patch).centroid
+        shift = jnp.where(jnp.any(wrench != 0), patch.point - centroid, 0)
+        rows.append(wrench.at[3:].add(jnp.cross(shift, wrench[:3])))
+    return jnp.stack(rows)
 
 
 def patches(scene: Scene, state: State) -> tuple[Patch, ...]:
     """Overlap of every contact of a scene at a state, in the order of `scene.contacts`."""
-    return _patches(scene, state, tuple(quat_to_matrix(q) for q in state.orientation))
+    found = _patches(scene, state, tuple(quat_to_matrix(q) for q in state.orientation))
+    return tuple(c.law.summary(patch) for c, patch in zip(scene.contacts, found, strict=True))
 
 
-def _patches(scene: Scene, state: State, rotations: tuple[Float[Array, "3 3"], ...]) -> tuple[Patch, ...]:
-    sides = [colliders(scene, contact, state.position, rotations) for contact in scene.contacts]
-    return _grouped(lambda pair: overlap(*pair), sides)
+def _patches(scene: Scene, state: State, rotations: tuple[Float[Array, "3 3"], ...]) -> tuple[Any, ...]:
+    items = [(c.law, *colliders(scene.bodies, c, state, rotations), scene.timestep) for c in scene.contacts]
+    return _grouped(lambda item: item[0].patch(*item[1:]), items)
 
 
 def _grouped(function, items: list):
@@ -175,9 +182,9 @@ def _problem(scene: Scene, state: State, control: Control | None, pairs: _Pairs)
     )
 
 
-def _arm(patch: Patch, position: Float[Array, "3"]) -> Float[Array, "3"]:
-    # Without contact there is no centroid; any arm will do, and zero keeps far-away bodies well scaled.
-    return jnp.where(patch.overlap > 0, patch.centroid - position, 0)
+def _arm(patch: Any, position: Float[Array, "3"]) -> Float[Array, "3"]:
+    # Without contact a centroid is nowhere; any arm will do, and zero keeps far-away bodies well scaled.
+    return jnp.where(patch.touching, patch.point - position, 0)
 
 
 # Floor of s(ω)² h²: 0.1 is |ω| = 1.975/h, 162° in one step. Beyond 2/h a step cannot represent the rotation;
@@ -205,7 +212,7 @@ def _angular_jacobian(omega: Float[Array, "3"], inertia: Float[Array, "3 3"], h:
     return 0.5 * h * (s * inertia - along + matmul(skew(omega), inertia) - skew(spin))
 
 
-def _contact_wrenches(velocities: Float[Array, "m 6"], problem: _Problem, pairs: _Pairs):
+def _contact_wrenches(velocities: Float[Array, "m 6"], problem: _Problem, pairs: _Pairs, softening: Softening):
     """Wrench and its derivative with respect to the relative twist, for every contact at given velocities."""
     spins = [matvec(r, w) for r, w in zip(problem.rotation, velocities[:, 3:], strict=True)]
     twists = []
@@ -216,17 +223,18 @@ def _contact_wrenches(velocities: Float[Array, "m 6"], problem: _Problem, pairs:
             if i >= 0
         ]
         twists.append(sum(terms[1:], terms[0]))
-    items = list(zip(problem.laws, problem.patches, problem.params, twists, strict=True))
-    return _grouped(lambda item: item[0].wrench(*item[1:]), items)
+    timesteps = [problem.timestep] * len(twists)
+    items = list(zip(problem.laws, problem.patches, problem.params, twists, timesteps, strict=True))
+    return _grouped(lambda item: item[0].wrench(*item[1:], softening), items)
 
 
-def _residual(velocities: Float[Array, "m 6"], problem: _Problem, pairs: _Pairs):
+def _residual(velocities: Float[Array, "m 6"], problem: _Problem, pairs: _Pairs, softening: Softening):
     """R(V⁺), shape (6 m,), and the derivative of each contact's wrench with respect to its twist."""
     h = problem.timestep
     linear = problem.mass[:, None] * velocities[:, :3]
     angular = jax.vmap(_angular_momentum, (0, 0, None, None))(velocities[:, 3:], problem.inertia, h, 1)
     rows = list(jnp.concatenate([linear, angular], axis=1) - problem.impulse)
-    wrenches = _contact_wrenches(velocities, problem, pairs)
+    wrenches = _contact_wrenches(velocities, problem, pairs, softening)
     for (wrench, _), arms, joined in zip(wrenches, problem.arms, pairs.of_contact, strict=True):
         for sign, arm, i in zip(_SIGNS, arms, joined, strict=True):
             if i >= 0:
@@ -285,13 +293,15 @@ def _solve(problem: _Problem, start: Float[Array, "m 6"], pairs: _Pairs, options
     """Root of the residual, with the derivative that the implicit function theorem gives it."""
 
     def find(problem, start):
-        def evaluate(point):
+        def evaluate(point, softening):
             velocities = point.reshape(start.shape)
-            residual, slopes = _residual(velocities, problem, pairs)
+            residual, slopes = _residual(velocities, problem, pairs, softening)
             return residual, _jacobian(velocities, problem, pairs, slopes)
 
-        size = jnp.max(jnp.abs(_to_velocity(problem) * problem.impulse.ravel()))
-        point, jacobian, report = newton(evaluate, start.ravel(), size, options)
+        scale = _to_velocity(problem)
+        size = jnp.max(jnp.abs(scale * problem.impulse.ravel()))
+        softens = any(law.stiction for law in problem.laws)
+        point, jacobian, report = newton(evaluate, start.ravel(), scale, size, options, softens=softens)
         return point.reshape(start.shape), jacobian, report
 
     @eqx.filter_custom_jvp
@@ -312,7 +322,7 @@ def _solve(problem: _Problem, start: Float[Array, "m 6"], pairs: _Pairs, options
             return (velocities, report), (jnp.zeros_like(velocities), d_report)
         perturbed = jax.tree.map(lambda t: t is not None, d_problem, is_leaf=lambda t: t is None)
         dynamic, static = eqx.partition(problem, perturbed)
-        of_problem = lambda p: _residual(velocities, eqx.combine(p, static), pairs)[0]  # noqa: E731
+        of_problem = lambda p: _residual(velocities, eqx.combine(p, static), pairs, Softening())[0]  # noqa: E731
         _, change = jax.jvp(of_problem, (dynamic,), (d_problem,))
         return (velocities, report), (-matvec(inverse, change).reshape(velocities.shape), d_report)
 

@@ -88,6 +88,15 @@ class SignedDistanceGrid(AbstractShape):
         self.solid_bounds = self.origin.astype(cells.dtype)[None] + cells * self.spacing[None]
 
     @property
+    def distances(self) -> Float[Array, "nx ny nz"]:
+        """Signed distances [m] at the nodes."""
+        degree = degree_of(self.interpolation)
+        shape = [size - 2 * border(degree) for size in self.coefficients.shape]
+        nodes = jnp.stack(jnp.meshgrid(*map(jnp.arange, shape), indexing="ij")).reshape(3, -1)
+        values = spline_jet(self.coefficients, nodes.astype(self.coefficients.dtype), degree, 0)
+        return values[0].reshape(shape)
+
+    @property
     def bounds(self) -> Float[Array, "2 3"]:
         """Box [m, F] around the solid and its smooth edge."""
         reach = jnp.broadcast_to(0.5 * self.edge_width.astype(self.solid_bounds.dtype), (3,))
@@ -253,7 +262,7 @@ def _load_solid(mesh: "str | Path | trimesh.Trimesh", scale: float) -> "trimesh.
 def _mesh_distances(
     solid: "trimesh.Trimesh", origin: np.ndarray, spacing: float, shape: np.ndarray
 ) -> np.ndarray:
-    """Signed distances [m] of all nodes: exact near the surface, by the nearest exact node elsewhere."""
+    """Signed distances [m] of all nodes: exact near the surface, see `spread_distances` elsewhere."""
     try:
         import igl
     except ImportError as error:
@@ -273,10 +282,32 @@ def _mesh_distances(
     signed, _, closest, _ = igl.signed_distance(
         points, vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
     )
-    row = np.full(shape, -1)
-    row[near] = np.arange(len(points))
-    nearest = ndimage.distance_transform_edt(~near, return_distances=False, return_indices=True)
-    row = row[tuple(nearest)]
-    nodes = origin + spacing * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
-    distances = np.where(near, np.abs(signed[row]), np.linalg.norm(nodes - closest[row], axis=-1))
+    distances, row = spread_distances(near, closest, origin, np.full(3, spacing))
     return np.copysign(distances, signed[row])
+
+
+def spread_distances(
+    near: np.ndarray, closest: np.ndarray, origin: np.ndarray, spacing: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances of all nodes of a grid to a surface, from its points closest to the nodes near it.
+
+    Args:
+        near: Which nodes are near, shape (nx, ny, nz).
+        closest: Point of the surface closest to each of these [m], in their order, shape (m, 3).
+        origin: Position [m] of node (0, 0, 0), shape (3,).
+        spacing: Distance [m] between nodes along each axis, shape (3,).
+
+    Returns:
+        Distance [m] of each node to the closest point of the nearest node that is near, and the row of that
+        node in `closest`; both of shape (nx, ny, nz).
+    """
+    from scipy import ndimage
+
+    row = np.full(near.shape, -1)
+    row[near] = np.arange(len(closest))
+    nearest = ndimage.distance_transform_edt(
+        ~near, sampling=spacing, return_distances=False, return_indices=True
+    )
+    row = row[tuple(nearest)]
+    nodes = origin + spacing * np.stack(np.meshgrid(*map(np.arange, near.shape), indexing="ij"), axis=-1)
+    return np.linalg.norm(nodes - closest[row], axis=-1), row

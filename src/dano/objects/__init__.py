@@ -3,3 +3,8 @@
 from dano.objects._mass import checked_inertia as checked_inertia, MassProperties as MassProperties
 from dano.objects._object import MassModel as MassModel, NeuralObject as NeuralObject
 from dano.objects._samples import ContactSamples as ContactSamples, surface_samples as surface_samples
+from dano.objects._surface import (
+    draw_surface as draw_surface,
+    support_volume as support_volume,
+    SurfaceSamples as SurfaceSamples,
+)

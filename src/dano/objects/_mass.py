@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.fields import AbstractField, GridField
+from dano.fields._base import Jet
 from dano.maths import checked_array, is_traced, Numbers
 
 Density = Callable[[Float[Array, "3"]], Float[Array, ""]]
@@ -161,6 +162,28 @@ def evaluate(density: Density, points: np.ndarray) -> np.ndarray:
 @eqx.filter_jit
 def _batched(density, points):
     return jax.vmap(density)(points)
+
+
+def host_jet(jet: Callable[[Array, int], Jet], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values (n,) and gradients (n, 3) of a field or a signed distance at host points (n, 3), in batches.
+
+    Args:
+        jet: `AbstractField.jet` or `AbstractShape.sdf_jet` of an instance.
+        points: [m, F].
+    """
+    values, gradients = np.empty(len(points)), np.empty((len(points), 3))
+    for start in range(0, len(points), BATCH // 2):
+        part = points[start : start + BATCH // 2]
+        padded = np.concatenate([part, np.repeat(part[-1:], BATCH // 2 - len(part), axis=0)])
+        value, gradient = _compiled_jet(jet, jnp.asarray(padded.T))
+        values[start : start + len(part)] = np.asarray(value)[: len(part)]
+        gradients[start : start + len(part)] = np.asarray(gradient).T[: len(part)]
+    return values, gradients
+
+
+@eqx.filter_jit
+def _compiled_jet(jet, points):
+    return jet(points, 1)
 
 
 def cells(bounds: Float[Array, "2 3"], resolution: int) -> tuple[np.ndarray, np.ndarray]:

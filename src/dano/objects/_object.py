@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.archive import read_archive, write_archive
-from dano.fields import AbstractField, GridField
+from dano.fields import AbstractField, GridField, SignedDistanceGrid
 from dano.maths import checked_array, floating, is_traced, Numbers
 from dano.objects._mass import checked_density, integrate, MassProperties, Progress
 from dano.objects._samples import (
+    baked,
     contact_grid,
     ContactSamples,
     draw_samples,
@@ -23,27 +24,34 @@ from dano.objects._samples import (
     surface_level,
     surface_range,
 )
+from dano.objects._solid import field_solid, level_set
+from dano.objects._surface import draw_surface, equal_areas, SurfaceSamples
 
 MassModel = Literal["density", "solid"]
-FORMAT, VERSION = "dano-object", 1
+FORMAT, VERSION = "dano-object", 2
 
 
 class NeuralObject(eqx.Module):
     """A density field made ready for simulation.
 
     Attributes:
-        samples: Contact samples.
+        samples: Samples of the density near its surface, for the centroid law.
+        surface: Samples on the surface of `solid`, with areas.
         mass: Mass properties in the field's frame.
         grid: The field baked for other objects' samples to query, without its floaters; None if there is no
             field.
+        solid: Signed distance of the object: of {φ = half the plateau density}, without floaters, cavities
+            filled; of a shape, its own. None if there is no field.
         density_range: Lower and upper density between which the samples lie, shape (2,).
         bake_error: Root mean square error of `grid` relative to the field's largest density (0 for a grid).
         mass_model: How density became mass.
     """
 
     samples: ContactSamples
+    surface: SurfaceSamples
     mass: MassProperties
     grid: GridField | None
+    solid: SignedDistanceGrid | None
     density_range: Float[Array, "2"]
     bake_error: Float[Array, ""]
     mass_model: str = eqx.field(static=True)
@@ -67,7 +75,7 @@ class NeuralObject(eqx.Module):
 
         Args:
             field: Density with finite bounds.
-            n_samples: Number of contact samples.
+            n_samples: Number of contact samples, and of surface samples.
             density_range: Densities between which the samples are drawn; default: around the field's own
                 surface (`surface_range`).
             mass_model: "density": mass density is α φ, as in the paper. "solid": the same mean density
@@ -105,6 +113,12 @@ class NeuralObject(eqx.Module):
         samples = ContactSamples(
             floating(points), floating(values), floating(outward_normals(field, points, body))
         )
+        if progress is not None:
+            progress("surface", 0.0)
+        grid, error = baked(field, resolution)
+        level = surface_level(lattice.values)
+        filled = field_solid(field, grid, level, floaters=floaters)
+        surface = draw_surface(filled, n_samples, key=jax.random.fold_in(key, 2))
         if mass_model == "density":
             properties = MassProperties.from_field(
                 field,
@@ -115,13 +129,21 @@ class NeuralObject(eqx.Module):
                 progress=progress,
             )
         else:
-            solid = Region.create(lattice, surface_level(lattice.values), floaters=False).solid(density)
-            properties = integrate(solid, field.bounds, mass_scale, mass, resolution, mass_key, progress)
-        grid, error = contact_grid(field, body, resolution)
+            homogeneous = Region.create(lattice, level, floaters=False).solid(density)
+            properties = integrate(
+                homogeneous, field.bounds, mass_scale, mass, resolution, mass_key, progress
+            )
         if progress is not None:
             progress("done", 1.0)
         return cls(
-            samples, properties, grid, floating((float(low), float(high))), floating(error), mass_model
+            samples=samples,
+            surface=surface,
+            mass=properties,
+            grid=contact_grid(grid, body),
+            solid=filled,
+            density_range=floating((float(low), float(high))),
+            bake_error=floating(error),
+            mass_model=mass_model,
         )
 
     @classmethod
@@ -134,6 +156,7 @@ class NeuralObject(eqx.Module):
         com: Numbers,
         inertia: Numbers,
         normals: Numbers | None = None,
+        areas: Numbers | None = None,
         field: GridField | None = None,
     ) -> "NeuralObject":
         """Build an object from explicit samples in the field frame.
@@ -145,6 +168,9 @@ class NeuralObject(eqx.Module):
             com: Centre of mass [m, F].
             inertia: Inertia tensor about the centre of mass [kg m²].
             normals: Unit outward normals [F]; default: away from the centre of mass.
+            areas: Area of the surface that each point stands for [m²]; default: equal shares of the area of
+                the points' convex hull. Points in a plane share the area of their bounding box, points on a
+                line or at one place that of the ball with this mass and inertia.
             field: Grid for other objects' samples to query; without it the object meets shapes only.
 
         Raises:
@@ -165,8 +191,23 @@ class NeuralObject(eqx.Module):
             outward = np.asarray(points) - np.asarray(properties.com)
             normals = floating(outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12))
         samples = ContactSamples(points, density, checked_array("normals", normals, points.shape))
-        bounds = floating((float(density.min()), float(density.max())))
-        return cls(samples, properties, field, bounds, floating(0.0), "given")
+        areas = equal_areas(points, properties) if areas is None else areas
+        areas = checked_array("areas", areas, (points.shape[0],))
+        if not is_traced(areas) and not (float(areas.min()) >= 0 and float(areas.max()) > 0):
+            raise ValueError(
+                f"areas must be ≥ 0 m² and not all zero, got values in [{float(areas.min())}, "
+                f"{float(areas.max())}]"
+            )
+        return cls(
+            samples=samples,
+            surface=SurfaceSamples(points, samples.normals, areas),
+            mass=properties,
+            grid=field,
+            solid=None if field is None else _grid_solid(field),
+            density_range=floating((float(density.min()), float(density.max()))),
+            bake_error=floating(0.0),
+            mass_model="given",
+        )
 
     @property
     def size(self) -> float:
@@ -186,6 +227,9 @@ class NeuralObject(eqx.Module):
             "points": self.samples.points,
             "density": self.samples.density,
             "normals": self.samples.normals,
+            "surface_points": self.surface.points,
+            "surface_normals": self.surface.normals,
+            "surface_areas": self.surface.areas,
             "density_range": self.density_range,
             "bake_error": self.bake_error,
             "mass": self.mass.mass,
@@ -202,11 +246,21 @@ class NeuralObject(eqx.Module):
                 "grid_spacing": self.grid.spacing,
                 "grid_interpolation": np.array(self.grid.interpolation),
             }
+        if self.solid is not None:
+            members |= {
+                "solid_distances": np.asarray(self.solid.distances, dtype=np.float32),
+                "solid_origin": self.solid.origin,
+                "solid_spacing": self.solid.spacing,
+                "solid_interpolation": np.array(self.solid.interpolation),
+            }
         write_archive(path, {name: np.asarray(value) for name, value in members.items()})
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "NeuralObject":
         """Read an object written by `save`.
+
+        Files of version 1 hold no solid and no surface samples: these are made anew from the grid, in some
+        seconds, or from the contact samples as `from_samples` does where there is no grid.
 
         Raises:
             ValueError: If the file is missing, truncated, not a dano object, or of a newer version.
@@ -231,7 +285,54 @@ class NeuralObject(eqx.Module):
                 checked_array("density", floating(data["density"]), (n,)),
                 checked_array("normals", floating(data["normals"]), (n, 3)),
             )
-            limits, error = floating(data["density_range"]), floating(data["bake_error"])
-            return cls(samples, mass, grid, limits, error, str(data["mass_model"]))
+            solid = _stored_solid(data)
+            if int(data["version"]) == 1 and grid is not None:
+                solid = _grid_solid(grid)
+            return cls(
+                samples=samples,
+                surface=_stored_surface(data, samples, mass, solid),
+                mass=mass,
+                grid=grid,
+                solid=solid,
+                density_range=floating(data["density_range"]),
+                bake_error=floating(data["bake_error"]),
+                mass_model=str(data["mass_model"]),
+            )
         except (KeyError, ValueError) as error:
             raise ValueError(f"{path} is not a valid dano object: {error}") from error
+
+
+def _grid_solid(grid: GridField) -> SignedDistanceGrid | None:
+    """The solid of a density grid at its own surface level, all of its parts; None while it is traced."""
+    if is_traced(grid.coefficients, grid.origin, grid.spacing):
+        return None
+    return level_set(grid, surface_level(np.asarray(grid.values)), floaters=True)
+
+
+def _stored_solid(data: dict[str, np.ndarray]) -> SignedDistanceGrid | None:
+    if "solid_distances" not in data:
+        return None
+    return SignedDistanceGrid(
+        floating(data["solid_distances"].astype(np.float64)),
+        floating(data["solid_origin"]),
+        floating(data["solid_spacing"]),
+        str(data["solid_interpolation"]),
+    )
+
+
+def _stored_surface(
+    data: dict[str, np.ndarray],
+    samples: ContactSamples,
+    mass: MassProperties,
+    solid: SignedDistanceGrid | None,
+) -> SurfaceSamples:
+    if int(data["version"]) > 1:
+        n = len(data["surface_points"])
+        return SurfaceSamples(
+            checked_array("surface_points", floating(data["surface_points"]), (n, 3)),
+            checked_array("surface_normals", floating(data["surface_normals"]), (n, 3)),
+            checked_array("surface_areas", floating(data["surface_areas"]), (n,)),
+        )
+    if solid is not None:
+        return draw_surface(solid, len(samples.points))
+    return SurfaceSamples(samples.points, samples.normals, equal_areas(samples.points, mass))

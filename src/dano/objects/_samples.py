@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dano.fields import AbstractField, AbstractShape, GridField
 from dano.maths import floating
 from dano.objects._mass import cells, checked_density, Density, evaluate, host_random
+from dano.objects._surface import farthest_points
 
 # Candidates per sample that the even selection chooses from, and random draws per candidate before giving up.
 CANDIDATES = 4
@@ -208,7 +209,7 @@ def draw_samples(
             f"object, found {len(points)} in {drawn} draws; "
             f"the field's densities reach {lattice.values.max():.6g}"
         )
-    chosen = _farthest_points(points[:wanted], n)
+    chosen = farthest_points(points[:wanted], n)
     return points[chosen], values[chosen]
 
 
@@ -235,19 +236,6 @@ def surface_samples(shape: AbstractShape, n: int, key: PRNGKeyArray | None = Non
     )
 
 
-def _farthest_points(points: np.ndarray, n: int) -> np.ndarray:
-    """Indices of `n` points, each the farthest from all chosen before: even, and reaching every corner."""
-    chosen = np.empty(n, dtype=int)
-    chosen[0] = int(np.argmax(((points - points.mean(axis=0)) ** 2).sum(axis=1)))
-    x, y, z = np.ascontiguousarray(points.T)
-    nearest = np.full(len(points), np.inf)
-    for i in range(1, n):
-        p = chosen[i - 1]
-        np.minimum(nearest, (x - x[p]) ** 2 + (y - y[p]) ** 2 + (z - z[p]) ** 2, out=nearest)
-        chosen[i] = int(np.argmax(nearest))
-    return chosen
-
-
 def outward_normals(field: AbstractField, points: np.ndarray, region: Region) -> np.ndarray:
     """−∇φ/|∇φ| at points (n, 3); where the density is flat, away from the region's middle."""
     normals = np.asarray(_normals(field, jnp.asarray(points)))
@@ -264,15 +252,18 @@ def _normals(field, points):
     return jax.lax.map(field.normal, points, batch_size=4096)
 
 
-def contact_grid(field: AbstractField, region: Region, resolution: int) -> tuple[GridField, float]:
-    """The field as a grid without floaters and haze, and the relative error of baking it (0 for a grid)."""
+def baked(field: AbstractField, resolution: int) -> tuple[GridField, float]:
+    """The field as a grid, and the relative error of baking it (0 for a grid)."""
     if isinstance(field, GridField):
-        grid, error = field, 0.0
-    else:
-        from dano.fields import bake
+        return field, 0.0
+    from dano.fields import bake
 
-        grid, bake_error = bake(field, resolution)
-        error = bake_error.rms
+    grid, error = bake(field, resolution)
+    return grid, error.rms
+
+
+def contact_grid(grid: GridField, region: Region) -> GridField:
+    """The grid without floaters and haze."""
     count = np.array(grid.values.shape)
     spacing = np.broadcast_to(np.asarray(grid.spacing, dtype=np.float64), (3,))
     nodes = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), axis=-1).reshape(-1, 3)
@@ -281,4 +272,4 @@ def contact_grid(field: AbstractField, region: Region, resolution: int) -> tuple
         tuple(count)
     )
     values = jnp.where(jnp.asarray(near), grid.values, 0)
-    return GridField(values, grid.origin, grid.spacing, interpolation="quadratic"), error
+    return GridField(values, grid.origin, grid.spacing, interpolation="quadratic")

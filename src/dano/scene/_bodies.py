@@ -1,0 +1,209 @@
+"""Bodies: geometry, mass properties, and a name."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.contact import Collider, SampleSet, Support
+from dano.fields import AbstractField, AbstractShape
+from dano.maths import checked_array, floating, is_traced, Numbers
+from dano.objects import checked_inertia, MassProperties, NeuralObject
+
+
+# Orientations over which the support of a body is sampled.
+ORIENTATIONS = 256
+
+
+class Body(eqx.Module):
+    """A rigid body: geometry, mass properties, and a name.
+
+    Attributes:
+        name: Unique name in its scene.
+        shape: Primitive shape, or None for a neural object.
+        object: Neural object, or None for a shape.
+        samples: Contact samples in the layout of the contact kernels, or None for a shape without them.
+        support: Culling map of the object's grid.
+        surface: Surface samples weighted by area, for distributed contact; None until a scene needs those of
+            a shape.
+        density_scale: Makes the object's density dimensionless in neural–neural contacts: one over the mean
+            density of its samples.
+        mass: [kg].
+        inertia: Tensor about the centre of mass [kg m², B].
+        com: Centre of mass in the field frame [m, F].
+        mass_scale: Multiplies mass and inertia [1].
+        com_offset: Moves the centre of mass [m, F].
+        fixed: Whether the body never moves.
+    """
+
+    name: str = eqx.field(static=True)
+    shape: AbstractShape | None
+    object: NeuralObject | None
+    samples: SampleSet | None
+    support: Support | None
+    surface: SampleSet | None
+    density_scale: Float[Array, ""]
+    mass: Float[Array, ""]
+    inertia: Float[Array, "3 3"]
+    com: Float[Array, "3"]
+    mass_scale: Float[Array, ""]
+    com_offset: Float[Array, "3"]
+    fixed: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        name: str,
+        geometry: NeuralObject | AbstractField,
+        *,
+        mass: Numbers | None = None,
+        inertia: Numbers | None = None,
+        com: Numbers | None = None,
+        mass_scale: Numbers = 1.0,
+        com_offset: Numbers = (0.0, 0.0, 0.0),
+        fixed: bool = False,
+    ):
+        """A body from a neural object (which brings its mass) or a shape (homogeneous, of the given mass).
+
+        Args:
+            name: Unique name.
+            geometry: Neural object or shape.
+            mass: [kg]; required for a shape that moves. For a neural object: replaces its mass, inertia in
+                proportion.
+            inertia: Tensor about the centre of mass [kg m²]; default from the geometry.
+            com: Centre of mass [m, F]; default from the geometry.
+            mass_scale: Multiplies mass and inertia.
+            com_offset: Moves the centre of mass [m, F].
+            fixed: Whether the body never moves; then it needs no mass.
+
+        Raises:
+            ValueError: If the name is empty, the geometry is no shape or object, or a mass property is
+                missing or out of range.
+        """
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"name must be a non-empty string, got {name!r}")
+        self.name = name
+        self.fixed = bool(fixed)
+        self.samples = self.support = self.surface = self.object = self.shape = None
+        self.density_scale = floating(1.0)
+        if isinstance(geometry, NeuralObject):
+            self.object = geometry
+            self.samples = SampleSet.create(geometry.samples.points, geometry.samples.density)
+            surface = geometry.surface
+            self.surface = SampleSet.create(surface.points, surface.areas, normalise=False)
+            self.density_scale = 1 / jnp.mean(geometry.samples.density)
+            if geometry.grid is not None:
+                self.support = Support.create(geometry.grid)
+            properties = geometry.mass
+        elif isinstance(geometry, AbstractShape):
+            self.shape = geometry
+            properties = None if mass is None else _homogeneous(name, geometry, float(np.asarray(mass)))
+        else:
+            raise ValueError(
+                f"geometry of body {name!r} must be a NeuralObject or a shape, "
+                f"got {type(geometry).__name__}; a field becomes an object by NeuralObject.from_field"
+            )
+        if properties is None:
+            if not self.fixed:
+                raise ValueError(
+                    f"mass of body {name!r} must be given: a shape that moves has none of its own"
+                )
+            properties = MassProperties(1.0, (0.0, 0.0, 0.0), np.eye(3))
+        share = 1.0
+        if mass is not None:
+            mass = checked_array(f"mass of body {name!r}", mass, ())
+            if not is_traced(mass) and not float(mass) > 0:
+                raise ValueError(f"mass of body {name!r} must be > 0 kg, got {float(mass)}")
+            share = mass / properties.mass
+        self.mass = properties.mass if mass is None else mass
+        self.inertia = (
+            properties.inertia * share
+            if inertia is None
+            else checked_inertia(f"inertia of body {name!r}", inertia)
+        )
+        self.com = properties.com if com is None else checked_array(f"com of body {name!r}", com, (3,))
+        self.mass_scale = checked_array(f"mass_scale of body {name!r}", mass_scale, ())
+        if not is_traced(self.mass_scale) and not float(self.mass_scale) > 0:
+            raise ValueError(f"mass_scale of body {name!r} must be > 0, got {float(self.mass_scale)}")
+        self.com_offset = checked_array(f"com_offset of body {name!r}", com_offset, (3,))
+
+    @property
+    def size(self) -> float:
+        """Largest extent [m]; infinite for a half-space."""
+        if self.object is not None:
+            return self.object.size
+        assert self.shape is not None
+        extent = np.asarray(self.shape.bounds[1] - self.shape.bounds[0])
+        return float(extent.max())
+
+    @property
+    def field(self) -> AbstractField | None:
+        """What other bodies' samples query: the shape, or the object's grid."""
+        return self.shape if self.object is None else self.object.grid
+
+    @property
+    def solid(self) -> AbstractShape | None:
+        """What other bodies' surface samples press on: the shape, or the object's signed distance."""
+        return self.shape if self.object is None else self.object.solid
+
+    def typical_support(self, depth: float) -> float:
+        """Σ A d [m³] of the samples below a floor when the lowest of them lies at a depth [m].
+
+        The median over orientations: most rest on a corner, an edge or a bulge.
+        """
+        assert self.surface is not None
+        heights = _directions(ORIENTATIONS) @ np.asarray(self.surface.points[:3])
+        depths = np.maximum(depth - (heights - heights.min(axis=1, keepdims=True)), 0)
+        return float(np.median(depths @ np.asarray(self.surface.weights)))
+
+    def collider(
+        self,
+        position: Float[Array, "3"],
+        rotation: Float[Array, "3 3"],
+        velocity: Float[Array, "3"],
+        omega: Float[Array, "3"],
+    ) -> Collider:
+        """The body as a contact sees it.
+
+        Args:
+            position: Of the centre of mass [m, W].
+            rotation: B → W.
+            velocity: Of the centre of mass [m/s, W].
+            omega: [rad/s, B].
+        """
+        com = self.com + self.com_offset
+        arm = -sum(rotation[:, i] * com[i] for i in range(3))
+        spin = sum(rotation[:, i] * omega[i] for i in range(3))
+        return Collider(
+            self.field,
+            self.samples,
+            support=self.support,
+            density_scale=self.density_scale,
+            mass=self.mass * self.mass_scale,
+            rotation=rotation,
+            origin=position + arm,
+            surface=self.surface,
+            solid=self.solid,
+            velocity=velocity + jnp.cross(spin, arm),
+            omega=spin,
+        )
+
+
+def _directions(n: int) -> np.ndarray:
+    """Unit vectors spread evenly over the sphere (a Fibonacci lattice), shape (n, 3)."""
+    k = np.arange(n) + 0.5
+    z, angle = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+
+
+def _homogeneous(name: str, shape: AbstractShape, mass: float) -> MassProperties:
+    """Mass properties of a homogeneous solid shape: closed form where there is one, else integrated."""
+    if not mass > 0:
+        raise ValueError(f"mass of body {name!r} must be > 0 kg, got {mass}")
+    if not np.all(np.isfinite(np.asarray(shape.bounds))):
+        raise ValueError(f"body {name!r} must have a bounded shape or be fixed, got {type(shape).__name__}")
+    moments = shape.solid_moments()
+    if moments is None:
+        return MassProperties.from_field(shape, mass=mass)
+    second = np.asarray(moments.second_moment) * (mass / float(moments.volume))
+    return MassProperties(mass, moments.centroid, np.trace(second) * np.eye(3) - second)

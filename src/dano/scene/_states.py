@@ -1,0 +1,101 @@
+"""What moves: states, controls, trajectories."""
+
+import os
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from dano.archive import read_archive, write_archive
+
+_REPORTED = ("residuals", "iterations", "converged")
+STATE_SIZES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
+"""Quantities of a state, and how many numbers each has per body."""
+
+
+class State(eqx.Module):
+    """Configuration and motion of all bodies of a scene, in the order of `Scene.bodies`.
+
+    Attributes:
+        position: Position of the centre of mass [m, W], shape (n, 3).
+        orientation: Unit quaternion wxyz, body → world, shape (n, 4).
+        velocity: Velocity of the centre of mass [m/s, W], shape (n, 3).
+        omega: Angular velocity [rad/s, B], shape (n, 3).
+    """
+
+    position: Float[Array, "*t n 3"]
+    orientation: Float[Array, "*t n 4"]
+    velocity: Float[Array, "*t n 3"]
+    omega: Float[Array, "*t n 3"]
+
+
+class Control(eqx.Module):
+    """External force and torque on each body, constant over a step.
+
+    Attributes:
+        force: At the centre of mass [N, W], shape (n, 3).
+        torque: [N m, W], shape (n, 3).
+    """
+
+    force: Float[Array, "*t n 3"]
+    torque: Float[Array, "*t n 3"]
+
+
+class Trajectory(eqx.Module):
+    """States over time, with what the solver said of each step.
+
+    Attributes:
+        times: [s], shape (n_steps + 1,).
+        states: States, leaves of shape (n_steps + 1, n_bodies, ·); the first entry is the initial state.
+        residuals: Largest remaining momentum error of each step divided by mass or inertia [m/s, rad/s],
+            shape (n_steps,).
+        iterations: Newton iterations of each step, shape (n_steps,).
+        converged: Whether each step reached the solver's tolerance, shape (n_steps,).
+        names: Names of the bodies.
+    """
+
+    times: Float[Array, " times"]
+    states: State
+    residuals: Float[Array, " steps"]
+    iterations: Int[Array, " steps"]
+    converged: Bool[Array, " steps"]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def save(self, path: str | os.PathLike[str], *, source: str | None = None) -> None:
+        """Write the trajectory to an .npz file, replacing an existing one only when complete.
+
+        Args:
+            path: The file.
+            source: Text kept in the file as member `source`: where the trajectory comes from.
+
+        Raises:
+            ValueError: If `path` is a directory or its parent does not exist.
+        """
+        write_archive(
+            path,
+            {
+                "format": np.array("dano-trajectory"),
+                "version": np.array(1),
+                "names": np.array(self.names),
+                "times": np.asarray(self.times),
+                **{name: np.asarray(getattr(self.states, name)) for name in STATE_SIZES},
+                **{name: np.asarray(getattr(self, name)) for name in _REPORTED},
+                **({} if source is None else {"source": np.array(source)}),
+            },
+        )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "Trajectory":
+        """Read a trajectory written by `save`.
+
+        Raises:
+            ValueError: If the file is missing, truncated or not a dano trajectory.
+        """
+        data = read_archive(path, "dano-trajectory", 1)
+        try:
+            arrays = {name: jnp.asarray(data[name]) for name in ("times", *_REPORTED)}
+            states = State(*(jnp.asarray(data[name]) for name in STATE_SIZES))
+            return cls(states=states, names=tuple(str(name) for name in data["names"]), **arrays)
+        except KeyError as error:
+            raise ValueError(f"{path} is not a valid dano trajectory: it lacks {error}") from error
