@@ -23,12 +23,11 @@ from dano.contact._centroid import sticking
 from dano.contact._derivatives import by_autodiff, keep
 from dano.contact._laws import Softening
 from dano.contact._small import contract, matmul, matvec
-from dano.fields import AbstractShape, column_norm
+from dano.fields import AbstractShape, column_norm, HalfSpace
 
 # Up to so many samples all are taken at once: finding the near ones would cost more, above all under `vmap`.
 _FEW = 512
-# Blocks gathered at once, and samples evaluated at once.
-_GATHERED = 4
+# Samples gathered and evaluated at once.
 _CHUNK = 128
 # Samples count as near within this share of the body's size, besides the way they go.
 _MARGIN = 0.001
@@ -59,20 +58,24 @@ class Material(NamedTuple):
 
 
 class _Response(NamedTuple):
-    """Traction of samples t and its derivative by their velocity, −(f n̂ᵀ + g (1 − n nᵀ) + c u uᵀ).
+    """What samples feel, per area: scalars of shape (n,), and the slip.
+
+    The traction is t = p n − g u and its derivative by the velocity −f (n − m u) nᵀ − g (1 − n nᵀ) − c u uᵀ.
 
     Attributes:
-        traction: t [Pa], shape (3, n).
-        pushed: f, by the separating speed [Pa s/m], shape (3, n).
-        held: g, by the slip in all directions alike [Pa s/m], shape (n,).
-        turned: c, by the slip along itself [Pa s³/m³], shape (n,).
+        pressure: p [Pa].
+        fall: f, of the pressure with the separating speed [Pa s/m].
+        grip: g [Pa s/m].
+        marginal: m, friction that a pressure brings per slip [s/m].
+        turn: c, by which the grip falls as the slip grows along itself [Pa s³/m³].
         slip: u [m/s], shape (3, n).
     """
 
-    traction: Float[Array, "3 n"]
-    pushed: Float[Array, "3 n"]
-    held: Float[Array, " n"]
-    turned: Float[Array, " n"]
+    pressure: Float[Array, " n"]
+    fall: Float[Array, " n"]
+    grip: Float[Array, " n"]
+    marginal: Float[Array, " n"]
+    turn: Float[Array, " n"]
     slip: Float[Array, "3 n"]
 
 
@@ -83,7 +86,7 @@ def respond(
     velocity: Float[Array, "3 n"],
     softening: Softening = Softening(),
 ) -> _Response:
-    """Force per area on samples at a depth [m] in a solid, moving at a velocity [m/s] relative to it.
+    """What samples feel at a depth [m] in a solid, moving at a velocity [m/s] relative to it.
 
     Pressure p = k max(0, d − D), friction −μ(p) p u / max(|u|, v_s) against the slip u with
     μ(p) = μ (1 − φ p/(p + p₀)). D is what the separating speed v_n takes off the depth d: the larger of
@@ -95,12 +98,9 @@ def respond(
     """
     rate = jnp.sum(normal * velocity, axis=0)
     slip = velocity - normal * rate[None]
-    # Barriers: without them XLA computes roots and quotients again for every component that they enter.
-    slip, rate = jax.lax.optimization_barrier((slip, rate))
     speed = column_norm(slip)
     scaled = rate / material.restitution_velocity
     inverse = jax.lax.rsqrt(1 + scaled * scaled)
-    speed, inverse = jax.lax.optimization_barrier((speed, inverse))
     lost = (1 - material.restitution**2) / (1 + material.restitution**2) * jnp.maximum(depth, 0)
     by_loss, by_time = lost * scaled * inverse, material.timestep * rate
     lossy = jnp.abs(by_loss) > jnp.abs(by_time)
@@ -114,15 +114,15 @@ def respond(
     friction = material.friction * (1 - material.friction_fading * (1 - lightness))
     # d(μ p)/dp
     marginal = material.friction * (1 - material.friction_fading * (1 - lightness * lightness))
-    held = friction * pressure * gain
-    # It multiplies u uᵀ, which vanishes with the slip, so any divisor will do there.
-    turned = friction * pressure * gain_slope / jnp.where(speed > 0, speed, 1)
-    pressure, fall, held, turned, braked = jax.lax.optimization_barrier(
-        (pressure, fall, held, turned, marginal * gain)
-    )
-    return _Response(
-        pressure * normal - held * slip, fall * (normal - braked * slip), held, turned, slip
-    )
+    force = friction * pressure
+    # The turn multiplies u uᵀ, which vanishes with the slip, so any divisor will do there.
+    turn = force * gain_slope / jnp.where(speed > 0, speed, 1)
+    return _Response(pressure, fall, force * gain, marginal * gain, turn, slip)
+
+
+def traction(response: _Response, normal: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    """Force per area [Pa]."""
+    return response.pressure * normal - response.grip * response.slip
 
 
 class Near(eqx.Module):
@@ -190,14 +190,20 @@ def find_near(
     speed = column_norm(matmul(motion, centers)) + jnp.sqrt(jnp.sum(motion[:, :3] ** 2)) * samples.radii
     size = jnp.max(jnp.max(samples.centers, axis=0) - jnp.min(samples.centers, axis=0))
     # Twice the way of a step, for what the step itself adds to the speed.
-    reach = samples.radii + 2 * timestep * speed + _MARGIN * size
-    near = solid.sdf_jet(matmul(to_field, centers), 0) <= reach
-    (blocks,) = jnp.nonzero(near, size=near.shape[0] + -near.shape[0] % _GATHERED, fill_value=0)
+    reach = 2 * timestep * speed + _MARGIN * size
+    if isinstance(solid, HalfSpace):
+        # So cheap that every sample can be asked, which is sharper.
+        normal = solid.normal_direction
+        plane = jnp.append(matvec(to_field[:, :3].T, normal), jnp.sum(normal * to_field[:, 3]) - solid.offset)
+        near = jnp.min((plane @ samples.points).reshape(-1, BLOCK), axis=1) <= reach
+    else:
+        near = solid.sdf_jet(matmul(to_field, centers), 0) <= reach + samples.radii
+    together = _CHUNK // BLOCK
+    (blocks,) = jnp.nonzero(near, size=near.shape[0] + -near.shape[0] % together, fill_value=0)
     count = BLOCK * jnp.sum(near)
-    step = BLOCK * _GATHERED
 
     def gather(i, buffer):
-        starts = [blocks[_GATHERED * i + k] * BLOCK for k in range(_GATHERED)]
+        starts = [blocks[together * i + k] * BLOCK for k in range(together)]
 
         def rows(x):
             parts = [jax.lax.dynamic_slice_in_dim(x, start, BLOCK, axis=-1) for start in starts]
@@ -206,12 +212,13 @@ def find_near(
         arms = matmul(to_field[:, :3], rows(samples.points)[:3])
         depth, normal = _touch(solid, arms + to_field[:, 3:])
         # What fills up the last pass weighs nothing.
-        areas = jnp.where(step * i + np.arange(step) < count, rows(samples.weights), 0)
+        areas = jnp.where(_CHUNK * i + np.arange(_CHUNK) < count, rows(samples.weights), 0)
         found = Near.of(arms, areas, depth, normal, count).rows
-        return jax.lax.dynamic_update_slice_in_dim(buffer, found, step * i, axis=1)
+        return jax.lax.dynamic_update_slice_in_dim(buffer, found, _CHUNK * i, axis=1)
 
-    empty = jnp.zeros((9, n + -n % max(_CHUNK, step)), to_field.dtype)
-    return Near(jax.lax.fori_loop(0, -(-count // step), gather, empty), count)
+    # Only what a pass has filled is read, so that nothing need be cleared.
+    empty = jnp.zeros((9, n + -n % _CHUNK), to_field.dtype)
+    return Near(jax.lax.fori_loop(0, -(-count // _CHUNK), gather, empty), count)
 
 
 def _touch(solid: AbstractShape, x: Float[Array, "3 n"]) -> tuple[Float[Array, " n"], Float[Array, "3 n"]]:
@@ -246,8 +253,7 @@ _LEVER[np.arange(3), np.arange(3), 3] = 1
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _LEVER[_i, 3 + _j, _k] = 1
     _LEVER[_i, 3 + _k, _j] = -1
-# From Σ A K_cd r̃_a r̃_b, flattened, to Σ A Jᵀ K J, with J the above.
-_TO_SLOPE = np.einsum("cxa,dyb->xycdab", _LEVER, _LEVER).reshape(36, 144)
+_LEVERS = _LEVER.transpose(1, 0, 2).reshape(6, 12)
 
 
 @eqx.filter_custom_jvp
@@ -268,22 +274,27 @@ def sums(to_field, motion, material, solid, samples, near, softening):
         frame by the twist there, both in queried axes. Only S can be differentiated further.
     """
 
+    def moments(part: Near, found: _Response):
+        slip, normal = found.slip, part.normal
+        across = found.grip * normal - found.fall * (normal - found.marginal * slip)
+        slope = across[:, None] * normal[None] - (found.turn * slip)[:, None] * slip[None]
+        slope = slope - found.grip * jnp.eye(3, dtype=slip.dtype)[:, :, None]
+        of_traction = contract(part.areas * traction(found, normal), part.arms)
+        of_slope = contract((part.areas * slope).reshape(9, -1), _products(part.arms))
+        return jnp.concatenate([of_traction.ravel(), of_slope.ravel()])
+
     def add(part: Near):
         found = respond(material, part.depth, part.normal, matmul(motion_of_arms, part.arms), softening)
-        held, turned = part.areas * found.held, part.areas * found.turned
-        across = held * part.normal - part.areas * found.pushed
-        traction, across, held, turned = jax.lax.optimization_barrier(
-            (part.areas * found.traction, across, held, turned)
-        )
-        eye = jnp.eye(3, dtype=held.dtype)[:, :, None]
-        slope = across[:, None] * part.normal[None] - (turned * found.slip)[:, None] * found.slip[None]
-        slope = (slope - held * eye).reshape(9, -1)
-        slope, products = jax.lax.optimization_barrier((slope, _products(part.arms)))
-        return jnp.concatenate([contract(traction, part.arms).ravel(), contract(slope, products).ravel()])
+        # Skips what does not press. It also makes XLA write the response down, which it would else compute
+        # again for each of the nine components of the slope.
+        return jax.lax.cond(jnp.any(found.pressure > 0), moments, lambda *_: zero, part, found)
 
+    zero = jnp.zeros(12 + 144, to_field.dtype)
     motion_of_arms = _turned(motion, to_field)
-    total = _chunks(near, add, jnp.zeros(12 + 144, to_field.dtype))
-    slope = matvec(jnp.asarray(_TO_SLOPE, total.dtype), total[12:]).reshape(6, 6)
+    total = _chunks(near, add, zero)
+    # Σ A Jᵀ K J from Σ A K_cd r̃_a r̃_b, with J = Σ_a LEVER_a r̃_a.
+    levers = jnp.asarray(_LEVERS, total.dtype)
+    slope = levers @ total[12:].reshape(3, 3, 4, 4).transpose(0, 2, 1, 3).reshape(12, 12) @ levers.T
     return _turned_back(total[:12].reshape(3, 4), to_field), slope
 
 
@@ -314,7 +325,8 @@ def _sums_jvp(primals, tangents):
         velocity = matmul(motion_of_arms, part.arms)
 
         def of(distance, gradient, velocity, material):
-            return respond(material, -distance, _unit(gradient), velocity).traction
+            normal = _unit(gradient)
+            return traction(respond(material, -distance, normal, velocity), normal)
 
         def along(tangent):
             return jax.jvp(of, (distance, gradient, velocity, material), tangent)[1]
@@ -329,8 +341,7 @@ def _sums_jvp(primals, tangents):
         none = jnp.zeros((n_material, 3, n), dtype)
         by_material = jax.vmap(along)((none[:, 0], none, none, units))
         every = part.areas * jnp.concatenate([by_place, by_velocity]).reshape(18, n)
-        every, products = jax.lax.optimization_barrier((every, _products(part.arms)))
-        of_motion = contract(every, products).ravel()
+        of_motion = contract(every, _products(part.arms)).ravel()
         of_material = contract(part.areas * by_material.reshape(-1, n), part.arms).ravel()
         return jnp.concatenate([of_motion, of_material])
 
@@ -351,5 +362,6 @@ def _sums_jvp(primals, tangents):
 def _all_sums(to_field, motion, material, solid, samples):
     """S over all samples, as plain code that can be differentiated by everything."""
     distance, gradient = solid.sdf_jet(to_field @ samples.points, 1)
-    response = respond(material, -distance, _unit(gradient), motion @ samples.points)
-    return contract(samples.weights * response.traction, samples.points)
+    normal = _unit(gradient)
+    found = respond(material, -distance, normal, motion @ samples.points)
+    return contract(samples.weights * traction(found, normal), samples.points)
