@@ -4,6 +4,7 @@ A quaternion is an array whose last axis holds (w, x, y, z). It rotates body-fra
 frame. Every function broadcasts over leading axes unless its signature says otherwise.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,6 +22,17 @@ Numbers = ArrayLike | Sequence[Any]
 def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
     """Euclidean norm whose derivative at zero is zero instead of NaN."""
     squared = jnp.sum(x * x, axis=axis)
+    # The untaken branch must be safe too: 0 · ∞ in the chain rule would be NaN.
+    positive = squared > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
+
+
+def column_norm(x: Float[Array, "k *batch"]) -> Float[Array, "*batch"]:
+    """Length of vectors stored as columns; its derivative at zero is zero instead of NaN.
+
+    Faster than `safe_norm` over the first axis of many columns on a CPU.
+    """
+    squared = functools.reduce(jnp.add, [row * row for row in x])
     # The untaken branch must be safe too: 0 · ∞ in the chain rule would be NaN.
     positive = squared > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)

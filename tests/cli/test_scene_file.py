@@ -36,7 +36,7 @@ fixed = true
     assert pairs == [("egg", "floor"), ("egg", "ball"), ("egg", "wall"), ("floor", "ball"), ("ball", "wall")]
     for contact in loaded.scene.contacts:
         assert float(contact.params.rolling_friction) == 0.002
-        assert float(contact.params.spring) == float(dano.ContactParams().spring)
+        assert float(contact.params.spring) == 3e4
         assert isinstance(contact.law, dano.CentroidLaw)
         assert float(contact.law.smoothing) == 500
     assert loaded.n_steps == 400
@@ -44,6 +44,70 @@ fixed = true
     np.testing.assert_allclose(loaded.scene.gravity, (0, 0, -9.81))
     np.testing.assert_allclose(loaded.state.velocity[2], (1, 0, 0))
     np.testing.assert_allclose(loaded.state.omega[0], (0, 0, 1))
+
+
+def test_distributed_law(scene):
+    text = scene.read_text(encoding="utf-8").split("[[contacts]]")[0]
+    text += """
+[default_contact]
+law = "distributed"
+sliding_friction = 0.3
+stiffness = 4e8
+restitution = 0.5
+restitution_velocity = 0.02
+friction_fading = 0.4
+friction_pressure = 2e3
+stiction_velocity = 1e-6
+"""
+    (contact,) = parse_scene(text, scene).scene.contacts
+    assert isinstance(contact.law, dano.DistributedLaw)
+    assert float(contact.law.stiction_velocity) == 1e-6
+    expected = {
+        "sliding_friction": 0.3,
+        "stiffness": 4e8,
+        "restitution": 0.5,
+        "restitution_velocity": 0.02,
+        "friction_fading": 0.4,
+        "friction_pressure": 2e3,
+    }
+    assert {key: float(getattr(contact.params, key)) for key in expected} == expected
+    (contact,) = parse_scene(text.replace("stiffness = 4e8\n", ""), scene).scene.contacts
+    assert contact.params.stiffness is not None and float(contact.params.stiffness) > 0
+
+
+def test_contact_with_another_law_than_the_default(scene):
+    text = scene.read_text(encoding="utf-8").split("[[contacts]]")[0]
+    text += """
+[[bodies]]
+name = "ball"
+shape = "sphere"
+radius = 0.05
+mass = 2
+position = [0, 0, 0.2]
+
+[default_contact]
+law = "distributed"
+sliding_friction = 0.3
+restitution = 0.5
+
+[[contacts]]
+a = "egg"
+b = "floor"
+
+[[contacts]]
+a = "ball"
+b = "floor"
+law = "centroid"
+stiction_velocity = 1e-6
+"""
+    egg, ball = parse_scene(text, scene).scene.contacts
+    assert isinstance(egg.law, dano.DistributedLaw)
+    assert float(egg.params.restitution) == 0.5
+    assert isinstance(ball.law, dano.CentroidLaw)
+    assert ball.law.stiction_velocity is not None and float(ball.law.stiction_velocity) == 1e-6
+    # What the default says for its own law is not for this one.
+    assert float(ball.params.restitution) == 0
+    assert float(ball.params.sliding_friction) == 0.3
 
 
 SHAPES = {
@@ -213,7 +277,30 @@ BAD = {
     ),
     "unknown law": (
         "n_steps = 1\n" + BODY + FLOOR + '[[contacts]]\na = "ball"\nb = "floor"\nlaw = "glue"\n',
-        "law must be one of 'centroid', got 'glue'",
+        "[[contacts]] 1 ('ball', 'floor'): law must be one of 'centroid', 'distributed', got 'glue'",
+    ),
+    "key of the other law": (
+        "n_steps = 1\n" + BODY + FLOOR + '[default_contact]\nlaw = "distributed"\nsmoothing = 100\n',
+        "[default_contact]: smoothing belongs to law = 'centroid', and this is 'distributed', whose keys are",
+    ),
+    "parameter of the other law": (
+        "n_steps = 1\n"
+        + BODY
+        + FLOOR
+        + '[[contacts]]\na = "ball"\nb = "floor"\nlaw = "distributed"\nrolling_friction = 0.01\n',
+        "[[contacts]] 1 ('ball', 'floor'): rolling_friction belongs to law = 'centroid'",
+    ),
+    "parameter of a law not chosen": (
+        "n_steps = 1\n" + BODY + FLOOR + "[default_contact]\nrestitution = 0.5\n",
+        "[default_contact]: restitution belongs to law = 'distributed', and this is 'centroid'",
+    ),
+    "restitution above one": (
+        "n_steps = 1\n" + BODY + FLOOR + '[default_contact]\nlaw = "distributed"\nrestitution = 1.5\n',
+        "[default_contact]: restitution must lie in [0, 1], got 1.5",
+    ),
+    "no stiction": (
+        "n_steps = 1\n" + BODY + FLOOR + "[default_contact]\nstiction_velocity = 0\n",
+        "[default_contact]: stiction_velocity must be > 0, got 0.0",
     ),
     "unknown body in control": ("n_steps = 1\n" + BODY + '[[controls]]\nbody = "bal"\n', "got 'bal'"),
     "control of a fixed body": (

@@ -7,6 +7,7 @@ import pytest
 
 import dano
 
+H = jnp.asarray(0.01)
 NORMAL = np.array([0.36, 0.48, 0.8])
 PATCH = dano.Patch(jnp.asarray(0.02), jnp.zeros(3), jnp.asarray(NORMAL))
 PARAMS = dano.ContactParams(
@@ -50,15 +51,15 @@ def expected(twist, params, law, psi=0.02, n=NORMAL):
 @pytest.mark.parametrize("twist", TWISTS)
 def test_wrench_and_jacobian(twist, adhesive):
     law = dano.CentroidLaw(smoothing=12.0, regularizer=2e-3, adhesive=adhesive)
-    wrench, jacobian = law.wrench(PATCH, PARAMS, jnp.asarray(twist))
+    wrench, jacobian = law.wrench(PATCH, PARAMS, jnp.asarray(twist), H)
     np.testing.assert_allclose(wrench, expected(twist, PARAMS, law), rtol=1e-12, atol=1e-12)
-    by_autodiff = jax.jacfwd(lambda t: law.wrench(PATCH, PARAMS, t)[0])(jnp.asarray(twist))
+    by_autodiff = jax.jacfwd(lambda t: law.wrench(PATCH, PARAMS, t, H)[0])(jnp.asarray(twist))
     np.testing.assert_allclose(jacobian, by_autodiff, rtol=1e-9, atol=1e-9)
     step = 1e-7 * np.eye(6)
     by_difference = [
         (
-            law.wrench(PATCH, PARAMS, jnp.asarray(twist + e))[0]
-            - law.wrench(PATCH, PARAMS, jnp.asarray(twist - e))[0]
+            law.wrench(PATCH, PARAMS, jnp.asarray(twist + e), H)[0]
+            - law.wrench(PATCH, PARAMS, jnp.asarray(twist - e), H)[0]
         )
         / 2e-7
         for e in step
@@ -82,24 +83,24 @@ def test_friction_saturation(smoothing, speed, factor):
     params = dano.ContactParams(spring=1.0, damper=0.0, sliding_friction=1.0, sliding_drag=0.0)
     patch = dano.Patch(jnp.asarray(1.0), jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]))
     wrench, _ = dano.CentroidLaw(smoothing=smoothing).wrench(
-        patch, params, jnp.array([speed, 0, 0, 0, 0, 0.0])
+        patch, params, jnp.array([speed, 0, 0, 0, 0, 0.0]), H
     )
     assert -wrench[0] == pytest.approx(factor, abs=6e-4)
 
 
 def test_contact_never_pulls_unless_adhesive():
     leaving = jnp.asarray(np.concatenate([2.0 * NORMAL, np.zeros(3)]))
-    assert not np.any(dano.CentroidLaw().wrench(PATCH, PARAMS, leaving)[0])
-    pulled, _ = dano.CentroidLaw(adhesive=True).wrench(PATCH, PARAMS, leaving)
+    assert not np.any(dano.CentroidLaw().wrench(PATCH, PARAMS, leaving, H)[0])
+    pulled, _ = dano.CentroidLaw(adhesive=True).wrench(PATCH, PARAMS, leaving, H)
     assert pulled[:3] @ NORMAL < 0
 
 
 def test_rest_has_a_finite_jacobian():
-    wrench, jacobian = dano.CentroidLaw().wrench(PATCH, PARAMS, jnp.zeros(6))
+    wrench, jacobian = dano.CentroidLaw().wrench(PATCH, PARAMS, jnp.zeros(6), H)
     np.testing.assert_allclose(wrench, np.concatenate([60.0 * NORMAL, np.zeros(3)]), atol=1e-12)
     assert np.all(np.isfinite(jacobian))
     assert np.all(
-        np.isfinite(jax.jacrev(lambda t: dano.CentroidLaw().wrench(PATCH, PARAMS, t)[0])(jnp.zeros(6)))
+        np.isfinite(jax.jacrev(lambda t: dano.CentroidLaw().wrench(PATCH, PARAMS, t, H)[0])(jnp.zeros(6)))
     )
 
 

@@ -38,25 +38,49 @@ class SampleSet(eqx.Module):
     radii: Float[Array, " blocks"]
 
     @classmethod
-    def create(cls, points: Numbers, weights: Numbers, *, normalise: bool = True) -> "SampleSet":
+    def create(cls, points: Numbers, density: Numbers) -> "SampleSet":
         """Order the samples in space and normalise their weights, on the host.
 
         Args:
             points: Sample positions [m, F].
-            weights: Density φ ≥ 0 of each sample [arbitrary unit], not all zero; or area [m²].
-            normalise: Whether the weights shall sum to one.
+            density: Density φ ≥ 0 of each sample [arbitrary unit]; not all zero.
         """
-        x, phi = np.asarray(points, dtype=np.float64), np.asarray(weights, dtype=np.float64)
+        x, phi = np.asarray(points, dtype=np.float64), np.asarray(density, dtype=np.float64)
         order = _spatial_order(x)
         missing = -len(order) % BLOCK
-        weights = np.concatenate([phi[order] / (phi.sum() if normalise else 1), np.zeros(missing)])
+        weights = np.concatenate([phi[order] / phi.sum(), np.zeros(missing)])
         x = np.concatenate([x[order], np.repeat(x[order[-1:]], missing, axis=0)])
-        blocks = x.reshape(-1, BLOCK, 3)
-        centers = 0.5 * (blocks.min(axis=1) + blocks.max(axis=1))
-        radii = np.linalg.norm(blocks - centers[:, None], axis=-1).max(axis=1)
+        centers, radii = _balls(x)
         homogeneous = np.concatenate([x.T, np.ones((1, len(x)))])
         products = np.stack([homogeneous[j] * homogeneous[k] for j, k in PRODUCTS])
         return cls(*(floating(x) for x in (homogeneous, products, weights, centers, radii)))
+
+
+class SurfaceSet(eqx.Module):
+    """Surface samples in the field frame, in blocks that are compact in space, as in `SampleSet`.
+
+    Attributes:
+        points: Homogeneous coordinates (x, y, z, 1) [m, F], shape (4, n).
+        vectors: Vector area of each [m², F], zero for what fills up the last block, shape (3, n).
+        centers: Centre of each block [m, F], shape (n / BLOCK, 3).
+        radii: Radius of each block about its centre [m], shape (n / BLOCK,).
+    """
+
+    points: Float[Array, "4 n"]
+    vectors: Float[Array, "3 n"]
+    centers: Float[Array, "blocks 3"]
+    radii: Float[Array, " blocks"]
+
+    @classmethod
+    def create(cls, points: Numbers, vectors: Numbers) -> "SurfaceSet":
+        """Order the samples in space, on the host; points [m, F] and vector areas [m², F], shape (n, 3) both."""
+        x, a = np.asarray(points, dtype=np.float64), np.asarray(vectors, dtype=np.float64)
+        order = _spatial_order(x)
+        missing = -len(order) % BLOCK
+        x = np.concatenate([x[order], np.repeat(x[order[-1:]], missing, axis=0)])
+        a = np.concatenate([a[order], np.zeros((missing, 3))])
+        homogeneous = np.concatenate([x.T, np.ones((1, len(x)))])
+        return cls(*(floating(part) for part in (homogeneous, a.T, *_balls(x))))
 
 
 class Support(eqx.Module):
@@ -120,7 +144,7 @@ class Collider(eqx.Module):
         mass: Mass [kg] that the sample weights sum to.
         rotation: Field frame → world, shape (3, 3).
         origin: Origin of the field frame [m, W], shape (3,).
-        surface: Surface samples weighted by area [m²], for distributed contact.
+        surface: Surface samples with vector areas, for distributed contact.
         solid: Signed distance that the other side's surface samples query.
         velocity: Of the point at the origin of the field frame [m/s, W].
         omega: Angular velocity [rad/s, W].
@@ -133,7 +157,7 @@ class Collider(eqx.Module):
     mass: Float[Array, ""]
     rotation: Float[Array, "3 3"]
     origin: Float[Array, "3"]
-    surface: SampleSet | None
+    surface: SurfaceSet | None
     solid: AbstractShape | None
     velocity: Float[Array, "3"]
     omega: Float[Array, "3"]
@@ -149,7 +173,7 @@ class Collider(eqx.Module):
         pose: Pose | None = None,
         rotation: Array | None = None,
         origin: Array | None = None,
-        surface: SampleSet | None = None,
+        surface: SurfaceSet | None = None,
         solid: AbstractShape | None = None,
         velocity: Array | None = None,
         omega: Array | None = None,
@@ -163,6 +187,13 @@ class Collider(eqx.Module):
         self.surface, self.solid = surface, solid
         self.velocity = jnp.zeros_like(self.origin) if velocity is None else velocity
         self.omega = jnp.zeros_like(self.origin) if omega is None else omega
+
+
+def _balls(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (n / BLOCK, 3) and radii (n / BLOCK,) of balls around each block of points (n, 3)."""
+    blocks = x.reshape(-1, BLOCK, 3)
+    centers = 0.5 * (blocks.min(axis=1) + blocks.max(axis=1))
+    return centers, np.linalg.norm(blocks - centers[:, None], axis=-1).max(axis=1)
 
 
 def _spatial_order(points: np.ndarray) -> np.ndarray:

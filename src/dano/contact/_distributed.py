@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from dano.contact._colliders import Collider, SampleSet
+from dano.contact._colliders import Collider, SurfaceSet
 from dano.contact._laws import AbstractContactLaw, ContactParams, positive, Setting, Softening
 from dano.contact._overlap import Patch
 from dano.contact._pressure import find_near, Material, Near, sums
@@ -34,7 +34,7 @@ class _Side(eqx.Module):
     rotation: Float[Array, "3 3"]
     lever: Float[Array, "3"]
     solid: AbstractShape
-    samples: SampleSet
+    samples: SurfaceSet
     near: Near
     flipped: bool = eqx.field(static=True)
 

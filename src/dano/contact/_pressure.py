@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dano.contact._colliders import BLOCK, SampleSet
+from dano.contact._colliders import BLOCK, SurfaceSet
 from dano.contact._centroid import sticking
 from dano.contact._derivatives import by_autodiff, keep
 from dano.contact._laws import Softening
 from dano.contact._small import contract, matmul, matvec
-from dano.fields import AbstractShape, column_norm, HalfSpace
+from dano.fields import AbstractShape, HalfSpace
+from dano.maths import column_norm
 
 # Up to so many samples all are taken at once: finding the near ones would cost more, above all under `vmap`.
 _FEW = 512
@@ -122,26 +123,28 @@ def respond(
 
 def traction(response: _Response, normal: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
     """Force per area [Pa]."""
-    return response.pressure * normal - response.grip * response.slip
+    return response.pressure[None] * normal - response.grip[None] * response.slip
 
 
 class Near(eqx.Module):
     """The samples that may touch, with what does not change within a step.
 
     Attributes:
-        rows: Arms, areas, depths and normals, as the properties below have them, shape (9, m). One array:
-            its parts would be copied in every step.
+        rows: Arms, areas, depths, normals and vector areas, as the properties below have them, shape (12, m).
+            One array: its parts would be copied in every step.
         count: How many columns are filled; the areas of others are zero.
     """
 
-    rows: Float[Array, "9 m"]
+    rows: Float[Array, "12 m"]
     count: Int[Array, ""]
 
     @classmethod
-    def of(cls, arms, areas, depth, normal, count) -> "Near":
-        """Stack the parts."""
-        ones = jnp.ones_like(areas)
-        return cls(jnp.concatenate([arms, jnp.stack([ones, areas, depth]), normal]), jnp.asarray(count))
+    def of(cls, arms, vectors, solid: AbstractShape, offset, count) -> "Near":
+        """Ask the solid about samples, given by arms and vector areas in its axes."""
+        distance, gradient = solid.sdf_jet(arms + offset, 1)
+        normal = _unit(gradient)
+        scalars = jnp.stack([jnp.ones_like(distance), _facing(vectors, normal), -distance])
+        return cls(jnp.concatenate([arms, scalars, normal, vectors]), jnp.asarray(count))
 
     @property
     def arms(self) -> Float[Array, "4 m"]:
@@ -150,7 +153,7 @@ class Near(eqx.Module):
 
     @property
     def areas(self) -> Float[Array, " m"]:
-        """Area of each [m²]."""
+        """Area of each that faces the solid [m²]."""
         return self.rows[4]
 
     @property
@@ -161,14 +164,19 @@ class Near(eqx.Module):
     @property
     def normal(self) -> Float[Array, "3 m"]:
         """Unit normal of that surface."""
-        return self.rows[6:]
+        return self.rows[6:9]
+
+    @property
+    def vectors(self) -> Float[Array, "3 m"]:
+        """Vector area of each [m²]."""
+        return self.rows[9:]
 
 
 def find_near(
     to_field: Float[Array, "3 4"],
     motion: Float[Array, "3 4"],
     solid: AbstractShape,
-    samples: SampleSet,
+    samples: SurfaceSet,
     timestep: Float[Array, ""],
 ) -> Near:
     """Samples that may reach the solid within a step, judged block by block.
@@ -182,9 +190,8 @@ def find_near(
     """
     n = samples.points.shape[1]
     if n <= _FEW:
-        arms = matmul(to_field[:, :3], samples.points[:3])
-        depth, normal = _touch(solid, arms + to_field[:, 3:])
-        return Near.of(arms, samples.weights, depth, normal, n)
+        arms, vectors = (matmul(to_field[:, :3], x) for x in (samples.points[:3], samples.vectors))
+        return Near.of(arms, vectors, solid, to_field[:, 3:], n)
     centers = jnp.concatenate([samples.centers.T, jnp.ones_like(samples.centers.T[:1])])
     # The spin of a block's points about its centre is at most |V₁₂₃| times their distance.
     speed = column_norm(matmul(motion, centers)) + jnp.sqrt(jnp.sum(motion[:, :3] ** 2)) * samples.radii
@@ -209,21 +216,19 @@ def find_near(
             parts = [jax.lax.dynamic_slice_in_dim(x, start, BLOCK, axis=-1) for start in starts]
             return jnp.concatenate(parts, axis=-1)
 
-        arms = matmul(to_field[:, :3], rows(samples.points)[:3])
-        depth, normal = _touch(solid, arms + to_field[:, 3:])
-        # What fills up the last pass weighs nothing.
-        areas = jnp.where(_CHUNK * i + np.arange(_CHUNK) < count, rows(samples.weights), 0)
-        found = Near.of(arms, areas, depth, normal, count).rows
+        # What fills up the last pass has no area.
+        areas = jnp.where(_CHUNK * i + np.arange(_CHUNK) < count, rows(samples.vectors), 0)
+        arms, vectors = (matmul(to_field[:, :3], x) for x in (rows(samples.points)[:3], areas))
+        found = Near.of(arms, vectors, solid, to_field[:, 3:], count).rows
         return jax.lax.dynamic_update_slice_in_dim(buffer, found, _CHUNK * i, axis=1)
 
-    # Only what a pass has filled is read, so that nothing need be cleared.
-    empty = jnp.zeros((9, n + -n % _CHUNK), to_field.dtype)
+    empty = jnp.zeros((12, n + -n % _CHUNK), to_field.dtype)
     return Near(jax.lax.fori_loop(0, -(-count // _CHUNK), gather, empty), count)
 
 
-def _touch(solid: AbstractShape, x: Float[Array, "3 n"]) -> tuple[Float[Array, " n"], Float[Array, "3 n"]]:
-    distance, gradient = solid.sdf_jet(x, 1)
-    return -distance, _unit(gradient)
+def _facing(vectors: Float[Array, "3 n"], normal: Float[Array, "3 n"]) -> Float[Array, " n"]:
+    """Area that faces a solid: only the part of a sample's surface across the normal carries pressure."""
+    return jnp.maximum(-jnp.sum(vectors * normal, axis=0), 0)
 
 
 def _unit(gradient: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
@@ -265,7 +270,7 @@ def sums(to_field, motion, material, solid, samples, near, softening):
         motion: V.
         material: The material.
         solid: The queried shape.
-        samples: Surface samples weighted by area.
+        samples: Surface samples of the other body.
         near: Those to sum over, from `find_near`; held constant by derivatives.
         softening: Of the friction.
 
@@ -276,11 +281,11 @@ def sums(to_field, motion, material, solid, samples, near, softening):
 
     def moments(part: Near, found: _Response):
         slip, normal = found.slip, part.normal
-        across = found.grip * normal - found.fall * (normal - found.marginal * slip)
-        slope = across[:, None] * normal[None] - (found.turn * slip)[:, None] * slip[None]
-        slope = slope - found.grip * jnp.eye(3, dtype=slip.dtype)[:, :, None]
-        of_traction = contract(part.areas * traction(found, normal), part.arms)
-        of_slope = contract((part.areas * slope).reshape(9, -1), _products(part.arms))
+        across = found.grip[None] * normal - found.fall[None] * (normal - found.marginal[None] * slip)
+        slope = across[:, None] * normal[None] - (found.turn[None] * slip)[:, None] * slip[None]
+        slope = slope - found.grip[None, None] * jnp.eye(3, dtype=slip.dtype)[:, :, None]
+        of_traction = contract(part.areas[None] * traction(found, normal), part.arms)
+        of_slope = contract(part.areas[None] * slope.reshape(9, -1), _products(part.arms))
         return jnp.concatenate([of_traction.ravel(), of_slope.ravel()])
 
     def add(part: Near):
@@ -326,7 +331,8 @@ def _sums_jvp(primals, tangents):
 
         def of(distance, gradient, velocity, material):
             normal = _unit(gradient)
-            return traction(respond(material, -distance, normal, velocity), normal)
+            areas = _facing(part.vectors, normal)
+            return areas * traction(respond(material, -distance, normal, velocity), normal)
 
         def along(tangent):
             return jax.jvp(of, (distance, gradient, velocity, material), tangent)[1]
@@ -340,28 +346,38 @@ def _sums_jvp(primals, tangents):
         units = Material(*jnp.eye(n_material, dtype=dtype))
         none = jnp.zeros((n_material, 3, n), dtype)
         by_material = jax.vmap(along)((none[:, 0], none, none, units))
-        every = part.areas * jnp.concatenate([by_place, by_velocity]).reshape(18, n)
-        of_motion = contract(every, _products(part.arms)).ravel()
-        of_material = contract(part.areas * by_material.reshape(-1, n), part.arms).ravel()
-        return jnp.concatenate([of_motion, of_material])
+        of_motion = contract(jnp.concatenate([by_place, by_velocity]).reshape(18, n), _products(part.arms))
+        of_material = contract(by_material.reshape(-1, n), part.arms)
+        # Turning the sampled body turns its vector areas: dA = −n·(dR Rᵀ a).
+        force = jnp.where(part.areas > 0, 1, 0) * traction(
+            respond(material, -distance, part.normal, velocity), part.normal
+        )
+        moment = (force[:, None] * part.arms[None]).reshape(12, n)
+        of_turning = -contract(moment, (part.normal[:, None] * part.vectors[None]).reshape(9, n))
+        return jnp.concatenate([of_motion.ravel(), of_turning.ravel(), of_material.ravel()])
 
-    total = _chunks(near, add, jnp.zeros(18 * 16 + 12 * n_material, to_field.dtype))
+    total = _chunks(near, add, jnp.zeros(288 + 108 + 12 * n_material, to_field.dtype))
     moments, slope, total = keep(*value, total)
     change = jnp.zeros((3, 4), to_field.dtype)
     # dS_ca = Σ D_dcab (dH T)_db, T the turn from x̃ to arms.
-    by_motion, by_material = total[:288].reshape(2, 3, 3, 4, 4), total[288:].reshape(n_material, 3, 4)
+    by_motion, by_turning = total[:288].reshape(2, 3, 3, 4, 4), total[288:396].reshape(3, 4, 3, 3)
+    by_material = total[396:].reshape(n_material, 3, 4)
     for derivative, tangent in zip(by_motion, (d_to_field, d_motion), strict=True):
         if tangent is not None:
             change = change + jnp.einsum("dcab,db->ca", derivative, _turned(tangent, to_field))
+    if d_to_field is not None:
+        turn = matmul(d_to_field[:, :3], to_field[:, :3].T)
+        change = change + jnp.einsum("cade,de->ca", by_turning, turn)
     for rows, tangent in zip(by_material, d_material, strict=True):
         if tangent is not None:
             change = change + rows * tangent
     return (moments, slope), (_turned_back(change, to_field), None)
 
 
-def _all_sums(to_field, motion, material, solid, samples):
+def _all_sums(to_field, motion, material, solid, samples: SurfaceSet):
     """S over all samples, as plain code that can be differentiated by everything."""
     distance, gradient = solid.sdf_jet(to_field @ samples.points, 1)
     normal = _unit(gradient)
+    areas = _facing(to_field[:, :3] @ samples.vectors, normal)
     found = respond(material, -distance, normal, motion @ samples.points)
-    return contract(samples.weights * traction(found, normal), samples.points)
+    return contract(areas * traction(found, normal), samples.points)

@@ -1,7 +1,7 @@
 """Fields: what occupies space. Densities of any kind, shapes, grids, meshes, and readers for them."""
 
 from dano.fields._bake import bake as bake, Baked as Baked, BakeError as BakeError
-from dano.fields._base import AbstractField as AbstractField, column_norm as column_norm
+from dano.fields._base import AbstractField as AbstractField
 from dano.fields._callable import CallableField as CallableField
 from dano.fields._compose import (
     Posed as Posed,

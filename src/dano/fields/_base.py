@@ -1,7 +1,6 @@
 """What every field offers: a density, its normal, and batched jets of its Taylor coefficients."""
 
 import abc
-import functools
 from collections.abc import Callable
 from typing import Any, TYPE_CHECKING
 
@@ -30,14 +29,6 @@ def unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:
     # A direction does not depend on that scale, hence neither do its derivatives.
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(vector)))
     return safe_normalize(vector / jnp.where(scale > 0, scale, 1))
-
-
-def column_norm(x: Float[Array, "k *batch"]) -> Float[Array, "*batch"]:
-    """Length of vectors stored as columns; its derivative at zero is zero instead of NaN."""
-    squared = functools.reduce(jnp.add, [row * row for row in x])
-    # The untaken branch must be safe too: 0 · ∞ in the chain rule would be NaN.
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
 
 
 def check_order(order: int) -> None:

@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from dano.fields._base import column_norm
 from dano.fields._shapes import AbstractCentred, checked_edge, column, positive, SolidMoments
-from dano.maths import Numbers
+from dano.maths import column_norm, Numbers
 
 
 class Ellipsoid(AbstractCentred):

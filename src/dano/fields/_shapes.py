@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from dano.fields._base import AbstractField, check_order, column_norm, Jet, vmapped_jet
-from dano.maths import checked_array, is_traced, Numbers, safe_normalize
+from dano.fields._base import AbstractField, check_order, Jet, vmapped_jet
+from dano.maths import checked_array, column_norm, is_traced, Numbers, safe_normalize
 
 DEFAULT_EDGE = 0.005
 """Edge width of a shape that states none, as a fraction of its size.

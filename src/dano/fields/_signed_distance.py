@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from dano.fields._base import check_order, column_norm, Jet
+from dano.fields._base import check_order, Jet
 from dano.fields._grid import checked_spacing, scaled_jet
 from dano.fields._shapes import AbstractShape, checked_edge, SolidMoments
 from dano.fields._spline import border, degree_of, interpolating_coefficients, spline_jet
-from dano.maths import checked_array, floating, is_traced, Numbers
+from dano.maths import checked_array, column_norm, floating, is_traced, Numbers
 
 if TYPE_CHECKING:
     import trimesh

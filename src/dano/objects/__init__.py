@@ -5,6 +5,5 @@ from dano.objects._object import MassModel as MassModel, NeuralObject as NeuralO
 from dano.objects._samples import ContactSamples as ContactSamples, surface_samples as surface_samples
 from dano.objects._surface import (
     draw_surface as draw_surface,
-    support_volume as support_volume,
     SurfaceSamples as SurfaceSamples,
 )

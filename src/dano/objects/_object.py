@@ -230,6 +230,7 @@ class NeuralObject(eqx.Module):
             "surface_points": self.surface.points,
             "surface_normals": self.surface.normals,
             "surface_areas": self.surface.areas,
+            "surface_vectors": self.surface.vectors,
             "density_range": self.density_range,
             "bake_error": self.bake_error,
             "mass": self.mass.mass,
@@ -332,6 +333,7 @@ def _stored_surface(
             checked_array("surface_points", floating(data["surface_points"]), (n, 3)),
             checked_array("surface_normals", floating(data["surface_normals"]), (n, 3)),
             checked_array("surface_areas", floating(data["surface_areas"]), (n,)),
+            checked_array("surface_vectors", floating(data["surface_vectors"]), (n, 3)),
         )
     if solid is not None:
         return draw_surface(solid, len(samples.points))

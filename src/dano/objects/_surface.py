@@ -12,7 +12,7 @@ from dano.fields import AbstractShape
 from dano.maths import floating, is_traced, Numbers
 from dano.objects._mass import host_jet, host_random, MassProperties
 
-SKIN = 0.01
+SKIN = 0.0025
 """Default thickness by which a surface is inflated to weigh its edges and corners, as a share of its size."""
 
 # Candidates that the selection chooses from and that the areas are counted with, per sample.
@@ -36,11 +36,25 @@ class SurfaceSamples(eqx.Module):
         points: Positions [m, F], shape (n, 3).
         normals: Unit outward normals [F], shape (n, 3).
         areas: Area of each [m²], shape (n,).
+        vectors: Vector area ∫n dA of each [m², F], shape (n, 3): what of its area faces a direction. Shorter
+            than the area on edges and corners, where normals differ. Over a closed surface they sum to zero.
     """
 
     points: Float[Array, "n 3"]
     normals: Float[Array, "n 3"]
     areas: Float[Array, " n"]
+    vectors: Float[Array, "n 3"]
+
+    def __init__(
+        self,
+        points: Float[Array, "n 3"],
+        normals: Float[Array, "n 3"],
+        areas: Float[Array, " n"],
+        vectors: Float[Array, "n 3"] | None = None,
+    ):
+        """Vector areas default to those of flat pieces: area · normal."""
+        self.points, self.normals, self.areas = points, normals, areas
+        self.vectors = areas[:, None] * normals if vectors is None else vectors
 
 
 class _Shell(NamedTuple):
@@ -82,7 +96,7 @@ def draw_surface(
     Args:
         shape: Bounded shape.
         n: Number of samples.
-        skin: Thickness [m]; default 1 % of the size.
+        skin: Thickness [m]; default 0.25 % of the size.
         key: Random key; default `jax.random.key(0)`.
 
     Raises:
@@ -100,8 +114,8 @@ def draw_surface(
     pitch = math.sqrt(shell.areas.sum() / n)
     chosen = _chosen(shell, n, pitch)
     points = shell.points[chosen]
-    normals, areas = _shares(shell, chosen, pitch)
-    return SurfaceSamples(floating(points), floating(normals), floating(areas))
+    normals, areas, vectors = _shares(shell, chosen, pitch)
+    return SurfaceSamples(floating(points), floating(normals), floating(areas), floating(vectors))
 
 
 def _shell(
@@ -198,21 +212,22 @@ def _places(points: np.ndarray, normals: np.ndarray, pitch: float) -> np.ndarray
     return np.concatenate([points, 0.5 * pitch * normals], axis=1)
 
 
-def _shares(shell: _Shell, chosen: np.ndarray, pitch: float) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (n, 3) and areas (n,) of the chosen points, from all points of the shell closest to each."""
+def _shares(shell: _Shell, chosen: np.ndarray, pitch: float) -> tuple[np.ndarray, ...]:
+    """Normals (n, 3), areas (n,) and vector areas (n, 3) of the chosen points, from the points closest to each."""
     if len(chosen) == 1:
-        return shell.normals[chosen], shell.areas.sum()[None]
+        return shell.normals[chosen], shell.areas.sum()[None], shell.areas.sum() * shell.normals[chosen]
     # On an edge or corner, what was chosen has any of the normals there; some points tell the mean one.
     some = slice(None, None, COUNTED // CHOICES)
-    normals, _ = _owned(shell, some, shell.points[chosen], shell.normals[chosen], pitch)
-    normals, areas = _owned(shell, slice(None), shell.points[chosen], normals, pitch)
-    return normals, _balanced(areas, shell, shell.points[chosen], normals)
+    normals, _, _ = _owned(shell, some, shell.points[chosen], shell.normals[chosen], pitch)
+    normals, areas, vectors = _owned(shell, slice(None), shell.points[chosen], normals, pitch)
+    balanced = _balanced(areas, shell, shell.points[chosen], normals)
+    return normals, balanced, vectors * (balanced / np.where(areas > 0, areas, 1))[:, None]
 
 
 def _owned(
     shell: _Shell, part: slice, points: np.ndarray, normals: np.ndarray, pitch: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean normals (n, 3) and areas (n,) of the points of a part of the shell that are closest to each."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean normals (n, 3), areas (n,) and vector areas (n, 3) of the points of a shell's part nearest to each."""
     from scipy.spatial import cKDTree
 
     n, measure, directions = len(points), shell.areas[part], shell.normals[part]
@@ -223,13 +238,16 @@ def _owned(
     # would cut cells at random, which is a third of the noise in the areas.
     inward = (distance[:, 1] ** 2 - distance[:, 0] ** 2) / (2 * np.maximum(apart, np.finfo(float).tiny))
     first = measure * (0.5 + np.minimum(inward / shell.spacing, 0.5))
-    areas = np.bincount(owner[:, 0], first, n) + np.bincount(owner[:, 1], measure - first, n)
-    # The mean over what a sample stands for, not across to the other side of a blade.
-    facing = np.einsum("ij,ij->i", directions, normals[owner[:, 0]]) > -1e-3
-    weighted = (facing * measure)[:, None] * directions
-    mean = np.stack([np.bincount(owner[:, 0], column, n) for column in weighted.T], axis=1)
-    length = np.linalg.norm(mean, axis=1, keepdims=True)
-    return np.where(length > 0, mean / np.where(length > 0, length, 1), normals), areas
+    shares = (first, measure - first)
+    areas = sum(np.bincount(owner[:, k], share, n) for k, share in enumerate(shares))
+    vectors = np.zeros((n, 3))
+    for k, share in enumerate(shares):
+        # What a sample stands for, not across to the other side of a blade.
+        facing = np.einsum("ij,ij->i", directions, normals[owner[:, k]]) > -1e-3
+        for axis in range(3):
+            vectors[:, axis] += np.bincount(owner[:, k], facing * share * directions[:, axis], n)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(length > 0, vectors / np.where(length > 0, length, 1), normals), areas, vectors
 
 
 def _balanced(areas: np.ndarray, shell: _Shell, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -316,34 +334,3 @@ def equal_areas(points: Float[Array, "n 3"], mass: MassProperties) -> Float[Arra
         except (QhullError, ValueError):
             area = box if box > 0 else area
     return jnp.full(len(points), floating(area) / len(points), dtype=points.dtype)
-
-
-def support_volume(surface: SurfaceSamples, depth: float, directions: Numbers) -> np.ndarray:
-    """How much a surface is deformed when a plane is pressed into it.
-
-    V(d) = Σ Aᵢ max(0, depth − gapᵢ), where gapᵢ is the height of sample i above the lowest one along d: the
-    volume between the plane and the surface, and for springs of a stiffness per area the force is that
-    stiffness times V.
-
-    Args:
-        surface: Samples.
-        depth: How deep the lowest sample is pressed in [m], ≥ 0.
-        directions: Normals of the planes, towards the object [F], shape (k, 3); normalised here.
-
-    Returns:
-        V [m³] for each direction, shape (k,).
-
-    Raises:
-        ValueError: If `depth` is negative or not finite, or a direction is zero or of the wrong shape.
-    """
-    if not (np.isfinite(depth) and depth >= 0):
-        raise ValueError(f"depth must be finite and ≥ 0 m, got {depth}")
-    ways = np.asarray(floating(directions), dtype=np.float64)
-    if ways.ndim != 2 or ways.shape[1] != 3:
-        raise ValueError(f"directions must have shape (k, 3), got {ways.shape}")
-    length = np.linalg.norm(ways, axis=1, keepdims=True)
-    if not np.all(np.isfinite(length) & (length > 0)):
-        raise ValueError(f"directions must be finite and not zero, got {ways.tolist()}")
-    height = (ways / length) @ np.asarray(surface.points, dtype=np.float64).T
-    pressed = depth - (height - height.min(axis=1, keepdims=True))
-    return np.maximum(pressed, 0) @ np.asarray(surface.areas, dtype=np.float64)

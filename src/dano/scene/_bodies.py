@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.contact import Collider, SampleSet, Support
+from dano.contact import Collider, SampleSet, Support, SurfaceSet
 from dano.fields import AbstractField, AbstractShape
 from dano.maths import checked_array, floating, is_traced, Numbers
 from dano.objects import checked_inertia, MassProperties, NeuralObject
@@ -24,7 +24,7 @@ class Body(eqx.Module):
         object: Neural object, or None for a shape.
         samples: Contact samples in the layout of the contact kernels, or None for a shape without them.
         support: Culling map of the object's grid.
-        surface: Surface samples weighted by area, for distributed contact; None until a scene needs those of
+        surface: Surface samples with vector areas, for distributed contact; None until a scene needs those of
             a shape.
         density_scale: Makes the object's density dimensionless in neural–neural contacts: one over the mean
             density of its samples.
@@ -41,7 +41,7 @@ class Body(eqx.Module):
     object: NeuralObject | None
     samples: SampleSet | None
     support: Support | None
-    surface: SampleSet | None
+    surface: SurfaceSet | None
     density_scale: Float[Array, ""]
     mass: Float[Array, ""]
     inertia: Float[Array, "3 3"]
@@ -89,7 +89,7 @@ class Body(eqx.Module):
             self.object = geometry
             self.samples = SampleSet.create(geometry.samples.points, geometry.samples.density)
             surface = geometry.surface
-            self.surface = SampleSet.create(surface.points, surface.areas, normalise=False)
+            self.surface = SurfaceSet.create(surface.points, surface.vectors)
             self.density_scale = 1 / jnp.mean(geometry.samples.density)
             if geometry.grid is not None:
                 self.support = Support.create(geometry.grid)
@@ -151,9 +151,11 @@ class Body(eqx.Module):
         The median over orientations: most rest on a corner, an edge or a bulge.
         """
         assert self.surface is not None
-        heights = _directions(ORIENTATIONS) @ np.asarray(self.surface.points[:3])
+        up = _directions(ORIENTATIONS)
+        heights = up @ np.asarray(self.surface.points[:3])
         depths = np.maximum(depth - (heights - heights.min(axis=1, keepdims=True)), 0)
-        return float(np.median(depths @ np.asarray(self.surface.weights)))
+        facing = np.maximum(-up @ np.asarray(self.surface.vectors), 0)
+        return float(np.median(np.sum(depths * facing, axis=1)))
 
     def collider(
         self,

@@ -15,6 +15,7 @@ from dano.contact import (
     non_negative,
     SampleSet,
     Setting,
+    SurfaceSet,
 )
 from dano.fields import AbstractShape, HalfSpace, PosedShape, Sphere
 from dano.maths import floating, Numbers
@@ -155,7 +156,7 @@ def _with_samples(body: Body, *, presses: bool) -> Body:
     assert body.shape is not None
     if presses and body.surface is None:
         drawn = draw_surface(body.shape, SHAPE_SAMPLES)
-        surface = SampleSet.create(drawn.points, drawn.areas, normalise=False)
+        surface = SurfaceSet.create(drawn.points, drawn.vectors)
         return eqx.tree_at(lambda b: b.surface, body, surface, is_leaf=_none)
     if not presses and body.samples is None:
         drawn = surface_samples(body.shape, SHAPE_SAMPLES)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, cast, get_args
 
 from dano.archive import checked_input
-from dano.contact import CentroidLaw, ContactParams
+from dano.contact import AbstractContactLaw, CentroidLaw, ContactParams, DistributedLaw
 from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSpace, load_field, Posed, Sphere
 from dano.maths import Pose
 from dano.objects import MassModel, NeuralObject
@@ -36,7 +36,22 @@ _GEOMETRY = ("object", "field", "asset", "shape")
 _BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE)
 _BUILD = ("samples", "density_range", "mass_model", "mass_scale", "resolution", "length", "seed", "floaters")
 _PARAMS = tuple(ContactParams.__dataclass_fields__)
-_LAW = ("law", "smoothing", "regularizer", "adhesive")
+_OF_SURFACES = ("stiffness", "restitution", "restitution_velocity", "friction_fading", "friction_pressure")
+_LAWS: dict[str, tuple[type[AbstractContactLaw], tuple[str, ...]]] = {
+    "centroid": (
+        CentroidLaw,
+        (
+            *(key for key in _PARAMS if key not in _OF_SURFACES),
+            "smoothing",
+            "regularizer",
+            "stiction_velocity",
+            "adhesive",
+        ),
+    ),
+    "distributed": (DistributedLaw, ("sliding_friction", *_OF_SURFACES, "stiction_velocity")),
+}
+"""Laws by name, with the keys that belong to them."""
+_CONTACT = ("law", "edge", *dict.fromkeys(key for _, keys in _LAWS.values() for key in keys))
 _TOP = ("timestep", "gravity", "duration", "n_steps", "bodies", "contacts", "default_contact", "controls")
 
 
@@ -210,29 +225,47 @@ def _from_field_file(path: Path, build: Table, progress: Progress | None) -> Neu
 
 
 def _contacts(top: Table, bodies: Sequence[Body]) -> list[Contact]:
-    valid = (*_PARAMS, *_LAW, "edge")
-    default = top.table("default_contact", valid)
+    default = top.table("default_contact", _CONTACT)
     default.where = f"{top.where}: [default_contact]"
-    all_pairs = top.data.get("contacts", "all") == "all"
-    if all_pairs:
-        pairs = [
-            (a.name, b.name)
-            for a, b in itertools.combinations(bodies, 2)
+    usual = _law_name(default, "centroid")
+    if top.data.get("contacts", "all") == "all":
+        pairs = itertools.combinations(bodies, 2)
+        return [
+            _contact(default, usual, a.name, b.name)
+            for a, b in pairs
             if a.name != b.name and _can_touch(a, b)
         ]
-        rows = [{"a": a, "b": b} for a, b in pairs]
-    elif isinstance(top.data["contacts"], str):
+    if isinstance(top.data["contacts"], str):
         raise top.wrong("contacts", "'all' or written as [[contacts]] tables")
-    else:
-        rows = top.tables("contacts")
-    contacts = []
-    for i, row in enumerate(rows):
-        table = Table(f"{top.where}: [[contacts]] {i + 1}", {**default.data, **row}, ("a", "b", *valid))
+    names, contacts = [body.name for body in bodies], []
+    for i, row in enumerate(top.tables("contacts")):
+        table = Table(f"{top.where}: [[contacts]] {i + 1}", row, ("a", "b", *_CONTACT))
         a, b = table.word("a"), table.word("b")
         table.where += f" ({a!r}, {b!r})"
-        with located(default.where if all_pairs else table.where):
-            contacts.append(_contact(table, a, b, [body.name for body in bodies]))
+        for name in (a, b):
+            if name not in names:
+                raise ValueError(
+                    f"{table.where}: a contact must name bodies of the scene {names}, got {name!r}"
+                )
+        law = _law_name(table, usual)
+        # What the default says for another law does not concern this contact.
+        inherited = {key: value for key, value in default.data.items() if key in ("edge", *_LAWS[law][1])}
+        table.data = {**inherited, **row}
+        contacts.append(_contact(table, law, a, b))
     return contacts
+
+
+def _law_name(table: Table, default: str) -> str:
+    """The law that a table chooses, whose other keys must belong to it."""
+    law = table.word("law", tuple(_LAWS), default)
+    for key in table.data:
+        owners = [name for name, (_, keys) in _LAWS.items() if key in keys]
+        if owners and law not in owners:
+            raise ValueError(
+                f"{table.where}: {key} belongs to law = {owners[0]!r}, and this is {law!r}, whose keys are "
+                f"{', '.join(_LAWS[law][1])}"
+            )
+    return law
 
 
 def _can_touch(a: Body, b: Body) -> bool:
@@ -244,14 +277,13 @@ def _can_touch(a: Body, b: Body) -> bool:
     return math.isfinite(a.size) or math.isfinite(b.size)
 
 
-def _contact(table: Table, a: str, b: str, names: Sequence[str]) -> Contact:
-    for name in (a, b):
-        if name not in names:
-            raise ValueError(f"a contact must name bodies of the scene {list(names)}, got {name!r}")
-    table.word("law", ("centroid",), "centroid")
-    params = ContactParams(**{key: table.number(key) for key in _PARAMS if key in table})
-    law = CentroidLaw(
-        adhesive=table.boolean("adhesive", False),
-        **{key: table.number(key) for key in ("smoothing", "regularizer") if key in table},
-    )
-    return Contact(a, b, params, law, edge=table.number("edge") if "edge" in table else None)
+def _contact(table: Table, law: str, a: str, b: str) -> Contact:
+    make, keys = _LAWS[law]
+    numbers = {key: table.number(key) for key in keys if key in table and key != "adhesive"}
+    options: dict[str, Any] = {key: value for key, value in numbers.items() if key not in _PARAMS}
+    if "adhesive" in table:
+        options["adhesive"] = table.boolean("adhesive", False)
+    edge = table.number("edge") if "edge" in table else None
+    with located(table.where):
+        params = ContactParams(**{key: value for key, value in numbers.items() if key in _PARAMS})
+        return Contact(a, b, params, make(**options), edge=edge)

@@ -1,0 +1,181 @@
+"""Gradients of distributed contact and of sticking friction: of the sums, and of rollouts through them."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from engine.scenes import last, point_cloud_box
+
+import dano
+from dano.contact import SampleSet, Softening
+from dano.contact._distributed import _motion
+from dano.contact._pressure import _all_sums, find_near, Material, sums
+from dano.fields import SignedDistanceGrid
+from dano.maths import quat_to_matrix
+
+# A stiction velocity that differences of 1e-6 m/s resolve.
+MATERIAL = Material(*(jnp.asarray(x) for x in (2e6, 0.4, 0.05, 0.5, 0.3, 2e3, 2e-3, 0.01)))
+
+
+def cloud(n):
+    """Samples on an ellipsoid of 12 cm × 9 cm × 7 cm, evenly spread and of uneven areas."""
+    k = np.arange(n) + 0.5
+    z, angle = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    radius = np.sqrt(1 - z * z)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    areas = (1 + 0.3 * points[:, 0]) * 4 * np.pi * 0.045**2 / n
+    return SampleSet.create(points * [0.06, 0.045, 0.035] + [0.01, 0, 0], areas, normalise=False)
+
+
+def ripples():
+    """A lump as a grid of distances: normals that turn everywhere."""
+    axis = np.linspace(-0.1, 0.1, 21)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    distance = np.sqrt(x**2 + (1.2 * y) ** 2 + z**2) - 0.06 - 0.004 * np.sin(60 * x) * np.cos(50 * y)
+    return SignedDistanceGrid(distance, (-0.1,) * 3, 0.01)
+
+
+TURN = np.array([0.96, 0.2, 0.12, 0.1]) / np.linalg.norm([0.96, 0.2, 0.12, 0.1])
+# Each with the height of its surface above its origin.
+SOLIDS = {
+    "plane": (dano.HalfSpace((0.1, -0.2, 1.0)), 0.0),
+    "sphere": (dano.Sphere(0.05), 0.05),
+    "box": (dano.Box((0.05, 0.04, 0.03), rounding=0.01), 0.03),
+    "grid": (ripples(), 0.06),
+}
+# Velocity at the origin of the samples, spin; the surface is about horizontal, the samples are above it.
+TWISTS = {
+    "sticking": (3e-4, -2e-4, 1e-4, 0, 0, 2e-3),
+    "slipping": (0.8, -0.5, 0.01, 0.3, 0.2, -1),
+    "approaching": (0.1, 0.05, -0.4, 0, 1, 0),
+    "separating": (0.1, 0.05, 0.06, 0, 0.2, 0),
+    "mixed": (1e-3, 0, 0.01, 0.6, -0.3, 0.1),
+    "gone": (0, 0, 5.0, 0, 0, 0),
+}
+
+
+@pytest.mark.parametrize(("name", "n"), [("plane", 1600), ("sphere", 480), ("box", 1600), ("grid", 480)])
+def test_sums(name, n):
+    """Their derivative rule and slope = plain autodiff of the plain sums = differences of those.
+
+    480 samples are all taken at once, 1600 are searched for near ones.
+    """
+    (solid, height), samples = SOLIDS[name], cloud(n)
+    turn = quat_to_matrix(jnp.asarray(TURN))
+    to_field = jnp.concatenate([turn, jnp.array([[0.004], [0.003], [height + 0.033]])], axis=1)
+
+    def split(theta):
+        return theta[:12].reshape(3, 4), theta[12:24].reshape(3, 4), Material(*theta[24:])
+
+    def by_rule(theta):
+        near = find_near(*jax.lax.stop_gradient((*split(theta)[:2], solid, samples, theta[-1])))
+        moments, slope = sums(*split(theta), solid, samples, near, Softening())
+        return moments, (moments, slope)
+
+    def plainly(theta):
+        moments = _all_sums(*split(theta), solid, samples)
+        return moments, moments
+
+    def wrench(twist):
+        moments = _all_sums(to_field, _motion(to_field, twist[:3], twist[3:]), MATERIAL, solid, samples)
+        torque = jnp.sum(jnp.cross(to_field[:, :3], moments[:, :3], axis=0), axis=1)
+        return jnp.append(moments[:, 3], torque)
+
+    @jax.jit
+    def everything(twist):
+        motion = _motion(to_field, twist[:3], twist[3:])
+        theta = jnp.concatenate([to_field.ravel(), motion.ravel(), jnp.stack(MATERIAL)])
+        # Metres, metres per second, shares of the parameter.
+        steps = jnp.concatenate([jnp.full(12, 1e-8), jnp.full(12, 1e-6), 1e-6 * theta[24:]])
+        ends = jax.vmap(plainly)(theta[None] + jnp.concatenate([jnp.diag(steps), jnp.diag(-steps)]))[0]
+        differences = jnp.moveaxis(ends[:32] - ends[32:], 0, -1) / (2 * steps)[None, None]
+        found, expected = (jax.jacfwd(f, has_aux=True)(theta) for f in (by_rule, plainly))
+        return found, expected, jax.jacfwd(wrench)(twist), differences
+
+    pressed = {}
+    for case, twist in TWISTS.items():
+        found, (plain, expected), by_twist, differences = jax.device_get(everything(jnp.asarray(twist)))
+        rule, (moments, slope) = found
+        pressed[case] = float(np.abs(expected).max())
+        np.testing.assert_allclose(moments, expected, atol=1e-11 * (1e-3 + pressed[case]))
+        np.testing.assert_allclose(slope, by_twist, atol=1e-11 * (1e-3 + np.abs(by_twist).max()))
+        size = 1e-9 + np.abs(plain).max(axis=(0, 1))
+        np.testing.assert_allclose(rule / size, plain / size, atol=1e-9, err_msg=case)
+        np.testing.assert_allclose(plain / size, differences / size, atol=1e-5, err_msg=case)
+    assert pressed.pop("gone") == 0
+    assert min(pressed.values()) > 1
+
+
+PARAMETERS = ["friction", "stiffness", "restitution", "velocity", "mass scale", "position"]
+
+
+class Case(NamedTuple):
+    """A scene with a first contact whose parameters and first body change, and where it starts."""
+
+    scene: dano.Scene
+    start: dano.State
+    control: dano.Control | None = None
+
+
+def final(case, theta, n_steps):
+    """Pose and velocity of the first body after some steps, and whether all of them converged."""
+    contact = case.scene.contacts[0]
+    params = contact.params
+    changes = {"sliding_friction": params.sliding_friction + theta[0]}
+    if contact.law.presses:
+        changes["stiffness"] = params.stiffness * (1 + theta[1])
+        changes["restitution"] = params.restitution + theta[2]
+    else:
+        changes["spring"] = params.spring * (1 + theta[1])
+        changes["damper"] = params.damper * (1 + theta[2])
+    scene = case.scene.replace_contact(contact.a, contact.b, **changes)
+    scene = scene.replace_body(contact.a, mass_scale=1 + theta[4])
+    start = dano.State(
+        case.start.position.at[0].add(theta[5] * jnp.array([0.1, 0.2, -0.1])),
+        case.start.orientation,
+        case.start.velocity.at[0].add(theta[3] * jnp.array([1.0, 0.5, -0.2])),
+        case.start.omega,
+    )
+    controls = None
+    if case.control is not None:
+        controls = jax.tree.map(lambda x: jnp.broadcast_to(x, (n_steps, *x.shape)), case.control)
+    run = dano.simulate(scene, start, n_steps, controls=controls)
+    end = last(run.states)
+    return jnp.concatenate([end.position[0], end.orientation[0]]), run.converged.all()
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def ends(case, thetas, n_steps):
+    return jax.lax.map(lambda theta: final(case, theta, n_steps), thetas)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def forward(case, theta, n_steps):
+    return jax.jacfwd(lambda theta: final(case, theta, n_steps)[0])(theta)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def reverse(case, theta, n_steps):
+    # One row for position and one for orientation keeps the reverse pass to two sweeps.
+    return jax.lax.map(lambda w: jax.grad(lambda theta: w @ final(case, theta, n_steps)[0])(theta), WEIGHTS)
+
+
+WEIGHTS = np.array([(1.0, 0.5, -0.7, 0, 0, 0, 0), (0, 0, 0, 0.3, -0.8, 0.5, 1.0)])
+
+
+def check_rollout(case, n_steps, *, irrelevant=(), step=1e-7):
+    """Forward = reverse = differences at a tiny step, in a smooth neighbourhood of a trajectory."""
+    zero = jnp.zeros(len(PARAMETERS))
+    by_forward, by_reverse = np.asarray(forward(case, zero, n_steps)), reverse(case, zero, n_steps)
+    scale = np.abs(by_forward).max(axis=0)
+    np.testing.assert_allclose(by_reverse, WEIGHTS @ by_forward, rtol=1e-8, atol=1e-8 * (1e-3 + scale))
+    steps = step * jnp.eye(len(PARAMETERS))
+    values, converged = ends(case, jnp.concatenate([steps, -steps]), n_steps)
+    assert bool(converged.all())
+    differences = np.asarray(values[: len(steps)] - values[len(steps) :]).T / (2 * step)
+    np.testing.assert_allclose(by_forward / (1e-3 + scale), differences / (1e-3 + scale), atol=1e-5)
+    for name, size in zip(PARAMETERS, scale, strict=True):
+        assert name in irrelevant or size > 1e-6, f"{name} must matter in this scene"
