@@ -29,11 +29,21 @@ class _Draw(NamedTuple):
     pushed: bool
 
 
-def gradient_rows(subject: Subject, *, quick: bool) -> list[Row]:
-    """Autodiff of the distance travelled with respect to friction, against central differences."""
-    place = _Place(subject)
+def gradient_rows(
+    subject: Subject, *, quick: bool, law: dano.AbstractContactLaw | None = None, name: str = ""
+) -> list[Row]:
+    """Autodiff of the distance travelled with respect to friction, against central differences.
+
+    Args:
+        subject: What slides and is pushed.
+        quick: Whether a few scenes are enough.
+        law: Contact law, with its default parameters; default: the paper's, scaled to the subject.
+        name: Of the law, for the heading.
+    """
+    place = _Place(subject, law)
     draws = _draws(4 if quick else N_SCENES)
     group = f"Derivative of a distance with respect to friction, {subject.name}, {len(draws)} scenes"
+    group = f"{group}, {name}" if name else group
     derivative, large, tiny = np.array([place.compare(draw) for draw in draws]).T
     relative = np.abs(derivative - large) / np.abs(large)
     agree = int(np.sum(np.sign(derivative) == np.sign(large)))
@@ -66,7 +76,7 @@ def _draws(n: int) -> list[_Draw]:
 class _Place:
     """A floor with a bunny at rest and a ball; compiles one rollout and its derivative."""
 
-    def __init__(self, subject: Subject):
+    def __init__(self, subject: Subject, law: dano.AbstractContactLaw | None = None):
         self.length = subject.length
         h = 0.01 * self.length**0.5
         bodies = [
@@ -74,7 +84,10 @@ class _Place:
             dano.Body("ball", dano.Sphere(0.25 * self.length), mass=3.0 * subject.mass),
             dano.Body("floor", dano.HalfSpace(), fixed=True),
         ]
-        params, law = subject.params(), subject.law()
+        if law is None:
+            params, law = subject.params(), subject.law()
+        else:
+            params = dano.ContactParams()
         pairs = (("bunny", "floor"), ("bunny", "ball"), ("ball", "floor"))
         contacts = [dano.Contact(a, b, params, law) for a, b in pairs]
         self.scene = dano.Scene.create(bodies, contacts, timestep=h)

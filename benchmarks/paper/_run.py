@@ -2,7 +2,7 @@
 
 from benchmarks import _subjects
 from benchmarks._measure import load_average, NO_DATA, parse_arguments, reference_folder, report, Row, skipped
-from benchmarks.paper import _gradients, _mass, _reference
+from benchmarks.paper import _contact, _gradients, _mass, _reference
 
 
 def run() -> None:
@@ -24,4 +24,5 @@ def _rows(*, quick: bool) -> list[Row]:
         rows += _gradients.gradient_rows(authors, quick=quick)
     rows += _gradients.gradient_rows(_subjects.shipped_bunny(), quick=quick)
     rows += _mass.mass_rows(quick=quick)
+    rows += _contact.contact_rows(quick=quick)
     return rows

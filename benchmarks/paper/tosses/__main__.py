@@ -1,4 +1,8 @@
-"""`python -m benchmarks.paper.tosses [--data FILE] [--params FILE] [--json FILE] [--quick] [--tune [SECONDS]]`."""
+"""The measured tosses; see `--help`.
+
+`python -m benchmarks.paper.tosses [--data FILE] [--params FILE] [--json FILE] [--picture FILE] [--quick]
+[--tune [SECONDS]]`
+"""
 
 from benchmarks import _environment
 

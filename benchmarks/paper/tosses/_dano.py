@@ -9,12 +9,16 @@ import numpy as np
 
 import dano
 from benchmarks.paper.tosses._data import FRAME, Motions, product, rotations, turn
+from dano.objects import draw_surface
 
 # Motions that advance together, and how many of them in the same vector operations: a batch goes on until
 # the slowest solve in it is done, so few are better than all.
 _BLOCK, _VECTOR = 64, 8
 # Frames simulated per call. One compiled function serves motions of any length.
 _CHUNK = 16
+
+BODY = ("com_z", "inertia", "inertia_ratio")
+"""Parameters of the body; the others are those of contact."""
 
 
 class Dano:
@@ -35,19 +39,26 @@ class Dano:
 
         Args:
             world: `gravity` [m/s²], `half_side` [m], `mass` [kg].
-            cube: `edge`, over which the density falls [m], `n_samples`, and `resolution` of the object.
+            cube: `edge`, over which the density falls [m]; `resolution` of the object; `n_samples` on its
+                surface, and the `skin` [m] that they are drawn with.
         """
         self.gravity, self.mass = world["gravity"], world["mass"]
-        self.cube = dano.NeuralObject.from_field(
+        n = int(cube["n_samples"])
+        soft = dano.NeuralObject.from_field(
             dano.Box((world["half_side"],) * 3, edge=cube["edge"]),
-            n_samples=int(cube["n_samples"]),
+            n_samples=n,
             resolution=int(cube["resolution"]),
             mass=self.mass,
         )
+        # The object's grid rounds its corners by about a cell. They are found, and sampled first, when the
+        # surface is drawn with a skin that is thicker than that.
+        assert soft.solid is not None
+        surface = draw_surface(soft.solid, n, skin=cube["skin"])
+        self.cube = eqx.tree_at(lambda o: o.surface, soft, surface)
         self.unconverged = 0.0
 
     def scene(self, values: Mapping[str, float], timestep: float) -> dano.Scene:
-        """The scene for some parameters: those of `dano.ContactParams`, `com_z` [m] and two of the inertia."""
+        """The scene for some parameters: those of `dano.ContactParams`, and those of the body in `BODY`."""
         contact = {name: value for name, value in values.items() if name not in BODY}
         inertia = values["inertia"] * np.diag([1.0, 1.0, values["inertia_ratio"]])
         cube = dano.Body("cube", self.cube, com=(0.0, 0.0, values["com_z"]), inertia=inertia)
@@ -86,10 +97,6 @@ class Dano:
                 position[rows], orientation[rows] = (x[k, : rows.stop - rows.start] for x in found)
         self.unconverged = failed / max(steps, 1)
         return position - rotations(orientation) @ com, orientation
-
-
-BODY = ("com_z", "inertia", "inertia_ratio")
-"""Parameters of the body; the others are those of contact."""
 
 
 def _starts(motions: Motions, com: np.ndarray, timestep: float) -> tuple[np.ndarray, ...]:

@@ -62,8 +62,15 @@ class Motions:
         parts = [self.rows(int(i)) for i in indices]
         rows = np.concatenate([np.arange(part.start, part.stop) for part in parts] or [np.zeros(0, int)])
         offsets = np.concatenate([[0], np.cumsum([part.stop - part.start for part in parts])])
-        starts = (x[np.asarray(indices, int)] for x in (self.velocity, self.omega, self.acceleration))
-        return Motions(self.position[rows], self.orientation[rows], offsets.astype(int), *starts)
+        chosen = np.asarray(indices, int)
+        return Motions(
+            self.position[rows],
+            self.orientation[rows],
+            offsets.astype(int),
+            self.velocity[chosen],
+            self.omega[chosen],
+            self.acceleration[chosen],
+        )
 
 
 @dataclass(frozen=True)
@@ -104,7 +111,9 @@ class Tosses:
                 raise ValueError(f"{path}: {name} must be finite")
         offsets, n = data["offsets"], len(data["pos"])
         if offsets.ndim != 1 or len(offsets) < 2 or offsets.dtype.kind not in "iu":
-            raise ValueError(f"{path}: offsets must be integers of shape (k + 1,), k ≥ 1, got {_said(offsets)}")
+            raise ValueError(
+                f"{path}: offsets must be integers of shape (k + 1,), k ≥ 1, got {_said(offsets)}"
+            )
         offsets = offsets.astype(int)
         if offsets[0] != 0 or offsets[-1] != n or np.any(np.diff(offsets) < 2):
             raise ValueError(
@@ -124,8 +133,13 @@ class Tosses:
     def first(self, n: int) -> "Tosses":
         """The first `n` tosses."""
         end = self.offsets[: n + 1][-1]
-        rows = (x[:end] for x in (self.position, self.orientation, self.velocity, self.omega))
-        return Tosses(*rows, self.offsets[: n + 1])
+        return Tosses(
+            self.position[:end],
+            self.orientation[:end],
+            self.velocity[:end],
+            self.omega[:end],
+            self.offsets[: n + 1],
+        )
 
     def whole(self, gravity: float) -> Motions:
         """Every toss from its first frame to its last."""
@@ -150,7 +164,8 @@ class Tosses:
             half_side: Height of the centre at rest [m].
             deceleration: Of a typical slide [m/s²].
         """
-        ends = [_slide(self, slice(int(a), int(b)), half_side) for a, b in zip(self.offsets, self.offsets[1:])]
+        bounds = zip(self.offsets[:-1], self.offsets[1:], strict=True)
+        ends = [_slide(self, slice(int(a), int(b)), half_side) for a, b in bounds]
         slides = [end for end in ends if end is not None]
         rows = np.concatenate([np.arange(end.start, end.stop) for end in slides] or [np.zeros(0, int)])
         starts = np.array([end.start for end in slides], int)
@@ -222,16 +237,18 @@ def data_folder() -> Path | None:
 
 
 def _members(path: Path) -> dict[str, np.ndarray]:
+    wanted = (*_COLUMNS, "offsets")
     try:
+        # NumPy takes what is no archive for a pickle, and says so.
+        if path.exists() and not zipfile.is_zipfile(path):
+            raise zipfile.BadZipFile("it is no zip file")
         with np.load(path) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError(f"{path} must be an .npz archive")
-            missing = [name for name in (*_COLUMNS, "offsets") if name not in archive.files]
-            if missing:
-                raise ValueError(f"{path} lacks {missing}: a file of tosses has {[*_COLUMNS, 'offsets']}")
-            return {name: archive[name] for name in (*_COLUMNS, "offsets")}
-    except (OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} cannot be read as an .npz archive: {error}") from error
+            missing = [name for name in wanted if name not in archive.files]
+            if not missing:
+                return {name: archive[name] for name in wanted}
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} cannot be read as an .npz archive of numbers: {error}") from error
+    raise ValueError(f"{path} lacks {missing}: a file of tosses has {list(wanted)}")
 
 
 def _said(array: np.ndarray) -> str:

@@ -73,14 +73,10 @@ class MuJoCo:
             mujoco.mj_getState(model, data, state, kind)
             steps = (rows.stop - rows.start - 1) * substeps
             states, _ = rollout.rollout(model, data, state[None], nstep=steps)
-            poses[rows.start] = data_pose(state)
+            # A full state begins with the time.
+            poses[rows.start] = state[1:8]
             poses[rows.start + 1 : rows.stop] = states[0, substeps - 1 :: substeps, 1:8]
         return poses[:, :3], poses[:, 3:]
-
-
-def data_pose(state: np.ndarray) -> np.ndarray:
-    """Position and orientation in a full state, which begins with the time."""
-    return state[1:8]
 
 
 def _velocities(motions: Motions, com_z: float, timestep: float) -> np.ndarray:

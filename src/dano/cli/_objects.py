@@ -102,6 +102,8 @@ def describe(made: NeuralObject, path: Path) -> dict[str, Any]:
         "extents": np.ptp(points, axis=0).tolist(),
         "samples": len(points),
         "density_range": np.asarray(made.density_range).tolist(),
+        "surface_samples": len(made.surface.areas),
+        "surface_area": float(np.sum(np.asarray(made.surface.areas))),
         "mass_model": made.mass_model,
         "grid": None if made.grid is None else list(made.grid.shape),
         "bake_error": float(made.bake_error),
@@ -125,6 +127,7 @@ def print_object(report: dict[str, Any]) -> None:
     put(f"extents             {numbers(report['extents'])} m")
     low, high = report["density_range"]
     put(f"contact samples     {report['samples']}, density {low:.4g} to {high:.4g}")
+    put(f"surface samples     {report['surface_samples']}, area {report['surface_area']:.4g} m²")
     if grid is None:
         put("density grid        none: meets shapes only")
     else:

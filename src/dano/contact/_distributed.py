@@ -62,10 +62,11 @@ class DistributedLaw(AbstractContactLaw):
     A sample of area A at depth d below the other body's surface, with outward normal n there, separating at
     v_n and slipping at u, feels
 
-        F = A p (n − μ(p) u / max(|u|, v_s)),   p = k max(0, d − D),   D = d ρ s(v_n/v_e)  or  h v_n,
+        F = A p (n − μ(p) c(u/v_s)),   p = k max(0, d − D),
+        D = d ((ρ − σ) s(v_n/v_e) + σ c(v_n/v_s))  or  h v_n,  whichever is larger,
 
-    whichever of the two is larger, with ρ = (1 − e²)/(1 + e²), s(x) = x/√(1 + x²) and μ(p) = μ (1 − φ p/(p + p₀))
-    (see `ContactParams` for the parameters). Velocities are those at the end of the step. Torsional and rolling resistance come out of the geometry.
+    with ρ = (1 − e²)/(1 + e²), s(x) = x/√(1 + x²), c(x) = x/max(|x|, 1) and μ(p) = μ (1 − φ p/(p + p₀)); A is the
+    part of the sample's area that faces the other body (see `ContactParams` for the parameters). Velocities are those at the end of the step. Torsional and rolling resistance come out of the geometry.
     Where both bodies have samples, each set carries half.
 
     Default stiffness: set down on a rigid floor in a typical (the median) orientation, so on a corner, an edge
@@ -130,6 +131,7 @@ class DistributedLaw(AbstractContactLaw):
             params.stiffness / len(patch.sides),
             params.restitution,
             params.restitution_velocity,
+            params.hysteresis,
             params.sliding_friction,
             params.friction_fading,
             params.friction_pressure,

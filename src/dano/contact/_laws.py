@@ -36,6 +36,8 @@ class ContactParams(eqx.Module):
         restitution: Distributed law: separating over approaching speed in an impact e ≤ 1 [1].
         restitution_velocity: Distributed law: speed [m/s] below which impacts lose more than `restitution`
             says, until at rest the contact is a damped spring.
+        hysteresis: Distributed law: share σ of the pressure that is lost between going in and coming out
+            however slowly (at most what `restitution` leaves): rolling and rocking come to rest [1].
         friction_fading: Distributed law: share φ ≤ 1 of the friction coefficient that is lost under high
             pressure [1].
         friction_pressure: Distributed law: pressure p₀ at which half of that is lost [Pa].
@@ -52,6 +54,7 @@ class ContactParams(eqx.Module):
     stiffness: Float[Array, ""] | None
     restitution: Float[Array, ""]
     restitution_velocity: Float[Array, ""] | None
+    hysteresis: Float[Array, ""]
     friction_fading: Float[Array, ""]
     friction_pressure: Float[Array, ""]
 
@@ -69,14 +72,15 @@ class ContactParams(eqx.Module):
         stiffness: Numbers | None = None,
         restitution: Numbers = 0.0,
         restitution_velocity: Numbers | None = None,
+        hysteresis: Numbers = 0.3,
         friction_fading: Numbers = 0.0,
         friction_pressure: Numbers = 1000.0,
     ):
         """See the class.
 
         Raises:
-            ValueError: If a parameter is negative, not finite or not a scalar, `restitution` or
-                `friction_fading` exceeds 1, or one that is divided by is zero.
+            ValueError: If a parameter is negative, not finite or not a scalar, `restitution`,
+                `hysteresis` or `friction_fading` exceeds 1, or one that is divided by is zero.
         """
         given = locals()
         for name in self.__dataclass_fields__:
@@ -103,7 +107,7 @@ def checked_parameter(name: str, value: Numbers) -> Float[Array, ""]:
     array = non_negative(name, value)
     if is_traced(array):
         return array
-    if name in ("restitution", "friction_fading") and float(array) > 1:
+    if name in ("restitution", "hysteresis", "friction_fading") and float(array) > 1:
         raise ValueError(f"{name} must lie in [0, 1], got {float(array)}")
     if name in ("stiffness", "restitution_velocity", "friction_pressure") and float(array) == 0:
         raise ValueError(f"{name} must be > 0, got {float(array)}")

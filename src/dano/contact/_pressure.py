@@ -41,6 +41,7 @@ class Material(NamedTuple):
         stiffness: k [Pa/m].
         restitution: e [1].
         restitution_velocity: v_e [m/s].
+        hysteresis: σ [1].
         friction: μ [1].
         friction_fading: φ [1].
         friction_pressure: p₀ [Pa].
@@ -51,6 +52,7 @@ class Material(NamedTuple):
     stiffness: Float[Array, ""]
     restitution: Float[Array, ""]
     restitution_velocity: Float[Array, ""]
+    hysteresis: Float[Array, ""]
     friction: Float[Array, ""]
     friction_fading: Float[Array, ""]
     friction_pressure: Float[Array, ""]
@@ -92,9 +94,10 @@ def respond(
     Pressure p = k max(0, d − D), friction −μ(p) p u / max(|u|, v_s) against the slip u with
     μ(p) = μ (1 − φ p/(p + p₀)). D is what the separating speed v_n takes off the depth d: the larger of
 
-    - d ρ s(v_n / v_e) with s(x) = x / √(1 + x²) and ρ = (1 − e²)/(1 + e²): the force going in exceeds that
-      going out by 1/e² whatever the path, so an impact returns e² of its energy; slower than v_e this is a
-      damper;
+    - d ((ρ − σ) s(v_n / v_e) + σ c(v_n / v_s)) with s(x) = x / √(1 + x²), c(x) = x / max(|x|, 1) and
+      ρ = (1 − e²)/(1 + e²): the force going in exceeds that going out by 1/e² whatever the path, so an impact
+      returns e² of its energy. Slower than v_e all but the share σ ≤ ρ becomes a damper; σ is lost however
+      slow the motion, which stops rolling and rocking;
     - h v_n: the depth at the end of the step instead of its start, which makes the spring implicit.
     """
     rate = jnp.sum(normal * velocity, axis=0)
@@ -102,11 +105,17 @@ def respond(
     speed = column_norm(slip)
     scaled = rate / material.restitution_velocity
     inverse = jax.lax.rsqrt(1 + scaled * scaled)
-    lost = (1 - material.restitution**2) / (1 + material.restitution**2) * jnp.maximum(depth, 0)
-    by_loss, by_time = lost * scaled * inverse, material.timestep * rate
+    loss = (1 - material.restitution**2) / (1 + material.restitution**2)
+    kept = jnp.minimum(material.hysteresis, loss)
+    seized = jnp.abs(rate)
+    grip, grip_slope = sticking(seized, material.stiction, softening)
+    sunk = jnp.maximum(depth, 0)
+    by_loss = sunk * ((loss - kept) * scaled * inverse + kept * rate * grip)
+    by_time = material.timestep * rate
     lossy = jnp.abs(by_loss) > jnp.abs(by_time)
     left = depth - jnp.where(lossy, by_loss, by_time)
-    delay = jnp.where(lossy, lost / material.restitution_velocity * inverse**3, material.timestep)
+    slower = (loss - kept) / material.restitution_velocity * inverse**3 + kept * (grip + grip_slope * seized)
+    delay = jnp.where(lossy, sunk * slower, material.timestep)
     pressure = material.stiffness * jnp.maximum(left, 0)
     fall = jnp.where(left > 0, material.stiffness * delay, 0)
 
@@ -332,7 +341,7 @@ def _sums_jvp(primals, tangents):
         def of(distance, gradient, velocity, material):
             normal = _unit(gradient)
             areas = _facing(part.vectors, normal)
-            return areas * traction(respond(material, -distance, normal, velocity), normal)
+            return areas[None] * traction(respond(material, -distance, normal, velocity), normal)
 
         def along(tangent):
             return jax.jvp(of, (distance, gradient, velocity, material), tangent)[1]
@@ -349,7 +358,7 @@ def _sums_jvp(primals, tangents):
         of_motion = contract(jnp.concatenate([by_place, by_velocity]).reshape(18, n), _products(part.arms))
         of_material = contract(by_material.reshape(-1, n), part.arms)
         # Turning the sampled body turns its vector areas: dA = −n·(dR Rᵀ a).
-        force = jnp.where(part.areas > 0, 1, 0) * traction(
+        force = jnp.where(part.areas > 0, 1, 0)[None] * traction(
             respond(material, -distance, part.normal, velocity), part.normal
         )
         moment = (force[:, None] * part.arms[None]).reshape(12, n)
@@ -380,4 +389,4 @@ def _all_sums(to_field, motion, material, solid, samples: SurfaceSet):
     normal = _unit(gradient)
     areas = _facing(to_field[:, :3] @ samples.vectors, normal)
     found = respond(material, -distance, normal, motion @ samples.points)
-    return contract(areas * traction(found, normal), samples.points)
+    return contract(areas[None] * traction(found, normal), samples.points)

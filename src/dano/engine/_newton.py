@@ -17,7 +17,7 @@ class SolverOptions(NamedTuple):
     """When a step's Newton solve stops: see `VariationalEngine`."""
 
     tolerance: float | None = None
-    max_iterations: int = 200
+    max_iterations: int = 300
 
 
 class Report(NamedTuple):
@@ -33,11 +33,16 @@ class Report(NamedTuple):
 _ENOUGH = 0.5
 _GIVE_UP = 0.01
 
-# Softness of friction in the course of a solve with stiction: as it is; if that does not converge, from a
-# thousand times softer downwards; if that does not either, from ten million times (1 m/s at 1e-7 m/s).
-_TIERS = ((1.0,(1.0,)), (1e7,(1e7, 1e6, 1e5, 1e4, 1e3, 1e2, 1e1, 1.0)))
+# Softness of stiction in the course of a solve, as multiples of the stiction velocity (1e-7 m/s): as it is; if
+# that does not converge, from a million times softer downwards in steps of √10; if that does not either, from
+# ten million times in steps of two. Each tier comes with the softness below which all stick at its start.
+_TIERS = (
+    (1.0, (1.0,)),
+    (1e6, tuple(np.geomspace(1e6, 1, 13).tolist())),
+    (1e7, tuple(np.geomspace(1e7, 1, 24).tolist())),
+)
 # Passes after which a level of each tier is left.
-_BUDGETS = (6, 14)
+_BUDGETS = (6, 8, 12)
 # Residual to which the levels above one are solved, per stiction velocity of theirs [m/s].
 _SOFT_TOLERANCE = 1e-8
 
@@ -154,8 +159,8 @@ def newton(
 
     Coulomb friction turns by its full size within a stiction velocity of 1e-7 m/s, which no line search finds.
     Steps whose friction hardly changes converge at once. For the others the root is followed from soft to hard
-    friction, each level ten times harder than the one before, with a predictor: what stuck at the last level
-    sticks at the next and creeps a tenth as fast, which is exact if nothing begins to slip.
+    friction, each level harder than the one before, with a predictor: what stuck at the last level
+    sticks at the next and creeps in proportion slower, which is exact if nothing begins to slip.
 
     Args:
         evaluate: Residual and its Jacobian at a point and a softness of friction.

@@ -43,7 +43,7 @@ class VariationalEngine(AbstractEngine):
     """
 
     tolerance: float | None = eqx.field(static=True, default=None)
-    max_iterations: int = eqx.field(static=True, default=200)
+    max_iterations: int = eqx.field(static=True, default=300)
 
     def __check_init__(self):
         """Raise a ValueError unless both options are positive."""

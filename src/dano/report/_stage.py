@@ -135,7 +135,7 @@ class ContactHistory(NamedTuple):
 
     Attributes:
         points: Centroids of the overlaps [m, W] at the starts of the steps, (steps, contacts, 3).
-        overlaps: Overlaps ψ [kg] there, (steps, contacts).
+        overlaps: Overlaps there, (steps, contacts): ψ [kg], or a volume [m³] of the distributed law.
         forces: On the first body of each contact [N, W], (steps, contacts, 3).
     """
 

@@ -36,19 +36,24 @@ _GEOMETRY = ("object", "field", "asset", "shape")
 _BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE)
 _BUILD = ("samples", "density_range", "mass_model", "mass_scale", "resolution", "length", "seed", "floaters")
 _PARAMS = tuple(ContactParams.__dataclass_fields__)
-_OF_SURFACES = ("stiffness", "restitution", "restitution_velocity", "friction_fading", "friction_pressure")
+_OF_CENTROIDS = (
+    "spring",
+    "damper",
+    "sliding_drag",
+    "torsional_friction",
+    "torsional_drag",
+    "rolling_friction",
+    "rolling_drag",
+)
 _LAWS: dict[str, tuple[type[AbstractContactLaw], tuple[str, ...]]] = {
     "centroid": (
         CentroidLaw,
-        (
-            *(key for key in _PARAMS if key not in _OF_SURFACES),
-            "smoothing",
-            "regularizer",
-            "stiction_velocity",
-            "adhesive",
-        ),
+        ("sliding_friction", *_OF_CENTROIDS, "smoothing", "regularizer", "stiction_velocity", "adhesive"),
     ),
-    "distributed": (DistributedLaw, ("sliding_friction", *_OF_SURFACES, "stiction_velocity")),
+    "distributed": (
+        DistributedLaw,
+        (*(key for key in _PARAMS if key not in _OF_CENTROIDS), "stiction_velocity"),
+    ),
 }
 """Laws by name, with the keys that belong to them."""
 _CONTACT = ("law", "edge", *dict.fromkeys(key for _, keys in _LAWS.values() for key in keys))
