@@ -90,7 +90,7 @@ def _panels(n: int) -> list[_Panel]:
     return [
         _Panel(
             f"released on a slope of {SLOPE:g}°: slides or sticks",
-            "friction μ / tan θ",
+            "friction μ (dotted: tan θ)",
             [tangent * x for x in np.linspace(0.5, 1.5, n)],
             1.0,
             HORIZONS[:1],
@@ -166,13 +166,16 @@ def _curves(panel: _Panel) -> list[_Curve]:
 def _print(panel: _Panel, curves: list[_Curve]) -> None:
     print(f"\n{panel.title}; derivative by {panel.label}")
     for curve in curves:
+        size = np.abs(curve.derivative)
         same = np.mean(np.sign(curve.derivative) == np.sign(curve.large))
-        error = np.median(np.abs(curve.derivative - curve.large) / (np.abs(curve.large) + 1e-9))
-        exact = np.median(np.abs(curve.derivative - curve.tiny) / (np.abs(curve.tiny) + 1e-9))
+        errors = [
+            np.median(np.abs(curve.derivative - difference) / (np.abs(difference) + 1e-6))
+            for difference in (curve.large, curve.tiny)
+        ]
         print(
-            f"  {curve.steps * TIMESTEP:4.1f} s: |derivative| median {np.median(np.abs(curve.derivative)):.3g}, "
-            f"largest {np.abs(curve.derivative).max():.3g}; sign as at the large step {same:.0%}; "
-            f"median error to the large step {error:.2g}, to the tiny one {exact:.2g}"
+            f"  after {curve.steps * TIMESTEP:g} s: size {np.median(size):.3g} (median), {size.max():.3g} "
+            f"(largest); sign as at the large step {same:.0%}; median relative error to the large step "
+            f"{errors[0]:.2g}, to the tiny one {errors[1]:.2g}"
         )
 
 
@@ -181,42 +184,29 @@ def _draw(panels: list[_Panel], curves: list[list[_Curve]], file: Path) -> None:
 
     figure = Figure(figsize=(13, 6.4), layout="constrained")
     axes = figure.subplots(2, len(panels), sharex="col")
-    tangent = float(np.tan(np.radians(SLOPE)))
-    for column, (panel, found) in enumerate(zip(panels, curves, strict=True)):
-        top, bottom = axes[:, column]
-        x = np.array(panel.values) / (tangent if column == 0 else 1)
+    for (top, bottom), panel, found in zip(axes.T, panels, curves, strict=True):
         for k, curve in enumerate(found):
-            color = f"C{k}"
-            label = f"after {curve.steps * TIMESTEP:g} s"
-            top.plot(x, curve.distance, ".-", color=color, markersize=3, linewidth=0.8, label=label)
-            bottom.plot(
-                x, curve.derivative, "-", color=color, linewidth=1.2, label="derivative" if k == 0 else None
-            )
-            bottom.plot(
-                x,
-                curve.large,
-                "o",
-                color=color,
-                markersize=4,
-                markerfacecolor="none",
-                label=f"difference, step {LARGE * panel.unit:g}" if k == 0 else None,
-            )
-            bottom.plot(
-                x,
-                curve.tiny,
-                "+",
-                color="black",
-                markersize=4,
-                label=f"difference, step {TINY * panel.unit:g}" if k == 0 else None,
-            )
+            color, first = f"C{k}", k == 0
+            names = [
+                "derivative",
+                f"difference, step {LARGE * panel.unit:g}",
+                f"difference, step {TINY * panel.unit:g}",
+            ]
+            names = names if first else [None] * 3
+            style = {"color": color, "markersize": 4, "linewidth": 1.0}
+            top.plot(panel.values, curve.distance, ".-", label=f"after {curve.steps * TIMESTEP:g} s", **style)
+            bottom.plot(panel.values, curve.derivative, "-", label=names[0], **style)
+            bottom.plot(panel.values, curve.large, "o", fillstyle="none", label=names[1], **style)
+            bottom.plot(panel.values, curve.tiny, "k+", markersize=4, label=names[2])
         top.set_title(panel.title, fontsize=10)
         bottom.set_xlabel(panel.label)
         if len(found) > 1:
             bottom.set_yscale("symlog", linthresh=1)
-        top.legend(fontsize=8)
-        bottom.legend(fontsize=8)
-        top.grid(alpha=0.3)
-        bottom.grid(alpha=0.3)
+        for axis in (top, bottom):
+            axis.legend(fontsize=8)
+            axis.grid(alpha=0.3)
+    for axis in axes[:, 0]:
+        axis.axvline(float(np.tan(np.radians(SLOPE))), color="gray", linewidth=0.8, linestyle=":")
     axes[0, 0].set_ylabel("distance [m]")
     axes[1, 0].set_ylabel("its derivative")
     figure.savefig(file, dpi=110)

@@ -239,24 +239,38 @@ STARTS = {
 }
 
 
-@pytest.mark.parametrize("hysteresis", [0.0, 0.3])
-@pytest.mark.parametrize("name", STARTS)
+@pytest.mark.parametrize(
+    ("name", "hysteresis"),
+    [
+        ("slide", 0.3),
+        ("touch-down", 0.0),
+        ("touch-down", 0.3),
+        ("tumble", 0.0),
+        ("tumble", 0.3),
+        ("push", 0.3),
+    ],
+)
 def test_rollouts_on_a_floor(playground, name, hysteresis):
     scene = playground
     for other in ("floor", "ball"):
         scene = scene.replace_contact("box", other, hysteresis=hysteresis)
     control = scene.control(ball={"force": (0, 0, 3 * 9.81)})
-    # What nothing leaves or enters does not rebound, and how a box at rest is pushed does not depend on k.
-    irrelevant = ["restitution", "stiffness"] if name in ("slide", "push") else []
+    # A box that lies on the floor does not rebound, and sticks before the ball comes whatever its velocity.
+    irrelevant = {"slide": ["restitution", "stiffness"], "push": ["restitution", "stiffness", "velocity"]}
+    irrelevant = irrelevant.get(name, [])
     check_rollout(Case(scene, scene.initial_state(**STARTS[name]), control), 50, irrelevant=irrelevant)
 
 
 def test_rollout_of_the_sticking_centroid_law():
     # An edge that many of its few samples are in at once.
     scene = on_floor(dano.CentroidLaw(stiction_velocity=1e-7), edge=0.02)
-    check_rollout(Case(scene, scene.initial_state(box=STARTS["slide"]["box"])), 50)
+    case = Case(scene, scene.initial_state(box=STARTS["slide"]["box"]))
+    # Overlap is mass, so the law's forces are proportional to it; and a landing flat bends the trajectory, so
+    # that differences need a smaller step.
+    check_rollout(case, 50, irrelevant=["mass scale"], step=1e-7)
 
 
+@pytest.mark.slow
 def test_two_neural_objects_meet():
     """Samples of either in the sampled distance of the other."""
     axis = np.linspace(-0.2, 0.2, 14)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree, ConvexHull, Voronoi
 
 import dano
-from dano.objects import draw_surface, support_volume, SurfaceSamples
+from dano.objects import draw_surface, SurfaceSamples
 
 SKIN = 0.01
 # Mean of s² over the bell of mean 1 on 0 < s < 2: ∫ s² (1 − cos π s)/2 ds.
@@ -68,8 +68,8 @@ def test_total_area_is_that_of_the_inflated_surface(name, n):
     assert np.linalg.norm(areas @ normals) < 4e-3 * areas.sum()
 
 
-def test_default_skin_is_a_hundredth_of_the_size():
-    given, default = draw_surface(dano.Box(HALF), 100, skin=0.01), draw_surface(dano.Box(HALF), 100)
+def test_default_skin_is_a_quarter_percent_of_the_size():
+    given, default = draw_surface(dano.Box(HALF), 100, skin=0.0025), draw_surface(dano.Box(HALF), 100)
     np.testing.assert_array_equal(given.areas, default.areas)
 
 
@@ -192,33 +192,31 @@ def test_few_samples_carry_the_whole_area(n):
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-12)
 
 
-def test_support_of_a_box(box_samples):
-    """A face pressed in by d is deformed by d · (its area and half of what its rim carries)."""
-    depth = 1e-3
-    ways = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    got = support_volume(box_samples, depth, ways) / depth
-    sides = 2 * HALF[[2, 2, 0, 1]]
-    a, b = 2 * HALF[[0, 0, 1, 0]], 2 * HALF[[1, 1, 2, 2]]
-    assert np.all(got > a * b)
-    # At most the samples on the rim with all that they stand for: half a pitch on the sides.
-    pitch = np.sqrt(float(box_samples.areas.sum()) / 3000)
-    assert np.all(got < a * b + 2 * (a + b) * (0.7 * pitch + 0.5 * np.pi * SKIN))
-    assert sides.shape == got.shape
+def test_vector_areas_of_a_box(box_samples):
+    """What faces a direction is the face's area and the skin around it; over all directions they sum to zero."""
+    vectors, points = np.asarray(box_samples.vectors), np.asarray(box_samples.points)
+    for axis in range(3):
+        others = [2 * HALF[k] for k in range(3) if k != axis]
+        for side in (-1, 1):
+            facing = np.maximum(side * vectors[:, axis], 0)
+            inflated = np.prod([length + 2 * SKIN for length in others])
+            np.testing.assert_allclose(facing.sum(), inflated, rtol=0.01)
+            # On the face itself, none of it from the sides.
+            on_face = np.isclose(points[:, axis], side * HALF[axis])
+            assert facing[~on_face].sum() < 3e-3 * inflated
+    np.testing.assert_allclose(vectors.sum(axis=0), 0, atol=5e-3 * float(box_samples.areas.sum()))
+    assert np.all(np.linalg.norm(vectors, axis=1) <= np.asarray(box_samples.areas) * (1 + 1e-6))
+
+
+def test_vector_areas_default_to_flat_pieces():
     one = SurfaceSamples(jnp.zeros((1, 3)), jnp.array([[0.0, 0.0, 1.0]]), jnp.array([2.0]))
-    np.testing.assert_allclose(support_volume(one, 0.5, [[0, 1, 1]]), [1.0])
-    # A ball pressed in by d is deformed by the volume of the cap, π d² r.
-    ball = draw_surface(dano.Sphere(0.5), 5000, skin=1e-3)
-    got = support_volume(ball, 0.05, np.random.default_rng(0).normal(size=(20, 3)))
-    np.testing.assert_allclose(got, np.pi * 0.05**2 * 0.5, rtol=0.1)
+    np.testing.assert_array_equal(one.vectors, [[0.0, 0.0, 2.0]])
 
 
 BAD = {
     "half-space": (lambda: draw_surface(dano.HalfSpace(), 10), "finite bounds"),
     "n": (lambda: draw_surface(dano.Sphere(1.0), 0), "n must be ≥ 1"),
     "skin": (lambda: draw_surface(dano.Sphere(1.0), 10, skin=0.0), "skin must be"),
-    "depth": (lambda: support_volume(draw_surface(dano.Sphere(1.0), 5), -1.0, [[0, 0, 1]]), "depth must be"),
-    "direction": (lambda: support_volume(draw_surface(dano.Sphere(1.0), 5), 1.0, [[0, 0, 0]]), "directions"),
-    "shape": (lambda: support_volume(draw_surface(dano.Sphere(1.0), 5), 1.0, [0, 0, 1]), "directions"),
 }
 
 

@@ -88,7 +88,8 @@ class CentroidLaw(AbstractContactLaw):
         )
 
     def wrench(self, patch: Patch, params, twist, timestep, softening: Softening = Softening()):
-        """See `AbstractContactLaw.wrench`."""
+        """See `AbstractContactLaw.wrench`; parameters that no scene has filled in are the paper's."""
+        params = params.filled(**PAPER)
         n, psi = patch.normal, patch.overlap
         nn = n[:, None] * n[None]
         tangential = jnp.eye(3, dtype=n.dtype) - nn

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from dano.contact._colliders import Collider, SurfaceSet
@@ -10,7 +11,7 @@ from dano.contact._laws import AbstractContactLaw, ContactParams, positive, Sett
 from dano.contact._overlap import Patch
 from dano.contact._pressure import find_near, Material, Near, sums
 from dano.contact._small import matmul, matvec
-from dano.fields import AbstractShape
+from dano.fields import AbstractShape, HalfSpace, Sphere
 from dano.maths import Numbers, safe_normalize, skew
 
 # Share of its size by which a body sinks under its weight in a typical orientation, at default stiffness.
@@ -70,8 +71,8 @@ class DistributedLaw(AbstractContactLaw):
     Where both bodies have samples, each set carries half.
 
     Default stiffness: set down on a rigid floor in a typical (the median) orientation, so on a corner, an edge
-    or a bulge, a body sinks by 0.5 % of its size; on a flat side by much less. Default restitution velocity: that at which the damping of a body that sinks so
-    far is critical, √(g · 0.5 % size)/2.
+    or a bulge, a body sinks by 0.5 % of its size; on a flat side by much less. Default restitution velocity:
+    √(g · 0.5 % size)/5, small against impacts, large against what is left of motion at rest.
 
     Attributes:
         stiction_velocity: v_s, slip up to which friction counts as sticking [m/s].
@@ -101,7 +102,7 @@ class DistributedLaw(AbstractContactLaw):
         """See `AbstractContactLaw.complete`."""
         if params.stiffness is None:
             params = params.filled(stiffness=setting.stiffness(SINKING))
-        return params.filled(restitution_velocity=0.5 * (setting.gravity * SINKING * setting.size) ** 0.5)
+        return params.filled(restitution_velocity=0.2 * (setting.gravity * SINKING * setting.size) ** 0.5)
 
     def patch(self, a: Collider, b: Collider, timestep: Float[Array, ""]) -> SurfacePatch:
         """See `AbstractContactLaw.patch`.
@@ -142,19 +143,29 @@ class DistributedLaw(AbstractContactLaw):
         return sum(wrenches[1:], wrenches[0]), sum(slopes[1:], slopes[0])
 
     def summary(self, patch: SurfacePatch) -> Patch:
-        """Overlap here is the volume Σ A d [m³], averaged over the sides; centroid and normal are its means."""
+        """Overlap here is the volume Σ A d [m³], averaged over the sides; centroid and normal are its means.
+
+        A contact that is felt before bodies overlap, at the end of the step, has its centroid at the sample
+        that is deepest.
+        """
         total, normal = jnp.zeros(4, patch.point.dtype), jnp.zeros(3, patch.point.dtype)
+        foremost, height = patch.point, -jnp.inf
         for side in patch.sides:
             near = side.near
             share = near.areas * jnp.maximum(near.depth, 0) / len(patch.sides)
             volume = jnp.sum(share)
             middle = patch.point + side.lever
-            moment = matvec(side.rotation, near.arms @ share) + middle * volume
+            depth = jnp.where(near.areas > 0, near.depth, -jnp.inf)
+            deepest = jnp.argmax(depth)
+            place = middle + matvec(side.rotation, near.arms[:3, deepest])
+            foremost = jnp.where(depth[deepest] > height, place, foremost)
+            height = jnp.maximum(depth[deepest], height)
+            moment = matvec(side.rotation, near.arms[:3] @ share) + middle * volume
             total = total + jnp.concatenate([moment, volume[None]])
             outward = matvec(side.rotation, near.normal @ share)
             normal = normal + (-outward if side.flipped else outward)
         touching = total[3] > 0
-        centroid = jnp.where(touching, total[:3] / jnp.where(touching, total[3], 1), 0)
+        centroid = jnp.where(touching, total[:3] / jnp.where(touching, total[3], 1), foremost)
         return Patch(total[3], centroid, safe_normalize(normal))
 
 
@@ -162,15 +173,47 @@ def _side(sampled: Collider, queried: Collider, flipped: bool, point, timestep) 
     assert sampled.surface is not None and queried.solid is not None
     inverse = queried.rotation.T
     apart = sampled.origin - queried.origin
-    to_field = jnp.concatenate([matmul(inverse, sampled.rotation), matvec(inverse, apart)[:, None]], axis=1)
+    samples, turned = sampled.surface, matmul(inverse, sampled.rotation)
+    if isinstance(sampled.solid, Sphere) and isinstance(queried.solid, HalfSpace):
+        # A ball looks the same from all sides: samples that stay below its middle instead of turning with it
+        # let it roll smoothly.
+        turned = _towards(queried.solid.normal_direction)
+        samples = _cap(sampled.solid.radius)
+    to_field = jnp.concatenate([turned, matvec(inverse, apart)[:, None]], axis=1)
     velocity = sampled.velocity - queried.velocity - jnp.cross(queried.omega, apart)
     motion = _motion(to_field, matvec(inverse, velocity), matvec(inverse, sampled.omega - queried.omega))
-    near = find_near(
-        *jax.lax.stop_gradient((to_field, motion, queried.solid, sampled.surface, timestep))
-    )
-    return _Side(
-        to_field, queried.rotation, sampled.origin - point, queried.solid, sampled.surface, near, flipped
-    )
+    near = find_near(*jax.lax.stop_gradient((to_field, motion, queried.solid, samples, timestep)))
+    return _Side(to_field, queried.rotation, sampled.origin - point, queried.solid, samples, near, flipped)
+
+
+# Rings of the samples of a ball on a plane, samples a ring, and how far up they reach: to a depth of half the
+# radius.
+_RINGS, _SPOKES, _REACH = 16, 12, np.pi / 3
+
+
+def _cap(radius: Float[Array, ""]) -> SurfaceSet:
+    """Samples on the lower side of a ball, denser towards its lowest point."""
+    edges = _REACH * np.linspace(0, 1, _RINGS + 1) ** 2
+    angle = np.repeat(0.5 * (edges[1:] + edges[:-1]), _SPOKES)
+    turn = np.tile(np.arange(_SPOKES) * 2 * np.pi / _SPOKES, _RINGS)
+    direction = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), -np.cos(angle)])
+    share = np.repeat(2 * np.pi * (np.cos(edges[:-1]) - np.cos(edges[1:])) / _SPOKES, _SPOKES)
+    points = radius * jnp.asarray(direction, radius.dtype)
+    vectors = radius**2 * jnp.asarray(share * direction, radius.dtype)
+    # Few enough never to be sorted out by blocks.
+    none = jnp.zeros((0, 3), radius.dtype), jnp.zeros((0,), radius.dtype)
+    return SurfaceSet(jnp.concatenate([points, jnp.ones_like(points[:1])]), vectors, *none)
+
+
+def _towards(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """A rotation that takes z to a unit vector (Duff et al., Building an orthonormal basis, revisited)."""
+    x, y, z = normal
+    sign = jnp.where(z < 0, -1, 1).astype(normal.dtype)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = jnp.stack([1 + sign * x * x * a, sign * b, -sign * x])
+    second = jnp.stack([b, sign + y * y * a, -y])
+    return jnp.stack([first, second, normal], axis=1)
 
 
 def _motion(to_field, velocity, spin) -> Float[Array, "3 4"]:

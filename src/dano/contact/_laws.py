@@ -91,7 +91,7 @@ class ContactParams(eqx.Module):
         """These parameters with defaults where they are None."""
         mine = {name: getattr(self, name) for name in self.__dataclass_fields__}
         missing = {name: value for name, value in defaults.items() if mine[name] is None}
-        return ContactParams(**{**mine, **missing})
+        return ContactParams(**{**mine, **missing}) if missing else self
 
 
 def checked_parameter(name: str, value: Numbers) -> Float[Array, ""]:

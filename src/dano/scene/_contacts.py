@@ -170,16 +170,13 @@ def _setting(a: Body, b: Body, gravity: Float[Array, "3"]) -> Setting:
     strength = jnp.where(strength > 0, strength, STANDARD_GRAVITY)
 
     def stiffness(sinking: float) -> Float[Array, ""]:
-        carried = [
-            body.mass * body.mass_scale * strength / body.typical_support(sinking * body.size)
-            for body in (a, b)
-            if not body.fixed and body.surface is not None
-        ]
-        if not carried:
-            raise ValueError(
-                f"stiffness of the contact between {a.name!r} and {b.name!r} must be given: the body that "
-                "moves has no surface samples to derive it from"
-            )
+        carried = []
+        for body, other in ((a, b), (b, a)):
+            if not body.fixed:
+                # A shape that meets an object has no samples of its own; those of the object do as well.
+                sampled = body if body.surface is not None else other
+                support = sampled.typical_support(sinking * sampled.size)
+                carried.append(body.mass * body.mass_scale * strength / support)
         return jnp.max(jnp.stack(carried))
 
     return Setting(min(a.size, b.size), strength, stiffness)
