@@ -1,4 +1,4 @@
-"""Distributed contact against closed forms: rest, stiction, sliding, spinning, bouncing, and its convergence."""
+"""Distributed contact against closed forms: rest, stiction, sliding, spinning, bouncing, convergence."""
 
 import functools
 
@@ -111,7 +111,7 @@ def _stack_rows(h: float, seconds: float) -> list[Row]:
 def _friction_rows(h: float) -> list[Row]:
     rows = []
     box = dano.Body("body", dano.Box((0.05, 0.05, 0.02)), mass=0.5)
-    start = {"position": (0, 0, 0.02)}
+    start: dict = {"position": (0, 0, 0.02)}
     mu = 0.4
 
     def on_slope(share: float) -> float:
@@ -199,9 +199,7 @@ def _egg(n: int) -> dano.NeuralObject:
 
 def _end(n: int, h: float) -> np.ndarray:
     """Position 0.5 s after the drop of an ellipsoid that rolls on, with stiffness the same for all."""
-    scene = floor_scene(
-        dano.Body("body", _egg(n)), h, stiffness=2e6, restitution=0.3, sliding_friction=0.3
-    )
+    scene = floor_scene(dano.Body("body", _egg(n)), h, stiffness=2e6, restitution=0.3, sliding_friction=0.3)
     state = scene.initial_state(
         body={"position": (0, 0, 0.12), "orientation": (1, 0.2, 0.1, 0), "velocity": (0.5, 0.2, 0)}
     )

@@ -23,13 +23,21 @@ PRESSED = "Two bodies in contact in every step, per step"
 GRADIENTS = f"Derivatives of a rollout of {N_STEPS} steps, per step"
 BATCH = f"{N_ROLLOUTS} rollouts at once by vmap, per step and rollout"
 QUERIES = "Field queries"
+DISTRIBUTED = ", distributed"
 
 
-def floor_scene(subject: Subject) -> tuple[dano.Scene, dano.State]:
+def _contact_of(subject: Subject, *, distributed: bool) -> tuple[dano.ContactParams, dano.AbstractContactLaw]:
+    """Parameters and law: the paper's, scaled to the subject, or the distributed law's defaults."""
+    if distributed:
+        return dano.ContactParams(sliding_friction=FRICTION), dano.DistributedLaw()
+    return subject.params(sliding_friction=FRICTION), subject.law()
+
+
+def floor_scene(subject: Subject, *, distributed: bool = False) -> tuple[dano.Scene, dano.State]:
     """A bunny at rest on a floor."""
     scene = dano.Scene.create(
         [dano.Body("bunny", subject.bunny), dano.Body("floor", dano.HalfSpace(), fixed=True)],
-        [dano.Contact("bunny", "floor", subject.params(sliding_friction=FRICTION), subject.law())],
+        [dano.Contact("bunny", "floor", *_contact_of(subject, distributed=distributed))],
         timestep=subject.timestep,
     )
     return scene, subject.settled(scene)
@@ -41,9 +49,9 @@ def sliding(subject: Subject, state: dano.State) -> dano.State:
     return eqx.tree_at(lambda s: s.velocity, state, state.velocity.at[0, 0].set(speed))
 
 
-def floor_cases(subject: Subject) -> list[Case]:
+def floor_cases(subject: Subject, *, distributed: bool = False) -> list[Case]:
     """Forward rollouts: sliding, then at rest."""
-    scene, rest = floor_scene(subject)
+    scene, rest = floor_scene(subject, distributed=distributed)
     arrays, static = eqx.partition(scene, eqx.is_array)
     run, seconds = compiled(_rollout(static), arrays, rest)
     cases = []
@@ -52,10 +60,10 @@ def floor_cases(subject: Subject) -> list[Case]:
         cases.append(
             Case(
                 FLOOR,
-                f"{subject.name} {word}",
+                f"{subject.name} {word}{DISTRIBUTED if distributed else ''}",
                 lambda state=state: run(arrays, state),
                 N_STEPS,
-                15.0,
+                60.0 if distributed else 15.0,
                 compile_seconds=seconds if word == "slides" else None,
                 note=note,
             )
@@ -86,10 +94,10 @@ def sphere_cases() -> list[Case]:
     ]
 
 
-def pressed_cases(subject: Subject, *, floor: bool) -> list[Case]:
+def pressed_cases(subject: Subject, *, floor: bool, distributed: bool = False) -> list[Case]:
     """Two bunnies drawn together by a spring between their centres of mass, on a floor or without gravity."""
     bodies = [dano.Body("a", subject.bunny), dano.Body("b", subject.bunny)]
-    params, law = subject.params(sliding_friction=FRICTION), subject.law()
+    params, law = _contact_of(subject, distributed=distributed)
     contacts = [dano.Contact("a", "b", params, law)]
     if floor:
         bodies.append(dano.Body("floor", dano.HalfSpace(), fixed=True))
@@ -111,13 +119,14 @@ def pressed_cases(subject: Subject, *, floor: bool) -> list[Case]:
     overlap = np.asarray(dano.contact_patches(scene, rollout.states)[0].overlap)
     note = f"touching in {np.mean(overlap > 0):.0%} of the steps; {_solver_note(rollout)}"
     name = f"two of {subject.name}, {'on a floor' if floor else 'in the air'}"
+    name += DISTRIBUTED if distributed else ""
     return [
         Case(
             PRESSED,
             name,
             lambda: run(arrays, state),
             N_STEPS,
-            200.0,
+            500.0 if distributed else 200.0,
             compile_seconds=seconds,
             note=note,
         )

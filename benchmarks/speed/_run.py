@@ -29,10 +29,12 @@ def _rows(repeats: int, *, quick: bool) -> list[Row]:
     elif not quick:
         missing.append(skipped(_dano.FLOOR, "authors' bunny", NO_DATA))
     cases = [case for subject in subjects for case in _dano.floor_cases(subject)]
+    cases += [case for subject in subjects for case in _dano.floor_cases(subject, distributed=True)]
     cases += _dano.sphere_cases()
     for subject in subjects:
         cases += _dano.pressed_cases(subject, floor=True)
         cases += _dano.pressed_cases(subject, floor=False)
+        cases += _dano.pressed_cases(subject, floor=False, distributed=True)
         cases += _dano.gradient_cases(subject)
         cases += _dano.batch_cases(subject)
     cases += _dano.query_cases()

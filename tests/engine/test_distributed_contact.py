@@ -46,7 +46,7 @@ def pressed(scene, height):
     ],
 )
 def test_force_is_stiffness_times_displaced_volume(shape, height, volume, tolerance):
-    """For a body at rest, whatever its shape (hydrostatics); the skin makes a body one quarter percent larger."""
+    """For a body at rest, whatever its shape (hydrostatics); the skin makes it a quarter percent larger."""
     scene = on_floor(dano.Body("body", shape, mass=0.5), stiffness=1e7)
     for depth in (0.002, 0.005):
         force = pressed(scene, jnp.asarray(height - depth))
@@ -195,7 +195,7 @@ def test_stack_stands():
         for lower, upper in zip(names[:-1], names[1:], strict=True)
     ]
     scene = dano.Scene.create([*boxes, floor], contacts, timestep=1 / 60)
-    places = {f"box{i}": {"position": (0.004 * i, 0, 0.0502 + 0.1004 * i)} for i in range(3)}
+    places: dict[str, dict] = {f"box{i}": {"position": (0.004 * i, 0, 0.0502 + 0.1004 * i)} for i in range(3)}
     run = dano.simulate(scene, scene.initial_state(**places), 600)
     assert jnp.all(run.converged)
     np.testing.assert_allclose(run.states.position[-1, :3, 2], [0.05, 0.15, 0.25], atol=1e-4)
@@ -230,7 +230,7 @@ def test_collision_conserves_momentum():
 
 
 def test_a_ball_rolls_without_slipping():
-    """From sliding it is left with 5/7 of its speed (2/5 m r² of inertia), then it rolls on, losing little."""
+    """From sliding it is left with 5/7 of its speed (2/5 m r² of inertia), then it rolls on."""
     ball = dano.Body("body", dano.Sphere(0.05), mass=0.5)
     scene = on_floor(ball, h=0.001, sliding_friction=0.5, restitution=1.0)
     state = scene.initial_state(body={"position": (0, 0, 0.05), "velocity": (1.0, 0, 0)})

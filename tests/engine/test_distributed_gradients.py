@@ -149,7 +149,7 @@ def final(case, theta, n_steps):
     scene = case.scene.replace_contact(contact.a, contact.b, **changes)
     scene = scene.replace_body(contact.a, mass_scale=1 + theta[4])
     start = dano.State(
-        case.start.position.at[0].add(theta[5] * jnp.array([0.1, 0.2, -0.1])),
+        case.start.position.at[0].add(theta[5] * jnp.array([0.02, 0.04, -0.02])),
         case.start.orientation,
         case.start.velocity.at[0].add(theta[3] * jnp.array([1.0, 0.5, -0.2])),
         case.start.omega,
@@ -186,7 +186,8 @@ def check_rollout(case, n_steps, *, irrelevant=(), step=1e-6):
     """Forward = reverse = differences at a tiny step, in a smooth neighbourhood of a trajectory."""
     zero = np.zeros(len(PARAMETERS))
     by_forward, by_reverse = jax.device_get((forward(case, zero, n_steps)[0], reverse(case, zero, n_steps)))
-    scale = np.abs(by_forward).max(axis=0) + 1e-3
+    # Differences of roots that are found to 1e-12 say nothing of derivatives below 1e-6.
+    scale = np.abs(by_forward).max(axis=0) + 1e-2
     np.testing.assert_allclose(by_reverse / scale, WEIGHTS @ by_forward / scale, atol=1e-8)
     columns = []
     for change in step * np.eye(len(PARAMETERS)):
@@ -194,7 +195,7 @@ def check_rollout(case, n_steps, *, irrelevant=(), step=1e-6):
         assert all(converged for _, converged in ends)
         columns.append((ends[0][0] - ends[1][0]) / (2 * step))
     np.testing.assert_allclose(by_forward / scale, np.stack(columns, axis=1) / scale, atol=1e-5)
-    for name, size in zip(PARAMETERS, scale - 1e-3, strict=True):
+    for name, size in zip(PARAMETERS, scale - 1e-2, strict=True):
         assert name in irrelevant or size > 1e-6, f"{name} must matter in this scene"
 
 

@@ -193,7 +193,7 @@ def test_few_samples_carry_the_whole_area(n):
 
 
 def test_vector_areas_of_a_box(box_samples):
-    """What faces a direction is the face's area and the skin around it; over all directions they sum to zero."""
+    """What faces a direction is the face's area and the skin around it; all directions sum to zero."""
     vectors, points = np.asarray(box_samples.vectors), np.asarray(box_samples.points)
     for axis in range(3):
         others = [2 * HALF[k] for k in range(3) if k != axis]

@@ -1,7 +1,12 @@
 """Contact: overlap of density fields, pressure on surfaces, and the laws that turn them into force."""
 
 from dano.contact._centroid import CentroidLaw as CentroidLaw
-from dano.contact._colliders import Collider as Collider, SampleSet as SampleSet, Support as Support, SurfaceSet as SurfaceSet
+from dano.contact._colliders import (
+    Collider as Collider,
+    SampleSet as SampleSet,
+    Support as Support,
+    SurfaceSet as SurfaceSet,
+)
 from dano.contact._distributed import DistributedLaw as DistributedLaw, SurfacePatch as SurfacePatch
 from dano.contact._laws import (
     AbstractContactLaw as AbstractContactLaw,

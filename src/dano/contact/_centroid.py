@@ -4,7 +4,15 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dano.contact._laws import AbstractContactLaw, ContactParams, non_negative, positive, Setting, Softening
+from dano.contact._laws import (
+    AbstractContactLaw,
+    ContactParams,
+    HARD,
+    non_negative,
+    positive,
+    Setting,
+    Softening,
+)
 from dano.contact._overlap import Patch
 from dano.maths import Numbers, safe_norm
 
@@ -32,8 +40,8 @@ class CentroidLaw(AbstractContactLaw):
     - with a `stiction_velocity` v_s, Coulomb's: c(u) = −u / max(|u|, v_s). It sticks, and when sliding
       |F_t| = μ_s |F_n|.
 
-    Default parameters are the paper's for the first. For the second they are scaled to the size of the smaller
-    body, so that large and small bodies move alike, and without drag.
+    Default parameters are the paper's for the first. For the second they are scaled to the size of the
+    smaller body, so that large and small bodies move alike, and without drag.
 
     Attributes:
         smoothing: s [s/m, and s/rad for the moments]; larger is nearer to Coulomb's law and creeps less.
@@ -87,7 +95,7 @@ class CentroidLaw(AbstractContactLaw):
             }
         )
 
-    def wrench(self, patch: Patch, params, twist, timestep, softening: Softening = Softening()):
+    def wrench(self, patch: Patch, params, twist, timestep, softening: Softening = HARD):
         """See `AbstractContactLaw.wrench`; parameters that no scene has filled in are the paper's."""
         params = params.filled(**PAPER)
         n, psi = patch.normal, patch.overlap

@@ -73,7 +73,7 @@ class SurfaceSet(eqx.Module):
 
     @classmethod
     def create(cls, points: Numbers, vectors: Numbers) -> "SurfaceSet":
-        """Order the samples in space, on the host; points [m, F] and vector areas [m², F], shape (n, 3) both."""
+        """Order the samples in space, on the host; points [m, F] and vector areas [m², F], both (n, 3)."""
         x, a = np.asarray(points, dtype=np.float64), np.asarray(vectors, dtype=np.float64)
         order = _spatial_order(x)
         missing = -len(order) % BLOCK

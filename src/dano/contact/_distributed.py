@@ -1,5 +1,7 @@
 """The distributed law: pressure and friction at every surface sample."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from dano.contact._colliders import Collider, SurfaceSet
-from dano.contact._laws import AbstractContactLaw, ContactParams, positive, Setting, Softening
+from dano.contact._laws import AbstractContactLaw, ContactParams, HARD, positive, Setting, Softening
 from dano.contact._overlap import Patch
 from dano.contact._pressure import find_near, Material, Near, sums
 from dano.contact._small import matmul, matvec
@@ -66,13 +68,14 @@ class DistributedLaw(AbstractContactLaw):
         F = A p (n − μ(p) c(u/v_s)),   p = k max(0, d − D),
         D = d ((ρ − σ) s(v_n/v_e) + σ c(v_n/v_s))  or  h v_n,  whichever is larger,
 
-    with ρ = (1 − e²)/(1 + e²), s(x) = x/√(1 + x²), c(x) = x/max(|x|, 1) and μ(p) = μ (1 − φ p/(p + p₀)); A is the
-    part of the sample's area that faces the other body (see `ContactParams` for the parameters). Velocities are those at the end of the step. Torsional and rolling resistance come out of the geometry.
+    with ρ = (1 − e²)/(1 + e²), s(x) = x/√(1 + x²), c(x) = x/max(|x|, 1) and μ(p) = μ (1 − φ p/(p + p₀)); A is
+    the part of the sample's area that faces the other body (see `ContactParams` for the parameters).
+    Velocities are those at the end of the step. Torsional and rolling resistance come out of the geometry.
     Where both bodies have samples, each set carries half.
 
-    Default stiffness: set down on a rigid floor in a typical (the median) orientation, so on a corner, an edge
-    or a bulge, a body sinks by 0.5 % of its size; on a flat side by much less. Default restitution velocity:
-    √(g · 0.5 % size)/5, small against impacts, large against what is left of motion at rest.
+    Default stiffness: set down on a rigid floor in a typical (the median) orientation, so on a corner, an
+    edge or a bulge, a body sinks by 0.5 % of its size; on a flat side by much less. Default restitution
+    velocity: √(g · 0.5 % size)/5, small against impacts, large against what is left of motion at rest.
 
     Attributes:
         stiction_velocity: v_s, slip up to which friction counts as sticking [m/s].
@@ -125,7 +128,7 @@ class DistributedLaw(AbstractContactLaw):
         return SurfacePatch(point, tuple(_side(*pair, point, timestep) for pair in pairs))
 
     def wrench(
-        self, patch: SurfacePatch, params: ContactParams, twist, timestep, softening: Softening = Softening()
+        self, patch: SurfacePatch, params: ContactParams, twist, timestep, softening: Softening = HARD
     ):
         """See `AbstractContactLaw.wrench`."""
         material = Material(
@@ -139,8 +142,10 @@ class DistributedLaw(AbstractContactLaw):
             self.stiction_velocity,
             timestep,
         )
-        wrenches, slopes = zip(*(_wrench(side, material, twist, softening) for side in patch.sides), strict=True)
-        return sum(wrenches[1:], wrenches[0]), sum(slopes[1:], slopes[0])
+        wrenches, slopes = zip(
+            *(_wrench(side, material, twist, softening) for side in patch.sides), strict=True
+        )
+        return functools.reduce(jnp.add, wrenches), functools.reduce(jnp.add, slopes)
 
     def summary(self, patch: SurfacePatch) -> Patch:
         """Overlap here is the volume Σ A d [m³], averaged over the sides; centroid and normal are its means.
@@ -230,9 +235,7 @@ def _wrench(side: _Side, material: Material, twist: Float[Array, "6"], softening
     to_side = jnp.concatenate([upper, lower])
     local = sign * matvec(to_side, twist)
     motion = _motion(side.to_field, local[:3], local[3:])
-    moments, slope = sums(
-        side.to_field, motion, material, side.solid, side.samples, side.near, softening
-    )
+    moments, slope = sums(side.to_field, motion, material, side.solid, side.samples, side.near, softening)
     torque = sum(jnp.cross(side.to_field[:, j], moments[:, j]) for j in range(3))
     wrench = sign * matvec(to_side.T, jnp.concatenate([moments[:, 3], torque]))
     return wrench, matmul(matmul(to_side.T, slope), to_side)

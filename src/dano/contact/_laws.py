@@ -9,13 +9,15 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from dano.contact._colliders import Collider
 from dano.contact._overlap import overlap, Patch
 from dano.maths import floating, is_traced, Numbers
+
+# A scalar, or None until a scene fills it in; written so that type checkers let users read it from a scene.
+Filled = Float[Array, ""] | Any
 
 
 class ContactParams(eqx.Module):
@@ -44,16 +46,16 @@ class ContactParams(eqx.Module):
     """
 
     sliding_friction: Float[Array, ""]
-    spring: Float[Array, ""] | None
-    damper: Float[Array, ""] | None
-    sliding_drag: Float[Array, ""] | None
-    torsional_friction: Float[Array, ""] | None
-    torsional_drag: Float[Array, ""] | None
-    rolling_friction: Float[Array, ""] | None
-    rolling_drag: Float[Array, ""] | None
-    stiffness: Float[Array, ""] | None
+    spring: Filled
+    damper: Filled
+    sliding_drag: Filled
+    torsional_friction: Filled
+    torsional_drag: Filled
+    rolling_friction: Filled
+    rolling_drag: Filled
+    stiffness: Filled
     restitution: Float[Array, ""]
-    restitution_velocity: Float[Array, ""] | None
+    restitution_velocity: Filled
     hysteresis: Float[Array, ""]
     friction_fading: Float[Array, ""]
     friction_pressure: Float[Array, ""]
@@ -141,6 +143,10 @@ class Softening(NamedTuple):
     scale: Float[Array, ""] | float = 1.0
 
 
+HARD = Softening()
+"""Friction as it is."""
+
+
 class AbstractContactLaw(eqx.Module):
     """How the contact of two bodies becomes force."""
 
@@ -155,7 +161,7 @@ class AbstractContactLaw(eqx.Module):
         return False
 
     def patch(self, a: Collider, b: Collider, timestep: Float[Array, ""]) -> Any:
-        """Geometry of a contact at the current configuration, which a step holds constant: by default `overlap`.
+        """Geometry of a contact at the current configuration, constant within a step: by default `overlap`.
 
         The result has a `point` [m, W] that twists and wrenches refer to, and says whether the bodies are
         `touching`.
@@ -177,7 +183,7 @@ class AbstractContactLaw(eqx.Module):
         params: ContactParams,
         twist: Float[Array, "6"],
         timestep: Float[Array, ""],
-        softening: Softening = Softening(),
+        softening: Softening = HARD,
     ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
         """Wrench on the first body and its derivative with respect to the relative twist.
 

@@ -1,8 +1,8 @@
 """Distributed contact: every surface sample of one body presses on the solid of the other.
 
-With H (3×4) the transform from the sampled frame into the queried one and V (3×4) the relative velocity there,
-sample x̃ = (x, y, z, 1) sits at y = H x̃, moves with v = V x̃, and carries its area times the traction t(y, v).
-All that a step needs of it are the sums
+With H (3×4) the transform from the sampled frame into the queried one and V (3×4) the relative velocity
+there, sample x̃ = (x, y, z, 1) sits at y = H x̃, moves with v = V x̃, and carries its area times the traction
+t(y, v). All that a step needs of it are the sums
 
     S = Σ A t(y, v) x̃ᵀ   (3×4: force, and torque through the antisymmetric part),   ∂S/∂V, ∂S/∂H, ∂S/∂params,
 
@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dano.contact._colliders import BLOCK, SurfaceSet
 from dano.contact._centroid import sticking
+from dano.contact._colliders import BLOCK, SurfaceSet
 from dano.contact._derivatives import by_autodiff, keep
-from dano.contact._laws import Softening
+from dano.contact._laws import HARD, Softening
 from dano.contact._small import contract, matmul, matvec
 from dano.fields import AbstractShape, HalfSpace
 from dano.maths import column_norm
@@ -87,7 +87,7 @@ def respond(
     depth: Float[Array, " n"],
     normal: Float[Array, "3 n"],
     velocity: Float[Array, "3 n"],
-    softening: Softening = Softening(),
+    softening: Softening = HARD,
 ) -> _Response:
     """What samples feel at a depth [m] in a solid, moving at a velocity [m/s] relative to it.
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,9 +32,9 @@ class Report(NamedTuple):
 _ENOUGH = 0.5
 _GIVE_UP = 0.01
 
-# Softness of stiction in the course of a solve, as multiples of the stiction velocity (1e-7 m/s): as it is; if
-# that does not converge, from a million times softer downwards in steps of √10; if that does not either, from
-# ten million times in steps of two. Each tier comes with the softness below which all stick at its start.
+# Softness of stiction in the course of a solve, as multiples of the stiction velocity (1e-7 m/s): as it is;
+# if that does not converge, from a million times softer downwards in steps of √10; if that does not either,
+# from ten million times in steps of two. Each tier comes with the softness below which all stick at first.
 _TIERS = (
     (1.0, (1.0,)),
     (1e6, tuple(np.geomspace(1e6, 1, 13).tolist())),
@@ -152,14 +151,14 @@ def newton(
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Report]:
     """Root of a small monotone system by Newton with a line search, and with continuation in stiction.
 
-    A loop pass evaluates residual and Jacobian once. With mass and contact the residual is nearly the gradient
-    of a convex function with kinks (contact that opens or closes), so a step is as long as its work on the
-    residual takes to vanish, not as long as the residual takes to fall in some norm: at a kink it may have to
-    grow.
+    A loop pass evaluates residual and Jacobian once. With mass and contact the residual is nearly the
+    gradient of a convex function with kinks (contact that opens or closes), so a step is as long as its work
+    on the residual takes to vanish, not as long as the residual takes to fall in some norm: at a kink it may
+    have to grow.
 
-    Coulomb friction turns by its full size within a stiction velocity of 1e-7 m/s, which no line search finds.
-    Steps whose friction hardly changes converge at once. For the others the root is followed from soft to hard
-    friction, each level harder than the one before, with a predictor: what stuck at the last level
+    Coulomb friction turns by its full size within a stiction velocity of 1e-7 m/s, which no line search
+    finds. Steps whose friction hardly changes converge at once. For the others the root is followed from soft
+    to hard friction, each level harder than the one before, with a predictor: what stuck at the last level
     sticks at the next and creeps in proportion slower, which is exact if nothing begins to slip.
 
     Args:
@@ -218,7 +217,9 @@ def newton(
     def change_level(it: _Iterate):
         remaining, tolerance = error(it)
         last, steps = schedule.last[it.level], it.action == _STEP
-        enough = jnp.where(last, tolerance, jnp.maximum(tolerance, _SOFT_TOLERANCE * schedule.scale[it.level]))
+        enough = jnp.where(
+            last, tolerance, jnp.maximum(tolerance, _SOFT_TOLERANCE * schedule.scale[it.level])
+        )
         spent = (it.budget <= 0) & (remaining > enough)
         harder = steps & ~last & ((remaining <= enough) | spent)
         restart = steps & last & spent & (schedule.restart[it.level] >= 0)

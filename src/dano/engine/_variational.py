@@ -212,7 +212,9 @@ def _angular_jacobian(omega: Float[Array, "3"], inertia: Float[Array, "3 3"], h:
     return 0.5 * h * (s * inertia - along + matmul(skew(omega), inertia) - skew(spin))
 
 
-def _contact_wrenches(velocities: Float[Array, "m 6"], problem: _Problem, pairs: _Pairs, softening: Softening):
+def _contact_wrenches(
+    velocities: Float[Array, "m 6"], problem: _Problem, pairs: _Pairs, softening: Softening
+):
     """Wrench and its derivative with respect to the relative twist, for every contact at given velocities."""
     spins = [matvec(r, w) for r, w in zip(problem.rotation, velocities[:, 3:], strict=True)]
     twists = []

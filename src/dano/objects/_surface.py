@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.fields import AbstractShape
-from dano.maths import floating, is_traced, Numbers
+from dano.maths import floating, is_traced
 from dano.objects._mass import host_jet, host_random, MassProperties
 
 SKIN = 0.0025
@@ -213,7 +213,7 @@ def _places(points: np.ndarray, normals: np.ndarray, pitch: float) -> np.ndarray
 
 
 def _shares(shell: _Shell, chosen: np.ndarray, pitch: float) -> tuple[np.ndarray, ...]:
-    """Normals (n, 3), areas (n,) and vector areas (n, 3) of the chosen points, from the points closest to each."""
+    """Normals (n, 3), areas (n,) and vector areas (n, 3) of the chosen, from the points closest to each."""
     if len(chosen) == 1:
         return shell.normals[chosen], shell.areas.sum()[None], shell.areas.sum() * shell.normals[chosen]
     # On an edge or corner, what was chosen has any of the normals there; some points tell the mean one.
@@ -227,7 +227,7 @@ def _shares(shell: _Shell, chosen: np.ndarray, pitch: float) -> tuple[np.ndarray
 def _owned(
     shell: _Shell, part: slice, points: np.ndarray, normals: np.ndarray, pitch: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean normals (n, 3), areas (n,) and vector areas (n, 3) of the points of a shell's part nearest to each."""
+    """Mean normals (n, 3), areas (n,), vector areas (n, 3) of a shell's points nearest to each."""
     from scipy.spatial import cKDTree
 
     n, measure, directions = len(points), shell.areas[part], shell.normals[part]
@@ -239,7 +239,7 @@ def _owned(
     inward = (distance[:, 1] ** 2 - distance[:, 0] ** 2) / (2 * np.maximum(apart, np.finfo(float).tiny))
     first = measure * (0.5 + np.minimum(inward / shell.spacing, 0.5))
     shares = (first, measure - first)
-    areas = sum(np.bincount(owner[:, k], share, n) for k, share in enumerate(shares))
+    areas = np.bincount(owner[:, 0], first, n) + np.bincount(owner[:, 1], measure - first, n)
     vectors = np.zeros((n, 3))
     for k, share in enumerate(shares):
         # What a sample stands for, not across to the other side of a blade.

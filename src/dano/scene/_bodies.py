@@ -1,5 +1,7 @@
 """Bodies: geometry, mass properties, and a name."""
 
+import functools
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,6 @@ from dano.contact import Collider, SampleSet, Support, SurfaceSet
 from dano.fields import AbstractField, AbstractShape
 from dano.maths import checked_array, floating, is_traced, Numbers
 from dano.objects import checked_inertia, MassProperties, NeuralObject
-
 
 # Orientations over which the support of a body is sampled.
 ORIENTATIONS = 256
@@ -174,7 +175,7 @@ class Body(eqx.Module):
         """
         com = self.com + self.com_offset
         arm = -sum(rotation[:, i] * com[i] for i in range(3))
-        spin = sum(rotation[:, i] * omega[i] for i in range(3))
+        spin = functools.reduce(jnp.add, [rotation[:, i] * omega[i] for i in range(3)])
         return Collider(
             self.field,
             self.samples,

@@ -121,7 +121,12 @@ class Scene(eqx.Module):
         i = self.contact_index(a, b)
         names = list(changes)
         values = [checked_parameter(name, changes[name]).astype(self.timestep.dtype) for name in names]
-        return eqx.tree_at(lambda s: [getattr(s.contacts[i].params, name) for name in names], self, values, is_leaf=lambda x: x is None)
+        return eqx.tree_at(
+            lambda s: [getattr(s.contacts[i].params, name) for name in names],
+            self,
+            values,
+            is_leaf=lambda x: x is None,
+        )
 
     def replace_body(self, name: str, **changes: Numbers) -> "Scene":
         """The scene with some of a body's `mass, inertia, com, mass_scale, com_offset` changed.
