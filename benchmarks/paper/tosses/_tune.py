@@ -19,9 +19,7 @@ EVERY, EVERY_TAIL = 2, 4
 # Of a typical slide [m/s²], for the start of tails at different steps.
 DECELERATION = 0.218 * 9.61
 # A millimetre at the end of a slide in the objective.
-_TAIL_WEIGHT = 0.015
-# Mean errors at the step of a frame over those at the fine step: up to here they agree.
-_AGREED, _DISAGREEMENT_WEIGHT = 1.05, 1.0
+_TAIL_WEIGHT = 0.03
 
 # Size of the first simplex: of the logarithm, or of the parameter itself.
 _RELATIVE = {
@@ -81,23 +79,20 @@ def _objective(
 ) -> Callable[[dict[str, float]], float]:
     """What is minimised.
 
-    For dano, whole tosses at the fine step and at the step of a frame, by how much the errors of the two
-    disagree, and the slides. For MuJoCo, whole tosses at the fine step alone: its friction does not depend on
-    the load, so slides would only spoil its tosses.
+    For dano, whole tosses at the fine step and at the step of a frame, and the slides. For MuJoCo, whole
+    tosses at the fine step alone: its friction does not depend on the load, so slides would only spoil its
+    tosses.
     """
 
-    def errors(values: dict[str, float], n: int) -> Errors:
-        return Errors.of(whole, *simulator.simulate(values, whole, n))
+    def misfit(values: dict[str, float], n: int) -> float:
+        return Errors.of(whole, *simulator.simulate(values, whole, n)).misfit
 
     def of_dano(values: dict[str, float]) -> float:
-        fine, coarse = errors(values, substeps), errors(values, 1)
-        pairs = ((fine.position, coarse.position), (fine.rotation, coarse.rotation))
-        apart = sum(max(0.0, float(b.mean() / a.mean()) - _AGREED) for a, b in pairs)
         slides = Errors.of(tails, *simulator.simulate(values, tails, substeps)).last_position
         slid = float(np.mean(np.minimum(np.nan_to_num(slides, nan=30.0), 30.0)))
-        return fine.misfit + coarse.misfit + _DISAGREEMENT_WEIGHT * apart + _TAIL_WEIGHT * slid
+        return misfit(values, substeps) + misfit(values, 1) + _TAIL_WEIGHT * slid
 
-    return of_dano if isinstance(simulator, Dano) else lambda values: errors(values, substeps).misfit
+    return of_dano if isinstance(simulator, Dano) else lambda values: misfit(values, substeps)
 
 
 class _BudgetSpentError(Exception):

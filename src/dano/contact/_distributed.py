@@ -9,12 +9,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from dano.contact._colliders import Collider, SurfaceSet
-from dano.contact._laws import AbstractContactLaw, ContactParams, HARD, positive, Setting, Softening
+from dano.contact._laws import (
+    AbstractContactLaw,
+    ContactParams,
+    HARD,
+    non_negative,
+    positive,
+    Setting,
+    Softening,
+)
 from dano.contact._overlap import Patch
 from dano.contact._pressure import find_near, Material, Near, sums
 from dano.contact._small import matmul, matvec
 from dano.fields import AbstractShape, HalfSpace, Sphere
-from dano.maths import Numbers, safe_normalize, skew
+from dano.maths import is_traced, Numbers, safe_normalize, skew
 
 # Share of its size by which a body sinks under its weight in a typical orientation, at default stiffness.
 SINKING = 0.005
@@ -66,7 +74,7 @@ class DistributedLaw(AbstractContactLaw):
     v_n and slipping at u, feels
 
         F = A p (n − μ(p) c(u/v_s)),   p = k max(0, d − D),
-        D = d ((ρ − σ) s(v_n/v_e) + σ c(v_n/v_s))  or  h v_n,  whichever is larger,
+        D = d ((ρ − σ) s(v_n/v_e) + σ c(v_n/v_s))  or  θ h v_n,  whichever is larger,
 
     with ρ = (1 − e²)/(1 + e²), s(x) = x/√(1 + x²), c(x) = x/max(|x|, 1) and μ(p) = μ (1 − φ p/(p + p₀)); A is
     the part of the sample's area that faces the other body (see `ContactParams` for the parameters).
@@ -79,17 +87,23 @@ class DistributedLaw(AbstractContactLaw):
 
     Attributes:
         stiction_velocity: v_s, slip up to which friction counts as sticking [m/s].
+        implicitness: θ from 1/2 to 1: where in a step the depth is taken. 1, its end, is quietest, and
+            perfectly plastic where a step is longer than an impact; with 1/2 such impacts still bounce.
     """
 
     stiction_velocity: Float[Array, ""]
+    implicitness: Float[Array, ""]
 
-    def __init__(self, *, stiction_velocity: Numbers = 1e-7):
+    def __init__(self, *, stiction_velocity: Numbers = 1e-7, implicitness: Numbers = 1.0):
         """See the class.
 
         Raises:
-            ValueError: If `stiction_velocity` is not a positive number.
+            ValueError: If `stiction_velocity` is not a positive number or `implicitness` not in [1/2, 1].
         """
         self.stiction_velocity = positive("stiction_velocity", stiction_velocity)
+        self.implicitness = non_negative("implicitness", implicitness)
+        if not is_traced(self.implicitness) and not 0.5 <= float(self.implicitness) <= 1:
+            raise ValueError(f"implicitness must lie in [1/2, 1], got {float(self.implicitness)}")
 
     @property
     def presses(self) -> bool:
@@ -140,7 +154,7 @@ class DistributedLaw(AbstractContactLaw):
             params.friction_fading,
             params.friction_pressure,
             self.stiction_velocity,
-            timestep,
+            self.implicitness * timestep,
         )
         wrenches, slopes = zip(
             *(_wrench(side, material, twist, softening) for side in patch.sides), strict=True

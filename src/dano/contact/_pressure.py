@@ -46,7 +46,7 @@ class Material(NamedTuple):
         friction_fading: φ [1].
         friction_pressure: p₀ [Pa].
         stiction: v_s [m/s].
-        timestep: h [s].
+        ahead: θ h, how far ahead the depth is taken [s].
     """
 
     stiffness: Float[Array, ""]
@@ -57,7 +57,7 @@ class Material(NamedTuple):
     friction_fading: Float[Array, ""]
     friction_pressure: Float[Array, ""]
     stiction: Float[Array, ""]
-    timestep: Float[Array, ""]
+    ahead: Float[Array, ""]
 
 
 class _Response(NamedTuple):
@@ -98,7 +98,8 @@ def respond(
       ρ = (1 − e²)/(1 + e²): the force going in exceeds that going out by 1/e² whatever the path, so an impact
       returns e² of its energy. Slower than v_e all but the share σ ≤ ρ becomes a damper; σ is lost however
       slow the motion, which stops rolling and rocking;
-    - h v_n: the depth at the end of the step instead of its start, which makes the spring implicit.
+    - θ h v_n: the depth at the end of the step, or in its middle, instead of its start, which makes the spring
+      implicit.
     """
     rate = jnp.sum(normal * velocity, axis=0)
     slip = velocity - normal * rate[None]
@@ -111,11 +112,11 @@ def respond(
     grip, grip_slope = sticking(seized, material.stiction, softening)
     sunk = jnp.maximum(depth, 0)
     by_loss = sunk * ((loss - kept) * scaled * inverse + kept * rate * grip)
-    by_time = material.timestep * rate
+    by_time = material.ahead * rate
     lossy = jnp.abs(by_loss) > jnp.abs(by_time)
     left = depth - jnp.where(lossy, by_loss, by_time)
     slower = (loss - kept) / material.restitution_velocity * inverse**3 + kept * (grip + grip_slope * seized)
-    delay = jnp.where(lossy, sunk * slower, material.timestep)
+    delay = jnp.where(lossy, sunk * slower, material.ahead)
     pressure = material.stiffness * jnp.maximum(left, 0)
     fall = jnp.where(left > 0, material.stiffness * delay, 0)
 

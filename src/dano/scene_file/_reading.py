@@ -52,7 +52,7 @@ _LAWS: dict[str, tuple[type[AbstractContactLaw], tuple[str, ...]]] = {
     ),
     "distributed": (
         DistributedLaw,
-        (*(key for key in _PARAMS if key not in _OF_CENTROIDS), "stiction_velocity"),
+        (*(key for key in _PARAMS if key not in _OF_CENTROIDS), "stiction_velocity", "implicitness"),
     ),
 }
 """Laws by name, with the keys that belong to them."""
