@@ -64,7 +64,7 @@ class Dano:
         cube = dano.Body("cube", self.cube, com=(0.0, 0.0, values["com_z"]), inertia=inertia)
         floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
         params = dano.ContactParams(**contact)
-        # A frame of the data is longer than an impact: with the depth at the end of a step all would be plastic.
+        # A frame is longer than an impact: with the depth at the end of a step all would be plastic.
         law = dano.DistributedLaw(implicitness=0.5)
         contacts = [dano.Contact("cube", "floor", params, law)]
         gravity = (0.0, 0.0, -self.gravity)

@@ -98,8 +98,8 @@ def respond(
       ρ = (1 − e²)/(1 + e²): the force going in exceeds that going out by 1/e² whatever the path, so an impact
       returns e² of its energy. Slower than v_e all but the share σ ≤ ρ becomes a damper; σ is lost however
       slow the motion, which stops rolling and rocking;
-    - θ h v_n: the depth at the end of the step, or in its middle, instead of its start, which makes the spring
-      implicit.
+    - θ h v_n: the depth at the end of the step, or in its middle, instead of its start, which makes the
+      spring implicit.
     """
     rate = jnp.sum(normal * velocity, axis=0)
     slip = velocity - normal * rate[None]
