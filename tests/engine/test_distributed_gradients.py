@@ -28,7 +28,7 @@ MATERIAL = Material(
     friction_fading=jnp.asarray(0.3),
     friction_pressure=jnp.asarray(2e3),
     stiction=jnp.asarray(2e-3),
-    timestep=jnp.asarray(0.01),
+    ahead=jnp.asarray(0.01),
 )
 
 

@@ -107,7 +107,7 @@ def test_surface_lies_on_the_solid(name, built):
     gradient = np.asarray(solid_of(made).sdf_jet(made.surface.points.T, 1)[1]).T
     assert np.min(np.sum(normals * gradient, axis=1)) > 0.9
     if truth is ball:
-        inflated = 0.4 + offset + 0.01 * solid_of(made).size
+        inflated = 0.4 + offset + 0.0025 * solid_of(made).size
         np.testing.assert_allclose(made.surface.areas.sum(), 4 * np.pi * inflated**2, rtol=5e-3)
 
 
