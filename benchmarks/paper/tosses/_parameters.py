@@ -15,7 +15,8 @@ STORED = Path(__file__).with_name("parameters.json")
 
 VARIANTS = ("fitted", "centred")
 
-SIMULATORS = {
+OF_BODY = ("com_z", "inertia")
+OF_CONTACT = {
     "dano": (
         "sliding_friction",
         "friction_fading",
@@ -23,12 +24,14 @@ SIMULATORS = {
         "stiffness",
         "restitution",
         "restitution_velocity",
-        "hysteresis",
-        "com_z",
-        "inertia",
-        "inertia_ratio",
     ),
-    "mujoco": ("friction", "stiffness", "damping", "radius", "com_z", "inertia", "inertia_ratio"),
+    "mujoco": ("friction", "stiffness", "damping", "radius"),
+}
+"""What tuning may change: of the body if that is fitted, and of the contact."""
+
+SIMULATORS = {
+    "dano": (*OF_CONTACT["dano"], "hysteresis", *OF_BODY, "inertia_ratio"),
+    "mujoco": (*OF_CONTACT["mujoco"], *OF_BODY, "inertia_ratio"),
 }
 """Names that each set must hold. `inertia` [kg m²] is about x and y, `inertia_ratio` times that about z."""
 

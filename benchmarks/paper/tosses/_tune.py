@@ -12,6 +12,7 @@ import numpy as np
 from benchmarks.paper.tosses._dano import Dano
 from benchmarks.paper.tosses._data import Motions, Tosses
 from benchmarks.paper.tosses._mujoco import MuJoCo
+from benchmarks.paper.tosses._parameters import OF_BODY, OF_CONTACT
 from benchmarks.paper.tosses._score import Errors
 
 # Every second toss; of the slides, every fourth.
@@ -35,19 +36,6 @@ _RELATIVE = {
 }
 _ABSOLUTE = {"friction_fading": 0.03, "com_z": 0.0003}
 _LIMITED = {"restitution": 1.0, "friction_fading": 1.0}
-
-OF_BODY = ("com_z", "inertia")
-OF_CONTACT = {
-    "dano": (
-        "sliding_friction",
-        "friction_fading",
-        "friction_pressure",
-        "stiffness",
-        "restitution",
-        "restitution_velocity",
-    ),
-    "mujoco": ("friction", "stiffness", "damping", "radius"),
-}
 
 
 def tune(parameters: dict[str, Any], train: Tosses, seconds: float) -> None:

@@ -46,12 +46,7 @@ class SampleSet(eqx.Module):
             density: Density φ ≥ 0 of each sample [arbitrary unit]; not all zero.
         """
         x, phi = np.asarray(points, dtype=np.float64), np.asarray(density, dtype=np.float64)
-        order = _spatial_order(x)
-        missing = -len(order) % BLOCK
-        weights = np.concatenate([phi[order] / phi.sum(), np.zeros(missing)])
-        x = np.concatenate([x[order], np.repeat(x[order[-1:]], missing, axis=0)])
-        centers, radii = _balls(x)
-        homogeneous = np.concatenate([x.T, np.ones((1, len(x)))])
+        homogeneous, weights, centers, radii = _in_blocks(x, phi / phi.sum())
         products = np.stack([homogeneous[j] * homogeneous[k] for j, k in PRODUCTS])
         return cls(*(floating(x) for x in (homogeneous, products, weights, centers, radii)))
 
@@ -75,12 +70,7 @@ class SurfaceSet(eqx.Module):
     def create(cls, points: Numbers, vectors: Numbers) -> "SurfaceSet":
         """Order the samples in space, on the host; points [m, F] and vector areas [m², F], both (n, 3)."""
         x, a = np.asarray(points, dtype=np.float64), np.asarray(vectors, dtype=np.float64)
-        order = _spatial_order(x)
-        missing = -len(order) % BLOCK
-        x = np.concatenate([x[order], np.repeat(x[order[-1:]], missing, axis=0)])
-        a = np.concatenate([a[order], np.zeros((missing, 3))])
-        homogeneous = np.concatenate([x.T, np.ones((1, len(x)))])
-        return cls(*(floating(part) for part in (homogeneous, a.T, *_balls(x))))
+        return cls(*(floating(part) for part in _in_blocks(x, a)))
 
 
 class Support(eqx.Module):
@@ -189,11 +179,21 @@ class Collider(eqx.Module):
         self.omega = jnp.zeros_like(self.origin) if omega is None else omega
 
 
-def _balls(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (n / BLOCK, 3) and radii (n / BLOCK,) of balls around each block of points (n, 3)."""
+def _in_blocks(points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Points (n, 3) and what each counts, (n,) or (n, k), in compact blocks that zeros fill up.
+
+    Returns:
+        Homogeneous coordinates (4, m) and values (m,) or (k, m), then centres (m / BLOCK, 3) and radii
+        (m / BLOCK,) of balls around the blocks.
+    """
+    order = _spatial_order(points)
+    missing = -len(order) % BLOCK
+    x = np.concatenate([points[order], np.repeat(points[order[-1:]], missing, axis=0)])
+    counted = np.concatenate([values[order], np.zeros((missing, *values.shape[1:]))])
     blocks = x.reshape(-1, BLOCK, 3)
     centers = 0.5 * (blocks.min(axis=1) + blocks.max(axis=1))
-    return centers, np.linalg.norm(blocks - centers[:, None], axis=-1).max(axis=1)
+    radii = np.linalg.norm(blocks - centers[:, None], axis=-1).max(axis=1)
+    return np.concatenate([x.T, np.ones((1, len(x)))]), counted.T, centers, radii
 
 
 def _spatial_order(points: np.ndarray) -> np.ndarray:

@@ -79,7 +79,7 @@ class _Schedule(NamedTuple):
 
 
 # What a pass of the Newton loop does: a step; look where it stands, with the sticking samples of the softer
-# level before; the step from there, which is accepted unseen; look again at the start.
+# level before, or of all at the start again; the step from there, which is accepted unseen.
 _STEP, _PREDICT, _FOLLOW = range(3)
 
 
