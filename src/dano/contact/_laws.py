@@ -74,7 +74,7 @@ class ContactParams(eqx.Module):
         stiffness: Numbers | None = None,
         restitution: Numbers = 0.0,
         restitution_velocity: Numbers | None = None,
-        hysteresis: Numbers = 0.3,
+        hysteresis: Numbers = 0.35,
         friction_fading: Numbers = 0.0,
         friction_pressure: Numbers = 1000.0,
     ):
