@@ -139,7 +139,7 @@ def _friction_rows(h: float) -> list[Row]:
         ("box", dano.Box((0.08, 0.04, 0.01)), _mean_distance(0.08, 0.04)),
     ):
         scene = floor_scene(dano.Body("body", shape, mass=0.5), h, sliding_friction=0.3)
-        state = scene.initial_state(body={"position": (0, 0, 0.01), "omega": (0, 0, 5.0)})
+        state = scene.initial_state(body={"position": (0, 0, 0.01), "omega": (0, 0, 15.0)})
         run = dano.simulate(scene, state, int(0.1 / h))
         spin, first = np.asarray(run.states.omega[:, 0, 2]), int(0.03 / h)
         slowing = (spin[first] - spin[-1]) / (h * (len(spin) - 1 - first))
