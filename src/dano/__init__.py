@@ -51,6 +51,14 @@ from dano.engine import (
     step as step,
     VariationalEngine as VariationalEngine,
 )
+from dano.identify import (
+    Identification as Identification,
+    identify as identify,
+    load_motion as load_motion,
+    Motion as Motion,
+    Parameter as Parameter,
+    save_motion as save_motion,
+)
 from dano.scene_file import load_scene as load_scene
 
 __version__ = "0.1.0"

@@ -234,11 +234,11 @@ def _jitted_linearize(engine, scene, state, control):
     nominal, _ = engine.step(scene, state, control)
 
     def perturbed(change, input_change):
-        moved = _retract(state, rows, change)
+        moved = retract(state, rows, change)
         force = control.force.at[rows].add(input_change[:, :3])
         torque = control.torque.at[rows].add(input_change[:, 3:])
         following, _ = engine.step(scene, moved, Control(force, torque))
-        return _difference(nominal, following, rows)
+        return difference(nominal, following, rows)
 
     n = len(rows)
     zero = jnp.zeros((n, 12), state.position.dtype), jnp.zeros((n, 6), state.position.dtype)
@@ -246,7 +246,8 @@ def _jitted_linearize(engine, scene, state, control):
     return a.reshape(12 * n, 12 * n), b.reshape(12 * n, 6 * n)
 
 
-def _retract(state: State, rows: np.ndarray, change: Float[Array, "k 12"]) -> State:
+def retract(state: State, rows: np.ndarray, change: Float[Array, "k 12"]) -> State:
+    """A state moved by a change of the bodies `rows` in the coordinates of `linearize`."""
     half = 0.5 * change[:, 3:6]
     angle = safe_norm(half)[:, None]
     turn = jnp.concatenate([jnp.cos(angle), half * jnp.sinc(angle / jnp.pi)], axis=1)
@@ -258,8 +259,8 @@ def _retract(state: State, rows: np.ndarray, change: Float[Array, "k 12"]) -> St
     )
 
 
-def _difference(nominal: State, state: State, rows: np.ndarray) -> Float[Array, "k 12"]:
-    """Change of state to first order, in the coordinates of `linearize`."""
+def difference(nominal: State, state: State, rows: np.ndarray) -> Float[Array, "k 12"]:
+    """What takes the bodies `rows` from one state to another, to first order, in those coordinates."""
     relative = quat_multiply(quat_conjugate(nominal.orientation[rows]), state.orientation[rows])
     return jnp.concatenate(
         [

@@ -1,0 +1,11 @@
+"""Identification: from observed motions to the parameters of a scene, with error bars."""
+
+from dano.identify._identify import (
+    Errors as Errors,
+    Identification as Identification,
+    identify as identify,
+    Minimum as Minimum,
+)
+from dano.identify._motion import Motion as Motion
+from dano.identify._motion_files import load_motion as load_motion, save_motion as save_motion
+from dano.identify._parameters import Parameter as Parameter

@@ -1,0 +1,604 @@
+"""The verb: from observed motions to parameters, with error bars."""
+
+import dataclasses
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from scipy.stats import qmc
+
+from dano.engine import AbstractEngine, Policy, VariationalEngine
+from dano.identify._motion import Motion, QUANTITIES
+from dano.identify._parameters import Parameter, Space, space_of, values_at, with_values
+from dano.identify._residuals import COLUMNS, Linearized, linearized, Model, moved
+from dano.identify._uncertainty import quantile, uncertainty
+from dano.identify._windows import Plan, plan_windows
+from dano.scene import Control, Scene, State, Trajectory
+from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
+
+Initial = Literal["given", "velocities", "states"]
+Observed = Motion | Trajectory
+
+# Of each start that is refined, so many are only looked at.
+_LOOKS = 4
+# Windows simulated at once on an accelerator; a CPU is fastest one by one.
+_BATCH = 1024
+
+
+class Errors(NamedTuple):
+    """How far the fitted motion is from the observed one, over all frames that count.
+
+    Attributes:
+        mean_position: [m]; NaN if positions were not observed.
+        final_position: Mean over motions of the last frame's [m].
+        mean_rotation: [rad].
+        final_rotation: Mean over motions of the last frame's [rad].
+        rms: Of all residuals, in standard deviations of the noise [1].
+    """
+
+    mean_position: float
+    final_position: float
+    mean_rotation: float
+    final_rotation: float
+    rms: float
+
+
+class Minimum(NamedTuple):
+    """Where one of several starts ended: values by name, loss, and why there."""
+
+    values: dict[str, Any]
+    loss: float
+    stop: Stop
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Identification:
+    """Identified parameters.
+
+    Attributes:
+        values: By name of the parameter.
+        standard_errors: By name; ∞ where the data say nothing, NaN for a value on a bound.
+        covariance: Of the coordinates `labels`, shape (p, p).
+        labels: Names of the coordinates: those of the parameters, with indices for arrays.
+        stop: Why the search ended.
+        loss_history: Half the sum of squared residuals, in standard deviations, at the start and after each
+            step.
+        messages: Sentences about parameters on a bound or not determined, and about failed steps.
+        errors: Of the fit.
+        held_out_errors: Of the motions held out, or None.
+        minima: Where each start ended, best first.
+        scene: The scene with the values.
+        controls: The controls with the values, as they were given.
+        initial_states: State in which each window begins.
+        motions: What was observed.
+        fitted: What the simulation says at the frames of each motion, with the values found.
+        guessed: The same at the start of the search.
+        freedom: Observed numbers less estimated ones.
+        evaluations: How often all windows were simulated, with derivatives.
+        seconds: Time it took [s], compilation included.
+    """
+
+    values: dict[str, Any]
+    standard_errors: dict[str, Any]
+    covariance: np.ndarray
+    labels: tuple[str, ...]
+    stop: Stop
+    loss_history: np.ndarray
+    messages: tuple[str, ...]
+    errors: Errors
+    held_out_errors: Errors | None
+    minima: tuple[Minimum, ...]
+    scene: Scene
+    controls: Any
+    initial_states: State
+    motions: tuple[Motion, ...]
+    fitted: tuple[Motion, ...]
+    guessed: tuple[Motion, ...]
+    freedom: int
+    evaluations: int
+    seconds: float
+
+    @property
+    def converged(self) -> bool:
+        """Whether the search ended in a minimum."""
+        return self.stop.converged
+
+    def interval(self, name: str, level: float = 0.95) -> tuple[Any, Any]:
+        """Lower and upper end of the interval that holds a parameter at this rate.
+
+        Raises:
+            ValueError: If there is no such parameter or the level is not between 0 and 1.
+        """
+        if name not in self.values:
+            raise ValueError(f"name must be one of {list(self.values)}, got {name!r}")
+        if not 0 < level < 1:
+            raise ValueError(f"level must lie between 0 and 1, got {level}")
+        half = quantile(level, self.freedom) * np.asarray(self.standard_errors[name])
+        low, high = self.values[name] - half, self.values[name] + half
+        return (float(low), float(high)) if np.ndim(half) == 0 else (low, high)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Numbers and words, as JSON takes them; what is not finite is None."""
+        return {
+            "values": _plain(self.values),
+            "standard_errors": _plain(self.standard_errors),
+            "intervals_95": {name: _plain(list(self.interval(name))) for name in self.values},
+            "stop": self.stop.value,
+            "converged": self.converged,
+            "messages": list(self.messages),
+            "errors": _plain(self.errors._asdict()),
+            "held_out_errors": None
+            if self.held_out_errors is None
+            else _plain(self.held_out_errors._asdict()),
+            "loss_history": _plain(self.loss_history),
+            "labels": list(self.labels),
+            "covariance": _plain(self.covariance),
+            "minima": [
+                {"values": _plain(m.values), "loss": m.loss, "stop": m.stop.value} for m in self.minima
+            ],
+            "freedom": self.freedom,
+            "evaluations": self.evaluations,
+            "seconds": self.seconds,
+        }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray, Array)) and np.ndim(value) > 0:
+        return [_plain(item) for item in value]
+    number = float(np.asarray(value))
+    return number if np.isfinite(number) else None
+
+
+def identify(
+    scene: Scene,
+    observed: Observed | Sequence[Observed],
+    parameters: Sequence[Parameter],
+    *,
+    state: State | Sequence[State | None] | None = None,
+    controls: Control | Policy | Sequence[Control | None] | None = None,
+    initial: Initial | None = None,
+    noise: Mapping[str, float] | None = None,
+    huber: float | None = None,
+    window: int | None = None,
+    continuity: float | None = None,
+    starts: int = 1,
+    seed: int = 0,
+    held_out: Observed | Sequence[Observed] = (),
+    jacobian: Literal["auto", "forward", "reverse"] = "auto",
+    max_iterations: int = 50,
+    tolerance: float = 1e-6,
+    batch: int | None = None,
+    engine: AbstractEngine | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Identification:
+    """Find the parameters of a scene with which it moves as observed.
+
+    Minimises ½ Σ ‖(x̂ − x)/σ‖² over frames, bodies and quantities (Sec. V-A of the paper, with W = 1/σ²) by
+    Levenberg–Marquardt within the bounds, differentiating the simulation.
+
+    Args:
+        scene: The scene, with values for whatever is not a parameter.
+        observed: One motion or several: simulated trajectories or `Motion`s, of any bodies, in any frames,
+            with any gaps; frames need not lie on steps. Each begins at its own first complete frame.
+        parameters: What is unknown.
+        state: What a motion does not say of its beginning, e.g. where an unobserved body is; one for all
+            motions or one for each.
+        controls: Forces and torques [N, N m]: those of each step of each motion, or a policy as in `simulate`
+            (whose time runs from the first frame of the motion).
+        initial: What to estimate of the state in which each window begins: nothing ("given": it is as
+            observed), velocities and spins ("velocities"), or all ("states": right for noisy poses, and
+            needed for honest standard errors then). Default: "given" if velocities and spins are observed,
+            "velocities" if not.
+        noise: Standard deviations by quantity: position [m], orientation [rad], velocity [m/s], omega
+            [rad/s]. What is left out does not count. Default: positions and orientations, which weigh as if
+            seen at the bodies' surface.
+        huber: Length of a residual, in those standard deviations, from which it counts linearly instead of
+            squared, e.g. 2: outliers then pull less.
+        window: Frames of the windows that motions are cut into, each simulated from its own initial state
+            (multiple shooting); default: no cuts. For long and for chaotic motions.
+        continuity: Standard deviation, as multiple of `noise`, by which the end of a window may miss the
+            beginning of the next; default: they need not meet. Needs `initial="states"`.
+        starts: Points to start from: the scene's values, and others in the bounds, the best of many by their
+            loss. For losses with several minima.
+        seed: Of those points.
+        held_out: Motions that are not fitted, to measure the error on.
+        jacobian: Forward mode costs one rollout per unknown, reverse mode several per observed number.
+        max_iterations: Steps of each search.
+        tolerance: Relative change of loss and parameters, below which to stop.
+        batch: Windows simulated at once; default one on a CPU, many on a GPU.
+        engine: Default `VariationalEngine()`.
+        progress: Called with a description and the share done. Ctrl-C during the search returns the best
+            so far.
+
+    Returns:
+        Values, standard errors, what is not determined, and the fitted motion. Steps that did not converge
+        are said in `messages` and raise a RuntimeWarning, as does what the data leave open.
+
+    Raises:
+        ValueError: If motions, parameters and scene do not fit each other, an option is out of range, or
+            there are fewer observed numbers than unknowns.
+    """
+    began = time.perf_counter()
+    motions = _motions("observed", observed)
+    if not motions:
+        raise ValueError("observed must hold at least one motion, got none")
+    space = space_of(scene, controls, parameters)
+    chosen = _initial(initial, motions)
+    _check_options(huber, window, continuity, starts, chosen, jacobian, max_iterations)
+    setup = _Setup(
+        space,
+        scene,
+        controls,
+        chosen,
+        _noise(scene, motions, noise),
+        huber,
+        window,
+        continuity,
+        jacobian,
+        engine or VariationalEngine(),
+        batch,
+    )
+    fit = _Fit(setup, motions, state)
+    tell = progress or (lambda description, share: None)
+    tell("compiling", 0.0)
+    solutions = []
+    points = fit.points(starts, seed)
+    for k, x in enumerate(points):
+        solutions.append(
+            fit.search(
+                x,
+                max_iterations,
+                tolerance,
+                lambda i, loss, k=k: tell(
+                    f"fitting, loss {loss:.6g}", (k + i / max_iterations) / len(points)
+                ),
+            )
+        )
+        if solutions[-1].stop is Stop.INTERRUPTED:
+            break
+    solutions.sort(key=lambda s: s.normal.loss)
+    best = solutions[0]
+    at_best = fit.simulate(best.x, best.blocks)
+    at_start = fit.simulate(space.start, fit.plan.start)
+    known = np.asarray(at_best.lengths)
+    found = uncertainty(space, best.x, best.normal, known[known >= 0], huber, fit.plan.n_data, scene)
+    values, errors = values_at(space.selections, best.x, found.covariance)
+    messages = list(found.messages)
+    if failed := int(np.sum(np.asarray(at_best.unconverged))):
+        messages.append(f"{failed} steps did not converge at the values found; try a smaller timestep")
+    if not best.stop.converged:
+        messages.append(f"the search did not end in a minimum: {best.stop.value}")
+    held = _motions("held_out", held_out)
+    held_errors = None
+    if held:
+        other = _Fit(setup, held, state)
+        fixed = other.search(best.x, max_iterations, tolerance, None, free=False)
+        held_errors = _errors(other.plan, held, other.simulate(fixed.x, fixed.blocks))
+    for message in messages:
+        warnings.warn(message, RuntimeWarning, stacklevel=2)
+    tell("done", 1.0)
+    x = jnp.asarray(best.x, scene.timestep.dtype)
+    return Identification(
+        values=values,
+        standard_errors=errors,
+        covariance=found.covariance,
+        labels=tuple(space.labels),
+        stop=best.stop,
+        loss_history=best.losses,
+        messages=tuple(messages),
+        errors=_errors(fit.plan, motions, at_best),
+        held_out_errors=held_errors,
+        minima=tuple(
+            Minimum(values_at(space.selections, s.x, found.covariance)[0], s.normal.loss, s.stop)
+            for s in solutions
+        ),
+        scene=with_values(space.selections, "scene", scene, x),
+        controls=controls if controls is None else with_values(space.selections, "controls", controls, x),
+        initial_states=best.blocks,
+        motions=motions,
+        fitted=_as_motions(fit.plan, motions, at_best, scene),
+        guessed=_as_motions(fit.plan, motions, at_start, scene),
+        freedom=found.freedom,
+        evaluations=fit.evaluations,
+        seconds=time.perf_counter() - began,
+    )
+
+
+class _Setup(NamedTuple):
+    """Arguments of `identify`, checked, that do not depend on the motions."""
+
+    space: Space
+    scene: Scene
+    controls: Any
+    initial: Initial
+    noise: dict[str, float]
+    huber: float | None
+    window: int | None
+    continuity: float | None
+    jacobian: str
+    engine: AbstractEngine
+    batch: int | None
+
+
+class _Fit:
+    """The least squares problem of some motions: residuals of windows over parameters and initial states."""
+
+    def __init__(self, setup: _Setup, motions: Sequence[Motion], state: Any):
+        space, scene, controls, initial, noise, huber, window, continuity, jacobian, engine, batch = setup
+        self.space = space
+        self.evaluations = 0
+        policy = controls if callable(controls) else None
+        self.plan = plan_windows(
+            scene,
+            motions,
+            states=_for_each("state", state, motions),
+            controls=[None] * len(motions) if policy is not None else _control_list(scene, controls, motions),
+            noise=noise,
+            initial=initial,
+            window=window,
+            continuous=continuity is not None,
+        )
+        dtype = scene.timestep.dtype
+        self.private = len(self.plan.bodies) * len(COLUMNS[initial])
+        unknowns = len(space.start) + self.private
+        n_windows = len(self.plan.rows)
+        if self.plan.n_data <= len(space.start) + n_windows * self.private:
+            raise ValueError(
+                f"observed must hold more numbers than there are unknowns, got {self.plan.n_data} for "
+                f"{len(space.start)} parameters and {n_windows * self.private} of initial states: take "
+                "more frames, longer windows, or estimate less"
+            )
+        numbers = max(1, self.plan.n_data // n_windows)
+        # A backward pass per observed number costs about four forward ones.
+        reverse = jacobian == "reverse" or (jacobian == "auto" and unknowns > 4 * numbers)
+        on_cpu = jax.default_backend() == "cpu"
+        jumps = None
+        if continuity is not None:
+            usual = {**dict.fromkeys(QUANTITIES, np.inf), **noise}
+            rate = max(1e-6, float(self.plan.n_steps * scene.timestep))
+            # Velocities that were not observed may miss by what would move a window's end by the noise.
+            for slow, fast in (("position", "velocity"), ("orientation", "omega")):
+                usual[fast] = min(usual[fast], usual[slow] / rate)
+            jumps = jnp.asarray([continuity * usual[key] for key in QUANTITIES], dtype)
+        self.model = Model(
+            scene,
+            policy,
+            engine,
+            self.plan.windows,
+            None if huber is None else jnp.asarray(huber, dtype),
+            jumps,
+            space.selections,
+            self.plan.bodies,
+            self.plan.quantities,
+            initial,
+            self.plan.n_steps,
+            reverse,
+            batch or (1 if on_cpu else _BATCH),
+        )
+
+    def simulate(self, x: np.ndarray, start: State) -> Linearized:
+        """All windows at coordinates and initial states."""
+        self.evaluations += 1
+        at = jnp.asarray(x, self.model.scene.timestep.dtype)
+        following = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), start)
+        return linearized(self.model, at, start, following)
+
+    def linearize(self, x: np.ndarray, start: State) -> NormalEquations:
+        """Normal equations over parameters and the blocks of initial states.
+
+        A block is a window; or a motion, where windows are to meet.
+        """
+        found = self.simulate(x, start)
+        loss, gradient, hessian, jump, slope = (np.asarray(v, float) for v in found[:5])
+        p, k = len(x), self.private
+        if self.model.jumps is not None:
+            return _chained(p, k, self.plan.owner, self.model.jumps, loss, gradient, hessian, jump, slope)
+        return NormalEquations(
+            float(loss.sum()),
+            gradient[:, :p].sum(axis=0),
+            hessian[:, :p, :p].sum(axis=0),
+            gradient[:, p:] if k else np.zeros((0, 0)),
+            hessian[:, p:, p:] if k else np.zeros((0, 0, 0)),
+            hessian[:, p:, :p] if k else np.zeros((0, 0, p)),
+        )
+
+    def retract(self, start: State, change: np.ndarray) -> State:
+        """Initial states moved by the change of all blocks."""
+        if not self.private:
+            return start
+        n = len(self.plan.rows)
+        if self.model.jumps is not None:
+            change = _unchained(change, self.plan.owner, self.private)
+        rows = jnp.asarray(change.reshape(n, self.private), self.model.scene.timestep.dtype)
+        return moved(start, rows, self.plan.bodies, self.model.initial)
+
+    def points(self, starts: int, seed: int) -> list[np.ndarray]:
+        """Where to start: the given start, and the best by loss of many others in the bounds."""
+        points = [self.space.start]
+        if starts == 1:
+            return points
+        if not (np.all(np.isfinite(self.space.lower)) and np.all(np.isfinite(self.space.upper))):
+            raise ValueError("starts > 1 needs finite bounds on every parameter")
+        n = _LOOKS * (starts - 1)
+        unit = qmc.Sobol(len(self.space.start), seed=seed).random(1 << (n - 1).bit_length())[:n]
+        tried = self.space.lower + unit * (self.space.upper - self.space.lower)
+        losses = np.array([self.linearize(x, self.plan.start).loss for x in tried])
+        order = np.argsort(np.where(np.isfinite(losses), losses, np.inf))
+        return points + [tried[i] for i in order[: starts - 1]]
+
+    def search(
+        self, x: np.ndarray, max_iterations: int, tolerance: float, tell, free: bool = True
+    ) -> Solution:
+        """Minimise from x; with `free` false over the initial states alone."""
+        return bounded_least_squares(
+            self.linearize,
+            x,
+            lower=self.space.lower if free else x,
+            upper=self.space.upper if free else x,
+            start_blocks=self.plan.start,
+            retract=self.retract,
+            max_iterations=max_iterations,
+            tolerance=tolerance,
+            progress=tell,
+        )
+
+
+def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> NormalEquations:
+    """Normal equations with one block for each motion, whose windows are tied by their jumps."""
+    counts = np.bincount(owner)
+    size = int(counts.max()) * k
+    place = np.concatenate([np.arange(n) for n in counts])
+    m = len(counts)
+    shared, shared_hessian = gradient[:, :p].sum(axis=0), hessian[:, :p, :p].sum(axis=0)
+    g, b, c = np.zeros((m, size)), np.zeros((m, size, size)), np.zeros((m, size, p))
+    # Windows that a shorter motion does not have stay where they are.
+    for i, n in enumerate(counts):
+        tail = np.arange(n * k, size)
+        b[i, tail, tail] = 1.0
+    total = float(loss.sum() + 0.5 * np.sum(jump**2))
+    # The jump falls one to one as the next window's beginning moves towards the end of this one.
+    step = np.tile(1 / np.repeat(np.asarray(jumps), 3), jump.shape[1] // 12)
+    for w, (i, j) in enumerate(zip(owner, place, strict=True)):
+        mine = slice(j * k, (j + 1) * k)
+        g[i, mine] += gradient[w, p:]
+        b[i, mine, mine] += hessian[w, p:, p:]
+        c[i, mine] += hessian[w, p:, :p]
+        if j + 1 == counts[i]:
+            continue
+        by_x, by_mine, by_next = slope[w, :, :p], slope[w, :, p:], -np.diag(step)
+        following = slice((j + 1) * k, (j + 2) * k)
+        shared += by_x.T @ jump[w]
+        shared_hessian += by_x.T @ by_x
+        for rows, a in ((mine, by_mine), (following, by_next)):
+            g[i, rows] += a.T @ jump[w]
+            c[i, rows] += a.T @ by_x
+            for columns, d in ((mine, by_mine), (following, by_next)):
+                b[i, rows, columns] += a.T @ d
+    return NormalEquations(total, shared, shared_hessian, g, b, c)
+
+
+def _unchained(change: np.ndarray, owner: np.ndarray, k: int) -> np.ndarray:
+    counts = np.bincount(owner)
+    return np.concatenate([change[i, : n * k].reshape(n, k) for i, n in enumerate(counts)])
+
+
+def _motions(name: str, observed: Observed | Sequence[Observed]) -> tuple[Motion, ...]:
+    items = [observed] if isinstance(observed, (Motion, Trajectory)) else list(observed)
+    found = []
+    for item in items:
+        if not isinstance(item, (Motion, Trajectory)):
+            raise ValueError(f"{name} must hold Motions or Trajectories, got {type(item).__name__}")
+        found.append(item if isinstance(item, Motion) else Motion.from_trajectory(item))
+    return tuple(found)
+
+
+def _initial(initial: Initial | None, motions: Sequence[Motion]) -> Initial:
+    if initial is None:
+        first = [np.concatenate([m.velocity, m.omega], axis=-1) for m in motions]
+        return "given" if all(np.isfinite(v).all() for v in first) else "velocities"
+    if initial not in COLUMNS:
+        raise ValueError(f"initial must be one of {list(COLUMNS)}, got {initial!r}")
+    return initial
+
+
+def _check_options(huber, window, continuity, starts, initial, jacobian, max_iterations) -> None:
+    if huber is not None and not huber > 0:
+        raise ValueError(f"huber must be > 0, got {huber}")
+    if window is not None and window < 2:
+        raise ValueError(f"window must hold at least 2 frames, got {window}")
+    if continuity is not None:
+        if not continuity > 0:
+            raise ValueError(f"continuity must be > 0, got {continuity}")
+        if window is None or initial != "states":
+            raise ValueError(
+                f"continuity needs window and initial='states', got window {window}, initial {initial!r}"
+            )
+    if starts < 1:
+        raise ValueError(f"starts must be ≥ 1, got {starts}")
+    if jacobian not in ("auto", "forward", "reverse"):
+        raise ValueError(f"jacobian must be 'auto', 'forward' or 'reverse', got {jacobian!r}")
+    if max_iterations < 1:
+        raise ValueError(f"max_iterations must be ≥ 1, got {max_iterations}")
+
+
+def _noise(scene: Scene, motions: Sequence[Motion], noise: Mapping[str, float] | None) -> dict[str, float]:
+    if noise is None:
+        sizes = [scene.body(name).size for m in motions for name in m.names if name in scene.names]
+        finite = [size for size in sizes if np.isfinite(size)] or [1.0]
+        # A thousandth of the size, seen at half the size from the middle.
+        return {"position": 1e-3 * float(np.mean(finite)), "orientation": 2e-3}
+    for key, value in noise.items():
+        if key not in QUANTITIES:
+            raise ValueError(f"noise must be given for some of {list(QUANTITIES)}, got {key!r}")
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"noise of {key} must be finite and > 0, got {value}")
+    if not noise:
+        raise ValueError(f"noise must be given for at least one of {list(QUANTITIES)}, got none")
+    return dict(noise)
+
+
+def _for_each(name: str, given: Any, motions: Sequence[Motion]) -> list[Any]:
+    items = list(given) if isinstance(given, (list, tuple)) else [given] * len(motions)
+    if len(items) != len(motions):
+        raise ValueError(f"{name} must be one for all or one for each of {len(motions)}, got {len(items)}")
+    return items
+
+
+def _control_list(scene: Scene, controls: Any, motions: Sequence[Motion]) -> list[Control | None]:
+    items = _for_each("controls", controls, motions)
+    for control in items:
+        if control is None:
+            continue
+        shapes = control.force.shape, control.torque.shape
+        if any(len(s) != 3 or s[1:] != (len(scene.bodies), 3) for s in shapes):
+            raise ValueError(
+                f"controls must have shape (steps, {len(scene.bodies)}, 3), got {shapes[0]} and {shapes[1]}"
+            )
+    return items
+
+
+def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:
+    lengths = np.asarray(found.lengths)
+    weights = {key: np.asarray(w) for key, w in plan.windows.weights.items()}
+    means, finals = {}, {}
+    for key in ("position", "orientation"):
+        if key not in plan.quantities:
+            means[key] = finals[key] = float("nan")
+            continue
+        weight = weights[key][:, :, list(plan.bodies)]
+        size = lengths[..., plan.quantities.index(key)] / np.where(weight > 0, weight, 1)
+        means[key] = float(np.mean(size[weight > 0]))
+        last = []
+        for i in range(len(motions)):
+            mine = np.flatnonzero(plan.owner == i)[-1]
+            frames = np.flatnonzero((weight[mine] > 0).any(axis=-1))
+            if len(frames):
+                last.append(np.mean(size[mine, frames[-1]][weight[mine, frames[-1]] > 0]))
+        finals[key] = float(np.mean(last)) if last else float("nan")
+    known = lengths[lengths >= 0]
+    rms = float(np.sqrt(np.sum(known**2) / plan.n_data))
+    return Errors(means["position"], finals["position"], means["orientation"], finals["orientation"], rms)
+
+
+def _as_motions(plan: Plan, motions: Sequence[Motion], found: Linearized, scene: Scene) -> tuple[Motion, ...]:
+    """Predictions at the frames of each motion, of its bodies; NaN for frames before its first window."""
+    predicted = {key: np.asarray(getattr(found.predicted, key)) for key in QUANTITIES}
+    result = []
+    for i, motion in enumerate(motions):
+        bodies = [scene.index(name) for name in motion.names]
+        arrays = {
+            key: np.full((len(motion.times), len(bodies), size), np.nan) for key, size in QUANTITIES.items()
+        }
+        for w in np.flatnonzero(plan.owner == i):
+            rows = plan.rows[w]
+            for key in QUANTITIES:
+                arrays[key][rows] = predicted[key][w, : len(rows)][:, bodies]
+        result.append(dataclasses.replace(motion, **arrays))
+    return tuple(result)

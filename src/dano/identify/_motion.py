@@ -1,0 +1,259 @@
+"""Motions: poses of bodies over time, as a tracker, a file or another simulation gives them."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from dano.maths import Numbers
+from dano.scene import Trajectory
+
+Point = Literal["com", "origin"]
+QUANTITIES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
+"""What a motion may hold of each body and frame, and how many numbers it has."""
+
+# Frames that a local parabola is fitted to for velocities: three on each side.
+SMOOTHING_FRAMES = 7
+# Finite differences of a motion and its own angular velocity differ by noise, but not by so large a share.
+_INCONSISTENT = 0.5
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Motion:
+    """Observed motion of some bodies. What was not observed is NaN.
+
+    Attributes:
+        times: Of the frames [s], increasing, shape (T,).
+        position: Of `point` [m, W], shape (T, n, 3).
+        orientation: Unit quaternions wxyz, body → world, shape (T, n, 4).
+        velocity: Of `point` [m/s, W], shape (T, n, 3).
+        omega: [rad/s, B], shape (T, n, 3).
+        names: Names of the n bodies.
+        point: Whether positions are those of the centres of mass or of the origins of the field frames (F).
+        lag: How long before a frame its velocities hold [s]: half a timestep in a `Trajectory`, because
+            x⁺ = x + h v⁺; 0 for measured ones.
+    """
+
+    times: np.ndarray
+    position: np.ndarray
+    orientation: np.ndarray
+    velocity: np.ndarray
+    omega: np.ndarray
+    names: tuple[str, ...]
+    point: Point = "com"
+    lag: float = 0.0
+
+    @classmethod
+    def create(
+        cls,
+        times: Numbers,
+        names: str | Sequence[str],
+        *,
+        position: Numbers | None = None,
+        orientation: Numbers | None = None,
+        velocity: Numbers | None = None,
+        omega: Numbers | None = None,
+        point: Point = "com",
+        lag: float = 0.0,
+    ) -> "Motion":
+        """A motion from arrays of shape (T, n, ·), or (T, ·) for a single body.
+
+        Args:
+            times: [s], shape (T,).
+            names: Name or names of the bodies.
+            position: [m, W]; NaN where a body was not seen.
+            orientation: Quaternions wxyz, body → world, normalised here; NaN where unknown.
+            velocity: [m/s, W].
+            omega: [rad/s, B].
+            point: What positions and velocities refer to: "com" or "origin".
+            lag: How long before a frame its velocities hold [s].
+
+        Raises:
+            ValueError: If there are fewer than two frames, times do not increase, a shape is wrong, nothing
+                was observed, an entry is infinite, a quaternion is not of unit length, or orientations
+                contradict the angular velocities (as they do in another order than wxyz).
+        """
+        names = (names,) if isinstance(names, str) else tuple(names)
+        if not names or len(set(names)) < len(names) or not all(names):
+            raise ValueError(f"names must be different non-empty names of bodies, got {list(names)}")
+        stamps = np.asarray(times, dtype=float)
+        if stamps.ndim != 1 or len(stamps) < 2:
+            raise ValueError(f"times must be a vector of at least two frames, got shape {stamps.shape}")
+        if not np.all(np.isfinite(stamps)) or not np.all(np.diff(stamps) > 0):
+            bad = int(np.flatnonzero(~(np.diff(stamps) > 0))[0]) + 1
+            raise ValueError(f"times must be finite and increase, got {stamps[bad]} s at frame {bad}")
+        if point not in ("com", "origin"):
+            raise ValueError(f"point must be 'com' or 'origin', got {point!r}")
+        if not (np.isfinite(lag) and lag >= 0):
+            raise ValueError(f"lag must be finite and ≥ 0 s, got {lag}")
+        given = {"position": position, "orientation": orientation, "velocity": velocity, "omega": omega}
+        arrays = {name: _frames(name, value, len(stamps), len(names)) for name, value in given.items()}
+        for row, name in enumerate(names):
+            if not any(np.isfinite(arrays[key][:, row]).all(axis=-1).any() for key in QUANTITIES):
+                raise ValueError(f"motion of {name!r} must hold at least one observed frame, got none")
+        arrays["orientation"] = _unit_quaternions(arrays["orientation"])
+        motion = cls(stamps, **arrays, names=names, point=point, lag=float(lag))
+        _check_rotation(motion)
+        return motion
+
+    @classmethod
+    def from_trajectory(
+        cls, trajectory: Trajectory, *, bodies: Sequence[str] | None = None, every: int = 1
+    ) -> "Motion":
+        """Some bodies of a simulated trajectory, every so many steps.
+
+        Raises:
+            ValueError: If a body is unknown or `every` < 1.
+        """
+        chosen = trajectory.names if bodies is None else tuple(bodies)
+        for name in chosen:
+            if name not in trajectory.names:
+                raise ValueError(f"bodies must be among {list(trajectory.names)}, got {name!r}")
+        if every < 1:
+            raise ValueError(f"every must be ≥ 1, got {every}")
+        rows = [trajectory.names.index(name) for name in chosen]
+        times = np.asarray(trajectory.times)
+        states = trajectory.states
+        return cls.create(
+            times[::every],
+            chosen,
+            position=np.asarray(states.position)[::every, rows],
+            orientation=np.asarray(states.orientation)[::every, rows],
+            velocity=np.asarray(states.velocity)[::every, rows],
+            omega=np.asarray(states.omega)[::every, rows],
+            lag=0.5 * float(times[1] - times[0]),
+        )
+
+    def part(self, first: int, last: int) -> "Motion":
+        """Frames from `first` up to, not including, `last`; times stay as they are."""
+        rows = slice(first, last)
+        cut = {name: getattr(self, name)[rows] for name in ("times", *QUANTITIES)}
+        return dataclasses.replace(self, **cut)
+
+    def with_velocities(self, frames: int = SMOOTHING_FRAMES) -> "Motion":
+        """The motion with velocities and spins where they are missing, from its poses.
+
+        A parabola is fitted to the nearest frames around each; orientations as rotation vectors from the
+        middle frame, so that the slope there is the angular velocity in body axes. A motion in contact is not
+        that smooth: estimate initial states rather than trust these where it matters.
+
+        Raises:
+            ValueError: If `frames` is even or < 3.
+        """
+        if frames < 3 or frames % 2 == 0:
+            raise ValueError(f"frames must be odd and ≥ 3, got {frames}")
+        shift = self.times - self.lag
+        velocity, omega = self.velocity.copy(), self.omega.copy()
+        for row in range(len(self.names)):
+            places, turns = self.position[:, row], self.orientation[:, row]
+            for t in np.flatnonzero(~np.isfinite(velocity[:, row]).all(axis=1)):
+                velocity[t, row] = _slope(self.times, places, shift[t], frames)
+            for t in np.flatnonzero(~np.isfinite(omega[:, row]).all(axis=1)):
+                if np.isfinite(turns[t]).all():
+                    vectors = rotation_vectors(turns[t], turns)
+                    omega[t, row] = _slope(self.times, vectors, shift[t], frames)
+        return dataclasses.replace(self, velocity=velocity, omega=omega)
+
+
+def rotation_vectors(reference: np.ndarray, orientation: np.ndarray) -> np.ndarray:
+    """Rotation vectors [rad, axes of `reference`] that take one orientation to others; NaN stays NaN."""
+    w, v = reference[..., :1], -reference[..., 1:]
+    qw, qv = orientation[..., :1], orientation[..., 1:]
+    real = w * qw - np.sum(v * qv, axis=-1, keepdims=True)
+    imaginary = w * qv + qw * v + np.cross(v, qv)
+    imaginary = np.where(real < 0, -imaginary, imaginary)
+    length = np.linalg.norm(imaginary, axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(length, np.abs(real))
+    return imaginary * np.where(length > 0, angle / np.where(length > 0, length, 1), 2.0)
+
+
+def _frames(name: str, value: Numbers | None, n_frames: int, n_bodies: int) -> np.ndarray:
+    size = QUANTITIES[name]
+    shape = (n_frames, n_bodies, size)
+    if value is None:
+        return np.full(shape, np.nan)
+    array = np.array(value, dtype=float)
+    if array.ndim == 2 and n_bodies == 1:
+        array = array[:, None]
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape} (frames, bodies, {size}), got {array.shape}")
+    if np.any(np.isinf(array)):
+        frame = int(np.argwhere(np.isinf(array))[0, 0])
+        raise ValueError(f"{name} must be finite, or NaN where it is unknown; frame {frame} is infinite")
+    # A frame that is known in part is of no use.
+    array[~np.isfinite(array).all(axis=-1)] = np.nan
+    return array
+
+
+def _unit_quaternions(orientation: np.ndarray) -> np.ndarray:
+    norms = np.linalg.norm(orientation, axis=-1)
+    wrong = np.isfinite(norms) & (np.abs(norms - 1) > 0.05)
+    if np.any(wrong):
+        frame, body = (int(i) for i in np.argwhere(wrong)[0])
+        raise ValueError(
+            "orientation must hold unit quaternions (w, x, y, z), got one of length "
+            f"{norms[frame, body]:.4g} at frame {frame}"
+        )
+    return orientation / norms[..., None]
+
+
+def _slope(times: np.ndarray, values: np.ndarray, when: float, frames: int) -> np.ndarray:
+    """Derivative at a time of the parabola through the nearest known values; a line through only two."""
+    known = np.flatnonzero(np.isfinite(values).all(axis=1))
+    nearest = known[np.argsort(np.abs(times[known] - when), kind="stable")[:frames]]
+    if len(nearest) < 2:
+        return np.full(values.shape[1], np.nan)
+    degree = 1 if len(nearest) < 4 else 2
+    reach = float(np.ptp(times[nearest]))
+    coefficients = np.polynomial.polynomial.polyfit((times[nearest] - when) / reach, values[nearest], degree)
+    return coefficients[1] / reach
+
+
+def _check_rotation(motion: Motion) -> None:
+    """Compare turns from frame to frame with the angular velocities.
+
+    Raises:
+        ValueError: If they contradict each other as given but not in another convention.
+    """
+    for row, name in enumerate(motion.names):
+        turns, omega = motion.orientation[:, row], motion.omega[:, row]
+        steps = np.diff(motion.times)[:, None]
+        known = np.isfinite(turns[:-1]).all(axis=1) & np.isfinite(turns[1:]).all(axis=1)
+        known &= np.isfinite(omega[:-1]).all(axis=1) & np.isfinite(omega[1:]).all(axis=1)
+        mean = 0.5 * (omega[:-1] + omega[1:])
+        # Slower than this, noise decides; faster, frames are too far apart to tell turns.
+        known &= (np.linalg.norm(mean, axis=1) > 0.2) & (np.linalg.norm(mean * steps, axis=1) < 1.0)
+        if known.sum() < 4:
+            continue
+
+        def mismatch(q: np.ndarray, spin: np.ndarray, known=known, steps=steps) -> float:
+            rates = rotation_vectors(q[:-1], q[1:]) / steps
+            wrong = np.linalg.norm(rates - spin, axis=1) / np.linalg.norm(spin, axis=1)
+            return float(np.median(wrong[known]))
+
+        given = mismatch(turns, mean)
+        if given < _INCONSISTENT:
+            continue
+        other_order = mismatch(turns[:, [3, 0, 1, 2]], mean)
+        inverse = mismatch(turns * np.array([1.0, -1, -1, -1]), mean)
+        in_world = mismatch(
+            turns, np.stack([_into_body(q, w) for q, w in zip(turns[:-1], mean, strict=True)])
+        )
+        best = min(other_order, inverse, in_world)
+        if best < 0.5 * given and best < _INCONSISTENT:
+            reason = {
+                other_order: "they fit as (x, y, z, w): say so, or reorder them",
+                inverse: "they fit as world → body: take their conjugates",
+                in_world: "they fit if omega is given in world axes: turn it into body axes",
+            }[best]
+            raise ValueError(
+                f"orientation of {name!r} must be wxyz, body → world, and omega in body axes, but they "
+                f"contradict each other ({100 * given:.0f} % apart): {reason}"
+            )
+
+
+def _into_body(q: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    w, u = q[0], -q[1:]
+    t = 2 * np.cross(u, vector)
+    return vector + w * t + np.cross(u, t)

@@ -1,0 +1,247 @@
+"""Parameters: which leaves of a scene are unknown, within which bounds, and in which coordinates."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.maths import Numbers
+
+Coordinates = Literal["value", "log", "inertia"]
+Home = Literal["scene", "controls"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Parameter:
+    """An unknown: leaves of a scene that take one value, and where that value may lie.
+
+    Attributes:
+        name: What results call it.
+        where: From the scene to a leaf, or to a list of leaves that share the value, e.g.
+            ``lambda s: s.contact("bunny", "floor").sliding_friction``.
+        lower: Smallest value (a number, or an array of the leaf's shape).
+        upper: Largest value.
+        start: Where to begin; default the scene's own value, moved into the bounds.
+        coordinates: What the solver steps in: the "value" itself; its logarithm ("log"), for positive
+            quantities whose order of magnitude is unknown; or "inertia": the log-Cholesky factor of the
+            matrix Σ = ½ tr(J) I − J of second moments, so that every value is the inertia tensor of some
+            mass distribution. Default: "inertia" for leaves of shape (3, 3), "value" for others.
+        of: "scene", or "controls" for leaves of the controls given to `identify`.
+    """
+
+    name: str
+    where: Callable[[Any], Any]
+    lower: Numbers = -np.inf
+    upper: Numbers = np.inf
+    start: Numbers | None = None
+    coordinates: Coordinates | None = None
+    of: Home = "scene"
+
+
+class Selection(NamedTuple):
+    """Static part of a parameter, checked: enough to read it from and write it to a scene."""
+
+    name: str
+    where: Callable[[Any], Any]
+    of: Home
+    coordinates: Coordinates
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return 6 if self.coordinates == "inertia" else int(np.prod(self.shape))
+
+    def value(self, x: Float[Array, " k"]) -> Array:
+        """The value at coordinates x."""
+        if self.coordinates == "inertia":
+            return _inertia(x)
+        flat = jnp.exp(x) if self.coordinates == "log" else x
+        return flat.reshape(self.shape)
+
+    def coordinates_of(self, value: np.ndarray) -> np.ndarray:
+        """Coordinates of a value."""
+        if self.coordinates == "inertia":
+            return _log_cholesky(value)
+        flat = np.ravel(value)
+        return np.log(flat) if self.coordinates == "log" else flat
+
+    @property
+    def labels(self) -> list[str]:
+        """Names of the coordinates."""
+        if self.size == 1:
+            return [self.name]
+        if self.coordinates == "inertia":
+            return [f"{self.name}[{axes}]" for axes in ("xx", "yy", "zz", "xy", "xz", "yz")]
+        return [f"{self.name}[{', '.join(map(str, index))}]" for index in np.ndindex(*self.shape)]
+
+
+class Space(NamedTuple):
+    """The solver's coordinates of all parameters, one after the other."""
+
+    selections: tuple[Selection, ...]
+    start: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+    @property
+    def labels(self) -> list[str]:
+        """Names of the coordinates."""
+        return [label for selection in self.selections for label in selection.labels]
+
+
+def space_of(scene: Any, controls: Any, parameters: Sequence[Parameter]) -> Space:
+    """Check parameters against a scene.
+
+    Raises:
+        ValueError: If there is none, two have one name, one picks no array, its leaves differ in shape, its
+            bounds cross or exclude its start, or its coordinates do not fit.
+    """
+    if not parameters:
+        raise ValueError("parameters must hold at least one Parameter, got none")
+    names = [p.name for p in parameters]
+    if len(set(names)) < len(names):
+        raise ValueError(f"parameters must have different names, got {names}")
+    parts = [_checked(p, controls if p.of == "controls" else scene) for p in parameters]
+    selections, *columns = zip(*parts, strict=True)
+    return Space(selections, *(np.concatenate(column) for column in columns))
+
+
+def _checked(p: Parameter, home: Any) -> tuple[Selection, np.ndarray, np.ndarray, np.ndarray]:
+    if not isinstance(p.name, str) or not p.name:
+        raise ValueError(f"name of a parameter must be a non-empty string, got {p.name!r}")
+    what = f"parameter {p.name!r}"
+    if p.of not in ("scene", "controls"):
+        raise ValueError(f"of in {what} must be 'scene' or 'controls', got {p.of!r}")
+    if home is None:
+        raise ValueError(f"{what} is one of the controls, but no controls are given")
+    try:
+        leaves = _leaves(p.where, home)
+        changed = eqx.tree_at(lambda tree: _leaves(p.where, tree), home, leaves)
+    except (AttributeError, TypeError, KeyError, IndexError, RuntimeError) as error:
+        raise ValueError(f"where in {what} must pick leaves of the {p.of}: {error}") from error
+    except ValueError as error:
+        raise ValueError(f"where in {what}: {error}") from error
+    del changed
+    for leaf in leaves:
+        if leaf is None or not eqx.is_inexact_array(leaf):
+            raise ValueError(
+                f"where in {what} must pick floating-point arrays of the {p.of}, got {type(leaf).__name__}"
+                + (": its law does not use it" if leaf is None else "")
+            )
+    shapes = {leaf.shape for leaf in leaves}
+    if len(shapes) != 1:
+        raise ValueError(f"leaves of {what} must have one shape, got {sorted(shapes)}")
+    shape = shapes.pop()
+    coordinates = p.coordinates or ("inertia" if shape == (3, 3) else "value")
+    if coordinates not in ("value", "log", "inertia"):
+        raise ValueError(f"coordinates of {what} must be 'value', 'log' or 'inertia', got {coordinates!r}")
+    selection = Selection(p.name, p.where, p.of, coordinates, shape)
+    value = np.asarray(leaves[0] if p.start is None else p.start, dtype=float)
+    if coordinates == "inertia":
+        return selection, *_inertia_box(what, p, shape, value)
+    lower, upper = (_bound(what, key, getattr(p, key), shape) for key in ("lower", "upper"))
+    if np.any(lower > upper):
+        raise ValueError(f"lower of {what} must be ≤ upper, got {p.lower} and {p.upper}")
+    if p.start is None:
+        value = np.clip(value, lower, upper)
+    elif value.shape not in (shape, ()):
+        raise ValueError(f"start of {what} must have shape {shape}, got {value.shape}")
+    value = np.broadcast_to(value, shape)
+    if not np.all((lower <= value) & (value <= upper)):
+        raise ValueError(
+            f"start of {what} must lie between {lower.tolist()} and {upper.tolist()}, got {value.tolist()}"
+        )
+    if coordinates == "log":
+        if np.any(value <= 0) or np.any(upper <= 0):
+            raise ValueError(f"{what} must be > 0 to have a logarithm, got start {value.tolist()}")
+        with np.errstate(divide="ignore"):
+            lower, upper = np.log(np.maximum(lower, 0)), np.log(upper)
+        value = np.log(value)
+    return selection, np.ravel(value), np.ravel(lower), np.ravel(upper)
+
+
+def _bound(what: str, key: str, bound: Numbers, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.asarray(bound, dtype=float)
+    if array.shape not in ((), shape) or np.any(np.isnan(array)):
+        raise ValueError(f"{key} of {what} must be a number or have shape {shape}, got {bound}")
+    return np.broadcast_to(array, shape)
+
+
+def _inertia_box(what: str, p: Parameter, shape: tuple[int, ...], value: np.ndarray):
+    if shape != (3, 3) or value.shape != (3, 3):
+        raise ValueError(f"{what} must be a (3, 3) inertia tensor, got shape {shape}, start {value.shape}")
+    if np.any(np.isfinite(np.asarray(p.lower))) or np.any(np.isfinite(np.asarray(p.upper))):
+        raise ValueError(f"{what} is an inertia tensor: its form bounds it, leave lower and upper out")
+    try:
+        start = _log_cholesky(value)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(
+            f"start of {what} must be the inertia of some body, got principal values "
+            f"{np.linalg.eigvalsh(value).tolist()}"
+        ) from error
+    infinite = np.full(6, np.inf)
+    return start, -infinite, infinite
+
+
+def _leaves(where: Callable[[Any], Any], tree: Any) -> list[Any]:
+    found = where(tree)
+    return list(found) if isinstance(found, (list, tuple)) else [found]
+
+
+def with_values(selections: Sequence[Selection], home: Home, tree: Any, x: Float[Array, " p"]) -> Any:
+    """A scene, or controls, whose leaves hold the values at coordinates x."""
+    offset = 0
+    for selection in selections:
+        part = x[offset : offset + selection.size]
+        offset += selection.size
+        if selection.of == home:
+            value = selection.value(part)
+            leaves = _leaves(selection.where, tree)
+            values = [value.astype(leaf.dtype) for leaf in leaves]
+            tree = eqx.tree_at(lambda t, s=selection: _leaves(s.where, t), tree, values)
+    return tree
+
+
+def values_at(
+    selections: Sequence[Selection], x: np.ndarray, covariance: np.ndarray
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Values by name, and their standard errors to first order, from coordinates and their covariance."""
+    values, errors = {}, {}
+    offset = 0
+    for selection in selections:
+        part = slice(offset, offset + selection.size)
+        offset += selection.size
+        at = jnp.asarray(x[part])
+        slope = np.asarray(jax.jacfwd(selection.value)(at)).reshape(-1, selection.size)
+        with np.errstate(invalid="ignore"):
+            variance = np.einsum("ia,ab,ib->i", slope, covariance[part, part], slope)
+        error = np.sqrt(np.maximum(variance, 0)).reshape(selection.shape)
+        value = np.asarray(selection.value(at), dtype=float)
+        values[selection.name] = float(value) if value.shape == () else value
+        errors[selection.name] = float(error) if error.shape == () else error
+    return values, errors
+
+
+def _inertia(x: Float[Array, "6"]) -> Float[Array, "3 3"]:
+    zero = jnp.zeros_like(x[0])
+    factor = jnp.stack(
+        [
+            jnp.stack([jnp.exp(x[0]), zero, zero]),
+            jnp.stack([x[3], jnp.exp(x[1]), zero]),
+            jnp.stack([x[4], x[5], jnp.exp(x[2])]),
+        ]
+    )
+    second = factor @ factor.T
+    return jnp.trace(second) * jnp.eye(3, dtype=x.dtype) - second
+
+
+def _log_cholesky(inertia: np.ndarray) -> np.ndarray:
+    second = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    factor = np.linalg.cholesky(second)
+    return np.array([*np.log(np.diag(factor)), factor[1, 0], factor[2, 0], factor[2, 1]])

@@ -1,0 +1,248 @@
+"""Residuals of windows, and their normal equations, in one compiled program each."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from dano.engine import AbstractEngine, difference, retract, simulate
+from dano.identify._parameters import Selection, with_values
+from dano.identify._windows import Windows
+from dano.maths import quat_conjugate, quat_multiply, quat_normalize, quat_rotate, safe_norm
+from dano.scene import Control, Scene, State
+
+# Columns of a body's state change (position, rotation vector, velocity, omega) that are estimated.
+COLUMNS = {"given": (), "velocities": tuple(range(6, 12)), "states": tuple(range(12))}
+
+
+class Model(NamedTuple):
+    """What residuals depend on besides the unknowns; its static part decides the program.
+
+    Attributes:
+        scene: The scene.
+        policy: Controls as a function of state and time, or None.
+        engine: What simulates.
+        windows: The windows.
+        huber: Length of a residual, in standard deviations, from which it counts linearly; None: never.
+        jumps: Standard deviations of position, orientation, velocity and spin by which a window may miss the
+            beginning of the next, shape (4,), or None.
+        selections: The parameters.
+        bodies: Which bodies were observed.
+        quantities: Which quantities count.
+        initial: What of the initial states is estimated.
+        n_steps: Steps of each window.
+        reverse: Whether Jacobians are taken in reverse mode.
+        batch: How many windows are simulated at once.
+    """
+
+    scene: Scene
+    policy: Any
+    engine: AbstractEngine
+    windows: Windows
+    huber: Float[Array, ""] | None
+    jumps: Float[Array, "4"] | None
+    selections: tuple[Selection, ...]
+    bodies: tuple[int, ...]
+    quantities: tuple[str, ...]
+    initial: str
+    n_steps: int
+    reverse: bool
+    batch: int
+
+
+class Linearized(NamedTuple):
+    """A simulation of all windows, with derivatives: leaves with a leading axis of windows.
+
+    Unknowns u of a window are the coordinates x, then the change of its initial state.
+
+    Attributes:
+        loss: Half the sum of squared residuals, or Huber's function of them.
+        gradient: Of the loss.
+        hessian: Gauss–Newton's.
+        jump: By which a window misses the beginning of the next, in standard deviations; empty if it may.
+        jump_slope: Its derivative.
+        predicted: States at the frames, positions and velocities of what was observed.
+        lengths: Of the residuals in standard deviations; −1 where nothing was observed.
+        unconverged: Steps that did not converge.
+    """
+
+    loss: Float[Array, " w"]
+    gradient: Float[Array, "w u"]
+    hessian: Float[Array, "w u u"]
+    jump: Float[Array, "w c"]
+    jump_slope: Float[Array, "w c u"]
+    predicted: State
+    lengths: Float[Array, "w f b q"]
+    unconverged: Int[Array, " w"]
+
+
+class _Late(eqx.Module):
+    """A policy for a rollout that begins later than its motion."""
+
+    policy: Any
+    begin: Float[Array, ""]
+
+    def __call__(self, state: State, time: Float[Array, ""]) -> Control:
+        """Control of the step that begins at a time [s] of the rollout."""
+        return self.policy(state, self.begin + time)
+
+
+@eqx.filter_jit
+def linearized(model: Model, x: Float[Array, " p"], start: State, following: State) -> Linearized:
+    """Simulate all windows at coordinates x from their initial states.
+
+    Args:
+        model: The model.
+        x: Coordinates of the parameters.
+        start: Initial states of the windows.
+        following: Initial states of the windows that come next in the same motions.
+    """
+    p = x.shape[0]
+
+    def one(item):
+        window, state, after = item
+
+        def residuals(unknowns):
+            rows, jump, predicted, unconverged = _residuals(
+                model, window, state, after, unknowns[:p], unknowns[p:]
+            )
+            return jnp.concatenate([rows.ravel(), jump]), (rows, jump, predicted, unconverged)
+
+        at = jnp.concatenate([x, _no_change(model)])
+        jacobian = jax.jacrev if model.reverse else jax.jacfwd
+        slope, (rows, jump, predicted, unconverged) = jacobian(residuals, has_aux=True)(at)
+        weights, lengths, loss = _robust(model, rows)
+        seen = jnp.stack([window.weights[key][:, _bodies(model)] for key in model.quantities], axis=-1) > 0
+        slope, jump_slope = slope[: rows.size], slope[rows.size :]
+        weighted = jnp.broadcast_to(weights[..., None], rows.shape).ravel()[:, None] * slope
+        return Linearized(
+            loss,
+            weighted.T @ rows.ravel(),
+            weighted.T @ slope,
+            jump,
+            jump_slope,
+            predicted,
+            jnp.where(seen, lengths, -1),
+            unconverged,
+        )
+
+    return _map(one, (model.windows, start, following), model.batch)
+
+
+def _map(function, items, batch: int):
+    n = jax.tree.leaves(items)[0].shape[0]
+    if batch >= n:
+        return jax.vmap(function)(items)
+    return jax.lax.map(function, items, batch_size=None if batch == 1 else batch)
+
+
+@eqx.filter_jit
+def moved(start: State, change: Float[Array, "w k"], bodies: tuple[int, ...], initial: str) -> State:
+    """Initial states moved by a change of what is estimated of them."""
+    return jax.vmap(lambda s, c: retract(s, np.array(bodies), _spread(c, len(bodies), initial)))(
+        start, change
+    )
+
+
+def _spread(change: Float[Array, " k"], n: int, initial: str) -> Float[Array, "n 12"]:
+    columns = np.array(COLUMNS[initial], dtype=int)
+    full = jnp.zeros((n, 12), change.dtype)
+    return full.at[:, columns].set(change.reshape(n, len(columns))) if len(columns) else full
+
+
+def _no_change(model: Model) -> Float[Array, " k"]:
+    return jnp.zeros(len(model.bodies) * len(COLUMNS[model.initial]), model.scene.timestep.dtype)
+
+
+def _bodies(model: Model) -> np.ndarray:
+    return np.array(model.bodies)
+
+
+def _residuals(model: Model, window: Windows, start: State, following: State, x, change):
+    """Residuals (frames, bodies, quantities, 3) in standard deviations, and what they were computed from."""
+    scene = with_values(model.selections, "scene", model.scene, x)
+    controls = window.controls
+    if model.policy is not None:
+        controls = _Late(with_values(model.selections, "controls", model.policy, x), window.begin)
+    elif controls is not None:
+        controls = with_values(model.selections, "controls", controls, x)
+    if model.initial != "given":
+        start = retract(start, _bodies(model), _spread(change, len(model.bodies), model.initial))
+    trajectory = simulate(
+        scene,
+        _shifted(scene, start, window.origins, 1),
+        model.n_steps,
+        controls=controls,
+        engine=model.engine,
+    )
+    states = trajectory.states
+    places = _at(states, window.frame)
+    speeds = _at(states, window.moment)
+    predicted = _shifted(
+        scene, State(places.position, places.orientation, speeds.velocity, speeds.omega), window.origins, -1
+    )
+    rows = jnp.stack([_row(model, window, predicted, key) for key in model.quantities], axis=2)
+    jump = jnp.zeros(0, rows.dtype)
+    if model.jumps is not None:
+        last = _shifted(scene, _at(states, tuple(part[None] for part in window.end)), window.origins, -1)
+        last = jax.tree.map(lambda leaf: leaf[0], last)
+        missed = difference(following, last, _bodies(model)) / jnp.repeat(model.jumps, 3)[None]
+        jump = window.chained * missed.ravel()
+    used = jnp.arange(model.n_steps) <= jnp.max(window.frame[0])
+    unconverged = jnp.sum(used & ~trajectory.converged)
+    return rows, jump, predicted, unconverged
+
+
+def _at(states: State, where) -> State:
+    """States between steps: positions and velocities in proportion, orientations normalised."""
+    step, share = where
+    share = share[:, None, None]
+    before = jax.tree.map(lambda leaf: leaf[step], states)
+    after = jax.tree.map(lambda leaf: leaf[step + 1], states)
+    mixed = jax.tree.map(lambda a, b: a + share * (b - a), before, after)
+    return eqx.tree_at(lambda s: s.orientation, mixed, quat_normalize(mixed.orientation))
+
+
+def _shifted(scene: Scene, state: State, origins, sign: int) -> State:
+    """From origins of the field frames to centres of mass (+) or back (−), for the bodies marked."""
+    arm = jnp.stack([body.com + body.com_offset for body in scene.bodies])
+    arm = jnp.where(origins[:, None], sign * arm, 0).astype(state.position.dtype)
+    arm = jnp.broadcast_to(arm, state.position.shape)
+    return State(
+        state.position + quat_rotate(state.orientation, arm),
+        state.orientation,
+        state.velocity + quat_rotate(state.orientation, jnp.cross(state.omega, arm)),
+        state.omega,
+    )
+
+
+def _row(model: Model, window: Windows, predicted: State, key: str) -> Float[Array, "f b 3"]:
+    bodies = _bodies(model)
+    found, seen = getattr(predicted, key)[:, bodies], getattr(window.observed, key)[:, bodies]
+    weight = window.weights[key][:, bodies, None]
+    if key == "orientation":
+        # Where nothing was seen, a rotation to differentiate, not to count.
+        seen = jnp.where(weight > 0, seen, found)
+        relative = quat_multiply(quat_conjugate(seen), found)
+        sign = jnp.where(relative[..., :1] < 0, -1, 1).astype(relative.dtype)
+        real, imaginary = sign * relative[..., :1], sign * relative[..., 1:]
+        length = safe_norm(imaginary)[..., None]
+        positive = length > 0
+        stretch = 2 * jnp.arctan2(length, real) / jnp.where(positive, length, 1)
+        return weight * jnp.where(positive, stretch, 2) * imaginary
+    return weight * (found - seen)
+
+
+def _robust(model: Model, rows: Float[Array, "f b q 3"]):
+    """Weight and length of each residual, and the loss."""
+    squared = jnp.sum(rows * rows, axis=-1)
+    lengths = jnp.sqrt(squared)
+    if model.huber is None:
+        return jnp.ones_like(squared), lengths, 0.5 * jnp.sum(squared)
+    far = lengths > model.huber
+    weights = jnp.where(far, model.huber / jnp.where(far, lengths, 1), 1)
+    each = jnp.where(far, model.huber * (lengths - 0.5 * model.huber), 0.5 * squared)
+    return weights, lengths, jnp.sum(each)

@@ -1,0 +1,312 @@
+"""Motions cut into windows, each simulated from its own initial state, as arrays to map over."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from dano.identify._motion import Motion, QUANTITIES
+from dano.scene import Control, Scene, State
+
+_CONFIGURATION = ("position", "orientation")
+
+
+class Windows(eqx.Module):
+    """All windows of all motions, padded to one length; leaves have a leading axis of windows.
+
+    Attributes:
+        begin: Time of the first frame of each [s].
+        first_step: Steps from the beginning of the motion to that of the window.
+        origins: Which bodies have positions of their field frame's origin instead of the centre of mass.
+        frame: Where in the rollout each frame lies: step, and share of the next one.
+        moment: The same for velocities, which hold half a step before.
+        observed: What was seen, zero where nothing was; leaves (w, frames, bodies, ·).
+        weights: One over the standard deviation of each number, zero where nothing was seen, by quantity;
+            shape (w, frames, bodies).
+        end: Where the next window of the same motion begins, as `frame` has it.
+        chained: Whether there is such a window, 1 or 0.
+        controls: Forces and torques of each step, or None.
+    """
+
+    begin: Float[Array, " w"]
+    first_step: Int[Array, " w"]
+    origins: Bool[Array, "w n"]
+    frame: tuple[Int[Array, "w f"], Float[Array, "w f"]]
+    moment: tuple[Int[Array, "w f"], Float[Array, "w f"]]
+    observed: State
+    weights: dict[str, Float[Array, "w f n"]]
+    end: tuple[Int[Array, " w"], Float[Array, " w"]]
+    chained: Float[Array, " w"]
+    controls: Control | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Windows, and what the host knows of them.
+
+    Attributes:
+        windows: The windows.
+        start: Their initial states, positions as `Windows.origins` says.
+        n_steps: Steps that each is simulated.
+        owner: Index of the motion that each belongs to.
+        rows: The frames of the motion that each covers.
+        bodies: Indices of the bodies that were observed and move.
+        quantities: Quantities that count.
+        n_data: How many numbers were observed and count.
+    """
+
+    windows: Windows
+    start: State
+    n_steps: int
+    owner: np.ndarray
+    rows: list[np.ndarray]
+    bodies: tuple[int, ...]
+    quantities: tuple[str, ...]
+    n_data: int
+
+
+def plan_windows(
+    scene: Scene,
+    motions: Sequence[Motion],
+    *,
+    states: Sequence[State | None],
+    controls: Sequence[Control | None],
+    noise: Mapping[str, float],
+    initial: str,
+    window: int | None,
+    continuous: bool,
+) -> Plan:
+    """Cut motions into windows.
+
+    Args:
+        scene: The scene.
+        motions: At least one.
+        states: Initial state of each motion, for what it does not say itself.
+        controls: Forces for each step of each motion, or None.
+        noise: Standard deviation of each quantity that counts.
+        initial: What of the initial states is estimated: see `identify`.
+        window: Frames of a window; None: all.
+        continuous: Whether windows are simulated up to the beginning of the next.
+
+    Raises:
+        ValueError: If a motion does not fit the scene, or does not say how a window begins.
+    """
+    h = float(scene.timestep)
+    pieces: list[dict] = []
+    for number, (motion, state, control) in enumerate(zip(motions, states, controls, strict=True)):
+        what = f"motion {number}" if len(motions) > 1 else "the motion"
+        full = _on_all_bodies(scene, motion, what)
+        pieces += _cut(scene, motion, full, state, control, number, window, what)
+    moving = [i for i, body in enumerate(scene.bodies) if not body.fixed]
+    seen = [i for i in moving if any(scene.names[i] in motion.names for motion in motions)]
+    if not seen:
+        raise ValueError(f"observed must hold a body that moves, got only fixed ones of {list(scene.names)}")
+    longest = max(len(piece["rows"]) for piece in pieces)
+
+    def stacked(values: list[np.ndarray], fill: float = 0.0) -> np.ndarray:
+        padded = [
+            np.concatenate([v, np.full((longest - len(v), *v.shape[1:]), fill, v.dtype)]) for v in values
+        ]
+        return np.stack(padded)
+
+    dtype = scene.timestep.dtype
+    observed, weights = {}, {}
+    for key in QUANTITIES:
+        values = stacked([piece[key] for piece in pieces], np.nan)
+        known = np.asarray(np.isfinite(values).all(axis=-1))
+        observed[key] = jnp.asarray(np.where(known[..., None], values, 0.0), dtype)
+        if key not in noise:
+            continue
+        counts = known.copy()
+        counts[:, :, [i for i in range(len(scene.bodies)) if i not in seen]] = False
+        if initial == "given" or (initial == "velocities" and key in _CONFIGURATION):
+            counts[:, 0] = False
+        if counts.any():
+            weights[key] = jnp.asarray(counts / noise[key], dtype)
+    if not weights:
+        raise ValueError(
+            f"observed must hold frames after the first of one of {list(noise)}, got none that count"
+        )
+    sizes = {"position": 3, "orientation": 3, "velocity": 3, "omega": 3}
+    n_data = sum(int(np.count_nonzero(np.asarray(w))) * sizes[key] for key, w in weights.items())
+    elapsed = [piece["times"] - piece["times"][0] for piece in pieces]
+    until = [
+        piece["until"] - piece["times"][0] if continuous else e[-1]
+        for piece, e in zip(pieces, elapsed, strict=True)
+    ]
+    n_steps = max(1, max(_steps_to(max(e[-1], u), h) for e, u in zip(elapsed, until, strict=True)))
+    owner = np.array([piece["owner"] for piece in pieces])
+    lags = [motions[piece["owner"]].lag for piece in pieces]
+    frame = _located(stacked(elapsed) / h, n_steps)
+    late = [np.maximum(e - lag + 0.5 * h, 0.0) for e, lag in zip(elapsed, lags, strict=True)]
+    moment = _located(stacked(late) / h, n_steps)
+    first_step = np.array([_steps_to(piece["times"][0] - piece["origin"], h) for piece in pieces])
+    forces = [piece["control"] for piece in pieces]
+    windows = Windows(
+        jnp.asarray([piece["times"][0] - piece["origin"] for piece in pieces], dtype),
+        jnp.asarray(first_step),
+        jnp.asarray(np.stack([piece["origins"] for piece in pieces])),
+        _arrays(frame, dtype),
+        _arrays(moment, dtype),
+        State(**observed),
+        weights,
+        _arrays(_located(np.array(until) / h, n_steps), dtype),
+        jnp.asarray(np.append(owner[1:] == owner[:-1], False), dtype),
+        _control_rows(scene, forces, first_step, n_steps),
+    )
+    start = State(
+        *(jnp.asarray(np.stack([piece["start"][key] for piece in pieces]), dtype) for key in QUANTITIES)
+    )
+    return Plan(
+        windows,
+        start,
+        n_steps,
+        owner,
+        [piece["rows"] for piece in pieces],
+        tuple(seen),
+        tuple(weights),
+        n_data,
+    )
+
+
+def _on_all_bodies(scene: Scene, motion: Motion, what: str) -> dict[str, np.ndarray]:
+    """Quantities of a motion for all bodies of a scene; NaN for those not in it."""
+    for name in motion.names:
+        if name not in scene.names:
+            raise ValueError(f"{what} must be of bodies of the scene {list(scene.names)}, got {name!r}")
+    rows = [scene.index(name) for name in motion.names]
+    full = {}
+    for key, size in QUANTITIES.items():
+        full[key] = np.full((len(motion.times), len(scene.bodies), size), np.nan)
+        full[key][:, rows] = getattr(motion, key)
+    return full
+
+
+def _cut(scene, motion: Motion, full, state, control, number: int, window: int | None, what: str):
+    """The windows of one motion, one after the other without overlap."""
+    h = float(scene.timestep)
+    moving = np.array([i for i, body in enumerate(scene.bodies) if not body.fixed])
+    derived = motion.with_velocities()
+    smooth = _on_all_bodies(scene, derived, what)
+    complete = _says_where(scene, motion, full, state is not None, moving)
+    origins = np.array([motion.point == "origin" and name in motion.names for name in scene.names])
+    pieces, first, n = [], 0, len(motion.times)
+    while first < n:
+        ready = np.flatnonzero(complete[first:])
+        if len(ready) == 0:
+            break
+        first += int(ready[0])
+        last = n if window is None else min(first + window, n)
+        if last - first >= 2:
+            start = _initial(scene, motion, full, smooth, state, first, h, what, only=window is None)
+            pieces.append(
+                {
+                    "owner": number,
+                    "rows": np.arange(first, last),
+                    "times": motion.times[first:last],
+                    "until": motion.times[min(last, n - 1)],
+                    "origin": motion.times[0],
+                    "origins": origins,
+                    "start": start,
+                    "control": control,
+                    **{key: full[key][first:last] for key in QUANTITIES},
+                }
+            )
+        first = last
+    if not pieces:
+        seen = ", ".join(motion.names)
+        raise ValueError(
+            f"{what} must have a frame with positions of all its bodies ({seen}) and at least one after it, "
+            "got none"
+        )
+    return pieces
+
+
+def _says_where(scene, motion, full, has_state: bool, moving) -> np.ndarray:
+    """Frames at which every body that moves has a position and an orientation, seen or stated."""
+    ready = np.ones(len(motion.times), bool)
+    for i in moving:
+        name = scene.names[i]
+        for key in _CONFIGURATION:
+            known = np.isfinite(full[key][:, i]).all(axis=-1)
+            never = name not in motion.names or (key == "orientation" and not known.any())
+            if never and not has_state:
+                raise ValueError(
+                    f"{key} of {name!r} is not observed: give the state in which the motion begins"
+                )
+            if not never:
+                ready &= known
+    return ready
+
+
+def _initial(scene, motion, full, smooth, state, first: int, h: float, what: str, *, only: bool):
+    """Initial state of the window that begins at a frame, as a dict of arrays (n, ·)."""
+    start = {}
+    unseen = [i for i, body in enumerate(scene.bodies) if not body.fixed and body.name not in motion.names]
+    if unseen and first > 0:
+        raise ValueError(
+            f"{scene.names[unseen[0]]!r} moves and is not observed, so {what} must be one window that "
+            "begins at its first frame"
+        )
+    for key in QUANTITIES:
+        if state is None:
+            value = np.zeros((len(scene.bodies), QUANTITIES[key]))
+            if key == "orientation":
+                value[:, 0] = 1.0
+        else:
+            value = np.array(getattr(state, key), dtype=float)
+        found = full[key][first] if key in _CONFIGURATION else _earlier(motion, smooth[key], first, h)
+        if key == "omega":
+            # What spins cannot be told where no orientation is known.
+            found = np.where(np.isfinite(found), found, np.nan)
+        known = np.isfinite(found).all(axis=-1)
+        value[known] = found[known]
+        start[key] = value
+    return start
+
+
+def _earlier(motion: Motion, values: np.ndarray, first: int, h: float) -> np.ndarray:
+    """Velocities half a step before a frame, which is where the rollout has them, from the frames around."""
+    shift = motion.lag - 0.5 * h
+    neighbours = range(max(first - 1, 0), min(first + 2, len(values)))
+    low, high = neighbours[0], neighbours[-1]
+    slope = (values[high] - values[low]) / (motion.times[high] - motion.times[low])
+    moved = values[first] + shift * slope
+    return np.where(np.isfinite(moved), moved, values[first])
+
+
+def _steps_to(elapsed: float, h: float) -> int:
+    """Steps after which a rollout has passed a time, forgiving rounding in it."""
+    return int(np.ceil(elapsed / h - 1e-6))
+
+
+def _located(at: np.ndarray, n_steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Step and share of the next one."""
+    nearest = np.round(at)
+    at = np.where(np.abs(at - nearest) < 1e-6, nearest, at)
+    step = np.clip(np.floor(at).astype(int), 0, n_steps - 1)
+    return step, np.clip(at - step, 0.0, 1.0)
+
+
+def _arrays(located: tuple[np.ndarray, np.ndarray], dtype) -> tuple[Array, Array]:
+    return jnp.asarray(located[0]), jnp.asarray(located[1], dtype)
+
+
+def _control_rows(scene: Scene, controls: list[Control | None], first_step, n_steps: int) -> Control | None:
+    """Rows of each window, zero after the last one that is given."""
+    if all(control is None for control in controls):
+        return None
+    shape = (n_steps, len(scene.bodies), 3)
+
+    def rows(name: str) -> Array:
+        table = np.zeros((len(controls), *shape))
+        for row, control, first in zip(table, controls, first_step, strict=True):
+            if control is not None:
+                part = np.asarray(getattr(control, name))[first : first + n_steps]
+                row[: len(part)] = part
+        return jnp.asarray(table, scene.timestep.dtype)
+
+    return Control(rows("force"), rows("torque"))

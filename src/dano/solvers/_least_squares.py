@@ -1,0 +1,264 @@
+"""Levenberg–Marquardt with bounds, for a few shared unknowns and many small blocks of private ones.
+
+Minimises f(x, z) = ½ Σ r² over x in a box and blocks z₁ … z_m without bounds, where every residual depends on
+x and one block at most. With Gauss–Newton matrices the step solves
+
+    [ H + λD   C₁ᵀ …       ] [ dx  ]     [ g  ]
+    [ C₁       B₁ + λD₁    ] [ dz₁ ] = − [ b₁ ]      with  lower ≤ x + dx ≤ upper.
+    [ ⋮                 ⋱  ] [ ⋮   ]     [ ⋮  ]
+
+The blocks are eliminated (Schur complement), which leaves a quadratic programme in dx with simple bounds.
+That one is solved exactly by an active set, so that x may start on a bound, run along it, and leave it.
+"""
+
+import enum
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+
+class NormalEquations(NamedTuple):
+    """Gauss–Newton model of the loss at a point.
+
+    Attributes:
+        loss: f = ½ Σ r².
+        gradient: g = ∂f/∂x, shape (p,).
+        hessian: H ≈ ∂²f/∂x², shape (p, p).
+        block_gradient: b = ∂f/∂z, shape (m, k).
+        block_hessian: B, shape (m, k, k).
+        coupling: C ≈ ∂²f/∂z∂x, shape (m, k, p).
+    """
+
+    loss: float
+    gradient: np.ndarray
+    hessian: np.ndarray
+    block_gradient: np.ndarray
+    block_hessian: np.ndarray
+    coupling: np.ndarray
+
+
+class Stop(enum.Enum):
+    """Why a minimisation ended."""
+
+    GRADIENT = "the gradient vanishes within the bounds"
+    STEP = "the steps became negligible"
+    LOSS = "the loss no longer falls"
+    PERFECT = "the residuals vanish"
+    STUCK = "no step reduces the loss, although the gradient does not vanish: it may be rough here"
+    ITERATIONS = "the largest number of iterations was reached"
+    INTERRUPTED = "it was interrupted; this is the best point so far"
+
+    @property
+    def converged(self) -> bool:
+        """Whether this is a minimum as far as can be told."""
+        return self in (Stop.GRADIENT, Stop.STEP, Stop.LOSS, Stop.PERFECT)
+
+
+class Solution(NamedTuple):
+    """Where a minimisation ended, and why.
+
+    Attributes:
+        x: Shared unknowns, shape (p,).
+        blocks: Private unknowns, as `start_blocks` was given.
+        normal: The model there.
+        stop: Why it ended.
+        losses: Loss at the start and after each accepted step.
+        evaluations: How often `linearize` was called.
+    """
+
+    x: np.ndarray
+    blocks: Any
+    normal: NormalEquations
+    stop: Stop
+    losses: np.ndarray
+    evaluations: int
+
+
+_DAMPING = 1e-4
+_MOST_DAMPING = 1e12
+# A step is accepted when it brings this share of what the model promises.
+_SUFFICIENT = 1e-4
+
+
+def bounded_least_squares(
+    linearize: Callable[[np.ndarray, Any], NormalEquations],
+    start: np.ndarray,
+    *,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    start_blocks: Any = None,
+    retract: Callable[[Any, np.ndarray], Any] = lambda blocks, change: blocks,
+    max_iterations: int = 50,
+    tolerance: float = 1e-8,
+    progress: Callable[[int, float], None] | None = None,
+) -> Solution:
+    """Minimise a sum of squares within bounds.
+
+    Args:
+        linearize: The normal equations at (x, blocks); a step to where the loss is not finite is rejected.
+        start: First x, shape (p,).
+        lower: Bounds, shape (p,); may be −∞.
+        upper: Bounds, shape (p,); may be ∞.
+        start_blocks: First private unknowns, of any kind; `linearize` and `retract` understand it.
+        retract: Blocks moved by dz, shape (m, k).
+        max_iterations: Accepted steps after which to give up.
+        tolerance: Relative change of loss and of x, and share of the gradient, below which to stop.
+        progress: Called with the number of accepted steps and the loss. An interrupt (Ctrl-C) ends the
+            minimisation with the best point so far.
+
+    Raises:
+        ValueError: If shapes differ, a bound is NaN or crossed, the start lies outside, or the loss is not
+            finite there.
+    """
+    x = np.array(start, dtype=float)
+    lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+    if x.ndim != 1 or lower.shape != x.shape or upper.shape != x.shape:
+        raise ValueError(
+            "start, lower and upper must be vectors of one length, got "
+            f"{x.shape}, {lower.shape}, {upper.shape}"
+        )
+    if not np.all(lower <= upper):
+        raise ValueError(f"lower must be ≤ upper, got {lower.tolist()} and {upper.tolist()}")
+    if not np.all((lower <= x) & (x <= upper)):
+        raise ValueError(f"start must lie between {lower.tolist()} and {upper.tolist()}, got {x.tolist()}")
+    blocks, normal = start_blocks, linearize(x, start_blocks)
+    if not np.isfinite(normal.loss):
+        raise ValueError(f"loss must be finite at the start {x.tolist()}, got {normal.loss}")
+    losses, damping, growth = [float(normal.loss)], _DAMPING, 2.0
+    evaluations = 1
+    spread = _scales(normal)
+    try:
+        for iteration in range(max_iterations + 1):
+            if progress is not None:
+                progress(iteration, losses[-1])
+            slope = _free_gradient(normal, x, lower, upper) / np.sqrt(spread[0])
+            blocks_slope = normal.block_gradient / np.sqrt(spread[1])
+            steepest = max(np.max(np.abs(slope), initial=0), np.max(np.abs(blocks_slope), initial=0))
+            # In units in which a slope of √(2 f) is as steep as can be.
+            if steepest <= tolerance * np.sqrt(2 * losses[-1]):
+                return _solution(x, blocks, normal, Stop.GRADIENT, losses, evaluations)
+            if losses[-1] <= np.finfo(float).tiny:
+                return _solution(x, blocks, normal, Stop.PERFECT, losses, evaluations)
+            if iteration == max_iterations:
+                break
+            while True:
+                change, block_change, promised = _step(normal, damping, spread, lower - x, upper - x)
+                negligible = np.all(np.abs(change) <= tolerance * (np.abs(x) + tolerance)) and np.all(
+                    block_change**2 * spread[1] <= tolerance**2 * 2 * losses[-1]
+                )
+                if negligible:
+                    stop = Stop.STEP if damping <= 1 else Stop.STUCK
+                    return _solution(x, blocks, normal, stop, losses, evaluations)
+                tried, tried_blocks = np.clip(x + change, lower, upper), retract(blocks, block_change)
+                following = linearize(tried, tried_blocks)
+                evaluations += 1
+                value = float(following.loss)
+                gain = (losses[-1] - value) / promised if promised > 0 else -np.inf
+                if np.isfinite(value) and gain > _SUFFICIENT:
+                    break
+                damping, growth = damping * growth, 2 * growth
+                if damping > _MOST_DAMPING:
+                    return _solution(x, blocks, normal, Stop.STUCK, losses, evaluations)
+            # Nielsen's rule: less damping the better the model was.
+            damping, growth = damping * max(1 / 10, 1 - (2 * gain - 1) ** 3), 2.0
+            damping = max(damping, np.finfo(float).eps)
+            x, blocks, normal = tried, tried_blocks, following
+            spread = tuple(np.maximum(new, old) for new, old in zip(_scales(normal), spread, strict=True))
+            fell = losses[-1] - value
+            losses.append(value)
+            if fell <= tolerance * value and promised <= tolerance * value:
+                return _solution(x, blocks, normal, Stop.LOSS, losses, evaluations)
+    except KeyboardInterrupt:
+        return _solution(x, blocks, normal, Stop.INTERRUPTED, losses, evaluations)
+    return _solution(x, blocks, normal, Stop.ITERATIONS, losses, evaluations)
+
+
+def _solution(x, blocks, normal, stop, losses, evaluations) -> Solution:
+    return Solution(x, blocks, normal, stop, np.array(losses), evaluations)
+
+
+def _scales(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
+    """Diagonals D of the Hessians, which measure damping and slopes; 1 where there is no curvature."""
+    shared = np.diag(normal.hessian)
+    private = np.diagonal(normal.block_hessian, axis1=1, axis2=2)
+    return np.where(shared > 0, shared, 1.0), np.where(private > 0, private, 1.0)
+
+
+def _free_gradient(normal: NormalEquations, x, lower, upper) -> np.ndarray:
+    """The gradient without components that point out of the box."""
+    g = normal.gradient
+    blocked = ((x <= lower) & (g > 0)) | ((x >= upper) & (g < 0))
+    return np.where(blocked, 0.0, g)
+
+
+def eliminated(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient (p,) and Hessian (p, p) of the loss in x alone, minimised over the blocks."""
+    gradient, hessian, _, _ = _eliminate(normal, 0.0, _scales(normal))
+    return gradient, hessian
+
+
+def _eliminate(normal: NormalEquations, damping: float, spread: tuple[np.ndarray, np.ndarray]):
+    hessian = normal.hessian + damping * np.diag(spread[0])
+    if normal.block_gradient.size == 0:
+        return normal.gradient, hessian, normal.block_gradient, normal.coupling
+    blocks = normal.block_hessian + damping * spread[1][:, :, None] * np.eye(spread[1].shape[1])
+    right = np.concatenate([normal.block_gradient[:, :, None], normal.coupling], axis=2)
+    solved = _solve_blocks(blocks, right)
+    shift, follow = solved[:, :, 0], solved[:, :, 1:]
+    gradient = normal.gradient - np.einsum("mkp,mk->p", normal.coupling, shift)
+    hessian = hessian - np.einsum("mkp,mkq->pq", normal.coupling, follow)
+    return gradient, 0.5 * (hessian + hessian.T), shift, follow
+
+
+def _solve_blocks(blocks: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solutions of symmetric systems, of least norm where a block is singular."""
+    # Rows and columns of size one, so that units do not decide what counts as singular.
+    diagonal = np.diagonal(blocks, axis1=1, axis2=2)
+    size = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scaled = blocks / (size[:, :, None] * size[:, None, :])
+    values, vectors = np.linalg.eigh(scaled)
+    keep = values > 1e-12 * np.maximum(values[:, -1:], 1e-300)
+    inverse = np.where(keep, 1 / np.where(keep, values, 1.0), 0.0)
+    rotated = np.einsum("mij,mik->mjk", vectors, right / size[:, :, None])
+    return np.einsum("mij,mj,mjk->mik", vectors, inverse, rotated) / size[:, :, None]
+
+
+def _step(normal: NormalEquations, damping: float, spread, lower: np.ndarray, upper: np.ndarray):
+    """Step within bounds on dx, and the fall of the loss that the model promises for it."""
+    gradient, hessian, shift, follow = _eliminate(normal, damping, spread)
+    change = _bounded_quadratic(gradient, hessian, lower, upper)
+    block_change = -shift - follow @ change
+    promised = -(
+        normal.gradient @ change
+        + np.sum(normal.block_gradient * block_change)
+        + 0.5 * change @ normal.hessian @ change
+        + np.sum((normal.coupling @ change) * block_change)
+        + 0.5 * np.einsum("mi,mij,mj->", block_change, normal.block_hessian, block_change)
+    )
+    return change, block_change, promised
+
+
+def _bounded_quadratic(gradient, hessian, lower, upper) -> np.ndarray:
+    """Minimiser of gᵀd + ½ dᵀHd in a box that holds zero, H positive definite."""
+    # In scaled unknowns, for the same reason as above.
+    size = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(hessian / (size[:, None] * size[None]))
+    values = np.maximum(values, 1e-15 * values[-1])
+    # H = AᵀA, and gᵀd = −bᵀA d.
+    root = np.sqrt(values)[:, None] * vectors.T
+    target = -(vectors.T @ (gradient / size)) / np.sqrt(values)
+    free = vectors @ (target / np.sqrt(values))
+    scaled_lower, scaled_upper = lower * size, upper * size
+    if np.all((scaled_lower <= free) & (free <= scaled_upper)):
+        return free / size
+    # Where the box has no width there is nothing to choose, and BVLS wants none such.
+    open_ = scaled_lower < scaled_upper
+    best = np.zeros_like(free)
+    if np.any(open_):
+        found = lsq_linear(
+            root[:, open_], target, (scaled_lower[open_], scaled_upper[open_]), method="bvls", tol=1e-14
+        )
+        best[open_] = found.x
+    return best / size
