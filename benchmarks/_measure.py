@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 import dano
+from dano.archive import replacing
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 VERSIONS_OF = ("jax", "jaxlib", "equinox", "numpy", "scipy", "mujoco")
@@ -115,9 +116,15 @@ NO_DATA = "no reference data: set DANO_REFERENCE_DATA to the folder that holds i
 
 
 def report(
-    name: str, rows: Sequence[Row], settings: dict[str, object], load_before: float, file: Path | None
+    name: str,
+    rows: Sequence[Row],
+    settings: dict[str, object],
+    load_before: float,
+    file: Path | None,
+    *,
+    values: Mapping[str, float] | None = None,
 ) -> None:
-    """Print the rows as a table and, if a file is given, write them to it as JSON."""
+    """Print the rows as a table and, if a file is given, write them and named values to it as JSON."""
     result = {
         "benchmark": name,
         "date": datetime.date.today().isoformat(),
@@ -125,6 +132,7 @@ def report(
         "load": {"before": round(load_before, 2), "after": round(load_average(), 2)},
         "versions": _versions(),
         "settings": settings,
+        **(values or {}),
         "rows": [{**asdict(row), "verdict": row.verdict} for row in rows],
     }
     _print_table(rows)
@@ -132,9 +140,8 @@ def report(
     print("\n" + ", ".join(f"{n} {word}" for word, n in counts.items()) + f"   {result['machine']}")
     print(f"load average {result['load']}   {settings}")
     if file is not None:
-        beside = file.with_name(file.name + ".part")
-        beside.write_text(json.dumps(_rounded(result), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-        beside.replace(file)
+        with replacing(file) as output:
+            output.write((json.dumps(_rounded(result), indent=1, ensure_ascii=False) + "\n").encode())
 
 
 def load_average() -> float:

@@ -121,7 +121,7 @@ def test_a_direction_without_curvature_stays_where_it_is():
 
 
 def test_says_why_it_stopped():
-    assert solve(ROSENBROCK, (1.0, 1.0), (-2, -2), (2, 2)).stop in (Stop.GRADIENT, Stop.PERFECT)
+    assert solve(ROSENBROCK, (1.0, 1.0), (-2, -2), (2, 2)).stop in (Stop.LOSS, Stop.PERFECT)
     residual, jacobian = ROSENBROCK
     few = bounded_least_squares(
         lambda x, _: NormalEquations(

@@ -11,6 +11,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from dano.archive import replacing
+
 STORED = Path(__file__).with_name("parameters.json")
 
 VARIANTS = ("fitted", "centred")
@@ -65,9 +67,8 @@ def load(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def save(path: str | os.PathLike[str], parameters: dict[str, Any]) -> None:
     """Write a parameter file, replacing another only when complete."""
-    beside = Path(path).with_name(Path(path).name + ".part")
-    beside.write_text(json.dumps(parameters, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    beside.replace(path)
+    with replacing(path) as file:
+        file.write((json.dumps(parameters, indent=1, ensure_ascii=False) + "\n").encode())
 
 
 def _check(path, found: Any, keys: tuple[str, ...], names: tuple[str, ...]) -> None:

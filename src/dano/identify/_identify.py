@@ -15,15 +15,19 @@ from scipy.stats import qmc
 from dano.engine import AbstractEngine, Policy, VariationalEngine
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Parameter, Space, space_of, values_at, with_values
-from dano.identify._residuals import COLUMNS, Linearized, linearized, Model, moved
+from dano.identify._residuals import Linearized, linearized, Model, moved
 from dano.identify._uncertainty import quantile, uncertainty
 from dano.identify._windows import Plan, plan_windows
 from dano.scene import Control, Scene, State, Trajectory
 from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
 
-Initial = Literal["given", "velocities", "states"]
+Initial = Literal["given", "velocities", "states"] | Sequence[str]
 Observed = Motion | Trajectory
 
+_INITIAL = {"given": (), "velocities": ("velocity", "omega"), "states": tuple(QUANTITIES)}
+
+# Root mean square of residuals, in standard deviations, below which a fit cannot be better.
+_PERFECT = 1e-6
 # Of each start that is refined, so many are only looked at.
 _LOOKS = 4
 # Windows simulated at once on an accelerator; a CPU is fastest one by one.
@@ -173,7 +177,7 @@ def identify(
     held_out: Observed | Sequence[Observed] = (),
     jacobian: Literal["auto", "forward", "reverse"] = "auto",
     max_iterations: int = 50,
-    tolerance: float = 1e-6,
+    tolerance: float = 0.03,
     batch: int | None = None,
     engine: AbstractEngine | None = None,
     progress: Callable[[str, float], None] | None = None,
@@ -193,9 +197,9 @@ def identify(
         controls: Forces and torques [N, N m]: those of each step of each motion, or a policy as in `simulate`
             (whose time runs from the first frame of the motion).
         initial: What to estimate of the state in which each window begins: nothing ("given": it is as
-            observed), velocities and spins ("velocities"), or all ("states": right for noisy poses, and
-            needed for honest standard errors then). Default: "given" if velocities and spins are observed,
-            "velocities" if not.
+            observed), velocities and spins ("velocities"), all ("states": right for noisy poses, and
+            needed for honest standard errors then), or a list of quantities, e.g. ["velocity"]. Default:
+            "given" if velocities and spins are observed, "velocities" if not.
         noise: Standard deviations by quantity: position [m], orientation [rad], velocity [m/s], omega
             [rad/s]. What is left out does not count. Default: positions and orientations, which weigh as if
             seen at the bodies' surface.
@@ -211,7 +215,7 @@ def identify(
         held_out: Motions that are not fitted, to measure the error on.
         jacobian: Forward mode costs one rollout per unknown, reverse mode several per observed number.
         max_iterations: Steps of each search.
-        tolerance: Relative change of loss and parameters, below which to stop.
+        tolerance: Stop when a step promises to move the parameters by less than this, in standard errors.
         batch: Windows simulated at once; default one on a CPU, many on a GPU.
         engine: Default `VariationalEngine()`.
         progress: Called with a description and the share done. Ctrl-C during the search returns the best
@@ -231,7 +235,7 @@ def identify(
         raise ValueError("observed must hold at least one motion, got none")
     space = space_of(scene, controls, parameters)
     chosen = _initial(initial, motions)
-    _check_options(huber, window, continuity, starts, chosen, jacobian, max_iterations)
+    _check_options(huber, window, continuity, starts, chosen, jacobian, max_iterations, tolerance)
     setup = _Setup(
         space,
         scene,
@@ -317,7 +321,7 @@ class _Setup(NamedTuple):
     space: Space
     scene: Scene
     controls: Any
-    initial: Initial
+    initial: tuple[str, ...]
     noise: dict[str, float]
     huber: float | None
     window: int | None
@@ -346,10 +350,11 @@ class _Fit:
             continuous=continuity is not None,
         )
         dtype = scene.timestep.dtype
-        self.private = len(self.plan.bodies) * len(COLUMNS[initial])
+        self.private = 3 * len(self.plan.bodies) * len(initial)
         unknowns = len(space.start) + self.private
         n_windows = len(self.plan.rows)
-        if self.plan.n_data <= len(space.start) + n_windows * self.private:
+        self.freedom = self.plan.n_data - len(space.start) - n_windows * self.private
+        if self.freedom <= 0:
             raise ValueError(
                 f"observed must hold more numbers than there are unknowns, got {self.plan.n_data} for "
                 f"{len(space.start)} parameters and {n_windows * self.private} of initial states: take "
@@ -445,7 +450,9 @@ class _Fit:
             start_blocks=self.plan.start,
             retract=self.retract,
             max_iterations=max_iterations,
-            tolerance=tolerance,
+            # A step of δ standard errors reduces the loss ½ s² (N − p) by ½ s² δ².
+            tolerance=tolerance**2 / self.freedom,
+            perfect=0.5 * self.plan.n_data * _PERFECT**2,
             progress=tell,
         )
 
@@ -499,16 +506,20 @@ def _motions(name: str, observed: Observed | Sequence[Observed]) -> tuple[Motion
     return tuple(found)
 
 
-def _initial(initial: Initial | None, motions: Sequence[Motion]) -> Initial:
+def _initial(initial: Initial | None, motions: Sequence[Motion]) -> tuple[str, ...]:
     if initial is None:
         first = [np.concatenate([m.velocity, m.omega], axis=-1) for m in motions]
-        return "given" if all(np.isfinite(v).all() for v in first) else "velocities"
-    if initial not in COLUMNS:
-        raise ValueError(f"initial must be one of {list(COLUMNS)}, got {initial!r}")
-    return initial
+        initial = "given" if all(np.isfinite(v).all() for v in first) else "velocities"
+    if isinstance(initial, str):
+        if initial not in _INITIAL:
+            raise ValueError(f"initial must be one of {list(_INITIAL)} or list quantities, got {initial!r}")
+        return _INITIAL[initial]
+    if wrong := [key for key in initial if key not in QUANTITIES]:
+        raise ValueError(f"initial must list some of {list(QUANTITIES)}, got {wrong[0]!r}")
+    return tuple(key for key in QUANTITIES if key in initial)
 
 
-def _check_options(huber, window, continuity, starts, initial, jacobian, max_iterations) -> None:
+def _check_options(huber, window, continuity, starts, initial, jacobian, max_iterations, tolerance) -> None:
     if huber is not None and not huber > 0:
         raise ValueError(f"huber must be > 0, got {huber}")
     if window is not None and window < 2:
@@ -516,14 +527,16 @@ def _check_options(huber, window, continuity, starts, initial, jacobian, max_ite
     if continuity is not None:
         if not continuity > 0:
             raise ValueError(f"continuity must be > 0, got {continuity}")
-        if window is None or initial != "states":
+        if window is None or len(initial) < len(QUANTITIES):
             raise ValueError(
-                f"continuity needs window and initial='states', got window {window}, initial {initial!r}"
+                f"continuity needs window and initial='states', got window {window}, initial {list(initial)}"
             )
     if starts < 1:
         raise ValueError(f"starts must be ≥ 1, got {starts}")
     if jacobian not in ("auto", "forward", "reverse"):
         raise ValueError(f"jacobian must be 'auto', 'forward' or 'reverse', got {jacobian!r}")
+    if not tolerance > 0:
+        raise ValueError(f"tolerance must be > 0 standard errors, got {tolerance}")
     if max_iterations < 1:
         raise ValueError(f"max_iterations must be ≥ 1, got {max_iterations}")
 

@@ -9,13 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dano.engine import AbstractEngine, difference, retract, simulate
+from dano.identify._motion import QUANTITIES
 from dano.identify._parameters import Selection, with_values
 from dano.identify._windows import Windows
 from dano.maths import quat_conjugate, quat_multiply, quat_normalize, quat_rotate, safe_norm
 from dano.scene import Control, Scene, State
-
-# Columns of a body's state change (position, rotation vector, velocity, omega) that are estimated.
-COLUMNS = {"given": (), "velocities": tuple(range(6, 12)), "states": tuple(range(12))}
 
 
 class Model(NamedTuple):
@@ -32,7 +30,7 @@ class Model(NamedTuple):
         selections: The parameters.
         bodies: Which bodies were observed.
         quantities: Which quantities count.
-        initial: What of the initial states is estimated.
+        initial: Quantities of the initial states that are estimated.
         n_steps: Steps of each window.
         reverse: Whether Jacobians are taken in reverse mode.
         batch: How many windows are simulated at once.
@@ -47,7 +45,7 @@ class Model(NamedTuple):
     selections: tuple[Selection, ...]
     bodies: tuple[int, ...]
     quantities: tuple[str, ...]
-    initial: str
+    initial: tuple[str, ...]
     n_steps: int
     reverse: bool
     batch: int
@@ -133,28 +131,29 @@ def linearized(model: Model, x: Float[Array, " p"], start: State, following: Sta
 
 
 def _map(function, items, batch: int):
-    n = jax.tree.leaves(items)[0].shape[0]
-    if batch >= n:
-        return jax.vmap(function)(items)
+    # Mapped one by one, the solver's loops end where each rollout's do, not where the slowest one's.
     return jax.lax.map(function, items, batch_size=None if batch == 1 else batch)
 
 
 @eqx.filter_jit
-def moved(start: State, change: Float[Array, "w k"], bodies: tuple[int, ...], initial: str) -> State:
+def moved(
+    start: State, change: Float[Array, "w k"], bodies: tuple[int, ...], initial: tuple[str, ...]
+) -> State:
     """Initial states moved by a change of what is estimated of them."""
     return jax.vmap(lambda s, c: retract(s, np.array(bodies), _spread(c, len(bodies), initial)))(
         start, change
     )
 
 
-def _spread(change: Float[Array, " k"], n: int, initial: str) -> Float[Array, "n 12"]:
-    columns = np.array(COLUMNS[initial], dtype=int)
-    full = jnp.zeros((n, 12), change.dtype)
-    return full.at[:, columns].set(change.reshape(n, len(columns))) if len(columns) else full
+def _spread(change: Float[Array, " k"], n: int, initial: tuple[str, ...]) -> Float[Array, "n 12"]:
+    """Changes of all that `retract` moves, from those of what is estimated."""
+    given = iter(jnp.split(change.reshape(n, -1), len(initial), axis=1)) if initial else iter(())
+    zero = jnp.zeros((n, 3), change.dtype)
+    return jnp.concatenate([next(given) if key in initial else zero for key in QUANTITIES], axis=1)
 
 
 def _no_change(model: Model) -> Float[Array, " k"]:
-    return jnp.zeros(len(model.bodies) * len(COLUMNS[model.initial]), model.scene.timestep.dtype)
+    return jnp.zeros(3 * len(model.bodies) * len(model.initial), model.scene.timestep.dtype)
 
 
 def _bodies(model: Model) -> np.ndarray:
@@ -169,7 +168,7 @@ def _residuals(model: Model, window: Windows, start: State, following: State, x,
         controls = _Late(with_values(model.selections, "controls", model.policy, x), window.begin)
     elif controls is not None:
         controls = with_values(model.selections, "controls", controls, x)
-    if model.initial != "given":
+    if model.initial:
         start = retract(start, _bodies(model), _spread(change, len(model.bodies), model.initial))
     trajectory = simulate(
         scene,

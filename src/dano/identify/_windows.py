@@ -75,7 +75,7 @@ def plan_windows(
     states: Sequence[State | None],
     controls: Sequence[Control | None],
     noise: Mapping[str, float],
-    initial: str,
+    initial: Sequence[str],
     window: int | None,
     continuous: bool,
 ) -> Plan:
@@ -87,7 +87,7 @@ def plan_windows(
         states: Initial state of each motion, for what it does not say itself.
         controls: Forces for each step of each motion, or None.
         noise: Standard deviation of each quantity that counts.
-        initial: What of the initial states is estimated: see `identify`.
+        initial: Quantities of the initial states that are estimated.
         window: Frames of a window; None: all.
         continuous: Whether windows are simulated up to the beginning of the next.
 
@@ -122,7 +122,7 @@ def plan_windows(
             continue
         counts = known.copy()
         counts[:, :, [i for i in range(len(scene.bodies)) if i not in seen]] = False
-        if initial == "given" or (initial == "velocities" and key in _CONFIGURATION):
+        if key not in initial:
             counts[:, 0] = False
         if counts.any():
             weights[key] = jnp.asarray(counts / noise[key], dtype)

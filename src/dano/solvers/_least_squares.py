@@ -42,18 +42,17 @@ class NormalEquations(NamedTuple):
 class Stop(enum.Enum):
     """Why a minimisation ended."""
 
-    GRADIENT = "the gradient vanishes within the bounds"
+    LOSS = "the loss cannot fall further by more than is asked for"
     STEP = "the steps became negligible"
-    LOSS = "the loss no longer falls"
-    PERFECT = "the residuals vanish"
-    STUCK = "no step reduces the loss, although the gradient does not vanish: it may be rough here"
+    PERFECT = "the residuals vanish, but for rounding"
+    STUCK = "no step reduces the loss, although its gradient says that it could fall: it is rough here"
     ITERATIONS = "the largest number of iterations was reached"
     INTERRUPTED = "it was interrupted; this is the best point so far"
 
     @property
     def converged(self) -> bool:
         """Whether this is a minimum as far as can be told."""
-        return self in (Stop.GRADIENT, Stop.STEP, Stop.LOSS, Stop.PERFECT)
+        return self in (Stop.LOSS, Stop.STEP, Stop.PERFECT)
 
 
 class Solution(NamedTuple):
@@ -77,7 +76,11 @@ class Solution(NamedTuple):
 
 
 _DAMPING = 1e-4
-_MOST_DAMPING = 1e12
+_LEAST_DAMPING, _MOST_DAMPING = 1e-15, 1e12
+# Relative change of x that is none.
+_NEGLIGIBLE = 1e-10
+# A loss that should fall by so many tolerances, but does not, is said to be rough.
+_ROUGH = 100
 # A step is accepted when it brings this share of what the model promises.
 _SUFFICIENT = 1e-4
 
@@ -91,7 +94,8 @@ def bounded_least_squares(
     start_blocks: Any = None,
     retract: Callable[[Any, np.ndarray], Any] = lambda blocks, change: blocks,
     max_iterations: int = 50,
-    tolerance: float = 1e-8,
+    tolerance: float = 1e-10,
+    perfect: float = 0.0,
     progress: Callable[[int, float], None] | None = None,
 ) -> Solution:
     """Minimise a sum of squares within bounds.
@@ -104,7 +108,8 @@ def bounded_least_squares(
         start_blocks: First private unknowns, of any kind; `linearize` and `retract` understand it.
         retract: Blocks moved by dz, shape (m, k).
         max_iterations: Accepted steps after which to give up.
-        tolerance: Relative change of loss and of x, and share of the gradient, below which to stop.
+        tolerance: Stop when the model promises to reduce the loss by less than this share of it.
+        perfect: Stop when the loss is no larger: what is left is rounding.
         progress: Called with the number of accepted steps and the loss. An interrupt (Ctrl-C) ends the
             minimisation with the best point so far.
 
@@ -133,43 +138,34 @@ def bounded_least_squares(
         for iteration in range(max_iterations + 1):
             if progress is not None:
                 progress(iteration, losses[-1])
-            slope = _free_gradient(normal, x, lower, upper) / np.sqrt(spread[0])
-            blocks_slope = normal.block_gradient / np.sqrt(spread[1])
-            steepest = max(np.max(np.abs(slope), initial=0), np.max(np.abs(blocks_slope), initial=0))
-            # In units in which a slope of √(2 f) is as steep as can be.
-            if steepest <= tolerance * np.sqrt(2 * losses[-1]):
-                return _solution(x, blocks, normal, Stop.GRADIENT, losses, evaluations)
-            if losses[-1] <= np.finfo(float).tiny:
+            if losses[-1] <= max(perfect, np.finfo(float).tiny):
                 return _solution(x, blocks, normal, Stop.PERFECT, losses, evaluations)
+            box = lower - x, upper - x
+            change, _, hoped = _step(normal, 0.0, spread, *box)
+            if hoped <= tolerance * losses[-1]:
+                return _solution(x, blocks, normal, Stop.LOSS, losses, evaluations)
+            if normal.block_gradient.size == 0 and _negligible(change, x):
+                return _solution(x, blocks, normal, Stop.STEP, losses, evaluations)
             if iteration == max_iterations:
                 break
             while True:
-                change, block_change, promised = _step(normal, damping, spread, lower - x, upper - x)
-                negligible = np.all(np.abs(change) <= tolerance * (np.abs(x) + tolerance)) and np.all(
-                    block_change**2 * spread[1] <= tolerance**2 * 2 * losses[-1]
-                )
-                if negligible:
-                    stop = Stop.STEP if damping <= 1 else Stop.STUCK
+                change, block_change, promised = _step(normal, damping, spread, *box)
+                if promised <= tolerance * losses[-1] or damping > _MOST_DAMPING:
+                    rough = hoped > _ROUGH * tolerance * losses[-1]
+                    stop = Stop.STUCK if rough else Stop.LOSS
                     return _solution(x, blocks, normal, stop, losses, evaluations)
                 tried, tried_blocks = np.clip(x + change, lower, upper), retract(blocks, block_change)
                 following = linearize(tried, tried_blocks)
                 evaluations += 1
-                value = float(following.loss)
-                gain = (losses[-1] - value) / promised if promised > 0 else -np.inf
-                if np.isfinite(value) and gain > _SUFFICIENT:
+                gain = (losses[-1] - float(following.loss)) / promised
+                if np.isfinite(following.loss) and gain > _SUFFICIENT:
                     break
                 damping, growth = damping * growth, 2 * growth
-                if damping > _MOST_DAMPING:
-                    return _solution(x, blocks, normal, Stop.STUCK, losses, evaluations)
             # Nielsen's rule: less damping the better the model was.
-            damping, growth = damping * max(1 / 10, 1 - (2 * gain - 1) ** 3), 2.0
-            damping = max(damping, np.finfo(float).eps)
+            damping, growth = max(damping * max(1 / 10, 1 - (2 * gain - 1) ** 3), _LEAST_DAMPING), 2.0
             x, blocks, normal = tried, tried_blocks, following
             spread = tuple(np.maximum(new, old) for new, old in zip(_scales(normal), spread, strict=True))
-            fell = losses[-1] - value
-            losses.append(value)
-            if fell <= tolerance * value and promised <= tolerance * value:
-                return _solution(x, blocks, normal, Stop.LOSS, losses, evaluations)
+            losses.append(float(normal.loss))
     except KeyboardInterrupt:
         return _solution(x, blocks, normal, Stop.INTERRUPTED, losses, evaluations)
     return _solution(x, blocks, normal, Stop.ITERATIONS, losses, evaluations)
@@ -186,11 +182,8 @@ def _scales(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
     return np.where(shared > 0, shared, 1.0), np.where(private > 0, private, 1.0)
 
 
-def _free_gradient(normal: NormalEquations, x, lower, upper) -> np.ndarray:
-    """The gradient without components that point out of the box."""
-    g = normal.gradient
-    blocked = ((x <= lower) & (g > 0)) | ((x >= upper) & (g < 0))
-    return np.where(blocked, 0.0, g)
+def _negligible(change: np.ndarray, x: np.ndarray) -> bool:
+    return bool(np.all(np.abs(change) <= _NEGLIGIBLE * (np.abs(x) + _NEGLIGIBLE)))
 
 
 def eliminated(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,1 @@
+"""The real soap: its friction from a video (paper, Sec. V-A)."""
