@@ -7,6 +7,7 @@ that a straight path cannot show.
 
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -51,11 +52,7 @@ def _real(folder: Path) -> tuple[list[Row], dict[str, float]]:
     friction = dano.Parameter(
         "friction", lambda s: s.contact("soap", "table").sliding_friction, 0.0, 1.0, start=0.0
     )
-    seconds = []
-    for _ in range(2):
-        started = time.perf_counter()
-        fit = dano.identify(scene, motion, [friction], state=begin, initial=["velocity"])
-        seconds.append(time.perf_counter() - started)
+    fit, seconds = _twice(lambda: dano.identify(scene, motion, [friction], state=begin, initial=["velocity"]))
     deceleration, error = _deceleration(times, path)
     values = {
         "friction": fit.values["friction"],
@@ -92,6 +89,16 @@ def _real(folder: Path) -> tuple[list[Row], dict[str, float]]:
     return rows, values
 
 
+def _twice(identification: Callable[[], dano.Identification]) -> tuple[dano.Identification, list[float]]:
+    """What it finds, and how long it takes the first and the second time [s]."""
+    seconds, fits = [], []
+    for _ in range(2):
+        started = time.perf_counter()
+        fits.append(identification())
+        seconds.append(time.perf_counter() - started)
+    return fits[1], seconds
+
+
 def _path_on_table(data) -> tuple[np.ndarray, np.ndarray]:
     """Positions [m] from the first one in axes of the table, x along the path; and those axes (rows)."""
     # The file divides by three after turning the tracker's axes into the table's.
@@ -121,7 +128,7 @@ def _settled(folder: Path, data, axes: np.ndarray, timestep: float) -> tuple[dan
         [dano.Contact("soap", "table", params, dano.CentroidLaw(stiction_velocity=1e-6))],
         timestep=timestep,
     )
-    turned = quat_multiply(quat_from_matrix(axes), jnp.asarray(data["Q_data"][0]))
+    turned = quat_multiply(quat_from_matrix(jnp.asarray(axes)), jnp.asarray(data["Q_data"][0]))
     start = scene.initial_state(soap={"position": (0, 0, 0.32 * LENGTH), "orientation": turned})
     rest = jax.tree.map(lambda x: x[-1], dano.simulate(scene, start, int(1.0 / timestep)).states)
     return scene, rest
@@ -175,14 +182,12 @@ def _scaled(folder: Path, starts: int) -> list[Row]:
     )
     # Their weights: 1 on positions and quaternions (half the angle), 0.1 on velocities.
     noise = {"position": 1.0, "orientation": 2.0, "velocity": 0.1**-0.5, "omega": 0.1**-0.5}
-    seconds = []
-    for _ in range(2):
-        started = time.perf_counter()
-        with warnings.catch_warnings():
-            # The loss is rough, and is said to be.
-            warnings.simplefilter("ignore", RuntimeWarning)
-            fit = dano.identify(scene, motion, [friction], noise=noise, starts=starts, initial="given")
-        seconds.append(time.perf_counter() - started)
+    with warnings.catch_warnings():
+        # The loss is rough, and is said to be.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        fit, seconds = _twice(
+            lambda: dano.identify(scene, motion, [friction], noise=noise, starts=starts, initial="given")
+        )
     unit = LENGTH / MESH_LENGTH
     ends = ", ".join(f"{m.values['friction']:.3f} ({m.loss:.2f})" for m in fit.minima)
     return [

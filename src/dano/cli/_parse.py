@@ -23,7 +23,7 @@ def parse(argv: Sequence[str]) -> Callable[[], None]:
     if list(argv) == ["--version"]:
         print(f"dano {__version__}")
         raise SystemExit(0)
-    commands = {function.__name__: function for function in (build, inspect, simulate, view, demo)}
+    commands = {function.__name__: function for function in (build, inspect, simulate, identify, view, demo)}
     return tyro.extras.subcommand_cli_from_dict(
         commands,
         prog="dano",
@@ -138,6 +138,74 @@ def simulate(
         timestep=timestep,
         slow_motion=slow_motion,
         as_json=json,
+    )
+
+
+def identify(
+    scene: Positional[Path],
+    motions: Positional[tuple[Path, ...]],
+    /,
+    parameter: Annotated[tuple[str, ...], arg(aliases=["-p"])],
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None,
+    body: str | None = None,
+    initial: Literal["given", "velocities", "states"] | None = None,
+    position_noise: float | None = None,
+    rotation_noise: float | None = None,
+    huber: float | None = None,
+    window: int | None = None,
+    continuity: float | None = None,
+    starts: int = 1,
+    held_out: tuple[Path, ...] = (),
+    order: Literal["wxyz", "xyzw"] = "wxyz",
+    point: Literal["com", "origin"] | None = None,
+    rate: float | None = None,
+    timestep: float | None = None,
+    json: bool = False,
+) -> Callable[[], None]:
+    """Find parameters of a scene with which its bodies move as observed, with error bars.
+
+    Args:
+        scene: Scene file (.toml).
+        motions: Observed motions (.npz, .csv): times [s], positions [m], quaternions, see docs.
+        parameter: What is unknown, with bounds and where to start, e.g. soap,table.sliding_friction:0:1,
+            soap,table.sliding_friction:0:1:0.3 or soap.mass_scale:0.2:5; several after each other.
+        output: Where to write the result (.json).
+        body: Which body the motions are of, if they do not say.
+        initial: What to estimate of the initial states: nothing (given), velocities, or all (states).
+        position_noise: Standard deviation of observed positions [m].
+        rotation_noise: Standard deviation of observed orientations [rad].
+        huber: Residuals count linearly from so many standard deviations on.
+        window: Frames of the windows that motions are cut into; default: whole.
+        continuity: How far windows may miss the beginning of the next, in standard deviations; default: any.
+        starts: Points in the bounds to start from.
+        held_out: Motions not to fit, to measure the error on.
+        order: Of the quaternions in the files.
+        point: What positions refer to: centre of mass (com) or origin of the field's frame (origin).
+        rate: Frames a second, if the files have no times.
+        timestep: Of the simulation [s], instead of the file's.
+        json: Print one JSON object instead of text.
+    """
+    from dano.cli import _identify
+
+    return functools.partial(
+        _identify.identify,
+        scene,
+        motions,
+        parameter,
+        output=output,
+        body=body,
+        held_out=held_out,
+        timestep=timestep,
+        as_json=json,
+        noise={"position": position_noise, "orientation": rotation_noise},
+        reading={"order": order, "point": point, "rate": rate},
+        options={
+            "initial": initial,
+            "huber": huber,
+            "window": window,
+            "continuity": continuity,
+            "starts": starts,
+        },
     )
 
 

@@ -4,7 +4,7 @@ import dataclasses
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array
 from scipy.stats import qmc
 
-from dano.engine import AbstractEngine, Policy, VariationalEngine
+from dano.engine import AbstractEngine, VariationalEngine
+from dano.engine._rollout import Policy
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Parameter, Space, space_of, values_at, with_values
 from dano.identify._residuals import Linearized, linearized, Model, moved
@@ -21,13 +22,10 @@ from dano.identify._windows import Plan, plan_windows
 from dano.scene import Control, Scene, State, Trajectory
 from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
 
-Initial = Literal["given", "velocities", "states"] | Sequence[str]
 Observed = Motion | Trajectory
 
 _INITIAL = {"given": (), "velocities": ("velocity", "omega"), "states": tuple(QUANTITIES)}
 
-# Root mean square of residuals, in standard deviations, below which a fit cannot be better.
-_PERFECT = 1e-6
 # Of each start that is refined, so many are only looked at.
 _LOOKS = 4
 # Windows simulated at once on an accelerator; a CPU is fastest one by one.
@@ -162,22 +160,22 @@ def _plain(value: Any) -> Any:
 
 def identify(
     scene: Scene,
-    observed: Observed | Sequence[Observed],
+    observed: Observed | Sequence[Any],
     parameters: Sequence[Parameter],
     *,
     state: State | Sequence[State | None] | None = None,
     controls: Control | Policy | Sequence[Control | None] | None = None,
-    initial: Initial | None = None,
+    initial: str | Sequence[str] | None = None,
     noise: Mapping[str, float] | None = None,
     huber: float | None = None,
     window: int | None = None,
     continuity: float | None = None,
     starts: int = 1,
     seed: int = 0,
-    held_out: Observed | Sequence[Observed] = (),
-    jacobian: Literal["auto", "forward", "reverse"] = "auto",
-    max_iterations: int = 50,
-    tolerance: float = 0.03,
+    held_out: Observed | Sequence[Any] = (),
+    jacobian: str = "auto",
+    max_iterations: int = 100,
+    tolerance: float = 0.1,
     batch: int | None = None,
     engine: AbstractEngine | None = None,
     progress: Callable[[str, float], None] | None = None,
@@ -452,7 +450,8 @@ class _Fit:
             max_iterations=max_iterations,
             # A step of δ standard errors reduces the loss ½ s² (N − p) by ½ s² δ².
             tolerance=tolerance**2 / self.freedom,
-            perfect=0.5 * self.plan.n_data * _PERFECT**2,
+            # A step is solved to about the dtype's resolution to the power 3/4.
+            perfect=0.5 * self.plan.n_data * float(jnp.finfo(self.plan.start.position.dtype).eps) ** 0.75,
             progress=tell,
         )
 
@@ -496,7 +495,7 @@ def _unchained(change: np.ndarray, owner: np.ndarray, k: int) -> np.ndarray:
     return np.concatenate([change[i, : n * k].reshape(n, k) for i, n in enumerate(counts)])
 
 
-def _motions(name: str, observed: Observed | Sequence[Observed]) -> tuple[Motion, ...]:
+def _motions(name: str, observed: Observed | Sequence[Any]) -> tuple[Motion, ...]:
     items = [observed] if isinstance(observed, (Motion, Trajectory)) else list(observed)
     found = []
     for item in items:
@@ -506,7 +505,7 @@ def _motions(name: str, observed: Observed | Sequence[Observed]) -> tuple[Motion
     return tuple(found)
 
 
-def _initial(initial: Initial | None, motions: Sequence[Motion]) -> tuple[str, ...]:
+def _initial(initial: str | Sequence[str] | None, motions: Sequence[Motion]) -> tuple[str, ...]:
     if initial is None:
         first = [np.concatenate([m.velocity, m.omega], axis=-1) for m in motions]
         initial = "given" if all(np.isfinite(v).all() for v in first) else "velocities"

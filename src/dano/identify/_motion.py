@@ -2,14 +2,12 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 
 from dano.maths import Numbers
 from dano.scene import Trajectory
 
-Point = Literal["com", "origin"]
 QUANTITIES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 """What a motion may hold of each body and frame, and how many numbers it has."""
 
@@ -41,7 +39,7 @@ class Motion:
     velocity: np.ndarray
     omega: np.ndarray
     names: tuple[str, ...]
-    point: Point = "com"
+    point: str = "com"
     lag: float = 0.0
 
     @classmethod
@@ -54,7 +52,7 @@ class Motion:
         orientation: Numbers | None = None,
         velocity: Numbers | None = None,
         omega: Numbers | None = None,
-        point: Point = "com",
+        point: str = "com",
         lag: float = 0.0,
     ) -> "Motion":
         """A motion from arrays of shape (T, n, ·), or (T, ·) for a single body.
@@ -228,9 +226,9 @@ def _check_rotation(motion: Motion) -> None:
             continue
 
         def mismatch(q: np.ndarray, spin: np.ndarray, known=known, steps=steps) -> float:
-            rates = rotation_vectors(q[:-1], q[1:]) / steps
-            wrong = np.linalg.norm(rates - spin, axis=1) / np.linalg.norm(spin, axis=1)
-            return float(np.median(wrong[known]))
+            rates = (rotation_vectors(q[:-1], q[1:]) / steps)[known]
+            wrong = np.linalg.norm(rates - spin[known], axis=1) / np.linalg.norm(spin[known], axis=1)
+            return float(np.median(wrong))
 
         given = mismatch(turns, mean)
         if given < _INCONSISTENT:

@@ -6,14 +6,12 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from dano.archive import checked_input, checked_output, replacing, write_archive
-from dano.identify._motion import Motion, Point, QUANTITIES
+from dano.identify._motion import Motion, QUANTITIES
 
-Order = Literal["wxyz", "xyzw"]
 _SYNONYMS = {
     "times": ("times", "time", "t", "timestamp"),
     "position": ("position", "positions", "pos"),
@@ -33,8 +31,8 @@ def load_motion(
     path: str | os.PathLike[str],
     *,
     names: str | Sequence[str] | None = None,
-    order: Order = "wxyz",
-    point: Point | None = None,
+    order: str = "wxyz",
+    point: str | None = None,
     rate: float | None = None,
 ) -> Motion:
     """Read a motion.

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,9 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.maths import Numbers
-
-Coordinates = Literal["value", "log", "inertia"]
-Home = Literal["scene", "controls"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -39,8 +36,8 @@ class Parameter:
     lower: Numbers = -np.inf
     upper: Numbers = np.inf
     start: Numbers | None = None
-    coordinates: Coordinates | None = None
-    of: Home = "scene"
+    coordinates: str | None = None
+    of: str = "scene"
 
 
 class Selection(NamedTuple):
@@ -48,8 +45,8 @@ class Selection(NamedTuple):
 
     name: str
     where: Callable[[Any], Any]
-    of: Home
-    coordinates: Coordinates
+    of: str
+    coordinates: str
     shape: tuple[int, ...]
 
     @property
@@ -122,18 +119,22 @@ def _checked(p: Parameter, home: Any) -> tuple[Selection, np.ndarray, np.ndarray
         raise ValueError(f"{what} is one of the controls, but no controls are given")
     try:
         leaves = _leaves(p.where, home)
-        changed = eqx.tree_at(lambda tree: _leaves(p.where, tree), home, leaves)
-    except (AttributeError, TypeError, KeyError, IndexError, RuntimeError) as error:
+    except (AttributeError, TypeError, KeyError, IndexError) as error:
         raise ValueError(f"where in {what} must pick leaves of the {p.of}: {error}") from error
     except ValueError as error:
         raise ValueError(f"where in {what}: {error}") from error
-    del changed
     for leaf in leaves:
-        if leaf is None or not eqx.is_inexact_array(leaf):
+        if not eqx.is_inexact_array(leaf):
             raise ValueError(
                 f"where in {what} must pick floating-point arrays of the {p.of}, got {type(leaf).__name__}"
                 + (": its law does not use it" if leaf is None else "")
             )
+    try:
+        eqx.tree_at(lambda tree: _leaves(p.where, tree), home, leaves)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise ValueError(
+            f"where in {what} must pick whole leaves of the {p.of}, not parts or copies of them"
+        ) from error
     shapes = {leaf.shape for leaf in leaves}
     if len(shapes) != 1:
         raise ValueError(f"leaves of {what} must have one shape, got {sorted(shapes)}")
@@ -194,7 +195,7 @@ def _leaves(where: Callable[[Any], Any], tree: Any) -> list[Any]:
     return list(found) if isinstance(found, (list, tuple)) else [found]
 
 
-def with_values(selections: Sequence[Selection], home: Home, tree: Any, x: Float[Array, " p"]) -> Any:
+def with_values(selections: Sequence[Selection], home: str, tree: Any, x: Float[Array, " p"]) -> Any:
     """A scene, or controls, whose leaves hold the values at coordinates x."""
     offset = 0
     for selection in selections:

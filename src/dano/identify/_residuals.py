@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dano.engine import AbstractEngine, difference, retract, simulate
+from dano.engine import AbstractEngine, simulate
+from dano.engine._rollout import difference, retract
 from dano.identify._motion import QUANTITIES
 from dano.identify._parameters import Selection, with_values
 from dano.identify._windows import Windows

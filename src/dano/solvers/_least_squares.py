@@ -81,6 +81,9 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-15, 1e12
 _NEGLIGIBLE = 1e-10
 # A loss that should fall by so many tolerances, but does not, is said to be rough.
 _ROUGH = 100
+# Curvature over a parameter's range, as a share of the largest there is, that may be rounding: a parameter
+# with less stays about where it is instead of running off.
+_FLAT = 1e-10
 # A step is accepted when it brings this share of what the model promises.
 _SUFFICIENT = 1e-4
 
@@ -134,6 +137,8 @@ def bounded_least_squares(
     losses, damping, growth = [float(normal.loss)], _DAMPING, 2.0
     evaluations = 1
     spread = _scales(normal)
+    width = upper - lower
+    span = np.where(np.isfinite(width) & (width > 0), width, np.maximum(np.abs(x), 1.0))
     try:
         for iteration in range(max_iterations + 1):
             if progress is not None:
@@ -141,7 +146,8 @@ def bounded_least_squares(
             if losses[-1] <= max(perfect, np.finfo(float).tiny):
                 return _solution(x, blocks, normal, Stop.PERFECT, losses, evaluations)
             box = lower - x, upper - x
-            change, _, hoped = _step(normal, 0.0, spread, *box)
+            floor = _FLAT * np.max(np.diag(normal.hessian) * span**2, initial=0) / span**2
+            change, _, hoped = _step(normal, 0.0, floor, spread, *box)
             if hoped <= tolerance * losses[-1]:
                 return _solution(x, blocks, normal, Stop.LOSS, losses, evaluations)
             if normal.block_gradient.size == 0 and _negligible(change, x):
@@ -149,7 +155,7 @@ def bounded_least_squares(
             if iteration == max_iterations:
                 break
             while True:
-                change, block_change, promised = _step(normal, damping, spread, *box)
+                change, block_change, promised = _step(normal, damping, floor, spread, *box)
                 if promised <= tolerance * losses[-1] or damping > _MOST_DAMPING:
                     rough = hoped > _ROUGH * tolerance * losses[-1]
                     stop = Stop.STUCK if rough else Stop.LOSS
@@ -218,10 +224,10 @@ def _solve_blocks(blocks: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.einsum("mij,mj,mjk->mik", vectors, inverse, rotated) / size[:, :, None]
 
 
-def _step(normal: NormalEquations, damping: float, spread, lower: np.ndarray, upper: np.ndarray):
+def _step(normal: NormalEquations, damping: float, floor: np.ndarray, spread, lower, upper):
     """Step within bounds on dx, and the fall of the loss that the model promises for it."""
     gradient, hessian, shift, follow = _eliminate(normal, damping, spread)
-    change = _bounded_quadratic(gradient, hessian, lower, upper)
+    change = _bounded_quadratic(gradient, hessian + np.diag(floor), lower, upper)
     block_change = -shift - follow @ change
     promised = -(
         normal.gradient @ change

@@ -1,0 +1,143 @@
+"""`dano identify`."""
+
+import json
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dano import scene_file
+from dano.archive import checked_output, replacing
+from dano.cli._console import Progress, put, put_json, say
+from dano.contact import ContactParams
+from dano.identify import Identification, identify as fit_parameters, load_motion, Parameter
+from dano.scene import Scene
+
+_OF_BODIES = ("mass_scale", "com_offset", "inertia", "mass", "com")
+
+
+def identify(
+    scene: Path,
+    motions: Sequence[Path],
+    parameters: Sequence[str],
+    *,
+    output: Path | None,
+    body: str | None,
+    held_out: Sequence[Path],
+    timestep: float | None,
+    as_json: bool,
+    noise: Mapping[str, float | None],
+    reading: Mapping[str, Any],
+    options: Mapping[str, Any],
+) -> None:
+    """See `dano identify --help`."""
+    if output is not None:
+        if output.suffix.lower() != ".json":
+            raise ValueError(f"output must be a .json file, got {output}")
+        checked_output(output)
+    if not motions:
+        raise ValueError("motions must name at least one file, got none")
+    progress = Progress()
+    loaded = scene_file.load_scene(scene, timestep=timestep, progress=progress)
+    chosen = [_parameter(text, loaded.scene) for text in parameters]
+    name = body or _only_free_body(loaded.scene)
+    found = [_motion(path, name, body is not None, reading) for path in motions]
+    others = [_motion(path, name, body is not None, reading) for path in held_out]
+    given = {key: value for key, value in noise.items() if value is not None}
+    with warnings.catch_warnings():
+        # They are in the result, and said at the end.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        fit = fit_parameters(
+            loaded.scene,
+            found,
+            chosen,
+            state=loaded.state,
+            controls=loaded.controls,
+            noise=given or None,
+            held_out=others,
+            progress=progress,
+            **options,
+        )
+    progress.close()
+    result = {"scene": str(scene), "motions": [str(path) for path in motions], **fit.to_dict()}
+    if output is not None:
+        with replacing(output) as file:
+            file.write((json.dumps(result, indent=2, ensure_ascii=False) + "\n").encode())
+    if as_json:
+        put_json(result)
+    else:
+        _print(fit)
+        if output is not None:
+            put(f"result      {output}")
+    for message in fit.messages:
+        say(f"warning: {message}")
+
+
+def _parameter(text: str, scene: Scene) -> Parameter:
+    """A parameter from PATH:LOWER:UPPER[:START], PATH being BODY.PROPERTY or BODY,BODY.PROPERTY.
+
+    Raises:
+        ValueError: If the text is not of that form or names nothing in the scene.
+    """
+    form = "BODY.PROPERTY:LOWER:UPPER[:START] or BODY,BODY.PROPERTY:LOWER:UPPER[:START]"
+    path, *numbers = text.split(":")
+    owner, _, name = path.rpartition(".")
+    try:
+        bounds = [float(number) for number in numbers]
+    except ValueError as error:
+        raise ValueError(f"parameter must be written {form}, got {text!r}") from error
+    if not owner or len(bounds) not in (0, 2, 3):
+        raise ValueError(f"parameter must be written {form}, got {text!r}")
+    lower, upper = bounds[:2] or (-np.inf, np.inf)
+    start = bounds[2] if len(bounds) == 3 else None
+    if "," in owner:
+        a, b = (part.strip() for part in owner.split(",", 1))
+        valid = tuple(ContactParams.__dataclass_fields__)
+        place = scene.contact_index(a, b)
+        where = lambda s: getattr(s.contacts[place].params, name)  # noqa: E731
+    else:
+        valid = _OF_BODIES
+        place = scene.index(owner)
+        where = lambda s: getattr(s.bodies[place], name)  # noqa: E731
+    if name not in valid:
+        raise ValueError(f"property in parameter {text!r} must be one of {', '.join(valid)}, got {name!r}")
+    return Parameter(path, where, lower, upper, start=start)
+
+
+def _only_free_body(scene: Scene) -> str | None:
+    free = [body.name for body in scene.bodies if not body.fixed]
+    return free[0] if len(free) == 1 else None
+
+
+def _motion(path: Path, name: str | None, force: bool, reading: Mapping[str, Any]):
+    """A motion, of the bodies that the file names unless one was asked for."""
+    if not force:
+        try:
+            return load_motion(path, **reading)
+        except ValueError as error:
+            if "does not name its bodies" not in str(error) or name is None:
+                raise
+    return load_motion(path, names=name, **reading)
+
+
+def _print(fit: Identification) -> None:
+    put("parameter                            value        standard error    95 % interval")
+    for name, value in fit.values.items():
+        if np.ndim(value) == 0:
+            low, high = fit.interval(name)
+            put(f"{name:<32.32} {value:12.6g} {fit.standard_errors[name]:15.3g}    {low:.6g} … {high:.6g}")
+        else:
+            put(f"{name:<32.32} {np.array2string(np.asarray(value), precision=5).replace(chr(10), ' ')}")
+            errors = np.asarray(fit.standard_errors[name])
+            put(f"{'':<32} ± {np.array2string(errors, precision=2).replace(chr(10), ' ')}")
+    put()
+    for label, errors in (("fit", fit.errors), ("held out", fit.held_out_errors)):
+        if errors is not None:
+            put(
+                f"{label:<10}  position {1e3 * errors.mean_position:.3g} mm (last frame "
+                f"{1e3 * errors.final_position:.3g}), rotation {np.degrees(errors.mean_rotation):.3g}° "
+                f"(last {np.degrees(errors.final_rotation):.3g})"
+            )
+    put(f"stopped     {fit.stop.value}; {fit.evaluations} evaluations, {fit.seconds:.1f} s")

@@ -1,0 +1,79 @@
+"""`dano identify`: a slide in a file, and arguments that are wrong."""
+
+import json
+
+import numpy as np
+import pytest
+
+import dano
+
+SCENE = """
+timestep = 0.005
+n_steps = 10
+
+[[bodies]]
+name = "ball"
+shape = "sphere"
+radius = 0.05
+mass = 0.5
+
+[[bodies]]
+name = "floor"
+shape = "half_space"
+fixed = true
+
+[[contacts]]
+a = "ball"
+b = "floor"
+sliding_friction = 0.5
+sliding_drag = 0.0
+"""
+
+
+@pytest.fixture
+def files(tmp_path):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    loaded = dano.load_scene(tmp_path / "scene.toml")
+    scene = loaded.scene.replace_contact("ball", "floor", sliding_friction=0.25)
+    start = scene.initial_state(ball={"position": (0, 0, 0.05), "velocity": (1.5, 0.3, 0)})
+    run = dano.simulate(scene, start, 40)
+    dano.save_motion(tmp_path / "slide.csv", dano.Motion.from_trajectory(run, bodies=["ball"], every=2))
+    return tmp_path
+
+
+def test_finds_the_friction(files, run):
+    answer = run(
+        "identify", files / "scene.toml", files / "slide.csv", "-p", "ball,floor.sliding_friction:0:1:0.6",
+        "--held-out", files / "slide.csv", "-o", files / "fit.json",
+    )  # fmt: skip
+    assert answer.code == 0, answer.err
+    assert "ball,floor.sliding_friction" in answer.out and "held out" in answer.out
+    result = json.loads((files / "fit.json").read_text())
+    # A .csv does not say that the velocities are those of half a step before.
+    assert result["values"]["ball,floor.sliding_friction"] == pytest.approx(0.25, rel=0.02)
+    assert result["converged"] and np.isfinite(result["standard_errors"]["ball,floor.sliding_friction"])
+
+
+@pytest.mark.parametrize(
+    ("parameter", "match"),
+    [
+        ("ball,floor.sliding_friction:0", "BODY.PROPERTY:LOWER:UPPER"),
+        ("ball,floor.sliding_friction:a:b", "BODY.PROPERTY:LOWER:UPPER"),
+        ("sliding_friction:0:1", "BODY.PROPERTY:LOWER:UPPER"),
+        ("ball,wall.sliding_friction:0:1", "contact must be one of"),
+        ("ball.colour:0:1", "must be one of mass_scale"),
+        ("ball,floor.sliding_friction:1:0", "lower of parameter"),
+    ],
+)
+def test_wrong_parameters(files, run, parameter, match):
+    answer = run("identify", files / "scene.toml", files / "slide.csv", "-p", parameter)
+    assert answer.code == 2 and match in answer.err
+
+
+def test_wrong_files(files, run):
+    scene, slide, given = files / "scene.toml", files / "slide.csv", ("-p", "ball.mass_scale:0.5:2")
+    assert "existing file" in run("identify", scene, files / "none.csv", *given).err
+    assert ".json file" in run("identify", scene, slide, *given, "-o", files / "fit.txt").err
+    assert not (files / "fit.txt").exists()
+    (files / "empty.csv").write_text("time,x,y,z\n")
+    assert "at least one row" in run("identify", scene, files / "empty.csv", *given).err

@@ -1,0 +1,353 @@
+"""Identification of simulated motions: what went in comes out, with honest error bars."""
+
+import dataclasses
+import warnings
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dano
+from dano.maths import quat_multiply
+
+RADIUS, H = 0.05, 0.005
+
+
+def ball_scene(mu=0.25, timestep=H):
+    """Two balls on a floor: closed-form overlaps, so that everything here is quick."""
+    params = dano.ContactParams(sliding_friction=mu, sliding_drag=0.0, spring=5e4, damper=1e5)
+    law = dano.CentroidLaw(stiction_velocity=1e-4)
+    ball = dano.Sphere(RADIUS)
+    return dano.Scene.create(
+        [
+            dano.Body("ball", ball, mass=0.5),
+            dano.Body("floor", dano.HalfSpace(), fixed=True),
+        ],
+        [dano.Contact("ball", "floor", params, law)],
+        timestep=timestep,
+    )
+
+
+def sliding(scene, n=40, speed=(1.5, 0.3, 0.0), omega=(0.0, 0.0, 0.0)):
+    start = scene.initial_state(ball={"position": (0, 0, RADIUS), "velocity": speed, "omega": omega})
+    return dano.simulate(scene, start, n)
+
+
+FRICTION = dano.Parameter("mu", lambda s: s.contact("ball", "floor").sliding_friction, 0.0, 1.0, start=0.6)
+
+
+NOISE = {"position": 1e-4, "orientation": 2e-3}
+
+
+def noisy(motion, rng, position=1e-4, orientation=2e-3):
+    turn = rng.normal(size=(*motion.orientation.shape[:2], 3)) * orientation
+    turn = np.concatenate([np.ones_like(turn[..., :1]), 0.5 * turn], axis=-1)
+    turned = quat_multiply(jnp.asarray(motion.orientation), jnp.asarray(turn))
+    turned = np.asarray(turned) / np.linalg.norm(turned, axis=-1, keepdims=True)
+    return dano.Motion.create(
+        motion.times,
+        motion.names,
+        position=motion.position + rng.normal(size=motion.position.shape) * position,
+        orientation=turned,
+    )
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return sliding(ball_scene())
+
+
+@pytest.fixture(scope="module")
+def observed(truth):
+    return dano.Motion.from_trajectory(truth, bodies=["ball"], every=2)
+
+
+def test_friction_of_a_simulated_slide(truth):
+    fit = dano.identify(ball_scene(mu=0.6), truth, [FRICTION])
+    assert fit.converged
+    assert fit.values["mu"] == pytest.approx(0.25, abs=1e-6)
+    assert fit.errors.mean_position < 1e-7
+    assert fit.loss_history[-1] < 1e-6 * fit.loss_history[0]
+    assert float(fit.scene.contact("ball", "floor").sliding_friction) == fit.values["mu"]
+    assert fit.to_dict()["values"]["mu"] == fit.values["mu"]
+
+
+def test_several_motions_of_different_length_rate_and_gaps(truth, observed):
+    gaps = observed.position.copy()
+    gaps[5:9] = np.nan
+    first = dataclasses.replace(observed, position=gaps)
+    other = sliding(ball_scene(timestep=H / 2), n=70, speed=(-0.4, 1.0, 0.0), omega=(3.0, 0.0, 9.0))
+    second = dano.Motion.from_trajectory(other, bodies=["ball"], every=3)
+    fit = dano.identify(ball_scene(), [first, second], [FRICTION], held_out=[observed])
+    # The second one was simulated at half the step.
+    assert fit.values["mu"] == pytest.approx(0.25, rel=0.02)
+    assert [len(m.times) for m in fit.fitted] == [len(first.times), len(second.times)]
+    assert fit.held_out_errors is not None and fit.held_out_errors.mean_position < 2e-3
+
+
+def test_both_jacobians_give_the_same_answer(observed):
+    rng = np.random.default_rng(3)
+    motion = noisy(observed.part(0, 8), rng)
+    fits = [
+        dano.identify(ball_scene(), motion, [FRICTION], initial=["velocity"], jacobian=mode, tolerance=1e-3)
+        for mode in ("forward", "reverse")
+    ]
+    assert fits[0].values["mu"] == pytest.approx(fits[1].values["mu"], abs=1e-6)
+    assert fits[0].standard_errors["mu"] == pytest.approx(fits[1].standard_errors["mu"], rel=1e-4)
+
+
+def test_standard_errors_cover_the_truth(observed):
+    inside, fits = 0, []
+    for seed in range(100):
+        motion = noisy(observed, np.random.default_rng(seed))
+        with warnings.catch_warnings():
+            # Balls that begin a little above the floor hop: for a few the loss is rough, and said to be.
+            warnings.filterwarnings("ignore", "the search did not end", RuntimeWarning)
+            fit = dano.identify(ball_scene(), motion, [FRICTION], initial="states", noise=NOISE)
+        low, high = fit.interval("mu")
+        inside += low <= 0.25 <= high
+        fits.append(fit)
+    assert 90 <= inside <= 99
+    assert sum(fit.converged for fit in fits) >= 90
+    spread = np.std([fit.values["mu"] for fit in fits])
+    assert np.mean([fit.standard_errors["mu"] for fit in fits]) == pytest.approx(spread, rel=0.3)
+    # The residuals are as large as the noise that was stated.
+    assert np.mean([fit.errors.rms for fit in fits]) == pytest.approx(1.0, rel=0.1)
+
+
+def test_outliers_pull_less_with_hubers_loss(observed):
+    motion = noisy(observed, np.random.default_rng(5))
+    wrong = motion.position.copy()
+    wrong[[5, 11, 16], 0, 0] += (0.01, 0.02, -0.01)
+    motion = dataclasses.replace(motion, position=wrong)
+    plain = dano.identify(ball_scene(), motion, [FRICTION], initial="states", noise=NOISE)
+    robust = dano.identify(ball_scene(), motion, [FRICTION], initial="states", noise=NOISE, huber=2.0)
+    assert abs(robust.values["mu"] - 0.25) < 0.02
+    assert abs(robust.values["mu"] - 0.25) < 0.3 * abs(plain.values["mu"] - 0.25)
+    assert robust.standard_errors["mu"] < plain.standard_errors["mu"]
+
+
+@pytest.mark.parametrize("continuity", [None, 0.3])
+def test_multiple_shooting(observed, continuity):
+    motion = noisy(observed, np.random.default_rng(7))
+    fit = dano.identify(
+        ball_scene(),
+        motion,
+        [FRICTION],
+        initial="states",
+        window=8,
+        continuity=continuity,
+        noise=NOISE,
+    )
+    assert fit.initial_states.position.shape[0] == 3
+    assert abs(fit.values["mu"] - 0.25) < 4 * fit.standard_errors["mu"]
+    # Windows that must meet know the velocity better, and so the friction.
+    assert fit.standard_errors["mu"] < (0.05 if continuity is None else 0.01)
+
+
+class Push(eqx.Module):
+    """A constant force along x."""
+
+    force: jnp.ndarray
+
+    def __call__(self, state, time):
+        none = jnp.zeros_like(state.position)
+        return dano.Control(none.at[0, 0].set(self.force), none)
+
+
+MASS = dano.Parameter("alpha", lambda s: s.body("ball").mass_scale, 0.1, 4.0, start=2.0)
+
+
+def pushed(scene, policy):
+    start = scene.initial_state(ball={"position": (0, 0, RADIUS)})
+    return dano.simulate(scene, start, 50, controls=policy)
+
+
+def test_a_known_force_shows_the_mass_and_a_known_mass_the_force():
+    scene, policy = ball_scene(), Push(jnp.asarray(3.0))
+    motion = pushed(scene, policy)
+    fit = dano.identify(scene, motion, [MASS, FRICTION], controls=policy)
+    assert fit.values["alpha"] == pytest.approx(1.0, abs=1e-5)
+    assert fit.values["mu"] == pytest.approx(0.25, abs=1e-5)
+    force = dano.Parameter("force", lambda c: c.force, 0.0, 10.0, start=1.0, of="controls")
+    fit = dano.identify(scene, motion, [force], controls=policy)
+    assert fit.values["force"] == pytest.approx(3.0, abs=1e-5)
+    assert float(fit.controls.force) == fit.values["force"]
+
+
+def test_recorded_forces_do_as_well_as_the_policy():
+    scene, policy = ball_scene(), Push(jnp.asarray(3.0))
+    motion = dano.Motion.from_trajectory(pushed(scene, policy), bodies=["ball"])
+    rows = np.zeros((50, 2, 3))
+    rows[:, 0, 0] = 3.0
+    control = dano.Control(jnp.asarray(rows), jnp.zeros((50, 2, 3)))
+    # Cut, so that windows must find their own rows.
+    rows[25:, 0, 0] = 3.0
+    fit = dano.identify(scene, motion, [MASS], controls=[control], window=17, initial="given")
+    assert fit.values["alpha"] == pytest.approx(1.0, abs=1e-4)
+
+
+def test_mass_without_a_known_force_is_said_to_be_open(truth):
+    with pytest.warns(RuntimeWarning, match="alpha does not affect what was observed.*force that is known"):
+        fit = dano.identify(ball_scene(), truth, [MASS, FRICTION])
+    assert np.isinf(fit.standard_errors["alpha"])
+    assert fit.values["mu"] == pytest.approx(0.25, abs=1e-5)
+    assert np.isfinite(fit.standard_errors["mu"])
+
+
+def tumbling(com_offset=(0.0, 0.0, 0.0), inertia=None):
+    body = dano.Body("box", dano.Box((0.05, 0.04, 0.03)), mass=0.5, com_offset=com_offset, inertia=inertia)
+    return dano.Scene.create([body], timestep=0.002)
+
+
+def test_centre_of_mass_and_inertia_from_free_flight():
+    offset = np.array([0.004, -0.003, 0.002])
+    usual = np.asarray(tumbling().body("box").inertia)
+    inertia = usual @ np.diag([1.0, 1.1, 0.8])
+    inertia[0, 1] = inertia[1, 0] = 0.05 * usual[0, 0]
+    scene = tumbling(offset, inertia)
+    start = scene.initial_state(box={"velocity": (1, 0, 2), "omega": (8, 5, -6)})
+    run = dano.simulate(scene, start, 200)
+    # A tracker sees the body's own frame, not its centre of mass.
+    matrices = np.array([np.asarray(dano.Pose(orientation=q).matrix) for q in run.states.orientation[:, 0]])
+    position = np.asarray(run.states.position[:, 0]) - matrices @ offset
+    every = slice(None, None, 5)
+    motion = dano.Motion.create(
+        np.asarray(run.times)[every],
+        "box",
+        position=position[every],
+        orientation=np.asarray(run.states.orientation[every, 0]),
+        point="origin",
+    )
+    parameters = [
+        dano.Parameter("com", lambda s: s.body("box").com_offset, -0.02, 0.02),
+        dano.Parameter("inertia", lambda s: s.body("box").inertia),
+    ]
+    with pytest.warns(RuntimeWarning, match="cannot be told apart"):
+        fit = dano.identify(tumbling(), motion, parameters, initial="velocities")
+    np.testing.assert_allclose(fit.values["com"], offset, atol=1e-6)
+    # Without a known torque only ratios of the inertia show.
+    found = fit.values["inertia"]
+    np.testing.assert_allclose(found / np.trace(found), inertia / np.trace(inertia), atol=1e-5)
+
+
+def test_unobserved_body_of_unknown_mass_in_a_collision():
+    params = dano.ContactParams(sliding_friction=0.0, spring=5e4, damper=1e4)
+    bodies = [dano.Body(name, dano.Sphere(RADIUS), mass=0.5) for name in ("a", "b")]
+    scene = dano.Scene.create(bodies, [dano.Contact("a", "b", params)], timestep=0.002, gravity=(0, 0, 0))
+    heavy = scene.replace_body("b", mass_scale=1.7)
+    start = {"a": {"velocity": (1, 0, 0)}, "b": {"position": (0.12, 0.01, 0)}}
+    run = dano.simulate(heavy, heavy.initial_state(**start), 60)
+    motion = dano.Motion.from_trajectory(run, bodies=["a"], every=2)
+    mass = dano.Parameter("b", lambda s: s.body("b").mass_scale, 0.2, 5.0, coordinates="log")
+    fit = dano.identify(scene, motion, [mass], state=scene.initial_state(**start))
+    assert fit.values["b"] == pytest.approx(1.7, rel=1e-4)
+
+
+def test_many_starts_find_the_lower_minimum():
+    # A pendulum of a force: the end of a push over many periods repeats itself.
+    scene = dano.Scene.create(
+        [dano.Body("ball", dano.Sphere(RADIUS), mass=1.0)], timestep=0.01, gravity=(0, 0, 0)
+    )
+
+    class Spring(eqx.Module):
+        stiffness: jnp.ndarray
+
+        def __call__(self, state, time):
+            force = -self.stiffness * state.position
+            return dano.Control(force, jnp.zeros_like(force))
+
+    start = scene.initial_state(ball={"position": (1, 0, 0)})
+    run = dano.simulate(scene, start, 200, controls=Spring(jnp.asarray(60.0)))
+    motion = dano.Motion.from_trajectory(run, every=10)
+    stiffness = dano.Parameter("k", lambda c: c.stiffness, 1.0, 200.0, start=150.0, of="controls")
+    options = {"controls": Spring(jnp.asarray(1.0)), "noise": {"position": 1e-3}}
+    alone = dano.identify(scene, motion, [stiffness], **options)
+    many = dano.identify(scene, motion, [stiffness], starts=6, **options)
+    assert abs(alone.values["k"] - 60) > 1
+    assert many.values["k"] == pytest.approx(60, abs=1e-3)
+    assert many.minima[0].loss <= many.minima[-1].loss and len(many.minima) == 6
+
+
+def test_a_value_on_its_bound_is_said_to_be_there(truth):
+    low = dataclasses.replace(FRICTION, upper=0.2, start=0.1)
+    with pytest.warns(RuntimeWarning, match="upper bound"):
+        fit = dano.identify(ball_scene(), truth, [low])
+    assert fit.values["mu"] == 0.2
+    assert np.isnan(fit.standard_errors["mu"])
+
+
+def test_single_precision():
+    import jax
+
+    with jax.enable_x64(False):
+        run = sliding(ball_scene())
+        assert run.states.position.dtype == jnp.float32
+        fit = dano.identify(ball_scene(mu=0.5), run, [FRICTION], noise={"position": 1e-3})
+    assert fit.values["mu"] == pytest.approx(0.25, abs=2e-3)
+
+
+def refuse(match, observed=None, parameters=(FRICTION,), **options):
+    scene = ball_scene()
+    if observed is None:
+        observed = sliding_motion()
+    with pytest.raises(ValueError, match=match):
+        dano.identify(scene, observed, list(parameters), **options)
+
+
+def sliding_motion(n=10):
+    times = np.arange(n) * 0.01
+    position = np.stack([times, 0 * times, RADIUS + 0 * times], axis=1)
+    return dano.Motion.create(times, "ball", position=position, orientation=np.tile([1.0, 0, 0, 0], (n, 1)))
+
+
+def changed(**options):
+    return [dataclasses.replace(FRICTION, **options)]
+
+
+def test_bad_input():
+    at = lambda path: changed(where=path)  # noqa: E731
+    refuse("at least one motion", observed=[])
+    refuse("Motions or Trajectories", observed=[3])
+    refuse("at least one Parameter", parameters=[])
+    refuse("different names", parameters=[FRICTION, FRICTION])
+    refuse("lower of parameter 'mu' must be ≤ upper", parameters=changed(lower=2.0))
+    refuse("start of parameter 'mu' must lie between", parameters=changed(start=3.0))
+    refuse("must pick leaves", parameters=at(lambda s: s.contact("ball", "floor").slipperiness))
+    refuse("contact must be one of", parameters=at(lambda s: s.contact("ball", "wall").sliding_friction))
+    refuse("its law does not use it", parameters=at(lambda s: s.contact("ball", "floor").stiffness))
+    refuse("not parts or copies", parameters=at(lambda s: s.gravity[2]))
+    refuse("no controls are given", parameters=changed(of="controls"))
+    refuse("'value', 'log' or 'inertia'", parameters=changed(coordinates="cubic"))
+    refuse("must be > 0 to have a logarithm", parameters=changed(coordinates="log", start=0.0))
+    refuse("noise of position", noise={"position": 0.0})
+    refuse("noise must be given for some", noise={"place": 1.0})
+    refuse("window must hold", window=1)
+    refuse("continuity needs", continuity=0.1)
+    refuse("huber must be", huber=-1.0)
+    refuse("starts must be", starts=0)
+    refuse("initial must be one of", initial="everything")
+    refuse("initial must list", initial=["speed"])
+    refuse("jacobian must be", jacobian="sideways")
+    refuse("state must be one for all", state=[None, None])
+    refuse("more numbers than there are unknowns", observed=sliding_motion(2), initial="states")
+    refuse("finite bounds", parameters=changed(upper=np.inf), starts=3)
+    nobody = dataclasses.replace(sliding_motion(), names=("cube",))
+    refuse("bodies of the scene", observed=nobody)
+    only_turns = dataclasses.replace(sliding_motion(), position=np.full((10, 1, 3), np.nan))
+    refuse("must have a frame with positions", observed=only_turns)
+    only_floor = dataclasses.replace(sliding_motion(), names=("floor",))
+    refuse("not observed: give the state", observed=only_floor)
+
+
+def test_an_interrupt_returns_the_best_so_far(truth):
+    def stop(description, share):
+        if description.startswith("fitting") and share > 0:
+            raise KeyboardInterrupt
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        fit = dano.identify(ball_scene(), truth, [FRICTION], progress=stop)
+    assert not fit.converged and "interrupted" in fit.stop.value
+    assert fit.loss_history[-1] < fit.loss_history[0]
