@@ -79,7 +79,7 @@ def whole_distances(distances: np.ndarray, spacing: np.ndarray) -> np.ndarray:
             )
     cut = np.abs(distances) >= (1 - 1e-6) * width
     if cut.mean() > 0.05 and width > 2.5 * step:
-        return extended_distances(distances, spacing, width - 1.01 * step)
+        return extended_distances(distances, spacing, width)
     return distances
 
 

@@ -85,6 +85,9 @@ class _Placeholder:
     def __init__(self, *_: Any, **__: Any) -> None:
         pass
 
+    def __call__(self, *_: Any, **__: Any) -> "_Placeholder":
+        return self
+
     def __setstate__(self, _: Any) -> None:
         pass
 

@@ -59,7 +59,7 @@ _READERS: dict[str, _Reader] = {
     ".ckpt": _Reader(load_checkpoint, _CHECKPOINT, crops=True),
     **dict.fromkeys((".ingp", ".msgpack"), _Reader(load_snapshot, ("cascade", "interpolation"), crops=True)),
     **dict.fromkeys((".vdb", ".nvdb"), _Reader(load_vdb, ("grid", "interpolation"), crops=True)),
-    **dict.fromkeys((".pt", ".pth"), _Reader(load_module, ("module",), crops=True)),
+    **dict.fromkeys((".pt", ".pth", ".pt2"), _Reader(load_module, ("module",), crops=True)),
 }
 
 
@@ -84,8 +84,8 @@ def load_field(
     - `.ingp`, `.msgpack`: the density grid of an instant-ngp snapshot; options `cascade`, `interpolation`.
     - `.vdb`, `.nvdb`: a fog volume or level set of OpenVDB or NanoVDB; options `grid` (its name),
       `interpolation`.
-    - `.pt`, `.pth`: a TorchScript module (n, 3) → (n,), or weights for the one that option `module` =
-      "package.module:name" makes; `crop` is required.
+    - `.pt2`, `.pt`, `.pth`: a module (n, 3) → (n,) of torch.export or TorchScript, or weights for the one that
+      option `module` = "package.module:name" makes; `crop` is required.
     - `"package.module:name"` instead of a file: that function (n, 3) → (n,); `crop` is required.
     - `.dano`: the grid stored in a neural object; option `interpolation`.
 

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt32
 
 from dano.fields._base import AbstractField
 from dano.fields._callable import CallableField
@@ -38,7 +38,7 @@ class HashGrid(eqx.Module):
         shift: Where x = 0 lies, in cells: 0 or ½ (static).
     """
 
-    tables: tuple[Float[Array, "entries features"], ...]
+    tables: tuple[Float[Array, "_ features"], ...]
     scales: tuple[float, ...] = eqx.field(static=True)
     resolutions: tuple[int, ...] = eqx.field(static=True)
     shift: float = eqx.field(static=True)
@@ -63,7 +63,7 @@ class HashGrid(eqx.Module):
         return total
 
 
-def _row(node: Int[Array, "n 3"], resolution: int, entries: int) -> Int[Array, " n"]:
+def _row(node: UInt32[Array, "n 3"], resolution: int, entries: int) -> Int[Array, " n"]:
     if resolution:
         index = node[:, 0] + resolution * (node[:, 1] + resolution * node[:, 2])
     else:
@@ -85,8 +85,8 @@ class HashDensity(eqx.Module):
     """
 
     grid: HashGrid
-    weights: tuple[Float[Array, "outputs inputs"], ...]
-    biases: tuple[Float[Array, " outputs"], ...]
+    weights: tuple[Float[Array, "_ _"], ...]
+    biases: tuple[Float[Array, " _"], ...]
     box: Float[Array, "2 3"]
     factor: float
     contracted: bool = eqx.field(static=True)

@@ -160,25 +160,26 @@ class SignedDistanceGrid(AbstractShape):
         return eqx.tree_at(lambda shape: shape.moments, made, moments, is_leaf=lambda x: x is None)
 
 
-def extended_distances(distances: np.ndarray, spacing: np.ndarray, band: float) -> np.ndarray:
+def extended_distances(distances: np.ndarray, spacing: np.ndarray, width: float) -> np.ndarray:
     """Signed distances that are right near the surface only, as level sets keep them, made right everywhere.
 
     Args:
-        distances: Shape (nx, ny, nz), cut off at ± some width beyond `band`.
+        distances: Shape (nx, ny, nz), cut off at ± `width`.
         spacing: Distance between nodes along each axis, shape (3,).
-        band: Distance up to which they and their differences are to be trusted.
+        width: Must be wider than a cell.
 
     Raises:
-        ValueError: If no node is that near to the surface.
+        ValueError: If no node is more than a cell within the width.
     """
-    near = np.abs(distances) <= band
+    # Only there do central differences see no value that was cut off.
+    near = np.abs(distances) <= width - 1.01 * spacing.max()
     if not near.any():
-        raise ValueError(f"distances must be known near the surface, got none below {band}")
+        raise ValueError(f"distances must be known to more than a cell from the surface, got {width}")
     slope = np.stack(np.gradient(distances, *spacing), axis=-1)[near]
     slope = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
     closest = spacing * np.argwhere(near) - distances[near][:, None] * slope
     far, _ = spread_distances(near, closest, np.zeros(3), spacing)
-    return np.where(near, distances, np.copysign(far, distances))
+    return np.where(np.abs(distances) < (1 - 1e-6) * width, distances, np.copysign(far, distances))
 
 
 def _checked_distances(distances: Numbers) -> np.ndarray:

@@ -86,5 +86,5 @@ def unblosc(data: bytes) -> bytes:
         raise ImportError("reading this VDB file needs blosc: pip install 'dano[import]'") from error
     try:
         return blosc.decompress(data)
-    except blosc.error as error:
+    except Exception as error:  # of a class that blosc does not export
         raise ValueError(f"a compressed block is damaged: {error}") from error

@@ -1,4 +1,4 @@
-"""Densities that are code: TorchScript files, and functions and modules by import path."""
+"""Densities that are code: exported PyTorch modules, and functions and modules by import path."""
 
 import importlib
 import sys
@@ -16,7 +16,7 @@ def load_module(path: Path, *, crop: Numbers | None, module: str | None = None) 
     """A PyTorch module that maps points (n, 3) to densities (n,).
 
     Args:
-        path: A TorchScript file; or weights, a state dictionary for the module that `module` makes.
+        path: A file of torch.export (.pt2) or TorchScript; or weights, a state dictionary for the module that `module` makes.
         crop: Box [units of the module] outside of which the density is zero; required.
         module: "package.module:name" of a class or function that makes a torch.nn.Module without arguments.
             It is imported, and so runs: name only code that you trust.
@@ -30,12 +30,15 @@ def load_module(path: Path, *, crop: Numbers | None, module: str | None = None) 
     torch = _torch()
     if module is None:
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DeprecationWarning)
-                made = torch.jit.load(str(path), map_location="cpu").eval()
-        except (RuntimeError, ValueError, OSError) as error:
+            if path.suffix.lower() == ".pt2":
+                made = torch.export.load(str(path)).module()
+            else:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", DeprecationWarning)
+                    made = torch.jit.load(str(path), map_location="cpu").eval()
+        except (RuntimeError, ValueError, OSError, KeyError, AttributeError) as error:
             raise ValueError(
-                f"{path}: expected a TorchScript file, or weights and module='package.module:name' that makes"
+                f"{path}: expected an exported or TorchScript module, or weights and module='package.module:name' that makes"
                 f" their torch.nn.Module; {str(error).splitlines()[0]}"
             ) from error
     else:

@@ -62,7 +62,7 @@ def load_vdb(
         if not level_set:
             return GridField(values[flips], origin, spacing, interpolation)
         width = abs(found.background)
-        whole = extended_distances(values[flips].astype(np.float64), spacing, width - 1.01 * spacing.max())
+        whole = extended_distances(values[flips].astype(np.float64), spacing, width)
         return SignedDistanceGrid(whole, origin, spacing, interpolation)
     except ValueError as error:
         raise ValueError(f"{path}: grid {found.name!r}: {error}") from error
