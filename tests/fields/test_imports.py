@@ -125,7 +125,9 @@ def test_modules_of_pytorch(tmp_path, monkeypatch):
         "    return 1.0 * ((x * x).sum(1) < 0.25)\n"
     )
     monkeypatch.chdir(tmp_path)
-    model = torch.nn.Sequential(torch.nn.Linear(3, 8), torch.nn.ReLU(), torch.nn.Linear(8, 1), torch.nn.Softplus())
+    model = torch.nn.Sequential(
+        torch.nn.Linear(3, 8), torch.nn.ReLU(), torch.nn.Linear(8, 1), torch.nn.Softplus()
+    )
     box = [(-1.0,) * 3, (1.0,) * 3]
     x = np.random.default_rng(0).uniform(-1, 1, (10_000, 3))
     with torch.no_grad():
@@ -135,7 +137,9 @@ def test_modules_of_pytorch(tmp_path, monkeypatch):
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.jit.trace(model, torch.zeros(5, 3)).save("script.pt")
     batch = {0: torch.export.Dim("batch")}
-    torch.export.save(torch.export.export(model, (torch.zeros(5, 3),), dynamic_shapes=(batch,)), "exported.pt2")
+    torch.export.save(
+        torch.export.export(model, (torch.zeros(5, 3),), dynamic_shapes=(batch,)), "exported.pt2"
+    )
     for field in (
         load_field("weights.pt", module="lamps:lamp", crop=box),
         load_field("script.pt", crop=box),
@@ -245,7 +249,10 @@ def test_broken_files(name, tmp_path):
 def test_what_does_not_fit_is_said(tmp_path):
     needs("fog")
     for options, message in {
-        "grid": ({"grid": "mask"}, r"expected one grid of floats named 'mask', got the grids 'density' \(Tree_float"),
+        "grid": (
+            {"grid": "mask"},
+            r"expected one grid of floats named 'mask', got the grids 'density' \(Tree_float",
+        ),
         "crop": ({"grid": "levelset", "crop": [(0, 0, 0), (1, 1, 1)]}, "level set, which cannot be cropped"),
         "far": ({"grid": "density", "crop": [(8, 8, 8), (9, 9, 9)]}, "less than two voxels"),
     }.values():

@@ -51,7 +51,9 @@ def make_nerfstudio():
     from nerfstudio.models.nerfacto import NerfactoModelConfig
 
     torch.manual_seed(0)
-    sizes = dict(num_levels=4, base_res=8, max_res=64, log2_hashmap_size=9, hidden_dim=16, average_init_density=0.01)
+    sizes = dict(
+        num_levels=4, base_res=8, max_res=64, log2_hashmap_size=9, hidden_dim=16, average_init_density=0.01
+    )
     box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
     contraction = SceneContraction(order=float("inf"))
     field = NerfactoField(box, 3, implementation="torch", spatial_distortion=contraction, **sizes)
@@ -65,10 +67,14 @@ def make_nerfstudio():
     weights = {f"_model.field.{name}": value for name, value in field.state_dict().items()}
     weights["_model.proposal_networks.0.mlp_base.model.0.hash_table"] = torch.zeros(4, 2)
     content = dict(step=3, pipeline=weights, scalers={}, anything=types.SimpleNamespace(a=1))
-    content |= dict(optimizers={"fields": optimiser.state_dict()}, schedulers={"fields": scheduler.state_dict()})
+    content |= dict(
+        optimizers={"fields": optimiser.state_dict()}, schedulers={"fields": scheduler.state_dict()}
+    )
     torch.save(content, run / "nerfstudio_models" / "step-000000003.ckpt")
     pipeline = types.SimpleNamespace(model=NerfactoModelConfig(**sizes))
-    (run / "config.yml").write_text(yaml.dump(types.SimpleNamespace(method_name="nerfacto", pipeline=pipeline)))
+    (run / "config.yml").write_text(
+        yaml.dump(types.SimpleNamespace(method_name="nerfacto", pipeline=pipeline))
+    )
     turn = [[0.0, -1.0, 0.0, 0.3], [1.0, 0.0, 0.0, -0.2], [0.0, 0.0, 1.0, 0.1]]
     (run / "dataparser_transforms.json").write_text(json.dumps(dict(transform=turn, scale=0.25)))
 
@@ -98,14 +104,19 @@ def make_tcnn():
     )
     random = np.random.default_rng(1)
     table = random.normal(0, 1, grid.n_params).astype(np.float16).astype(np.float32)
-    network = [random.normal(0, 0.25, shape).astype(np.float16) for shape in ((hidden, 2 * levels), (16, hidden))]
+    network = [
+        random.normal(0, 0.25, shape).astype(np.float16) for shape in ((hidden, 2 * levels), (16, hidden))
+    ]
     grid.set_params(Float32(table))
     x = points("tcnn")
     features = np.stack([np.asarray(feature) for feature in grid(ArrayXf(x.T))], axis=1).astype(np.float64)
     keep("tcnn", np.exp((np.maximum(features @ network[0].T, 0) @ network[1].T)[:, 0]))
 
     flat = torch.tensor(np.concatenate([*(m.ravel() for m in network), table]).astype(np.float32))
-    weights = {"_model.field.mlp_base.model.params": flat, "_model.field.aabb": torch.tensor([[0.0] * 3, [1.0] * 3])}
+    weights = {
+        "_model.field.mlp_base.model.params": flat,
+        "_model.field.aabb": torch.tensor([[0.0] * 3, [1.0] * 3]),
+    }
     numbers = dict(max_res=highest, num_levels=levels, log2_hashmap_size=log2_table)
     weights |= {f"_model.field.{name}": torch.tensor(value) for name, value in numbers.items()}
     torch.save(dict(step=0, pipeline=weights), HERE / "tcnn.ckpt")
