@@ -6,6 +6,7 @@ import runpy
 import warnings
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -173,10 +174,12 @@ def test_signed_distances_in_files(width, tmp_path):
     """Also such as were cut off: the distance goes on to the middle of the ball."""
     np.save(tmp_path / "ball.npy", ball_distances(width=width))
     ball = load_field(tmp_path / "ball.npy", spacing=2 / 23, signed_distance=True)
+    assert isinstance(ball, SignedDistanceGrid)
     assert float(ball.sdf(jnp.zeros(3))) == pytest.approx(-0.6, abs=0.05)
     assert float(ball.sdf(jnp.asarray([0.7, 0.0, 0.0]))) == pytest.approx(0.1, abs=5e-3)
     save_field(ball, tmp_path / "again.npz")
     again = load_field(tmp_path / "again.npz", scale=0.1)
+    assert isinstance(again, SignedDistanceGrid)
     x = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (3, 100)))
     np.testing.assert_allclose(again.sdf_jet(0.1 * x, 0), 0.1 * ball.sdf_jet(x, 0), atol=1e-12)
     with pytest.raises(ValueError, match="change by about 1 a unit near the surface, got 11.5"):
@@ -233,7 +236,7 @@ def test_broken_files(name, tmp_path):
     """Cut off, empty, foreign, or with a spoilt byte: a ValueError that names the file, or no effect."""
     needs({"splats.ply": "splats", "openvdb.vdb": "fog"}.get(name, ""))
     whole, path = (FILES / name).read_bytes(), tmp_path / Path(name).name
-    options = {"grid": "density"} if name == "openvdb.vdb" else {}
+    options: dict[str, Any] = {"grid": "density"} if name == "openvdb.vdb" else {}
     for content in (b"", b"nothing of the kind", whole[:100], whole[: len(whole) // 3]):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=path.name):

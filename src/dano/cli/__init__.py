@@ -1,4 +1,4 @@
-"""The command line: `dano build | inspect | simulate | view | demo`."""
+"""The command line: `dano build | import | inspect | simulate | view | demo`."""
 
 import sys
 import warnings

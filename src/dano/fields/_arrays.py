@@ -70,7 +70,7 @@ def whole_distances(distances: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     step = float(spacing.max())
     near = np.abs(distances) < min(2 * step, 0.9 * width)
     if near.any():
-        gradient = np.stack(np.gradient(distances, *spacing))[:, near]
+        gradient = [part[near] for part in np.gradient(distances, *spacing)]
         slope = float(np.median(np.linalg.norm(gradient, axis=0)))
         if not 0.5 < slope < 2:
             raise ValueError(

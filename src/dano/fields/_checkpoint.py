@@ -7,14 +7,14 @@ from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
-import ml_dtypes
+import jax.numpy as jnp
 import numpy as np
 
 _DTYPES = {
     "DoubleStorage": np.float64,
     "FloatStorage": np.float32,
     "HalfStorage": np.float16,
-    "BFloat16Storage": ml_dtypes.bfloat16,
+    "BFloat16Storage": jnp.bfloat16,
     "LongStorage": np.int64,
     "IntStorage": np.int32,
     "ShortStorage": np.int16,
@@ -56,7 +56,7 @@ def read_weights(path: Path) -> dict[str, np.ndarray]:
     try:
         if not zipfile.is_zipfile(path):
             raise ValueError(
-                "it is no zip, or cut off (files written before torch 1.6 must be saved again with a newer torch)"
+                "it is no zip, or cut off (files of torch before 1.6 must be saved again with a newer one)"
             )
         with zipfile.ZipFile(path) as archive:
             names = [name for name in archive.namelist() if name.endswith("/data.pkl")]
@@ -122,16 +122,16 @@ class _Unpickler(pickle.Unpickler):
             ("torch._utils", "_rebuild_parameter_with_state"): lambda data, *_: data,
         }
         if module in ("torch", "torch.storage") and name in _DTYPES:
-            return _DTYPES[name]
+            return np.dtype(_DTYPES[name])
         return allowed.get((module, name), _Placeholder)
 
     def persistent_load(self, pid: Any) -> np.ndarray:
         kind, dtype, key, _, count = pid
-        if kind != "storage" or not isinstance(dtype, type) or issubclass(dtype, _Placeholder):
+        if kind != "storage" or not isinstance(dtype, np.dtype):
             raise ValueError(f"it has a storage of a kind that cannot be read: {kind!r}")
         if key not in self._storages:
             data = self._archive.read(f"{self._folder}data/{key}")
-            if len(data) != count * np.dtype(dtype).itemsize:
+            if len(data) != count * dtype.itemsize:
                 raise ValueError(f"its storage {key} has {len(data)} bytes for {count} numbers")
             self._storages[key] = np.frombuffer(data, dtype)
         return self._storages[key]

@@ -25,12 +25,12 @@ def load_snapshot(
     """The density grid of an instant-ngp snapshot, in the frame and units of its transforms.json.
 
     Cascade k covers the cube [½ − 2ᵏ⁻¹, ½ + 2ᵏ⁻¹]³ of instant-ngp's space with 128³ cells, stored as half
-    floats in Morton order, x in the lowest bit. instant-ngp's space is that of transforms.json scaled by `scale`,
-    moved by `offset`, its axes renamed (x, y, z) → (y, z, x) unless it came from Mitsuba. Cells that no camera
-    saw are marked with a negative number; here they are empty.
+    floats in Morton order, x in the lowest bit. instant-ngp's space is that of transforms.json scaled by
+    `scale`, moved by `offset`, its axes renamed (x, y, z) → (y, z, x) unless it came from Mitsuba. Cells
+    that no camera saw are marked with a negative number; here they are empty.
 
-    The grid is what instant-ngp skips empty space by: a decaying maximum over random points of each cell, hence
-    up to a cell larger than the density of its network.
+    The grid is what instant-ngp skips empty space by: a decaying maximum over random points of each cell,
+    hence up to a cell larger than the density of its network.
 
     Args:
         path: A .ingp or .msgpack file.
@@ -100,7 +100,7 @@ def _content(path: Path) -> Any:
 def _unscrambled(cells: Float[np.ndarray, " n"]) -> Float[np.ndarray, "128 128 128"]:
     """Cells in Morton order as an array over x, y, z."""
     bits = np.arange(_SIDE)
-    spread = sum(((bits >> k) & 1) << (3 * k) for k in range(7))
+    spread = np.bitwise_or.reduce([((bits >> k) & 1) << (3 * k) for k in range(7)])
     code = spread[:, None, None] | spread[None, :, None] << 1 | spread[None, None, :] << 2
     return cells[code]
 

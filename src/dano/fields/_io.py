@@ -79,20 +79,20 @@ def load_field(
       `signed_distance=True` if they are distances, negative inside.
     - `.obj`, `.stl`, `.off`, `.glb`, `.gltf`, `.ply`: a watertight triangle mesh; options of `mesh_field`.
     - `.ply` with Gaussian splats: their occupancy.
-    - `.ckpt`: a nerfstudio checkpoint (nerfacto, splatfacto); option `undo_transform`, and nerfacto's sizes where
-      no config.yml tells them.
+    - `.ckpt`: a nerfstudio checkpoint (nerfacto, splatfacto); option `undo_transform`, and nerfacto's sizes
+      where no config.yml tells them.
     - `.ingp`, `.msgpack`: the density grid of an instant-ngp snapshot; options `cascade`, `interpolation`.
     - `.vdb`, `.nvdb`: a fog volume or level set of OpenVDB or NanoVDB; options `grid` (its name),
       `interpolation`.
-    - `.pt2`, `.pt`, `.pth`: a module (n, 3) → (n,) of torch.export or TorchScript, or weights for the one that
-      option `module` = "package.module:name" makes; `crop` is required.
+    - `.pt2`, `.pt`, `.pth`: a module (n, 3) → (n,) of torch.export or TorchScript, or weights for the one
+      that option `module` = "package.module:name" makes; `crop` is required.
     - `"package.module:name"` instead of a file: that function (n, 3) → (n,); `crop` is required.
     - `.dano`: the grid stored in a neural object; option `interpolation`.
 
     Args:
         path: The file.
-        crop: Lower and upper corner, shape (2, 3), of the part to be kept, in the frame and units of the file;
-            for densities. Grids keep the nodes within.
+        crop: Lower and upper corner, shape (2, 3), of the part to be kept, in the frame and units of the
+            file; for densities. Grids keep the nodes within.
         scale: Length [m] of a unit of the file, applied after `crop`, about the origin. Densities keep their
             values.
         pose: Moves the scaled field into the frame F that you want.

@@ -1,6 +1,7 @@
 """NanoVDB's .nvdb files: one buffer a grid, its nodes in arrays.
 
-Layout: nanovdb/NanoVDB.h, version 32: GridData of 672 bytes, TreeData of 64, root, upper, lower and leaf nodes.
+Layout: nanovdb/NanoVDB.h, version 32: GridData of 672 bytes, TreeData of 64, then root, upper, lower and
+leaf nodes.
 """
 
 import struct
@@ -53,7 +54,7 @@ def _buffers(data: bytes) -> list[tuple[str, int, bytes]]:
 
 
 def _decompressed(stream: Stream, size: int, codec: int) -> bytes:
-    """One piece or several, each after its length; files disagree on whether their size counts the lengths."""
+    """One piece or several, each after its length, which the size in the file's head may count or not."""
     pieces = bytearray()
     while len(pieces) < size:
         piece = stream.take(stream.unpack("q")[0])
@@ -79,12 +80,12 @@ def _grid(data: bytes) -> SparseGrid:
         key, child, state = struct.unpack_from("<QqI", data, at)
         # Key: z, y, x of the 4096³ cube, 21 bits each, as unsigned numbers.
         x, y, z = ((key >> shift & 0x1FFFFF) << 12 for shift in (42, 21, 0))
-        origin = tuple(int(n - (1 << 32) if n >= 1 << 31 else n) for n in (x, y, z))
+        x, y, z = (int(n - (1 << 32) if n >= 1 << 31 else n) for n in (x, y, z))
         if child:
-            _node(data, root + child, origin, (5, 4, 3), value, background, blocks)
+            _node(data, root + child, (x, y, z), (5, 4, 3), value, background, blocks)
         else:
             tile = float(np.frombuffer(data, value, 1, at + (20 if value.itemsize == 4 else 24))[0])
-            blocks.append(Block(origin, 4096, tile, bool(state)))
+            blocks.append(Block((x, y, z), 4096, tile, bool(state)))
     return SparseGrid(name, _NANO_CLASSES.get(kind, ""), matrix, offset, background, blocks)
 
 

@@ -27,9 +27,9 @@ _PRIMES = (1, 2654435761, 805459861)
 class HashGrid(eqx.Module):
     """Multiresolution hash encoding: trilinear features of several grids, one after the other.
 
-    Two layouts exist. nerfstudio's own ("torch") hashes every level and puts node i of a level at x = i / scale.
-    tiny-cuda-nn ("tcnn") stores levels that fit into the table densely, x fastest, and puts node i at
-    (i − ½) / scale.
+    Two layouts exist. nerfstudio's own ("torch") hashes every level and puts node i of a level at
+    x = i / scale. tiny-cuda-nn ("tcnn") stores levels that fit into the table densely, x fastest, and puts
+    node i at (i − ½) / scale.
 
     Attributes:
         tables: Features of each level, shape (entries, features).
@@ -168,15 +168,15 @@ def load_checkpoint(
 ) -> AbstractField:
     """Density of a nerfstudio checkpoint (nerfacto or splatfacto).
 
-    The numbers that the weights do not tell are read from `config.yml` beside the checkpoint or one folder up,
-    where nerfstudio writes it, unless stated.
+    The numbers that the weights do not tell are read from `config.yml` beside the checkpoint or one folder
+    up, where nerfstudio writes it, unless stated.
 
     Args:
         path: A step-*.ckpt file.
-        crop: Box in the frame of training, which is that of nerfstudio's viewer; None: [−1, 1]³, where space is
-            not contracted, or the scene box of a field without contraction.
-        undo_transform: Whether to go back to the frame of the data set by `dataparser_transforms.json`, if it is
-            there.
+        crop: Box in the frame of training, which is that of nerfstudio's viewer; None: [−1, 1]³, where space
+            is not contracted, or the scene box of a field without contraction.
+        undo_transform: Whether to go back to the frame of the data set by `dataparser_transforms.json`, if
+            it is there.
         **stated: `average_init_density`, `base_res`, `max_res`, `hidden_dim`, `num_layers`,
             `features_per_level`, `num_levels`, `log2_hashmap_size`, `disable_scene_contraction`.
 

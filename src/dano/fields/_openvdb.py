@@ -1,7 +1,7 @@
 """OpenVDB's .vdb files: a stream of nodes, first all topology, then all leaves.
 
-Layout: openvdb/io/{Archive,File,GridDescriptor,Compression}.h and tree/{RootNode,InternalNode,LeafNode}.h, file
-versions 222 to 224.
+Layout: openvdb/io/{Archive,File,GridDescriptor,Compression}.h and tree/{RootNode,InternalNode,LeafNode}.h,
+file versions 222 to 224.
 """
 
 import zlib

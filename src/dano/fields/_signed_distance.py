@@ -175,7 +175,7 @@ def extended_distances(distances: np.ndarray, spacing: np.ndarray, width: float)
     near = np.abs(distances) <= width - 1.01 * spacing.max()
     if not near.any():
         raise ValueError(f"distances must be known to more than a cell from the surface, got {width}")
-    slope = np.stack(np.gradient(distances, *spacing), axis=-1)[near]
+    slope = np.stack([part[near] for part in np.gradient(distances, *spacing)], axis=-1)
     slope = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
     closest = spacing * np.argwhere(near) - distances[near][:, None] * slope
     far, _ = spread_distances(near, closest, np.zeros(3), spacing)

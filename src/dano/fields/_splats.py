@@ -129,7 +129,7 @@ class _Occupancy:
         log_clear = np.zeros(len(points))
         first, last = cells.index(self.means - self.reach), cells.index(self.means + self.reach)
         counts = np.prod(last - first + 1, axis=1)
-        # Gaussian by Gaussian the cells under its box, then cell by cell the points; in portions of bounded size.
+        # Gaussian by Gaussian the cells under its box, then cell by cell the points; in bounded portions.
         for some in _portions(counts, _PAIRS // 8):
             gaussian, cell = cells.under(first[some], last[some])
             gaussian = some[gaussian]
@@ -137,7 +137,7 @@ class _Occupancy:
             for part in _portions(stop - start, _PAIRS):
                 n = (stop - start)[part]
                 owner = np.repeat(gaussian[part], n)
-                row = cells.order[np.repeat(start[part], n) + _counting(n)]
+                row = cells.order[np.add(np.repeat(start[part], n), _counting(n))]
                 offset = points[row] - self.means[owner]
                 near = np.all(np.abs(offset) <= self.reach[owner], axis=1)
                 owner, row, offset = owner[near], row[near], offset[near]
@@ -150,7 +150,7 @@ class _Occupancy:
 
 
 class _Cells:
-    """Points sorted into the cells of a grid: of a given side, or larger so that each holds a point or more."""
+    """Points sorted into the cells of a grid, of a given side or larger: on average a point in each."""
 
     def __init__(self, points: np.ndarray, side: float):
         self.low = points.min(0)
@@ -158,9 +158,9 @@ class _Cells:
         most = np.clip(np.ceil(len(points) ** (1 / 3)), 1, 128)
         self.shape = np.clip(np.ceil(extent / max(side, 1e-12)), 1, most).astype(np.int64)
         self.side = np.maximum(extent / self.shape, 1e-300)
-        flat = np.ravel_multi_index(tuple(self.index(points).T), tuple(self.shape))
+        flat = np.asarray(np.ravel_multi_index(tuple(self.index(points).T), tuple(self.shape)))
         self.order = np.argsort(flat, kind="stable")
-        self.start = np.searchsorted(flat[self.order], np.arange(np.prod(self.shape) + 1))
+        self.start = np.searchsorted(flat[self.order], np.arange(int(np.prod(self.shape)) + 1))
 
     def index(self, x: np.ndarray) -> np.ndarray:
         """Cell of each position, the nearest one if it lies outside."""
@@ -176,13 +176,13 @@ class _Cells:
         z, rest = within % size[box, 2], within // size[box, 2]
         y, x = rest % size[box, 1], rest // size[box, 1]
         cell = first[box] + np.stack([x, y, z], axis=1)
-        return box, np.ravel_multi_index(tuple(cell.T), tuple(self.shape))
+        return box, np.asarray(np.ravel_multi_index(tuple(cell.T), tuple(self.shape)))
 
 
 def _counting(counts: np.ndarray) -> np.ndarray:
     """0, 1, …, n − 1 for each n of `counts`, one after the other."""
     ends = np.cumsum(counts)
-    return np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - counts, counts)
+    return np.arange(int(counts.sum())) - np.repeat(ends - counts, counts)
 
 
 def _portions(counts: np.ndarray, limit: int) -> list[np.ndarray]:

@@ -16,14 +16,15 @@ def load_module(path: Path, *, crop: Numbers | None, module: str | None = None) 
     """A PyTorch module that maps points (n, 3) to densities (n,).
 
     Args:
-        path: A file of torch.export (.pt2) or TorchScript; or weights, a state dictionary for the module that `module` makes.
+        path: A file of torch.export (.pt2) or TorchScript; or weights, a state dictionary for the module
+            that `module` makes.
         crop: Box [units of the module] outside of which the density is zero; required.
         module: "package.module:name" of a class or function that makes a torch.nn.Module without arguments.
             It is imported, and so runs: name only code that you trust.
 
     Raises:
-        ValueError: If `crop` is missing, the file is neither, its weights do not fit, or the module does not map
-            points to densities.
+        ValueError: If `crop` is missing, the file is neither, its weights do not fit, or the module does not
+            map points to densities.
         ImportError: If torch is missing or `module` cannot be imported.
     """
     bounds = _required(crop, path)
@@ -37,12 +38,13 @@ def load_module(path: Path, *, crop: Numbers | None, module: str | None = None) 
                     warnings.simplefilter("ignore", DeprecationWarning)
                     made = torch.jit.load(str(path), map_location="cpu").eval()
         except (RuntimeError, ValueError, OSError, KeyError, AttributeError) as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise ValueError(
-                f"{path}: expected an exported or TorchScript module, or weights and module='package.module:name' that makes"
-                f" their torch.nn.Module; {str(error).splitlines()[0]}"
+                f"{path}: expected an exported or TorchScript module, or weights and"
+                f" module='package.module:name' that makes their torch.nn.Module; {reason}"
             ) from error
     else:
-        made = imported(module)
+        made: Any = imported(module)
         made = made if isinstance(made, torch.nn.Module) else made()
         if not isinstance(made, torch.nn.Module):
             raise ValueError(f"module {module!r} must make a torch.nn.Module, got {type(made).__name__}")
@@ -69,7 +71,7 @@ def load_callable(name: str, *, crop: Numbers | None) -> CallableField:
         ImportError: If it cannot be imported.
     """
     bounds = _required(crop, name)
-    function = imported(name)
+    function: Any = imported(name)
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(function, torch.nn.Module):
         function = _Flat(function.eval(), torch)

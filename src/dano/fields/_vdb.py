@@ -1,7 +1,7 @@
 """Grids of OpenVDB (.vdb) and NanoVDB (.nvdb) files as dense fields.
 
-The readers are dano's own: of those that the package index has, one loses tiles, which hold the inside of most
-volumes, and the other is a simulator of 130 MB.
+The readers are dano's own: of those that the package index has, one loses tiles, which hold the inside of
+most volumes, and the other is a simulator of 130 MB.
 """
 
 import struct
@@ -37,8 +37,8 @@ def load_vdb(
         interpolation: "linear", as OpenVDB's own sampler, "quadratic" or "cubic".
 
     Raises:
-        ValueError: If the file is damaged or of an unknown version, has no such grid or none of floats, or its
-            grid is turned, negative (and no level set), or too large.
+        ValueError: If the file is damaged or of an unknown version, has no such grid or none of floats, or
+            its grid is turned, negative (and no level set), or too large.
         ImportError: If the file is compressed with Blosc and the package blosc is missing.
     """
     data = path.read_bytes()
@@ -129,8 +129,8 @@ def _dense(grid: SparseGrid, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         if np.any(a >= b):
             continue
         into = tuple(slice(i, j) for i, j in zip(a, b, strict=True))
-        if isinstance(block.values, float):
-            out[into] = block.values
-        else:
+        if isinstance(block.values, np.ndarray):
             out[into] = block.values[tuple(slice(i, j) for i, j in zip(a - start, b - start, strict=True))]
+        else:
+            out[into] = block.values
     return out

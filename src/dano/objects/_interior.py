@@ -23,13 +23,15 @@ GAPS = (0, 1, 2)
 """Radii [cells] to which pores of the surface are closed, tried in turn at each level."""
 
 POROUS = 0.06
-"""A solid that closing by one more cell enlarges by more than this share has pores; convex edges add 1–3 %."""
+"""A solid that closing by one more cell enlarges by more than this share has pores; convex edges add 1–3
+%."""
 
 LEAK = 0.05
 """Share of the solid's volume that may be hollow at a lower level without being inside at this one."""
 
 _SURROUNDED = 0.7
-"""Share of a hollow's border that must lie within two cells of the dense part; pockets in a haze have less."""
+"""Share of a hollow's border that must lie within two cells of the dense part; pockets in a haze have
+less."""
 
 _BALL = np.ones((3, 3, 3))
 
@@ -39,10 +41,12 @@ class Interior(eqx.Module):
 
     Attributes:
         level: Density of its surface.
+        wall: Median density near the surface, 1.5 to 4 cells inside.
         gap: Radius [cells of the lattice] of the pores that were closed to make the surface watertight.
-        deep: Median density deep inside as a share of that near the surface: 1 for a solid, 0 for a hollow; NaN
-            if it is too thin to tell.
-        spread: Unevenness, (upper − lower quartile)/(2 · median) of the densities inside; about 0 for a solid.
+        deep: Median density deep inside as a share of that near the surface: 1 for a solid, 0 for a hollow;
+            NaN if it is too thin to tell.
+        spread: Unevenness, (upper − lower quartile)/(2 · median) of the densities inside; about 0 for a
+            solid.
         outside: Share of ∫φ further than two cells from the solid: haze and floaters.
         cavity: Share of the solid's volume whose density is below the level.
         largest: Largest density.
@@ -50,6 +54,7 @@ class Interior(eqx.Module):
     """
 
     level: Float[Array, ""]
+    wall: Float[Array, ""]
     gap: Float[Array, ""]
     deep: Float[Array, ""]
     spread: Float[Array, ""]
@@ -61,9 +66,13 @@ class Interior(eqx.Module):
     def flaws(self) -> list[str]:
         """Why the density should not be read as mass density, in words; empty if it may be."""
         found = []
-        deep, largest = float(self.deep), float(self.largest)
-        if largest > 1.05 or largest < 0.8:
-            found.append(f"densities reach {largest:.3g}, so they are no probability of occupancy")
+        deep, wall, largest = float(self.deep), float(self.wall), float(self.largest)
+        # Splines through samples of an occupancy may overshoot by a fifth.
+        if not 0.8 <= wall <= 1.1 or largest > 1.3:
+            found.append(
+                f"densities of {wall:.3g} near the surface and up to {largest:.3g} are no probability of"
+                " occupancy"
+            )
         if deep < 0.25:
             found.append(f"it is hollow: deep inside {100 * deep:.0f} % of the density near the surface")
         elif deep < 0.85:
@@ -84,15 +93,16 @@ class Interior(eqx.Module):
 def examine(lattice: Lattice) -> tuple[Interior, Bool[np.ndarray, "nx ny nz"]]:
     """Find the solid that a density stands for, and what its inside looks like.
 
-    The level of the surface is half the plateau density, the natural one of an occupancy and the middle of the
-    wall of anything else, unless the part above it is no watertight solid. It is not if
+    The level of the surface is half the plateau density, the natural one of an occupancy and the middle of
+    the wall of anything else, unless the part above it is no watertight solid. It is not if
 
     - closing its pores by one more cell enlarges it by more than 6 %, or
-    - a lower level finds a hollow of more than 5 % of its volume, bordered by its dense part, that it does not
+    - a lower level finds a hollow of more than 5 % of its volume, bordered by its dense part, that it does
+      not
       enclose: then the hollow is connected with the outside through pores.
 
-    In that case pores of up to four cells are closed, and then lower levels are tried. Higher levels never are:
-    they cost volume and raise no alarm, since a porous solid still covers its silhouettes.
+    In that case pores of up to four cells are closed, and then lower levels are tried. Higher levels never
+    are: they cost volume and raise no alarm, since a porous solid still covers its silhouettes.
 
     Returns:
         The numbers, and the lattice points inside the solid: the largest connected part, its pores closed and
@@ -115,10 +125,27 @@ def examine(lattice: Lattice) -> tuple[Interior, Bool[np.ndarray, "nx ny nz"]]:
     return _described(values, level * scale, gap, inside, solid(level / 2, gap)), inside
 
 
+def fill_hollows(grid: GridField) -> tuple[GridField, Interior]:
+    """A shell of density as a solid: what it encloses gets the density of its wall.
+
+    Gaussian splats and many radiance fields are shells. Pores of up to four cells are closed if need be.
+
+    Args:
+        grid: Density.
+
+    Returns:
+        The grid whose nodes inside the solid have at least the density of the wall, and what `grid` was like
+        (`cavity`: share of the solid that was hollow).
+    """
+    lattice = Lattice(*(np.asarray(x, np.float64) for x in (grid.values, grid.origin, grid.spacing)))
+    interior, inside = examine(lattice)
+    return sealed(lattice, interior, inside), interior
+
+
 def sealed(lattice: Lattice, interior: Interior, inside: Bool[np.ndarray, "nx ny nz"]) -> GridField:
-    """The field on its lattice, with everything inside the solid at least as dense as a wall."""
-    level = float(interior.level)
-    values = np.where(inside, np.maximum(lattice.values, 2 * level), lattice.values)
+    """The field on its lattice, with everything inside the solid at least as dense as its wall."""
+    wall = max(float(interior.wall), 2 * float(interior.level))
+    values = np.where(inside, np.maximum(lattice.values, wall), lattice.values)
     return GridField.interpolating(values, lattice.origin, lattice.side)
 
 
@@ -171,13 +198,15 @@ def _described(values: np.ndarray, level: float, gap: int, inside: np.ndarray, w
     quartiles = np.quantile(values[core], [0.25, 0.5, 0.75]) if core.any() else np.ones(3)
     spread = 0.5 * (quartiles[2] - quartiles[0]) / max(quartiles[1], 1e-3 * level)
     deepest = float(depth.max())
+    near = (depth >= min(1.5, deepest)) & (depth < 4)
+    wall = float(np.median(values[near]))
     deep = math.nan
     if deepest >= 6:
-        shell = np.median(values[(depth >= 1.5) & (depth < 4)])
-        deep = float(np.median(values[depth >= max(4.0, 0.5 * deepest)]) / shell)
+        deep = float(np.median(values[depth >= max(4.0, 0.5 * deepest)])) / max(wall, 1e-3 * level)
     far = ~ndimage.binary_dilation(inside, _BALL, iterations=2)
     numbers = {
         "level": level,
+        "wall": wall,
         "gap": gap,
         "deep": deep,
         "spread": min(float(spread), 1e3),

@@ -43,11 +43,12 @@ class NeuralObject(eqx.Module):
         mass: Mass properties in the field's frame.
         grid: The field baked for other objects' samples to query, without its floaters; None if there is no
             field.
-        solid: Signed distance of the object: of {φ = `interior.level`}, without floaters, cavities filled; of a
-            shape, its own. None if there is no field.
+        solid: Signed distance of the object: of {φ = `interior.level`}, without floaters, cavities filled;
+            of a shape, its own. None if there is no field.
         density_range: Lower and upper density between which the samples lie, shape (2,).
         bake_error: Root mean square error of `grid` relative to the field's largest density (0 for a grid).
-        interior: What the inside of the field looks like; None for objects made of samples, and in older files.
+        interior: What the inside of the field looks like; None for objects made of samples, and in older
+            files.
         mass_model: How density became mass: "density", "solid", or "given" (static).
         mass_reason: Why this model, in words (static).
     """

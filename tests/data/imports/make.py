@@ -1,4 +1,5 @@
-"""Writes the files of this folder, each with the library of its format, and what that library says is in them.
+"""Writes the files of this folder, each with the library of its format, and what that library says is in
+them.
 
     python make.py nerfstudio | gsplat | openvdb | nanovdb | tcnn
 
@@ -86,7 +87,8 @@ def make_nerfstudio():
 
 
 def make_tcnn():
-    """Dr.Jit's hash grid has tiny-cuda-nn's layout and runs without a GPU; the network after it is NumPy's."""
+    """Dr.Jit's hash grid has tiny-cuda-nn's layout and runs without a GPU; the network after it is
+    NumPy's."""
     import drjit.nn
     import torch
     from drjit.llvm.ad import ArrayXf, Float32
