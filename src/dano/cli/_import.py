@@ -12,7 +12,7 @@ from dano.fields import bake, GridField, load_field, save_field, SignedDistanceG
 from dano.fields._splats import is_splats
 from dano.maths import Pose
 from dano.objects import fill_hollows
-from dano.objects._mass import host_jet
+from dano.objects._interior import node_values
 
 
 def import_field(
@@ -37,7 +37,13 @@ def import_field(
     progress = Progress()
     progress("reading the field", 0.0)
     box = None if crop is None else np.reshape(crop, (2, 3))
-    sampled = {"resolution": resolution} if _kind(file) == "mesh" else {}
+    splats, sampled = _kind(file) == "splats", {}
+    if _kind(file) == "mesh":
+        sampled = {"resolution": resolution}
+    elif splats:
+        # Gaussians thinner than the distance between nodes would fall between them: a shell full of pores.
+        lower, upper = np.asarray(load_field(file, crop=box).bounds)
+        sampled = {"min_width": 0.5 * float(np.max(upper - lower)) / (resolution - 1)}
     field = load_field(file, crop=box, scale=scale, pose=pose, **sampled, **options)
     kind, error = type(field).__name__, None
     if not isinstance(field, (GridField, SignedDistanceGrid)):
@@ -48,7 +54,7 @@ def import_field(
 
         field, error = bake(field, resolution, interpolation=interpolation, progress=baking)
     filled = 0.0
-    if _kind(file) == "splats" and not hollow and isinstance(field, GridField):
+    if splats and not hollow and isinstance(field, GridField):
         field, before = fill_hollows(field)
         filled = float(before.cavity)
     progress.close()
@@ -67,13 +73,7 @@ def _kind(file: str) -> str:
 
 
 def _described(field: GridField | SignedDistanceGrid, output: Path, file: str, kind: str) -> dict[str, Any]:
-    if isinstance(field, SignedDistanceGrid):
-        values = np.asarray(field.distances)
-    else:
-        # Between the nodes of a spline lie its values, at the nodes its coefficients.
-        origin, spacing = np.asarray(field.origin, float), np.asarray(field.spacing, float)
-        nodes = origin + spacing * np.argwhere(np.ones(field.shape, bool))
-        values = host_jet(field.jet, nodes)[0].reshape(field.shape)
+    values = np.asarray(field.distances) if isinstance(field, SignedDistanceGrid) else node_values(field)
     return {
         "file": str(output),
         "source": file,

@@ -50,7 +50,7 @@ _CHECKPOINT = (
     "disable_scene_contraction",
 )
 _MESH = _Reader(mesh_field, ("resolution", "interpolation", "edge"))
-_SPLATS = _Reader(load_splats, (), crops=True)
+_SPLATS = _Reader(load_splats, ("min_width",), crops=True)
 _READERS: dict[str, _Reader] = {
     ".npz": _Reader(load_npz, ("interpolation",)),
     ".npy": _Reader(load_npy, ("spacing", "origin", "interpolation", "signed_distance")),
@@ -78,7 +78,8 @@ def load_field(
     - `.npy`: voxels (nx, ny, nz), booleans or densities; options `spacing`, `origin`, `interpolation`, and
       `signed_distance=True` if they are distances, negative inside.
     - `.obj`, `.stl`, `.off`, `.glb`, `.gltf`, `.ply`: a watertight triangle mesh; options of `mesh_field`.
-    - `.ply` with Gaussian splats: their occupancy.
+    - `.ply` with Gaussian splats: their occupancy; option `min_width`, the least standard deviation of a
+      Gaussian.
     - `.ckpt`: a nerfstudio checkpoint (nerfacto, splatfacto); option `undo_transform`, and nerfacto's sizes
       where no config.yml tells them.
     - `.ingp`, `.msgpack`: the density grid of an instant-ngp snapshot; options `cascade`, `interpolation`.

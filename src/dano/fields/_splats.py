@@ -27,7 +27,7 @@ def is_splats(path: Path) -> bool:
     )
 
 
-def load_splats(path: Path, *, crop: Numbers | None) -> CallableField:
+def load_splats(path: Path, *, crop: Numbers | None, min_width: float = 0.0) -> CallableField:
     """Occupancy of Gaussian splats in a .ply file, in the frame of the file.
 
     φ(x) = 1 − Π (1 − oᵢ exp(−½ (x − μᵢ)ᵀ Σᵢ⁻¹ (x − μᵢ))) with Σᵢ = R diag(s²) Rᵀ: the chance that at least
@@ -37,10 +37,12 @@ def load_splats(path: Path, *, crop: Numbers | None) -> CallableField:
     Args:
         path: A .ply file with x, y, z, opacity (logit), scale_0–2 (log) and rot_0–3 (wxyz) of each Gaussian.
         crop: Box [units of the file]; None: around all Gaussians.
+        min_width: Least standard deviation [units of the file] of a Gaussian along any of its axes; half the
+            distance between the nodes of a grid leaves no pores in a shell that is sampled there.
 
     Raises:
-        ValueError: If the file cannot be read, lacks a property, or holds no Gaussian or numbers that are not
-            finite.
+        ValueError: If `min_width` is negative, the file cannot be read, lacks a property, or holds no
+            Gaussian or numbers that are not finite.
         ImportError: If plyfile is missing.
     """
     try:
@@ -62,12 +64,14 @@ def load_splats(path: Path, *, crop: Numbers | None) -> CallableField:
         "opacities": columns["opacity"],
     }
     try:
-        return splat_field(parameters, crop)
+        return splat_field(parameters, crop, min_width)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
 
-def splat_field(parameters: Mapping[str, np.ndarray], crop: Numbers | None) -> CallableField:
+def splat_field(
+    parameters: Mapping[str, np.ndarray], crop: Numbers | None, min_width: float = 0.0
+) -> CallableField:
     """Occupancy of Gaussians given by `means`, log `scales`, `quats` (wxyz) and logit `opacities`.
 
     Raises:
@@ -92,7 +96,9 @@ def splat_field(parameters: Mapping[str, np.ndarray], crop: Numbers | None) -> C
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     ).transpose(2, 0, 1)
-    deviations = np.exp(np.clip(scales, -46, 46))
+    if not (np.isfinite(min_width) and min_width >= 0):
+        raise ValueError(f"min_width must be finite and ≥ 0, got {min_width}")
+    deviations = np.maximum(np.exp(np.clip(scales, -46, 46)), min_width)
     # Extent of the ellipsoid along the axes: √Σ_kk.
     reach = REACH * np.sqrt(np.einsum("nij,nj->ni", turn**2, deviations**2))
     opacity = 1 / (1 + np.exp(-np.clip(logits, -60, 60)))

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from dano.fields import GridField
 from dano.maths import floating
+from dano.objects._mass import host_jet
 from dano.objects._samples import Lattice, plateau
 
 LEVELS = (0.5, 0.35, 0.25, 0.17, 0.12)
@@ -137,9 +138,17 @@ def fill_hollows(grid: GridField) -> tuple[GridField, Interior]:
         The grid whose nodes inside the solid have at least the density of the wall, and what `grid` was like
         (`cavity`: share of the solid that was hollow).
     """
-    lattice = Lattice(*(np.asarray(x, np.float64) for x in (grid.values, grid.origin, grid.spacing)))
+    origin, spacing = np.asarray(grid.origin, np.float64), np.asarray(grid.spacing, np.float64)
+    lattice = Lattice(node_values(grid), origin, spacing)
     interior, inside = examine(lattice)
     return sealed(lattice, interior, inside), interior
+
+
+def node_values(grid: GridField) -> Float[np.ndarray, "nx ny nz"]:
+    """Densities at the nodes of a grid, where its coefficients may overshoot."""
+    origin, spacing = np.asarray(grid.origin, np.float64), np.asarray(grid.spacing, np.float64)
+    nodes = origin + spacing * np.argwhere(np.ones(grid.shape, bool))
+    return host_jet(grid.jet, nodes)[0].reshape(grid.shape)
 
 
 def sealed(lattice: Lattice, interior: Interior, inside: Bool[np.ndarray, "nx ny nz"]) -> GridField:
