@@ -7,6 +7,7 @@ to a few, if the surface is watertight at the level at which it is cut.
 """
 
 import math
+from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
@@ -43,7 +44,8 @@ class Interior(eqx.Module):
     Attributes:
         level: Density of its surface.
         wall: Median density near the surface, 1.5 to 4 cells inside.
-        gap: Radius [cells of the lattice] of the pores that were closed to make the surface watertight.
+        gap: Radius [cells of the lattice] of the pores that were closed to make the surface watertight; NaN
+            if no watertight surface was found.
         deep: Median density deep inside as a share of that near the surface: 1 for a solid, 0 for a hollow;
             NaN if it is too thin to tell.
         spread: Unevenness, (upper − lower quartile)/(2 · median) of the densities inside; about 0 for a
@@ -82,10 +84,12 @@ class Interior(eqx.Module):
             found.append(f"deep inside it has {100 * deep:.0f} % of the density near the surface")
         if float(self.spread) > 0.1:
             found.append(f"the density inside is uneven by {100 * float(self.spread):.0f} %")
-        if float(self.cavity) > 0.02 and deep >= 0.25:
+        if float(self.cavity) > 0.02 and not deep < 0.25:
             found.append(f"{100 * float(self.cavity):.0f} % of its volume is hollow")
         if float(self.gap) > 0:
             found.append(f"its surface had pores, closed up to {2 * float(self.gap):.0f} cells wide")
+        if math.isnan(float(self.gap)):
+            found.append("no watertight surface was found, so what is inside is uncertain")
         if float(self.outside) > 0.01:
             found.append(f"{100 * float(self.outside):.0f} % of the density is haze or floaters")
         return found
@@ -99,11 +103,12 @@ def examine(lattice: Lattice) -> tuple[Interior, Bool[np.ndarray, "nx ny nz"]]:
 
     - closing its pores by one more cell enlarges it by more than 6 %, or
     - a lower level finds a hollow of more than 5 % of its volume, bordered by its dense part, that it does
-      not
-      enclose: then the hollow is connected with the outside through pores.
+      not enclose: then the hollow is connected with the outside through pores.
 
     In that case pores of up to four cells are closed, and then lower levels are tried. Higher levels never
     are: they cost volume and raise no alarm, since a porous solid still covers its silhouettes.
+
+    If none of these is watertight, the first level is taken as it is, and `gap` is NaN.
 
     Returns:
         The numbers, and the lattice points inside the solid: the largest connected part, its pores closed and
@@ -118,12 +123,14 @@ def examine(lattice: Lattice) -> tuple[Interior, Bool[np.ndarray, "nx ny nz"]]:
             solids[level, gap] = _filled(values, level * scale, gap)
         return solids[level, gap]
 
-    level, gap = next(
+    tight = next(
         ((level, gap) for level in LEVELS for gap in GAPS if _is_tight(values, scale, level, gap, solid)),
-        (LEVELS[0], GAPS[0]),
+        None,
     )
+    level, gap = tight or (LEVELS[0], GAPS[0])
     inside = solid(level, gap)
-    return _described(values, level * scale, gap, inside, solid(level / 2, gap)), inside
+    stated = math.nan if tight is None else float(gap)
+    return _described(values, level * scale, stated, inside, solid(level / 2, gap)), inside
 
 
 def fill_hollows(grid: GridField) -> tuple[GridField, Interior]:
@@ -158,7 +165,9 @@ def sealed(lattice: Lattice, interior: Interior, inside: Bool[np.ndarray, "nx ny
     return GridField.interpolating(values, lattice.origin, lattice.side)
 
 
-def _is_tight(values: np.ndarray, scale: float, level: float, gap: int, solid) -> bool:
+def _is_tight(
+    values: np.ndarray, scale: float, level: float, gap: int, solid: Callable[[float, int], np.ndarray]
+) -> bool:
     from scipy import ndimage
 
     here = solid(level, gap)
@@ -198,7 +207,9 @@ def _filled(values: np.ndarray, level: float, gap: int) -> np.ndarray:
     return ndimage.binary_fill_holes(part)
 
 
-def _described(values: np.ndarray, level: float, gap: int, inside: np.ndarray, wider: np.ndarray) -> Interior:
+def _described(
+    values: np.ndarray, level: float, gap: float, inside: np.ndarray, wider: np.ndarray
+) -> Interior:
     from scipy import ndimage
 
     depth = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1, 1:-1]
