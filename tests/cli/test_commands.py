@@ -79,7 +79,7 @@ def test_import_fills_splats_and_keeps_signed_distances(run, tmp_path):
     pytest.importorskip("blosc")
     middle = jnp.zeros(3)
     for options, filled in (((), True), (("--hollow",), False)):
-        answer = run("import", IMPORTS / "splats.ply", "-o", tmp_path / "a.npz", "--resolution", 64, *options)
+        answer = run("import", IMPORTS / "splats.ply", "-o", tmp_path / "a.npz", "--resolution", 40, *options)
         assert answer.code == 0
         assert ("was hollow" in answer.out) == filled
         assert (float(dano.load_field(tmp_path / "a.npz").density(middle)) > 0.4) == filled
