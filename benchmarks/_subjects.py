@@ -74,6 +74,6 @@ def authors_bunny() -> Subject | None:
     data = np.load(folder / "bunny_density_grid.npz")
     field = dano.GridField(data["values"], data["origin"], data["spacing"])
     bunny = dano.NeuralObject.from_field(
-        field, density_range=(1.0, 105.0), mass_scale=0.1, key=jax.random.key(0)
+        field, density_range=(1.0, 105.0), mass_model="density", mass_scale=0.1, key=jax.random.key(0)
     )
     return Subject("authors' bunny", bunny, 1.0, 0.01)

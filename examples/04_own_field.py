@@ -20,7 +20,10 @@ def main(quick: bool = False) -> dict[str, float]:
     field = dano.CallableField(torus, bounds=[(-0.075, -0.075, -0.025), (0.075, 0.075, 0.025)])
     # A grid: its moments are exact, and other objects can query it fast.
     baked = dano.bake(field, 96)
-    ring = dano.NeuralObject.from_field(baked.grid, mass=MASS, n_samples=2000, key=jax.random.key(0))
+    # Homogeneous by construction, so it is weighed by its density; by default dano looks at what is inside.
+    ring = dano.NeuralObject.from_field(
+        baked.grid, mass=MASS, mass_model="density", n_samples=2000, key=jax.random.key(0)
+    )
 
     # Homogeneous torus: J_z = m (R² + 3/4 r²), J_x = m (R²/2 + 5/8 r²).
     exact = MASS * np.array([RING**2 / 2 + 5 / 8 * TUBE**2] * 2 + [RING**2 + 3 / 4 * TUBE**2])

@@ -14,7 +14,8 @@ seconds = time.process_time() - begin
 changed = [name for name, value in before.items() if getattr(jax.config, name) != value]
 print(json.dumps({"seconds": seconds, "changed": changed, "modules": sorted(sys.modules)}))
 """
-OPTIONAL = {"PIL", "av", "igl", "imageio", "matplotlib", "mujoco", "skimage", "torch", "trimesh", "viser"}
+OPTIONAL = {"PIL", "av", "blosc", "igl", "imageio", "matplotlib", "mujoco", "msgpack", "plyfile", "skimage"}
+OPTIONAL |= {"torch", "trimesh", "viser"}
 
 
 def import_in_new_process() -> dict:

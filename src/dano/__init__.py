@@ -16,6 +16,7 @@ from dano.fields import (
     mesh_field as mesh_field,
     Posed as Posed,
     save_field as save_field,
+    Scaled as Scaled,
     Sphere as Sphere,
     Union as Union,
 )

@@ -17,7 +17,7 @@ from dano.scene_file import _objects as shipped, load_run, load_scene
 def test_help_without_arguments(run):
     answer = run()
     assert answer.code == 0
-    for command in ("build", "inspect", "simulate", "view", "demo"):
+    for command in ("build", "import", "inspect", "simulate", "view", "demo"):
         assert command in answer.out
         assert run(command, "--help").code == 0
     assert dano.__version__ in run("--version").out
@@ -50,9 +50,69 @@ def test_build_of_another_mass_model_and_range(run, field, tmp_path):
     assert "centre of mass" in answer.out
     made = dano.NeuralObject.load(path)
     assert made.mass_model == "density"
+    assert "mass model          density: as asked; auto would take solid: densities of" in answer.out
     assert 40 <= float(made.samples.density.min()) <= float(made.samples.density.max()) <= 60
     with np.load(field) as data:
         assert float(made.mass.mass) == pytest.approx(2 * data["values"].sum() * 1e-6, rel=0.02)
+
+
+IMPORTS = Path(__file__).parents[1] / "data" / "imports"
+
+
+def test_import_writes_a_placed_grid(run, tmp_path):
+    """A NanoVDB grid in centimetres, turned by 90° about z: the density where it belongs."""
+    path, nano = tmp_path / "ball.npz", IMPORTS / "nanovdb.nvdb"
+    half = float(np.sqrt(0.5))
+    place = ("--scale", 0.01, "--position", 1, 0, 0, "--orientation", half, 0, 0, half)
+    answer = run("import", nano, "-o", path, *place, "--resolution", 48, "--json")
+    assert (answer.code, answer.err) == (0, "")
+    report = json.loads(answer.out)
+    assert report["bake_error"] < 0.01
+    assert report["range"][1] == pytest.approx(3, rel=0.05)
+    x = np.array([0.1, -0.2, 0.3]) + 0.02 * np.array([9.0, 13.0, 12.0])
+    found = dano.load_field(path).density(jnp.asarray([1 - 0.01 * x[1], 0.01 * x[0], 0.01 * x[2]]))
+    assert float(found) == pytest.approx(float(dano.load_field(nano).density(jnp.asarray(x))), rel=0.02)
+
+
+def test_import_fills_splats_and_keeps_signed_distances(run, tmp_path):
+    pytest.importorskip("plyfile")
+    pytest.importorskip("blosc")
+    middle = jnp.zeros(3)
+    for options, filled in (((), True), (("--hollow",), False)):
+        answer = run("import", IMPORTS / "splats.ply", "-o", tmp_path / "a.npz", "--resolution", 40, *options)
+        assert answer.code == 0
+        assert ("was hollow" in answer.out) == filled
+        assert (float(dano.load_field(tmp_path / "a.npz").density(middle)) > 0.4) == filled
+    level = tmp_path / "level.npz"
+    assert run("import", IMPORTS / "openvdb.vdb", "-o", level, "--grid", "levelset").code == 0
+    made = tmp_path / "ball.dano"
+    answer = run("build", level, "-o", made, "--samples", 100, "--resolution", 24, "--mass", 1, "--json")
+    assert json.loads(answer.out)["mass_reason"] == "a shape's occupancy is exact"
+    np.testing.assert_allclose(json.loads(answer.out)["principal_inertias"], 0.4 * 0.04**2, rtol=0.03)
+
+
+@pytest.mark.parametrize(
+    "file, options, message",
+    {
+        "kind": ("field.txt", (), "unknown kind of field '.txt'"),
+        "absent": ("no.vdb", (), "no such file"),
+        "damaged": ("damaged.ckpt", (), "expected a PyTorch checkpoint"),
+        "option": ("damaged.ckpt", ("--cascade", 1), "unknown options"),
+        "scale": ("damaged.ckpt", ("--scale", 0), "scale must be finite and > 0"),
+        "resolution": ("damaged.ckpt", ("--resolution", 1), "resolution must lie between 4 and 1024"),
+        "orientation": ("damaged.ckpt", ("--orientation", 0, 0, 0, 0), "non-zero quaternion"),
+        "module": ("nowhere.module:density", ("--crop", 0, 0, 0, 1, 1, 1), "No module named 'nowhere'"),
+    }.values(),
+)
+def test_bad_imports_leave_what_was_there(run, file, options, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "damaged.ckpt").write_bytes(b"PK\x03\x04 and nothing more")
+    (tmp_path / "a.npz").write_bytes(b"precious")
+    answer = run("import", file, "-o", "a.npz", *options)
+    assert answer.code == 2
+    assert message in answer.err
+    assert (tmp_path / "a.npz").read_bytes() == b"precious"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "damaged.ckpt"]
 
 
 def test_inspect_prints_and_draws(run, egg, tmp_path, monkeypatch):

@@ -30,7 +30,7 @@ def test_grids_round_trip(kind, tmp_path):
     assert again.interpolation == kind
     np.testing.assert_array_equal(again.values, VALUES)
     np.testing.assert_array_equal(again.bounds, field(kind).bounds)
-    assert load_field(str(path), interpolation="linear").interpolation == "linear"
+    assert load_grid(str(path), interpolation="linear").interpolation == "linear"
     assert os.listdir(tmp_path) == ["grid.npz"]
 
 

@@ -1,5 +1,8 @@
 """`dano build` and `dano inspect`."""
 
+import dataclasses
+import math
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +11,7 @@ import numpy as np
 from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._outputs import check_output, missing_for_pictures
 from dano.fields import load_field
-from dano.objects import MassModel, NeuralObject
+from dano.objects import Interior, MassModel, NeuralObject
 from dano.scene_file import build_object
 
 
@@ -105,17 +108,27 @@ def describe(made: NeuralObject, path: Path) -> dict[str, Any]:
         "surface_samples": len(made.surface.areas),
         "surface_area": float(np.sum(np.asarray(made.surface.areas))),
         "mass_model": made.mass_model,
+        "mass_reason": made.mass_reason,
+        "interior": None if made.interior is None else _interior(made.interior),
         "grid": None if made.grid is None else list(made.grid.shape),
         "bake_error": float(made.bake_error),
     }
+
+
+def _interior(interior: Interior) -> dict[str, float]:
+    return {field.name: float(getattr(interior, field.name)) for field in dataclasses.fields(interior)}
 
 
 def print_object(report: dict[str, Any]) -> None:
     """Print what `describe` found."""
     grid = report["grid"]
     put(f"object              {report['file']}")
-    error = f" ± {report['mass_error']:.1g}" if report["mass_error"] else ""
-    put(f"mass                {report['mass']:.6g}{error} kg ({report['mass_model']})")
+    error = f" ± {report['mass_error']:.1g}" if report["mass_error"] > 1e-9 * report["mass"] else ""
+    put(f"mass                {report['mass']:.6g}{error} kg")
+    for i, line in enumerate(textwrap.wrap(f"{report['mass_model']}: {report['mass_reason']}", 90)):
+        put(f"{'mass model' if i == 0 else '':<19} {line}")
+    if report["interior"] is not None:
+        _print_interior(report["interior"])
     put(f"centre of mass      {numbers(report['com'])} ± {max(report['com_error']):.1g} m")
     for i, row in enumerate(report["inertia"]):
         label = "inertia about it" if i == 0 else ""
@@ -133,3 +146,13 @@ def print_object(report: dict[str, Any]) -> None:
     else:
         size = " × ".join(map(str, grid))
         put(f"density grid        {size} nodes, baking error {100 * report['bake_error']:.2g} %")
+
+
+def _print_interior(interior: dict[str, float]) -> None:
+    deep = interior["deep"]
+    inside = "too thin to tell" if math.isnan(deep) else f"{100 * deep:.0f} % of the density near the surface"
+    put(f"deep inside         {inside}, uneven by {100 * interior['spread']:.0f} %")
+    put(
+        f"surface level       {interior['level']:.4g} of at most {interior['largest']:.4g};"
+        f" half of it: volume +{100 * interior['growth']:.0f} %"
+    )

@@ -23,7 +23,8 @@ def parse(argv: Sequence[str]) -> Callable[[], None]:
     if list(argv) == ["--version"]:
         print(f"dano {__version__}")
         raise SystemExit(0)
-    commands = {function.__name__: function for function in (build, inspect, simulate, identify, view, demo)}
+    functions = (build, import_, inspect, simulate, identify, view, demo)
+    commands = {function.__name__.rstrip("_"): function for function in functions}
     return tyro.extras.subcommand_cli_from_dict(
         commands,
         prog="dano",
@@ -42,7 +43,7 @@ def build(
     output: Output,
     samples: int = 5000,
     density_range: tuple[float, float] | None = None,
-    mass_model: Literal["density", "solid"] = "solid",
+    mass_model: Literal["auto", "density", "solid"] = "auto",
     mass_scale: float | None = None,
     mass: float | None = None,
     resolution: int = 96,
@@ -54,12 +55,13 @@ def build(
     """Make a neural object of a density field: mass, centre of mass, inertia, contact samples.
 
     Args:
-        field: Density grid (.npz with values, origin, spacing), voxels (.npy), mesh (.obj, .stl, …) or object
-            (.dano).
+        field: Density grid (.npz with values, origin, spacing), voxels (.npy), mesh (.obj, .stl, …), object
+            (.dano), or what `dano import` reads.
         output: Where to write the object, usually *.dano.
         samples: Number of contact samples.
         density_range: Lower and upper density of the samples; default: around the field's own surface.
         mass_model: solid: uniform inside the surface, hollow cores filled. density: as dense as the field.
+            auto: density where it is the occupancy of a solid inside, else solid.
         mass_scale: Mass per unit of density and cubic metre [kg]; default 1.
         mass: Total mass [kg], instead of the mass scale.
         resolution: Cells along the longest axis for mass integrals and sampling.
@@ -83,6 +85,76 @@ def build(
         length=length,
         floaters=floaters,
         seed=seed,
+        as_json=json,
+    )
+
+
+def import_(
+    file: Positional[str],
+    /,
+    output: Output,
+    crop: tuple[float, float, float, float, float, float] | None = None,
+    scale: float = 1.0,
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
+    resolution: int = 128,
+    interpolation: Literal["linear", "quadratic", "cubic"] | None = None,
+    hollow: bool = False,
+    spacing: float | None = None,
+    origin: tuple[float, float, float] | None = None,
+    signed_distance: bool = False,
+    grid: str | None = None,
+    cascade: int | None = None,
+    module: str | None = None,
+    keep_transform: bool = False,
+    json: bool = False,
+) -> Callable[[], None]:
+    """Read a field of another program and write it as a grid that dano reads.
+
+    Args:
+        file: nerfstudio checkpoint (.ckpt), instant-ngp snapshot (.ingp, .msgpack), Gaussian splats (.ply),
+            OpenVDB or NanoVDB grid (.vdb, .nvdb), PyTorch module (.pt2, .pt, .pth), voxels (.npy, .npz),
+            mesh (.obj, .stl, .ply, .off, .glb, .gltf), or a function as package.module:name.
+        output: Where to write the grid (.npz).
+        crop: Lowest x y z and highest x y z to be kept, in the file's frame and units.
+        scale: Length of a unit of the file [m].
+        position: Moves the scaled field [m].
+        orientation: Turns the scaled field before it is moved; quaternion w x y z.
+        resolution: Nodes along the longest axis of what is not a grid already.
+        interpolation: Between nodes.
+        hollow: Leave what Gaussian splats enclose empty. Splats are shells; otherwise it is filled.
+        spacing: Voxels (.npy): distance between voxels in the file's units; default: longest side 1.
+        origin: Voxels (.npy): centre of the first voxel.
+        signed_distance: Voxels (.npy) are signed distances, negative inside.
+        grid: OpenVDB, NanoVDB: name of the grid.
+        cascade: instant-ngp: which cascade of the density grid; 0 is the finest.
+        module: Weights (.pt, .pth): package.module:name of what makes their torch.nn.Module. Its code runs.
+        keep_transform: nerfstudio: stay in the frame of training instead of that of the data set.
+        json: Print one JSON object instead of text.
+    """
+    from dano.cli import _import
+
+    options = {
+        "interpolation": interpolation,
+        "spacing": spacing,
+        "origin": origin,
+        "signed_distance": signed_distance or None,
+        "grid": grid,
+        "cascade": cascade,
+        "module": module,
+        "undo_transform": False if keep_transform else None,
+    }
+    return functools.partial(
+        _import.import_field,
+        file,
+        output,
+        crop=crop,
+        scale=scale,
+        position=position,
+        orientation=orientation,
+        resolution=resolution,
+        hollow=hollow,
+        options={name: value for name, value in options.items() if value is not None},
         as_json=json,
     )
 

@@ -1,4 +1,4 @@
-"""Fields made of fields: placed by a pose, or joined."""
+"""Fields made of fields: placed by a pose, scaled, or joined."""
 
 from collections.abc import Callable
 from typing import overload
@@ -8,8 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from dano.fields._base import AbstractField, check_order, Jet
-from dano.fields._shapes import AbstractShape, checked_edge, SolidMoments
-from dano.maths import Pose
+from dano.fields._grid import GridField
+from dano.fields._shapes import AbstractShape, checked_edge, scaled_moments, SolidMoments
+from dano.fields._signed_distance import SignedDistanceGrid
+from dano.maths import checked_array, is_traced, Pose
 
 
 @overload
@@ -35,6 +37,40 @@ def Posed(field: AbstractField, pose: Pose) -> "PosedShape | PosedField":  # noq
         if isinstance(field, AbstractShape)
         else PosedField(field=field, pose=pose)
     )
+
+
+@overload
+def Scaled(field: AbstractShape, factor: ArrayLike) -> AbstractShape: ...
+@overload
+def Scaled(field: AbstractField, factor: ArrayLike) -> AbstractField: ...
+def Scaled(field: AbstractField, factor: ArrayLike) -> AbstractField:  # noqa: N802 - reads as a constructor
+    """`field` enlarged about its origin: its density at `factor` · x is that of `field` at x.
+
+    Densities keep their values, so that the integral grows with the cube of the factor.
+
+    Args:
+        field: Any field.
+        factor: > 0; for instance 0.001 for a field in millimetres.
+
+    Returns:
+        A grid for a grid (density or signed distance), a `ScaledShape` for another shape, else a
+        `ScaledField`.
+
+    Raises:
+        ValueError: If `field` is not a field or `factor` is not finite and positive.
+    """
+    if not isinstance(field, AbstractField):
+        raise ValueError(f"field must be a dano field (an AbstractField), got {type(field).__name__}")
+    factor = checked_array("factor", factor, ())
+    if not is_traced(factor) and not float(factor) > 0:
+        raise ValueError(f"factor must be > 0, got {float(factor)}")
+    if isinstance(field, GridField):
+        return GridField(field.values, field.origin * factor, field.spacing * factor, field.interpolation)
+    if isinstance(field, SignedDistanceGrid):
+        return field.scaled(factor)
+    if isinstance(field, AbstractShape):
+        return ScaledShape(field, factor)
+    return ScaledField(field=field, factor=factor)
 
 
 @overload
@@ -182,6 +218,97 @@ class PosedShape(AbstractShape):
         matrix = self.pose.matrix.astype(moments.centroid.dtype)
         centroid = matrix @ moments.centroid + self.pose.position.astype(moments.centroid.dtype)
         return SolidMoments(moments.volume, centroid, matrix @ moments.second_moment @ matrix.T)
+
+
+def _scaled_jet(
+    jet_of: Callable[[Array, int], Jet], factor: Array, x: Float[Array, "3 n"], order: int
+) -> Jet:
+    """Jet of x ↦ f(x / s): f, ∇f / s, ∇∇f / s²."""
+    check_order(order)
+    factor = factor.astype(x.dtype)
+    jet = jet_of(x / factor, order)
+    return jet if order == 0 else tuple(part / factor**rank for rank, part in enumerate(jet))
+
+
+class ScaledField(AbstractField):
+    """A field enlarged about its origin; see `Scaled`.
+
+    Attributes:
+        field: The field, in its own units.
+        factor: Length in this field of a unit length of `field`.
+    """
+
+    field: AbstractField
+    factor: Float[Array, ""]
+
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """Scaled bounds [m] of the inner field."""
+        return self.field.bounds * self.factor.astype(self.field.bounds.dtype)
+
+    def density(self, x: Float[Array, "3"]) -> Float[Array, ""]:
+        """Density of the inner field at x / factor."""
+        return self.field.density(x / self.factor.astype(x.dtype))
+
+    def outward(self, x: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Outward direction of the inner field."""
+        return self.field.outward(x / self.factor.astype(x.dtype))
+
+    def jet(self, x: Float[Array, "3 n"], order: int) -> Jet:
+        """See `AbstractField.jet`."""
+        return _scaled_jet(self.field.jet, self.factor, x, order)
+
+
+class ScaledShape(AbstractShape):
+    """A shape enlarged about its origin; see `Scaled`.
+
+    Attributes:
+        shape: The shape, in its own units.
+        factor: Length [m] in this shape of a unit length of `shape`.
+    """
+
+    shape: AbstractShape
+    factor: Float[Array, ""]
+
+    def __init__(self, shape: AbstractShape, factor: Float[Array, ""]):
+        """Build an enlarged shape."""
+        self.shape = shape
+        self.factor = factor
+
+    @property
+    def edge(self) -> Float[Array, ""] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The edge width [m] that the inner shape states, scaled."""
+        edge = self.shape.edge
+        return None if edge is None else edge * self.factor.astype(edge.dtype)
+
+    @property
+    def size(self) -> Float[Array, ""]:
+        """Scaled size of the inner shape [m]."""
+        return self.shape.size * self.factor.astype(self.shape.size.dtype)
+
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """Scaled bounds [m] of the inner shape."""
+        return self.shape.bounds * self.factor.astype(self.shape.bounds.dtype)
+
+    def sdf(self, x: Float[Array, "3"]) -> Float[Array, ""]:
+        """Factor · (signed distance of the inner shape at x / factor) [m]."""
+        factor = self.factor.astype(x.dtype)
+        return factor * self.shape.sdf(x / factor)
+
+    def outward(self, x: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Outward direction of the inner shape."""
+        return self.shape.outward(x / self.factor.astype(x.dtype))
+
+    def sdf_jet(self, x: Float[Array, "3 n"], order: int) -> Jet:
+        """See `AbstractShape.sdf_jet`."""
+        factor = self.factor.astype(x.dtype)
+        return jax.tree.map(lambda part: factor * part, _scaled_jet(self.shape.sdf_jet, factor, x, order))
+
+    def solid_moments(self) -> SolidMoments | None:
+        """Moments of the inner shape: V s³, c s, S s⁵."""
+        moments = self.shape.solid_moments()
+        return None if moments is None else scaled_moments(moments, self.factor)
 
 
 def _joined_bounds(fields: tuple[AbstractField, ...]) -> Float[Array, "2 3"]:

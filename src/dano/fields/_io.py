@@ -1,66 +1,171 @@
-"""Reading fields from files, and writing grids."""
+"""Reading fields from files of many kinds, and writing grids."""
 
-import zipfile
-import zlib
+import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dano.archive import write_archive
-from dano.fields._grid import checked_spacing, GridField
+from dano.fields._arrays import load_npy, load_npz, load_object
+from dano.fields._base import AbstractField
+from dano.fields._callable import checked_bounds
+from dano.fields._compose import Posed, Scaled
+from dano.fields._grid import GridField
+from dano.fields._instant_ngp import load_snapshot
+from dano.fields._nerfacto import load_checkpoint
+from dano.fields._shapes import AbstractShape
 from dano.fields._signed_distance import mesh_field, SignedDistanceGrid
-from dano.maths import Numbers
-
-_MESHES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")
-
-_BROKEN = (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-"""What NumPy and zipfile raise for files that are truncated, foreign, encrypted or hold pickled objects."""
+from dano.fields._splats import is_splats, load_splats
+from dano.fields._torch_module import load_callable, load_module
+from dano.fields._vdb import load_vdb
+from dano.maths import Numbers, Pose
 
 
-def load_field(path: str | Path, **options: Any) -> GridField | SignedDistanceGrid:
+class _Reader(NamedTuple):
+    """How a kind of file is read.
+
+    Attributes:
+        read: Takes the path and the options.
+        options: Names of the options.
+        crops: Whether it takes `crop` itself.
+    """
+
+    read: Callable[..., AbstractField]
+    options: tuple[str, ...] = ()
+    crops: bool = False
+
+
+_CHECKPOINT = (
+    "undo_transform",
+    "average_init_density",
+    "base_res",
+    "max_res",
+    "hidden_dim",
+    "num_layers",
+    "num_levels",
+    "features_per_level",
+    "log2_hashmap_size",
+    "disable_scene_contraction",
+)
+_MESH = _Reader(mesh_field, ("resolution", "interpolation", "edge"))
+_SPLATS = _Reader(load_splats, ("min_width",), crops=True)
+_READERS: dict[str, _Reader] = {
+    ".npz": _Reader(load_npz, ("interpolation",)),
+    ".npy": _Reader(load_npy, ("spacing", "origin", "interpolation", "signed_distance")),
+    ".dano": _Reader(load_object, ("interpolation",)),
+    **dict.fromkeys((".obj", ".stl", ".ply", ".off", ".glb", ".gltf"), _MESH),
+    ".ckpt": _Reader(load_checkpoint, _CHECKPOINT, crops=True),
+    **dict.fromkeys((".ingp", ".msgpack"), _Reader(load_snapshot, ("cascade", "interpolation"), crops=True)),
+    **dict.fromkeys((".vdb", ".nvdb"), _Reader(load_vdb, ("grid", "interpolation"), crops=True)),
+    **dict.fromkeys((".pt", ".pth", ".pt2"), _Reader(load_module, ("module",), crops=True)),
+}
+
+
+def load_field(
+    path: str | Path,
+    *,
+    crop: Numbers | None = None,
+    scale: float = 1.0,
+    pose: Pose | None = None,
+    **options: Any,
+) -> AbstractField:
     """Read a field from a file; nothing is ever unpickled.
 
-    - `.npz`: `values` (nx, ny, nz), `origin` (3,) and `spacing`; option `interpolation`.
-    - `.npy`: voxels (nx, ny, nz), booleans or densities; options `spacing`, `origin`, `interpolation`.
-    - `.obj`, `.stl`, `.ply`, `.off`, `.glb`, `.gltf`: a watertight triangle mesh; options of `mesh_field`.
+    - `.npz`: `values` (nx, ny, nz), or signed `distances`, with `origin` (3,) and `spacing`; option
+      `interpolation`.
+    - `.npy`: voxels (nx, ny, nz), booleans or densities; options `spacing`, `origin`, `interpolation`, and
+      `signed_distance=True` if they are distances, negative inside.
+    - `.obj`, `.stl`, `.off`, `.glb`, `.gltf`, `.ply`: a watertight triangle mesh; options of `mesh_field`.
+    - `.ply` with Gaussian splats: their occupancy; option `min_width`, the least standard deviation of a
+      Gaussian.
+    - `.ckpt`: a nerfstudio checkpoint (nerfacto, splatfacto); option `undo_transform`, and nerfacto's sizes
+      where no config.yml tells them.
+    - `.ingp`, `.msgpack`: the density grid of an instant-ngp snapshot; options `cascade`, `interpolation`.
+    - `.vdb`, `.nvdb`: a fog volume or level set of OpenVDB or NanoVDB; options `grid` (its name),
+      `interpolation`.
+    - `.pt2`, `.pt`, `.pth`: a module (n, 3) → (n,) of torch.export or TorchScript, or weights for the one
+      that option `module` = "package.module:name" makes; `crop` is required.
+    - `"package.module:name"` instead of a file: that function (n, 3) → (n,); `crop` is required.
     - `.dano`: the grid stored in a neural object; option `interpolation`.
 
     Args:
         path: The file.
-        **options: See above. `spacing` [m] and `origin` [m, centre of the first voxel] place an .npy array,
-            which is otherwise centred on the origin with its longest side 1 m.
+        crop: Lower and upper corner, shape (2, 3), of the part to be kept, in the frame and units of the
+            file; for densities. Grids keep the nodes within.
+        scale: Length [m] of a unit of the file, applied after `crop`, about the origin. Densities keep their
+            values.
+        pose: Moves the scaled field into the frame F that you want.
+        **options: See above. `spacing` and `origin` (centre of the first voxel) place an .npy array, which is
+            otherwise centred on the origin with its longest side 1.
 
     Returns:
-        A `GridField`, or for meshes a `SignedDistanceGrid`.
+        A `GridField` for densities on a grid, a `SignedDistanceGrid` for signed distances and meshes, else a
+        field that evaluates what the file holds: `dano.bake` it for simulation. A `pose` wraps it in a
+        `PosedField` or `PosedShape`.
 
     Raises:
         ValueError: If the file is missing, of an unknown kind, truncated, or does not hold what its kind
             promises, or an option is not known; the message names the file and what was expected.
-        ImportError: If reading a mesh needs a package that is not installed.
+        ImportError: If reading it needs a package that is not installed, or a function cannot be imported.
     """
+    if not (np.isfinite(scale) and scale > 0):
+        raise ValueError(f"scale must be finite and > 0, got {scale}")
+    if pose is not None and not isinstance(pose, Pose):
+        raise ValueError(f"pose must be a dano.maths.Pose, got {type(pose).__name__}")
+    box = None if crop is None else np.asarray(checked_bounds(crop), np.float64)
+    field = _read(path, box, options)
+    field = Scaled(field, scale) if scale != 1 else field
+    return field if pose is None else Posed(field, pose)
+
+
+def _read(path: str | Path, crop: np.ndarray | None, options: dict[str, Any]) -> AbstractField:
+    if (
+        isinstance(path, str)
+        and re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", path)
+        and not Path(path).exists()
+    ):
+        _check_options(path, "function", options, ())
+        return load_callable(path, crop=crop)
     path = Path(path)
     suffix = path.suffix.lower()
-    readers: dict[str, tuple[Callable[..., GridField | SignedDistanceGrid], tuple[str, ...]]] = {
-        ".npz": (_load_npz, ("interpolation",)),
-        ".npy": (_load_npy, ("spacing", "origin", "interpolation")),
-        ".dano": (_load_object, ("interpolation",)),
-    }
-    readers |= dict.fromkeys(_MESHES, (mesh_field, ("resolution", "interpolation", "edge", "scale")))
-    if suffix not in readers:
-        raise ValueError(f"{path}: unknown kind of field {suffix!r}; expected one of {', '.join(readers)}")
+    if suffix not in _READERS:
+        raise ValueError(f"{path}: unknown kind of field {suffix!r}; expected one of {', '.join(_READERS)}")
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "no such file"
-        raise ValueError(f"{path}: {what}; expected a field ({', '.join(readers)})")
-    reader, known = readers[suffix]
+        raise ValueError(f"{path}: {what}; expected a field ({', '.join(_READERS)})")
+    reader = _SPLATS if suffix == ".ply" and is_splats(path) else _READERS[suffix]
+    _check_options(path, f"{suffix} file", options, reader.options)
+    if reader.crops:
+        return reader.read(path, crop=crop, **options)
+    field = reader.read(path, **options)
+    return field if crop is None else _cropped(field, crop, path)
+
+
+def _check_options(what: object, kind: str, options: dict[str, Any], known: tuple[str, ...]) -> None:
     if unknown := sorted(set(options) - set(known)):
-        raise ValueError(f"{path}: unknown options {unknown} for a {suffix} file; it takes {list(known)}")
-    return reader(path, **options)
+        raise ValueError(f"{what}: unknown options {unknown} for a {kind}; it takes {list(known)}")
 
 
-def save_field(field: GridField, path: str | Path) -> None:
-    """Write a grid field to an .npz file that `load_field` reads.
+def _cropped(field: AbstractField, crop: np.ndarray, path: Path) -> GridField:
+    """The nodes of a grid within a box."""
+    if isinstance(field, AbstractShape) or not isinstance(field, GridField):
+        raise ValueError(f"{path}: crop applies to densities, got a {type(field).__name__}")
+    origin, spacing = np.asarray(field.origin, np.float64), np.asarray(field.spacing, np.float64)
+    first = np.maximum(np.ceil((crop[0] - origin) / spacing - 1e-9), 0).astype(int)
+    last = np.minimum(np.floor((crop[1] - origin) / spacing + 1e-9), np.array(field.shape) - 1).astype(int)
+    if np.any(last - first < 1):
+        raise ValueError(f"{path}: crop must hold two nodes an axis or more, got {crop.tolist()}")
+    box = tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))
+    try:
+        return GridField(field.values[box], origin + first * spacing, spacing, field.interpolation)
+    except ValueError as error:
+        raise ValueError(f"{path}: within crop {crop.tolist()}: {error}") from error
+
+
+def save_field(field: GridField | SignedDistanceGrid, path: str | Path) -> None:
+    """Write a grid of densities or signed distances to an .npz file that `load_field` reads.
 
     The file is written beside its place and then renamed: an existing file is replaced by a complete one or
     not at all.
@@ -70,85 +175,20 @@ def save_field(field: GridField, path: str | Path) -> None:
         path: File name ending in .npz, in an existing folder.
 
     Raises:
-        ValueError: If `field` is not a `GridField`, or `path` does not end in .npz, is a folder, or lies in
-            none.
+        ValueError: If `field` is no grid, or `path` does not end in .npz, is a folder, or lies in none.
     """
     path = Path(path)
-    if not isinstance(field, GridField):
-        raise ValueError(f"field must be a GridField to be saved, got {type(field).__name__}: bake it first")
+    if not isinstance(field, (GridField, SignedDistanceGrid)):
+        raise ValueError(
+            f"field must be a GridField or SignedDistanceGrid to be saved, got {type(field).__name__}:"
+            " bake it first"
+        )
     if path.suffix.lower() != ".npz":
         raise ValueError(f"path must end in .npz, got {path}")
-    write_archive(
-        path,
-        {
-            "values": np.asarray(field.values),
-            "origin": np.asarray(field.origin),
-            "spacing": np.asarray(field.spacing),
-            "interpolation": np.asarray(field.interpolation),
-        },
-    )
-
-
-def _load_npz(path: Path, interpolation: str | None = None) -> GridField:
-    return _grid_from_npz(path, "", interpolation, "a grid: values (nx, ny, nz), origin (3,) and spacing")
-
-
-def _load_object(path: Path, interpolation: str | None = None) -> GridField:
-    """The grid inside a neural object: members grid_values, grid_origin and grid_spacing of its zip file."""
-    expected = (
-        "a neural object with a stored grid: grid_values (nx, ny, nz), grid_origin (3,) and grid_spacing"
-    )
-    return _grid_from_npz(path, "grid_", interpolation, expected)
-
-
-def _grid_from_npz(path: Path, prefix: str, interpolation: str | None, expected: str) -> GridField:
-    names = [prefix + name for name in ("values", "origin", "spacing")]
-    optional = prefix + "interpolation"
-    try:
-        with open(path, "rb") as file:
-            archive = np.load(file, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError("it is a single array, not a zip of arrays")
-            if missing := [name for name in names if name not in archive.files]:
-                raise ValueError(f"it has no {', '.join(missing)}, only {archive.files}")
-            values, origin, spacing = (archive[name] for name in names)
-            if interpolation is None:
-                interpolation = str(archive[optional]) if optional in archive.files else "quadratic"
-    except _BROKEN as error:
-        raise ValueError(f"{path}: expected {expected}; {_reason(error)}") from error
-    try:
-        return GridField(values, origin, spacing, interpolation)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _load_npy(
-    path: Path,
-    spacing: Numbers | None = None,
-    origin: Numbers | None = None,
-    interpolation: str = "quadratic",
-) -> GridField:
-    try:
-        with open(path, "rb") as file:
-            values = np.load(file, allow_pickle=False)
-        if not isinstance(values, np.ndarray):
-            raise ValueError("it is a zip of arrays, not a single one")
-        if values.ndim != 3 or values.dtype.kind not in "buif":
-            raise ValueError(f"it holds {values.dtype} of shape {values.shape}")
-    except _BROKEN as error:
-        expected = "voxels (nx, ny, nz) of booleans, integers or floats"
-        raise ValueError(f"{path}: expected {expected}; {_reason(error)}") from error
-    step = np.asarray(checked_spacing(1 / max(values.shape) if spacing is None else spacing))
-    if origin is None:
-        origin = -0.5 * step * (np.asarray(values.shape) - 1)
-    try:
-        return GridField(values, origin, step, interpolation)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _reason(error: Exception) -> str:
-    text = str(error)
-    if "allow_pickle" in text or "pickled" in text:
-        return "it holds pickled objects, which are never loaded"
-    return text.splitlines()[0] if text else type(error).__name__
+    signed = isinstance(field, SignedDistanceGrid)
+    members = {"distances": field.distances} if signed else {"values": field.values}
+    if signed and field.edge is not None:
+        members["edge"] = field.edge
+    members |= {"origin": field.origin, "spacing": field.spacing}
+    arrays = {name: np.asarray(value) for name, value in members.items()}
+    write_archive(path, arrays | {"interpolation": np.asarray(field.interpolation)})

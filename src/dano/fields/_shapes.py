@@ -40,6 +40,14 @@ class SolidMoments(NamedTuple):
     second_moment: Float[Array, "3 3"]
 
 
+def scaled_moments(moments: SolidMoments, factor: Float[Array, ""]) -> SolidMoments:
+    """Moments of a solid enlarged about the origin."""
+    factor = factor.astype(moments.volume.dtype)
+    return SolidMoments(
+        moments.volume * factor**3, moments.centroid * factor, moments.second_moment * factor**5
+    )
+
+
 def occupancy(sdf: Float[Array, "*batch"], edge: ArrayLike) -> Float[Array, "*batch"]:
     """Smooth indicator of {sdf ≤ 0}: t²(3 − 2t) with t = clip(1/2 − sdf/edge, 0, 1).
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from dano.fields._base import check_order, Jet
 from dano.fields._grid import checked_spacing, scaled_jet
-from dano.fields._shapes import AbstractShape, checked_edge, SolidMoments
+from dano.fields._shapes import AbstractShape, checked_edge, scaled_moments, SolidMoments
 from dano.fields._spline import border, degree_of, interpolating_coefficients, spline_jet
 from dano.maths import checked_array, column_norm, floating, is_traced, Numbers
 
@@ -146,6 +146,40 @@ class SignedDistanceGrid(AbstractShape):
     def solid_moments(self) -> SolidMoments | None:
         """The moments given at construction: those of the mesh for a shape made by `mesh_field`."""
         return self.moments
+
+    def scaled(self, factor: Float[Array, ""]) -> "SignedDistanceGrid":
+        """This shape enlarged about its origin."""
+        lengths = (self.coefficients, self.origin, self.spacing, self.solid_bounds, self.edge)
+        made = eqx.tree_at(
+            lambda shape: (shape.coefficients, shape.origin, shape.spacing, shape.solid_bounds, shape.edge),
+            self,
+            tuple(None if x is None else x * factor.astype(x.dtype) for x in lengths),
+            is_leaf=lambda x: x is None,
+        )
+        moments = None if self.moments is None else scaled_moments(self.moments, factor)
+        return eqx.tree_at(lambda shape: shape.moments, made, moments, is_leaf=lambda x: x is None)
+
+
+def extended_distances(distances: np.ndarray, spacing: np.ndarray, width: float) -> np.ndarray:
+    """Signed distances that are right near the surface only, as level sets keep them, made right everywhere.
+
+    Args:
+        distances: Shape (nx, ny, nz), cut off at ± `width`.
+        spacing: Distance between nodes along each axis, shape (3,).
+        width: Must be wider than a cell.
+
+    Raises:
+        ValueError: If no node is more than a cell within the width.
+    """
+    # Only there do central differences see no value that was cut off.
+    near = np.abs(distances) <= width - 1.01 * spacing.max()
+    if not near.any():
+        raise ValueError(f"distances must be known to more than a cell from the surface, got {width}")
+    slope = np.stack([part[near] for part in np.gradient(distances, *spacing)], axis=-1)
+    slope = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
+    closest = spacing * np.argwhere(near) - distances[near][:, None] * slope
+    far, _ = spread_distances(near, closest, np.zeros(3), spacing)
+    return np.where(np.abs(distances) < (1 - 1e-6) * width, distances, np.copysign(far, distances))
 
 
 def _checked_distances(distances: Numbers) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Neural objects: a density field with mass properties and contact samples, saved as one file."""
 
+import dataclasses
 import os
 from typing import get_args, Literal
 
@@ -10,8 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.archive import read_archive, write_archive
-from dano.fields import AbstractField, GridField, SignedDistanceGrid
+from dano.fields import AbstractField, AbstractShape, GridField, SignedDistanceGrid
 from dano.maths import checked_array, floating, is_traced, Numbers
+from dano.objects._interior import examine, Interior, sealed
 from dano.objects._mass import checked_density, integrate, MassProperties, Progress
 from dano.objects._samples import (
     baked,
@@ -22,13 +24,14 @@ from dano.objects._samples import (
     outward_normals,
     Region,
     surface_level,
-    surface_range,
 )
 from dano.objects._solid import field_solid, level_set
 from dano.objects._surface import draw_surface, equal_areas, SurfaceSamples
 
-MassModel = Literal["density", "solid"]
+MassModel = Literal["auto", "density", "solid"]
 FORMAT, VERSION = "dano-object", 2
+
+_INTERIOR = tuple(field.name for field in dataclasses.fields(Interior))
 
 
 class NeuralObject(eqx.Module):
@@ -40,11 +43,14 @@ class NeuralObject(eqx.Module):
         mass: Mass properties in the field's frame.
         grid: The field baked for other objects' samples to query, without its floaters; None if there is no
             field.
-        solid: Signed distance of the object: of {φ = half the plateau density}, without floaters, cavities
-            filled; of a shape, its own. None if there is no field.
+        solid: Signed distance of the object: of {φ = `interior.level`}, without floaters, cavities filled;
+            of a shape, its own. None if there is no field.
         density_range: Lower and upper density between which the samples lie, shape (2,).
         bake_error: Root mean square error of `grid` relative to the field's largest density (0 for a grid).
-        mass_model: How density became mass.
+        interior: What the inside of the field looks like; None for objects made of samples, and in older
+            files.
+        mass_model: How density became mass: "density", "solid", or "given" (static).
+        mass_reason: Why this model, in words (static).
     """
 
     samples: ContactSamples
@@ -54,7 +60,9 @@ class NeuralObject(eqx.Module):
     solid: SignedDistanceGrid | None
     density_range: Float[Array, "2"]
     bake_error: Float[Array, ""]
+    interior: Interior | None
     mass_model: str = eqx.field(static=True)
+    mass_reason: str = eqx.field(static=True)
 
     @classmethod
     def from_field(
@@ -63,7 +71,7 @@ class NeuralObject(eqx.Module):
         *,
         n_samples: int = 5000,
         density_range: tuple[float, float] | None = None,
-        mass_model: MassModel = "density",
+        mass_model: MassModel = "auto",
         mass_scale: float = 1.0,
         mass: float | None = None,
         resolution: int = 96,
@@ -79,8 +87,10 @@ class NeuralObject(eqx.Module):
             density_range: Densities between which the samples are drawn; default: around the field's own
                 surface (`surface_range`).
             mass_model: "density": mass density is α φ, as in the paper. "solid": the same mean density
-                everywhere inside the largest connected part of {φ ≥ half the plateau density}, its cavities
-                filled, floaters dropped.
+                everywhere inside the largest connected part of {φ ≥ `interior.level`}, its pores closed, its
+                cavities filled, floaters dropped. "auto": "density" for shapes, and for probabilities of
+                occupancy of a solid inside; "solid" for everything else, that is for most fields learned from
+                images. `mass_reason` says what was chosen and why.
             mass_scale: α [kg per unit of density and m³].
             mass: If given, the total mass [kg]; replaces `mass_scale`.
             resolution: Cells along the longest axis for mass integrals, sampling and baking.
@@ -103,7 +113,16 @@ class NeuralObject(eqx.Module):
         sampling_key, mass_key = jax.random.split(key)
         density = checked_density(field)
         lattice = Lattice.create(density, field.bounds, resolution)
-        low, high = surface_range(lattice.values) if density_range is None else density_range
+        interior, inside = examine(lattice)
+        level = float(interior.level)
+        model, reason = _weighed(field, interior, mass_model)
+        original = field
+        if float(interior.gap) > 0:
+            # A porous surface: contact, too, is with the solid whose pores are closed.
+            field = sealed(lattice, interior, inside)
+            density = checked_density(field)
+            lattice = Lattice.create(density, field.bounds, resolution)
+        low, high = (level, 1.8 * level) if density_range is None else density_range
         if not 0 <= low < high:
             raise ValueError(f"density_range must satisfy 0 ≤ low < high, got ({low}, {high})")
         body = Region.create(lattice, low, floaters=floaters)
@@ -116,12 +135,11 @@ class NeuralObject(eqx.Module):
         if progress is not None:
             progress("surface", 0.0)
         grid, error = baked(field, resolution)
-        level = surface_level(lattice.values)
         filled = field_solid(field, grid, level, floaters=floaters)
         surface = draw_surface(filled, n_samples, key=jax.random.fold_in(key, 2))
-        if mass_model == "density":
+        if model == "density":
             properties = MassProperties.from_field(
-                field,
+                original,
                 mass_scale=mass_scale,
                 mass=mass,
                 resolution=resolution,
@@ -143,7 +161,9 @@ class NeuralObject(eqx.Module):
             solid=filled,
             density_range=floating((float(low), float(high))),
             bake_error=floating(error),
-            mass_model=mass_model,
+            interior=interior,
+            mass_model=model,
+            mass_reason=reason,
         )
 
     @classmethod
@@ -206,7 +226,9 @@ class NeuralObject(eqx.Module):
             solid=None if field is None else _grid_solid(field),
             density_range=floating((float(density.min()), float(density.max()))),
             bake_error=floating(0.0),
+            interior=None,
             mass_model="given",
+            mass_reason="mass, centre of mass and inertia were given",
         )
 
     @property
@@ -224,6 +246,7 @@ class NeuralObject(eqx.Module):
             "format": np.array(FORMAT),
             "version": np.array(VERSION),
             "mass_model": np.array(self.mass_model),
+            "mass_reason": np.array(self.mass_reason),
             "points": self.samples.points,
             "density": self.samples.density,
             "normals": self.samples.normals,
@@ -240,6 +263,8 @@ class NeuralObject(eqx.Module):
             "com_error": self.mass.com_error,
             "inertia_error": self.mass.inertia_error,
         }
+        if self.interior is not None:
+            members |= {f"interior_{name}": getattr(self.interior, name) for name in _INTERIOR}
         if self.grid is not None:
             members |= {
                 "grid_values": np.asarray(self.grid.values, dtype=np.float32),
@@ -297,10 +322,32 @@ class NeuralObject(eqx.Module):
                 solid=solid,
                 density_range=floating(data["density_range"]),
                 bake_error=floating(data["bake_error"]),
+                interior=_stored_interior(data),
                 mass_model=str(data["mass_model"]),
+                mass_reason=str(data.get("mass_reason", "not recorded")),
             )
         except (KeyError, ValueError) as error:
             raise ValueError(f"{path} is not a valid dano object: {error}") from error
+
+
+def _weighed(field: AbstractField, interior: Interior, wanted: MassModel) -> tuple[str, str]:
+    """The mass model to be used, "density" or "solid", and why."""
+    flaws = [] if isinstance(field, AbstractShape) else interior.flaws()
+    best = "solid" if flaws else "density"
+    if isinstance(field, AbstractShape):
+        reason = "a shape's occupancy is exact"
+    else:
+        reason = "; ".join(flaws) or "densities are the occupancy of a solid inside"
+    if wanted == "auto":
+        return best, reason
+    return wanted, "as asked" if wanted == best else f"as asked; auto would take {best}: {reason}"
+
+
+def _stored_interior(data: dict[str, np.ndarray]) -> Interior | None:
+    names = {name: f"interior_{name}" for name in _INTERIOR}
+    if not all(member in data for member in names.values()):
+        return None
+    return Interior(**{name: floating(data[member]).reshape(()) for name, member in names.items()})
 
 
 def _grid_solid(grid: GridField) -> SignedDistanceGrid | None:

@@ -261,6 +261,7 @@ def _table(axes: Any, obj: NeuralObject) -> None:
     low, high = (float(x) for x in np.asarray(obj.density_range))
     rows += [
         ("mass model", obj.mass_model, "", _INK),
+        *_interior_rows(obj),
         ("size", f"{obj.size:.4g}", "m", _INK),
         ("samples from φ =", f"{low:.4g}", "", "#d62839"),
         ("to φ =", f"{high:.4g}", "", "#d98a1f"),
@@ -269,19 +270,28 @@ def _table(axes: Any, obj: NeuralObject) -> None:
         rows.append(("baking error (rms)", f"{100 * float(obj.bake_error):.2g}", "%", _INK))
     _heading(axes, "Mass properties")
     for i, (name, value, unit, colour) in enumerate(rows):
-        y = 0.93 - 0.082 * i
+        y = 0.94 - 0.076 * i
         axes.text(0.0, y, name, fontsize=9.5, color=_FAINT if colour == _INK else colour, va="center")
         axes.text(0.83, y, value, fontsize=9.5, color=_INK, va="center", ha="right")
         axes.text(0.86, y, unit, fontsize=9.5, color=_FAINT, va="center")
-        axes.plot([0, 1], [y - 0.041, y - 0.041], color="#eceff1", lw=0.8)
+        axes.plot([0, 1], [y - 0.038, y - 0.038], color="#eceff1", lw=0.8)
     axes.set_xlim(0, 1)
     axes.set_ylim(0, 1)
     _bare(axes)
 
 
+def _interior_rows(obj: NeuralObject) -> list[tuple[str, str, str, str]]:
+    """How solid the field is inside: why the mass model was chosen."""
+    if obj.interior is None:
+        return []
+    deep = float(obj.interior.deep)
+    return [("density deep inside", "thin" if math.isnan(deep) else f"{100 * deep:.0f}", "%", _INK)]
+
+
 def with_error(value: float, error: float) -> str:
     """A number to the digits its standard error leaves meaning: "0.4213 ± 0.0007"."""
-    if not error > 0:
+    # Errors below that are the round-off of a mass that was given.
+    if not error > 1e-9 * abs(value):
         return f"{value:.5g}"
     digits = max(0, 1 - math.floor(math.log10(error)))
     if digits > 6:

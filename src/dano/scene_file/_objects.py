@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from dano.fields import AbstractField, GridField, load_field
+from dano.fields import AbstractField, load_field, Scaled
 from dano.objects import MassModel, NeuralObject
 
 Progress = Callable[[str, float], None]
@@ -24,7 +24,7 @@ def build_object(
     *,
     n_samples: int = 5000,
     density_range: tuple[float, float] | None = None,
-    mass_model: MassModel = "solid",
+    mass_model: MassModel = "auto",
     mass_scale: float = 1.0,
     mass: float | None = None,
     resolution: int = 96,
@@ -39,8 +39,7 @@ def build_object(
         field: Density with finite bounds.
         n_samples: See `NeuralObject.from_field`, as for all that is not described here.
         density_range: See there.
-        mass_model: See there, but "solid" unless asked otherwise: it is right for most fields learned from
-            images.
+        mass_model: See there.
         mass_scale: See there.
         mass: See there.
         resolution: See there.
@@ -51,7 +50,7 @@ def build_object(
         progress: See there.
 
     Raises:
-        ValueError: As `NeuralObject.from_field`, or if `length` is not positive or the field is no grid.
+        ValueError: As `NeuralObject.from_field`, or if `length` is not positive.
     """
     options: dict[str, Any] = {
         "density_range": density_range,
@@ -61,14 +60,9 @@ def build_object(
     if length is not None:
         if not (math.isfinite(length) and length > 0):
             raise ValueError(f"length must be finite and > 0 m, got {length}")
-        if not isinstance(field, GridField):
-            raise ValueError(
-                f"length applies to a density grid, got {type(field).__name__}: scale it when loading"
-            )
-        # A coarse object tells how much of the grid is object, to half a per cent.
+        # A coarse object tells how much of the field is object, to half a per cent.
         coarse = NeuralObject.from_field(field, n_samples=1000, resolution=64, **options)
-        share = length / coarse.size
-        field = GridField(field.values, field.origin * share, field.spacing * share, field.interpolation)
+        field = Scaled(field, length / coarse.size)
     return NeuralObject.from_field(
         field,
         n_samples=n_samples,

@@ -222,7 +222,7 @@ def _from_field_file(path: Path, build: Table, progress: Progress | None) -> Neu
     options: dict[str, Any] = {"n_samples": build.integer("samples", 5000), "seed": build.integer("seed", 0)}
     options["resolution"] = build.integer("resolution", 96)
     options["floaters"] = build.boolean("floaters", False)
-    options["mass_model"] = build.word("mass_model", get_args(MassModel), "solid")
+    options["mass_model"] = build.word("mass_model", get_args(MassModel), "auto")
     options |= {key: build.number(key) for key in ("mass_scale", "length") if key in build}
     if "density_range" in build:
         options["density_range"] = build.vector("density_range", 2)

@@ -1,0 +1,100 @@
+"""`dano import`."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dano.cli._console import numbers, Progress, put, put_json
+from dano.cli._outputs import check_output
+from dano.fields import bake, GridField, load_field, save_field, SignedDistanceGrid
+from dano.fields._splats import is_splats
+from dano.maths import Pose
+from dano.objects import fill_hollows
+from dano.objects._interior import node_values
+
+
+def import_field(
+    file: str,
+    output: Path,
+    *,
+    crop: tuple[float, ...] | None,
+    scale: float,
+    position: tuple[float, float, float],
+    orientation: tuple[float, float, float, float],
+    resolution: int,
+    hollow: bool,
+    options: Mapping[str, Any],
+    as_json: bool,
+) -> None:
+    """See `dano import --help`."""
+    check_output(output, Path(file), suffix=".npz")
+    if not 4 <= resolution <= 1024:
+        raise ValueError(f"resolution must lie between 4 and 1024 nodes, got {resolution}")
+    moved = np.any(position) or tuple(orientation) != (1.0, 0.0, 0.0, 0.0)
+    pose = Pose(position, orientation) if moved else None
+    progress = Progress()
+    progress("reading the field", 0.0)
+    box = None if crop is None else np.reshape(crop, (2, 3))
+    splats, sampled = _kind(file) == "splats", {}
+    if _kind(file) == "mesh":
+        sampled = {"resolution": resolution}
+    elif splats:
+        # Gaussians thinner than the distance between nodes would fall between them: a shell full of pores.
+        lower, upper = np.asarray(load_field(file, crop=box).bounds)
+        sampled = {"min_width": 0.5 * float(np.max(upper - lower)) / (resolution - 1)}
+    field = load_field(file, crop=box, scale=scale, pose=pose, **sampled, **options)
+    kind, error = type(field).__name__, None
+    if not isinstance(field, (GridField, SignedDistanceGrid)):
+        interpolation = options.get("interpolation", "quadratic")
+
+        def baking(done: int, total: int) -> None:
+            progress("sampling the field", done / total)
+
+        field, error = bake(field, resolution, interpolation=interpolation, progress=baking)
+    filled = 0.0
+    if splats and not hollow and isinstance(field, GridField):
+        field, before = fill_hollows(field)
+        filled = float(before.cavity)
+    progress.close()
+    save_field(field, output)
+    report = _described(field, output, file, kind) | {"filled": filled}
+    report["bake_error"] = None if error is None else error.rms
+    put_json(report) if as_json else _print(report)
+
+
+def _kind(file: str) -> str:
+    """What is treated specially: "mesh", "splats", or "" for everything else."""
+    suffix = Path(file).suffix.lower()
+    if suffix == ".ply" and Path(file).is_file():
+        return "splats" if is_splats(Path(file)) else "mesh"
+    return "mesh" if suffix in (".obj", ".stl", ".off", ".glb", ".gltf") else ""
+
+
+def _described(field: GridField | SignedDistanceGrid, output: Path, file: str, kind: str) -> dict[str, Any]:
+    values = np.asarray(field.distances) if isinstance(field, SignedDistanceGrid) else node_values(field)
+    return {
+        "file": str(output),
+        "source": file,
+        "kind": kind,
+        "quantity": "density" if isinstance(field, GridField) else "signed distance",
+        "nodes": list(values.shape),
+        "spacing": np.asarray(field.spacing).tolist(),
+        "bounds": np.asarray(field.bounds).tolist(),
+        "range": [float(values.min()), float(values.max())],
+    }
+
+
+def _print(report: dict[str, Any]) -> None:
+    put(f"field       {report['file']}, from {report['source']}")
+    low, high = report["range"]
+    put(f"{report['quantity']:<11} {low:.4g} to {high:.4g}")
+    put(f"nodes       {' × '.join(map(str, report['nodes']))}, {report['spacing'][0]:.4g} m apart")
+    put(f"bounds      {numbers(report['bounds'][0])} to {numbers(report['bounds'][1])} m")
+    if report["bake_error"] is not None:
+        put(f"sampling    {100 * report['bake_error']:.2g} % of the largest density (rms)")
+    if report["filled"]:
+        put(f"filled      {100 * report['filled']:.0f} % of the solid was hollow")
+    put()
+    put(f"`dano build {report['file']} -o OBJ.dano` makes an object of it")

@@ -1,0 +1,90 @@
+"""What the sparse grids of OpenVDB and NanoVDB have in common.
+
+Both keep a tree of three levels of nodes of 32³, 16³ and 8³ entries; an entry is a child or a tile, one value
+for its whole cube.
+"""
+
+import struct
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Block(NamedTuple):
+    """A cube of a sparse grid: its first voxel, and its values (8, 8, 8) or the one value of its tile."""
+
+    origin: tuple[int, int, int]
+    size: int
+    values: np.ndarray | float
+    active: bool
+
+
+class SparseGrid(NamedTuple):
+    """A grid as it stands in a file.
+
+    Attributes:
+        name: Of the grid.
+        kind: "fog volume", "level set", or another class, possibly "".
+        matrix: Index (i, j, k) to the file's world: x = matrix @ index + offset, shape (3, 3).
+        offset: Shape (3,).
+        background: Value outside of all blocks.
+        blocks: Leaves and tiles.
+    """
+
+    name: str
+    kind: str
+    matrix: Float[np.ndarray, "3 3"]
+    offset: Float[np.ndarray, "3"]
+    background: float
+    blocks: list[Block]
+
+
+Rows = list[tuple[str, str, SparseGrid | None]]
+"""Name and type of each grid of a file, and the grid itself if it is one of floats."""
+
+
+class Stream:
+    """Reads little-endian values one after the other."""
+
+    def __init__(self, data: bytes):
+        self.data, self.at = data, 0
+
+    def take(self, count: int) -> bytes:
+        if count < 0 or self.at + count > len(self.data):
+            raise EOFError
+        self.at += count
+        return self.data[self.at - count : self.at]
+
+    def unpack(self, form: str) -> tuple:
+        return struct.unpack("<" + form, self.take(struct.calcsize("<" + form)))
+
+    def text(self) -> str:
+        return self.take(self.unpack("I")[0]).decode()
+
+    def mask(self, bits: int) -> np.ndarray:
+        return np.unpackbits(np.frombuffer(self.take(bits // 8), np.uint8), bitorder="little").astype(bool)
+
+    def metadata(self) -> dict[str, bytes]:
+        entries = {}
+        for _ in range(self.unpack("I")[0]):
+            name, _, size = self.text(), self.text(), self.unpack("I")[0]
+            entries[name] = self.take(size)
+        return entries
+
+
+def corner(origin: tuple[int, int, int], n: int, side: int, size: int) -> tuple[int, int, int]:
+    """First voxel of entry n of a node, z fastest."""
+    x, y, z = origin
+    return x + size * (n // side**2), y + size * (n // side % side), z + size * (n % side)
+
+
+def unblosc(data: bytes) -> bytes:
+    try:
+        import blosc
+    except ImportError as error:
+        raise ImportError("reading this VDB file needs blosc: pip install 'dano[import]'") from error
+    try:
+        return blosc.decompress(data)
+    except Exception as error:  # of a class that blosc does not export
+        raise ValueError(f"a compressed block is damaged: {error}") from error
