@@ -65,8 +65,8 @@ class TrainOptions:
     iterations: int = 1000
     batch: int = 4096
     features: int = 8
-    rate_distance: float = 0.015
-    rate_features: float = 0.02
+    rate_distance: float = 0.25
+    rate_features: float = 0.01
     rate_network: float = 0.003
     mask_weight: float = 0.5
     eikonal_weight: float = 0.05
@@ -323,7 +323,7 @@ class _Trainer:
         """All steps, or as many as it takes."""
         state = self.fresh() if state is None else state
         good, best, best_score = state, state, -np.inf
-        rays, spent, stopped = self._rays(state), 0.0, "finished"
+        rays, spent, stopped = self._rays(state.iteration), 0.0, "finished"
         options = self.options
         step = _make_step(options)
         last_loss, last_speed, since = float("nan"), 0.0, time.perf_counter()
@@ -331,12 +331,16 @@ class _Trainer:
             while state.iteration < options.iterations:
                 if state.iteration == self.switch and state.model.distance.shape != self.found.box.shape:
                     state = self.refined(state)
-                    rays = self._rays(state)
+                    rays = self._rays(state.iteration)
                 begin = time.perf_counter()
                 key = jax.random.fold_in(self.key, 2 + state.iteration)
                 sharpness = jnp.float32(self.sharpness(state.iteration))
+                # First without highlights: what moves with the viewer must be explained by shape.
+                view_share = jnp.float32(state.iteration >= self.switch)
                 decay = jnp.float32(0.1 ** (state.iteration / options.iterations))
-                model, optimiser, loss = step(state.model, state.optimiser, rays, sharpness, decay, key)
+                model, optimiser, loss = step(
+                    state.model, state.optimiser, rays, sharpness, decay, view_share, key
+                )
                 last_loss = float(loss)
                 if not np.isfinite(last_loss):
                     return good, "diverged"
@@ -375,11 +379,12 @@ class _Trainer:
             raise
         return (best if stopped == "geometry" else state), stopped
 
-    def _rays(self, state: _State) -> RaySet:
-        box = self.box(min(state.iteration, self.options.iterations - 1))
+    def _rays(self, iteration: int) -> RaySet:
+        """Rays that may meet the hull: the same whenever training is resumed."""
+        box = self.box(iteration)
+        hull = _resampled(self.found.hull, self.found.box, box)
         # Wide enough that the surface can move outwards by as much as its blur.
-        near = state.model.distances < max(3 * box.spacing, 2 * self.pixel)
-        return collect(self.capture.split("train"), box, near)
+        return collect(self.capture.split("train"), box, hull < max(3 * box.spacing, 2 * self.pixel))
 
     def _checked(self, state: _State, spent: float, speed: float, loss: float) -> Progress:
         """Look at a few held-out views and at the solid."""
@@ -488,7 +493,7 @@ def _resampled(values: np.ndarray, old: Box, new: Box) -> np.ndarray:
     return ndimage.map_coordinates(values, index, order=1, mode="nearest").reshape(new.shape)
 
 
-def _trainable(model: SurfaceModel) -> tuple[Array, Array, Any]:
+def _trainable(model: SurfaceModel) -> Any:
     return model.distance, model.appearance.features, model.appearance.network
 
 
@@ -538,14 +543,22 @@ def _make_step(options: TrainOptions) -> Callable[..., tuple[SurfaceModel, Any, 
 
     @eqx.filter_jit
     def step(
-        model: SurfaceModel, state: Any, rays: RaySet, sharpness: Array, decay: Array, key: PRNGKeyArray
+        model: SurfaceModel,
+        state: Any,
+        rays: RaySet,
+        sharpness: Array,
+        decay: Array,
+        view_share: Array,
+        key: PRNGKeyArray,
     ) -> tuple[SurfaceModel, Any, Array]:
         pick, own = jax.random.split(key)
         index = jax.random.randint(pick, (options.batch,), 0, len(rays.mask))
         batch = RaySet(Rays(*(x[index] for x in rays.rays)), rays.colour[index], rays.mask[index])
         parts = _trainable(model)
-        value, gradient = jax.value_and_grad(loss)(parts, model, batch, sharpness, jnp.float32(1), own)
-        updates, state = optimiser.update(gradient, state, parts)
+        value, gradient = jax.value_and_grad(loss)(parts, model, batch, sharpness, view_share, own)
+        # optax counts steps in integers and takes powers of floats by them.
+        with jax.numpy_dtype_promotion("standard"):
+            updates, state = optimiser.update(gradient, state, parts)
         updates = jax.tree.map(lambda u: decay * u, updates)
         return eqx.tree_at(_trainable, model, optax.apply_updates(parts, updates)), state, value
 
