@@ -1,7 +1,8 @@
 """Renders the photographs that dano ships: a painted bunny and a semi-translucent bar of soap.
 
 Path tracing by Mitsuba 3 (`pip install mitsuba`), one distant light a view out of several directions, a black
-void around. Each object gets a folder of PNGs with alpha (the object's silhouette) and a `transforms.json` in the
+void around. Each object gets a folder of PNGs with alpha (the object's silhouette) and a `transforms.json`
+in the
 nerfstudio convention, with per-frame `light_direction` and `split`: "train"; "test", other views under the
 lights of the training views; "relight", other views under lights that no training view has.
 
@@ -13,6 +14,7 @@ Usage: python assets/render_images.py [bunny soap mug] [--out assets/images] [--
 
 import argparse
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,7 +42,7 @@ class Subject:
         faceted: Whether faces are flat, which leaves sharp edges sharp.
     """
 
-    mesh: object
+    mesh: Callable[[], tuple[np.ndarray, np.ndarray]]
     pixels: int
     samples: int
     test_samples: int
@@ -127,7 +129,7 @@ def photograph(mi, subject: Subject, folder: Path, fewer: int) -> None:
 
 
 def directions(count: int, lowest: float, rng: np.random.Generator) -> np.ndarray:
-    """Unit vectors spread evenly (a Fibonacci lattice) over the sphere above z = `lowest`, turned at random."""
+    """Unit vectors spread evenly over the sphere above z = `lowest` (Fibonacci lattice, turned at random)."""
     z = lowest + (0.99 - lowest) * (np.arange(count) + 0.5) / count
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(count) + rng.uniform(0, 2 * np.pi)
     flat = np.sqrt(1 - z**2)

@@ -1,7 +1,7 @@
 """The true solids behind the photographs that dano ships: signed distances and triangle meshes, in metres.
 
-`bunny` is the Stanford bunny 12 cm long, `soap` a bar of 9 × 6 × 3 cm with a word carved into it, `mug` a mug of
-10 cm with a handle, whose inside no silhouette shows.
+`bunny` is the Stanford bunny 12 cm long, `soap` a bar of 9 × 6 × 3 cm with a word carved into it, `mug` a
+mug of 10 cm with a handle, whose inside no silhouette shows.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ def bunny_mesh() -> Mesh:
     mesh = trimesh.load_mesh(HERE / "bunny.obj", process=True)
     vertices, faces = trimesh.remesh.subdivide_to_size(
         np.asarray(mesh.vertices) * BUNNY_EXTENT, np.asarray(mesh.faces), max_edge=0.02 * BUNNY_EXTENT
-    )
+    )[:2]
     mesh = trimesh.Trimesh(vertices, faces, process=True)
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 

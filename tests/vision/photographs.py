@@ -56,7 +56,13 @@ def photograph(camera: PosedCamera, light: np.ndarray | None) -> tuple[np.ndarra
 
 
 def capture(
-    n_train: int = 24, n_test: int = 3, pixels: int = 32, *, lit: bool = True, focal: float = 1.0, lowest=-0.95
+    n_train: int = 24,
+    n_test: int = 3,
+    pixels: int = 32,
+    *,
+    lit: bool = True,
+    focal: float = 1.0,
+    lowest=-0.95,
 ) -> Capture:
     """A capture; `focal` other than 1 states a focal length that is wrong by this factor."""
     views = []
@@ -64,15 +70,23 @@ def capture(
         for i, direction in enumerate(away):
             true = 2.2 * pixels
             options = {"width": pixels, "height": pixels}
-            # Not all from one distance: then a wrong focal length would only look like another size.
-            matrix = pose(direction, 0.26 + 0.04 * (i % 3))
+            # Not all from one distance nor at the middle: then a wrong focal length would only look like
+            # another size.
+            matrix = pose(direction, 0.3 + 0.04 * (i % 3))
+            matrix[:3, 3] += 0.016 * (matrix[:3, 0] * np.cos(2.4 * i) + matrix[:3, 1] * np.sin(2.4 * i))
             camera = PosedCamera(matrix, focal=true, **options)
             light = LIGHTS[i % 3] if lit else None
             image, mask = photograph(camera, light)
             stated = PosedCamera(matrix, focal=focal * true, **options)
             views.append(
                 View(
-                    name=f"{split}_{i}", camera=stated, image=image, mask=mask, light=light, split=split, cut_out=True
+                    name=f"{split}_{i}",
+                    camera=stated,
+                    image=image,
+                    mask=mask,
+                    light=light,
+                    split=split,
+                    cut_out=True,
                 )
             )
     return Capture(views, "ellipsoid")

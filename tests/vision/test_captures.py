@@ -28,6 +28,7 @@ def check(read: Capture, photos: Capture, *, lit: bool = True) -> None:
         np.testing.assert_allclose(a.mask, b.mask, atol=0.003)
         np.testing.assert_allclose(a.image, b.image, atol=0.01)
         if lit:
+            assert a.light is not None and b.light is not None
             np.testing.assert_allclose(a.light, b.light, atol=1e-12)
 
 

@@ -13,8 +13,17 @@ from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._outputs import check_output, missing_for_pictures
 from dano.fields import bake, save_field
 from dano.objects import NeuralObject
-from dano.vision import Capture, load_capture, survey, Survey, TrainOptions, Trained, train as learn, with_masks
-from dano.vision import Progress as Learned
+from dano.vision import (
+    Capture,
+    load_capture,
+    Progress as Learned,
+    Survey,
+    survey,
+    train as learn,
+    Trained,
+    TrainOptions,
+    with_masks,
+)
 
 
 def data(
@@ -77,13 +86,20 @@ def describe(capture: Capture, found: Survey, *, masks_given: bool) -> dict[str,
 def _print_data(report: dict[str, Any]) -> None:
     counts = report["views"]
     put(f"photographs         {report['source']}")
-    put(f"views               {counts['train']} to train on, {counts['test']} held out, {counts['relight']} relit")
+    put(
+        f"views               {counts['train']} to train on, {counts['test']} held out,"
+        f" {counts['relight']} relit"
+    )
     put(f"size                {', '.join(f'{w} × {h}' for w, h in report['image_sizes'])} pixels")
-    put(f"focal length        {', '.join(map(str, report['focal']))} pixels" + ", distorted" * report["distorted"])
+    put(
+        f"focal length        {', '.join(map(str, report['focal']))} pixels"
+        + ", distorted" * report["distorted"]
+    )
     put(f"masks               {report['masks']}, cover {100 * report['covered']:.1f} % of the images")
     put(f"lights              {report['lights'] or 'not stated'}")
     lower, upper = (np.array(x) for x in report["hull"])
-    put(f"visual hull         {numbers((upper - lower).tolist())} m around {numbers((0.5 * (lower + upper)).tolist())}")
+    size, middle = (upper - lower).tolist(), (0.5 * (lower + upper)).tolist()
+    put(f"visual hull         {numbers(size)} m around {numbers(middle)}")
     put(f"silhouettes fit     to {100 * report['residual']:.2f} %")
     put(f"widest gap          {math.degrees(report['gap']):.0f}° between a direction and the nearest view")
     for text in report["warnings"]:
@@ -128,13 +144,13 @@ def train(
 
     def show(done: Learned) -> None:
         quality = "" if done.psnr is None else f"{done.psnr:.1f} dB "
-        progress(f"training {quality}{done.rays_per_second / 1000:.0f}k rays/s", done.iteration / done.iterations)
+        progress(
+            f"training {quality}{done.rays_per_second / 1000:.0f}k rays/s", done.iteration / done.iterations
+        )
 
     progress("visual hull", 0.0)
     try:
-        trained = learn(
-            capture, options, checkpoint=outputs["checkpoint"], resume=resume, progress=show
-        )
+        trained = learn(capture, options, checkpoint=outputs["checkpoint"], resume=resume, progress=show)
     except KeyboardInterrupt:
         progress.close()
         say(f"stopped; `--resume` goes on from {outputs['checkpoint']}")
@@ -213,8 +229,8 @@ def _summary(trained: Trained, made: NeuralObject, output: Path, *, masks_given:
 def _print_trained(summary: dict[str, Any], outputs: dict[str, Path], *, with_report: bool) -> None:
     for split, value in summary["scores"].items():
         put(
-            f"{split:<19} {value['psnr']:.2f} dB (object {value['psnr_object']:.2f}), SSIM {value['ssim']:.4f},"
-            f" mask IoU {value['mask_iou']:.4f}"
+            f"{split:<19} {value['psnr']:.2f} dB (object {value['psnr_object']:.2f}),"
+            f" SSIM {value['ssim']:.4f}, mask IoU {value['mask_iou']:.4f}"
         )
     put(f"trained             in {summary['seconds']:.0f} s: {summary['stopped']}")
     put(f"mass                {summary['mass']:.5g} kg")

@@ -23,7 +23,9 @@ def parse(argv: Sequence[str]) -> Callable[[], None]:
     if list(argv) == ["--version"]:
         print(f"dano {__version__}")
         raise SystemExit(0)
-    commands = {function.__name__: function for function in (train, data, build, inspect, simulate, view, demo)}
+    commands = {
+        function.__name__: function for function in (train, data, build, inspect, simulate, view, demo)
+    }
     return tyro.extras.subcommand_cli_from_dict(
         commands,
         prog="dano",

@@ -69,7 +69,9 @@ def _cameras(axes: Any, capture: Capture, found: Survey) -> None:
             for a, b in zip(ends, np.roll(ends, 1, axis=0), strict=True):
                 axes.plot(*np.stack([camera.position, a]).T, color=colour, lw=0.5)
                 axes.plot(*np.stack([a, b]).T, color=colour, lw=0.7)
-    lights = {tuple(np.round(v.light, 4)) for v in capture.views if v.light is not None and not v.light_is_near}
+    lights = {
+        tuple(np.round(v.light, 4)) for v in capture.views if v.light is not None and not v.light_is_near
+    }
     for light in lights:
         start = centre + 0.55 * reach * np.array(light)
         axes.quiver(*start, *(-0.25 * reach * np.array(light)), color="#e0b400", lw=1.2)

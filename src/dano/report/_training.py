@@ -25,11 +25,12 @@ _SIDE = 224
 _STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:980px;padding:0 1rem;color:#22262b}
 h1{font-size:1.5rem}h2{font-size:1.1rem;margin-top:2rem}
-table{border-collapse:collapse}td,th{padding:.25rem .8rem .25rem 0;text-align:right;border-bottom:1px solid #e5e8eb}
+table{border-collapse:collapse}td,th{padding:.25rem .8rem .25rem 0;text-align:right}
+td,th{border-bottom:1px solid #e5e8eb}
 td:first-child,th:first-child{text-align:left}th{color:#6b747c;font-weight:500}
 .views{display:flex;flex-wrap:wrap;gap:1rem}figure{margin:0}figcaption{font-size:.8rem;color:#6b747c}
-img{image-rendering:auto;border:1px solid #e5e8eb}.warn{background:#fff4e0;padding:.5rem .8rem;border-radius:4px}
-"""
+img{image-rendering:auto;border:1px solid #e5e8eb}.warn{background:#fff4e0;padding:.5rem
+.8rem;border-radius:4px} """
 
 
 class MassEstimates(NamedTuple):
@@ -46,14 +47,12 @@ class MassEstimates(NamedTuple):
     occupancy: MassProperties
 
     def differences(self, size: float) -> dict[str, dict[str, float]]:
-        """Of `hull` and `occupancy` from `fill`: COM as a share of `size` [m], largest of principal inertias."""
+        """Of `hull` and `occupancy` from `fill`: COM as a share of `size` [m], principal inertias."""
         own = np.linalg.eigvalsh(np.asarray(self.fill.inertia))
         return {
             name: {
                 "com": float(np.linalg.norm(np.asarray(other.com) - np.asarray(self.fill.com))) / size,
-                "inertia": float(
-                    np.abs(np.linalg.eigvalsh(np.asarray(other.inertia)) / own - 1).max()
-                ),
+                "inertia": float(np.abs(np.linalg.eigvalsh(np.asarray(other.inertia)) / own - 1).max()),
             }
             for name, other in (("hull", self.hull), ("occupancy", self.occupancy))
         }
@@ -126,7 +125,13 @@ def _summary(trained: Trained, made: NeuralObject) -> str:
     rows = []
     for split, value in trained.scores.items():
         rows.append(
-            (split, f"{value.psnr:.2f}", f"{value.psnr_object:.2f}", f"{value.ssim:.4f}", f"{value.mask_iou:.4f}")
+            (
+                split,
+                f"{value.psnr:.2f}",
+                f"{value.psnr_object:.2f}",
+                f"{value.ssim:.4f}",
+                f"{value.mask_iou:.4f}",
+            )
         )
     head = ("views", "PSNR [dB]", "on the object [dB]", "SSIM", "mask IoU")
     extent = np.ptp(np.asarray(made.surface.points), axis=0) * 1e3
@@ -146,10 +151,9 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _views(trained: Trained, views: Sequence[View]) -> str:
     figures = []
-    white = np.ones(3)
     for view in views:
-        wanted = view.over(white)
-        got = trained.field.picture(view.camera, view.light).over(white)
+        wanted = view.over(view.backdrop)
+        got = trained.field.picture(view.camera, view.light).over(view.backdrop)
         strip = np.concatenate([wanted, got, 1 - np.clip(3 * np.abs(got - wanted), 0, 1)], axis=1)
         caption = f"{view.name}: {psnr(got, wanted):.1f} dB, SSIM {ssim(got, wanted):.3f}"
         figures.append(
@@ -193,7 +197,10 @@ def _slices(trained: Trained, com: np.ndarray) -> str:
         values = np.take(occupancy, centre[axis], axis).T[::-1]
         outline = np.take(hull, centre[axis], axis).T[::-1] < 0
         edge = outline & ~(
-            np.roll(outline, 1, 0) & np.roll(outline, -1, 0) & np.roll(outline, 1, 1) & np.roll(outline, -1, 1)
+            np.roll(outline, 1, 0)
+            & np.roll(outline, -1, 0)
+            & np.roll(outline, 1, 1)
+            & np.roll(outline, -1, 1)
         )
         picture = np.repeat(1 - 0.8 * values[..., None], 3, axis=2)
         picture[edge] = (0.24, 0.49, 0.85)

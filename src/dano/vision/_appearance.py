@@ -105,7 +105,7 @@ class Appearance(eqx.Module):
         light: Float[Array, "n 3"],
         view_share: Share = 1.0,
     ) -> Float[Array, "n 3"]:
-        """sRGB in [0, 1] sent from points.
+        """SRGB in [0, 1] sent from points.
 
         Args:
             points: [m].

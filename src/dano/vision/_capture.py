@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from dano.vision._camera import PosedCamera
 
 SPLITS = ("train", "test", "relight")
-"""What a view is for: to learn from; to check, under known lights; to check, under lights not learned from."""
+"""What a view is for: to learn from; to check, under known lights; to check, under other lights."""
 
 
 class View(eqx.Module):
@@ -26,7 +27,8 @@ class View(eqx.Module):
             not known, as under light that stays the same.
         light_is_near: Whether `light` is a position (static).
         split: One of `SPLITS` (static).
-        cut_out: Whether `image` is black outside of the mask because the file says so (static).
+        cut_out: Whether `image` shows the object alone, over black (static).
+        background: Colour that it was photographed against, if that is plain and known, shape (3,).
     """
 
     name: str = eqx.field(static=True)
@@ -37,6 +39,16 @@ class View(eqx.Module):
     light_is_near: bool = eqx.field(static=True, default=False)
     split: str = eqx.field(static=True, default="train")
     cut_out: bool = eqx.field(static=True, default=False)
+    background: Float[np.ndarray, "3"] | None = None
+
+    @property
+    def backdrop(self) -> Float[np.ndarray, "3"]:
+        """What to draw the object on for comparison: the photograph's own background, or white."""
+        return np.ones(3) if self.background is None else self.background
+
+    def replaced(self, **fields: Any) -> "View":
+        """This view with other values of some fields."""
+        return View(**{**{name: getattr(self, name) for name in View.__dataclass_fields__}, **fields})
 
     def over(self, background: Float[np.ndarray, "3"]) -> Float[np.ndarray, "height width 3"]:
         """The object on a background: the photograph itself where its mask is not known."""
@@ -63,16 +75,8 @@ class View(eqx.Module):
             height=height // factor,
             distortion=self.camera.distortion,
         )
-        return View(
-            name=self.name,
-            camera=camera,
-            image=shrunk(self.image),
-            mask=None if self.mask is None else shrunk(self.mask),
-            light=self.light,
-            light_is_near=self.light_is_near,
-            split=self.split,
-            cut_out=self.cut_out,
-        )
+        mask = None if self.mask is None else shrunk(self.mask)
+        return self.replaced(camera=camera, image=shrunk(self.image), mask=mask)
 
 
 class Capture(eqx.Module):

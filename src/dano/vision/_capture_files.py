@@ -1,4 +1,4 @@
-"""Readers of captures: `transforms.json` of nerfstudio, instant-ngp and Blender's NeRF scenes, OSF's `anno.json`.
+"""Readers of captures: `transforms.json` of nerfstudio, instant-ngp and Blender, OSF's `anno.json`.
 
 All of them give poses as camera to world with OpenGL's axes. They differ in where the intrinsics stand, how
 photographs are named, how they are split, and whether a light is given.
@@ -14,6 +14,7 @@ import numpy as np
 
 from dano.vision._camera import PosedCamera
 from dano.vision._capture import Capture, SPLITS, View
+from dano.vision._masks import cut_out
 
 _HOLD_OUT = 8
 """Where a capture has no split, one in this many views is held out, as is usual since LLFF."""
@@ -60,7 +61,8 @@ def load_capture(path: str | Path, *, hold_out: int | None = None, downscale: in
     if not any(view.split != "train" for view in views) and hold_out != 0:
         step = _HOLD_OUT if hold_out is None else hold_out
         held = range(step // 2, len(views), step) if len(views) >= 2 * step else ()
-        views = [_with_split(v, "test") if i in held else v for i, v in enumerate(views)]
+        views = [v.replaced(split="test") if i in held else v for i, v in enumerate(views)]
+    views = [cut_out(view) for view in views]
     if downscale > 1:
         views = [view.resized(downscale) for view in views]
     return Capture(views, path)
@@ -79,15 +81,16 @@ def _views(path: Path) -> list[View]:
         files = [(split, path / f"{form}_{split}.json") for split in SPLITS]
         if files[0][1].is_file():
             return [
-                _with_split(view, split)
+                view.replaced(split=split)
                 for split, file in files
                 if file.is_file()
                 for view in _reader(file.name)(file)
             ]
     found = sorted(p.name for p in path.iterdir())[:8]
     raise ValueError(
-        f"{path}: no transforms.json, transforms_train.json, anno.json or anno_train.json in it, only {found};"
-        " photographs without poses need structure from motion first (COLMAP, or nerfstudio's ns-process-data)"
+        f"{path}: no transforms.json, transforms_train.json, anno.json or anno_train.json in it, only"
+        f" {found}; photographs without poses need structure from motion first (COLMAP, or nerfstudio's"
+        " ns-process-data)"
     )
 
 
@@ -129,7 +132,7 @@ def _read_transforms(path: Path) -> list[View]:
 
 
 def _read_anno(path: Path) -> list[View]:
-    """A list of records with filename (in rgba/), RT (world to camera, 3 × 4, OpenCV's axes), K and light_pos."""
+    """Records with filename (in rgba/), RT (world to camera, 3 × 4, OpenCV's axes), K and light_pos."""
     views = []
     for i, record in enumerate(_json(path)["frames"]):
         if not isinstance(record, dict) or not {"filename", "RT", "K"} <= set(record):
@@ -242,7 +245,7 @@ def _camera(path: Path, name: str, values: dict[str, Any], shape: tuple[int, ...
     height, width = shape
     try:
         stated = (int(values.get("h", height)), int(values.get("w", width)))
-        # A smaller copy of the photographs with the intrinsics of the original: nerfstudio's images_2, images_4.
+        # Smaller copies of photographs (nerfstudio's images_2) with the intrinsics of the original.
         scale = width / stated[1]
         if abs(stated[0] * scale - height) > 1:
             raise ValueError(f"image is {width} × {height} but w × h is {stated[1]} × {stated[0]}")
@@ -287,7 +290,3 @@ def _split(path: Path, i: int, value: Any) -> str:
     if split not in SPLITS:
         raise ValueError(f"{path}: split of frame {i} must be one of {SPLITS}, got {value!r}")
     return split
-
-
-def _with_split(view: View, split: str) -> View:
-    return View(**{**{name: getattr(view, name) for name in View.__dataclass_fields__}, "split": split})

@@ -216,7 +216,7 @@ def redistanced(level: Float[np.ndarray, "nx ny nz"], box: Box) -> Float[np.ndar
     above it; those further away the distance to the point nearest to the nearest such node.
     """
     points, normals = [], []
-    slope = np.stack(np.gradient(level), axis=-1)
+    slope = np.stack(list(np.gradient(level)), axis=-1)
     for axis in range(3):
         low = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
         high = tuple(slice(1, None) if a == axis else slice(None) for a in range(3))

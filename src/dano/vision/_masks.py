@@ -34,7 +34,7 @@ def with_masks(capture: Capture, network: str | Path | None = None) -> Capture:
     views = []
     for view in capture.views:
         if view.mask is None:
-            view = _with_mask(view, segment(view))
+            view = cut_out(view.replaced(mask=segment(view).astype(np.float32)))
         views.append(view)
     return Capture(views, capture.source)
 
@@ -54,8 +54,8 @@ def background_mask(view: View) -> Float[np.ndarray, "height width"]:
     spread = float(np.quantile(away[border], 0.8))
     if spread > _PLAIN:
         raise ValueError(
-            f"{view.name}: the background is not plain (its colours differ by {spread:.2f} from their median, at"
-            f" most {_PLAIN} can be told from an object): give masks, or a segmentation network"
+            f"{view.name}: the background is not plain (its colours differ by {spread:.2f} from their median,"
+            f" at most {_PLAIN} can be told from an object): give masks, or a segmentation network"
         )
     threshold = max(4 * spread, 0.03)
     smooth = ndimage.gaussian_filter(away, 0.7)
@@ -70,7 +70,7 @@ def background_mask(view: View) -> Float[np.ndarray, "height width"]:
 
 
 def _coverage(image: np.ndarray, background: np.ndarray, solid: np.ndarray) -> np.ndarray:
-    """How much of each pixel a solid covers: its colour between the background's and that of the nearest core.
+    """How much of each pixel a solid covers: where its colour is between background and nearest core.
 
     A threshold low enough to find a dark object lies far out in the blur of its edge: taken as the outline it
     would make the object almost a pixel too large all around.
@@ -120,9 +120,25 @@ class _Network:
         return np.clip(ndimage.zoom(answer, back, order=1, mode="nearest", grid_mode=True), 0, 1)
 
 
-def _with_mask(view: View, mask: np.ndarray) -> View:
-    fields = {name: getattr(view, name) for name in View.__dataclass_fields__}
-    return View(**{**fields, "mask": mask.astype(np.float32)})
+def cut_out(view: View) -> View:
+    """The object alone, over black, if the background is plain: C − (1 − M) B, without B's share of the edge.
+
+    Without this a dark background would leave a dark rim on every rendering, a bright one a bright rim. A
+    view whose background is not plain stays as it is.
+    """
+    if view.mask is None or view.cut_out:
+        return view
+    outside = ndimage.binary_erosion(view.mask < 0.02, iterations=2)
+    if outside.sum() < 50:
+        return view
+    colours = view.image[outside]
+    background = np.median(colours, axis=0)
+    if float(np.quantile(np.abs(colours - background).max(axis=1), 0.8)) > _PLAIN:
+        return view
+    alone = np.clip(view.image - (1 - view.mask[..., None]) * background, 0, view.mask[..., None])
+    return view.replaced(
+        image=alone.astype(np.float32), cut_out=True, background=background.astype(np.float64)
+    )
 
 
 def check_masks(views: Sequence[View]) -> None:

@@ -8,14 +8,14 @@ from scipy import ndimage
 def psnr(
     a: Float[np.ndarray, "*shape"], b: Float[np.ndarray, "*shape"], where: np.ndarray | None = None
 ) -> float:
-    """Peak signal-to-noise ratio [dB] of images in [0, 1], of some of their pixels; infinite if they are equal."""
+    """Peak signal-to-noise ratio [dB] of images in [0, 1], or of some pixels; infinite if equal."""
     square = (a.astype(np.float64) - b) ** 2
     error = float(square.mean() if where is None else square[where].mean())
     return float(-10 * np.log10(error)) if error > 0 else float("inf")
 
 
 def ssim(a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"]) -> float:
-    """Structural similarity of images in [0, 1] (Wang et al. 2004): Gaussian window of 1.5 pixels, mean of RGB."""
+    """Structural similarity of images in [0, 1] (Wang et al. 2004), Gaussian window of 1.5 pixels."""
     a, b = a.astype(np.float64), b.astype(np.float64)
 
     def mean(x: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Radiance models: what a photograph is explained by. A surface, a density on a grid.
 
-A model answers two questions about points along rays: how opaque is it there, and what colour does it send. The
-renderer `see` needs no more, and training no more than that this is differentiable.
+A model answers two questions about points along rays: how opaque is it there, and what colour does it
+send. The renderer `see` needs no more, and training no more than that this is differentiable.
 """
 
 import abc
@@ -100,7 +100,7 @@ class AbstractModel(eqx.Module):
         light: Float[Array, "n 3"],
         view_share: Share = 1.0,
     ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-        """sRGB sent from points against directions of view, and unit outward normals there."""
+        """SRGB sent from points against directions of view, and unit outward normals there."""
 
     def interest(
         self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
@@ -130,8 +130,8 @@ def see(
     """
     keys = (None, None) if key is None else jax.random.split(key)
     edges = stratified_edges(rays.near, rays.far, sampling.coarse, keys[0])
-    frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, model)
-    edges = importance_edges(edges, frozen.interest(rays, edges, sharpness), sampling.fine, keys[1])
+    # Weights for sampling are not differentiated: `importance_edges` stops their gradient.
+    edges = importance_edges(edges, model.interest(rays, edges, sharpness), sampling.fine, keys[1])
     weights = section_weights(model.alpha(rays, edges, sharpness))
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
     _, chosen = jax.lax.top_k(jax.lax.stop_gradient(weights), sampling.colours)

@@ -43,7 +43,7 @@ def rays_of(
         occupied: Which of them may be part of the object, with a margin.
 
     Returns:
-        Their pixels (row · width + column) and the rays, on the host.
+        Their pixels (row · width + column) and the rays.
     """
     directions = camera.rays().reshape(-1, 3).astype(np.float32)
     origin = camera.position.astype(np.float32)
@@ -59,11 +59,16 @@ def rays_of(
     shape = (len(pixels), 3)
     light = np.zeros(3) if light is None else light
     return pixels, Rays(
-        np.broadcast_to(origin, shape),
-        directions[pixels],
-        near[pixels],
-        far[pixels],
-        np.broadcast_to(light.astype(np.float32), shape),
+        *map(
+            jnp.asarray,
+            (
+                np.broadcast_to(origin, shape),
+                directions[pixels],
+                near[pixels],
+                far[pixels],
+                np.broadcast_to(light.astype(np.float32), shape),
+            ),
+        )
     )
 
 

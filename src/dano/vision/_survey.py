@@ -16,8 +16,12 @@ from dano.vision._metrics import mask_iou
 from dano.vision._models import Sampling, SurfaceModel
 from dano.vision._picture import picture
 
-BAD_RESIDUAL = 0.05
+BAD_RESIDUAL = 0.03
 """Share of the silhouettes that may fail to fit the hull before something must be wrong."""
+
+_ONE_SIDE = np.radians(110)
+"""Gap [rad] from which views are all from one side; photographs of something that stands on a table, from all
+around and above, leave 90°."""
 
 _MARGIN = 0.04
 """Kept free around the hull, as a share of its longest side."""
@@ -68,13 +72,13 @@ def survey(capture: Capture, resolution: int = 96) -> Survey:
     warnings = []
     if residual > BAD_RESIDUAL:
         warnings.append(
-            f"the silhouettes do not fit together: {100 * residual:.1f} % of them is not explained by any shape"
-            " (below 2 % is usual); check the focal length, the poses and the masks"
+            f"the silhouettes do not fit together: {100 * residual:.1f} % of them is not explained by any"
+            " shape (below 2 % is usual); check the focal length, the poses and the masks"
         )
-    if gap > np.pi / 2:
+    if gap > _ONE_SIDE:
         warnings.append(
-            f"all {len(views)} views are from one side: nothing within {np.degrees(gap):.0f}° of the direction"
-            f" {np.round(direction, 2).tolist()} is seen, and the shape there is a guess"
+            f"all {len(views)} views are from one side: nothing within {np.degrees(gap):.0f}° of the"
+            f" direction {np.round(direction, 2).tolist()} is seen, and the shape there is a guess"
         )
     elif gap > np.pi / 3:
         warnings.append(
@@ -117,7 +121,7 @@ def widest_gap(views: Sequence[View]) -> tuple[float, Float[np.ndarray, "3"]]:
     z = 1 - 2 * (np.arange(n) + 0.5) / n
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
     flat = np.sqrt(1 - z**2)
-    sphere = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
+    sphere = np.asarray([flat * np.cos(angle), flat * np.sin(angle), z]).T
     nearest = np.arccos(np.clip((sphere @ towards.T).max(axis=1), -1, 1))
     worst = int(np.argmax(nearest))
     return float(nearest[worst]), sphere[worst]
@@ -130,7 +134,7 @@ def unseen_share(model: SurfaceModel, views: Sequence[View], n_points: int = 300
     if len(near) == 0:
         return 1.0
     near = near[np.random.default_rng(0).choice(len(near), min(n_points, len(near)), replace=False)]
-    slope = np.stack(np.gradient(distances, box.spacing), axis=-1)[tuple(near.T)]
+    slope = np.stack(list(np.gradient(distances, box.spacing)), axis=-1)[tuple(near.T)]
     normal = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
     points = box.origin + box.spacing * near
     points = points - normal * distances[tuple(near.T)][:, None]

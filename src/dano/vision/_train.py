@@ -1,12 +1,12 @@
 """Training: from photographs with masks to a solid field.
 
-The solid starts as the visual hull of the masks, on a coarse grid; rendering is compared with random rays of the
-photographs, in front of random backgrounds, so that transparency cannot pass for colour:
+The solid starts as the visual hull of the masks, on a coarse grid; rendering is compared with random rays
+of the photographs, in front of random backgrounds, so that transparency cannot pass for colour:
 
     E |c + (1 − o) b − C − (1 − M) b|²  +  w_m |o − M|²  +  w_e (|∇d| − 1)²  +  w_s (h ∇²d)²
 
-with c, o the rendered colour and opacity, C, M the photograph and its mask, b the background, and the last two
-terms over nodes near the surface, which keep d a smooth signed distance. Coarse first, finer later.
+with c, o the rendered colour and opacity, C, M the photograph and its mask, b the background, and the last
+two terms over nodes near the surface, which keep d a smooth signed distance. Coarse first, finer later.
 """
 
 import dataclasses
@@ -30,12 +30,11 @@ from dano.vision._hull import Box
 from dano.vision._learned import LearnedField
 from dano.vision._metrics import mask_iou, psnr, ssim
 from dano.vision._models import Rays, roughness, Sampling, see, SurfaceModel
-from dano.vision._picture import Picture, picture
+from dano.vision._picture import picture
 from dano.vision._ray_set import collect, RaySet
 from dano.vision._survey import Survey, survey, unseen_share
 
 CHECKPOINT, CHECKPOINT_VERSION = "dano-training", 1
-WHITE = np.ones(3)
 
 Stopped = Literal["finished", "converged", "geometry", "time", "diverged"]
 
@@ -108,7 +107,7 @@ class Score(NamedTuple):
     """How well views are rendered, means over them.
 
     Attributes:
-        psnr: Of whole images on white [dB].
+        psnr: Of whole images, on the photographs' own background or on white [dB].
         psnr_object: Of the pixels that show the object [dB].
         ssim: Structural similarity of whole images.
         mask_iou: Intersection over union of the silhouettes.
@@ -235,7 +234,7 @@ def train(
 
 
 def score(field: LearnedField, views: tuple[View, ...]) -> Score:
-    """Compare renderings with photographs, both on white.
+    """Compare renderings with photographs, on these's own background if it is plain, else both on white.
 
     Raises:
         ValueError: If there is no view, or one has no mask.
@@ -247,7 +246,7 @@ def score(field: LearnedField, views: tuple[View, ...]) -> Score:
         if view.mask is None:
             raise ValueError(f"{view.name} must have a mask to be compared with")
         drawn = field.picture(view.camera, view.light)
-        wanted, got = view.over(WHITE), drawn.over(WHITE)
+        wanted, got = view.over(view.backdrop), drawn.over(view.backdrop)
         rows.append(
             (
                 psnr(got, wanted),
@@ -395,7 +394,12 @@ class _Trainer:
             light = view.light if model.appearance.lit else None
             drawn = picture(model, view.camera, light, model.box, occupied, sharpness)
             assert view.mask is not None
-            rows.append((psnr(drawn.over(WHITE), view.over(WHITE)), mask_iou(drawn.opacity, view.mask)))
+            rows.append(
+                (
+                    psnr(drawn.over(view.backdrop), view.over(view.backdrop)),
+                    mask_iou(drawn.opacity, view.mask),
+                )
+            )
         quality, overlap = np.mean(rows, axis=0)
         entry = Progress(
             state.iteration,

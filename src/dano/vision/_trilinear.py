@@ -1,9 +1,10 @@
 """Trilinear interpolation of small grids, made for training: fast with respect to the values at the nodes.
 
-One gather per corner, which XLA's CPU backend turns into eight sequential scatters in the reverse pass; a single
-gather of all corners takes ten times as long.
+One gather per corner, which XLA's CPU backend turns into eight sequential scatters in the reverse pass; a
+single gather of all corners takes ten times as long.
 """
 
+import functools
 import itertools
 
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))
 
 
 def cell_of(
-    shape: tuple[int, int, int], u: Float[Array, "3 n"]
+    shape: tuple[int, ...], u: Float[Array, "3 n"]
 ) -> tuple[list[Int[Array, " n"]], Float[Array, "3 n"]]:
     """Flat indices of the eight corners around points, and where the points are between them.
 
@@ -35,7 +36,7 @@ def value_at(grid: Float[Array, "nx ny nz"], u: Float[Array, "3 n"]) -> Float[Ar
     index, f = cell_of(grid.shape, u)
     v = _gathered(grid.ravel(), index)
     g = 1 - f
-    return sum(w * c for w, c in zip(_products(f, g), v, strict=True))
+    return _weighted(_products(f, g), v)
 
 
 def value_and_slope_at(
@@ -45,7 +46,7 @@ def value_and_slope_at(
     index, f = cell_of(grid.shape, u)
     c = _gathered(grid.ravel(), index)
     g = 1 - f
-    value = sum(w * corner for w, corner in zip(_products(f, g), c, strict=True))
+    value = _weighted(_products(f, g), c)
     x = (
         g[1] * g[2] * (c[4] - c[0])
         + g[1] * f[2] * (c[5] - c[1])
@@ -72,7 +73,11 @@ def rows_at(grid: Float[Array, "nx ny nz k"], u: Float[Array, "3 n"]) -> Float[A
     shape = grid.shape[:3]
     index, f = cell_of(shape, u)
     rows = _gathered(grid.reshape(-1, grid.shape[3]), index)
-    return sum(w[:, None] * row for w, row in zip(_products(f, 1 - f), rows, strict=True))
+    return _weighted([w[:, None] for w in _products(f, 1 - f)], rows)
+
+
+def _weighted(weights: list[Array], values: list[Array]) -> Array:
+    return functools.reduce(jnp.add, (w * v for w, v in zip(weights, values, strict=True)))
 
 
 def _gathered(flat: Array, index: list[Array]) -> list[Array]:

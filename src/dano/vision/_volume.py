@@ -1,8 +1,7 @@
 """Volume rendering as arithmetic on arrays: where to sample rays, and what the samples add up to.
 
-Throughout, `t` are distances along rays, (rays, samples + 1) of them the edges of `samples` sections; `alpha` is
-the opacity of a section by itself, and `weights` the share of a pixel that is seen of it. Nothing here knows
-what is rendered.
+Throughout, `edges` are distances along rays that divide them into sections; `alpha` is the opacity of a
+section by itself, and `weights` the share of a pixel that is seen of it. Nothing here knows what is rendered.
 """
 
 import jax
@@ -74,7 +73,7 @@ def importance_edges(
 
 
 def section_weights(alpha: Float[Array, "rays sections"]) -> Float[Array, "rays sections"]:
-    """Share of a pixel seen of each section: wᵢ = αᵢ Π_{j<i} (1 − αⱼ), front to back (paper: eq. of the OSF)."""
+    """Share of a pixel seen of each section, front to back: wᵢ = αᵢ Π_{j<i} (1 − αⱼ)."""
     clear = jnp.cumprod(1 - alpha, axis=1)
     before = jnp.concatenate([jnp.ones_like(clear[:, :1]), clear[:, :-1]], axis=1)
     return alpha * before
@@ -92,8 +91,8 @@ def surface_alpha(
 ) -> Float[Array, "rays sections"]:
     """Opacity of sections of a soft surface (NeuS, Wang et al. 2021, eq. 13).
 
-    αᵢ = max(Φ(dᵢ) − Φ(dᵢ₊₁), 0)/Φ(dᵢ) with Φ(d) = 1/(1 + exp(−s d)): unlike the opacity of a density it is not
-    biased, the weight along a ray is largest where d = 0, and exact for sections of any length.
+    αᵢ = max(Φ(dᵢ) − Φ(dᵢ₊₁), 0)/Φ(dᵢ) with Φ(d) = 1/(1 + exp(−s d)). Unlike the opacity of a density it is
+    not biased, the weight along a ray being largest where d = 0, and it is exact for sections of any length.
 
     Args:
         distance: Signed distances at the edges [m].
