@@ -137,8 +137,8 @@ def see(
     _, chosen = jax.lax.top_k(jax.lax.stop_gradient(weights), sampling.colours)
     some = jnp.take_along_axis(weights, chosen, axis=1)
     at = rays.at(jnp.take_along_axis(middle, chosen, axis=1))
-    repeated = [jnp.repeat(x, sampling.colours, axis=0) for x in (rays.direction, rays.light)]
-    colour, normal = model.colour(at, *repeated, view_share)
+    view, light = (jnp.repeat(x, sampling.colours, axis=0) for x in (rays.direction, rays.light))
+    colour, normal = model.colour(at, view, light, view_share)
     opacity = jnp.sum(weights, axis=1)
     # What is not looked at is taken to look as the rest of the ray does.
     share = (opacity / jnp.maximum(jnp.sum(some, axis=1), 1e-6))[:, None]
