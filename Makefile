@@ -62,7 +62,7 @@ $(VENV)/.demo: $(VENV)/.pip $(PACKAGE)
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.pip $(PACKAGE)
-	$(INSTALL) --editable '.[dev,view,mesh,mujoco,import]'
+	$(INSTALL) --editable '.[dev,view,mesh,mujoco,import,train]'
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.pip $(PACKAGE)

@@ -1,4 +1,4 @@
-"""The command line: `dano build | import | inspect | simulate | identify | view | demo`."""
+"""The command line: `dano train | data | import | build | inspect | simulate | identify | view | demo`."""
 
 import sys
 import warnings

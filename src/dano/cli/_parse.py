@@ -23,7 +23,7 @@ def parse(argv: Sequence[str]) -> Callable[[], None]:
     if list(argv) == ["--version"]:
         print(f"dano {__version__}")
         raise SystemExit(0)
-    functions = (build, import_, inspect, simulate, identify, view, demo)
+    functions = (train, data, build, import_, inspect, simulate, identify, view, demo)
     commands = {function.__name__.rstrip("_"): function for function in functions}
     return tyro.extras.subcommand_cli_from_dict(
         commands,
@@ -34,6 +34,102 @@ def parse(argv: Sequence[str]) -> Callable[[], None]:
         ),
         args=list(argv),
         config=(FlagCreatePairsOff,),
+    )
+
+
+def train(
+    images: Positional[Path],
+    /,
+    output: Output,
+    resolution: int = 96,
+    iterations: int = 1000,
+    batch: int = 4096,
+    seconds: float | None = None,
+    views: int | None = None,
+    downscale: int = 1,
+    network: Path | None = None,
+    mass: float | None = None,
+    mass_density: float = 1000.0,
+    resume: bool = False,
+    no_report: bool = False,
+    seed: int = 0,
+    json: Path | None = None,
+) -> Callable[[], None]:
+    """Learn a solid neural object from photographs with known poses.
+
+    Writes the object, and beside it the learned field (.field.npz), its density grid (.grid.npz) and a report
+    (.html).
+
+    Args:
+        images: Folder with transforms.json or anno_train.json, or one of these files.
+        output: Where to write the object, *.dano.
+        resolution: Nodes along the longest side of the object.
+        iterations: Training steps at most.
+        batch: Rays per step.
+        seconds: Stop training after this time [s].
+        views: Train on so many of the views only.
+        downscale: Average so many pixels a side into one.
+        network: Segmentation network (.onnx) for photographs without masks; default: what differs from the
+            background.
+        mass: Mass of the object [kg].
+        mass_density: Else: mass per volume [kg/m³].
+        resume: Go on with a training that was interrupted.
+        no_report: Write no report.
+        seed: Seed of everything random.
+        json: Write figures of merit and mass properties to this file.
+    """
+    from dano.cli import _learn
+    from dano.vision import TrainOptions
+
+    def run() -> None:
+        _learn.train(
+            images,
+            output,
+            options=TrainOptions(
+                resolution=resolution, iterations=iterations, batch=batch, seconds=seconds, seed=seed
+            ),
+            downscale=downscale,
+            views=views,
+            network=network,
+            mass=mass,
+            mass_density=mass_density,
+            resume=resume,
+            report=not no_report,
+            json_file=json,
+        )
+
+    return run
+
+
+def data(
+    images: Positional[Path],
+    /,
+    png: Path | None = None,
+    no_png: bool = False,
+    downscale: int = 1,
+    network: Path | None = None,
+    json: bool = False,
+) -> Callable[[], None]:
+    """Check photographs before training: poses, masks, coverage; and draw the cameras.
+
+    Args:
+        images: Folder with transforms.json or anno_train.json, or one of these files.
+        png: Where to draw; default: the folder's name in the current folder.
+        no_png: Draw nothing.
+        downscale: Average so many pixels a side into one.
+        network: Segmentation network (.onnx) for photographs without masks.
+        json: Print one JSON object instead of text.
+    """
+    from dano.cli import _learn
+
+    return functools.partial(
+        _learn.data,
+        images,
+        png=png,
+        draw=not no_png,
+        downscale=downscale,
+        network=network,
+        as_json=json,
     )
 
 

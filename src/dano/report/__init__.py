@@ -1,6 +1,12 @@
 """Pictures for people: videos of trajectories, figures of objects, an interactive viewer."""
 
+from dano.report._capture import draw_capture as draw_capture
 from dano.report._object import draw_object as draw_object
 from dano.report._stage import contact_history as contact_history, ContactHistory as ContactHistory
+from dano.report._training import (
+    mass_estimates as mass_estimates,
+    MassEstimates as MassEstimates,
+    write_training_report as write_training_report,
+)
 from dano.report._video import render_trajectory as render_trajectory
 from dano.report._viewer import view as view, Viewer as Viewer

@@ -1,5 +1,6 @@
-"""Pinhole cameras."""
+"""Pinhole cameras: one that keeps z up and looks at a point, one that a photograph was taken with."""
 
+import abc
 import math
 
 import equinox as eqx
@@ -8,11 +9,51 @@ from jaxtyping import Float
 
 from dano.maths import checked_array, is_traced, Numbers
 
+_ROTATION_TOLERANCE = 1e-3
+"""By which the columns of a pose may fail to be orthonormal: what files with four digits round off."""
 
-class Camera(eqx.Module):
-    """A pinhole camera that keeps z up.
+
+class AbstractCamera(eqx.Module):
+    """A camera with a centre of projection.
 
     Pixel (0, 0) is the upper left one; its centre lies at image coordinates (0.5, 0.5).
+
+    Attributes:
+        position: Centre of projection [m, W], shape (3,).
+        width: Image width [pixels].
+        height: Image height [pixels].
+        axes: Rows: unit vectors to the right, upwards and forwards [W], shape (3, 3).
+    """
+
+    position: eqx.AbstractVar[Float[np.ndarray, "3"]]
+    width: eqx.AbstractVar[int]
+    height: eqx.AbstractVar[int]
+    axes: eqx.AbstractVar[Float[np.ndarray, "3 3"]]
+
+    @property
+    @abc.abstractmethod
+    def pixel_angle(self) -> float:
+        """Angle that a pixel in the middle of the image spans [rad]."""
+
+    @abc.abstractmethod
+    def directions(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+        """Unit directions [W] of rays through image coordinates (x to the right, y downwards) [pixels]."""
+
+    @abc.abstractmethod
+    def project(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Image coordinates x, y [pixels] and depth along the optical axis [m] of points [m, W].
+
+        Points that are not in front of the camera have no image: NaN.
+        """
+
+    def rays(self) -> Float[np.ndarray, "height width 3"]:
+        """Unit directions [W] of the rays from `position` through all pixel centres."""
+        y, x = np.mgrid[: self.height, : self.width] + 0.5
+        return self.directions(np.stack([x.ravel(), y.ravel()], axis=1)).reshape(self.height, self.width, 3)
+
+
+class Camera(AbstractCamera):
+    """A pinhole camera that keeps z up.
 
     Attributes:
         position: Centre of projection [m, W], shape (3,).
@@ -56,7 +97,7 @@ class Camera(eqx.Module):
             raise ValueError(f"width and height must be ≥ 1 pixel, got {width} × {height}")
 
     @property
-    def axes(self) -> Float[np.ndarray, "3 3"]:
+    def axes(self) -> Float[np.ndarray, "3 3"]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Rows: unit vectors to the right, upwards and forwards [W]."""
         return view_axes(self.look_at - self.position)
 
@@ -72,11 +113,6 @@ class Camera(eqx.Module):
         y = (0.5 * self.height - pixels[:, 1:]) * self.pixel_angle
         towards = forward + x * right + y * up
         return towards / np.linalg.norm(towards, axis=1, keepdims=True)
-
-    def rays(self) -> Float[np.ndarray, "height width 3"]:
-        """Unit directions [W] of the rays from `position` through all pixel centres."""
-        y, x = np.mgrid[: self.height, : self.width] + 0.5
-        return self.directions(np.stack([x.ravel(), y.ravel()], axis=1)).reshape(self.height, self.width, 3)
 
     def project(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Image coordinates x, y [pixels] and depth along the optical axis [m] of points [m, W].
@@ -133,6 +169,153 @@ class Camera(eqx.Module):
         return cls(
             position, position + distance * axes[2], vertical_fov=vertical_fov, width=width, height=height
         )
+
+
+class PosedCamera(AbstractCamera):
+    """The camera of a photograph: any orientation, measured intrinsics, lens distortion (OpenCV's model).
+
+    A direction with slopes x, y to the right and downwards has the image coordinates
+
+        (fₓ x_d + cₓ, f_y y_d + c_y),  r² = x² + y²,
+        x_d = x (1 + k₁r² + k₂r⁴ + k₃r⁶) + 2 p₁ x y + p₂ (r² + 2x²), y_d likewise with p₁ and p₂ exchanged.
+
+    Attributes:
+        position: Centre of projection [m, W], shape (3,).
+        axes: Rows: unit vectors to the right, upwards and forwards [W], shape (3, 3).
+        focal: Focal lengths fₓ, f_y [pixels], shape (2,).
+        centre: Principal point cₓ, c_y [pixels], shape (2,).
+        distortion: k₁, k₂, k₃, p₁, p₂, shape (5,).
+        width: Image width [pixels].
+        height: Image height [pixels].
+    """
+
+    position: Float[np.ndarray, "3"]
+    axes: Float[np.ndarray, "3 3"]
+    focal: Float[np.ndarray, "2"]
+    centre: Float[np.ndarray, "2"]
+    distortion: Float[np.ndarray, "5"]
+    width: int = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        camera_to_world: Numbers,
+        *,
+        focal: Numbers,
+        width: int,
+        height: int,
+        centre: Numbers | None = None,
+        distortion: Numbers = (0.0, 0.0, 0.0, 0.0, 0.0),
+    ):
+        """Place a camera.
+
+        Args:
+            camera_to_world: Matrix (4, 4) or (3, 4) with OpenGL's axes, as nerfstudio, instant-ngp and
+                Blender write it: columns to the right, upwards, backwards, and the position [m, W].
+            focal: Focal length [pixels], a number or one per axis.
+            width: Image width [pixels].
+            height: Image height [pixels].
+            centre: Principal point [pixels]; default the middle of the image.
+            distortion: k₁, k₂, k₃, p₁, p₂.
+
+        Raises:
+            ValueError: If the pose is no rotation and translation, a focal length is not positive, the image
+                is empty, or the distortion folds the image over itself.
+        """
+        pose = np.asarray(camera_to_world, dtype=np.float64)
+        if pose.shape not in ((4, 4), (3, 4)) or not np.all(np.isfinite(pose)):
+            raise ValueError(f"camera_to_world must be finite with shape (4, 4) or (3, 4), got {pose.shape}")
+        rotation = pose[:3, :3]
+        off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+        if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+            what = "a reflection" if off <= _ROTATION_TOLERANCE else f"off by {off:.2g} from one"
+            raise ValueError(f"camera_to_world must hold a rotation, got {what}: {rotation.tolist()}")
+        # Files round; the closest rotation.
+        u, _, vt = np.linalg.svd(rotation)
+        self.axes = (u @ vt).T * np.array([1.0, 1.0, -1.0])[:, None]
+        self.position = pose[:3, 3].copy()
+        self.focal = np.broadcast_to(np.asarray(focal, dtype=np.float64), (2,)).copy()
+        self.width, self.height = int(width), int(height)
+        middle = (0.5 * self.width, 0.5 * self.height)
+        self.centre = np.asarray(
+            checked_array("centre", middle if centre is None else centre, (2,)), dtype=np.float64
+        )
+        self.distortion = np.asarray(checked_array("distortion", distortion, (5,)), dtype=np.float64)
+        if not (np.all(np.isfinite(self.focal)) and np.all(self.focal > 0)):
+            raise ValueError(f"focal must be positive [pixels], got {self.focal.tolist()}")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"width and height must be ≥ 1 pixel, got {width} × {height}")
+        if np.any(self.distortion):
+            corners = np.array([[0, 0], [self.width, 0], [0, self.height], [self.width, self.height]])
+            slopes = self._undistorted((corners - self.centre) / self.focal)
+            if not np.allclose(self._distorted(slopes) * self.focal + self.centre, corners, atol=0.01):
+                raise ValueError(
+                    "distortion must be invertible over the whole image, got"
+                    f" {self.distortion.tolist()} for {self.width} × {self.height} pixels"
+                )
+
+    @property
+    def pixel_angle(self) -> float:
+        """Angle that a pixel in the middle of the image spans [rad]."""
+        return 1 / float(np.mean(self.focal))
+
+    def directions(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+        """See `AbstractCamera.directions`."""
+        slopes = (np.asarray(pixels, dtype=np.float64) - self.centre) / self.focal
+        if np.any(self.distortion):
+            slopes = self._undistorted(slopes)
+        right, up, forward = self.axes
+        towards = forward + slopes[:, :1] * right - slopes[:, 1:] * up
+        return towards / np.linalg.norm(towards, axis=1, keepdims=True)
+
+    def project(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """See `AbstractCamera.project`."""
+        local = (np.asarray(points, dtype=np.float64) - self.position) @ self.axes.T
+        depth = np.where(local[:, 2] > 0, local[:, 2], np.nan)
+        slopes = np.stack([local[:, 0], -local[:, 1]], axis=1) / depth[:, None]
+        if np.any(self.distortion):
+            slopes = self._distorted(slopes)
+        return np.concatenate([slopes * self.focal + self.centre, depth[:, None]], axis=1)
+
+    @property
+    def pose(self) -> Float[np.ndarray, "3 4"]:
+        """`camera_to_world` of the constructor, without its last row."""
+        return np.concatenate([self.axes.T * np.array([1.0, 1.0, -1.0]), self.position[:, None]], axis=1)
+
+    def _distorted(self, slopes: np.ndarray) -> np.ndarray:
+        k1, k2, k3, p1, p2 = self.distortion
+        x, y = slopes.T
+        square = x * x + y * y
+        radial = 1 + square * (k1 + square * (k2 + square * k3))
+        return np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
+                y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
+            ],
+            axis=1,
+        )
+
+    def _undistorted(self, distorted: np.ndarray) -> np.ndarray:
+        """Newton's method with a Jacobian by differences, from the distorted slopes."""
+        step = 1e-6
+        slopes = distorted.copy()
+        for _ in range(8):
+            miss = self._distorted(slopes) - distorted
+            a, b = (
+                (self._distorted(slopes + step * axis) - self._distorted(slopes - step * axis)) / (2 * step)
+                for axis in np.eye(2)
+            )
+            determinant = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+            # Beyond the fold of a strong distortion there is no solution; the constructor has checked.
+            determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+            slopes = slopes - np.stack(
+                [
+                    (b[:, 1] * miss[:, 0] - b[:, 0] * miss[:, 1]) / determinant,
+                    (a[:, 0] * miss[:, 1] - a[:, 1] * miss[:, 0]) / determinant,
+                ],
+                axis=1,
+            )
+        return slopes
 
 
 def view_axes(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -1,0 +1,245 @@
+"""`dano data` and `dano train`."""
+
+import json
+import math
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dano.archive import replacing
+from dano.cli._console import numbers, Progress, put, put_json, say
+from dano.cli._outputs import check_output, missing_for_pictures
+from dano.fields import bake, save_field
+from dano.objects import NeuralObject
+from dano.vision import (
+    Capture,
+    load_capture,
+    Progress as Learned,
+    Survey,
+    survey,
+    train as learn,
+    Trained,
+    TrainOptions,
+    with_masks,
+)
+
+
+def data(
+    images: Path, *, png: Path | None, draw: bool, downscale: int, network: Path | None, as_json: bool
+) -> None:
+    """See `dano data --help`."""
+    picture = (png or Path(f"{images.resolve().stem}.png")) if draw else None
+    if picture is not None:
+        check_output(picture, suffix=".png")
+        if missing := missing_for_pictures(video=False):
+            if png is not None:
+                raise ImportError(missing)
+            say(f"warning: not drawn, {missing}")
+            picture = None
+    progress = Progress()
+    progress("reading photographs", 0.0)
+    capture = load_capture(images, downscale=downscale)
+    given = capture.has_masks
+    if not given:
+        progress("making masks", 0.2)
+        capture = with_masks(capture, network)
+    progress("visual hull", 0.4)
+    found = survey(capture, 64)
+    progress.close()
+    report = describe(capture, found, masks_given=given)
+    if picture is not None:
+        from dano.report import draw_capture
+
+        draw_capture(capture, found, picture)
+        report["picture"] = str(picture)
+    if as_json:
+        put_json(report)
+        return
+    _print_data(report)
+
+
+def describe(capture: Capture, found: Survey, *, masks_given: bool) -> dict[str, Any]:
+    """A capture in numbers."""
+    views = capture.split("train")
+    inside = np.argwhere(found.hull < 0)
+    lower, upper = (found.box.origin + found.box.spacing * i for i in (inside.min(0), inside.max(0)))
+    lights = {tuple(np.round(view.light, 3)) for view in views if view.light is not None}
+    sizes = sorted({view.image.shape[1::-1] for view in views})
+    return {
+        "source": capture.source,
+        "views": {s: len(capture.split(s)) for s in ("train", "test", "relight")},
+        "image_sizes": [list(size) for size in sizes],
+        "focal": sorted({round(float(view.camera.focal[0]), 1) for view in views})[:4],
+        "distorted": any(bool(np.any(view.camera.distortion)) for view in views),
+        "masks": "given" if masks_given else "made",
+        "covered": float(np.mean([np.mean(view.mask) for view in views if view.mask is not None])),
+        "lights": len(lights),
+        "hull": [lower.tolist(), upper.tolist()],
+        "residual": found.residual,
+        "gap": found.gap,
+        "warnings": list(found.warnings),
+    }
+
+
+def _print_data(report: dict[str, Any]) -> None:
+    counts = report["views"]
+    put(f"photographs         {report['source']}")
+    put(
+        f"views               {counts['train']} to train on, {counts['test']} held out,"
+        f" {counts['relight']} relit"
+    )
+    put(f"size                {', '.join(f'{w} × {h}' for w, h in report['image_sizes'])} pixels")
+    put(
+        f"focal length        {', '.join(map(str, report['focal']))} pixels"
+        + ", distorted" * report["distorted"]
+    )
+    put(f"masks               {report['masks']}, cover {100 * report['covered']:.1f} % of the images")
+    put(f"lights              {report['lights'] or 'not stated'}")
+    lower, upper = (np.array(x) for x in report["hull"])
+    size, middle = (upper - lower).tolist(), (0.5 * (lower + upper)).tolist()
+    put(f"visual hull         {numbers(size)} m around {numbers(middle)}")
+    put(f"silhouettes fit     to {100 * report['residual']:.2f} %")
+    put(f"widest gap          {math.degrees(report['gap']):.0f}° between a direction and the nearest view")
+    for text in report["warnings"]:
+        say(f"warning: {text}")
+    if "picture" in report:
+        put()
+        put(f"drawn in {report['picture']}")
+
+
+def train(
+    images: Path,
+    output: Path,
+    *,
+    options: TrainOptions,
+    downscale: int,
+    views: int | None,
+    network: Path | None,
+    mass: float | None,
+    mass_density: float,
+    resume: bool,
+    report: bool,
+    json_file: Path | None,
+) -> None:
+    """See `dano train --help`."""
+    outputs = _outputs(output)
+    for path in outputs.values():
+        check_output(path)
+    if json_file is not None:
+        check_output(json_file)
+    for name, value in (("--mass", mass), ("--mass-density", mass_density)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be positive, got {value}")
+    progress = Progress()
+    progress("reading photographs", 0.0)
+    capture = load_capture(images, downscale=downscale)
+    given = capture.has_masks
+    if not given:
+        progress("making masks", 0.0)
+        capture = with_masks(capture, network)
+    if views is not None:
+        capture = capture.thinned(views)
+
+    def show(done: Learned) -> None:
+        quality = "" if done.psnr is None else f"{done.psnr:.1f} dB "
+        progress(
+            f"training {quality}{done.rays_per_second / 1000:.0f}k rays/s", done.iteration / done.iterations
+        )
+
+    progress("visual hull", 0.0)
+    try:
+        trained = learn(capture, options, checkpoint=outputs["checkpoint"], resume=resume, progress=show)
+    except KeyboardInterrupt:
+        progress.close()
+        say(f"stopped; `--resume` goes on from {outputs['checkpoint']}")
+        raise
+    progress("solid", 0.0)
+    volume = _solid_volume(trained)
+    made = NeuralObject.from_field(
+        trained.field,
+        mass_model="solid",
+        mass=mass_density * volume if mass is None else mass,
+        progress=lambda what, share: progress(what, share),
+    )
+    grid = bake(trained.field, options.resolution)
+    progress.close()
+    trained.field.save(outputs["field"])
+    save_field(grid.grid, outputs["grid"])
+    made.save(output)
+    from dano.report import mass_estimates, write_training_report
+
+    estimates = mass_estimates(trained, made, grid.grid)
+    summary = _summary(trained, made, output, masks_given=given)
+    summary |= {"confidence": estimates.differences(made.size)}
+    if report:
+        write_training_report(outputs["report"], trained, capture, made, estimates, title=output.stem)
+    if json_file is not None:
+        with replacing(json_file) as file:
+            file.write((json.dumps(summary, indent=1) + "\n").encode())
+    # What it was for is done.
+    outputs["checkpoint"].unlink(missing_ok=True)
+    for text in trained.warnings:
+        warnings.warn(text, stacklevel=1)
+    _print_trained(summary, outputs, with_report=report)
+
+
+def _outputs(output: Path) -> dict[str, Path]:
+    if output.suffix.lower() != ".dano":
+        raise ValueError(f"output path must end in .dano, got {output}")
+    names = {"object": ".dano", "field": ".field.npz", "grid": ".grid.npz", "report": ".html"}
+    return {
+        **{name: output.with_name(output.stem + ending) for name, ending in names.items()},
+        "object": output,
+        "checkpoint": output.with_name(output.stem + ".checkpoint.npz"),
+    }
+
+
+def _solid_volume(trained: Trained) -> float:
+    from dano.vision import Box, volume
+
+    solid = trained.field.solid
+    distances = np.asarray(solid.distances, np.float64)
+    nx, ny, nz = distances.shape
+    return volume(distances, Box(np.asarray(solid.origin), float(solid.spacing[0]), (nx, ny, nz)))
+
+
+def _summary(trained: Trained, made: NeuralObject, output: Path, *, masks_given: bool) -> dict[str, Any]:
+    main = trained.scores.get("test") or next(iter(trained.scores.values()))
+    points = np.asarray(made.surface.points)
+    return {
+        "file": str(output),
+        "psnr": main.psnr,
+        "mask_iou": main.mask_iou,
+        "seconds": trained.seconds,
+        "mass": float(made.mass.mass),
+        "com": np.asarray(made.mass.com).tolist(),
+        "inertia": np.asarray(made.mass.inertia).tolist(),
+        "scores": {split: value._asdict() for split, value in trained.scores.items()},
+        "stopped": trained.stopped,
+        "bounds": [points.min(0).tolist(), points.max(0).tolist()],
+        "masks": "given" if masks_given else "made",
+        "unseen": trained.unseen,
+        "silhouette_residual": trained.survey.residual,
+        "warnings": list(trained.warnings),
+    }
+
+
+def _print_trained(summary: dict[str, Any], outputs: dict[str, Path], *, with_report: bool) -> None:
+    for split, value in summary["scores"].items():
+        put(
+            f"{split:<19} {value['psnr']:.2f} dB (object {value['psnr_object']:.2f}),"
+            f" SSIM {value['ssim']:.4f}, mask IoU {value['mask_iou']:.4f}"
+        )
+    put(f"trained             in {summary['seconds']:.0f} s: {summary['stopped']}")
+    put(f"mass                {summary['mass']:.5g} kg")
+    put(f"centre of mass      {numbers(summary['com'])} m")
+    moments = np.linalg.eigvalsh(np.array(summary["inertia"])).tolist()
+    put(f"principal inertias  {numbers(moments)} kg m²")
+    hull = summary["confidence"]["hull"]
+    put(f"the hull differs    by {100 * hull['com']:.2f} % in COM, {100 * hull['inertia']:.1f} % in inertia")
+    put()
+    put(f"wrote {outputs['object']} (simulate, inspect), {outputs['grid']}, {outputs['field']}")
+    if with_report:
+        put(f"look at {outputs['report']}")

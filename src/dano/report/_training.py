@@ -1,0 +1,234 @@
+"""The report of a training: one HTML page that needs nothing else."""
+
+import base64
+import html
+import io
+import os
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from dano.archive import replacing
+from dano.fields import GridField
+from dano.objects import MassProperties, NeuralObject
+from dano.report._video import require
+from dano.vision import Capture, Progress, psnr, ssim, Trained, View
+
+_SHOWN = 6
+"""Most views drawn of each split."""
+
+_SIDE = 224
+"""Side of a drawn view [CSS pixels]."""
+
+_STYLE = """
+body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:980px;padding:0 1rem;color:#22262b}
+h1{font-size:1.5rem}h2{font-size:1.1rem;margin-top:2rem}
+table{border-collapse:collapse}td,th{padding:.25rem .8rem .25rem 0;text-align:right}
+td,th{border-bottom:1px solid #e5e8eb}
+td:first-child,th:first-child{text-align:left}th{color:#6b747c;font-weight:500}
+.views{display:flex;flex-wrap:wrap;gap:1rem}figure{margin:0}figcaption{font-size:.8rem;color:#6b747c}
+img{image-rendering:auto;border:1px solid #e5e8eb}.warn{background:#fff4e0;padding:.5rem
+.8rem;border-radius:4px} """
+
+
+class MassEstimates(NamedTuple):
+    """Mass properties of the same object by three ways, for the same mass.
+
+    Attributes:
+        hull: Of the visual hull of the silhouettes.
+        fill: Of the density's level set, cavities filled: those of the neural object.
+        occupancy: Of φ itself, as a mass density.
+    """
+
+    hull: MassProperties
+    fill: MassProperties
+    occupancy: MassProperties
+
+    def differences(self, size: float) -> dict[str, dict[str, float]]:
+        """Of `hull` and `occupancy` from `fill`: COM as a share of `size` [m], principal inertias."""
+        own = np.linalg.eigvalsh(np.asarray(self.fill.inertia))
+        return {
+            name: {
+                "com": float(np.linalg.norm(np.asarray(other.com) - np.asarray(self.fill.com))) / size,
+                "inertia": float(np.abs(np.linalg.eigvalsh(np.asarray(other.inertia)) / own - 1).max()),
+            }
+            for name, other in (("hull", self.hull), ("occupancy", self.occupancy))
+        }
+
+
+def mass_estimates(trained: Trained, made: NeuralObject, grid: GridField) -> MassEstimates:
+    """Mass properties by hull, fill and occupancy, all for the mass of the object.
+
+    Args:
+        trained: What came out of training.
+        made: The object built of its field.
+        grid: The field baked.
+    """
+    mass = float(made.mass.mass)
+    box = trained.survey.box
+    share = np.clip(0.5 - trained.survey.hull / box.spacing, 0, 1)
+    hull = GridField(jnp.asarray(share), jnp.asarray(box.origin), box.spacing)
+    return MassEstimates(
+        MassProperties.from_field(hull, mass=mass), made.mass, MassProperties.from_field(grid, mass=mass)
+    )
+
+
+def write_training_report(
+    path: str | os.PathLike[str],
+    trained: Trained,
+    capture: Capture,
+    made: NeuralObject,
+    estimates: MassEstimates,
+    *,
+    title: str,
+) -> None:
+    """Write a page with renderings beside photographs, the course of training, slices and mass properties.
+
+    Args:
+        path: Where to; written whole or not at all.
+        trained: What came out of training.
+        capture: The photographs it was trained on.
+        made: The object built of the field.
+        estimates: Its mass properties by several ways.
+        title: Heading.
+
+    Raises:
+        ValueError: If `path` is a directory or lies in none.
+        ImportError: If pillow is missing.
+    """
+    require("PIL", "pillow")
+    parts = [f"<h1>{html.escape(title)}</h1>", _summary(trained, made)]
+    parts += [f'<p class="warn">{html.escape(text)}</p>' for text in trained.warnings]
+    for split, heading in (
+        ("test", "Held-out views"),
+        ("relight", "Held-out lights"),
+        ("train", "Views trained on"),
+    ):
+        views = capture.split(split)[:_SHOWN]
+        if views and (split != "train" or len(parts) == 2 + len(trained.warnings)):
+            parts += [f"<h2>{heading}: photograph, rendering, difference × 3</h2>", _views(trained, views)]
+    parts += ["<h2>Training</h2>", _curves(trained.history)]
+    parts += ["<h2>Occupancy through the centre of mass, outline of the visual hull in blue</h2>"]
+    parts += [_slices(trained, np.asarray(made.mass.com, dtype=np.float64))]
+    parts += ["<h2>Mass properties, by three ways</h2>", _masses(estimates, made.size)]
+    page = (
+        "<!doctype html><html lang='en'><meta charset='utf-8'>"
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style><body>{''.join(parts)}</body></html>"
+    )
+    with replacing(path) as file:
+        file.write(page.encode())
+
+
+def _summary(trained: Trained, made: NeuralObject) -> str:
+    rows = []
+    for split, value in trained.scores.items():
+        rows.append(
+            (
+                split,
+                f"{value.psnr:.2f}",
+                f"{value.psnr_object:.2f}",
+                f"{value.ssim:.4f}",
+                f"{value.mask_iou:.4f}",
+            )
+        )
+    head = ("views", "PSNR [dB]", "on the object [dB]", "SSIM", "mask IoU")
+    extent = np.ptp(np.asarray(made.surface.points), axis=0) * 1e3
+    text = (
+        f"{trained.seconds:.0f} s, {trained.stopped}. Size {' × '.join(f'{x:.1f}' for x in extent)} mm."
+        f" Silhouettes unexplained by the hull: {100 * trained.survey.residual:.1f} %."
+        f" Surface seen by fewer than two views: {100 * trained.unseen:.1f} %."
+    )
+    return _table(head, rows) + f"<p>{text}</p>"
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    cells = "".join(f"<th>{html.escape(x)}</th>" for x in head)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(x)}</td>" for x in row) + "</tr>" for row in rows)
+    return f"<table><tr>{cells}</tr>{body}</table>"
+
+
+def _views(trained: Trained, views: Sequence[View]) -> str:
+    figures = []
+    for view in views:
+        wanted = view.over(view.backdrop)
+        got = trained.field.picture(view.camera, view.light).over(view.backdrop)
+        strip = np.concatenate([wanted, got, 1 - np.clip(3 * np.abs(got - wanted), 0, 1)], axis=1)
+        caption = f"{view.name}: {psnr(got, wanted):.1f} dB, SSIM {ssim(got, wanted):.3f}"
+        figures.append(
+            f"<figure>{_image(strip, 3 * _SIDE)}<figcaption>{html.escape(caption)}</figcaption></figure>"
+        )
+    return f'<div class="views">{"".join(figures)}</div>'
+
+
+def _image(picture: np.ndarray, width: int) -> str:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)).save(buffer, "PNG")
+    data = base64.b64encode(buffer.getvalue()).decode()
+    return f'<img alt="" width="{width}" src="data:image/png;base64,{data}">'
+
+
+def _curves(history: Sequence[Progress]) -> str:
+    """PSNR, mask IoU and volume over the steps, as one table and a line of PSNR."""
+    rows = [
+        (
+            str(p.iteration),
+            f"{p.seconds:.0f}",
+            f"{p.rays_per_second:,.0f}",
+            f"{p.psnr:.2f}" if p.psnr is not None else "",
+            f"{p.mask_iou:.4f}" if p.mask_iou is not None else "",
+            f"{1e6 * p.volume:.2f}",
+        )
+        for p in history
+    ]
+    return _table(("step", "seconds", "rays/s", "PSNR [dB]", "mask IoU", "volume [cm³]"), rows)
+
+
+def _slices(trained: Trained, com: np.ndarray) -> str:
+    box, hull = trained.survey.box, trained.survey.hull
+    nodes = jnp.asarray(box.nodes.T)
+    occupancy = np.asarray(trained.field.jet(nodes, 0)).reshape(box.shape)
+    centre = np.clip(np.rint((com - box.origin) / box.spacing).astype(int), 0, np.array(box.shape) - 1)
+    figures: list[Any] = []
+    for axis, name in enumerate("xyz"):
+        values = np.take(occupancy, centre[axis], axis).T[::-1]
+        outline = np.take(hull, centre[axis], axis).T[::-1] < 0
+        edge = outline & ~(
+            np.roll(outline, 1, 0)
+            & np.roll(outline, -1, 0)
+            & np.roll(outline, 1, 1)
+            & np.roll(outline, -1, 1)
+        )
+        picture = np.repeat(1 - 0.8 * values[..., None], 3, axis=2)
+        picture[edge] = (0.24, 0.49, 0.85)
+        picture = picture.repeat(3, axis=0).repeat(3, axis=1)
+        caption = f"{name} = {1e3 * com[axis]:.1f} mm"
+        figures.append(f"<figure>{_image(picture, 300)}<figcaption>{caption}</figcaption></figure>")
+    return f'<div class="views">{"".join(figures)}</div>'
+
+
+def _masses(estimates: MassEstimates, size: float) -> str:
+    difference = estimates.differences(size)
+    rows = []
+    for label, name, value in (
+        ("neural object: level set, filled", "", estimates.fill),
+        ("φ as mass density", "occupancy", estimates.occupancy),
+        ("visual hull", "hull", estimates.hull),
+    ):
+        moments = np.linalg.eigvalsh(np.asarray(value.inertia))
+        off = difference.get(name)
+        rows.append(
+            (
+                label,
+                f"{float(value.mass):.4g}",
+                " ".join(f"{1e3 * x:.2f}" for x in np.asarray(value.com)),
+                " ".join(f"{x:.4g}" for x in moments),
+                "" if off is None else f"{100 * off['com']:.2f} %",
+                "" if off is None else f"{100 * off['inertia']:.2f} %",
+            )
+        )
+    head = ("", "mass [kg]", "centre of mass [mm]", "principal inertias [kg m²]", "COM off", "inertia off")
+    return _table(head, rows)

@@ -1,0 +1,154 @@
+"""Masks for photographs that have none: from a plain background, or by a segmentation network."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from dano.vision._capture import Capture, View
+
+_BORDER = 0.03
+"""Share of the image on each side that is taken for background."""
+
+_PLAIN = 0.06
+"""Most that the middle 80 % of a plain background may deviate from its median, in sRGB."""
+
+
+def with_masks(capture: Capture, network: str | Path | None = None) -> Capture:
+    """The capture with a mask for every view: given ones stay, the others are made.
+
+    Args:
+        capture: Photographs.
+        network: Segmentation network as an ONNX file, such as ISNet or U²-Net: image (1, 3, h, w) in, mask in
+            [0, 1] out. None: what differs from the background, whose colour the image's border shows.
+
+    Raises:
+        ValueError: If the background is not plain and there is no network, or the masks come out empty.
+        ImportError: If there is a network but no onnxruntime.
+    """
+    if all(view.mask is not None for view in capture.views):
+        return capture
+    segment = background_mask if network is None else _Network(Path(network))
+    views = []
+    for view in capture.views:
+        if view.mask is None:
+            view = cut_out(view.replaced(mask=segment(view).astype(np.float32)))
+        views.append(view)
+    return Capture(views, capture.source)
+
+
+def background_mask(view: View) -> Float[np.ndarray, "height width"]:
+    """What differs from a plain background: largest connected part, holes filled, edges soft over two pixels.
+
+    Raises:
+        ValueError: If the border of the image is of many colours.
+    """
+    image = view.image
+    rim = max(2, round(_BORDER * min(image.shape[:2])))
+    border = np.ones(image.shape[:2], dtype=bool)
+    border[rim:-rim, rim:-rim] = False
+    colour = np.median(image[border], axis=0)
+    away = np.abs(image - colour).max(axis=2)
+    spread = float(np.quantile(away[border], 0.8))
+    if spread > _PLAIN:
+        raise ValueError(
+            f"{view.name}: the background is not plain (its colours differ by {spread:.2f} from their median,"
+            f" at most {_PLAIN} can be told from an object): give masks, or a segmentation network"
+        )
+    threshold = max(4 * spread, 0.03)
+    smooth = ndimage.gaussian_filter(away, 0.7)
+    solid = smooth > threshold
+    labels, count = ndimage.label(solid)
+    if count == 0:
+        raise ValueError(f"{view.name}: nothing differs from the background, the mask would be empty")
+    sizes = ndimage.sum_labels(solid, labels, np.arange(1, count + 1))
+    solid = ndimage.binary_fill_holes(labels == 1 + int(np.argmax(sizes)))
+    assert solid is not None
+    return _coverage(image, colour, solid)
+
+
+def _coverage(image: np.ndarray, background: np.ndarray, solid: np.ndarray) -> np.ndarray:
+    """How much of each pixel a solid covers: where its colour is between background and nearest core.
+
+    A threshold low enough to find a dark object lies far out in the blur of its edge: taken as the outline it
+    would make the object almost a pixel too large all around.
+    """
+    core = ndimage.binary_erosion(solid, iterations=2)
+    if not core.any():
+        return solid.astype(np.float32)
+    nearest = ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True)
+    inner = image[tuple(np.asarray(nearest))] - background
+    square = np.maximum(np.sum(inner**2, axis=2), 1e-4)
+    share = np.clip(np.sum((image - background) * inner, axis=2) / square, 0, 1)
+    rim = ndimage.binary_dilation(solid) & ~core
+    return np.where(core, 1, np.where(rim, share, 0)).astype(np.float32)
+
+
+class _Network:
+    """A segmentation network, asked image by image."""
+
+    def __init__(self, path: Path):
+        if not path.is_file():
+            raise ValueError(f"network must be an ONNX file, got {path}, which does not exist")
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise ImportError("segmentation needs onnxruntime: pip install 'dano[segment]'") from error
+        try:
+            self._session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime has exceptions of its own, not derived from a common one
+            raise ValueError(f"{path}: cannot be read as an ONNX network ({error})") from error
+        self._input = self._session.get_inputs()[0]
+        shape = self._input.shape
+        if len(shape) != 4:
+            raise ValueError(f"{path}: the network must take (1, 3, height, width), got {shape}")
+        self._size = [n if isinstance(n, int) and n > 0 else 1024 for n in shape[2:]]
+
+    def __call__(self, view: View) -> Float[np.ndarray, "height width"]:
+        height, width = view.image.shape[:2]
+        scale = (self._size[0] / height, self._size[1] / width, 1)
+        pixels = ndimage.zoom(view.image, scale, order=1, mode="nearest", grid_mode=True)
+        batch = (pixels - 0.5).transpose(2, 0, 1)[None].astype(np.float32)
+        answer = np.squeeze(np.asarray(self._session.run(None, {self._input.name: batch})[0]))
+        if answer.ndim != 2:
+            raise ValueError(f"the network must return one mask, got shape {answer.shape} for {view.name}")
+        if answer.min() < 0 or answer.max() > 1:
+            answer = 1 / (1 + np.exp(-answer))
+        back = (height / answer.shape[0], width / answer.shape[1])
+        return np.clip(ndimage.zoom(answer, back, order=1, mode="nearest", grid_mode=True), 0, 1)
+
+
+def cut_out(view: View) -> View:
+    """The object alone, over black, if the background is plain: C − (1 − M) B, without B's share of the edge.
+
+    Without this a dark background would leave a dark rim on every rendering, a bright one a bright rim. A
+    view whose background is not plain stays as it is.
+    """
+    if view.mask is None or view.cut_out:
+        return view
+    outside = ndimage.binary_erosion(view.mask < 0.02, iterations=2)
+    if outside.sum() < 50:
+        return view
+    colours = view.image[outside]
+    background = np.median(colours, axis=0)
+    if float(np.quantile(np.abs(colours - background).max(axis=1), 0.8)) > _PLAIN:
+        return view
+    alone = np.clip(view.image - (1 - view.mask[..., None]) * background, 0, view.mask[..., None])
+    return view.replaced(
+        image=alone.astype(np.float32), cut_out=True, background=background.astype(np.float64)
+    )
+
+
+def check_masks(views: Sequence[View]) -> None:
+    """Check that masks show something, and not everything.
+
+    Raises:
+        ValueError: If masks are empty or full; the message names the views.
+    """
+    empty = [view.name for view in views if view.mask is not None and not np.any(view.mask > 0.5)]
+    full = [view.name for view in views if view.mask is not None and np.all(view.mask > 0.5)]
+    for what, names in (("show nothing of the object", empty), ("cover the whole image", full)):
+        if names:
+            raise ValueError(f"masks must show the object, but {len(names)} {what}: {', '.join(names[:4])}")

@@ -1,0 +1,310 @@
+"""Radiance models: what a photograph is explained by. A surface, a density on a grid.
+
+A model answers two questions about points along rays: how opaque is it there, and what colour does it
+send. The renderer `see` needs no more, and training no more than that this is differentiable.
+"""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from dano.vision._appearance import Appearance, Share
+from dano.vision._hull import Box
+from dano.vision._trilinear import value_and_slope_at, value_at
+from dano.vision._volume import (
+    composite,
+    density_alpha,
+    importance_edges,
+    section_weights,
+    stratified_edges,
+    surface_alpha,
+    surface_interest,
+)
+
+
+class Rays(NamedTuple):
+    """Rays through the object, one a row, in float32.
+
+    Attributes:
+        origin: [m], shape (rays, 3).
+        direction: Unit vectors, shape (rays, 3).
+        near: Where the object may begin [m], shape (rays,).
+        far: Where it must have ended [m], shape (rays,).
+        light: Unit vectors towards the light, shape (rays, 3), or its position [m] if that is what is known.
+    """
+
+    origin: Float[Array, "rays 3"]
+    direction: Float[Array, "rays 3"]
+    near: Float[Array, " rays"]
+    far: Float[Array, " rays"]
+    light: Float[Array, "rays 3"]
+
+    def at(self, t: Float[Array, "rays k"]) -> Float[Array, "n 3"]:
+        """Points [m] at distances along the rays, those of a ray one after the other."""
+        return (self.origin[:, None] + t[..., None] * self.direction[:, None]).reshape(-1, 3)
+
+
+class Seen(NamedTuple):
+    """What rays see.
+
+    Attributes:
+        colour: Light of the object, without what is behind it, shape (rays, 3).
+        opacity: Share of the pixel that the object covers, shape (rays,).
+        depth: Mean distance of what is seen [m], shape (rays,); 0 where nothing is.
+        normal: Mean outward normal, shape (rays, 3), not of unit length.
+    """
+
+    colour: Float[Array, "rays 3"]
+    opacity: Float[Array, " rays"]
+    depth: Float[Array, " rays"]
+    normal: Float[Array, "rays 3"]
+
+
+class Sampling(NamedTuple):
+    """How finely rays are sampled (static).
+
+    Attributes:
+        coarse: Sections that look for the object, without derivatives.
+        fine: Sections around it, which give the opacity.
+        colours: Of these, those seen most, whose colour is computed.
+    """
+
+    coarse: int = 48
+    fine: int = 16
+    colours: int = 5
+
+
+DRAWING = Sampling(96, 32, 8)
+"""For pictures to look at and to measure errors by."""
+
+
+class AbstractModel(eqx.Module):
+    """Opacity and colour of an object."""
+
+    @abc.abstractmethod
+    def alpha(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays sections"]:
+        """Opacity of the sections between distances along rays."""
+
+    @abc.abstractmethod
+    def colour(
+        self,
+        points: Float[Array, "n 3"],
+        view: Float[Array, "n 3"],
+        light: Float[Array, "n 3"],
+        view_share: Share = 1.0,
+    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        """SRGB sent from points against directions of view, and unit outward normals there."""
+
+    def interest(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays sections"]:
+        """How much of what is seen is decided in sections: where to sample finely."""
+        return section_weights(self.alpha(rays, edges, sharpness))
+
+
+def see(
+    model: AbstractModel,
+    rays: Rays,
+    sharpness: Share = 1.0,
+    *,
+    sampling: Sampling = DRAWING,
+    view_share: Share = 1.0,
+    key: PRNGKeyArray | None = None,
+) -> Seen:
+    """Render rays: coarse sections find the object, fine ones give its opacity, a few of these its colour.
+
+    Args:
+        model: What is seen.
+        rays: From where, whither.
+        sharpness: Of a surface: s [1/m], the inverse of the distance over which its opacity rises.
+        sampling: How finely.
+        view_share: See `Appearance`.
+        key: Random key for jitter of the sections; None for none.
+    """
+    keys = (None, None) if key is None else jax.random.split(key)
+    edges = stratified_edges(rays.near, rays.far, sampling.coarse, keys[0])
+    # Weights for sampling are not differentiated: `importance_edges` stops their gradient.
+    edges = importance_edges(edges, model.interest(rays, edges, sharpness), sampling.fine, keys[1])
+    weights = section_weights(model.alpha(rays, edges, sharpness))
+    middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+    _, chosen = jax.lax.top_k(jax.lax.stop_gradient(weights), sampling.colours)
+    some = jnp.take_along_axis(weights, chosen, axis=1)
+    at = rays.at(jnp.take_along_axis(middle, chosen, axis=1))
+    view, light = (jnp.repeat(x, sampling.colours, axis=0) for x in (rays.direction, rays.light))
+    colour, normal = model.colour(at, view, light, view_share)
+    opacity = jnp.sum(weights, axis=1)
+    # What is not looked at is taken to look as the rest of the ray does.
+    share = (opacity / jnp.maximum(jnp.sum(some, axis=1), 1e-6))[:, None]
+    shape = (len(rays.near), sampling.colours, 3)
+    return Seen(
+        colour=composite(some, colour.reshape(shape)) * share,
+        opacity=opacity,
+        depth=jnp.sum(weights * middle, axis=1) / jnp.maximum(opacity, 1e-6),
+        normal=composite(some, normal.reshape(shape)) * share,
+    )
+
+
+class SurfaceModel(AbstractModel):
+    """A solid with a soft surface: a signed distance on a grid (opacity as in NeuS, Wang et al. 2021).
+
+    Attributes:
+        distance: Signed distance at the nodes in units of `scale`, negative inside, shape (nx, ny, nz).
+        appearance: What its surface looks like.
+        origin: Position [m] of node (0, 0, 0).
+        spacing: Distance between nodes [m].
+        scale: Half the longest side of the box [m], so that numbers to learn are of order one.
+    """
+
+    distance: Float[Array, "nx ny nz"]
+    appearance: Appearance
+    origin: Float[Array, "3"]
+    spacing: Float[Array, ""]
+    scale: Float[Array, ""]
+
+    @classmethod
+    def create(
+        cls, distance: Float[np.ndarray, "nx ny nz"], box: Box, appearance: Appearance
+    ) -> "SurfaceModel":
+        """A model that starts from signed distances [m] at the nodes of a box."""
+        scale = 0.5 * box.spacing * (max(box.shape) - 1)
+        return cls(
+            jnp.asarray(distance / scale, jnp.float32),
+            appearance,
+            *(jnp.asarray(x, jnp.float32) for x in (box.origin, box.spacing, scale)),
+        )
+
+    @property
+    def box(self) -> Box:
+        """The grid of the distances."""
+        nx, ny, nz = self.distance.shape
+        return Box(np.asarray(self.origin, np.float64), float(self.spacing), (nx, ny, nz))
+
+    @property
+    def distances(self) -> Float[np.ndarray, "nx ny nz"]:
+        """Signed distances at the nodes [m]."""
+        return np.asarray(self.distance, np.float64) * float(self.scale)
+
+    def distance_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Signed distances [m] at points [m]."""
+        return value_at(self.distance, self._index(points)) * self.scale
+
+    def _index(self, points: Float[Array, "n 3"]) -> Float[Array, "3 n"]:
+        return ((points - self.origin[None]) / self.spacing).T
+
+    def alpha(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays sections"]:
+        """See `surface_alpha`."""
+        return surface_alpha(self.distance_at(rays.at(edges)).reshape(edges.shape), jnp.asarray(sharpness))
+
+    def interest(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays sections"]:
+        """See `surface_interest`; as blurred as sections are long, or the surface hides between two edges."""
+        blurred = jnp.minimum(sharpness, 2 * (edges.shape[1] - 1) / (rays.far - rays.near))[:, None]
+        return surface_interest(self.distance_at(rays.at(edges)).reshape(edges.shape), blurred)
+
+    def colour(
+        self,
+        points: Float[Array, "n 3"],
+        view: Float[Array, "n 3"],
+        light: Float[Array, "n 3"],
+        view_share: Share = 1.0,
+    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        """See `AbstractModel.colour`; normals are the gradient of the distance."""
+        _, slope = value_and_slope_at(self.distance, self._index(points))
+        normal = slope.T * jax.lax.rsqrt(jnp.sum(slope * slope, axis=0) + 1e-12)[:, None]
+        return self.appearance(points, normal, view, light, view_share), normal
+
+
+class DensityModel(AbstractModel):
+    """A medium: extinction on a grid, as in a plain neural radiance field.
+
+    Attributes:
+        raw: Numbers whose softplus is the density in units of 1/`spacing`, shape (nx, ny, nz).
+        appearance: What it looks like.
+        origin: Position [m] of node (0, 0, 0).
+        spacing: Distance between nodes [m].
+    """
+
+    raw: Float[Array, "nx ny nz"]
+    appearance: Appearance
+    origin: Float[Array, "3"]
+    spacing: Float[Array, ""]
+
+    @classmethod
+    def create(cls, inside: np.ndarray, box: Box, appearance: Appearance, thickness: float) -> "DensityModel":
+        """A thin fog where nodes are `inside`, nothing elsewhere; `thickness` is its extinction per cell."""
+        raw = np.where(inside, np.log(np.expm1(thickness)), -12.0)
+        return cls(
+            jnp.asarray(raw, jnp.float32),
+            appearance,
+            *(jnp.asarray(x, jnp.float32) for x in (box.origin, box.spacing)),
+        )
+
+    @property
+    def box(self) -> Box:
+        """The grid of the densities."""
+        nx, ny, nz = self.raw.shape
+        return Box(np.asarray(self.origin, np.float64), float(self.spacing), (nx, ny, nz))
+
+    def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Extinction [1/m] at points [m]."""
+        u = ((points - self.origin[None]) / self.spacing).T
+        return jax.nn.softplus(value_at(self.raw, u)) / self.spacing
+
+    def alpha(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays sections"]:
+        """See `density_alpha`, with the density in the middle of each section."""
+        middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+        return density_alpha(self.density_at(rays.at(middle)).reshape(middle.shape), edges)
+
+    def colour(
+        self,
+        points: Float[Array, "n 3"],
+        view: Float[Array, "n 3"],
+        light: Float[Array, "n 3"],
+        view_share: Share = 1.0,
+    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        """See `AbstractModel.colour`; a medium's normals are against the gradient of its density."""
+        u = ((points - self.origin[None]) / self.spacing).T
+        # Not learned through: fog has normals in all directions, and explaining shading by them makes noise.
+        _, slope = value_and_slope_at(jax.lax.stop_gradient(self.raw), u)
+        normal = -slope.T * jax.lax.rsqrt(jnp.sum(slope * slope, axis=0) + 1e-6)[:, None]
+        return self.appearance(points, normal, view, light, view_share), normal
+
+
+def roughness(
+    distance: Float[Array, "nx ny nz"], spacing: Float[Array, ""], band: float
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """How far values near the zero level are from a smooth signed distance.
+
+    Args:
+        distance: Values at nodes.
+        spacing: Between nodes, in the same unit.
+        band: Cells around the zero level that count.
+
+    Returns:
+        Mean of (|∇d| − 1)² and mean of (spacing · ∇²d)², over the nodes of the band.
+    """
+    d = distance / spacing
+    inner = d[1:-1, 1:-1, 1:-1]
+    neighbours = [
+        (d[2:, 1:-1, 1:-1], d[:-2, 1:-1, 1:-1]),
+        (d[1:-1, 2:, 1:-1], d[1:-1, :-2, 1:-1]),
+        (d[1:-1, 1:-1, 2:], d[1:-1, 1:-1, :-2]),
+    ]
+    near = jax.lax.stop_gradient((jnp.abs(inner) < band).astype(d.dtype))
+    count = jnp.sum(near) + 1
+    square = sum((0.25 * (a - b) ** 2 for a, b in neighbours), jnp.float32(0))
+    laplacian = sum((a + b for a, b in neighbours), -6 * inner)
+    length = jnp.sqrt(square + 1e-8)
+    return jnp.sum(near * (length - 1) ** 2) / count, jnp.sum(near * laplacian**2) / count

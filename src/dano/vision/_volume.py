@@ -1,0 +1,131 @@
+"""Volume rendering as arithmetic on arrays: where to sample rays, and what the samples add up to.
+
+Throughout, `edges` are distances along rays that divide them into sections; `alpha` is the opacity of a
+section by itself, and `weights` the share of a pixel that is seen of it. Nothing here knows what is rendered.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+
+def stratified_edges(
+    near: Float[Array, " rays"], far: Float[Array, " rays"], n_sections: int, key: PRNGKeyArray | None
+) -> Float[Array, "rays edges"]:
+    """Edges of equal sections of each interval, all shifted by one random share of a section per ray.
+
+    Args:
+        near: Starts of the intervals [m].
+        far: Their ends [m].
+        n_sections: Sections per ray.
+        key: Random key; None shifts by nothing.
+
+    Returns:
+        Ascending distances (rays, n_sections + 1), the first and the last at the ends of the interval.
+    """
+    share = jnp.arange(n_sections + 1, dtype=near.dtype)[None] / n_sections
+    if key is not None:
+        inner = (share > 0) & (share < 1)
+        shift = (jax.random.uniform(key, (len(near), 1), near.dtype) - 0.5) / n_sections
+        share = share + jnp.where(inner, shift, 0)
+    return near[:, None] + share * (far - near)[:, None]
+
+
+def importance_edges(
+    edges: Float[Array, "rays edges"],
+    weights: Float[Array, "rays sections"],
+    n_sections: int,
+    key: PRNGKeyArray | None,
+    *,
+    floor: float = 0.02,
+) -> Float[Array, "rays fine"]:
+    """Edges that divide the weight of each ray into equal parts (inverse transform sampling).
+
+    Args:
+        edges: Ascending edges of coarse sections [m].
+        weights: What each coarse section is worth, ≥ 0.
+        n_sections: Number of sections wanted.
+        key: Random key that shifts each ray's edges together; None for none.
+        floor: Share of the weight that is spread evenly, so that no part of a ray is never looked at.
+
+    Returns:
+        Ascending distances (rays, n_sections + 1).
+    """
+    n_coarse = weights.shape[1]
+    weights = jax.lax.stop_gradient(weights)
+    total = jnp.sum(weights, axis=1, keepdims=True)
+    mass = (1 - floor) * weights / jnp.maximum(total, 1e-12) + floor / n_coarse
+    # A ray without any weight is sampled evenly.
+    mass = jnp.where(total > 1e-12, mass, 1 / n_coarse)
+    cumulative = jnp.cumsum(mass, axis=1)
+    cumulative = jnp.concatenate([jnp.zeros_like(total), cumulative / cumulative[:, -1:]], axis=1)
+    share = (jnp.arange(n_sections + 1, dtype=edges.dtype)[None]) / n_sections
+    if key is not None:
+        inner = (share > 0) & (share < 1)
+        shift = (jax.random.uniform(key, (len(edges), 1), edges.dtype) - 0.5) / n_sections
+        share = share + jnp.where(inner, shift, 0)
+    share = jnp.broadcast_to(share, (len(edges), n_sections + 1))
+    # Comparing all with all is faster than a search: a few dozen of each.
+    below = jnp.sum(cumulative[:, None, 1:-1] <= share[:, :, None], axis=2)
+    low, high = (jnp.take_along_axis(cumulative, below + step, axis=1) for step in (0, 1))
+    start, end = (jnp.take_along_axis(edges, below + step, axis=1) for step in (0, 1))
+    return start + jnp.clip((share - low) / jnp.maximum(high - low, 1e-9), 0, 1) * (end - start)
+
+
+def section_weights(alpha: Float[Array, "rays sections"]) -> Float[Array, "rays sections"]:
+    """Share of a pixel seen of each section, front to back: wᵢ = αᵢ Π_{j<i} (1 − αⱼ)."""
+    clear = jnp.cumprod(1 - alpha, axis=1)
+    before = jnp.concatenate([jnp.ones_like(clear[:, :1]), clear[:, :-1]], axis=1)
+    return alpha * before
+
+
+def density_alpha(
+    density: Float[Array, "rays sections"], edges: Float[Array, "rays edges"]
+) -> Float[Array, "rays sections"]:
+    """Opacity 1 − exp(−σ Δt) of sections of a medium with extinction σ [1/m]."""
+    return -jnp.expm1(-density * jnp.diff(edges, axis=1))
+
+
+def surface_alpha(
+    distance: Float[Array, "rays edges"], sharpness: Float[Array, "*#rays 1"] | Float[Array, ""]
+) -> Float[Array, "rays sections"]:
+    """Opacity of sections of a soft surface (NeuS, Wang et al. 2021, eq. 13).
+
+    αᵢ = max(Φ(dᵢ) − Φ(dᵢ₊₁), 0)/Φ(dᵢ) with Φ(d) = 1/(1 + exp(−s d)). Unlike the opacity of a density it is
+    not biased, the weight along a ray being largest where d = 0, and it is exact for sections of any length.
+
+    Args:
+        distance: Signed distances at the edges [m].
+        sharpness: s [1/m].
+    """
+    # log Φ is smooth and does not overflow where Φ itself would be 0 deep inside.
+    logs = -jax.nn.softplus(-sharpness * distance)
+    return -jnp.expm1(jnp.minimum(jnp.diff(logs, axis=1), 0))
+
+
+def surface_interest(
+    distance: Float[Array, "rays edges"], sharpness: Float[Array, "*#rays 1"] | Float[Array, ""]
+) -> Float[Array, "rays sections"]:
+    """Where along rays the opacity of a soft surface is decided, as weights for `importance_edges`.
+
+    Those of `surface_alpha` end where a ray is closest to the surface: sampling by them would never meet that
+    point, and rays that only graze the object would come out too clear. So what lies behind it counts as much
+    as what lies before.
+    """
+    logs = -jax.nn.softplus(-sharpness * distance)
+    change = jnp.diff(logs, axis=1)
+    before = jnp.cumsum(jnp.minimum(change, 0), axis=1)
+    before = jnp.concatenate([jnp.zeros_like(before[:, :1]), before[:, :-1]], axis=1)
+    return -jnp.exp(before) * jnp.expm1(-jnp.abs(change))
+
+
+def composite(
+    weights: Float[Array, "rays sections"], values: Float[Array, "rays sections k"]
+) -> Float[Array, "rays k"]:
+    """Σ wᵢ vᵢ: the expected value of what is seen of each ray; the rest, 1 − Σ wᵢ, is background."""
+    return jnp.einsum("rs,rsk->rk", weights, values)
+
+
+def transmittance(alpha: Float[Array, "rays sections"]) -> Float[Array, " rays"]:
+    """Share of light that gets through all sections, Π (1 − αᵢ)."""
+    return jnp.prod(1 - alpha, axis=1)

@@ -1,0 +1,173 @@
+"""From photographs of an ellipsoid in closed form to its field."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from vision.photographs import capture, CENTRE, SEMI_AXES
+
+from dano import NeuralObject
+from dano.vision import Box, Capture, hull_distance, LearnedField, survey, train, Trained, TrainOptions, View
+from dano.vision._hull import object_box, redistanced, silhouettes
+
+VOLUME = 4 / 3 * np.pi * float(np.prod(SEMI_AXES))
+QUICK = TrainOptions(resolution=32, iterations=150, batch=512, features=4, check_every=50)
+
+
+@pytest.fixture(scope="module")
+def photos() -> Capture:
+    return capture()
+
+
+@pytest.fixture(scope="module")
+def trained(photos: Capture) -> Trained:
+    return train(photos, QUICK)
+
+
+def test_the_hull_is_the_solid_to_a_tenth_of_a_pixel(photos: Capture):
+    views = photos.split("train")
+    lower, upper = object_box(views)
+    assert np.all(lower < CENTRE - SEMI_AXES) and np.all(upper > CENTRE + SEMI_AXES)
+    assert np.all(upper - lower < 2.6 * SEMI_AXES)
+    box = Box.around(lower - 0.004, upper + 0.004, 40)
+    hull = hull_distance(views, box)
+    share = np.clip(0.5 - hull / box.spacing, 0, 1)
+    # A pixel is 4.3 mm wide there; a tenth of it all around is 3 % of the volume.
+    assert 0.97 < share.sum() * box.spacing**3 / VOLUME < 1.03
+    # Nothing that belongs to the solid is cut away.
+    ball = np.random.default_rng(0).normal(size=(500, 3))
+    on_surface = CENTRE + SEMI_AXES * ball / np.linalg.norm(ball, axis=1, keepdims=True)
+    seen, cover = silhouettes(CENTRE + 0.95 * (on_surface - CENTRE), views)
+    assert np.all(seen == len(views)) and np.all(cover > 0.5)
+
+
+def test_redistancing_restores_a_signed_distance():
+    box = Box(np.full(3, -1.2), 0.1, (25, 25, 25))
+    radius = np.linalg.norm(box.nodes, axis=1).reshape(box.shape)
+    distance = redistanced(radius**3 - 0.8**3, box)
+    near = np.abs(radius - 0.8) < 0.2
+    np.testing.assert_allclose(distance[near], radius[near] - 0.8, atol=0.015)
+    # Further away by the nearest point of the nearest node that is near.
+    np.testing.assert_allclose(distance, radius - 0.8, atol=0.05)
+
+
+def test_training_recovers_the_solid_and_its_look(trained: Trained):
+    assert trained.scores["test"].psnr > 30
+    assert trained.scores["test"].mask_iou > 0.97
+    assert trained.unseen < 0.02 and trained.warnings == ()
+    made = NeuralObject.from_field(trained.field, mass_model="solid", mass=0.2, resolution=40, n_samples=500)
+    np.testing.assert_allclose(made.mass.com, CENTRE, atol=0.0005)
+    squares = SEMI_AXES**2
+    inertia = 0.2 / 5 * (squares.sum() - squares)
+    np.testing.assert_allclose(np.diag(made.mass.inertia), inertia, rtol=0.05)
+    share = np.asarray(trained.field.jet(jnp.asarray(trained.survey.box.nodes.T), 0))
+    np.testing.assert_allclose(share.sum() * trained.survey.box.spacing**3, VOLUME, rtol=0.05)
+
+
+def test_the_field_is_a_probability_with_right_derivatives(trained: Trained):
+    field = trained.field
+    x = jnp.asarray(CENTRE + SEMI_AXES * np.array([[1.0, 0, 0], [0, 0.98, 0], [0, 0, 1.03]])).T
+    value, gradient = field.jet(x, 1)
+    assert np.all((value > 0) & (value < 1))
+    np.testing.assert_allclose(value, [field.density(p) for p in x.T], rtol=1e-10)
+    np.testing.assert_allclose(field.jet(x, 0), value, rtol=1e-12)
+    expected = jax.vmap(jax.grad(field.density), in_axes=1, out_axes=1)(x)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-6, atol=1e-6)
+    assert float(field.density(jnp.asarray(CENTRE))) > 0.999
+    assert float(field.density(jnp.asarray(CENTRE + 0.2))) == 0
+
+
+def test_a_saved_field_draws_the_same_picture(trained: Trained, photos: Capture, tmp_path: Path):
+    trained.field.save(tmp_path / "egg.npz")
+    again = LearnedField.load(tmp_path / "egg.npz")
+    view = photos.split("test")[0]
+    a, b = (f.picture(view.camera, view.light) for f in (trained.field, again))
+    np.testing.assert_allclose(a.opacity, b.opacity, atol=1e-6)
+    np.testing.assert_allclose(a.colour, b.colour, atol=2e-3)
+    before = np.linalg.norm(view.camera.position - CENTRE) - a.depth[16, 16]
+    assert SEMI_AXES.min() - 0.001 < before < SEMI_AXES.max()
+    with pytest.raises(ValueError, match="light must be given"):
+        again.picture(view.camera)
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "egg.npz").read_bytes()[:1000])
+    with pytest.raises(ValueError, match="cut.npz"):
+        LearnedField.load(tmp_path / "cut.npz")
+
+
+def test_an_interrupted_training_resumes_where_it_was(trained: Trained, photos: Capture, tmp_path: Path):
+    file = tmp_path / "state.npz"
+
+    def interrupt(progress):
+        if progress.iteration >= 100:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(photos, QUICK, checkpoint=file, progress=interrupt)
+    again = train(photos, QUICK, checkpoint=file, resume=True)
+    # Same seed, same random numbers at each step: the same field as without the interruption.
+    np.testing.assert_array_equal(again.field.model.distance, trained.field.model.distance)
+    assert again.scores == trained.scores
+    other = TrainOptions(**{**vars(QUICK), "batch": 256})
+    with pytest.raises(ValueError, match="other photographs or options"):
+        train(photos, other, checkpoint=file, resume=True)
+
+
+def test_numbers_that_are_not_finite_stop_training_at_the_last_good_state(photos: Capture):
+    broken = TrainOptions(**{**vars(QUICK), "rate_network": 1e30, "iterations": 40, "check_every": 1})
+    result = train(photos, broken)
+    assert result.stopped == "diverged"
+    assert any("not finite" in text for text in result.warnings)
+    assert np.all(np.isfinite(result.field.model.distance))
+
+
+def test_a_full_disk_does_not_end_training(photos: Capture, tmp_path: Path, monkeypatch):
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("dano.vision._train.write_archive", full)
+    with pytest.warns(UserWarning, match="could not be written"):
+        train(
+            photos,
+            TrainOptions(**{**vars(QUICK), "iterations": 2, "check_every": 1}),
+            checkpoint=tmp_path / "s.npz",
+        )
+
+
+def test_what_photographs_cannot_tell_is_said():
+    good = survey(capture(12, 0), 32)
+    assert good.residual < 0.03 and good.warnings == ()
+    wrong = survey(capture(12, 0, focal=1.3), 32)
+    assert wrong.residual > 0.04 and "focal length" in wrong.warnings[0]
+    one_sided = survey(capture(12, 0, lowest=0.6), 32)
+    assert one_sided.gap > np.pi / 2 and "from one side" in one_sided.warnings[0]
+    few = survey(capture(4, 0), 32)
+    assert any("only 4 views" in text for text in few.warnings)
+
+
+def test_bad_masks_are_refused(photos: Capture):
+    def with_mask(mask) -> Capture:
+        fields = {name: getattr(photos.views[0], name) for name in View.__dataclass_fields__}
+        return Capture([View(**{**fields, "mask": mask}), *photos.views[1:]])
+
+    with pytest.raises(ValueError, match="1 show nothing of the object: train_0"):
+        survey(with_mask(np.zeros((32, 32), np.float32)), 32)
+    with pytest.raises(ValueError, match="cover the whole image"):
+        survey(with_mask(np.ones((32, 32), np.float32)), 32)
+    with pytest.raises(ValueError, match="every view must have a mask"):
+        survey(with_mask(None), 32)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"resolution": 4}, "resolution must lie"),
+        ({"iterations": 0}, "iterations must lie"),
+        ({"rate_distance": 0.0}, "rate_distance must be positive"),
+        ({"mask_weight": -1.0}, "mask_weight must be"),
+        ({"seconds": 0.0}, "seconds must be positive"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        TrainOptions(**options)

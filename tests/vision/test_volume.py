@@ -1,0 +1,70 @@
+"""Volume rendering against closed forms and against loops that are obviously right."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dano.vision._volume import (
+    composite,
+    density_alpha,
+    importance_edges,
+    section_weights,
+    stratified_edges,
+    surface_alpha,
+    surface_interest,
+    transmittance,
+)
+
+
+def test_weights_are_those_of_the_loop():
+    alpha = np.random.default_rng(0).uniform(0, 1, (3, 7))
+    expected = np.zeros_like(alpha)
+    for ray in range(3):
+        clear = 1.0
+        for i in range(7):
+            expected[ray, i] = clear * alpha[ray, i]
+            clear *= 1 - alpha[ray, i]
+        np.testing.assert_allclose(transmittance(jnp.asarray(alpha))[ray], clear)
+    weights = section_weights(jnp.asarray(alpha))
+    np.testing.assert_allclose(weights, expected, atol=1e-12)
+    values = np.random.default_rng(1).normal(size=(3, 7, 2))
+    summed = composite(weights, jnp.asarray(values))
+    np.testing.assert_allclose(summed, (expected[..., None] * values).sum(1), atol=1e-12)
+
+
+def test_a_homogeneous_medium_absorbs_exponentially():
+    edges = stratified_edges(jnp.array([1.0]), jnp.array([3.0]), 16, jax.random.key(0))
+    assert np.all(np.diff(edges[0]) > 0)
+    np.testing.assert_allclose(edges[0, [0, -1]], [1.0, 3.0])
+    alpha = density_alpha(jnp.full((1, 16), 0.7), edges)
+    np.testing.assert_allclose(transmittance(alpha)[0], np.exp(-1.4), rtol=1e-12)
+
+
+@pytest.mark.parametrize("miss", [-0.02, 0.0, 0.01])
+def test_a_ray_past_a_plane_edge_sees_the_logistic_of_its_distance(miss):
+    # Towards a surface and away again, closest at `miss`: what NeuS's opacity adds up to.
+    t = jnp.linspace(-1.0, 1.0, 401)[None]
+    distance = jnp.abs(t) + miss
+    alpha = surface_alpha(distance, jnp.asarray(60.0))
+    np.testing.assert_allclose(1 - transmittance(alpha)[0], 1 / (1 + np.exp(60 * miss)), rtol=1e-6)
+
+
+def test_fine_sections_gather_where_the_weight_is_also_behind_the_closest_point():
+    edges = jnp.linspace(0.0, 1.0, 33)[None]
+    # A ray that grazes: its opacity is decided at t = 0.6, the last point at which the distance falls.
+    interest = surface_interest(jnp.abs(edges - 0.6) + 0.01, jnp.asarray(100.0))
+    fine = np.asarray(importance_edges(edges, interest, 16, None))[0]
+    assert np.all(np.diff(fine) >= 0) and fine[0] == 0 and fine[-1] == 1
+    assert np.sum(np.abs(fine - 0.6) < 0.05) >= 10
+    assert np.any((fine > 0.6) & (fine < 0.63))
+
+
+def test_importance_edges_divide_the_weight_equally():
+    edges = jnp.linspace(0.0, 1.0, 5)[None]
+    fine = importance_edges(edges, jnp.array([[0.0, 3.0, 1.0, 0.0]]), 8, None, floor=0.0)
+    # Three quarters of the weight lie in [¼, ½], the rest in [½, ¾].
+    inside = [0.25 + 0.25 * k / 6 for k in range(1, 6)]
+    np.testing.assert_allclose(fine[0, 1:6], inside, atol=1e-6)
+    even = importance_edges(edges, jnp.zeros((1, 4)), 4, None)
+    np.testing.assert_allclose(even[0], [0, 0.25, 0.5, 0.75, 1], atol=1e-6)
