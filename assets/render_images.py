@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent / "images")
     parser.add_argument("--quick", action="store_true", help="a sixteenth of the paths")
     arguments = parser.parse_args()
-    import mitsuba as mi
+    import mitsuba as mi  # pyright: ignore[reportMissingImports]
 
     mi.set_variant("scalar_rgb")
     for name in arguments.subjects:

@@ -47,7 +47,7 @@ def mug_mesh() -> Mesh:
 def surface(distance: SignedDistance, box: np.ndarray, spacing: float) -> Mesh:
     """Triangles of the zero level of a signed distance [m], outward, watertight."""
     import trimesh
-    from skimage.measure import marching_cubes
+    from skimage.measure import marching_cubes  # pyright: ignore[reportMissingImports]
 
     shape = np.ceil((box[1] - box[0]) / spacing).astype(int) + 1
     x = box[0] + spacing * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)

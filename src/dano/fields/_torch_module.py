@@ -125,7 +125,7 @@ def _required(crop: Numbers | None, what: object) -> Numbers:
 
 def _torch() -> Any:
     try:
-        import torch
+        import torch  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError("PyTorch modules need torch: pip install 'dano[torch]'") from error
     return torch

@@ -93,7 +93,7 @@ class _Network:
         if not path.is_file():
             raise ValueError(f"network must be an ONNX file, got {path}, which does not exist")
         try:
-            import onnxruntime
+            import onnxruntime  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise ImportError("segmentation needs onnxruntime: pip install 'dano[segment]'") from error
         try:
