@@ -45,9 +45,12 @@ def test_finds_the_friction(files, run):
     answer = run(
         "identify", files / "scene.toml", files / "slide.csv", "-p", "ball,floor.sliding_friction:0:1:0.6",
         "--held-out", files / "slide.csv", "-o", files / "fit.json",
+        "--report", files / "fit.html",
     )  # fmt: skip
     assert answer.code == 0, answer.err
     assert "ball,floor.sliding_friction" in answer.out and "held out" in answer.out
+    page = (files / "fit.html").read_text()
+    assert "data:video/mp4" in page and "data:image/png" in page and "http" not in page
     result = json.loads((files / "fit.json").read_text())
     # A .csv does not say that the velocities are those of half a step before.
     assert result["values"]["ball,floor.sliding_friction"] == pytest.approx(0.25, rel=0.02)
@@ -73,6 +76,7 @@ def test_wrong_parameters(files, run, parameter, match):
 def test_wrong_files(files, run):
     scene, slide, given = files / "scene.toml", files / "slide.csv", ("-p", "ball.mass_scale:0.5:2")
     assert "existing file" in run("identify", scene, files / "none.csv", *given).err
+    assert ".html file" in run("identify", scene, slide, *given, "--report", files / "fit.txt").err
     assert ".json file" in run("identify", scene, slide, *given, "-o", files / "fit.txt").err
     assert not (files / "fit.txt").exists()
     (files / "empty.csv").write_text("time,x,y,z\n")

@@ -11,6 +11,7 @@ import numpy as np
 from dano import scene_file
 from dano.archive import checked_output, replacing
 from dano.cli._console import Progress, put, put_json, say
+from dano.cli._outputs import missing_for_pictures
 from dano.contact import ContactParams
 from dano.identify import Identification, identify as fit_parameters, load_motion, Parameter
 from dano.scene import Scene
@@ -24,6 +25,7 @@ def identify(
     parameters: Sequence[str],
     *,
     output: Path | None,
+    report: Path | None,
     body: str | None,
     held_out: Sequence[Path],
     timestep: float | None,
@@ -33,10 +35,13 @@ def identify(
     options: Mapping[str, Any],
 ) -> None:
     """See `dano identify --help`."""
-    if output is not None:
-        if output.suffix.lower() != ".json":
-            raise ValueError(f"output must be a .json file, got {output}")
-        checked_output(output)
+    for label, file, suffix in (("output", output, ".json"), ("report", report, ".html")):
+        if file is not None:
+            if file.suffix.lower() != suffix:
+                raise ValueError(f"{label} must be a {suffix} file, got {file}")
+            checked_output(file)
+    if report is not None and (missing := missing_for_pictures(video=True)):
+        raise ImportError(missing)
     if not motions:
         raise ValueError("motions must name at least one file, got none")
     progress = Progress()
@@ -65,12 +70,19 @@ def identify(
     if output is not None:
         with replacing(output) as file:
             file.write((json.dumps(result, indent=2, ensure_ascii=False) + "\n").encode())
+    if report is not None:
+        from dano.report import write_identification_report
+
+        progress("drawing", 0.0)
+        write_identification_report(report, fit, title=f"Identification: {scene.name}")
+        progress.close()
     if as_json:
         put_json(result)
     else:
         _print(fit)
-        if output is not None:
-            put(f"result      {output}")
+        for label, file in (("result", output), ("report", report)):
+            if file is not None:
+                put(f"{label:<10}  {file}")
     for message in fit.messages:
         say(f"warning: {message}")
 

@@ -315,6 +315,7 @@ def identify(
     /,
     parameter: Annotated[tuple[str, ...], arg(aliases=["-p"])],
     output: Annotated[Path | None, arg(aliases=["-o"])] = None,
+    report: Path | None = None,
     body: str | None = None,
     initial: Literal["given", "velocities", "states"] | None = None,
     position_noise: float | None = None,
@@ -338,6 +339,7 @@ def identify(
         parameter: What is unknown, with bounds and where to start, e.g. soap,table.sliding_friction:0:1,
             soap,table.sliding_friction:0:1:0.3 or soap.mass_scale:0.2:5; several after each other.
         output: Where to write the result (.json).
+        report: Where to write a page with the motions, residuals, losses and a film (.html).
         body: Which body the motions are of, if they do not say.
         initial: What to estimate of the initial states: nothing (given), velocities, or all (states).
         position_noise: Standard deviation of observed positions [m].
@@ -361,6 +363,7 @@ def identify(
         motions,
         parameter,
         output=output,
+        report=report,
         body=body,
         held_out=held_out,
         timestep=timestep,

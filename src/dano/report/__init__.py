@@ -1,6 +1,7 @@
 """Pictures for people: videos of trajectories, figures of objects, an interactive viewer."""
 
 from dano.report._capture import draw_capture as draw_capture
+from dano.report._identification import write_identification_report as write_identification_report
 from dano.report._object import draw_object as draw_object
 from dano.report._stage import contact_history as contact_history, ContactHistory as ContactHistory
 from dano.report._training import (

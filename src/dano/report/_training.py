@@ -1,8 +1,6 @@
 """The report of a training: one HTML page that needs nothing else."""
 
-import base64
 import html
-import io
 import os
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -10,9 +8,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from dano.archive import replacing
 from dano.fields import GridField
 from dano.objects import MassProperties, NeuralObject
+from dano.report._page import image, table, warnings, write_page
 from dano.report._video import require
 from dano.vision import Capture, Progress, psnr, ssim, Trained, View
 
@@ -21,16 +19,6 @@ _SHOWN = 6
 
 _SIDE = 224
 """Side of a drawn view [CSS pixels]."""
-
-_STYLE = """
-body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:980px;padding:0 1rem;color:#22262b}
-h1{font-size:1.5rem}h2{font-size:1.1rem;margin-top:2rem}
-table{border-collapse:collapse}td,th{padding:.25rem .8rem .25rem 0;text-align:right}
-td,th{border-bottom:1px solid #e5e8eb}
-td:first-child,th:first-child{text-align:left}th{color:#6b747c;font-weight:500}
-.views{display:flex;flex-wrap:wrap;gap:1rem}figure{margin:0}figcaption{font-size:.8rem;color:#6b747c}
-img{image-rendering:auto;border:1px solid #e5e8eb}.warn{background:#fff4e0;padding:.5rem
-.8rem;border-radius:4px} """
 
 
 class MassEstimates(NamedTuple):
@@ -99,26 +87,20 @@ def write_training_report(
         ImportError: If pillow is missing.
     """
     require("PIL", "pillow")
-    parts = [f"<h1>{html.escape(title)}</h1>", _summary(trained, made)]
-    parts += [f'<p class="warn">{html.escape(text)}</p>' for text in trained.warnings]
+    parts = [_summary(trained, made), warnings(trained.warnings)]
     for split, heading in (
         ("test", "Held-out views"),
         ("relight", "Held-out lights"),
         ("train", "Views trained on"),
     ):
         views = capture.split(split)[:_SHOWN]
-        if views and (split != "train" or len(parts) == 2 + len(trained.warnings)):
+        if views and (split != "train" or len(parts) == 2):
             parts += [f"<h2>{heading}: photograph, rendering, difference × 3</h2>", _views(trained, views)]
     parts += ["<h2>Training</h2>", _curves(trained.history)]
     parts += ["<h2>Occupancy through the centre of mass, outline of the visual hull in blue</h2>"]
     parts += [_slices(trained, np.asarray(made.mass.com, dtype=np.float64))]
     parts += ["<h2>Mass properties, by three ways</h2>", _masses(estimates, made.size)]
-    page = (
-        "<!doctype html><html lang='en'><meta charset='utf-8'>"
-        f"<title>{html.escape(title)}</title><style>{_STYLE}</style><body>{''.join(parts)}</body></html>"
-    )
-    with replacing(path) as file:
-        file.write(page.encode())
+    write_page(path, title, parts)
 
 
 def _summary(trained: Trained, made: NeuralObject) -> str:
@@ -140,13 +122,7 @@ def _summary(trained: Trained, made: NeuralObject) -> str:
         f" Silhouettes unexplained by the hull: {100 * trained.survey.residual:.1f} %."
         f" Surface seen by fewer than two views: {100 * trained.unseen:.1f} %."
     )
-    return _table(head, rows) + f"<p>{text}</p>"
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    cells = "".join(f"<th>{html.escape(x)}</th>" for x in head)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(x)}</td>" for x in row) + "</tr>" for row in rows)
-    return f"<table><tr>{cells}</tr>{body}</table>"
+    return table(head, rows) + f"<p>{text}</p>"
 
 
 def _views(trained: Trained, views: Sequence[View]) -> str:
@@ -157,18 +133,9 @@ def _views(trained: Trained, views: Sequence[View]) -> str:
         strip = np.concatenate([wanted, got, 1 - np.clip(3 * np.abs(got - wanted), 0, 1)], axis=1)
         caption = f"{view.name}: {psnr(got, wanted):.1f} dB, SSIM {ssim(got, wanted):.3f}"
         figures.append(
-            f"<figure>{_image(strip, 3 * _SIDE)}<figcaption>{html.escape(caption)}</figcaption></figure>"
+            f"<figure>{image(strip, 3 * _SIDE)}<figcaption>{html.escape(caption)}</figcaption></figure>"
         )
     return f'<div class="views">{"".join(figures)}</div>'
-
-
-def _image(picture: np.ndarray, width: int) -> str:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)).save(buffer, "PNG")
-    data = base64.b64encode(buffer.getvalue()).decode()
-    return f'<img alt="" width="{width}" src="data:image/png;base64,{data}">'
 
 
 def _curves(history: Sequence[Progress]) -> str:
@@ -184,7 +151,7 @@ def _curves(history: Sequence[Progress]) -> str:
         )
         for p in history
     ]
-    return _table(("step", "seconds", "rays/s", "PSNR [dB]", "mask IoU", "volume [cm³]"), rows)
+    return table(("step", "seconds", "rays/s", "PSNR [dB]", "mask IoU", "volume [cm³]"), rows)
 
 
 def _slices(trained: Trained, com: np.ndarray) -> str:
@@ -206,7 +173,7 @@ def _slices(trained: Trained, com: np.ndarray) -> str:
         picture[edge] = (0.24, 0.49, 0.85)
         picture = picture.repeat(3, axis=0).repeat(3, axis=1)
         caption = f"{name} = {1e3 * com[axis]:.1f} mm"
-        figures.append(f"<figure>{_image(picture, 300)}<figcaption>{caption}</figcaption></figure>")
+        figures.append(f"<figure>{image(picture, 300)}<figcaption>{caption}</figcaption></figure>")
     return f'<div class="views">{"".join(figures)}</div>'
 
 
@@ -231,4 +198,4 @@ def _masses(estimates: MassEstimates, size: float) -> str:
             )
         )
     head = ("", "mass [kg]", "centre of mass [mm]", "principal inertias [kg m²]", "COM off", "inertia off")
-    return _table(head, rows)
+    return table(head, rows)

@@ -77,7 +77,8 @@ def render_trajectory(
     with contextlib.ExitStack() as stack:
         add = None
         if outputs[0] is not None:
-            add = stack.enter_context(_encoder(stack.enter_context(replacing(outputs[0])), fps, camera))
+            file = stack.enter_context(replacing(outputs[0]))
+            add = stack.enter_context(encoder(file, fps, camera.width, camera.height))
         for count, frame in enumerate(frames):
             image = picture(frame)
             if add is not None:
@@ -87,7 +88,7 @@ def render_trajectory(
             if progress is not None:
                 progress("drawing", (count + 1) / len(frames))
     if outputs[1] is not None:
-        write_png(outputs[1], _side_by_side(kept))
+        write_png(outputs[1], side_by_side(kept))
 
 
 def _checked(scene, trajectory, path, strip, size) -> tuple[Path | None, Path | None]:
@@ -118,14 +119,14 @@ def _checked(scene, trajectory, path, strip, size) -> tuple[Path | None, Path | 
 
 
 @contextlib.contextmanager
-def _encoder(file: BinaryIO, fps: int, camera: Camera) -> Iterator[Callable[[np.ndarray], None]]:
-    """A function that appends pictures to an MP4 file."""
+def encoder(file: BinaryIO, fps: int, width: int, height: int) -> Iterator[Callable[[np.ndarray], None]]:
+    """A function that appends pictures of even width and height to an MP4 file."""
     av = require("av")
     with av.open(file, mode="w", format="mp4") as container:
         codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
         options = {"crf": "18", "preset": "medium"} if codec == "libx264" else {"qscale": "3"}
         stream = container.add_stream(codec, rate=int(fps), options=options)
-        stream.width, stream.height = camera.width, camera.height
+        stream.width, stream.height = width, height
         # The only pixel format that every player and browser shows.
         stream.pix_fmt = "yuv420p"
 
@@ -147,7 +148,7 @@ def _moments(position: Float[np.ndarray, "frames bodies 3"], n: int) -> Int[np.n
     return np.unique(np.interp(np.linspace(0, way[-1], n), way, np.arange(len(way))).round().astype(int))
 
 
-def _side_by_side(images: list[np.ndarray]) -> np.ndarray:
+def side_by_side(images: list[np.ndarray]) -> np.ndarray:
     """Pictures from left to right, three a row, with a thin white line between them."""
     per_row = 3 if len(images) > 3 else len(images)
     height, width, _ = images[0].shape
