@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.contact import Softening
+from dano.contact._laws import HARD
 from dano.contact._small import matmul
 
 
@@ -88,43 +89,49 @@ class _Search(NamedTuple):
 
     Attributes:
         direction: The step from the accepted point.
-        work: Of the residual along it at the accepted point; negative where the step leads downhill.
-        length: Share of the step to try next.
-        low: Share that falls short, and the work there.
-        high: Share that goes too far, and the work there; 0 until one is known.
+        numbers: One array, because each array that a loop carries costs time:
+            work of the residual along the step at the accepted point, negative where it leads downhill;
+            share of the step to try next;
+            share that falls short, and the work there;
+            share that goes too far, and the work there; 0 until one is known.
     """
 
     direction: Float[Array, " n"]
-    work: Float[Array, ""]
-    length: Float[Array, ""]
-    low: tuple[Float[Array, ""], Float[Array, ""]]
-    high: tuple[Float[Array, ""], Float[Array, ""]]
+    numbers: Float[Array, "6"]
 
     @classmethod
     def start(cls, direction, work) -> "_Search":
         zero, one = jnp.zeros_like(work), jnp.ones_like(work)
-        return cls(direction, work, one, (zero, work), (zero, zero))
+        return cls(direction, jnp.stack([work, one, zero, work, zero, zero]))
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        """Share of the step to try next."""
+        return self.numbers[1]
 
     def accepts(self, work) -> Bool[Array, ""]:
         """Whether the point at `length`, where the residual does this work, is good enough."""
-        limit = _ENOUGH * jnp.abs(self.work)
-        bracketed = self.high[0] > 0
+        start, _, low, _, high, _ = self.numbers
+        limit = _ENOUGH * jnp.abs(start)
+        bracketed = high > 0
         misses = (work > limit) | (bracketed & (work < -limit)) | jnp.isnan(work)
-        narrow = bracketed & (self.high[0] - self.low[0] < _GIVE_UP)
-        return ~misses | narrow | (self.work >= 0)
+        narrow = bracketed & (high - low < _GIVE_UP)
+        return ~misses | narrow | (start >= 0)
 
     def narrowed(self, work) -> "_Search":
         """The search after a miss: regula falsi, kept from the ends of the bracket."""
+        start, length, low, low_work, high, high_work = self.numbers
         far = ~(work < 0)
-        here = self.length, work
         # The Illinois rule: an end that stays twice counts half, so that both move.
-        low = tuple(jnp.where(far, old, new) for old, new in zip(self.low, here, strict=True))
-        high = tuple(jnp.where(far, new, old) for old, new in zip(self.high, here, strict=True))
-        low = low[0], jnp.where(far, 0.5 * low[1], low[1])
-        high = high[0], jnp.where(far | (self.high[0] == 0), high[1], 0.5 * high[1])
-        share = jnp.clip(-low[1] / (high[1] - low[1]), 0.1, 0.9)
+        new_low = jnp.where(far, low, length)
+        new_low_work = jnp.where(far, 0.5 * low_work, work)
+        new_high = jnp.where(far, length, high)
+        new_high_work = jnp.where(far, work, jnp.where(high == 0, high_work, 0.5 * high_work))
+        share = jnp.clip(-new_low_work / (new_high_work - new_low_work), 0.1, 0.9)
         share = jnp.where(jnp.isnan(share), 0.1, share)
-        return self._replace(length=low[0] + share * (high[0] - low[0]), low=low, high=high)
+        next_length = new_low + share * (new_high - new_low)
+        numbers = [start, next_length, new_low, new_low_work, new_high, new_high_work]
+        return _Search(self.direction, jnp.stack(numbers))
 
 
 class _Iterate(NamedTuple):
@@ -184,7 +191,8 @@ def newton(
 
     def converged(it: _Iterate):
         remaining, tolerance = error(it)
-        return schedule.last[it.level] & (it.action == _STEP) & (remaining <= tolerance)
+        solved = remaining <= tolerance
+        return solved & schedule.last[it.level] & (it.action == _STEP) if softens else solved
 
     def unfinished(it: _Iterate):
         return (it.iteration < options.max_iterations) & ((it.iteration < 0) | ~converged(it))
@@ -194,13 +202,18 @@ def newton(
         return _Search.start(direction, jnp.sum(direction * residual / scale))
 
     def advance(it: _Iterate):
-        looks = (it.action == _PREDICT) | (it.iteration < 0)
+        # The first pass looks, too: its direction is zero.
+        looks = it.action == _PREDICT if softens else jnp.zeros((), bool)
         tried = it.point + jnp.where(looks, 0, it.search.length) * it.search.direction
-        softness = schedule.scale[it.level]
-        held = jnp.where(it.action == _PREDICT, schedule.held[it.level], softness)
-        residual, jacobian = evaluate(tried, Softening(held, softness))
+        softening = HARD
+        if softens:
+            softness = schedule.scale[it.level]
+            softening = Softening(jnp.where(looks, schedule.held[it.level], softness), softness)
+        residual, jacobian = evaluate(tried, softening)
         work = jnp.sum(it.search.direction * residual / scale)
-        accept = it.search.accepts(work) | looks | (it.action == _FOLLOW)
+        accept = it.search.accepts(work)
+        if softens:
+            accept = accept | looks | (it.action == _FOLLOW)
         pick = lambda new, old: jnp.where(accept, new, old)  # noqa: E731
         after = _Iterate(
             pick(tried, it.point),
@@ -209,8 +222,8 @@ def newton(
             jax.tree.map(pick, step_from(residual, jacobian), it.search.narrowed(work)),
             it.iteration + 1,
             it.level,
-            jnp.where(it.action == _PREDICT, _FOLLOW, _STEP),
-            it.budget - 1,
+            jnp.where(looks, _FOLLOW, _STEP) if softens else it.action,
+            it.budget - 1 if softens else it.budget,
         )
         return change_level(after) if softens else after
 
