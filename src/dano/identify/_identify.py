@@ -190,8 +190,8 @@ def identify(
         observed: One motion or several: simulated trajectories or `Motion`s, of any bodies, in any frames,
             with any gaps; frames need not lie on steps. Each begins at its own first complete frame.
         parameters: What is unknown.
-        state: What a motion does not say of its beginning, e.g. where an unobserved body is; one for all
-            motions or one for each.
+        state: What a motion does not say of its beginning, e.g. where an unobserved or a fixed body is (by
+            default fixed ones are at the origin); one for all motions or one for each.
         controls: Forces and torques [N, N m]: those of each step of each motion, or a policy as in `simulate`
             (whose time runs from the first frame of the motion).
         initial: What to estimate of the state in which each window begins: nothing ("given": it is as

@@ -201,7 +201,7 @@ def _cut(scene, motion: Motion, full, state, control, number: int, window: int |
         first += int(ready[0])
         last = n if window is None else min(first + window, n)
         if last - first >= 2:
-            start = _initial(scene, motion, full, smooth, state, first, h, what, only=window is None)
+            start = _initial(scene, motion, full, smooth, state, first, h, what)
             pieces.append(
                 {
                     "owner": number,
@@ -242,7 +242,7 @@ def _says_where(scene, motion, full, has_state: bool, moving) -> np.ndarray:
     return ready
 
 
-def _initial(scene, motion, full, smooth, state, first: int, h: float, what: str, *, only: bool):
+def _initial(scene, motion, full, smooth, state, first: int, h: float, what: str):
     """Initial state of the window that begins at a frame, as a dict of arrays (n, ·)."""
     start = {}
     unseen = [i for i, body in enumerate(scene.bodies) if not body.fixed and body.name not in motion.names]
@@ -259,9 +259,6 @@ def _initial(scene, motion, full, smooth, state, first: int, h: float, what: str
         else:
             value = np.array(getattr(state, key), dtype=float)
         found = full[key][first] if key in _CONFIGURATION else _earlier(motion, smooth[key], first, h)
-        if key == "omega":
-            # What spins cannot be told where no orientation is known.
-            found = np.where(np.isfinite(found), found, np.nan)
         known = np.isfinite(found).all(axis=-1)
         value[known] = found[known]
         start[key] = value
