@@ -4,7 +4,7 @@ import contextlib
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -119,8 +119,8 @@ def _checked(scene, trajectory, path, strip, size) -> tuple[Path | None, Path | 
 
 
 @contextlib.contextmanager
-def encoder(file: BinaryIO, fps: int, width: int, height: int) -> Iterator[Callable[[np.ndarray], None]]:
-    """A function that appends pictures of even width and height to an MP4 file."""
+def encoder(file: Any, fps: int, width: int, height: int) -> Iterator[Callable[[np.ndarray], None]]:
+    """A function that appends pictures of even width and height to an MP4 file, open for writing bytes."""
     av = require("av")
     with av.open(file, mode="w", format="mp4") as container:
         codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
