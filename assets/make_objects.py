@@ -10,12 +10,12 @@ Usage: python assets/make_objects.py [--out src/dano/assets] [--seed 0]
 
 import argparse
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from solids import BUNNY_EXTENT, SignedDistance, soap_distance, SOAP_HALF_EXTENTS
 
 from dano.fields import mesh_field
 
@@ -23,11 +23,6 @@ HERE = Path(__file__).resolve().parent
 NODES = 96  # along the longest axis
 MARGIN = 8  # nodes of air on each side: room for floaters
 
-SOAP_HALF_EXTENTS = np.array([0.045, 0.030, 0.015])  # [m]
-SOAP_ROUNDING = 0.008  # [m]
-ENGRAVING_DEPTH = 0.003  # [m]
-ENGRAVING_STROKE = 0.0038  # [m], width of a stroke
-BUNNY_EXTENT = 0.12  # [m], longest side of the bounding box
 BUNNY_BOUNDS = BUNNY_EXTENT * np.array(
     [[-0.5, -0.3806, 0.0], [0.5, 0.3806, 0.9748]]
 )  # [m], those of bunny.obj
@@ -40,8 +35,6 @@ PLATEAU = 150.0  # typical density [1/m] of the shell
 VARIATION = 0.25  # by which its logarithm varies over the surface, standard deviation
 N_FLOATERS = 6
 MANTISSA_BITS = 10  # a NeRF is not known better than to a thousandth, and zeros compress well
-
-SignedDistance = Callable[[np.ndarray], np.ndarray]
 
 
 def main() -> None:
@@ -112,42 +105,6 @@ def smooth_noise(x: np.ndarray, wavelength: float, rng: np.random.Generator, n_w
     for wave, phase in zip(waves, rng.uniform(0, 2 * np.pi, n_waves), strict=True):
         total += np.cos(x @ wave + phase)
     return total * np.sqrt(2 / n_waves)
-
-
-def soap_distance(x: np.ndarray) -> np.ndarray:
-    """Signed distance [m] of a bar with rounded edges and "dano" carved into its top face."""
-    q = np.abs(x) - (SOAP_HALF_EXTENTS - SOAP_ROUNDING)
-    bar = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0) - SOAP_ROUNDING
-    floor = SOAP_HALF_EXTENTS[2] - ENGRAVING_DEPTH
-    groove = np.maximum(letters_distance(x[..., :2]) - ENGRAVING_STROKE / 2, floor - x[..., 2])
-    return np.maximum(bar, -groove)
-
-
-def letters_distance(p: np.ndarray) -> np.ndarray:
-    """Distance [m] in the plane to the strokes of the word "dano", centred at the origin."""
-    size, pitch = 0.0060, 0.0188  # radius of a bowl, distance between letters [m]
-    p = p + np.array([0.0, 0.2 * size])
-
-    def stroke(letter: int, start: tuple[float, float], end: tuple[float, float]) -> np.ndarray:
-        """Distance to a straight stroke, its ends in radii from the middle of the letter."""
-        middle = np.array([(letter - 1.5) * pitch, 0.0])
-        a, b = middle + size * np.array(start), middle + size * np.array(end)
-        along = np.clip((p - a) @ (b - a) / np.dot(b - a, b - a), 0, 1)
-        return np.linalg.norm(p - a - along[..., None] * (b - a), axis=-1)
-
-    def bowl(letter: int, upper_half: bool = False) -> np.ndarray:
-        """Distance to a circle, or to its upper half."""
-        q = p - np.array([(letter - 1.5) * pitch, 0.0])
-        ring = np.abs(np.linalg.norm(q, axis=-1) - size)
-        return np.where(q[..., 1] >= 0, ring, np.inf) if upper_half else ring
-
-    strokes = [
-        *(bowl(0), stroke(0, (1, -1), (1, 2.2))),
-        *(bowl(1), stroke(1, (1, -1), (1, 1))),
-        *(bowl(2, upper_half=True), stroke(2, (-1, -1), (-1, 1)), stroke(2, (1, -1), (1, 0))),
-        bowl(3),
-    ]
-    return np.min(strokes, axis=0)
 
 
 def bunny_distance(x: np.ndarray) -> np.ndarray:

@@ -109,6 +109,21 @@ class AbstractModel(eqx.Module):
         return section_weights(self.alpha(rays, edges, sharpness))
 
 
+class AbstractMedium(AbstractModel):
+    """What has an extinction at every point."""
+
+    @abc.abstractmethod
+    def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Extinction [1/m] at points [m]."""
+
+    def alpha(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays sections"]:
+        """See `density_alpha`, with the density in the middle of each section."""
+        middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+        return density_alpha(self.density_at(rays.at(middle)).reshape(middle.shape), edges)
+
+
 def see(
     model: AbstractModel,
     rays: Rays,
@@ -224,7 +239,7 @@ class SurfaceModel(AbstractModel):
         return self.appearance(points, normal, view, light, view_share), normal
 
 
-class DensityModel(AbstractModel):
+class DensityModel(AbstractMedium):
     """A medium: extinction on a grid, as in a plain neural radiance field.
 
     Attributes:
@@ -259,13 +274,6 @@ class DensityModel(AbstractModel):
         """Extinction [1/m] at points [m]."""
         u = ((points - self.origin[None]) / self.spacing).T
         return jax.nn.softplus(value_at(self.raw, u)) / self.spacing
-
-    def alpha(
-        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> Float[Array, "rays sections"]:
-        """See `density_alpha`, with the density in the middle of each section."""
-        middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
-        return density_alpha(self.density_at(rays.at(middle)).reshape(middle.shape), edges)
 
     def colour(
         self,

@@ -21,8 +21,7 @@ from dano.archive import read_archive, write_archive
 from dano.fields import CallableField
 from dano.maths import Numbers
 from dano.vision._appearance import Share
-from dano.vision._models import AbstractModel, Rays
-from dano.vision._volume import density_alpha
+from dano.vision._models import AbstractMedium
 
 FORMAT, VERSION = "dano-osf", 1
 _DEPTH, _WIDTH, _SKIP, _HEAD = 8, 256, 4, 128
@@ -37,7 +36,7 @@ def encoded(x: Float[Array, "n k"], n_frequencies: int) -> Float[Array, "n e"]:
     return jnp.concatenate(parts, axis=1)
 
 
-class OSF(AbstractModel):
+class OSF(AbstractMedium):
     """Density φ(x) and radiance transfer ρ(x, ω_light, ω_out) by one network.
 
     Attributes:
@@ -125,13 +124,6 @@ class OSF(AbstractModel):
         lower, upper = self.bounds.astype(points.dtype)
         inside = jnp.all((points >= lower[None]) & (points <= upper[None]), axis=1)
         return jnp.where(inside, jax.nn.relu(raw) / self.scale.astype(points.dtype), 0)
-
-    def alpha(
-        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> Float[Array, "rays sections"]:
-        """See `density_alpha`, with the density in the middle of each section."""
-        middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
-        return density_alpha(self.density_at(rays.at(middle)).reshape(middle.shape), edges)
 
     def colour(
         self,
