@@ -81,3 +81,32 @@ def test_wrong_files(files, run):
     assert not (files / "fit.txt").exists()
     (files / "empty.csv").write_text("time,x,y,z\n")
     assert "at least one row" in run("identify", scene, files / "empty.csv", *given).err
+
+
+def test_motions_that_cannot_be_used(files, run):
+    scene, given = files / "scene.toml", ("-p", "ball,floor.sliding_friction:0:1")
+    table = (files / "slide.csv").read_text().splitlines()
+    names = table[0].split(",")
+    rows = [line.split(",") for line in table[1:]]
+
+    def refused(change, match):
+        (files / "bad.csv").write_text("\n".join(",".join(row) for row in change) + "\n")
+        answer = run("identify", scene, files / "bad.csv", *given, "-o", files / "none.json")
+        assert answer.code == 2 and match in answer.err, answer.err
+        assert not (files / "none.json").exists()
+
+    blank = [[row[0], *([""] * (len(row) - 1))] for row in rows]
+    refused([names, *blank], "at least one observed frame")
+    refused([names, rows[0]], "at least two frames")
+    place = [names.index(name) for name in ("qw", "qx", "qy", "qz")]
+    spin = [names.index(name) for name in ("wx", "wy", "wz")]
+    turned = []
+    for i, row in enumerate(rows):
+        # A turn about z, with its scalar last although the columns say first.
+        changed, angle = list(row), 0.02 * i
+        for column, value in zip(place, (0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)), strict=True):
+            changed[column] = repr(float(value))
+        for column, value in zip(spin, (0.0, 0.0, 0.02 / 0.01), strict=True):
+            changed[column] = repr(float(value))
+        turned.append(changed)
+    refused([names, *turned], "(x, y, z, w)")

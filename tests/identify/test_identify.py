@@ -146,6 +146,51 @@ def test_multiple_shooting(observed, continuity):
     assert fit.standard_errors["mu"] < (0.05 if continuity is None else 0.01)
 
 
+def test_windows_that_are_tied_more_and_more_tightly(observed):
+    motion = noisy(observed, np.random.default_rng(7))
+    options = {"initial": "states", "window": 8, "noise": NOISE}
+    loose = dano.identify(ball_scene(), motion, [FRICTION], continuity=3.0, **options)
+    tied = dano.identify(ball_scene(), motion, [FRICTION], continuity=(3.0, 0.1, 0.01), **options)
+    whole = dano.identify(ball_scene(), motion, [FRICTION], initial="states", noise=NOISE)
+    assert tied.standard_errors["mu"] < loose.standard_errors["mu"]
+    # Windows that meet are one window.
+    assert tied.values["mu"] == pytest.approx(whole.values["mu"], abs=0.1 * whole.standard_errors["mu"])
+    assert tied.standard_errors["mu"] == pytest.approx(whole.standard_errors["mu"], rel=0.2)
+
+
+def test_velocities_are_compared_at_their_own_times():
+    # In free fall steps of any size give the same velocities, half a step before each state.
+    fall = lambda h: dano.Scene.create([dano.Body("ball", dano.Sphere(RADIUS), mass=0.5)], [], timestep=h)  # noqa: E731
+    scene = fall(0.001)
+    start = scene.initial_state(ball={"velocity": (1.0, 0.0, 0.0), "omega": (0.0, 0.0, 2.0)})
+    fine = dano.Motion.from_trajectory(dano.simulate(scene, start, 200), every=20)
+    sampled = dataclasses.replace(fine, velocity=fine.velocity - 0.0005 * 9.81 * np.array([0, 0, 1]), lag=0.0)
+    gravity = dano.Parameter("gravity", lambda s: s.gravity, -20.0, 20.0)
+    for motion in (fine, sampled):
+        fit = dano.identify(
+            fall(0.004), motion, [gravity], window=3, initial="given", noise={"velocity": 0.01}
+        )
+        np.testing.assert_allclose(fit.values["gravity"], [0, 0, -9.81], atol=1e-6)
+        np.testing.assert_allclose(fit.guessed[0].velocity, motion.velocity, atol=1e-9)
+
+
+def test_a_parameter_that_is_no_leaf():
+    # Downhill by an angle: gravity is turned, friction is known.
+    def tilted(scene, angle):
+        along = jnp.stack([jnp.sin(angle), 0 * angle, -jnp.cos(angle)])
+        return eqx.tree_at(lambda s: s.gravity, scene, 9.81 * along)
+
+    angle = dano.Parameter("angle", lower=-1.0, upper=1.0, start=0.0, apply=tilted)
+    motion = sliding(tilted(ball_scene(), jnp.asarray(0.1)))
+    fit = dano.identify(ball_scene(), motion, [angle])
+    assert fit.values["angle"] == pytest.approx(0.1, abs=1e-6)
+    assert float(fit.scene.gravity[0]) == pytest.approx(9.81 * np.sin(0.1), abs=1e-5)
+    refuse("either where or apply", parameters=[dataclasses.replace(angle, where=FRICTION.where)])
+    refuse("either where or apply", parameters=[dano.Parameter("nothing")])
+    refuse("give its start", parameters=[dataclasses.replace(angle, start=None)])
+    refuse("must return the scene", parameters=[dataclasses.replace(angle, apply=lambda s, value: value)])
+
+
 class Push(eqx.Module):
     """A constant force along x."""
 
@@ -325,6 +370,7 @@ def test_bad_input():
     refuse("noise must be given for some", noise={"place": 1.0})
     refuse("window must hold", window=1)
     refuse("continuity needs", continuity=0.1)
+    refuse("sequence of it must fall", continuity=(0.1, 0.3), window=4, initial="states")
     refuse("huber must be", huber=-1.0)
     refuse("starts must be", starts=0)
     refuse("initial must be one of", initial="everything")

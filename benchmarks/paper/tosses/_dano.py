@@ -1,14 +1,17 @@
 """The cube as a neural object on a half-space, with dano's distributed contact."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 import dano
 from benchmarks.paper.tosses._data import FRAME, Motions, product, rotations, turn
+from dano.contact import SurfaceSet
 from dano.objects import draw_surface
 
 # Motions that advance together, and how many of them in the same vector operations: a batch goes on until
@@ -17,7 +20,7 @@ _BLOCK, _VECTOR = 64, 8
 # Frames simulated per call. One compiled function serves motions of any length.
 _CHUNK = 16
 
-BODY = ("com_z", "inertia", "inertia_ratio")
+BODY = ("com_z", "com", "inertia", "inertia_ratio", "corners")
 """Parameters of the body; the others are those of contact."""
 
 
@@ -55,28 +58,44 @@ class Dano:
         assert soft.solid is not None
         surface = draw_surface(soft.solid, n, skin=cube["skin"])
         self.cube = eqx.tree_at(lambda o: o.surface, soft, surface)
+        placed = SurfaceSet.create(surface.points, surface.vectors)
+        self._places = placed.points
+        self._octant = (np.asarray(placed.points)[:3] > 0).T @ np.array([4, 2, 1])
         self.unconverged = 0.0
 
-    def scene(self, values: Mapping[str, float], timestep: float) -> dano.Scene:
-        """The scene for some parameters: those of `dano.ContactParams`, and those of the body in `BODY`."""
+    def scene(self, values: Mapping[str, Any], timestep: float) -> dano.Scene:
+        """The scene for some parameters: those of `dano.ContactParams`, and those of the body.
+
+        These are the centre of mass `com` [m], or `com_z` alone; the tensor `inertia` [kg m²], or its value
+        about x and y, and `inertia_ratio` times that about z; and, if given, `corners` as in `moved`.
+        """
         contact = {name: value for name, value in values.items() if name not in BODY}
-        inertia = values["inertia"] * np.diag([1.0, 1.0, values["inertia_ratio"]])
-        cube = dano.Body("cube", self.cube, com=(0.0, 0.0, values["com_z"]), inertia=inertia)
+        inertia = np.asarray(values["inertia"])
+        if inertia.ndim == 0:
+            inertia = inertia * np.diag([1.0, 1.0, values["inertia_ratio"]])
+        cube = dano.Body("cube", self.cube, com=_com(values), inertia=inertia)
         floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
         params = dano.ContactParams(**contact)
         # A frame is longer than an impact: with the depth at the end of a step all would be plastic.
         law = dano.DistributedLaw(implicitness=0.5)
         contacts = [dano.Contact("cube", "floor", params, law)]
         gravity = (0.0, 0.0, -self.gravity)
-        return dano.Scene.create([cube, floor], contacts, timestep=timestep, gravity=gravity)
+        scene = dano.Scene.create([cube, floor], contacts, timestep=timestep, gravity=gravity)
+        return self.moved(scene, jnp.asarray(values["corners"])) if "corners" in values else scene
+
+    def moved(self, scene: dano.Scene, corners: Float[Array, "8 3"]) -> dano.Scene:
+        """The scene with each corner moved from where it is on a box [m], in order of (x, y, z) signs."""
+        moves = corners[self._octant].T.astype(self._places.dtype)
+        points = self._places.at[:3].add(moves)
+        return eqx.tree_at(lambda s: s.body("cube").surface.points, scene, points)
 
     def simulate(
-        self, values: Mapping[str, float], motions: Motions, substeps: int
+        self, values: Mapping[str, Any], motions: Motions, substeps: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Poses of the geometric centre at every frame, rows as in `motions`."""
         timestep = FRAME / substeps
         scene = self.scene(values, timestep)
-        com = np.array([0.0, 0.0, values["com_z"]])
+        com = _com(values)
         states = _starts(motions, com, timestep)
         position, orientation = np.empty_like(motions.position), np.empty_like(motions.orientation)
         failed = steps = 0
@@ -99,6 +118,10 @@ class Dano:
                 position[rows], orientation[rows] = (x[k, : rows.stop - rows.start] for x in found)
         self.unconverged = failed / max(steps, 1)
         return position - rotations(orientation) @ com, orientation
+
+
+def _com(values: Mapping[str, Any]) -> np.ndarray:
+    return np.asarray(values["com"]) if "com" in values else np.array([0.0, 0.0, values["com_z"]])
 
 
 def _starts(motions: Motions, com: np.ndarray, timestep: float) -> tuple[np.ndarray, ...]:

@@ -13,6 +13,7 @@ from benchmarks._measure import load_average, report, Row, skipped
 from benchmarks.paper.tosses import _parameters
 from benchmarks.paper.tosses._dano import Dano
 from benchmarks.paper.tosses._data import data_folder, NO_DATA, Tosses
+from benchmarks.paper.tosses._identify import Found, identify, slides, TOSSES, WINDOW
 from benchmarks.paper.tosses._mujoco import MuJoCo
 from benchmarks.paper.tosses._score import bootstrap_difference, Errors
 from benchmarks.paper.tosses._tune import DECELERATION, tune
@@ -60,6 +61,13 @@ def run() -> None:
     if arguments.quick:
         tosses = tosses.first(10)
     settings |= {"data": Path(path or "").name, "tosses": len(tosses)}
+    if arguments.identify:
+        train = _named("train")
+        if train is None or not train.is_file():
+            sys.exit(f"error: {NO_DATA}")
+        rows = identified_rows(Tosses.load(train), tosses, parameters)
+        report("tosses.identify", rows, settings, load, arguments.json)
+        return
     sections = score(tosses, parameters)
     rows = _rows(sections)
     report("tosses", rows, settings, load, arguments.json)
@@ -110,6 +118,70 @@ def score(tosses: Tosses, parameters: dict[str, Any]) -> dict[str, Any]:
             mean, error = bootstrap_difference(*pair)
             sections["difference"] |= {key: mean, f"{key}_standard_error": error}
     return sections
+
+
+def identified_rows(train: Tosses, tosses: Tosses, parameters: dict[str, Any]) -> list[Row]:
+    """Parameters by derivatives from train tosses, and how they do on whole tosses beside the stored ones."""
+    world, n = parameters["world"], int(parameters["substeps"]["dano"])
+    simulator = Dano(world, parameters["cube"])
+    stored = parameters["dano"]["fitted"]["values"]
+    tails = train.first(TOSSES).tails(world["half_side"], DECELERATION)
+    friction = slides(simulator, stored, tails)
+    group = "Friction of flat slides"
+    spread = "{:.3f}, {:.3f}, {:.3f}".format(*friction.quartiles)
+    rows = [
+        Row(group, "all slides together", friction.value, "", note=f"± {friction.standard_error:.1g}"),
+        Row(
+            group,
+            "mean over slides",
+            friction.mean,
+            "",
+            note=f"± {friction.mean_error:.1g}; quartiles {spread} of {friction.slides} slides; "
+            "kinematics 0.218, quartiles 0.208 and 0.225",
+        ),
+    ]
+    found = identify(simulator, train)
+    rows += _found_rows(found)
+    whole = tosses.whole(world["gravity"])
+    ours = Errors.of(whole, *simulator.simulate(found.values, whole, n))
+    search = Errors.of(whole, *simulator.simulate(stored, whole, n))
+    group = "Whole tosses, validation"
+    for attribute, word, unit in (("position", "position", "%"), ("rotation", "rotation", "°")):
+        mine, theirs = getattr(ours, attribute), getattr(search, attribute)
+        mean, error = bootstrap_difference(mine, theirs)
+        note = f"median {np.median(mine):.3g}; less the search's {mean:.2g} ± {error:.2g} toss by toss"
+        rows.append(Row(group, f"{word}, by derivatives", float(mine.mean()), unit, note=note))
+        rows.append(Row(group, f"{word}, by search", float(theirs.mean()), unit))
+        rows.append(Row(group, f"{word}, difference in standard errors", mean / error, "", 1.0))
+    ends = tosses.tails(world["half_side"], DECELERATION)
+    if len(ends):
+        for word, values in (("derivatives", found.values), ("search", stored)):
+            last = Errors.of(ends, *simulator.simulate(values, ends, n)).last_position
+            rows.append(Row(group, f"flat slides, position at the end, by {word}", float(last.mean()), "mm"))
+    return rows
+
+
+def _found_rows(found: Found) -> list[Row]:
+    group = f"By derivatives, windows of {WINDOW} frames of {TOSSES} train tosses"
+    rows = [
+        Row(group, "tosses simulated", float(found.simulated), "", note=f"{found.seconds:.3g} s"),
+        Row(group, "mean position error in a window", 1e3 * found.fit.errors.mean_position, "mm"),
+    ]
+    errors = found.fit.standard_errors
+    for name in ("sliding_friction", "friction_fading", "restitution"):
+        rows.append(Row(group, name.replace("_", " "), found.values[name], "", note=f"± {errors[name]:.1g}"))
+    com, spread = 1e3 * found.values["com"], 1e3 * errors["com"]
+    for axis, value, error in zip("xyz", com, spread, strict=True):
+        rows.append(Row(group, f"centre of mass, {axis}", float(value), "mm", note=f"± {error:.1g}"))
+    principal = np.linalg.eigvalsh(found.values["inertia"])
+    words = ", ".join(f"{1e3 * value:.3f}" for value in principal)
+    rows.append(Row(group, "principal inertias, mean", float(1e3 * principal.mean()), "g m²", note=words))
+    corners = 1e3 * found.values["corners"]
+    note = f"largest {np.abs(corners).max():.2g} mm, ± {1e3 * float(np.nanmax(errors['corners'])):.1g}"
+    rows.append(
+        Row(group, "corners, rms way from a box", float(np.sqrt(np.mean(corners**2))), "mm", note=note)
+    )
+    return rows
 
 
 def _section(
@@ -219,6 +291,11 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results to this file")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="also draw four of the tosses")
+    parser.add_argument(
+        "--identify",
+        action="store_true",
+        help="instead find parameters by derivatives from train.npz and score these",
+    )
     parser.add_argument("--quick", action="store_true", help="ten tosses: to see that it runs")
     parser.add_argument(
         "--tune",

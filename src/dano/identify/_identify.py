@@ -6,30 +6,24 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from scipy.stats import qmc
 
 from dano.engine import AbstractEngine, VariationalEngine
 from dano.engine._rollout import Policy
 from dano.identify._motion import Motion, QUANTITIES
-from dano.identify._parameters import Parameter, Space, space_of, values_at, with_values
-from dano.identify._residuals import Linearized, linearized, Model, moved
+from dano.identify._parameters import Parameter, space_of, values_at, with_values
+from dano.identify._problem import Problem, Setup
+from dano.identify._residuals import Linearized
 from dano.identify._uncertainty import quantile, uncertainty
-from dano.identify._windows import Plan, plan_windows
+from dano.identify._windows import Plan
 from dano.scene import Control, Scene, State, Trajectory
-from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
+from dano.solvers import Stop
 
 Observed = Motion | Trajectory
 
 _INITIAL = {"given": (), "velocities": ("velocity", "omega"), "states": tuple(QUANTITIES)}
-
-# Of each start that is refined, so many are only looked at.
-_LOOKS = 4
-# Windows simulated at once on an accelerator; a CPU is fastest one by one.
-_BATCH = 1024
 
 
 class Errors(NamedTuple):
@@ -169,7 +163,7 @@ def identify(
     noise: Mapping[str, float] | None = None,
     huber: float | None = None,
     window: int | None = None,
-    continuity: float | None = None,
+    continuity: float | Sequence[float] | None = None,
     starts: int = 1,
     seed: int = 0,
     held_out: Observed | Sequence[Any] = (),
@@ -206,7 +200,9 @@ def identify(
         window: Frames of the windows that motions are cut into, each simulated from its own initial state
             (multiple shooting); default: no cuts. For long and for chaotic motions.
         continuity: Standard deviation, as multiple of `noise`, by which the end of a window may miss the
-            beginning of the next; default: they need not meet. Needs `initial="states"`.
+            beginning of the next; default: they need not meet. Needs `initial="states"`. A falling sequence
+            is searched with one after the other, each from where the last one ended: loose windows find
+            the way from afar, tight ones use all that the motion says.
         starts: Points to start from: the scene's values, and others in the bounds, the best of many by their
             loss. For losses with several minima.
         seed: Of those points.
@@ -233,8 +229,9 @@ def identify(
         raise ValueError("observed must hold at least one motion, got none")
     space = space_of(scene, controls, parameters)
     chosen = _initial(initial, motions)
-    _check_options(huber, window, continuity, starts, chosen, jacobian, max_iterations, tolerance)
-    setup = _Setup(
+    ties = () if continuity is None else tuple(np.atleast_1d(np.asarray(continuity, float)).tolist())
+    _check_options(huber, window, ties, starts, chosen, jacobian, max_iterations, tolerance)
+    setup = Setup(
         space,
         scene,
         controls,
@@ -242,19 +239,19 @@ def identify(
         _noise(scene, motions, noise),
         huber,
         window,
-        continuity,
+        ties,
         jacobian,
         engine or VariationalEngine(),
         batch,
     )
-    fit = _Fit(setup, motions, state)
+    problem = Problem(setup, motions, state)
     tell = progress or (lambda description, share: None)
     tell("compiling", 0.0)
     solutions = []
-    points = fit.points(starts, seed)
+    points = problem.points(starts, seed)
     for k, x in enumerate(points):
         solutions.append(
-            fit.search(
+            problem.search(
                 x,
                 max_iterations,
                 tolerance,
@@ -267,10 +264,10 @@ def identify(
             break
     solutions.sort(key=lambda s: s.normal.loss)
     best = solutions[0]
-    at_best = fit.simulate(best.x, best.blocks)
-    at_start = fit.simulate(space.start, fit.plan.start)
+    at_best = problem.simulate(best.x, best.blocks)
+    at_start = problem.simulate(space.start, problem.plan.start)
     known = np.asarray(at_best.lengths)
-    found = uncertainty(space, best.x, best.normal, known[known >= 0], huber, fit.plan.n_data, scene)
+    found = uncertainty(space, best.x, best.normal, known[known >= 0], huber, problem.plan.n_data, scene)
     values, errors = values_at(space.selections, best.x, found.covariance)
     messages = list(found.messages)
     if failed := int(np.sum(np.asarray(at_best.unconverged))):
@@ -280,7 +277,7 @@ def identify(
     held = _motions("held_out", held_out)
     held_errors = None
     if held:
-        other = _Fit(setup, held, state)
+        other = Problem(setup, held, state)
         fixed = other.search(best.x, max_iterations, tolerance, None, free=False)
         held_errors = _errors(other.plan, held, other.simulate(fixed.x, fixed.blocks))
     for message in messages:
@@ -295,7 +292,7 @@ def identify(
         stop=best.stop,
         loss_history=best.losses,
         messages=tuple(messages),
-        errors=_errors(fit.plan, motions, at_best),
+        errors=_errors(problem.plan, motions, at_best),
         held_out_errors=held_errors,
         minima=tuple(
             Minimum(values_at(space.selections, s.x, found.covariance)[0], s.normal.loss, s.stop)
@@ -305,194 +302,12 @@ def identify(
         controls=controls if controls is None else with_values(space.selections, "controls", controls, x),
         initial_states=best.blocks,
         motions=motions,
-        fitted=_as_motions(fit.plan, motions, at_best, scene),
-        guessed=_as_motions(fit.plan, motions, at_start, scene),
+        fitted=_as_motions(problem.plan, motions, at_best, scene),
+        guessed=_as_motions(problem.plan, motions, at_start, scene),
         freedom=found.freedom,
-        evaluations=fit.evaluations,
+        evaluations=problem.evaluations,
         seconds=time.perf_counter() - began,
     )
-
-
-class _Setup(NamedTuple):
-    """Arguments of `identify`, checked, that do not depend on the motions."""
-
-    space: Space
-    scene: Scene
-    controls: Any
-    initial: tuple[str, ...]
-    noise: dict[str, float]
-    huber: float | None
-    window: int | None
-    continuity: float | None
-    jacobian: str
-    engine: AbstractEngine
-    batch: int | None
-
-
-class _Fit:
-    """The least squares problem of some motions: residuals of windows over parameters and initial states."""
-
-    def __init__(self, setup: _Setup, motions: Sequence[Motion], state: Any):
-        space, scene, controls, initial, noise, huber, window, continuity, jacobian, engine, batch = setup
-        self.space = space
-        self.evaluations = 0
-        policy = controls if callable(controls) else None
-        self.plan = plan_windows(
-            scene,
-            motions,
-            states=_for_each("state", state, motions),
-            controls=[None] * len(motions) if policy is not None else _control_list(scene, controls, motions),
-            noise=noise,
-            initial=initial,
-            window=window,
-            continuous=continuity is not None,
-        )
-        dtype = scene.timestep.dtype
-        self.private = 3 * len(self.plan.bodies) * len(initial)
-        unknowns = len(space.start) + self.private
-        n_windows = len(self.plan.rows)
-        self.freedom = self.plan.n_data - len(space.start) - n_windows * self.private
-        if self.freedom <= 0:
-            raise ValueError(
-                f"observed must hold more numbers than there are unknowns, got {self.plan.n_data} for "
-                f"{len(space.start)} parameters and {n_windows * self.private} of initial states: take "
-                "more frames, longer windows, or estimate less"
-            )
-        numbers = max(1, self.plan.n_data // n_windows)
-        # A backward pass per observed number costs about four forward ones.
-        reverse = jacobian == "reverse" or (jacobian == "auto" and unknowns > 4 * numbers)
-        on_cpu = jax.default_backend() == "cpu"
-        jumps = None
-        if continuity is not None:
-            usual = {**dict.fromkeys(QUANTITIES, np.inf), **noise}
-            rate = max(1e-6, float(self.plan.n_steps * scene.timestep))
-            # Velocities that were not observed may miss by what would move a window's end by the noise.
-            for slow, fast in (("position", "velocity"), ("orientation", "omega")):
-                usual[fast] = min(usual[fast], usual[slow] / rate)
-            jumps = jnp.asarray([continuity * usual[key] for key in QUANTITIES], dtype)
-        self.model = Model(
-            scene,
-            policy,
-            engine,
-            self.plan.windows,
-            None if huber is None else jnp.asarray(huber, dtype),
-            jumps,
-            space.selections,
-            self.plan.bodies,
-            self.plan.quantities,
-            initial,
-            self.plan.n_steps,
-            reverse,
-            batch or (1 if on_cpu else _BATCH),
-        )
-
-    def simulate(self, x: np.ndarray, start: State) -> Linearized:
-        """All windows at coordinates and initial states."""
-        self.evaluations += 1
-        at = jnp.asarray(x, self.model.scene.timestep.dtype)
-        following = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), start)
-        return linearized(self.model, at, start, following)
-
-    def linearize(self, x: np.ndarray, start: State) -> NormalEquations:
-        """Normal equations over parameters and the blocks of initial states.
-
-        A block is a window; or a motion, where windows are to meet.
-        """
-        found = self.simulate(x, start)
-        loss, gradient, hessian, jump, slope = (np.asarray(v, float) for v in found[:5])
-        p, k = len(x), self.private
-        if self.model.jumps is not None:
-            return _chained(p, k, self.plan.owner, self.model.jumps, loss, gradient, hessian, jump, slope)
-        return NormalEquations(
-            float(loss.sum()),
-            gradient[:, :p].sum(axis=0),
-            hessian[:, :p, :p].sum(axis=0),
-            gradient[:, p:] if k else np.zeros((0, 0)),
-            hessian[:, p:, p:] if k else np.zeros((0, 0, 0)),
-            hessian[:, p:, :p] if k else np.zeros((0, 0, p)),
-        )
-
-    def retract(self, start: State, change: np.ndarray) -> State:
-        """Initial states moved by the change of all blocks."""
-        if not self.private:
-            return start
-        n = len(self.plan.rows)
-        if self.model.jumps is not None:
-            change = _unchained(change, self.plan.owner, self.private)
-        rows = jnp.asarray(change.reshape(n, self.private), self.model.scene.timestep.dtype)
-        return moved(start, rows, self.plan.bodies, self.model.initial)
-
-    def points(self, starts: int, seed: int) -> list[np.ndarray]:
-        """Where to start: the given start, and the best by loss of many others in the bounds."""
-        points = [self.space.start]
-        if starts == 1:
-            return points
-        if not (np.all(np.isfinite(self.space.lower)) and np.all(np.isfinite(self.space.upper))):
-            raise ValueError("starts > 1 needs finite bounds on every parameter")
-        n = _LOOKS * (starts - 1)
-        unit = qmc.Sobol(len(self.space.start), seed=seed).random(1 << (n - 1).bit_length())[:n]
-        tried = self.space.lower + unit * (self.space.upper - self.space.lower)
-        losses = np.array([self.linearize(x, self.plan.start).loss for x in tried])
-        order = np.argsort(np.where(np.isfinite(losses), losses, np.inf))
-        return points + [tried[i] for i in order[: starts - 1]]
-
-    def search(
-        self, x: np.ndarray, max_iterations: int, tolerance: float, tell, free: bool = True
-    ) -> Solution:
-        """Minimise from x; with `free` false over the initial states alone."""
-        return bounded_least_squares(
-            self.linearize,
-            x,
-            lower=self.space.lower if free else x,
-            upper=self.space.upper if free else x,
-            start_blocks=self.plan.start,
-            retract=self.retract,
-            max_iterations=max_iterations,
-            # A step of δ standard errors reduces the loss ½ s² (N − p) by ½ s² δ².
-            tolerance=tolerance**2 / self.freedom,
-            # A step is solved to about the dtype's resolution to the power 3/4.
-            perfect=0.5 * self.plan.n_data * float(jnp.finfo(self.plan.start.position.dtype).eps) ** 0.75,
-            progress=tell,
-        )
-
-
-def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> NormalEquations:
-    """Normal equations with one block for each motion, whose windows are tied by their jumps."""
-    counts = np.bincount(owner)
-    size = int(counts.max()) * k
-    place = np.concatenate([np.arange(n) for n in counts])
-    m = len(counts)
-    shared, shared_hessian = gradient[:, :p].sum(axis=0), hessian[:, :p, :p].sum(axis=0)
-    g, b, c = np.zeros((m, size)), np.zeros((m, size, size)), np.zeros((m, size, p))
-    # Windows that a shorter motion does not have stay where they are.
-    for i, n in enumerate(counts):
-        tail = np.arange(n * k, size)
-        b[i, tail, tail] = 1.0
-    total = float(loss.sum() + 0.5 * np.sum(jump**2))
-    # The jump falls one to one as the next window's beginning moves towards the end of this one.
-    step = np.tile(1 / np.repeat(np.asarray(jumps), 3), jump.shape[1] // 12)
-    for w, (i, j) in enumerate(zip(owner, place, strict=True)):
-        mine = slice(j * k, (j + 1) * k)
-        g[i, mine] += gradient[w, p:]
-        b[i, mine, mine] += hessian[w, p:, p:]
-        c[i, mine] += hessian[w, p:, :p]
-        if j + 1 == counts[i]:
-            continue
-        by_x, by_mine, by_next = slope[w, :, :p], slope[w, :, p:], -np.diag(step)
-        following = slice((j + 1) * k, (j + 2) * k)
-        shared += by_x.T @ jump[w]
-        shared_hessian += by_x.T @ by_x
-        for rows, a in ((mine, by_mine), (following, by_next)):
-            g[i, rows] += a.T @ jump[w]
-            c[i, rows] += a.T @ by_x
-            for columns, d in ((mine, by_mine), (following, by_next)):
-                b[i, rows, columns] += a.T @ d
-    return NormalEquations(total, shared, shared_hessian, g, b, c)
-
-
-def _unchained(change: np.ndarray, owner: np.ndarray, k: int) -> np.ndarray:
-    counts = np.bincount(owner)
-    return np.concatenate([change[i, : n * k].reshape(n, k) for i, n in enumerate(counts)])
 
 
 def _motions(name: str, observed: Observed | Sequence[Any]) -> tuple[Motion, ...]:
@@ -518,14 +333,14 @@ def _initial(initial: str | Sequence[str] | None, motions: Sequence[Motion]) -> 
     return tuple(key for key in QUANTITIES if key in initial)
 
 
-def _check_options(huber, window, continuity, starts, initial, jacobian, max_iterations, tolerance) -> None:
+def _check_options(huber, window, ties, starts, initial, jacobian, max_iterations, tolerance) -> None:
     if huber is not None and not huber > 0:
         raise ValueError(f"huber must be > 0, got {huber}")
     if window is not None and window < 2:
         raise ValueError(f"window must hold at least 2 frames, got {window}")
-    if continuity is not None:
-        if not continuity > 0:
-            raise ValueError(f"continuity must be > 0, got {continuity}")
+    if ties:
+        if not all(tie > 0 for tie in ties) or any(b >= a for a, b in zip(ties, ties[1:], strict=False)):
+            raise ValueError(f"continuity must be > 0, and a sequence of it must fall, got {list(ties)}")
         if window is None or len(initial) < len(QUANTITIES):
             raise ValueError(
                 f"continuity needs window and initial='states', got window {window}, initial {list(initial)}"
@@ -554,26 +369,6 @@ def _noise(scene: Scene, motions: Sequence[Motion], noise: Mapping[str, float] |
     if not noise:
         raise ValueError(f"noise must be given for at least one of {list(QUANTITIES)}, got none")
     return dict(noise)
-
-
-def _for_each(name: str, given: Any, motions: Sequence[Motion]) -> list[Any]:
-    items = list(given) if isinstance(given, (list, tuple)) else [given] * len(motions)
-    if len(items) != len(motions):
-        raise ValueError(f"{name} must be one for all or one for each of {len(motions)}, got {len(items)}")
-    return items
-
-
-def _control_list(scene: Scene, controls: Any, motions: Sequence[Motion]) -> list[Control | None]:
-    items = _for_each("controls", controls, motions)
-    for control in items:
-        if control is None:
-            continue
-        shapes = control.force.shape, control.torque.shape
-        if any(len(s) != 3 or s[1:] != (len(scene.bodies), 3) for s in shapes):
-            raise ValueError(
-                f"controls must have shape (steps, {len(scene.bodies)}, 3), got {shapes[0]} and {shapes[1]}"
-            )
-    return items
 
 
 def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:

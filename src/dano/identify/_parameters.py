@@ -21,6 +21,7 @@ class Parameter:
         name: What results call it.
         where: From the scene to a leaf, or to a list of leaves that share the value, e.g.
             ``lambda s: s.contact("bunny", "floor").sliding_friction``.
+            For what is no leaf see `apply`.
         lower: Smallest value (a number, or an array of the leaf's shape).
         upper: Largest value.
         start: Where to begin; default the scene's own value, moved into the bounds.
@@ -29,22 +30,25 @@ class Parameter:
             matrix Σ = ½ tr(J) I − J of second moments, so that every value is the inertia tensor of some
             mass distribution. Default: "inertia" for leaves of shape (3, 3), "value" for others.
         of: "scene", or "controls" for leaves of the controls given to `identify`.
+        apply: Instead of `where`, from the scene and the value to the scene that has it, for what is no leaf
+            itself, e.g. the half side of a box whose corners follow; needs `start`, which gives the shape.
     """
 
     name: str
-    where: Callable[[Any], Any]
+    where: Callable[[Any], Any] | None = None
     lower: Numbers = -np.inf
     upper: Numbers = np.inf
     start: Numbers | None = None
     coordinates: str | None = None
     of: str = "scene"
+    apply: Callable[[Any, Array], Any] | None = None
 
 
 class Selection(NamedTuple):
     """Static part of a parameter, checked: enough to read it from and write it to a scene."""
 
     name: str
-    where: Callable[[Any], Any]
+    put: Callable[[Any, Array], Any]
     of: str
     coordinates: str
     shape: tuple[int, ...]
@@ -76,6 +80,18 @@ class Selection(NamedTuple):
         if self.coordinates == "inertia":
             return [f"{self.name}[{axes}]" for axes in ("xx", "yy", "zz", "xy", "xz", "yz")]
         return [f"{self.name}[{', '.join(map(str, index))}]" for index in np.ndindex(*self.shape)]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Leaves:
+    """Puts a value into leaves; equal to others of the same leaves, so that programs are compiled once."""
+
+    where: Callable[[Any], Any]
+
+    def __call__(self, tree: Any, value: Array) -> Any:
+        """The tree with the value in all of its leaves."""
+        values = [value.astype(leaf.dtype) for leaf in _leaves(self.where, tree)]
+        return eqx.tree_at(lambda t: _leaves(self.where, t), tree, values)
 
 
 class Space(NamedTuple):
@@ -117,33 +133,17 @@ def _checked(p: Parameter, home: Any) -> tuple[Selection, np.ndarray, np.ndarray
         raise ValueError(f"of in {what} must be 'scene' or 'controls', got {p.of!r}")
     if home is None:
         raise ValueError(f"{what} is one of the controls, but no controls are given")
-    try:
-        leaves = _leaves(p.where, home)
-    except (AttributeError, TypeError, KeyError, IndexError) as error:
-        raise ValueError(f"where in {what} must pick leaves of the {p.of}: {error}") from error
-    except ValueError as error:
-        raise ValueError(f"where in {what}: {error}") from error
-    for leaf in leaves:
-        if not eqx.is_inexact_array(leaf):
-            raise ValueError(
-                f"where in {what} must pick floating-point arrays of the {p.of}, got {type(leaf).__name__}"
-                + (": its law does not use it" if leaf is None else "")
-            )
-    try:
-        eqx.tree_at(lambda tree: _leaves(p.where, tree), home, leaves)
-    except (ValueError, TypeError, RuntimeError) as error:
+    if (p.where is None) == (p.apply is None):
         raise ValueError(
-            f"where in {what} must pick whole leaves of the {p.of}, not parts or copies of them"
-        ) from error
-    shapes = {leaf.shape for leaf in leaves}
-    if len(shapes) != 1:
-        raise ValueError(f"leaves of {what} must have one shape, got {sorted(shapes)}")
-    shape = shapes.pop()
+            f"{what} must have either where or apply, got {'none' if p.where is None else 'both'}"
+        )
+    current, put = _derived(p, what, home) if p.where is None else _picked(p, what, home)
+    shape = current.shape
     coordinates = p.coordinates or ("inertia" if shape == (3, 3) else "value")
     if coordinates not in ("value", "log", "inertia"):
         raise ValueError(f"coordinates of {what} must be 'value', 'log' or 'inertia', got {coordinates!r}")
-    selection = Selection(p.name, p.where, p.of, coordinates, shape)
-    value = np.asarray(leaves[0] if p.start is None else p.start, dtype=float)
+    selection = Selection(p.name, put, p.of, coordinates, shape)
+    value = np.asarray(current if p.start is None else p.start, dtype=float)
     if coordinates == "inertia":
         return selection, *_inertia_box(what, p, shape, value)
     lower, upper = (_bound(what, key, getattr(p, key), shape) for key in ("lower", "upper"))
@@ -165,6 +165,48 @@ def _checked(p: Parameter, home: Any) -> tuple[Selection, np.ndarray, np.ndarray
             lower, upper = np.log(np.maximum(lower, 0)), np.log(upper)
         value = np.log(value)
     return selection, np.ravel(value), np.ravel(lower), np.ravel(upper)
+
+
+def _derived(p: Parameter, what: str, home: Any) -> tuple[np.ndarray, Callable[[Any, Array], Any]]:
+    """Start and setter of a parameter with `apply`."""
+    if p.start is None:
+        raise ValueError(f"{what} has no leaf to begin at: give its start")
+    assert p.apply is not None
+    start = np.asarray(p.start, dtype=float)
+    tree = p.apply(home, jnp.asarray(start))
+    if jax.tree_util.tree_structure(tree) != jax.tree_util.tree_structure(home):
+        raise ValueError(
+            f"apply in {what} must return the {p.of} with other values, got {type(tree).__name__}"
+        )
+    return start, p.apply
+
+
+def _picked(p: Parameter, what: str, home: Any) -> tuple[np.ndarray, Callable[[Any, Array], Any]]:
+    """Current value and setter of a parameter with `where`."""
+    where = p.where
+    assert where is not None
+    try:
+        leaves = _leaves(where, home)
+    except (AttributeError, TypeError, KeyError, IndexError) as error:
+        raise ValueError(f"where in {what} must pick leaves of the {p.of}: {error}") from error
+    except ValueError as error:
+        raise ValueError(f"where in {what}: {error}") from error
+    for leaf in leaves:
+        if not eqx.is_inexact_array(leaf):
+            raise ValueError(
+                f"where in {what} must pick floating-point arrays of the {p.of}, got {type(leaf).__name__}"
+                + (": its law does not use it" if leaf is None else "")
+            )
+    try:
+        eqx.tree_at(lambda tree: _leaves(where, tree), home, leaves)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise ValueError(
+            f"where in {what} must pick whole leaves of the {p.of}, not parts or copies of them"
+        ) from error
+    shapes = {leaf.shape for leaf in leaves}
+    if len(shapes) != 1:
+        raise ValueError(f"leaves of {what} must have one shape, got {sorted(shapes)}")
+    return np.asarray(leaves[0]), _Leaves(where)
 
 
 def _bound(what: str, key: str, bound: Numbers, shape: tuple[int, ...]) -> np.ndarray:
@@ -202,10 +244,7 @@ def with_values(selections: Sequence[Selection], home: str, tree: Any, x: Float[
         part = x[offset : offset + selection.size]
         offset += selection.size
         if selection.of == home:
-            value = selection.value(part)
-            leaves = _leaves(selection.where, tree)
-            values = [value.astype(leaf.dtype) for leaf in leaves]
-            tree = eqx.tree_at(lambda t, s=selection: _leaves(s.where, t), tree, values)
+            tree = selection.put(tree, selection.value(part))
     return tree
 
 

@@ -137,11 +137,13 @@ def plan_windows(
         piece["until"] - piece["times"][0] if continuous else e[-1]
         for piece, e in zip(pieces, elapsed, strict=True)
     ]
-    n_steps = max(1, max(_steps_to(max(e[-1], u), h) for e, u in zip(elapsed, until, strict=True)))
     owner = np.array([piece["owner"] for piece in pieces])
     lags = [motions[piece["owner"]].lag for piece in pieces]
-    frame = _located(stacked(elapsed) / h, n_steps)
+    # Velocities hold half a step before a state, so those of the last frame may need a step more.
     late = [np.maximum(e - lag + 0.5 * h, 0.0) for e, lag in zip(elapsed, lags, strict=True)]
+    ends = [max(e[-1], u, v[-1]) for e, u, v in zip(elapsed, until, late, strict=True)]
+    n_steps = max(1, _steps_to(max(ends), h))
+    frame = _located(stacked(elapsed) / h, n_steps)
     moment = _located(stacked(late) / h, n_steps)
     first_step = np.array([_steps_to(piece["times"][0] - piece["origin"], h) for piece in pieces])
     forces = [piece["control"] for piece in pieces]
