@@ -84,7 +84,13 @@ DRAWING = Sampling(96, 32, 8)
 
 
 class AbstractModel(eqx.Module):
-    """Opacity and colour of an object."""
+    """Opacity and colour of an object.
+
+    Attributes:
+        bounds: Lower and upper corner [m] of a box outside of which there is nothing, shape (2, 3).
+    """
+
+    bounds: eqx.AbstractVar[Float[Array, "2 3"]]
 
     @abc.abstractmethod
     def alpha(
@@ -196,6 +202,12 @@ class SurfaceModel(AbstractModel):
         )
 
     @property
+    def bounds(self) -> Float[Array, "2 3"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """First and last node [m]."""
+        last = jnp.asarray(np.array(self.distance.shape) - 1, self.origin.dtype)
+        return jnp.stack([self.origin, self.origin + self.spacing * last])
+
+    @property
     def box(self) -> Box:
         """The grid of the distances."""
         nx, ny, nz = self.distance.shape
@@ -263,6 +275,12 @@ class DensityModel(AbstractMedium):
             appearance,
             *(jnp.asarray(x, jnp.float32) for x in (box.origin, box.spacing)),
         )
+
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """First and last node [m]."""
+        last = jnp.asarray(np.array(self.raw.shape) - 1, self.origin.dtype)
+        return jnp.stack([self.origin, self.origin + self.spacing * last])
 
     @property
     def box(self) -> Box:
