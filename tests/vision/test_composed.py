@@ -2,58 +2,22 @@
 
 import math
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxtyping import Array, Float
 from scipy.spatial import ConvexHull
+from vision.models import Fog, learned
 
 from dano import Box as BoxShape, GridField, HalfSpace, Pose, Sphere
-from dano.vision import (
-    AbstractMedium,
-    Appearance,
-    Box,
-    Camera,
-    compose,
-    Item,
-    Light,
-    PosedCamera,
-    SurfaceModel,
-)
+from dano.vision import Camera, compose, Item, Light, PosedCamera
 from dano.vision._composed import shared_weights
 from dano.vision._picture import picture
 
 ABOVE = Light((0.0, 0.0, 1.0))
 
 
-class Fog(AbstractMedium):
-    """A homogeneous medium in a box that glows in one colour."""
-
-    bounds: Float[Array, "2 3"]
-    extinction: Float[Array, ""]
-
-    def density_at(self, points):
-        inside = jnp.all((points >= self.bounds[0][None]) & (points <= self.bounds[1][None]), axis=1)
-        return jnp.where(inside, self.extinction, 0)
-
-    def colour(self, points, view, light, view_share=1.0):
-        return jnp.full_like(points, 0.5), jnp.zeros_like(points)
-
-
 def fog(lower, upper, extinction) -> Item:
-    return Item(Fog(jnp.array([lower, upper], jnp.float32), jnp.asarray(extinction, jnp.float32)))
-
-
-def learned(lit: bool = True, near: bool = False, seed: int = 0) -> SurfaceModel:
-    """A ball with a bump, in colours that depend on everything."""
-    box = Box.around(np.full(3, -0.5), np.full(3, 0.5), 40)
-    look = Appearance.create(box, lit=lit, near_light=near, resolution=8, key=jax.random.key(seed))
-    x = box.nodes
-    distance = np.minimum(
-        np.linalg.norm(x, axis=1) - 0.3, np.linalg.norm(x - np.array([0.25, 0.1, 0.1]), axis=1) - 0.15
-    )
-    return SurfaceModel.create(distance.reshape(box.shape), box, look)
+    return Item(Fog.create(lower, upper, extinction))
 
 
 def test_overlapping_media_share_one_transmittance():
@@ -87,7 +51,7 @@ def test_the_order_of_the_list_is_of_no_account():
         Item(HalfSpace()),
     ]
     camera = Camera((1.5, -2.0, 1.6), (0.0, 0.0, 0.4), width=24, height=20)
-    lights = [Light((1, -1, 2)), Light(position=(0, 0, 3), colour=(0.2, 0.3, 0.4), reach=2.0)]
+    lights = [Light(position=(1, -1, 3), colour=(0.5, 0.6, 0.7), reach=2.0)]
     first = compose(items, camera, lights, ambient=0.1)
     back = compose(items[::-1], camera, lights, ambient=0.1)
     for name in ("colour", "opacity", "depth"):
@@ -214,7 +178,7 @@ def test_pictures_lie_over_any_background():
         (lambda: compose([], Camera((1, 0, 0)), ABOVE, item_lights={2: []}), r"got \[2\]"),
         (lambda: compose([], Camera((1, 0, 0)), ABOVE, ambient=2.0), "ambient must lie"),
         (lambda: Item(learned(), level=3.0), "level and density_scale are of fields"),
-        (lambda: Item(Fog(jnp.zeros((2, 3)), jnp.zeros(())), colour="#ffffff"), "colour is of solids"),
+        (lambda: Item(Fog.create((0,) * 3, (1,) * 3, 1.0), colour="#ffffff"), "colour is of solids"),
     ],
 )
 def test_bad_input_is_refused(call, message):

@@ -167,7 +167,7 @@ def train(
     progress.close()
     trained.field.save(outputs["field"])
     save_field(grid.grid, outputs["grid"])
-    made.save(output)
+    made.save(output, look=trained.field.look)
     from dano.report import mass_estimates, write_training_report
 
     estimates = mass_estimates(trained, made, grid.grid)

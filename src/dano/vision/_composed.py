@@ -21,7 +21,7 @@ from dano.vision._camera import AbstractCamera
 from dano.vision._item import Item, placement
 from dano.vision._light import Light
 from dano.vision._models import AbstractMedium, AbstractModel, DRAWING, Rays, Sampling
-from dano.vision._picture import Picture
+from dano.vision._picture import Picture, tiles
 from dano.vision._volume import (
     composite,
     importance_edges,
@@ -31,7 +31,8 @@ from dano.vision._volume import (
     transmittance,
 )
 
-_CHUNK = 2048
+_CHUNK = 1024
+"""Rays at once: few enough that many bundles miss an object altogether."""
 _SHADOWS = Sampling(32, 16, 1)
 """For rays towards lamps: only what gets through matters."""
 
@@ -80,9 +81,20 @@ class Part(eqx.Module):
 
     def sections(self, rays: Rays, sampling: Sampling) -> tuple[Array, Array]:
         """Edges (n, fine + 1) of sections around what is opaque, and their opacity (n, fine)."""
-        edges = stratified_edges(rays.near, rays.far, sampling.coarse, None)
-        edges = importance_edges(edges, self.model.interest(rays, edges, self.sharpness), sampling.fine, None)
-        return edges, self.model.alpha(rays, edges, self.sharpness)
+
+        def found() -> tuple[Array, Array]:
+            edges = stratified_edges(rays.near, rays.far, sampling.coarse, None)
+            edges = importance_edges(
+                edges, self.model.interest(rays, edges, self.sharpness), sampling.fine, None
+            )
+            return edges, self.model.alpha(rays, edges, self.sharpness)
+
+        def none() -> tuple[Array, Array]:
+            edges = jnp.broadcast_to(rays.near[:, None], (len(rays.near), sampling.fine + 1))
+            return edges, jnp.zeros_like(edges[:, 1:])
+
+        # Most bundles of rays miss most objects.
+        return jax.lax.cond(jnp.any(rays.far > rays.near), found, none)
 
 
 class Plane(NamedTuple):
@@ -230,7 +242,8 @@ def compose(
     lamps = tuple(tuple(own.get(i, common)) for i in numbers)
     directions = camera.rays().reshape(-1, 3).astype(np.float32)
     origin = camera.position.astype(np.float32)
-    pixels = np.flatnonzero(_may_meet([item for _, item in things], floors, origin, directions))
+    order = tiles(camera.width, camera.height)
+    pixels = order[_may_meet([item for _, item in things], floors, origin, directions[order])]
     n = len(directions)
     columns = np.zeros((n, 3), np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32), np.full(n, -1)
     for start in range(0, len(pixels), _CHUNK):
@@ -303,17 +316,7 @@ def _composed(parts, planes, lamps, origin, directions, ambient, sampling):
         t = _to_plane(plane, origins, directions)
         floor = jnp.where(t < limit, j, floor)
         limit = jnp.minimum(limit, t)
-    rays = [part.local(origins, directions, limit) for part in parts]
-    found = [part.sections(own, sampling) for part, own in zip(parts, rays, strict=True)]
-    weights, clear = shared_weights([edges for edges, _ in found], [alpha for _, alpha in found], n)
-    colour, depth = jnp.zeros((n, 3), jnp.float32), jnp.zeros(n, jnp.float32)
-    shares = []
-    for i in range(len(parts)):
-        seen, distance, share = _sent(
-            parts, i, lamps[i], rays[i], found[i][0], weights[i], origins, directions, ambient, sampling
-        )
-        colour, depth = colour + seen, depth + distance
-        shares.append(share)
+    colour, depth, shares, clear = through(parts, lamps, origins, directions, limit, ambient, sampling)
     for j, plane in enumerate(planes):
         share = jnp.where(floor == j, clear, 0)
         t = jnp.where(floor == j, limit, 0)
@@ -331,6 +334,28 @@ def _composed(parts, planes, lamps, origin, directions, ambient, sampling):
     opacity = jnp.sum(stacked, axis=0)
     which = jnp.where(opacity > 0.5, jnp.argmax(stacked, axis=0), -1)
     return colour, opacity, depth / jnp.maximum(opacity, _GONE), which
+
+
+def through(parts, lamps, origins, directions, limit, ambient, sampling):
+    """What rays [W] see of parts before they end.
+
+    Returns:
+        SRGB over black (n, 3), mean distance times opacity [m] (n,), the share of every part, each (n,), and
+        the share that gets through (n,).
+    """
+    n = len(directions)
+    rays = [part.local(origins, directions, limit) for part in parts]
+    found = [part.sections(own, sampling) for part, own in zip(parts, rays, strict=True)]
+    weights, clear = shared_weights([edges for edges, _ in found], [alpha for _, alpha in found], n)
+    colour, depth = jnp.zeros((n, 3), jnp.float32), jnp.zeros(n, jnp.float32)
+    shares = []
+    for i in range(len(parts)):
+        seen, distance, share = _sent(
+            parts, i, lamps[i], rays[i], found[i][0], weights[i], origins, directions, ambient, sampling
+        )
+        colour, depth = colour + seen, depth + distance
+        shares.append(share)
+    return colour, depth, shares, clear
 
 
 def shared_weights(
@@ -387,7 +412,11 @@ def _sent(parts, i, lamps, rays, edges, weights, origins, directions, ambient, s
     t = jnp.take_along_axis(middle, chosen, axis=1)
     world = (origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3)
     local, view = rays.at(t), jnp.repeat(rays.direction, k, axis=0)
-    light = radiance(parts, i, lamps, world, local, view, ambient)
+    light = jax.lax.cond(
+        jnp.any(weights > 0),
+        lambda: radiance(parts, i, lamps, world, local, view, ambient),
+        lambda: jnp.zeros_like(world),
+    )
     share = jnp.sum(weights, axis=1)
     whole = (share / jnp.maximum(jnp.sum(some, axis=1), _GONE))[:, None]
     colour = composite(some, light.reshape(len(share), k, 3)) * whole
@@ -408,7 +437,7 @@ def radiance(parts, i, lamps, world, local, view, ambient):
         start = world + (4 / part.sharpness) * (normals @ part.rotation.T)
     for lamp in lamps:
         towards, away, power = lamp.at(world)
-        sent, _ = part.model.colour(local, view, _as_learned(part, lamp, towards, world))
+        sent, _ = part.model.colour(local, view, as_learned(part, lamp, towards, world))
         arriving = _reaching(others, start, towards, away)[:, None] * power
         if len(lamps) == 1 and not painted:
             # Nothing is added up: a learned colour just below 0 or above 1 stays what it is.
@@ -417,7 +446,7 @@ def radiance(parts, i, lamps, world, local, view, ambient):
     return _srgb(total)
 
 
-def _as_learned(part, lamp, towards, world):
+def as_learned(part, lamp, towards, world):
     """A lamp as a model was taught to see it: a direction, or a position [m], in its own frame."""
     look = getattr(part.model, "appearance", None)
     if look is not None and look.near_light:
@@ -441,11 +470,15 @@ def reached_through(
 ) -> Float[Array, " n"]:
     """Transmittance of a part between points [m, W] and a lamp at distances `away` [m]."""
     rays = part.local(points, towards, away)
-    edges = stratified_edges(rays.near, rays.far, _SHADOWS.coarse, None)
-    fine, _ = part.sections(rays, _SHADOWS)
-    # The deepest point of a solid decides, and fine sections crowd where a ray enters: both together.
-    edges = jnp.sort(jnp.concatenate([edges, fine], axis=1), axis=1)
-    return transmittance(part.model.alpha(rays, edges, part.sharpness))
+
+    def found() -> Array:
+        edges = stratified_edges(rays.near, rays.far, _SHADOWS.coarse, None)
+        fine, _ = part.sections(rays, _SHADOWS)
+        # The deepest point of a solid decides, and fine sections crowd where a ray enters: both together.
+        edges = jnp.sort(jnp.concatenate([edges, fine], axis=1), axis=1)
+        return transmittance(part.model.alpha(rays, edges, part.sharpness))
+
+    return jax.lax.cond(jnp.any(rays.far > rays.near), found, lambda: jnp.ones_like(rays.far))
 
 
 def _to_plane(plane: Plane, origins: Array, directions: Array) -> Float[Array, " n"]:

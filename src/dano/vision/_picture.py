@@ -1,5 +1,6 @@
 """Whole pictures of learned models."""
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -65,6 +66,13 @@ def picture(
     opacity = opacity.reshape(shape)
     identity = np.where(opacity > 0.5, 0, -1).astype(np.int32)
     return Picture(colour.reshape(*shape, 3), opacity, depth.reshape(shape), identity)
+
+
+@functools.lru_cache(maxsize=8)
+def tiles(width: int, height: int) -> Int[np.ndarray, " pixels"]:
+    """Pixel indices ordered by small tiles, so that rays that are traced together see similar things."""
+    y, x = np.mgrid[:height, :width]
+    return np.argsort(((y // 16) * (width // 16 + 1) + x // 16).ravel(), kind="stable")
 
 
 def _padded(x: np.ndarray, n: int) -> np.ndarray:
