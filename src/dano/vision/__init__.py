@@ -9,6 +9,7 @@ from dano.vision._camera import (
 from dano.vision._capture import Capture as Capture, View as View
 from dano.vision._capture_files import load_capture as load_capture
 from dano.vision._composed import compose as compose
+from dano.vision._hash_model import HashModel as HashModel
 from dano.vision._hull import Box as Box, hull_distance as hull_distance
 from dano.vision._item import (
     checked_colour as checked_colour,

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from dano.fields import CallableField
 from dano.vision._appearance import Appearance, Share
 from dano.vision._hull import Box
 from dano.vision._trilinear import value_and_slope_at, value_at
@@ -128,6 +129,17 @@ class AbstractMedium(AbstractModel):
         """See `density_alpha`, with the density in the middle of each section."""
         middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
         return density_alpha(self.density_at(rays.at(middle)).reshape(middle.shape), edges)
+
+    def field(self) -> CallableField:
+        """The density as a field, with gradients by automatic differentiation; bake it before simulating."""
+        return CallableField(_Density(self), self.bounds, "jax")
+
+
+class _Density(eqx.Module):
+    model: AbstractMedium
+
+    def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        return self.model.density_at(points)
 
 
 def see(

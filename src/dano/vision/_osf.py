@@ -11,14 +11,12 @@ training, where `SurfaceModel` has thirty thousand.
 import os
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.archive import read_archive, write_archive
-from dano.fields import CallableField
 from dano.maths import Numbers
 from dano.vision._appearance import Share
 from dano.vision._models import AbstractMedium
@@ -139,10 +137,6 @@ class OSF(AbstractMedium):
         colour = 1.2 * (jax.nn.sigmoid(_affine(self.colour_layer, h)) - 0.5) + 0.5
         return colour, jnp.zeros_like(points)
 
-    def field(self) -> CallableField:
-        """The density as a field; bake it before simulating."""
-        return CallableField(_Density(self), self.bounds, "jax")
-
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to one file (a zip of arrays, no pickle), replacing another only when complete.
 
@@ -176,13 +170,6 @@ class OSF(AbstractMedium):
 
     def _layers(self) -> list[tuple[Array, Array]]:
         return [*self.trunk, self.density_layer, self.bottleneck, self.head, self.colour_layer]
-
-
-class _Density(eqx.Module):
-    model: OSF
-
-    def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        return self.model.density_at(points)
 
 
 def _affine(layer: tuple[Array, Array], x: Float[Array, "n i"]) -> Float[Array, "n o"]:
