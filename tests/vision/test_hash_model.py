@@ -9,7 +9,7 @@ import pytest
 from scipy.interpolate import RegularGridInterpolator
 
 from dano.fields import HashGrid
-from dano.fields._hash_grid import _row
+from dano.fields._hash_grid import rows_of
 from dano.vision import HashModel, Rays, Sampling, see
 
 BOX = ((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3))
@@ -26,7 +26,8 @@ def test_without_collisions_it_is_trilinear_interpolation(hashed):
     nodes = np.stack(np.meshgrid(*[np.arange(cells + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     values = rng.normal(size=(len(nodes), 2))
     resolution, entries = (0, 2**18) if hashed else (cells + 1, (cells + 1) ** 3)
-    rows = np.asarray(_row(jnp.asarray(nodes, jnp.uint32), resolution, entries))
+    at = [jnp.asarray(column, jnp.uint32)[:, None] for column in nodes.T]
+    rows = np.asarray(rows_of(at, (resolution,), (entries,)))[:, 0]
     assert len(set(rows.tolist())) == len(rows)
     table = np.zeros((entries, 2))
     table[rows] = values

@@ -156,13 +156,18 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _soap_rows(pair: Pair, n_drops: int) -> list[Row]:
-    """Tilt of the face that it lies on; a bar that stands on its edge is no flat one, and counts."""
-    scene, tilts = _scene(pair.trained), []
+    """Tilt of the face that it lies on: one of the two large ones, or a narrow side that it stands on."""
+    scene, flat, standing = _scene(pair.trained), [], []
     for seed in range(n_drops):
         up = _moved(scene, _dropped(scene, _points(pair.trained), seed), _REST_SECONDS).rotation[-1][2]
-        tilts.append(min(_angle(sign * axis, up) for axis in np.eye(3) for sign in (1, -1)))
-    row = Row(REST, "largest tilt of a face against the floor", max(tilts), "°", 1.0)
-    return [row, Row(REST, "median tilt", float(np.median(tilts)), "°", note=f"{n_drops} random drops")]
+        axis = int(np.argmax(np.abs(up)))
+        (flat if axis == 2 else standing).append(_angle(np.sign(up[axis]) * np.eye(3)[axis], up))
+    note = f"{len(flat)} of {n_drops} random drops"
+    rows = [Row(REST, "lying flat, largest tilt", max(flat), "°", 1.0, note=note)] if flat else []
+    if standing:
+        note = f"{len(standing)} drops"
+        rows.append(Row(REST, "standing on a narrow side, largest tilt", max(standing), "°", note=note))
+    return rows
 
 
 def _bunny_rows(pair: Pair, n_drops: int) -> list[Row]:

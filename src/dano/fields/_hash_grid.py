@@ -1,5 +1,7 @@
 """Multiresolution hash encoding (Müller et al., Instant Neural Graphics Primitives, 2022)."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -69,28 +71,32 @@ class HashGrid(eqx.Module):
 
     def __call__(self, x: Float[Array, "n 3"]) -> Float[Array, "n width"]:
         """Features at points in the unit cube."""
-        levels = zip(self.tables, self.scales, self.resolutions, strict=True)
-        return jnp.concatenate([self._level(x, *level) for level in levels], axis=1)
-
-    def _level(
-        self, x: Float[Array, "n 3"], table: Float[Array, "entries features"], scale: float, resolution: int
-    ) -> Float[Array, "n features"]:
-        u = x * scale + self.shift
-        base = jnp.floor(u)
-        fraction = u - base
-        node = base.astype(jnp.uint32)
-        total = jnp.zeros((x.shape[0], table.shape[1]), x.dtype)
+        # All levels at once, a corner at a time: one program for a dozen levels, and gathers that are fast.
+        entries = [len(table) for table in self.tables]
+        starts = jnp.asarray(np.cumsum([0, *entries[:-1]]), jnp.int32)
+        joined = jnp.concatenate(self.tables)
+        scales = jnp.asarray(self.scales, x.dtype)[None]
+        # One array per axis: a last axis of three would leave most of a vector unit idle.
+        u = [x[:, i, None] * scales + self.shift for i in range(3)]
+        base = [jnp.floor(v) for v in u]
+        far = [v - b for v, b in zip(u, base, strict=True)]
+        node = [b.astype(jnp.uint32) for b in base]
+        total = jnp.zeros((len(x), len(self.tables), joined.shape[1]), x.dtype)
         for corner in np.ndindex(2, 2, 2):
-            row = _row(node + jnp.asarray(corner, jnp.uint32)[None], resolution, table.shape[0])
-            weight = jnp.prod(jnp.where(jnp.asarray(corner)[None] == 1, fraction, 1 - fraction), axis=1)
-            total += weight[:, None] * table.at[row].get(mode="promise_in_bounds").astype(x.dtype)
-        return total
+            at = [n + jnp.uint32(step) for n, step in zip(node, corner, strict=True)]
+            row = starts[None] + rows_of(at, self.resolutions, entries)
+            share = [f if step else 1 - f for f, step in zip(far, corner, strict=True)]
+            features = joined.at[row].get(mode="promise_in_bounds").astype(x.dtype)
+            total += (share[0] * share[1] * share[2])[..., None] * features
+        return total.reshape(len(x), -1)
 
 
-def _row(node: UInt32[Array, "n 3"], resolution: int, entries: int) -> Int[Array, " n"]:
-    if resolution:
-        index = node[:, 0] + resolution * (node[:, 1] + resolution * node[:, 2])
-    else:
-        products = [node[:, i] * jnp.uint32(prime) for i, prime in enumerate(_PRIMES)]
-        index = products[0] ^ products[1] ^ products[2]
-    return (index % jnp.uint32(entries)).astype(jnp.int32)
+def rows_of(
+    node: Sequence[UInt32[Array, "n levels"]], resolutions: Sequence[int], entries: Sequence[int]
+) -> Int[Array, "n levels"]:
+    """Rows of a level's table that belong to its nodes: x fastest in dense levels, hashed in others."""
+    side, size = (jnp.asarray(x, jnp.uint32)[None] for x in (resolutions, entries))
+    dense = node[0] + side * (node[1] + side * node[2])
+    products = [n * jnp.uint32(prime) for n, prime in zip(node, _PRIMES, strict=True)]
+    index = jnp.where(side > 0, dense, products[0] ^ products[1] ^ products[2])
+    return (index % size).astype(jnp.int32)
