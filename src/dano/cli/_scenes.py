@@ -160,6 +160,7 @@ class _Artist:
             video,
             strip=strip,
             fps=DEMO_FPS,
+            looks=loaded.looks(),
             size=DEMO_SIZE,
             progress=self._tell,
         )

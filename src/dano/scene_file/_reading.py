@@ -16,7 +16,7 @@ from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSp
 from dano.maths import Pose
 from dano.objects import MassModel, NeuralObject
 from dano.scene import Body, Contact, Scene, State
-from dano.scene_file._objects import build_asset, build_object, Progress
+from dano.scene_file._objects import asset_look, build_asset, build_object, Progress
 from dano.scene_file._schedule import read_schedule, Schedule
 from dano.scene_file._table import located, Table
 from dano.vision import LearnedField
@@ -72,7 +72,7 @@ class SceneFile:
         controls: Forces and torques over time, or None.
         path: Where the file is, or would be: names in it are relative to its folder.
         text: The file's text.
-        objects: Files of neural objects by the names of their bodies.
+        objects: Files of neural objects, or names of shipped ones, by the names of their bodies.
     """
 
     scene: Scene
@@ -81,7 +81,7 @@ class SceneFile:
     controls: Schedule | None
     path: Path
     text: str
-    objects: dict[str, Path]
+    objects: dict[str, Path | str]
 
     def looks(self) -> dict[str, LearnedField]:
         """What bodies look like whose objects' files say so, by name: for pictures.
@@ -89,8 +89,11 @@ class SceneFile:
         Raises:
             ValueError: If a file cannot be read any more.
         """
-        read = {path: LearnedField.of_object(path) for path in sorted(set(self.objects.values()))}
-        return {name: look for name, path in self.objects.items() if (look := read[path]) is not None}
+        read = {
+            source: asset_look(source) if isinstance(source, str) else LearnedField.of_object(source)
+            for source in set(self.objects.values())
+        }
+        return {name: look for name, source in self.objects.items() if (look := read[source]) is not None}
 
 
 def load_scene(
@@ -158,7 +161,9 @@ def parse_scene(
         start = {row["name"]: {key: row[key] for key in _STATE if key in row} for row in tables}
         state = scene.initial_state(**start)
     objects = {
-        row["name"]: path.parent / Path(row["object"]).expanduser() for row in tables if "object" in row
+        row["name"]: row["asset"] if "asset" in row else path.parent / Path(row["object"]).expanduser()
+        for row in tables
+        if "asset" in row or "object" in row
     }
     return SceneFile(scene, state, steps, read_schedule(top, scene), path, text, objects)
 
