@@ -143,6 +143,26 @@ def test_a_lamp_nearby_sends_light_by_the_inverse_square():
     np.testing.assert_allclose(got, 0.5 * 0.5**1.5, rtol=1e-3)
 
 
+def test_a_look_learned_under_a_lamp_nearby_knows_where_it_is():
+    near, far = learned(near=True), learned()
+    rng = np.random.default_rng(0)
+    points, view, normal = (jnp.asarray(rng.uniform(-0.3, 0.3, (50, 3)), jnp.float32) for _ in range(3))
+    lamp = jnp.array([0.4, -0.2, 0.5], jnp.float32)
+    towards = lamp[None] - points
+    towards = towards / jnp.linalg.norm(towards, axis=1, keepdims=True)
+    positions = jnp.broadcast_to(lamp, points.shape)
+    expected = far.appearance(points, normal, view, towards)
+    np.testing.assert_allclose(near.appearance(points, normal, view, positions), expected, atol=1e-6)
+    assert float(jnp.std(expected)) > 0.01
+    # In a picture: as a direction learned, from a place; and as a place learned, from a direction.
+    camera, place = Camera((0.0, -1.5, 0.3), width=20, height=16), Pose((0.1, 0.0, 0.2))
+    lamps = Light(position=(0.4, -0.9, 0.5)), Light((0.5, -0.8, 0.9))
+    for light in lamps:
+        a, b = (compose([Item(model, place)], camera, light).colour for model in (near, far))
+        np.testing.assert_allclose(a, b, atol=6e-3)
+    assert np.abs(compose([Item(near, place)], camera, lamps[0]).colour - a).max() > 0.01
+
+
 def test_each_item_may_have_its_own_lamps():
     items = [
         Item(Sphere(0.3), Pose((-0.5, 0, 0)), "#ffffff"),
