@@ -11,12 +11,16 @@ from dano.vision import AbstractMedium, Appearance, Box, SurfaceModel
 class Fog(AbstractMedium):
     """A homogeneous medium in a box that glows in one grey."""
 
-    bounds: Float[Array, "2 3"]
+    corners: Float[Array, "2 3"]
     extinction: Float[Array, ""]
 
     @classmethod
     def create(cls, lower, upper, extinction) -> "Fog":
         return cls(jnp.array([lower, upper], jnp.float32), jnp.asarray(extinction, jnp.float32))
+
+    @property
+    def bounds(self):
+        return self.corners
 
     def density_at(self, points):
         inside = jnp.all((points >= self.bounds[0][None]) & (points <= self.bounds[1][None]), axis=1)

@@ -7,7 +7,7 @@ solids do: thrown up and tumbling without contact, and dropped until after their
 import argparse
 import tempfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -121,7 +121,7 @@ def _scene(thing: dano.NeuralObject) -> dano.Scene:
     return dano.Scene.create(bodies, [contact], timestep=_TIMESTEP)
 
 
-def _moved(scene: dano.Scene, start: dict[str, np.ndarray], seconds: float) -> Motion:
+def _moved(scene: dano.Scene, start: dict[str, Any], seconds: float) -> Motion:
     """Simulate from a place of the field frame's origin, an orientation and velocities."""
     body = scene.bodies[0]
     com = np.asarray(body.com)
@@ -135,7 +135,7 @@ def _moved(scene: dano.Scene, start: dict[str, np.ndarray], seconds: float) -> M
     return Motion(turned, np.asarray(states.position[:, 0]) - turned @ com)
 
 
-def _dropped(scene: dano.Scene, points: np.ndarray, seed: int, *, above: float = 0.5) -> dict:
+def _dropped(scene: dano.Scene, points: np.ndarray, seed: int, *, above: float = 0.5) -> dict[str, Any]:
     """A random orientation, the lowest point `above` sizes over the floor, turning slowly."""
     rng = np.random.default_rng(seed)
     orientation = rng.normal(size=4)

@@ -123,7 +123,7 @@ class PaintedSolid(AbstractModel):
     albedo: Float[Array, "3"]
 
     @property
-    def bounds(self) -> Float[Array, "2 3"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def bounds(self) -> Float[Array, "2 3"]:
         """Of the shape, with room for its soft edge."""
         bounds = self.shape.bounds
         room = jnp.broadcast_to(0.02 * jnp.max(bounds[1] - bounds[0]), (3,))
@@ -174,7 +174,7 @@ class PaintedMedium(AbstractMedium):
     albedo: Float[Array, "3"]
 
     @property
-    def bounds(self) -> Float[Array, "2 3"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def bounds(self) -> Float[Array, "2 3"]:
         """Of the grid."""
         return self.grid.bounds
 

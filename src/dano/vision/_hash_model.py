@@ -29,7 +29,7 @@ class HashModel(AbstractMedium):
         grid: Features of places in the box, as a unit cube.
         trunk: Features → h.
         head: (h, view, light) → raw colour.
-        bounds: Box [m], shape (2, 3); nothing is outside of it.
+        corners: Box [m], shape (2, 3); nothing is outside of it.
         scale: Length [m] over which a density of h₀ = 0 dims light by 1/e.
         lit: Whether the colour depends on a light (static).
     """
@@ -37,7 +37,7 @@ class HashModel(AbstractMedium):
     grid: HashGrid
     trunk: Network
     head: Network
-    bounds: Float[Array, "2 3"]
+    corners: Float[Array, "2 3"]
     scale: Float[Array, ""]
     lit: bool = eqx.field(static=True)
 
@@ -61,6 +61,11 @@ class HashModel(AbstractMedium):
             jnp.asarray(0.1 * (box[1] - box[0]).max(), jnp.float32),
             lit,
         )
+
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """`corners`."""
+        return self.corners
 
     def _code_at(self, points: Float[Array, "n 3"]) -> tuple[Float[Array, "n 16"], Array]:
         lower, upper = self.bounds.astype(points.dtype)
@@ -123,7 +128,8 @@ class HashModel(AbstractMedium):
                 tuple(map(int, data["resolutions"])),
                 float(data["shift"]),
             )
-            trunk, head = (Network(series(f"{n}_weight"), series(f"{n}_bias")) for n in ("trunk", "head"))
+            trunk = Network(series("trunk_weight"), series("trunk_bias"))
+            head = Network(series("head_weight"), series("head_bias"))
             box, scale, lit = jnp.asarray(data["bounds"]), jnp.asarray(data["scale"]), bool(data["lit"])
         except (KeyError, ValueError) as error:
             raise ValueError(f"{path} is not a valid hash-grid model: {error}") from error

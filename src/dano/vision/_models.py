@@ -85,13 +85,12 @@ DRAWING = Sampling(96, 32, 8)
 
 
 class AbstractModel(eqx.Module):
-    """Opacity and colour of an object.
+    """Opacity and colour of an object."""
 
-    Attributes:
-        bounds: Lower and upper corner [m] of a box outside of which there is nothing, shape (2, 3).
-    """
-
-    bounds: eqx.AbstractVar[Float[Array, "2 3"]]
+    @property
+    @abc.abstractmethod
+    def bounds(self) -> Float[Array, "2 3"]:
+        """Lower and upper corner [m] of a box outside of which there is nothing."""
 
     @abc.abstractmethod
     def alpha(
@@ -214,7 +213,7 @@ class SurfaceModel(AbstractModel):
         )
 
     @property
-    def bounds(self) -> Float[Array, "2 3"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def bounds(self) -> Float[Array, "2 3"]:
         """First and last node [m]."""
         last = jnp.asarray(np.array(self.distance.shape) - 1, self.origin.dtype)
         return jnp.stack([self.origin, self.origin + self.spacing * last])
@@ -289,7 +288,7 @@ class DensityModel(AbstractMedium):
         )
 
     @property
-    def bounds(self) -> Float[Array, "2 3"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def bounds(self) -> Float[Array, "2 3"]:
         """First and last node [m]."""
         last = jnp.asarray(np.array(self.raw.shape) - 1, self.origin.dtype)
         return jnp.stack([self.origin, self.origin + self.spacing * last])

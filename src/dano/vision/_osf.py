@@ -43,7 +43,7 @@ class OSF(AbstractMedium):
         bottleneck: Trunk → 256.
         head: Bottleneck and encoded directions → 128.
         colour_layer: Head → raw colour.
-        bounds: Box [m] outside of which there is nothing, shape (2, 3).
+        corners: Box [m] outside of which there is nothing, shape (2, 3).
         scale: Length of a unit of the network's coordinates [m].
     """
 
@@ -52,7 +52,7 @@ class OSF(AbstractMedium):
     bottleneck: tuple[Float[Array, "_ _"], Float[Array, " _"]]
     head: tuple[Float[Array, "_ _"], Float[Array, " _"]]
     colour_layer: tuple[Float[Array, "3 _"], Float[Array, "3"]]
-    bounds: Float[Array, "2 3"]
+    corners: Float[Array, "2 3"]
     scale: Float[Array, ""]
 
     @classmethod
@@ -68,7 +68,7 @@ class OSF(AbstractMedium):
         """Random weights, uniform in ±1/√inputs.
 
         Args:
-            bounds: See the class.
+            bounds: Lower and upper corner of the box [m], shape (2, 3).
             scale: See the class.
             depth: Layers of the trunk, at least two more than the one after which the encoding is joined.
             width: Units of each.
@@ -105,6 +105,11 @@ class OSF(AbstractMedium):
             jnp.asarray(box, jnp.float32),
             jnp.asarray(scale, jnp.float32),
         )
+
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """`corners`."""
+        return self.corners
 
     def _trunk_at(self, points: Float[Array, "n 3"]) -> Float[Array, "n w"]:
         code = encoded(points / self.scale.astype(points.dtype), _POSITION_FREQUENCIES)
