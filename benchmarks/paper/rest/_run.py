@@ -24,7 +24,7 @@ REST, BUNNY_REST = "The trained soap at rest", "The trained bunny at rest"
 BESIDE = "The trained object beside the true solid, thrown alike"
 _TIMESTEP, _REST_SECONDS, _SECONDS = 0.002, 4.0, 1.0
 _NODES = 128
-_FRICTION = 0.3
+_FRICTION, _RESTITUTION = 0.3, 0.3
 _N_DROPS = 10
 _LIKELY = 0.01
 """Share of random drops from which a stable pose counts: others are facets of a few triangles."""
@@ -71,7 +71,13 @@ def run() -> None:
             rows += _beside_rows(name, pair)
         if arguments.film is not None:
             _film(pairs["bunny"], arguments.film)
-    settings = {"timestep": _TIMESTEP, "law": "distributed", "sliding_friction": _FRICTION, "drops": n_drops}
+    settings: dict[str, object] = {
+        "timestep": _TIMESTEP,
+        "law": "distributed",
+        "sliding_friction": _FRICTION,
+        "restitution beside the true solid": _RESTITUTION,
+        "drops": n_drops,
+    }
     report("paper.rest", rows, settings, load, arguments.json)
 
 
@@ -113,10 +119,9 @@ def _true_soap() -> SignedDistanceGrid:
 TRUE = {"bunny": _true_bunny, "soap": _true_soap}
 
 
-def _scene(thing: dano.NeuralObject) -> dano.Scene:
-    contact = dano.Contact(
-        "object", "floor", dano.ContactParams(sliding_friction=_FRICTION), dano.DistributedLaw()
-    )
+def _scene(thing: dano.NeuralObject, restitution: float = 0.0) -> dano.Scene:
+    params = dano.ContactParams(sliding_friction=_FRICTION, restitution=restitution)
+    contact = dano.Contact("object", "floor", params, dano.DistributedLaw())
     bodies = [dano.Body("object", thing), dano.Body("floor", dano.HalfSpace(), fixed=True)]
     return dano.Scene.create(bodies, [contact], timestep=_TIMESTEP)
 
@@ -135,7 +140,7 @@ def _moved(scene: dano.Scene, start: dict[str, Any], seconds: float) -> Motion:
     return Motion(turned, np.asarray(states.position[:, 0]) - turned @ com)
 
 
-def _dropped(scene: dano.Scene, points: np.ndarray, seed: int, *, above: float = 0.5) -> dict[str, Any]:
+def _dropped(points: np.ndarray, seed: int, *, above: float = 0.5) -> dict[str, Any]:
     """A random orientation, the lowest point `above` sizes over the floor, turning slowly."""
     rng = np.random.default_rng(seed)
     orientation = rng.normal(size=4)
@@ -159,7 +164,7 @@ def _soap_rows(pair: Pair, n_drops: int) -> list[Row]:
     """Tilt of the face that it lies on: one of the two large ones, or a narrow side that it stands on."""
     scene, flat, standing = _scene(pair.trained), [], []
     for seed in range(n_drops):
-        up = _moved(scene, _dropped(scene, _points(pair.trained), seed), _REST_SECONDS).rotation[-1][2]
+        up = _moved(scene, _dropped(_points(pair.trained), seed), _REST_SECONDS).rotation[-1][2]
         axis = int(np.argmax(np.abs(up)))
         (flat if axis == 2 else standing).append(_angle(np.sign(up[axis]) * np.eye(3)[axis], up))
     note = f"{len(flat)} of {n_drops} random drops"
@@ -175,7 +180,7 @@ def _bunny_rows(pair: Pair, n_drops: int) -> list[Row]:
     scene, misses, true_misses = _scene(pair.trained), [], []
     true_scene = _scene(pair.true)
     for seed in range(n_drops):
-        start = _dropped(scene, _points(pair.true), seed)
+        start = _dropped(_points(pair.true), seed)
         for found, one in ((misses, scene), (true_misses, true_scene)):
             up = _moved(one, start, _REST_SECONDS).rotation[-1][2]
             found.append(min(_angle(pose, up) for pose in poses))
@@ -220,20 +225,28 @@ def _beside_rows(name: str, pair: Pair) -> list[Row]:
     """Largest distance between the same point of both, over the size."""
     points = _points(pair.true)[::10]
     size = pair.true.size
-    thrown = _dropped(_scene(pair.true), points, 100, above=0.0)
+    scenes = [_scene(thing, _RESTITUTION) for thing in (pair.trained, pair.true)]
+    thrown = _dropped(points, 100, above=0.0)
     thrown["motion"] = {"velocity": (0.3, 0.2, 0.5 * 9.81 * _SECONDS + 0.1), "omega": (6.0, 4.0, -5.0)}
     thrown["origin"] = thrown["origin"] + np.array([0.0, 0.0, size])
-    bounced = _dropped(_scene(pair.true), points, 101, above=1.0)
+    bounced = _dropped(points, 101, above=2.0)
     bounced["motion"] = {"velocity": (0.2, 0.0, 0.0), "omega": (2.0, 3.0, 1.0)}
-    rows = []
+    off = np.linalg.norm(np.asarray(pair.trained.mass.com - pair.true.mass.com)) / size
+    moments = [np.linalg.eigvalsh(np.asarray(thing.mass.inertia)) for thing in (pair.trained, pair.true)]
+    rows = [
+        Row(BESIDE, f"{name}, centre of mass", 100 * float(off), "% of size"),
+        Row(
+            BESIDE, f"{name}, principal inertias", 100 * float(np.abs(moments[0] / moments[1] - 1).max()), "%"
+        ),
+    ]
     for what, start in (("free tumbling", thrown), ("drop", bounced)):
-        a, b = (_moved(_scene(thing), start, _SECONDS) for thing in (pair.trained, pair.true))
+        a, b = (_moved(scene, start, _SECONDS) for scene in scenes)
         apart = np.linalg.norm(a.of(points) - b.of(points), axis=-1).max(axis=1) / size
         com = np.asarray(pair.true.mass.com)[None]
         middle = np.linalg.norm(a.of(com) - b.of(com), axis=-1)[:, 0] / size
         end, note = len(apart), f"{_SECONDS:g} s"
         if what == "drop":
-            end = _after_bounce(b.of(points)[..., 2].min(axis=1))
+            end = _after_bounce(b.of(points)[..., 2].min(axis=1), b.of(com)[:, 0, 2])
             note = f"to the top of the first bounce, {end * _TIMESTEP:.2f} s"
             rows.append(
                 Row(BESIDE, f"{name}, drop, centre, {_SECONDS:g} s", 100 * float(middle.max()), "% of size")
@@ -259,17 +272,20 @@ def _beside_rows(name: str, pair: Pair) -> list[Row]:
     return rows
 
 
-def _after_bounce(lowest: np.ndarray) -> int:
-    """Steps until the lowest point has come up again after it first touched the floor, or to the end."""
+def _after_bounce(lowest: np.ndarray, height: np.ndarray) -> int:
+    """Steps from the start until the centre of mass is highest after the first touch, or to the end.
+
+    Args:
+        lowest: Height of the lowest point over time [m].
+        height: That of the centre of mass [m].
+    """
     touching = np.flatnonzero(lowest <= 0)
     if len(touching) == 0:
         return len(lowest)
-    later = np.flatnonzero(lowest[touching[0] :] > 0)
-    if len(later) == 0:
-        return len(lowest)
-    start = touching[0] + later[0]
-    falling = np.flatnonzero(np.diff(lowest[start:]) < 0)
-    return int(start + falling[0]) if len(falling) else len(lowest)
+    climb = np.diff(height[touching[0] :])
+    rising = np.flatnonzero(climb > 0)
+    falling = np.flatnonzero(climb[rising[0] :] < 0) if len(rising) else []
+    return int(touching[0] + rising[0] + falling[0]) if len(falling) else len(lowest)
 
 
 def _film(pair: Pair, path: Path) -> None:
@@ -286,7 +302,7 @@ def _film(pair: Pair, path: Path) -> None:
         dano.Body("floor", dano.HalfSpace(), fixed=True),
     ]
     scene = dano.Scene.create(bodies, contacts, timestep=_TIMESTEP)
-    start = _dropped(_scene(pair.true), _points(pair.true), 101, above=1.0)
+    start = _dropped(_points(pair.true), 101, above=2.0)
     rotation = np.asarray(quat_to_matrix(jnp.asarray(start["orientation"])))
     states = {}
     for i, body in enumerate(bodies[:2]):
