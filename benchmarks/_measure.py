@@ -61,13 +61,17 @@ def skipped(group: str, name: str, reason: str) -> Row:
     return Row(group, name, None, "", note=reason)
 
 
-def parse_arguments(description: str) -> argparse.Namespace:
-    """The options `--json FILE` and `--quick`."""
+def parse_arguments(
+    description: str, add: Callable[[argparse.ArgumentParser], None] | None = None
+) -> argparse.Namespace:
+    """The options `--json FILE` and `--quick`, and those that `add` adds."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results to this file")
     parser.add_argument(
         "--quick", action="store_true", help="few repeats: to see that it runs, not to compare"
     )
+    if add is not None:
+        add(parser)
     return parser.parse_args()
 
 

@@ -1,4 +1,4 @@
-"""The shipped density grids are as described: soft, hollow, with floaters, and of the right size."""
+"""The shipped density grids are as described, soft, hollow, with floaters; the trained objects are right."""
 
 from importlib.resources import files
 from pathlib import Path
@@ -6,6 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import ndimage
+
+from dano.scene_file import asset_look
+from dano.vision import load_capture, score
 
 MODEL = Path(__file__).resolve().parents[1] / "assets" / "bunny.obj"
 
@@ -74,3 +77,18 @@ def test_bunny_stands_on_the_plane():
     values, origin, spacing = load("bunny")
     lowest = np.argwhere(values > 75)[:, 2].min()
     assert abs(origin[2] + lowest * spacing) < 2 * spacing
+
+
+@pytest.mark.parametrize(("name", "volume"), [("soap", soap_volume()), ("bunny", bunny_volume())])
+def test_trained_objects_are_the_solids_and_look_like_the_photographs(name: str, volume: float):
+    assert len((files("dano") / "assets" / f"trained_{name}.npz").read_bytes()) < 1_000_000
+    look = asset_look(f"trained_{name}")
+    assert look is not None
+    distances = np.asarray(look.solid.distances)
+    cell = float(look.solid.spacing[0])
+    found = np.clip(0.5 - distances / cell, 0, 1).sum() * cell**3
+    np.testing.assert_allclose(found, volume, rtol=0.03)
+    view = load_capture(MODEL.parent / "images" / name).split("test")[0]
+    quality = score(look, (view,))
+    assert quality.psnr > 29 and quality.mask_iou > 0.985
+    assert asset_look(name) is None

@@ -18,7 +18,7 @@ class Case:
         call: What to time.
         count: The time of one call is divided by this: steps, rollouts times steps, …
         target: For the time, in `unit`.
-        unit: "µs" or "ms".
+        unit: "µs" or "ms" for the time, or "rays/s": `count` over the time.
         compile_seconds: What its compilation took, or None for what is not compiled.
         note: See `Row`.
         base: Name of a case; report the ratio to it too.
@@ -43,8 +43,11 @@ def measure(cases: Sequence[Case], repeats: int) -> list[Row]:
     counts = {case.name: case.count for case in cases}
     rows = []
     for case in cases:
-        scale = {"µs": 1e6, "ms": 1e3}[case.unit] / case.count
-        value, quartiles = summary(seconds[case.name] * scale)
+        if case.unit == "rays/s":
+            value, quartiles = summary(case.count / seconds[case.name])
+        else:
+            scale = {"µs": 1e6, "ms": 1e3}[case.unit] / case.count
+            value, quartiles = summary(seconds[case.name] * scale)
         rows.append(
             Row(case.group, case.name, value, case.unit, case.target, quartiles=quartiles, note=case.note)
         )

@@ -4,7 +4,7 @@ import importlib.util
 
 from benchmarks import _subjects
 from benchmarks._measure import load_average, NO_DATA, parse_arguments, report, Row, skipped, warm_up
-from benchmarks.speed import _dano, _mujoco
+from benchmarks.speed import _dano, _learning, _mujoco
 from benchmarks.speed._cases import measure
 
 REPEATS, QUICK_REPEATS = 21, 3
@@ -42,9 +42,11 @@ def _rows(repeats: int, *, quick: bool) -> list[Row]:
         cases += [*_mujoco.mujoco_floor_cases(), *_mujoco.mujoco_pressed_cases()]
     else:
         missing.append(skipped(_dano.FLOOR, "MuJoCo", "not installed: pip install 'dano[mujoco]'"))
+    photographs = _learning.bunny_photographs()
+    cases += _learning.learning_cases(photographs)
     cases.append(_dano.memory_case())
     order = list(dict.fromkeys(case.group for case in cases))
     cases.sort(key=lambda case: order.index(case.group))
-    rows = [*measure(cases, repeats), *missing]
+    rows = [*measure(cases, repeats), *_learning.quality_rows(photographs, quick=quick), *missing]
     groups = list(dict.fromkeys(row.group for row in rows))
     return sorted(rows, key=lambda row: groups.index(row.group))

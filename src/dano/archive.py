@@ -11,6 +11,12 @@ from typing import BinaryIO
 
 import numpy as np
 
+OBJECT = "dano-object", 2
+"""Format and newest version of files that hold a neural object."""
+
+LOOK = "look_"
+"""What the names of their members start with that say how the object looks."""
+
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:

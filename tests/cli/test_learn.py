@@ -5,9 +5,11 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
+from PIL import Image
 from vision.photographs import capture, CENTRE, write_transforms
 
 from dano import load_field, NeuralObject
+from dano.vision import LearnedField
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +32,13 @@ def test_photographs_are_checked_and_drawn(images: Path, run, tmp_path: Path):
 
 def test_training_leaves_object_grid_field_report_and_figures(images: Path, run, tmp_path: Path):
     output, figures = tmp_path / "egg.dano", tmp_path / "egg.json"
+    previews = "--previews", tmp_path / "previews"
     sizes = ("--resolution", 24, "--iterations", 12, "--batch", 256)
-    answer = run("train", images, "-o", output, "--mass", 0.3, "--json", figures, *sizes)
+    answer = run("train", images, "-o", output, "--mass", 0.3, "--json", figures, *previews, *sizes)
     assert answer.code == 0, answer.err
+    with Image.open(tmp_path / "previews" / "000012.png") as sheet:
+        assert sheet.height > 2 * 90
+    assert LearnedField.of_object(output) is not None
     made = NeuralObject.load(output)
     assert float(made.mass.mass) == pytest.approx(0.3)
     assert abs(made.mass.com - CENTRE).max() < 0.002

@@ -248,7 +248,7 @@ BAD = {
     "no geometry": ('n_steps = 1\n[[bodies]]\nname = "x"\n', "needs exactly one of object, field, asset"),
     "unknown asset": (
         'n_steps = 1\n[[bodies]]\nname = "x"\nasset = "cow"\n',
-        "asset must be one of ['bunny', 'soap']",
+        "asset must be one of ['bunny', 'soap', 'trained_bunny', 'trained_soap']",
     ),
     "no mass": ("n_steps = 1\n" + BODY.replace("mass = 1.0\n", ""), "mass of body 'ball' must be given"),
     "two names": ("n_steps = 1\n" + BODY + BODY, "bodies must have different names, got 'ball' 2 times"),

@@ -1,14 +1,19 @@
 import socket
 import urllib.request
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from vision.models import learned
 
 import dano
 from dano.report import draw_object, render_trajectory, view
 from dano.report._object import with_error
 from dano.report._resample import frame_times, poses_at, slerp
+from dano.scene_file import drop_scene, parse_scene
+from dano.vision import LearnedField
 
 av = pytest.importorskip("av")
 Image = pytest.importorskip("PIL.Image")
@@ -58,6 +63,44 @@ def cube() -> dano.NeuralObject:
         inertia=np.diag([1e-3, 2e-3, 2.5e-3]),
         field=field,
     )
+
+
+def test_a_film_shows_what_an_object_has_learned_to_look_like(cube, tmp_path):
+    """From the object's file, through the scene, to the picture: black where the palette has orange."""
+    field = LearnedField.from_model(learned(), 120.0)
+    network = field.model.appearance.network
+    field = eqx.tree_at(
+        lambda f: f.model.appearance.network.biases[-1], field, jnp.full_like(network.biases[-1], -20)
+    )
+    made = dano.NeuralObject.from_field(field, n_samples=200, resolution=24, mass=1.0)
+    made.save(tmp_path / "black.dano", look=field.look)
+    cube.save(tmp_path / "cube.dano")
+    assert LearnedField.of_object(tmp_path / "cube.dano") is None
+    again = LearnedField.of_object(tmp_path / "black.dano")
+    for a, b in zip(jax.tree.leaves(field), jax.tree.leaves(again), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-3)
+
+    text = drop_scene(tmp_path / "black.dano")
+    loaded = parse_scene(text, tmp_path / "scene.toml", n_steps=30)
+    run = dano.simulate(loaded.scene, loaded.state, n_steps=30)
+    pictures = []
+    for looks in (None, loaded.looks()):
+        render_trajectory(
+            loaded.scene,
+            run,
+            None,
+            strip=tmp_path / "strip.png",
+            size=SIZE,
+            contact_points=False,
+            looks=looks,
+        )
+        pictures.append(np.asarray(Image.open(tmp_path / "strip.png")).astype(int))
+    painted, black = pictures
+    where = painted[..., 0] - painted[..., 2] > 60
+    assert where.sum() > 100
+    assert np.median(black[where]) < 5
+    with pytest.raises(ValueError, match="nobody"):
+        render_trajectory(loaded.scene, run, None, strip=tmp_path / "no.png", looks={"nobody": field})
 
 
 def test_video_has_every_frame_and_moves(run: Run, tmp_path):

@@ -4,9 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from vision.models import Fog, learned
 
 from dano import Box, GridField, HalfSpace, Pose, Sphere
-from dano.vision import Camera, Item, level_surface, render
+from dano.vision import Camera, Item, level_surface, PosedCamera, render
+from dano.vision._picture import picture
 from dano.vision._rays import CHUNK, Placed, transmitted
 from dano.vision._render import _first_hits
 
@@ -119,6 +121,52 @@ def test_planes_are_known_wherever_they_are_put():
     # Turned by 90° about x: z becomes −y; the plane passes 0.2 above the new origin along it.
     assert plane is not None
     np.testing.assert_allclose(plane, (0, -1, 0, 0.2 - 2.0), atol=1e-7)
+
+
+def test_a_learned_look_is_drawn_as_it_was_learned():
+    model = learned(lit=False)
+    camera = PosedCamera(
+        np.array([[1.0, 0, 0, 0.02], [0, 0, -1, -1.5], [0, 1, 0, 0.03]]), focal=80.0, width=64, height=64
+    )
+    seen = picture(model, camera, None, model.box, np.ones(model.box.shape, bool), 400.0)
+    drawn = render([Item(model)], camera, floor=False, antialias=False) / 255
+    inside = seen.opacity > 0.97
+    assert inside.sum() > 500
+    difference = np.abs(drawn - seen.colour / np.maximum(seen.opacity, 0.1)[..., None])[inside]
+    assert np.median(difference) < 0.004
+    assert np.quantile(difference, 0.99) < 0.03
+    # In one colour, if that is asked for.
+    painted = render([Item(model, colour="#ff0000")], camera, floor=False)[inside]
+    assert np.all(painted[:, 0].astype(int) > painted[:, 1] + 40)
+
+
+def test_a_learned_look_follows_the_lamp_and_others_shadows():
+    item, camera = Item(learned()), Camera((0.0, -2.0, 0.4), width=48, height=32)
+    screen = Item(Box((0.5, 0.02, 0.5)), Pose((0.0, -0.9, 1.2)), "#222222")
+    left, right = (render([item], camera, light=(x, -1, 1), floor=False).astype(int) for x in (-2, 2))
+    assert np.abs(left - right)[16, 24].max() > 2
+    bare, shaded = (
+        render(items, camera, light=(0, -1, 1.2), floor=False).astype(int)[14:18, 22:26].sum()
+        for items in ([item], [item, screen])
+    )
+    assert shaded < 0.85 * bare
+
+
+def test_learned_media_dim_what_is_behind_them_and_shadow_the_floor():
+    cloud = Item(Fog.create((-0.5, -0.5, 0.2), (0.5, 0.5, 0.6), 2.0))
+    camera = Camera((0.0, 0.0, 40.0), vertical_fov=0.06, width=40, height=40)
+    light = (1.0, 0.0, 1.0)
+    bare, clouded = (render(items, camera, light=light) / 255 for items in ([], [cloud]))
+    # Where the cloud's shadow falls beside it: lamp light dimmed, light of the sky as before.
+    x, y = camera.project(np.array([[-0.6, 0.0, 0.0]]))[0, :2].astype(int)
+    dimmed = (clouded[y, x] / bare[y, x]) ** 2.2
+    # At 45° through 0.4 m.
+    share = math.exp(-2.0 * 0.4 * math.sqrt(2))
+    lamp = 0.78 * math.sqrt(0.5)
+    np.testing.assert_allclose(dimmed[0], (lamp * share + 0.42 * 0.93) / (lamp + 0.42 * 0.93), rtol=0.03)
+    # The medium is brighter than black: it lies over what is behind it.
+    assert clouded[20, 20].max() < bare[20, 20].max()
+    assert np.abs(clouded[2, 2] - bare[2, 2]).max() < 0.02
 
 
 @pytest.mark.parametrize(

@@ -122,6 +122,7 @@ def train(
     resume: bool,
     report: bool,
     json_file: Path | None,
+    previews: Path | None,
 ) -> None:
     """See `dano train --help`."""
     outputs = _outputs(output)
@@ -150,7 +151,14 @@ def train(
 
     progress("visual hull", 0.0)
     try:
-        trained = learn(capture, options, checkpoint=outputs["checkpoint"], resume=resume, progress=show)
+        trained = learn(
+            capture,
+            options,
+            checkpoint=outputs["checkpoint"],
+            resume=resume,
+            progress=show,
+            previews=previews,
+        )
     except KeyboardInterrupt:
         progress.close()
         say(f"stopped; `--resume` goes on from {outputs['checkpoint']}")
@@ -167,7 +175,7 @@ def train(
     progress.close()
     trained.field.save(outputs["field"])
     save_field(grid.grid, outputs["grid"])
-    made.save(output)
+    made.save(output, look=trained.field.look)
     from dano.report import mass_estimates, write_training_report
 
     estimates = mass_estimates(trained, made, grid.grid)

@@ -54,6 +54,7 @@ def train(
     no_report: bool = False,
     seed: int = 0,
     json: Path | None = None,
+    previews: Path | None = None,
 ) -> Callable[[], None]:
     """Learn a solid neural object from photographs with known poses.
 
@@ -77,6 +78,7 @@ def train(
         no_report: Write no report.
         seed: Seed of everything random.
         json: Write figures of merit and mass properties to this file.
+        previews: Folder for pictures of what has been learned so far, beside photographs held out.
     """
     from dano.cli import _learn
     from dano.vision import TrainOptions
@@ -96,6 +98,7 @@ def train(
             resume=resume,
             report=not no_report,
             json_file=json,
+            previews=previews,
         )
 
     return run

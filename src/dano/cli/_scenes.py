@@ -160,6 +160,7 @@ class _Artist:
             video,
             strip=strip,
             fps=DEMO_FPS,
+            looks=loaded.looks(),
             size=DEMO_SIZE,
             progress=self._tell,
         )
@@ -204,7 +205,13 @@ def _run(
 
         progress = Progress()
         render_trajectory(
-            loaded.scene, rollout.trajectory, video, strip=strip, slow_motion=slow_motion, progress=progress
+            loaded.scene,
+            rollout.trajectory,
+            video,
+            strip=strip,
+            slow_motion=slow_motion,
+            looks=loaded.looks(),
+            progress=progress,
         )
         progress.close()
     for key, picture in (("video", video), ("strip", strip)):

@@ -11,65 +11,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Float
 
 from dano.fields._base import AbstractField
 from dano.fields._callable import CallableField
 from dano.fields._checkpoint import read_weights
 from dano.fields._compose import Posed, Scaled
+from dano.fields._hash_grid import HashGrid
 from dano.fields._splats import splat_field
 from dano.maths import Numbers, Pose, quat_from_matrix
-
-_PRIMES = (1, 2654435761, 805459861)
-"""Of the spatial hash (Müller et al., Instant Neural Graphics Primitives, 2022, eq. 4)."""
-
-
-class HashGrid(eqx.Module):
-    """Multiresolution hash encoding: trilinear features of several grids, one after the other.
-
-    Two layouts exist. nerfstudio's own ("torch") hashes every level and puts node i of a level at
-    x = i / scale. tiny-cuda-nn ("tcnn") stores levels that fit into the table densely, x fastest, and puts
-    node i at (i − ½) / scale.
-
-    Attributes:
-        tables: Features of each level, shape (entries, features).
-        scales: Cells along an axis, one a level (static).
-        resolutions: Nodes along an axis of a dense level, 0 for a hashed one (static).
-        shift: Where x = 0 lies, in cells: 0 or ½ (static).
-    """
-
-    tables: tuple[Float[Array, "_ features"], ...]
-    scales: tuple[float, ...] = eqx.field(static=True)
-    resolutions: tuple[int, ...] = eqx.field(static=True)
-    shift: float = eqx.field(static=True)
-
-    def __call__(self, x: Float[Array, "n 3"]) -> Float[Array, "n width"]:
-        """Features at points in the unit cube."""
-        levels = zip(self.tables, self.scales, self.resolutions, strict=True)
-        return jnp.concatenate([self._level(x, *level) for level in levels], axis=1)
-
-    def _level(
-        self, x: Float[Array, "n 3"], table: Float[Array, "entries features"], scale: float, resolution: int
-    ) -> Float[Array, "n features"]:
-        u = x * scale + self.shift
-        base = jnp.floor(u)
-        fraction = u - base
-        node = base.astype(jnp.uint32)
-        total = jnp.zeros((x.shape[0], table.shape[1]), x.dtype)
-        for corner in np.ndindex(2, 2, 2):
-            row = _row(node + jnp.asarray(corner, jnp.uint32)[None], resolution, table.shape[0])
-            weight = jnp.prod(jnp.where(jnp.asarray(corner)[None] == 1, fraction, 1 - fraction), axis=1)
-            total += weight[:, None] * table.at[row].get(mode="promise_in_bounds").astype(x.dtype)
-        return total
-
-
-def _row(node: UInt32[Array, "n 3"], resolution: int, entries: int) -> Int[Array, " n"]:
-    if resolution:
-        index = node[:, 0] + resolution * (node[:, 1] + resolution * node[:, 2])
-    else:
-        products = [node[:, i] * jnp.uint32(prime) for i, prime in enumerate(_PRIMES)]
-        index = products[0] ^ products[1] ^ products[2]
-    return (index % jnp.uint32(entries)).astype(jnp.int32)
 
 
 class HashDensity(eqx.Module):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from typing import get_args, Literal
 
 import equinox as eqx
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from dano.archive import read_archive, write_archive
+from dano.archive import LOOK, OBJECT, read_archive, write_archive
 from dano.fields import AbstractField, AbstractShape, GridField, SignedDistanceGrid
 from dano.maths import checked_array, floating, is_traced, Numbers
 from dano.objects._interior import examine, Interior, sealed
@@ -29,7 +30,7 @@ from dano.objects._solid import field_solid, level_set
 from dano.objects._surface import draw_surface, equal_areas, SurfaceSamples
 
 MassModel = Literal["auto", "density", "solid"]
-FORMAT, VERSION = "dano-object", 2
+FORMAT, VERSION = OBJECT
 
 _INTERIOR = tuple(field.name for field in dataclasses.fields(Interior))
 
@@ -236,8 +237,13 @@ class NeuralObject(eqx.Module):
         """Largest extent of the samples [m]."""
         return float(jnp.max(jnp.ptp(self.samples.points, axis=0)))
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str], *, look: Mapping[str, np.ndarray] | None = None) -> None:
         """Write the object to one file (a zip of arrays, no pickle), replacing another only when complete.
+
+        Args:
+            path: The file.
+            look: Arrays that say what the object looks like, kept beside its physics for those who draw it:
+                `dano.vision.LearnedField.look`.
 
         Raises:
             ValueError: If `path` is a directory or its parent does not exist.
@@ -279,6 +285,8 @@ class NeuralObject(eqx.Module):
                 "solid_spacing": self.solid.spacing,
                 "solid_interpolation": np.array(self.solid.interpolation),
             }
+        if look is not None:
+            members |= {f"{LOOK}{name}": value for name, value in look.items()}
         write_archive(path, {name: np.asarray(value) for name, value in members.items()})
 
     @classmethod

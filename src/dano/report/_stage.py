@@ -1,5 +1,6 @@
 """Scenes as pictures see them: drawable items, their poses, a camera that keeps all in view, forces."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,7 +12,7 @@ from jaxtyping import Array, Float
 from dano.engine import contact_patches, contact_wrenches
 from dano.maths import Pose
 from dano.scene import Body, Scene, State, Trajectory
-from dano.vision import Camera, Item, PALETTE
+from dano.vision import Camera, Item, LearnedField, PALETTE
 
 
 class Stage(NamedTuple):
@@ -43,14 +44,16 @@ class Stage(NamedTuple):
         return placed
 
 
-def stage(scene: Scene, colours: dict[str, str] | None = None) -> Stage:
+def stage(
+    scene: Scene, colours: dict[str, str] | None = None, looks: Mapping[str, LearnedField] | None = None
+) -> Stage:
     """Make the bodies of a scene ready for drawing; bodies without a field or shape are left out.
 
     Raises:
-        ValueError: If a colour is none or names no body, or nothing can be drawn.
+        ValueError: If a colour is none, a colour or look names no body, or nothing can be drawn.
     """
-    colours = {} if colours is None else colours
-    for name in colours:
+    colours, looks = {} if colours is None else colours, {} if looks is None else looks
+    for name in (*colours, *looks):
         scene.index(name)
     items, rows, offsets, used = [], [], [], 0
     for row, body in enumerate(scene.bodies):
@@ -58,7 +61,10 @@ def stage(scene: Scene, colours: dict[str, str] | None = None) -> Stage:
             continue
         plane = body.shape is not None and not np.isfinite(body.size)
         colour = colours.get(body.name, None if plane else PALETTE[used % len(PALETTE)])
-        items.append(Item(body.field, Pose(), colour, level=level_of(body)))
+        if body.name in looks and body.name not in colours:
+            items.append(Item(looks[body.name]))
+        else:
+            items.append(Item(body.field, Pose(), colour, level=level_of(body)))
         rows.append(row)
         offsets.append(np.asarray(body.com + body.com_offset, dtype=np.float64))
         used += not plane

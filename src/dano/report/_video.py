@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from dano.report._overlay import draw_touches
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import camera_for, stage, touches
 from dano.scene import Scene, Trajectory
-from dano.vision import Camera, render
+from dano.vision import Camera, LearnedField, render
 
 Progress = Callable[[str, float], None]
 
@@ -33,6 +33,7 @@ def render_trajectory(
     strip: str | os.PathLike[str] | None = None,
     camera: Camera | None = None,
     colours: dict[str, str] | None = None,
+    looks: Mapping[str, LearnedField] | None = None,
     progress: Progress | None = None,
 ) -> None:
     """Film a trajectory: an MP4 video (H.264), a strip of still pictures, or both.
@@ -50,6 +51,8 @@ def render_trajectory(
         strip: A PNG with some moments of the motion, from left to right; None for none.
         camera: From where; default: chosen such that all bodies stay in view. Replaces `size`.
         colours: "#rrggbb" by body name, for those that shall have a certain one.
+        looks: What bodies have learned to look like, by name: `LearnedField.of_object`, or
+            `SceneFile.looks`. A colour takes precedence.
         progress: Called with a description and the share done.
 
     Raises:
@@ -61,7 +64,7 @@ def render_trajectory(
         scene, trajectory, path, strip, size if camera is None else (camera.width, camera.height)
     )
     times = frame_times(trajectory, fps, slow_motion)
-    drawn = stage(scene, colours)
+    drawn = stage(scene, colours, looks)
     camera = camera_for(scene, drawn, trajectory, *size) if camera is None else camera
     touched = touches(scene, trajectory, times) if contact_points else None
     length = 0.55 * float(np.median([item.radius for item in drawn.items if item.plane is None] or [1.0]))

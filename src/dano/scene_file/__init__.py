@@ -4,6 +4,7 @@ A run remembers the text of the scene that it came from, so that it can be looke
 """
 
 from dano.scene_file._objects import (
+    asset_look as asset_look,
     ASSETS as ASSETS,
     build_asset as build_asset,
     build_object as build_object,

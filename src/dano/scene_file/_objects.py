@@ -10,11 +10,14 @@ import jax.numpy as jnp
 
 from dano.fields import AbstractField, load_field, Scaled
 from dano.objects import MassModel, NeuralObject
+from dano.vision import LearnedField
 
 Progress = Callable[[str, float], None]
 
-ASSETS = {"bunny": 1.0, "soap": 0.15}
+ASSETS = {"bunny": 1.0, "soap": 0.15, "trained_bunny": 1.0, "trained_soap": 0.15}
 """Shipped objects and their masses [kg]."""
+
+_TRAINED = "trained_"
 
 _built: dict[tuple[str, str], NeuralObject] = {}
 
@@ -76,10 +79,12 @@ def build_object(
 
 
 def build_asset(name: str, *, progress: Progress | None = None) -> NeuralObject:
-    """A shipped object, built from its density grid on first use in a process (some seconds).
+    """A shipped object, built from its field on first use in a process (some seconds).
 
     Args:
-        name: "bunny" (12 cm, 1 kg) or "soap" (9 × 6 × 3 cm, 0.15 kg).
+        name: "bunny" (12 cm, 1 kg) or "soap" (9 × 6 × 3 cm, 0.15 kg): density grids with the flaws of
+            ordinary radiance fields, hollow and with floaters. "trained_bunny" or "trained_soap": what
+            `dano train` makes of photographs of the same objects.
         progress: Called with a description and the share done.
 
     Raises:
@@ -90,6 +95,18 @@ def build_asset(name: str, *, progress: Progress | None = None) -> NeuralObject:
     # Objects follow the precision that JAX is set to, which may change within a process.
     key = (name, jnp.result_type(float).name)
     if key not in _built:
-        with as_file(files("dano") / "assets" / f"{name}.npz") as path:
-            _built[key] = build_object(load_field(path), mass=ASSETS[name], progress=progress)
+        look = asset_look(name)
+        if look is not None:
+            _built[key] = build_object(look, mass=ASSETS[name], mass_model="solid", progress=progress)
+        else:
+            with as_file(files("dano") / "assets" / f"{name}.npz") as path:
+                _built[key] = build_object(load_field(path), mass=ASSETS[name], progress=progress)
     return _built[key]
+
+
+def asset_look(name: str) -> LearnedField | None:
+    """The field that photographs taught of a shipped object; None for those that are plain density grids."""
+    if not name.startswith(_TRAINED):
+        return None
+    with as_file(files("dano") / "assets" / f"{name}.npz") as path:
+        return LearnedField.load(path)

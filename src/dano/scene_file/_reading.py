@@ -16,9 +16,10 @@ from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSp
 from dano.maths import Pose
 from dano.objects import MassModel, NeuralObject
 from dano.scene import Body, Contact, Scene, State
-from dano.scene_file._objects import build_asset, build_object, Progress
+from dano.scene_file._objects import asset_look, build_asset, build_object, Progress
 from dano.scene_file._schedule import read_schedule, Schedule
 from dano.scene_file._table import located, Table
+from dano.vision import LearnedField
 
 SHAPES: dict[str, tuple[type[AbstractShape], dict[str, int]]] = {
     "half_space": (HalfSpace, {"normal": 3, "offset": 1}),
@@ -71,6 +72,7 @@ class SceneFile:
         controls: Forces and torques over time, or None.
         path: Where the file is, or would be: names in it are relative to its folder.
         text: The file's text.
+        objects: Files of neural objects, or names of shipped ones, by the names of their bodies.
     """
 
     scene: Scene
@@ -79,6 +81,19 @@ class SceneFile:
     controls: Schedule | None
     path: Path
     text: str
+    objects: dict[str, Path | str]
+
+    def looks(self) -> dict[str, LearnedField]:
+        """What bodies look like whose objects' files say so, by name: for pictures.
+
+        Raises:
+            ValueError: If a file cannot be read any more.
+        """
+        read = {
+            source: asset_look(source) if isinstance(source, str) else LearnedField.of_object(source)
+            for source in set(self.objects.values())
+        }
+        return {name: look for name, source in self.objects.items() if (look := read[source]) is not None}
 
 
 def load_scene(
@@ -145,7 +160,12 @@ def parse_scene(
         scene = Scene.create(bodies, contacts, timestep=h, gravity=gravity)
         start = {row["name"]: {key: row[key] for key in _STATE if key in row} for row in tables}
         state = scene.initial_state(**start)
-    return SceneFile(scene, state, steps, read_schedule(top, scene), path, text)
+    objects = {
+        row["name"]: row["asset"] if "asset" in row else path.parent / Path(row["object"]).expanduser()
+        for row in tables
+        if "asset" in row or "object" in row
+    }
+    return SceneFile(scene, state, steps, read_schedule(top, scene), path, text, objects)
 
 
 def _steps(top: Table, timestep: float) -> int:

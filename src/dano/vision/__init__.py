@@ -8,6 +8,8 @@ from dano.vision._camera import (
 )
 from dano.vision._capture import Capture as Capture, View as View
 from dano.vision._capture_files import load_capture as load_capture
+from dano.vision._composed import compose as compose
+from dano.vision._hash_model import HashModel as HashModel
 from dano.vision._hull import Box as Box, hull_distance as hull_distance
 from dano.vision._item import (
     checked_colour as checked_colour,
@@ -17,9 +19,11 @@ from dano.vision._item import (
     placement as placement,
 )
 from dano.vision._learned import LearnedField as LearnedField
+from dano.vision._light import Light as Light
 from dano.vision._masks import background_mask as background_mask, with_masks as with_masks
 from dano.vision._metrics import mask_iou as mask_iou, psnr as psnr, ssim as ssim
 from dano.vision._models import (
+    AbstractMedium as AbstractMedium,
     AbstractModel as AbstractModel,
     DensityModel as DensityModel,
     Rays as Rays,

@@ -36,8 +36,8 @@ class Network(eqx.Module):
     def __call__(self, x: Float[Array, "n i"]) -> Float[Array, "n o"]:
         """Outputs of the last layer, before any activation."""
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            x = jax.nn.silu(x @ weight + bias[None])
-        return x @ self.weights[-1] + self.biases[-1][None]
+            x = jax.nn.silu(x @ weight.astype(x.dtype) + bias.astype(x.dtype)[None])
+        return x @ self.weights[-1].astype(x.dtype) + self.biases[-1].astype(x.dtype)[None]
 
 
 class Appearance(eqx.Module):

@@ -19,6 +19,8 @@ from dano.fields import (
     SignedDistanceGrid,
 )
 from dano.maths import checked_array, Numbers, Pose
+from dano.vision._learned import LearnedField
+from dano.vision._models import AbstractModel, SurfaceModel
 
 PALETTE = ("#e07a3f", "#3d7ea6", "#5f9e6e", "#c9a227", "#8d6cab", "#c8553d", "#4aa3a2", "#7a8450")
 """Colours for objects that state none, matte and different from each other in lightness too."""
@@ -37,8 +39,10 @@ class Item(eqx.Module):
 
     Attributes:
         shape: What is drawn of a solid, in float32: the field itself if it is a shape, else the signed
-            distance of its level surface; None if the field is drawn as a translucent medium.
-        medium: The density that is drawn as a translucent medium, in float32, else None.
+            distance of its level surface; None if it is translucent.
+        medium: The density that is drawn as a translucent medium of one colour, in float32, else None.
+        model: The look that photographs taught, else None.
+        sharpness: Of the model's surface [1/m], if it has one.
         pose: Field frame → world.
         colour: sRGB in [0, 1], shape (3,).
         density_scale: Extinction [1/m] of a medium per unit of its density.
@@ -48,6 +52,8 @@ class Item(eqx.Module):
 
     shape: AbstractShape | None
     medium: GridField | None
+    model: AbstractModel | None
+    sharpness: float
     pose: Pose
     colour: Float[np.ndarray, "3"]
     density_scale: float
@@ -56,17 +62,19 @@ class Item(eqx.Module):
 
     def __init__(
         self,
-        field: AbstractField,
+        field: AbstractField | AbstractModel,
         pose: Pose | None = None,
         colour: str | Numbers | None = None,
         *,
         level: int | float | None = None,
         density_scale: int | float | None = None,
+        sharpness: int | float | None = None,
     ):
         """Make a field ready for drawing; what takes time happens here and not per picture.
 
         Args:
-            field: A shape, which is drawn as it is, or a density.
+            field: A shape, which is drawn as it is, a density, or what was learned from photographs: a
+                `LearnedField` or a model, which keep their look unless a colour is given.
             pose: Field frame → world; default the identity.
             colour: "#rrggbb" or three numbers in [0, 1]; default: the first of `PALETTE`, white for a
                 half-space.
@@ -74,25 +82,46 @@ class Item(eqx.Module):
                 holds.
             density_scale: If given, the field is no solid but a medium with extinction density_scale · φ
                 [1/m].
+            sharpness: Of the surface of a `SurfaceModel` [1/m]; default: its opacity rises over half a cell.
 
         Raises:
             ValueError: If the field is unbounded and no half-space, it nowhere reaches `level`, both
                 `level` and `density_scale` are given, or a number is out of range.
         """
-        if not isinstance(field, AbstractField):
+        if not isinstance(field, AbstractField | AbstractModel):
             raise ValueError(f"field must be a dano field (an AbstractField), got {type(field).__name__}")
+        if isinstance(field, AbstractModel) and (level is not None or density_scale is not None):
+            raise ValueError("level and density_scale are of fields, got one for a model with its own look")
         if level is not None and density_scale is not None:
             raise ValueError(
                 f"level (a solid) excludes density_scale (a medium), got {level} and {density_scale}"
             )
-        for name, value in (("level", level), ("density_scale", density_scale)):
+        for name, value in (
+            ("level", level),
+            ("density_scale", density_scale),
+            ("sharpness", sharpness),
+        ):
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be positive and finite, got {value}")
         self.pose = Pose() if pose is None else pose
         self.density_scale = 0.0 if density_scale is None else float(density_scale)
-        self.shape = self.medium = None
-        if density_scale is not None:
+        self.shape = self.medium = self.model = None
+        self.sharpness = 0.0
+        model, solid = _learned(field)
+        if model is not None and level is None and density_scale is None and colour is None:
+            self.model = _single(model)
+            self.sharpness = _drawn_sharpness(field) if sharpness is None else float(sharpness)
+        if isinstance(field, AbstractModel):
+            if solid is None and colour is not None:
+                raise ValueError(
+                    f"colour is of solids and fields, got {colour!r} for a {type(field).__name__}"
+                )
+            self.shape = solid if solid is None else _single(solid)
+            drawn = field if solid is None else solid
+        elif density_scale is not None:
             self.medium = drawn = _single(_grid(field))
+        elif solid is not None and level is None:
+            self.shape = drawn = _single(solid)
         elif isinstance(field, AbstractShape):
             self.shape = drawn = _single(_without_moments(field))
         else:
@@ -232,6 +261,22 @@ def _distances(share: np.ndarray, middle: float, spacing: np.ndarray) -> np.ndar
     near = np.clip(2 - length / spacing.max(), 0, 1)
     distance[close] = near * planar + (1 - near) * length
     return np.where(occupied, -distance, distance)
+
+
+def _learned(field: AbstractField | AbstractModel) -> tuple[AbstractModel | None, AbstractShape | None]:
+    """The look of what was learned from photographs, and its solid if it has one."""
+    if isinstance(field, LearnedField):
+        return field.model, field.solid
+    if isinstance(field, SurfaceModel):
+        box = field.box
+        return field, SignedDistanceGrid(field.distances, box.origin, box.spacing)
+    return (field, None) if isinstance(field, AbstractModel) else (None, None)
+
+
+def _drawn_sharpness(field: AbstractField | AbstractModel) -> float:
+    if isinstance(field, LearnedField):
+        return float(field.drawn_sharpness)
+    return 4 / float(field.spacing) if isinstance(field, SurfaceModel) else 0.0
 
 
 def _grid(field: AbstractField) -> GridField:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.archive import read_archive, write_archive
+from dano.archive import LOOK, OBJECT, read_archive, write_archive
 from dano.fields import AbstractField, SignedDistanceGrid
 from dano.fields._base import check_order, Jet, vmapped_jet
 from dano.maths import Numbers
@@ -121,16 +121,11 @@ class LearnedField(AbstractField):
             self.model, camera, towards, self.model.box, self.occupied, float(self.drawn_sharpness)
         )
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the field to one file (a zip of arrays, no pickle), replacing another only when complete.
-
-        Raises:
-            ValueError: If `path` is a directory or its parent does not exist.
-        """
+    @property
+    def look(self) -> dict[str, np.ndarray]:
+        """All that the field is made of, as arrays: what a file of it, or of an object with it, holds."""
         model, look = self.model, self.model.appearance
         members = {
-            "format": np.array(FORMAT),
-            "version": np.array(VERSION),
             "distance": model.distance,
             "origin": model.origin,
             "spacing": model.spacing,
@@ -146,7 +141,15 @@ class LearnedField(AbstractField):
         }
         for i, (weight, bias) in enumerate(zip(look.network.weights, look.network.biases, strict=True)):
             members |= {f"weight_{i}": weight, f"bias_{i}": bias}
-        write_archive(path, {name: np.asarray(value) for name, value in members.items()})
+        return {name: np.asarray(value) for name, value in members.items()}
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the field to one file (a zip of arrays, no pickle), replacing another only when complete.
+
+        Raises:
+            ValueError: If `path` is a directory or its parent does not exist.
+        """
+        write_archive(path, {"format": np.array(FORMAT), "version": np.array(VERSION), **self.look})
 
     @classmethod
     def load(cls, path: str | Path) -> "LearnedField":
@@ -155,7 +158,24 @@ class LearnedField(AbstractField):
         Raises:
             ValueError: If the file is missing, truncated, of another kind, or newer.
         """
-        data = read_archive(path, FORMAT, VERSION)
+        return cls._from_look(read_archive(path, FORMAT, VERSION), path)
+
+    @classmethod
+    def of_object(cls, path: str | Path) -> "LearnedField | None":
+        """The field that an object was made of, from the file that `dano train` wrote of the object.
+
+        Returns:
+            None if the object's file holds no look.
+
+        Raises:
+            ValueError: If the file is missing, truncated, of another kind, or newer.
+        """
+        data = read_archive(path, *OBJECT)
+        members = {name.removeprefix(LOOK): value for name, value in data.items() if name.startswith(LOOK)}
+        return cls._from_look(members, path) if members else None
+
+    @classmethod
+    def _from_look(cls, data: dict[str, np.ndarray], path: str | Path) -> "LearnedField":
         try:
             layers = range(int(data["layers"]))
             network = Network(

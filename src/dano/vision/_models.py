@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from dano.fields import CallableField
 from dano.vision._appearance import Appearance, Share
 from dano.vision._hull import Box
 from dano.vision._trilinear import value_and_slope_at, value_at
@@ -86,6 +87,11 @@ DRAWING = Sampling(96, 32, 8)
 class AbstractModel(eqx.Module):
     """Opacity and colour of an object."""
 
+    @property
+    @abc.abstractmethod
+    def bounds(self) -> Float[Array, "2 3"]:
+        """Lower and upper corner [m] of a box outside of which there is nothing."""
+
     @abc.abstractmethod
     def alpha(
         self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
@@ -122,6 +128,17 @@ class AbstractMedium(AbstractModel):
         """See `density_alpha`, with the density in the middle of each section."""
         middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
         return density_alpha(self.density_at(rays.at(middle)).reshape(middle.shape), edges)
+
+    def field(self) -> CallableField:
+        """The density as a field, with gradients by automatic differentiation; bake it before simulating."""
+        return CallableField(_Density(self), self.bounds, "jax")
+
+
+class _Density(eqx.Module):
+    model: AbstractMedium
+
+    def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        return self.model.density_at(points)
 
 
 def see(
@@ -196,6 +213,12 @@ class SurfaceModel(AbstractModel):
         )
 
     @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """First and last node [m]."""
+        last = jnp.asarray(np.array(self.distance.shape) - 1, self.origin.dtype)
+        return jnp.stack([self.origin, self.origin + self.spacing * last])
+
+    @property
     def box(self) -> Box:
         """The grid of the distances."""
         nx, ny, nz = self.distance.shape
@@ -263,6 +286,12 @@ class DensityModel(AbstractMedium):
             appearance,
             *(jnp.asarray(x, jnp.float32) for x in (box.origin, box.spacing)),
         )
+
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """First and last node [m]."""
+        last = jnp.asarray(np.array(self.raw.shape) - 1, self.origin.dtype)
+        return jnp.stack([self.origin, self.origin + self.spacing * last])
 
     @property
     def box(self) -> Box:

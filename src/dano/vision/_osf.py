@@ -11,14 +11,12 @@ training, where `SurfaceModel` has thirty thousand.
 import os
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.archive import read_archive, write_archive
-from dano.fields import CallableField
 from dano.maths import Numbers
 from dano.vision._appearance import Share
 from dano.vision._models import AbstractMedium
@@ -45,7 +43,7 @@ class OSF(AbstractMedium):
         bottleneck: Trunk → 256.
         head: Bottleneck and encoded directions → 128.
         colour_layer: Head → raw colour.
-        bounds: Box [m] outside of which there is nothing, shape (2, 3).
+        corners: Box [m] outside of which there is nothing, shape (2, 3).
         scale: Length of a unit of the network's coordinates [m].
     """
 
@@ -54,7 +52,7 @@ class OSF(AbstractMedium):
     bottleneck: tuple[Float[Array, "_ _"], Float[Array, " _"]]
     head: tuple[Float[Array, "_ _"], Float[Array, " _"]]
     colour_layer: tuple[Float[Array, "3 _"], Float[Array, "3"]]
-    bounds: Float[Array, "2 3"]
+    corners: Float[Array, "2 3"]
     scale: Float[Array, ""]
 
     @classmethod
@@ -70,7 +68,7 @@ class OSF(AbstractMedium):
         """Random weights, uniform in ±1/√inputs.
 
         Args:
-            bounds: See the class.
+            bounds: Lower and upper corner of the box [m], shape (2, 3).
             scale: See the class.
             depth: Layers of the trunk, at least two more than the one after which the encoding is joined.
             width: Units of each.
@@ -108,6 +106,11 @@ class OSF(AbstractMedium):
             jnp.asarray(scale, jnp.float32),
         )
 
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """`corners`."""
+        return self.corners
+
     def _trunk_at(self, points: Float[Array, "n 3"]) -> Float[Array, "n w"]:
         code = encoded(points / self.scale.astype(points.dtype), _POSITION_FREQUENCIES)
         h = code
@@ -138,10 +141,6 @@ class OSF(AbstractMedium):
         h = jax.nn.relu(_affine(self.head, jnp.concatenate([middle, *directions], axis=1)))
         colour = 1.2 * (jax.nn.sigmoid(_affine(self.colour_layer, h)) - 0.5) + 0.5
         return colour, jnp.zeros_like(points)
-
-    def field(self) -> CallableField:
-        """The density as a field; bake it before simulating."""
-        return CallableField(_Density(self), self.bounds, "jax")
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to one file (a zip of arrays, no pickle), replacing another only when complete.
@@ -176,13 +175,6 @@ class OSF(AbstractMedium):
 
     def _layers(self) -> list[tuple[Array, Array]]:
         return [*self.trunk, self.density_layer, self.bottleneck, self.head, self.colour_layer]
-
-
-class _Density(eqx.Module):
-    model: OSF
-
-    def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        return self.model.density_at(points)
 
 
 def _affine(layer: tuple[Array, Array], x: Float[Array, "n i"]) -> Float[Array, "n o"]:

@@ -1,11 +1,12 @@
 """Whole pictures of learned models."""
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dano.vision._camera import AbstractCamera
 from dano.vision._hull import Box
@@ -22,14 +23,18 @@ class Picture(NamedTuple):
         colour: sRGB over black, shape (height, width, 3).
         opacity: Share of each pixel that the object covers, (height, width).
         depth: Mean distance from the camera of what is seen [m], (height, width); 0 where nothing is.
+        identity: Index of the object that is seen most, (height, width); −1 where more than half is empty.
     """
 
     colour: Float[np.ndarray, "height width 3"]
     opacity: Float[np.ndarray, "height width"]
     depth: Float[np.ndarray, "height width"]
+    identity: Int[np.ndarray, "height width"]
 
-    def over(self, background: Float[np.ndarray, "3"]) -> Float[np.ndarray, "height width 3"]:
-        """The object on a background, clipped to [0, 1]."""
+    def over(
+        self, background: Float[np.ndarray, "3"] | Float[np.ndarray, "height width 3"]
+    ) -> Float[np.ndarray, "height width 3"]:
+        """What is seen on a background, sRGB of one colour or of every pixel, clipped to [0, 1]."""
         return np.clip(self.colour + (1 - self.opacity[..., None]) * background.astype(np.float32), 0, 1)
 
 
@@ -58,7 +63,16 @@ def picture(
         colour[pixels[part]] = np.asarray(seen.colour)[:n]
         opacity[pixels[part]] = np.asarray(seen.opacity)[:n]
         depth[pixels[part]] = np.asarray(seen.depth)[:n]
-    return Picture(colour.reshape(*shape, 3), opacity.reshape(shape), depth.reshape(shape))
+    opacity = opacity.reshape(shape)
+    identity = np.where(opacity > 0.5, 0, -1).astype(np.int32)
+    return Picture(colour.reshape(*shape, 3), opacity, depth.reshape(shape), identity)
+
+
+@functools.lru_cache(maxsize=8)
+def tiles(width: int, height: int) -> Int[np.ndarray, " pixels"]:
+    """Pixel indices ordered by small tiles, so that rays that are traced together see similar things."""
+    y, x = np.mgrid[:height, :width]
+    return np.argsort(((y // 16) * (width // 16 + 1) + x // 16).ravel(), kind="stable")
 
 
 def _padded(x: np.ndarray, n: int) -> np.ndarray:

@@ -7,18 +7,21 @@ more where neighbouring pixels differ, which smooths every kind of edge at a sma
 so everywhere.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 from scipy import ndimage
 
 from dano.maths import checked_array, Numbers
-from dano.vision._camera import Camera
+from dano.vision._camera import AbstractCamera, Camera
+from dano.vision._composed import part_of, radiance, reached_through, through
 from dano.vision._item import checked_colour, Item, placement
+from dano.vision._models import Sampling
+from dano.vision._picture import tiles
 from dano.vision._rays import (
     ambient_light,
     CHUNK,
@@ -30,12 +33,14 @@ from dano.vision._rays import (
     Placed,
     transmitted,
 )
-from dano.vision._shade import backdrop, floor_tint, Look, shade, to_srgb
+from dano.vision._shade import backdrop, floor_tint, lamps_of, Look, shade, to_srgb
 
 # Half the angular width of the lamp [rad]: shadows are crisp where things touch and soft a length away.
 _LAMP = 0.07
 # Steps along rays, after each number of which those that have ended are sorted out.
 _STEPS = (10, 16, 70)
+# How finely learned media are looked through.
+_CLOUD_SAMPLING = Sampling(64, 24, 6)
 # Colour difference [1/255] between neighbours from which a pixel is worth four more rays.
 _ROUGH = 10
 # Most pixels refined in one go; bounds the memory of large pictures.
@@ -67,18 +72,25 @@ class _Empty(NamedTuple):
 class _View:
     """One picture in the making: what is in it, and where the light comes from (host only)."""
 
-    def __init__(self, items: Sequence[Item], camera: Camera, look: Look, floor: bool | int | float):
+    def __init__(self, items: Sequence[Item], camera: AbstractCamera, look: Look, floor: bool | int | float):
         self.origin = camera.position.astype(np.float32)
         self.look = look
         self.planes = [(item.plane, item.colour) for item in items if item.plane is not None]
         self.solids = [item for item in items if item.shape is not None and item.plane is None]
         self.media = [item for item in items if item.medium is not None]
+        # Learned, and translucent: without a surface that a ray could hit.
+        self.clouds = [item for item in items if item.model is not None and item.shape is None]
         if floor is not False and not self.planes:
             self.planes = [(np.array([0.0, 0.0, 1.0, 0.0 if floor is True else float(floor)]), np.ones(3))]
-        balls = [item.placed_ball for item in self.solids + self.media]
+        balls = [item.placed_ball for item in self.solids + self.media + self.clouds]
         self.radii = np.array([radius for _, radius in balls], dtype=np.float32)
         self.centres = np.array([centre for centre, _ in balls], dtype=np.float32).reshape(-1, 3)
         self.placed = [Placed(item.shape, *_frame(item)) for item in self.solids if item.shape is not None]
+        self.learned = {
+            i: part_of(item, camera) for i, item in enumerate(self.solids) if item.model is not None
+        }
+        self.cloud_parts = tuple(part_of(item, camera) for item in self.clouds)
+        self.lamps = lamps_of(look)
 
 
 def _frame(item: Item) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
@@ -88,7 +100,7 @@ def _frame(item: Item) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
 
 def render(
     items: Sequence[Item],
-    camera: Camera,
+    camera: AbstractCamera,
     *,
     floor: bool | int | float = True,
     light: Numbers | None = None,
@@ -116,7 +128,7 @@ def render(
             raise ValueError(
                 f"items[{i}] must be an Item (a field made ready for drawing), got {type(item).__name__}"
             )
-    view = _View(items, camera, _look(camera, light, background), floor)
+    view = _View(items, camera, _look(camera, _focus(camera, items), light, background), floor)
     empty = _empty(view, camera)
     colour, touched = _radiance(view, empty.directions, empty.depth, empty.which, empty.colour)
     picture = empty.picture.copy()
@@ -133,7 +145,9 @@ def render(
     return picture.reshape(camera.height, camera.width, 3)
 
 
-def _look(camera: Camera, light: Numbers | None, background: str | Numbers | None) -> Look:
+def _look(
+    camera: AbstractCamera, focus: np.ndarray, light: Numbers | None, background: str | Numbers | None
+) -> Look:
     right, up, forward = camera.axes
     if light is None:
         ahead = np.array([forward[0], forward[1], 0.0])
@@ -145,29 +159,33 @@ def _look(camera: Camera, light: Numbers | None, background: str | Numbers | Non
         if not np.linalg.norm(towards) > 0:
             raise ValueError("light must be a direction other than zero, got (0, 0, 0)")
     horizon = checked_colour("#eef0f2" if background is None else background)
-    distance = float(np.linalg.norm(camera.look_at - camera.position))
-    return Look.create(towards, horizon, camera.look_at, distance, camera.pixel_angle)
+    distance = float(np.linalg.norm(focus - camera.position))
+    return Look.create(towards, horizon, focus, distance, camera.pixel_angle)
 
 
-@functools.lru_cache(maxsize=8)
-def _tiles(width: int, height: int) -> Int[np.ndarray, " pixels"]:
-    """Pixel indices ordered by small tiles, so that rays that are traced together see similar things."""
-    y, x = np.mgrid[:height, :width]
-    return np.argsort(((y // 16) * (width // 16 + 1) + x // 16).ravel(), kind="stable")
+def _focus(camera: AbstractCamera, items: Sequence[Item]) -> np.ndarray:
+    """The point looked at [m, W]: the camera's own, or as far ahead as the items are on average."""
+    if isinstance(camera, Camera):
+        return camera.look_at
+    centres = [item.placed_ball[0] for item in items if item.plane is None]
+    ahead = camera.axes[2]
+    away = float(np.mean(centres, axis=0) @ ahead - camera.position @ ahead) if centres else 1.0
+    return camera.position + (away if away > 0 else 1.0) * ahead
 
 
 _kept: dict[tuple, _Empty] = {}
 
 
-def _empty(view: _View, camera: Camera) -> _Empty:
+def _empty(view: _View, camera: AbstractCamera) -> _Empty:
     """The empty picture, kept from the last call if camera, floor and light are the same."""
-    numbers = [camera.position, camera.look_at, camera.vertical_fov, *view.look]
+    frame = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], float)
+    numbers = [camera.position, camera.axes, camera.directions(frame), *view.look]
     for plane, tint in view.planes:
         numbers += [plane, tint]
     key = (camera.width, camera.height, *(np.asarray(x, dtype=np.float64).tobytes() for x in numbers))
     kept = _kept.get(key)
     if kept is None:
-        order = _tiles(camera.width, camera.height)
+        order = tiles(camera.width, camera.height)
         points = np.stack([order % camera.width, order // camera.width], axis=1) + 0.5
         directions = np.ascontiguousarray(camera.directions(points).T, dtype=np.float32)
         depth, which, colour = _background(view, directions)
@@ -242,9 +260,13 @@ def _radiance(view, d, depth, which, colour):
     hit, lamp, ambient = hit[changed], lamp[changed], ambient[changed]
     colour[:, hit] = _lit(view, d[:, hit], depth[hit], which[hit], normals[:, hit], lamp, ambient)
     touched = [hit]
-    for i, item in enumerate(view.media):
-        touched.append(_lay_over(view, len(view.solids) + i, item, d, depth, colour))
-    return colour, np.unique(np.concatenate(touched)) if view.media else hit
+    # From the back to the front.
+    away = [-float(np.linalg.norm(item.placed_ball[0] - view.origin)) for item in view.media]
+    for i in np.argsort(away):
+        touched.append(_lay_over(view, len(view.solids) + int(i), view.media[i], d, depth, colour))
+    if view.clouds:
+        touched.append(_lay_clouds_over(view, d, depth, colour))
+    return colour, np.unique(np.concatenate(touched)) if len(touched) > 1 else hit
 
 
 def _lit(view, d, depth, which, normals, lamp, ambient):
@@ -258,7 +280,66 @@ def _lit(view, d, depth, which, normals, lamp, ambient):
         albedo[:, own], fade[own] = floor_tint(view.look, plane, tint, points[:, own], d[:, own], depth[own])
     for i, item in enumerate(view.solids):
         albedo[:, which == len(view.planes) + i] = (item.colour.astype(np.float32) ** 2.2)[:, None]
-    return shade(view.look, albedo, normals, d, lamp, ambient, which < len(view.planes), fade)
+    colour = shade(view.look, albedo, normals, d, lamp, ambient, which < len(view.planes), fade)
+    for i, part in view.learned.items():
+        own = np.flatnonzero(which == len(view.planes) + i)
+        if len(own):
+            (colour[:, own],) = _in_chunks(
+                lambda p, v, a, b, part=part: (_sent(part, view.lamps, p, v, a, b),),
+                (points[:, own], d[:, own], lamp[own], ambient[own]),
+            )
+    return colour
+
+
+@eqx.filter_jit
+def _sent(part, lamps, points, view, lamp, ambient):
+    """Linear light (3, n) of a learned surface at points [m, W] for the shares of light that reach them.
+
+    A look that was learned under known lamps answers each direction of lamp and sky by itself; one that was
+    not holds the light of its photographs, and is but darkened where others stand in the way.
+    """
+    local, towards = (points.T - part.position[None]) @ part.rotation, view.T @ part.rotation
+    if not part.model.appearance.lit:
+        sent, _ = part.model.colour(local, towards, jnp.zeros_like(local))
+        return jnp.maximum(sent, 0).T ** 2.2 * (0.45 * lamp + 0.55 * ambient)[None]
+    first, *sky = (
+        jnp.maximum(radiance((part,), 0, (light,), points.T, local, towards, None).T, 0) ** 2.2
+        for light in lamps
+    )
+    return first * lamp[None] + sum(sky, jnp.zeros_like(first)) * ambient[None]
+
+
+def _lay_clouds_over(view, d, depth, colour):
+    """Blend learned media over what lies behind them, in place; the indices of their rays."""
+    first = len(view.solids) + len(view.media)
+    meet = [
+        _towards_ball(view.centres[first + i] - view.origin, view.radii[first + i], d)
+        for i in range(len(view.clouds))
+    ]
+    index = np.unique(np.concatenate(meet))
+    origins = np.broadcast_to(view.origin[:, None], (3, len(index)))
+    sent, clear = _in_chunks(
+        lambda o, r, far: _seen_clouds(view.cloud_parts, view.lamps, o, r, far),
+        (origins, d[:, index], depth[index]),
+    )
+    opacity = np.maximum(1 - clear, 1e-6)
+    # Blended in sRGB among themselves, as they were learned.
+    colour[:, index] = clear * colour[:, index] + opacity * np.clip(sent / opacity, 0, None) ** 2.2
+    return index
+
+
+@eqx.filter_jit
+def _seen_clouds(parts, lamps, origins, directions, limit):
+    sent, _, _, clear = through(
+        parts, (lamps,) * len(parts), origins.T, directions.T, limit, None, _CLOUD_SAMPLING
+    )
+    return sent.T, clear
+
+
+@eqx.filter_jit
+def _let_through(part, points, light):
+    towards = jnp.broadcast_to(light[None], points.T.shape)
+    return reached_through(part, points.T, towards, jnp.full(points.shape[1], jnp.inf, points.dtype))
 
 
 def _first_hits(placed, origin, d, limit, index, pixel):
@@ -317,15 +398,23 @@ def _light_at(view, points, normals, kind):
         square = np.einsum("in,in->n", to_centre, to_centre)
         aside = square - ahead * ahead
         shadowed = faces_lamp & (ahead > -radius) & (aside < (radius + _LAMP * np.maximum(ahead, 0)) ** 2)
-        index = np.flatnonzero(near_focus & shadowed)
+        # A learned look holds its own shadows.
+        other = kind != len(view.planes) + i if i in view.learned else np.ones_like(near_focus)
+        index = np.flatnonzero(near_focus & shadowed & other)
         # From a little above the surface, or it would shadow itself by rounding.
         lamp[index] *= _lamp_share(placed, points[:, index] + bias * normals[:, index], light, bias)
-        index = np.flatnonzero(near_focus & (square < (radius + reach) ** 2))
+        index = np.flatnonzero(near_focus & (square < (radius + reach) ** 2) & other)
         arrays = points[:, index], normals[:, index]
         (around,) = _in_chunks(
             lambda p, n, placed=placed, reach=reach: (ambient_light(placed, p, n, reach),), arrays
         )
         ambient[index] *= around
+    for part in view.cloud_parts:
+        index = np.flatnonzero(near_focus & faces_lamp)
+        (share,) = _in_chunks(
+            lambda p, part=part: (_let_through(part, p, jnp.asarray(light)),), (points[:, index],)
+        )
+        lamp[index] *= share
     for plane, _ in view.planes if view.solids else ():
         index = np.flatnonzero(kind >= len(view.planes))
         reach = np.float32(0.5 * np.median(view.radii))

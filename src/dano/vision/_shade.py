@@ -5,6 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from dano.vision._light import Light
+
 _LAMP_COLOUR = np.array([1.0, 0.965, 0.91], dtype=np.float32)
 _SKY = np.array([0.93, 0.97, 1.0], dtype=np.float32)
 _GROUND = np.array([0.62, 0.59, 0.56], dtype=np.float32)
@@ -51,6 +53,21 @@ class Look(NamedTuple):
             tile,
             pixel,
         )
+
+
+def lamps_of(look: Look) -> tuple[Light, ...]:
+    """The lamp, and lamps that together stand for sky and ground, for looks learned under single lamps.
+
+    On a white matte surface that faces up, those of the sky add up to what `shade` gives it.
+    """
+    around = [(np.cos(a), np.sin(a), 1.0) for a in (0.5, 0.5 + 2.094, 0.5 + 4.189)]
+    sky = [Light(d, colour=_SKY_POWER * _SKY, intensity=0.33) for d in around]
+    return (
+        Light(look.light, colour=_LAMP_POWER * _LAMP_COLOUR),
+        Light((0.0, 0.0, 1.0), colour=_SKY_POWER * _SKY, intensity=0.3),
+        *sky,
+        Light((0.0, 0.0, -1.0), colour=_SKY_POWER * _GROUND, intensity=0.6),
+    )
 
 
 def backdrop(look: Look, d: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:

@@ -31,6 +31,7 @@ from dano.vision._learned import LearnedField
 from dano.vision._metrics import mask_iou, psnr, ssim
 from dano.vision._models import Rays, roughness, Sampling, see, SurfaceModel
 from dano.vision._picture import picture
+from dano.vision._preview import checked_folder, write_preview
 from dano.vision._ray_set import collect, RaySet
 from dano.vision._survey import Survey, survey, unseen_share
 
@@ -182,6 +183,7 @@ def train(
     checkpoint: str | Path | None = None,
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
+    previews: str | Path | None = None,
 ) -> Trained:
     """Learn a solid field from photographs with poses and masks (`with_masks` makes these).
 
@@ -191,24 +193,26 @@ def train(
         checkpoint: File that the state is written to at each look at held-out views, and when interrupted.
         resume: Go on from `checkpoint` if it exists.
         progress: Called after every few steps.
+        previews: Folder for a PNG per look at held-out views: photographs, and their renderings below.
 
     Returns:
         The field, and how good it is.
 
     Raises:
         ValueError: If the capture cannot be learned from (see `survey`), or the checkpoint is of another
-            training.
-        ImportError: If optax is missing.
+            training, or `previews` is no folder.
+        ImportError: If optax is missing, or pillow for previews.
         KeyboardInterrupt: When interrupted, after the state has been saved to `checkpoint`.
     """
     start = time.perf_counter()
     options = TrainOptions() if options is None else options
+    folder = None if previews is None else checked_folder(previews)
     near = {view.light_is_near for view in capture.views if view.light is not None}
     if len(near) > 1:
         raise ValueError("lights must be given as directions or as positions, got some of each")
     found = survey(capture, options.resolution)
     trainer = _Trainer(
-        capture, options, found, Path(checkpoint) if checkpoint is not None else None, progress
+        capture, options, found, Path(checkpoint) if checkpoint is not None else None, progress, folder
     )
     state = trainer.resumed() if resume else None
     state, stopped = trainer.run(state)
@@ -268,9 +272,10 @@ class _Trainer:
         found: Survey,
         checkpoint: Path | None,
         progress: Callable[[Progress], None] | None,
+        previews: Path | None,
     ):
         self.capture, self.options, self.found = capture, options, found
-        self.checkpoint, self.progress = checkpoint, progress
+        self.checkpoint, self.progress, self.previews = checkpoint, progress, previews
         self.history: list[Progress] = []
         self.key = jax.random.key(options.seed)
         held = capture.split("test") or capture.split("train")
@@ -388,18 +393,16 @@ class _Trainer:
     def _checked(self, state: _State, spent: float, speed: float, loss: float) -> Progress:
         """Look at a few held-out views and at the solid."""
         sharpness = self.sharpness(state.iteration)
-        model, rows = state.model, []
+        model, rows, pairs = state.model, [], []
         occupied = model.distances < 3 * model.box.spacing
         for view in self.checked:
             light = view.light if model.appearance.lit else None
             drawn = picture(model, view.camera, light, model.box, occupied, sharpness)
             assert view.mask is not None
-            rows.append(
-                (
-                    psnr(drawn.over(view.backdrop), view.over(view.backdrop)),
-                    mask_iou(drawn.opacity, view.mask),
-                )
-            )
+            pairs.append((view.over(view.backdrop), drawn.over(view.backdrop)))
+            rows.append((psnr(pairs[-1][1], pairs[-1][0]), mask_iou(drawn.opacity, view.mask)))
+        if self.previews is not None:
+            write_preview(self.previews / f"{state.iteration:06d}.png", pairs)
         quality, overlap = np.mean(rows, axis=0)
         entry = Progress(
             state.iteration,
