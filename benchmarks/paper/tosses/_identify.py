@@ -2,8 +2,9 @@
 
 Through a whole toss derivatives grow without bound; over ten frames they are those of one impact. Each
 window begins where the measured motion is smooth, so that its measured velocities can be trusted, and is
-simulated from there; friction, its fading, stiffness and restitution, centre of mass, inertia tensor and the places of all
-corners are found together by `dano.identify`. Flat slides tell friction alone, with a standard error.
+simulated from there. Friction, its fading, stiffness and restitution, centre of mass, inertia tensor and the
+places of all corners are found together by `dano.identify`. Flat slides tell friction alone, with a standard
+error.
 """
 
 import warnings
