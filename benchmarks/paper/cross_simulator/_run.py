@@ -99,4 +99,4 @@ def _identified(body: dano.NeuralObject, runs: list[_mujoco.Run]) -> dano.Identi
         force = np.zeros((steps, 2, 3))
         force[pushed, 0] = run.force
         controls.append(dano.Control(jnp.asarray(force), jnp.zeros((steps, 2, 3))))
-    return dano.identify(scene, motions, parameters, controls=controls)
+    return dano.identify(scene, motions, parameters, controls=controls, tolerance=1.0, max_iterations=30)
