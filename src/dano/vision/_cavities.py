@@ -1,0 +1,204 @@
+"""Cavities that no silhouette shows, such as the inside of a mug: found by a fog that fits the photographs.
+
+A surface that starts as the visual hull cannot sink to the bottom of a deep cavity: its lid hides everything
+below from the derivatives. So a fog fills the hull first, thin enough for rays to reach everywhere, and its
+density and colour are fitted to the photographs. Where it dissolves, and a ball can roll in from outside,
+there is a cavity. Three things make this work within seconds:
+
+- Colours are divided by opacity where the mask says that a ray meets the object, so that nothing is won by
+  making fog opaque where it only hides what is behind.
+- Colours do not depend on the direction of view, so that they cannot explain away a wrong depth.
+- Opacities of cells are drawn to 0 or 1 (entropy-like a (1 − a)) and to those of their neighbours (total
+  variation), or the fog stays a fog.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from scipy import ndimage
+
+from dano.vision._appearance import Appearance
+from dano.vision._capture import View
+from dano.vision._hull import Box, redistanced, resampled
+from dano.vision._models import DensityModel, Rays, Sampling, see
+from dano.vision._ray_set import collect, RaySet
+
+_RESOLUTION = 64
+"""Nodes of the fog along the longest side, at most."""
+
+_BATCH, _STEPS = 2048, 400
+_SAMPLING = Sampling(48, 32, 12)
+
+_THICKNESS = 0.01
+"""Extinction of the fog at the start, per cell: across the whole object most of the light gets through."""
+
+_MASK_WEIGHT, _CLEAR_WEIGHT, _EVEN_WEIGHT = 0.01, 0.01, 0.005
+
+_SOLID = 0.2
+"""Opacity of a cell above which it is no cavity: walls thinner than two cells come out half as opaque."""
+
+_BALL = 2.5
+"""Radius in cells of the ball that must fit into a cavity: finer detail is left to the surface to find."""
+
+
+class Cavities(NamedTuple):
+    """What a fog found.
+
+    Attributes:
+        distance: Signed distance [m] of the hull without its cavities, on the nodes of the hull's box.
+        share: Volume of the cavities as a share of the hull's.
+    """
+
+    distance: Float[np.ndarray, "nx ny nz"]
+    share: float
+
+
+def find_cavities(
+    views: Sequence[View],
+    hull: Float[np.ndarray, "nx ny nz"],
+    box: Box,
+    *,
+    lit: bool,
+    key: PRNGKeyArray,
+    progress: Callable[[], None] | None = None,
+) -> Cavities:
+    """Look for cavities of the visual hull.
+
+    Args:
+        views: Photographs with masks.
+        hull: Signed distance [m] of the visual hull at the nodes of `box`.
+        box: Nodes.
+        lit: Whether the light of every view is known.
+        key: Random key.
+        progress: Called after every few steps.
+    """
+    coarse = Box.around(box.origin, box.upper, min(_RESOLUTION, max(box.shape)))
+    distance = resampled(hull, box, coarse)
+    opacity = _fog(views, distance, coarse, lit, key, progress)
+    cavity = cavity_of(opacity, distance < 0)
+    share = float((cavity & (distance < 0)).sum() / max(int((distance < 0).sum()), 1))
+    if not cavity.any():
+        return Cavities(hull, 0.0)
+    outside, inside = (ndimage.distance_transform_edt(a) for a in (~cavity, cavity))
+    below = coarse.spacing * ndimage.gaussian_filter(np.asarray(outside) - np.asarray(inside), 0.7)
+    level = np.maximum(hull, -resampled(below, coarse, box))
+    labels, count = ndimage.label(level < 0)
+    sizes = ndimage.sum_labels(np.ones_like(level), labels, np.arange(1, count + 1))
+    if count == 0:
+        return Cavities(hull, 0.0)
+    kept = labels == 1 + int(np.argmax(sizes))
+    return Cavities(redistanced(np.where(kept, level, np.maximum(level, 1e-3 * box.spacing)), box), share)
+
+
+def cavity_of(
+    opacity: Float[np.ndarray, "nx ny nz"], hull: Bool[np.ndarray, "nx ny nz"]
+) -> Bool[np.ndarray, "nx ny nz"]:
+    """Nodes of the hull that a ball of `_BALL` cells reaches from outside without touching what is opaque.
+
+    Nodes of the mouth, next to them outside of the hull, are among them, or a skin would be left over it.
+
+    Args:
+        opacity: Of the cells, in [0, 1].
+        hull: Nodes inside the hull.
+    """
+    share = ndimage.gaussian_filter(hull.astype(float), 1.0)
+    smooth = np.where(hull, ndimage.gaussian_filter(np.where(hull, opacity, 0), 1.0), 0)
+    smooth = smooth / np.maximum(share, 0.1)
+    labels, count = ndimage.label(smooth > _SOLID)
+    if count == 0:
+        # Not even the outside of the object is opaque: the fog has found nothing.
+        return np.zeros_like(hull)
+    sizes = ndimage.sum_labels(np.ones_like(smooth), labels, np.arange(1, count + 1))
+    solid = np.isin(labels, 1 + np.flatnonzero(sizes > 0.1 * sizes.max()))
+    pad = int(np.ceil(2 * _BALL))
+    empty = np.pad(~solid, pad, constant_values=True)
+    centres, _ = ndimage.label(np.asarray(ndimage.distance_transform_edt(empty)) > _BALL)
+    reached = np.asarray(ndimage.distance_transform_edt(centres != centres[0, 0, 0])) <= _BALL
+    cavity = reached[pad:-pad, pad:-pad, pad:-pad] & hull
+    # Grazed skin is no cavity: it must be as deep as the ball.
+    depth = np.asarray(ndimage.distance_transform_edt(np.pad(hull, 1)))[1:-1, 1:-1, 1:-1]
+    labels, count = ndimage.label(cavity)
+    deepest = ndimage.maximum(depth, labels, np.arange(1, count + 1)) if count else np.zeros(0)
+    deep = np.isin(labels, 1 + np.flatnonzero(np.asarray(deepest) > _BALL))
+    if not deep.any():
+        return deep
+    return ndimage.binary_dilation(deep, iterations=3, mask=reached[pad:-pad, pad:-pad, pad:-pad])
+
+
+def _fog(views, distance, box, lit, key, progress) -> np.ndarray:
+    """Opacity of each cell after fitting the photographs."""
+    inside = distance < 0.5 * box.spacing
+    rays = collect(views, box, distance < 1.5 * box.spacing)
+    look = Appearance.create(
+        box,
+        lit=lit,
+        near_light=lit and views[0].light_is_near,
+        n_features=6,
+        resolution=max(8, 2 * max(box.shape) // 3),
+        width=32,
+        key=jax.random.fold_in(key, 0),
+    )
+    model = DensityModel.create(inside, box, look, _THICKNESS)
+    optimiser = _optimiser()
+    state = optimiser.init(_trainable(model))
+    allowed = jnp.asarray(inside)
+    for i in range(_STEPS):
+        decay = jnp.float32(0.1 ** (i / _STEPS))
+        model, state, loss = _step(model, state, rays, allowed, decay, jax.random.fold_in(key, 1 + i))
+        if progress is not None and i % 5 == 0:
+            loss.block_until_ready()
+            progress()
+    opacity = -np.expm1(-np.asarray(jax.nn.softplus(model.raw), np.float64))
+    return np.where(inside & np.isfinite(opacity), opacity, 0)
+
+
+def _trainable(model: DensityModel) -> Any:
+    return model.raw, model.appearance.features, model.appearance.network
+
+
+def _optimiser() -> Any:
+    import optax
+
+    rates = {"density": 0.3, "features": 0.02, "network": 0.005}
+    parts = {name: optax.adam(rate, b1=0.9, b2=0.99, eps=1e-12) for name, rate in rates.items()}
+    return optax.multi_transform(parts, tuple(rates))
+
+
+def _loss(
+    parts: Any, model: DensityModel, allowed: Array, batch: RaySet, key: PRNGKeyArray
+) -> Float[Array, ""]:
+    model = eqx.tree_at(_trainable, model, parts)
+    raw = jnp.where(allowed, model.raw, -12)
+    model = eqx.tree_at(lambda m: m.raw, model, raw)
+    seen = see(model, batch.rays, sampling=_SAMPLING, view_share=0.0, key=key)
+    met = batch.mask[:, None] * seen.colour / jnp.maximum(seen.opacity, 1e-3)[:, None]
+    cell = -jnp.expm1(-jax.nn.softplus(raw))
+    unclear = jnp.sum(jnp.where(allowed, cell * (1 - cell), 0)) / jnp.sum(allowed)
+    uneven = sum((jnp.mean(jnp.abs(jnp.diff(cell, axis=axis))) for axis in range(3)), jnp.float32(0))
+    return (
+        jnp.mean((met - batch.colour) ** 2)
+        + _MASK_WEIGHT * jnp.mean((seen.opacity - batch.mask) ** 2)
+        + _CLEAR_WEIGHT * unclear
+        + _EVEN_WEIGHT * uneven
+    )
+
+
+@eqx.filter_jit
+def _step(model, state, rays, allowed, decay, key):
+    import optax
+
+    pick, own = jax.random.split(key)
+    index = jax.random.randint(pick, (_BATCH,), 0, len(rays.mask))
+    batch = RaySet(Rays(*(x[index] for x in rays.rays)), rays.colour[index], rays.mask[index])
+    parts = _trainable(model)
+    value, gradient = jax.value_and_grad(_loss)(parts, model, allowed, batch, own)
+    # optax counts steps in integers and takes powers of floats by them.
+    with jax.numpy_dtype_promotion("standard"):
+        updates, state = _optimiser().update(gradient, state, parts)
+    updates = jax.tree.map(lambda u: decay * u, updates)
+    return eqx.tree_at(_trainable, model, optax.apply_updates(parts, updates)), state, value
