@@ -25,7 +25,7 @@ from scipy import ndimage
 from dano.vision._appearance import Appearance
 from dano.vision._capture import View
 from dano.vision._hull import Box, redistanced, resampled
-from dano.vision._models import DensityModel, Rays, Sampling, see
+from dano.vision._models import DensityModel, Sampling, see
 from dano.vision._ray_set import collect, RaySet
 
 _RESOLUTION = 64
@@ -193,10 +193,8 @@ def _step(model, state, rays, allowed, decay, key):
     import optax
 
     pick, own = jax.random.split(key)
-    index = jax.random.randint(pick, (_BATCH,), 0, len(rays.mask))
-    batch = RaySet(Rays(*(x[index] for x in rays.rays)), rays.colour[index], rays.mask[index])
     parts = _trainable(model)
-    value, gradient = jax.value_and_grad(_loss)(parts, model, allowed, batch, own)
+    value, gradient = jax.value_and_grad(_loss)(parts, model, allowed, rays.drawn(_BATCH, pick), own)
     # optax counts steps in integers and takes powers of floats by them.
     with jax.numpy_dtype_promotion("standard"):
         updates, state = _optimiser().update(gradient, state, parts)

@@ -5,7 +5,7 @@ grid; rendering is compared with random rays of the photographs (see `make_step`
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import Float
 
 from dano.vision import _checkpoint
+from dano.vision._adjustment import Adjustment
 from dano.vision._appearance import Appearance
-from dano.vision._capture import Capture
+from dano.vision._capture import Capture, View
 from dano.vision._cavities import find_cavities
-from dano.vision._hull import Box, resampled
+from dano.vision._hull import Box, object_box, resampled
 from dano.vision._learned import LearnedField
 from dano.vision._metrics import mask_iou, psnr
 from dano.vision._models import SurfaceModel
@@ -28,11 +29,14 @@ from dano.vision._picture import picture
 from dano.vision._preview import checked_folder, write_preview
 from dano.vision._ray_set import collect, RaySet
 from dano.vision._score import Score, score
-from dano.vision._steps import make_step, optimiser_of, trainable
+from dano.vision._steps import make_step, optimiser_of, Scene
 from dano.vision._survey import Survey, survey, unseen_share
 
 _WORTH_TRYING = 0.02
 """Share of the hull that cavities must take for a surface without them to be tried."""
+
+_OFF = 0.015
+"""Share of the silhouettes that the hull does not explain from which on cameras are taken to be inexact."""
 
 _TRIAL = 80
 """Steps that tell whether a surface without cavities explains more."""
@@ -69,6 +73,8 @@ class Trained(NamedTuple):
 
     Attributes:
         field: The field.
+        capture: The photographs as they were compared: at the resolution that was worked with, seen by
+            corrected cameras.
         survey: What the silhouettes told, with the visual hull.
         scores: By split: "test", "relight", or "train" (some of its views) if nothing was held out.
         history: One entry per look at held-out views.
@@ -79,6 +85,7 @@ class Trained(NamedTuple):
     """
 
     field: LearnedField
+    capture: Capture
     survey: Survey
     scores: dict[str, Score]
     history: tuple[Progress, ...]
@@ -91,9 +98,13 @@ class Trained(NamedTuple):
 class _State(eqx.Module):
     """What a checkpoint holds besides options."""
 
-    model: SurfaceModel
+    scene: Scene
     optimiser: Any
     iteration: int
+
+    @property
+    def model(self) -> SurfaceModel:
+        return self.scene.model
 
 
 def train(
@@ -130,6 +141,7 @@ def train(
     near = {view.light_is_near for view in capture.views if view.light is not None}
     if len(near) > 1:
         raise ValueError("lights must be given as directions or as positions, got some of each")
+    capture = _shrunk(capture, options)
     found = survey(capture, options.resolution)
     trainer = _Trainer(
         capture, options, found, Path(checkpoint) if checkpoint is not None else None, progress, folder
@@ -137,6 +149,7 @@ def train(
     state = trainer.resumed() if resume else None
     state, stopped = trainer.run(state)
     field = LearnedField.from_model(state.model, trainer.sharpness(options.iterations))
+    capture = trainer.with_corrected_cameras(state)
     splits = [s for s in ("test", "relight") if capture.split(s)] or ["train"]
     scores = {s: score(field, capture.split(s)[: 16 if s == "train" else None]) for s in splits}
     unseen = unseen_share(state.model, capture.split("train"))
@@ -147,6 +160,7 @@ def train(
         warnings.append("training met a number that is not finite; what it had before is kept")
     return Trained(
         field,
+        capture,
         found,
         scores,
         tuple(trainer.history),
@@ -177,12 +191,10 @@ class _Trainer:
         few = [held[i] for i in np.unique(np.linspace(0, len(held) - 1, 6).round().astype(int))]
         self.checked = [view.resized(max(1, min(view.image.shape[:2]) // 96)) for view in few]
         self.switch = options.iterations // 3
-        self.step = make_step(options)
-        views = capture.split("train")
-        angles = [view.camera.pixel_angle for view in views]
-        middle = 0.5 * (found.box.origin + found.box.upper)
-        ranges = [np.linalg.norm(view.camera.position - middle) for view in views]
-        self.pixel = float(np.median(np.multiply(angles, ranges)))
+        cameras = found.residual > _OFF if options.cameras is None else options.cameras
+        self.step = make_step(options, refine_cameras=cameras)
+        self.middle = 0.5 * (found.box.origin + found.box.upper)
+        self.pixel = pixel_at(capture.split("train"), self.middle)
 
     def sharpness(self, iteration: int) -> float:
         """Of the surface [1/m] at a step: geometric from the first blur to the last."""
@@ -210,14 +222,17 @@ class _Trainer:
             key=jax.random.fold_in(self.key, 1),
         )
         model = SurfaceModel.create(resampled(start, self.found.box, box), box, look)
-        return _State(model, optimiser_of(model, self.options).init(trainable(model)), 0)
+        return self._begun(Scene(model, Adjustment.create(views, self.middle)), 0)
+
+    def _begun(self, scene: Scene, iteration: int) -> _State:
+        return _State(scene, optimiser_of(self.options).init(scene.parts), iteration)
 
     def refined(self, state: _State) -> _State:
         """The state on the fine grid; the optimiser's memory starts anew."""
         coarse, fine = state.model.box, self.found.box
         distances = resampled(state.model.distances, coarse, fine)
         model = SurfaceModel.create(distances, fine, state.model.appearance)
-        return _State(model, optimiser_of(model, self.options).init(trainable(model)), state.iteration)
+        return self._begun(Scene(model, state.scene.cameras), state.iteration)
 
     def started(self) -> _State:
         """The visual hull, or the hull without the cavities that a fog finds if that explains more."""
@@ -250,8 +265,8 @@ class _Trainer:
     def advanced(self, state: _State, rays: RaySet) -> tuple[_State, float]:
         """One step, and the loss before it."""
         i, options = state.iteration, self.options
-        model, optimiser, loss = self.step(
-            state.model,
+        scene, optimiser, error = self.step(
+            state.scene,
             state.optimiser,
             rays,
             jnp.float32(self.sharpness(i)),
@@ -260,7 +275,7 @@ class _Trainer:
             jnp.float32(i >= self.switch),
             jax.random.fold_in(self.key, 2 + i),
         )
-        return _State(model, optimiser, i + 1), float(loss)
+        return _State(scene, optimiser, i + 1), float(error)
 
     def run(self, state: _State | None) -> tuple[_State, Stopped]:
         """All steps, or as many as it takes."""
@@ -300,6 +315,12 @@ class _Trainer:
             self._save(state)
             raise
         return (best if stopped == "geometry" else state), stopped
+
+    def with_corrected_cameras(self, state: _State) -> Capture:
+        """The photographs, those held out corrected by what all cameras have in common."""
+        train, cameras = self.capture.split("train"), state.scene.cameras
+        other = [view for view in self.capture.views if view.split != "train"]
+        return Capture((*cameras.corrected(train), *cameras.corrected_lens(other)), self.capture.source)
 
     def _rays(self, iteration: int) -> RaySet:
         """Rays that may meet the hull: the same whenever training is resumed."""
@@ -355,7 +376,7 @@ class _Trainer:
         if self.checkpoint is not None:
             rows = [[np.nan if x is None else x for x in entry] for entry in self.history]
             name = _checkpoint.name_of(self.options, self.capture)
-            _checkpoint.save(self.checkpoint, name, state.iteration, (state.model, state.optimiser), rows)
+            _checkpoint.save(self.checkpoint, name, state.iteration, (state.scene, state.optimiser), rows)
 
     def resumed(self) -> _State | None:
         """The state in the checkpoint; None if there is no checkpoint.
@@ -369,11 +390,30 @@ class _Trainer:
         state = self.fresh(self.found.hull)
         if stored.iteration > self.switch or len(stored.leaves[0]) != len(state.model.distance):
             state = self.refined(state)
-        model, optimiser = stored.filled((state.model, state.optimiser))
+        scene, optimiser = stored.filled((state.scene, state.optimiser))
         self.history = [
             Progress(int(row[0]), int(row[1]), *(float(x) for x in row[2:])) for row in stored.history
         ]
-        return _State(model, optimiser, stored.iteration)
+        return _State(scene, optimiser, stored.iteration)
+
+
+def pixel_at(views: Sequence[View], point: Float[np.ndarray, "3"]) -> float:
+    """Width of a pixel [m] at a point [m, W], median over views."""
+    ranges = [np.linalg.norm(view.camera.position - point) for view in views]
+    return float(np.median(np.multiply([view.camera.pixel_angle for view in views], ranges)))
+
+
+def _shrunk(capture: Capture, options: TrainOptions) -> Capture:
+    """Photographs whose pixels are about as large as the cells of the finest grid, if they are smaller."""
+    views = capture.split("train")
+    if not capture.has_masks:
+        return capture
+    lower, upper = object_box(views)
+    cell = float((upper - lower).max()) / options.resolution
+    factor = max(1, round(cell / pixel_at(views, 0.5 * (lower + upper))))
+    return (
+        Capture([view.resized(factor) for view in capture.views], capture.source) if factor > 1 else capture
+    )
 
 
 def _nothing_yet(iteration: int, iterations: int) -> Progress:
