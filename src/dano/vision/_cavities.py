@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 from scipy import ndimage
 
 from dano.vision._appearance import Appearance
@@ -39,15 +39,16 @@ _THICKNESS = 0.01
 
 _MASK_WEIGHT, _CLEAR_WEIGHT, _EVEN_WEIGHT = 0.01, 0.01, 0.005
 
-_SOLID = 0.2
-"""Opacity of a cell above which it is no cavity: walls thinner than two cells come out half as opaque."""
-
 _BALL = 2.5
-"""Radius in cells of the ball that must fit into a cavity: finer detail is left to the surface to find."""
+"""Radius in cells of the ball that must fit into a cavity: a pore in a wall is none."""
+
+_READINGS = ((1.0, 0.2), (0.0, 0.5))
+"""Cells over which opacities are averaged, and the average that stops the ball. The first reading keeps thin
+walls, which come out half as opaque; the second follows a surface that came out sharp into every dent."""
 
 
 class Cavities(NamedTuple):
-    """What a fog found.
+    """One reading of a fog.
 
     Attributes:
         distance: Signed distance [m] of the hull without its cavities, on the nodes of the hull's box.
@@ -66,8 +67,11 @@ def find_cavities(
     lit: bool,
     key: PRNGKeyArray,
     progress: Callable[[], None] | None = None,
-) -> Cavities:
+) -> tuple[Cavities, ...]:
     """Look for cavities of the visual hull.
+
+    What is right depends on walls and texture, and nothing at all may be: a translucent object is a fog.
+    Whoever asks should try which of the readings, or the hull, a surface explains the photographs best from.
 
     Args:
         views: Photographs with masks.
@@ -76,58 +80,62 @@ def find_cavities(
         lit: Whether the light of every view is known.
         key: Random key.
         progress: Called after every few steps.
+
+    Returns:
+        Readings of the fog that leave something of the hull.
     """
     coarse = Box.around(box.origin, box.upper, min(_RESOLUTION, max(box.shape)))
-    distance = resampled(hull, box, coarse)
-    opacity = _fog(views, distance, coarse, lit, key, progress)
-    cavity = cavity_of(opacity, distance < 0)
-    share = float((cavity & (distance < 0)).sum() / max(int((distance < 0).sum()), 1))
-    if not cavity.any():
-        return Cavities(hull, 0.0)
-    outside, inside = (ndimage.distance_transform_edt(a) for a in (~cavity, cavity))
-    below = coarse.spacing * ndimage.gaussian_filter(np.asarray(outside) - np.asarray(inside), 0.7)
-    level = np.maximum(hull, -resampled(below, coarse, box))
-    labels, count = ndimage.label(level < 0)
-    sizes = ndimage.sum_labels(np.ones_like(level), labels, np.arange(1, count + 1))
-    if count == 0:
-        return Cavities(hull, 0.0)
-    kept = labels == 1 + int(np.argmax(sizes))
-    return Cavities(redistanced(np.where(kept, level, np.maximum(level, 1e-3 * box.spacing)), box), share)
+    opacity = _fog(views, resampled(hull, box, coarse), coarse, lit, key, progress)
+    found = (without_cavities(opacity, coarse, hull, box, *reading) for reading in _READINGS)
+    return tuple(each for each in found if each is not None)
 
 
-def cavity_of(
-    opacity: Float[np.ndarray, "nx ny nz"], hull: Bool[np.ndarray, "nx ny nz"]
-) -> Bool[np.ndarray, "nx ny nz"]:
-    """Nodes of the hull that a ball of `_BALL` cells reaches from outside without touching what is opaque.
-
-    Nodes of the mouth, next to them outside of the hull, are among them, or a skin would be left over it.
+def without_cavities(
+    opacity: Float[np.ndarray, "mx my mz"],
+    coarse: Box,
+    hull: Float[np.ndarray, "nx ny nz"],
+    box: Box,
+    width: float,
+    solid: float,
+) -> Cavities | None:
+    """The hull without what a ball of `_BALL` cells reaches from outside; None if that leaves nothing.
 
     Args:
-        opacity: Of the cells, in [0, 1].
-        hull: Nodes inside the hull.
+        opacity: Of the cells around the nodes of `coarse`, in [0, 1].
+        coarse: Nodes.
+        hull: Signed distance [m] of the visual hull at the nodes of `box`.
+        box: Nodes.
+        width: Cells over which opacities are averaged.
+        solid: Average opacity that stops the ball, but for crumbs in the air.
     """
-    share = ndimage.gaussian_filter(hull.astype(float), 1.0)
-    smooth = np.where(hull, ndimage.gaussian_filter(np.where(hull, opacity, 0), 1.0), 0)
-    smooth = smooth / np.maximum(share, 0.1)
-    labels, count = ndimage.label(smooth > _SOLID)
+    hull_there = resampled(hull, box, coarse)
+    inside = hull_there < 0
+    smooth = np.where(inside, opacity, 0.0)
+    if width > 0:
+        share = np.maximum(ndimage.gaussian_filter(inside.astype(float), width), 0.1)
+        smooth = np.where(inside, ndimage.gaussian_filter(smooth, width) / share, 0)
+    labels, count = ndimage.label(smooth > solid, np.ones((3, 3, 3)))
     if count == 0:
-        # Not even the outside of the object is opaque: the fog has found nothing.
-        return np.zeros_like(hull)
+        return None
     sizes = ndimage.sum_labels(np.ones_like(smooth), labels, np.arange(1, count + 1))
-    solid = np.isin(labels, 1 + np.flatnonzero(sizes > 0.1 * sizes.max()))
-    pad = int(np.ceil(2 * _BALL))
-    empty = np.pad(~solid, pad, constant_values=True)
-    centres, _ = ndimage.label(np.asarray(ndimage.distance_transform_edt(empty)) > _BALL)
-    reached = np.asarray(ndimage.distance_transform_edt(centres != centres[0, 0, 0])) <= _BALL
-    cavity = reached[pad:-pad, pad:-pad, pad:-pad] & hull
-    # Grazed skin is no cavity: it must be as deep as the ball.
-    depth = np.asarray(ndimage.distance_transform_edt(np.pad(hull, 1)))[1:-1, 1:-1, 1:-1]
-    labels, count = ndimage.label(cavity)
-    deepest = ndimage.maximum(depth, labels, np.arange(1, count + 1)) if count else np.zeros(0)
-    deep = np.isin(labels, 1 + np.flatnonzero(np.asarray(deepest) > _BALL))
-    if not deep.any():
-        return deep
-    return ndimage.binary_dilation(deep, iterations=3, mask=reached[pad:-pad, pad:-pad, pad:-pad])
+    walls = np.isin(labels, 1 + np.flatnonzero(sizes > 0.1 * sizes.max()))
+    pad = int(np.ceil(2 * _BALL)) + 1
+    clear = np.asarray(ndimage.distance_transform_edt(np.pad(~walls, pad, constant_values=True)))
+    centres, _ = ndimage.label(clear > _BALL)
+    beyond = np.asarray(ndimage.distance_transform_edt(centres != centres[0, 0, 0])) - _BALL
+    beyond = beyond[pad:-pad, pad:-pad, pad:-pad]
+    # Where the ball only rolls along the hull, the hull itself is more exact.
+    cavity = ndimage.binary_dilation((beyond <= 0) & (hull_there < -0.5 * coarse.spacing), iterations=2)
+    below = resampled(coarse.spacing * ndimage.gaussian_filter(beyond, 0.7), coarse, box)
+    carved = resampled(cavity.astype(float), coarse, box) > 0
+    level = np.maximum(hull, np.where(carved, -below, -np.inf))
+    labels, count = ndimage.label(level < 0)
+    if count == 0:
+        return None
+    sizes = ndimage.sum_labels(np.ones_like(level), labels, np.arange(1, count + 1))
+    kept = labels == 1 + int(np.argmax(sizes))
+    distance = redistanced(np.where(kept, level, np.maximum(level, 1e-3 * box.spacing)), box)
+    return Cavities(distance, 1 - float(kept.sum() / (hull < 0).sum()))
 
 
 def _fog(views, distance, box, lit, key, progress) -> np.ndarray:
@@ -178,7 +186,8 @@ def _loss(
     seen = see(model, batch.rays, sampling=_SAMPLING, view_share=0.0, key=key)
     met = batch.mask[:, None] * seen.colour / jnp.maximum(seen.opacity, 1e-3)[:, None]
     cell = -jnp.expm1(-jax.nn.softplus(raw))
-    unclear = jnp.sum(jnp.where(allowed, cell * (1 - cell), 0)) / jnp.sum(allowed)
+    count = jnp.sum(allowed.astype(cell.dtype))
+    unclear = jnp.sum(jnp.where(allowed, cell * (1 - cell), 0)) / count
     uneven = sum((jnp.mean(jnp.abs(jnp.diff(cell, axis=axis))) for axis in range(3)), jnp.float32(0))
     return (
         jnp.mean((met - batch.colour) ** 2)

@@ -29,7 +29,7 @@ class TrainOptions:
     """
 
     resolution: int = 96
-    iterations: int = 1000
+    iterations: int = 800
     batch: int = 4096
     features: int = 8
     rate_distance: float = 0.25
@@ -41,7 +41,7 @@ class TrainOptions:
     cavities: bool = True
     cameras: bool | None = None
     blur: tuple[float, float] = (0.2, 0.15)
-    check_every: int = 100
+    check_every: int = 200
     seconds: float | None = None
     seed: int = 0
 

@@ -32,7 +32,7 @@ from dano.vision._score import Score, score
 from dano.vision._steps import make_step, optimiser_of, Scene
 from dano.vision._survey import Survey, survey, unseen_share
 
-_WORTH_TRYING = 0.02
+_WORTH_TRYING = 0.003
 """Share of the hull that cavities must take for a surface without them to be tried."""
 
 _OFF = 0.015
@@ -244,11 +244,11 @@ class _Trainer:
         found = find_cavities(
             views, self.found.hull, self.found.box, lit=lit, key=key, progress=self._searched
         )
-        if found.share < _WORTH_TRYING:
+        worth = [each.distance for each in found if each.share > _WORTH_TRYING]
+        if not worth:
             return hull
-        carved = self.fresh(found.distance)
         rays = self._rays(0)
-        return min((hull, carved), key=lambda state: self._trial(state, rays))
+        return min((hull, *map(self.fresh, worth)), key=lambda state: self._trial(state, rays))
 
     def _searched(self) -> None:
         if self.progress is not None:
