@@ -334,7 +334,7 @@ class _Trainer:
         sharpness = self.sharpness(state.iteration)
         model, rows, pairs = state.model, [], []
         occupied = model.distances < 3 * model.box.spacing
-        for view in self.checked:
+        for view in state.scene.cameras.corrected_lens(self.checked):
             light = view.light if model.appearance.lit else None
             drawn = picture(model, view.camera, light, model.box, occupied, sharpness)
             assert view.mask is not None
