@@ -40,7 +40,7 @@ class TrainOptions:
     smoothness_weight: float = 0.003
     cavities: bool = True
     cameras: bool | None = None
-    blur: tuple[float, float] = (0.2, 0.15)
+    blur: tuple[float, float] = (0.5, 0.15)
     check_every: int = 200
     seconds: float | None = None
     seed: int = 0

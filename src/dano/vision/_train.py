@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from dano.vision import _checkpoint
 from dano.vision._adjustment import Adjustment
@@ -34,6 +34,9 @@ from dano.vision._survey import Survey, survey, unseen_share
 
 _WORTH_TRYING = 0.003
 """Share of the hull that cavities must take for a surface without them to be tried."""
+
+_CLOSE = 0.2
+"""Blur [pixels] of a surface that starts without the cavities of the hull."""
 
 _OFF = 0.015
 """Share of the silhouettes that the hull does not explain from which on cameras are taken to be inexact."""
@@ -101,6 +104,7 @@ class _State(eqx.Module):
     scene: Scene
     optimiser: Any
     iteration: int
+    blur: Float[Array, ""]
 
     @property
     def model(self) -> SurfaceModel:
@@ -148,7 +152,7 @@ def train(
     )
     state = trainer.resumed() if resume else None
     state, stopped = trainer.run(state)
-    field = LearnedField.from_model(state.model, trainer.sharpness(options.iterations))
+    field = LearnedField.from_model(state.model, trainer.sharpness(options.iterations, options.blur[0]))
     capture = trainer.with_corrected_cameras(state)
     splits = [s for s in ("test", "relight") if capture.split(s)] or ["train"]
     scores = {s: score(field, capture.split(s)[: 16 if s == "train" else None]) for s in splits}
@@ -196,9 +200,9 @@ class _Trainer:
         self.middle = 0.5 * (found.box.origin + found.box.upper)
         self.pixel = pixel_at(capture.split("train"), self.middle)
 
-    def sharpness(self, iteration: int) -> float:
+    def sharpness(self, iteration: int, first: float) -> float:
         """Of the surface [1/m] at a step: geometric from the first blur to the last."""
-        first, last = self.options.blur
+        last = self.options.blur[1]
         share = min(1.0, iteration / (0.7 * self.options.iterations))
         return 1 / (max(self.pixel, 0.5 * self.found.box.spacing) * first * (last / first) ** share)
 
@@ -209,8 +213,8 @@ class _Trainer:
             return fine
         return Box.around(fine.origin, fine.upper, max(16, 2 * self.options.resolution // 3))
 
-    def fresh(self, start: np.ndarray) -> _State:
-        """A surface at signed distances [m] on the survey's box, grey all over."""
+    def fresh(self, start: np.ndarray, blur: float) -> _State:
+        """A surface at signed distances [m] on the survey's box, grey all over and blurred [pixels]."""
         views, box = self.capture.split("train"), self.box(0)
         lit = self.capture.is_lit
         look = Appearance.create(
@@ -222,33 +226,41 @@ class _Trainer:
             key=jax.random.fold_in(self.key, 1),
         )
         model = SurfaceModel.create(resampled(start, self.found.box, box), box, look)
-        return self._begun(Scene(model, Adjustment.create(views, self.middle)), 0)
+        cameras = Adjustment.create(views, self.middle)
+        return self._begun(Scene(model, cameras), 0, jnp.float32(blur))
 
-    def _begun(self, scene: Scene, iteration: int) -> _State:
-        return _State(scene, optimiser_of(self.options).init(scene.parts), iteration)
+    def _begun(self, scene: Scene, iteration: int, blur: Float[Array, ""]) -> _State:
+        return _State(scene, optimiser_of(self.options).init(scene.parts), iteration, blur)
 
     def refined(self, state: _State) -> _State:
         """The state on the fine grid; the optimiser's memory starts anew."""
         coarse, fine = state.model.box, self.found.box
         distances = resampled(state.model.distances, coarse, fine)
         model = SurfaceModel.create(distances, fine, state.model.appearance)
-        return self._begun(Scene(model, state.scene.cameras), state.iteration)
+        return self._begun(Scene(model, state.scene.cameras), state.iteration, state.blur)
 
     def started(self) -> _State:
         """The visual hull, or the hull without the cavities that a fog finds if that explains more."""
-        hull = self.fresh(self.found.hull)
+        hull = self.fresh(self.found.hull, self.options.blur[0])
         if not self.options.cavities:
             return hull
-        views, lit = self.capture.split("train"), self.capture.is_lit
-        key = jax.random.fold_in(self.key, 0)
         found = find_cavities(
-            views, self.found.hull, self.found.box, lit=lit, key=key, progress=self._searched
+            self.capture.split("train"),
+            self.found.hull,
+            self.found.box,
+            lit=self.capture.is_lit,
+            key=jax.random.fold_in(self.key, 0),
+            progress=self._searched,
         )
         worth = [each.distance for each in found if each.share > _WORTH_TRYING]
         if not worth:
             return hull
+        # Blur helps to find the way from a hull; a start that is close already would be filled up by it.
+        sharp = min(_CLOSE, self.options.blur[0])
         rays = self._rays(0)
-        return min((hull, *map(self.fresh, worth)), key=lambda state: self._trial(state, rays))
+        starts = [self.fresh(start, sharp) for start in (self.found.hull, *worth)]
+        best = min(range(len(starts)), key=lambda i: self._trial(starts[i], rays))
+        return starts[best] if best > 0 else hull
 
     def _searched(self) -> None:
         if self.progress is not None:
@@ -269,13 +281,13 @@ class _Trainer:
             state.scene,
             state.optimiser,
             rays,
-            jnp.float32(self.sharpness(i)),
+            jnp.float32(self.sharpness(i, float(state.blur))),
             jnp.float32(0.1 ** (i / options.iterations)),
             # First without highlights: what moves with the viewer must be explained by shape.
             jnp.float32(i >= self.switch),
             jax.random.fold_in(self.key, 2 + i),
         )
-        return _State(scene, optimiser, i + 1), float(error)
+        return _State(scene, optimiser, i + 1, state.blur), float(error)
 
     def run(self, state: _State | None) -> tuple[_State, Stopped]:
         """All steps, or as many as it takes."""
@@ -331,7 +343,7 @@ class _Trainer:
 
     def _checked(self, state: _State, spent: float, speed: float, loss: float) -> Progress:
         """Look at a few held-out views and at the solid."""
-        sharpness = self.sharpness(state.iteration)
+        sharpness = self.sharpness(state.iteration, float(state.blur))
         model, rows, pairs = state.model, [], []
         occupied = model.distances < 3 * model.box.spacing
         for view in state.scene.cameras.corrected_lens(self.checked):
@@ -376,7 +388,9 @@ class _Trainer:
         if self.checkpoint is not None:
             rows = [[np.nan if x is None else x for x in entry] for entry in self.history]
             name = _checkpoint.name_of(self.options, self.capture)
-            _checkpoint.save(self.checkpoint, name, state.iteration, (state.scene, state.optimiser), rows)
+            _checkpoint.save(
+                self.checkpoint, name, state.iteration, (state.scene, state.optimiser, state.blur), rows
+            )
 
     def resumed(self) -> _State | None:
         """The state in the checkpoint; None if there is no checkpoint.
@@ -387,14 +401,14 @@ class _Trainer:
         if self.checkpoint is None or not self.checkpoint.exists():
             return None
         stored = _checkpoint.load(self.checkpoint, _checkpoint.name_of(self.options, self.capture))
-        state = self.fresh(self.found.hull)
+        state = self.fresh(self.found.hull, self.options.blur[0])
         if stored.iteration > self.switch or len(stored.leaves[0]) != len(state.model.distance):
             state = self.refined(state)
-        scene, optimiser = stored.filled((state.scene, state.optimiser))
+        scene, optimiser, blur = stored.filled((state.scene, state.optimiser, state.blur))
         self.history = [
             Progress(int(row[0]), int(row[1]), *(float(x) for x in row[2:])) for row in stored.history
         ]
-        return _State(scene, optimiser, stored.iteration)
+        return _State(scene, optimiser, stored.iteration, blur)
 
 
 def pixel_at(views: Sequence[View], point: Float[np.ndarray, "3"]) -> float:
