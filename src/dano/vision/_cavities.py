@@ -31,7 +31,11 @@ from dano.vision._ray_set import collect, RaySet
 _RESOLUTION = 64
 """Nodes of the fog along the longest side, at most."""
 
-_BATCH, _STEPS = 2048, 400
+_BATCH = 2048
+
+STEPS = 400
+"""Steps that the fog takes to clear."""
+
 _SAMPLING = Sampling(48, 32, 12)
 
 _THICKNESS = 0.01
@@ -66,6 +70,7 @@ def find_cavities(
     *,
     lit: bool,
     key: PRNGKeyArray,
+    n_steps: int = STEPS,
     progress: Callable[[], None] | None = None,
 ) -> tuple[Cavities, ...]:
     """Look for cavities of the visual hull.
@@ -79,13 +84,14 @@ def find_cavities(
         box: Nodes.
         lit: Whether the light of every view is known.
         key: Random key.
+        n_steps: Steps of the optimiser.
         progress: Called after every few steps.
 
     Returns:
         Readings of the fog that leave something of the hull.
     """
     coarse = Box.around(box.origin, box.upper, min(_RESOLUTION, max(box.shape)))
-    opacity = _fog(views, resampled(hull, box, coarse), coarse, lit, key, progress)
+    opacity = _fog(views, resampled(hull, box, coarse), coarse, lit, key, n_steps, progress)
     found = (without_cavities(opacity, coarse, hull, box, *reading) for reading in _READINGS)
     return tuple(each for each in found if each is not None)
 
@@ -138,7 +144,7 @@ def without_cavities(
     return Cavities(distance, 1 - float(kept.sum() / (hull < 0).sum()))
 
 
-def _fog(views, distance, box, lit, key, progress) -> np.ndarray:
+def _fog(views, distance, box, lit, key, n_steps, progress) -> np.ndarray:
     """Opacity of each cell after fitting the photographs."""
     inside = distance < 0.5 * box.spacing
     rays = collect(views, box, distance < 1.5 * box.spacing)
@@ -155,8 +161,8 @@ def _fog(views, distance, box, lit, key, progress) -> np.ndarray:
     optimiser = _optimiser()
     state = optimiser.init(_trainable(model))
     allowed = jnp.asarray(inside)
-    for i in range(_STEPS):
-        decay = jnp.float32(0.1 ** (i / _STEPS))
+    for i in range(n_steps):
+        decay = jnp.float32(0.1 ** (i / n_steps))
         model, state, loss = _step(model, state, rays, allowed, decay, jax.random.fold_in(key, 1 + i))
         if progress is not None and i % 5 == 0:
             loss.block_until_ready()

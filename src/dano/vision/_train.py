@@ -19,7 +19,7 @@ from dano.vision import _checkpoint
 from dano.vision._adjustment import Adjustment
 from dano.vision._appearance import Appearance
 from dano.vision._capture import Capture, View
-from dano.vision._cavities import find_cavities
+from dano.vision._cavities import find_cavities, STEPS
 from dano.vision._hull import Box, object_box, resampled
 from dano.vision._learned import LearnedField
 from dano.vision._metrics import mask_iou, psnr
@@ -250,6 +250,7 @@ class _Trainer:
             self.found.box,
             lit=self.capture.is_lit,
             key=jax.random.fold_in(self.key, 0),
+            n_steps=min(STEPS, max(1, self.options.iterations // 2)),
             progress=self._searched,
         )
         worth = [each.distance for each in found if each.share > _WORTH_TRYING]
