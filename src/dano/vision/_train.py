@@ -387,7 +387,7 @@ class _Trainer:
 
     def _save(self, state: _State) -> None:
         if self.checkpoint is not None:
-            rows = [[np.nan if x is None else x for x in entry] for entry in self.history]
+            rows = [[np.nan if x is None else float(x) for x in entry] for entry in self.history]
             name = _checkpoint.name_of(self.options, self.capture)
             _checkpoint.save(
                 self.checkpoint, name, state.iteration, (state.scene, state.optimiser, state.blur), rows
