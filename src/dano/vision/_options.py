@@ -21,7 +21,7 @@ class TrainOptions:
         eikonal_weight: Weight of (|∇d| − 1)².
         smoothness_weight: Weight of (h ∇²d)².
         cavities: Whether to look for cavities of the visual hull first (see `find_cavities`).
-        cameras: Whether to correct poses and lenses by up to a few pixels; None if silhouettes do not fit.
+        cameras: Whether to correct poses and lenses by up to a few pixels.
         blur: Distance over which the surface is soft, in pixels, at the start and from 70 % of the steps on.
         check_every: Steps between looks at held-out views, which decide when to stop.
         seconds: Stop after this time [s]; None for no limit.
@@ -39,7 +39,7 @@ class TrainOptions:
     eikonal_weight: float = 0.05
     smoothness_weight: float = 0.003
     cavities: bool = True
-    cameras: bool | None = None
+    cameras: bool = False
     blur: tuple[float, float] = (0.5, 0.15)
     check_every: int = 200
     seconds: float | None = None

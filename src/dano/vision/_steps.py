@@ -77,12 +77,11 @@ def optimiser_of(options: TrainOptions) -> Any:
     return optax.multi_transform(parts, tuple(rates))
 
 
-def make_step(options: TrainOptions, *, refine_cameras: bool) -> Callable[..., tuple[Scene, Any, Array]]:
+def make_step(options: TrainOptions) -> Callable[..., tuple[Scene, Any, Array]]:
     """One step of the optimiser on a random batch of rays, compiled.
 
     Args:
         options: Of the training.
-        refine_cameras: Whether to learn corrections of the cameras.
 
     Returns:
         A function of scene, state of the optimiser, rays, sharpness [1/m], factor of all rates, share of the
@@ -99,7 +98,7 @@ def make_step(options: TrainOptions, *, refine_cameras: bool) -> Callable[..., t
     ) -> tuple[Array, Array]:
         scene = scene.replaced(parts)
         model, rays, stated = scene.model, batch.rays, jnp.float32(0)
-        if refine_cameras:
+        if options.cameras:
             rays = scene.cameras.moved(rays, batch.view)
             stated = jnp.mean(scene.cameras.corrections**2)
         jitter, paint = jax.random.split(key)

@@ -38,9 +38,6 @@ _WORTH_TRYING = 0.003
 _CLOSE = 0.2
 """Blur [pixels] of a surface that starts without the cavities of the hull."""
 
-_OFF = 0.015
-"""Share of the silhouettes that the hull does not explain from which on cameras are taken to be inexact."""
-
 _TRIAL = 80
 """Steps that tell whether a surface without cavities explains more."""
 
@@ -195,8 +192,7 @@ class _Trainer:
         few = [held[i] for i in np.unique(np.linspace(0, len(held) - 1, 6).round().astype(int))]
         self.checked = [view.resized(max(1, min(view.image.shape[:2]) // 96)) for view in few]
         self.switch = options.iterations // 3
-        cameras = found.residual > _OFF if options.cameras is None else options.cameras
-        self.step = make_step(options, refine_cameras=cameras)
+        self.step = make_step(options)
         self.middle = 0.5 * (found.box.origin + found.box.upper)
         self.pixel = pixel_at(capture.split("train"), self.middle)
 
