@@ -40,19 +40,22 @@ def soap_mesh() -> Mesh:
 
 def mug_mesh() -> Mesh:
     """The mug, standing on z = 0."""
-    box = np.array([[-0.046, -0.046, -0.005], [0.08, 0.046, 0.1]])
+    # No node lies on a flat face, where triangles would have no area.
+    box = np.array([[-0.0461, -0.0463, -0.0053], [0.08, 0.046, 0.1]])
     return surface(mug_distance, box, 0.001)
 
 
 def surface(distance: SignedDistance, box: np.ndarray, spacing: float) -> Mesh:
     """Triangles of the zero level of a signed distance [m], outward, watertight."""
+    import igl
     import trimesh
-    from skimage.measure import marching_cubes  # pyright: ignore[reportMissingImports]
 
     shape = np.ceil((box[1] - box[0]) / spacing).astype(int) + 1
     x = box[0] + spacing * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
-    vertices, faces, _, _ = marching_cubes(distance(x), 0.0)
-    mesh = trimesh.Trimesh(box[0] + spacing * vertices, faces, process=True)
+    # The first index of libigl's grids runs fastest.
+    nodes = x.transpose(2, 1, 0, 3).reshape(-1, 3)
+    vertices, faces, _ = igl.marching_cubes(distance(nodes), nodes, *(int(n) for n in shape))
+    mesh = trimesh.Trimesh(vertices, faces, process=True)
     if mesh.volume < 0:
         mesh.invert()
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)

@@ -119,7 +119,7 @@ def _models(found) -> dict[str, tuple[AbstractModel, int]]:
 
 def _batch(rays: RaySet, count: int) -> RaySet:
     index = np.random.default_rng(0).choice(len(rays.mask), count, replace=False)
-    return RaySet(Rays(*(x[index] for x in rays.rays)), rays.colour[index], rays.mask[index])
+    return jax.tree.map(lambda x: x[index], rays)
 
 
 def _drawing(model: AbstractModel, rays: Rays) -> Callable[[], object]:

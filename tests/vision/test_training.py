@@ -9,11 +9,22 @@ import pytest
 from vision.photographs import capture, CENTRE, SEMI_AXES
 
 from dano import NeuralObject
-from dano.vision import Box, Capture, hull_distance, LearnedField, survey, train, Trained, TrainOptions, View
+from dano.vision import (
+    Box,
+    Capture,
+    hull_distance,
+    LearnedField,
+    PosedCamera,
+    survey,
+    train,
+    Trained,
+    TrainOptions,
+    View,
+)
 from dano.vision._hull import object_box, redistanced, silhouettes
 
 VOLUME = 4 / 3 * np.pi * float(np.prod(SEMI_AXES))
-QUICK = TrainOptions(resolution=32, iterations=150, batch=512, features=4, check_every=50)
+QUICK = TrainOptions(resolution=32, iterations=150, batch=512, features=4, check_every=50, cavities=False)
 
 
 @pytest.fixture(scope="module")
@@ -125,13 +136,46 @@ def test_a_full_disk_does_not_end_training(photos: Capture, tmp_path: Path, monk
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dano.vision._train.write_archive", full)
+    monkeypatch.setattr("dano.vision._checkpoint.write_archive", full)
     with pytest.warns(UserWarning, match="could not be written"):
         train(
             photos,
             TrainOptions(**{**vars(QUICK), "iterations": 2, "check_every": 1}),
             checkpoint=tmp_path / "s.npz",
         )
+
+
+def test_a_third_of_the_views_still_gives_the_solid(photos: Capture):
+    few = train(photos.thinned(8), QUICK)
+    assert few.scores["test"].psnr > 26
+    centre, radii = few.survey.box.nodes - CENTRE, SEMI_AXES
+    true = (np.sum((centre / radii) ** 2, axis=1) < 1).reshape(few.survey.box.shape)
+    inside = np.asarray(few.field.jet(jnp.asarray(few.survey.box.nodes.T), 0)).reshape(true.shape) > 0.5
+    assert np.sum(inside & true) / np.sum(inside | true) > 0.92
+
+
+def test_a_lens_that_is_off_centre_is_corrected_for_held_out_views_too(photos: Capture):
+    def off(view: View) -> View:
+        c = view.camera
+        centre = c.centre + np.array([0.8, -0.6])
+        size = {"width": c.width, "height": c.height}
+        return view.replaced(camera=PosedCamera(c.pose, focal=c.focal, centre=centre, **size))
+
+    stated = Capture([off(view) for view in photos.views])
+    result = train(stated, TrainOptions(**{**vars(QUICK), "cameras": True}))
+    errors = []
+    for true, corrected in zip(photos.split("test"), result.capture.split("test"), strict=True):
+        # Where the middle of the solid is seen, whatever motion of everything training has agreed on.
+        middle = np.asarray(result.field.solid.solid_bounds).mean(0)
+        image = corrected.camera.project(middle[None])[0, :2]
+        errors.append(np.linalg.norm(image - true.camera.project(CENTRE[None])[0, :2]))
+    # A whole pixel as stated.
+    assert np.mean(errors) < 0.5
+
+
+def test_resolution_of_the_photographs_follows_the_grid():
+    coarse = train(capture(12, 2, 96), TrainOptions(**{**vars(QUICK), "iterations": 2, "check_every": 2}))
+    assert {view.image.shape for view in coarse.capture.views} == {(48, 48, 3)}
 
 
 def test_what_photographs_cannot_tell_is_said():

@@ -182,7 +182,7 @@ def train(
     summary = _summary(trained, made, output, masks_given=given)
     summary |= {"confidence": estimates.differences(made.size)}
     if report:
-        write_training_report(outputs["report"], trained, capture, made, estimates, title=output.stem)
+        write_training_report(outputs["report"], trained, trained.capture, made, estimates, title=output.stem)
     if json_file is not None:
         with replacing(json_file) as file:
             file.write((json.dumps(summary, indent=1) + "\n").encode())

@@ -42,7 +42,7 @@ def train(
     /,
     output: Output,
     resolution: int = 96,
-    iterations: int = 1000,
+    iterations: int = 800,
     batch: int = 4096,
     seconds: float | None = None,
     views: int | None = None,

@@ -32,16 +32,15 @@ from dano.vision._models import (
     Seen as Seen,
     SurfaceModel as SurfaceModel,
 )
+from dano.vision._options import TrainOptions as TrainOptions
 from dano.vision._osf import OSF as OSF
 from dano.vision._picture import Picture as Picture, picture as picture
 from dano.vision._render import render as render
+from dano.vision._score import Score as Score, score as score
 from dano.vision._survey import Survey as Survey, survey as survey
 from dano.vision._train import (
     Progress as Progress,
-    Score as Score,
-    score as score,
     train as train,
     Trained as Trained,
-    TrainOptions as TrainOptions,
     volume as volume,
 )

@@ -239,3 +239,9 @@ def redistanced(level: Float[np.ndarray, "nx ny nz"], box: Box) -> Float[np.ndar
     blend = np.clip(distance - 1, 0, 1)
     distances[near] = (1 - blend) * np.minimum(off, distance) + blend * distance
     return np.where(positive, distances, -distances) * box.spacing
+
+
+def resampled(values: Float[np.ndarray, "nx ny nz"], old: Box, new: Box) -> Float[np.ndarray, "mx my mz"]:
+    """Values at the nodes of another box, trilinear between the old nodes, constant beyond them."""
+    index = (new.nodes - old.origin).T / old.spacing
+    return ndimage.map_coordinates(values, index, order=1, mode="nearest").reshape(new.shape)

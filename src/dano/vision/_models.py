@@ -83,6 +83,9 @@ class Sampling(NamedTuple):
 DRAWING = Sampling(96, 32, 8)
 """For pictures to look at and to measure errors by."""
 
+_BAND, _SKIN = 4.0, 1.25
+"""Cells around the zero level where values are to be distances, and where they are to be smooth."""
+
 
 class AbstractModel(eqx.Module):
     """Opacity and colour of an object."""
@@ -320,17 +323,21 @@ class DensityModel(AbstractMedium):
 
 
 def roughness(
-    distance: Float[Array, "nx ny nz"], spacing: Float[Array, ""], band: float
+    distance: Float[Array, "nx ny nz"], spacing: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """How far values near the zero level are from a smooth signed distance.
+
+    Slopes are those to both neighbours along each axis, their squares averaged: in the middle of a thin wall,
+    where a signed distance turns round, they are 1, whereas central differences would vanish there, and to
+    want them to be 1 would fill narrow cavities and thicken walls. For the same reason bending counts next to
+    the surface only.
 
     Args:
         distance: Values at nodes.
         spacing: Between nodes, in the same unit.
-        band: Cells around the zero level that count.
 
     Returns:
-        Mean of (|∇d| − 1)² and mean of (spacing · ∇²d)², over the nodes of the band.
+        Mean of (|∇d| − 1)² within `_BAND` cells of the zero level, mean of (spacing · ∇²d)² within `_SKIN`.
     """
     d = distance / spacing
     inner = d[1:-1, 1:-1, 1:-1]
@@ -339,9 +346,11 @@ def roughness(
         (d[1:-1, 2:, 1:-1], d[1:-1, :-2, 1:-1]),
         (d[1:-1, 1:-1, 2:], d[1:-1, 1:-1, :-2]),
     ]
-    near = jax.lax.stop_gradient((jnp.abs(inner) < band).astype(d.dtype))
-    count = jnp.sum(near) + 1
-    square = sum((0.25 * (a - b) ** 2 for a, b in neighbours), jnp.float32(0))
+
+    def mean(values: Array, width: float) -> Array:
+        near = jax.lax.stop_gradient((jnp.abs(inner) < width).astype(d.dtype))
+        return jnp.sum(near * values) / (jnp.sum(near) + 1)
+
+    square = sum((0.5 * ((a - inner) ** 2 + (inner - b) ** 2) for a, b in neighbours), jnp.float32(0))
     laplacian = sum((a + b for a, b in neighbours), -6 * inner)
-    length = jnp.sqrt(square + 1e-8)
-    return jnp.sum(near * (length - 1) ** 2) / count, jnp.sum(near * laplacian**2) / count
+    return mean((jnp.sqrt(square + 1e-8) - 1) ** 2, _BAND), mean(laplacian**2, _SKIN)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dano.vision._camera import AbstractCamera
 from dano.vision._capture import View
@@ -24,11 +24,18 @@ class RaySet(NamedTuple):
         rays: Those that may meet the object.
         colour: sRGB over black of the object alone, shape (rays, 3).
         mask: Share of the pixel that the object covers, shape (rays,).
+        view: Number of the view that each belongs to, shape (rays,).
     """
 
     rays: Rays
     colour: Float[Array, "rays 3"]
     mask: Float[Array, " rays"]
+    view: Int[Array, " rays"]
+
+    def drawn(self, n: int, key: PRNGKeyArray) -> "RaySet":
+        """`n` of them at random, with repetition."""
+        index = jax.random.randint(key, (n,), 0, len(self.mask))
+        return jax.tree.map(lambda x: x[index], self)
 
 
 def rays_of(
@@ -119,4 +126,5 @@ def collect(views: Sequence[View], box: Box, occupied: Bool[np.ndarray, "nx ny n
         Rays(*columns),
         jnp.asarray(np.concatenate(colours), jnp.float32),
         jnp.asarray(np.concatenate(masks), jnp.float32),
+        jnp.asarray(np.repeat(np.arange(len(views), dtype=np.int32), [len(mask) for mask in masks])),
     )

@@ -1,19 +1,11 @@
 """Training: from photographs with masks to a solid field.
 
-The solid starts as the visual hull of the masks, on a coarse grid; rendering is compared with random rays
-of the photographs, in front of random backgrounds, so that transparency cannot pass for colour:
-
-    E |c + (1 − o) b − C − (1 − M) b|²  +  w_m |o − M|²  +  w_e (|∇d| − 1)²  +  w_s (h ∇²d)²
-
-with c, o the rendered colour and opacity, C, M the photograph and its mask, b the background, and the last
-two terms over nodes near the surface, which keep d a smooth signed distance. Coarse first, finer later.
+The solid starts as the visual hull of the masks, without the cavities that a fog finds in it, on a coarse
+grid; rendering is compared with random rays of the photographs (see `make_step`). Coarse first, finer later.
 """
 
-import dataclasses
-import hashlib
-import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -21,103 +13,35 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
-from dano.archive import read_archive, write_archive
+from dano.vision import _checkpoint
+from dano.vision._adjustment import Adjustment
 from dano.vision._appearance import Appearance
 from dano.vision._capture import Capture, View
-from dano.vision._hull import Box
+from dano.vision._cavities import find_cavities, STEPS
+from dano.vision._hull import Box, object_box, resampled
 from dano.vision._learned import LearnedField
-from dano.vision._metrics import mask_iou, psnr, ssim
-from dano.vision._models import Rays, roughness, Sampling, see, SurfaceModel
+from dano.vision._metrics import mask_iou, psnr
+from dano.vision._models import SurfaceModel
+from dano.vision._options import TrainOptions
 from dano.vision._picture import picture
 from dano.vision._preview import checked_folder, write_preview
 from dano.vision._ray_set import collect, RaySet
+from dano.vision._score import Score, score
+from dano.vision._steps import make_step, optimiser_of, Scene
 from dano.vision._survey import Survey, survey, unseen_share
 
-CHECKPOINT, CHECKPOINT_VERSION = "dano-training", 1
+_WORTH_TRYING = 0.003
+"""Share of the hull that cavities must take for a surface without them to be tried."""
+
+_CLOSE = 0.2
+"""Blur [pixels] of a surface that starts without the cavities of the hull."""
+
+_TRIAL = 80
+"""Steps that tell whether a surface without cavities explains more."""
 
 Stopped = Literal["finished", "converged", "geometry", "time", "diverged"]
-
-
-@dataclasses.dataclass(frozen=True)
-class TrainOptions:
-    """How to train.
-
-    Attributes:
-        resolution: Nodes along the longest side of the finest grid of distances.
-        iterations: Steps in all; a third of them on a grid of two thirds the resolution.
-        batch: Rays per step.
-        features: Numbers that say what a place looks like.
-        rate_distance: Learning rate of the distances, in cells per step.
-        rate_features: Learning rate of the features.
-        rate_network: Learning rate of the network.
-        mask_weight: Weight of the mask's error.
-        eikonal_weight: Weight of (|∇d| − 1)².
-        smoothness_weight: Weight of (h ∇²d)².
-        blur: Distance over which the surface is soft, in pixels, at the start and from 70 % of the steps on.
-        check_every: Steps between looks at held-out views, which decide when to stop.
-        seconds: Stop after this time [s]; None for no limit.
-        seed: Of everything random.
-    """
-
-    resolution: int = 96
-    iterations: int = 1000
-    batch: int = 4096
-    features: int = 8
-    rate_distance: float = 0.25
-    rate_features: float = 0.01
-    rate_network: float = 0.003
-    mask_weight: float = 0.5
-    eikonal_weight: float = 0.05
-    smoothness_weight: float = 0.003
-    blur: tuple[float, float] = (0.5, 0.15)
-    check_every: int = 100
-    seconds: float | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Check all numbers.
-
-        Raises:
-            ValueError: If one is out of range.
-        """
-        ranges: dict[str, tuple[float, float]] = {
-            "resolution": (16, 384),
-            "iterations": (1, 10**6),
-            "batch": (16, 2**20),
-            "features": (1, 64),
-            "check_every": (1, 10**6),
-        }
-        for name, (low, high) in ranges.items():
-            if not low <= getattr(self, name) <= high:
-                raise ValueError(f"{name} must lie between {low} and {high}, got {getattr(self, name)}")
-        for name in ("rate_distance", "rate_features", "rate_network"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("mask_weight", "eikonal_weight", "smoothness_weight"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise ValueError(f"{name} must be ≥ 0, got {getattr(self, name)}")
-        if not all(b > 0 for b in self.blur):
-            raise ValueError(f"blur must be positive, got {self.blur}")
-        if self.seconds is not None and not self.seconds > 0:
-            raise ValueError(f"seconds must be positive, got {self.seconds}")
-
-
-class Score(NamedTuple):
-    """How well views are rendered, means over them.
-
-    Attributes:
-        psnr: Of whole images, on the photographs' own background or on white [dB].
-        psnr_object: Of the pixels that show the object [dB].
-        ssim: Structural similarity of whole images.
-        mask_iou: Intersection over union of the silhouettes.
-    """
-
-    psnr: float
-    psnr_object: float
-    ssim: float
-    mask_iou: float
 
 
 class Progress(NamedTuple):
@@ -149,6 +73,8 @@ class Trained(NamedTuple):
 
     Attributes:
         field: The field.
+        capture: The photographs as they were compared: at the resolution that was worked with, seen by
+            corrected cameras.
         survey: What the silhouettes told, with the visual hull.
         scores: By split: "test", "relight", or "train" (some of its views) if nothing was held out.
         history: One entry per look at held-out views.
@@ -159,6 +85,7 @@ class Trained(NamedTuple):
     """
 
     field: LearnedField
+    capture: Capture
     survey: Survey
     scores: dict[str, Score]
     history: tuple[Progress, ...]
@@ -171,9 +98,14 @@ class Trained(NamedTuple):
 class _State(eqx.Module):
     """What a checkpoint holds besides options."""
 
-    model: SurfaceModel
+    scene: Scene
     optimiser: Any
     iteration: int
+    blur: Float[Array, ""]
+
+    @property
+    def model(self) -> SurfaceModel:
+        return self.scene.model
 
 
 def train(
@@ -210,13 +142,15 @@ def train(
     near = {view.light_is_near for view in capture.views if view.light is not None}
     if len(near) > 1:
         raise ValueError("lights must be given as directions or as positions, got some of each")
+    capture = _shrunk(capture, options)
     found = survey(capture, options.resolution)
     trainer = _Trainer(
         capture, options, found, Path(checkpoint) if checkpoint is not None else None, progress, folder
     )
     state = trainer.resumed() if resume else None
     state, stopped = trainer.run(state)
-    field = LearnedField.from_model(state.model, trainer.sharpness(options.iterations))
+    field = LearnedField.from_model(state.model, trainer.sharpness(options.iterations, options.blur[0]))
+    capture = trainer.with_corrected_cameras(state)
     splits = [s for s in ("test", "relight") if capture.split(s)] or ["train"]
     scores = {s: score(field, capture.split(s)[: 16 if s == "train" else None]) for s in splits}
     unseen = unseen_share(state.model, capture.split("train"))
@@ -227,6 +161,7 @@ def train(
         warnings.append("training met a number that is not finite; what it had before is kept")
     return Trained(
         field,
+        capture,
         found,
         scores,
         tuple(trainer.history),
@@ -235,31 +170,6 @@ def train(
         unseen,
         tuple(warnings),
     )
-
-
-def score(field: LearnedField, views: tuple[View, ...]) -> Score:
-    """Compare renderings with photographs, on these's own background if it is plain, else both on white.
-
-    Raises:
-        ValueError: If there is no view, or one has no mask.
-    """
-    if not views:
-        raise ValueError("views must hold at least one view, got none")
-    rows = []
-    for view in views:
-        if view.mask is None:
-            raise ValueError(f"{view.name} must have a mask to be compared with")
-        drawn = field.picture(view.camera, view.light)
-        wanted, got = view.over(view.backdrop), drawn.over(view.backdrop)
-        rows.append(
-            (
-                psnr(got, wanted),
-                psnr(got, wanted, view.mask > 0.5),
-                ssim(got, wanted),
-                mask_iou(drawn.opacity, view.mask),
-            )
-        )
-    return Score(*(float(x) for x in np.mean(rows, axis=0)))
 
 
 class _Trainer:
@@ -282,15 +192,13 @@ class _Trainer:
         few = [held[i] for i in np.unique(np.linspace(0, len(held) - 1, 6).round().astype(int))]
         self.checked = [view.resized(max(1, min(view.image.shape[:2]) // 96)) for view in few]
         self.switch = options.iterations // 3
-        views = capture.split("train")
-        angles = [view.camera.pixel_angle for view in views]
-        middle = 0.5 * (found.box.origin + found.box.upper)
-        ranges = [np.linalg.norm(view.camera.position - middle) for view in views]
-        self.pixel = float(np.median(np.multiply(angles, ranges)))
+        self.step = make_step(options)
+        self.middle = 0.5 * (found.box.origin + found.box.upper)
+        self.pixel = pixel_at(capture.split("train"), self.middle)
 
-    def sharpness(self, iteration: int) -> float:
+    def sharpness(self, iteration: int, first: float) -> float:
         """Of the surface [1/m] at a step: geometric from the first blur to the last."""
-        first, last = self.options.blur
+        last = self.options.blur[1]
         share = min(1.0, iteration / (0.7 * self.options.iterations))
         return 1 / (max(self.pixel, 0.5 * self.found.box.spacing) * first * (last / first) ** share)
 
@@ -301,8 +209,8 @@ class _Trainer:
             return fine
         return Box.around(fine.origin, fine.upper, max(16, 2 * self.options.resolution // 3))
 
-    def fresh(self) -> _State:
-        """The visual hull, grey all over."""
+    def fresh(self, start: np.ndarray, blur: float) -> _State:
+        """A surface at signed distances [m] on the survey's box, grey all over and blurred [pixels]."""
         views, box = self.capture.split("train"), self.box(0)
         lit = self.capture.is_lit
         look = Appearance.create(
@@ -313,46 +221,90 @@ class _Trainer:
             resolution=max(8, 2 * self.options.resolution // 3),
             key=jax.random.fold_in(self.key, 1),
         )
-        model = SurfaceModel.create(_resampled(self.found.hull, self.found.box, box), box, look)
-        return _State(model, _optimiser(model, self.options).init(_trainable(model)), 0)
+        model = SurfaceModel.create(resampled(start, self.found.box, box), box, look)
+        cameras = Adjustment.create(views, self.middle)
+        return self._begun(Scene(model, cameras), 0, jnp.float32(blur))
+
+    def _begun(self, scene: Scene, iteration: int, blur: Float[Array, ""]) -> _State:
+        return _State(scene, optimiser_of(self.options).init(scene.parts), iteration, blur)
 
     def refined(self, state: _State) -> _State:
         """The state on the fine grid; the optimiser's memory starts anew."""
         coarse, fine = state.model.box, self.found.box
-        distances = _resampled(state.model.distances, coarse, fine)
+        distances = resampled(state.model.distances, coarse, fine)
         model = SurfaceModel.create(distances, fine, state.model.appearance)
-        return _State(model, _optimiser(model, self.options).init(_trainable(model)), state.iteration)
+        return self._begun(Scene(model, state.scene.cameras), state.iteration, state.blur)
+
+    def started(self) -> _State:
+        """The visual hull, or the hull without the cavities that a fog finds if that explains more."""
+        hull = self.fresh(self.found.hull, self.options.blur[0])
+        if not self.options.cavities:
+            return hull
+        found = find_cavities(
+            self.capture.split("train"),
+            self.found.hull,
+            self.found.box,
+            lit=self.capture.is_lit,
+            key=jax.random.fold_in(self.key, 0),
+            n_steps=min(STEPS, max(1, self.options.iterations // 2)),
+            progress=self._searched,
+        )
+        worth = [each.distance for each in found if each.share > _WORTH_TRYING]
+        if not worth:
+            return hull
+        # Blur helps to find the way from a hull; a start that is close already would be filled up by it.
+        sharp = min(_CLOSE, self.options.blur[0])
+        rays = self._rays(0)
+        starts = [self.fresh(start, sharp) for start in (self.found.hull, *worth)]
+        best = min(range(len(starts)), key=lambda i: self._trial(starts[i], rays))
+        return starts[best] if best > 0 else hull
+
+    def _searched(self) -> None:
+        if self.progress is not None:
+            self.progress(_nothing_yet(0, self.options.iterations))
+
+    def _trial(self, state: _State, rays: RaySet) -> float:
+        """Mean loss of the last of a few steps: translucency deceives a fog, but not a surface."""
+        losses = []
+        for _ in range(max(1, min(_TRIAL, self.switch))):
+            state, loss = self.advanced(state, rays)
+            losses.append(loss)
+        return float(np.mean(losses[-max(1, len(losses) // 4) :]))
+
+    def advanced(self, state: _State, rays: RaySet) -> tuple[_State, float]:
+        """One step, and the loss before it."""
+        i, options = state.iteration, self.options
+        scene, optimiser, error = self.step(
+            state.scene,
+            state.optimiser,
+            rays,
+            jnp.float32(self.sharpness(i, float(state.blur))),
+            jnp.float32(0.1 ** (i / options.iterations)),
+            # First without highlights: what moves with the viewer must be explained by shape.
+            jnp.float32(i >= self.switch),
+            jax.random.fold_in(self.key, 2 + i),
+        )
+        return _State(scene, optimiser, i + 1, state.blur), float(error)
 
     def run(self, state: _State | None) -> tuple[_State, Stopped]:
         """All steps, or as many as it takes."""
-        state = self.fresh() if state is None else state
+        state = self.started() if state is None else state
         good, best, best_score = state, state, -np.inf
         rays, spent, stopped = self._rays(state.iteration), 0.0, "finished"
-        options = self.options
-        step = _make_step(options)
-        last_loss, last_speed, since = float("nan"), 0.0, time.perf_counter()
+        options, since = self.options, time.perf_counter()
         try:
             while state.iteration < options.iterations:
                 if state.iteration == self.switch and state.model.distance.shape != self.found.box.shape:
                     state = self.refined(state)
                     rays = self._rays(state.iteration)
                 begin = time.perf_counter()
-                key = jax.random.fold_in(self.key, 2 + state.iteration)
-                sharpness = jnp.float32(self.sharpness(state.iteration))
-                # First without highlights: what moves with the viewer must be explained by shape.
-                view_share = jnp.float32(state.iteration >= self.switch)
-                decay = jnp.float32(0.1 ** (state.iteration / options.iterations))
-                model, optimiser, loss = step(
-                    state.model, state.optimiser, rays, sharpness, decay, view_share, key
-                )
-                last_loss = float(loss)
-                if not np.isfinite(last_loss):
+                state, loss = self.advanced(state, rays)
+                if not np.isfinite(loss):
                     return good, "diverged"
-                state = _State(model, optimiser, state.iteration + 1)
                 took = time.perf_counter() - begin
-                spent, last_speed = spent + took, options.batch / took
+                spent, speed = spent + took, options.batch / took
                 if state.iteration % options.check_every == 0 or state.iteration == options.iterations:
-                    entry = self._checked(state, spent, last_speed, last_loss)
+                    entry = self._checked(state, spent, speed, loss)
                     good = state
                     self._save(state)
                     merit = (entry.mask_iou or 0.0) + 0.002 * (entry.psnr or 0.0)
@@ -362,19 +314,9 @@ class _Trainer:
                         stopped = reason
                         break
                 elif self.progress is not None and state.iteration % 5 == 0:
-                    previous = self.history[-1] if self.history else None
-                    self.progress(
-                        Progress(
-                            state.iteration,
-                            options.iterations,
-                            spent,
-                            last_speed,
-                            last_loss,
-                            previous.psnr if previous else None,
-                            previous.mask_iou if previous else None,
-                            previous.volume if previous else float("nan"),
-                        )
-                    )
+                    last = self.history[-1] if self.history else _nothing_yet(0, options.iterations)
+                    now = {"iteration": state.iteration, "seconds": spent, "loss": loss}
+                    self.progress(last._replace(**now, rays_per_second=speed))
                 if options.seconds is not None and time.perf_counter() - since > options.seconds:
                     stopped = "time"
                     break
@@ -383,19 +325,25 @@ class _Trainer:
             raise
         return (best if stopped == "geometry" else state), stopped
 
+    def with_corrected_cameras(self, state: _State) -> Capture:
+        """The photographs, those held out corrected by what all cameras have in common."""
+        train, cameras = self.capture.split("train"), state.scene.cameras
+        other = [view for view in self.capture.views if view.split != "train"]
+        return Capture((*cameras.corrected(train), *cameras.corrected_lens(other)), self.capture.source)
+
     def _rays(self, iteration: int) -> RaySet:
         """Rays that may meet the hull: the same whenever training is resumed."""
         box = self.box(iteration)
-        hull = _resampled(self.found.hull, self.found.box, box)
+        hull = resampled(self.found.hull, self.found.box, box)
         # Wide enough that the surface can move outwards by as much as its blur.
         return collect(self.capture.split("train"), box, hull < max(3 * box.spacing, 2 * self.pixel))
 
     def _checked(self, state: _State, spent: float, speed: float, loss: float) -> Progress:
         """Look at a few held-out views and at the solid."""
-        sharpness = self.sharpness(state.iteration)
+        sharpness = self.sharpness(state.iteration, float(state.blur))
         model, rows, pairs = state.model, [], []
         occupied = model.distances < 3 * model.box.spacing
-        for view in self.checked:
+        for view in state.scene.cameras.corrected_lens(self.checked):
             light = view.light if model.appearance.lit else None
             drawn = picture(model, view.camera, light, model.box, occupied, sharpness)
             assert view.mask is not None
@@ -433,31 +381,13 @@ class _Trainer:
         settled = max(volumes) - min(volumes) < 5e-4 * volumes[-1]
         return "converged" if settled and max(quality[-2:]) < max(quality[:-2]) + 0.03 else None
 
-    def _name(self) -> str:
-        """What a checkpoint must belong to."""
-        told = {**dataclasses.asdict(self.options), "seconds": None}
-        names = [(view.name, view.split, view.image.shape) for view in self.capture.views]
-        return hashlib.sha256(json.dumps([told, names], default=str).encode()).hexdigest()
-
     def _save(self, state: _State) -> None:
-        if self.checkpoint is None:
-            return
-        leaves = jax.tree.leaves((state.model, state.optimiser))
-        members = {f"leaf_{i:03d}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
-        members |= {
-            "format": np.array(CHECKPOINT),
-            "version": np.array(CHECKPOINT_VERSION),
-            "training": np.array(self._name()),
-            "iteration": np.array(state.iteration),
-            "history": np.array([[np.nan if x is None else x for x in entry] for entry in self.history]),
-        }
-        try:
-            write_archive(self.checkpoint, members)
-        except OSError as error:
-            # A full disk must not cost what has been learned.
-            import warnings
-
-            warnings.warn(f"checkpoint {self.checkpoint} could not be written: {error}", stacklevel=2)
+        if self.checkpoint is not None:
+            rows = [[np.nan if x is None else float(x) for x in entry] for entry in self.history]
+            name = _checkpoint.name_of(self.options, self.capture)
+            _checkpoint.save(
+                self.checkpoint, name, state.iteration, (state.scene, state.optimiser, state.blur), rows
+            )
 
     def resumed(self) -> _State | None:
         """The state in the checkpoint; None if there is no checkpoint.
@@ -467,106 +397,40 @@ class _Trainer:
         """
         if self.checkpoint is None or not self.checkpoint.exists():
             return None
-        data = read_archive(self.checkpoint, CHECKPOINT, CHECKPOINT_VERSION)
-        if str(data["training"]) != self._name():
-            raise ValueError(
-                f"{self.checkpoint} is of a training with other photographs or options: remove it, or train"
-                " without resuming"
-            )
-        iteration = int(data["iteration"])
-        state = self.fresh()
-        if iteration > self.switch or len(data["leaf_000"]) != len(state.model.distance):
+        stored = _checkpoint.load(self.checkpoint, _checkpoint.name_of(self.options, self.capture))
+        state = self.fresh(self.found.hull, self.options.blur[0])
+        if stored.iteration > self.switch or len(stored.leaves[0]) != len(state.model.distance):
             state = self.refined(state)
-        leaves, structure = jax.tree.flatten((state.model, state.optimiser))
-        stored = [jnp.asarray(data[f"leaf_{i:03d}"]) for i in range(len(leaves))]
-        if [x.shape for x in stored] != [x.shape for x in leaves]:
-            raise ValueError(f"{self.checkpoint} does not fit this training: arrays of other shapes")
-        model, optimiser = jax.tree.unflatten(structure, stored)
+        scene, optimiser, blur = stored.filled((state.scene, state.optimiser, state.blur))
         self.history = [
-            Progress(int(row[0]), int(row[1]), *(float(x) for x in row[2:])) for row in data["history"]
+            Progress(int(row[0]), int(row[1]), *(float(x) for x in row[2:])) for row in stored.history
         ]
-        return _State(model, optimiser, iteration)
+        return _State(scene, optimiser, stored.iteration, blur)
+
+
+def pixel_at(views: Sequence[View], point: Float[np.ndarray, "3"]) -> float:
+    """Width of a pixel [m] at a point [m, W], median over views."""
+    ranges = [np.linalg.norm(view.camera.position - point) for view in views]
+    return float(np.median(np.multiply([view.camera.pixel_angle for view in views], ranges)))
+
+
+def _shrunk(capture: Capture, options: TrainOptions) -> Capture:
+    """Photographs whose pixels are about as large as the cells of the finest grid, if they are smaller."""
+    views = capture.split("train")
+    if not capture.has_masks:
+        return capture
+    lower, upper = object_box(views)
+    cell = float((upper - lower).max()) / options.resolution
+    factor = max(1, round(cell / pixel_at(views, 0.5 * (lower + upper))))
+    return (
+        Capture([view.resized(factor) for view in capture.views], capture.source) if factor > 1 else capture
+    )
+
+
+def _nothing_yet(iteration: int, iterations: int) -> Progress:
+    return Progress(iteration, iterations, 0.0, 0.0, float("nan"), None, None, float("nan"))
 
 
 def volume(distances: Float[np.ndarray, "nx ny nz"], box: Box) -> float:
     """Volume [m³] of {d < 0}, nodes near the surface counted in part."""
     return float(np.sum(np.clip(0.5 - distances / box.spacing, 0, 1)) * box.spacing**3)
-
-
-def _resampled(values: np.ndarray, old: Box, new: Box) -> np.ndarray:
-    from scipy import ndimage
-
-    index = (new.nodes - old.origin).T / old.spacing
-    return ndimage.map_coordinates(values, index, order=1, mode="nearest").reshape(new.shape)
-
-
-def _trainable(model: SurfaceModel) -> Any:
-    return model.distance, model.appearance.features, model.appearance.network
-
-
-def _optimiser(model: SurfaceModel | None, options: TrainOptions) -> Any:
-    try:
-        import optax
-    except ImportError as error:
-        raise ImportError("training needs optax: pip install 'dano[train]'") from error
-    # Half the longest side of the box is the unit of distances.
-    cell = 2 / options.resolution
-
-    def adam(rate: float) -> Any:
-        # Grids get a gradient only where rays pass: a short memory, and no floor under tiny gradients.
-        return optax.adam(rate, b1=0.9, b2=0.99, eps=1e-12)
-
-    parts = {
-        "distance": adam(options.rate_distance * cell),
-        "features": adam(options.rate_features),
-        "network": adam(options.rate_network),
-    }
-    return optax.multi_transform(parts, ("distance", "features", "network"))
-
-
-def _make_step(options: TrainOptions) -> Callable[..., tuple[SurfaceModel, Any, Array]]:
-    """One step of the optimiser on a random batch of rays, compiled."""
-    import optax
-
-    sampling = Sampling(48, 16, 5)
-    optimiser = _optimiser(None, options)
-
-    def loss(
-        parts: Any, model: SurfaceModel, batch: RaySet, sharpness: Array, view_share: Array, key: PRNGKeyArray
-    ) -> Array:
-        model = eqx.tree_at(_trainable, model, parts)
-        jitter, paint = jax.random.split(key)
-        background = jax.random.uniform(paint, batch.colour.shape, jnp.float32)
-        seen = see(model, batch.rays, sharpness, sampling=sampling, view_share=view_share, key=jitter)
-        wanted = batch.colour + (1 - batch.mask)[:, None] * background
-        got = seen.colour + (1 - seen.opacity)[:, None] * background
-        eikonal, bending = roughness(model.distance, model.spacing / model.scale, 4.0)
-        return (
-            jnp.mean((got - wanted) ** 2)
-            + options.mask_weight * jnp.mean((seen.opacity - batch.mask) ** 2)
-            + options.eikonal_weight * eikonal
-            + options.smoothness_weight * bending
-        )
-
-    @eqx.filter_jit
-    def step(
-        model: SurfaceModel,
-        state: Any,
-        rays: RaySet,
-        sharpness: Array,
-        decay: Array,
-        view_share: Array,
-        key: PRNGKeyArray,
-    ) -> tuple[SurfaceModel, Any, Array]:
-        pick, own = jax.random.split(key)
-        index = jax.random.randint(pick, (options.batch,), 0, len(rays.mask))
-        batch = RaySet(Rays(*(x[index] for x in rays.rays)), rays.colour[index], rays.mask[index])
-        parts = _trainable(model)
-        value, gradient = jax.value_and_grad(loss)(parts, model, batch, sharpness, view_share, own)
-        # optax counts steps in integers and takes powers of floats by them.
-        with jax.numpy_dtype_promotion("standard"):
-            updates, state = optimiser.update(gradient, state, parts)
-        updates = jax.tree.map(lambda u: decay * u, updates)
-        return eqx.tree_at(_trainable, model, optax.apply_updates(parts, updates)), state, value
-
-    return step

@@ -1,0 +1,1 @@
+"""Learning from photographs: pictures, solids and mass properties against what they should be."""

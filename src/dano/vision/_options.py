@@ -1,0 +1,73 @@
+"""How to train: every number that may be chosen."""
+
+import dataclasses
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainOptions:
+    """How to train.
+
+    Attributes:
+        resolution: Nodes along the longest side of the finest grid of distances.
+        iterations: Steps in all; a third of them on a grid of two thirds the resolution.
+        batch: Rays per step.
+        features: Numbers that say what a place looks like.
+        rate_distance: Learning rate of the distances, in cells per step.
+        rate_features: Learning rate of the features.
+        rate_network: Learning rate of the network.
+        mask_weight: Weight of the mask's error.
+        eikonal_weight: Weight of (|∇d| − 1)².
+        smoothness_weight: Weight of (h ∇²d)².
+        cavities: Whether to look for cavities of the visual hull first (see `find_cavities`).
+        cameras: Whether to correct poses and lenses by up to a few pixels.
+        blur: Distance over which the surface is soft, in pixels, at the start and from 70 % of the steps on.
+        check_every: Steps between looks at held-out views, which decide when to stop.
+        seconds: Stop after this time [s]; None for no limit.
+        seed: Of everything random.
+    """
+
+    resolution: int = 96
+    iterations: int = 800
+    batch: int = 4096
+    features: int = 8
+    rate_distance: float = 0.25
+    rate_features: float = 0.01
+    rate_network: float = 0.003
+    mask_weight: float = 0.5
+    eikonal_weight: float = 0.05
+    smoothness_weight: float = 0.003
+    cavities: bool = True
+    cameras: bool = False
+    blur: tuple[float, float] = (0.5, 0.15)
+    check_every: int = 200
+    seconds: float | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check all numbers.
+
+        Raises:
+            ValueError: If one is out of range.
+        """
+        ranges: dict[str, tuple[float, float]] = {
+            "resolution": (16, 384),
+            "iterations": (1, 10**6),
+            "batch": (16, 2**20),
+            "features": (1, 64),
+            "check_every": (1, 10**6),
+        }
+        for name, (low, high) in ranges.items():
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name} must lie between {low} and {high}, got {getattr(self, name)}")
+        for name in ("rate_distance", "rate_features", "rate_network"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("mask_weight", "eikonal_weight", "smoothness_weight"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise ValueError(f"{name} must be ≥ 0, got {getattr(self, name)}")
+        if not all(b > 0 for b in self.blur):
+            raise ValueError(f"blur must be positive, got {self.blur}")
+        if self.seconds is not None and not self.seconds > 0:
+            raise ValueError(f"seconds must be positive, got {self.seconds}")

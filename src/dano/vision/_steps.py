@@ -1,0 +1,142 @@
+"""One step of training: the loss of a batch of random rays, its derivative, Adam.
+
+Rays are rendered in front of random backgrounds, so that transparency cannot pass for colour:
+
+    E |c + (1 − o) b − C − (1 − M) b|²  +  w_m |o − M|²  +  w_e (|∇d| − 1)²  +  w_s (h ∇²d)²
+
+with c, o the rendered colour and opacity, C, M the photograph and its mask, b the background, and the last
+two terms over nodes near the surface, which keep d a smooth signed distance.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PRNGKeyArray
+
+from dano.vision._adjustment import Adjustment
+from dano.vision._models import roughness, Sampling, see, SurfaceModel
+from dano.vision._options import TrainOptions
+from dano.vision._ray_set import RaySet
+
+_REACH = 3.0
+"""Cells from the surface within which distances are learned."""
+
+
+_RATE_CAMERAS = 0.02
+"""Learning rate of corrections of cameras [pixels]."""
+
+_STATED = 1e-4
+"""Weight of squared corrections [pixels²]: what photographs leave open stays as stated."""
+
+
+class Scene(eqx.Module):
+    """What is learned.
+
+    Attributes:
+        model: The object.
+        cameras: Corrections of the cameras.
+    """
+
+    model: SurfaceModel
+    cameras: Adjustment
+
+    @property
+    def parts(self) -> Any:
+        """Arrays that change: distances, features, network, cameras."""
+        look = self.model.appearance
+        return self.model.distance, look.features, look.network, self.cameras.correction
+
+    def replaced(self, parts: Any) -> "Scene":
+        """With other values of `parts`."""
+        return eqx.tree_at(lambda scene: scene.parts, self, parts)
+
+
+def optimiser_of(options: TrainOptions) -> Any:
+    """Adam with a rate for each of `Scene.parts`.
+
+    Raises:
+        ImportError: If optax is missing.
+    """
+    try:
+        import optax
+    except ImportError as error:
+        raise ImportError("training needs optax: pip install 'dano[train]'") from error
+    # Half the longest side of the box is the unit of distances.
+    cell = 2 / options.resolution
+    rates = {
+        "distance": options.rate_distance * cell,
+        "features": options.rate_features,
+        "network": options.rate_network,
+        "cameras": _RATE_CAMERAS,
+    }
+    # Grids get a gradient only where rays pass: a short memory, and no floor under tiny gradients.
+    parts = {name: optax.adam(rate, b1=0.9, b2=0.99, eps=1e-12) for name, rate in rates.items()}
+    return optax.multi_transform(parts, tuple(rates))
+
+
+def make_step(options: TrainOptions) -> Callable[..., tuple[Scene, Any, Array]]:
+    """One step of the optimiser on a random batch of rays, compiled.
+
+    Args:
+        options: Of the training.
+
+    Returns:
+        A function of scene, state of the optimiser, rays, sharpness [1/m], factor of all rates, share of the
+        view's direction in colours (see `Appearance`) and key, which returns the first two anew and the mean
+        error of colours and masks.
+    """
+    import optax
+
+    sampling = Sampling(48, 16, 5)
+    optimiser = optimiser_of(options)
+
+    def loss(
+        parts: Any, scene: Scene, batch: RaySet, sharpness: Array, view_share: Array, key: PRNGKeyArray
+    ) -> tuple[Array, Array]:
+        scene = scene.replaced(parts)
+        model, rays, stated = scene.model, batch.rays, jnp.float32(0)
+        if options.cameras:
+            rays = scene.cameras.moved(rays, batch.view)
+            stated = jnp.mean(scene.cameras.corrections**2)
+        jitter, paint = jax.random.split(key)
+        background = jax.random.uniform(paint, batch.colour.shape, jnp.float32)
+        seen = see(model, rays, sharpness, sampling=sampling, view_share=view_share, key=jitter)
+        wanted = batch.colour + (1 - batch.mask)[:, None] * background
+        got = seen.colour + (1 - seen.opacity)[:, None] * background
+        eikonal, bending = roughness(model.distance, model.spacing / model.scale)
+        error = jnp.mean((got - wanted) ** 2) + options.mask_weight * jnp.mean(
+            (seen.opacity - batch.mask) ** 2
+        )
+        smooth = options.eikonal_weight * eikonal + options.smoothness_weight * bending
+        return error + smooth + _STATED * stated, error
+
+    @eqx.filter_jit
+    def step(
+        scene: Scene,
+        state: Any,
+        rays: RaySet,
+        sharpness: Array,
+        decay: Array,
+        view_share: Array,
+        key: PRNGKeyArray,
+    ) -> tuple[Scene, Any, Array]:
+        pick, own = jax.random.split(key)
+        parts = scene.parts
+        (_, error), gradient = jax.value_and_grad(loss, has_aux=True)(
+            parts, scene, rays.drawn(options.batch, pick), sharpness, view_share, own
+        )
+        # optax counts steps in integers and takes powers of floats by them.
+        with jax.numpy_dtype_promotion("standard"):
+            updates, state = optimiser.update(gradient, state, parts)
+        updates = jax.tree.map(lambda u: decay * u, updates)
+        # Adam makes steps of one length of gradients of any length: where the surface is far away, of mere
+        # traces of them, out of which walls would grow in empty space.
+        model = scene.model
+        near = jnp.abs(model.distance) < _REACH * model.spacing / model.scale
+        updates = (jnp.where(near, updates[0], 0), *updates[1:])
+        return scene.replaced(optax.apply_updates(parts, updates)), state, error
+
+    return step

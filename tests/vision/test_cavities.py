@@ -1,0 +1,106 @@
+"""Cavities that no silhouette shows: a cup in closed form."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from vision.photographs import pose
+
+from dano.vision import Box, Capture, PosedCamera, survey, View
+from dano.vision._cavities import find_cavities, without_cavities
+from dano.vision._models import roughness
+
+RADIUS, HEIGHT, WALL = 0.05, 0.06, 0.014  # [m]
+
+
+def cup_distance(x: np.ndarray) -> np.ndarray:
+    """Signed distance [m], nearly, of a cup around the origin, open at the top."""
+    radial = np.hypot(x[..., 0], x[..., 1])
+    solid = np.maximum(radial - RADIUS, np.abs(x[..., 2]) - HEIGHT / 2)
+    inner = np.maximum(radial - RADIUS + WALL, WALL - HEIGHT / 2 - x[..., 2])
+    return np.maximum(solid, -inner)
+
+
+def hull_of_cup(x: np.ndarray) -> np.ndarray:
+    return np.maximum(np.hypot(x[..., 0], x[..., 1]) - RADIUS, np.abs(x[..., 2]) - HEIGHT / 2)
+
+
+@pytest.fixture(scope="module")
+def box() -> Box:
+    return Box.around(np.array([-0.06, -0.06, -0.04]), np.array([0.06, 0.06, 0.04]), 48)
+
+
+def overlap(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sum(a & b) / np.sum(a | b))
+
+
+def test_a_ball_rolls_into_the_cup_but_not_through_a_pore(box: Box):
+    true, hull = (f(box.nodes).reshape(box.shape) for f in (cup_distance, hull_of_cup))
+    opacity = np.clip(0.5 - true / box.spacing, 0, 1)
+    # Crumbs in the air, a hollow inside the bottom with a pore: what fogs leave.
+    middle = tuple(n // 2 for n in box.shape)
+    opacity[middle[0] + 3, middle[1], middle[2] + 4] = 1
+    deep = np.abs(true + 0.5 * WALL) < 1.2 * box.spacing
+    opacity[deep & (box.nodes[:, 2].reshape(box.shape) < -0.02)] = 0
+    opacity[middle[0], middle[1], : middle[2]] = 0
+    found = without_cavities(opacity, box, hull, box, 0.0, 0.5)
+    assert found is not None
+    assert overlap(found.distance < 0, true < 0) > 0.93
+    assert overlap(hull < 0, true < 0) < 0.7
+    assert found.share == pytest.approx(1 - np.sum(true < 0) / np.sum(hull < 0), abs=0.03)
+
+
+def test_a_solid_without_cavities_stays_as_it_is(box: Box):
+    hull = hull_of_cup(box.nodes).reshape(box.shape)
+    found = without_cavities((hull < 0).astype(float), box, hull, box, 0.0, 0.5)
+    assert found is not None and found.share < 0.01
+    assert without_cavities(np.zeros(box.shape), box, hull, box, 0.0, 0.5) is None
+
+
+def photographs(n: int, pixels: int) -> Capture:
+    """A painted cup by sphere tracing, 2 × 2 rays a pixel, light all around."""
+    views, z = [], 0.98 - 1.9 * (np.arange(n) + 0.5) / n
+    for i, height in enumerate(z):
+        flat, angle = np.sqrt(1 - height**2), np.pi * (3 - np.sqrt(5)) * i
+        away = np.array([flat * np.cos(angle), flat * np.sin(angle), height])
+        matrix = pose(away)
+        matrix[:3, 3] = 0.3 * away
+        camera = PosedCamera(matrix, focal=1.9 * pixels, width=pixels, height=pixels)
+        y, x = (np.mgrid[: 2 * pixels, : 2 * pixels] + 0.5) / 2
+        d = camera.directions(np.stack([x.ravel(), y.ravel()], axis=1))
+        t = np.full(len(d), 0.2)
+        for _ in range(60):
+            t = np.minimum(t + 0.9 * cup_distance(camera.position + t[:, None] * d), 0.5)
+        hit = (t < 0.45)[:, None]
+        points = camera.position + t[:, None] * d
+        paint = 0.5 + 0.3 * np.sin(120 * points + 60 * np.roll(points, 1, axis=1) + np.arange(3.0))
+
+        def averaged(values: np.ndarray) -> np.ndarray:
+            return values.reshape(pixels, 2, pixels, 2, -1).mean((1, 3)).astype(np.float32)
+
+        image, mask = averaged(np.where(hit, paint, 0)), averaged(hit.astype(float))[..., 0]
+        views.append(View(name=str(i), camera=camera, image=image, mask=mask, cut_out=True))
+    return Capture(views)
+
+
+def test_photographs_show_the_inside_of_a_cup():
+    capture = photographs(40, 32)
+    found = survey(capture, 32)
+    true = cup_distance(found.box.nodes).reshape(found.box.shape) < 0
+    readings = find_cavities(capture.split("train"), found.hull, found.box, lit=False, key=jax.random.key(0))
+    best = max(overlap(each.distance < 0, true) for each in readings)
+    assert overlap(found.hull < 0, true) < 0.7 < 0.8 < best
+
+
+def test_roughness_of_planes_walls_and_balls():
+    x = np.stack(np.meshgrid(*3 * [np.arange(24.0)], indexing="ij"), -1) - 11.7
+    one = jnp.float32(1)
+    plane = x @ np.array([0.6, 0.0, 0.8])
+    np.testing.assert_allclose(roughness(jnp.asarray(plane, jnp.float32), one), (0, 0), atol=1e-9)
+    # A wall three cells thick: its middle is as it should be, a ball is bent by 2/r.
+    wall = np.abs(x[..., 0] + 0.2) - 1.5
+    assert float(roughness(jnp.asarray(wall, jnp.float32), one)[0]) < 1e-9
+    ball = np.linalg.norm(x, axis=-1) - 8
+    eikonal, bending = roughness(jnp.asarray(ball, jnp.float32), one)
+    assert float(eikonal) < 1e-4
+    assert float(bending) == pytest.approx((2 / 8) ** 2, rel=0.05)
