@@ -89,7 +89,9 @@ def test_photographs_show_the_inside_of_a_cup():
     true = cup_distance(found.box.nodes).reshape(found.box.shape) < 0
     readings = find_cavities(capture.split("train"), found.hull, found.box, lit=False, key=jax.random.key(0))
     best = max(overlap(each.distance < 0, true) for each in readings)
-    assert overlap(found.hull < 0, true) < 0.7 < 0.8 < best
+    # At least two fifths of what the hull is wrong about is gone, with walls four cells thick.
+    hull = overlap(found.hull < 0, true)
+    assert hull < 0.65 and 1 - best < 0.6 * (1 - hull), (hull, best)
 
 
 def test_roughness_of_planes_walls_and_balls():
@@ -97,9 +99,14 @@ def test_roughness_of_planes_walls_and_balls():
     one = jnp.float32(1)
     plane = x @ np.array([0.6, 0.0, 0.8])
     np.testing.assert_allclose(roughness(jnp.asarray(plane, jnp.float32), one), (0, 0), atol=1e-9)
-    # A wall three cells thick: its middle is as it should be, a ball is bent by 2/r.
-    wall = np.abs(x[..., 0] + 0.2) - 1.5
+    # A wall three cells thick: its middle is as it should be on a node. Half-way between two, a slope there
+    # is 1 on one side and 0 on the other, for two of ten nodes within four cells of a face.
+    wall = np.abs(x[..., 0] + 0.7) - 1.5
     assert float(roughness(jnp.asarray(wall, jnp.float32), one)[0]) < 1e-9
+    between = np.abs(x[..., 0] + 0.2) - 1.5
+    expected = 0.2 * (np.sqrt(0.5) - 1) ** 2
+    assert float(roughness(jnp.asarray(between, jnp.float32), one)[0]) == pytest.approx(expected, rel=1e-3)
+    # A ball is bent by 2/r.
     ball = np.linalg.norm(x, axis=-1) - 8
     eikonal, bending = roughness(jnp.asarray(ball, jnp.float32), one)
     assert float(eikonal) < 1e-4
