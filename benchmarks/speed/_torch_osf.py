@@ -7,8 +7,8 @@ of them, as in the authors' code (michguo/osf) without its data handling.
 from collections.abc import Callable
 
 import numpy as np
-import torch
-from torch import nn
+import torch  # pyright: ignore[reportMissingImports]
+from torch import nn  # pyright: ignore[reportMissingImports]
 
 from dano.vision._ray_set import RaySet
 
