@@ -31,14 +31,14 @@ CLEAN_OPTIONS: dict[str, Any] = {
 }
 # With noise states are estimated too, in windows that are tied more and more tightly.
 NOISE = (1e-3, np.pi / 180)  # m, rad
-NOISY_TIMESTEP, NOISY_FRAMES = 5e-4, slice(10, 45)
+NOISY_TIMESTEP, NOISY_FRAMES = 5e-4, slice(5, 55)
 NOISY_OPTIONS: dict[str, Any] = {
     "initial": "states",
     "window": 10,
-    "continuity": (1.0, 0.1),
+    "continuity": (1.0, 0.1, 0.01),
     "noise": {"position": NOISE[0], "orientation": NOISE[1]},
     "max_iterations": 30,
-    "tolerance": 0.5,
+    "tolerance": 0.3,
 }
 TRUTH = {"mass scale": 1.0, "friction": _data.FRICTION}
 

@@ -177,7 +177,11 @@ def _found_rows(found: Found) -> list[Row]:
     words = ", ".join(f"{1e3 * value:.3f}" for value in principal)
     rows.append(Row(group, "principal inertias, mean", float(1e3 * principal.mean()), "g m²", note=words))
     corners = 1e3 * found.values["corners"]
-    note = f"largest {np.abs(corners).max():.2g} mm, ± {1e3 * float(np.nanmax(errors['corners'])):.1g}"
+    # A corner on its bound has no error.
+    sure = errors["corners"][np.isfinite(errors["corners"])]
+    note = f"largest {np.abs(corners).max():.2g} mm"
+    if len(sure):
+        note += f", standard errors ≤ {1e3 * sure.max():.1g} mm"
     rows.append(
         Row(group, "corners, rms way from a box", float(np.sqrt(np.mean(corners**2))), "mm", note=note)
     )
