@@ -5,14 +5,13 @@ import concurrent.futures
 import multiprocessing
 import time
 import warnings
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import dano
 from benchmarks import _subjects
-from benchmarks._measure import load_average, NO_DATA, report, Row, skipped
+from benchmarks._measure import load_average, NO_DATA, parse_arguments, report, Row, skipped
 from benchmarks.paper.bunny import _data
 
 CLEAN, NOISY = "Without noise", "With noise of 1 mm and 1° on all poses"
@@ -61,7 +60,7 @@ class Result(NamedTuple):
 
 def run() -> None:
     """Measure, print and report."""
-    arguments = _arguments()
+    arguments = parse_arguments("Identify mass and friction of the paper's bunny.", _options)
     load = load_average()
     n = 2 if arguments.quick else arguments.sets
     settings: dict[str, object] = {
@@ -154,10 +153,6 @@ def _rows(group: str, results: list[Result]) -> list[Row]:
     return rows
 
 
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Identify mass and friction of the paper's bunny.")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results to this file")
-    parser.add_argument("--quick", action="store_true", help="two data sets: to see that it runs")
+def _options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sets", type=int, default=SETS, metavar="N", help=f"data sets; default: {SETS}")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes; default: 1")
-    return parser.parse_args()

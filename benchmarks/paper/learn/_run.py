@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import dano
-from benchmarks._measure import load_average, report, REPOSITORY, Row, skipped
+from benchmarks._measure import load_average, parse_arguments, report, REPOSITORY, Row, skipped
 from benchmarks.paper.learn._truth import bounds, off, truth
 from dano.vision import Capture, load_capture, train, Trained, TrainOptions, with_masks
 
@@ -23,12 +23,7 @@ MINUTES = 180.0
 
 def run() -> None:
     """Measure, print and report."""
-    parser = argparse.ArgumentParser(description="Learn objects of photographs and compare with the truth.")
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), metavar="NAME")
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="also write the objects and fields there")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results to this file")
-    parser.add_argument("--quick", action="store_true", help="few steps: to see that it runs")
-    arguments = parser.parse_args()
+    arguments = parse_arguments("Learn objects of photographs and compare with the truth.", _options)
     load, rows = load_average(), []
     if arguments.keep is not None:
         arguments.keep.mkdir(parents=True, exist_ok=True)
@@ -36,6 +31,11 @@ def run() -> None:
         rows += CASES[case](case, _Learner(QUICK if arguments.quick else TrainOptions(), arguments.keep))
     settings: dict[str, object] = {"quick": arguments.quick, "options": str(TrainOptions())}
     report("paper.learn", rows, settings, load, arguments.json)
+
+
+def _options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), metavar="NAME")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="also write the objects and fields there")
 
 
 class _Learner:

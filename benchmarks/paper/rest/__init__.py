@@ -1,0 +1,1 @@
+"""Objects learned from photographs, at rest and beside the true solids."""

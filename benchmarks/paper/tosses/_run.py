@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._measure import load_average, report, Row, skipped
+from benchmarks._measure import load_average, parse_arguments, report, Row, skipped
 from benchmarks.paper.tosses import _parameters
 from benchmarks.paper.tosses._dano import Dano
 from benchmarks.paper.tosses._data import data_folder, NO_DATA, Tosses
@@ -36,7 +36,7 @@ WHAT = (("position_percent", "position", "%"), ("rotation_deg", "rotation", "°"
 
 
 def run() -> None:
-    arguments = _arguments()
+    arguments = parse_arguments("Compare simulated tosses of a cube with measured ones.", _options)
     load = load_average()
     try:
         parameters = _parameters.load(arguments.params)
@@ -287,20 +287,17 @@ def _named(name: str) -> Path | None:
     return None if folder is None else folder / f"{name}.npz"
 
 
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Compare simulated tosses of a cube with measured ones.")
+def _options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, metavar="FILE", help="tosses to score; default: validation.npz")
     parser.add_argument(
         "--params", type=Path, metavar="FILE", default=_parameters.STORED, help="parameters; default: stored"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results to this file")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="also draw four of the tosses")
     parser.add_argument(
         "--identify",
         action="store_true",
         help="instead find parameters by derivatives from train.npz and score these",
     )
-    parser.add_argument("--quick", action="store_true", help="ten tosses: to see that it runs")
     parser.add_argument(
         "--tune",
         type=float,
@@ -309,4 +306,3 @@ def _arguments() -> argparse.Namespace:
         metavar="SECONDS",
         help="first tune each simulator on train.npz for so long per set, and write --params; default: 300",
     )
-    return parser.parse_args()

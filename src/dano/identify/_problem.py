@@ -85,7 +85,8 @@ class Problem:
             engine,
             self.plan.windows,
             None if huber is None else jnp.asarray(huber, dtype),
-            self.jumps,
+            # Starts are compared as the first search sees them.
+            None if self.jumps is None else self.ties[0] * self.jumps,
             space.selections,
             self.plan.bodies,
             self.plan.quantities,

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from scipy import ndimage
 
+from dano.vision._adam import adam, updates_of
 from dano.vision._appearance import Appearance
 from dano.vision._capture import View
 from dano.vision._hull import Box, redistanced, resampled
@@ -176,11 +177,7 @@ def _trainable(model: DensityModel) -> Any:
 
 
 def _optimiser() -> Any:
-    import optax
-
-    rates = {"density": 0.3, "features": 0.02, "network": 0.005}
-    parts = {name: optax.adam(rate, b1=0.9, b2=0.99, eps=1e-12) for name, rate in rates.items()}
-    return optax.multi_transform(parts, tuple(rates))
+    return adam({"density": 0.3, "features": 0.02, "network": 0.005})
 
 
 def _loss(
@@ -210,8 +207,5 @@ def _step(model, state, rays, allowed, decay, key):
     pick, own = jax.random.split(key)
     parts = _trainable(model)
     value, gradient = jax.value_and_grad(_loss)(parts, model, allowed, rays.drawn(_BATCH, pick), own)
-    # optax counts steps in integers and takes powers of floats by them.
-    with jax.numpy_dtype_promotion("standard"):
-        updates, state = _optimiser().update(gradient, state, parts)
-    updates = jax.tree.map(lambda u: decay * u, updates)
+    updates, state = updates_of(_optimiser(), gradient, state, parts, decay)
     return eqx.tree_at(_trainable, model, optax.apply_updates(parts, updates)), state, value

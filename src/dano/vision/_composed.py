@@ -20,14 +20,12 @@ from dano.vision._appearance import Share
 from dano.vision._camera import AbstractCamera
 from dano.vision._item import Item, placement
 from dano.vision._light import Light
-from dano.vision._models import AbstractMedium, AbstractModel, DRAWING, Rays, Sampling
+from dano.vision._models import AbstractMedium, AbstractModel, AbstractSurface, DRAWING, Rays, Sampling
 from dano.vision._picture import Picture, tiles
 from dano.vision._volume import (
     composite,
     importance_edges,
     stratified_edges,
-    surface_alpha,
-    surface_interest,
     transmittance,
 )
 
@@ -111,7 +109,7 @@ class Plane(NamedTuple):
     albedo: Float[Array, "3"]
 
 
-class PaintedSolid(AbstractModel):
+class PaintedSolid(AbstractSurface):
     """A shape of one matte colour.
 
     Attributes:
@@ -129,22 +127,9 @@ class PaintedSolid(AbstractModel):
         room = jnp.broadcast_to(0.02 * jnp.max(bounds[1] - bounds[0]), (3,))
         return bounds + jnp.stack([-room, room])
 
-    def _distance(self, rays: Rays, edges: Array) -> Array:
-        return self.shape.sdf_jet(rays.at(edges).T, 0).reshape(edges.shape)
-
-    def alpha(
-        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> Float[Array, "rays sections"]:
-        """See `surface_alpha`."""
-        return surface_alpha(self._distance(rays, edges), jnp.asarray(sharpness))
-
-    def interest(
-        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> Float[Array, "rays sections"]:
-        """See `surface_interest`."""
-        length = jnp.maximum(rays.far - rays.near, 1e-9)
-        blurred = jnp.minimum(sharpness, 2 * (edges.shape[1] - 1) / length)[:, None]
-        return surface_interest(self._distance(rays, edges), blurred)
+    def distance_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Signed distances [m] of the shape."""
+        return self.shape.sdf_jet(points.T, 0)
 
     def colour(
         self,

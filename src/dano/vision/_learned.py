@@ -191,9 +191,8 @@ class LearnedField(AbstractField):
                 bool(data["near_light"]),
             )
             model = SurfaceModel(
-                jnp.asarray(data["distance"]),
-                look,
-                *(jnp.asarray(data[name]) for name in ("origin", "spacing", "scale")),
+                appearance=look,
+                **{name: jnp.asarray(data[name]) for name in ("distance", "origin", "spacing", "scale")},
             )
             return cls.from_model(model, float(data["drawn_sharpness"]))
         except (KeyError, ValueError) as error:

@@ -137,6 +137,28 @@ class AbstractMedium(AbstractModel):
         return CallableField(_Density(self), self.bounds, "jax")
 
 
+class AbstractSurface(AbstractModel):
+    """What has a soft surface: a signed distance, and an opacity as in NeuS (Wang et al. 2021)."""
+
+    @abc.abstractmethod
+    def distance_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Signed distances [m] at points [m], negative inside."""
+
+    def alpha(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays sections"]:
+        """See `surface_alpha`."""
+        return surface_alpha(self.distance_at(rays.at(edges)).reshape(edges.shape), jnp.asarray(sharpness))
+
+    def interest(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays sections"]:
+        """See `surface_interest`; as blurred as sections are long, or the surface hides between two edges."""
+        length = jnp.maximum(rays.far - rays.near, 1e-9)
+        blurred = jnp.minimum(sharpness, 2 * (edges.shape[1] - 1) / length)[:, None]
+        return surface_interest(self.distance_at(rays.at(edges)).reshape(edges.shape), blurred)
+
+
 class _Density(eqx.Module):
     model: AbstractMedium
 
@@ -186,8 +208,34 @@ def see(
     )
 
 
-class SurfaceModel(AbstractModel):
-    """A solid with a soft surface: a signed distance on a grid (opacity as in NeuS, Wang et al. 2021).
+class _OnNodes(AbstractModel):
+    """What is learned at the nodes of a grid; its fields are those of whoever derives from it."""
+
+    origin: eqx.AbstractVar[Float[Array, "3"]]
+    spacing: eqx.AbstractVar[Float[Array, ""]]
+
+    @property
+    @abc.abstractmethod
+    def shape(self) -> tuple[int, int, int]:
+        """Number of nodes along each axis."""
+
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """First and last node [m]."""
+        last = jnp.asarray(np.array(self.shape) - 1, self.origin.dtype)
+        return jnp.stack([self.origin, self.origin + self.spacing * last])
+
+    @property
+    def box(self) -> Box:
+        """The grid."""
+        return Box(np.asarray(self.origin, np.float64), float(self.spacing), self.shape)
+
+    def _index(self, points: Float[Array, "n 3"]) -> Float[Array, "3 n"]:
+        return ((points - self.origin[None]) / self.spacing).T
+
+
+class SurfaceModel(_OnNodes, AbstractSurface):
+    """A solid with a soft surface: a signed distance on a grid.
 
     Attributes:
         distance: Signed distance at the nodes in units of `scale`, negative inside, shape (nx, ny, nz).
@@ -210,22 +258,18 @@ class SurfaceModel(AbstractModel):
         """A model that starts from signed distances [m] at the nodes of a box."""
         scale = 0.5 * box.spacing * (max(box.shape) - 1)
         return cls(
-            jnp.asarray(distance / scale, jnp.float32),
-            appearance,
-            *(jnp.asarray(x, jnp.float32) for x in (box.origin, box.spacing, scale)),
+            distance=jnp.asarray(distance / scale, jnp.float32),
+            appearance=appearance,
+            origin=jnp.asarray(box.origin, jnp.float32),
+            spacing=jnp.asarray(box.spacing, jnp.float32),
+            scale=jnp.asarray(scale, jnp.float32),
         )
 
     @property
-    def bounds(self) -> Float[Array, "2 3"]:
-        """First and last node [m]."""
-        last = jnp.asarray(np.array(self.distance.shape) - 1, self.origin.dtype)
-        return jnp.stack([self.origin, self.origin + self.spacing * last])
-
-    @property
-    def box(self) -> Box:
-        """The grid of the distances."""
+    def shape(self) -> tuple[int, int, int]:
+        """Of the grid of distances."""
         nx, ny, nz = self.distance.shape
-        return Box(np.asarray(self.origin, np.float64), float(self.spacing), (nx, ny, nz))
+        return nx, ny, nz
 
     @property
     def distances(self) -> Float[np.ndarray, "nx ny nz"]:
@@ -235,22 +279,6 @@ class SurfaceModel(AbstractModel):
     def distance_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Signed distances [m] at points [m]."""
         return value_at(self.distance, self._index(points)) * self.scale
-
-    def _index(self, points: Float[Array, "n 3"]) -> Float[Array, "3 n"]:
-        return ((points - self.origin[None]) / self.spacing).T
-
-    def alpha(
-        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> Float[Array, "rays sections"]:
-        """See `surface_alpha`."""
-        return surface_alpha(self.distance_at(rays.at(edges)).reshape(edges.shape), jnp.asarray(sharpness))
-
-    def interest(
-        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> Float[Array, "rays sections"]:
-        """See `surface_interest`; as blurred as sections are long, or the surface hides between two edges."""
-        blurred = jnp.minimum(sharpness, 2 * (edges.shape[1] - 1) / (rays.far - rays.near))[:, None]
-        return surface_interest(self.distance_at(rays.at(edges)).reshape(edges.shape), blurred)
 
     def colour(
         self,
@@ -265,7 +293,7 @@ class SurfaceModel(AbstractModel):
         return self.appearance(points, normal, view, light, view_share), normal
 
 
-class DensityModel(AbstractMedium):
+class DensityModel(_OnNodes, AbstractMedium):
     """A medium: extinction on a grid, as in a plain neural radiance field.
 
     Attributes:
@@ -285,26 +313,21 @@ class DensityModel(AbstractMedium):
         """A thin fog where nodes are `inside`, nothing elsewhere; `thickness` is its extinction per cell."""
         raw = np.where(inside, np.log(np.expm1(thickness)), -12.0)
         return cls(
-            jnp.asarray(raw, jnp.float32),
-            appearance,
-            *(jnp.asarray(x, jnp.float32) for x in (box.origin, box.spacing)),
+            raw=jnp.asarray(raw, jnp.float32),
+            appearance=appearance,
+            origin=jnp.asarray(box.origin, jnp.float32),
+            spacing=jnp.asarray(box.spacing, jnp.float32),
         )
 
     @property
-    def bounds(self) -> Float[Array, "2 3"]:
-        """First and last node [m]."""
-        last = jnp.asarray(np.array(self.raw.shape) - 1, self.origin.dtype)
-        return jnp.stack([self.origin, self.origin + self.spacing * last])
-
-    @property
-    def box(self) -> Box:
-        """The grid of the densities."""
+    def shape(self) -> tuple[int, int, int]:
+        """Of the grid of densities."""
         nx, ny, nz = self.raw.shape
-        return Box(np.asarray(self.origin, np.float64), float(self.spacing), (nx, ny, nz))
+        return nx, ny, nz
 
     def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Extinction [1/m] at points [m]."""
-        u = ((points - self.origin[None]) / self.spacing).T
+        u = self._index(points)
         return jax.nn.softplus(value_at(self.raw, u)) / self.spacing
 
     def colour(
@@ -315,7 +338,7 @@ class DensityModel(AbstractMedium):
         view_share: Share = 1.0,
     ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
         """See `AbstractModel.colour`; a medium's normals are against the gradient of its density."""
-        u = ((points - self.origin[None]) / self.spacing).T
+        u = self._index(points)
         # Not learned through: fog has normals in all directions, and explaining shading by them makes noise.
         _, slope = value_and_slope_at(jax.lax.stop_gradient(self.raw), u)
         normal = -slope.T * jax.lax.rsqrt(jnp.sum(slope * slope, axis=0) + 1e-6)[:, None]

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray
 
+from dano.vision._adam import adam, updates_of
 from dano.vision._adjustment import Adjustment
 from dano.vision._models import roughness, Sampling, see, SurfaceModel
 from dano.vision._options import TrainOptions
@@ -60,21 +61,16 @@ def optimiser_of(options: TrainOptions) -> Any:
     Raises:
         ImportError: If optax is missing.
     """
-    try:
-        import optax
-    except ImportError as error:
-        raise ImportError("training needs optax: pip install 'dano[train]'") from error
     # Half the longest side of the box is the unit of distances.
     cell = 2 / options.resolution
-    rates = {
-        "distance": options.rate_distance * cell,
-        "features": options.rate_features,
-        "network": options.rate_network,
-        "cameras": _RATE_CAMERAS,
-    }
-    # Grids get a gradient only where rays pass: a short memory, and no floor under tiny gradients.
-    parts = {name: optax.adam(rate, b1=0.9, b2=0.99, eps=1e-12) for name, rate in rates.items()}
-    return optax.multi_transform(parts, tuple(rates))
+    return adam(
+        {
+            "distance": options.rate_distance * cell,
+            "features": options.rate_features,
+            "network": options.rate_network,
+            "cameras": _RATE_CAMERAS,
+        }
+    )
 
 
 def make_step(options: TrainOptions) -> Callable[..., tuple[Scene, Any, Array]]:
@@ -128,10 +124,7 @@ def make_step(options: TrainOptions) -> Callable[..., tuple[Scene, Any, Array]]:
         (_, error), gradient = jax.value_and_grad(loss, has_aux=True)(
             parts, scene, rays.drawn(options.batch, pick), sharpness, view_share, own
         )
-        # optax counts steps in integers and takes powers of floats by them.
-        with jax.numpy_dtype_promotion("standard"):
-            updates, state = optimiser.update(gradient, state, parts)
-        updates = jax.tree.map(lambda u: decay * u, updates)
+        updates, state = updates_of(optimiser, gradient, state, parts, decay)
         # Adam makes steps of one length of gradients of any length: where the surface is far away, of mere
         # traces of them, out of which walls would grow in empty space.
         model = scene.model
