@@ -8,6 +8,7 @@ import pytest
 
 import dano
 from dano.contact import SampleSet, Support
+from dano.fields import PosedShape
 from dano.maths import quat_from_axis_angle, quat_multiply
 
 
@@ -205,6 +206,33 @@ def test_derivatives_with_respect_to_both_poses(pair, kind):
     differences = [(compiled(zero + step * e) - compiled(zero - step * e)) / (2 * step) for e in np.eye(12)]
     np.testing.assert_allclose(forward, differences, rtol=1e-5, atol=1e-6)
     assert np.abs(forward).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        dano.Sphere(0.2, edge=0.0),
+        dano.Box((0.25, 0.1, 0.15), edge=0.1),
+        dano.Capsule(0.1, 0.2),
+        dano.Cylinder(0.15, 0.1, edge=0.02),
+        PosedShape(dano.Box((0.3, 0.05, 0.1)), dano.Pose((0.1, 0.0, 0.0), (0.9, 0.2, 0.1, 0.3))),
+    ],
+    ids=lambda shape: type(shape).__name__,
+)
+def test_no_sample_that_a_shape_reaches_is_skipped(shape):
+    """Sums over some blocks are those over all samples, wherever the shape is."""
+    points = np.random.default_rng(3).uniform(-0.5, 0.5, (4000, 3))
+    density = np.random.default_rng(4).uniform(0.1, 1.0, 4000)
+    samples = SampleSet.create(points, density)
+    weights = density / density.sum()
+    for place in np.random.default_rng(5).uniform(-0.7, 0.7, (12, 3)):
+        pose = dano.Pose(place, (0.3, 0.5, -0.7, 0.2))
+        patch = dano.overlap(dano.Collider(None, samples, mass=2.0), dano.Collider(shape, pose=pose))
+        local = (points - place) @ np.asarray(pose.matrix)
+        mass = 2.0 * weights * np.asarray(jax.vmap(shape.density)(jnp.asarray(local)))
+        assert float(patch.overlap) == pytest.approx(mass.sum(), rel=1e-12, abs=1e-15)
+        if mass.sum() > 0:
+            np.testing.assert_allclose(patch.centroid, mass @ points / mass.sum(), atol=1e-12)
 
 
 def test_derivative_with_respect_to_a_radius():

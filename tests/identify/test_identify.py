@@ -158,6 +158,26 @@ def test_windows_that_are_tied_more_and_more_tightly(observed):
     assert tied.standard_errors["mu"] == pytest.approx(whole.standard_errors["mu"], rel=0.2)
 
 
+def test_windows_leave_a_wrong_basin_by_where_the_ones_before_end():
+    # 229° from frame to frame look like −131°; only at the first frame the spin was observed.
+    scene = dano.Scene.create([dano.Body("ball", dano.Sphere(RADIUS), mass=0.5)], [], timestep=0.01)
+    start = scene.initial_state(ball={"velocity": (1.0, 0.0, 0.0), "omega": (0.0, 0.0, 40.0)})
+    seen = dano.Motion.from_trajectory(dano.simulate(scene, start, 110), every=10)
+    omega = np.where(np.arange(12)[:, None, None] == 0, seen.omega, np.nan)
+    fit = dano.identify(
+        scene,
+        dataclasses.replace(seen, omega=omega, velocity=np.full_like(omega, np.nan)),
+        [dano.Parameter("gravity", lambda s: s.gravity, -20.0, 20.0, start=[0.0, 0.0, -5.0])],
+        initial="states",
+        window=4,
+        continuity=(1e3, 1.0),
+        noise=NOISE,
+    )
+    np.testing.assert_allclose(fit.initial_states.omega[:, 0], [[0, 0, 40.0]] * 3, atol=1e-3)
+    np.testing.assert_allclose(fit.values["gravity"], [0, 0, -9.81], atol=1e-3)
+    assert fit.errors.rms < 1e-3
+
+
 def test_velocities_are_compared_at_their_own_times():
     # In free fall steps of any size give the same velocities, half a step before each state.
     fall = lambda h: dano.Scene.create([dano.Body("ball", dano.Sphere(RADIUS), mass=0.5)], [], timestep=h)  # noqa: E731

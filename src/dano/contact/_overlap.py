@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from dano.contact._colliders import BLOCK, Collider, SampleSet, Support, SYMMETRIC
 from dano.contact._derivatives import by_autodiff, keep
 from dano.contact._small import contract, matmul, matvec
-from dano.fields import AbstractField, GridField, HalfSpace, PosedField, PosedShape, Sphere
+from dano.fields import AbstractField, AbstractShape, GridField, HalfSpace, PosedField, PosedShape, Sphere
 from dano.maths import safe_normalize
 
 
@@ -55,6 +55,9 @@ class _Side(eqx.Module):
 
 # Blocks of samples that one pass through a grid takes: enough to outweigh the cost of starting it.
 _BLOCKS_AT_ONCE = 4
+
+# Slope that no signed distance exceeds: 1 in theory, √2 beyond an edge of a grid's box.
+_STEEPEST = 2**0.5
 
 # Below this share of a body's mass an overlap counts as none: ψ² must not underflow where χ = S/ψ is
 # differentiated.
@@ -145,7 +148,7 @@ def _dispatch(
         scaled = plane / jnp.maximum(field.edge_width, _HARD)
         moments = _planar(scaled, samples)
         return _Side(moments, normal * moments[3])
-    if isinstance(field, GridField) and support is not None:
+    if isinstance(field, AbstractShape) or (isinstance(field, GridField) and support is not None):
         sums = _culled(to_field, field, samples, support)
     else:
         sums = _dense(to_field, field, samples)
@@ -200,14 +203,13 @@ def _dense_jvp(primals, tangents):
     to_field, field, samples = primals
     if jax.tree.leaves(tangents[1:]):
         return by_autodiff(_dense_sums, primals, tangents)
-    x = to_field @ samples.points
-    value, jacobian = jax.vmap(_value_and_jacobian, (None, 1), -1)(field, x)
+    value, jacobian = _features_and_jacobian(field, to_field @ samples.points)
     sums, derivative = keep(*_accumulate(value, jacobian, samples.points, samples.products, samples.weights))
     return sums, jnp.einsum("kab,ab->k", derivative, tangents[0])
 
 
 def _dense_sums(to_field, field, samples: SampleSet):
-    value = jax.vmap(_features, (None, 1), -1)(field, to_field @ samples.points)
+    value = _all_features(field, to_field @ samples.points)
     return jnp.concatenate(
         [contract(samples.weights * value[0], samples.points), contract(value[1:], samples.weights)]
     )
@@ -219,18 +221,22 @@ def _features(field: AbstractField, x: Float[Array, "3"]) -> Float[Array, "4"]:
     return jnp.concatenate([density[None], density * field.outward(x)])
 
 
-def _value_and_jacobian(field, x):
-    def twice(y):
-        value = _features(field, y)
+def _all_features(field: AbstractField, x: Float[Array, "3 n"]) -> Float[Array, "4 n"]:
+    return jax.vmap(_features, (None, 1), -1)(field, x)
+
+
+def _features_and_jacobian(field: AbstractField, x: Float[Array, "3 n"]):
+    def twice(point):
+        value = _features(field, point)
         return value, value
 
-    jacobian, value = jax.jacfwd(twice, has_aux=True)(x)
+    jacobian, value = jax.vmap(jax.jacfwd(twice, has_aux=True), 1, -1)(x)
     return value, jacobian
 
 
 @eqx.filter_custom_jvp
 def _culled(to_field, field, samples, support):
-    """Sums (S, D) over the blocks of samples that can reach a grid's support."""
+    """Sums (S, D) over the blocks of samples that can reach a grid's support, or a shape."""
     return _culled_sums(to_field, field, samples, support, derivative=False)[0]
 
 
@@ -243,9 +249,13 @@ def _culled_jvp(primals, tangents):
     return sums, jnp.einsum("kab,ab->k", derivative, tangents[0])
 
 
-def _culled_sums(to_field, field: GridField, samples: SampleSet, support: Support, *, derivative: bool):
-    centers = jnp.concatenate([samples.centers.T, jnp.ones_like(samples.centers.T[:1])])
-    near = support.lower_bound(to_field @ centers) <= samples.radii
+def _culled_sums(to_field, field, samples: SampleSet, support: Support | None, *, derivative: bool):
+    centers = to_field @ jnp.concatenate([samples.centers.T, jnp.ones_like(samples.centers.T[:1])])
+    if support is not None:
+        clearance = support.lower_bound(centers)
+    else:
+        clearance = field.sdf_jet(centers, 0) / _STEEPEST - 0.5 * field.edge_width.astype(centers.dtype)
+    near = clearance <= samples.radii
     padded = near.shape[0] + -near.shape[0] % _BLOCKS_AT_ONCE
     (blocks,) = jnp.nonzero(near, size=padded, fill_value=0)
     count = jnp.sum(near)
@@ -262,27 +272,36 @@ def _culled_sums(to_field, field: GridField, samples: SampleSet, support: Suppor
         weights = jnp.concatenate(
             [jnp.where(n < count, w, 0) for n, w in zip(numbers, gather(samples.weights), strict=True)]
         )
-        sums, matrix = _grid_sums(to_field, field, points, products, weights, derivative=derivative)
+        sums, matrix = _block_sums(to_field, field, points, products, weights, derivative=derivative)
         return total[0] + sums, total[1] + matrix
 
     return jax.lax.fori_loop(0, -(-count // _BLOCKS_AT_ONCE), add_blocks, zero)
 
 
-def _grid_sums(to_field, field: GridField, points, products, weights, *, derivative: bool):
-    """Sums and, if asked, their derivative (7, 3, 4) over some samples; the direction is −∇φ."""
+def _block_sums(to_field, field, points, products, weights, *, derivative: bool):
+    """Sums and, if asked, their derivative (7, 3, 4) over some samples."""
     x = to_field @ points
     if not derivative:
-        density, gradient = field.jet(x, 1)
-        weighted = weights * density
-        return jnp.concatenate([contract(weighted, points), -contract(gradient, weighted)]), jnp.zeros(
-            (0,), x.dtype
-        )
+        value = _grid_features(field, x) if isinstance(field, GridField) else _all_features(field, x)
+        sums = [contract(weights * value[0], points), contract(value[1:], weights)]
+        return jnp.concatenate(sums), jnp.zeros((0,), x.dtype)
+    of = _grid_features_and_jacobian if isinstance(field, GridField) else _features_and_jacobian
+    return _accumulate(*of(field, x), points, products, weights)
+
+
+def _grid_features(field: GridField, x: Float[Array, "3 n"]) -> Float[Array, "4 n"]:
+    """`_features` of a grid, whose direction is −∇φ, from its closed forms."""
+    density, gradient = field.jet(x, 1)
+    return jnp.concatenate([density[None], -density[None] * gradient])
+
+
+def _grid_features_and_jacobian(field: GridField, x: Float[Array, "3 n"]):
     density, gradient, hessian = field.jet(x, 2)
     value = jnp.concatenate([density[None], -density[None] * gradient])
     jacobian = jnp.concatenate(
         [gradient[None], -(gradient[:, None] * gradient[None] + density[None, None] * hessian)]
     )
-    return _accumulate(value, jacobian, points, products, weights)
+    return value, jacobian
 
 
 def _accumulate(value, jacobian, points, products, weights):

@@ -1,6 +1,6 @@
 """The least squares problem: residuals of all windows over parameters and initial states, and its search."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -18,6 +18,8 @@ from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
 
 # Of each start that is refined, so many are only looked at.
 _LOOKS = 4
+# How often windows may begin anew where those before them end, and by how much a motion's loss must fall.
+_SWEEPS, _BETTER = 2, 1.0
 # Windows simulated at once on an accelerator; a CPU is fastest one by one.
 _BATCH = 1024
 
@@ -150,12 +152,9 @@ class Problem:
         self, x: np.ndarray, max_iterations: int, tolerance: float, tell, free: bool = True
     ) -> Solution:
         """Minimise from x; with `free` false over the initial states alone."""
-        blocks, solution = self.plan.start, None
-        for tie in self.ties or (None,):
-            if tie is not None and self.jumps is not None:
-                self.model = self.model._replace(jumps=tie * self.jumps)
-            is_last = tie is None or tie == self.ties[-1]
-            solution = bounded_least_squares(
+
+        def minimise(x, blocks, tolerance: float) -> Solution:
+            return bounded_least_squares(
                 self.linearize,
                 x,
                 lower=self.space.lower if free else x,
@@ -163,18 +162,60 @@ class Problem:
                 start_blocks=blocks,
                 retract=self.retract,
                 max_iterations=max_iterations,
-                # A step of δ standard errors reduces the loss ½ s² (N − p) by ½ s² δ². Before the last
-                # search one standard error is near enough.
-                tolerance=(tolerance if is_last else max(tolerance, 1.0)) ** 2 / self.freedom,
+                # A step of δ standard errors reduces the loss ½ s² (N − p) by ½ s² δ².
+                tolerance=tolerance**2 / self.freedom,
                 # A step is solved to about the dtype's resolution to the power 3/4.
                 perfect=0.5 * self.plan.n_data * float(jnp.finfo(self.plan.start.position.dtype).eps) ** 0.75,
                 progress=tell,
             )
+
+        if self.jumps is None:
+            return minimise(x, self.plan.start, tolerance)
+        # Before the last search one standard error is near enough.
+        rough = tolerance if len(self.ties) == 1 else max(tolerance, 1.0)
+        self.model = self.model._replace(jumps=self.ties[0] * self.jumps)
+        solution = self._swept(
+            minimise(x, self.plan.start, rough), lambda at, begin: minimise(at, begin, rough)
+        )
+        for tie in self.ties[1:]:
             if solution.stop is Stop.INTERRUPTED:
                 break
-            x, blocks = solution.x, solution.blocks
-        assert solution is not None
+            self.model = self.model._replace(jumps=tie * self.jumps)
+            solution = minimise(solution.x, solution.blocks, tolerance if tie == self.ties[-1] else rough)
         return solution
+
+    def _swept(self, solution: Solution, minimise: Callable[[np.ndarray, State], Solution]) -> Solution:
+        """A better minimum for motions with a window that began in the wrong basin.
+
+        What was measured says little of velocities around impacts. Where the window before ends says more,
+        once that window fits: so windows begin there, and motions that this is better for keep it.
+        """
+        for _ in range(_SWEEPS):
+            if solution.stop is Stop.INTERRUPTED:
+                break
+            found = self.simulate(solution.x, solution.blocks)
+            missed = np.asarray(found.jump) * _widths(self.model.jumps, found.jump.shape[1])
+            change = np.concatenate([np.zeros_like(missed[:1]), missed[:-1]])
+            begin = jnp.asarray(change, self.model.scene.timestep.dtype)
+            other = minimise(solution.x, moved(solution.blocks, begin, self.plan.bodies, self.model.initial))
+            if other.stop is Stop.INTERRUPTED:
+                return solution._replace(stop=Stop.INTERRUPTED)
+            here = self._by_motion(found)
+            there = self._by_motion(self.simulate(solution.x, other.blocks))
+            better = there < here - _BETTER
+            if not better.any():
+                break
+            if np.all(there < here + _BETTER):
+                solution = other
+            else:
+                blocks = _where(better[self.plan.owner], other.blocks, solution.blocks)
+                solution = minimise(solution.x, blocks)
+        return solution
+
+    def _by_motion(self, found: Linearized) -> np.ndarray:
+        """Loss of each motion, jumps between its windows included."""
+        each = np.asarray(found.loss) + 0.5 * np.sum(np.asarray(found.jump) ** 2, axis=1)
+        return np.bincount(self.plan.owner, each)
 
 
 def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> NormalEquations:
@@ -191,7 +232,7 @@ def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> Normal
         b[i, tail, tail] = 1.0
     total = float(loss.sum() + 0.5 * np.sum(jump**2))
     # The jump falls one to one as the next window's beginning moves towards the end of this one.
-    step = np.tile(1 / np.repeat(np.asarray(jumps), 3), jump.shape[1] // 12)
+    step = 1 / _widths(jumps, jump.shape[1])
     for w, (i, j) in enumerate(zip(owner, place, strict=True)):
         mine = slice(j * k, (j + 1) * k)
         g[i, mine] += gradient[w, p:]
@@ -209,6 +250,16 @@ def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> Normal
             for columns, d in ((mine, by_mine), (following, by_next)):
                 b[i, rows, columns] += a.T @ d
     return NormalEquations(total, shared, shared_hessian, g, b, c)
+
+
+def _where(windows: np.ndarray, one: State, other: State) -> State:
+    pick = jnp.asarray(windows)[:, None, None]
+    return jax.tree.map(lambda a, b: jnp.where(pick, a, b), one, other)
+
+
+def _widths(jumps, size: int) -> np.ndarray:
+    """Standard deviation of each number of a jump of all bodies."""
+    return np.tile(np.repeat(np.asarray(jumps), 3), size // 12)
 
 
 def _unchained(change: np.ndarray, owner: np.ndarray, k: int) -> np.ndarray:
