@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import qmc
 
 from dano.engine import AbstractEngine
 from dano.identify._motion import Motion, QUANTITIES
@@ -141,6 +140,8 @@ class Problem:
             return points
         if not (np.all(np.isfinite(self.space.lower)) and np.all(np.isfinite(self.space.upper))):
             raise ValueError("starts > 1 needs finite bounds on every parameter")
+        from scipy.stats import qmc
+
         n = _LOOKS * (starts - 1)
         unit = qmc.Sobol(len(self.space.start), seed=seed).random(1 << (n - 1).bit_length())[:n]
         tried = self.space.lower + unit * (self.space.upper - self.space.lower)

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import t as student
 
 from dano.identify._parameters import Selection, Space, with_values
 from dano.scene import Scene
@@ -86,7 +85,9 @@ def uncertainty(
 
 def quantile(level: float, freedom: int) -> float:
     """Half-width, in standard errors, of an interval that holds the truth at this rate (Student's t)."""
-    return float(student.ppf(0.5 + 0.5 * level, max(freedom, 1)))
+    from scipy.special import stdtrit
+
+    return float(stdtrit(max(freedom, 1), 0.5 + 0.5 * level))
 
 
 def _private(normal: NormalEquations) -> int:

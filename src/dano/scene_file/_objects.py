@@ -3,14 +3,16 @@
 import math
 from collections.abc import Callable
 from importlib.resources import as_file, files
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 
 from dano.fields import AbstractField, load_field, Scaled
 from dano.objects import MassModel, NeuralObject
-from dano.vision import LearnedField
+
+if TYPE_CHECKING:
+    from dano.vision import LearnedField
 
 Progress = Callable[[str, float], None]
 
@@ -104,9 +106,12 @@ def build_asset(name: str, *, progress: Progress | None = None) -> NeuralObject:
     return _built[key]
 
 
-def asset_look(name: str) -> LearnedField | None:
+def asset_look(name: str) -> "LearnedField | None":
     """The field that photographs taught of a shipped object; None for those that are plain density grids."""
     if not name.startswith(_TRAINED):
         return None
+    # Here, because most scenes are simulated without a picture: drawing is not imported with dano.
+    from dano.vision import LearnedField
+
     with as_file(files("dano") / "assets" / f"{name}.npz") as path:
         return LearnedField.load(path)

@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, cast, get_args, TYPE_CHECKING
 
 from dano.archive import checked_input
 from dano.contact import AbstractContactLaw, CentroidLaw, ContactParams, DistributedLaw
@@ -19,7 +19,9 @@ from dano.scene import Body, Contact, Scene, State
 from dano.scene_file._objects import asset_look, build_asset, build_object, Progress
 from dano.scene_file._schedule import read_schedule, Schedule
 from dano.scene_file._table import located, Table
-from dano.vision import LearnedField
+
+if TYPE_CHECKING:
+    from dano.vision import LearnedField
 
 SHAPES: dict[str, tuple[type[AbstractShape], dict[str, int]]] = {
     "half_space": (HalfSpace, {"normal": 3, "offset": 1}),
@@ -83,12 +85,14 @@ class SceneFile:
     text: str
     objects: dict[str, Path | str]
 
-    def looks(self) -> dict[str, LearnedField]:
+    def looks(self) -> dict[str, "LearnedField"]:
         """What bodies look like whose objects' files say so, by name: for pictures.
 
         Raises:
             ValueError: If a file cannot be read any more.
         """
+        from dano.vision import LearnedField
+
         read = {
             source: asset_look(source) if isinstance(source, str) else LearnedField.of_object(source)
             for source in set(self.objects.values())

@@ -16,7 +16,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 
 class NormalEquations(NamedTuple):
@@ -256,6 +255,8 @@ def _bounded_quadratic(gradient, hessian, lower, upper) -> np.ndarray:
     open_ = scaled_lower < scaled_upper
     best = np.zeros_like(free)
     if np.any(open_):
+        from scipy.optimize import lsq_linear
+
         found = lsq_linear(
             root[:, open_], target, (scaled_lower[open_], scaled_upper[open_]), method="bvls", tol=1e-14
         )

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy import ndimage, spatial
+from scipy import ndimage
 
 from dano.fields._signed_distance import spread_distances
 from dano.vision._camera import PosedCamera
@@ -215,6 +215,8 @@ def redistanced(level: Float[np.ndarray, "nx ny nz"], box: Box) -> Float[np.ndar
     within three cells get the distance to the plane of the nearest of them, or to the point if they are not
     above it; those further away the distance to the point nearest to the nearest such node.
     """
+    from scipy.spatial import cKDTree
+
     points, normals = [], []
     slope = np.stack(list(np.gradient(level)), axis=-1)
     for axis in range(3):
@@ -232,7 +234,7 @@ def redistanced(level: Float[np.ndarray, "nx ny nz"], box: Box) -> Float[np.ndar
     touched = ndimage.binary_dilation(positive) & ~ndimage.binary_erosion(positive, border_value=1)
     near = ndimage.distance_transform_edt(~touched) <= 3
     nodes = np.argwhere(near)
-    distance, nearest = spatial.cKDTree(cloud).query(nodes)
+    distance, nearest = cKDTree(cloud).query(nodes)
     distances, row = spread_distances(near, cloud[nearest], np.zeros(3), np.ones(3))
     off = np.abs(np.einsum("ij,ij->i", nodes - cloud[nearest], normal[nearest]))
     # Crossings lie up to a cell apart: near the surface the plane through one is closer than the point.

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy import ndimage, spatial
+from scipy import ndimage
 
 from dano.fields import (
     AbstractField,
@@ -237,6 +237,8 @@ def level_surface(field: GridField, level: int | float | None = None) -> SignedD
 def _distances(share: np.ndarray, middle: float, spacing: np.ndarray) -> np.ndarray:
     """Signed distances [m] of all nodes to the surface {share = middle}, negative inside."""
     gradient = np.stack([np.gradient(share, axis=axis) for axis in range(3)], axis=-1)
+    from scipy.spatial import cKDTree
+
     points, normals = [], []
     for axis in range(3):
         first, second = (np.take(share, range(a, share.shape[axis] - 1 + a), axis) for a in (0, 1))
@@ -256,7 +258,7 @@ def _distances(share: np.ndarray, middle: float, spacing: np.ndarray) -> np.ndar
     distance = np.maximum(outside + within - 0.5 * float(spacing.max()), 0)
     close = distance < 3 * spacing.max()
     nodes = np.argwhere(close) * spacing
-    length, nearest = spatial.cKDTree(surface).query(nodes)
+    length, nearest = cKDTree(surface).query(nodes)
     planar = np.abs(np.sum((nodes - surface[nearest]) * outward[nearest], axis=1))
     near = np.clip(2 - length / spacing.max(), 0, 1)
     distance[close] = near * planar + (1 - near) * length
