@@ -135,7 +135,9 @@ def test_modules_of_pytorch(tmp_path, monkeypatch):
         expected = model(torch.tensor(x, dtype=torch.float32))[:, 0].numpy()
     torch.save({"state_dict": model.state_dict()}, "weights.pt")
     with warnings.catch_warnings():
+        # Deprecated, under one category or another by version; but such files are around.
         warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.simplefilter("ignore", FutureWarning)
         torch.jit.trace(model, torch.zeros(5, 3)).save("script.pt")
     batch = {0: torch.export.Dim("batch")}
     torch.export.save(

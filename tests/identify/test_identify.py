@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import dano
+from dano.identify._parameters import space_of
 from dano.maths import quat_multiply
 
 RADIUS, H = 0.05, 0.005
@@ -95,6 +96,21 @@ def test_both_jacobians_give_the_same_answer(observed):
     ]
     assert fits[0].values["mu"] == pytest.approx(fits[1].values["mu"], abs=1e-6)
     assert fits[0].standard_errors["mu"] == pytest.approx(fits[1].standard_errors["mu"], rel=1e-4)
+
+
+def test_windows_at_once_give_the_same_answer(observed):
+    options = {"initial": "given", "window": 8}
+    fits = [dano.identify(ball_scene(), observed, [FRICTION], batch=batch, **options) for batch in (1, 3)]
+    assert fits[0].values["mu"] == pytest.approx(fits[1].values["mu"], abs=1e-9)
+
+
+def test_equal_leaves_need_no_new_program():
+    def picked():
+        where = lambda s: s.contact("ball", "floor").sliding_friction  # noqa: E731
+        return space_of(ball_scene(), None, [dano.Parameter("mu", where)]).selections
+
+    assert picked() == picked()
+    assert hash(picked()) == hash(picked())
 
 
 def test_standard_errors_cover_the_truth(observed):
@@ -383,6 +399,8 @@ def test_bad_input():
     refuse("contact must be one of", parameters=at(lambda s: s.contact("ball", "wall").sliding_friction))
     refuse("its law does not use it", parameters=at(lambda s: s.contact("ball", "floor").stiffness))
     refuse("not parts or copies", parameters=at(lambda s: s.gravity[2]))
+    refuse("not parts or copies", parameters=at(lambda s: 2 * s.gravity))
+    refuse("each leaf once", parameters=at(lambda s: [s.gravity, s.gravity]))
     refuse("no controls are given", parameters=changed(of="controls"))
     refuse("'value', 'log' or 'inertia'", parameters=changed(coordinates="cubic"))
     refuse("must be > 0 to have a logarithm", parameters=changed(coordinates="log", start=0.0))

@@ -124,6 +124,15 @@ def test_video_has_every_frame_and_moves(run: Run, tmp_path):
     assert sorted(tmp_path.iterdir()) == [path, strip]
 
 
+def test_a_motion_shorter_than_a_frame_is_one_picture(run: Run, tmp_path):
+    path, strip = tmp_path / "run.mp4", tmp_path / "run.png"
+    render_trajectory(*run, path, fps=1, size=SIZE, strip=strip, contact_points=False)
+    with av.open(path) as container:
+        assert len(list(container.decode(video=0))) == 1
+    with Image.open(strip) as sheet:
+        assert sheet.size == SIZE
+
+
 def test_an_interrupted_video_leaves_what_was_there(run: Run, tmp_path):
     path = tmp_path / "run.mp4"
     path.write_bytes(b"old")

@@ -15,6 +15,9 @@ import numpy as np
 import dano
 from benchmarks.paper.tosses._dano import Dano
 from benchmarks.paper.tosses._data import FRAME, Motions, Tosses
+from benchmarks.paper.tosses._parameters import OF_BODY, OF_CONTACT
+from benchmarks.paper.tosses._score import Errors
+from benchmarks.paper.tosses._tune import minimise
 
 TOSSES = 120
 WINDOW = 10  # frames
@@ -111,6 +114,33 @@ def identify(simulator: Dano, train: Tosses) -> Found:
         evaluations, seconds = evaluations + fit.evaluations, seconds + fit.seconds
     assert fit is not None
     return Found(values, fit, evaluations * len(tosses), seconds)
+
+
+def search(simulator: Dano, train: Tosses, simulated: int) -> tuple[dict[str, float], int]:
+    """Parameters from the same tosses and the same start by Nelder and Mead's simplex, without derivatives.
+
+    Args:
+        simulator: What simulates.
+        train: The tosses; the first `TOSSES` of them are used, whole and at the same step.
+        simulated: How many tosses may be simulated in all.
+
+    Returns:
+        Values for `Dano.simulate`, and how many tosses were simulated.
+    """
+    whole = train.first(TOSSES).whole(simulator.gravity)
+    names = OF_CONTACT["dano"] + OF_BODY
+    start = {key: NOMINAL[key] for key in OF_CONTACT["dano"]} | {
+        "hysteresis": NOMINAL["hysteresis"],
+        "com_z": 0.0,
+        "inertia": float(NOMINAL["inertia"][0, 0]),
+        "inertia_ratio": 1.0,
+    }
+
+    def objective(values: dict[str, float]) -> float:
+        return Errors.of(whole, *simulator.simulate(values, whole, SUBSTEPS)).misfit
+
+    values, _, count = minimise(objective, start, names, evaluations=simulated // len(whole))
+    return values, count * len(whole)
 
 
 def _parameters(simulator: Dano, values: dict[str, Any]) -> list[dano.Parameter]:

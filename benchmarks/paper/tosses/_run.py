@@ -13,7 +13,7 @@ from benchmarks._measure import load_average, parse_arguments, report, Row, skip
 from benchmarks.paper.tosses import _parameters
 from benchmarks.paper.tosses._dano import Dano
 from benchmarks.paper.tosses._data import data_folder, NO_DATA, Tosses
-from benchmarks.paper.tosses._identify import Found, identify, slides, TOSSES, WINDOW
+from benchmarks.paper.tosses._identify import Found, identify, search, slides, TOSSES, WINDOW
 from benchmarks.paper.tosses._mujoco import MuJoCo
 from benchmarks.paper.tosses._score import bootstrap_difference, Errors
 from benchmarks.paper.tosses._tune import DECELERATION, tune
@@ -65,7 +65,7 @@ def run() -> None:
         train = _named("train")
         if train is None or not train.is_file():
             sys.exit(f"error: {NO_DATA}")
-        rows = identified_rows(Tosses.load(train), tosses, parameters)
+        rows = identified_rows(Tosses.load(train), tosses, parameters, arguments.search)
         report("tosses.identify", rows, settings, load, arguments.json)
         return
     sections = score(tosses, parameters)
@@ -120,8 +120,12 @@ def score(tosses: Tosses, parameters: dict[str, Any]) -> dict[str, Any]:
     return sections
 
 
-def identified_rows(train: Tosses, tosses: Tosses, parameters: dict[str, Any]) -> list[Row]:
-    """Parameters by derivatives from train tosses, and how they do on whole tosses beside the stored ones."""
+def identified_rows(train: Tosses, tosses: Tosses, parameters: dict[str, Any], times: float) -> list[Row]:
+    """Parameters by derivatives from train tosses, and how they do on whole tosses beside the stored ones.
+
+    With `times` above zero also parameters by a search from the same start, with so many times as many
+    simulated tosses.
+    """
     world, n = parameters["world"], int(parameters["substeps"]["dano"])
     simulator = Dano(world, parameters["cube"])
     stored = parameters["dano"]["fitted"]["values"]
@@ -144,18 +148,35 @@ def identified_rows(train: Tosses, tosses: Tosses, parameters: dict[str, Any]) -
     rows += _found_rows(found)
     whole = tosses.whole(world["gravity"])
     ours = Errors.of(whole, *simulator.simulate(found.values, whole, n))
-    search = Errors.of(whole, *simulator.simulate(stored, whole, n))
+    others = {"the stored search": stored}
+    if times:
+        values, simulated = search(simulator, train, int(times * found.simulated))
+        rows.append(
+            Row(rows[-1].group, "tosses simulated by a new search from the same start", simulated, "")
+        )
+        others["the new search"] = values
     group = "Whole tosses, validation"
     for attribute, word, unit in (("position", "position", "%"), ("rotation", "rotation", "°")):
-        mine, theirs = getattr(ours, attribute), getattr(search, attribute)
-        mean, error = bootstrap_difference(mine, theirs)
-        note = f"median {np.median(mine):.3g}; less the search's {mean:.2g} ± {error:.2g} toss by toss"
-        rows.append(Row(group, f"{word}, by derivatives", float(mine.mean()), unit, note=note))
-        rows.append(Row(group, f"{word}, by search", float(theirs.mean()), unit))
-        rows.append(Row(group, f"{word}, difference in standard errors", mean / error, "", 1.0))
+        mine = getattr(ours, attribute)
+        rows.append(
+            Row(
+                group,
+                f"{word}, by derivatives",
+                float(mine.mean()),
+                unit,
+                note=f"median {np.median(mine):.3g}",
+            )
+        )
+        for name, values in others.items():
+            theirs = getattr(Errors.of(whole, *simulator.simulate(values, whole, n)), attribute)
+            mean, error = bootstrap_difference(mine, theirs)
+            note = f"by derivatives less this {mean:.2g} ± {error:.2g} toss by toss"
+            rows.append(Row(group, f"{word}, by {name}", float(theirs.mean()), unit, note=note))
+            words = f"{word}, less {name}'s in standard errors"
+            rows.append(Row(group, words, mean / error, "", 1.0))
     ends = tosses.tails(world["half_side"], DECELERATION)
     if len(ends):
-        for word, values in (("derivatives", found.values), ("search", stored)):
+        for word, values in {"derivatives": found.values, **others}.items():
             last = Errors.of(ends, *simulator.simulate(values, ends, n)).last_position
             rows.append(Row(group, f"flat slides, position at the end, by {word}", float(last.mean()), "mm"))
     return rows
@@ -297,6 +318,15 @@ def _options(parser: argparse.ArgumentParser) -> None:
         "--identify",
         action="store_true",
         help="instead find parameters by derivatives from train.npz and score these",
+    )
+    parser.add_argument(
+        "--search",
+        type=float,
+        nargs="?",
+        default=0.0,
+        const=10.0,
+        metavar="TIMES",
+        help="with --identify, also search without derivatives, in TIMES as many simulations; default: 10",
     )
     parser.add_argument(
         "--tune",

@@ -3,6 +3,7 @@
 Derivatives would not help: through a whole toss they grow without bound.
 """
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -91,9 +92,10 @@ def minimise(
     objective: Callable[[dict[str, float]], float],
     values: dict[str, float],
     free: tuple[str, ...],
-    seconds: float,
+    seconds: float = math.inf,
+    evaluations: float = math.inf,
 ) -> tuple[dict[str, float], float, int]:
-    """The best parameters found in some time, their objective, and how often it was evaluated.
+    """The best parameters found in some time or evaluations, their objective, and how often it was evaluated.
 
     The first evaluation, which compiles, is outside of the time. When the simplex has shrunk to nothing,
     another one starts around the best point.
@@ -117,7 +119,7 @@ def minimise(
 
     def watched(x: np.ndarray) -> float:
         nonlocal best, best_value, count
-        if time.monotonic() > end:
+        if time.monotonic() > end or count >= evaluations:
             raise _BudgetSpentError
         value, count = objective(moved(x)), count + 1
         if value < best_value:

@@ -35,7 +35,9 @@ def load_module(path: Path, *, crop: Numbers | None, module: str | None = None) 
                 made = torch.export.load(str(path)).module()
             else:
                 with warnings.catch_warnings():
+                    # Of one category or another by version: that torch drops this format says nothing here.
                     warnings.simplefilter("ignore", DeprecationWarning)
+                    warnings.simplefilter("ignore", FutureWarning)
                     made = torch.jit.load(str(path), map_location="cpu").eval()
         except (RuntimeError, ValueError, OSError, KeyError, AttributeError) as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]

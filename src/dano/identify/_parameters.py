@@ -84,14 +84,26 @@ class Selection(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class _Leaves:
-    """Puts a value into leaves; equal to others of the same leaves, so that programs are compiled once."""
+    """Puts a value into leaves; equal to others of the same leaves, so that programs are compiled once.
 
-    where: Callable[[Any], Any]
+    Leaves are told by their places in the flattened tree: functions that pick them are never equal.
+    """
+
+    places: tuple[int, ...]
 
     def __call__(self, tree: Any, value: Array) -> Any:
         """The tree with the value in all of its leaves."""
-        values = [value.astype(leaf.dtype) for leaf in _leaves(self.where, tree)]
-        return eqx.tree_at(lambda t: _leaves(self.where, t), tree, values)
+        leaves, structure = jax.tree.flatten(tree)
+        for place in self.places:
+            leaves[place] = value.astype(leaves[place].dtype)
+        return jax.tree.unflatten(structure, leaves)
+
+
+class _Place:
+    """Stands for a leaf of a tree."""
+
+    def __init__(self, index: int):
+        self.index = index
 
 
 class Space(NamedTuple):
@@ -185,6 +197,7 @@ def _picked(p: Parameter, what: str, home: Any) -> tuple[np.ndarray, Callable[[A
     """Current value and setter of a parameter with `where`."""
     where = p.where
     assert where is not None
+    not_whole = f"where in {what} must pick whole leaves of the {p.of}, not parts or copies of them"
     try:
         leaves = _leaves(where, home)
     except (AttributeError, TypeError, KeyError, IndexError) as error:
@@ -197,16 +210,20 @@ def _picked(p: Parameter, what: str, home: Any) -> tuple[np.ndarray, Callable[[A
                 f"where in {what} must pick floating-point arrays of the {p.of}, got {type(leaf).__name__}"
                 + (": its law does not use it" if leaf is None else "")
             )
+    structure = jax.tree.structure(home)
     try:
-        eqx.tree_at(lambda tree: _leaves(where, tree), home, leaves)
-    except (ValueError, TypeError, RuntimeError) as error:
-        raise ValueError(
-            f"where in {what} must pick whole leaves of the {p.of}, not parts or copies of them"
-        ) from error
+        picked = _leaves(where, jax.tree.unflatten(structure, map(_Place, range(structure.num_leaves))))
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ValueError(not_whole) from error
+    places = tuple(each.index for each in picked if isinstance(each, _Place))
+    if len(places) < len(leaves):
+        raise ValueError(not_whole)
+    if len(set(places)) < len(places):
+        raise ValueError(f"where in {what} must pick each leaf once")
     shapes = {leaf.shape for leaf in leaves}
     if len(shapes) != 1:
         raise ValueError(f"leaves of {what} must have one shape, got {sorted(shapes)}")
-    return np.asarray(leaves[0]), _Leaves(where)
+    return np.asarray(leaves[0]), _Leaves(places)
 
 
 def _bound(what: str, key: str, bound: Numbers, shape: tuple[int, ...]) -> np.ndarray:

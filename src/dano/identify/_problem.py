@@ -18,7 +18,9 @@ from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
 # Of each start that is refined, so many are only looked at.
 _LOOKS = 4
 # How often windows may begin anew where those before them end, and by how much a motion's loss must fall.
-_SWEEPS, _BETTER = 2, 1.0
+_SWEEPS, _BETTER = 2, 5.0
+# Standard errors to which searches before the last one are near enough.
+_NEAR = 3.0
 # Windows simulated at once on an accelerator; a CPU is fastest one by one.
 _BATCH = 1024
 
@@ -172,8 +174,7 @@ class Problem:
 
         if self.jumps is None:
             return minimise(x, self.plan.start, tolerance)
-        # Before the last search one standard error is near enough.
-        rough = tolerance if len(self.ties) == 1 else max(tolerance, 1.0)
+        rough = tolerance if len(self.ties) == 1 else max(tolerance, _NEAR)
         self.model = self.model._replace(jumps=self.ties[0] * self.jumps)
         solution = self._swept(
             minimise(x, self.plan.start, rough), lambda at, begin: minimise(at, begin, rough)

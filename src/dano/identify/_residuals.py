@@ -61,7 +61,7 @@ class Linearized(NamedTuple):
         loss: Half the sum of squared residuals, or Huber's function of them.
         gradient: Of the loss.
         hessian: Gauss–Newton's.
-        jump: By which a window misses the beginning of the next, in standard deviations; empty if it may.
+        jump: By which a window misses the beginning of the next, in standard deviations; one zero if it may.
         jump_slope: Its derivative.
         predicted: States at the frames, positions and velocities of what was observed.
         lengths: Of the residuals in standard deviations; −1 where nothing was observed.
@@ -185,7 +185,8 @@ def _residuals(model: Model, window: Windows, start: State, following: State, x,
         scene, State(places.position, places.orientation, speeds.velocity, speeds.omega), window.origins, -1
     )
     rows = jnp.stack([_row(model, window, predicted, key) for key in model.quantities], axis=2)
-    jump = jnp.zeros(0, rows.dtype)
+    # Not empty: mapping in batches cannot put empty arrays together.
+    jump = jnp.zeros(1, rows.dtype)
     if model.jumps is not None:
         last = _shifted(scene, _at(states, tuple(part[None] for part in window.end)), window.origins, -1)
         last = jax.tree.map(lambda leaf: leaf[0], last)

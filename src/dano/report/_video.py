@@ -146,7 +146,7 @@ def _moments(position: Float[np.ndarray, "frames bodies 3"], n: int) -> Int[np.n
     """Frames from the first to the last, closer together where much moves."""
     travel = np.linalg.norm(np.diff(position, axis=0), axis=-1).sum(axis=1)
     # A third of the way is time: a strip should say where everything rests, but not in half of its pictures.
-    pace = travel / max(float(travel.mean()), 1e-12) + 0.5
+    pace = travel / max(float(travel.sum()) / max(len(travel), 1), 1e-12) + 0.5
     way = np.concatenate([[0.0], np.cumsum(pace)])
     return np.unique(np.interp(np.linspace(0, way[-1], n), way, np.arange(len(way))).round().astype(int))
 

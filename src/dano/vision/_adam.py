@@ -8,15 +8,10 @@ from jaxtyping import Array
 
 
 def adam(rates: Mapping[str, float]) -> Any:
-    """An optimiser of a tuple with one entry for each rate.
+    """An optimiser of a tuple with one entry for each rate."""
+    # Here, because it takes long to import, and only training needs it.
+    import optax
 
-    Raises:
-        ImportError: If optax is missing.
-    """
-    try:
-        import optax
-    except ImportError as error:
-        raise ImportError("training needs optax: pip install 'dano[train]'") from error
     # Grids get a gradient only where rays pass: a short memory, and no floor under tiny gradients.
     parts = {name: optax.adam(rate, b1=0.9, b2=0.99, eps=1e-12) for name, rate in rates.items()}
     return optax.multi_transform(parts, tuple(rates))

@@ -56,11 +56,7 @@ class Scene(eqx.Module):
 
 
 def optimiser_of(options: TrainOptions) -> Any:
-    """Adam with a rate for each of `Scene.parts`.
-
-    Raises:
-        ImportError: If optax is missing.
-    """
+    """Adam with a rate for each of `Scene.parts`."""
     # Half the longest side of the box is the unit of distances.
     cell = 2 / options.resolution
     return adam(

@@ -133,7 +133,7 @@ def train(
     Raises:
         ValueError: If the capture cannot be learned from (see `survey`), or the checkpoint is of another
             training, or `previews` is no folder.
-        ImportError: If optax is missing, or pillow for previews.
+        ImportError: If pillow is missing for previews.
         KeyboardInterrupt: When interrupted, after the state has been saved to `checkpoint`.
     """
     start = time.perf_counter()
