@@ -24,7 +24,7 @@ def solve(problem, start, lower, upper, **options):
     def linearize(x, _):
         r, j = residual(x), jacobian(x)
         empty = np.zeros((0, 0)), np.zeros((0, 0, 0)), np.zeros((0, 0, p))
-        return NormalEquations(0.5 * r @ r, j.T @ r, j.T @ j, *empty)
+        return NormalEquations(0.5 * r @ r, j.T @ r, j.T @ j, *empty, np.zeros(0))
 
     return bounded_least_squares(
         linearize,
@@ -86,6 +86,7 @@ def blocks_problem(seed):
             r.sum(axis=1, keepdims=True),
             np.full((4, 1, 1), 7.0),
             t.sum(axis=1)[:, None, None],
+            0.5 * np.sum(r**2, axis=1),
         )
 
     dense = np.concatenate([t.reshape(-1, 1), np.kron(np.eye(4), np.ones((7, 1)))], axis=1)
@@ -114,6 +115,45 @@ def test_blocks_are_eliminated_exactly(bound):
     np.testing.assert_allclose(1 / hessian, np.linalg.inv(dense.T @ dense)[:1, :1], rtol=1e-9)
 
 
+def test_blocks_that_bend_hold_up_no_others():
+    """Circles through points far around (x, z): each block bends, and each first step is too long."""
+    rng = np.random.default_rng(4)
+    turns = rng.uniform(-1.2, 1.2, 8)
+    calls = []
+
+    def linearize(x, z):
+        # Residuals x cos z − c, x sin z − s.
+        calls.append((x.copy(), z.copy()))
+        r = np.stack([x[0] * np.cos(z[:, 0]) - 2 * np.cos(turns), x[0] * np.sin(z[:, 0]) - 2 * np.sin(turns)])
+        by_x = np.stack([np.cos(z[:, 0]), np.sin(z[:, 0])])
+        by_z = x[0] * np.stack([-np.sin(z[:, 0]), np.cos(z[:, 0])])
+        return NormalEquations(
+            0.5 * np.sum(r**2),
+            np.array([np.sum(r * by_x)]),
+            np.array([[np.sum(by_x**2)]]),
+            np.sum(r * by_z, axis=0)[:, None],
+            np.sum(by_z**2, axis=0)[:, None, None],
+            np.sum(by_x * by_z, axis=0)[:, None, None],
+            0.5 * np.sum(r**2, axis=0),
+        )
+
+    start = turns + np.where(np.arange(8) < 6, 0.1, 2.3)
+    found = bounded_least_squares(
+        linearize,
+        np.ones(1),
+        lower=np.array([0.1]),
+        upper=np.array([10.0]),
+        start_blocks=start[:, None],
+        retract=lambda z, dz: z + dz,
+    )
+    assert found.x[0] == pytest.approx(2, abs=1e-6)
+    np.testing.assert_allclose(found.blocks[:, 0], turns, atol=1e-5)
+    assert np.all(np.diff(found.losses) <= 0)
+    # Blocks tried again at the same x while others stayed where they were.
+    pairs = [(a[1] != b[1]) for a, b in zip(calls[:-1], calls[1:], strict=True) if a[0] == b[0]]
+    assert any(0 < changed.sum() < 8 for changed in pairs)
+
+
 def test_a_direction_without_curvature_stays_where_it_is():
     flat = lambda x: np.array([x[0] - 1.0]), lambda x: np.array([[1.0, 0.0]])
     found = solve(flat, (0.0, 0.3), (-2, -2), (2, 2))
@@ -131,6 +171,7 @@ def test_says_why_it_stopped():
             np.zeros((0, 0)),
             np.zeros((0, 0, 0)),
             np.zeros((0, 0, 2)),
+            np.zeros(0),
         ),
         np.array([-1.2, 1.0]),
         lower=np.full(2, -2.0),

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.paper.bunny [--json FILE] [--quick] [--sets N] [--jobs N]`."""
+"""`python -m benchmarks.paper.bunny [--json FILE] [--quick] [--sets N] [--jobs N] [--keep FILE]`."""
 
 from benchmarks import _environment
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from dano.engine import AbstractEngine
 from dano.identify._motion import Motion, QUANTITIES
@@ -47,7 +48,8 @@ class Problem:
     def __init__(self, setup: Setup, motions: Sequence[Motion], state: Any):
         space, scene, controls, initial, noise, huber, window, self.ties, jacobian, engine, batch = setup
         self.space = space
-        self.evaluations = 0
+        self.simulations = 0
+        self._last: tuple[Model, Array, tuple[State, State], Linearized] | None = None
         policy = controls if callable(controls) else None
         self.plan = plan_windows(
             scene,
@@ -100,11 +102,27 @@ class Problem:
         )
 
     def simulate(self, x: np.ndarray, start: State) -> Linearized:
-        """All windows at coordinates and initial states."""
-        self.evaluations += 1
+        """All windows at coordinates and initial states; those as last time are not simulated again."""
         at = jnp.asarray(x, self.model.scene.timestep.dtype)
         following = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), start)
-        return linearized(self.model, at, start, following)
+        changed = np.ones(len(self.plan.rows), bool)
+        if self._last is not None and self._last[0] is self.model and np.array_equal(at, self._last[1]):
+            changed = _different((start, following), self._last[2])
+        found = linearized(self.model, at, start, following, jnp.asarray(changed))
+        if self._last is not None and not changed.all():
+            found = jax.tree.map(
+                lambda new, old: jnp.where(changed.reshape(-1, *[1] * (new.ndim - 1)), new, old),
+                found,
+                self._last[3],
+            )
+        self._last = self.model, at, (start, following), found
+        self.simulations += int(changed.sum())
+        return found
+
+    @property
+    def evaluations(self) -> int:
+        """How often all windows were simulated; those that were simulated alone count as their share."""
+        return -(-self.simulations // len(self.plan.rows))
 
     def linearize(self, x: np.ndarray, start: State) -> NormalEquations:
         """Normal equations over parameters and the blocks of initial states.
@@ -123,6 +141,7 @@ class Problem:
             gradient[:, p:] if k else np.zeros((0, 0)),
             hessian[:, p:, p:] if k else np.zeros((0, 0, 0)),
             hessian[:, p:, :p] if k else np.zeros((0, 0, p)),
+            loss if k else np.zeros(0),
         )
 
     def retract(self, start: State, change: np.ndarray) -> State:
@@ -215,9 +234,7 @@ class Problem:
         return solution
 
     def _by_motion(self, found: Linearized) -> np.ndarray:
-        """Loss of each motion, jumps between its windows included."""
-        each = np.asarray(found.loss) + 0.5 * np.sum(np.asarray(found.jump) ** 2, axis=1)
-        return np.bincount(self.plan.owner, each)
+        return _by_owner(self.plan.owner, np.asarray(found.loss), np.asarray(found.jump))
 
 
 def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> NormalEquations:
@@ -232,7 +249,7 @@ def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> Normal
     for i, n in enumerate(counts):
         tail = np.arange(n * k, size)
         b[i, tail, tail] = 1.0
-    total = float(loss.sum() + 0.5 * np.sum(jump**2))
+    losses = _by_owner(owner, loss, jump)
     # The jump falls one to one as the next window's beginning moves towards the end of this one.
     step = 1 / _widths(jumps, jump.shape[1])
     for w, (i, j) in enumerate(zip(owner, place, strict=True)):
@@ -251,7 +268,18 @@ def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> Normal
             c[i, rows] += a.T @ by_x
             for columns, d in ((mine, by_mine), (following, by_next)):
                 b[i, rows, columns] += a.T @ d
-    return NormalEquations(total, shared, shared_hessian, g, b, c)
+    return NormalEquations(float(losses.sum()), shared, shared_hessian, g, b, c, losses)
+
+
+def _by_owner(owner: np.ndarray, loss: np.ndarray, jump: np.ndarray) -> np.ndarray:
+    """Loss of each motion, jumps between its windows included."""
+    return np.bincount(owner, loss + 0.5 * np.sum(jump**2, axis=1))
+
+
+def _different(states: tuple[State, State], others: tuple[State, State]) -> np.ndarray:
+    """Which windows have other states."""
+    pairs = zip(jax.tree.leaves(states), jax.tree.leaves(others), strict=True)
+    return np.any([np.any(np.asarray(a) != np.asarray(b), axis=(1, 2)) for a, b in pairs], axis=0)
 
 
 def _where(windows: np.ndarray, one: State, other: State) -> State:

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from dano.engine import AbstractEngine, simulate
 from dano.engine._rollout import difference, retract
@@ -90,19 +90,26 @@ class _Late(eqx.Module):
 
 
 @eqx.filter_jit
-def linearized(model: Model, x: Float[Array, " p"], start: State, following: State) -> Linearized:
-    """Simulate all windows at coordinates x from their initial states.
+def linearized(
+    model: Model,
+    x: Float[Array, " p"],
+    start: State,
+    following: State,
+    wanted: Bool[Array, " w"],
+) -> Linearized:
+    """Simulate windows at coordinates x from their initial states.
 
     Args:
         model: The model.
         x: Coordinates of the parameters.
         start: Initial states of the windows.
         following: Initial states of the windows that come next in the same motions.
+        wanted: Which windows to simulate; rows of the others are zero.
     """
     p = x.shape[0]
 
     def one(item):
-        window, state, after = item
+        window, state, after, _ = item
 
         def residuals(unknowns):
             rows, jump, predicted, unconverged = _residuals(
@@ -128,7 +135,31 @@ def linearized(model: Model, x: Float[Array, " p"], start: State, following: Sta
             unconverged,
         )
 
-    return _map(one, (model.windows, start, following), model.batch)
+    def one_or_none(item):
+        return jax.lax.cond(item[-1], one, lambda item: _nothing(model, item[1], p), item)
+
+    return _map(one_or_none, (model.windows, start, following, wanted), model.batch)
+
+
+def _nothing(model: Model, state: State, p: int) -> Linearized:
+    """Zeros in place of a window."""
+    frames, bodies = model.windows.frame[0].shape[1], len(model.bodies)
+    unknowns = p + len(_no_change(model))
+    jumps = 1 if model.jumps is None else 12 * bodies
+
+    def zeros(*shape: int) -> Array:
+        return jnp.zeros(shape, model.scene.timestep.dtype)
+
+    return Linearized(
+        zeros(),
+        zeros(unknowns),
+        zeros(unknowns, unknowns),
+        zeros(jumps),
+        zeros(jumps, unknowns),
+        jax.tree.map(lambda leaf: zeros(frames, *leaf.shape), state),
+        zeros(frames, bodies, len(model.quantities)),
+        jnp.zeros((), int),
+    )
 
 
 def _map(function, items, batch: int):

@@ -9,6 +9,9 @@ x and one block at most. With Gauss–Newton matrices the step solves
 
 The blocks are eliminated (Schur complement), which leaves a quadratic programme in dx with simple bounds.
 That one is solved exactly by an active set, so that x may start on a bound, run along it, and leave it.
+
+Where a step fails because of some blocks only, these alone try shorter ones, for the same dx. So a problem
+with many blocks, of which now one and then another bends, does not crawl at the pace of the worst.
 """
 
 import enum
@@ -28,6 +31,7 @@ class NormalEquations(NamedTuple):
         block_gradient: b = ∂f/∂z, shape (m, k).
         block_hessian: B, shape (m, k, k).
         coupling: C ≈ ∂²f/∂z∂x, shape (m, k, p).
+        block_losses: Parts of the loss that belong to the blocks, shape (m,).
     """
 
     loss: float
@@ -36,6 +40,7 @@ class NormalEquations(NamedTuple):
     block_gradient: np.ndarray
     block_hessian: np.ndarray
     coupling: np.ndarray
+    block_losses: np.ndarray
 
 
 class Stop(enum.Enum):
@@ -85,6 +90,11 @@ _ROUGH = 100
 _FLAT = 1e-10
 # A step is accepted when it brings this share of what the model promises.
 _SUFFICIENT = 1e-4
+# A step that brings less than this share is poor: blocks whose loss grew try again, damped more and more.
+_POOR = 0.25
+_AGAIN = (0.1, 1.0, 10.0)
+# So many such steps in a row that bring less than what is asked for are the end.
+_SLOW = 3
 
 
 def bounded_least_squares(
@@ -104,6 +114,7 @@ def bounded_least_squares(
 
     Args:
         linearize: The normal equations at (x, blocks); a step to where the loss is not finite is rejected.
+            After a poor step it is called with the same x again, and other values of some blocks.
         start: First x, shape (p,).
         lower: Bounds, shape (p,); may be −∞.
         upper: Bounds, shape (p,); may be ∞.
@@ -134,7 +145,7 @@ def bounded_least_squares(
     if not np.isfinite(normal.loss):
         raise ValueError(f"loss must be finite at the start {x.tolist()}, got {normal.loss}")
     losses, damping, growth = [float(normal.loss)], _DAMPING, 2.0
-    evaluations = 1
+    evaluations, slow = 1, 0
     spread = _scales(normal)
     width = upper - lower
     span = np.where(np.isfinite(width) & (width > 0), width, np.maximum(np.abs(x), 1.0))
@@ -162,15 +173,37 @@ def bounded_least_squares(
                 tried, tried_blocks = np.clip(x + change, lower, upper), retract(blocks, block_change)
                 following = linearize(tried, tried_blocks)
                 evaluations += 1
-                gain = (losses[-1] - float(following.loss)) / promised
-                if np.isfinite(following.loss) and gain > _SUFFICIENT:
+                gain, whole = _gain(normal, following, promised), True
+                for more in _AGAIN:
+                    worse = _worse(normal, following, promised)
+                    if gain > _POOR or more <= damping or not worse.any() or worse.all():
+                        break
+                    shorter = _following(normal, change, more, spread)
+                    block_change = np.where(worse[:, None], shorter, block_change)
+                    less = _promised(normal, change, block_change)
+                    if less <= 0:
+                        break
+                    again_blocks = retract(blocks, block_change)
+                    again = linearize(tried, again_blocks)
+                    evaluations += 1
+                    if (found := _gain(normal, again, less)) > gain:
+                        tried_blocks, following, promised, gain = again_blocks, again, less, found
+                        whole = False
+                if gain > _SUFFICIENT:
                     break
                 damping, growth = damping * growth, 2 * growth
-            # Nielsen's rule: less damping the better the model was.
-            damping, growth = max(damping * max(1 / 10, 1 - (2 * gain - 1) ** 3), _LEAST_DAMPING), 2.0
+            if whole:
+                # Nielsen's rule: less damping the better the model was.
+                damping, growth = max(damping * max(1 / 10, 1 - (2 * gain - 1) ** 3), _LEAST_DAMPING), 2.0
+            else:
+                damping, growth = damping * growth, 2 * growth
+            slow = 0 if whole or normal.loss - following.loss > tolerance * normal.loss else slow + 1
             x, blocks, normal = tried, tried_blocks, following
             spread = tuple(np.maximum(new, old) for new, old in zip(_scales(normal), spread, strict=True))
             losses.append(float(normal.loss))
+            if slow == _SLOW:
+                # The model promises more, in blocks that bend too much to get there.
+                return _solution(x, blocks, normal, Stop.LOSS, losses, evaluations)
     except KeyboardInterrupt:
         return _solution(x, blocks, normal, Stop.INTERRUPTED, losses, evaluations)
     return _solution(x, blocks, normal, Stop.ITERATIONS, losses, evaluations)
@@ -201,13 +234,17 @@ def _eliminate(normal: NormalEquations, damping: float, spread: tuple[np.ndarray
     hessian = normal.hessian + damping * np.diag(spread[0])
     if normal.block_gradient.size == 0:
         return normal.gradient, hessian, normal.block_gradient, normal.coupling
-    blocks = normal.block_hessian + damping * spread[1][:, :, None] * np.eye(spread[1].shape[1])
+    blocks = _damped_blocks(normal, damping, spread)
     right = np.concatenate([normal.block_gradient[:, :, None], normal.coupling], axis=2)
     solved = _solve_blocks(blocks, right)
     shift, follow = solved[:, :, 0], solved[:, :, 1:]
     gradient = normal.gradient - np.einsum("mkp,mk->p", normal.coupling, shift)
     hessian = hessian - np.einsum("mkp,mkq->pq", normal.coupling, follow)
     return gradient, 0.5 * (hessian + hessian.T), shift, follow
+
+
+def _damped_blocks(normal: NormalEquations, damping: float, spread) -> np.ndarray:
+    return normal.block_hessian + damping * spread[1][:, :, None] * np.eye(spread[1].shape[1])
 
 
 def _solve_blocks(blocks: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -228,14 +265,36 @@ def _step(normal: NormalEquations, damping: float, floor: np.ndarray, spread, lo
     gradient, hessian, shift, follow = _eliminate(normal, damping, spread)
     change = _bounded_quadratic(gradient, hessian + np.diag(floor), lower, upper)
     block_change = -shift - follow @ change
-    promised = -(
+    return change, block_change, _promised(normal, change, block_change)
+
+
+def _promised(normal: NormalEquations, change: np.ndarray, block_change: np.ndarray) -> float:
+    """The fall of the loss that the model promises for a step."""
+    return -float(
         normal.gradient @ change
         + np.sum(normal.block_gradient * block_change)
         + 0.5 * change @ normal.hessian @ change
         + np.sum((normal.coupling @ change) * block_change)
         + 0.5 * np.einsum("mi,mij,mj->", block_change, normal.block_hessian, block_change)
     )
-    return change, block_change, promised
+
+
+def _gain(normal: NormalEquations, following: NormalEquations, promised: float) -> float:
+    """The share of the promised fall of the loss that came true; −∞ where the loss is not finite."""
+    return (normal.loss - following.loss) / promised if np.isfinite(following.loss) else -np.inf
+
+
+def _worse(normal: NormalEquations, following: NormalEquations, promised: float) -> np.ndarray:
+    """Which blocks lose what matters beside the promise."""
+    allowed = normal.block_losses + _SUFFICIENT * promised
+    # What is not a number is not less either.
+    return ~(following.block_losses <= allowed)
+
+
+def _following(normal: NormalEquations, change: np.ndarray, damping: float, spread) -> np.ndarray:
+    """Steps of the blocks, damped, for a given step of x."""
+    right = normal.block_gradient + normal.coupling @ change
+    return -_solve_blocks(_damped_blocks(normal, damping, spread), right[:, :, None])[:, :, 0]
 
 
 def _bounded_quadratic(gradient, hessian, lower, upper) -> np.ndarray:
