@@ -15,6 +15,7 @@ with many blocks, of which now one and then another bends, does not crawl at the
 """
 
 import enum
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -170,35 +171,22 @@ def bounded_least_squares(
                     rough = hoped > _ROUGH * tolerance * losses[-1]
                     stop = Stop.STUCK if rough else Stop.LOSS
                     return _solution(x, blocks, normal, stop, losses, evaluations)
-                tried, tried_blocks = np.clip(x + change, lower, upper), retract(blocks, block_change)
-                following = linearize(tried, tried_blocks)
-                evaluations += 1
-                gain, whole = _gain(normal, following, promised), True
-                for more in _AGAIN:
-                    worse = _worse(normal, following, promised)
-                    if gain > _POOR or more <= damping or not worse.any() or worse.all():
-                        break
-                    shorter = _following(normal, change, more, spread)
-                    block_change = np.where(worse[:, None], shorter, block_change)
-                    less = _promised(normal, change, block_change)
-                    if less <= 0:
-                        break
-                    again_blocks = retract(blocks, block_change)
-                    again = linearize(tried, again_blocks)
-                    evaluations += 1
-                    if (found := _gain(normal, again, less)) > gain:
-                        tried_blocks, following, promised, gain = again_blocks, again, less, found
-                        whole = False
-                if gain > _SUFFICIENT:
+                at = np.clip(x + change, lower, upper)
+                trial = functools.partial(_tried, linearize, retract, normal, at, blocks)
+                first = trial(block_change, promised)
+                best, again = _shortened(trial, first, normal, change, block_change, damping, spread)
+                evaluations += 1 + again
+                if best.gain > _SUFFICIENT:
                     break
                 damping, growth = damping * growth, 2 * growth
-            if whole:
+            if best is first:
                 # Nielsen's rule: less damping the better the model was.
-                damping, growth = max(damping * max(1 / 10, 1 - (2 * gain - 1) ** 3), _LEAST_DAMPING), 2.0
+                damping = max(damping * max(1 / 10, 1 - (2 * best.gain - 1) ** 3), _LEAST_DAMPING)
+                growth, slow = 2.0, 0
             else:
                 damping, growth = damping * growth, 2 * growth
-            slow = 0 if whole or normal.loss - following.loss > tolerance * normal.loss else slow + 1
-            x, blocks, normal = tried, tried_blocks, following
+                slow = slow + 1 if normal.loss - best.normal.loss <= tolerance * normal.loss else 0
+            x, blocks, normal = at, best.blocks, best.normal
             spread = tuple(np.maximum(new, old) for new, old in zip(_scales(normal), spread, strict=True))
             losses.append(float(normal.loss))
             if slow == _SLOW:
@@ -207,6 +195,48 @@ def bounded_least_squares(
     except KeyboardInterrupt:
         return _solution(x, blocks, normal, Stop.INTERRUPTED, losses, evaluations)
     return _solution(x, blocks, normal, Stop.ITERATIONS, losses, evaluations)
+
+
+class _Trial(NamedTuple):
+    """A step that was tried: where it led, and the share of the promise that it kept."""
+
+    blocks: Any
+    normal: NormalEquations
+    gain: float
+    promised: float
+
+
+def _tried(linearize, retract, normal, at, blocks, block_change: np.ndarray, promised: float) -> _Trial:
+    moved = retract(blocks, block_change)
+    following = linearize(at, moved)
+    return _Trial(moved, following, _gain(normal, following, promised), promised)
+
+
+def _shortened(
+    trial: Callable[[np.ndarray, float], _Trial],
+    best: _Trial,
+    normal: NormalEquations,
+    change: np.ndarray,
+    block_change: np.ndarray,
+    damping: float,
+    spread,
+) -> tuple[_Trial, int]:
+    """The best of a poor trial and others in which blocks that lose go less far, and how many these were."""
+    count = 0
+    for more in _AGAIN:
+        worse = _worse(normal, best.normal, best.promised)
+        if best.gain > _POOR or more <= damping or not worse.any() or worse.all():
+            break
+        shorter = _following(normal, change, more, spread)
+        block_change = np.where(worse[:, None], shorter, block_change)
+        promised = _promised(normal, change, block_change)
+        if promised <= 0:
+            break
+        again = trial(block_change, promised)
+        count += 1
+        if again.gain > best.gain:
+            best = again
+    return best, count
 
 
 def _solution(x, blocks, normal, stop, losses, evaluations) -> Solution:
