@@ -236,9 +236,9 @@ def level_surface(field: GridField, level: int | float | None = None) -> SignedD
 
 def _distances(share: np.ndarray, middle: float, spacing: np.ndarray) -> np.ndarray:
     """Signed distances [m] of all nodes to the surface {share = middle}, negative inside."""
-    gradient = np.stack([np.gradient(share, axis=axis) for axis in range(3)], axis=-1)
     from scipy.spatial import cKDTree
 
+    gradient = np.stack([np.gradient(share, axis=axis) for axis in range(3)], axis=-1)
     points, normals = [], []
     for axis in range(3):
         first, second = (np.take(share, range(a, share.shape[axis] - 1 + a), axis) for a in (0, 1))
