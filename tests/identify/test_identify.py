@@ -173,6 +173,25 @@ def test_windows_that_are_tied_more_and_more_tightly(observed):
     assert tied.standard_errors["mu"] == pytest.approx(whole.standard_errors["mu"], rel=0.2)
 
 
+def test_a_fit_may_go_on_from_an_earlier_one(observed):
+    motion = noisy(observed, np.random.default_rng(7))
+    options = {"initial": "states", "window": 8, "noise": NOISE}
+    loose = dano.identify(ball_scene(), motion, [FRICTION], continuity=3.0, **options)
+    sequence = dano.identify(ball_scene(), motion, [FRICTION], continuity=(3.0, 0.1), **options)
+    fit = dano.identify(ball_scene(), motion, [FRICTION], continuity=0.1, after=loose, **options)
+    assert fit.loss_history[-1] == pytest.approx(sequence.loss_history[-1], rel=1e-3)
+    # At its own minimum there is nothing left to do.
+    again = dano.identify(ball_scene(), motion, [FRICTION], continuity=0.1, after=fit, **options)
+    assert again.evaluations == 1
+    assert again.values["mu"] == pytest.approx(fit.values["mu"], abs=1e-12)
+    # What was not estimated before begins as measured.
+    given = dano.identify(ball_scene(), motion, [FRICTION], initial="given", window=8, noise=NOISE)
+    states = dano.identify(ball_scene(), motion, [FRICTION], continuity=0.1, after=given, **options)
+    assert states.loss_history[-1] == pytest.approx(sequence.loss_history[-1], rel=1e-3)
+    with pytest.raises(ValueError, match="after must be a fit of the same motions in the same windows: 5 "):
+        dano.identify(ball_scene(), motion, [FRICTION], initial="states", window=4, after=loose)
+
+
 def test_windows_leave_a_wrong_basin_by_where_the_ones_before_end():
     # 229° from frame to frame look like −131°; only at the first frame the spin was observed.
     scene = dano.Scene.create([dano.Body("ball", dano.Sphere(RADIUS), mass=0.5)], [], timestep=0.01)

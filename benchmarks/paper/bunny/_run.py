@@ -2,7 +2,6 @@
 
 import argparse
 import concurrent.futures
-import dataclasses
 import json
 import multiprocessing
 import time
@@ -25,18 +24,23 @@ PAPER = "paper: < 1.5 % without noise, at the step of the data"
 # Without noise impacts, which differ from step to step, are the only errors: a small step, and residuals that
 # count linearly. Windows tell of impacts one by one; the ball meets the bunny at about frame 20. The way
 # there is found at a step that is five times as long.
-CLEAN_TIMESTEP, CLEAN_FRAMES = 1e-4, slice(15, 45)  # s
-COARSE_TIMESTEP, COARSE_OPTIONS = 5e-4, {"max_iterations": 15, "tolerance": 1.0}
+COARSE_TIMESTEP = 5e-4  # s
+CLEAN_TIMESTEP, CLEAN_FRAMES = 1e-4, slice(15, 45)
 CLEAN_OPTIONS: dict[str, Any] = {
     "initial": "given",
     "window": 10,
     "noise": {"position": 1e-3, "orientation": 1e-2, "velocity": 1e-2, "omega": 1e-1},
     "huber": 0.01,
 }
+CLEAN_SEARCHES = (
+    (COARSE_TIMESTEP, CLEAN_OPTIONS | {"max_iterations": 15, "tolerance": 1.0}),
+    (CLEAN_TIMESTEP, CLEAN_OPTIONS),
+)
 # With noise states are estimated too, in windows that are tied more and more tightly; but not from so far
-# off, where they would fit to wrong parameters: first the parameters alone, with states as measured.
+# off, where they would fit to wrong parameters: first the parameters alone, with states as measured. The
+# tightest ties, which tell the most of friction, also tell of the step, so the last search takes a small one.
 NOISE = (1e-3, np.pi / 180)  # m, rad
-NOISY_TIMESTEP, NOISY_FRAMES = 5e-4, slice(5, 55)
+NOISY_TIMESTEP, NOISY_FRAMES = 2e-4, slice(5, 55)
 NEAR_OPTIONS: dict[str, Any] = {
     "initial": "given",
     "window": 10,
@@ -44,12 +48,13 @@ NEAR_OPTIONS: dict[str, Any] = {
     "max_iterations": 15,
     "tolerance": 1.0,
 }
-NOISY_OPTIONS: dict[str, Any] = {
-    **NEAR_OPTIONS,
-    "initial": "states",
-    "continuity": (1.0, 0.3, 0.1),
-    "max_iterations": 30,
-}
+STATES_OPTIONS: dict[str, Any] = {**NEAR_OPTIONS, "initial": "states", "max_iterations": 30}
+LOOSE, TIGHT = (1.0, 0.3), 0.1
+NOISY_SEARCHES = (
+    (COARSE_TIMESTEP, NEAR_OPTIONS),
+    (COARSE_TIMESTEP, STATES_OPTIONS | {"continuity": LOOSE}),
+    (NOISY_TIMESTEP, STATES_OPTIONS | {"continuity": TIGHT}),
+)
 TRUTH = {"mass scale": 1.0, "friction": _data.FRICTION}
 
 
@@ -78,7 +83,7 @@ def run() -> None:
         "dtype": "float64",
         "quick": arguments.quick,
         "timestep_of_data": _data.TIMESTEP_OF_DATA,
-        "timesteps": {"clean": CLEAN_TIMESTEP, "noisy": NOISY_TIMESTEP},
+        "timesteps": {"coarse": COARSE_TIMESTEP, "clean": CLEAN_TIMESTEP, "noisy": NOISY_TIMESTEP},
     }
     if _subjects.authors_bunny() is None:
         rows = [skipped(group, "all of it", NO_DATA) for group in LIMITS]
@@ -136,30 +141,30 @@ def _identified(seed: int) -> dict[str, Result]:
     clean = _data.observed(states, CLEAN_FRAMES)
     noisy = _data.observed(states, NOISY_FRAMES, NOISE, seed)
     return {
-        CLEAN: _fit(
-            subject.bunny,
-            clean,
-            (COARSE_TIMESTEP, CLEAN_OPTIONS | COARSE_OPTIONS),
-            (CLEAN_TIMESTEP, CLEAN_OPTIONS),
-        ),
-        NOISY: _fit(subject.bunny, noisy, (NOISY_TIMESTEP, NEAR_OPTIONS), (NOISY_TIMESTEP, NOISY_OPTIONS)),
+        CLEAN: _fit(subject.bunny, clean, CLEAN_SEARCHES),
+        NOISY: _fit(subject.bunny, noisy, NOISY_SEARCHES),
     }
 
 
 def _fit(
-    bunny: dano.NeuralObject, motions: list[dano.Motion], *searches: tuple[float, dict[str, Any]]
+    bunny: dano.NeuralObject, motions: list[dano.Motion], searches: tuple[tuple[float, dict[str, Any]], ...]
 ) -> Result:
     """Searches at these timesteps [s] with these options, each from where the last one ended."""
-    parameters, fit, evaluations, seconds = _data.parameters(), None, 0, 0.0
+    fit, evaluations, seconds = None, 0, 0.0
     for timestep, options in searches:
         scene = _data.scene(bunny, timestep)
         with warnings.catch_warnings():
             # At so small residuals the solver's own precision may end a search; errors tell how it went.
             warnings.simplefilter("ignore", RuntimeWarning)
             fit = dano.identify(
-                scene, motions, parameters, state=scene.initial_state(), controls=_data.Pull(), **options
+                scene,
+                motions,
+                _data.parameters(),
+                state=scene.initial_state(),
+                controls=_data.Pull(),
+                after=fit,
+                **options,
             )
-        parameters = [dataclasses.replace(each, start=fit.values[each.name]) for each in parameters]
         evaluations, seconds = evaluations + fit.evaluations, seconds + fit.seconds
     assert fit is not None
     errors = {name: 100 * abs(fit.values[name] / truth - 1) for name, truth in TRUTH.items()}

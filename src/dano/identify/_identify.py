@@ -70,6 +70,7 @@ class Identification:
         minima: Where each start ended, best first.
         scene: The scene with the values.
         controls: The controls with the values, as they were given.
+        initial: Quantities that were estimated of the state in which each window begins.
         initial_states: State in which each window begins.
         motions: What was observed.
         fitted: What the simulation says at the frames of each motion, with the values found.
@@ -91,6 +92,7 @@ class Identification:
     minima: tuple[Minimum, ...]
     scene: Scene
     controls: Any
+    initial: tuple[str, ...]
     initial_states: State
     motions: tuple[Motion, ...]
     fitted: tuple[Motion, ...]
@@ -164,6 +166,7 @@ def identify(
     huber: float | None = None,
     window: int | None = None,
     continuity: float | Sequence[float] | None = None,
+    after: Identification | None = None,
     starts: int = 1,
     seed: int = 0,
     held_out: Observed | Sequence[Any] = (),
@@ -203,6 +206,9 @@ def identify(
             beginning of the next; default: they need not meet. Needs `initial="states"`. A falling sequence
             is searched with one after the other, each from where the last one ended: loose windows find
             the way from afar, tight ones use all that the motion says.
+        after: An earlier fit of the same motions in the same windows, from which this one goes on: from its
+            values, by name, instead of where parameters start, and from the initial states that it
+            estimated. To fit at a coarse timestep first, or with fewer unknowns.
         starts: Points to start from: the scene's values, and others in the bounds, the best of many by their
             loss. For losses with several minima.
         seed: Of those points.
@@ -227,6 +233,10 @@ def identify(
     motions = _motions("observed", observed)
     if not motions:
         raise ValueError("observed must hold at least one motion, got none")
+    if after is not None:
+        parameters = [
+            dataclasses.replace(each, start=after.values.get(each.name, each.start)) for each in parameters
+        ]
     space = space_of(scene, controls, parameters)
     chosen = _initial(initial, motions)
     ties = () if continuity is None else tuple(np.atleast_1d(np.asarray(continuity, float)).tolist())
@@ -245,6 +255,8 @@ def identify(
         batch,
     )
     problem = Problem(setup, motions, state)
+    if after is not None:
+        problem.begin_near(after.initial_states, after.initial)
     tell = progress or (lambda description, share: None)
     tell("compiling", 0.0)
     solutions = []
@@ -300,6 +312,7 @@ def identify(
         ),
         scene=with_values(space.selections, "scene", scene, x),
         controls=controls if controls is None else with_values(space.selections, "controls", controls, x),
+        initial=chosen,
         initial_states=best.blocks,
         motions=motions,
         fitted=_as_motions(problem.plan, motions, at_best, scene),

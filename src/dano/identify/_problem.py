@@ -1,5 +1,6 @@
 """The least squares problem: residuals of all windows over parameters and initial states, and its search."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -61,6 +62,7 @@ class Problem:
             window=window,
             continuous=bool(self.ties),
         )
+        self.measured = True
         dtype = scene.timestep.dtype
         self.private = 3 * len(self.plan.bodies) * len(initial)
         unknowns = len(space.start) + self.private
@@ -100,6 +102,21 @@ class Problem:
             reverse,
             batch or (1 if on_cpu else _BATCH),
         )
+
+    def begin_near(self, states: State, estimated: tuple[str, ...]) -> None:
+        """Begin where an earlier fit left what it estimated of the windows' states, if this one does too."""
+        start = self.plan.start
+        if states.position.shape != start.position.shape:
+            here, there = start.position.shape[:2], states.position.shape[:2]
+            raise ValueError(
+                "after must be a fit of the same motions in the same windows: "
+                f"{here[0]} windows of {here[1]} bodies, got {there[0]} of {there[1]}"
+            )
+        taken = [key for key in self.model.initial if key in estimated]
+        fitted = {key: jnp.asarray(getattr(states, key), start.position.dtype) for key in taken}
+        self.plan = dataclasses.replace(self.plan, start=dataclasses.replace(start, **fitted))
+        # Windows that were fitted have left the wrong basins that measured velocities may begin in.
+        self.measured = len(taken) < len(QUANTITIES)
 
     def simulate(self, x: np.ndarray, start: State) -> Linearized:
         """All windows at coordinates and initial states; those as last time are not simulated again."""
@@ -195,9 +212,9 @@ class Problem:
             return minimise(x, self.plan.start, tolerance)
         rough = tolerance if len(self.ties) == 1 else max(tolerance, _NEAR)
         self.model = self.model._replace(jumps=self.ties[0] * self.jumps)
-        solution = self._swept(
-            minimise(x, self.plan.start, rough), lambda at, begin: minimise(at, begin, rough)
-        )
+        solution = minimise(x, self.plan.start, rough)
+        if self.measured:
+            solution = self._swept(solution, lambda at, begin: minimise(at, begin, rough))
         for tie in self.ties[1:]:
             if solution.stop is Stop.INTERRUPTED:
                 break
@@ -221,8 +238,10 @@ class Problem:
             other = minimise(solution.x, moved(solution.blocks, begin, self.plan.bodies, self.model.initial))
             if other.stop is Stop.INTERRUPTED:
                 return solution._replace(stop=Stop.INTERRUPTED)
-            here = self._by_motion(found)
-            there = self._by_motion(self.simulate(solution.x, other.blocks))
+            here, there = (
+                _by_owner(self.plan.owner, np.asarray(each.loss), np.asarray(each.jump))
+                for each in (found, self.simulate(solution.x, other.blocks))
+            )
             better = there < here - _BETTER
             if not better.any():
                 break
@@ -232,9 +251,6 @@ class Problem:
                 blocks = _where(better[self.plan.owner], other.blocks, solution.blocks)
                 solution = minimise(solution.x, blocks)
         return solution
-
-    def _by_motion(self, found: Linearized) -> np.ndarray:
-        return _by_owner(self.plan.owner, np.asarray(found.loss), np.asarray(found.jump))
 
 
 def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> NormalEquations:

@@ -223,9 +223,9 @@ def _shortened(
 ) -> tuple[_Trial, int]:
     """The best of a poor trial and others in which blocks that lose go less far, and how many these were."""
     count = 0
-    for more in _AGAIN:
+    for more in (each for each in _AGAIN if each > damping):
         worse = _worse(normal, best.normal, best.promised)
-        if best.gain > _POOR or more <= damping or not worse.any() or worse.all():
+        if best.gain > _POOR or not worse.any() or worse.all():
             break
         shorter = _following(normal, change, more, spread)
         block_change = np.where(worse[:, None], shorter, block_change)
