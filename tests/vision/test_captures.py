@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from vision.photographs import capture, directions, pose, write_png, write_transforms
 
-from dano.vision import Capture, load_capture, View, with_masks
+from dano.vision import background_mask, Capture, load_capture, PosedCamera, View, with_masks
 
 
 @pytest.fixture(scope="module")
@@ -157,6 +157,51 @@ def test_masks_come_from_a_plain_background():
     noise = np.random.default_rng(0).uniform(0, 1, (48, 48, 3))
     with pytest.raises(ValueError, match="background is not plain"):
         with_masks(without_masks(photos, noise))
+
+
+def wrong_share(made: Capture, photos: Capture) -> list[float]:
+    return [
+        float(np.mean((a.mask > 0.5) != (b.mask > 0.5)))
+        for a, b in zip(made.views, photos.views, strict=True)
+    ]
+
+
+def test_masks_know_a_dim_cloth_from_the_object():
+    photos = capture(3, 1, 48)
+    cloth = np.full((48, 48, 3), 0.01)
+    cloth[24:, 20:28] = 0.05
+    assert max(wrong_share(with_masks(without_masks(photos, cloth)), photos)) < 0.02
+
+
+def test_masks_drop_what_other_views_deny():
+    photos = capture(12, 0, 48)
+    views = list(without_masks(photos, 0.0).views)
+
+    def struck(view: View) -> View:
+        assert view.mask is None
+        image = view.image.copy()
+        image[24:, 22:26] = np.maximum(image[24:, 22:26], 0.4)
+        return view.replaced(image=image)
+
+    one = with_masks(Capture([struck(views[0]), *views[1:]]))
+    assert max(wrong_share(one, photos)) < 0.03
+    # If poses are wrong, what is made stays, for `survey` to find that it does not fit together.
+    rng = np.random.default_rng(0)
+    lost = []
+    for view in views:
+        camera = view.camera
+        pose = camera.pose.copy()
+        pose[:3, 3] += rng.normal(0, 0.02, 3)
+        moved = PosedCamera(
+            pose,
+            focal=camera.focal,
+            centre=camera.centre,
+            width=camera.width,
+            height=camera.height,
+        )
+        lost.append(view.replaced(camera=moved))
+    for view, made in zip(lost, with_masks(Capture(lost)).views, strict=True):
+        np.testing.assert_array_equal(made.mask, background_mask(view))
 
 
 def test_masks_come_from_a_network(tmp_path: Path):

@@ -13,7 +13,7 @@ from dano.fields._signed_distance import spread_distances
 from dano.vision._camera import PosedCamera
 from dano.vision._capture import View
 
-_LOST = 0.02
+LOST = 0.02
 """Share of the views that may miss a point of the object: one bad mask does not cut a hole into it."""
 
 _CHUNK = 1 << 18
@@ -53,16 +53,18 @@ class Box(NamedTuple):
         return self.origin + self.spacing * (np.array(self.shape) - 1)
 
 
-def silhouettes(points: Float[np.ndarray, "n 3"], views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+def silhouettes(
+    points: Float[np.ndarray, "n 3"], views: Sequence[View], lost: float = LOST
+) -> tuple[np.ndarray, np.ndarray]:
     """How many views see points [m, W], and how well the silhouettes of those views cover them.
 
     Returns:
         Number of views that have each point in their image, (n,), and the value that all of these masks but
-        the share `_LOST` of them reach at it, (n,): above ½ for points of the hull, 1 where no view looks.
+        the share `lost` of them reach at it, (n,): above ½ for points of the hull, 1 where no view looks.
     """
     masked = [view for view in views if view.mask is not None]
     size = max(max(view.mask.shape) for view in masked if view.mask is not None)
-    n_spare = int(_LOST * len(masked))
+    n_spare = int(lost * len(masked))
     seen, least = [], []
     for start in range(0, len(points), _CHUNK):
         part = points[start : start + _CHUNK]

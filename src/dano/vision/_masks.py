@@ -8,6 +8,8 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from dano.vision._capture import Capture, View
+from dano.vision._hull import Box, object_box, silhouettes
+from dano.vision._ray_set import rays_of
 
 _BORDER = 0.03
 """Share of the image on each side that is taken for background."""
@@ -15,9 +17,19 @@ _BORDER = 0.03
 _PLAIN = 0.06
 """Most that the middle 80 % of a plain background may deviate from its median, in sRGB."""
 
+_CLEARLY_OBJECT = 0.12
+"""Deviation from the background, in sRGB, that always counts as object."""
+
+_DOUBTED, _USUAL = 0.1, 0.01
+"""Share of the views that may say otherwise of a point of the object, and share of the silhouettes that may
+lie beside such points if masks are made well and poses are right."""
+
 
 def with_masks(capture: Capture, network: str | Path | None = None) -> Capture:
     """The capture with a mask for every view: given ones stay, the others are made.
+
+    What was made is compared: where most silhouettes agree on a solid, the parts of others that lie beside it
+    are background, such as a cloth that the light falls on in some photographs.
 
     Args:
         capture: Photographs.
@@ -31,12 +43,38 @@ def with_masks(capture: Capture, network: str | Path | None = None) -> Capture:
     if all(view.mask is not None for view in capture.views):
         return capture
     segment = background_mask if network is None else _Network(Path(network))
-    views = []
-    for view in capture.views:
-        if view.mask is None:
-            view = cut_out(view.replaced(mask=segment(view).astype(np.float32)))
-        views.append(view)
+    new = [view.mask is None for view in capture.views]
+    views = [
+        view.replaced(mask=segment(view).astype(np.float32)) if made else view
+        for view, made in zip(capture.views, new, strict=True)
+    ]
+    kept = _agreed(Capture(views).split("train"), views)
+    views = [
+        cut_out(view.replaced(mask=view.mask * here)) if made else view
+        for view, here, made in zip(views, kept, new, strict=True)
+    ]
     return Capture(views, capture.source)
+
+
+def _agreed(train: Sequence[View], views: Sequence[View]) -> list[np.ndarray]:
+    """For each view the pixels that may show what most silhouettes agree on; all if too few agree."""
+    everything = [np.ones(view.image.shape[:2], bool) for view in views]
+    try:
+        lower, upper = object_box(train)
+    except ValueError:
+        # Poses or masks are wrong, which `survey` says in words.
+        return everything
+    box = Box.around(lower, upper, 64)
+    _, cover = silhouettes(box.nodes, train, _DOUBTED)
+    near = ndimage.binary_dilation((cover > 0.5).reshape(box.shape), iterations=2)
+    kept, beside = [], []
+    for view in views:
+        here = np.zeros(view.image.shape[:2], bool)
+        here.ravel()[rays_of(view.camera, None, box, near)[0]] = True
+        kept.append(here)
+        assert view.mask is not None
+        beside.append(float(np.sum(view.mask * ~here) / max(np.sum(view.mask), 1.0)))
+    return kept if np.median(beside) < _USUAL else everything
 
 
 def background_mask(view: View) -> Float[np.ndarray, "height width"]:
@@ -57,8 +95,9 @@ def background_mask(view: View) -> Float[np.ndarray, "height width"]:
             f"{view.name}: the background is not plain (its colours differ by {spread:.2f} from their median,"
             f" at most {_PLAIN} can be told from an object): give masks, or a segmentation network"
         )
-    threshold = max(4 * spread, 0.03)
     smooth = ndimage.gaussian_filter(away, 0.7)
+    # A dimly lit cloth is darker than half the way to what is bright, which shadows on the object may not be.
+    threshold = max(4 * spread, 0.03, min(0.5 * _otsu(smooth), _CLEARLY_OBJECT))
     solid = smooth > threshold
     labels, count = ndimage.label(solid)
     if count == 0:
@@ -67,6 +106,17 @@ def background_mask(view: View) -> Float[np.ndarray, "height width"]:
     solid = ndimage.binary_fill_holes(labels == 1 + int(np.argmax(sizes)))
     assert solid is not None
     return _coverage(image, colour, solid)
+
+
+def _otsu(values: np.ndarray) -> float:
+    """The value that splits others into the two groups that vary least within (Otsu 1979)."""
+    counts, edges = np.histogram(values, 256)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    below, total = np.cumsum(counts)[:-1], counts.sum()
+    mean_below = np.cumsum(counts * middle)[:-1] / np.maximum(below, 1)
+    mean_above = (np.sum(counts * middle) - below * mean_below) / np.maximum(total - below, 1)
+    between = below * (total - below) * (mean_above - mean_below) ** 2
+    return float(middle[int(np.argmax(between))])
 
 
 def _coverage(image: np.ndarray, background: np.ndarray, solid: np.ndarray) -> np.ndarray:
