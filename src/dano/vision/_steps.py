@@ -33,8 +33,8 @@ _STATED = 1e-4
 """Weight of squared corrections [pixels²]: what photographs leave open stays as stated."""
 
 
-class Scene(eqx.Module):
-    """What is learned.
+class Learned(eqx.Module):
+    """What is learned: an object, and where it was photographed from.
 
     Attributes:
         model: The object.
@@ -50,13 +50,13 @@ class Scene(eqx.Module):
         look = self.model.appearance
         return self.model.distance, look.features, look.network, self.cameras.correction
 
-    def replaced(self, parts: Any) -> "Scene":
+    def replaced(self, parts: Any) -> "Learned":
         """With other values of `parts`."""
-        return eqx.tree_at(lambda scene: scene.parts, self, parts)
+        return eqx.tree_at(lambda learned: learned.parts, self, parts)
 
 
 def optimiser_of(options: TrainOptions) -> Any:
-    """Adam with a rate for each of `Scene.parts`."""
+    """Adam with a rate for each of `Learned.parts`."""
     # Half the longest side of the box is the unit of distances.
     cell = 2 / options.resolution
     return adam(
@@ -69,16 +69,16 @@ def optimiser_of(options: TrainOptions) -> Any:
     )
 
 
-def make_step(options: TrainOptions) -> Callable[..., tuple[Scene, Any, Array]]:
+def make_step(options: TrainOptions) -> Callable[..., tuple[Learned, Any, Array]]:
     """One step of the optimiser on a random batch of rays, compiled.
 
     Args:
         options: Of the training.
 
     Returns:
-        A function of scene, state of the optimiser, rays, sharpness [1/m], factor of all rates, share of the
-        view's direction in colours (see `Appearance`) and key, which returns the first two anew and the mean
-        error of colours and masks.
+        A function of what is learned, state of the optimiser, rays, sharpness [1/m], factor of all rates,
+        share of the view's direction in colours (see `Appearance`) and key, which returns the first two anew
+        and the mean error of colours and masks.
     """
     import optax
 
@@ -86,13 +86,13 @@ def make_step(options: TrainOptions) -> Callable[..., tuple[Scene, Any, Array]]:
     optimiser = optimiser_of(options)
 
     def loss(
-        parts: Any, scene: Scene, batch: RaySet, sharpness: Array, view_share: Array, key: PRNGKeyArray
+        parts: Any, learned: Learned, batch: RaySet, sharpness: Array, view_share: Array, key: PRNGKeyArray
     ) -> tuple[Array, Array]:
-        scene = scene.replaced(parts)
-        model, rays, stated = scene.model, batch.rays, jnp.float32(0)
+        learned = learned.replaced(parts)
+        model, rays, stated = learned.model, batch.rays, jnp.float32(0)
         if options.cameras:
-            rays = scene.cameras.moved(rays, batch.view)
-            stated = jnp.mean(scene.cameras.corrections**2)
+            rays = learned.cameras.moved(rays, batch.view)
+            stated = jnp.mean(learned.cameras.corrections**2)
         jitter, paint = jax.random.split(key)
         background = jax.random.uniform(paint, batch.colour.shape, jnp.float32)
         seen = see(model, rays, sharpness, sampling=sampling, view_share=view_share, key=jitter)
@@ -107,25 +107,25 @@ def make_step(options: TrainOptions) -> Callable[..., tuple[Scene, Any, Array]]:
 
     @eqx.filter_jit
     def step(
-        scene: Scene,
+        learned: Learned,
         state: Any,
         rays: RaySet,
         sharpness: Array,
         decay: Array,
         view_share: Array,
         key: PRNGKeyArray,
-    ) -> tuple[Scene, Any, Array]:
+    ) -> tuple[Learned, Any, Array]:
         pick, own = jax.random.split(key)
-        parts = scene.parts
+        parts = learned.parts
         (_, error), gradient = jax.value_and_grad(loss, has_aux=True)(
-            parts, scene, rays.drawn(options.batch, pick), sharpness, view_share, own
+            parts, learned, rays.drawn(options.batch, pick), sharpness, view_share, own
         )
         updates, state = updates_of(optimiser, gradient, state, parts, decay)
         # Adam makes steps of one length of gradients of any length: where the surface is far away, of mere
         # traces of them, out of which walls would grow in empty space.
-        model = scene.model
+        model = learned.model
         near = jnp.abs(model.distance) < _REACH * model.spacing / model.scale
         updates = (jnp.where(near, updates[0], 0), *updates[1:])
-        return scene.replaced(optax.apply_updates(parts, updates)), state, error
+        return learned.replaced(optax.apply_updates(parts, updates)), state, error
 
     return step

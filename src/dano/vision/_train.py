@@ -29,7 +29,7 @@ from dano.vision._picture import picture
 from dano.vision._preview import checked_folder, write_preview
 from dano.vision._ray_set import collect, RaySet
 from dano.vision._score import Score, score
-from dano.vision._steps import make_step, optimiser_of, Scene
+from dano.vision._steps import Learned, make_step, optimiser_of
 from dano.vision._survey import Survey, survey, unseen_share
 
 _WORTH_TRYING = 0.003
@@ -98,14 +98,14 @@ class Trained(NamedTuple):
 class _State(eqx.Module):
     """What a checkpoint holds besides options."""
 
-    scene: Scene
+    learned: Learned
     optimiser: Any
     iteration: int
     blur: Float[Array, ""]
 
     @property
     def model(self) -> SurfaceModel:
-        return self.scene.model
+        return self.learned.model
 
 
 def train(
@@ -223,17 +223,17 @@ class _Trainer:
         )
         model = SurfaceModel.create(resampled(start, self.found.box, box), box, look)
         cameras = Adjustment.create(views, self.middle)
-        return self._begun(Scene(model, cameras), 0, jnp.float32(blur))
+        return self._begun(Learned(model, cameras), 0, jnp.float32(blur))
 
-    def _begun(self, scene: Scene, iteration: int, blur: Float[Array, ""]) -> _State:
-        return _State(scene, optimiser_of(self.options).init(scene.parts), iteration, blur)
+    def _begun(self, learned: Learned, iteration: int, blur: Float[Array, ""]) -> _State:
+        return _State(learned, optimiser_of(self.options).init(learned.parts), iteration, blur)
 
     def refined(self, state: _State) -> _State:
         """The state on the fine grid; the optimiser's memory starts anew."""
         coarse, fine = state.model.box, self.found.box
         distances = resampled(state.model.distances, coarse, fine)
         model = SurfaceModel.create(distances, fine, state.model.appearance)
-        return self._begun(Scene(model, state.scene.cameras), state.iteration, state.blur)
+        return self._begun(Learned(model, state.learned.cameras), state.iteration, state.blur)
 
     def started(self) -> _State:
         """The visual hull, or the hull without the cavities that a fog finds if that explains more."""
@@ -274,8 +274,8 @@ class _Trainer:
     def advanced(self, state: _State, rays: RaySet) -> tuple[_State, float]:
         """One step, and the loss before it."""
         i, options = state.iteration, self.options
-        scene, optimiser, error = self.step(
-            state.scene,
+        learned, optimiser, error = self.step(
+            state.learned,
             state.optimiser,
             rays,
             jnp.float32(self.sharpness(i, float(state.blur))),
@@ -284,7 +284,7 @@ class _Trainer:
             jnp.float32(i >= self.switch),
             jax.random.fold_in(self.key, 2 + i),
         )
-        return _State(scene, optimiser, i + 1, state.blur), float(error)
+        return _State(learned, optimiser, i + 1, state.blur), float(error)
 
     def run(self, state: _State | None) -> tuple[_State, Stopped]:
         """All steps, or as many as it takes."""
@@ -327,7 +327,7 @@ class _Trainer:
 
     def with_corrected_cameras(self, state: _State) -> Capture:
         """The photographs, those held out corrected by what all cameras have in common."""
-        train, cameras = self.capture.split("train"), state.scene.cameras
+        train, cameras = self.capture.split("train"), state.learned.cameras
         other = [view for view in self.capture.views if view.split != "train"]
         return Capture((*cameras.corrected(train), *cameras.corrected_lens(other)), self.capture.source)
 
@@ -343,7 +343,7 @@ class _Trainer:
         sharpness = self.sharpness(state.iteration, float(state.blur))
         model, rows, pairs = state.model, [], []
         occupied = model.distances < 3 * model.box.spacing
-        for view in state.scene.cameras.corrected_lens(self.checked):
+        for view in state.learned.cameras.corrected_lens(self.checked):
             light = view.light if model.appearance.lit else None
             drawn = picture(model, view.camera, light, model.box, occupied, sharpness)
             assert view.mask is not None
@@ -386,7 +386,7 @@ class _Trainer:
             rows = [[np.nan if x is None else float(x) for x in entry] for entry in self.history]
             name = _checkpoint.name_of(self.options, self.capture)
             _checkpoint.save(
-                self.checkpoint, name, state.iteration, (state.scene, state.optimiser, state.blur), rows
+                self.checkpoint, name, state.iteration, (state.learned, state.optimiser, state.blur), rows
             )
 
     def resumed(self) -> _State | None:
@@ -401,11 +401,11 @@ class _Trainer:
         state = self.fresh(self.found.hull, self.options.blur[0])
         if stored.iteration > self.switch or len(stored.leaves[0]) != len(state.model.distance):
             state = self.refined(state)
-        scene, optimiser, blur = stored.filled((state.scene, state.optimiser, state.blur))
+        learned, optimiser, blur = stored.filled((state.learned, state.optimiser, state.blur))
         self.history = [
             Progress(int(row[0]), int(row[1]), *(float(x) for x in row[2:])) for row in stored.history
         ]
-        return _State(scene, optimiser, stored.iteration, blur)
+        return _State(learned, optimiser, stored.iteration, blur)
 
 
 def pixel_at(views: Sequence[View], point: Float[np.ndarray, "3"]) -> float:
