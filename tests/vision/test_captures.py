@@ -204,6 +204,28 @@ def test_masks_drop_what_other_views_deny():
         np.testing.assert_array_equal(made.mask, background_mask(view))
 
 
+def test_given_masks_are_completed_where_the_object_lies_in_shadow(tmp_path: Path):
+    photos = capture(2, 0, 64)
+    write_transforms(tmp_path, photos)
+    for view in photos.views:
+        assert view.mask is not None
+        image, mask = view.image.copy(), view.mask.copy()
+        # A shadow that the mask takes for a hole, and a hole that shows the background.
+        image[30:34, 32:36] *= 0.5
+        mask[30:34, 32:36] = 0
+        image[30:34, 22:26], mask[30:34, 22:26] = 0, 0
+        write_png(tmp_path / f"{view.name}.png", image)
+        write_png(tmp_path / f"{view.name}_mask.png", np.repeat(mask[..., None], 3, axis=2))
+    edit(tmp_path, lambda c: [f.update(mask_path=f["file_path"][:-4] + "_mask.png") for f in c["frames"]])
+    with pytest.warns(RuntimeWarning, match="2 masks left out shadows on the object"):
+        read = load_capture(tmp_path)
+    for view in read.views:
+        assert view.mask is not None
+        assert view.mask[30:34, 32:36].min() == 1
+        assert view.mask[31:33, 23:25].max() == 0
+        assert view.image[31:33, 33:35].min() > 0.02
+
+
 def test_masks_come_from_a_network(tmp_path: Path):
     onnx = pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")

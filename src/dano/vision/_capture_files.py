@@ -6,7 +6,8 @@ photographs are named, how they are split, and whether a light is given.
 
 import json
 import math
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,10 +63,28 @@ def load_capture(path: str | Path, *, hold_out: int | None = None, downscale: in
         step = _HOLD_OUT if hold_out is None else hold_out
         held = range(step // 2, len(views), step) if len(views) >= 2 * step else ()
         views = [v.replaced(split="test") if i in held else v for i, v in enumerate(views)]
-    views = [cut_out(view) for view in views]
+    views = _cut_out(views)
     if downscale > 1:
         views = [view.resized(downscale) for view in views]
     return Capture(views, path)
+
+
+def _cut_out(views: Sequence[View]) -> list[View]:
+    """Objects without plain backgrounds; says where that has completed masks."""
+    cut = [cut_out(view) for view in views]
+    grown = [
+        a.name
+        for a, b in zip(views, cut, strict=True)
+        if a.mask is not None and b.mask is not None and b.mask.sum() > 1.005 * a.mask.sum()
+    ]
+    if grown:
+        warnings.warn(
+            f"{len(grown)} masks left out shadows on the object, holes or narrow bays in which the photograph"
+            f" shows no background; they were filled: {', '.join(grown[:4])}",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+    return cut
 
 
 def _views(path: Path) -> list[View]:

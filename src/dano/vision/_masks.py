@@ -20,6 +20,9 @@ _PLAIN = 0.06
 _CLEARLY_OBJECT = 0.12
 """Deviation from the background, in sRGB, that always counts as object."""
 
+_BAY = 0.08
+"""Half the width of bays in a mask that may be shadows, as a share of the root of its area."""
+
 _DOUBTED, _USUAL = 0.1, 0.01
 """Share of the views that may say otherwise of a point of the object, and share of the silhouettes that may
 lie beside such points if masks are made well and poses are right."""
@@ -95,10 +98,7 @@ def background_mask(view: View) -> Float[np.ndarray, "height width"]:
             f"{view.name}: the background is not plain (its colours differ by {spread:.2f} from their median,"
             f" at most {_PLAIN} can be told from an object): give masks, or a segmentation network"
         )
-    smooth = ndimage.gaussian_filter(away, 0.7)
-    # A dimly lit cloth is darker than half the way to what is bright, which shadows on the object may not be.
-    threshold = max(4 * spread, 0.03, min(0.5 * _otsu(smooth), _CLEARLY_OBJECT))
-    solid = smooth > threshold
+    solid = _unlike(away, spread)
     labels, count = ndimage.label(solid)
     if count == 0:
         raise ValueError(f"{view.name}: nothing differs from the background, the mask would be empty")
@@ -106,6 +106,29 @@ def background_mask(view: View) -> Float[np.ndarray, "height width"]:
     solid = ndimage.binary_fill_holes(labels == 1 + int(np.argmax(sizes)))
     assert solid is not None
     return _coverage(image, colour, solid)
+
+
+def _unlike(away: np.ndarray, spread: float) -> np.ndarray:
+    """Where deviations from a background's colour are too large to be those that it has itself, `spread`."""
+    smooth = ndimage.gaussian_filter(away, 0.7)
+    # A dimly lit cloth is darker than half the way to what is bright, which shadows on the object may not be.
+    return smooth > max(4 * spread, 0.03, min(0.5 * _otsu(smooth), _CLEARLY_OBJECT))
+
+
+def _completed(mask: np.ndarray, unlike: np.ndarray) -> np.ndarray:
+    """A mask with holes and narrow bays filled where the photograph shows no background.
+
+    Masks by a threshold leave out what lies in shadow, which cuts deep into the hull of all silhouettes.
+    """
+    solid = mask > 0.5
+    reach = _BAY * float(np.sqrt(solid.sum()))
+    pad = int(reach) + 2
+    grown = ndimage.distance_transform_edt(~np.pad(solid, pad)) <= reach
+    closed = (np.asarray(ndimage.distance_transform_edt(grown)) > reach)[pad:-pad, pad:-pad]
+    missing = closed & unlike & ~solid
+    # What is a pixel wide is the blur of an edge.
+    missing = ndimage.binary_propagation(ndimage.binary_opening(missing), mask=missing)
+    return np.maximum(mask, missing.astype(mask.dtype))
 
 
 def _otsu(values: np.ndarray) -> float:
@@ -173,8 +196,9 @@ class _Network:
 def cut_out(view: View) -> View:
     """The object alone, over black, if the background is plain: C − (1 − M) B, without B's share of the edge.
 
-    Without this a dark background would leave a dark rim on every rendering, a bright one a bright rim. A
-    view whose background is not plain stays as it is.
+    Without this a dark background would leave a dark rim on every rendering, a bright one a bright rim. Holes
+    and narrow bays of the mask are filled where the photograph shows no background, but shadows. A view whose
+    background is not plain stays as it is.
     """
     if view.mask is None or view.cut_out:
         return view
@@ -183,11 +207,13 @@ def cut_out(view: View) -> View:
         return view
     colours = view.image[outside]
     background = np.median(colours, axis=0)
-    if float(np.quantile(np.abs(colours - background).max(axis=1), 0.8)) > _PLAIN:
+    spread = float(np.quantile(np.abs(colours - background).max(axis=1), 0.8))
+    if spread > _PLAIN:
         return view
-    alone = np.clip(view.image - (1 - view.mask[..., None]) * background, 0, view.mask[..., None])
+    mask = _completed(view.mask, _unlike(np.abs(view.image - background).max(axis=2), spread))
+    alone = np.clip(view.image - (1 - mask[..., None]) * background, 0, mask[..., None])
     return view.replaced(
-        image=alone.astype(np.float32), cut_out=True, background=background.astype(np.float64)
+        image=alone.astype(np.float32), mask=mask, cut_out=True, background=background.astype(np.float64)
     )
 
 
