@@ -10,6 +10,7 @@ import pytest
 
 import dano
 from dano.identify._parameters import space_of
+from dano.identify._windows import plan_windows
 from dano.maths import quat_multiply
 
 RADIUS, H = 0.05, 0.005
@@ -210,6 +211,32 @@ def test_windows_leave_a_wrong_basin_by_where_the_ones_before_end():
     np.testing.assert_allclose(fit.initial_states.omega[:, 0], [[0, 0, 40.0]] * 3, atol=1e-3)
     np.testing.assert_allclose(fit.values["gravity"], [0, 0, -9.81], atol=1e-3)
     assert fit.errors.rms < 1e-3
+
+
+def test_an_impact_soon_after_the_first_frame():
+    # Seven frames are smoothed, and the spin begins at the fourth: there it looks like a spin before.
+    scene = dano.Scene.create([dano.Body("ball", dano.Sphere(RADIUS), mass=0.5)], [], timestep=0.01)
+    kick = np.zeros((40, 1, 3))
+    kick[3, 0, 2] = 0.5
+    control = dano.Control(jnp.zeros((40, 1, 3)), jnp.asarray(kick))
+    start = scene.initial_state(ball={"velocity": (1.0, 0.0, 0.0)})
+    run = dano.simulate(scene, start, 40, controls=control)
+    seen = dano.Motion.from_trajectory(run)
+    nothing = np.full(seen.velocity.shape, np.nan)
+    poses = dataclasses.replace(seen, velocity=nothing, omega=nothing)
+    plan = plan_windows(
+        scene,
+        [poses],
+        states=[None],
+        controls=[control],
+        noise=NOISE,
+        initial=("position", "orientation", "velocity", "omega"),
+        window=10,
+        continuous=True,
+    )
+    assert abs(plan.start.omega[0, 0, 2]) > 1.0
+    np.testing.assert_allclose(plan.narrow.omega[0, 0], 0, atol=1e-6)
+    np.testing.assert_allclose(plan.narrow.velocity[0, 0], run.states.velocity[0, 0], atol=0.2)
 
 
 def test_velocities_are_compared_at_their_own_times():

@@ -160,10 +160,11 @@ def test_masks_come_from_a_plain_background():
 
 
 def wrong_share(made: Capture, photos: Capture) -> list[float]:
-    return [
-        float(np.mean((a.mask > 0.5) != (b.mask > 0.5)))
-        for a, b in zip(made.views, photos.views, strict=True)
-    ]
+    shares = []
+    for a, b in zip(made.views, photos.views, strict=True):
+        assert a.mask is not None and b.mask is not None
+        shares.append(float(np.mean((a.mask > 0.5) != (b.mask > 0.5))))
+    return shares
 
 
 def test_masks_know_a_dim_cloth_from_the_object():

@@ -21,6 +21,8 @@ from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
 _LOOKS = 4
 # How often windows may begin anew where those before them end, and by how much a motion's loss must fall.
 _SWEEPS, _BETTER = 2, 5.0
+# How much worse than most a motion fits that should try other beginnings.
+_POOR = 2.0
 # Standard errors to which searches before the last one are near enough.
 _NEAR = 3.0
 # Windows simulated at once on an accelerator; a CPU is fastest one by one.
@@ -226,31 +228,53 @@ class Problem:
         """A better minimum for motions with a window that began in the wrong basin.
 
         What was measured says little of velocities around impacts. Where the window before ends says more,
-        once that window fits: so windows begin there, and motions that this is better for keep it.
+        once that window fits: so windows begin there. Motions that then still fit worse than others begin
+        with what only the frames next to theirs say.
         """
         for _ in range(_SWEEPS):
             if solution.stop is Stop.INTERRUPTED:
-                break
+                return solution
             found = self.simulate(solution.x, solution.blocks)
             missed = np.asarray(found.jump) * _widths(self.model.jumps, found.jump.shape[1])
             change = np.concatenate([np.zeros_like(missed[:1]), missed[:-1]])
-            begin = jnp.asarray(change, self.model.scene.timestep.dtype)
-            other = minimise(solution.x, moved(solution.blocks, begin, self.plan.bodies, self.model.initial))
-            if other.stop is Stop.INTERRUPTED:
-                return solution._replace(stop=Stop.INTERRUPTED)
-            here, there = (
-                _by_owner(self.plan.owner, np.asarray(each.loss), np.asarray(each.jump))
-                for each in (found, self.simulate(solution.x, other.blocks))
-            )
-            better = there < here - _BETTER
-            if not better.any():
+            ends = jnp.asarray(change, self.model.scene.timestep.dtype)
+            begin = moved(solution.blocks, ends, self.plan.bodies, self.model.initial)
+            solution, any_better = self._better_of(solution, begin, minimise)
+            if not any_better:
                 break
-            if np.all(there < here + _BETTER):
-                solution = other
-            else:
-                blocks = _where(better[self.plan.owner], other.blocks, solution.blocks)
-                solution = minimise(solution.x, blocks)
-        return solution
+        poor = self._fits_poorly(self.simulate(solution.x, solution.blocks))
+        if solution.stop is Stop.INTERRUPTED or not poor.any():
+            return solution
+        begin = _where(poor[self.plan.owner], self.plan.narrow, solution.blocks)
+        return self._better_of(solution, begin, minimise)[0]
+
+    def _better_of(
+        self, solution: Solution, begin: State, minimise: Callable[[np.ndarray, State], Solution]
+    ) -> tuple[Solution, bool]:
+        """The solution, with what is found from other beginnings for motions that this explains better."""
+        found = self.simulate(solution.x, solution.blocks)
+        other = minimise(solution.x, begin)
+        if other.stop is Stop.INTERRUPTED:
+            return solution._replace(stop=Stop.INTERRUPTED), False
+        here, there = (
+            _by_owner(self.plan.owner, np.asarray(each.loss), np.asarray(each.jump))
+            for each in (found, self.simulate(solution.x, other.blocks))
+        )
+        better = there < here - _BETTER
+        if not better.any():
+            return solution, False
+        if np.all(there < here + _BETTER):
+            return other, True
+        blocks = _where(better[self.plan.owner], other.blocks, solution.blocks)
+        return minimise(solution.x, blocks), True
+
+    def _fits_poorly(self, found: Linearized) -> np.ndarray:
+        """Which motions explain each of their numbers much worse than most do; all if there are too few."""
+        losses = _by_owner(self.plan.owner, np.asarray(found.loss), np.asarray(found.jump))
+        lengths = np.asarray(found.lengths)
+        counts = np.bincount(self.plan.owner, np.sum(lengths >= 0, axis=tuple(range(1, lengths.ndim))))
+        mean = losses / np.maximum(counts, 1)
+        return mean > _POOR * np.median(mean) if len(mean) > 2 else np.ones(len(mean), bool)
 
 
 def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> NormalEquations:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.identify._motion import Motion, QUANTITIES
+from dano.identify._motion import Motion, QUANTITIES, SMOOTHING_FRAMES
 from dano.scene import Control, Scene, State
 
 _CONFIGURATION = ("position", "orientation")
@@ -50,6 +50,8 @@ class Plan:
     Attributes:
         windows: The windows.
         start: Their initial states, positions as `Windows.origins` says.
+        narrow: The same with velocities that were not observed from three frames only: noisier, but no
+            further than a frame from an impact do they know of it.
         n_steps: Steps that each is simulated.
         owner: Index of the motion that each belongs to.
         rows: The frames of the motion that each covers.
@@ -60,6 +62,7 @@ class Plan:
 
     windows: Windows
     start: State
+    narrow: State
     n_steps: int
     owner: np.ndarray
     rows: list[np.ndarray]
@@ -159,12 +162,14 @@ def plan_windows(
         jnp.asarray(np.append(owner[1:] == owner[:-1], False), dtype),
         _control_rows(scene, forces, first_step, n_steps),
     )
-    start = State(
-        *(jnp.asarray(np.stack([piece["start"][key] for piece in pieces]), dtype) for key in QUANTITIES)
+    start, narrow = (
+        State(*(jnp.asarray(np.stack([piece[name][key] for piece in pieces]), dtype) for key in QUANTITIES))
+        for name in ("start", "narrow")
     )
     return Plan(
         windows,
         start,
+        narrow,
         n_steps,
         owner,
         [piece["rows"] for piece in pieces],
@@ -191,8 +196,9 @@ def _cut(scene, motion: Motion, full, state, control, number: int, window: int |
     """The windows of one motion, one after the other without overlap."""
     h = float(scene.timestep)
     moving = np.array([i for i, body in enumerate(scene.bodies) if not body.fixed])
-    derived = motion.with_velocities()
-    smooth = _on_all_bodies(scene, derived, what)
+    smooth, narrow = (
+        _on_all_bodies(scene, motion.with_velocities(frames), what) for frames in (SMOOTHING_FRAMES, 3)
+    )
     complete = _says_where(scene, motion, full, state is not None, moving)
     origins = np.array([motion.point == "origin" and name in motion.names for name in scene.names])
     pieces, first, n = [], 0, len(motion.times)
@@ -203,7 +209,10 @@ def _cut(scene, motion: Motion, full, state, control, number: int, window: int |
         first += int(ready[0])
         last = n if window is None else min(first + window, n)
         if last - first >= 2:
-            start = _initial(scene, motion, full, smooth, state, first, h, what)
+            start, other = (
+                _initial(scene, motion, full, velocities, state, first, h, what)
+                for velocities in (smooth, narrow)
+            )
             pieces.append(
                 {
                     "owner": number,
@@ -213,6 +222,7 @@ def _cut(scene, motion: Motion, full, state, control, number: int, window: int |
                     "origin": motion.times[0],
                     "origins": origins,
                     "start": start,
+                    "narrow": other,
                     "control": control,
                     **{key: full[key][first:last] for key in QUANTITIES},
                 }
