@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from vision.photographs import capture, directions, pose, write_png, write_transforms
 
-from dano.vision import background_mask, Capture, load_capture, PosedCamera, View, with_masks
+from dano.vision import background_mask, Capture, load_capture, View, with_masks
 
 
 @pytest.fixture(scope="module")
@@ -190,17 +190,9 @@ def test_masks_drop_what_other_views_deny():
     rng = np.random.default_rng(0)
     lost = []
     for view in views:
-        camera = view.camera
-        pose = camera.pose.copy()
-        pose[:3, 3] += rng.normal(0, 0.02, 3)
-        moved = PosedCamera(
-            pose,
-            focal=camera.focal,
-            centre=camera.centre,
-            width=camera.width,
-            height=camera.height,
-        )
-        lost.append(view.replaced(camera=moved))
+        place = view.camera.pose.copy()
+        place[:3, 3] += rng.normal(0, 0.02, 3)
+        lost.append(view.replaced(camera=view.camera.replaced(camera_to_world=place)))
     for view, made in zip(lost, with_masks(Capture(lost)).views, strict=True):
         np.testing.assert_array_equal(made.mask, background_mask(view))
 

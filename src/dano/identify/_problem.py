@@ -1,6 +1,7 @@
 """The least squares problem: residuals of all windows over parameters and initial states, and its search."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -21,8 +22,9 @@ from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
 _LOOKS = 4
 # How often windows may begin anew where those before them end, and by how much a motion's loss must fall.
 _SWEEPS, _BETTER = 2, 5.0
-# How much worse than most a motion fits that should try other beginnings.
-_POOR = 2.0
+# How much worse than most a motion fits that should begin anew, with velocities from so few frames: noisier,
+# but no further than a frame from an impact do they know of it.
+_POOR, _NARROW = 2.0, 3
 # Standard errors to which searches before the last one are near enough.
 _NEAR = 3.0
 # Windows simulated at once on an accelerator; a CPU is fastest one by one.
@@ -54,7 +56,8 @@ class Problem:
         self.simulations = 0
         self._last: tuple[Model, Array, tuple[State, State], Linearized] | None = None
         policy = controls if callable(controls) else None
-        self.plan = plan_windows(
+        self._planned = functools.partial(
+            plan_windows,
             scene,
             motions,
             states=_for_each("state", state, motions),
@@ -64,6 +67,7 @@ class Problem:
             window=window,
             continuous=bool(self.ties),
         )
+        self.plan = self._planned()
         self.measured = True
         dtype = scene.timestep.dtype
         self.private = 3 * len(self.plan.bodies) * len(initial)
@@ -239,27 +243,31 @@ class Problem:
             change = np.concatenate([np.zeros_like(missed[:1]), missed[:-1]])
             ends = jnp.asarray(change, self.model.scene.timestep.dtype)
             begin = moved(solution.blocks, ends, self.plan.bodies, self.model.initial)
-            solution, any_better = self._better_of(solution, begin, minimise)
+            solution, any_better = self._better_of(solution, found, begin, minimise)
             if not any_better:
                 break
-        poor = self._fits_poorly(self.simulate(solution.x, solution.blocks))
-        if solution.stop is Stop.INTERRUPTED or not poor.any():
+        if solution.stop is Stop.INTERRUPTED:
             return solution
-        begin = _where(poor[self.plan.owner], self.plan.narrow, solution.blocks)
-        return self._better_of(solution, begin, minimise)[0]
+        found = self.simulate(solution.x, solution.blocks)
+        poor = self._fits_poorly(found)
+        if not poor.any():
+            return solution
+        narrow = self._planned(smoothing=_NARROW).start
+        begin = _where(poor[self.plan.owner], narrow, solution.blocks)
+        return self._better_of(solution, found, begin, minimise)[0]
 
     def _better_of(
-        self, solution: Solution, begin: State, minimise: Callable[[np.ndarray, State], Solution]
+        self,
+        solution: Solution,
+        found: Linearized,
+        begin: State,
+        minimise: Callable[[np.ndarray, State], Solution],
     ) -> tuple[Solution, bool]:
-        """The solution, with what is found from other beginnings for motions that this explains better."""
-        found = self.simulate(solution.x, solution.blocks)
+        """The solution, `found` there, with other beginnings for motions that these explain better."""
         other = minimise(solution.x, begin)
         if other.stop is Stop.INTERRUPTED:
             return solution._replace(stop=Stop.INTERRUPTED), False
-        here, there = (
-            _by_owner(self.plan.owner, np.asarray(each.loss), np.asarray(each.jump))
-            for each in (found, self.simulate(solution.x, other.blocks))
-        )
+        here, there = self._by_motion(found), self._by_motion(self.simulate(solution.x, other.blocks))
         better = there < here - _BETTER
         if not better.any():
             return solution, False
@@ -270,11 +278,13 @@ class Problem:
 
     def _fits_poorly(self, found: Linearized) -> np.ndarray:
         """Which motions explain each of their numbers much worse than most do; all if there are too few."""
-        losses = _by_owner(self.plan.owner, np.asarray(found.loss), np.asarray(found.jump))
         lengths = np.asarray(found.lengths)
         counts = np.bincount(self.plan.owner, np.sum(lengths >= 0, axis=tuple(range(1, lengths.ndim))))
-        mean = losses / np.maximum(counts, 1)
+        mean = self._by_motion(found) / np.maximum(counts, 1)
         return mean > _POOR * np.median(mean) if len(mean) > 2 else np.ones(len(mean), bool)
+
+    def _by_motion(self, found: Linearized) -> np.ndarray:
+        return _by_owner(self.plan.owner, np.asarray(found.loss), np.asarray(found.jump))
 
 
 def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> NormalEquations:

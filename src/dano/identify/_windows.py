@@ -50,8 +50,6 @@ class Plan:
     Attributes:
         windows: The windows.
         start: Their initial states, positions as `Windows.origins` says.
-        narrow: The same with velocities that were not observed from three frames only: noisier, but no
-            further than a frame from an impact do they know of it.
         n_steps: Steps that each is simulated.
         owner: Index of the motion that each belongs to.
         rows: The frames of the motion that each covers.
@@ -62,7 +60,6 @@ class Plan:
 
     windows: Windows
     start: State
-    narrow: State
     n_steps: int
     owner: np.ndarray
     rows: list[np.ndarray]
@@ -81,6 +78,7 @@ def plan_windows(
     initial: Sequence[str],
     window: int | None,
     continuous: bool,
+    smoothing: int = SMOOTHING_FRAMES,
 ) -> Plan:
     """Cut motions into windows.
 
@@ -93,6 +91,7 @@ def plan_windows(
         initial: Quantities of the initial states that are estimated.
         window: Frames of a window; None: all.
         continuous: Whether windows are simulated up to the beginning of the next.
+        smoothing: Frames that say how fast a window begins where that was not observed.
 
     Raises:
         ValueError: If a motion does not fit the scene, or does not say how a window begins.
@@ -102,7 +101,7 @@ def plan_windows(
     for number, (motion, state, control) in enumerate(zip(motions, states, controls, strict=True)):
         what = f"motion {number}" if len(motions) > 1 else "the motion"
         full = _on_all_bodies(scene, motion, what)
-        pieces += _cut(scene, motion, full, state, control, number, window, what)
+        pieces += _cut(scene, motion, full, state, control, number, window, smoothing, what)
     moving = [i for i, body in enumerate(scene.bodies) if not body.fixed]
     seen = [i for i in moving if any(scene.names[i] in motion.names for motion in motions)]
     if not seen:
@@ -162,14 +161,12 @@ def plan_windows(
         jnp.asarray(np.append(owner[1:] == owner[:-1], False), dtype),
         _control_rows(scene, forces, first_step, n_steps),
     )
-    start, narrow = (
-        State(*(jnp.asarray(np.stack([piece[name][key] for piece in pieces]), dtype) for key in QUANTITIES))
-        for name in ("start", "narrow")
+    start = State(
+        *(jnp.asarray(np.stack([piece["start"][key] for piece in pieces]), dtype) for key in QUANTITIES)
     )
     return Plan(
         windows,
         start,
-        narrow,
         n_steps,
         owner,
         [piece["rows"] for piece in pieces],
@@ -192,13 +189,13 @@ def _on_all_bodies(scene: Scene, motion: Motion, what: str) -> dict[str, np.ndar
     return full
 
 
-def _cut(scene, motion: Motion, full, state, control, number: int, window: int | None, what: str):
+def _cut(
+    scene, motion: Motion, full, state, control, number: int, window: int | None, smoothing: int, what: str
+):
     """The windows of one motion, one after the other without overlap."""
     h = float(scene.timestep)
     moving = np.array([i for i, body in enumerate(scene.bodies) if not body.fixed])
-    smooth, narrow = (
-        _on_all_bodies(scene, motion.with_velocities(frames), what) for frames in (SMOOTHING_FRAMES, 3)
-    )
+    smooth = _on_all_bodies(scene, motion.with_velocities(smoothing), what)
     complete = _says_where(scene, motion, full, state is not None, moving)
     origins = np.array([motion.point == "origin" and name in motion.names for name in scene.names])
     pieces, first, n = [], 0, len(motion.times)
@@ -209,10 +206,7 @@ def _cut(scene, motion: Motion, full, state, control, number: int, window: int |
         first += int(ready[0])
         last = n if window is None else min(first + window, n)
         if last - first >= 2:
-            start, other = (
-                _initial(scene, motion, full, velocities, state, first, h, what)
-                for velocities in (smooth, narrow)
-            )
+            start = _initial(scene, motion, full, smooth, state, first, h, what)
             pieces.append(
                 {
                     "owner": number,
@@ -222,7 +216,6 @@ def _cut(scene, motion: Motion, full, state, control, number: int, window: int |
                     "origin": motion.times[0],
                     "origins": origins,
                     "start": start,
-                    "narrow": other,
                     "control": control,
                     **{key: full[key][first:last] for key in QUANTITIES},
                 }

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dano.vision._camera import PosedCamera
 from dano.vision._capture import View
 from dano.vision._models import Rays
 
@@ -105,12 +104,4 @@ def _turned(view: View, correction: np.ndarray, angle: float, length: float) -> 
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         pose[:3, :3] = (np.eye(3) + np.sin(size) * cross + (1 - np.cos(size)) * cross @ cross) @ pose[:3, :3]
     pose[:3, 3] += camera.axes.T @ correction[3:] * length
-    made = PosedCamera(
-        pose,
-        focal=camera.focal,
-        centre=camera.centre,
-        width=camera.width,
-        height=camera.height,
-        distortion=camera.distortion,
-    )
-    return view.replaced(camera=made)
+    return view.replaced(camera=camera.replaced(camera_to_world=pose))

@@ -2,6 +2,7 @@
 
 import abc
 import math
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -281,6 +282,18 @@ class PosedCamera(AbstractCamera):
     def pose(self) -> Float[np.ndarray, "3 4"]:
         """`camera_to_world` of the constructor, without its last row."""
         return np.concatenate([self.axes.T * np.array([1.0, 1.0, -1.0]), self.position[:, None]], axis=1)
+
+    def replaced(self, **arguments: Any) -> "PosedCamera":
+        """This camera with other values of some of the constructor's arguments."""
+        own = {
+            "camera_to_world": self.pose,
+            "focal": self.focal,
+            "width": self.width,
+            "height": self.height,
+            "centre": self.centre,
+            "distortion": self.distortion,
+        }
+        return PosedCamera(**{**own, **arguments})
 
     def _distorted(self, slopes: np.ndarray) -> np.ndarray:
         k1, k2, k3, p1, p2 = self.distortion

@@ -67,13 +67,11 @@ class View(eqx.Module):
             )
             return blocks.mean(axis=(1, 3), dtype=np.float32)
 
-        camera = PosedCamera(
-            self.camera.pose,
+        camera = self.camera.replaced(
             focal=self.camera.focal / factor,
             centre=self.camera.centre / factor,
             width=width // factor,
             height=height // factor,
-            distortion=self.camera.distortion,
         )
         mask = None if self.mask is None else shrunk(self.mask)
         return self.replaced(camera=camera, image=shrunk(self.image), mask=mask)

@@ -13,7 +13,7 @@ from dano.fields._signed_distance import spread_distances
 from dano.vision._camera import PosedCamera
 from dano.vision._capture import View
 
-LOST = 0.02
+_LOST = 0.02
 """Share of the views that may miss a point of the object: one bad mask does not cut a hole into it."""
 
 _CHUNK = 1 << 18
@@ -54,7 +54,7 @@ class Box(NamedTuple):
 
 
 def silhouettes(
-    points: Float[np.ndarray, "n 3"], views: Sequence[View], lost: float = LOST
+    points: Float[np.ndarray, "n 3"], views: Sequence[View], lost: float = _LOST
 ) -> tuple[np.ndarray, np.ndarray]:
     """How many views see points [m, W], and how well the silhouettes of those views cover them.
 

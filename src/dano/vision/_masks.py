@@ -46,21 +46,22 @@ def with_masks(capture: Capture, network: str | Path | None = None) -> Capture:
     if all(view.mask is not None for view in capture.views):
         return capture
     segment = background_mask if network is None else _Network(Path(network))
-    new = [view.mask is None for view in capture.views]
+    made = Capture(
+        [
+            view.replaced(mask=segment(view).astype(np.float32)) if view.mask is None else view
+            for view in capture.views
+        ]
+    )
     views = [
-        view.replaced(mask=segment(view).astype(np.float32)) if made else view
-        for view, made in zip(capture.views, new, strict=True)
-    ]
-    kept = _agreed(Capture(views).split("train"), views)
-    views = [
-        cut_out(view.replaced(mask=view.mask * here)) if made else view
-        for view, here, made in zip(views, kept, new, strict=True)
+        cut_out(view.replaced(mask=view.mask * here)) if given.mask is None else given
+        for given, view, here in zip(capture.views, made.views, _agreed(made), strict=True)
     ]
     return Capture(views, capture.source)
 
 
-def _agreed(train: Sequence[View], views: Sequence[View]) -> list[np.ndarray]:
+def _agreed(capture: Capture) -> list[np.ndarray]:
     """For each view the pixels that may show what most silhouettes agree on; all if too few agree."""
+    train, views = capture.split("train"), capture.views
     everything = [np.ones(view.image.shape[:2], bool) for view in views]
     try:
         lower, upper = object_box(train)
@@ -90,9 +91,7 @@ def background_mask(view: View) -> Float[np.ndarray, "height width"]:
     rim = max(2, round(_BORDER * min(image.shape[:2])))
     border = np.ones(image.shape[:2], dtype=bool)
     border[rim:-rim, rim:-rim] = False
-    colour = np.median(image[border], axis=0)
-    away = np.abs(image - colour).max(axis=2)
-    spread = float(np.quantile(away[border], 0.8))
+    colour, away, spread = _against(image, border)
     if spread > _PLAIN:
         raise ValueError(
             f"{view.name}: the background is not plain (its colours differ by {spread:.2f} from their median,"
@@ -106,6 +105,13 @@ def background_mask(view: View) -> Float[np.ndarray, "height width"]:
     solid = ndimage.binary_fill_holes(labels == 1 + int(np.argmax(sizes)))
     assert solid is not None
     return _coverage(image, colour, solid)
+
+
+def _against(image: np.ndarray, outside: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Colour of the background that some pixels show, deviations from it everywhere, and its own, usually."""
+    colour = np.median(image[outside], axis=0)
+    away = np.abs(image - colour).max(axis=2)
+    return colour, away, float(np.quantile(away[outside], 0.8))
 
 
 def _unlike(away: np.ndarray, spread: float) -> np.ndarray:
@@ -205,12 +211,10 @@ def cut_out(view: View) -> View:
     outside = ndimage.binary_erosion(view.mask < 0.02, iterations=2)
     if outside.sum() < 50:
         return view
-    colours = view.image[outside]
-    background = np.median(colours, axis=0)
-    spread = float(np.quantile(np.abs(colours - background).max(axis=1), 0.8))
+    background, away, spread = _against(view.image, outside)
     if spread > _PLAIN:
         return view
-    mask = _completed(view.mask, _unlike(np.abs(view.image - background).max(axis=2), spread))
+    mask = _completed(view.mask, _unlike(away, spread))
     alone = np.clip(view.image - (1 - mask[..., None]) * background, 0, mask[..., None])
     return view.replaced(
         image=alone.astype(np.float32), mask=mask, cut_out=True, background=background.astype(np.float64)
