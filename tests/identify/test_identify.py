@@ -10,7 +10,7 @@ import pytest
 
 import dano
 from dano.identify._parameters import space_of
-from dano.identify._windows import plan_windows
+from dano.identify._windows import draw_velocities, plan_windows
 from dano.maths import quat_multiply
 
 RADIUS, H = 0.05, 0.005
@@ -211,6 +211,53 @@ def test_windows_leave_a_wrong_basin_by_where_the_ones_before_end():
     np.testing.assert_allclose(fit.initial_states.omega[:, 0], [[0, 0, 40.0]] * 3, atol=1e-3)
     np.testing.assert_allclose(fit.values["gravity"], [0, 0, -9.81], atol=1e-3)
     assert fit.errors.rms < 1e-3
+
+
+def test_a_motion_in_a_wrong_basin_among_motions_that_fit():
+    # As above, in one of three motions: the others say what gravity is, so that it can be held.
+    scene = dano.Scene.create([dano.Body("ball", dano.Sphere(RADIUS), mass=0.5)], [], timestep=0.01)
+    seen = []
+    for spin in (3.0, 40.0, -5.0):
+        start = scene.initial_state(ball={"velocity": (1.0, 0.0, 0.0), "omega": (0.0, 0.0, spin)})
+        motion = dano.Motion.from_trajectory(dano.simulate(scene, start, 110), every=10)
+        omega = np.where(np.arange(12)[:, None, None] == 0, motion.omega, np.nan)
+        seen.append(dataclasses.replace(motion, omega=omega, velocity=np.full_like(omega, np.nan)))
+    fit = dano.identify(
+        scene,
+        seen,
+        [dano.Parameter("gravity", lambda s: s.gravity, -20.0, 20.0, start=[0.0, 0.0, -5.0])],
+        initial="states",
+        window=4,
+        continuity=1.0,
+        noise=NOISE,
+    )
+    spins = np.repeat([3.0, 40.0, -5.0], 3)
+    np.testing.assert_allclose(fit.initial_states.omega[:, 0, 2], spins, atol=1e-3)
+    np.testing.assert_allclose(fit.values["gravity"], [0, 0, -9.81], atol=1e-3)
+
+
+def test_beginnings_are_drawn_within_the_noise_of_three_frames():
+    scene = dano.Scene.create([dano.Body("ball", dano.Sphere(RADIUS), mass=0.5)], [], timestep=0.01)
+    run = dano.simulate(scene, scene.initial_state(ball={"velocity": (1.0, 0.0, 0.0)}), 4)
+    still = dano.Motion.from_trajectory(run)
+    nothing = np.full(still.velocity.shape, np.nan)
+    rng = np.random.default_rng(0)
+    noisy = [
+        dataclasses.replace(
+            still,
+            position=still.position + NOISE["position"] * rng.standard_normal(still.position.shape),
+            velocity=nothing,
+            omega=nothing,
+        )
+        for _ in range(400)
+    ]
+    measured = np.array([motion.with_velocities(3).velocity[2, 0] for motion in noisy])
+    zero = jnp.zeros((400, 2, 3))
+    start = dano.State(zero, jnp.zeros((400, 2, 4)), zero, zero)
+    drawn = draw_velocities(start, (0,), {"position": NOISE["position"]}, 0.01, rng)
+    spread = np.std(drawn.velocity, axis=0)
+    np.testing.assert_allclose(spread[0], np.std(measured, axis=0), rtol=0.15)
+    assert np.all(spread[1] == 0) and np.all(np.asarray(drawn.omega) == 0)
 
 
 def test_an_impact_soon_after_the_first_frame():

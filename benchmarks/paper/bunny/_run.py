@@ -55,6 +55,7 @@ NOISY_SEARCHES = (
     (COARSE_TIMESTEP, STATES_OPTIONS | {"continuity": LOOSE}),
     (NOISY_TIMESTEP, STATES_OPTIONS | {"continuity": TIGHT}),
 )
+SEARCHES = {CLEAN: CLEAN_SEARCHES, NOISY: NOISY_SEARCHES}
 TRUTH = {"mass scale": 1.0, "friction": _data.FRICTION}
 
 
@@ -90,60 +91,60 @@ def run() -> None:
         report("paper.bunny", rows, settings, load, arguments.json)
         return
     results = _all(range(n), arguments.jobs, arguments.keep)
-    settings["sets"] = len(results)
-    rows = [row for group in LIMITS for row in _rows(group, [result[group] for result in results])]
+    settings["sets"] = {group: len(found) for group, found in results.items()}
+    rows = [row for group, found in results.items() if found for row in _rows(group, found)]
     report("paper.bunny", rows, settings, load, arguments.json)
 
 
-def _all(seeds: range, jobs: int, keep: Path | None) -> list[dict[str, Result]]:
+def _all(seeds: range, jobs: int, keep: Path | None) -> dict[str, list[Result]]:
     kept = _kept(keep)
-    done = [kept[seed] for seed in seeds if seed in kept]
-    missing = [seed for seed in seeds if seed not in kept]
+    missing = [(s, [g for g in LIMITS if (s, g) not in kept]) for s in seeds]
+    missing = [task for task in missing if task[1]]
+    results = {group: [kept[s, group] for s in seeds if (s, group) in kept] for group in LIMITS}
     started = time.perf_counter()
     # Processes, because one simulation keeps one core busy.
     context = multiprocessing.get_context("spawn")
     pool = concurrent.futures.ProcessPoolExecutor(jobs, mp_context=context)
     try:
-        for seed, result in zip(missing, pool.map(_identified, missing), strict=True):
-            done.append(result)
-            if keep is not None:
-                line = {"seed": seed, **{group: found._asdict() for group, found in result.items()}}
-                with keep.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(line) + "\n")
-            said = "; ".join(
-                f"{group.lower()}: " + ", ".join(f"{k} {v:.3f} %" for k, v in found.errors.items())
-                for group, found in result.items()
-            )
-            print(f"set {seed}, {time.perf_counter() - started:.0f} s: {said}", flush=True)
+        for (seed, _), found in zip(missing, pool.map(_identified, missing), strict=True):
+            for group, result in found.items():
+                results[group].append(result)
+                if keep is not None:
+                    line = {"seed": seed, "group": group, **result._asdict()}
+                    with keep.open("a", encoding="utf-8") as file:
+                        file.write(json.dumps(line) + "\n")
+                said = ", ".join(f"{name} {error:.3f} %" for name, error in result.errors.items())
+                took = time.perf_counter() - started
+                print(f"set {seed}, {took:.0f} s: {group.lower()}: {said}", flush=True)
     except KeyboardInterrupt:
         # Hours of work: what is done is reported.
-        print(f"interrupted after {len(done)} of {len(seeds)} sets", flush=True)
+        print(f"interrupted after {min(map(len, results.values()))} of {len(seeds)} sets", flush=True)
     finally:
         pool.shutdown(cancel_futures=True)
-    return done
+    return results
 
 
-def _kept(file: Path | None) -> dict[int, dict[str, Result]]:
-    """Results by seed that an earlier, interrupted run has left in a file."""
+def _kept(file: Path | None) -> dict[tuple[int, str], Result]:
+    """Results that an earlier, interrupted run has left in a file."""
     if file is None or not file.exists():
         return {}
     lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    return {line["seed"]: {group: Result(**line[group]) for group in LIMITS} for line in lines}
+    return {(line.pop("seed"), line.pop("group")): Result(**line) for line in lines}
 
 
-def _identified(seed: int) -> dict[str, Result]:
-    """Both identifications of one data set."""
+def _identified(task: tuple[int, list[str]]) -> dict[str, Result]:
+    """Identifications of one data set."""
+    seed, groups = task
     subject = _subjects.authors_bunny()
     assert subject is not None
     states, failed = _data.simulate(subject.bunny, seed)
     if failed:
         raise RuntimeError(f"{failed} steps of data set {seed} did not converge")
-    clean = _data.observed(states, CLEAN_FRAMES)
-    noisy = _data.observed(states, NOISY_FRAMES, NOISE, seed)
-    return {
-        CLEAN: _fit(subject.bunny, clean, CLEAN_SEARCHES),
-        NOISY: _fit(subject.bunny, noisy, NOISY_SEARCHES),
+    motions = {
+        CLEAN: _data.observed(states, CLEAN_FRAMES),
+        NOISY: _data.observed(states, NOISY_FRAMES, NOISE, seed),
     }
+    return {group: _fit(subject.bunny, motions[group], SEARCHES[group]) for group in groups}
 
 
 def _fit(
@@ -201,6 +202,6 @@ def _rows(group: str, results: list[Result]) -> list[Row]:
 def _options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sets", type=int, default=SETS, metavar="N", help=f"data sets; default: {SETS}")
     parser.add_argument(
-        "--keep", type=Path, metavar="FILE", help="write each set's result there, and skip those it holds"
+        "--keep", type=Path, metavar="FILE", help="write each result there, and skip those it holds"
     )
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes; default: 1")

@@ -211,7 +211,7 @@ def identify(
             estimated. To fit at a coarse timestep first, or with fewer unknowns.
         starts: Points to start from: the scene's values, and others in the bounds, the best of many by their
             loss. For losses with several minima.
-        seed: Of those points.
+        seed: Of everything random.
         held_out: Motions that are not fitted, to measure the error on.
         jacobian: Forward mode costs one rollout per unknown, reverse mode several per observed number.
         max_iterations: Steps of each search.
@@ -253,6 +253,7 @@ def identify(
         jacobian,
         engine or VariationalEngine(),
         batch,
+        seed,
     )
     problem = Problem(setup, motions, state)
     if after is not None:
@@ -260,7 +261,7 @@ def identify(
     tell = progress or (lambda description, share: None)
     tell("compiling", 0.0)
     solutions = []
-    points = problem.points(starts, seed)
+    points = problem.points(starts)
     for k, x in enumerate(points):
         solutions.append(
             problem.search(

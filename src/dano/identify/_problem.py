@@ -14,17 +14,17 @@ from dano.engine import AbstractEngine
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Space
 from dano.identify._residuals import Linearized, linearized, Model, moved
-from dano.identify._windows import plan_windows
+from dano.identify._windows import draw_velocities, plan_windows
 from dano.scene import Control, Scene, State
 from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
 
 # Of each start that is refined, so many are only looked at.
 _LOOKS = 4
-# How often windows may begin anew where those before them end, and by how much a motion's loss must fall.
-_SWEEPS, _BETTER = 2, 5.0
-# How much worse than most a motion fits that should begin anew, with velocities from so few frames: noisier,
-# but no further than a frame from an impact do they know of it.
-_POOR, _NARROW = 2.0, 3
+# How much worse than most a window fits that should begin anew, and by how much a motion's loss must fall.
+_POOR, _BETTER = 2.0, 5.0
+# How often windows may begin anew where those before them end; then with velocities from so few frames, which
+# are noisier, but no further than a frame from an impact do they know of it; then at so many draws of these.
+_SWEEPS, _NARROW, _DRAWS = 2, 3, 8
 # Standard errors to which searches before the last one are near enough.
 _NEAR = 3.0
 # Windows simulated at once on an accelerator; a CPU is fastest one by one.
@@ -45,14 +45,17 @@ class Setup(NamedTuple):
     jacobian: str
     engine: AbstractEngine
     batch: int | None
+    seed: int
 
 
 class Problem:
     """The least squares problem of some motions: residuals of windows over parameters and initial states."""
 
     def __init__(self, setup: Setup, motions: Sequence[Motion], state: Any):
-        space, scene, controls, initial, noise, huber, window, self.ties, jacobian, engine, batch = setup
-        self.space = space
+        space, scene, controls, initial, noise = setup[:5]
+        huber, window, ties, jacobian, engine, batch, seed = setup[5:]
+        self.space, self.noise, self.ties, self.seed = space, noise, ties, seed
+        self.spacing = float(np.median(np.concatenate([np.diff(motion.times) for motion in motions])))
         self.simulations = 0
         self._last: tuple[Model, Array, tuple[State, State], Linearized] | None = None
         policy = controls if callable(controls) else None
@@ -177,7 +180,7 @@ class Problem:
         rows = jnp.asarray(change.reshape(n, self.private), self.model.scene.timestep.dtype)
         return moved(start, rows, self.plan.bodies, self.model.initial)
 
-    def points(self, starts: int, seed: int) -> list[np.ndarray]:
+    def points(self, starts: int) -> list[np.ndarray]:
         """Where to start: the given start, and the best by loss of many others in the bounds."""
         points = [self.space.start]
         if starts == 1:
@@ -187,7 +190,7 @@ class Problem:
         from scipy.stats import qmc
 
         n = _LOOKS * (starts - 1)
-        unit = qmc.Sobol(len(self.space.start), seed=seed).random(1 << (n - 1).bit_length())[:n]
+        unit = qmc.Sobol(len(self.space.start), seed=self.seed).random(1 << (n - 1).bit_length())[:n]
         tried = self.space.lower + unit * (self.space.upper - self.space.lower)
         losses = np.array([self.linearize(x, self.plan.start).loss for x in tried])
         order = np.argsort(np.where(np.isfinite(losses), losses, np.inf))
@@ -198,12 +201,12 @@ class Problem:
     ) -> Solution:
         """Minimise from x; with `free` false over the initial states alone."""
 
-        def minimise(x, blocks, tolerance: float) -> Solution:
+        def minimise(x, blocks, tolerance: float, held: bool = not free) -> Solution:
             return bounded_least_squares(
                 self.linearize,
                 x,
-                lower=self.space.lower if free else x,
-                upper=self.space.upper if free else x,
+                lower=x if held else self.space.lower,
+                upper=x if held else self.space.upper,
                 start_blocks=blocks,
                 retract=self.retract,
                 max_iterations=max_iterations,
@@ -219,69 +222,92 @@ class Problem:
         rough = tolerance if len(self.ties) == 1 else max(tolerance, _NEAR)
         self.model = self.model._replace(jumps=self.ties[0] * self.jumps)
         solution = minimise(x, self.plan.start, rough)
+        first = solution
         if self.measured:
-            solution = self._swept(solution, lambda at, begin: minimise(at, begin, rough))
-        for tie in self.ties[1:]:
+            solution = self._swept(first, lambda *at, held: minimise(*at, rough, held or not free))
+        # Parameters may have been held meanwhile.
+        for tie in self.ties[1:] or (() if solution is first else self.ties):
             if solution.stop is Stop.INTERRUPTED:
                 break
             self.model = self.model._replace(jumps=tie * self.jumps)
             solution = minimise(solution.x, solution.blocks, tolerance if tie == self.ties[-1] else rough)
         return solution
 
-    def _swept(self, solution: Solution, minimise: Callable[[np.ndarray, State], Solution]) -> Solution:
+    def _swept(self, solution: Solution, minimise: Callable[..., Solution]) -> Solution:
         """A better minimum for motions with a window that began in the wrong basin.
 
         What was measured says little of velocities around impacts. Where the window before ends says more,
-        once that window fits: so windows begin there. Motions that then still fit worse than others begin
-        with what only the frames next to theirs say.
+        once that window fits: so windows begin there. Those that then still fit worse than others begin
+        with what only the frames next to theirs say, and within the noise of that.
         """
         for _ in range(_SWEEPS):
-            if solution.stop is Stop.INTERRUPTED:
-                return solution
             found = self.simulate(solution.x, solution.blocks)
             missed = np.asarray(found.jump) * _widths(self.model.jumps, found.jump.shape[1])
             change = np.concatenate([np.zeros_like(missed[:1]), missed[:-1]])
             ends = jnp.asarray(change, self.model.scene.timestep.dtype)
             begin = moved(solution.blocks, ends, self.plan.bodies, self.model.initial)
-            solution, any_better = self._better_of(solution, found, begin, minimise)
-            if not any_better:
+            poor = self._owned(self._fits_poorly(found))
+            # One or two motions may be wrong for the most part.
+            mine = poor[self.plan.owner] if len(poor) > 2 else np.ones(len(self.plan.rows), bool)
+            solution, better = self._better_of(solution, found, mine, begin, minimise)
+            if not better:
                 break
-        if solution.stop is Stop.INTERRUPTED:
-            return solution
-        found = self.simulate(solution.x, solution.blocks)
-        poor = self._fits_poorly(found)
-        if not poor.any():
-            return solution
-        narrow = self._planned(smoothing=_NARROW).start
-        begin = _where(poor[self.plan.owner], narrow, solution.blocks)
-        return self._better_of(solution, found, begin, minimise)[0]
+        narrow, random = None, np.random.default_rng(self.seed)
+        # Too few windows do not tell which of them fits poorly.
+        for draw in range(1 + (_DRAWS if len(self.plan.rows) > 2 else 0)):
+            found = self.simulate(solution.x, solution.blocks)
+            poor = self._fits_poorly(found)
+            if solution.stop is Stop.INTERRUPTED or not poor.any():
+                break
+            narrow = self._planned(smoothing=_NARROW).start if narrow is None else narrow
+            begin = (
+                narrow
+                if draw == 0
+                else draw_velocities(narrow, self.plan.bodies, self.noise, self.spacing, random)
+            )
+            solution, _ = self._better_of(solution, found, poor, begin, minimise)
+        return solution
 
     def _better_of(
         self,
         solution: Solution,
         found: Linearized,
+        windows: np.ndarray,
         begin: State,
-        minimise: Callable[[np.ndarray, State], Solution],
+        minimise: Callable[..., Solution],
     ) -> tuple[Solution, bool]:
-        """The solution, `found` there, with other beginnings for motions that these explain better."""
-        other = minimise(solution.x, begin)
+        """The solution, `found` there, with other beginnings of windows, for motions that fit better then."""
+        if solution.stop is Stop.INTERRUPTED or not windows.any():
+            return solution, False
+        # Where most motions fit, the parameters are good enough to tell which beginning is better; and
+        # only motions that begin anew are simulated.
+        held = bool(np.mean(self._owned(windows)) <= 0.5)
+        other = minimise(solution.x, _where(windows, begin, solution.blocks), held=held)
         if other.stop is Stop.INTERRUPTED:
             return solution._replace(stop=Stop.INTERRUPTED), False
         here, there = self._by_motion(found), self._by_motion(self.simulate(solution.x, other.blocks))
         better = there < here - _BETTER
         if not better.any():
             return solution, False
-        if np.all(there < here + _BETTER):
+        if not held and np.all(there < here + _BETTER):
             return other, True
         blocks = _where(better[self.plan.owner], other.blocks, solution.blocks)
-        return minimise(solution.x, blocks), True
+        if held:
+            return other._replace(blocks=blocks, normal=self.linearize(solution.x, blocks)), True
+        return minimise(solution.x, blocks, held=False), True
 
     def _fits_poorly(self, found: Linearized) -> np.ndarray:
-        """Which motions explain each of their numbers much worse than most do; all if there are too few."""
+        """Which windows explain each of their numbers much worse than most do; all if there are too few."""
         lengths = np.asarray(found.lengths)
-        counts = np.bincount(self.plan.owner, np.sum(lengths >= 0, axis=tuple(range(1, lengths.ndim))))
-        mean = self._by_motion(found) / np.maximum(counts, 1)
-        return mean > _POOR * np.median(mean) if len(mean) > 2 else np.ones(len(mean), bool)
+        counts = np.sum(lengths >= 0, axis=tuple(range(1, lengths.ndim)))
+        losses = np.asarray(found.loss) + 0.5 * np.sum(np.asarray(found.jump) ** 2, axis=1)
+        mean = losses / np.maximum(counts, 1)
+        worse = mean > _POOR * np.median(mean) if len(mean) > 2 else np.ones(len(mean), bool)
+        return worse & (losses > _BETTER)
+
+    def _owned(self, windows: np.ndarray) -> np.ndarray:
+        """Which motions have one of these windows."""
+        return np.bincount(self.plan.owner, windows) > 0
 
     def _by_motion(self, found: Linearized) -> np.ndarray:
         return _by_owner(self.plan.owner, np.asarray(found.loss), np.asarray(found.jump))

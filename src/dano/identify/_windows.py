@@ -176,6 +176,32 @@ def plan_windows(
     )
 
 
+def draw_velocities(
+    start: State,
+    bodies: Sequence[int],
+    noise: Mapping[str, float],
+    spacing: float,
+    random: np.random.Generator,
+) -> State:
+    """Other initial states within the noise of velocities that the poses of three frames say.
+
+    Args:
+        start: Velocities from three frames, that is over twice the spacing.
+        bodies: Those that move.
+        noise: Standard deviations of positions [m] and orientations [rad]; what has none stays.
+        spacing: Time between frames [s].
+        random: Where draws come from.
+    """
+    changed = {}
+    for key, pose in (("velocity", "position"), ("omega", "orientation")):
+        value = getattr(start, key)
+        width = np.zeros(value.shape)
+        # The difference of two poses has the variance of both.
+        width[:, list(bodies)] = np.sqrt(2) * noise.get(pose, 0.0) / (2 * spacing)
+        changed[key] = value + jnp.asarray(width * random.standard_normal(value.shape), value.dtype)
+    return dataclasses.replace(start, **changed)
+
+
 def _on_all_bodies(scene: Scene, motion: Motion, what: str) -> dict[str, np.ndarray]:
     """Quantities of a motion for all bodies of a scene; NaN for those not in it."""
     for name in motion.names:
