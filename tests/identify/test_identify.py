@@ -228,7 +228,7 @@ def test_a_motion_in_a_wrong_basin_among_motions_that_fit():
         [dano.Parameter("gravity", lambda s: s.gravity, -20.0, 20.0, start=[0.0, 0.0, -5.0])],
         initial="states",
         window=4,
-        continuity=1.0,
+        continuity=(1e3, 1.0),
         noise=NOISE,
     )
     spins = np.repeat([3.0, 40.0, -5.0], 3)

@@ -224,7 +224,11 @@ class Problem:
         solution = minimise(x, self.plan.start, rough)
         first = solution
         if self.measured:
-            solution = self._swept(first, lambda *at, held: minimise(*at, rough, held or not free))
+
+            def refit(x, blocks, held: bool) -> Solution:
+                return minimise(x, blocks, rough, held or not free)
+
+            solution = self._redrawn(self._swept(first, refit), refit)
         # Parameters may have been held meanwhile.
         for tie in self.ties[1:] or (() if solution is first else self.ties):
             if solution.stop is Stop.INTERRUPTED:
@@ -237,8 +241,7 @@ class Problem:
         """A better minimum for motions with a window that began in the wrong basin.
 
         What was measured says little of velocities around impacts. Where the window before ends says more,
-        once that window fits: so windows begin there. Those that then still fit worse than others begin
-        with what only the frames next to theirs say, and within the noise of that.
+        once that window fits: so windows begin there.
         """
         for _ in range(_SWEEPS):
             found = self.simulate(solution.x, solution.blocks)
@@ -246,12 +249,19 @@ class Problem:
             change = np.concatenate([np.zeros_like(missed[:1]), missed[:-1]])
             ends = jnp.asarray(change, self.model.scene.timestep.dtype)
             begin = moved(solution.blocks, ends, self.plan.bodies, self.model.initial)
-            poor = self._owned(self._fits_poorly(found))
+            poor = np.bincount(self.plan.owner, self._fits_poorly(found)) > 0
             # One or two motions may be wrong for the most part.
             mine = poor[self.plan.owner] if len(poor) > 2 else np.ones(len(self.plan.rows), bool)
             solution, better = self._better_of(solution, found, mine, begin, minimise)
             if not better:
                 break
+        return solution
+
+    def _redrawn(self, solution: Solution, minimise: Callable[..., Solution]) -> Solution:
+        """A better minimum for motions with a window that still fits worse than others.
+
+        Such windows begin with velocities that only the frames next to theirs say, then within their noise.
+        """
         narrow, random = None, np.random.default_rng(self.seed)
         # Too few windows do not tell which of them fits poorly.
         for draw in range(1 + (_DRAWS if len(self.plan.rows) > 2 else 0)):
@@ -260,11 +270,9 @@ class Problem:
             if solution.stop is Stop.INTERRUPTED or not poor.any():
                 break
             narrow = self._planned(smoothing=_NARROW).start if narrow is None else narrow
-            begin = (
-                narrow
-                if draw == 0
-                else draw_velocities(narrow, self.plan.bodies, self.noise, self.spacing, random)
-            )
+            begin = narrow
+            if draw > 0:
+                begin = draw_velocities(narrow, self.plan.bodies, self.noise, self.spacing, random)
             solution, _ = self._better_of(solution, found, poor, begin, minimise)
         return solution
 
@@ -279,9 +287,9 @@ class Problem:
         """The solution, `found` there, with other beginnings of windows, for motions that fit better then."""
         if solution.stop is Stop.INTERRUPTED or not windows.any():
             return solution, False
-        # Where most motions fit, the parameters are good enough to tell which beginning is better; and
-        # only motions that begin anew are simulated.
-        held = bool(np.mean(self._owned(windows)) <= 0.5)
+        # Where most windows fit, the parameters are good enough to tell which beginning is better; and only
+        # motions that begin anew are simulated.
+        held = bool(np.mean(windows) <= 0.5)
         other = minimise(solution.x, _where(windows, begin, solution.blocks), held=held)
         if other.stop is Stop.INTERRUPTED:
             return solution._replace(stop=Stop.INTERRUPTED), False
@@ -304,10 +312,6 @@ class Problem:
         mean = losses / np.maximum(counts, 1)
         worse = mean > _POOR * np.median(mean) if len(mean) > 2 else np.ones(len(mean), bool)
         return worse & (losses > _BETTER)
-
-    def _owned(self, windows: np.ndarray) -> np.ndarray:
-        """Which motions have one of these windows."""
-        return np.bincount(self.plan.owner, windows) > 0
 
     def _by_motion(self, found: Linearized) -> np.ndarray:
         return _by_owner(self.plan.owner, np.asarray(found.loss), np.asarray(found.jump))
