@@ -21,6 +21,7 @@ from dano.vision import (
     View,
 )
 from dano.vision._hull import object_box, redistanced, silhouettes
+from dano.vision._train import Progress, reason_to_stop
 
 VOLUME = 4 / 3 * np.pi * float(np.prod(SEMI_AXES))
 QUICK = TrainOptions(resolution=32, iterations=150, batch=512, features=4, check_every=50, cavities=False)
@@ -199,12 +200,34 @@ def test_bad_masks_are_refused(photos: Capture):
         survey(with_mask(None), 32)
 
 
+def looks(psnr: list[float], iou: list[float], volume: list[float]) -> list[Progress]:
+    """Looks at held-out views, the last of them after all steps."""
+    n = len(psnr)
+    rows = zip(psnr, iou, volume, strict=True)
+    return [Progress(100 * (i + 1), 100 * n, 0.0, 0.0, 0.0, *row) for i, row in enumerate(rows)]
+
+
+def test_training_stops_when_outlines_become_worse_or_nothing_changes():
+    better, shrinking = [24.0, 25.0, 26.0, 27.0, 28.0], [5.0, 4.0, 3.0, 2.0, 1.0]
+    eaten = [0.98, 0.982, 0.975, 0.974, 0.973]
+    assert reason_to_stop(looks(better, eaten, shrinking), 0.002) == "geometry"
+    # Silhouettes that do not fit together by 4 % cannot tell.
+    assert reason_to_stop(looks(better, eaten, shrinking), 0.04) is None
+    level = [0.98] * 5
+    assert reason_to_stop(looks(better, level, shrinking), 0.002) is None
+    assert reason_to_stop(looks([28.0] * 5, level, [1.0] * 5), 0.002) == "converged"
+    # Too early: the surface is still being made sharp.
+    early = [entry._replace(iterations=1000) for entry in looks(better, eaten, shrinking)]
+    assert reason_to_stop(early, 0.002) is None
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"resolution": 4}, "resolution must lie"),
         ({"iterations": 0}, "iterations must lie"),
         ({"rate_distance": 0.0}, "rate_distance must be positive"),
+        ({"rate_features": -0.1}, "rate_features must be positive"),
         ({"mask_weight": -1.0}, "mask_weight must be"),
         ({"seconds": 0.0}, "seconds must be positive"),
     ],

@@ -159,7 +159,7 @@ def _fog(views, distance, box, lit, key, n_steps, progress) -> np.ndarray:
         key=jax.random.fold_in(key, 0),
     )
     model = DensityModel.create(inside, box, look, _THICKNESS)
-    optimiser = _optimiser()
+    optimiser = _optimiser(lit)
     state = optimiser.init(_trainable(model))
     allowed = jnp.asarray(inside)
     for i in range(n_steps):
@@ -176,8 +176,10 @@ def _trainable(model: DensityModel) -> Any:
     return model.raw, model.appearance.features, model.appearance.network
 
 
-def _optimiser() -> Any:
-    return adam({"density": 0.3, "features": 0.02, "network": 0.005})
+def _optimiser(lit: bool) -> Any:
+    # Without a light, features alone say which places are bright; slow ones leave that to the density, which
+    # then stays where the hull is.
+    return adam({"density": 0.3, "features": 0.02 if lit else 0.1, "network": 0.005})
 
 
 def _loss(
@@ -207,5 +209,5 @@ def _step(model, state, rays, allowed, decay, key):
     pick, own = jax.random.split(key)
     parts = _trainable(model)
     value, gradient = jax.value_and_grad(_loss)(parts, model, allowed, rays.drawn(_BATCH, pick), own)
-    updates, state = updates_of(_optimiser(), gradient, state, parts, decay)
+    updates, state = updates_of(_optimiser(model.appearance.lit), gradient, state, parts, decay)
     return eqx.tree_at(_trainable, model, optax.apply_updates(parts, updates)), state, value

@@ -15,7 +15,8 @@ class TrainOptions:
         batch: Rays per step.
         features: Numbers that say what a place looks like.
         rate_distance: Learning rate of the distances, in cells per step.
-        rate_features: Learning rate of the features.
+        rate_features: Learning rate of the features; None for 0.01 where the light of photographs is known,
+            and 0.1 where it is not and features alone say which places are bright.
         rate_network: Learning rate of the network.
         mask_weight: Weight of the mask's error.
         eikonal_weight: Weight of (|∇d| − 1)².
@@ -33,7 +34,7 @@ class TrainOptions:
     batch: int = 4096
     features: int = 8
     rate_distance: float = 0.25
-    rate_features: float = 0.01
+    rate_features: float | None = None
     rate_network: float = 0.003
     mask_weight: float = 0.5
     eikonal_weight: float = 0.05
@@ -61,9 +62,12 @@ class TrainOptions:
         for name, (low, high) in ranges.items():
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"{name} must lie between {low} and {high}, got {getattr(self, name)}")
-        for name in ("rate_distance", "rate_features", "rate_network"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        rates = {"rate_distance": self.rate_distance, "rate_network": self.rate_network}
+        if self.rate_features is not None:
+            rates["rate_features"] = self.rate_features
+        for name, rate in rates.items():
+            if not (np.isfinite(rate) and rate > 0):
+                raise ValueError(f"{name} must be positive, got {rate}")
         for name in ("mask_weight", "eikonal_weight", "smoothness_weight"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ValueError(f"{name} must be ≥ 0, got {getattr(self, name)}")
@@ -71,3 +75,7 @@ class TrainOptions:
             raise ValueError(f"blur must be positive, got {self.blur}")
         if self.seconds is not None and not self.seconds > 0:
             raise ValueError(f"seconds must be positive, got {self.seconds}")
+
+    def rate_of_features(self, *, lit: bool) -> float:
+        """`rate_features`, or the rate for photographs whose light is known (`lit`) or not."""
+        return self.rate_features or (0.01 if lit else 0.1)

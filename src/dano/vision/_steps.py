@@ -55,25 +55,26 @@ class Learned(eqx.Module):
         return eqx.tree_at(lambda learned: learned.parts, self, parts)
 
 
-def optimiser_of(options: TrainOptions) -> Any:
-    """Adam with a rate for each of `Learned.parts`."""
+def optimiser_of(options: TrainOptions, *, lit: bool) -> Any:
+    """Adam with a rate for each of `Learned.parts`; `lit` says whether the light is known."""
     # Half the longest side of the box is the unit of distances.
     cell = 2 / options.resolution
     return adam(
         {
             "distance": options.rate_distance * cell,
-            "features": options.rate_features,
+            "features": options.rate_of_features(lit=lit),
             "network": options.rate_network,
             "cameras": _RATE_CAMERAS,
         }
     )
 
 
-def make_step(options: TrainOptions) -> Callable[..., tuple[Learned, Any, Array]]:
+def make_step(options: TrainOptions, *, lit: bool) -> Callable[..., tuple[Learned, Any, Array]]:
     """One step of the optimiser on a random batch of rays, compiled.
 
     Args:
         options: Of the training.
+        lit: Whether the light of the photographs is known.
 
     Returns:
         A function of what is learned, state of the optimiser, rays, sharpness [1/m], factor of all rates,
@@ -83,7 +84,7 @@ def make_step(options: TrainOptions) -> Callable[..., tuple[Learned, Any, Array]
     import optax
 
     sampling = Sampling(48, 16, 5)
-    optimiser = optimiser_of(options)
+    optimiser = optimiser_of(options, lit=lit)
 
     def loss(
         parts: Any, learned: Learned, batch: RaySet, sharpness: Array, view_share: Array, key: PRNGKeyArray

@@ -192,7 +192,7 @@ class _Trainer:
         few = [held[i] for i in np.unique(np.linspace(0, len(held) - 1, 6).round().astype(int))]
         self.checked = [view.resized(max(1, min(view.image.shape[:2]) // 96)) for view in few]
         self.switch = options.iterations // 3
-        self.step = make_step(options)
+        self.step = make_step(options, lit=capture.is_lit)
         self.middle = 0.5 * (found.box.origin + found.box.upper)
         self.pixel = pixel_at(capture.split("train"), self.middle)
 
@@ -226,7 +226,8 @@ class _Trainer:
         return self._begun(Learned(model, cameras), 0, jnp.float32(blur))
 
     def _begun(self, learned: Learned, iteration: int, blur: Float[Array, ""]) -> _State:
-        return _State(learned, optimiser_of(self.options).init(learned.parts), iteration, blur)
+        optimiser = optimiser_of(self.options, lit=self.capture.is_lit)
+        return _State(learned, optimiser.init(learned.parts), iteration, blur)
 
     def refined(self, state: _State) -> _State:
         """The state on the fine grid; the optimiser's memory starts anew."""
@@ -310,7 +311,7 @@ class _Trainer:
                     merit = (entry.mask_iou or 0.0) + 0.002 * (entry.psnr or 0.0)
                     if merit > best_score:
                         best, best_score = state, merit
-                    if reason := self._reason_to_stop():
+                    if reason := reason_to_stop(self.history, self.found.residual):
                         stopped = reason
                         break
                 elif self.progress is not None and state.iteration % 5 == 0:
@@ -367,20 +368,6 @@ class _Trainer:
             self.progress(entry)
         return entry
 
-    def _reason_to_stop(self) -> Stopped | None:
-        """Whether the outlines of held-out views have become worse, or nothing changes any more."""
-        if len(self.history) < 4 or self.history[-1].iteration < 0.7 * self.options.iterations:
-            # Until then the surface is still being made sharp.
-            return None
-        overlap = [entry.mask_iou or 0.0 for entry in self.history]
-        # Brighter pictures with worse outlines: training has begun to eat into the solid.
-        if max(overlap[:-2]) - max(overlap[-2:]) > 0.004:
-            return "geometry"
-        quality = [entry.psnr or 0.0 for entry in self.history]
-        volumes = [entry.volume for entry in self.history[-3:]]
-        settled = max(volumes) - min(volumes) < 5e-4 * volumes[-1]
-        return "converged" if settled and max(quality[-2:]) < max(quality[:-2]) + 0.03 else None
-
     def _save(self, state: _State) -> None:
         if self.checkpoint is not None:
             rows = [[np.nan if x is None else float(x) for x in entry] for entry in self.history]
@@ -406,6 +393,27 @@ class _Trainer:
             Progress(int(row[0]), int(row[1]), *(float(x) for x in row[2:])) for row in stored.history
         ]
         return _State(learned, optimiser, stored.iteration, blur)
+
+
+def reason_to_stop(history: Sequence[Progress], residual: float) -> Stopped | None:
+    """Whether the outlines of held-out views have become worse, or nothing changes any more.
+
+    Args:
+        history: All looks at held-out views.
+        residual: Share of the silhouettes that no solid explains (see `Survey`).
+    """
+    if len(history) < 4 or history[-1].iteration < 0.7 * history[-1].iterations:
+        # Until then the surface is still being made sharp.
+        return None
+    overlap = [entry.mask_iou or 0.0 for entry in history]
+    # Brighter pictures with worse outlines: training has begun to eat into the solid. Outlines that do not
+    # agree with one another cannot tell that any more exactly.
+    if max(overlap[:-2]) - max(overlap[-2:]) > max(0.004, 0.5 * residual):
+        return "geometry"
+    quality = [entry.psnr or 0.0 for entry in history]
+    volumes = [entry.volume for entry in history[-3:]]
+    settled = max(volumes) - min(volumes) < 5e-4 * volumes[-1]
+    return "converged" if settled and max(quality[-2:]) < max(quality[:-2]) + 0.03 else None
 
 
 def pixel_at(views: Sequence[View], point: Float[np.ndarray, "3"]) -> float:
