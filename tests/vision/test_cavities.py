@@ -7,7 +7,7 @@ import pytest
 from vision.photographs import pose
 
 from dano.vision import Box, Capture, PosedCamera, survey, View
-from dano.vision._cavities import find_cavities, without_cavities
+from dano.vision._cavities import find_cavities, without_cavities, witnesses
 from dano.vision._models import roughness
 
 RADIUS, HEIGHT, WALL = 0.05, 0.06, 0.014  # [m]
@@ -30,6 +30,10 @@ def box() -> Box:
     return Box.around(np.array([-0.06, -0.06, -0.04]), np.array([0.06, 0.06, 0.04]), 48)
 
 
+def everywhere(box: Box) -> np.ndarray:
+    return np.ones(box.shape, bool)
+
+
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sum(a & b) / np.sum(a | b))
 
@@ -43,7 +47,7 @@ def test_a_ball_rolls_into_the_cup_but_not_through_a_pore(box: Box):
     deep = np.abs(true + 0.5 * WALL) < 1.2 * box.spacing
     opacity[deep & (box.nodes[:, 2].reshape(box.shape) < -0.02)] = 0
     opacity[middle[0], middle[1], : middle[2]] = 0
-    found = without_cavities(opacity, box, hull, box, 0.0, 0.5)
+    found = without_cavities(opacity, everywhere(box), box, hull, box, 0.0, 0.5)
     assert found is not None
     assert overlap(found.distance < 0, true < 0) > 0.93
     assert overlap(hull < 0, true < 0) < 0.7
@@ -52,9 +56,35 @@ def test_a_ball_rolls_into_the_cup_but_not_through_a_pore(box: Box):
 
 def test_a_solid_without_cavities_stays_as_it_is(box: Box):
     hull = hull_of_cup(box.nodes).reshape(box.shape)
-    found = without_cavities((hull < 0).astype(float), box, hull, box, 0.0, 0.5)
+    found = without_cavities((hull < 0).astype(float), everywhere(box), box, hull, box, 0.0, 0.5)
     assert found is not None and found.share < 0.01
-    assert without_cavities(np.zeros(box.shape), box, hull, box, 0.0, 0.5) is None
+    nothing = np.zeros(box.shape)
+    assert without_cavities(nothing, everywhere(box), box, hull, box, 0.0, 0.5) is None
+
+
+def test_what_no_camera_looks_into_stays_solid(box: Box):
+    # A shell that is open below, as fog leaves a solid on a table that is seen from above only.
+    hull = hull_of_cup(box.nodes).reshape(box.shape)
+    below = box.nodes * [1, 1, -1]
+    shell = np.clip(0.5 - cup_distance(below).reshape(box.shape) / box.spacing, 0, 1)
+
+    def cameras(side: float) -> list[View]:
+        rim = [[np.cos(a), np.sin(a), side] for a in np.arange(8) * np.pi / 4]
+        views = []
+        for away in np.array([[0.1, 0, side], [0, 0.1, side], *rim]) :
+            matrix = pose(away / np.linalg.norm(away))
+            matrix[:3, 3] = 0.4 * away / np.linalg.norm(away)
+            camera = PosedCamera(matrix, focal=60.0, width=32, height=32)
+            views.append(View(name="", camera=camera, image=np.zeros((32, 32, 3), np.float32)))
+        return views
+
+    seen, unseen = (witnesses(shell, box, cameras(side)) for side in (-1.0, 1.0))
+    middle = tuple(n // 2 for n in box.shape)
+    assert seen[middle] > 2 and unseen[middle] == 0
+    hollow = without_cavities(shell, seen >= 2, box, hull, box, 0.0, 0.5)
+    whole = without_cavities(shell, unseen >= 2, box, hull, box, 0.0, 0.5)
+    assert hollow is not None and hollow.share > 0.3
+    assert whole is not None and whole.share < 0.01
 
 
 def photographs(n: int, pixels: int) -> Capture:

@@ -29,6 +29,8 @@ class View(eqx.Module):
         split: One of `SPLITS` (static).
         cut_out: Whether `image` shows the object alone, over black (static).
         background: Colour that it was photographed against, if that is plain and known, shape (3,).
+        doubt: How far the mask of each pixel may be wrong, (height, width): 1 where shadow on the object may
+            have been taken for background (see `with_doubts`); None for nowhere.
     """
 
     name: str = eqx.field(static=True)
@@ -40,6 +42,12 @@ class View(eqx.Module):
     split: str = eqx.field(static=True, default="train")
     cut_out: bool = eqx.field(static=True, default=False)
     background: Float[np.ndarray, "3"] | None = None
+    doubt: Float[np.ndarray, "height width"] | None = None
+
+    @property
+    def possible(self) -> Float[np.ndarray, "height width"] | None:
+        """Share of each pixel that the object may cover: the mask, and what is doubted of it."""
+        return self.mask if self.mask is None or self.doubt is None else np.maximum(self.mask, self.doubt)
 
     @property
     def backdrop(self) -> Float[np.ndarray, "3"]:
@@ -73,8 +81,8 @@ class View(eqx.Module):
             width=width // factor,
             height=height // factor,
         )
-        mask = None if self.mask is None else shrunk(self.mask)
-        return self.replaced(camera=camera, image=shrunk(self.image), mask=mask)
+        mask, doubt = (None if a is None else shrunk(a) for a in (self.mask, self.doubt))
+        return self.replaced(camera=camera, image=shrunk(self.image), mask=mask, doubt=doubt)
 
 
 class Capture(eqx.Module):

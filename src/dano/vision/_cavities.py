@@ -10,6 +10,9 @@ there is a cavity. Three things make this work within seconds:
 - Colours do not depend on the direction of view, so that they cannot explain away a wrong depth.
 - Opacities of cells are drawn to 0 or 1 (entropy-like a (1 − a)) and to those of their neighbours (total
   variation), or the fog stays a fog.
+
+The ball rolls only where photographs show that nothing is: what no camera looks into, such as the inside of
+something that stands on a table, stays solid.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy import ndimage
 
 from dano.vision._adam import adam, updates_of
@@ -46,6 +49,9 @@ _MASK_WEIGHT, _CLEAR_WEIGHT, _EVEN_WEIGHT = 0.01, 0.01, 0.005
 
 _BALL = 2.5
 """Radius in cells of the ball that must fit into a cavity: a pore in a wall is none."""
+
+_WITNESSES, _SEEN = 2, 0.3
+"""Cameras that must look at a place for it to be known as empty, and share of their light that gets there."""
 
 _READINGS = ((1.0, 0.2), (0.0, 0.5))
 """Cells over which opacities are averaged, and the average that stops the ball. The first reading keeps thin
@@ -93,12 +99,51 @@ def find_cavities(
     """
     coarse = Box.around(box.origin, box.upper, min(_RESOLUTION, max(box.shape)))
     opacity = _fog(views, resampled(hull, box, coarse), coarse, lit, key, n_steps, progress)
-    found = (without_cavities(opacity, coarse, hull, box, *reading) for reading in _READINGS)
+    known = witnesses(opacity, coarse, views) >= _WITNESSES
+    found = (without_cavities(opacity, known, coarse, hull, box, *reading) for reading in _READINGS)
     return tuple(each for each in found if each is not None)
+
+
+def witnesses(
+    opacity: Float[np.ndarray, "mx my mz"], coarse: Box, views: Sequence[View]
+) -> Int[np.ndarray, "mx my mz"]:
+    """Number of cameras that see each node through a fog; the cells around a node do not hide it."""
+    thickness = jnp.asarray(-np.log1p(-np.clip(opacity, 0, 0.999)), jnp.float32)
+    nodes = jnp.asarray(np.argwhere(np.ones(coarse.shape, bool)).T, jnp.float32)
+    count = np.zeros(nodes.shape[1], int)
+    for view in views:
+        camera = jnp.asarray((view.camera.position - coarse.origin) / coarse.spacing, jnp.float32)
+        image = view.camera.project(coarse.nodes)
+        with np.errstate(invalid="ignore"):
+            size = view.camera.width, view.camera.height
+            inside = np.all((image[:, :2] > 0) & (image[:, :2] < size), axis=1)
+        count += inside & (np.asarray(_thickness_before(thickness, nodes, camera)) < -np.log(_SEEN))
+    return count.reshape(coarse.shape)
+
+
+@jax.jit
+def _thickness_before(
+    thickness: Float[Array, "mx my mz"], nodes: Float[Array, "3 n"], camera: Float[Array, "3"]
+) -> Float[Array, " n"]:
+    """Optical thickness between nodes and a camera, in index coordinates, in steps of a cell."""
+    away = camera[:, None] - nodes
+    away = away * jax.lax.rsqrt(jnp.sum(away * away, axis=0))[None]
+    last = jnp.asarray(np.array(thickness.shape)[:, None] - 1, jnp.int32)
+    zero = jnp.zeros_like(last)
+
+    def further(step: Array, total: Array) -> Array:
+        node = jnp.round(nodes + (step.astype(jnp.float32) + 1.5) * away).astype(jnp.int32)
+        there = jnp.clip(node, zero, last)
+        within = jnp.all(node == there, axis=0)
+        return total + jnp.where(within, thickness[there[0], there[1], there[2]], 0)
+
+    steps = int(np.ceil(np.linalg.norm(thickness.shape)))
+    return jax.lax.fori_loop(0, steps, further, jnp.zeros(nodes.shape[1], jnp.float32))
 
 
 def without_cavities(
     opacity: Float[np.ndarray, "mx my mz"],
+    known: Bool[np.ndarray, "mx my mz"],
     coarse: Box,
     hull: Float[np.ndarray, "nx ny nz"],
     box: Box,
@@ -109,6 +154,7 @@ def without_cavities(
 
     Args:
         opacity: Of the cells around the nodes of `coarse`, in [0, 1].
+        known: Nodes that cameras look at: the others stop the ball.
         coarse: Nodes.
         hull: Signed distance [m] of the visual hull at the nodes of `box`.
         box: Nodes.
@@ -125,7 +171,7 @@ def without_cavities(
     if count == 0:
         return None
     sizes = ndimage.sum_labels(np.ones_like(smooth), labels, np.arange(1, count + 1))
-    walls = np.isin(labels, 1 + np.flatnonzero(sizes > 0.1 * sizes.max()))
+    walls = np.isin(labels, 1 + np.flatnonzero(sizes > 0.1 * sizes.max())) | (inside & ~known)
     pad = int(np.ceil(2 * _BALL)) + 1
     clear = np.asarray(ndimage.distance_transform_edt(np.pad(~walls, pad, constant_values=True)))
     centres, _ = ndimage.label(clear > _BALL)
@@ -196,7 +242,7 @@ def _loss(
     uneven = sum((jnp.mean(jnp.abs(jnp.diff(cell, axis=axis))) for axis in range(3)), jnp.float32(0))
     return (
         jnp.mean((met - batch.colour) ** 2)
-        + _MASK_WEIGHT * jnp.mean((seen.opacity - batch.mask) ** 2)
+        + _MASK_WEIGHT * jnp.mean((1 - batch.doubt) * (seen.opacity - batch.mask) ** 2)
         + _CLEAR_WEIGHT * unclear
         + _EVEN_WEIGHT * uneven
     )

@@ -13,7 +13,7 @@ from dano.fields._signed_distance import spread_distances
 from dano.vision._camera import PosedCamera
 from dano.vision._capture import View
 
-_LOST = 0.02
+LOST = 0.02
 """Share of the views that may miss a point of the object: one bad mask does not cut a hole into it."""
 
 _CHUNK = 1 << 18
@@ -54,7 +54,7 @@ class Box(NamedTuple):
 
 
 def silhouettes(
-    points: Float[np.ndarray, "n 3"], views: Sequence[View], lost: float = _LOST
+    points: Float[np.ndarray, "n 3"], views: Sequence[View], lost: float = LOST
 ) -> tuple[np.ndarray, np.ndarray]:
     """How many views see points [m, W], and how well the silhouettes of those views cover them.
 
@@ -62,8 +62,8 @@ def silhouettes(
         Number of views that have each point in their image, (n,), and the value that all of these masks but
         the share `lost` of them reach at it, (n,): above ½ for points of the hull, 1 where no view looks.
     """
-    masked = [view for view in views if view.mask is not None]
-    size = max(max(view.mask.shape) for view in masked if view.mask is not None)
+    masked = [(view, view.possible) for view in views if view.possible is not None]
+    size = max(max(possible.shape) for _, possible in masked)
     n_spare = int(lost * len(masked))
     seen, least = [], []
     for start in range(0, len(points), _CHUNK):
@@ -72,9 +72,9 @@ def silhouettes(
         padded = np.pad(part, ((0, -len(part) % _GRANULE), (0, 0))).T.astype(np.float32)
         n_seen = jnp.zeros(padded.shape[1], jnp.int32)
         lowest = jnp.ones((n_spare + 1, padded.shape[1]), jnp.float32)
-        for view in masked:
+        for view, possible in masked:
             mask = np.zeros((size, size), np.float32)
-            mask[: view.camera.height, : view.camera.width] = view.mask
+            mask[: view.camera.height, : view.camera.width] = possible
             n_seen, lowest = _carve(mask, _numbers(view.camera), padded, n_seen, lowest)
         seen.append(np.asarray(n_seen)[: len(part)])
         least.append(np.asarray(lowest[n_spare])[: len(part)])
@@ -182,7 +182,9 @@ def viewed_ball(views: Sequence[View]) -> tuple[np.ndarray, float]:
     return centre, float(np.linalg.norm(positions - centre, axis=1).min())
 
 
-def hull_distance(views: Sequence[View], box: Box) -> Float[np.ndarray, "nx ny nz"]:
+def hull_distance(
+    views: Sequence[View], box: Box, lost: float = LOST
+) -> Float[np.ndarray, "nx ny nz"]:
     """Signed distance [m] of the visual hull at the nodes of a grid, accurate to a fraction of a cell.
 
     The least mask value over the views crosses ½ on the hull; where it does along the grid's edges lie points
@@ -191,7 +193,7 @@ def hull_distance(views: Sequence[View], box: Box) -> Float[np.ndarray, "nx ny n
     Raises:
         ValueError: If no node is inside.
     """
-    _, cover = silhouettes(box.nodes, views)
+    _, cover = silhouettes(box.nodes, views, lost)
     value = cover.reshape(box.shape) - 0.5
     # Outside on the border, so that the hull is closed where no view looks.
     border = np.ones(box.shape, dtype=bool)

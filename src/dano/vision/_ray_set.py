@@ -24,12 +24,16 @@ class RaySet(NamedTuple):
         rays: Those that may meet the object.
         colour: sRGB over black of the object alone, shape (rays, 3).
         mask: Share of the pixel that the object covers, shape (rays,).
+        doubt: How far that may be wrong, shape (rays,).
+        backdrop: What the object was photographed against, or white, shape (rays, 3).
         view: Number of the view that each belongs to, shape (rays,).
     """
 
     rays: Rays
     colour: Float[Array, "rays 3"]
     mask: Float[Array, " rays"]
+    doubt: Float[Array, " rays"]
+    backdrop: Float[Array, "rays 3"]
     view: Int[Array, " rays"]
 
     def drawn(self, n: int, key: PRNGKeyArray) -> "RaySet":
@@ -111,7 +115,7 @@ def collect(views: Sequence[View], box: Box, occupied: Bool[np.ndarray, "nx ny n
     Raises:
         ValueError: If there is none.
     """
-    rays, colours, masks = [], [], []
+    rays, colours, masks, doubts, backdrops = [], [], [], [], []
     for view in views:
         if view.mask is None:
             raise ValueError(f"{view.name} must have a mask")
@@ -119,12 +123,14 @@ def collect(views: Sequence[View], box: Box, occupied: Bool[np.ndarray, "nx ny n
         rays.append(found)
         colours.append(view.over(np.zeros(3)).reshape(-1, 3)[pixels])
         masks.append(view.mask.reshape(-1)[pixels])
+        doubt = np.zeros_like(view.mask) if view.doubt is None else view.doubt
+        doubts.append(doubt.reshape(-1)[pixels])
+        backdrops.append(np.broadcast_to(view.backdrop, (len(pixels), 3)))
     if not sum(map(len, masks)):
         raise ValueError("no ray of any view meets the object")
     columns = [jnp.asarray(np.concatenate(column), jnp.float32) for column in zip(*rays, strict=True)]
     return RaySet(
         Rays(*columns),
-        jnp.asarray(np.concatenate(colours), jnp.float32),
-        jnp.asarray(np.concatenate(masks), jnp.float32),
+        *(jnp.asarray(np.concatenate(x), jnp.float32) for x in (colours, masks, doubts, backdrops)),
         jnp.asarray(np.repeat(np.arange(len(views), dtype=np.int32), [len(mask) for mask in masks])),
     )

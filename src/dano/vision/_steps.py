@@ -5,7 +5,8 @@ Rays are rendered in front of random backgrounds, so that transparency cannot pa
     E |c + (1 − o) b − C − (1 − M) b|²  +  w_m |o − M|²  +  w_e (|∇d| − 1)²  +  w_s (h ∇²d)²
 
 with c, o the rendered colour and opacity, C, M the photograph and its mask, b the background, and the last
-two terms over nodes near the surface, which keep d a smooth signed distance.
+two terms over nodes near the surface, which keep d a smooth signed distance. Where a mask is doubted the object
+may be there or not, as long as the photograph comes out: b is its own background, and w_m is 0.
 """
 
 from collections.abc import Callable
@@ -95,13 +96,15 @@ def make_step(options: TrainOptions, *, lit: bool) -> Callable[..., tuple[Learne
             rays = learned.cameras.moved(rays, batch.view)
             stated = jnp.mean(learned.cameras.corrections**2)
         jitter, paint = jax.random.split(key)
+        doubt = batch.doubt[:, None]
         background = jax.random.uniform(paint, batch.colour.shape, jnp.float32)
+        background = (1 - doubt) * background + doubt * batch.backdrop
         seen = see(model, rays, sharpness, sampling=sampling, view_share=view_share, key=jitter)
         wanted = batch.colour + (1 - batch.mask)[:, None] * background
         got = seen.colour + (1 - seen.opacity)[:, None] * background
         eikonal, bending = roughness(model.distance, model.spacing / model.scale)
         error = jnp.mean((got - wanted) ** 2) + options.mask_weight * jnp.mean(
-            (seen.opacity - batch.mask) ** 2
+            (1 - batch.doubt) * (seen.opacity - batch.mask) ** 2
         )
         smooth = options.eikonal_weight * eikonal + options.smoothness_weight * bending
         return error + smooth + _STATED * stated, error

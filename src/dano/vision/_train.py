@@ -20,6 +20,7 @@ from dano.vision._adjustment import Adjustment
 from dano.vision._appearance import Appearance
 from dano.vision._capture import Capture, View
 from dano.vision._cavities import find_cavities, STEPS
+from dano.vision._doubt import with_doubts
 from dano.vision._hull import Box, object_box, resampled
 from dano.vision._learned import LearnedField
 from dano.vision._metrics import mask_iou, psnr
@@ -143,7 +144,7 @@ def train(
     if len(near) > 1:
         raise ValueError("lights must be given as directions or as positions, got some of each")
     capture = _shrunk(capture, options)
-    found = survey(capture, options.resolution)
+    capture, found = with_doubts(capture, survey(capture, options.resolution))
     trainer = _Trainer(
         capture, options, found, Path(checkpoint) if checkpoint is not None else None, progress, folder
     )
