@@ -11,8 +11,8 @@ there is a cavity. Three things make this work within seconds:
 - Opacities of cells are drawn to 0 or 1 (entropy-like a (1 − a)) and to those of their neighbours (total
   variation), or the fog stays a fog.
 
-The ball rolls only where photographs show that nothing is: what no camera looks into, such as the inside of
-something that stands on a table, stays solid.
+The ball rolls only where cameras look: what none looks into, such as the inside of something that stands on a
+table, stays solid.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,8 +50,11 @@ _MASK_WEIGHT, _CLEAR_WEIGHT, _EVEN_WEIGHT = 0.01, 0.01, 0.005
 _BALL = 2.5
 """Radius in cells of the ball that must fit into a cavity: a pore in a wall is none."""
 
-_WITNESSES, _SEEN = 2, 0.3
-"""Cameras that must look at a place for it to be known as empty, and share of their light that gets there."""
+_LEAST_WITNESSES, _WITNESSES = 2, (0.0, 0.06, 0.15)
+"""Cameras that must look at a place for it to be empty, at least, and as shares of all: one reading each."""
+
+_SEEN = 0.3
+"""Share of a place's light that must reach a camera that looks at it."""
 
 _READINGS = ((1.0, 0.2), (0.0, 0.5))
 """Cells over which opacities are averaged, and the average that stops the ball. The first reading keeps thin
@@ -79,11 +82,13 @@ def find_cavities(
     key: PRNGKeyArray,
     n_steps: int = STEPS,
     progress: Callable[[], None] | None = None,
-) -> tuple[Cavities, ...]:
+) -> tuple[tuple[Cavities, ...], ...]:
     """Look for cavities of the visual hull.
 
     What is right depends on walls and texture, and nothing at all may be: a translucent object is a fog.
-    Whoever asks should try which of the readings, or the hull, a surface explains the photographs best from.
+    Whoever asks should try which of the readings, or the hull, a surface explains the photographs best from,
+    and whether it explains them as well from one that opens only what more cameras look into: where few do, a
+    fog may be thin because nothing says that it is not.
 
     Args:
         views: Photographs with masks.
@@ -95,13 +100,17 @@ def find_cavities(
         progress: Called after every few steps.
 
     Returns:
-        Readings of the fog that leave something of the hull.
+        Readings of the fog that leave something of the hull; of each the one that opens most comes first.
     """
     coarse = Box.around(box.origin, box.upper, min(_RESOLUTION, max(box.shape)))
     opacity = _fog(views, resampled(hull, box, coarse), coarse, lit, key, n_steps, progress)
-    known = witnesses(opacity, coarse, views) >= _WITNESSES
-    found = (without_cavities(opacity, known, coarse, hull, box, *reading) for reading in _READINGS)
-    return tuple(each for each in found if each is not None)
+    count = witnesses(opacity, coarse, views)
+    enough = sorted({max(_LEAST_WITNESSES, int(np.ceil(share * len(views)))) for share in _WITNESSES})
+    found = (
+        [without_cavities(opacity, count >= n, coarse, hull, box, *reading) for n in enough]
+        for reading in _READINGS
+    )
+    return tuple(tuple(each for each in reading if each is not None) for reading in found)
 
 
 def witnesses(

@@ -39,6 +39,9 @@ _WORTH_TRYING = 0.003
 _CLOSE = 0.2
 """Blur [pixels] of a surface that starts without the cavities of the hull."""
 
+_NO_WORSE = 1.005
+"""Factor of the error up to which a surface explains photographs as well as another."""
+
 _TRIAL = 80
 """Steps that tell whether a surface without cavities explains more."""
 
@@ -251,15 +254,31 @@ class _Trainer:
             n_steps=min(STEPS, max(1, self.options.iterations // 2)),
             progress=self._searched,
         )
-        worth = [each.distance for each in found if each.share > _WORTH_TRYING]
+        worth = [[each for each in reading if each.share > _WORTH_TRYING] for reading in found]
+        worth = [reading for reading in worth if reading]
         if not worth:
             return hull
         # Blur helps to find the way from a hull; a start that is close already would be filled up by it.
         sharp = min(_CLOSE, self.options.blur[0])
         rays = self._rays(0)
-        starts = [self.fresh(start, sharp) for start in (self.found.hull, *worth)]
-        best = min(range(len(starts)), key=lambda i: self._trial(starts[i], rays))
-        return starts[best] if best > 0 else hull
+
+        def tried(distance: np.ndarray) -> tuple[float, _State]:
+            start = self.fresh(distance, sharp)
+            return self._trial(start, rays), start
+
+        without, _ = tried(self.found.hull)
+        trials = [tried(reading[0].distance) for reading in worth]
+        best = min(range(len(trials)), key=lambda i: trials[i][0])
+        (error, start), opened = trials[best], worth[best][0].share
+        if error >= without:
+            return hull
+        for other in worth[best][1:]:
+            # What explains no more by an opening that few cameras look into leaves it shut.
+            if opened - other.share > _WORTH_TRYING:
+                shut = tried(other.distance)
+                if shut[0] < error * _NO_WORSE:
+                    (error, start), opened = shut, other.share
+        return start
 
     def _searched(self) -> None:
         if self.progress is not None:
