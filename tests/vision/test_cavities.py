@@ -71,7 +71,7 @@ def test_what_no_camera_looks_into_stays_solid(box: Box):
     def cameras(side: float) -> list[View]:
         rim = [[np.cos(a), np.sin(a), side] for a in np.arange(8) * np.pi / 4]
         views = []
-        for away in np.array([[0.1, 0, side], [0, 0.1, side], *rim]) :
+        for away in np.array([[0.1, 0, side], [0, 0.1, side], *rim]):
             matrix = pose(away / np.linalg.norm(away))
             matrix[:3, 3] = 0.4 * away / np.linalg.norm(away)
             camera = PosedCamera(matrix, focal=60.0, width=32, height=32)

@@ -1,9 +1,9 @@
 """Doubts about masks: shadow on the object that was taken for background.
 
-A mask by a threshold leaves out what is as dark as a dark background, and a bite out of few masks is a hole in
-the hull of all silhouettes. Nothing in one photograph tells such a bite from a gap through which the background
-is seen. But if the silhouettes fit a hull better that more of them may miss, then bites are likely: they are
-left open, and what the other photographs show decides.
+A mask by a threshold leaves out what is as dark as a dark background, and a bite out of few masks is a hole
+in the hull of all silhouettes. Nothing in one photograph tells such a bite from a gap through which the
+background is seen. But if the silhouettes fit a hull better that more of them may miss, then bites are
+likely: they are left open, and what the other photographs show decides.
 """
 
 import numpy as np
@@ -56,8 +56,8 @@ def with_doubts(capture: Capture, found: Survey) -> tuple[Capture, Survey]:
         return capture, found
     again = survey(doubted, max(found.box.shape))
     told = (
-        f"{len(shares)} of {len(views)} masks leave out up to {100 * max(shares):.0f} % of what most others show,"
-        " as masks by a threshold do with shadows: what is there is left to the photographs"
+        f"{len(shares)} of {len(views)} masks leave out up to {100 * max(shares):.0f} % of what most others"
+        " show, as masks by a threshold do with shadows: what is there is left to the photographs"
     )
     return doubted, again._replace(residual=found.residual, warnings=(*found.warnings, told))
 

@@ -182,9 +182,7 @@ def viewed_ball(views: Sequence[View]) -> tuple[np.ndarray, float]:
     return centre, float(np.linalg.norm(positions - centre, axis=1).min())
 
 
-def hull_distance(
-    views: Sequence[View], box: Box, lost: float = LOST
-) -> Float[np.ndarray, "nx ny nz"]:
+def hull_distance(views: Sequence[View], box: Box, lost: float = LOST) -> Float[np.ndarray, "nx ny nz"]:
     """Signed distance [m] of the visual hull at the nodes of a grid, accurate to a fraction of a cell.
 
     The least mask value over the views crosses ½ on the hull; where it does along the grid's edges lie points

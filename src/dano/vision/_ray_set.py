@@ -128,9 +128,15 @@ def collect(views: Sequence[View], box: Box, occupied: Bool[np.ndarray, "nx ny n
         backdrops.append(np.broadcast_to(view.backdrop, (len(pixels), 3)))
     if not sum(map(len, masks)):
         raise ValueError("no ray of any view meets the object")
-    columns = [jnp.asarray(np.concatenate(column), jnp.float32) for column in zip(*rays, strict=True)]
+
+    def joined(parts: Sequence[np.ndarray]) -> Array:
+        return jnp.asarray(np.concatenate(parts), jnp.float32)
+
     return RaySet(
-        Rays(*columns),
-        *(jnp.asarray(np.concatenate(x), jnp.float32) for x in (colours, masks, doubts, backdrops)),
-        jnp.asarray(np.repeat(np.arange(len(views), dtype=np.int32), [len(mask) for mask in masks])),
+        rays=Rays(*(joined(column) for column in zip(*rays, strict=True))),
+        colour=joined(colours),
+        mask=joined(masks),
+        doubt=joined(doubts),
+        backdrop=joined(backdrops),
+        view=jnp.asarray(np.repeat(np.arange(len(views), dtype=np.int32), [len(mask) for mask in masks])),
     )

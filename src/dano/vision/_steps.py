@@ -5,8 +5,8 @@ Rays are rendered in front of random backgrounds, so that transparency cannot pa
     E |c + (1 − o) b − C − (1 − M) b|²  +  w_m |o − M|²  +  w_e (|∇d| − 1)²  +  w_s (h ∇²d)²
 
 with c, o the rendered colour and opacity, C, M the photograph and its mask, b the background, and the last
-two terms over nodes near the surface, which keep d a smooth signed distance. Where a mask is doubted the object
-may be there or not, as long as the photograph comes out: b is its own background, and w_m is 0.
+two terms over nodes near the surface, which keep d a smooth signed distance. Where a mask is doubted the
+object may be there or not, as long as the photograph comes out: b is its own background, and w_m is 0.
 """
 
 from collections.abc import Callable
