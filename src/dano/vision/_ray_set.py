@@ -129,7 +129,7 @@ def collect(views: Sequence[View], box: Box, occupied: Bool[np.ndarray, "nx ny n
     if not sum(map(len, masks)):
         raise ValueError("no ray of any view meets the object")
 
-    def joined(parts: Sequence[np.ndarray]) -> Array:
+    def joined(parts: Sequence[np.ndarray | Array]) -> Array:
         return jnp.asarray(np.concatenate(parts), jnp.float32)
 
     return RaySet(
