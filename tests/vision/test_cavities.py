@@ -1,14 +1,12 @@
 """Cavities that no silhouette shows: a cup in closed form."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from vision.photographs import pose
 
 from dano.vision import Box, Capture, PosedCamera, survey, View
-from dano.vision._cavities import find_cavities, without_cavities, witnesses
-from dano.vision._models import roughness
+from dano.vision._cavities import carve, find_cavities, without_cavities, witnesses
 
 RADIUS, HEIGHT, WALL = 0.05, 0.06, 0.014  # [m]
 
@@ -47,7 +45,7 @@ def test_a_ball_rolls_into_the_cup_but_not_through_a_pore(box: Box):
     deep = np.abs(true + 0.5 * WALL) < 1.2 * box.spacing
     opacity[deep & (box.nodes[:, 2].reshape(box.shape) < -0.02)] = 0
     opacity[middle[0], middle[1], : middle[2]] = 0
-    found = without_cavities(opacity, everywhere(box), box, hull, box, 0.0, 0.5)
+    found = carve(opacity, everywhere(box), box, hull, box, 0.0, 0.5)
     assert found is not None
     assert overlap(found.distance < 0, true < 0) > 0.93
     assert overlap(hull < 0, true < 0) < 0.7
@@ -56,10 +54,10 @@ def test_a_ball_rolls_into_the_cup_but_not_through_a_pore(box: Box):
 
 def test_a_solid_without_cavities_stays_as_it_is(box: Box):
     hull = hull_of_cup(box.nodes).reshape(box.shape)
-    found = without_cavities((hull < 0).astype(float), everywhere(box), box, hull, box, 0.0, 0.5)
+    found = carve((hull < 0).astype(float), everywhere(box), box, hull, box, 0.0, 0.5)
     assert found is not None and found.share < 0.01
     nothing = np.zeros(box.shape)
-    assert without_cavities(nothing, everywhere(box), box, hull, box, 0.0, 0.5) is None
+    assert carve(nothing, everywhere(box), box, hull, box, 0.0, 0.5) is None
 
 
 def test_what_no_camera_looks_into_stays_solid(box: Box):
@@ -78,11 +76,14 @@ def test_what_no_camera_looks_into_stays_solid(box: Box):
             views.append(View(name="", camera=camera, image=np.zeros((32, 32, 3), np.float32)))
         return views
 
-    seen, unseen = (witnesses(shell, box, cameras(side)) for side in (-1.0, 1.0))
     middle = tuple(n // 2 for n in box.shape)
-    assert seen[middle] > 2 and unseen[middle] == 0
-    hollow = without_cavities(shell, seen >= 2, box, hull, box, 0.0, 0.5)
-    whole = without_cavities(shell, unseen >= 2, box, hull, box, 0.0, 0.5)
+    assert witnesses(shell, box, cameras(-1.0))[middle] > 2
+    assert witnesses(shell, box, cameras(1.0))[middle] == 0
+    # A haze that stops the ball but not the cameras.
+    haze = 0.12 * shell
+    assert witnesses(haze, box, cameras(1.0))[middle] > 2
+    hollow = without_cavities(haze, box, cameras(-1.0), hull, box, 0.0, 0.08)
+    whole = without_cavities(haze, box, cameras(1.0), hull, box, 0.0, 0.08)
     assert hollow is not None and hollow.share > 0.3
     assert whole is not None and whole.share < 0.01
 
@@ -118,27 +119,7 @@ def test_photographs_show_the_inside_of_a_cup():
     found = survey(capture, 32)
     true = cup_distance(found.box.nodes).reshape(found.box.shape) < 0
     readings = find_cavities(capture.split("train"), found.hull, found.box, lit=False, key=jax.random.key(0))
-    assert all(reading[0].share >= reading[-1].share for reading in readings)
-    best = max(overlap(reading[0].distance < 0, true) for reading in readings)
+    best = max(overlap(reading.distance < 0, true) for reading in readings)
     # At least two fifths of what the hull is wrong about is gone, with walls four cells thick.
     hull = overlap(found.hull < 0, true)
     assert hull < 0.65 and 1 - best < 0.6 * (1 - hull), (hull, best)
-
-
-def test_roughness_of_planes_walls_and_balls():
-    x = np.stack(np.meshgrid(*3 * [np.arange(24.0)], indexing="ij"), -1) - 11.7
-    one = jnp.float32(1)
-    plane = x @ np.array([0.6, 0.0, 0.8])
-    np.testing.assert_allclose(roughness(jnp.asarray(plane, jnp.float32), one), (0, 0), atol=1e-9)
-    # A wall three cells thick: its middle is as it should be on a node. Half-way between two, a slope there
-    # is 1 on one side and 0 on the other, for two of ten nodes within four cells of a face.
-    wall = np.abs(x[..., 0] + 0.7) - 1.5
-    assert float(roughness(jnp.asarray(wall, jnp.float32), one)[0]) < 1e-9
-    between = np.abs(x[..., 0] + 0.2) - 1.5
-    expected = 0.2 * (np.sqrt(0.5) - 1) ** 2
-    assert float(roughness(jnp.asarray(between, jnp.float32), one)[0]) == pytest.approx(expected, rel=1e-3)
-    # A ball is bent by 2/r.
-    ball = np.linalg.norm(x, axis=-1) - 8
-    eikonal, bending = roughness(jnp.asarray(ball, jnp.float32), one)
-    assert float(eikonal) < 1e-4
-    assert float(bending) == pytest.approx((2 / 8) ** 2, rel=0.05)

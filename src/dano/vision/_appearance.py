@@ -88,9 +88,15 @@ class Appearance(eqx.Module):
         first, second = jax.random.split(key)
         coarse = Box.around(box.origin, box.upper, resolution)
         n_inputs = n_features + 6 + (7 if lit else 0)
+        network = Network.create((n_inputs, width, width, 3), second)
+        # What depends on the view starts at nothing: where it is left out at first, it would else come in as
+        # noise, and push the surface about before it is learned.
+        seen = np.arange(n_features + 3, n_features + 6)
+        seen = np.append(seen, (n_inputs - 2, n_inputs - 1)) if lit else seen
+        first_layer = network.weights[0].at[seen].set(0)
         return cls(
             features=0.1 * jax.random.normal(first, (*coarse.shape, n_features), jnp.float32),
-            network=Network.create((n_inputs, width, width, 3), second),
+            network=Network((first_layer, *network.weights[1:]), network.biases),
             origin=jnp.asarray(coarse.origin, jnp.float32),
             spacing=jnp.asarray(coarse.spacing, jnp.float32),
             lit=lit,

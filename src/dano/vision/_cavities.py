@@ -11,8 +11,9 @@ there is a cavity. Three things make this work within seconds:
 - Opacities of cells are drawn to 0 or 1 (entropy-like a (1 − a)) and to those of their neighbours (total
   variation), or the fog stays a fog.
 
-The ball rolls only where cameras look: what none looks into, such as the inside of something that stands on a
-table, stays solid.
+What no camera looks into, such as the inside of something that stands on a table, may be thin because nothing
+says that it is not. Looking through the fog does not tell, as its walls leak. So the ball rolls twice, the
+second time only where cameras look past the walls that stopped it the first time.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,11 +51,8 @@ _MASK_WEIGHT, _CLEAR_WEIGHT, _EVEN_WEIGHT = 0.01, 0.01, 0.005
 _BALL = 2.5
 """Radius in cells of the ball that must fit into a cavity: a pore in a wall is none."""
 
-_LEAST_WITNESSES, _WITNESSES = 2, (0.0, 0.06, 0.15)
-"""Cameras that must look at a place for it to be empty, at least, and as shares of all: one reading each."""
-
-_SEEN = 0.3
-"""Share of a place's light that must reach a camera that looks at it."""
+_WITNESSES, _SEEN = 2, 0.3
+"""Cameras that must look at a place for it to be empty, and the share of its light that must reach them."""
 
 _READINGS = ((1.0, 0.2), (0.0, 0.5))
 """Cells over which opacities are averaged, and the average that stops the ball. The first reading keeps thin
@@ -82,13 +80,11 @@ def find_cavities(
     key: PRNGKeyArray,
     n_steps: int = STEPS,
     progress: Callable[[], None] | None = None,
-) -> tuple[tuple[Cavities, ...], ...]:
+) -> tuple[Cavities, ...]:
     """Look for cavities of the visual hull.
 
     What is right depends on walls and texture, and nothing at all may be: a translucent object is a fog.
-    Whoever asks should try which of the readings, or the hull, a surface explains the photographs best from,
-    and whether it explains them as well from one that opens only what more cameras look into: where few do, a
-    fog may be thin because nothing says that it is not.
+    Whoever asks should try which of the readings, or the hull, a surface explains the photographs best from.
 
     Args:
         views: Photographs with masks.
@@ -100,23 +96,46 @@ def find_cavities(
         progress: Called after every few steps.
 
     Returns:
-        Readings of the fog that leave something of the hull; of each the one that opens most comes first.
+        Readings of the fog that leave something of the hull.
     """
     coarse = Box.around(box.origin, box.upper, min(_RESOLUTION, max(box.shape)))
     opacity = _fog(views, resampled(hull, box, coarse), coarse, lit, key, n_steps, progress)
-    count = witnesses(opacity, coarse, views)
-    enough = sorted({max(_LEAST_WITNESSES, int(np.ceil(share * len(views)))) for share in _WITNESSES})
-    found = (
-        [without_cavities(opacity, count >= n, coarse, hull, box, *reading) for n in enough]
-        for reading in _READINGS
-    )
-    return tuple(tuple(each for each in reading if each is not None) for reading in found)
+    found = (without_cavities(opacity, coarse, views, hull, box, *reading) for reading in _READINGS)
+    return tuple(each for each in found if each is not None)
+
+
+def without_cavities(
+    opacity: Float[np.ndarray, "mx my mz"],
+    coarse: Box,
+    views: Sequence[View],
+    hull: Float[np.ndarray, "nx ny nz"],
+    box: Box,
+    width: float,
+    solid: float,
+) -> Cavities | None:
+    """The hull without what cameras look into and the ball reaches; None if that leaves nothing.
+
+    Args:
+        opacity: Of the cells around the nodes of `coarse`, in [0, 1].
+        coarse: Nodes.
+        views: Whose cameras look.
+        hull: Signed distance [m] of the visual hull at the nodes of `box`.
+        box: Nodes.
+        width: Cells over which opacities are averaged.
+        solid: Average opacity that stops the ball, but for crumbs in the air.
+    """
+    carved = carve(opacity, np.ones(coarse.shape, bool), coarse, hull, box, width, solid)
+    if carved is None:
+        return None
+    walls = np.clip(0.5 - resampled(carved.distance, box, coarse) / coarse.spacing, 0, 1)
+    known = witnesses(walls, coarse, views) >= _WITNESSES
+    return carve(opacity, known, coarse, hull, box, width, solid)
 
 
 def witnesses(
     opacity: Float[np.ndarray, "mx my mz"], coarse: Box, views: Sequence[View]
 ) -> Int[np.ndarray, "mx my mz"]:
-    """Number of cameras that see each node through a fog; the cells around a node do not hide it."""
+    """Number of cameras that see each node past cells of given opacities, but for those around the node."""
     thickness = jnp.asarray(-np.log1p(-np.clip(opacity, 0, 0.999)), jnp.float32)
     nodes = jnp.asarray(np.argwhere(np.ones(coarse.shape, bool)).T, jnp.float32)
     count = np.zeros(nodes.shape[1], int)
@@ -150,7 +169,7 @@ def _thickness_before(
     return jax.lax.fori_loop(0, steps, further, jnp.zeros(nodes.shape[1], jnp.float32))
 
 
-def without_cavities(
+def carve(
     opacity: Float[np.ndarray, "mx my mz"],
     known: Bool[np.ndarray, "mx my mz"],
     coarse: Box,

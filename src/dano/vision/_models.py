@@ -83,9 +83,6 @@ class Sampling(NamedTuple):
 DRAWING = Sampling(96, 32, 8)
 """For pictures to look at and to measure errors by."""
 
-_BAND, _SKIN = 4.0, 1.25
-"""Cells around the zero level where values are to be distances, and where they are to be smooth."""
-
 
 class AbstractModel(eqx.Module):
     """Opacity and colour of an object."""
@@ -343,37 +340,3 @@ class DensityModel(_OnNodes, AbstractMedium):
         _, slope = value_and_slope_at(jax.lax.stop_gradient(self.raw), u)
         normal = -slope.T * jax.lax.rsqrt(jnp.sum(slope * slope, axis=0) + 1e-6)[:, None]
         return self.appearance(points, normal, view, light, view_share), normal
-
-
-def roughness(
-    distance: Float[Array, "nx ny nz"], spacing: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """How far values near the zero level are from a smooth signed distance.
-
-    Slopes are those to both neighbours along each axis, their squares averaged: in the middle of a thin wall,
-    where a signed distance turns round, they are 1 or little less, whereas central differences would vanish
-    there, and to want them to be 1 would fill narrow cavities and thicken walls. For the same reason bending
-    counts next to the surface only.
-
-    Args:
-        distance: Values at nodes.
-        spacing: Between nodes, in the same unit.
-
-    Returns:
-        Mean of (|∇d| − 1)² within `_BAND` cells of the zero level, mean of (spacing · ∇²d)² within `_SKIN`.
-    """
-    d = distance / spacing
-    inner = d[1:-1, 1:-1, 1:-1]
-    neighbours = [
-        (d[2:, 1:-1, 1:-1], d[:-2, 1:-1, 1:-1]),
-        (d[1:-1, 2:, 1:-1], d[1:-1, :-2, 1:-1]),
-        (d[1:-1, 1:-1, 2:], d[1:-1, 1:-1, :-2]),
-    ]
-
-    def mean(values: Array, width: float) -> Array:
-        near = jax.lax.stop_gradient((jnp.abs(inner) < width).astype(d.dtype))
-        return jnp.sum(near * values) / (jnp.sum(near) + 1)
-
-    square = sum((0.5 * ((a - inner) ** 2 + (inner - b) ** 2) for a, b in neighbours), jnp.float32(0))
-    laplacian = sum((a + b for a, b in neighbours), -6 * inner)
-    return mean((jnp.sqrt(square + 1e-8) - 1) ** 2, _BAND), mean(laplacian**2, _SKIN)

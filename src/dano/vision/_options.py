@@ -33,12 +33,12 @@ class TrainOptions:
     iterations: int = 800
     batch: int = 4096
     features: int = 8
-    rate_distance: float = 0.25
+    rate_distance: float = 0.15
     rate_features: float | None = None
     rate_network: float = 0.003
     mask_weight: float = 0.5
-    eikonal_weight: float = 0.05
-    smoothness_weight: float = 0.003
+    eikonal_weight: float = 0.003
+    smoothness_weight: float = 0.001
     cavities: bool = True
     cameras: bool = False
     blur: tuple[float, float] = (0.5, 0.15)

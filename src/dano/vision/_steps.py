@@ -7,6 +7,13 @@ Rays are rendered in front of random backgrounds, so that transparency cannot pa
 with c, o the rendered colour and opacity, C, M the photograph and its mask, b the background, and the last
 two terms over nodes near the surface, which keep d a smooth signed distance. Where a mask is doubted the
 object may be there or not, as long as the photograph comes out: b is its own background, and w_m is 0.
+
+Where a pixel shows nothing but the object, its error is |c/o − C|² and opacity enough at o = 0.9: a thin wall
+is not opaque as long as its surface is blurred, and to want it to be would thicken it by more than its looks
+could ever correct.
+
+What single rays say of single nodes is mostly noise, and what many agree on is that a whole wall should move.
+So the derivative with respect to distances is spread over neighbouring nodes at first (`coherence`).
 """
 
 from collections.abc import Callable
@@ -15,17 +22,23 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.vision._adam import adam, updates_of
 from dano.vision._adjustment import Adjustment
-from dano.vision._models import roughness, Sampling, see, SurfaceModel
+from dano.vision._level_set import roughness, spread
+from dano.vision._models import Sampling, see, SurfaceModel
 from dano.vision._options import TrainOptions
 from dano.vision._ray_set import RaySet
 
 _REACH = 3.0
 """Cells from the surface within which distances are learned."""
 
+_WHOLE, _OPAQUE = 0.999, 0.9
+"""Mask of a pixel that shows nothing but the object, and the opacity that is enough there."""
+
+_PASSES = 3
+"""Times that derivatives are spread to neighbours."""
 
 _RATE_CAMERAS = 0.02
 """Learning rate of corrections of cameras [pixels]."""
@@ -55,6 +68,10 @@ class Learned(eqx.Module):
         """With other values of `parts`."""
         return eqx.tree_at(lambda learned: learned.parts, self, parts)
 
+    def moved_to(self, distance: Float[Array, "nx ny nz"]) -> "Learned":
+        """With another surface."""
+        return eqx.tree_at(lambda learned: learned.model.distance, self, distance)
+
 
 def optimiser_of(options: TrainOptions, *, lit: bool) -> Any:
     """Adam with a rate for each of `Learned.parts`; `lit` says whether the light is known."""
@@ -79,8 +96,9 @@ def make_step(options: TrainOptions, *, lit: bool) -> Callable[..., tuple[Learne
 
     Returns:
         A function of what is learned, state of the optimiser, rays, sharpness [1/m], factor of all rates,
-        share of the view's direction in colours (see `Appearance`) and key, which returns the first two anew
-        and the mean error of colours and masks.
+        share of the view's direction in colours (see `Appearance`), share of the derivative of distances that
+        is spread over neighbours, and key, which returns the first two anew and the mean error of colours and
+        masks.
     """
     import optax
 
@@ -100,12 +118,16 @@ def make_step(options: TrainOptions, *, lit: bool) -> Callable[..., tuple[Learne
         background = jax.random.uniform(paint, batch.colour.shape, jnp.float32)
         background = (1 - doubt) * background + doubt * batch.backdrop
         seen = see(model, rays, sharpness, sampling=sampling, view_share=view_share, key=jitter)
+        # What is wrong about a camera shows where object and background mix: that counts everywhere then.
+        whole = (batch.mask > _WHOLE) & (not options.cameras)
+        met = seen.colour / jnp.maximum(seen.opacity, 0.05)[:, None]
+        mixed = seen.colour + (1 - seen.opacity)[:, None] * background
+        got = jnp.where(whole[:, None], met, mixed)
+        # Nothing of the background where the mask is whole, but for a thousandth.
         wanted = batch.colour + (1 - batch.mask)[:, None] * background
-        got = seen.colour + (1 - seen.opacity)[:, None] * background
+        lacking = jnp.where(whole, jnp.maximum(_OPAQUE - seen.opacity, 0), seen.opacity - batch.mask)
         eikonal, bending = roughness(model.distance, model.spacing / model.scale)
-        error = jnp.mean((got - wanted) ** 2) + options.mask_weight * jnp.mean(
-            (1 - batch.doubt) * (seen.opacity - batch.mask) ** 2
-        )
+        error = jnp.mean((got - wanted) ** 2) + options.mask_weight * jnp.mean((1 - batch.doubt) * lacking**2)
         smooth = options.eikonal_weight * eikonal + options.smoothness_weight * bending
         return error + smooth + _STATED * stated, error
 
@@ -117,6 +139,7 @@ def make_step(options: TrainOptions, *, lit: bool) -> Callable[..., tuple[Learne
         sharpness: Array,
         decay: Array,
         view_share: Array,
+        coherence: Array,
         key: PRNGKeyArray,
     ) -> tuple[Learned, Any, Array]:
         pick, own = jax.random.split(key)
@@ -124,11 +147,17 @@ def make_step(options: TrainOptions, *, lit: bool) -> Callable[..., tuple[Learne
         (_, error), gradient = jax.value_and_grad(loss, has_aux=True)(
             parts, learned, rays.drawn(options.batch, pick), sharpness, view_share, own
         )
-        updates, state = updates_of(optimiser, gradient, state, parts, decay)
-        # Adam makes steps of one length of gradients of any length: where the surface is far away, of mere
-        # traces of them, out of which walls would grow in empty space.
         model = learned.model
         near = jnp.abs(model.distance) < _REACH * model.spacing / model.scale
+        shared = jax.lax.cond(
+            coherence > 0,
+            lambda own: coherence * spread(own, near, _PASSES) + (1 - coherence) * own,
+            lambda own: own,
+            gradient[0],
+        )
+        updates, state = updates_of(optimiser, (shared, *gradient[1:]), state, parts, decay)
+        # Adam makes steps of one length of gradients of any length: where the surface is far away, of mere
+        # traces of them, out of which walls would grow in empty space.
         updates = (jnp.where(near, updates[0], 0), *updates[1:])
         return learned.replaced(optax.apply_updates(parts, updates)), state, error
 

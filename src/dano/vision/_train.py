@@ -39,11 +39,13 @@ _WORTH_TRYING = 0.003
 _CLOSE = 0.2
 """Blur [pixels] of a surface that starts without the cavities of the hull."""
 
-_NO_WORSE = 1.005
-"""Factor of the error up to which a surface explains photographs as well as another."""
-
 _TRIAL = 80
 """Steps that tell whether a surface without cavities explains more."""
+
+_STILL, _COHERENT, _SHARP = 0.125, 0.6, 0.7
+"""Shares of the steps until which the surface stays where it is, so that looks do not push it about which are
+not learned yet (but cameras and surface are learned together); until its nodes move each on its own; and
+until it is sharp."""
 
 Stopped = Literal["finished", "converged", "geometry", "time", "diverged"]
 
@@ -203,7 +205,7 @@ class _Trainer:
     def sharpness(self, iteration: int, first: float) -> float:
         """Of the surface [1/m] at a step: geometric from the first blur to the last."""
         last = self.options.blur[1]
-        share = min(1.0, iteration / (0.7 * self.options.iterations))
+        share = min(1.0, iteration / (_SHARP * self.options.iterations))
         return 1 / (max(self.pixel, 0.5 * self.found.box.spacing) * first * (last / first) ** share)
 
     def box(self, iteration: int) -> Box:
@@ -254,31 +256,18 @@ class _Trainer:
             n_steps=min(STEPS, max(1, self.options.iterations // 2)),
             progress=self._searched,
         )
-        worth = [[each for each in reading if each.share > _WORTH_TRYING] for reading in found]
-        worth = [reading for reading in worth if reading]
+        worth = [each for each in found if each.share > _WORTH_TRYING]
         if not worth:
             return hull
         # Blur helps to find the way from a hull; a start that is close already would be filled up by it.
         sharp = min(_CLOSE, self.options.blur[0])
         rays = self._rays(0)
-
-        def tried(distance: np.ndarray) -> tuple[float, _State]:
-            start = self.fresh(distance, sharp)
-            return self._trial(start, rays), start
-
-        without, _ = tried(self.found.hull)
-        trials = [tried(reading[0].distance) for reading in worth]
-        best = min(range(len(trials)), key=lambda i: trials[i][0])
-        (error, start), opened = trials[best], worth[best][0].share
-        if error >= without:
-            return hull
-        for other in worth[best][1:]:
-            # What explains no more by an opening that few cameras look into leaves it shut.
-            if opened - other.share > _WORTH_TRYING:
-                shut = tried(other.distance)
-                if shut[0] < error * _NO_WORSE:
-                    (error, start), opened = shut, other.share
-        return start
+        without, *starts = (
+            self.fresh(distance, sharp) for distance in (self.found.hull, *(each.distance for each in worth))
+        )
+        error = self._trial(without, rays)
+        errors = [self._trial(start, rays) for start in starts]
+        return starts[int(np.argmin(errors))] if min(errors) < error else hull
 
     def _searched(self) -> None:
         if self.progress is not None:
@@ -303,8 +292,11 @@ class _Trainer:
             jnp.float32(0.1 ** (i / options.iterations)),
             # First without highlights: what moves with the viewer must be explained by shape.
             jnp.float32(i >= self.switch),
+            jnp.float32(max(0.0, 1 - i / (_COHERENT * options.iterations))),
             jax.random.fold_in(self.key, 2 + i),
         )
+        if i < _STILL * options.iterations and not options.cameras:
+            learned = learned.moved_to(state.model.distance)
         return _State(learned, optimiser, i + 1, state.blur), float(error)
 
     def run(self, state: _State | None) -> tuple[_State, Stopped]:
@@ -422,7 +414,7 @@ def reason_to_stop(history: Sequence[Progress], residual: float) -> Stopped | No
         history: All looks at held-out views.
         residual: Share of the silhouettes that no solid explains (see `Survey`).
     """
-    if len(history) < 4 or history[-1].iteration < 0.7 * history[-1].iterations:
+    if len(history) < 4 or history[-1].iteration < _SHARP * history[-1].iterations:
         # Until then the surface is still being made sharp.
         return None
     overlap = [entry.mask_iou or 0.0 for entry in history]
