@@ -82,8 +82,8 @@ def test_what_no_camera_looks_into_stays_solid(box: Box):
     # A haze that stops the ball but not the cameras.
     haze = 0.12 * shell
     assert witnesses(haze, box, cameras(1.0))[middle] > 2
-    hollow = without_cavities(haze, box, cameras(-1.0), hull, box, 0.0, 0.08)
-    whole = without_cavities(haze, box, cameras(1.0), hull, box, 0.0, 0.08)
+    hollow = without_cavities(haze, box, cameras(-1.0), hull, box, (0.0, 0.08))
+    whole = without_cavities(haze, box, cameras(1.0), hull, box, (0.0, 0.08))
     assert hollow is not None and hollow.share > 0.3
     assert whole is not None and whole.share < 0.01
 

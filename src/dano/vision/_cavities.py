@@ -100,7 +100,7 @@ def find_cavities(
     """
     coarse = Box.around(box.origin, box.upper, min(_RESOLUTION, max(box.shape)))
     opacity = _fog(views, resampled(hull, box, coarse), coarse, lit, key, n_steps, progress)
-    found = (without_cavities(opacity, coarse, views, hull, box, *reading) for reading in _READINGS)
+    found = (without_cavities(opacity, coarse, views, hull, box, reading) for reading in _READINGS)
     return tuple(each for each in found if each is not None)
 
 
@@ -110,26 +110,22 @@ def without_cavities(
     views: Sequence[View],
     hull: Float[np.ndarray, "nx ny nz"],
     box: Box,
-    width: float,
-    solid: float,
+    reading: tuple[float, float],
 ) -> Cavities | None:
-    """The hull without what cameras look into and the ball reaches; None if that leaves nothing.
+    """What `carve` leaves of the hull, rolling the ball only where cameras look past what it left at first.
 
-    Args:
-        opacity: Of the cells around the nodes of `coarse`, in [0, 1].
-        coarse: Nodes.
-        views: Whose cameras look.
-        hull: Signed distance [m] of the visual hull at the nodes of `box`.
-        box: Nodes.
-        width: Cells over which opacities are averaged.
-        solid: Average opacity that stops the ball, but for crumbs in the air.
+    The reading is the width and the opacity of `carve`, the other arguments are its own; `_WITNESSES` of the
+    views must look.
     """
-    carved = carve(opacity, np.ones(coarse.shape, bool), coarse, hull, box, width, solid)
-    if carved is None:
+
+    def carved(known: Bool[np.ndarray, "mx my mz"]) -> Cavities | None:
+        return carve(opacity, known, coarse, hull, box, *reading)
+
+    first = carved(np.ones(coarse.shape, bool))
+    if first is None:
         return None
-    walls = np.clip(0.5 - resampled(carved.distance, box, coarse) / coarse.spacing, 0, 1)
-    known = witnesses(walls, coarse, views) >= _WITNESSES
-    return carve(opacity, known, coarse, hull, box, width, solid)
+    walls = np.clip(0.5 - resampled(first.distance, box, coarse) / coarse.spacing, 0, 1)
+    return carved(witnesses(walls, coarse, views) >= _WITNESSES)
 
 
 def witnesses(
