@@ -62,7 +62,7 @@ $(VENV)/.demo: $(VENV)/.pip $(PACKAGE)
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.pip $(PACKAGE)
-	$(INSTALL) --editable '.[dev,view,mesh,mujoco,import,train]'
+	$(INSTALL) --editable '.[dev,view,mesh,mujoco,import,train,batch]'
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.pip $(PACKAGE)

@@ -3,6 +3,8 @@
 import json
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 PROGRAM = """
 import json, sys, time
@@ -15,7 +17,7 @@ changed = [name for name, value in before.items() if getattr(jax.config, name) !
 print(json.dumps({"seconds": seconds, "changed": changed, "modules": sorted(sys.modules)}))
 """
 OPTIONAL = {"PIL", "av", "blosc", "igl", "imageio", "matplotlib", "mujoco", "msgpack", "plyfile", "skimage"}
-OPTIONAL |= {"torch", "trimesh", "viser"}
+OPTIONAL |= {"torch", "trimesh", "viser", "zarr"}
 # Not optional, but each takes as long as much of dano: imported where they are used.
 OPTIONAL |= {"scipy.ndimage", "scipy.optimize", "scipy.spatial", "scipy.special", "scipy.stats"}
 
@@ -32,3 +34,11 @@ def test_import_is_light_and_changes_nothing():
     # The first import of an installation also compiles bytecode: what counts is the second.
     seconds = min(report["seconds"], import_in_new_process()["seconds"])
     assert seconds < 1.0, f"import dano took {seconds:.2f} s of processor time beyond JAX"
+
+
+def test_the_extra_all_holds_every_extra_for_users():
+    project = Path(__file__).resolve().parents[1] / "pyproject.toml"
+    extras = tomllib.loads(project.read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    (requirement,) = extras["all"]
+    named = requirement.removeprefix("dano[").removesuffix("]").split(",")
+    assert sorted(named) == sorted(set(extras) - {"all", "dev", "docs"})

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from benchmarks._measure import Row, summary, time_in_turn
 
 COMPILE_TARGET = 6.0  # [s]
@@ -23,6 +25,7 @@ class Case:
         note: See `Row`.
         base: Name of a case; report the ratio to it too.
         ratio_target: For that ratio.
+        repeats: At most so many, for calls that take seconds.
     """
 
     group: str
@@ -35,11 +38,16 @@ class Case:
     note: str = ""
     base: str | None = None
     ratio_target: float | None = None
+    repeats: int | None = None
 
 
 def measure(cases: Sequence[Case], repeats: int) -> list[Row]:
-    """Time all cases in turn."""
-    seconds = time_in_turn({case.name: case.call for case in cases}, repeats)
+    """Time all cases in turn; those that take long in turn with each other, less often."""
+    seconds: dict[str, np.ndarray] = {}
+    wanted = {case.name: min(repeats, case.repeats or repeats) for case in cases}
+    for count in sorted(set(wanted.values())):
+        calls = {case.name: case.call for case in cases if wanted[case.name] == count}
+        seconds.update(time_in_turn(calls, count))
     counts = {case.name: case.count for case in cases}
     rows = []
     for case in cases:
@@ -51,8 +59,11 @@ def measure(cases: Sequence[Case], repeats: int) -> list[Row]:
         rows.append(
             Row(case.group, case.name, value, case.unit, case.target, quartiles=quartiles, note=case.note)
         )
-        if case.base is not None:
-            ratios = seconds[case.name] / case.count / (seconds[case.base] / counts[case.base])
+        if case.base is not None and case.base in seconds:
+            base = seconds[case.base] / counts[case.base]
+            # Rounds of different number are not the same rounds: then the base's median stands for it.
+            base = base if len(base) == len(seconds[case.name]) else np.median(base)
+            ratios = seconds[case.name] / case.count / base
             value, quartiles = summary(ratios)
             name = f"{case.name} / rollout"
             rows.append(Row(case.group, name, value, "×", case.ratio_target, quartiles=quartiles))

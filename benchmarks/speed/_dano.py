@@ -24,6 +24,8 @@ GRADIENTS = f"Derivatives of a rollout of {N_STEPS} steps, per step"
 BATCH = f"{N_ROLLOUTS} rollouts at once by vmap, per step and rollout"
 QUERIES = "Field queries"
 DISTRIBUTED = ", distributed"
+SLOW_REPEATS = 5
+"""Of cases whose call takes seconds."""
 
 
 def _contact_of(subject: Subject, *, distributed: bool) -> tuple[dano.ContactParams, dano.AbstractContactLaw]:
@@ -133,17 +135,18 @@ def pressed_cases(subject: Subject, *, floor: bool, distributed: bool = False) -
     ]
 
 
-def gradient_cases(subject: Subject) -> list[Case]:
+def gradient_cases(subject: Subject, *, distributed: bool = False) -> list[Case]:
     """Reverse and forward mode, as multiples of the plain rollout from the same state."""
-    scene, rest = floor_scene(subject)
+    scene, rest = floor_scene(subject, distributed=distributed)
     state = sliding(subject, rest)
     arrays, static = eqx.partition(scene, eqx.is_array)
     three = jnp.array([FRICTION, float(state.velocity[0, 0]), 1.0])
-    base = f"{subject.name} slides"
+    law = DISTRIBUTED if distributed else ""
+    base = f"{subject.name} slides{law}"
 
     def case(label, function, *args):
         run, seconds = compiled(function, *args)
-        name = f"{subject.name}: {label}"
+        name = f"{subject.name}: {label}{law}"
         return Case(
             GRADIENTS,
             name,
@@ -152,21 +155,24 @@ def gradient_cases(subject: Subject) -> list[Case]:
             compile_seconds=seconds,
             base=base,
             ratio_target=4.0,
+            repeats=SLOW_REPEATS if distributed else None,
         )
 
-    few = _distance_of_three(static)
-    many = _distance_of_all(static)
-    inputs = (scene.contacts[0].params, _mass_leaves(scene), state)
-    return [
+    few = _distance_of_three(static, distributed=distributed)
+    cases = [
         case("reverse, 3 parameters", jax.grad(few), three, arrays, state),
         case("forward mode, 3 parameters", jax.jacfwd(few), three, arrays, state),
-        case("reverse, 38 parameters", jax.grad(many), inputs, arrays),
     ]
+    if distributed:
+        return cases
+    many = _distance_of_all(static)
+    inputs = (scene.contacts[0].params, _mass_leaves(scene), state)
+    return [*cases, case("reverse, 38 parameters", jax.grad(many), inputs, arrays)]
 
 
-def batch_cases(subject: Subject) -> list[Case]:
-    """Rollouts that differ in friction only, and in friction, speed and spring."""
-    scene, rest = floor_scene(subject)
+def batch_cases(subject: Subject, *, distributed: bool = False) -> list[Case]:
+    """Sliding rollouts that differ in friction only, and in friction, speed and spring."""
+    scene, rest = floor_scene(subject, distributed=distributed)
     state = sliding(subject, rest)
     arrays, static = eqx.partition(scene, eqx.is_array)
     share = jnp.linspace(0.7, 1.3, N_ROLLOUTS)[:, None]
@@ -175,16 +181,17 @@ def batch_cases(subject: Subject) -> list[Case]:
         "friction varies": middle * jnp.concatenate([share, jnp.ones((N_ROLLOUTS, 2))], axis=1),
         "all vary": middle * share,
     }
-    batched = jax.vmap(_distance_of_three(static), (0, None, None))
+    batched = jax.vmap(_distance_of_three(static, distributed=distributed), (0, None, None))
     run, seconds = compiled(batched, middle * share, arrays, state)
     return [
         Case(
             BATCH,
-            f"{N_ROLLOUTS} of {subject.name}, {words}",
+            f"{N_ROLLOUTS} of {subject.name}, {words}{DISTRIBUTED if distributed else ''}",
             lambda parameters=parameters: run(parameters, arrays, state),
             N_STEPS * N_ROLLOUTS,
-            6.0,
+            None if distributed else 6.0,
             compile_seconds=seconds if words == "all vary" else None,
+            repeats=SLOW_REPEATS if distributed else None,
         )
         for words, parameters in varied.items()
     ]
@@ -240,13 +247,14 @@ def _attraction(stiffness: float, n_bodies: int) -> Callable:
     return control
 
 
-def _distance_of_three(static: dano.Scene) -> Callable:
+def _distance_of_three(static: dano.Scene, *, distributed: bool = False) -> Callable:
     """Where the bunny ends up, as a function of friction, initial speed and spring (a factor)."""
+    spring = "stiffness" if distributed else "spring"
 
     def distance(parameters, arrays, state):
         scene = eqx.combine(arrays, static)
-        spring = scene.contact("bunny", "floor").spring * parameters[2]
-        scene = scene.replace_contact("bunny", "floor", sliding_friction=parameters[0], spring=spring)
+        changes = {spring: getattr(scene.contact("bunny", "floor"), spring) * parameters[2]}
+        scene = scene.replace_contact("bunny", "floor", sliding_friction=parameters[0], **changes)
         start = eqx.tree_at(lambda s: s.velocity, state, state.velocity.at[0, 0].set(parameters[1]))
         return dano.simulate(scene, start, N_STEPS).states.position[-1, 0, 0]
 

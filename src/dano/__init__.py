@@ -48,8 +48,12 @@ from dano.engine import (
     contact_patches as contact_patches,
     contact_wrenches as contact_wrenches,
     linearize as linearize,
+    load_rollouts as load_rollouts,
+    Rollouts as Rollouts,
+    rollouts as rollouts,
     simulate as simulate,
     step as step,
+    StoredRollouts as StoredRollouts,
     VariationalEngine as VariationalEngine,
 )
 from dano.identify import (

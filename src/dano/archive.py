@@ -1,15 +1,21 @@
 """Files of named arrays: one zip, versioned, without pickle, written whole or not at all."""
 
 import contextlib
+import io
+import lzma
+import math
 import os
+import shutil
 import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast, IO
 
 import numpy as np
+
+from dano.memory import in_bytes, memory_limit
 
 OBJECT = "dano-object", 2
 """Format and newest version of files that hold a neural object."""
@@ -17,15 +23,41 @@ OBJECT = "dano-object", 2
 LOOK = "look_"
 """What the names of their members start with that say how the object looks."""
 
+_PICKLED = "it holds pickled objects, which are never loaded"
+_BROKEN = (
+    OSError,
+    ValueError,
+    EOFError,
+    KeyError,
+    RuntimeError,
+    OverflowError,
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+)
+"""What NumPy and zipfile raise for files that are truncated, foreign or encrypted."""
+
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """Open a temporary file beside `path` that takes its place when the block ends without an error.
+    """Open a temporary file that takes the place of `path` when the block ends without an error.
+
+    A regular file, or one that does not exist yet, is replaced by renaming; a link stays and what it leads to
+    is replaced. A device or a pipe (`/dev/null`, `>(…)`) cannot be replaced: it is written to, after the
+    block.
 
     Raises:
-        ValueError: If `path` is a directory or its parent does not exist.
+        ValueError: If `path` cannot be written, see `checked_output`.
     """
     target = checked_output(path)
+    if target.exists() and not target.is_file():
+        with tempfile.TemporaryFile() as whole:
+            yield whole
+            whole.seek(0)
+            with open(target, "wb") as stream:
+                shutil.copyfileobj(whole, stream)
+        return
+    target = target.resolve()
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -42,18 +74,24 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def checked_output(path: str | os.PathLike[str]) -> Path:
-    """`path` if a file can be written there.
+    """`path` if it can be written: a file, new or not, a character device, or a pipe.
 
     Raises:
-        ValueError: If it is a directory or its parent does not exist.
+        ValueError: If it is a directory, a disk or a socket, or its parent does not exist.
     """
     target = Path(path)
     if target.is_dir():
         raise ValueError(f"output path must be a file, got the directory {target}")
-    if not target.parent.is_dir():
-        raise ValueError(
-            f"output path must be in an existing directory, got {target} in missing {target.parent}"
-        )
+    # A link to nothing is made a file where it leads to.
+    if not target.exists():
+        target_parent = target.resolve().parent
+        if not target_parent.is_dir():
+            raise ValueError(
+                f"output path must be in an existing directory, got {target} in missing {target_parent}"
+            )
+    elif not (target.is_file() or target.is_char_device() or target.is_fifo()):
+        kind = "disk" if target.is_block_device() else "socket"
+        raise ValueError(f"output path must be a file, a character device or a pipe, got the {kind} {target}")
     return target
 
 
@@ -75,10 +113,119 @@ def write_archive(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]
     """Write arrays to a compressed zip (`numpy.savez_compressed`), atomically.
 
     Raises:
-        ValueError: If `path` is a directory or its parent does not exist.
+        ValueError: If `path` cannot be written, see `checked_output`.
     """
     with replacing(path) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+class Arrays:
+    """The arrays in a zip (.npz), each read when asked for, after a look at what it claims to be.
+
+    Attributes:
+        names: Of the arrays.
+    """
+
+    def __init__(self, file: BinaryIO):
+        """Open a zip.
+
+        Args:
+            file: Open for reading bytes; must stay open.
+
+        Raises:
+            ValueError: If it is no zip.
+        """
+        if not zipfile.is_zipfile(file):
+            file.seek(0)
+            start = file.read(6)
+            if start == b"\x93NUMPY":
+                raise ValueError("it is a single array, not a zip of arrays")
+            # How every pickle of the last twenty years begins.
+            if start[:1] == b"\x80":
+                raise ValueError(_PICKLED)
+            raise ValueError("it is no archive of arrays, or cut off")
+        file.seek(0)
+        try:
+            self._zip = zipfile.ZipFile(file)
+        except _BROKEN as error:
+            raise ValueError(_reason(error)) from error
+        self._members = {info.filename.removesuffix(".npy"): info for info in self._zip.infolist()}
+        self.names = tuple(self._members)
+        self._left = memory_limit()
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Read an array.
+
+        Raises:
+            ValueError: If there is none of this name, it holds pickled objects, is cut off, or is so large
+                that all arrays read so far exceed the `memory_limit`.
+        """
+        if name not in self._members:
+            raise ValueError(f"it has no {name}, only {list(self.names)}")
+        info = self._members[name]
+        try:
+            with self._zip.open(info) as stream:
+                self._left -= _checked_size(stream, name, info.file_size, self._left)
+            with self._zip.open(info) as stream:
+                return np.lib.format.read_array(stream, allow_pickle=False)
+        except _BROKEN as error:
+            raise ValueError(_reason(error)) from error
+
+
+def read_array(path: str | os.PathLike[str]) -> np.ndarray:
+    """Read a single array (.npy).
+
+    Raises:
+        ValueError: If the file is missing, no such array, holds pickled objects, is cut off or larger than
+            the `memory_limit`.
+    """
+    source = checked_input(path)
+    with open(source, "rb") as file:
+        if (start := file.read(6)) != b"\x93NUMPY":
+            kinds = {b"\x80": _PICKLED, b"P": "it is a zip of arrays, not a single one"}
+            raise ValueError(kinds.get(start[:1], "it is no array of NumPy"))
+        file.seek(0)
+        try:
+            _checked_size(file, "the array", source.stat().st_size, memory_limit())
+            file.seek(0)
+            return np.lib.format.read_array(file, allow_pickle=False)
+        except _BROKEN as error:
+            raise ValueError(_reason(error)) from error
+
+
+def _checked_size(stream: IO[bytes] | io.BufferedIOBase, name: str, held: int, limit: int) -> int:
+    """Bytes that an array takes, by the header at the start of a stream of `held` bytes."""
+    file = cast(IO[bytes], stream)
+    version = np.lib.format.read_magic(file)
+    readers = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    if version not in readers:
+        raise ValueError(f"{name} is an array of version {version}, expected 1.0 or 2.0")
+    shape, _, dtype = readers[version](file)
+    if dtype.hasobject:
+        raise ValueError(_PICKLED)
+    if min(shape, default=0) < 0:
+        raise ValueError(f"{name} must have a shape without negative numbers, got {shape}")
+    # In Python's integers, which do not overflow.
+    size = math.prod(shape) * dtype.itemsize
+    if size > held:
+        raise ValueError(
+            f"{name} is cut off: by its shape {shape} it takes {in_bytes(size)},"
+            f" the file has {in_bytes(held)}"
+        )
+    if size > limit:
+        raise ValueError(
+            f"{name} of shape {shape} takes {in_bytes(size)}; the arrays of a file may take"
+            f" {in_bytes(memory_limit())} on this machine"
+        )
+    return size
+
+
+def _reason(error: Exception) -> str:
+    text = str(error)
+    return text.splitlines()[0] if text else type(error).__name__
 
 
 def read_archive(path: str | os.PathLike[str], form: str, version: int) -> dict[str, np.ndarray]:
@@ -94,20 +241,10 @@ def read_archive(path: str | os.PathLike[str], form: str, version: int) -> dict[
     """
     source = checked_input(path)
     try:
-        if not zipfile.is_zipfile(source):
-            raise ValueError("it is no archive of arrays, or cut off")
-        # Opened here, because NumPy leaves its own handle open when the content turns out to be foreign.
-        with open(source, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            data = {name: archive[name] for name in archive.files}
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        EOFError,
-        OSError,
-        ValueError,
-        KeyError,
-        NotImplementedError,
-    ) as error:
+        with open(source, "rb") as file:
+            archive = Arrays(file)
+            data = {name: archive[name] for name in archive.names}
+    except (ValueError, OSError) as error:
         raise ValueError(f"{source} is not a readable {form} file: {error}") from error
     found = str(data.get("format", "of no stated format"))
     if found != form:

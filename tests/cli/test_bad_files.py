@@ -1,10 +1,18 @@
 """Bad fields, files and options: one line on stderr, code 2, and nothing written or destroyed."""
 
+import io
+import os
 import shutil
+import socket
+import stat
+import threading
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from dano.archive import replacing
 
 ORIGIN, SPACING = np.zeros(3), np.asarray(0.01)
 
@@ -35,6 +43,8 @@ FIELDS = {
     "range reversed": (ball(), ("--density-range", "60", "40"), "density_range"),
     "no samples": (ball(), ("--samples", "0"), "n_samples must be ≥ 1"),
     "coarse": (ball(), ("--resolution", "1"), "resolution must be ≥ 4"),
+    "many samples": (ball(), ("--samples", "100000000"), "samples must be at most 200000, got 100000000"),
+    "fine": (ball(), ("--resolution", "100000"), "here, got 100000, which needs 1.36e+05 TiB of memory"),
     "no mass": (ball(), ("--mass", "0"), "> 0 kg, got 0"),
     "mass twice": (ball(), ("--mass", "1", "--mass-scale", "1"), "--mass"),
     "no length": (ball(), ("--length", "-1"), "length must be finite and > 0"),
@@ -130,9 +140,12 @@ def test_bad_outputs(run, egg, field, scene, tmp_path):
         (("--timestep", "nan"), "timestep must be finite and > 0 s, got nan"),
         (("--timestep", "2.5"), "state.omega must be below 2/timestep"),
         (("--slow-motion", "0"), "slow_motion must be > 0, got 0.0"),
+        (("--slow-motion", "1e9", "--video", "RUN.mp4"), "slow_motion must be at most 4.17e+03, so that"),
+        (("--steps", "100000000000"), "steps of 2 bodies, got 1e+11 of 0.002 s"),
     ],
 )
-def test_bad_options(options, message, run, scene, tmp_path):
+def test_bad_options(options, message, run, scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     files = {scene.name: scene.read_bytes()}
     answer = run("simulate", scene, "-o", tmp_path / "run.npz", *options)
     assert_refused(answer, message, tmp_path, files)
@@ -148,3 +161,62 @@ def test_pictures_without_their_packages(run, egg, scene, tmp_path, monkeypatch)
     answer = run("inspect", egg)
     assert answer.code == 0
     assert "warning: not drawn" in answer.err
+
+
+@pytest.fixture
+def pipe(tmp_path):
+    """A named pipe, what has arrived in it, and its reader, which ends when it has been written to."""
+    path, arrived = tmp_path / "pipe", []
+    os.mkfifo(path)
+    reader = threading.Thread(target=lambda: arrived.append(path.read_bytes()), daemon=True)
+    reader.start()
+    return path, arrived, reader
+
+
+def test_a_pipe_is_written_to_and_stays(run, field, pipe):
+    path, arrived, reader = pipe
+    assert run("build", field, "-o", path, "--samples", 50, "--resolution", 12, "--mass", 1).code == 0
+    reader.join(timeout=10)
+    assert stat.S_ISFIFO(path.stat().st_mode)
+    with zipfile.ZipFile(io.BytesIO(arrived[0])) as archive:
+        assert archive.testzip() is None
+
+
+def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path):
+    (tmp_path / "folder").mkdir()
+    link, file = tmp_path / "link", tmp_path / "folder" / "file"
+    for old in (None, b"old"):
+        if old is not None:
+            file.write_bytes(old)
+        else:
+            link.symlink_to(file)
+        with replacing(link) as stream:
+            stream.write(b"new")
+        assert link.is_symlink()
+        assert file.read_bytes() == b"new"
+
+
+def test_a_socket_is_refused(run, field, tmp_path, monkeypatch):
+    # Paths of sockets must be short.
+    monkeypatch.chdir(tmp_path)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind("s")
+        answer = run("build", field, "-o", "s")
+    assert (answer.code, answer.err.count("\n")) == (2, 1)
+    assert "must be a file, a character device or a pipe, got the socket s" in answer.err
+
+
+def test_outputs_must_differ_from_each_other_and_from_what_is_read(run, egg, scene, tmp_path):
+    copy = Path(shutil.copy(egg, tmp_path / "egg.mp4"))
+    scene.write_text(scene.read_text().replace(str(egg), copy.name))
+    files = {path.name: path.read_bytes() for path in (copy, scene)}
+    for options, message in (
+        (
+            ("-o", tmp_path / "a.mp4", "--video", tmp_path / "." / "a.mp4"),
+            "output and video must be different",
+        ),
+        (("-o", tmp_path / "a.png", "--strip", tmp_path / "a.png"), "output and strip must be different"),
+        (("-o", copy), "must not be the input"),
+        (("-o", tmp_path / "a.npz", "--video", copy), "must not be the input"),
+    ):
+        assert_refused(run("simulate", scene, *options), message, tmp_path, files)

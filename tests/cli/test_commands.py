@@ -1,16 +1,20 @@
 """Each command on a small object."""
 
+import contextlib
 import json
 import shutil
+import signal
 from importlib.resources import files
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cli.conftest import ellipsoid_values
 
 import dano
 from dano.cli import _rollout, _scenes
+from dano.fields import GridField, save_field
 from dano.scene_file import _objects as shipped, load_run, load_scene
 
 
@@ -22,6 +26,8 @@ def test_help_without_arguments(run):
         assert run(command, "--help").code == 0
     assert dano.__version__ in run("--version").out
     assert run("nonsense").code == 2
+    answer = run("buidl", "x")
+    assert answer.code == 2 and answer.err.endswith("got 'buidl'; did you mean 'build'?\n")
 
 
 def test_build_writes_an_object(run, field, tmp_path):
@@ -54,6 +60,70 @@ def test_build_of_another_mass_model_and_range(run, field, tmp_path):
     assert 40 <= float(made.samples.density.min()) <= float(made.samples.density.max()) <= 60
     with np.load(field) as data:
         assert float(made.mass.mass) == pytest.approx(2 * data["values"].sum() * 1e-6, rel=0.02)
+
+
+DOUBTS = {
+    "no mass": (0.01, slice(None), (), "warning: nobody gave a mass: 0.04", "give --mass or --mass-scale"),
+    "millimetres": (
+        10.0,
+        slice(None),
+        ("--mass", 1),
+        "warning: the object is 118 m long",
+        "give --length, its longest extent [m] (0.118 if it is in millimetres)",
+    ),
+    "cut off": (0.01, slice(5, 12), ("--mass", 1), "cut off where its grid ends, at −x, +x;", "--crop"),
+}
+
+
+@pytest.mark.parametrize("case", DOUBTS)
+def test_build_says_what_it_assumed_and_what_mends_it(case, run, tmp_path):
+    spacing, kept, options, *texts = DOUBTS[case]
+    path = tmp_path / "egg.npz"
+    save_field(GridField(jnp.asarray(ellipsoid_values()[kept]), (0.0, 0.0, 0.0), spacing), path)
+    answer = run(
+        "build", path, "-o", tmp_path / "egg.dano", "--samples", 100, "--resolution", 16, *options, "--json"
+    )
+    assert answer.code == 0
+    assert answer.err.count("\n") == 1
+    for text in texts:
+        assert text in answer.err
+    # What the warning names mends it.
+    if case == "millimetres":
+        options = ("--samples", 100, "--resolution", 16, *options, "--length", 0.118)
+        assert run("build", path, "-o", tmp_path / "egg.dano", *options).err == ""
+
+
+def test_scene_files_say_that_nobody_gave_a_mass(field, run, tmp_path):
+    scene = tmp_path / "scene.toml"
+    build = "build = {samples = 50, resolution = 12}"
+    scene.write_text(f'n_steps = 2\n[[bodies]]\nname = "egg"\nfield = {json.dumps(str(field))}\n{build}\n')
+    answer = run("simulate", scene, "-o", tmp_path / "run.npz")
+    assert answer.code == 0
+    assert "warning: nobody gave a mass" in answer.err and "give mass or mass_scale" in answer.err
+
+
+def test_import_says_that_a_mesh_is_rather_in_millimetres(run, tmp_path):
+    pytest.importorskip("igl")
+    mesh = tmp_path / "box.stl"
+    pytest.importorskip("trimesh").creation.box((60, 90, 120)).export(mesh)
+    options = ("-o", tmp_path / "box.npz", "--resolution", 16)
+    answer = run("import", mesh, *options)
+    assert answer.code == 0
+    assert "the field is 137 m wide" in answer.err and "give --scale" in answer.err
+    assert run("import", mesh, *options, "--scale", 0.001).err == ""
+
+
+def test_a_second_part_of_a_mesh_feels_contact(run, tmp_path):
+    pytest.importorskip("igl")
+    trimesh = pytest.importorskip("trimesh")
+    other = trimesh.creation.box((0.02, 0.02, 0.02))
+    other.apply_translation((0.08, 0, 0))
+    mesh, made = tmp_path / "two.stl", tmp_path / "two.dano"
+    trimesh.util.concatenate([trimesh.creation.box((0.04, 0.04, 0.04)), other]).export(mesh)
+    options = ("--samples", 300, "--resolution", 32, "--mass", 1)
+    assert run("build", mesh, "-o", made, *options).code == 0
+    points = np.asarray(dano.NeuralObject.load(made).samples.points)
+    np.testing.assert_allclose([points[:, 0].min(), points[:, 0].max()], [-0.02, 0.09], atol=1e-3)
 
 
 IMPORTS = Path(__file__).parents[1] / "data" / "imports"
@@ -100,6 +170,7 @@ def test_import_fills_splats_and_keeps_signed_distances(run, tmp_path):
         "option": ("damaged.ckpt", ("--cascade", 1), "unknown options"),
         "scale": ("damaged.ckpt", ("--scale", 0), "scale must be finite and > 0"),
         "resolution": ("damaged.ckpt", ("--resolution", 1), "resolution must lie between 4 and 1024"),
+        "fine": ("damaged.ckpt", ("--resolution", 100000), "resolution must lie between 4 and 1024"),
         "orientation": ("damaged.ckpt", ("--orientation", 0, 0, 0, 0), "non-zero quaternion"),
         "module": ("nowhere.module:density", ("--crop", 0, 0, 0, 1, 1, 1), "No module named 'nowhere'"),
     }.values(),
@@ -205,6 +276,34 @@ def test_interrupt_leaves_nothing(run, scene, tmp_path, monkeypatch):
     assert answer.code == 130
     assert "Traceback" not in answer.err
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_an_interrupt_that_was_swallowed_still_ends_the_command(run, scene, tmp_path, monkeypatch):
+    def swallowing(*given, **options):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        return dano.simulate(*given, **options)
+
+    monkeypatch.setattr(_rollout, "simulate", swallowing)
+    answer = run("simulate", scene, "-o", tmp_path / "run.npz")
+    assert (answer.code, answer.err) == (130, "dano: interrupted\n")
+    assert not (tmp_path / "run.npz").exists()
+    # The next command is none the wiser.
+    monkeypatch.setattr(_rollout, "simulate", dano.simulate)
+    assert run("simulate", scene, "-o", tmp_path / "run.npz", "--steps", 400).code == 0
+
+
+def test_interrupting_the_page_is_an_interrupt(run, scene, tmp_path, monkeypatch):
+    out = tmp_path / "run.npz"
+    assert run("simulate", scene, "-o", out).code == 0
+
+    def serve(*_, **__):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("dano.report.view", serve)
+    answer = run("view", out)
+    assert (answer.code, answer.err) == (130, "dano: interrupted\n")
 
 
 def test_view_shows_the_run(run, scene, tmp_path, monkeypatch):

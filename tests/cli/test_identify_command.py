@@ -1,11 +1,14 @@
 """`dano identify`: a slide in a file, and arguments that are wrong."""
 
 import json
+import signal
 
 import numpy as np
 import pytest
 
 import dano
+from dano.identify._problem import Problem
+from dano.solvers import bounded_least_squares
 
 SCENE = """
 timestep = 0.005
@@ -63,7 +66,10 @@ def test_finds_the_friction(files, run):
         ("ball,floor.sliding_friction:0", "BODY.PROPERTY:LOWER:UPPER"),
         ("ball,floor.sliding_friction:a:b", "BODY.PROPERTY:LOWER:UPPER"),
         ("sliding_friction:0:1", "BODY.PROPERTY:LOWER:UPPER"),
-        ("ball,wall.sliding_friction:0:1", "contact must be one of"),
+        ("ball,wall.sliding_friction:0:1", "must name bodies of the scene ['ball', 'floor'], got 'wall'"),
+        ("ball,flor.sliding_friction:0:1", "got 'flor'; did you mean 'floor'?"),
+        ("ball,floor.slidng_friction:0:1", "got 'slidng_friction'; did you mean 'sliding_friction'?"),
+        ("ball,ball.sliding_friction:0:1", "contact must be one of"),
         ("ball.colour:0:1", "must be one of mass_scale"),
         ("ball,floor.sliding_friction:1:0", "lower of parameter"),
     ],
@@ -110,3 +116,45 @@ def test_motions_that_cannot_be_used(files, run):
             changed[column] = repr(float(value))
         turned.append(changed)
     refused([names, *turned], "(x, y, z, w)")
+
+
+def test_an_interrupted_search_keeps_its_best_and_says_so(files, run, monkeypatch):
+    def search(self, x, *given, **options):
+        calls = []
+
+        def linearize(*state):
+            if calls:
+                signal.raise_signal(signal.SIGINT)
+            calls.append(state)
+            return Problem.linearize(self, *state)
+
+        found = bounded_least_squares(linearize, x, lower=x - 1, upper=x + 1, start_blocks=self.plan.start,
+                                      retract=self.retract)  # fmt: skip
+        return found
+
+    monkeypatch.setattr(Problem, "search", search)
+    answer = run(
+        "identify", files / "scene.toml", files / "slide.csv", "-p", "ball,floor.sliding_friction:0:1:0.6",
+        "-o", files / "fit.json", "--report", files / "fit.html",
+    )  # fmt: skip
+    assert (answer.code, answer.err) == (130, "dano: interrupted; the values are the best so far\n")
+    result = json.loads((files / "fit.json").read_text())
+    assert result["values"] == {"ball,floor.sliding_friction": pytest.approx(0.6)}
+    assert "interrupted" in result["stop"] and not result["converged"]
+    assert not (files / "fit.html").exists()
+
+
+def test_units_are_checked_before_the_search(files, run, monkeypatch):
+    """The slide in millimetres, and in milliseconds."""
+    monkeypatch.setattr(Problem, "search", lambda *_, **__: pytest.fail("searched all the same"))
+    slide = dano.load_motion(files / "slide.csv", names="ball")
+    for name, times, position, message in (
+        ("mm", slide.times, 1000 * slide.position, "if positions are in millimetres, divide them by 1000"),
+        ("ms", 1000 * slide.times, slide.position, "times must be in seconds, and span at most 20000 steps"),
+    ):
+        path = files / f"{name}.csv"
+        motion = dano.Motion.create(times, ("ball",), position=position, orientation=slide.orientation)
+        dano.save_motion(path, motion)
+        answer = run("identify", files / "scene.toml", path, "-p", "ball,floor.sliding_friction:0:1")
+        assert (answer.code, answer.err.count("\n")) == (2, 1)
+        assert message in answer.err

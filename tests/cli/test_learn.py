@@ -1,6 +1,7 @@
 """`dano data` and `dano train` on a few photographs of an ellipsoid."""
 
 import json
+import os
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ from PIL import Image
 from vision.photographs import capture, CENTRE, write_transforms
 
 from dano import load_field, NeuralObject
+from dano.cli import _learn
 from dano.vision import LearnedField
 
 
@@ -50,3 +52,25 @@ def test_training_leaves_object_grid_field_report_and_figures(images: Path, run,
     assert not (tmp_path / "egg.checkpoint.npz").exists()
     refused = run("train", images, "-o", tmp_path / "egg.npz")
     assert refused.code == 2 and "must end in .dano" in refused.err
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_an_interrupted_training_promises_only_a_checkpoint_that_it_wrote(when, run, tmp_path, monkeypatch):
+    """Also beside a checkpoint that an earlier training left."""
+    output, checkpoint = tmp_path / "egg.dano", tmp_path / "egg.checkpoint.npz"
+
+    def learn(capture, options, *, checkpoint, **_):
+        if when == "after":
+            checkpoint.write_bytes(b"what was learned so far")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_learn, "load_capture", lambda *_, **__: capture(n_train=4, n_test=1, pixels=8))
+    monkeypatch.setattr(_learn, "learn", learn)
+    for old in (False, True):
+        if old:
+            checkpoint.write_bytes(b"old")
+            os.utime(checkpoint, (1, 1))
+        answer = run("train", tmp_path, "-o", output)
+        assert answer.code == 130 and answer.err.count("\n") == 1
+        assert ("--resume" in answer.err) == (when == "after"), answer.err
+        checkpoint.unlink(missing_ok=True)

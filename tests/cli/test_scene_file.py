@@ -59,10 +59,12 @@ hysteresis = 0.1
 friction_fading = 0.4
 friction_pressure = 2e3
 stiction_velocity = 1e-6
+compliant = true
 """
     (contact,) = parse_scene(text, scene).scene.contacts
     assert isinstance(contact.law, dano.DistributedLaw)
     assert float(contact.law.stiction_velocity) == 1e-6
+    assert contact.law.compliant is True
     expected = {
         "sliding_friction": 0.3,
         "stiffness": 4e8,
@@ -75,6 +77,8 @@ stiction_velocity = 1e-6
     assert {key: float(getattr(contact.params, key)) for key in expected} == expected
     (contact,) = parse_scene(text.replace("stiffness = 4e8\n", ""), scene).scene.contacts
     assert contact.params.stiffness is not None and float(contact.params.stiffness) > 0
+    (contact,) = parse_scene(text.replace("compliant = true", ""), scene).scene.contacts
+    assert isinstance(contact.law, dano.DistributedLaw) and contact.law.compliant is False
 
 
 def test_contact_with_another_law_than_the_default(scene):
@@ -108,7 +112,7 @@ stiction_velocity = 1e-6
     assert isinstance(ball.law, dano.CentroidLaw)
     assert ball.law.stiction_velocity is not None and float(ball.law.stiction_velocity) == 1e-6
     # What the default says for its own law is not for this one.
-    assert float(ball.params.restitution) == 0
+    assert ball.params.restitution is None
     assert float(ball.params.sliding_friction) == 0.3
 
 
@@ -218,6 +222,8 @@ BAD = {
     "unknown key": ("n_steps = 1\nspeed = 2\n" + BODY, "unknown key 'speed'; valid keys are timestep"),
     "no length": (BODY, "either duration [s] or n_steps"),
     "both lengths": ("n_steps = 1\nduration = 1.0\n" + BODY, "either duration [s] or n_steps"),
+    "long": ("duration = 1e9\n" + BODY, "steps of 1 bodies, got 1e+11 of 0.01 s"),
+    "endless": ("timestep = 1e-300\nduration = 1e300\n" + BODY, "steps of 1 bodies, got inf of"),
     "zero steps": ("n_steps = 0\n" + BODY, "n_steps must be ≥ 1, got 0"),
     "negative timestep": (
         "n_steps = 1\ntimestep = -0.1\n" + BODY,
@@ -231,7 +237,20 @@ BAD = {
     ),
     "unknown body key": (
         "n_steps = 1\n" + BODY + "radus = 1\n",
-        "[[bodies]] 1 ('ball'): unknown key 'radus'",
+        "[[bodies]] 1 ('ball'): unknown key 'radus'; valid keys are ",
+    ),
+    "key nearly right": ("n_steps = 1\n" + BODY + "radus = 1\n", "; did you mean 'radius'?"),
+    "shape nearly right": (
+        'n_steps = 1\n[[bodies]]\nname = "x"\nshape = "shpere"\n',
+        "got 'shpere'; did you mean 'sphere'?",
+    ),
+    "body nearly right": (
+        "n_steps = 1\n" + BODY + FLOOR + '[[contacts]]\na = "ball"\nb = "flor"\n',
+        "got 'flor'; did you mean 'floor'?",
+    ),
+    "asset nearly right": (
+        'n_steps = 1\n[[bodies]]\nname = "x"\nasset = "Bunny"\n',
+        "got 'Bunny'; did you mean 'bunny'?",
     ),
     "unknown shape": (
         'n_steps = 1\n[[bodies]]\nname = "x"\nshape = "cone"\n',
@@ -296,6 +315,14 @@ BAD = {
         "n_steps = 1\n" + BODY + FLOOR + "[default_contact]\nrestitution = 0.5\n",
         "[default_contact]: restitution belongs to law = 'distributed', and this is 'centroid'",
     ),
+    "compliant as a number": (
+        "n_steps = 1\n" + BODY + FLOOR + '[default_contact]\nlaw = "distributed"\ncompliant = 1\n',
+        "[default_contact]: compliant must be true or false",
+    ),
+    "compliant with the paper's law": (
+        "n_steps = 1\n" + BODY + FLOOR + '[default_contact]\nlaw = "centroid"\ncompliant = true\n',
+        "[default_contact]: compliant belongs to law = 'distributed'",
+    ),
     "restitution above one": (
         "n_steps = 1\n" + BODY + FLOOR + '[default_contact]\nlaw = "distributed"\nrestitution = 1.5\n',
         "[default_contact]: restitution must lie in [0, 1], got 1.5",
@@ -357,3 +384,9 @@ def test_documented_scene_loads(tmp_path):
     assert loaded.scene.names == ("soap", "ball", "floor")
     assert loaded.n_steps == 300
     assert loaded.controls is not None
+
+
+def test_byte_order_mark(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text("n_steps = 1\n" + BODY, encoding="utf-8-sig")
+    assert load_scene(path).scene.names == ("ball",)

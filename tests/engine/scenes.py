@@ -22,9 +22,9 @@ def point_cloud_box(half=(0.1, 0.07, 0.05), mass=1.3, n=8, com=(0.0, 0.0, 0.0)):
 
 
 def on_floor(body, **params):
-    """A body on a floor at a step of 10 ms, with a generous edge so that few samples carry it smoothly."""
+    """A body on a floor by the centroid law, at 10 ms, with a wide edge so that few samples carry it."""
     floor = dano.Body("floor", dano.HalfSpace(edge=0.02), fixed=True)
-    contact = dano.Contact(body.name, "floor", dano.ContactParams(**params))
+    contact = dano.Contact(body.name, "floor", dano.ContactParams(**params), dano.CentroidLaw())
     return dano.Scene.create([body, floor], [contact], timestep=0.01)
 
 

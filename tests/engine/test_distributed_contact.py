@@ -7,7 +7,6 @@ import pytest
 from engine.scenes import angular_momentum
 
 import dano
-from dano.contact import Collider
 
 G = 9.81
 PLATE = (0.05, 0.05, 0.02)
@@ -71,7 +70,8 @@ def test_default_stiffness_carries_the_weight_at_half_a_percent():
         support = scene.bodies[0].typical_support(0.005 * scene.bodies[0].size)
         assert float(scene.contact("body", "floor").stiffness) * support == pytest.approx(mass * G)
         given = dano.Scene.create(
-            scene.bodies, [dano.Contact("body", "floor", dano.ContactParams(stiffness=3e5))]
+            scene.bodies,
+            [dano.Contact("body", "floor", dano.ContactParams(stiffness=3e5), dano.DistributedLaw())],
         )
         assert float(given.contact("body", "floor").stiffness) == 3e5
 
@@ -241,9 +241,11 @@ def test_a_ball_rolls_without_slipping():
     assert w * 0.05 == pytest.approx(v, rel=0.02)
 
 
-def test_nothing_to_press_on_is_an_error():
-    with pytest.raises(ValueError, match="surface samples on one side and a solid"):
-        dano.DistributedLaw().patch(Collider(dano.Sphere(1.0)), Collider(dano.HalfSpace()), jnp.asarray(0.01))
+def test_parameters_of_another_law_are_an_error():
+    with pytest.raises(ValueError, match="CentroidLaw does not read restitution"):
+        dano.Contact("a", "b", dano.ContactParams(restitution=0.5), dano.CentroidLaw())
+    with pytest.raises(ValueError, match="DistributedLaw does not read spring"):
+        dano.Contact("a", "b", dano.ContactParams(spring=1e4), dano.DistributedLaw())
 
 
 @pytest.mark.parametrize(

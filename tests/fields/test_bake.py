@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dano import memory
 from dano.fields import bake, CallableField, HalfSpace, Sphere
 
 WIDTH = 0.25
@@ -65,3 +66,10 @@ def test_bad_bakes():
     empty = CallableField(lambda x: 0 * x[:, 0], ((-1.0,) * 3, (1.0,) * 3))
     with pytest.raises(ValueError, match="some of them positive"):
         bake(empty, 8)
+
+
+def test_a_grid_that_does_not_fit_into_memory_is_refused(monkeypatch):
+    monkeypatch.setattr(memory, "memory_limit", lambda: 16 * 64 * 1000)
+    assert bake(Sphere(1.0), 24).grid.shape == (24, 24, 24)
+    with pytest.raises(ValueError, match="resolution must be at most 30 here, got 40, which needs 4.21 MiB"):
+        bake(Sphere(1.0), 40)

@@ -1,12 +1,15 @@
 """Files: what is written is read back, and what cannot be read says why."""
 
+import io
 import os
 import pickle
+import zipfile
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dano import archive as archive_module
 from dano.fields import GridField, load_field, save_field, SignedDistanceGrid, Sphere
 
 VALUES = np.random.default_rng(0).random((6, 5, 7))
@@ -101,6 +104,8 @@ def corrupt(path, kind):
     elif kind == "single array":
         with open(path, "wb") as file:
             np.save(file, VALUES)
+    elif kind == "text member":
+        np.savez(path, values=np.full((4, 4, 4), "1.0"), origin=np.zeros(3), spacing=0.1)
     elif kind == "missing member":
         np.savez(path, values=VALUES, spacing=0.1)
     elif kind == "negative":
@@ -114,7 +119,8 @@ def corrupt(path, kind):
     {
         "truncated": "expected a grid: values",
         "damaged": "expected a grid: values",
-        "text": "expected a grid: values",
+        "text": "expected a grid: values .* it is no archive of arrays",
+        "text member": r"values must hold numbers, got text of shape \(4, 4, 4\)",
         "empty": "expected a grid: values",
         "pickle": "pickled objects, which are never loaded",
         "pickled member": "pickled objects, which are never loaded",
@@ -184,3 +190,42 @@ def test_saving_refuses_bad_places_and_never_destroys(tmp_path, monkeypatch):
 def test_shapes_are_not_saved_as_grids(tmp_path):
     with pytest.raises((ValueError, TypeError), match="(bake it first|GridField)"):
         save_field(Sphere(0.1), tmp_path / "ball.npz")  # pyright: ignore[reportArgumentType]
+
+
+def header(shape: tuple[int, ...]) -> bytes:
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+def test_sizes_are_checked_before_memory_is_taken(tmp_path, monkeypatch):
+    """A header that claims more than the file has; zeros that a small zip unfolds into more than fits."""
+    (tmp_path / "claims.npy").write_bytes(header((2**14, 2**14, 2**15)) + bytes(64))
+    with zipfile.ZipFile(tmp_path / "claims.npz", "w") as zipped:
+        for name in ("values", "origin", "spacing"):
+            zipped.writestr(f"{name}.npy", header((2**14, 2**14, 2**15)) + bytes(64))
+    for name in ("claims.npy", "claims.npz"):
+        with pytest.raises(
+            ValueError, match=r"is cut off: by its shape .* it takes 64 TiB, the file has 192 B"
+        ):
+            load_field(tmp_path / name)
+    np.savez_compressed(
+        tmp_path / "zeros.npz", values=np.zeros((64, 64, 64)), origin=np.zeros(3), spacing=0.1
+    )
+    np.save(tmp_path / "zeros.npy", np.zeros((64, 64, 64)))
+    assert (tmp_path / "zeros.npz").stat().st_size < 5000
+    monkeypatch.setattr(archive_module, "memory_limit", lambda: 1 << 20)
+    for name in ("zeros.npy", "zeros.npz"):
+        with pytest.raises(ValueError, match=r"takes 2 MiB; the arrays of a file may take 1 MiB"):
+            load_field(tmp_path / name)
+
+
+def test_all_arrays_of_a_file_count(tmp_path, monkeypatch):
+    path = tmp_path / "run.npz"
+    archive_module.write_archive(path, {f"a{i}": np.zeros(1000) for i in range(10)})
+    monkeypatch.setattr(archive_module, "memory_limit", lambda: 50_000)
+    with open(path, "rb") as file:
+        arrays = archive_module.Arrays(file)
+        with pytest.raises(ValueError, match="a6 of shape"):
+            for name in arrays.names:
+                assert arrays[name].shape == (1000,)

@@ -2,9 +2,11 @@
 
 import io
 import pickle
+import re
 import runpy
 import warnings
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,9 @@ import numpy as np
 import pytest
 
 import dano
-from dano.fields import GridField, load_field, save_field, SignedDistanceGrid
+from dano import memory
+from dano.fields import _checkpoint, GridField, load_field, save_field, SignedDistanceGrid
+from dano.fields._splats import splat_field
 
 FILES = Path(__file__).parents[1] / "data" / "imports"
 CHECKPOINT = FILES / "nerfacto" / "nerfstudio_models" / "step-000000003.ckpt"
@@ -234,6 +238,7 @@ BROKEN = ["nerfacto/nerfstudio_models/step-000000003.ckpt", "splats.ply", "openv
 
 
 @pytest.mark.parametrize("name", BROKEN)
+@pytest.mark.filterwarnings("ignore:.* Gaussians lie far from the others")
 def test_broken_files(name, tmp_path):
     """Cut off, empty, foreign, or with a spoilt byte: a ValueError that names the file, or no effect."""
     needs({"splats.ply": "splats", "openvdb.vdb": "fog"}.get(name, ""))
@@ -271,3 +276,38 @@ def test_what_does_not_fit_is_said(tmp_path):
     pytest.importorskip("msgpack")
     with pytest.raises(ValueError, match="x.ingp: it is cut off or no msgpack"):
         load_field(tmp_path / "x.ingp")
+
+
+def test_stray_gaussians_are_said_with_a_crop_that_leaves_them_out():
+    random = np.random.default_rng(0)
+    n = 200
+    parameters = {
+        "means": 0.1 * random.standard_normal((n, 3)),
+        "scales": np.full((n, 3), np.log(0.01)),
+        "quats": np.tile([1.0, 0, 0, 0], (n, 1)),
+        "opacities": np.full(n, 3.0),
+    }
+    splat_field(parameters, None)
+    parameters["means"][7] = 8000.0, 0, 0
+    with pytest.warns(UserWarning, match="1 of 200 Gaussians lie far .* is 8e.03 wide") as said:
+        splat_field(parameters, None)
+    crop = re.search(r"--crop ([-0-9. ]+)`", str(said[0].message))
+    assert crop is not None
+    box = np.reshape([float(x) for x in crop[1].split()], (2, 3))
+    others = np.delete(parameters["means"], 7, axis=0)
+    assert np.all(box[0] < others.min(0)) and np.all(box[1] > others.max(0)) and np.all(np.ptp(box, 0) < 1)
+    splat_field(parameters, box)
+
+
+def test_files_that_unfold_into_more_than_fits_are_refused(tmp_path, monkeypatch):
+    needs("ngp")
+    snapshot, weights = tmp_path / "x.ingp", tmp_path / "x.ckpt"
+    snapshot.write_bytes(zlib.compress(bytes(1 << 21)))
+    with zipfile.ZipFile(weights, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data/0", bytes(1 << 21))
+    monkeypatch.setattr(memory, "memory_limit", lambda: 1 << 20)
+    monkeypatch.setattr(_checkpoint, "memory_limit", lambda: 1 << 20)
+    for path in (snapshot, weights):
+        assert path.stat().st_size < 5000
+        with pytest.raises(ValueError, match=rf"{path.name}: .*it unfolds into .* MiB"):
+            load_field(path)

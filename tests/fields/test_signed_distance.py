@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import dano
 from dano.fields import Box, mesh_field, SignedDistanceGrid, Sphere
 
 N = 2000
@@ -161,3 +162,69 @@ def test_meshes_that_enclose_nothing_are_refused(trimesh, tmp_path):
         mesh_field(box, 4)
     with pytest.raises(ValueError, match="scale must be positive"):
         mesh_field(box, scale=0.0)
+
+
+def block(trimesh, sides, middle, *, inside_out=False):
+    made = trimesh.creation.box(sides)
+    made.apply_translation(middle)
+    if inside_out:
+        made.invert()
+    return made
+
+
+def occupied_volume(field) -> float:
+    """Of a signed distance at nodes: each cell counts by how far it is inside."""
+    spacing = np.asarray(field.spacing)
+    return float(np.clip(0.5 - np.asarray(field.distances) / spacing[0], 0, 1).sum() * spacing.prod())
+
+
+def test_parts_of_a_mesh_make_their_union(trimesh):
+    """Overlapping, nested, hollow with something inside, and turned inside out beside the others."""
+    cube = block(trimesh, (0.1, 0.1, 0.1), (0, 0, 0))
+    arm = block(trimesh, (0.1, 0.06, 0.06), (0.08, 0, 0))
+    small, hollow = ((0.02, 0.02, 0.02), (0, 0, 0)), ((0.06, 0.06, 0.06), (0, 0, 0))
+    cavity = block(trimesh, *hollow, inside_out=True)
+    apart = block(trimesh, (0.02, 0.02, 0.02), (0.1, 0, 0), inside_out=True)
+    cases = {
+        "overlap": ([cube, arm], 1e-3 + 3.6e-4 - 7.2e-5, False),
+        "nested": ([cube, block(trimesh, *small)], 1e-3, False),
+        "hollow": ([cube, cavity, block(trimesh, *small)], 1e-3 - 2.16e-4 + 8e-6, True),
+        "inside out": ([cube, apart], 1e-3 + 8e-6, True),
+    }
+    for name, (meshes, volume, closed_form) in cases.items():
+        field = mesh_field(trimesh.util.concatenate(meshes), 64)
+        assert occupied_volume(field) == pytest.approx(volume, rel=5e-3), name
+        moments = field.solid_moments()
+        assert (moments is not None) == closed_form, name
+        if moments is not None:
+            assert float(moments.volume) == pytest.approx(volume, rel=1e-6), name
+    field = mesh_field(trimesh.util.concatenate([cube, arm]), 64)
+    # Near the concave edge of the union; and where one part ends inside the other, to the wall of that one.
+    x = jnp.asarray([[0.06, 0.0, 0.04], [0.03, 0.0, 0.0]]).T
+    np.testing.assert_allclose(distance_of(field, x)[0], [0.01, -0.02], atol=1e-3)
+
+
+def test_overlapping_parts_weigh_once(trimesh):
+    """Inertia of two crossed bars against the sum over their three disjoint pieces."""
+    bars = [block(trimesh, (0.2, 0.04, 0.04), (0, 0, 0)), block(trimesh, (0.04, 0.2, 0.04), (0, 0, 0))]
+    made = dano.MassProperties.from_field(mesh_field(trimesh.util.concatenate(bars)), mass=1.0)
+    pieces = [((0.2, 0.04, 0.04), 0.0), ((0.04, 0.08, 0.04), 0.06), ((0.04, 0.08, 0.04), -0.06)]
+    volumes = np.array([np.prod(sides) for sides, _ in pieces])
+    about_z = sum(
+        m * ((a**2 + b**2) / 12 + y**2)
+        for m, ((a, b, _), y) in zip(volumes / volumes.sum(), pieces, strict=True)
+    )
+    assert float(made.inertia[2, 2]) == pytest.approx(about_z, rel=0.01)
+
+
+def test_thin_walls_choose_the_resolution_or_say_what_would_do(trimesh):
+    plate = trimesh.creation.box((0.1, 0.1, 0.0007))
+    field = mesh_field(plate)
+    assert 216 <= max(field.distances.shape) <= 230
+    assert occupied_volume(field) == pytest.approx(7e-6, rel=0.02)
+    with pytest.raises(ValueError, match="of 64 none does: walls thinner than .* resolution 216 keeps them"):
+        mesh_field(plate, 64)
+    with pytest.warns(UserWarning, match="mesh: walls thinner than 0.0015 m.* resolution 144 keeps them"):
+        mesh_field(trimesh.creation.box((0.1, 0.1, 0.0012)), 101)
+    with pytest.raises(ValueError, match="thicken them in the mesh"):
+        mesh_field(trimesh.creation.box((0.1, 0.1, 0.00002)))

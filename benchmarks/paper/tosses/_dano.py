@@ -77,7 +77,7 @@ class Dano:
         floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
         params = dano.ContactParams(**contact)
         # A frame is longer than an impact: with the depth at the end of a step all would be plastic.
-        law = dano.DistributedLaw(implicitness=0.5)
+        law = dano.DistributedLaw(implicitness=0.5, compliant=True)
         contacts = [dano.Contact("cube", "floor", params, law)]
         gravity = (0.0, 0.0, -self.gravity)
         scene = dano.Scene.create([cube, floor], contacts, timestep=timestep, gravity=gravity)

@@ -1,5 +1,6 @@
 """The command line: `dano train | data | import | build | inspect | simulate | identify | view | demo`."""
 
+import contextlib
 import sys
 import warnings
 from collections.abc import Sequence
@@ -11,29 +12,50 @@ def main(argv: Sequence[str] | None = None) -> None:
     Exits with code 2 after a one-line message if the input is wrong, with 130 if interrupted.
 
     Args:
-        argv: Arguments without the program's name; default those of the process.
+        argv: Arguments without the program's name; default those of the process, which then also keeps what
+            it compiles for the next one (see `dano.cli._compiled`).
     """
     # Here and below: what a command needs is imported when it runs, so that `dano --help` answers at once.
+    from dano.cli._console import end_line, say
+    from dano.cli._interrupt import interrupted, listening
+
+    with listening():
+        try:
+            _run(list(sys.argv[1:] if argv is None else argv), keep=argv is None)
+            if interrupted():
+                raise KeyboardInterrupt
+        except KeyboardInterrupt as stop:
+            end_line()
+            say("; ".join(["interrupted", *map(str, stop.args)]))
+            raise SystemExit(130) from None
+        except Exception as error:
+            end_line()
+            if interrupted():
+                # Whatever went wrong then is a consequence.
+                say("interrupted")
+                raise SystemExit(130) from error
+            if not isinstance(error, (ValueError, ImportError, OSError, MemoryError)):
+                raise
+            say("error: " + (" ".join(str(error).split()) or "out of memory"))
+            raise SystemExit(2) from error
+
+
+def _run(argv: list[str], keep: bool) -> None:
+    """Run a command; `keep`: keep what it compiles."""
     from dano.cli._parse import parse
 
-    command = parse(list(sys.argv[1:] if argv is None else argv))
+    command = parse(argv)
     import jax
 
-    from dano.cli._console import end_line, say
+    from dano.cli._compiled import compiled_programs
 
     jax.config.update("jax_enable_x64", True)
-    try:
-        with warnings.catch_warnings():
-            warnings.showwarning = _say_warning
-            command()
-    except (ValueError, ImportError, OSError) as error:
-        end_line()
-        say("error: " + " ".join(str(error).split()))
-        raise SystemExit(2) from error
-    except KeyboardInterrupt:
-        end_line()
-        say("interrupted")
-        raise SystemExit(130) from None
+    # Called from another program, JAX's settings are that program's.
+    with compiled_programs() if keep else contextlib.nullcontext(), warnings.catch_warnings():
+        warnings.showwarning = _say_warning
+        # What dano says of its results is heard whatever the process makes of warnings, once.
+        warnings.simplefilter("default", UserWarning)
+        command()
 
 
 def _say_warning(message: Warning | str, *_: object, **__: object) -> None:

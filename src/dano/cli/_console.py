@@ -6,17 +6,29 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from dano.cli._interrupt import interrupted
+
 BAR = 24
 
 
 class Progress:
-    """A line on stderr that says what is being done and how far it is; silent if stderr is no terminal."""
+    """A line on stderr that says what is being done and how far it is; silent if stderr is no terminal.
 
-    def __init__(self) -> None:
+    An interrupt that was lost is raised again here, unless what runs returns its best so far instead.
+    """
+
+    def __init__(self, *, stops: bool = True) -> None:
         self._shown = sys.stderr.isatty()
+        self._stops = stops
 
     def __call__(self, description: str, share: float) -> None:
-        """Show a description and the share done, between 0 and 1."""
+        """Show a description and the share done, between 0 and 1.
+
+        Raises:
+            KeyboardInterrupt: If the command was interrupted.
+        """
+        if self._stops and interrupted():
+            raise KeyboardInterrupt
         if not self._shown:
             return
         done = round(BAR * min(max(share, 0.0), 1.0))

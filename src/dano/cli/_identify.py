@@ -11,10 +11,13 @@ import numpy as np
 from dano import scene_file
 from dano.archive import checked_output, replacing
 from dano.cli._console import Progress, put, put_json, say
+from dano.cli._interrupt import interrupted
 from dano.cli._outputs import missing_for_pictures
 from dano.contact import ContactParams
 from dano.identify import Identification, identify as fit_parameters, load_motion, Parameter
+from dano.names import did_you_mean
 from dano.scene import Scene
+from dano.solvers import Stop
 
 _OF_BODIES = ("mass_scale", "com_offset", "inertia", "mass", "com")
 
@@ -44,7 +47,8 @@ def identify(
         raise ImportError(missing)
     if not motions:
         raise ValueError("motions must name at least one file, got none")
-    progress = Progress()
+    # An interrupted search returns its best so far.
+    progress = Progress(stops=False)
     loaded = scene_file.load_scene(scene, timestep=timestep, progress=progress)
     chosen = [_parameter(text, loaded.scene) for text in parameters]
     name = body or _only_free_body(loaded.scene)
@@ -70,7 +74,8 @@ def identify(
     if output is not None:
         with replacing(output) as file:
             file.write((json.dumps(result, indent=2, ensure_ascii=False) + "\n").encode())
-    if report is not None:
+    stopped = interrupted() or any(minimum.stop is Stop.INTERRUPTED for minimum in fit.minima)
+    if report is not None and not stopped:
         from dano.report import write_identification_report
 
         progress("drawing", 0.0)
@@ -80,9 +85,11 @@ def identify(
         put_json(result)
     else:
         _print(fit)
-        for label, file in (("result", output), ("report", report)):
+        for label, file in (("result", output), ("report", None if stopped else report)):
             if file is not None:
                 put(f"{label:<10}  {file}")
+    if stopped:
+        raise KeyboardInterrupt("the values are the best so far")
     for message in fit.messages:
         say(f"warning: {message}")
 
@@ -104,6 +111,13 @@ def _parameter(text: str, scene: Scene) -> Parameter:
         raise ValueError(f"parameter must be written {form}, got {text!r}")
     lower, upper = bounds[:2] or (-np.inf, np.inf)
     start = bounds[2] if len(bounds) == 3 else None
+    bodies = [body.name for body in scene.bodies]
+    for body in map(str.strip, owner.split(",")):
+        if body not in bodies:
+            raise ValueError(
+                f"parameter {text!r} must name bodies of the scene {bodies}, got {body!r}"
+                + did_you_mean(body, bodies)
+            )
     if "," in owner:
         a, b = (part.strip() for part in owner.split(",", 1))
         valid = tuple(ContactParams.__dataclass_fields__)
@@ -114,7 +128,10 @@ def _parameter(text: str, scene: Scene) -> Parameter:
         place = scene.index(owner)
         where = lambda s: getattr(s.bodies[place], name)  # noqa: E731
     if name not in valid:
-        raise ValueError(f"property in parameter {text!r} must be one of {', '.join(valid)}, got {name!r}")
+        raise ValueError(
+            f"property in parameter {text!r} must be one of {', '.join(valid)}, got {name!r}"
+            + did_you_mean(name, valid)
+        )
     return Parameter(path, where, lower, upper, start=start)
 
 

@@ -1,5 +1,6 @@
 """`dano import`."""
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,9 @@ from dano.maths import Pose
 from dano.objects import fill_hollows
 from dano.objects._interior import node_values
 
+_USUAL = (1e-3, 20.0)
+"""Widths [m] of a field beyond which its file is rather in other units than so small or large."""
+
 
 def import_field(
     file: str,
@@ -23,14 +27,14 @@ def import_field(
     scale: float,
     position: tuple[float, float, float],
     orientation: tuple[float, float, float, float],
-    resolution: int,
+    resolution: int | None,
     hollow: bool,
     options: Mapping[str, Any],
     as_json: bool,
 ) -> None:
     """See `dano import --help`."""
     check_output(output, Path(file), suffix=".npz")
-    if not 4 <= resolution <= 1024:
+    if resolution is not None and not 4 <= resolution <= 1024:
         raise ValueError(f"resolution must lie between 4 and 1024 nodes, got {resolution}")
     moved = np.any(position) or tuple(orientation) != (1.0, 0.0, 0.0, 0.0)
     pose = Pose(position, orientation) if moved else None
@@ -38,12 +42,13 @@ def import_field(
     progress("reading the field", 0.0)
     box = None if crop is None else np.reshape(crop, (2, 3))
     splats, sampled = _kind(file) == "splats", {}
+    nodes = 128 if resolution is None else resolution
     if _kind(file) == "mesh":
-        sampled = {"resolution": resolution}
+        sampled = {} if resolution is None else {"resolution": resolution}
     elif splats:
         # Gaussians thinner than the distance between nodes would fall between them: a shell full of pores.
         lower, upper = np.asarray(load_field(file, crop=box).bounds)
-        sampled = {"min_width": 0.5 * float(np.max(upper - lower)) / (resolution - 1)}
+        sampled = {"min_width": 0.5 * float(np.max(upper - lower)) / (nodes - 1)}
     field = load_field(file, crop=box, scale=scale, pose=pose, **sampled, **options)
     kind, error = type(field).__name__, None
     if not isinstance(field, (GridField, SignedDistanceGrid)):
@@ -52,7 +57,7 @@ def import_field(
         def baking(done: int, total: int) -> None:
             progress("sampling the field", done / total)
 
-        field, error = bake(field, resolution, interpolation=interpolation, progress=baking)
+        field, error = bake(field, nodes, interpolation=interpolation, progress=baking)
     filled = 0.0
     if splats and not hollow and isinstance(field, GridField):
         field, before = fill_hollows(field)
@@ -61,6 +66,13 @@ def import_field(
     save_field(field, output)
     report = _described(field, output, file, kind) | {"filled": filled}
     report["bake_error"] = None if error is None else error.rms
+    longest = float(np.max(np.ptp(np.asarray(field.bounds), axis=0)))
+    if scale == 1 and not _USUAL[0] <= longest <= _USUAL[1]:
+        warnings.warn(
+            f"the field is {longest:.3g} m wide; if the file is not in metres, give --scale, the length of"
+            " its unit [m] (0.001 for millimetres)",
+            stacklevel=2,
+        )
     put_json(report) if as_json else _print(report)
 
 

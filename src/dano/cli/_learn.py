@@ -10,8 +10,8 @@ import numpy as np
 
 from dano.archive import replacing
 from dano.cli._console import numbers, Progress, put, put_json, say
-from dano.cli._outputs import check_output, missing_for_pictures
-from dano.fields import bake, save_field
+from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
+from dano.fields import bake, GridField, save_field
 from dano.objects import NeuralObject
 from dano.vision import (
     Capture,
@@ -130,10 +130,90 @@ def train(
         check_output(path)
     if json_file is not None:
         check_output(json_file)
+    check_distinct(**outputs, json=json_file)
     for name, value in (("--mass", mass), ("--mass-density", mass_density)):
         if value is not None and not (math.isfinite(value) and value > 0):
             raise ValueError(f"{name} must be positive, got {value}")
+    checkpoint = outputs["checkpoint"]
+    before = _written_at(checkpoint)
     progress = Progress()
+    try:
+        trained, given = _learned(
+            images,
+            options,
+            checkpoint,
+            progress,
+            downscale=downscale,
+            views=views,
+            network=network,
+            resume=resume,
+            previews=previews,
+        )
+        progress("solid", 0.0)
+        volume = _solid_volume(trained)
+        made = NeuralObject.from_field(
+            trained.field,
+            mass_model="solid",
+            mass=mass_density * volume if mass is None else mass,
+            progress=lambda what, share: progress(what, share),
+        )
+        grid = bake(trained.field, options.resolution)
+    except KeyboardInterrupt:
+        # An older checkpoint counts only if this training went on from it.
+        kept = checkpoint.exists() and (resume or _written_at(checkpoint) != before)
+        rest = (
+            f"`--resume` goes on from {checkpoint}" if kept else "too early for a checkpoint to resume from"
+        )
+        raise KeyboardInterrupt(rest) from None
+    progress.close()
+    _write(trained, made, grid.grid, outputs, masks_given=given, report=report, json_file=json_file)
+
+
+def _write(
+    trained: Trained,
+    made: NeuralObject,
+    grid: GridField,
+    outputs: dict[str, Path],
+    *,
+    masks_given: bool,
+    report: bool,
+    json_file: Path | None,
+) -> None:
+    """Write and print what was learned."""
+    output = outputs["object"]
+    trained.field.save(outputs["field"])
+    save_field(grid, outputs["grid"])
+    made.save(output, look=trained.field.look)
+    from dano.report import mass_estimates, write_training_report
+
+    estimates = mass_estimates(trained, made, grid)
+    summary = _summary(trained, made, output, masks_given=masks_given)
+    summary |= {"confidence": estimates.differences(made.size)}
+    if report:
+        write_training_report(outputs["report"], trained, trained.capture, made, estimates, title=output.stem)
+    if json_file is not None:
+        with replacing(json_file) as file:
+            file.write((json.dumps(summary, indent=1) + "\n").encode())
+    # What it was for is done.
+    outputs["checkpoint"].unlink(missing_ok=True)
+    for text in trained.warnings:
+        warnings.warn(text, stacklevel=1)
+    _print_trained(summary, outputs, with_report=report)
+
+
+def _learned(
+    images: Path,
+    options: TrainOptions,
+    checkpoint: Path,
+    progress: Progress,
+    *,
+    downscale: int,
+    views: int | None,
+    network: Path | None,
+    resume: bool,
+    previews: Path | None,
+) -> tuple[Trained, bool]:
+    """What photographs teach, and whether they came with masks."""
     progress("reading photographs", 0.0)
     capture = load_capture(images, downscale=downscale)
     given = capture.has_masks
@@ -150,47 +230,13 @@ def train(
         )
 
     progress("visual hull", 0.0)
-    try:
-        trained = learn(
-            capture,
-            options,
-            checkpoint=outputs["checkpoint"],
-            resume=resume,
-            progress=show,
-            previews=previews,
-        )
-    except KeyboardInterrupt:
-        progress.close()
-        say(f"stopped; `--resume` goes on from {outputs['checkpoint']}")
-        raise
-    progress("solid", 0.0)
-    volume = _solid_volume(trained)
-    made = NeuralObject.from_field(
-        trained.field,
-        mass_model="solid",
-        mass=mass_density * volume if mass is None else mass,
-        progress=lambda what, share: progress(what, share),
-    )
-    grid = bake(trained.field, options.resolution)
-    progress.close()
-    trained.field.save(outputs["field"])
-    save_field(grid.grid, outputs["grid"])
-    made.save(output, look=trained.field.look)
-    from dano.report import mass_estimates, write_training_report
+    trained = learn(capture, options, checkpoint=checkpoint, resume=resume, progress=show, previews=previews)
+    return trained, given
 
-    estimates = mass_estimates(trained, made, grid.grid)
-    summary = _summary(trained, made, output, masks_given=given)
-    summary |= {"confidence": estimates.differences(made.size)}
-    if report:
-        write_training_report(outputs["report"], trained, trained.capture, made, estimates, title=output.stem)
-    if json_file is not None:
-        with replacing(json_file) as file:
-            file.write((json.dumps(summary, indent=1) + "\n").encode())
-    # What it was for is done.
-    outputs["checkpoint"].unlink(missing_ok=True)
-    for text in trained.warnings:
-        warnings.warn(text, stacklevel=1)
-    _print_trained(summary, outputs, with_report=report)
+
+def _written_at(path: Path) -> int | None:
+    """When a file was written last [ns]; None if there is none."""
+    return path.stat().st_mtime_ns if path.exists() else None
 
 
 def _outputs(output: Path) -> dict[str, Path]:

@@ -41,12 +41,13 @@ def build(
         n_samples=samples,
         density_range=density_range,
         mass_model=mass_model,
-        mass_scale=1.0 if mass_scale is None else mass_scale,
+        mass_scale=mass_scale,
         mass=mass,
         resolution=resolution,
         length=length,
         floaters=floaters,
         seed=seed,
+        dashes="--",
         progress=progress,
     )
     progress.close()

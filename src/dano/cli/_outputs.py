@@ -26,6 +26,24 @@ def check_output(path: Path, *inputs: Path, suffix: str | None = None) -> None:
         raise ValueError(f"output path must end in {suffix}, got {path}")
 
 
+def check_distinct(**outputs: Path | None) -> None:
+    """Check that no two results go to one file.
+
+    Args:
+        **outputs: Where to, by the name of the option; None where nothing is written.
+
+    Raises:
+        ValueError: If two are the same file. Devices and pipes may take several.
+    """
+    named: dict[Path, str] = {}
+    for name, path in outputs.items():
+        if path is None or (path.exists() and not path.is_file()):
+            continue
+        other = named.setdefault(path.resolve(), name)
+        if other != name:
+            raise ValueError(f"{other} and {name} must be different files, got {path} for both")
+
+
 def missing_for_pictures(*, video: bool) -> str | None:
     """What to install before pictures, or videos, can be made; None if all is there."""
     packages = ["matplotlib", "PIL", *(["av"] if video else [])]

@@ -9,6 +9,7 @@ import tyro
 from tyro.conf import arg, FlagCreatePairsOff, Positional
 
 from dano import __version__
+from dano.names import did_you_mean
 
 Output = Annotated[Path, arg(aliases=["-o"])]
 
@@ -17,6 +18,9 @@ def parse(argv: Sequence[str]) -> Callable[[], None]:
     """The command that the arguments ask for, ready to be called.
 
     Exits with code 0 after printing help, with 2 if the arguments are wrong.
+
+    Raises:
+        ValueError: If there is no such command.
     """
     if not argv:
         argv = ["--help"]
@@ -25,6 +29,10 @@ def parse(argv: Sequence[str]) -> Callable[[], None]:
         raise SystemExit(0)
     functions = (train, data, build, import_, inspect, simulate, identify, view, demo)
     commands = {function.__name__.rstrip("_"): function for function in functions}
+    if not argv[0].startswith("-") and argv[0] not in commands:
+        raise ValueError(
+            f"command must be one of {', '.join(commands)}, got {argv[0]!r}{did_you_mean(argv[0], commands)}"
+        )
     return tyro.extras.subcommand_cli_from_dict(
         commands,
         prog="dano",
@@ -165,7 +173,7 @@ def build(
         mass: Total mass [kg], instead of the mass scale.
         resolution: Cells along the longest axis for mass integrals and sampling.
         length: Scale the field so that the object's longest extent is this [m].
-        floaters: Let parts apart from the largest one feel contact, too.
+        floaters: Let parts apart from the largest one feel contact, too; those of meshes always do.
         seed: Seed of the random samples.
         json: Print one JSON object instead of text.
     """
@@ -196,7 +204,7 @@ def import_(
     scale: float = 1.0,
     position: tuple[float, float, float] = (0.0, 0.0, 0.0),
     orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
-    resolution: int = 128,
+    resolution: int | None = None,
     interpolation: Literal["linear", "quadratic", "cubic"] | None = None,
     hollow: bool = False,
     spacing: float | None = None,
@@ -219,7 +227,8 @@ def import_(
         scale: Length of a unit of the file [m].
         position: Moves the scaled field [m].
         orientation: Turns the scaled field before it is moved; quaternion w x y z.
-        resolution: Nodes along the longest axis of what is not a grid already.
+        resolution: Nodes along the longest axis of what is not a grid already; default 128, and for meshes as
+            many as their walls need.
         interpolation: Between nodes.
         hollow: Leave what Gaussian splats enclose empty. Splats are shells; otherwise it is filled.
         spacing: Voxels (.npy): distance between voxels in the file's units; default: longest side 1.

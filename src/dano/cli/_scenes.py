@@ -12,7 +12,7 @@ from dano import scene_file
 from dano.archive import replacing
 from dano.cli import _rollout
 from dano.cli._console import Progress, put, put_json, say
-from dano.cli._outputs import check_output, missing_for_pictures
+from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
 from dano.objects import NeuralObject
 
 SCENES = ("drop", "collision")
@@ -40,7 +40,15 @@ def simulate(
                 raise ImportError(missing)
     if not slow_motion > 0:
         raise ValueError(f"slow_motion must be > 0, got {slow_motion}")
+    check_distinct(output=output, video=video, strip=strip)
     loaded = _load(scene, steps, timestep)
+    for path in (output, video, strip):
+        if path is not None:
+            check_output(path, *loaded.inputs())
+    if video is not None or strip is not None:
+        from dano.report import frame_count
+
+        frame_count(loaded.n_steps * float(loaded.scene.timestep), slow_motion)
     report = _run(loaded, output, video, strip, slow_motion)
     if as_json:
         put_json({"scene": str(scene), **report})

@@ -1,4 +1,4 @@
-"""Contact: overlap of density fields, pressure on surfaces, and the laws that turn them into force."""
+"""Contact, in two halves that do not know each other: finding it, and turning it into force."""
 
 from dano.contact._centroid import CentroidLaw as CentroidLaw
 from dano.contact._colliders import (
@@ -7,13 +7,43 @@ from dano.contact._colliders import (
     Support as Support,
     SurfaceSet as SurfaceSet,
 )
-from dano.contact._distributed import DistributedLaw as DistributedLaw, SurfacePatch as SurfacePatch
+from dano.contact._derivatives import by_autodiff as by_autodiff, KEPT as KEPT
+from dano.contact._distributed import DistributedLaw as DistributedLaw
+from dano.contact._finding import find as find, Impacts as Impacts, points_of as points_of
+from dano.contact._geometry import (
+    gather_geometry as gather_geometry,
+    Geometry as Geometry,
+    Links as Links,
+    Part as Part,
+)
 from dano.contact._laws import (
     AbstractContactLaw as AbstractContactLaw,
+    AbstractPatchLaw as AbstractPatchLaw,
     checked_parameter as checked_parameter,
     ContactParams as ContactParams,
+    HARD as HARD,
     non_negative as non_negative,
     Setting as Setting,
     Softening as Softening,
 )
 from dano.contact._overlap import overlap as overlap, Patch as Patch
+from dano.contact._points import (
+    CHUNK as CHUNK,
+    cross as cross,
+    Found as Found,
+    Motion as Motion,
+    point_motion as point_motion,
+    Points as Points,
+)
+from dano.contact._pressure import (
+    Duals as Duals,
+    first_duals as first_duals,
+    Linear as Linear,
+    linearized as linearized,
+    Material as Material,
+    Pressure as Pressure,
+    Spring as Spring,
+    spring as spring,
+    traction as traction,
+    updated as updated,
+)

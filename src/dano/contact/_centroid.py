@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dano.contact._laws import (
-    AbstractContactLaw,
+    AbstractPatchLaw,
     ContactParams,
     HARD,
     non_negative,
@@ -28,7 +28,7 @@ PAPER = {
 }
 
 
-class CentroidLaw(AbstractContactLaw):
+class CentroidLaw(AbstractPatchLaw):
     """One wrench at the centroid of the overlap.
 
     F_n = ψ (k − d n·v) n,  F_t = |F_n| (μ_s c(v_t) − drag_s v_t),  τ = |F_n| (μ_t c(w_n) − drag_t w_n
@@ -74,6 +74,11 @@ class CentroidLaw(AbstractContactLaw):
         sticks = stiction_velocity is not None
         self.stiction_velocity = positive("stiction_velocity", stiction_velocity) if sticks else None
         self.adhesive = bool(adhesive)
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """See `AbstractContactLaw.reads`."""
+        return ("sliding_friction", *PAPER)
 
     @property
     def stiction(self) -> bool:

@@ -3,12 +3,12 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, DTypeLike, Float
 
-from dano.fields import AbstractField, AbstractShape, GridField
+from dano.fields import AbstractField, GridField
 from dano.maths import floating, Numbers, Pose, safe_norm
 
-# Samples per block. Fewer make the culling finer, more make each pass over a block fatter; 32 measured best.
+# Samples per block. Fewer make the culling finer, more make each pass over a block fatter.
 BLOCK = 16
 
 # Order of `SampleSet.products`, and where each entry of the symmetric 4×4 matrix stands in it.
@@ -59,18 +59,29 @@ class SurfaceSet(eqx.Module):
         vectors: Vector area of each [m², F], zero for what fills up the last block, shape (3, n).
         centers: Centre of each block [m, F], shape (n / BLOCK, 3).
         radii: Radius of each block about its centre [m], shape (n / BLOCK,).
+        turning: How samples turn with the body (static): "fixed" to it; about its z "axis" they keep facing
+            the other body; of a "ball" all do, and `points` are directions on the unit ball.
     """
 
     points: Float[Array, "4 n"]
     vectors: Float[Array, "3 n"]
     centers: Float[Array, "blocks 3"]
     radii: Float[Array, " blocks"]
+    turning: str = eqx.field(static=True, default="fixed")
 
     @classmethod
-    def create(cls, points: Numbers, vectors: Numbers) -> "SurfaceSet":
+    def create(cls, points: Numbers, vectors: Numbers, turning: str = "fixed") -> "SurfaceSet":
         """Order the samples in space, on the host; points [m, F] and vector areas [m², F], both (n, 3)."""
         x, a = np.asarray(points, dtype=np.float64), np.asarray(vectors, dtype=np.float64)
-        return cls(*(floating(part) for part in _in_blocks(x, a)))
+        points, vectors, centers, radii = (floating(part) for part in _in_blocks(x, a))
+        return cls(points, vectors, centers, radii, turning)
+
+    @classmethod
+    def none(cls, dtype: DTypeLike, blocks: int = 0) -> "SurfaceSet":
+        """Blocks of samples without area."""
+        n = blocks * BLOCK
+        points, vectors = jnp.zeros((4, n), dtype), jnp.zeros((3, n), dtype)
+        return cls(points, vectors, jnp.zeros((blocks, 3), dtype), jnp.zeros((blocks,), dtype))
 
 
 class Support(eqx.Module):
@@ -134,10 +145,6 @@ class Collider(eqx.Module):
         mass: Mass [kg] that the sample weights sum to.
         rotation: Field frame → world, shape (3, 3).
         origin: Origin of the field frame [m, W], shape (3,).
-        surface: Surface samples with vector areas, for distributed contact.
-        solid: Signed distance that the other side's surface samples query.
-        velocity: Of the point at the origin of the field frame [m/s, W].
-        omega: Angular velocity [rad/s, W].
     """
 
     samples: SampleSet | None
@@ -147,10 +154,6 @@ class Collider(eqx.Module):
     mass: Float[Array, ""]
     rotation: Float[Array, "3 3"]
     origin: Float[Array, "3"]
-    surface: SurfaceSet | None
-    solid: AbstractShape | None
-    velocity: Float[Array, "3"]
-    omega: Float[Array, "3"]
 
     def __init__(
         self,
@@ -163,10 +166,6 @@ class Collider(eqx.Module):
         pose: Pose | None = None,
         rotation: Array | None = None,
         origin: Array | None = None,
-        surface: SurfaceSet | None = None,
-        solid: AbstractShape | None = None,
-        velocity: Array | None = None,
-        omega: Array | None = None,
     ):
         """Build a collider; give either `pose` or both `rotation` and `origin` (default: identity)."""
         pose = Pose() if pose is None else pose
@@ -174,9 +173,6 @@ class Collider(eqx.Module):
         self.density_scale, self.mass = floating(density_scale), floating(mass)
         self.rotation = pose.matrix if rotation is None else rotation
         self.origin = pose.position if origin is None else origin
-        self.surface, self.solid = surface, solid
-        self.velocity = jnp.zeros_like(self.origin) if velocity is None else velocity
-        self.omega = jnp.zeros_like(self.origin) if omega is None else omega
 
 
 def _in_blocks(points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, ...]:

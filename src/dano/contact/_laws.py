@@ -21,7 +21,7 @@ Filled = Float[Array, ""] | Any
 
 
 class ContactParams(eqx.Module):
-    """Parameters of a contact: leaves, scalars ≥ 0. Each law reads its own.
+    """Parameters of a contact: leaves, scalars ≥ 0. Each law reads its own; others must stay None.
 
     What is None is chosen by the law of the contact when a scene is created (`AbstractContactLaw.complete`).
 
@@ -54,11 +54,11 @@ class ContactParams(eqx.Module):
     rolling_friction: Filled
     rolling_drag: Filled
     stiffness: Filled
-    restitution: Float[Array, ""]
+    restitution: Filled
     restitution_velocity: Filled
-    hysteresis: Float[Array, ""]
-    friction_fading: Float[Array, ""]
-    friction_pressure: Float[Array, ""]
+    hysteresis: Filled
+    friction_fading: Filled
+    friction_pressure: Filled
 
     def __init__(
         self,
@@ -72,11 +72,11 @@ class ContactParams(eqx.Module):
         rolling_friction: Numbers | None = None,
         rolling_drag: Numbers | None = None,
         stiffness: Numbers | None = None,
-        restitution: Numbers = 0.0,
+        restitution: Numbers | None = None,
         restitution_velocity: Numbers | None = None,
-        hysteresis: Numbers = 0.35,
-        friction_fading: Numbers = 0.0,
-        friction_pressure: Numbers = 1000.0,
+        hysteresis: Numbers | None = None,
+        friction_fading: Numbers | None = None,
+        friction_pressure: Numbers | None = None,
     ):
         """See the class.
 
@@ -148,7 +148,24 @@ HARD = Softening()
 
 
 class AbstractContactLaw(eqx.Module):
-    """How the contact of two bodies becomes force."""
+    """How the contact of two bodies becomes force: at a patch (`AbstractPatchLaw`) or at points."""
+
+    @property
+    @abc.abstractmethod
+    def reads(self) -> tuple[str, ...]:
+        """Names of the parameters that the law reads."""
+
+    def check(self, params: ContactParams) -> None:
+        """Check that only parameters are given that the law reads.
+
+        Raises:
+            ValueError: If another one is given.
+        """
+        for name in params.__dataclass_fields__:
+            if name not in self.reads and getattr(params, name) is not None:
+                raise ValueError(
+                    f"{type(self).__name__} does not read {name}; it reads {', '.join(self.reads)}"
+                )
 
     @property
     def presses(self) -> bool:
@@ -157,29 +174,25 @@ class AbstractContactLaw(eqx.Module):
 
     @property
     def stiction(self) -> bool:
-        """Whether the law has a stiction velocity, which `wrench` softens when asked to."""
+        """Whether `AbstractPatchLaw.wrench` has a stiction velocity, which it softens when asked to."""
         return False
-
-    def patch(self, a: Collider, b: Collider, timestep: Float[Array, ""]) -> Any:
-        """Geometry of a contact at the current configuration, constant within a step: by default `overlap`.
-
-        The result has a `point` [m, W] that twists and wrenches refer to, and says whether the bodies are
-        `touching`.
-        """
-        return overlap(a, b)
 
     def complete(self, params: ContactParams, setting: Setting) -> ContactParams:
         """Parameters with this law's defaults in place of None."""
         return params
 
-    def summary(self, patch: Any) -> Patch:
-        """Overlap, centroid and normal of a contact's geometry, for plots."""
-        return patch
+
+class AbstractPatchLaw(AbstractContactLaw):
+    """One wrench for all of the overlap of two bodies."""
+
+    def patch(self, a: Collider, b: Collider) -> Patch:
+        """Geometry of a contact at the current configuration, constant within a step."""
+        return overlap(a, b)
 
     @abc.abstractmethod
     def wrench(
         self,
-        patch: Any,
+        patch: Patch,
         params: ContactParams,
         twist: Float[Array, "6"],
         timestep: Float[Array, ""],

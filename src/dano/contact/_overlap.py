@@ -17,9 +17,8 @@ from jaxtyping import Array, Bool, Float
 
 from dano.contact._colliders import BLOCK, Collider, SampleSet, Support, SYMMETRIC
 from dano.contact._derivatives import by_autodiff, keep
-from dano.contact._small import contract, matmul, matvec
 from dano.fields import AbstractField, AbstractShape, GridField, HalfSpace, PosedField, PosedShape, Sphere
-from dano.maths import safe_normalize
+from dano.maths import contract, matmul, matvec, safe_normalize
 
 
 class Patch(eqx.Module):

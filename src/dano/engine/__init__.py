@@ -1,5 +1,11 @@
 """Engines: from a scene and a state to the next one, and everything built on that."""
 
+from dano.engine._batches import (
+    load_rollouts as load_rollouts,
+    Rollouts as Rollouts,
+    rollouts as rollouts,
+    StoredRollouts as StoredRollouts,
+)
 from dano.engine._newton import Report as Report
 from dano.engine._rollout import (
     AbstractEngine as AbstractEngine,

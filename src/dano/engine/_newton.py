@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.contact import Softening
-from dano.contact._laws import HARD
-from dano.contact._small import matmul
+from dano.contact import HARD, Softening
+from dano.maths import matmul
 
 
 class SolverOptions(NamedTuple):
@@ -84,7 +83,7 @@ class _Schedule(NamedTuple):
 _STEP, _PREDICT, _FOLLOW = range(3)
 
 
-class _Search(NamedTuple):
+class Search(NamedTuple):
     """A line search: the step, and the zero of its work on the residual, bracketed.
 
     Attributes:
@@ -100,7 +99,7 @@ class _Search(NamedTuple):
     numbers: Float[Array, "6"]
 
     @classmethod
-    def start(cls, direction, work) -> "_Search":
+    def start(cls, direction, work) -> "Search":
         zero, one = jnp.zeros_like(work), jnp.ones_like(work)
         return cls(direction, jnp.stack([work, one, zero, work, zero, zero]))
 
@@ -118,7 +117,7 @@ class _Search(NamedTuple):
         narrow = bracketed & (high - low < _GIVE_UP)
         return ~misses | narrow | (start >= 0)
 
-    def narrowed(self, work) -> "_Search":
+    def narrowed(self, work) -> "Search":
         """The search after a miss: regula falsi, kept from the ends of the bracket."""
         start, length, low, low_work, high, high_work = self.numbers
         far = ~(work < 0)
@@ -131,7 +130,7 @@ class _Search(NamedTuple):
         share = jnp.where(jnp.isnan(share), 0.1, share)
         next_length = new_low + share * (new_high - new_low)
         numbers = [start, next_length, new_low, new_low_work, new_high, new_high_work]
-        return _Search(self.direction, jnp.stack(numbers))
+        return Search(self.direction, jnp.stack(numbers))
 
 
 class _Iterate(NamedTuple):
@@ -140,7 +139,7 @@ class _Iterate(NamedTuple):
     point: Float[Array, " n"]
     residual: Float[Array, " n"]
     jacobian: Float[Array, "n n"]
-    search: _Search
+    search: Search
     iteration: Int[Array, ""]
     level: Int[Array, ""]
     action: Int[Array, ""]
@@ -199,7 +198,7 @@ def newton(
 
     def step_from(residual, jacobian):
         direction = solve_small(jacobian, -residual[:, None])[:, 0]
-        return _Search.start(direction, jnp.sum(direction * residual / scale))
+        return Search.start(direction, jnp.sum(direction * residual / scale))
 
     def advance(it: _Iterate):
         # The first pass looks, too: its direction is zero.
@@ -254,7 +253,7 @@ def newton(
         start,
         jnp.ones_like(start),
         jnp.eye(start.size, dtype=start.dtype),
-        _Search.start(jnp.zeros_like(start), zero),
+        Search.start(jnp.zeros_like(start), zero),
         jnp.asarray(-1),
         jnp.asarray(0),
         jnp.asarray(_STEP),
@@ -281,14 +280,14 @@ def solve_small(matrix: Float[Array, "n n"], right: Float[Array, "n k"]) -> Floa
     augmented = jnp.concatenate([matrix, right], axis=1)
     for start in range(0, n, 3):
         rows = slice(start, start + 3)
-        pivot_rows = matmul(_inverse3(augmented[rows, rows]), augmented[rows])
+        pivot_rows = matmul(inverse3(augmented[rows, rows]), augmented[rows])
         factor = jnp.where((np.arange(n) // 3 == start // 3)[:, None], 0, augmented[:, rows])
         reduced = augmented - matmul(factor, pivot_rows)
         augmented = jnp.concatenate([reduced[:start], pivot_rows, reduced[start + 3 :]])
     return augmented[:, n:]
 
 
-def _inverse3(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+def inverse3(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """Inverse of a 3×3 matrix by cofactors."""
     rows = jnp.stack([jnp.cross(m[:, 1], m[:, 2]), jnp.cross(m[:, 2], m[:, 0]), jnp.cross(m[:, 0], m[:, 1])])
     return rows / jnp.sum(m[:, 0] * rows[0])

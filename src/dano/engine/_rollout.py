@@ -4,6 +4,7 @@ import abc
 import math
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.contact import Patch
-from dano.contact._derivatives import KEPT
+from dano.contact import KEPT, Patch
 from dano.engine import _variational
 from dano.engine._newton import Report, SolverOptions
 from dano.maths import is_traced, quat_conjugate, quat_multiply, safe_norm
@@ -27,8 +27,14 @@ CHECKPOINT_FROM = 2000
 class AbstractEngine(eqx.Module):
     """Advances the state of a scene."""
 
+    def prepare(self, scene: Scene) -> Any:
+        """What the steps of a scene share, computed once a rollout; passed to `step`."""
+        return None
+
     @abc.abstractmethod
-    def step(self, scene: Scene, state: State, control: Control | None) -> tuple[State, Report]:
+    def step(
+        self, scene: Scene, prepared: Any, state: State, control: Control | None
+    ) -> tuple[State, Report]:
         """One timestep; the report says whether the step's equations were solved."""
 
 
@@ -40,10 +46,13 @@ class VariationalEngine(AbstractEngine):
             this times (1 + its largest velocity) [m/s, rad/s]; default: the dtype's resolution to the power
             3/4 (2e-12, 6e-6).
         max_iterations: Newton and line search passes after which a step is reported as not converged.
+        capacity: Chunks of 16 point contacts that a step has room for; default by the number of bodies. A
+            step with more is reported as not converged.
     """
 
     tolerance: float | None = eqx.field(static=True, default=None)
     max_iterations: int = eqx.field(static=True, default=300)
+    capacity: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         """Raise a ValueError unless both options are positive."""
@@ -51,10 +60,19 @@ class VariationalEngine(AbstractEngine):
             raise ValueError(f"tolerance must be > 0, got {self.tolerance}")
         if self.max_iterations < 1:
             raise ValueError(f"max_iterations must be ≥ 1, got {self.max_iterations}")
+        if self.capacity is not None and self.capacity < 1:
+            raise ValueError(f"capacity must be ≥ 1, got {self.capacity}")
 
-    def step(self, scene: Scene, state: State, control: Control | None) -> tuple[State, Report]:
+    def prepare(self, scene: Scene) -> _variational.Prepared:
+        """See `AbstractEngine.prepare`."""
+        return _variational.prepare(scene, self.capacity)
+
+    def step(
+        self, scene: Scene, prepared: Any, state: State, control: Control | None
+    ) -> tuple[State, Report]:
         """See `AbstractEngine.step`."""
-        return _variational.step(scene, state, control, SolverOptions(self.tolerance, self.max_iterations))
+        options = SolverOptions(self.tolerance, self.max_iterations)
+        return _variational.step(scene, prepared, state, control, options)
 
 
 def step(
@@ -190,16 +208,18 @@ def contact_patches(scene: Scene, states: State) -> tuple[Patch, ...]:
 
 @eqx.filter_jit
 def _jitted_step(engine, scene, state, control):
-    return engine.step(scene, state, control)
+    return engine.step(scene, engine.prepare(scene), state, control)
 
 
 @eqx.filter_jit
 def _jitted_rollout(engine, scene, state, controls, n_steps, segment):
+    prepared = engine.prepare(scene)
+
     def advance(state, inputs):
         index, control = inputs
         if callable(controls):
             control = controls(state, scene.timestep * index)
-        following, report = engine.step(scene, state, control)
+        following, report = engine.step(scene, prepared, state, control)
         return following, (following, report)
 
     # Reverse mode keeps the few numbers that are dear and computes the rest of a step again: storing every
@@ -231,13 +251,14 @@ def _jitted_linearize(engine, scene, state, control):
     rows = np.array([i for i, body in enumerate(scene.bodies) if not body.fixed])
     if control is None:
         control = Control(jnp.zeros_like(state.position), jnp.zeros_like(state.position))
-    nominal, _ = engine.step(scene, state, control)
+    prepared = engine.prepare(scene)
+    nominal, _ = engine.step(scene, prepared, state, control)
 
     def perturbed(change, input_change):
         moved = retract(state, rows, change)
         force = control.force.at[rows].add(input_change[:, :3])
         torque = control.torque.at[rows].add(input_change[:, 3:])
-        following, _ = engine.step(scene, moved, Control(force, torque))
+        following, _ = engine.step(scene, prepared, moved, Control(force, torque))
         return difference(nominal, following, rows)
 
     n = len(rows)
@@ -277,12 +298,14 @@ def difference(nominal: State, state: State, rows: np.ndarray) -> Float[Array, "
 def _jitted_wrenches(scene, states):
     before = jax.tree.map(lambda x: x[:-1], states)
     after = jax.tree.map(lambda x: x[1:], states)
-    return jax.lax.map(lambda pair: _variational.wrenches(scene, *pair), (before, after))
+    prepared = _variational.prepare(scene, None)
+    return jax.lax.map(lambda pair: _variational.wrenches(scene, prepared, *pair), (before, after))
 
 
 @eqx.filter_jit
 def _jitted_patches(scene, states):
-    return jax.lax.map(lambda state: _variational.patches(scene, state), states)
+    prepared = _variational.prepare(scene, None)
+    return jax.lax.map(lambda state: _variational.patches(scene, prepared, state), states)
 
 
 def _check_control(scene: Scene, control: Control | None, leading: tuple[int, ...]) -> None:
@@ -304,7 +327,8 @@ def _say_unconverged(converged, residual) -> None:
     worst = float(np.nanmax(np.atleast_1d(np.asarray(residual))[failed], initial=0.0))
     warnings.warn(
         f"{len(failed)} of {np.size(converged)} steps did not converge, first step {failed[0]}, "
-        f"largest residual {worst:.3g} m/s; try a smaller timestep, damper or smoothing",
+        f"largest residual {worst:.3g} m/s; try a smaller timestep, a smaller damper or "
+        "smoothing, or a larger capacity for contacts",
         RuntimeWarning,
         stacklevel=3,
     )

@@ -18,6 +18,7 @@ from dano.fields._ellipsoid import Ellipsoid as Ellipsoid
 from dano.fields._grid import DensityMoments as DensityMoments, GridField as GridField
 from dano.fields._hash_grid import HashGrid as HashGrid
 from dano.fields._io import load_field as load_field, save_field as save_field
+from dano.fields._mesh import mesh_field as mesh_field
 from dano.fields._shapes import (
     AbstractShape as AbstractShape,
     Box as Box,
@@ -28,4 +29,4 @@ from dano.fields._shapes import (
     SolidMoments as SolidMoments,
     Sphere as Sphere,
 )
-from dano.fields._signed_distance import mesh_field as mesh_field, SignedDistanceGrid as SignedDistanceGrid
+from dano.fields._signed_distance import SignedDistanceGrid as SignedDistanceGrid

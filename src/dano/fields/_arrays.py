@@ -1,17 +1,16 @@
 """Grids in NumPy's files: densities, signed distances, and the grid inside a neural object."""
 
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 
+from dano.archive import Arrays, read_array
 from dano.fields._grid import checked_spacing, GridField
 from dano.fields._signed_distance import extended_distances, SignedDistanceGrid
 from dano.maths import Numbers
 
-_BROKEN = (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-"""What NumPy and zipfile raise for files that are truncated, foreign, encrypted or hold pickled objects."""
+_REAL = "buif"
+"""Kinds of dtypes: booleans, integers, floats."""
 
 
 def load_npz(path: Path, *, interpolation: str | None = None) -> GridField | SignedDistanceGrid:
@@ -37,15 +36,12 @@ def load_npy(
 ) -> GridField | SignedDistanceGrid:
     """Voxels; see `load_field`."""
     try:
-        with open(path, "rb") as file:
-            values = np.load(file, allow_pickle=False)
-        if not isinstance(values, np.ndarray):
-            raise ValueError("it is a zip of arrays, not a single one")
-        if values.ndim != 3 or values.dtype.kind not in "buif":
-            raise ValueError(f"it holds {values.dtype} of shape {values.shape}")
-    except _BROKEN as error:
+        values = read_array(path)
+        if values.ndim != 3 or values.dtype.kind not in _REAL:
+            raise ValueError(f"it holds {_described(values)}")
+    except (OSError, ValueError) as error:
         expected = "voxels (nx, ny, nz) of booleans, integers or floats"
-        raise ValueError(f"{path}: expected {expected}; {_reason(error)}") from error
+        raise ValueError(f"{path}: expected {expected}; {error}") from error
     step = np.asarray(checked_spacing(1 / max(values.shape) if spacing is None else spacing))
     if origin is None:
         origin = -0.5 * step * (np.asarray(values.shape) - 1)
@@ -89,20 +85,18 @@ def _grid_from_npz(
     optional, edge = prefix + "interpolation", None
     try:
         with open(path, "rb") as file:
-            archive = np.load(file, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError("it is a single array, not a zip of arrays")
-            signed = not prefix and "distances" in archive.files and "values" not in archive.files
+            archive = Arrays(file)
+            signed = not prefix and "distances" in archive.names and "values" not in archive.names
             names = [prefix + name for name in ("distances" if signed else "values", "origin", "spacing")]
-            if missing := [name for name in names if name not in archive.files]:
-                raise ValueError(f"it has no {', '.join(missing)}, only {archive.files}")
-            values, origin, spacing = (archive[name] for name in names)
+            if missing := [name for name in names if name not in archive.names]:
+                raise ValueError(f"it has no {', '.join(missing)}, only {list(archive.names)}")
             if interpolation is None:
-                interpolation = str(archive[optional]) if optional in archive.files else "quadratic"
-            if signed and "edge" in archive.files:
+                interpolation = str(archive[optional]) if optional in archive.names else "quadratic"
+            if signed and "edge" in archive.names:
                 edge = archive["edge"]
-    except _BROKEN as error:
-        raise ValueError(f"{path}: expected {expected}; {_reason(error)}") from error
+            values, origin, spacing = (_numbers(name, archive[name]) for name in names)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: expected {expected}; {error}") from error
     try:
         if not signed:
             return GridField(values, origin, spacing, interpolation)
@@ -112,8 +106,11 @@ def _grid_from_npz(
         raise ValueError(f"{path}: {error}") from error
 
 
-def _reason(error: Exception) -> str:
-    text = str(error)
-    if "allow_pickle" in text or "pickled" in text:
-        return "it holds pickled objects, which are never loaded"
-    return text.splitlines()[0] if text else type(error).__name__
+def _numbers(name: str, array: np.ndarray) -> np.ndarray:
+    if array.dtype.kind not in _REAL:
+        raise ValueError(f"{name} must hold numbers, got {_described(array)}")
+    return array
+
+
+def _described(array: np.ndarray) -> str:
+    return f"{'text' if array.dtype.kind in 'US' else array.dtype} of shape {array.shape}"

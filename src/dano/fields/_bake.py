@@ -12,6 +12,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dano.fields._base import AbstractField
 from dano.fields._grid import GridField
 from dano.fields._spline import degree_of
+from dano.memory import check_nodes
+
+_BYTES_PER_NODE = 64
+"""Samples, and what finding their spline takes."""
 
 _N_TESTS = 20_000
 """Held-out points: their number fixes the error of the mass error, below 0.1 % where the other errors are."""
@@ -70,8 +74,8 @@ def bake(
         The grid and its error at 20,000 random points in the grid's bounds.
 
     Raises:
-        ValueError: If the bounds are infinite, an option is out of range, or the field is zero or not finite
-            at the nodes.
+        ValueError: If the bounds are infinite, an option is out of range or needs more memory than there is,
+            or the field is zero or not finite at the nodes.
     """
     degree_of(interpolation)
     if not isinstance(field, AbstractField):
@@ -86,6 +90,7 @@ def bake(
             f"field must have finite bounds to be baked, got {[lower.tolist(), upper.tolist()]} for"
             f" {type(field).__name__}"
         )
+    check_nodes(upper - lower, resolution, _BYTES_PER_NODE)
     spacing = np.max(upper - lower) / (resolution - 1)
     shape = np.maximum(np.ceil((upper - lower) / spacing - 1e-9).astype(int) + 1, 2)
     origin = 0.5 * (lower + upper) - 0.5 * spacing * (shape - 1)

@@ -10,6 +10,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from dano.memory import in_bytes, memory_limit
+
 _DTYPES = {
     "DoubleStorage": np.float64,
     "FloatStorage": np.float32,
@@ -59,6 +61,11 @@ def read_weights(path: Path) -> dict[str, np.ndarray]:
                 "it is no zip, or cut off (files of torch before 1.6 must be saved again with a newer one)"
             )
         with zipfile.ZipFile(path) as archive:
+            if (size := sum(info.file_size for info in archive.infolist())) > memory_limit():
+                raise ValueError(
+                    f"it unfolds into {in_bytes(size)}; at most {in_bytes(memory_limit())} are read on this"
+                    " machine"
+                )
             names = [name for name in archive.namelist() if name.endswith("/data.pkl")]
             if any(name.endswith("/constants.pkl") for name in archive.namelist()):
                 raise ValueError("it is a TorchScript module, not a table of weights")

@@ -1,8 +1,6 @@
 """Density grids of instant-ngp's snapshots."""
 
-import gzip
 import math
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ from jaxtyping import Float
 
 from dano.fields._grid import GridField
 from dano.maths import Numbers
+from dano.memory import decompressed
 
 _SIDE = 128
 """Cells along an axis of each cascade."""
@@ -88,12 +87,10 @@ def _content(path: Path) -> Any:
         ) from error
     data = path.read_bytes()
     try:
-        if data[:2] == b"\x1f\x8b":
-            data = gzip.decompress(data)
-        elif data[:1] == b"\x78":
-            data = zlib.decompress(data)
+        if data[:2] == b"\x1f\x8b" or data[:1] == b"\x78":
+            data = decompressed(data)
         return msgpack.unpackb(data, strict_map_key=False)
-    except (zlib.error, OSError, EOFError, ValueError, msgpack.UnpackException, RecursionError) as error:
+    except (OSError, EOFError, ValueError, msgpack.UnpackException, RecursionError) as error:
         raise ValueError(f"{path}: it is cut off or no msgpack ({error})") from error
 
 

@@ -14,13 +14,15 @@ from dano.fields._callable import checked_bounds
 from dano.fields._compose import Posed, Scaled
 from dano.fields._grid import GridField
 from dano.fields._instant_ngp import load_snapshot
+from dano.fields._mesh import mesh_field
 from dano.fields._nerfacto import load_checkpoint
 from dano.fields._shapes import AbstractShape
-from dano.fields._signed_distance import mesh_field, SignedDistanceGrid
+from dano.fields._signed_distance import SignedDistanceGrid
 from dano.fields._splats import is_splats, load_splats
 from dano.fields._torch_module import load_callable, load_module
 from dano.fields._vdb import load_vdb
 from dano.maths import Numbers, Pose
+from dano.names import did_you_mean
 
 
 class _Reader(NamedTuple):
@@ -131,7 +133,10 @@ def _read(path: str | Path, crop: np.ndarray | None, options: dict[str, Any]) ->
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in _READERS:
-        raise ValueError(f"{path}: unknown kind of field {suffix!r}; expected one of {', '.join(_READERS)}")
+        raise ValueError(
+            f"{path}: unknown kind of field {suffix!r}; expected one of {', '.join(_READERS)}"
+            + did_you_mean(suffix, _READERS)
+        )
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "no such file"
         raise ValueError(f"{path}: {what}; expected a field ({', '.join(_READERS)})")
@@ -145,7 +150,10 @@ def _read(path: str | Path, crop: np.ndarray | None, options: dict[str, Any]) ->
 
 def _check_options(what: object, kind: str, options: dict[str, Any], known: tuple[str, ...]) -> None:
     if unknown := sorted(set(options) - set(known)):
-        raise ValueError(f"{what}: unknown options {unknown} for a {kind}; it takes {list(known)}")
+        raise ValueError(
+            f"{what}: unknown options {unknown} for a {kind}; it takes {list(known)}"
+            + did_you_mean(unknown[0], known)
+        )
 
 
 def _cropped(field: AbstractField, crop: np.ndarray, path: Path) -> GridField:

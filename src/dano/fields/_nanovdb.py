@@ -5,11 +5,11 @@ leaf nodes.
 """
 
 import struct
-import zlib
 
 import numpy as np
 
 from dano.fields._sparse import Block, corner, Rows, SparseGrid, Stream, unblosc
+from dano.memory import decompressed
 
 _NANO_CLASSES = {1: "level set", 2: "fog volume"}
 
@@ -58,7 +58,7 @@ def _decompressed(stream: Stream, size: int, codec: int) -> bytes:
     pieces = bytearray()
     while len(pieces) < size:
         piece = stream.take(stream.unpack("q")[0])
-        pieces += zlib.decompress(piece) if codec == 1 else unblosc(piece)
+        pieces += decompressed(piece) if codec == 1 else unblosc(piece)
     return bytes(pieces)
 
 

@@ -4,11 +4,10 @@ Layout: openvdb/io/{Archive,File,GridDescriptor,Compression}.h and tree/{RootNod
 file versions 222 to 224.
 """
 
-import zlib
-
 import numpy as np
 
 from dano.fields._sparse import Block, corner, Rows, SparseGrid, Stream, unblosc
+from dano.memory import decompressed
 
 _MAGIC = 0x56444220
 _MAPS = {
@@ -147,7 +146,7 @@ class _OpenVdbTree:
             length = self.stream.unpack("q")[0]
             data = self.stream.take(abs(length))
             if length > 0:
-                data = unblosc(data) if self.compression & _BLOSC else zlib.decompress(data)
+                data = unblosc(data) if self.compression & _BLOSC else decompressed(data)
         if len(data) != size:
             raise ValueError(f"a block has {len(data)} bytes instead of {size}")
         return np.frombuffer(data, self.stored).astype(np.float64)

@@ -1,7 +1,4 @@
-"""Shapes from a sampled signed distance, and from triangle meshes."""
-
-from pathlib import Path
-from typing import TYPE_CHECKING
+"""Shapes from a sampled signed distance."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,9 +10,6 @@ from dano.fields._grid import checked_spacing, scaled_jet
 from dano.fields._shapes import AbstractShape, checked_edge, scaled_moments, SolidMoments
 from dano.fields._spline import border, degree_of, interpolating_coefficients, spline_jet
 from dano.maths import checked_array, column_norm, floating, is_traced, Numbers
-
-if TYPE_CHECKING:
-    import trimesh
 
 _EXTENSION = 16
 """Nodes added by odd reflection, which continues a slope, to keep the spline filter's ends away."""
@@ -203,121 +197,6 @@ def _checked_distances(distances: Numbers) -> np.ndarray:
             " until it surrounds the solid"
         )
     return host
-
-
-def mesh_field(
-    mesh: "str | Path | trimesh.Trimesh",
-    resolution: int = 96,
-    *,
-    interpolation: str = "quadratic",
-    edge: float | None = None,
-    scale: float = 1.0,
-) -> SignedDistanceGrid:
-    """The solid inside a watertight triangle mesh, as a sampled signed distance.
-
-    Distances within three cells of the surface are exact at the nodes; those further away are distances to
-    the closest surface point of the nearest such node. Interpolation rounds edges and corners over about half
-    a cell.
-
-    Args:
-        mesh: File (.obj, .stl, .ply, .off, .glb, …) or trimesh object.
-        resolution: Nodes along the longest axis of the mesh, from 8 to 512.
-        interpolation: "linear", "quadratic" or "cubic".
-        edge: Width [m] of the smooth edge; None means 0.5 % of the size.
-        scale: Factor from the units of the mesh to metres, for instance 0.001 for millimetres.
-
-    Returns:
-        A shape in the frame of the mesh, with the volume moments of the mesh in closed form.
-
-    Raises:
-        ImportError: If trimesh or libigl is missing.
-        ValueError: If the file cannot be read, the mesh is not watertight or encloses no volume, or an option
-            is out of range.
-    """
-    degree_of(interpolation)
-    if not 8 <= resolution <= 512:
-        raise ValueError(f"resolution must lie between 8 and 512 nodes, got {resolution}")
-    if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"scale must be positive, got {scale}")
-    solid = _load_solid(mesh, scale)
-    lower, upper = solid.bounds
-    spacing = float(np.max(upper - lower)) / (resolution - 1)
-    margin = 3
-    shape = np.ceil((upper - lower) / spacing).astype(int) + 1 + 2 * margin
-    origin = 0.5 * (lower + upper) - 0.5 * spacing * (shape - 1)
-    distances = _mesh_distances(solid, origin, spacing, shape)
-    inertia = np.asarray(solid.moment_inertia)
-    second_moment = 0.5 * np.trace(inertia) * np.eye(3) - inertia
-    dtype = jnp.result_type(float)
-    moments = SolidMoments(
-        jnp.asarray(solid.volume, dtype),
-        jnp.asarray(solid.center_mass, dtype),
-        jnp.asarray(second_moment, dtype),
-    )
-    return SignedDistanceGrid(distances, origin, spacing, interpolation, edge=edge, moments=moments)
-
-
-def _load_solid(mesh: "str | Path | trimesh.Trimesh", scale: float) -> "trimesh.Trimesh":
-    """A watertight mesh with outward faces, in metres."""
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError("reading meshes needs trimesh: pip install 'dano[mesh]'") from error
-    name = "mesh"
-    if isinstance(mesh, (str, Path)):
-        name = str(mesh)
-        if not Path(mesh).is_file():
-            raise ValueError(f"{name}: no such file; expected a triangle mesh")
-        try:
-            mesh = trimesh.load_mesh(mesh)
-        except Exception as error:  # each of trimesh's readers raises its own kinds
-            raise ValueError(f"{name}: cannot be read as a triangle mesh ({error})") from error
-    if isinstance(mesh, trimesh.Scene):
-        mesh = mesh.to_mesh()
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise ValueError(f"{name}: expected a triangle mesh with faces, got {type(mesh).__name__}")
-    solid = trimesh.Trimesh(np.asarray(mesh.vertices) * scale, np.asarray(mesh.faces), process=True)
-    # Texture and normal seams duplicate vertices, which tears a closed surface apart.
-    solid.merge_vertices(merge_tex=True, merge_norm=True)
-    solid.update_faces(solid.nondegenerate_faces())
-    if not solid.is_watertight:
-        _, uses = np.unique(solid.edges_sorted, axis=0, return_counts=True)
-        raise ValueError(
-            f"{name}: the mesh must be watertight (each edge shared by two faces), got {np.sum(uses != 2)}"
-            f" edges of {len(uses)} that are not; close its holes first, as trimesh.repair.fill_holes does"
-        )
-    if not solid.is_winding_consistent or solid.volume < 0:
-        trimesh.repair.fix_normals(solid, multibody=True)
-    if not solid.volume > 0:
-        raise ValueError(f"{name}: the mesh must enclose a volume, got {solid.volume} m³")
-    return solid
-
-
-def _mesh_distances(
-    solid: "trimesh.Trimesh", origin: np.ndarray, spacing: float, shape: np.ndarray
-) -> np.ndarray:
-    """Signed distances [m] of all nodes: exact near the surface, see `spread_distances` elsewhere."""
-    try:
-        import igl
-    except ImportError as error:
-        raise ImportError("signed distances of meshes need libigl: pip install 'dano[mesh]'") from error
-    import trimesh
-    from scipy import ndimage
-
-    vertices = np.ascontiguousarray(solid.vertices, dtype=np.float64)
-    faces = np.ascontiguousarray(solid.faces, dtype=np.int64)
-    # An exact query costs 12 µs; only nodes near the surface need one. Vertices of a mesh whose edges are
-    # shorter than a cell mark them: no surface point is then further than 1.5 cells from a marked node.
-    fine = trimesh.remesh.subdivide_to_size(vertices, faces, max_edge=spacing, max_iter=32)[0]
-    marked = np.zeros(shape, dtype=bool)
-    marked[tuple(np.rint((fine - origin) / spacing).astype(int).T)] = True
-    near = ndimage.distance_transform_edt(~marked) <= 3
-    points = origin + spacing * np.argwhere(near)
-    signed, _, closest, _ = igl.signed_distance(
-        points, vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    )
-    distances, row = spread_distances(near, closest, origin, np.full(3, spacing))
-    return np.copysign(distances, signed[row])
 
 
 def spread_distances(

@@ -1,5 +1,6 @@
 """Densities of 3-D Gaussian splats."""
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,6 +15,9 @@ REACH = 5.5
 
 _PAIRS = 1 << 21
 """Pairs of a Gaussian and a point evaluated at once: some 200 MB."""
+
+_STRAY = 10.0
+"""How many times wider than nine tenths of the Gaussians the box around all must be to be doubted."""
 
 _MEMBERS = ("x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 
@@ -74,6 +78,8 @@ def splat_field(
 ) -> CallableField:
     """Occupancy of Gaussians given by `means`, log `scales`, `quats` (wxyz) and logit `opacities`.
 
+    A box around all that is made large by few raises a UserWarning.
+
     Raises:
         ValueError: If there is none, a number is not finite, a quaternion is zero, or none reaches `crop`.
     """
@@ -107,6 +113,8 @@ def splat_field(
         if crop is None
         else np.asarray(crop, float)
     )
+    if crop is None:
+        _warn_of_strays(means - reach, means + reach)
     touch = np.all((means + reach >= box[0]) & (means - reach <= box[1]), axis=1) & (opacity > 1e-4)
     if not touch.any():
         raise ValueError(f"no visible Gaussian reaches the box {box.tolist()}")
@@ -114,6 +122,24 @@ def splat_field(
     occupancy = _Occupancy(means[touch], whiten[touch], reach[touch], opacity[touch])
     # Central differences within the width of a typical Gaussian.
     return CallableField(occupancy, box, "numpy", step=0.02 * float(np.median(deviations[touch].min(axis=1))))
+
+
+def _warn_of_strays(lower: np.ndarray, upper: np.ndarray) -> None:
+    """Say if a few Gaussians make the box around all much larger than most need."""
+    middle = 0.5 * (lower + upper)
+    low, high = np.quantile(middle, 0.05, axis=0), np.quantile(middle, 0.95, axis=0)
+    usual = float(np.max(high - low))
+    whole = float(np.max(upper.max(axis=0) - lower.min(axis=0)))
+    near = np.all((lower >= low - 2 * usual) & (upper <= high + 2 * usual), axis=1)
+    if whole <= _STRAY * usual or not near.any():
+        return
+    box = np.concatenate([lower[near].min(axis=0), upper[near].max(axis=0)])
+    warnings.warn(
+        f"{np.sum(~near)} of {len(near)} Gaussians lie far from the others or are huge: the box around all is"
+        f" {whole:.3g} wide, that around the others {np.max(box[3:] - box[:3]):.3g}; crop to the object"
+        f" (`dano import --crop {' '.join(f'{x:.4g}' for x in box)}`)",
+        stacklevel=2,
+    )
 
 
 class _Occupancy:

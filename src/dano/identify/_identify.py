@@ -16,6 +16,7 @@ from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Parameter, space_of, values_at, with_values
 from dano.identify._problem import Problem, Setup
 from dano.identify._residuals import Linearized
+from dano.identify._scales import check_scales
 from dano.identify._uncertainty import quantile, uncertainty
 from dano.identify._windows import Plan
 from dano.scene import Control, Scene, State, Trajectory
@@ -24,6 +25,7 @@ from dano.solvers import Stop
 Observed = Motion | Trajectory
 
 _INITIAL = {"given": (), "velocities": ("velocity", "omega"), "states": tuple(QUANTITIES)}
+_MOST_STARTS = 10_000
 
 
 class Errors(NamedTuple):
@@ -216,18 +218,21 @@ def identify(
         jacobian: Forward mode costs one rollout per unknown, reverse mode several per observed number.
         max_iterations: Steps of each search.
         tolerance: Stop when a step promises to move the parameters by less than this, in standard errors.
-        batch: Windows simulated at once; default one on a CPU, many on a GPU.
+        batch: Windows that a device simulates at once; default one on a CPU, many on a GPU. All devices of
+            this process, and all processes of `jax.distributed`, take a share of the windows.
         engine: Default `VariationalEngine()`.
         progress: Called with a description and the share done. Ctrl-C during the search returns the best
             so far.
 
     Returns:
         Values, standard errors, what is not determined, and the fitted motion. Steps that did not converge
-        are said in `messages` and raise a RuntimeWarning, as does what the data leave open.
+        are said in `messages` and raise a RuntimeWarning, as does what the data leave open. Motions that
+        can hardly be in metres and seconds raise a UserWarning before the search.
 
     Raises:
-        ValueError: If motions, parameters and scene do not fit each other, an option is out of range, or
-            there are fewer observed numbers than unknowns.
+        ValueError: If motions, parameters and scene do not fit each other, an option is out of range,
+            there are fewer observed numbers than unknowns, a body moves faster than sound, or a window has
+            more than 20,000 steps.
     """
     began = time.perf_counter()
     motions = _motions("observed", observed)
@@ -241,6 +246,7 @@ def identify(
     chosen = _initial(initial, motions)
     ties = () if continuity is None else tuple(np.atleast_1d(np.asarray(continuity, float)).tolist())
     _check_options(huber, window, ties, starts, chosen, jacobian, max_iterations, tolerance)
+    check_scales(scene, motions, window)
     setup = Setup(
         space,
         scene,
@@ -293,6 +299,9 @@ def identify(
         other = Problem(setup, held, state)
         fixed = other.search(best.x, max_iterations, tolerance, None, free=False)
         held_errors = _errors(other.plan, held, other.simulate(fixed.x, fixed.blocks))
+    fit_errors = _errors(problem.plan, motions, at_best)
+    if missed := _missed(scene, motions, fit_errors):
+        messages.append(missed)
     for message in messages:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
     tell("done", 1.0)
@@ -305,7 +314,7 @@ def identify(
         stop=best.stop,
         loss_history=best.losses,
         messages=tuple(messages),
-        errors=_errors(problem.plan, motions, at_best),
+        errors=fit_errors,
         held_out_errors=held_errors,
         minima=tuple(
             Minimum(values_at(space.selections, s.x, found.covariance)[0], s.normal.loss, s.stop)
@@ -359,8 +368,8 @@ def _check_options(huber, window, ties, starts, initial, jacobian, max_iteration
             raise ValueError(
                 f"continuity needs window and initial='states', got window {window}, initial {list(initial)}"
             )
-    if starts < 1:
-        raise ValueError(f"starts must be ≥ 1, got {starts}")
+    if not 1 <= starts <= _MOST_STARTS:
+        raise ValueError(f"starts must be ≥ 1 and ≤ {_MOST_STARTS}, got {starts}")
     if jacobian not in ("auto", "forward", "reverse"):
         raise ValueError(f"jacobian must be 'auto', 'forward' or 'reverse', got {jacobian!r}")
     if not tolerance > 0:
@@ -406,6 +415,19 @@ def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:
     known = lengths[lengths >= 0]
     rms = float(np.sqrt(np.sum(known**2) / plan.n_data))
     return Errors(means["position"], finals["position"], means["orientation"], finals["orientation"], rms)
+
+
+def _missed(scene: Scene, motions: Sequence[Motion], errors: Errors) -> str | None:
+    """What to say of a fit that is further off than the bodies are long."""
+    sizes = [scene.body(name).size for m in motions for name in m.names]
+    largest = max([size for size in sizes if np.isfinite(size)], default=np.inf)
+    if not errors.mean_position > largest:
+        return None
+    return (
+        f"the fit misses the observed positions by {errors.mean_position:.3g} m on average, more than the"
+        f" bodies are long ({largest:.3g} m): what was found does not move as observed; check units, frames"
+        " and the initial state, or try more starts"
+    )
 
 
 def _as_motions(plan: Plan, motions: Sequence[Motion], found: Linearized, scene: Scene) -> tuple[Motion, ...]:

@@ -2,14 +2,12 @@
 
 import csv
 import os
-import zipfile
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from dano.archive import checked_input, checked_output, replacing, write_archive
+from dano.archive import Arrays, checked_input, checked_output, replacing, write_archive
 from dano.identify._motion import Motion, QUANTITIES
 
 _SYNONYMS = {
@@ -121,9 +119,10 @@ def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
 
 def _read_npz(source: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     try:
-        with np.load(source, allow_pickle=False) as archive:
-            data = {key: archive[key] for key in archive.files}
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, AttributeError) as error:
+        with open(source, "rb") as file:
+            archive = Arrays(file)
+            data = {key: archive[key] for key in archive.names}
+    except (OSError, ValueError) as error:
         raise ValueError(f"{source} is not a readable .npz file: {error}") from error
     arrays = {}
     for key, words in _SYNONYMS.items():
@@ -131,7 +130,10 @@ def _read_npz(source: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
         if len(present) > 1:
             raise ValueError(f"{source} must give {key} once, got members {present}")
         if present:
-            arrays[key] = np.asarray(data[present[0]], dtype=float)
+            values = data[present[0]]
+            if values.dtype.kind not in "buif":
+                raise ValueError(f"{source}: {present[0]} must hold numbers, got {values.dtype}")
+            arrays[key] = values.astype(float)
     if not any(key in arrays for key in QUANTITIES):
         raise ValueError(
             f"{source} must hold one of {list(QUANTITIES)} as arrays, got members {sorted(data)}"

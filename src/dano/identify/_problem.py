@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.engine import AbstractEngine
+from dano.engine._devices import device_mesh
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Space
 from dano.identify._residuals import Linearized, linearized, Model, moved
@@ -110,6 +111,7 @@ class Problem:
             self.plan.n_steps,
             reverse,
             batch or (1 if on_cpu else _BATCH),
+            device_mesh(),
         )
 
     def begin_near(self, states: State, estimated: tuple[str, ...]) -> None:

@@ -6,9 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.engine import AbstractEngine, simulate
+from dano.engine._devices import gather, map_rows
 from dano.engine._rollout import difference, retract
 from dano.identify._motion import QUANTITIES
 from dano.identify._parameters import Selection, with_values
@@ -34,7 +36,8 @@ class Model(NamedTuple):
         initial: Quantities of the initial states that are estimated.
         n_steps: Steps of each window.
         reverse: Whether Jacobians are taken in reverse mode.
-        batch: How many windows are simulated at once.
+        batch: How many windows a device simulates at once.
+        mesh: The devices of this process.
     """
 
     scene: Scene
@@ -50,6 +53,7 @@ class Model(NamedTuple):
     n_steps: int
     reverse: bool
     batch: int
+    mesh: Mesh
 
 
 class Linearized(NamedTuple):
@@ -89,7 +93,6 @@ class _Late(eqx.Module):
         return self.policy(state, self.begin + time)
 
 
-@eqx.filter_jit
 def linearized(
     model: Model,
     x: Float[Array, " p"],
@@ -105,7 +108,27 @@ def linearized(
         start: Initial states of the windows.
         following: Initial states of the windows that come next in the same motions.
         wanted: Which windows to simulate; rows of the others are zero.
+
+    Returns:
+        All windows, in every process: each process, and each of its devices, simulates a share of them.
     """
+    n, processes = len(wanted), jax.process_count()
+    if processes * model.mesh.size == 1:
+        return _linearized(model, x, start, following, wanted)
+    each = -(-n // (processes * model.mesh.size)) * model.mesh.size
+    mine = jax.process_index() * each + np.arange(each)
+    # Past the end nothing is wanted: the shares have one size.
+    rows = np.minimum(mine, n - 1)
+    windows, start, following = jax.tree.map(lambda leaf: leaf[rows], (model.windows, start, following))
+    share = jnp.asarray(np.asarray(wanted)[rows] & (mine < n))
+    found = _linearized(model._replace(windows=windows), x, start, following, share)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf[:n]), gather(found))
+
+
+@eqx.filter_jit
+def _linearized(
+    model: Model, x: Float[Array, " p"], start: State, following: State, wanted: Bool[Array, " w"]
+) -> Linearized:
     p = x.shape[0]
 
     def one(item):
@@ -138,7 +161,8 @@ def linearized(
     def one_or_none(item):
         return jax.lax.cond(item[-1], one, lambda item: _nothing(model, item[1], p), item)
 
-    return _map(one_or_none, (model.windows, start, following, wanted), model.batch)
+    rows = model.windows, start, following, wanted
+    return map_rows(one_or_none, rows, batch_size=model.batch, mesh=model.mesh)
 
 
 def _nothing(model: Model, state: State, p: int) -> Linearized:
@@ -160,11 +184,6 @@ def _nothing(model: Model, state: State, p: int) -> Linearized:
         zeros(frames, bodies, len(model.quantities)),
         jnp.zeros((), int),
     )
-
-
-def _map(function, items, batch: int):
-    # Mapped one by one, the solver's loops end where each rollout's do, not where the slowest one's.
-    return jax.lax.map(function, items, batch_size=None if batch == 1 else batch)
 
 
 @eqx.filter_jit

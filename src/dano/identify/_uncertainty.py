@@ -13,6 +13,8 @@ from dano.solvers import eliminated, NormalEquations
 
 # Curvature of the loss, relative to the largest, below which a combination changes nothing that is observed.
 _FLAT = 1e-10
+# Share of the bounds, or of the value, that may be uncertain.
+_OPEN = 0.5
 # Share of a combination that a parameter must have to be named.
 _TAKES_PART = 0.25
 _MASSES = (".mass", ".mass_scale", ".inertia")
@@ -77,7 +79,7 @@ def uncertainty(
         for i in np.flatnonzero(on_bound)
     ]
     if len(free):
-        found, more = _inverse(space, x, hessian[np.ix_(free, free)], variance, free, scene)
+        found, more = _inverse(space, x, hessian[np.ix_(free, free)], variance, free, scene, freedom)
         covariance[np.ix_(free, free)] = found
         messages += more
     return Uncertainty(covariance, freedom, tuple(messages))
@@ -100,7 +102,7 @@ def _private(normal: NormalEquations) -> int:
     return int(np.sum(values > 1e-9))
 
 
-def _inverse(space: Space, x, hessian, variance: float, free, scene: Scene):
+def _inverse(space: Space, x, hessian, variance: float, free, scene: Scene, freedom: int):
     width = space.upper[free] - space.lower[free]
     span = np.where(np.isfinite(width), width, np.maximum(np.abs(x[free]), 1e-3))
     # In shares of each parameter's range, so that units do not decide what is flat.
@@ -114,12 +116,36 @@ def _inverse(space: Space, x, hessian, variance: float, free, scene: Scene):
         lost = np.abs(vectors[:, k]) > 1e-3
         covariance[lost, lost] = np.inf
     errors = np.sqrt(np.diag(covariance))
-    for k in np.flatnonzero(np.isfinite(errors) & (errors > 1)):
-        messages.append(
-            f"{space.labels[free[k]]} is hardly determined: its standard error is {errors[k]:.3g} times "
-            + ("the width of its bounds" if np.isfinite(width[k]) else "its value")
+    logarithms = [log for s in space.selections for log in [s.coordinates == "log"] * s.size]
+    for k in np.flatnonzero(np.isfinite(errors)):
+        i = int(free[k])
+        said = _width(
+            float(x[i]), float(errors[k] * span[k]), space.lower[i], space.upper[i], logarithms[i], freedom
         )
+        if said is not None:
+            messages.append(f"{space.labels[i]} is hardly determined: {said}")
     return covariance * span[:, None] * span[None], messages
+
+
+def _width(x: float, error: float, lower: float, upper: float, logarithm: bool, freedom: int) -> str | None:
+    """What to say of a coordinate whose standard error leaves it open; None if the data determine it."""
+    width = upper - lower
+    if not np.isfinite(width):
+        # Nothing to compare with but the value, and for a logarithm one: a factor of e.
+        value = 1.0 if logarithm else max(abs(x), 1e-3)
+        return f"its standard error is {error / value:.3g} times its value" if error > value else None
+    half = quantile(0.95, freedom) * error
+    low, high = max(x - half, lower), min(x + half, upper)
+    share = (high - low) / width
+    if share > _OPEN:
+        ends = np.exp([low, high]) if logarithm else (low, high)
+        return (
+            f"its 95 % interval, {ends[0]:.3g} to {ends[1]:.3g}, holds {100 * share:.0f} % of what its bounds"
+            " allow"
+        )
+    # Bounds that exclude zero say that the order of magnitude is what counts, such as that of a mass.
+    relative = error if logarithm else error / abs(x) if lower > 0 else 0.0
+    return f"its standard error is {relative:.2g} times its value" if relative > _OPEN else None
 
 
 def _words(space: Space, free, direction: np.ndarray, scene: Scene) -> str:

@@ -3,6 +3,7 @@
 from dano.report._capture import draw_capture as draw_capture
 from dano.report._identification import write_identification_report as write_identification_report
 from dano.report._object import draw_object as draw_object
+from dano.report._resample import frame_count as frame_count
 from dano.report._stage import contact_history as contact_history, ContactHistory as ContactHistory
 from dano.report._training import (
     mass_estimates as mass_estimates,

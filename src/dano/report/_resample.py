@@ -5,6 +5,8 @@ from jaxtyping import Float
 
 from dano.scene import Trajectory
 
+MOST_FRAMES = 100_000
+
 
 def frame_times(
     trajectory: Trajectory, fps: int | float, slow_motion: int | float
@@ -12,14 +14,35 @@ def frame_times(
     """Simulation time [s] of each frame of a video that plays `slow_motion` times slower than life.
 
     Raises:
-        ValueError: If a rate is not positive.
+        ValueError: See `frame_count`.
+    """
+    times = np.asarray(trajectory.times, dtype=np.float64)
+    count = frame_count(float(times[-1] - times[0]), slow_motion, fps)
+    return times[0] + np.arange(count) / (fps * slow_motion)
+
+
+def frame_count(duration: float, slow_motion: int | float, fps: int | float = 30) -> int:
+    """Number of frames of a video, asked before anything is drawn.
+
+    Args:
+        duration: Simulated time [s].
+        slow_motion: How many times slower than life the video plays.
+        fps: Frames per second of the video.
+
+    Raises:
+        ValueError: If a rate is not positive, or there are more than a hundred thousand frames: drawing them
+            would take hours.
     """
     for name, value in (("fps", fps), ("slow_motion", slow_motion)):
         if not (np.isfinite(value) and value > 0):
             raise ValueError(f"{name} must be positive, got {value}")
-    times = np.asarray(trajectory.times, dtype=np.float64)
-    duration = float(times[-1] - times[0])
-    return times[0] + np.arange(int(np.floor(duration * fps * slow_motion + 1e-6)) + 1) / (fps * slow_motion)
+    count = duration * fps * slow_motion
+    if not count < MOST_FRAMES:
+        raise ValueError(
+            f"slow_motion must be at most {MOST_FRAMES / (duration * fps):.3g}, so that a video of"
+            f" {duration:.4g} s has at most {MOST_FRAMES} frames, got {slow_motion:g}"
+        )
+    return int(np.floor(count + 1e-6)) + 1
 
 
 def poses_at(

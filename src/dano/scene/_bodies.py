@@ -1,14 +1,12 @@
 """Bodies: geometry, mass properties, and a name."""
 
-import functools
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.contact import Collider, SampleSet, Support, SurfaceSet
-from dano.fields import AbstractField, AbstractShape
+from dano.contact import Collider, Part, SampleSet, Support, SurfaceSet
+from dano.fields import AbstractField, AbstractShape, Ellipsoid, SignedDistanceGrid, Sphere
 from dano.maths import checked_array, floating, is_traced, Numbers
 from dano.objects import checked_inertia, MassProperties, NeuralObject
 
@@ -27,6 +25,8 @@ class Body(eqx.Module):
         support: Culling map of the object's grid.
         surface: Surface samples with vector areas, for distributed contact; None until a scene needs those of
             a shape.
+        extent: Middle [m, F], radius, size and thickness [m] of the body as contact sees it, see `Part`; None
+            until a scene needs it.
         density_scale: Makes the object's density dimensionless in neural–neural contacts: one over the mean
             density of its samples.
         mass: [kg].
@@ -43,6 +43,7 @@ class Body(eqx.Module):
     samples: SampleSet | None
     support: Support | None
     surface: SurfaceSet | None
+    extent: Float[Array, "6"] | None
     density_scale: Float[Array, ""]
     mass: Float[Array, ""]
     inertia: Float[Array, "3 3"]
@@ -84,7 +85,7 @@ class Body(eqx.Module):
             raise ValueError(f"name must be a non-empty string, got {name!r}")
         self.name = name
         self.fixed = bool(fixed)
-        self.samples = self.support = self.surface = self.object = self.shape = None
+        self.samples = self.support = self.surface = self.extent = self.object = self.shape = None
         self.density_scale = floating(1.0)
         if isinstance(geometry, NeuralObject):
             self.object = geometry
@@ -152,30 +153,68 @@ class Body(eqx.Module):
         The median over orientations: most rest on a corner, an edge or a bulge.
         """
         assert self.surface is not None
-        up = _directions(ORIENTATIONS)
-        heights = up @ np.asarray(self.surface.points[:3])
+        scale = np.asarray(self.scale)[:, None]
+        points = scale * np.asarray(self.surface.points[:3])
+        vectors = scale.prod() / scale * np.asarray(self.surface.vectors)
+        turned = self.surface.turning == "ball"
+        # The densest samples of a ball lie at its −z, and turn to where it touches.
+        up = np.array([[0.0, 0.0, 1.0]]) if turned else _directions(ORIENTATIONS)
+        heights = up @ points
         depths = np.maximum(depth - (heights - heights.min(axis=1, keepdims=True)), 0)
-        facing = np.maximum(-up @ np.asarray(self.surface.vectors), 0)
+        facing = np.maximum(-up @ vectors, 0)
         return float(np.median(np.sum(depths * facing, axis=1)))
 
-    def collider(
-        self,
-        position: Float[Array, "3"],
-        rotation: Float[Array, "3 3"],
-        velocity: Float[Array, "3"],
-        omega: Float[Array, "3"],
-    ) -> Collider:
-        """The body as a contact sees it.
+    @property
+    def scale(self) -> Float[Array, "3"]:
+        """What directions on the unit ball are multiplied with to lie on the surface [m]; ones if unused."""
+        if self.surface is None or self.surface.turning != "ball":
+            return jnp.ones_like(self.com)
+        if isinstance(self.shape, Sphere):
+            return jnp.broadcast_to(self.shape.radius, (3,))
+        assert isinstance(self.shape, Ellipsoid)
+        return self.shape.semi_axes
+
+    def measured(self) -> Float[Array, "6"]:
+        """`extent` of this body, on the host."""
+        solid = self.solid
+        if self.object is not None:
+            points = np.asarray(self.object.surface.points)
+            lower, upper = points.min(axis=0), points.max(axis=0)
+        else:
+            assert self.shape is not None
+            lower, upper = np.asarray(self.shape.bounds)
+        if not np.all(np.isfinite(upper - lower)):
+            return floating([0.0, 0.0, 0.0, np.inf, np.inf, np.inf])
+        middle, size = 0.5 * (lower + upper), float((upper - lower).max())
+        if isinstance(solid, SignedDistanceGrid):
+            thickness = -float(np.min(np.asarray(solid.coefficients)))
+        else:
+            thickness = 0.0 if solid is None else -float(solid.sdf(floating(middle)))
+        # The middle of a hollow solid is no measure of its walls.
+        thickness = thickness if thickness > 0 else 0.5 * float((upper - lower).min())
+        radius = 0.5 * float(np.linalg.norm(upper - lower))
+        return floating([*middle, radius, size, thickness])
+
+    def unused(self) -> "Body":
+        """This body without what distributed contact asks of it."""
+        nothing = (None, jnp.zeros(6, self.com.dtype))
+        return eqx.tree_at(lambda b: (b.surface, b.extent), self, nothing, is_leaf=lambda x: x is None)
+
+    def part(self, twin: int) -> Part:
+        """The body as distributed contact sees it; `twin` is the first body with the same geometry."""
+        assert self.extent is not None
+        middle, (radius, size, thickness) = self.extent[:3], self.extent[3:]
+        return Part(self.surface, self.scale, self.solid, middle, radius, size, thickness, twin)
+
+    def collider(self, position: Float[Array, "3"], rotation: Float[Array, "3 3"]) -> Collider:
+        """The body as a contact of shared mass sees it.
 
         Args:
             position: Of the centre of mass [m, W].
             rotation: B → W.
-            velocity: Of the centre of mass [m/s, W].
-            omega: [rad/s, B].
         """
         com = self.com + self.com_offset
         arm = -sum(rotation[:, i] * com[i] for i in range(3))
-        spin = functools.reduce(jnp.add, [rotation[:, i] * omega[i] for i in range(3)])
         return Collider(
             self.field,
             self.samples,
@@ -184,10 +223,6 @@ class Body(eqx.Module):
             mass=self.mass * self.mass_scale,
             rotation=rotation,
             origin=position + arm,
-            surface=self.surface,
-            solid=self.solid,
-            velocity=velocity + jnp.cross(spin, arm),
-            omega=spin,
         )
 
 

@@ -1,10 +1,12 @@
 """Contacts between bodies, and what a scene fills in for them."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from dano.contact import (
@@ -19,7 +21,7 @@ from dano.contact import (
 )
 from dano.fields import AbstractShape, HalfSpace, PosedShape, Sphere
 from dano.maths import floating, Numbers
-from dano.objects import draw_surface, surface_samples
+from dano.objects import surface_quadrature, surface_samples
 from dano.scene._bodies import Body
 from dano.scene._states import State
 
@@ -59,13 +61,15 @@ class Contact(eqx.Module):
         """A contact with default parameters and the paper's law unless given otherwise.
 
         Raises:
-            ValueError: If the two names are equal or the edge is negative.
+            ValueError: If the two names are equal, the edge is negative, or the law does not read a parameter
+                that was given.
         """
         if a == b:
             raise ValueError(f"contact must join two different bodies, got {a!r} twice")
         self.a, self.b = a, b
         self.params = ContactParams() if params is None else params
         self.law = CentroidLaw() if law is None else law
+        self.law.check(self.params)
         self.edge = None if edge is None else non_negative("edge", edge)
 
 
@@ -79,12 +83,17 @@ def prepared(
     """
     by_name = {body.name: body for body in bodies}
     for contact in contacts:
+        if contact.law.presses:
+            for name in (contact.a, contact.b):
+                by_name[name] = _with_extent(by_name[name])
         for name in _needs_samples(contact, by_name[contact.a], by_name[contact.b]):
             by_name[name] = _with_samples(by_name[name], presses=contact.law.presses)
+    masses = [body.mass * body.mass_scale for body in bodies if not body.fixed]
+    load = functools.reduce(jnp.maximum, masses, floating(0.0))
     completed = []
     for contact in contacts:
         a, b = by_name[contact.a], by_name[contact.b]
-        params = contact.law.complete(contact.params, _setting(a, b, gravity))
+        params = contact.law.complete(contact.params, _setting(a, b, gravity, load))
         contact = eqx.tree_at(lambda c: c.params, contact, params)
         completed.append(_with_edge(contact, a, b))
     return tuple(by_name[body.name] for body in bodies), tuple(completed)
@@ -93,25 +102,48 @@ def prepared(
 def colliders(
     bodies: Sequence[Body], contact: Contact, state: State, rotations: Sequence[Float[Array, "3 3"]]
 ) -> tuple[Collider, Collider]:
-    """Both sides of a contact at a state, as `AbstractContactLaw.patch` takes them."""
+    """Both sides of a contact at a state, as `AbstractPatchLaw.patch` takes them."""
     names = [body.name for body in bodies]
     indices = [names.index(name) for name in (contact.a, contact.b)]
     pair = [bodies[i] for i in indices]
     sides = []
     for i, body, other in zip(indices, pair, reversed(pair), strict=True):
-        side = body.collider(state.position[i], rotations[i], state.velocity[i], state.omega[i])
+        side = body.collider(state.position[i], rotations[i])
         if body.shape is not None:
             # Against a neural object a primitive has no samples of its own (paper: the sum runs over the
             # object's).
-            mine = (side.samples, side.surface) if other.object is None else (None, None)
+            mine = side.samples if other.object is None else None
             side = eqx.tree_at(
-                lambda c: (c.field, c.samples, c.surface),
+                lambda c: (c.field, c.samples),
                 side,
-                (_shape_with_edge(body.shape, contact.edge), *mine),
+                (_shape_with_edge(body.shape, contact.edge), mine),
                 is_leaf=_none,
             )
         sides.append(side)
     return sides[0], sides[1]
+
+
+def pressing_pairs(bodies: Sequence[Body], contacts: Sequence[Contact]) -> list[tuple[int, int, int]]:
+    """Pairs (first, second, contact) of which the first body's samples press on the second's solid.
+
+    Both bodies' samples do where both have some. Against a ball or an ellipsoid a box's do not: the ball's
+    own lie where it comes closest, and are enough.
+    """
+    names = [body.name for body in bodies]
+    pairs = []
+    for k, contact in enumerate(contacts):
+        if not contact.law.presses:
+            continue
+        ends = names.index(contact.a), names.index(contact.b)
+        for i, j in (ends, ends[::-1]):
+            first, second = bodies[i], bodies[j]
+            if first.surface is None or second.solid is None:
+                continue
+            ball = second.surface is not None and second.surface.turning == "ball"
+            if first.object is None and first.surface.turning != "ball" and ball:
+                continue
+            pairs.append((i, j, k))
+    return pairs
 
 
 def _shape_with_edge(shape: AbstractShape, edge: Array | None) -> AbstractShape:
@@ -143,9 +175,11 @@ def _needs_samples(contact: Contact, a: Body, b: Body) -> set[str]:
                 "NeuralObject.from_samples a field"
             )
         return set()
+    if contact.law.presses:
+        return {body.name for body in (a, b) if body.shape is not None and np.isfinite(body.size)}
     if a.object is not None or b.object is not None:
         return set()
-    if {type(a.shape), type(b.shape)} == {Sphere, HalfSpace} and not contact.law.presses:
+    if {type(a.shape), type(b.shape)} == {Sphere, HalfSpace}:
         return set()
     # A fixed shape has no mass that its samples could carry; the moving side's samples find it.
     return {body.name for body in (a, b) if not body.fixed}
@@ -155,8 +189,7 @@ def _with_samples(body: Body, *, presses: bool) -> Body:
     """The shape with contact samples, so that it can meet other shapes."""
     assert body.shape is not None
     if presses and body.surface is None:
-        drawn = draw_surface(body.shape, SHAPE_SAMPLES)
-        surface = SurfaceSet.create(drawn.points, drawn.vectors)
+        surface = SurfaceSet.create(*surface_quadrature(body.shape))
         return eqx.tree_at(lambda b: b.surface, body, surface, is_leaf=_none)
     if not presses and body.samples is None:
         drawn = surface_samples(body.shape, SHAPE_SAMPLES)
@@ -165,7 +198,13 @@ def _with_samples(body: Body, *, presses: bool) -> Body:
     return body
 
 
-def _setting(a: Body, b: Body, gravity: Float[Array, "3"]) -> Setting:
+def _with_extent(body: Body) -> Body:
+    if body.extent is not None:
+        return body
+    return eqx.tree_at(lambda b: b.extent, body, body.measured(), is_leaf=_none)
+
+
+def _setting(a: Body, b: Body, gravity: Float[Array, "3"], load: Float[Array, ""]) -> Setting:
     strength = jnp.sqrt(jnp.sum(gravity**2))
     strength = jnp.where(strength > 0, strength, STANDARD_GRAVITY)
 
@@ -173,10 +212,10 @@ def _setting(a: Body, b: Body, gravity: Float[Array, "3"]) -> Setting:
         carried = []
         for body, other in ((a, b), (b, a)):
             if not body.fixed:
-                # A shape that meets an object has no samples of its own; those of the object do as well.
+                # An object made of samples may meet a body that has none.
                 sampled = body if body.surface is not None else other
                 support = sampled.typical_support(sinking * sampled.size)
-                carried.append(body.mass * body.mass_scale * strength / support)
+                carried.append(load * strength / support)
         return jnp.max(jnp.stack(carried))
 
     return Setting(min(a.size, b.size), strength, stiffness)

@@ -23,12 +23,15 @@ class Scene(eqx.Module):
         contacts: Which pairs may touch.
         timestep: h [s].
         gravity: [m/s², W].
+        twins: For each body the first that is made of the same object: its samples and its solid stand once
+            in memory (static).
     """
 
     bodies: tuple[Body, ...]
     contacts: tuple[Contact, ...]
     timestep: Float[Array, ""]
     gravity: Float[Array, "3"]
+    twins: tuple[int, ...] = eqx.field(static=True, default=())
 
     @classmethod
     def create(
@@ -67,7 +70,12 @@ class Scene(eqx.Module):
             seen.add(frozenset((contact.a, contact.b)))
         gravity = checked_array("gravity", gravity, (3,))
         bodies, contacts = prepared(bodies, contacts, gravity)
-        return cls(bodies, contacts, timestep, gravity)
+        objects = [body.object for body in bodies]
+        twins = tuple(
+            i if o is None else next(j for j, p in enumerate(objects) if p is o)
+            for i, o in enumerate(objects)
+        )
+        return cls(bodies, contacts, timestep, gravity, twins)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -120,6 +128,11 @@ class Scene(eqx.Module):
         """
         i = self.contact_index(a, b)
         names = list(changes)
+        for name in names:
+            if name not in self.contacts[i].law.reads:
+                raise ValueError(
+                    f"contact parameter must be one of {list(self.contacts[i].law.reads)}, got {name!r}"
+                )
         values = [checked_parameter(name, changes[name]).astype(self.timestep.dtype) for name in names]
         return eqx.tree_at(
             lambda s: [getattr(s.contacts[i].params, name) for name in names],

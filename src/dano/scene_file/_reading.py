@@ -14,6 +14,8 @@ from dano.archive import checked_input
 from dano.contact import AbstractContactLaw, CentroidLaw, ContactParams, DistributedLaw
 from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSpace, load_field, Posed, Sphere
 from dano.maths import Pose
+from dano.memory import memory_limit
+from dano.names import did_you_mean
 from dano.objects import MassModel, NeuralObject
 from dano.scene import Body, Contact, Scene, State
 from dano.scene_file._objects import asset_look, build_asset, build_object, Progress
@@ -55,11 +57,20 @@ _LAWS: dict[str, tuple[type[AbstractContactLaw], tuple[str, ...]]] = {
     ),
     "distributed": (
         DistributedLaw,
-        (*(key for key in _PARAMS if key not in _OF_CENTROIDS), "stiction_velocity", "implicitness"),
+        (
+            *(key for key in _PARAMS if key not in _OF_CENTROIDS),
+            "stiction_velocity",
+            "implicitness",
+            "compliant",
+        ),
     ),
 }
 """Laws by name, with the keys that belong to them."""
+_FLAGS = ("adhesive", "compliant")
+"""Those of them that are true or false; the others are numbers."""
 _CONTACT = ("law", "edge", *dict.fromkeys(key for _, keys in _LAWS.values() for key in keys))
+_BYTES_PER_STEP = 500
+"""Of a body in memory: state, joined pieces, and contact forces."""
 _TOP = ("timestep", "gravity", "duration", "n_steps", "bodies", "contacts", "default_contact", "controls")
 
 
@@ -84,6 +95,12 @@ class SceneFile:
     path: Path
     text: str
     objects: dict[str, Path | str]
+
+    def inputs(self) -> list[Path]:
+        """Files that the scene is made of."""
+        rows = tomllib.loads(self.text)["bodies"]
+        named = [row[kind] for row in rows for kind in ("object", "field") if kind in row]
+        return [self.path, *(self.path.parent / Path(name).expanduser() for name in named)]
 
     def looks(self) -> dict[str, "LearnedField"]:
         """What bodies look like whose objects' files say so, by name: for pictures.
@@ -121,7 +138,8 @@ def load_scene(
     """
     source = checked_input(path)
     try:
-        text = source.read_bytes().decode("utf-8")
+        # Some editors on Windows begin files with a mark, which TOML does not know.
+        text = source.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"{source} must be a TOML scene file, got one that is not text") from error
     return parse_scene(text, source, timestep=timestep, n_steps=n_steps, progress=progress)
@@ -155,6 +173,12 @@ def parse_scene(
     tables = top.tables("bodies")
     if not tables:
         raise ValueError(f"{path}: needs at least one [[bodies]] table")
+    most = 2 * memory_limit() // (_BYTES_PER_STEP * len(tables))
+    if steps > most:
+        raise ValueError(
+            f"{path}: duration and n_steps must make at most {most} steps of {len(tables)} bodies,"
+            f" got {steps:.6g} of {h:.6g} s"
+        )
 
     built: dict[object, NeuralObject] = {}
     rows = [Table(f"{path}: [[bodies]] {i + 1}", table, None) for i, table in enumerate(tables)]
@@ -169,10 +193,10 @@ def parse_scene(
         for row in tables
         if "asset" in row or "object" in row
     }
-    return SceneFile(scene, state, steps, read_schedule(top, scene), path, text, objects)
+    return SceneFile(scene, state, int(steps), read_schedule(top, scene), path, text, objects)
 
 
-def _steps(top: Table, timestep: float) -> int:
+def _steps(top: Table, timestep: float) -> int | float:
     if ("duration" in top) == ("n_steps" in top):
         raise ValueError(f"{top.where}: needs either duration [s] or n_steps")
     if "n_steps" in top:
@@ -180,7 +204,8 @@ def _steps(top: Table, timestep: float) -> int:
     duration = top.number("duration")
     if duration <= 0:
         raise top.wrong("duration", "> 0 s")
-    return max(1, round(duration / timestep))
+    count = duration / timestep
+    return count if count > 2**62 else max(1, round(count))
 
 
 def _body(row: Table, folder: Path, built: dict[object, NeuralObject], progress: Progress | None) -> Body:
@@ -238,11 +263,16 @@ def _object(
     build = row.table("build", _BUILD)
     key = (kind, path, json.dumps(build.data, sort_keys=True))
     if key not in built:
-        built[key] = NeuralObject.load(path) if kind == "object" else _from_field_file(path, build, progress)
+        weighed = "mass" in row or "mass_scale" in row
+        built[key] = (
+            NeuralObject.load(path)
+            if kind == "object"
+            else _from_field_file(path, build, weighed=weighed, progress=progress)
+        )
     return built[key]
 
 
-def _from_field_file(path: Path, build: Table, progress: Progress | None) -> NeuralObject:
+def _from_field_file(path: Path, build: Table, *, weighed: bool, progress: Progress | None) -> NeuralObject:
     options: dict[str, Any] = {"n_samples": build.integer("samples", 5000), "seed": build.integer("seed", 0)}
     options["resolution"] = build.integer("resolution", 96)
     options["floaters"] = build.boolean("floaters", False)
@@ -250,7 +280,7 @@ def _from_field_file(path: Path, build: Table, progress: Progress | None) -> Neu
     options |= {key: build.number(key) for key in ("mass_scale", "length") if key in build}
     if "density_range" in build:
         options["density_range"] = build.vector("density_range", 2)
-    return build_object(load_field(path), progress=progress, **options)
+    return build_object(load_field(path), weighed=weighed, progress=progress, **options)
 
 
 def _contacts(top: Table, bodies: Sequence[Body]) -> list[Contact]:
@@ -275,6 +305,7 @@ def _contacts(top: Table, bodies: Sequence[Body]) -> list[Contact]:
             if name not in names:
                 raise ValueError(
                     f"{table.where}: a contact must name bodies of the scene {names}, got {name!r}"
+                    + did_you_mean(name, names)
                 )
         law = _law_name(table, usual)
         # What the default says for another law does not concern this contact.
@@ -308,10 +339,9 @@ def _can_touch(a: Body, b: Body) -> bool:
 
 def _contact(table: Table, law: str, a: str, b: str) -> Contact:
     make, keys = _LAWS[law]
-    numbers = {key: table.number(key) for key in keys if key in table and key != "adhesive"}
+    numbers = {key: table.number(key) for key in keys if key in table and key not in _FLAGS}
     options: dict[str, Any] = {key: value for key, value in numbers.items() if key not in _PARAMS}
-    if "adhesive" in table:
-        options["adhesive"] = table.boolean("adhesive", False)
+    options |= {key: table.boolean(key, False) for key in keys if key in table and key in _FLAGS}
     edge = table.number("edge") if "edge" in table else None
     with located(table.where):
         params = ContactParams(**{key: value for key, value in numbers.items() if key in _PARAMS})

@@ -5,6 +5,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, cast
 
+from dano.names import did_you_mean
+
 
 class Table:
     """A TOML table that is read key by key; every complaint names the file and the table.
@@ -22,7 +24,10 @@ class Table:
     def only(self, valid: Sequence[str]) -> None:
         for key in self.data:
             if key not in valid:
-                raise ValueError(f"{self.where}: unknown key {key!r}; valid keys are {', '.join(valid)}")
+                raise ValueError(
+                    f"{self.where}: unknown key {key!r}; valid keys are {', '.join(valid)}"
+                    + did_you_mean(key, valid)
+                )
 
     def __contains__(self, key: str) -> bool:
         return key in self.data
@@ -57,7 +62,8 @@ class Table:
     def word(self, key: str, choices: Sequence[str] | None = None, default: str | None = None) -> str:
         value = self.data.get(key, default)
         if choices is not None and value not in choices:
-            raise self.wrong(key, "one of " + ", ".join(map(repr, choices)))
+            wrong = self.wrong(key, "one of " + ", ".join(map(repr, choices)))
+            raise ValueError(f"{wrong}{did_you_mean(value, choices)}")
         if not isinstance(value, str) or not value:
             raise self.wrong(key, "a non-empty string")
         return value

@@ -1,0 +1,1 @@
+"""Many rollouts at once, by the number of rollouts and of devices."""

@@ -1,0 +1,137 @@
+"""Scenes of several bodies that may all touch, in dano."""
+
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+import dano
+from benchmarks._measure import compiled
+from benchmarks.speed._cases import Case
+from benchmarks.speed._dano import FRICTION
+from dano.scene_file import build_asset
+
+TIMESTEP = 0.005  # [s]
+REPEATS = 3
+"""Of each case: a call takes long, and is many steps of different kinds."""
+HALF = 0.05
+"""Half the side of a box, and the radius of a sphere [m]."""
+MASS = {"box": 1.0, "sphere": 0.5, "bunny": 1.0}  # [kg]
+
+
+@dataclass(frozen=True)
+class Member:
+    """One body of a crowd.
+
+    Attributes:
+        kind: "box", "sphere" or "bunny" (the trained one).
+        position: Of the centre of mass [m, W].
+        orientation: wxyz, body → world.
+    """
+
+    kind: str
+    position: np.ndarray
+    orientation: np.ndarray
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """Bodies above a floor, all pairs of which may touch.
+
+    Attributes:
+        name: For the table.
+        members: The bodies.
+        n_steps: Of a call: through the fall, to a heap.
+    """
+
+    name: str
+    members: tuple[Member, ...]
+    n_steps: int
+
+    @property
+    def group(self) -> str:
+        """Heading in the table."""
+        return f"{self.name} dropped, {self.n_steps} steps of {1000 * TIMESTEP:g} ms, per step"
+
+
+def crowds() -> tuple[Crowd, ...]:
+    """The crowds that are timed, the demo's drop aside."""
+    mixed = ["box" if i % 2 else "sphere" for i in range(64)]
+    return (
+        Crowd("8 boxes", _stacked(["box"] * 8, 2), 100),
+        Crowd("16 trained bunnies", _stacked(["bunny"] * 16, 2), 100),
+        Crowd("64 bodies (32 boxes, 32 spheres)", _stacked(mixed, 4), 100),
+    )
+
+
+def _stacked(kinds: list[str], across: int, pitch: float = 0.15) -> tuple[Member, ...]:
+    """Layers of across × across bodies, shaken and tilted a little, the lowest one close to the floor."""
+    random = np.random.default_rng(0)
+    members = []
+    for i, kind in enumerate(kinds):
+        layer, place = divmod(i, across * across)
+        grid = np.array([place % across, place // across, layer + 0.6])
+        turn = np.array([1.0, 0.0, 0.0, 0.0]) + 0.05 * random.normal(size=4)
+        shaken = pitch * grid + np.append(0.008 * random.uniform(-1, 1, 2), 0.0)
+        members.append(Member(kind, shaken, turn / np.linalg.norm(turn)))
+    return tuple(members)
+
+
+def crowd_case(crowd: Crowd) -> Case:
+    """A rollout of a crowd from its start."""
+    bodies = [
+        dano.Body(f"b{i}", _geometry(member.kind), mass=MASS[member.kind])
+        for i, member in enumerate(crowd.members)
+    ]
+    bodies.append(dano.Body("floor", dano.HalfSpace(), fixed=True))
+    params, law = dano.ContactParams(sliding_friction=FRICTION), dano.DistributedLaw()
+    contacts = [
+        dano.Contact(b.name, a.name, params, law=law) for i, a in enumerate(bodies) for b in bodies[:i]
+    ]
+    scene = dano.Scene.create(bodies, contacts, timestep=TIMESTEP)
+    starts: dict[str, dict[str, Any]] = {
+        f"b{i}": {"position": member.position, "orientation": member.orientation}
+        for i, member in enumerate(crowd.members)
+    }
+    return _case(crowd.group, crowd.name, scene, scene.initial_state(**starts), crowd.n_steps)
+
+
+DEMO = "Drop of the demo (bunny, soap, ball, floor), 320 steps of 5 ms, per step"
+
+
+def demo_case() -> Case:
+    """What `dano demo drop` simulates: the shipped scene file."""
+    with as_file(files("dano") / "scenes" / "drop.toml") as path:
+        loaded = dano.load_scene(path)
+    return _case(DEMO, "drop of the demo", loaded.scene, loaded.state, loaded.n_steps)
+
+
+def _geometry(kind: str) -> dano.NeuralObject | dano.AbstractShape:
+    if kind == "bunny":
+        return build_asset("trained_bunny")
+    return dano.Box((HALF,) * 3) if kind == "box" else dano.Sphere(HALF)
+
+
+def _case(group: str, name: str, scene: dano.Scene, state: dano.State, n_steps: int) -> Case:
+    arrays, static = eqx.partition(scene, eqx.is_array)
+
+    def rollout(arrays, state):
+        return dano.simulate(eqx.combine(arrays, static), state, n_steps)
+
+    run, seconds = compiled(rollout, arrays, state)
+    done = jax.block_until_ready(run(arrays, state))
+    iterations, failed = np.asarray(done.iterations), int((~np.asarray(done.converged)).sum())
+    note = f"{len(scene.contacts)} pairs, {iterations.mean():.1f} iterations"
+    note += f", {failed} steps NOT converged" if failed else ""
+    return Case(
+        group,
+        name,
+        lambda: run(arrays, state),
+        n_steps,
+        compile_seconds=seconds,
+        note=note,
+        repeats=REPEATS,
+    )

@@ -1,0 +1,119 @@
+"""The list of point contacts: where finding contact ends, and what laws turn into force.
+
+Finding contact knows shapes and no forces; a law knows forces and no shapes. Between them stands `Points`:
+chunks of at most `CHUNK` points that lie on one body (first), press on another (second), and share a contact.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+CHUNK = 16
+"""Points of a chunk. A chunk belongs to one pair of bodies, so sums over pairs are sums over chunks."""
+
+
+class Points(eqx.Module):
+    """Point contacts of a step, in chunks; c chunks of p points.
+
+    Geometry is that of a configuration predicted by the old velocities (see `dano.contact.find`), moved back
+    along with the first body's centre of mass, so that forces act on one line for both bodies.
+
+    Attributes:
+        arm: From the first body's centre of mass to the point [m, W].
+        normal: Unit normal out of the second body, toward the first [W].
+        moment: Moment of a unit pressure about the first body's centre of mass [m, W]: arm × normal, without
+            what a body that rolls on a smooth surface would feel of single samples.
+        depth: Depth below the second body's surface at the end of the step if nothing moved in it [m].
+        rate: Separating speed at the old velocities [m/s].
+        area: Area that faces the second body [m²]; zero where a chunk is not full.
+        stiffness: Of an impact that must end within the step: pressure per depth [Pa/m]; zero elsewhere,
+            where the material's own holds. Shape (c,).
+        between: From the second body's centre of mass to the first's, at the start of the step [m, W].
+        first: Index of the body that the points lie on, shape (c,).
+        second: Index of the other body.
+        contact: Index into the scene's contacts.
+    """
+
+    arm: Float[Array, "3 c p"]
+    normal: Float[Array, "3 c p"]
+    moment: Float[Array, "3 c p"]
+    depth: Float[Array, "c p"]
+    rate: Float[Array, "c p"]
+    area: Float[Array, "c p"]
+    stiffness: Float[Array, " c"]
+    between: Float[Array, "3 c"]
+    first: Int[Array, " c"]
+    second: Int[Array, " c"]
+    contact: Int[Array, " c"]
+
+
+class Found(eqx.Module):
+    """Where points were found: whole numbers, which derivatives hold fixed, and what was decided there.
+
+    Attributes:
+        sample: Row of each point in the table of samples, shape (c, p).
+        filled: Whether a place of a chunk is taken, shape (c, p).
+        group: Kind of solid that a chunk presses on, shape (c,).
+        side: Which pair of that kind, shape (c,).
+        share: Share of the step after which geometry was taken, shape (c,).
+        stiffness: See `Points`.
+        count: Number of chunks in use.
+        overflow: Whether there were more than the list holds.
+    """
+
+    sample: Int[Array, "c p"]
+    filled: Bool[Array, "c p"]
+    group: Int[Array, " c"]
+    side: Int[Array, " c"]
+    share: Float[Array, " c"]
+    stiffness: Float[Array, " c"]
+    count: Int[Array, ""]
+    overflow: Bool[Array, ""]
+
+
+class Motion(NamedTuple):
+    """How points move relative to the body that they press on.
+
+    Attributes:
+        rate: Separating speed [m/s], shape (c, p).
+        slip: Velocity across the normal [m/s, W], shape (3, c, p).
+    """
+
+    rate: Float[Array, "c p"]
+    slip: Float[Array, "3 c p"]
+
+
+def point_motion(velocity: Float[Array, "n 3"], spin: Float[Array, "n 3"], points: Points) -> Motion:
+    """Motion of points at the velocities of all bodies, see `relative_twist`."""
+    u, w = relative_twist(velocity, spin, points)
+    u, w = (jnp.broadcast_to(x[:, :, None], points.arm.shape) for x in (u, w))
+    full = u + cross(w, points.arm)
+    slip = full - points.normal * dot(points.normal, full)[None]
+    return Motion(dot(points.normal, u) + dot(points.moment, w), slip)
+
+
+def relative_twist(
+    velocity: Float[Array, "n 3"], spin: Float[Array, "n 3"], points: Points
+) -> tuple[Float[Array, "3 c"], Float[Array, "3 c"]]:
+    """Velocity at the first body's centre of mass and spin, of the first body relative to the second [W].
+
+    Args:
+        velocity: Of the centres of mass of all bodies [m/s, W].
+        spin: Of all bodies [rad/s, W].
+        points: The points.
+    """
+    va, vb = velocity[points.first].T, velocity[points.second].T
+    wa, wb = spin[points.first].T, spin[points.second].T
+    return va - vb - cross(wb, points.between), wa - wb
+
+
+def cross(a: Float[Array, "3 *batch"], b: Float[Array, "3 *batch"]) -> Float[Array, "3 *batch"]:
+    """Cross product of vectors stored as columns."""
+    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def dot(a: Float[Array, "3 *batch"], b: Float[Array, "3 *batch"]) -> Float[Array, "*batch"]:
+    """Scalar product of vectors stored as columns."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

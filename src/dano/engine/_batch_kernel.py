@@ -1,0 +1,106 @@
+"""The compiled part of many rollouts: rows on devices, and of each what is kept."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from jaxtyping import Array, Float, Int
+
+from dano.engine._devices import map_rows
+from dano.engine._rollout import AbstractEngine
+from dano.scene import Control, Scene, State
+
+
+class Kept(NamedTuple):
+    """What is kept of each of r rollouts: see `Rollouts`."""
+
+    states: State
+    timestep: Float[Array | np.ndarray, " r"]
+    first_unconverged: Int[Array | np.ndarray, " r"]
+    unconverged: Int[Array | np.ndarray, " r"]
+    residual: Float[Array | np.ndarray, " r"]
+
+
+class Program(NamedTuple):
+    """The static part of a simulation; it decides the compiled program.
+
+    Attributes:
+        static: What is no array of scene, parameters, state, controls and engine.
+        n_steps: Number of steps.
+        every: Steps between kept states; `n_steps` to keep the last alone.
+        first: Whether the initial state is kept.
+    """
+
+    static: Any
+    n_steps: int
+    every: int
+    first: bool
+
+
+class Inputs(NamedTuple):
+    """What a rollout starts from; arrays may be missing, in a part that others complete."""
+
+    scene: Scene | Callable[[Any], Scene]
+    parameters: Any
+    state: State
+    controls: Any
+    engine: AbstractEngine
+
+
+@eqx.filter_jit
+def simulate_rows(program: Program, shared: Any, rows: Any, batch_size: int, mesh: Mesh) -> Kept:
+    """Simulate rows.
+
+    Args:
+        program: What to do.
+        shared: Arrays of `Inputs` that all rollouts share.
+        rows: Arrays of `Inputs` with a leading axis of rollouts.
+        batch_size: Rollouts that a device simulates at once.
+        mesh: The devices.
+    """
+
+    def one(row):
+        return _rollout(eqx.combine(program.static, shared, row), program)
+
+    return map_rows(one, rows, batch_size=batch_size, mesh=mesh)
+
+
+def _rollout(inputs: Inputs, program: Program) -> Kept:
+    scene, controls, engine = inputs.scene, inputs.controls, inputs.engine
+    if not isinstance(scene, Scene):
+        scene = scene(inputs.parameters)
+    start, prepared = inputs.state, engine.prepare(scene)
+    policy = None if controls is None or isinstance(controls, Control) else controls
+
+    def advance(carry, step):
+        (state, first, count, worst), (index, control) = carry, step
+        if policy is not None:
+            control = policy(state, scene.timestep * index.astype(scene.timestep.dtype))
+        following, report = engine.step(scene, prepared, state, control)
+        failed = ~report.converged
+        first = jnp.where(failed & (first < 0), index, first)
+        # NaN stays: jnp.maximum hands it on.
+        worst = jnp.maximum(worst, report.residual.astype(worst.dtype))
+        return (following, first, count + failed.astype(count.dtype), worst), None
+
+    def segment(carry, steps):
+        carry, _ = jax.lax.scan(advance, carry, steps)
+        return carry, carry[0]
+
+    zero = jnp.zeros((), jnp.int32)
+    carry = start, zero - 1, zero, jnp.zeros((), start.position.dtype)
+    steps = jnp.arange(program.n_steps, dtype=jnp.int32), None if policy is not None else controls
+    whole = program.n_steps - program.n_steps % program.every
+    head = jax.tree.map(lambda x: x[:whole].reshape(-1, program.every, *x.shape[1:]), steps)
+    carry, states = jax.lax.scan(segment, carry, head)
+    parts = [jax.tree.map(lambda leaf: leaf[None], start)] if program.first else []
+    parts.append(states)
+    if whole < program.n_steps:
+        carry, last = segment(carry, jax.tree.map(lambda x: x[whole:], steps))
+        parts.append(jax.tree.map(lambda leaf: leaf[None], last))
+    states = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    return Kept(states, jnp.asarray(scene.timestep), *carry[1:])

@@ -1,0 +1,341 @@
+"""Many rollouts: in batches, on all devices, in several processes, into memory or onto disk."""
+
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, overload, TypedDict, Unpack
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from jaxtyping import Array, Bool, Float, Int
+
+from dano.engine._batch_input import checked_job, Job
+from dano.engine._batch_kernel import Kept, simulate_rows
+from dano.engine._batch_store import RolloutStore
+from dano.engine._devices import device_mesh, gather, meet, put_rows, put_whole, take_rows
+from dano.engine._rollout import AbstractEngine, Policy, VariationalEngine
+from dano.scene import Control, Scene, State
+from dano.scene._states import STATE_SIZES
+
+Progress = Callable[[str, float], None]
+
+# Rollouts that a device computes at once: more no longer fit a core's cache, fewer leave a GPU idle.
+_BATCH = {"cpu": 32}
+_BATCH_ELSEWHERE = 1024
+# A chunk is so many batches, if what it keeps stays below so many bytes.
+_BATCHES, _BYTES = 8, 64 * 2**20
+# So long [s] another machine's files may take to appear.
+_LATE = 60.0
+
+
+class Rollouts(eqx.Module):
+    """Many rollouts of n bodies: a leading axis of r rollouts, then k kept states.
+
+    Attributes:
+        steps: After how many steps each kept state stands, shape (k,); 0 is the initial state.
+        times: [s], shape (r, k).
+        states: States, leaves of shape (r, k, n, ·).
+        converged: Whether every step of a rollout reached the solver's tolerance, shape (r,).
+        first_unconverged: First step of a rollout that did not, shape (r,); −1: none.
+        unconverged: How many steps of a rollout did not, shape (r,).
+        residual: Largest residual of any step, as in `Trajectory.residuals` [m/s, rad/s], shape (r,).
+        names: Names of the bodies.
+    """
+
+    steps: Int[Array, " k"]
+    times: Float[Array, "r k"]
+    states: State
+    converged: Bool[Array, " r"]
+    first_unconverged: Int[Array, " r"]
+    unconverged: Int[Array, " r"]
+    residual: Float[Array, " r"]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+
+class StoredRollouts:
+    """Rollouts in a folder that `rollouts` writes: a zarr group, which other programs can read, too.
+
+    The group has arrays `position`, `orientation`, `velocity`, `omega` of shape (r, k, n, ·), `timestep` [s],
+    `first_unconverged`, `unconverged` and `residual` of shape (r,), and `complete`: one number a chunk.
+
+    Attributes:
+        path: The folder.
+        names: Names of the bodies.
+        n_rollouts: How many rollouts it has room for.
+        steps: After how many steps each kept state stands, shape (k,).
+    """
+
+    def __init__(self, path: str | os.PathLike[str]):
+        self._store = RolloutStore.open(path)
+        self.path = self._store.path
+        self.names: tuple[str, ...] = tuple(self._store.about["names"])
+        self.n_rollouts = int(self._store.about["n_rollouts"])
+        self.steps = np.array(self._store.about["steps"])
+
+    @property
+    def complete(self) -> bool:
+        """Whether all rollouts are in it; if not, the same call of `rollouts` goes on with it."""
+        return len(self._store.pending()) == 0
+
+    @property
+    def converged(self) -> np.ndarray:
+        """Whether every step of a rollout reached the solver's tolerance, shape (r,)."""
+        return self._store.read("first_unconverged", slice(None)) < 0
+
+    def read(self, rows: slice = slice(None)) -> Rollouts:
+        """Some of the rollouts.
+
+        Args:
+            rows: Which, e.g. ``slice(0, 100)``; default all, if memory allows.
+
+        Raises:
+            ValueError: If one of them is not there yet.
+        """
+        chunks = np.arange(self.n_rollouts)[rows] // self._store.chunk_size
+        missing = np.intersect1d(chunks, self._store.pending())
+        if len(missing):
+            first = int(missing[0]) * self._store.chunk_size
+            raise ValueError(
+                f"rows must be complete: rollout {first} of {self.path} is not there yet; "
+                "call rollouts with the same arguments to go on"
+            )
+        states = State(*(jnp.asarray(self._store.read(name, rows)) for name in STATE_SIZES))
+        kept = Kept(states, *(self._store.read(name, rows) for name in Kept._fields[1:]))
+        return _result(kept, self.steps, self.names)
+
+
+def load_rollouts(path: str | os.PathLike[str]) -> StoredRollouts:
+    """Open a folder that `rollouts` wrote, or is still writing.
+
+    Raises:
+        ValueError: If it is missing or something else.
+        ImportError: Without the extra `batch`.
+    """
+    return StoredRollouts(path)
+
+
+class _Options(TypedDict, total=False):
+    """Options of `rollouts` that do not decide what it returns."""
+
+    parameters: Any
+    controls: Control | Policy | None
+    engine: AbstractEngine | None
+    keep: str | int
+    batch_size: int | None
+    chunk_size: int | None
+    devices: Sequence[Any] | None
+    progress: Progress | None
+
+
+@overload
+def rollouts(
+    scene: Scene | Callable[[Any], Scene],
+    states: State,
+    n_steps: int | None = None,
+    *,
+    path: None = None,
+    **options: Unpack[_Options],
+) -> Rollouts: ...
+@overload
+def rollouts(
+    scene: Scene | Callable[[Any], Scene],
+    states: State,
+    n_steps: int | None = None,
+    *,
+    path: str | os.PathLike[str],
+    **options: Unpack[_Options],
+) -> StoredRollouts: ...
+def rollouts(
+    scene: Scene | Callable[[Any], Scene],
+    states: State,
+    n_steps: int | None = None,
+    *,
+    parameters: Any = None,
+    controls: Control | Policy | None = None,
+    engine: AbstractEngine | None = None,
+    keep: str | int = "all",
+    path: str | os.PathLike[str] | None = None,
+    batch_size: int | None = None,
+    chunk_size: int | None = None,
+    devices: Sequence[Any] | None = None,
+    progress: Progress | None = None,
+) -> Rollouts | StoredRollouts:
+    """Roll out many times: over states, parameters and controls, on all devices of this process.
+
+    Whatever has a leading axis of r rows is one per rollout, the rest is shared by all. Compiled once for all
+    chunks. For derivatives use `jax.vmap` of `simulate`: this runs outside of compiled programs.
+
+    Where `jax.distributed` is initialised, all processes call this with the same arguments; each simulates
+    its share of the chunks, and all get the result.
+
+    Args:
+        scene: The scene; or one per rollout, every array in it with a leading axis, as `jax.vmap` makes them
+            (copies of everything); or a function that makes the scene of a row of `parameters`, which
+            copies nothing.
+        states: Initial states, leaves of shape (r, n_bodies, ·), or (n_bodies, ·) for all.
+        n_steps: Number of steps; may be left out if `controls` are arrays.
+        parameters: Arrays with a leading axis, or a tree of them: what `scene`, a function, is called with,
+            row by row.
+        controls: Forces and torques, leaves of shape (r, n_steps, n_bodies, 3), or (n_steps, n_bodies, 3)
+            for all, or a function of (state, time [s]), as in `simulate`.
+        engine: Default `VariationalEngine()`.
+        keep: Which states to keep: "all", "last", or a number k: the first, every k-th and the last.
+        path: Folder to write to, chunk by chunk, instead of memory (extra `batch`). If it is there, complete
+            chunks are kept and the others simulated. Processes need a file system that all of them see.
+        batch_size: Rollouts that a device simulates at once; default 32 on a CPU, where more of them leave
+            the cache, and 1024 elsewhere.
+        chunk_size: Rollouts between two calls of `progress`, and in a file; a multiple of `batch_size`.
+            Default up to eight batches, fewer if few rollouts share many devices or much is kept.
+        devices: Some of `jax.local_devices()`; default all.
+        progress: Called with a description and the share done.
+
+    Returns:
+        All rollouts; with `path` what opens them. Rollouts with steps that did not converge are marked, and
+        raise a RuntimeWarning.
+
+    Raises:
+        ValueError: If numbers of rows differ, something does not fit the scene, an option is out of range,
+            or `path` holds something else, or rollouts of another scene or with other settings.
+        ImportError: With `path` and without the extra `batch`.
+    """
+    mesh = device_mesh(devices)
+    if batch_size is not None and batch_size < 1:
+        raise ValueError(f"batch_size must be ≥ 1, got {batch_size}")
+    job = checked_job(scene, states, n_steps, parameters, controls, engine or VariationalEngine(), keep)
+    batch, chunk = _sizes(job, mesh, batch_size, chunk_size)
+    tell = progress or (lambda description, share: None)
+    if path is None:
+        kept = _into_memory(job, mesh, batch, chunk, tell)
+        result = _result(kept, job.steps, job.names)
+        _say_unconverged(kept.first_unconverged)
+        return result
+    store = RolloutStore.create_or_open(path, job, chunk)
+    _onto_disk(job, mesh, batch, store, tell)
+    stored = StoredRollouts(path)
+    _say_unconverged(stored._store.read("first_unconverged", slice(None)))
+    return stored
+
+
+def _sizes(job: Job, mesh: Mesh, batch_size: int | None, chunk_size: int | None) -> tuple[int, int]:
+    """Rollouts at once, and in a chunk."""
+    each = -(-job.n_rollouts // (mesh.size * jax.process_count()))
+    usual = _BATCH.get(mesh.devices.flat[0].platform, _BATCH_ELSEWHERE)
+    batch = min(usual, each) if batch_size is None else batch_size
+    if chunk_size is None:
+        batches = min(_BATCHES, _BYTES // (batch * job.row_bytes), -(-each // batch))
+        return batch, batch * max(1, batches)
+    if batch_size is None:
+        batch = min(batch, chunk_size)
+    if chunk_size < 1 or chunk_size % batch:
+        raise ValueError(f"chunk_size must be a multiple of batch_size = {batch}, got {chunk_size}")
+    return batch, chunk_size
+
+
+def _into_memory(job: Job, mesh: Mesh, batch: int, chunk: int, tell: Progress) -> Kept:
+    """All rollouts, in all processes."""
+    n, count, me = job.n_rollouts, jax.process_count(), jax.process_index()
+    n_chunks = -(-n // chunk)
+    each = -(-n_chunks // count) * chunk
+    whole = job.room(n if count == 1 else each)
+    for index, rows in _chunks(job, mesh, batch, chunk, list(range(me, n_chunks, count)), tell):
+        start = (index // count) * chunk
+        jax.tree.map(lambda all_rows, leaf, start=start: _fill(all_rows, start, leaf), whole, rows)
+    if count == 1:
+        return whole
+    # Chunk j of process i is chunk i + j · count of all.
+    taken, within = np.divmod(np.arange(n), chunk)
+    places = (taken % count) * each + (taken // count) * chunk + within
+    return jax.tree.map(lambda leaf: leaf[places], gather(whole))
+
+
+def _fill(whole: np.ndarray, start: int, rows: np.ndarray) -> None:
+    whole[start : start + len(rows)] = rows
+
+
+def _onto_disk(job: Job, mesh: Mesh, batch: int, store: RolloutStore, tell: Progress) -> None:
+    mine = store.pending()[jax.process_index() :: jax.process_count()]
+    done = 1 - len(store.pending()) / store.n_chunks
+    # All have looked before the first chunk is written: they must agree on what is pending.
+    meet(f"dano rollouts start {store.path}")
+    for index, rows in _chunks(
+        job,
+        mesh,
+        min(batch, store.chunk_size),
+        store.chunk_size,
+        mine.tolist(),
+        lambda what, share: tell(what, done + (1 - done) * share),
+    ):
+        store.write(index, rows)
+    meet(f"dano rollouts end {store.path}")
+    begin = time.monotonic()
+    # A file system of several machines may show late what others wrote.
+    while len(missing := store.pending()) and jax.process_count() > 1 and time.monotonic() - begin < _LATE:
+        time.sleep(0.2)
+    if len(missing):
+        raise ValueError(
+            f"path must be on a file system that all processes share, got {store.path}: "
+            f"{len(missing)} of {store.n_chunks} chunks are not there"
+        )
+
+
+def _chunks(
+    job: Job, mesh: Mesh, batch: int, chunk: int, indices: list[int], tell: Progress
+) -> Iterator[tuple[int, Kept]]:
+    """Simulated chunks, one for each device at a time; the next ones compute while the last are used."""
+    shared = put_whole(job.shared, mesh)
+    groups = [indices[i : i + mesh.size] for i in range(0, len(indices), mesh.size)]
+    running: list[tuple[list[int], Any]] = []
+    done = 0
+
+    def finished(group: list[int], result: Any) -> Iterator[tuple[int, Kept]]:
+        host = jax.tree.map(np.asarray, result)
+        for k, index in enumerate(group):
+            rows = slice(k * chunk, k * chunk + min(chunk, job.n_rollouts - index * chunk))
+            yield index, take_rows(host, rows)
+
+    if indices:
+        tell("compiling", 0.0)
+    for group in groups:
+        # All calls have one shape: past the end, the last rollout is simulated again.
+        filled = group + group[-1:] * (mesh.size - len(group))
+        rows = np.concatenate([np.arange(i * chunk, (i + 1) * chunk) for i in filled])
+        rows = put_rows(take_rows(job.rows, np.minimum(rows, job.n_rollouts - 1)), mesh)
+        running.append((group, simulate_rows(job.program, shared, rows, batch, mesh)))
+        if len(running) > 1:
+            group, result = running.pop(0)
+            yield from finished(group, result)
+            done += len(group)
+            tell("simulating", done / len(indices))
+    for group, result in running:
+        yield from finished(group, result)
+    tell("simulating", 1.0)
+
+
+def _result(kept: Kept, steps: np.ndarray, names: tuple[str, ...]) -> Rollouts:
+    first, timestep = jnp.asarray(kept.first_unconverged), np.asarray(kept.timestep)
+    return Rollouts(
+        jnp.asarray(steps),
+        jnp.asarray(timestep[:, None] * steps.astype(timestep.dtype)[None]),
+        jax.tree.map(jnp.asarray, kept.states),
+        first < 0,
+        first,
+        jnp.asarray(kept.unconverged),
+        jnp.asarray(kept.residual),
+        names,
+    )
+
+
+def _say_unconverged(of_rollouts: Array | np.ndarray) -> None:
+    first = np.asarray(of_rollouts)
+    failed = np.flatnonzero(first >= 0)
+    if len(failed):
+        warnings.warn(
+            f"{len(failed)} of {len(first)} rollouts have steps that did not converge, first rollout "
+            f"{failed[0]} at step {first[failed[0]]}; try a smaller timestep, damper or smoothing",
+            RuntimeWarning,
+            stacklevel=3,
+        )

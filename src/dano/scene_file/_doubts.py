@@ -1,0 +1,57 @@
+"""What is odd about an object that was built of a field, and which option mends it, in words."""
+
+import numpy as np
+
+from dano.fields import AbstractField, GridField
+from dano.objects import NeuralObject
+
+_SHORT, _LONG = 1e-3, 5.0
+"""Sizes [m] beyond which an object is rather in other units than so large or small."""
+
+
+def mass_doubt(made: NeuralObject, dashes: str) -> str:
+    """What to say of a mass that nobody gave."""
+    return (
+        f"nobody gave a mass: {float(made.mass.mass):.3g} kg follow from 1 kg per unit of density and cubic"
+        f" metre; give {dashes}mass or {dashes}mass{'-' if dashes else '_'}scale"
+    )
+
+
+def size_doubts(size: float, option: str) -> list[str]:
+    """What to say of a size [m], if it hints at other units than metres.
+
+    Args:
+        size: Longest extent of an object.
+        option: Name of the option that takes the right one.
+    """
+    if _SHORT <= size <= _LONG:
+        return []
+    likely = f" ({size / 1000:.3g} if it is in millimetres)" if size > _LONG else ""
+    return [
+        f"the object is {size:.3g} m long; if its field is not in metres, give {option}, its longest"
+        f" extent [m]{likely}"
+    ]
+
+
+def border_doubts(field: AbstractField, points: np.ndarray) -> list[str]:
+    """What to say of a grid that ends within the object.
+
+    Args:
+        field: What the object was made of.
+        points: Points on its surface [m, F], shape (n, 3).
+    """
+    if not isinstance(field, GridField):
+        return []
+    origin, spacing = np.asarray(field.origin, np.float64), np.asarray(field.spacing, np.float64)
+    last = origin + spacing * (np.array(field.shape) - 1)
+    # The density of a node on the border falls to zero over the next cells: only there is surface beyond it.
+    below = np.min(points - origin, axis=0) < -0.2 * spacing
+    above = np.max(points - last, axis=0) > 0.2 * spacing
+    sides = [f"−{axis}" for axis, cut in zip("xyz", below, strict=True) if cut]
+    sides += [f"+{axis}" for axis, cut in zip("xyz", above, strict=True) if cut]
+    if not sides:
+        return []
+    return [
+        f"the object is cut off where its grid ends, at {', '.join(sides)}; take a larger part of the field,"
+        " as with a larger crop (`dano import --crop`)"
+    ]

@@ -1,0 +1,72 @@
+"""Motions in other units than metres and seconds, and fits that say nothing."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import dano
+from dano.identify._identify import _missed, Errors
+from dano.identify._scales import check_scales
+from dano.identify._uncertainty import _width
+
+SCENE = dano.Scene.create([dano.Body("ball", dano.Sphere(0.05), mass=1.0)], timestep=0.005)
+
+
+def pushed(unit: float = 1.0, second: float = 1.0, n: int = 12) -> dano.Motion:
+    """A ball that is pushed along at 5 cm/s and filmed at 30 Hz, with a frame in which it was not seen."""
+    times = np.arange(n) / 30
+    position = unit * np.stack([0.05 * times, 0 * times, 0.05 + 0 * times], axis=1)
+    position[4] = np.nan
+    return dano.Motion.create(second * times, ("ball",), position=position)
+
+
+def test_metres_and_seconds_pass():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_scales(
+            SCENE, [pushed(), dano.Motion.create([0.0, 3.0], ("ball",), position=np.eye(3)[:2])], None
+        )
+
+
+def test_slow_motions_in_other_units_are_doubted():
+    with pytest.warns(
+        UserWarning, match="'ball' is 0.101 m long .* 2.5 of its sizes a step; if .* millimetres"
+    ):
+        check_scales(SCENE, [pushed(unit=1000)], None)
+    # Short windows: not too many steps, but a camera of a frame in half a minute.
+    with pytest.warns(UserWarning, match="times of the motion are 33.33 s apart; if they are milliseconds"):
+        check_scales(SCENE, [pushed(second=1000)], 2)
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="position of 'ball' must be in metres .* got a speed of 500 m/s"):
+        check_scales(SCENE, [pushed(unit=10000)], None)
+    with pytest.raises(ValueError, match="span at most 20000 steps of 0.005 s .* got 366.7 s"):
+        check_scales(SCENE, [pushed(second=1000)], None)
+
+
+def test_a_fit_that_is_off_by_more_than_the_bodies_is_said():
+    assert _missed(SCENE, [pushed()], Errors(0.09, 0.1, 0.0, 0.0, 1.0)) is None
+    said = _missed(SCENE, [pushed()], Errors(39.0, 60.0, 0.0, 0.0, 1.0))
+    assert said is not None and "misses the observed positions by 39 m on average" in said
+
+
+@pytest.mark.parametrize(
+    ("x", "error", "lower", "upper", "logarithm", "text"),
+    [
+        (1.74, 1.39, 0.2, 5.0, False, "its 95 % interval, 0.2 to 4.46, holds 89 % of what its bounds allow"),
+        (1.74, 1.39, 0.01, 100.0, False, "its standard error is 0.8 times its value"),
+        (1.0, 0.02, 0.2, 5.0, False, None),
+        # Little friction, known to be little.
+        (0.01, 0.01, 0.0, 1.0, False, None),
+        (0.0, 0.4, -1.0, 1.0, False, "its 95 % interval, -0.784 to 0.784, holds 78 %"),
+        (np.log(1.7), 0.8, np.log(0.01), np.log(100.0), True, "its standard error is 0.8 times its value"),
+        (np.log(1.7), 0.8, np.log(0.5), np.log(5.0), True, "its 95 % interval, 0.5 to 5, holds 100 %"),
+        (3.0, 0.1, -np.inf, np.inf, False, None),
+        (3.0, 4.0, -np.inf, np.inf, False, "its standard error is 1.33 times its value"),
+    ],
+)
+def test_words_for_errors_that_leave_a_value_open(x, error, lower, upper, logarithm, text):
+    said = _width(float(x), error, float(lower), float(upper), logarithm, 100_000)
+    assert said is None if text is None else said is not None and text in said
