@@ -1,5 +1,6 @@
 """Settings and data shared by all tests."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -11,7 +12,20 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
+# A program that XLA compiles stays mapped while JAX keeps it, and Linux allows 65,530 maps a process.
+MANY_MAPS = 15_000
+
 REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_programs():
+    """Forget compiled programs between modules once there are many; a process that runs out of maps dies."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.is_file() and maps.read_bytes().count(b"\n") > MANY_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

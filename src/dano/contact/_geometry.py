@@ -17,7 +17,7 @@ from jaxtyping import Array, DTypeLike, Float, Int
 from dano.contact._colliders import BLOCK, SurfaceSet
 from dano.contact._points import cross
 from dano.fields import AbstractShape, HalfSpace
-from dano.maths import matmul, matvec, quat_to_matrix
+from dano.maths import matmul, matvec, quat_to_matrix, skew
 
 FIXED, AXIS, BALL = 0, 1, 2
 """How the samples of a surface turn with its body: with it; about its z axis they keep facing the other body;
@@ -362,15 +362,24 @@ def _direction(v: Float[Array, "3"]) -> Float[Array, "3"]:
     return v * jax.lax.rsqrt(jnp.maximum(jnp.sum(v * v), 1e-24))
 
 
+# Where `towards` is not smooth: a direction that bodies set upright do not press in.
+_POLE = np.array([0.36, -0.48, 0.8])
+# A rotation that takes z to the opposite of the pole.
+_FROM_Z = np.array([[0.8, 0.48, -0.36], [0.6, -0.64, 0.48], [0.0, -0.6, -0.8]])
+
+
 def towards(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """A rotation that takes z to a unit vector (Duff et al., Building an orthonormal basis, revisited)."""
-    x, y, z = normal
-    sign = jnp.where(z < 0, -1, 1).astype(normal.dtype)
-    a = -1 / (sign + z)
-    b = x * y * a
-    first = jnp.stack([1 + sign * x * x * a, sign * b, -sign * x])
-    second = jnp.stack([b, sign + y * y * a, -y])
-    return jnp.stack([first, second, normal], axis=1)
+    """A rotation that takes z to a unit vector, as a function that is smooth except at `_POLE`.
+
+    No such function is smooth everywhere. A seam along a circle, as usual formulas have it, would be crossed
+    by any ball that rolls: its samples would jump, and derivatives would not see it.
+    """
+    pole = jnp.asarray(-_POLE, normal.dtype)
+    axis = cross(pole, normal)
+    square = axis[:, None] * axis[None] - jnp.sum(axis * axis) * jnp.eye(3, dtype=normal.dtype)
+    beyond = jnp.maximum(1 + jnp.sum(pole * normal), 1e-12)
+    turn = jnp.eye(3, dtype=normal.dtype) + skew(axis) + square / beyond
+    return matmul(turn, jnp.asarray(_FROM_Z, normal.dtype))
 
 
 def unit(gradient: Float[Array, "3 *n"]) -> Float[Array, "3 *n"]:
