@@ -117,16 +117,16 @@ class Pressure(NamedTuple):
     Attributes:
         value: p [Pa].
         fall: −∂p/∂v_n, s eliminated [Pa s/m].
-        closing: Change of p that makes s fit the velocity [Pa].
         slope: ∂s/∂v_n [s/m].
         miss: Change of s that makes it fit the velocity.
+        shift: Change of the pressure that comes with it [Pa].
     """
 
     value: Float[Array, "c p"]
     fall: Float[Array, "c p"]
-    closing: Float[Array, "c p"]
     slope: Float[Array, "c p"]
     miss: Float[Array, "c p"]
+    shift: Float[Array, "c p"]
 
 
 def pressure(
@@ -148,7 +148,7 @@ def pressure(
         material: Of chunks.
         spring: From `spring`.
         rate: v_n [m/s].
-        going: The dual of c(v_n / v_s); None for the law itself.
+        going: The dual s of c(v_n / v_s), which only the derivatives depend on; None takes c itself.
         softness: Multiplies the stiction velocity.
     """
     stiction = (material.stiction * softness)[:, None]
@@ -161,8 +161,7 @@ def pressure(
     moves = jnp.abs(rate) > stiction
     s = direct if going is None else going
     slope = (1 - jnp.where(moves, s * jnp.sign(rate), 0)) / slow
-    miss = direct - s
-    by_loss = spring.damped * saturation + spring.lost * s
+    by_loss = spring.damped * saturation + spring.lost * direct
     by_time = spring.ahead * rate
     lossy = jnp.abs(by_loss) > jnp.abs(by_time)
     left = spring.depth - jnp.where(lossy, by_loss, by_time)
@@ -170,8 +169,9 @@ def pressure(
     delay = jnp.where(lossy, slower, spring.ahead)
     on = left > 0
     k = spring.stiffness
-    closing = jnp.where(on & lossy, -k * spring.lost * miss, 0)
-    return Pressure(k * jnp.maximum(left, 0), jnp.where(on, k * delay, 0), closing, slope, miss)
+    miss = direct - s
+    shift = jnp.where(on & lossy, -k * spring.lost * miss, 0)
+    return Pressure(k * jnp.maximum(left, 0), jnp.where(on, k * delay, 0), slope, miss, shift)
 
 
 def bound(material: Material, p: Float[Array, "c p"]) -> tuple[Float[Array, "c p"], Float[Array, "c p"]]:
@@ -198,9 +198,9 @@ def traction(
 
 
 class Linear(NamedTuple):
-    """The law at given velocities and duals, linearised, duals eliminated.
+    """The law at given velocities, and its derivatives at given duals, duals eliminated.
 
-    The traction is p n + λ, what closes the equations of the duals, and
+    The traction is p n + λ + slack, whatever the duals, and its change
 
         −f n dv_n + (b′ f dv_n) c − g du − l (û · du),    c = u / max(|u|, v_s).
 
@@ -238,7 +238,7 @@ def linearized(material: Material, springs: Spring, motion: Motion, duals: Duals
     return Linear(
         pressure=p,
         friction=friction,
-        slack=-friction - (limit + marginal * p.closing)[None] * gain,
+        slack=-friction - limit[None] * gain,
         grip=limit / slow,
         turn=jnp.where(slides[None], friction / slow[None], 0),
         along=jnp.where(slides[None], gain, 0),

@@ -3,9 +3,11 @@
 Unknowns are the end-of-step velocities V of all bodies that move, in world axes, and for every point the
 friction λ and the direction s of its hysteresis (see `dano.contact._pressure`). A pass linearises the
 momentum balance and the equations of λ and s, eliminates these point by point, solves for dV, takes the whole
-step, and projects λ and s onto |λ| ≤ b(p), |s| ≤ 1. The Jacobian uses the current λ instead of its limit, so
-it is right before directions of slip have settled: 4–15 passes where following the root from soft to hard
-friction takes 14–97.
+step, and projects λ and s onto |λ| ≤ b(p), |s| ≤ 1. What is left after the elimination is the law's own
+residual, whatever λ and s are; the Jacobian uses the current λ instead of its limit, so it is right before
+directions of slip have settled: 4–15 passes where following the root from soft to hard friction takes 14–97.
+A solve ends when the residual is small and λ and s fit the velocities, so that the Jacobian is that of the
+law, too: sums of forces may balance before those of single points do.
 
 Full steps can cycle. A solve that has not converged within a few passes goes on in smaller steps, then with a
 line search, then from softer friction in levels (`_TIERS`).
@@ -27,6 +29,7 @@ from dano.contact import (
     Linear,
     linearized,
     Material,
+    Motion,
     point_motion,
     Points,
     Pressure,
@@ -49,6 +52,8 @@ _TIERS = (
     (1.0, 1.0, True, 30),
     (1.0, 0.4, False, 100),
 )
+# Duals fit when what they miss is less than this power of the rounding, in shares of all pressure.
+_FIT = 0.375
 # Residual to which soft levels are solved, per stiction velocity of theirs [m/s].
 _SOFT_TOLERANCE = 1e-3
 
@@ -72,8 +77,8 @@ class _Iterate(NamedTuple):
 
     Attributes:
         velocities: V at the accepted point, shape (m, 6).
-        duals: λ (three rows) and s there, then their changes by the whole step.
-        closure: The law at the point that was tried: see `_packed`.
+        laws: The law and its duals at the accepted point and at the one before it: see `_packed`.
+        current: Which of the two is the accepted one.
         search: The step from the accepted point, and how much of it is tried next.
         jacobian: ∂R/∂V at the point before, shape (6 m, 6 m).
         residual: Largest residual over mass or inertia at the accepted point.
@@ -84,8 +89,8 @@ class _Iterate(NamedTuple):
     """
 
     velocities: Float[Array, "m 6"]
-    duals: Float[Array, "8 c p"]
-    closure: Float[Array, "19 c p"]
+    laws: Float[Array, "38 c p"]
+    current: Int[Array, ""]
     search: Search
     jacobian: Float[Array, "n n"]
     residual: Float[Array, ""]
@@ -132,6 +137,7 @@ def primal_dual(
     budgets = jnp.asarray([tier[3] for tier in _TIERS])
     points = eqx.tree_at(lambda p: (p.first, p.second), points, (rows[points.first], rows[points.second]))
     n_batches = -(-count // _BATCH)
+    fit = epsilon**_FIT
 
     def take(x, k, axis):
         return jax.lax.dynamic_slice_in_dim(x, k * _BATCH, _BATCH, axis=axis)
@@ -145,59 +151,50 @@ def primal_dual(
         moving = jnp.concatenate([v, jnp.zeros((1, 6), v.dtype)])
         return point_motion(moving[:, :3], moving[:, 3:], part)
 
-    def write(rows, new, k):
-        return jax.lax.dynamic_update_slice_in_dim(rows, new, k * _BATCH, axis=1)
+    def write(rows, new, k, row):
+        return jax.lax.dynamic_update_slice(rows, new, (row, k * _BATCH, 0))
 
     def begin(v, softness):
         def body(k, rows):
             part, stuff, springs = batch_of(k)
-            return write(rows, _rows_of(first_duals(stuff, springs, motion_of(part, v), softness)), k)
+            duals = first_duals(stuff, springs, motion_of(part, v), softness)
+            return write(rows, _resting(duals), k, 0)
 
-        return jax.lax.fori_loop(0, n_batches, body, jnp.zeros((8, *points.depth.shape), v.dtype))
+        return jax.lax.fori_loop(0, n_batches, body, jnp.zeros((2 * _ROWS, *points.depth.shape), v.dtype))
 
     def assemble(v, it: _Iterate, softness):
-        """Residual, what closes the duals, Jacobian, all as momenta; the law at the point that is tried."""
+        """Residual and Jacobian as momenta, and how well duals fit; the law at the point that is tried."""
+        change = it.search.direction.reshape(m, 6)
 
         def body(k, carry):
-            held, closing, blocks, closure = carry
+            held, blocks, unfit, laws = carry
             part, stuff, springs = batch_of(k)
-            rows = take(it.duals, k, 1)
-            duals = _duals_of(rows[:4] + it.search.length * rows[4:])
+            before = jax.lax.dynamic_slice(
+                laws, (it.current * _ROWS, k * _BATCH, 0), (_ROWS, _BATCH, points.depth.shape[1])
+            )
+            duals = _followed(before, motion_of(part, change), it.search.length)
             # Barriers, here and below: XLA would compute the law again inside each of the sums that read it.
             motion = jax.lax.optimization_barrier(motion_of(part, v))
             linear = jax.lax.optimization_barrier(linearized(stuff, springs, motion, duals, softness))
             weight = h * part.area
-            wrench = sum_wrenches(part, weight * linear.pressure.value, weight[None] * linear.friction)
-            push = sum_wrenches(part, weight * linear.pressure.closing, weight[None] * linear.slack)
-            slope = _slopes(part, linear, weight)
+            friction = linear.friction + linear.slack
+            wrench = sum_wrenches(part, weight * linear.pressure.value, weight[None] * friction)
+            missed = jnp.sum(jnp.abs(linear.slack), axis=0) + jnp.abs(linear.pressure.shift)
             return (
                 _add_wrenches(held, wrench, part),
-                _add_wrenches(closing, push, part),
-                _add_slopes(blocks, slope, part),
-                write(closure, _packed(linear, duals), k),
+                _add_slopes(blocks, _slopes(part, linear, weight), part),
+                unfit + jnp.stack([jnp.sum(weight * missed), jnp.sum(weight * linear.pressure.value)]),
+                write(laws, _packed(linear, duals), k, (1 - it.current) * _ROWS),
             )
 
         free = balance(v)
         zero = jnp.zeros((m + 1, 6), v.dtype)
         blocks = jnp.zeros((m + 1, m + 1, 6, 6), v.dtype).at[np.arange(m), np.arange(m)].set(-free.own)
-        carry = (zero, zero, blocks, it.closure)
-        held, closing, blocks, closure = jax.lax.fori_loop(0, n_batches, body, carry)
-        residual = free.residual - held[:m]
+        carry = (zero, blocks, jnp.zeros(2, v.dtype), it.laws)
+        held, blocks, unfit, laws = jax.lax.fori_loop(0, n_batches, body, carry)
         jacobian = -blocks[:m, :m].transpose(0, 2, 1, 3)
         jacobian = jacobian if free.coupled is None else jacobian + free.coupled
-        return residual, closing[:m], jacobian.reshape(6 * m, 6 * m), closure
-
-    def commit(dv, rows, closure, accept):
-        """The duals at the point that was tried, projected, and their change along the next step."""
-
-        def body(k, rows):
-            motion = motion_of(_columns(points, lambda x, axis: take(x, k, axis)), dv)
-            linear, duals = _unpacked(take(closure, k, 1))
-            kept = _rows_of(Duals(linear.friction, duals.going))
-            new = _rows_of(updated(linear, duals, motion))
-            return write(rows, jnp.concatenate([kept, new - kept]), k)
-
-        return jax.lax.fori_loop(0, jnp.where(accept, n_batches, 0), body, rows)
+        return free.residual - held[:m], jacobian.reshape(6 * m, 6 * m), unfit[0] <= fit * unfit[1], laws
 
     def unfinished(it: _Iterate):
         return ~it.solved & (it.iteration < options.max_iterations) & (it.level < len(_TIERS))
@@ -206,10 +203,10 @@ def primal_dual(
         level = jnp.minimum(it.level, len(_TIERS) - 1)
         softness, share = softnesses[level], shares[level]
         velocities = it.velocities + it.search.length * it.search.direction.reshape(m, 6)
-        residual, closing, jacobian, closure = assemble(velocities, it, softness)
+        residual, jacobian, fits, laws = assemble(velocities, it, softness)
         work = jnp.sum(it.search.direction * residual.ravel())
         accept = it.search.accepts(work) | ~searches[level]
-        error = jnp.maximum(jnp.max(jnp.abs(scale * residual)), jnp.max(jnp.abs(scale * closing)))
+        error = jnp.max(jnp.abs(scale * residual))
         scaled = scale.ravel()[:, None] * jacobian
         rounding = 16 * epsilon * jnp.max(jnp.sum(jnp.abs(scaled * velocities.ravel()[None]), axis=1))
         tolerance = jnp.maximum(relative * (1 + size), rounding)
@@ -217,21 +214,20 @@ def primal_dual(
         enough = jnp.where(hard, tolerance, jnp.maximum(tolerance, _SOFT_TOLERANCE * 1e-7 * softness))
         small = error <= enough
         accept = accept | small
-        solved = small & hard
-        right = scale.ravel() * (closing - residual).ravel()
+        # Where rounding keeps duals from fitting, a second small residual has to do.
+        solved = small & hard & (fits | (it.residual <= enough))
         # Once the residual falls as it should, there is nothing to be damped.
         fell = error < 0.5 * it.residual
-        step = jnp.where(fell, 1, share) * solve_small(scaled, right[:, None])[:, 0]
+        step = jnp.where(fell, 1, share) * solve_small(scaled, -(scale * residual).reshape(-1, 1))[:, 0]
         step = jnp.where(accept, step, it.search.direction)
-        duals = commit(step.reshape(m, 6), it.duals, closure, accept)
         pick = lambda new, old: jnp.where(accept, new, old)  # noqa: E731
         search = Search.start(step, jnp.sum(step * residual.ravel()))
         harder = accept & ((small & ~hard) | (~small & (it.budget <= 0)))
         next_level = jnp.where(harder, it.level + 1, it.level)
         return _Iterate(
             pick(velocities, it.velocities),
-            duals,
-            closure,
+            laws,
+            jnp.where(accept, 1 - it.current, it.current),
             jax.tree.map(pick, search, it.search.narrowed(work)),
             jacobian,
             pick(error, it.residual),
@@ -245,7 +241,7 @@ def primal_dual(
     initial = _Iterate(
         start,
         begin(start, one),
-        jnp.zeros((19, *points.depth.shape), start.dtype),
+        jnp.asarray(0),
         Search.start(jnp.zeros_like(start).ravel(), jnp.zeros((), start.dtype)),
         jnp.eye(6 * m, dtype=start.dtype),
         jnp.asarray(jnp.inf, start.dtype),
@@ -275,12 +271,8 @@ def _columns(points: Points, take) -> Points:
     )
 
 
-def _rows_of(duals: Duals) -> Float[Array, "4 c p"]:
-    return jnp.concatenate([duals.friction, duals.going[None]])
-
-
-def _duals_of(rows: Float[Array, "4 c p"]) -> Duals:
-    return Duals(rows[:3], rows[3])
+# Rows of `_packed`.
+_ROWS = 19
 
 
 def _packed(linear: Linear, duals: Duals) -> Float[Array, "19 c p"]:
@@ -290,13 +282,27 @@ def _packed(linear: Linear, duals: Duals) -> Float[Array, "19 c p"]:
     return jnp.concatenate([*vectors, jnp.stack(numbers)])
 
 
-def _unpacked(rows: Float[Array, "19 c p"]) -> tuple[Linear, Duals]:
-    """What `_packed` packed; of the pressure nothing else."""
+def _resting(duals: Duals) -> Float[Array, "19 c p"]:
+    """Rows of `_packed` from which nothing follows but these duals."""
+    zero = jnp.zeros_like(duals.going)
+    return jnp.concatenate(
+        [
+            duals.friction,
+            jnp.zeros((12, *zero.shape), zero.dtype),
+            duals.going[None],
+            jnp.zeros((3, *zero.shape), zero.dtype),
+        ]
+    )
+
+
+def _followed(rows: Float[Array, "19 c p"], change: Motion, length) -> Duals:
+    """Duals after a share of a step that changes the motion of points, from what `_packed` packed."""
     friction, slack, turn, along, lean = (rows[k : k + 3] for k in range(0, 15, 3))
     going, slope, miss, grip = rows[15:]
     none = jnp.zeros_like(miss)
-    pressure = Pressure(none, none, none, slope, miss)
-    return Linear(pressure, friction, slack, grip, turn, along, lean), Duals(friction, going)
+    linear = Linear(Pressure(none, none, slope, miss, none), friction, slack, grip, turn, along, lean)
+    new = updated(linear, Duals(friction, going), change)
+    return Duals(friction + length * (new.friction - friction), going + length * (new.going - going))
 
 
 def sum_wrenches(
