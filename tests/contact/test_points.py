@@ -6,18 +6,28 @@ import numpy as np
 import pytest
 
 import dano
-from dano.contact import Duals, find, first_duals, linearized, Material, Motion, points_of, spring, traction
-from dano.engine import _variational as variational
+from dano.contact import (
+    constants,
+    Duals,
+    find,
+    first_duals,
+    linearized,
+    Material,
+    Motion,
+    points_of,
+    traction,
+)
+from dano.engine._problem import links_of as links_at, prepare
 
 TURN = (0.96, 0.2, 0.12, 0.1)
 
 
 def links_of(scene, state):
-    return variational._links(scene, state, scene.timestep)
+    return links_at(scene, state, scene.timestep)
 
 
 def found(scene, state):
-    prepared = variational.prepare(scene, None)
+    prepared = prepare(scene, None)
     assert prepared.geometry is not None and prepared.impacts is not None
     points, where = find(
         prepared.geometry, links_of(scene, state), prepared.impacts, scene.timestep, prepared.capacity
@@ -129,9 +139,9 @@ def test_linearised_law_is_the_derivative_of_the_law(instant):
     rate = jnp.asarray(random.uniform(-0.3, 0.1, shape))
     slip = jnp.asarray(random.normal(0, 1, (3, *shape)) * 10 ** random.uniform(-4, 0, shape))
     motion, one = Motion(rate, slip), jnp.ones(())
-    springs = spring(material, points)
-    duals = first_duals(material, springs, motion, one)
-    linear = linearized(material, springs, motion, duals, one)
+    fixed = constants(material, points)
+    duals = first_duals(fixed, motion, one)
+    linear = linearized(fixed, motion, duals, one)
     pressure, friction = traction(material, points, motion)
     np.testing.assert_allclose(linear.pressure.value, pressure, rtol=1e-12)
     np.testing.assert_allclose(linear.friction, friction, rtol=1e-9, atol=1e-9)

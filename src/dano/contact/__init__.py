@@ -30,20 +30,21 @@ from dano.contact._overlap import overlap as overlap, Patch as Patch
 from dano.contact._points import (
     CHUNK as CHUNK,
     cross as cross,
+    dot as dot,
     Found as Found,
     Motion as Motion,
     point_motion as point_motion,
     Points as Points,
 )
 from dano.contact._pressure import (
+    Constants as Constants,
+    constants as constants,
     Duals as Duals,
     first_duals as first_duals,
     Linear as Linear,
     linearized as linearized,
     Material as Material,
     Pressure as Pressure,
-    Spring as Spring,
-    spring as spring,
     traction as traction,
     updated as updated,
 )

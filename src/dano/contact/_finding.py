@@ -35,7 +35,7 @@ from dano.contact._geometry import (
     Side,
     unit,
 )
-from dano.contact._points import CHUNK, cross, dot, Found, Points
+from dano.contact._points import CHUNK, cross, dot, Found, Points, ROUND
 from dano.maths import matmul, matvec
 
 # Blocks whose samples are looked at together.
@@ -87,8 +87,8 @@ def find(
         The points, and where they were found, for `points_of` to find them again with derivatives.
     """
     dtype = links.position.dtype
-    # A batch is written whole, so the list has room for one more.
-    room = capacity + _CHUNKS
+    # A batch is written whole, so the list has room for one more; and it is read in parts.
+    room = -(-(capacity + _CHUNKS) // ROUND) * ROUND
     whole = jnp.zeros(room, int)
     found = _List(
         jnp.zeros((12, room * CHUNK), dtype),

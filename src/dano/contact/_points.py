@@ -12,6 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 CHUNK = 16
 """Points of a chunk. A chunk belongs to one pair of bodies, so sums over pairs are sums over chunks."""
+ROUND = 16
+"""A list has room for a multiple of so many chunks."""
 
 
 class Points(eqx.Module):
@@ -109,11 +111,11 @@ def relative_twist(
     return va - vb - cross(wb, points.between), wa - wb
 
 
-def cross(a: Float[Array, "3 *batch"], b: Float[Array, "3 *batch"]) -> Float[Array, "3 *batch"]:
-    """Cross product of vectors stored as columns."""
+def cross(a: Float[Array, "3 *#batch"], b: Float[Array, "3 *#batch"]) -> Float[Array, "3 *batch"]:
+    """Cross product of vectors stored as columns, whose other axes broadcast."""
     return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-def dot(a: Float[Array, "3 *batch"], b: Float[Array, "3 *batch"]) -> Float[Array, "*batch"]:
-    """Scalar product of vectors stored as columns."""
+def dot(a: Float[Array, "3 *#batch"], b: Float[Array, "3 *#batch"]) -> Float[Array, "*batch"]:
+    """Scalar product of vectors stored as columns, whose other axes broadcast."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from dano.contact._points import dot, Motion, Points
 from dano.maths import column_norm
@@ -51,8 +51,8 @@ class Material(NamedTuple):
     bounce: Float[Array, " *n"]
 
 
-class Spring(NamedTuple):
-    """What of the pressure does not change within a step; arrays over points, shape (c, p) or (c, 1).
+class Constants(NamedTuple):
+    """What of the law does not change within a step; arrays over points, shape (c, p) or (c, 1).
 
     Attributes:
         stiffness: k [Pa/m].
@@ -60,7 +60,12 @@ class Spring(NamedTuple):
         damped: (ρ − σ) d⁺ [m].
         lost: σ d⁺ [m].
         ahead: θ h [s].
-        sharp: Whether the damping has its full size from v_e on, so that bodies are pushed apart no faster.
+        sharp: 1 where the damping has its full size from v_e on, so that bodies are pushed apart no faster.
+        restitution_velocity: v_e [m/s].
+        friction: μ [1].
+        fading: φ [1].
+        friction_pressure: p₀ [Pa].
+        stiction: v_s [m/s].
     """
 
     stiffness: Float[Array, "c #p"]
@@ -68,34 +73,40 @@ class Spring(NamedTuple):
     damped: Float[Array, "c p"]
     lost: Float[Array, "c p"]
     ahead: Float[Array, "c #p"]
-    sharp: Bool[Array, "c #p"]
+    sharp: Float[Array, "c #p"]
+    restitution_velocity: Float[Array, "c #p"]
+    friction: Float[Array, "c #p"]
+    fading: Float[Array, "c #p"]
+    friction_pressure: Float[Array, "c #p"]
+    stiction: Float[Array, "c #p"]
 
 
-def spring(material: Material, points: Points) -> Spring:
-    """The spring of every point; `material` is one of chunks.
+def constants(material: Material, points: Points) -> Constants:
+    """The constants of every point; `material` is one of chunks.
 
     In an impact that ends within the step, points are to rebound with e times their approaching speed; if
     that is too slow to matter, to touch the surface without going deeper, whatever is left of their way.
     """
-    column = lambda x: x[:, None]  # noqa: E731
-    hit = column(points.stiffness > 0)
-    rebound = -column(material.restitution) * points.rate
-    goal = jnp.where(
-        rebound > column(material.bounce), column(material.timestep) * rebound, jnp.minimum(points.depth, 0)
-    )
-    depth = jnp.where(hit, goal, points.depth)
-    instant = column(material.instant > 0)
+    material = Material(*(x[:, None] for x in material))
+    hit = points.stiffness[:, None] > 0
+    rebound = -material.restitution * points.rate
+    goal = jnp.where(rebound > material.bounce, material.timestep * rebound, jnp.minimum(points.depth, 0))
     # Impacts that end within the step have had their restitution: what presses on gives nothing back.
     loss = jnp.where(material.instant > 0, 1, (1 - material.restitution**2) / (1 + material.restitution**2))
     kept = jnp.minimum(material.hysteresis, loss)
     sunk = jnp.where(hit, 0, jnp.maximum(points.depth, 0))
-    return Spring(
-        jnp.where(hit, column(points.stiffness), column(material.stiffness)),
-        depth,
-        column(loss - kept) * sunk,
-        column(kept) * sunk,
-        jnp.where(hit, column(material.timestep), column(material.ahead)),
-        instant,
+    return Constants(
+        stiffness=jnp.where(hit, points.stiffness[:, None], material.stiffness),
+        depth=jnp.where(hit, goal, points.depth),
+        damped=(loss - kept) * sunk,
+        lost=kept * sunk,
+        ahead=jnp.where(hit, material.timestep, material.ahead),
+        sharp=material.instant,
+        restitution_velocity=material.restitution_velocity,
+        friction=material.friction,
+        fading=material.friction_fading,
+        friction_pressure=material.friction_pressure,
+        stiction=material.stiction,
     )
 
 
@@ -130,7 +141,7 @@ class Pressure(NamedTuple):
 
 
 def pressure(
-    material: Material, spring: Spring, rate: Float[Array, "c p"], going: Float[Array, "c p"] | None, softness
+    fixed: Constants, rate: Float[Array, "c p"], going: Float[Array, "c p"] | None, softness
 ) -> Pressure:
     """Pressure p = k max(0, d − D) at a separating speed v_n.
 
@@ -145,42 +156,40 @@ def pressure(
       spring implicit.
 
     Args:
-        material: Of chunks.
-        spring: From `spring`.
+        fixed: From `constants`.
         rate: v_n [m/s].
         going: The dual s of c(v_n / v_s), which only the derivatives depend on; None takes c itself.
         softness: Multiplies the stiction velocity.
     """
-    stiction = (material.stiction * softness)[:, None]
-    scaled = rate / material.restitution_velocity[:, None]
+    stiction = fixed.stiction * softness
+    scaled = rate / fixed.restitution_velocity
     inverse = jax.lax.rsqrt(1 + scaled * scaled)
-    saturation = jnp.where(spring.sharp, jnp.clip(scaled, -1, 1), scaled * inverse)
-    saturation_slope = jnp.where(spring.sharp, jnp.where(jnp.abs(scaled) < 1, 1, 0), inverse**3)
+    sharp = fixed.sharp > 0
+    saturation = jnp.where(sharp, jnp.clip(scaled, -1, 1), scaled * inverse)
+    saturation_slope = jnp.where(sharp, jnp.where(jnp.abs(scaled) < 1, 1, 0), inverse**3)
     slow = jnp.maximum(jnp.abs(rate), stiction)
     direct = rate / slow
     moves = jnp.abs(rate) > stiction
     s = direct if going is None else going
     slope = (1 - jnp.where(moves, s * jnp.sign(rate), 0)) / slow
-    by_loss = spring.damped * saturation + spring.lost * direct
-    by_time = spring.ahead * rate
+    by_loss = fixed.damped * saturation + fixed.lost * direct
+    by_time = fixed.ahead * rate
     lossy = jnp.abs(by_loss) > jnp.abs(by_time)
-    left = spring.depth - jnp.where(lossy, by_loss, by_time)
-    slower = spring.damped / material.restitution_velocity[:, None] * saturation_slope + spring.lost * slope
-    delay = jnp.where(lossy, slower, spring.ahead)
+    left = fixed.depth - jnp.where(lossy, by_loss, by_time)
+    slower = fixed.damped / fixed.restitution_velocity * saturation_slope + fixed.lost * slope
+    delay = jnp.where(lossy, slower, fixed.ahead)
     on = left > 0
-    k = spring.stiffness
+    k = fixed.stiffness
     miss = direct - s
-    shift = jnp.where(on & lossy, -k * spring.lost * miss, 0)
+    shift = jnp.where(on & lossy, -k * fixed.lost * miss, 0)
     return Pressure(k * jnp.maximum(left, 0), jnp.where(on, k * delay, 0), slope, miss, shift)
 
 
-def bound(material: Material, p: Float[Array, "c p"]) -> tuple[Float[Array, "c p"], Float[Array, "c p"]]:
+def bound(fixed: Constants, p: Float[Array, "c p"]) -> tuple[Float[Array, "c p"], Float[Array, "c p"]]:
     """Largest friction b(p) = μ (1 − φ p/(p + p₀)) p [Pa], and its derivative."""
-    half = material.friction_pressure[:, None]
-    lightness = half / (half + p)
-    friction, fading = material.friction[:, None], material.friction_fading[:, None]
-    value = friction * (1 - fading * (1 - lightness)) * p
-    return value, friction * (1 - fading * (1 - lightness * lightness))
+    lightness = fixed.friction_pressure / (fixed.friction_pressure + p)
+    value = fixed.friction * (1 - fixed.fading * (1 - lightness)) * p
+    return value, fixed.friction * (1 - fixed.fading * (1 - lightness * lightness))
 
 
 def traction(
@@ -188,12 +197,12 @@ def traction(
 ) -> tuple[Float[Array, "c p"], Float[Array, "3 c p"]]:
     """Pressure and friction [Pa] at points that move relative to the second body: the law."""
     rate, slip = motion
-    p = pressure(material, spring(material, points), rate, None, jnp.ones((), rate.dtype)).value
+    fixed = constants(material, points)
+    p = pressure(fixed, rate, None, jnp.ones((), rate.dtype)).value
     speed = column_norm(slip)
-    friction, _ = bound(material, p)
-    stiction = material.stiction[:, None]
+    friction, _ = bound(fixed, p)
     # The untaken branch must be safe too.
-    slow = jnp.where(speed > stiction, speed, jnp.broadcast_to(stiction, speed.shape))
+    slow = jnp.where(speed > fixed.stiction, speed, jnp.broadcast_to(fixed.stiction, speed.shape))
     return p, -(friction / slow)[None] * slip
 
 
@@ -223,13 +232,13 @@ class Linear(NamedTuple):
     lean: Float[Array, "3 c p"]
 
 
-def linearized(material: Material, springs: Spring, motion: Motion, duals: Duals, softness) -> Linear:
+def linearized(fixed: Constants, motion: Motion, duals: Duals, softness) -> Linear:
     """One linearisation of the law with its duals; `softness` multiplies the stiction velocity."""
     slip = motion.slip
     speed = column_norm(slip)
-    p = pressure(material, springs, motion.rate, duals.going, softness)
-    limit, marginal = bound(material, p.value)
-    stiction = (material.stiction * softness)[:, None]
+    p = pressure(fixed, motion.rate, duals.going, softness)
+    limit, marginal = bound(fixed, p.value)
+    stiction = fixed.stiction * softness
     slow = jnp.maximum(speed, stiction)
     size = column_norm(duals.friction)
     friction = duals.friction * jnp.where(size > limit, limit / jnp.where(size > 0, size, 1), 1)[None]
@@ -260,11 +269,11 @@ def updated(linear: Linear, duals: Duals, change: Motion) -> Duals:
     return Duals(friction, going)
 
 
-def first_duals(material: Material, springs: Spring, motion: Motion, softness) -> Duals:
+def first_duals(fixed: Constants, motion: Motion, softness) -> Duals:
     """Duals that fit given velocities."""
     rate, slip = motion
-    p = pressure(material, springs, rate, None, softness).value
-    stiction = (material.stiction * softness)[:, None]
-    friction, _ = bound(material, p)
+    p = pressure(fixed, rate, None, softness).value
+    stiction = fixed.stiction * softness
+    friction, _ = bound(fixed, p)
     slow = jnp.maximum(column_norm(slip), stiction)
     return Duals(-(friction / slow)[None] * slip, rate / jnp.maximum(jnp.abs(rate), stiction))

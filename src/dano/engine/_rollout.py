@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.contact import KEPT, Patch
-from dano.engine import _variational
+from dano.engine import _problem, _variational
 from dano.engine._newton import Report, SolverOptions
 from dano.maths import is_traced, quat_conjugate, quat_multiply, safe_norm
 from dano.scene import Control, Scene, State, Trajectory
@@ -63,9 +63,9 @@ class VariationalEngine(AbstractEngine):
         if self.capacity is not None and self.capacity < 1:
             raise ValueError(f"capacity must be ≥ 1, got {self.capacity}")
 
-    def prepare(self, scene: Scene) -> _variational.Prepared:
+    def prepare(self, scene: Scene) -> _problem.Prepared:
         """See `AbstractEngine.prepare`."""
-        return _variational.prepare(scene, self.capacity)
+        return _problem.prepare(scene, self.capacity)
 
     def step(
         self, scene: Scene, prepared: Any, state: State, control: Control | None
@@ -298,13 +298,13 @@ def difference(nominal: State, state: State, rows: np.ndarray) -> Float[Array, "
 def _jitted_wrenches(scene, states):
     before = jax.tree.map(lambda x: x[:-1], states)
     after = jax.tree.map(lambda x: x[1:], states)
-    prepared = _variational.prepare(scene, None)
+    prepared = _problem.prepare(scene, None)
     return jax.lax.map(lambda pair: _variational.wrenches(scene, prepared, *pair), (before, after))
 
 
 @eqx.filter_jit
 def _jitted_patches(scene, states):
-    prepared = _variational.prepare(scene, None)
+    prepared = _problem.prepare(scene, None)
     return jax.lax.map(lambda state: _variational.patches(scene, prepared, state), states)
 
 

@@ -1,0 +1,283 @@
+"""What a step has to solve: bodies, their momenta before contact, patches and points of contact."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Float
+
+from dano.contact import (
+    AbstractPatchLaw,
+    by_autodiff,
+    ContactParams,
+    DistributedLaw,
+    find,
+    Found,
+    gather_geometry,
+    Geometry,
+    Impacts,
+    KEPT,
+    Links,
+    Material,
+    Patch,
+    Points,
+    points_of,
+)
+from dano.engine._newton import inverse3
+from dano.engine._rigid import angular_momentum, turned
+from dano.maths import matmul, matvec, quat_to_matrix
+from dano.scene import colliders, Control, pressing_pairs, Scene, State
+
+# Chunks of points that a step has room for: of each body that moves, and more of one with many samples.
+_CHUNKS_A_BODY = 24
+_CHUNKS_OF_MANY = 48
+_MANY_SAMPLES = 1000
+
+
+class Prepared(eqx.Module):
+    """What does not change from step to step: see `prepare`.
+
+    Attributes:
+        geometry: Tables of all bodies that press at points; None if there are none.
+        material: Of the contacts with point laws, arrays over them.
+        impacts: How they treat impacts.
+        capacity: Chunks of points that a step has room for (static).
+    """
+
+    geometry: Geometry | None
+    material: Material | None
+    impacts: Impacts | None
+    capacity: int = eqx.field(static=True)
+
+
+class Problem(eqx.Module):
+    """Everything the residual of a step depends on, except the unknown velocities.
+
+    Attributes:
+        mass: [kg], shape (m,) for m bodies that move.
+        inertia: [kg m², B], shape (m, 3, 3).
+        impulse: Momentum before contact: old momentum plus gravity and controls, shape (m, 6), rotation in B.
+        rotation: Body → world, shape (m, 3, 3).
+        timestep: h [s].
+        patches: Geometry of each contact with a patch law.
+        arms: From the centres of mass of its two bodies to the patch's point [m, W]; unused for a fixed body.
+        params: Parameters of each of these contacts.
+        laws: Law of each of them.
+        points: Point contacts, or None if no contact has a point law.
+        material: Of their chunks.
+    """
+
+    mass: Float[Array, " m"]
+    inertia: Float[Array, "m 3 3"]
+    impulse: Float[Array, "m 6"]
+    rotation: Float[Array, "m 3 3"]
+    timestep: Float[Array, ""]
+    patches: tuple[Patch, ...]
+    arms: tuple[tuple[Float[Array, "3"], Float[Array, "3"]], ...]
+    params: tuple[ContactParams, ...]
+    laws: tuple[AbstractPatchLaw, ...]
+    points: Points | None
+    material: Material | None
+
+
+class Pairs(NamedTuple):
+    """Static structure.
+
+    Attributes:
+        moving: Bodies that move.
+        of_contact: Which of them each contact with a patch law joins; −1 is a fixed one.
+        rows: Place in `moving` of each body, their number for a fixed one.
+    """
+
+    moving: tuple[int, ...]
+    of_contact: tuple[tuple[int, int], ...]
+    rows: tuple[int, ...]
+
+
+def prepare(scene: Scene, capacity: int | None) -> Prepared:
+    """Tables for the steps of a scene.
+
+    Args:
+        scene: The scene.
+        capacity: Chunks of point contacts that a step has room for; None chooses by the bodies.
+    """
+    laws = [(c.law, c.params) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
+    if not laws:
+        return Prepared(None, None, None, 0)
+    h = scene.timestep
+    gravity = jnp.sqrt(jnp.sum(scene.gravity**2))
+    materials = [law.material(params, h, gravity) for law, params in laws]
+    material = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v).astype(h.dtype) for v in x]), *materials)
+    order = [k for k, c in enumerate(scene.contacts) if isinstance(c.law, DistributedLaw)]
+    pairs = [(i, j, order.index(k)) for i, j, k in pressing_pairs(scene.bodies, scene.contacts)]
+    used = {i for pair in pairs for i in pair[:2]}
+    twins = scene.twins or tuple(range(len(scene.bodies)))
+    parts = [
+        (body if i in used else body.unused()).part(twins[i] if i in used else -1 - i)
+        for i, body in enumerate(scene.bodies)
+    ]
+    geometry = gather_geometry(parts, pairs, gravity * h * h, h.dtype)
+    if capacity is None:
+        moving = [body for body in scene.bodies if not body.fixed]
+        many = [b for b in moving if b.surface is not None and b.surface.points.shape[1] >= _MANY_SAMPLES]
+        capacity = _CHUNKS_A_BODY * len(moving) + (_CHUNKS_OF_MANY - _CHUNKS_A_BODY) * len(many)
+    impacts = Impacts(material.instant > 0, material.bounce)
+    return Prepared(geometry, material, impacts, capacity)
+
+
+def structure_of(scene: Scene) -> Pairs:
+    moving = tuple(i for i, body in enumerate(scene.bodies) if not body.fixed)
+    position = {scene.bodies[i].name: k for k, i in enumerate(moving)}
+    of_contact = tuple(
+        (position.get(c.a, -1), position.get(c.b, -1))
+        for c in scene.contacts
+        if isinstance(c.law, AbstractPatchLaw)
+    )
+    rows = tuple(position.get(body.name, len(moving)) for body in scene.bodies)
+    return Pairs(moving, of_contact, rows)
+
+
+def build_problem(
+    scene: Scene, prepared: Prepared, state: State, control: Control | None, pairs: Pairs
+) -> tuple[Problem, Found | None]:
+    rows, h = pairs.moving, scene.timestep
+    bodies = [scene.bodies[i] for i in rows]
+    rotations = tuple(quat_to_matrix(q) for q in state.orientation)
+    rotation = jnp.stack([rotations[i] for i in rows])
+    mass = jnp.stack([body.mass * body.mass_scale for body in bodies])
+    inertia = jnp.stack([body.inertia * body.mass_scale for body in bodies])
+    velocity, omega = rows_of(state.velocity, rows), rows_of(state.omega, rows)
+    linear = mass[:, None] * (velocity + (h * scene.gravity)[None])
+    angular = jax.vmap(angular_momentum, (0, 0, None, None))(omega, inertia, h, -1)
+    if control is not None:
+        linear = linear + h * rows_of(control.force, rows)
+        angular = angular + h * jax.vmap(lambda r, t: matvec(r.T, t))(rotation, rows_of(control.torque, rows))
+    contacts = [c for c in scene.contacts if isinstance(c.law, AbstractPatchLaw)]
+    laws = tuple(c.law for c in contacts if isinstance(c.law, AbstractPatchLaw))
+    overlaps = find_patches(scene, state, rotations)
+    arms = tuple(
+        (
+            _arm(patch, state.position[scene.index(contact.a)]),
+            _arm(patch, state.position[scene.index(contact.b)]),
+        )
+        for contact, patch in zip(contacts, overlaps, strict=True)
+    )
+    points, material, found = _points(scene, prepared, state)
+    problem = Problem(
+        mass,
+        inertia,
+        jnp.concatenate([linear, angular], axis=1),
+        rotation,
+        h,
+        overlaps,
+        arms,
+        tuple(contact.params for contact in contacts),
+        laws,
+        points,
+        material,
+    )
+    return problem, found
+
+
+def find_patches(scene: Scene, state: State, rotations: tuple[Float[Array, "3 3"], ...]) -> tuple[Patch, ...]:
+    items = [
+        (c.law, *colliders(scene.bodies, c, state, rotations))
+        for c in scene.contacts
+        if isinstance(c.law, AbstractPatchLaw)
+    ]
+    return grouped(lambda item: item[0].patch(*item[1:]), items)
+
+
+def grouped(function, items: list):
+    """Apply a function to each item; items of equal structure and shapes are stacked and mapped together.
+
+    Written out pair by pair, scenes with many equal bodies would compile slowly.
+    """
+
+    def kind(item):
+        dynamic, static = eqx.partition(item, eqx.is_array)
+        return (
+            jax.tree.structure(item),
+            tuple((x.shape, x.dtype) for x in jax.tree.leaves(dynamic)),
+            str(static),
+        )
+
+    groups: dict[object, list[int]] = {}
+    for i, item in enumerate(items):
+        groups.setdefault(kind(item), []).append(i)
+    results: list = [None] * len(items)
+    for members in groups.values():
+        if len(members) == 1:
+            results[members[0]] = function(items[members[0]])
+            continue
+        dynamic, static = zip(*(eqx.partition(items[i], eqx.is_array) for i in members), strict=True)
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *dynamic)
+        mapped = jax.vmap(lambda d, s=static[0]: function(eqx.combine(d, s)))(stacked)
+        for k, i in enumerate(members):
+            results[i] = jax.tree.map(lambda leaf, k=k: leaf[k], mapped)
+    return tuple(results)
+
+
+def _points(scene: Scene, prepared: Prepared, state: State):
+    """Point contacts, the material of their chunks, and where they were found; None if there are none."""
+    if prepared.geometry is None or prepared.impacts is None:
+        return None, None, None
+    links, h = links_of(scene, state, scene.timestep), scene.timestep
+    fixed = jax.lax.stop_gradient((prepared.geometry, links, prepared.impacts, h))
+    points, found = find(*fixed, prepared.capacity)
+    found = jax.tree.map(lambda x: checkpoint_name(x, KEPT), found)
+    numbers, whole = eqx.partition(points, eqx.is_inexact_array)
+    points = eqx.combine(_listed(prepared.geometry, links, h, found, numbers), whole)
+    material = jax.tree.map(lambda x: x[points.contact], prepared.material)
+    return points, material, found
+
+
+@eqx.filter_custom_jvp
+def _listed(geometry, links, h, found, numbers):
+    """The points, whose derivatives are found anew from where they are."""
+    return numbers
+
+
+@_listed.def_jvp
+def _(primals, tangents):
+    geometry, links, h, found, numbers = primals
+    if not jax.tree.leaves(tangents[:3]):
+        return numbers, jax.tree.map(jnp.zeros_like, numbers)
+
+    def again(geometry, links, h):
+        return eqx.filter(points_of(geometry, links, found, h), eqx.is_inexact_array)
+
+    return by_autodiff(again, (geometry, links, h), tangents[:3])
+
+
+def links_of(scene: Scene, state: State, h) -> Links:
+    moves = np.array([not body.fixed for body in scene.bodies])
+    rotation = jax.vmap(quat_to_matrix)(state.orientation)
+    ahead = jnp.where(moves[:, None], turned(state.orientation, state.omega, h), state.orientation)
+    com = jnp.stack([body.com + body.com_offset for body in scene.bodies]).astype(h.dtype)
+    mass = jnp.stack([body.mass * body.mass_scale for body in scene.bodies])
+    inertia = jnp.stack([body.inertia * body.mass_scale for body in scene.bodies])
+    inverse = jax.vmap(lambda r, j: matmul(matmul(r, inverse3(j)), r.T))(rotation, inertia)
+    return Links(
+        state.position,
+        state.orientation,
+        ahead,
+        jnp.where(moves[:, None], state.velocity, 0),
+        jnp.where(moves[:, None], jax.vmap(matvec)(rotation, state.omega), 0),
+        com,
+        jnp.where(moves, 1 / mass, 0),
+        jnp.where(moves[:, None, None], inverse, 0),
+    )
+
+
+def _arm(patch: Patch, position: Float[Array, "3"]) -> Float[Array, "3"]:
+    # Without contact a centroid is nowhere; any arm will do, and zero keeps far-away bodies well scaled.
+    return jnp.where(patch.touching, patch.point - position, 0)
+
+
+def rows_of(x: Float[Array, "n k"], rows: tuple[int, ...]) -> Float[Array, "m k"]:
+    """Some rows of an array; slices, because a gather or scatter costs XLA's CPU backend a microsecond."""
+    return jnp.stack([x[i] for i in rows])
