@@ -29,7 +29,6 @@ fixed = true
 a = "ball"
 b = "floor"
 sliding_friction = 0.5
-sliding_drag = 0.0
 """
 
 
@@ -69,6 +68,7 @@ def test_finds_the_friction(files, run):
         ("ball,wall.sliding_friction:0:1", "must name bodies of the scene ['ball', 'floor'], got 'wall'"),
         ("ball,flor.sliding_friction:0:1", "got 'flor'; did you mean 'floor'?"),
         ("ball,floor.slidng_friction:0:1", "got 'slidng_friction'; did you mean 'sliding_friction'?"),
+        ("ball,floor.spring:1e3:1e5", "must be one of sliding_friction, stiffness, restitution"),
         ("ball,ball.sliding_friction:0:1", "contact must be one of"),
         ("ball.colour:0:1", "must be one of mass_scale"),
         ("ball,floor.sliding_friction:1:0", "lower of parameter"),
