@@ -79,6 +79,8 @@ def save_run(path: str | os.PathLike[str], trajectory: Trajectory, scene_file: S
 def load_run(path: str | os.PathLike[str], *, progress: Progress | None = None) -> Run:
     """Read what `save_run` wrote; the objects that the scene names must still be where they were.
 
+    Contacts that name no law have the one that was the default when the run was saved.
+
     Raises:
         ValueError: If the file is missing, truncated, not a dano trajectory, or was saved without its scene.
     """
