@@ -13,12 +13,10 @@ from dano.scene_file import build_asset
 def main(quick: bool = False, strip: str | None = None) -> dict[str, float]:
     """Simulate 1.2 s; `strip` is a file name (.png) for pictures of the motion."""
     bunny = build_asset("bunny")  # 12 cm, 1 kg, from a density grid with a hollow core and floaters
-    # A moment per normal force is a length: a millimetre suits a body of 12 cm. Smoothing 1000 hardly creeps.
-    params = dano.ContactParams(sliding_friction=0.3, rolling_friction=1e-3, torsional_friction=1e-3)
-    law = dano.CentroidLaw(smoothing=1000.0)
+    params = dano.ContactParams(sliding_friction=0.3, restitution=0.3)
     scene = dano.Scene.create(
         [dano.Body("bunny", bunny), dano.Body("floor", dano.HalfSpace(), fixed=True)],
-        [dano.Contact("bunny", "floor", params, law)],
+        [dano.Contact("bunny", "floor", params)],
         timestep=0.002,
     )
     start = scene.initial_state(

@@ -14,12 +14,9 @@ SPEED, FRICTION = 0.7, 0.25
 
 def main(quick: bool = False) -> dict[str, float]:
     bunny = build_asset("bunny")
-    params = dano.ContactParams(
-        sliding_friction=FRICTION, sliding_drag=0.0, rolling_friction=0.001, torsional_friction=0.001
-    )
     scene = dano.Scene.create(
         [dano.Body("bunny", bunny), dano.Body("floor", dano.HalfSpace(), fixed=True)],
-        [dano.Contact("bunny", "floor", params, dano.CentroidLaw(smoothing=1000.0))],
+        [dano.Contact("bunny", "floor", dano.ContactParams(sliding_friction=FRICTION))],
         timestep=0.005,
     )
     # Let it stand first: the slide then starts without a bounce.

@@ -14,6 +14,7 @@ SPEED = 0.5
 
 def main(quick: bool = False) -> dict[str, Any]:
     bunny = build_asset("bunny")
+    # The paper's law: one wrench a pair is what runs fastest under vmap. Its friction moments are lengths.
     params = dano.ContactParams(sliding_drag=0.0, rolling_friction=1e-3, torsional_friction=1e-3)
     scene = dano.Scene.create(
         [dano.Body("bunny", bunny), dano.Body("floor", dano.HalfSpace(), fixed=True)],

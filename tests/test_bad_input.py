@@ -31,6 +31,20 @@ def built(field: dano.AbstractField, **options) -> dano.NeuralObject:
     return dano.NeuralObject.from_field(field, **{"n_samples": 50, "resolution": 8, **options})
 
 
+def cloud(n: int) -> dano.NeuralObject:
+    """An object of n samples on a ball, without a field."""
+    points = np.random.default_rng(0).normal(size=(n, 3))
+    points *= 0.05 / np.linalg.norm(points, axis=1, keepdims=True)
+    return dano.NeuralObject.from_samples(
+        points=points, density=np.ones(n), mass=1.0, com=(0, 0, 0), inertia=1e-3 * np.eye(3)
+    )
+
+
+def two_clouds(law: dano.AbstractContactLaw | None) -> dano.Scene:
+    bodies = [dano.Body("a", cloud(9)), dano.Body("b", cloud(9))]
+    return dano.Scene.create(bodies, [dano.Contact("a", "b", law=law)])
+
+
 class Spoilt(dano.AbstractField):
     """A density that is wrong somewhere, as a user's own function may be."""
 
@@ -84,6 +98,24 @@ CASES = {
             [ball(), FLOOR], [dano.Contact("ball", "floor"), dano.Contact("floor", "ball")]
         ),
         "each pair once",
+    ),
+    "nothing to press on": (
+        lambda: two_clouds(None),
+        "objects 'a' and 'b' by DistributedLaw needs a solid on one side, got solid=None on both: give "
+        "NeuralObject.from_samples a field",
+    ),
+    "nothing to query": (
+        lambda: two_clouds(dano.CentroidLaw()),
+        "objects 'a' and 'b' by CentroidLaw needs a grid on one side, got grid=None on both: give "
+        "NeuralObject.from_samples a field",
+    ),
+    "samples at one place": (
+        lambda: dano.Scene.create([dano.Body("x", cloud(1)), FLOOR], [dano.Contact("x", "floor")]),
+        "stiffness and restitution_velocity of the contact between 'x' and 'floor' must be given",
+    ),
+    "spring without the paper's law": (
+        lambda: dano.Contact("a", "b", dano.ContactParams(spring=1e4)),
+        "DistributedLaw does not read spring",
     ),
     "no timestep": (lambda: dano.Scene.create([ball()], timestep=0.0), "timestep must be"),
     "infinite position": (lambda: state(position=(0.0, np.inf, 0.0)), "position of 'ball' must be finite"),

@@ -77,7 +77,7 @@ def sphere_cases() -> list[Case]:
     """A shape without samples, for comparison."""
     scene = dano.Scene.create(
         [dano.Body("ball", dano.Sphere(0.05), mass=1.0), dano.Body("floor", dano.HalfSpace(), fixed=True)],
-        [dano.Contact("ball", "floor")],
+        [dano.Contact("ball", "floor", law=dano.CentroidLaw())],
         timestep=0.002,
     )
     state = scene.initial_state(ball={"position": (0, 0, 0.05), "velocity": (0.2, 0, 0)})

@@ -84,5 +84,4 @@ fixed = true
 a = "egg"
 b = "floor"
 sliding_friction = 0.4
-smoothing = 100.0
 """

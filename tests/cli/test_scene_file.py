@@ -1,5 +1,6 @@
 """What a scene file may say."""
 
+import json
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -7,15 +8,15 @@ import numpy as np
 import pytest
 
 import dano
-from dano.scene_file import build_asset, load_run, load_scene, parse_scene
+from dano.scene_file import build_asset, load_run, load_scene, parse_scene, save_run
 
 
 def test_defaults_and_all_pairs(scene):
     text = scene.read_text(encoding="utf-8").split("[[contacts]]")[0]
     text += """
 [default_contact]
-rolling_friction = 0.002
-smoothing = 500
+restitution = 0.4
+stiction_velocity = 1e-6
 
 [[bodies]]
 name = "ball"
@@ -35,15 +36,37 @@ fixed = true
     pairs = [(contact.a, contact.b) for contact in loaded.scene.contacts]
     assert pairs == [("egg", "floor"), ("egg", "ball"), ("egg", "wall"), ("floor", "ball"), ("ball", "wall")]
     for contact in loaded.scene.contacts:
-        assert contact.params.rolling_friction == 0.002
-        assert contact.params.spring == 3e4
-        assert isinstance(contact.law, dano.CentroidLaw)
-        assert float(contact.law.smoothing) == 500
+        assert isinstance(contact.law, dano.DistributedLaw)
+        assert float(contact.law.stiction_velocity) == 1e-6
+        assert float(contact.params.restitution) == 0.4
+        assert float(contact.params.hysteresis) == 0.35
+        assert contact.params.spring is None
     assert loaded.n_steps == 400
     assert loaded.controls is None
     np.testing.assert_allclose(loaded.scene.gravity, (0, 0, -9.81))
     np.testing.assert_allclose(loaded.state.velocity[2], (1, 0, 0))
     np.testing.assert_allclose(loaded.state.omega[0], (0, 0, 1))
+
+
+def test_centroid_law(scene):
+    text = scene.read_text(encoding="utf-8").split("[[contacts]]")[0]
+    text += """
+[default_contact]
+law = "centroid"
+rolling_friction = 0.002
+smoothing = 500
+"""
+    (contact,) = parse_scene(text, scene).scene.contacts
+    assert isinstance(contact.law, dano.CentroidLaw)
+    assert float(contact.law.smoothing) == 500
+    assert float(contact.params.rolling_friction) == 0.002
+    assert float(contact.params.spring) == 3e4
+    # Files from before the distributed law was the default.
+    before = text.replace('law = "centroid"\n', "")
+    (contact,) = parse_scene(before, scene, default_law="centroid").scene.contacts
+    assert isinstance(contact.law, dano.CentroidLaw)
+    with pytest.raises(ValueError, match="default_law must be one of centroid, distributed, got 'glue'"):
+        parse_scene(before, scene, default_law="glue")
 
 
 def test_distributed_law(scene):
@@ -145,7 +168,9 @@ def test_field_is_built_and_shared(field, tmp_path):
     )
     loaded = parse_scene(text, field.parent / "scene.toml")
     a, b = loaded.scene.bodies
-    assert a.object is b.object
+    assert a.object is not None and b.object is not None
+    assert a.object.samples.points is b.object.samples.points
+    assert loaded.scene.twins == (0, 0)
     assert a.size == pytest.approx(0.2, rel=0.03)
     assert (float(a.mass), float(b.mass * b.mass_scale)) == (pytest.approx(0.3), pytest.approx(0.6))
     assert loaded.n_steps == 50
@@ -293,8 +318,8 @@ BAD = {
         "[[contacts]] 1 ('ball', 'floor'): sliding_friction must be finite and ≥ 0, got -0.2",
     ),
     "negative default friction": (
-        "n_steps = 1\n" + BODY + FLOOR + "[default_contact]\nspring = -1.0\n",
-        "[default_contact]: spring must be finite and ≥ 0",
+        "n_steps = 1\n" + BODY + FLOOR + "[default_contact]\nsliding_friction = -1.0\n",
+        "[default_contact]: sliding_friction must be finite and ≥ 0",
     ),
     "unknown law": (
         "n_steps = 1\n" + BODY + FLOOR + '[[contacts]]\na = "ball"\nb = "floor"\nlaw = "glue"\n',
@@ -312,8 +337,8 @@ BAD = {
         "[[contacts]] 1 ('ball', 'floor'): rolling_friction belongs to law = 'centroid'",
     ),
     "parameter of a law not chosen": (
-        "n_steps = 1\n" + BODY + FLOOR + "[default_contact]\nrestitution = 0.5\n",
-        "[default_contact]: restitution belongs to law = 'distributed', and this is 'centroid'",
+        "n_steps = 1\n" + BODY + FLOOR + "[default_contact]\nspring = 1e4\n",
+        "for the other law write law = 'centroid'",
     ),
     "compliant as a number": (
         "n_steps = 1\n" + BODY + FLOOR + '[default_contact]\nlaw = "distributed"\ncompliant = 1\n',
@@ -375,6 +400,22 @@ def test_run_without_its_scene(tmp_path):
     dano.Trajectory(jnp.zeros(2), states, *steps, ("x",)).save(path)
     with pytest.raises(ValueError, match="does not say which scene"):
         load_run(path)
+
+
+def test_run_from_before_the_distributed_law_was_the_default(tmp_path):
+    path, zeros = tmp_path / "run.npz", jnp.zeros((2, 2, 3))
+    text = "n_steps = 1\n" + BODY + FLOOR + "[default_contact]\nsmoothing = 100.0\n"
+    source = {"scene": text, "path": str(tmp_path / "scene.toml")}
+    states = dano.State(zeros, jnp.zeros((2, 2, 4)), zeros, zeros)
+    steps = jnp.zeros(1), jnp.zeros(1, int), jnp.ones(1, bool)
+    dano.Trajectory(jnp.zeros(2), states, *steps, ("ball", "floor")).save(path, source=json.dumps(source))
+    (contact,) = load_run(path).scene.contacts
+    assert isinstance(contact.law, dano.CentroidLaw) and float(contact.law.smoothing) == 100
+    # What is saved now says it.
+    loaded = parse_scene(text.replace("smoothing = 100.0", "restitution = 0.5"), tmp_path / "scene.toml")
+    save_run(path, dano.simulate(loaded.scene, loaded.state, 1), loaded)
+    (contact,) = load_run(path).scene.contacts
+    assert isinstance(contact.law, dano.DistributedLaw) and float(contact.params.restitution) == 0.5
 
 
 def test_documented_scene_loads(tmp_path):

@@ -248,6 +248,10 @@ def test_parameters_of_another_law_are_an_error():
         dano.Contact("a", "b", dano.ContactParams(spring=1e4), dano.DistributedLaw())
 
 
+def test_it_is_the_default():
+    assert isinstance(dano.Contact("a", "b").law, dano.DistributedLaw)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -74,7 +74,7 @@ def tumble():
 
 def hit():
     box, ball = dano.Body("box", point_cloud_box()), dano.Body("ball", dano.Sphere(0.12, edge=0.03), mass=3.0)
-    contact = dano.Contact("box", "ball", dano.ContactParams(damper=3e4))
+    contact = dano.Contact("box", "ball", dano.ContactParams(damper=3e4), dano.CentroidLaw())
     scene = dano.Scene.create([box, ball], [contact], timestep=0.01, gravity=(0.0, 0.0, 0.0))
     coming = {"position": (0.32, 0.03, 0.02), "velocity": (-2, 0.1, 0), "orientation": (1, 0.2, 0.1, 0.5)}
     return scene, scene.initial_state(box=coming), 40
@@ -125,7 +125,7 @@ def lumpy_pair():
     lump = dano.NeuralObject.from_field(field, n_samples=300, mass=1.0, resolution=20, key=jax.random.key(0))
     scene = dano.Scene.create(
         [dano.Body("a", lump), dano.Body("b", lump)],
-        [dano.Contact("a", "b", dano.ContactParams(damper=1e4, spring=3e3))],
+        [dano.Contact("a", "b", dano.ContactParams(damper=1e4, spring=3e3), dano.CentroidLaw())],
         timestep=0.01,
         gravity=(0.0, 0.0, 0.0),
     )

@@ -49,7 +49,7 @@ def test_two_body_collision_conserves_momentum():
     params = dano.ContactParams(spring=3e4, damper=3e4, sliding_friction=0.5, torsional_friction=0.02)
     scene = dano.Scene.create(
         [dano.Body("box", box), ball],
-        [dano.Contact("box", "ball", params)],
+        [dano.Contact("box", "ball", params, dano.CentroidLaw())],
         timestep=0.01,
         gravity=(0.0, 0.0, 0.0),
     )

@@ -402,7 +402,8 @@ def test_centre_of_mass_and_inertia_from_free_flight():
 def test_unobserved_body_of_unknown_mass_in_a_collision():
     params = dano.ContactParams(sliding_friction=0.0, spring=5e4, damper=1e4)
     bodies = [dano.Body(name, dano.Sphere(RADIUS), mass=0.5) for name in ("a", "b")]
-    scene = dano.Scene.create(bodies, [dano.Contact("a", "b", params)], timestep=0.002, gravity=(0, 0, 0))
+    contact = dano.Contact("a", "b", params, dano.CentroidLaw())
+    scene = dano.Scene.create(bodies, [contact], timestep=0.002, gravity=(0, 0, 0))
     heavy = scene.replace_body("b", mass_scale=1.7)
     start = {"a": {"velocity": (1, 0, 0)}, "b": {"position": (0.12, 0.01, 0)}}
     run = dano.simulate(heavy, heavy.initial_state(**start), 60)

@@ -55,7 +55,8 @@ def scene(bunny: dano.NeuralObject, timestep: float) -> dano.Scene:
         dano.Body("floor", dano.HalfSpace(), fixed=True),
     ]
     pairs = [("bunny", "floor"), ("ball", "floor"), ("bunny", "ball")]
-    return dano.Scene.create(bodies, [dano.Contact(a, b, params) for a, b in pairs], timestep=timestep)
+    contacts = [dano.Contact(a, b, params, dano.CentroidLaw()) for a, b in pairs]
+    return dano.Scene.create(bodies, contacts, timestep=timestep)
 
 
 def parameters() -> list[dano.Parameter]:

@@ -13,7 +13,6 @@ from dano.archive import checked_output, replacing
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import missing_for_pictures
-from dano.contact import ContactParams
 from dano.identify import Identification, identify as fit_parameters, load_motion, Parameter
 from dano.names import did_you_mean
 from dano.scene import Scene
@@ -120,8 +119,8 @@ def _parameter(text: str, scene: Scene) -> Parameter:
             )
     if "," in owner:
         a, b = (part.strip() for part in owner.split(",", 1))
-        valid = tuple(ContactParams.__dataclass_fields__)
         place = scene.contact_index(a, b)
+        valid = scene.contacts[place].law.reads
         where = lambda s: getattr(s.contacts[place].params, name)  # noqa: E731
     else:
         valid = _OF_BODIES

@@ -23,17 +23,13 @@ Filled = Float[Array, ""] | Any
 class ContactParams(eqx.Module):
     """Parameters of a contact: leaves, scalars ≥ 0. Each law reads its own; others must stay None.
 
+    "Distributed law" means `DistributedLaw`, the default of a `Contact`; "centroid law" means `CentroidLaw`,
+    the paper's.
+
     What is None is chosen by the law of the contact when a scene is created (`AbstractContactLaw.complete`).
 
     Attributes:
         sliding_friction: Coulomb coefficient μ [1]; both laws.
-        spring: Centroid law (paper: Table I): k, normal force per overlapping mass [N/kg].
-        damper: Centroid law: d, its decrease with the separating speed [N s/(m kg)].
-        sliding_drag: Centroid law: viscous sliding friction per normal force [s/m].
-        torsional_friction: Centroid law: friction moment about the normal per normal force μ_t [m].
-        torsional_drag: Centroid law: viscous moment about the normal per normal force [m s].
-        rolling_friction: Centroid law: friction moment in the tangent plane per normal force μ_r [m].
-        rolling_drag: Centroid law: viscous moment in the tangent plane per normal force [m s].
         stiffness: Distributed law: pressure per depth [Pa/m].
         restitution: Distributed law: separating over approaching speed in an impact e ≤ 1 [1].
         restitution_velocity: Distributed law: speed [m/s] below which impacts lose more than `restitution`
@@ -43,9 +39,22 @@ class ContactParams(eqx.Module):
         friction_fading: Distributed law: share φ ≤ 1 of the friction coefficient that is lost under high
             pressure [1].
         friction_pressure: Distributed law: pressure p₀ at which half of that is lost [Pa].
+        spring: Centroid law (paper: Table I): k, normal force per overlapping mass [N/kg].
+        damper: Centroid law: d, its decrease with the separating speed [N s/(m kg)].
+        sliding_drag: Centroid law: viscous sliding friction per normal force [s/m].
+        torsional_friction: Centroid law: friction moment about the normal per normal force μ_t [m].
+        torsional_drag: Centroid law: viscous moment about the normal per normal force [m s].
+        rolling_friction: Centroid law: friction moment in the tangent plane per normal force μ_r [m].
+        rolling_drag: Centroid law: viscous moment in the tangent plane per normal force [m s].
     """
 
     sliding_friction: Float[Array, ""]
+    stiffness: Filled
+    restitution: Filled
+    restitution_velocity: Filled
+    hysteresis: Filled
+    friction_fading: Filled
+    friction_pressure: Filled
     spring: Filled
     damper: Filled
     sliding_drag: Filled
@@ -53,17 +62,17 @@ class ContactParams(eqx.Module):
     torsional_drag: Filled
     rolling_friction: Filled
     rolling_drag: Filled
-    stiffness: Filled
-    restitution: Filled
-    restitution_velocity: Filled
-    hysteresis: Filled
-    friction_fading: Filled
-    friction_pressure: Filled
 
     def __init__(
         self,
         *,
         sliding_friction: Numbers = 0.2,
+        stiffness: Numbers | None = None,
+        restitution: Numbers | None = None,
+        restitution_velocity: Numbers | None = None,
+        hysteresis: Numbers | None = None,
+        friction_fading: Numbers | None = None,
+        friction_pressure: Numbers | None = None,
         spring: Numbers | None = None,
         damper: Numbers | None = None,
         sliding_drag: Numbers | None = None,
@@ -71,12 +80,6 @@ class ContactParams(eqx.Module):
         torsional_drag: Numbers | None = None,
         rolling_friction: Numbers | None = None,
         rolling_drag: Numbers | None = None,
-        stiffness: Numbers | None = None,
-        restitution: Numbers | None = None,
-        restitution_velocity: Numbers | None = None,
-        hysteresis: Numbers | None = None,
-        friction_fading: Numbers | None = None,
-        friction_pressure: Numbers | None = None,
     ):
         """See the class.
 

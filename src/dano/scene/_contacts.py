@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 
 from dano.contact import (
     AbstractContactLaw,
-    CentroidLaw,
     Collider,
     ContactParams,
+    DistributedLaw,
     non_negative,
     SampleSet,
     Setting,
@@ -21,7 +21,7 @@ from dano.contact import (
 )
 from dano.fields import AbstractShape, HalfSpace, PosedShape, Sphere
 from dano.maths import floating, Numbers
-from dano.objects import surface_quadrature, surface_samples
+from dano.objects import NeuralObject, surface_quadrature, surface_samples
 from dano.scene._bodies import Body
 from dano.scene._states import State
 
@@ -35,6 +35,10 @@ STANDARD_GRAVITY = 9.81
 
 class Contact(eqx.Module):
     """A pair of bodies that may touch, and how.
+
+    The default law is `DistributedLaw`: pressure, friction and restitution at every surface sample. The law
+    of the paper, one wrench at the centroid of the overlap, is `law=CentroidLaw()`; it reads other
+    parameters.
 
     Attributes:
         a: Name of the first body; the patch normal points from b to a.
@@ -58,7 +62,14 @@ class Contact(eqx.Module):
         law: AbstractContactLaw | None = None,
         edge: Numbers | None = None,
     ):
-        """A contact with default parameters and the paper's law unless given otherwise.
+        """A contact of two bodies of a scene.
+
+        Args:
+            a: Name of the first body.
+            b: Name of the second body.
+            params: Parameters of the law; default: all of them are chosen when the scene is created.
+            law: The law; default `DistributedLaw()`.
+            edge: Width of the smooth occupancy of a primitive in this pair [m], for the centroid law.
 
         Raises:
             ValueError: If the two names are equal, the edge is negative, or the law does not read a parameter
@@ -68,7 +79,7 @@ class Contact(eqx.Module):
             raise ValueError(f"contact must join two different bodies, got {a!r} twice")
         self.a, self.b = a, b
         self.params = ContactParams() if params is None else params
-        self.law = CentroidLaw() if law is None else law
+        self.law = DistributedLaw() if law is None else law
         self.law.check(self.params)
         self.edge = None if edge is None else non_negative("edge", edge)
 
@@ -169,11 +180,7 @@ def _needs_samples(contact: Contact, a: Body, b: Body) -> set[str]:
             f"contact must join at least one body that moves, got fixed {a.name!r} and {b.name!r}"
         )
     if a.object is not None and b.object is not None:
-        if a.object.grid is None and b.object.grid is None:
-            raise ValueError(
-                f"contact between {a.name!r} and {b.name!r} needs a density grid on one side: give "
-                "NeuralObject.from_samples a field"
-            )
+        _check_objects(contact, a.object, b.object)
         return set()
     if contact.law.presses:
         return {body.name for body in (a, b) if body.shape is not None and np.isfinite(body.size)}
@@ -183,6 +190,21 @@ def _needs_samples(contact: Contact, a: Body, b: Body) -> set[str]:
         return set()
     # A fixed shape has no mass that its samples could carry; the moving side's samples find it.
     return {body.name for body in (a, b) if not body.fixed}
+
+
+def _check_objects(contact: Contact, a: NeuralObject, b: NeuralObject) -> None:
+    """Check that the samples of one object have something to meet in the other.
+
+    Raises:
+        ValueError: If neither object has a solid to press on, or a density to query.
+    """
+    met = "solid" if contact.law.presses else "grid"
+    if getattr(a, met) is None and getattr(b, met) is None:
+        raise ValueError(
+            f"contact between the objects {contact.a!r} and {contact.b!r} by {type(contact.law).__name__} "
+            f"needs a {met} on one side, got {met}=None on both: give NeuralObject.from_samples a field "
+            "for one of them"
+        )
 
 
 def _with_samples(body: Body, *, presses: bool) -> Body:
@@ -215,6 +237,12 @@ def _setting(a: Body, b: Body, gravity: Float[Array, "3"], load: Float[Array, ""
                 # An object made of samples may meet a body that has none.
                 sampled = body if body.surface is not None else other
                 support = sampled.typical_support(sinking * sampled.size)
+                if not support > 0:
+                    raise ValueError(
+                        f"stiffness and restitution_velocity of the contact between {a.name!r} and "
+                        f"{b.name!r} must be given, or law=CentroidLaw(): the size of {sampled.name!r}, "
+                        f"{sampled.size} m, gives none"
+                    )
                 carried.append(load * strength / support)
         return jnp.max(jnp.stack(carried))
 

@@ -69,12 +69,13 @@ class Scene(eqx.Module):
                 )
             seen.add(frozenset((contact.a, contact.b)))
         gravity = checked_array("gravity", gravity, (3,))
-        bodies, contacts = prepared(bodies, contacts, gravity)
+        # Before the bodies are prepared, which makes new ones.
         objects = [body.object for body in bodies]
         twins = tuple(
             i if o is None else next(j for j, p in enumerate(objects) if p is o)
             for i, o in enumerate(objects)
         )
+        bodies, contacts = prepared(bodies, contacts, gravity)
         return cls(bodies, contacts, timestep, gravity, twins)
 
     @property

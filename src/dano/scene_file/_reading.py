@@ -66,6 +66,8 @@ _LAWS: dict[str, tuple[type[AbstractContactLaw], tuple[str, ...]]] = {
     ),
 }
 """Laws by name, with the keys that belong to them."""
+DEFAULT_LAW = "distributed"
+"""Law of contacts that name none."""
 _FLAGS = ("adhesive", "compliant")
 """Those of them that are true or false; the others are numbers."""
 _CONTACT = ("law", "edge", *dict.fromkeys(key for _, keys in _LAWS.values() for key in keys))
@@ -86,6 +88,7 @@ class SceneFile:
         path: Where the file is, or would be: names in it are relative to its folder.
         text: The file's text.
         objects: Files of neural objects, or names of shipped ones, by the names of their bodies.
+        default_law: Law of the contacts that name none.
     """
 
     scene: Scene
@@ -95,6 +98,7 @@ class SceneFile:
     path: Path
     text: str
     objects: dict[str, Path | str]
+    default_law: str = DEFAULT_LAW
 
     def inputs(self) -> list[Path]:
         """Files that the scene is made of."""
@@ -152,12 +156,23 @@ def parse_scene(
     timestep: float | None = None,
     n_steps: int | None = None,
     progress: Progress | None = None,
+    default_law: str = DEFAULT_LAW,
 ) -> SceneFile:
-    """Read the text of a scene file; `path` is where it would be, which need not exist. See `load_scene`.
+    """Read the text of a scene file.
+
+    Args:
+        text: The text.
+        path: Where the file would be; it need not exist.
+        timestep: See `load_scene`.
+        n_steps: See `load_scene`.
+        progress: See `load_scene`.
+        default_law: Law of contacts that name none.
 
     Raises:
         ValueError: As `load_scene`.
     """
+    if default_law not in _LAWS:
+        raise ValueError(f"default_law must be one of {', '.join(_LAWS)}, got {default_law!r}")
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -183,7 +198,7 @@ def parse_scene(
     built: dict[object, NeuralObject] = {}
     rows = [Table(f"{path}: [[bodies]] {i + 1}", table, None) for i, table in enumerate(tables)]
     bodies = [_body(row, path.parent, built, progress) for row in rows]
-    contacts = _contacts(top, bodies)
+    contacts = _contacts(top, bodies, default_law)
     with located(str(path)):
         scene = Scene.create(bodies, contacts, timestep=h, gravity=gravity)
         start = {row["name"]: {key: row[key] for key in _STATE if key in row} for row in tables}
@@ -193,7 +208,7 @@ def parse_scene(
         for row in tables
         if "asset" in row or "object" in row
     }
-    return SceneFile(scene, state, int(steps), read_schedule(top, scene), path, text, objects)
+    return SceneFile(scene, state, int(steps), read_schedule(top, scene), path, text, objects, default_law)
 
 
 def _steps(top: Table, timestep: float) -> int | float:
@@ -283,16 +298,16 @@ def _from_field_file(path: Path, build: Table, *, weighed: bool, progress: Progr
     return build_object(load_field(path), weighed=weighed, progress=progress, **options)
 
 
-def _contacts(top: Table, bodies: Sequence[Body]) -> list[Contact]:
+def _contacts(top: Table, bodies: Sequence[Body], default_law: str) -> list[Contact]:
     default = top.table("default_contact", _CONTACT)
     default.where = f"{top.where}: [default_contact]"
-    usual = _law_name(default, "centroid")
+    usual = _law_name(default, default_law)
     if top.data.get("contacts", "all") == "all":
         pairs = itertools.combinations(bodies, 2)
         return [
             _contact(default, usual, a.name, b.name)
             for a, b in pairs
-            if a.name != b.name and _can_touch(a, b)
+            if a.name != b.name and _can_touch(a, b, presses=_LAWS[usual][0]().presses)
         ]
     if isinstance(top.data["contacts"], str):
         raise top.wrong("contacts", "'all' or written as [[contacts]] tables")
@@ -321,19 +336,21 @@ def _law_name(table: Table, default: str) -> str:
     for key in table.data:
         owners = [name for name, (_, keys) in _LAWS.items() if key in keys]
         if owners and law not in owners:
+            hint = "" if "law" in table else f"; for the other law write law = {owners[0]!r}"
             raise ValueError(
                 f"{table.where}: {key} belongs to law = {owners[0]!r}, and this is {law!r}, whose keys are "
-                f"{', '.join(_LAWS[law][1])}"
+                f"{', '.join(_LAWS[law][1])}{hint}"
             )
     return law
 
 
-def _can_touch(a: Body, b: Body) -> bool:
+def _can_touch(a: Body, b: Body, *, presses: bool) -> bool:
     """Whether `Scene.create` would accept a contact between two bodies."""
     if a.fixed and b.fixed:
         return False
     if a.object is not None and b.object is not None:
-        return a.object.grid is not None or b.object.grid is not None
+        met = [x.object.solid if presses else x.object.grid for x in (a, b) if x.object is not None]
+        return any(x is not None for x in met)
     return math.isfinite(a.size) or math.isfinite(b.size)
 
 

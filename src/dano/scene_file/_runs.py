@@ -16,8 +16,8 @@ from dano.scene_file._objects import Progress
 from dano.scene_file._reading import parse_scene, SceneFile
 from dano.scene_file._table import located
 
-SHARP_ENOUGH = 1000.0
-"""Smoothing [s/m] of the friction in `drop_scene`: on a slope it creeps by about a millimetre a second."""
+_LAW_BEFORE = "centroid"
+"""Law of contacts that name none, in runs that were saved before runs said it."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Run:
 def drop_scene(object_path: str | os.PathLike[str]) -> str:
     """Text of a scene in which an object falls, slightly tilted, from 0.3 of its size onto a floor.
 
-    The text names the object by its absolute path. Friction moments follow the object's size.
+    The text names the object by its absolute path.
 
     Raises:
         ValueError: If the file is not a neural object.
@@ -48,10 +48,9 @@ def drop_scene(object_path: str | os.PathLike[str]) -> str:
 duration = {duration:.3g}
 
 [default_contact]
+law = "distributed"
 sliding_friction = 0.3
-rolling_friction = {0.005 * size:.3g}
-torsional_friction = {0.005 * size:.3g}
-smoothing = {SHARP_ENOUGH}
+restitution = 0.3
 
 [[bodies]]
 name = "object"
@@ -72,12 +71,15 @@ def save_run(path: str | os.PathLike[str], trajectory: Trajectory, scene_file: S
     Raises:
         ValueError: If `path` is a directory or its parent does not exist.
     """
-    source = {"scene": scene_file.text, "path": str(scene_file.path.resolve())}
+    path_of_scene = str(scene_file.path.resolve())
+    source = {"scene": scene_file.text, "path": path_of_scene, "default_law": scene_file.default_law}
     trajectory.save(path, source=json.dumps(source))
 
 
 def load_run(path: str | os.PathLike[str], *, progress: Progress | None = None) -> Run:
     """Read what `save_run` wrote; the objects that the scene names must still be where they were.
+
+    Contacts that name no law have the one that was the default when the run was saved.
 
     Raises:
         ValueError: If the file is missing, truncated, not a dano trajectory, or was saved without its scene.
@@ -91,10 +93,11 @@ def load_run(path: str | os.PathLike[str], *, progress: Progress | None = None) 
     try:
         source = json.loads(str(data["source"]))
         text, origin = str(source["scene"]), Path(source["path"])
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        law = str(source.get("default_law", _LAW_BEFORE))
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path} is not a valid run: its scene is not readable") from error
     with located(f"{path}: the scene of this run cannot be built"):
-        scene = parse_scene(text, origin, progress=progress).scene
+        scene = parse_scene(text, origin, default_law=law, progress=progress).scene
     if scene.names != trajectory.names:
         raise ValueError(
             f"{path} is not a valid run: its bodies {trajectory.names} are not its scene's {scene.names}"
