@@ -28,6 +28,7 @@ from dano.contact import (
 )
 from dano.engine._newton import inverse3
 from dano.engine._rigid import angular_momentum, turned
+from dano.engine._sequential import one_at_a_time
 from dano.maths import matmul, matvec, quat_to_matrix
 from dano.scene import colliders, Control, pressing_pairs, Scene, State
 
@@ -227,7 +228,7 @@ def _points(scene: Scene, prepared: Prepared, state: State):
         return None, None, None
     links, h = links_of(scene, state, scene.timestep), scene.timestep
     fixed = jax.lax.stop_gradient((prepared.geometry, links, prepared.impacts, h))
-    points, found = find(*fixed, prepared.capacity)
+    points, found = one_at_a_time(lambda *found_by: find(*found_by, prepared.capacity), *fixed)
     found = jax.tree.map(lambda x: checkpoint_name(x, KEPT), found)
     numbers, whole = eqx.partition(points, eqx.is_inexact_array)
     points = eqx.combine(_listed(prepared.geometry, links, h, found, numbers), whole)

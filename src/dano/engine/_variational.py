@@ -47,6 +47,7 @@ from dano.engine._problem import (
     structure_of,
 )
 from dano.engine._rigid import angular_jacobian, angular_momentum, too_fast, turned
+from dano.engine._sequential import one_at_a_time
 from dano.maths import matmul, matvec, quat_to_matrix, safe_normalize
 from dano.scene import Control, Scene, State
 
@@ -152,7 +153,7 @@ def _solve(problem: Problem, found: Found | None, start, pairs: Pairs, options: 
 
     def find_root(problem, found, start):
         if problem.points is not None:
-            return _solve_points(problem, found, start, pairs, options)
+            return one_at_a_time(lambda *given: _solve_points(*given, pairs, options), problem, found, start)
 
         def evaluate(point, softening):
             velocities = point.reshape(start.shape)
