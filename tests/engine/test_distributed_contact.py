@@ -241,6 +241,24 @@ def test_a_ball_rolls_without_slipping():
     assert w * 0.05 == pytest.approx(v, rel=0.02)
 
 
+def test_a_batch_gives_what_its_members_give(plate):
+    """One slides, one spins, one falls: their solves take different numbers of passes."""
+
+    @jax.jit
+    def ends(height, speed, spin):
+        state = plate.initial_state(body={"position": (0, 0, 0.0199)})
+        position = state.position.at[0, 2].add(height)
+        velocity, omega = state.velocity.at[0, 0].set(speed), state.omega.at[0, 2].set(spin)
+        run = dano.simulate(plate, dano.State(position, state.orientation, velocity, omega), 20)
+        return run.states.position[-1, 0], run.iterations
+
+    starts = jnp.array([0.0, 0.0, 0.02]), jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 9.0, 1.0])
+    positions, passes = jax.jit(jax.vmap(ends))(*starts)
+    alone = [ends(*start) for start in zip(*starts, strict=True)]
+    np.testing.assert_allclose(positions, np.stack([position for position, _ in alone]), atol=1e-12)
+    np.testing.assert_array_equal(passes, np.stack([count for _, count in alone]))
+
+
 def test_parameters_of_another_law_are_an_error():
     with pytest.raises(ValueError, match="CentroidLaw does not read restitution"):
         dano.Contact("a", "b", dano.ContactParams(restitution=0.5), dano.CentroidLaw())

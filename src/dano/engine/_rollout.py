@@ -327,8 +327,8 @@ def _say_unconverged(converged, residual) -> None:
     worst = float(np.nanmax(np.atleast_1d(np.asarray(residual))[failed], initial=0.0))
     warnings.warn(
         f"{len(failed)} of {np.size(converged)} steps did not converge, first step {failed[0]}, "
-        f"largest residual {worst:.3g} m/s; try a smaller timestep, a smaller damper or "
-        "smoothing, or a larger capacity for contacts",
+        f"largest residual {worst:.3g} m/s; try a smaller timestep, or where many points touch a larger "
+        "VariationalEngine(capacity=…); with CentroidLaw a smaller damper or smoothing",
         RuntimeWarning,
         stacklevel=3,
     )
