@@ -20,8 +20,8 @@ from dano.vision import (
     TrainOptions,
     View,
 )
-from dano.vision._hull import object_box, redistanced, silhouettes
-from dano.vision._train import Progress, reason_to_stop
+from dano.vision.capture._hull import object_box, redistanced, silhouettes
+from dano.vision.training._train import Progress, reason_to_stop
 
 VOLUME = 4 / 3 * np.pi * float(np.prod(SEMI_AXES))
 QUICK = TrainOptions(resolution=32, iterations=150, batch=512, features=4, check_every=50, cavities=False)
@@ -136,7 +136,7 @@ def test_a_full_disk_does_not_end_training(photos: Capture, tmp_path: Path, monk
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dano.vision._checkpoint.write_archive", full)
+    monkeypatch.setattr("dano.vision.training._checkpoint.write_archive", full)
     with pytest.warns(UserWarning, match="could not be written"):
         train(
             photos,

@@ -10,7 +10,7 @@ import numpy as np
 from dano.cli._console import numbers, Progress, put, put_json
 from dano.cli._outputs import check_output
 from dano.fields import bake, GridField, load_field, save_field, SignedDistanceGrid
-from dano.fields._splats import is_splats
+from dano.fields.readers._splats import is_splats
 from dano.maths import Pose
 from dano.objects import fill_hollows
 from dano.objects._interior import node_values

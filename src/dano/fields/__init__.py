@@ -17,7 +17,6 @@ from dano.fields._compose import (
 from dano.fields._ellipsoid import Ellipsoid as Ellipsoid
 from dano.fields._grid import DensityMoments as DensityMoments, GridField as GridField
 from dano.fields._hash_grid import HashGrid as HashGrid
-from dano.fields._io import load_field as load_field, save_field as save_field
 from dano.fields._mesh import mesh_field as mesh_field
 from dano.fields._shapes import (
     AbstractShape as AbstractShape,
@@ -30,3 +29,4 @@ from dano.fields._shapes import (
     Sphere as Sphere,
 )
 from dano.fields._signed_distance import SignedDistanceGrid as SignedDistanceGrid
+from dano.fields.readers import load_field as load_field, save_field as save_field

@@ -1,0 +1,3 @@
+"""Fields from files of many kinds, and files of fields."""
+
+from dano.fields.readers._io import load_field as load_field, save_field as save_field
