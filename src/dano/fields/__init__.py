@@ -1,7 +1,12 @@
 """Fields: what occupies space. Densities of any kind, shapes, grids, meshes, and readers for them."""
 
 from dano.fields._bake import bake as bake, Baked as Baked, BakeError as BakeError
-from dano.fields._base import AbstractField as AbstractField
+from dano.fields._base import (
+    AbstractField as AbstractField,
+    check_order as check_order,
+    Jet as Jet,
+    vmapped_jet as vmapped_jet,
+)
 from dano.fields._callable import CallableField as CallableField
 from dano.fields._compose import (
     Posed as Posed,
@@ -28,5 +33,8 @@ from dano.fields._shapes import (
     SolidMoments as SolidMoments,
     Sphere as Sphere,
 )
-from dano.fields._signed_distance import SignedDistanceGrid as SignedDistanceGrid
-from dano.fields.readers import load_field as load_field, save_field as save_field
+from dano.fields._signed_distance import (
+    SignedDistanceGrid as SignedDistanceGrid,
+    spread_distances as spread_distances,
+)
+from dano.fields.readers import is_splats as is_splats, load_field as load_field, save_field as save_field

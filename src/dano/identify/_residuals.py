@@ -9,9 +9,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.engine import AbstractEngine, simulate
-from dano.engine._devices import gather, map_rows
-from dano.engine._rollout import difference, retract
+from dano.engine import AbstractEngine, difference, gather, map_rows, retract, simulate
 from dano.identify._motion import QUANTITIES
 from dano.identify._parameters import Selection, with_values
 from dano.identify._windows import Windows

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy import ndimage
 
-from dano.fields._signed_distance import spread_distances
+from dano.fields import spread_distances
 from dano.vision.capture._camera import PosedCamera
 from dano.vision.capture._capture import View
 

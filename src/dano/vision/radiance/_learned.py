@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.archive import LOOK, OBJECT, read_archive, write_archive
-from dano.fields import AbstractField, SignedDistanceGrid
-from dano.fields._base import check_order, Jet, vmapped_jet
+from dano.fields import AbstractField, check_order, Jet, SignedDistanceGrid, vmapped_jet
 from dano.maths import Numbers
 from dano.vision.capture import AbstractCamera, Box, redistanced
 from dano.vision.radiance._appearance import Appearance, Network
