@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dano.fields._callable import CallableField
-from dano.maths import Numbers
+from dano.maths import Numbers, quat_to_matrix
 
 REACH = 5.5
 """Standard deviations after which a Gaussian is taken as zero: exp(−15) = 3e-7 of its peak."""
@@ -94,14 +94,7 @@ def splat_field(
         raise ValueError(
             f"Gaussians must be finite, at least one, their quaternions not zero; got {len(means)} of them"
         )
-    w, x, y, z = (quats / norms).T
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
+    turn = quat_to_matrix(quats / norms)
     if not (np.isfinite(min_width) and min_width >= 0):
         raise ValueError(f"min_width must be finite and ≥ 0, got {min_width}")
     deviations = np.maximum(np.exp(np.clip(scales, -46, 46)), min_width)

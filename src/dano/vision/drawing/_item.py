@@ -18,7 +18,7 @@ from dano.fields import (
     PosedShape,
     SignedDistanceGrid,
 )
-from dano.maths import checked_array, Numbers, Pose
+from dano.maths import checked_array, Numbers, Pose, quat_to_matrix
 from dano.vision.radiance import AbstractModel, LearnedField, SurfaceModel
 
 PALETTE = ("#e07a3f", "#3d7ea6", "#5f9e6e", "#c9a227", "#8d6cab", "#c8553d", "#4aa3a2", "#7a8450")
@@ -160,9 +160,8 @@ class Item(eqx.Module):
 
 def placement(pose: Pose) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """Rotation matrix and translation of a pose on the host, where one picture needs them many times."""
-    w, x, y, z = np.asarray(pose.orientation, dtype=np.float64)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + 2 * (w * cross + cross @ cross), np.asarray(pose.position, dtype=np.float64)
+    rotation = quat_to_matrix(np.asarray(pose.orientation, dtype=np.float64))
+    return rotation, np.asarray(pose.position, dtype=np.float64)
 
 
 def checked_colour(colour: str | Numbers) -> Float[np.ndarray, "3"]:

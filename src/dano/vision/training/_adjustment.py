@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from dano.maths import quat_exp, quat_to_matrix
 from dano.vision.capture import Rays, View
 
 
@@ -95,12 +96,8 @@ def _along(axes: np.ndarray, vectors: np.ndarray, length: np.ndarray) -> np.ndar
 
 def _turned(view: View, correction: np.ndarray, angle: float, length: float) -> View:
     camera = view.camera
-    turn = camera.axes.T @ correction[:3] * angle
-    size = float(np.linalg.norm(turn))
+    turn = quat_to_matrix(quat_exp(camera.axes.T @ correction[:3] * angle))
     pose = camera.pose.copy()
-    if size > 0:
-        x, y, z = turn / size
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        pose[:3, :3] = (np.eye(3) + np.sin(size) * cross + (1 - np.cos(size)) * cross @ cross) @ pose[:3, :3]
+    pose[:3, :3] = turn @ pose[:3, :3]
     pose[:3, 3] += camera.axes.T @ correction[3:] * length
     return view.replaced(camera=camera.replaced(camera_to_world=pose))
