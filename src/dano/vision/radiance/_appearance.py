@@ -132,13 +132,3 @@ class Appearance(eqx.Module):
             along = jnp.sum(light * view, axis=1, keepdims=True)
             inputs += [light, facing, jax.nn.relu(facing), -view_share * mirrored, view_share * along]
         return jax.nn.sigmoid(self.network(jnp.concatenate(inputs, axis=1)))
-
-    def resampled(self, box: Box) -> "Appearance":
-        """The same appearance on a finer or coarser grid of features."""
-        u = jnp.asarray((box.nodes - np.asarray(self.origin)) / float(self.spacing), jnp.float32).T
-        rows = rows_at(self.features, u).reshape(*box.shape, -1)
-        return eqx.tree_at(
-            lambda a: (a.features, a.origin, a.spacing),
-            self,
-            (rows, jnp.asarray(box.origin, jnp.float32), jnp.asarray(box.spacing, jnp.float32)),
-        )
