@@ -23,6 +23,8 @@ from dano.fields._ellipsoid import Ellipsoid as Ellipsoid
 from dano.fields._grid import DensityMoments as DensityMoments, GridField as GridField
 from dano.fields._hash_grid import HashGrid as HashGrid
 from dano.fields._mesh import mesh_field as mesh_field
+from dano.fields._parts import large_parts as large_parts, largest_part as largest_part
+from dano.fields._redistance import redistanced as redistanced, spread_distances as spread_distances
 from dano.fields._shapes import (
     AbstractShape as AbstractShape,
     Box as Box,
@@ -35,6 +37,5 @@ from dano.fields._shapes import (
 )
 from dano.fields._signed_distance import (
     SignedDistanceGrid as SignedDistanceGrid,
-    spread_distances as spread_distances,
 )
 from dano.fields.readers import is_splats as is_splats, load_field as load_field, save_field as save_field

@@ -1,5 +1,6 @@
 """Photographs from known places: cameras, files, masks, silhouettes, and the rays that see an object."""
 
+from dano.vision.capture._box import Box as Box, resampled as resampled
 from dano.vision.capture._camera import (
     AbstractCamera as AbstractCamera,
     Camera as Camera,
@@ -8,11 +9,8 @@ from dano.vision.capture._camera import (
 from dano.vision.capture._capture import Capture as Capture, View as View
 from dano.vision.capture._capture_files import load_capture as load_capture
 from dano.vision.capture._hull import (
-    Box as Box,
     hull_distance as hull_distance,
     object_box as object_box,
-    redistanced as redistanced,
-    resampled as resampled,
     viewed_ball as viewed_ball,
 )
 from dano.vision.capture._light import Light as Light
@@ -23,7 +21,7 @@ from dano.vision.capture._masks import (
 )
 from dano.vision.capture._ray_set import (
     collect as collect,
-    Rays as Rays,
     rays_of as rays_of,
     RaySet as RaySet,
 )
+from dano.vision.capture._rays import box_interval as box_interval, Rays as Rays

@@ -1,15 +1,14 @@
 """The visual hull: what all silhouettes leave of space (Laurentini 1994), as a signed distance on a grid."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy import ndimage
 
-from dano.fields import spread_distances
+from dano.fields import large_parts, redistanced
+from dano.vision.capture._box import Box
 from dano.vision.capture._camera import PosedCamera
 from dano.vision.capture._capture import View
 
@@ -18,39 +17,6 @@ LOST = 0.02
 
 _CHUNK = 1 << 18
 _GRANULE = 1 << 14
-
-
-class Box(NamedTuple):
-    """A regular grid of nodes around the object.
-
-    Attributes:
-        origin: Position [m, W] of node (0, 0, 0), shape (3,).
-        spacing: Distance between nodes [m].
-        shape: Nodes along each axis.
-    """
-
-    origin: Float[np.ndarray, "3"]
-    spacing: float
-    shape: tuple[int, int, int]
-
-    @classmethod
-    def around(cls, lower: np.ndarray, upper: np.ndarray, resolution: int) -> "Box":
-        """`resolution` nodes along the longest side of a box [m]."""
-        spacing = float((upper - lower).max()) / (resolution - 1)
-        shape = np.maximum(np.ceil((upper - lower) / spacing - 1e-6).astype(int) + 1, 4)
-        origin = 0.5 * (lower + upper) - 0.5 * spacing * (shape - 1)
-        return cls(origin, spacing, (int(shape[0]), int(shape[1]), int(shape[2])))
-
-    @property
-    def nodes(self) -> Float[np.ndarray, "n 3"]:
-        """Positions [m, W] of all nodes."""
-        index = np.stack(np.meshgrid(*map(np.arange, self.shape), indexing="ij"), axis=-1)
-        return self.origin + self.spacing * index.reshape(-1, 3)
-
-    @property
-    def upper(self) -> Float[np.ndarray, "3"]:
-        """Position [m, W] of the last node."""
-        return self.origin + self.spacing * (np.array(self.shape) - 1)
 
 
 def silhouettes(
@@ -200,52 +166,6 @@ def hull_distance(views: Sequence[View], box: Box, lost: float = LOST) -> Float[
     inside = value > 0
     if not inside.any():
         raise ValueError("the silhouettes leave nothing of the box: the object is thinner than a cell")
-    labels, count = ndimage.label(inside)
-    if count > 1:
-        sizes = ndimage.sum_labels(np.ones_like(value), labels, np.arange(1, count + 1))
-        # Crumbs of few views' silhouettes are no objects; parts of some size stay.
-        keep = np.flatnonzero(sizes > 0.02 * sizes.max()) + 1
-        inside &= np.isin(labels, keep)
-        value = np.where(inside, value, np.minimum(value, -1e-3))
-    return redistanced(-value, box)
-
-
-def redistanced(level: Float[np.ndarray, "nx ny nz"], box: Box) -> Float[np.ndarray, "nx ny nz"]:
-    """Signed distances [m] to the zero level of values at nodes, negative where these are.
-
-    Where the level crosses an edge of the grid lies a point of the surface, with a tangent plane. Nodes
-    within three cells get the distance to the plane of the nearest of them, or to the point if they are not
-    above it; those further away the distance to the point nearest to the nearest such node.
-    """
-    from scipy.spatial import cKDTree
-
-    points, normals = [], []
-    slope = np.stack(list(np.gradient(level)), axis=-1)
-    for axis in range(3):
-        low = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
-        high = tuple(slice(1, None) if a == axis else slice(None) for a in range(3))
-        cross = np.argwhere((level[low] > 0) != (level[high] > 0))
-        step = np.eye(3, dtype=int)[axis]
-        a, b = level[tuple(cross.T)], level[tuple((cross + step).T)]
-        share = (a / (a - b))[:, None]
-        points.append(cross + share * step)
-        normals.append((1 - share) * slope[tuple(cross.T)] + share * slope[tuple((cross + step).T)])
-    cloud, normal = np.concatenate(points), np.concatenate(normals)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    positive = level > 0
-    touched = ndimage.binary_dilation(positive) & ~ndimage.binary_erosion(positive, border_value=1)
-    near = ndimage.distance_transform_edt(~touched) <= 3
-    nodes = np.argwhere(near)
-    distance, nearest = cKDTree(cloud).query(nodes)
-    distances, row = spread_distances(near, cloud[nearest], np.zeros(3), np.ones(3))
-    off = np.abs(np.einsum("ij,ij->i", nodes - cloud[nearest], normal[nearest]))
-    # Crossings lie up to a cell apart: near the surface the plane through one is closer than the point.
-    blend = np.clip(distance - 1, 0, 1)
-    distances[near] = (1 - blend) * np.minimum(off, distance) + blend * distance
-    return np.where(positive, distances, -distances) * box.spacing
-
-
-def resampled(values: Float[np.ndarray, "nx ny nz"], old: Box, new: Box) -> Float[np.ndarray, "mx my mz"]:
-    """Values at the nodes of another box, trilinear between the old nodes, constant beyond them."""
-    index = (new.nodes - old.origin).T / old.spacing
-    return ndimage.map_coordinates(values, index, order=1, mode="nearest").reshape(new.shape)
+    # Crumbs of few views' silhouettes are no objects; parts of some size stay.
+    crumbs = inside & ~large_parts(inside, 0.02)
+    return redistanced(np.where(crumbs, 1e-3, -value), box.spacing)

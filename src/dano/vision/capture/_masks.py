@@ -7,8 +7,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
+from dano.fields import largest_part
+from dano.vision.capture._box import Box
 from dano.vision.capture._capture import Capture, View
-from dano.vision.capture._hull import Box, object_box, silhouettes
+from dano.vision.capture._hull import object_box, silhouettes
 from dano.vision.capture._ray_set import rays_of
 
 _BORDER = 0.03
@@ -98,11 +100,9 @@ def background_mask(view: View) -> Float[np.ndarray, "height width"]:
             f" at most {_PLAIN} can be told from an object): give masks, or a segmentation network"
         )
     solid = _unlike(away, spread)
-    labels, count = ndimage.label(solid)
-    if count == 0:
+    if not solid.any():
         raise ValueError(f"{view.name}: nothing differs from the background, the mask would be empty")
-    sizes = ndimage.sum_labels(solid, labels, np.arange(1, count + 1))
-    solid = ndimage.binary_fill_holes(labels == 1 + int(np.argmax(sizes)))
+    solid = ndimage.binary_fill_holes(largest_part(solid))
     assert solid is not None
     return _coverage(image, colour, solid)
 

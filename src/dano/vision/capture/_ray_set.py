@@ -8,34 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from dano.vision.capture._box import Box
 from dano.vision.capture._camera import AbstractCamera
 from dano.vision.capture._capture import View
-from dano.vision.capture._hull import Box
+from dano.vision.capture._rays import box_interval, Rays
 
 _STEPS = 160
 _CHUNK = 1 << 15
-
-
-class Rays(NamedTuple):
-    """Rays through the object, one a row, in float32.
-
-    Attributes:
-        origin: [m], shape (rays, 3).
-        direction: Unit vectors, shape (rays, 3).
-        near: Where the object may begin [m], shape (rays,).
-        far: Where it must have ended [m], shape (rays,).
-        light: Unit vectors towards the light, shape (rays, 3), or its position [m] if that is what is known.
-    """
-
-    origin: Float[Array, "rays 3"]
-    direction: Float[Array, "rays 3"]
-    near: Float[Array, " rays"]
-    far: Float[Array, " rays"]
-    light: Float[Array, "rays 3"]
-
-    def at(self, t: Float[Array, "rays k"]) -> Float[Array, "n 3"]:
-        """Points [m] at distances along the rays, those of a ray one after the other."""
-        return (self.origin[:, None] + t[..., None] * self.direction[:, None]).reshape(-1, 3)
 
 
 class RaySet(NamedTuple):
@@ -110,10 +89,7 @@ def _span(occupied, lowest, spacing, origin, directions):
     last = jnp.asarray(np.array(occupied.shape) - 1, jnp.float32)
     start = (origin - lowest) / spacing
     slope = directions.T / spacing
-    slope = jnp.where(jnp.abs(slope) < 1e-9, jnp.float32(1e-9), slope)
-    a, b = -start[:, None] / slope, (last - start)[:, None] / slope
-    enter = jnp.maximum(jnp.max(jnp.minimum(a, b), axis=0), 0)
-    leave = jnp.min(jnp.maximum(a, b), axis=0)
+    enter, leave = box_interval(jnp.zeros((3, 1), jnp.float32), last[:, None], start[:, None], slope)
     step = jnp.maximum(leave - enter, 0) / _STEPS
     end = np.array(occupied.shape, dtype=np.int32)[:, None] - 1
 

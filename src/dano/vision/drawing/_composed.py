@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.fields import AbstractShape, GridField
-from dano.vision.capture import AbstractCamera, Light, Rays
+from dano.vision.capture import AbstractCamera, box_interval, Light, Rays
 from dano.vision.drawing._item import Item, placement
+from dano.vision.drawing._shade import GAMMA
 from dano.vision.radiance import (
     AbstractMedium,
     AbstractModel,
@@ -41,7 +42,6 @@ _SHADOWS = Sampling(32, 16, 1)
 _THICKEST = np.float32(1 - 1e-7)
 """Opacity of a section up to which it has an optical depth in float32."""
 
-_GAMMA = 2.2
 _BLUR = 3.0
 """Sharpness of a painted solid times the width of a pixel on it."""
 
@@ -72,11 +72,9 @@ class Part(eqx.Module):
             limit: Distance [m] at which each ray ends, shape (n,).
         """
         o, d = (origin - self.position[None]) @ self.rotation, direction @ self.rotation
-        tiny = jnp.where(jnp.abs(d) < 1e-9, jnp.float32(1e-9), d)
-        bounds = self.model.bounds.astype(o.dtype)
-        a, b = (bounds[0][None] - o) / tiny, (bounds[1][None] - o) / tiny
-        near = jnp.maximum(jnp.max(jnp.minimum(a, b), axis=1), 0)
-        far = jnp.minimum(jnp.min(jnp.maximum(a, b), axis=1), limit)
+        lower, upper = self.model.bounds.astype(o.dtype)[:, :, None]
+        near, far = box_interval(lower, upper, o.T, d.T)
+        far = jnp.minimum(far, limit)
         # Those that miss get sections of no length, which are clear.
         near = jnp.where(far > near, near, 0)
         return Rays(o, d, near, jnp.where(far > near, far, near), jnp.zeros_like(o))
@@ -261,7 +259,7 @@ def compose(
 def part_of(item: Item, camera: AbstractCamera) -> Part:
     """An item as the volume renderer sees it: its learned look, or paint."""
     rotation, position = placement(item.pose)
-    albedo = jnp.asarray(item.colour**_GAMMA, jnp.float32)
+    albedo = jnp.asarray(item.colour**GAMMA, jnp.float32)
     sharpness = item.sharpness
     if item.model is not None:
         model = item.model
@@ -279,7 +277,7 @@ def part_of(item: Item, camera: AbstractCamera) -> Part:
 def _plane_of(item: Item) -> Plane:
     plane = item.plane
     assert plane is not None
-    return Plane(*(jnp.asarray(x, jnp.float32) for x in (plane[:3], plane[3], item.colour**_GAMMA)))
+    return Plane(*(jnp.asarray(x, jnp.float32) for x in (plane[:3], plane[3], item.colour**GAMMA)))
 
 
 def _may_meet(things: list[Item], floors: list, origin: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -430,8 +428,8 @@ def radiance(parts, i, lamps, world, local, view, ambient):
         arriving = _reaching(others, start, towards, away)[:, None] * power
         if len(lamps) == 1 and not painted:
             # Nothing is added up: a learned colour just below 0 or above 1 stays what it is.
-            return sent * arriving ** (1 / _GAMMA)
-        total = total + jnp.maximum(sent, 0) ** _GAMMA * arriving
+            return sent * arriving ** (1 / GAMMA)
+        total = total + jnp.maximum(sent, 0) ** GAMMA * arriving
     return _srgb(total)
 
 
@@ -479,4 +477,4 @@ def _to_plane(plane: Plane, origins: Array, directions: Array) -> Float[Array, "
 
 def _srgb(linear: Array) -> Array:
     # Zero has no derivative; no picture shows the difference.
-    return jnp.maximum(linear, 1e-12) ** (1 / _GAMMA)
+    return jnp.maximum(linear, 1e-12) ** (1 / GAMMA)

@@ -16,6 +16,7 @@ from dano.fields import (
     GridField,
     HalfSpace,
     PosedShape,
+    redistanced,
     SignedDistanceGrid,
 )
 from dano.maths import checked_array, Numbers, Pose, quat_to_matrix
@@ -226,41 +227,10 @@ def level_surface(field: GridField, level: int | float | None = None) -> SignedD
     # A thin wall may not survive the blur; the surface then moves to where half of the peak is left.
     peak = float(share.max())
     middle = 0.5 if peak > 0.5 else 0.5 * peak
-    distance = _distances(share, middle, spacing)
+    distance = redistanced(middle - share, spacing)
     return SignedDistanceGrid(
         distance.astype(np.float32), origin.astype(np.float32), spacing.astype(np.float32), edge=0.0
     )
-
-
-def _distances(share: np.ndarray, middle: float, spacing: np.ndarray) -> np.ndarray:
-    """Signed distances [m] of all nodes to the surface {share = middle}, negative inside."""
-    from scipy.spatial import cKDTree
-
-    gradient = np.stack([np.gradient(share, axis=axis) for axis in range(3)], axis=-1)
-    points, normals = [], []
-    for axis in range(3):
-        first, second = (np.take(share, range(a, share.shape[axis] - 1 + a), axis) for a in (0, 1))
-        cut = np.argwhere((first >= middle) != (second >= middle))
-        a, b = first[tuple(cut.T)], second[tuple(cut.T)]
-        along = ((middle - a) / (b - a))[:, None]
-        ahead = cut + np.eye(3, dtype=int)[axis]
-        points.append(cut + along * np.eye(3)[axis])
-        normals.append((1 - along) * gradient[tuple(cut.T)] + along * gradient[tuple(ahead.T)])
-    surface = np.concatenate(points) * spacing
-    outward = -np.concatenate(normals) / spacing
-    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
-    occupied = share >= middle
-    # Far from the surface a distance good to a cell is enough to skip empty space, and much cheaper.
-    outside = ndimage.distance_transform_edt(~occupied, sampling=spacing)
-    within = ndimage.distance_transform_edt(occupied, sampling=spacing)
-    distance = np.maximum(outside + within - 0.5 * float(spacing.max()), 0)
-    close = distance < 3 * spacing.max()
-    nodes = np.argwhere(close) * spacing
-    length, nearest = cKDTree(surface).query(nodes)
-    planar = np.abs(np.sum((nodes - surface[nearest]) * outward[nearest], axis=1))
-    near = np.clip(2 - length / spacing.max(), 0, 1)
-    distance[close] = near * planar + (1 - near) * length
-    return np.where(occupied, -distance, distance)
 
 
 def _learned(field: AbstractField | AbstractModel) -> tuple[AbstractModel | None, AbstractShape | None]:

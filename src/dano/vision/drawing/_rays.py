@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.fields import AbstractShape, GridField
+from dano.vision.capture import box_interval
 
 CHUNK = 2048
 """Rays per call: few enough that one slow ray does not hold many up, enough to make a call worth while."""
@@ -29,19 +30,6 @@ _WEIGHTS = (0.4, 0.3, 0.2, 0.1)
 
 # Share of the distance to the surface that a ray advances; interpolated distances are not quite 1-Lipschitz.
 _CAUTION = 0.95
-
-
-def _interval(
-    bounds: Float[Array, "2 3"],
-    origins: Float[Array, "3 n"],
-    directions: Float[Array, "3 n"],
-    grow: Float[Array, " n"],
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Where rays enter and leave a box grown by `grow`; enter > leave for rays that miss it."""
-    tiny = jnp.where(jnp.abs(directions) < 1e-9, jnp.float32(1e-9), directions)
-    low = (bounds[0][:, None] - grow[None] - origins) / tiny
-    high = (bounds[1][:, None] + grow[None] - origins) / tiny
-    return jnp.maximum(jnp.max(jnp.minimum(low, high), axis=0), 0), jnp.min(jnp.maximum(low, high), axis=0)
 
 
 def _local(rotation: Array, position: Array, origins: Array, directions: Array) -> tuple[Array, Array]:
@@ -94,7 +82,7 @@ def march(
     o, d = _local(rotation, position, origins, directions)
     bounds = shape.bounds
     size = jnp.max(bounds[1] - bounds[0])
-    enter, leave = _interval(bounds, o, d, jnp.zeros_like(limit))
+    enter, leave = box_interval(bounds[0][:, None], bounds[1][:, None], o, d)
     leave = jnp.minimum(leave, limit)
 
     def unfinished(carry: tuple[Array, Array, Array]) -> Bool[Array, ""]:
@@ -180,7 +168,9 @@ def march_to_lamp(
     o, d = _local(rotation, position, points, jnp.broadcast_to(light[:, None], points.shape))
     bounds = shape.bounds
     ahead = jnp.maximum(jnp.sum((0.5 * (bounds[0] + bounds[1])[:, None] - o) * d, axis=0), 0)
-    enter, leave = _interval(bounds, o, d, spread * ahead + 2 * bias)
+    # Grown by what the cone's width reaches beyond the box.
+    grow = (spread * ahead + 2 * bias)[None]
+    enter, leave = box_interval(bounds[0][:, None] - grow, bounds[1][:, None] + grow, o, d)
 
     def unfinished(carry: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
         _, _, state, i = carry
@@ -217,7 +207,7 @@ def transmitted(
         Opacity 1 − T, mean distance [m] of what is seen of the medium, and its mean unit normal [W].
     """
     o, d = _local(rotation, position, origins, directions)
-    enter, leave = _interval(medium.bounds, o, d, jnp.zeros_like(limit))
+    enter, leave = box_interval(medium.bounds[0][:, None], medium.bounds[1][:, None], o, d)
     leave = jnp.minimum(leave, limit)
     step = jnp.maximum(leave - enter, 0) / n_steps
 

@@ -31,7 +31,7 @@ from dano.vision.drawing._rays import (
     Placed,
     transmitted,
 )
-from dano.vision.drawing._shade import backdrop, floor_tint, lamps_of, Look, shade, to_srgb
+from dano.vision.drawing._shade import backdrop, floor_tint, GAMMA, lamps_of, Look, shade, to_srgb
 from dano.vision.radiance import Sampling, tiles
 
 # Half the angular width of the lamp [rad]: shadows are crisp where things touch and soft a length away.
@@ -278,7 +278,7 @@ def _lit(view, d, depth, which, normals, lamp, ambient):
         normals[:, own] = plane[:3].astype(np.float32)[:, None]
         albedo[:, own], fade[own] = floor_tint(view.look, plane, tint, points[:, own], d[:, own], depth[own])
     for i, item in enumerate(view.solids):
-        albedo[:, which == len(view.planes) + i] = (item.colour.astype(np.float32) ** 2.2)[:, None]
+        albedo[:, which == len(view.planes) + i] = (item.colour.astype(np.float32) ** GAMMA)[:, None]
     colour = shade(view.look, albedo, normals, d, lamp, ambient, which < len(view.planes), fade)
     for i, part in view.learned.items():
         own = np.flatnonzero(which == len(view.planes) + i)
@@ -300,9 +300,9 @@ def _sent(part, lamps, points, view, lamp, ambient):
     local, towards = (points.T - part.position[None]) @ part.rotation, view.T @ part.rotation
     if not part.model.appearance.lit:
         sent, _ = part.model.colour(local, towards, jnp.zeros_like(local))
-        return jnp.maximum(sent, 0).T ** 2.2 * (0.45 * lamp + 0.55 * ambient)[None]
+        return jnp.maximum(sent, 0).T ** GAMMA * (0.45 * lamp + 0.55 * ambient)[None]
     first, *sky = (
-        jnp.maximum(radiance((part,), 0, (light,), points.T, local, towards, None).T, 0) ** 2.2
+        jnp.maximum(radiance((part,), 0, (light,), points.T, local, towards, None).T, 0) ** GAMMA
         for light in lamps
     )
     return first * lamp[None] + sum(sky, jnp.zeros_like(first)) * ambient[None]
@@ -323,7 +323,7 @@ def _lay_clouds_over(view, d, depth, colour):
     )
     opacity = np.maximum(1 - clear, 1e-6)
     # Blended in sRGB among themselves, as they were learned.
-    colour[:, index] = clear * colour[:, index] + opacity * np.clip(sent / opacity, 0, None) ** 2.2
+    colour[:, index] = clear * colour[:, index] + opacity * np.clip(sent / opacity, 0, None) ** GAMMA
     return index
 
 
@@ -431,7 +431,7 @@ def _lay_over(view, i, item, d, depth, colour):
     opacity, _, normal = _in_chunks(
         lambda o, r, far: transmitted(item.medium, scale, *frame, o, r, far), arrays
     )
-    albedo = np.broadcast_to((item.colour.astype(np.float32) ** 2.2)[:, None], (3, len(index)))
+    albedo = np.broadcast_to((item.colour.astype(np.float32) ** GAMMA)[:, None], (3, len(index)))
     one, no = np.ones(len(index), dtype=np.float32), np.zeros(len(index), dtype=bool)
     own = shade(view.look, albedo, normal, d[:, index], one, one, no, 0 * one)
     colour[:, index] += opacity * (own - colour[:, index])

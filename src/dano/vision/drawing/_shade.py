@@ -7,6 +7,9 @@ from jaxtyping import Float, UInt8
 
 from dano.vision.capture import Light
 
+GAMMA = 2.2
+"""Exponent from pictures to linear light: a convention close to sRGB's curve, which is linear near black."""
+
 _LAMP_COLOUR = np.array([1.0, 0.965, 0.91], dtype=np.float32)
 _SKY = np.array([0.93, 0.97, 1.0], dtype=np.float32)
 _GROUND = np.array([0.62, 0.59, 0.56], dtype=np.float32)
@@ -46,7 +49,7 @@ class Look(NamedTuple):
         tile = decade * max(m for m in (1, 2, 5) if m * decade <= wish * 1.001)
         return cls(
             light,
-            (horizon**2.2).astype(np.float32),
+            (horizon**GAMMA).astype(np.float32),
             focus.astype(np.float32),
             0.7 * distance,
             3.2 * distance,
@@ -90,7 +93,7 @@ def floor_tint(look, plane, tint, points, d, t) -> tuple[np.ndarray, np.ndarray]
         width = np.float32(look.pixel / look.tile) * t * (np.abs(axis @ d) / cosine + 1) + np.float32(1e-6)
         low, high = (np.abs(_fraction((u + shift * width) * np.float32(0.5)) - 0.5) for shift in (-0.5, 0.5))
         pattern = pattern * np.clip(2 * (low - high) / width, -1, 1)
-    base = _FLOOR * (np.float32(0.4) + np.float32(0.6) * tint.astype(np.float32) ** np.float32(2.2))
+    base = _FLOOR * (np.float32(0.4) + np.float32(0.6) * tint.astype(np.float32) ** np.float32(GAMMA))
     mix = 0.5 * (1 + pattern)
     albedo = base[:, None] * (1 - (1 - _DARKER_TILE) * mix)
     distance = np.sqrt(np.sum((points - look.focus[:, None]) ** 2, axis=0))
@@ -125,8 +128,8 @@ def shade(look, albedo, normals, d, lamp, ambient, is_floor, fade):
 
 
 def to_srgb(colour: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-    """Linear colours as 8-bit sRGB (a plain power of 2.2)."""
-    return np.rint(255 * np.clip(colour, 0, 1) ** np.float32(1 / 2.2)).astype(np.uint8)
+    """Linear colours as 8-bit sRGB (its curve as a plain power)."""
+    return np.rint(255 * np.clip(colour, 0, 1) ** np.float32(1 / GAMMA)).astype(np.uint8)
 
 
 def _fraction(x: np.ndarray) -> np.ndarray:

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.archive import LOOK, OBJECT, read_archive, write_archive
-from dano.fields import AbstractField, check_order, Jet, SignedDistanceGrid, vmapped_jet
+from dano.fields import AbstractField, check_order, Jet, redistanced, SignedDistanceGrid, vmapped_jet
 from dano.maths import Numbers
-from dano.vision.capture import AbstractCamera, Box, redistanced
+from dano.vision.capture import AbstractCamera
 from dano.vision.radiance._appearance import Appearance, Network
 from dano.vision.radiance._models import SurfaceModel
 from dano.vision.radiance._picture import Picture, picture
@@ -54,7 +54,7 @@ class LearnedField(AbstractField):
         border[2:-2, 2:-2, 2:-2] = False
         wide[border] = np.maximum(wide[border], 0.5 * box.spacing)
         origin = box.origin - 2 * box.spacing
-        wide = redistanced(wide, Box(origin, box.spacing, (wide.shape[0], wide.shape[1], wide.shape[2])))
+        wide = redistanced(wide, box.spacing)
         return cls(
             SignedDistanceGrid(jnp.asarray(wide), origin, box.spacing),
             jnp.asarray(_EDGE / box.spacing),

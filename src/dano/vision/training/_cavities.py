@@ -26,7 +26,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy import ndimage
 
-from dano.vision.capture import Box, collect, RaySet, redistanced, resampled, View
+from dano.fields import large_parts, largest_part, redistanced
+from dano.vision.capture import Box, collect, RaySet, resampled, View
 from dano.vision.radiance import Appearance, DensityModel, Sampling, see
 from dano.vision.training._adam import adam, updates_of
 
@@ -188,11 +189,10 @@ def carve(
     if width > 0:
         share = np.maximum(ndimage.gaussian_filter(inside.astype(float), width), 0.1)
         smooth = np.where(inside, ndimage.gaussian_filter(smooth, width) / share, 0)
-    labels, count = ndimage.label(smooth > solid, np.ones((3, 3, 3)))
-    if count == 0:
+    dense = smooth > solid
+    if not dense.any():
         return None
-    sizes = ndimage.sum_labels(np.ones_like(smooth), labels, np.arange(1, count + 1))
-    walls = np.isin(labels, 1 + np.flatnonzero(sizes > 0.1 * sizes.max())) | (inside & ~known)
+    walls = large_parts(dense, 0.1, corners=True) | (inside & ~known)
     pad = int(np.ceil(2 * _BALL)) + 1
     clear = np.asarray(ndimage.distance_transform_edt(np.pad(~walls, pad, constant_values=True)))
     centres, _ = ndimage.label(clear > _BALL)
@@ -203,12 +203,10 @@ def carve(
     below = resampled(coarse.spacing * ndimage.gaussian_filter(beyond, 0.7), coarse, box)
     carved = resampled(cavity.astype(float), coarse, box) > 0
     level = np.maximum(hull, np.where(carved, -below, -np.inf))
-    labels, count = ndimage.label(level < 0)
-    if count == 0:
+    kept = largest_part(level < 0)
+    if not kept.any():
         return None
-    sizes = ndimage.sum_labels(np.ones_like(level), labels, np.arange(1, count + 1))
-    kept = labels == 1 + int(np.argmax(sizes))
-    distance = redistanced(np.where(kept, level, np.maximum(level, 1e-3 * box.spacing)), box)
+    distance = redistanced(np.where(kept, level, np.maximum(level, 1e-3 * box.spacing)), box.spacing)
     return Cavities(distance, 1 - float(kept.sum() / (hull < 0).sum()))
 
 
