@@ -30,7 +30,7 @@ from dano.vision import (
     train,
     TrainOptions,
 )
-from dano.vision._ray_set import collect, RaySet
+from dano.vision.capture._ray_set import collect, RaySet
 
 RENDERING = "Rendering of learned fields (96 + 32 sections, 8 colours)"
 TRAINING = "Training of learned fields, steps of Adam (48 + 16 sections, 5 colours)"

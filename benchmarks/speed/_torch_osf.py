@@ -10,7 +10,7 @@ import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 
-from dano.vision._ray_set import RaySet
+from dano.vision.capture._ray_set import RaySet
 
 _COARSE, _FINE = 64, 64
 

@@ -1,12 +1,14 @@
 """Quaternions (wxyz), rigid poses and norms that differentiate safely at zero.
 
 A quaternion is an array whose last axis holds (w, x, y, z). It rotates body-frame vectors into the world
-frame. Every function broadcasts over leading axes unless its signature says otherwise.
+frame. Every function broadcasts over leading axes unless its signature says otherwise. Functions of
+quaternions compute NumPy arrays with NumPy, on the host and in their own dtype, and all else with JAX.
 """
 
 import functools
 from collections.abc import Sequence
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -17,6 +19,17 @@ from jaxtyping import Array, ArrayLike, Float
 
 Numbers = ArrayLike | Sequence[Any]
 """What constructors take for an array: an array, a number, or (nested) lists and tuples of numbers."""
+
+Q = TypeVar("Q", Array, np.ndarray)
+"""Arrays of JAX or of NumPy."""
+
+_SERIES = 1e-4
+"""Below this, of the square of half an angle [rad²], five terms of a series are exact in float64."""
+
+
+def _library(*arrays: Array | np.ndarray) -> ModuleType:
+    """NumPy for its arrays, JAX's for others."""
+    return np if all(isinstance(array, np.ndarray) for array in arrays) else jnp
 
 
 def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
@@ -58,11 +71,11 @@ def skew(v: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
     )
 
 
-def quat_multiply(p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]) -> Float[Array, "*batch 4"]:
+def quat_multiply(p: Float[Q, "*#batch 4"], q: Float[Q, "*#batch 4"]) -> Float[Q, "*batch 4"]:
     """Hamilton product p ⊗ q: the rotation q followed by p."""
     pw, px, py, pz = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     qw, qx, qy, qz = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    return jnp.stack(
+    return _library(p, q).stack(
         [
             pw * qw - px * qx - py * qy - pz * qz,
             pw * qx + px * qw + py * qz - pz * qy,
@@ -73,47 +86,65 @@ def quat_multiply(p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]) ->
     )
 
 
-def quat_conjugate(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
+def quat_conjugate(q: Float[Q, "*batch 4"]) -> Float[Q, "*batch 4"]:
     """Inverse rotation of a unit quaternion."""
-    return jnp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
+    return _library(q).concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
-def quat_to_matrix(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 3 3"]:
+def quat_to_matrix(q: Float[Q, "*batch 4"]) -> Float[Q, "*batch 3 3"]:
     """Rotation matrix of a unit quaternion (body → world)."""
     w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    return jnp.stack(
+    stack = _library(q).stack
+    return stack(
         [
-            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+            stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
         ],
         -2,
     )
 
 
-def quat_from_matrix(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
-    """Unit quaternion (w ≥ 0) of a rotation matrix, on the host (Shepperd's method)."""
-    m = np.asarray(matrix)
-    # The eigenvector of the largest eigenvalue is stable for every rotation and projects a nearly-orthogonal
-    # input.
-    k = np.array(
+def quat_from_matrix(matrix: Float[Q, "*batch 3 3"]) -> Float[Q, "*batch 4"]:
+    """Unit quaternion (w ≥ 0) of a rotation matrix.
+
+    The matrix gives 4 q qᵀ without a root. Its row with the largest diagonal entry, which is at least 1, is
+    normalised (Shepperd 1978).
+    """
+    xp = _library(matrix)
+    m = [[matrix[..., i, j] for j in range(3)] for i in range(3)]
+    x, y, z = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
+    xy, xz, yz = m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]
+    diagonal = xp.stack(
         [
-            [m[0, 0] + m[1, 1] + m[2, 2], 0, 0, 0],
-            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], 0, 0],
-            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
+            1 + m[0][0] + m[1][1] + m[2][2],
+            1 + m[0][0] - m[1][1] - m[2][2],
+            1 - m[0][0] + m[1][1] - m[2][2],
+            1 - m[0][0] - m[1][1] + m[2][2],
+        ],
+        -1,
     )
-    _, vectors = np.linalg.eigh(k, UPLO="L")
-    q = vectors[:, -1]
-    return jnp.asarray(q if q[0] >= 0 else -q, dtype=jnp.result_type(float))
+    products = xp.stack(
+        [
+            xp.stack([diagonal[..., 0], x, y, z], -1),
+            xp.stack([x, diagonal[..., 1], xy, xz], -1),
+            xp.stack([y, xy, diagonal[..., 2], yz], -1),
+            xp.stack([z, xz, yz, diagonal[..., 3]], -1),
+        ],
+        -2,
+    )
+    largest = xp.argmax(diagonal, axis=-1)[..., None, None]
+    row = xp.take_along_axis(products, largest, axis=-2)[..., 0, :]
+    row = xp.where(row[..., :1] < 0, -row, row)
+    return row / xp.sqrt(xp.sum(row * row, axis=-1, keepdims=True))
 
 
-def quat_rotate(q: Float[Array, "*#batch 4"], v: Float[Array, "*#batch 3"]) -> Float[Array, "*batch 3"]:
+def quat_rotate(q: Float[Q, "*#batch 4"], v: Float[Q, "*#batch 3"]) -> Float[Q, "*batch 3"]:
     """Rotate vector(s) `v` by unit quaternion(s) `q`."""
+    cross = _library(q, v).cross
     w, u = q[..., :1], q[..., 1:]
-    t = 2 * jnp.cross(u, v)
-    return v + w * t + jnp.cross(u, t)
+    t = 2 * cross(u, v)
+    return v + w * t + cross(u, t)
 
 
 def quat_normalize(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
@@ -121,17 +152,55 @@ def quat_normalize(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
     return safe_normalize(q)
 
 
+def quat_exp(vector: Float[Q, "*batch 3"]) -> Float[Q, "*batch 4"]:
+    """Unit quaternion of a rotation vector [rad]: (cos |v|/2, sin |v|/2 · v/|v|), smooth at zero."""
+    xp = _library(vector)
+    half = 0.5 * vector
+    squared = xp.sum(half * half, axis=-1, keepdims=True)
+    small = squared < _SERIES
+    # The untaken branch must be safe too: 0 · ∞ in the chain rule would be NaN.
+    angle = xp.sqrt(xp.where(small, 1, squared))
+    s = xp.where(small, squared, 0)
+    cosine = 1 - s / 2 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56)))
+    sinc = 1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72)))
+    return xp.concatenate(
+        [
+            xp.where(small, cosine, xp.cos(angle)),
+            half * xp.where(small, sinc, xp.sin(angle) / angle),
+        ],
+        axis=-1,
+    )
+
+
+def quat_log(q: Float[Q, "*batch 4"]) -> Float[Q, "*batch 3"]:
+    """Rotation vector [rad] of a unit quaternion, the shortest: at most π long, the same for q and −q.
+
+    Smooth where the angle is below π. The direction does not change with the length of `q`. NaN stays NaN.
+    """
+    xp = _library(q)
+    q = xp.where(q[..., :1] < 0, -q, q)
+    w, u = q[..., :1], q[..., 1:]
+    squared = xp.sum(u * u, axis=-1, keepdims=True)
+    small = squared < _SERIES * w * w
+    # The untaken branch must be safe too: 0 · ∞ in the chain rule would be NaN.
+    sine = xp.sqrt(xp.where(small, 1, squared))
+    cosine = xp.where(small, w, 1)
+    s = xp.where(small, squared, 0) / (cosine * cosine)
+    series = (1 - s * (1 / 3 - s * (1 / 5 - s * (1 / 7 - s / 9)))) / cosine
+    return 2 * u * xp.where(small, series, xp.arctan2(sine, w) / sine)
+
+
+def quat_slerp(
+    p: Float[Q, "*#batch 4"], q: Float[Q, "*#batch 4"], share: Float[Q, "*#batch"]
+) -> Float[Q, "*batch 4"]:
+    """Orientation after a share of the shortest turn from p (0) to q (1), at constant angular velocity."""
+    return quat_multiply(p, quat_exp(share[..., None] * quat_log(quat_multiply(quat_conjugate(p), q))))
+
+
 def quat_from_axis_angle(axis: Numbers, angle: Numbers) -> Float[Array, "4"]:
     """Quaternion of a rotation by `angle` [rad] about `axis` (3,), which need not be normalised."""
     axis = safe_normalize(jnp.asarray(axis, dtype=jnp.result_type(float)))
-    half = 0.5 * jnp.asarray(angle, dtype=axis.dtype)
-    return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])
-
-
-def rotation_angle(p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]) -> Float[Array, "*batch"]:
-    """Geodesic angle [rad] between two orientations, in [0, π]; accurate for tiny angles."""
-    relative = quat_multiply(quat_conjugate(p), q)
-    return 2 * jnp.arctan2(safe_norm(relative[..., 1:]), jnp.abs(relative[..., 0]))
+    return quat_exp(jnp.asarray(angle, dtype=axis.dtype) * axis)
 
 
 # Small matrices as sums of outer products: XLA's CPU backend spends 0.2–2 µs on a dot of a few numbers, and a

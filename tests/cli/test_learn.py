@@ -9,8 +9,7 @@ import pytest
 from PIL import Image
 from vision.photographs import capture, CENTRE, write_transforms
 
-from dano import load_field, NeuralObject
-from dano.cli import _learn
+from dano import learning, load_field, NeuralObject
 from dano.vision import LearnedField
 
 
@@ -64,8 +63,8 @@ def test_an_interrupted_training_promises_only_a_checkpoint_that_it_wrote(when, 
             checkpoint.write_bytes(b"what was learned so far")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_learn, "load_capture", lambda *_, **__: capture(n_train=4, n_test=1, pixels=8))
-    monkeypatch.setattr(_learn, "learn", learn)
+    monkeypatch.setattr(learning, "load_capture", lambda *_, **__: capture(n_train=4, n_test=1, pixels=8))
+    monkeypatch.setattr(learning, "train", learn)
     for old in (False, True):
         if old:
             checkpoint.write_bytes(b"old")

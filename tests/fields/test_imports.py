@@ -16,8 +16,9 @@ import pytest
 
 import dano
 from dano import memory
-from dano.fields import _checkpoint, GridField, load_field, save_field, SignedDistanceGrid
-from dano.fields._splats import splat_field
+from dano.fields import GridField, load_field, save_field, SignedDistanceGrid
+from dano.fields.readers import _checkpoint
+from dano.fields.readers._splats import splat_field
 
 FILES = Path(__file__).parents[1] / "data" / "imports"
 CHECKPOINT = FILES / "nerfacto" / "nerfstudio_models" / "step-000000003.ckpt"

@@ -11,7 +11,7 @@ from vision.models import learned
 import dano
 from dano.report import draw_object, render_trajectory, view
 from dano.report._object import with_error
-from dano.report._resample import frame_times, poses_at, slerp
+from dano.report._resample import frame_times, poses_at
 from dano.scene_file import drop_scene, parse_scene
 from dano.vision import LearnedField
 
@@ -172,8 +172,6 @@ def test_frames_fall_between_steps(run):
     np.testing.assert_allclose(position[:, 0, 0], 2 * times - 0.5, atol=1e-12)
     expected = np.stack([np.cos(5 * times), 0 * times, np.sin(5 * times), 0 * times], axis=1)
     np.testing.assert_allclose(orientation[:, 0], expected, atol=1e-12)
-    # The shorter way, also when the two quaternions have opposite signs.
-    np.testing.assert_allclose(slerp(expected[1], -expected[2], np.array([0.0])), expected[1], atol=1e-12)
 
 
 def test_object_figure_is_a_picture(cube, tmp_path):

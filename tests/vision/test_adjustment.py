@@ -5,7 +5,7 @@ import numpy as np
 from vision.photographs import capture, CENTRE
 
 from dano.vision import Rays
-from dano.vision._adjustment import Adjustment
+from dano.vision.training._adjustment import Adjustment
 
 VIEWS = capture(12, 0).split("train")
 

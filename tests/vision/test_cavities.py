@@ -6,7 +6,7 @@ import pytest
 from vision.photographs import pose
 
 from dano.vision import Box, Capture, PosedCamera, survey, View
-from dano.vision._cavities import carve, find_cavities, without_cavities, witnesses
+from dano.vision.training._cavities import carve, find_cavities, without_cavities, witnesses
 
 RADIUS, HEIGHT, WALL = 0.05, 0.06, 0.014  # [m]
 

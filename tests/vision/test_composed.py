@@ -10,8 +10,8 @@ from vision.models import Fog, learned
 
 from dano import Box as BoxShape, GridField, HalfSpace, Pose, Sphere
 from dano.vision import Camera, compose, Item, Light, PosedCamera
-from dano.vision._composed import shared_weights
-from dano.vision._picture import picture
+from dano.vision.drawing._composed import shared_weights
+from dano.vision.radiance._picture import picture
 
 ABOVE = Light((0.0, 0.0, 1.0))
 

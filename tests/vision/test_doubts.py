@@ -5,7 +5,7 @@ import pytest
 from vision.photographs import capture, CENTRE, SEMI_AXES
 
 from dano.vision import Capture, survey, View
-from dano.vision._doubt import with_doubts
+from dano.vision.training._doubt import with_doubts
 
 RESOLUTION = 32
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from dano.vision._level_set import roughness, spread
+from dano.vision.training._level_set import roughness, spread
 
 NODES = np.stack(np.meshgrid(*3 * [np.arange(24.0)], indexing="ij"), -1) - 11.7
 ONE = jnp.float32(1)

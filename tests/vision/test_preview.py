@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dano.vision._preview import checked_folder, write_preview
+from dano.vision.training._preview import checked_folder, write_preview
 
 
 def test_photographs_stand_above_their_renderings(tmp_path):

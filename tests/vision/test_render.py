@@ -8,9 +8,9 @@ from vision.models import Fog, learned
 
 from dano import Box, GridField, HalfSpace, Pose, Sphere
 from dano.vision import Camera, Item, level_surface, PosedCamera, render
-from dano.vision._picture import picture
-from dano.vision._rays import CHUNK, Placed, transmitted
-from dano.vision._render import _first_hits
+from dano.vision.drawing._rays import CHUNK, Placed, transmitted
+from dano.vision.drawing._render import _first_hits
+from dano.vision.radiance._picture import picture
 
 EYE = np.eye(3, dtype=np.float32)
 ZERO = np.zeros(3, dtype=np.float32)

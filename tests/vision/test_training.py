@@ -9,6 +9,7 @@ import pytest
 from vision.photographs import capture, CENTRE, SEMI_AXES
 
 from dano import NeuralObject
+from dano.fields import redistanced
 from dano.vision import (
     Box,
     Capture,
@@ -20,8 +21,8 @@ from dano.vision import (
     TrainOptions,
     View,
 )
-from dano.vision._hull import object_box, redistanced, silhouettes
-from dano.vision._train import Progress, reason_to_stop
+from dano.vision.capture._hull import object_box, silhouettes
+from dano.vision.training._train import Progress, reason_to_stop
 
 VOLUME = 4 / 3 * np.pi * float(np.prod(SEMI_AXES))
 QUICK = TrainOptions(resolution=32, iterations=150, batch=512, features=4, check_every=50, cavities=False)
@@ -57,7 +58,7 @@ def test_the_hull_is_the_solid_to_a_tenth_of_a_pixel(photos: Capture):
 def test_redistancing_restores_a_signed_distance():
     box = Box(np.full(3, -1.2), 0.1, (25, 25, 25))
     radius = np.linalg.norm(box.nodes, axis=1).reshape(box.shape)
-    distance = redistanced(radius**3 - 0.8**3, box)
+    distance = redistanced(radius**3 - 0.8**3, box.spacing)
     near = np.abs(radius - 0.8) < 0.2
     np.testing.assert_allclose(distance[near], radius[near] - 0.8, atol=0.015)
     # Further away by the nearest point of the nearest node that is near.
@@ -136,7 +137,7 @@ def test_a_full_disk_does_not_end_training(photos: Capture, tmp_path: Path, monk
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dano.vision._checkpoint.write_archive", full)
+    monkeypatch.setattr("dano.vision.training._checkpoint.write_archive", full)
     with pytest.warns(UserWarning, match="could not be written"):
         train(
             photos,

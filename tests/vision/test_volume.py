@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dano.vision._volume import (
+from dano.vision.radiance._volume import (
     composite,
     density_alpha,
     importance_edges,

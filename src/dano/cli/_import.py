@@ -9,11 +9,9 @@ import numpy as np
 
 from dano.cli._console import numbers, Progress, put, put_json
 from dano.cli._outputs import check_output
-from dano.fields import bake, GridField, load_field, save_field, SignedDistanceGrid
-from dano.fields._splats import is_splats
+from dano.fields import bake, GridField, is_splats, load_field, save_field, SignedDistanceGrid
 from dano.maths import Pose
-from dano.objects import fill_hollows
-from dano.objects._interior import node_values
+from dano.objects import fill_hollows, node_values
 
 _USUAL = (1e-3, 20.0)
 """Widths [m] of a field beyond which its file is rather in other units than so small or large."""

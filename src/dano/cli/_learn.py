@@ -11,15 +11,14 @@ import numpy as np
 from dano.archive import replacing
 from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
-from dano.fields import bake, GridField, save_field
+from dano.fields import save_field
+from dano.learning import LearnedObject, train_object
 from dano.objects import NeuralObject
 from dano.vision import (
     Capture,
     load_capture,
-    Progress as Learned,
     Survey,
     survey,
-    train as learn,
     Trained,
     TrainOptions,
     with_masks,
@@ -131,33 +130,23 @@ def train(
     if json_file is not None:
         check_output(json_file)
     check_distinct(**outputs, json=json_file)
-    for name, value in (("--mass", mass), ("--mass-density", mass_density)):
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be positive, got {value}")
     checkpoint = outputs["checkpoint"]
     before = _written_at(checkpoint)
     progress = Progress()
     try:
-        trained, given = _learned(
+        learned = train_object(
             images,
             options,
-            checkpoint,
-            progress,
             downscale=downscale,
             views=views,
             network=network,
+            mass=mass,
+            mass_density=mass_density,
+            checkpoint=checkpoint,
             resume=resume,
             previews=previews,
+            progress=progress,
         )
-        progress("solid", 0.0)
-        volume = _solid_volume(trained)
-        made = NeuralObject.from_field(
-            trained.field,
-            mass_model="solid",
-            mass=mass_density * volume if mass is None else mass,
-            progress=lambda what, share: progress(what, share),
-        )
-        grid = bake(trained.field, options.resolution)
     except KeyboardInterrupt:
         # An older checkpoint counts only if this training went on from it.
         kept = checkpoint.exists() and (resume or _written_at(checkpoint) != before)
@@ -166,24 +155,16 @@ def train(
         )
         raise KeyboardInterrupt(rest) from None
     progress.close()
-    _write(trained, made, grid.grid, outputs, masks_given=given, report=report, json_file=json_file)
+    _write(learned, outputs, report=report, json_file=json_file)
 
 
-def _write(
-    trained: Trained,
-    made: NeuralObject,
-    grid: GridField,
-    outputs: dict[str, Path],
-    *,
-    masks_given: bool,
-    report: bool,
-    json_file: Path | None,
-) -> None:
+def _write(learned: LearnedObject, outputs: dict[str, Path], *, report: bool, json_file: Path | None) -> None:
     """Write and print what was learned."""
+    made, trained, grid, masks_given = learned
     output = outputs["object"]
     trained.field.save(outputs["field"])
     save_field(grid, outputs["grid"])
-    made.save(output, look=trained.field.look)
+    learned.save(output)
     from dano.report import mass_estimates, write_training_report
 
     estimates = mass_estimates(trained, made, grid)
@@ -201,39 +182,6 @@ def _write(
     _print_trained(summary, outputs, with_report=report)
 
 
-def _learned(
-    images: Path,
-    options: TrainOptions,
-    checkpoint: Path,
-    progress: Progress,
-    *,
-    downscale: int,
-    views: int | None,
-    network: Path | None,
-    resume: bool,
-    previews: Path | None,
-) -> tuple[Trained, bool]:
-    """What photographs teach, and whether they came with masks."""
-    progress("reading photographs", 0.0)
-    capture = load_capture(images, downscale=downscale)
-    given = capture.has_masks
-    if not given:
-        progress("making masks", 0.0)
-        capture = with_masks(capture, network)
-    if views is not None:
-        capture = capture.thinned(views)
-
-    def show(done: Learned) -> None:
-        quality = "" if done.psnr is None else f"{done.psnr:.1f} dB "
-        progress(
-            f"training {quality}{done.rays_per_second / 1000:.0f}k rays/s", done.iteration / done.iterations
-        )
-
-    progress("visual hull", 0.0)
-    trained = learn(capture, options, checkpoint=checkpoint, resume=resume, progress=show, previews=previews)
-    return trained, given
-
-
 def _written_at(path: Path) -> int | None:
     """When a file was written last [ns]; None if there is none."""
     return path.stat().st_mtime_ns if path.exists() else None
@@ -248,15 +196,6 @@ def _outputs(output: Path) -> dict[str, Path]:
         "object": output,
         "checkpoint": output.with_name(output.stem + ".checkpoint.npz"),
     }
-
-
-def _solid_volume(trained: Trained) -> float:
-    from dano.vision import Box, volume
-
-    solid = trained.field.solid
-    distances = np.asarray(solid.distances, np.float64)
-    nx, ny, nz = distances.shape
-    return volume(distances, Box(np.asarray(solid.origin), float(solid.spacing[0]), (nx, ny, nz)))
 
 
 def _summary(trained: Trained, made: NeuralObject, output: Path, *, masks_given: bool) -> dict[str, Any]:

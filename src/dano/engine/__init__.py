@@ -6,12 +6,16 @@ from dano.engine._batches import (
     rollouts as rollouts,
     StoredRollouts as StoredRollouts,
 )
+from dano.engine._devices import device_mesh as device_mesh, gather as gather, map_rows as map_rows
 from dano.engine._newton import Report as Report
 from dano.engine._rollout import (
     AbstractEngine as AbstractEngine,
     contact_patches as contact_patches,
     contact_wrenches as contact_wrenches,
+    difference as difference,
     linearize as linearize,
+    Policy as Policy,
+    retract as retract,
     simulate as simulate,
     step as step,
     VariationalEngine as VariationalEngine,

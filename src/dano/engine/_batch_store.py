@@ -12,7 +12,7 @@ import numpy as np
 from dano.archive import checked_output
 from dano.engine._batch_input import Job
 from dano.engine._batch_kernel import Kept
-from dano.scene._states import STATE_SIZES
+from dano.scene import STATE_SIZES
 
 FORMAT, VERSION = "dano-rollouts", 1
 _COMPLETE = "complete"

@@ -18,8 +18,7 @@ from dano.engine._batch_kernel import Kept, simulate_rows
 from dano.engine._batch_store import RolloutStore
 from dano.engine._devices import device_mesh, gather, meet, put_rows, put_whole, take_rows
 from dano.engine._rollout import AbstractEngine, Policy, VariationalEngine
-from dano.scene import Control, Scene, State
-from dano.scene._states import STATE_SIZES
+from dano.scene import Control, Scene, State, STATE_SIZES
 
 Progress = Callable[[str, float], None]
 

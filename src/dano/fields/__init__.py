@@ -1,7 +1,12 @@
 """Fields: what occupies space. Densities of any kind, shapes, grids, meshes, and readers for them."""
 
 from dano.fields._bake import bake as bake, Baked as Baked, BakeError as BakeError
-from dano.fields._base import AbstractField as AbstractField
+from dano.fields._base import (
+    AbstractField as AbstractField,
+    check_order as check_order,
+    Jet as Jet,
+    vmapped_jet as vmapped_jet,
+)
 from dano.fields._callable import CallableField as CallableField
 from dano.fields._compose import (
     Posed as Posed,
@@ -17,8 +22,9 @@ from dano.fields._compose import (
 from dano.fields._ellipsoid import Ellipsoid as Ellipsoid
 from dano.fields._grid import DensityMoments as DensityMoments, GridField as GridField
 from dano.fields._hash_grid import HashGrid as HashGrid
-from dano.fields._io import load_field as load_field, save_field as save_field
 from dano.fields._mesh import mesh_field as mesh_field
+from dano.fields._parts import large_parts as large_parts, largest_part as largest_part
+from dano.fields._redistance import redistanced as redistanced, spread_distances as spread_distances
 from dano.fields._shapes import (
     AbstractShape as AbstractShape,
     Box as Box,
@@ -29,4 +35,7 @@ from dano.fields._shapes import (
     SolidMoments as SolidMoments,
     Sphere as Sphere,
 )
-from dano.fields._signed_distance import SignedDistanceGrid as SignedDistanceGrid
+from dano.fields._signed_distance import (
+    SignedDistanceGrid as SignedDistanceGrid,
+)
+from dano.fields.readers import is_splats as is_splats, load_field as load_field, save_field as save_field

@@ -7,8 +7,9 @@ from typing import NamedTuple, TYPE_CHECKING
 import jax.numpy as jnp
 import numpy as np
 
+from dano.fields._redistance import spread_distances
 from dano.fields._shapes import SolidMoments
-from dano.fields._signed_distance import SignedDistanceGrid, spread_distances
+from dano.fields._signed_distance import SignedDistanceGrid
 from dano.fields._spline import degree_of
 from dano.memory import check_nodes
 

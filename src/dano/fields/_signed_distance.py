@@ -7,6 +7,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from dano.fields._base import check_order, Jet
 from dano.fields._grid import checked_spacing, scaled_jet
+from dano.fields._redistance import spread_distances
 from dano.fields._shapes import AbstractShape, checked_edge, scaled_moments, SolidMoments
 from dano.fields._spline import border, degree_of, interpolating_coefficients, spline_jet
 from dano.maths import checked_array, column_norm, floating, is_traced, Numbers
@@ -197,30 +198,3 @@ def _checked_distances(distances: Numbers) -> np.ndarray:
             " until it surrounds the solid"
         )
     return host
-
-
-def spread_distances(
-    near: np.ndarray, closest: np.ndarray, origin: np.ndarray, spacing: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Distances of all nodes of a grid to a surface, from its points closest to the nodes near it.
-
-    Args:
-        near: Which nodes are near, shape (nx, ny, nz).
-        closest: Point of the surface closest to each of these [m], in their order, shape (m, 3).
-        origin: Position [m] of node (0, 0, 0), shape (3,).
-        spacing: Distance [m] between nodes along each axis, shape (3,).
-
-    Returns:
-        Distance [m] of each node to the closest point of the nearest node that is near, and the row of that
-        node in `closest`; both of shape (nx, ny, nz).
-    """
-    from scipy import ndimage
-
-    row = np.full(near.shape, -1)
-    row[near] = np.arange(len(closest))
-    nearest = ndimage.distance_transform_edt(
-        ~near, sampling=spacing, return_distances=False, return_indices=True
-    )
-    row = row[tuple(nearest)]
-    nodes = origin + spacing * np.stack(np.meshgrid(*map(np.arange, near.shape), indexing="ij"), axis=-1)
-    return np.linalg.norm(nodes - closest[row], axis=-1), row

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dano.engine import AbstractEngine, VariationalEngine
-from dano.engine._rollout import Policy
+from dano.engine import AbstractEngine, Policy, VariationalEngine
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Parameter, space_of, values_at, with_values
 from dano.identify._problem import Problem, Setup

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dano.maths import Numbers
+from dano.maths import Numbers, quat_conjugate, quat_log, quat_multiply, quat_rotate
 from dano.scene import Trajectory
 
 QUANTITIES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
@@ -149,21 +149,9 @@ class Motion:
                 velocity[t, row] = _slope(self.times, places, shift[t], frames)
             for t in np.flatnonzero(~np.isfinite(omega[:, row]).all(axis=1)):
                 if np.isfinite(turns[t]).all():
-                    vectors = rotation_vectors(turns[t], turns)
+                    vectors = quat_log(quat_multiply(quat_conjugate(turns[t : t + 1]), turns))
                     omega[t, row] = _slope(self.times, vectors, shift[t], frames)
         return dataclasses.replace(self, velocity=velocity, omega=omega)
-
-
-def rotation_vectors(reference: np.ndarray, orientation: np.ndarray) -> np.ndarray:
-    """Rotation vectors [rad, axes of `reference`] that take one orientation to others; NaN stays NaN."""
-    w, v = reference[..., :1], -reference[..., 1:]
-    qw, qv = orientation[..., :1], orientation[..., 1:]
-    real = w * qw - np.sum(v * qv, axis=-1, keepdims=True)
-    imaginary = w * qv + qw * v + np.cross(v, qv)
-    imaginary = np.where(real < 0, -imaginary, imaginary)
-    length = np.linalg.norm(imaginary, axis=-1, keepdims=True)
-    angle = 2 * np.arctan2(length, np.abs(real))
-    return imaginary * np.where(length > 0, angle / np.where(length > 0, length, 1), 2.0)
 
 
 def _frames(name: str, value: Numbers | None, n_frames: int, n_bodies: int) -> np.ndarray:
@@ -226,7 +214,7 @@ def _check_rotation(motion: Motion) -> None:
             continue
 
         def mismatch(q: np.ndarray, spin: np.ndarray, known=known, steps=steps) -> float:
-            rates = (rotation_vectors(q[:-1], q[1:]) / steps)[known]
+            rates = (quat_log(quat_multiply(quat_conjugate(q[:-1]), q[1:])) / steps)[known]
             wrong = np.linalg.norm(rates - spin[known], axis=1) / np.linalg.norm(spin[known], axis=1)
             return float(np.median(wrong))
 
@@ -235,9 +223,7 @@ def _check_rotation(motion: Motion) -> None:
             continue
         other_order = mismatch(turns[:, [3, 0, 1, 2]], mean)
         inverse = mismatch(turns * np.array([1.0, -1, -1, -1]), mean)
-        in_world = mismatch(
-            turns, np.stack([_into_body(q, w) for q, w in zip(turns[:-1], mean, strict=True)])
-        )
+        in_world = mismatch(turns, quat_rotate(quat_conjugate(turns[:-1]), mean))
         best = min(other_order, inverse, in_world)
         if best < 0.5 * given and best < _INCONSISTENT:
             reason = {
@@ -249,9 +235,3 @@ def _check_rotation(motion: Motion) -> None:
                 f"orientation of {name!r} must be wxyz, body → world, and omega in body axes, but they "
                 f"contradict each other ({100 * given:.0f} % apart): {reason}"
             )
-
-
-def _into_body(q: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    w, u = q[0], -q[1:]
-    t = 2 * np.cross(u, vector)
-    return vector + w * t + np.cross(u, t)

@@ -65,13 +65,6 @@ class Selection(NamedTuple):
         flat = jnp.exp(x) if self.coordinates == "log" else x
         return flat.reshape(self.shape)
 
-    def coordinates_of(self, value: np.ndarray) -> np.ndarray:
-        """Coordinates of a value."""
-        if self.coordinates == "inertia":
-            return _log_cholesky(value)
-        flat = np.ravel(value)
-        return np.log(flat) if self.coordinates == "log" else flat
-
     @property
     def labels(self) -> list[str]:
         """Names of the coordinates."""

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dano.engine import AbstractEngine
-from dano.engine._devices import device_mesh
+from dano.engine import AbstractEngine, device_mesh
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Space
 from dano.identify._residuals import Linearized, linearized, Model, moved

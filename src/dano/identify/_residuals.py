@@ -9,13 +9,11 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.engine import AbstractEngine, simulate
-from dano.engine._devices import gather, map_rows
-from dano.engine._rollout import difference, retract
+from dano.engine import AbstractEngine, difference, gather, map_rows, retract, simulate
 from dano.identify._motion import QUANTITIES
 from dano.identify._parameters import Selection, with_values
 from dano.identify._windows import Windows
-from dano.maths import quat_conjugate, quat_multiply, quat_normalize, quat_rotate, safe_norm
+from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
 from dano.scene import Control, Scene, State
 
 
@@ -277,13 +275,7 @@ def _row(model: Model, window: Windows, predicted: State, key: str) -> Float[Arr
     if key == "orientation":
         # Where nothing was seen, a rotation to differentiate, not to count.
         seen = jnp.where(weight > 0, seen, found)
-        relative = quat_multiply(quat_conjugate(seen), found)
-        sign = jnp.where(relative[..., :1] < 0, -1, 1).astype(relative.dtype)
-        real, imaginary = sign * relative[..., :1], sign * relative[..., 1:]
-        length = safe_norm(imaginary)[..., None]
-        positive = length > 0
-        stretch = 2 * jnp.arctan2(length, real) / jnp.where(positive, length, 1)
-        return weight * jnp.where(positive, stretch, 2) * imaginary
+        return weight * quat_log(quat_multiply(quat_conjugate(seen), found))
     return weight * (found - seen)
 
 

@@ -1,6 +1,10 @@
 """Neural objects: mass properties, contact samples, and the object that carries both."""
 
-from dano.objects._interior import fill_hollows as fill_hollows, Interior as Interior
+from dano.objects._interior import (
+    fill_hollows as fill_hollows,
+    Interior as Interior,
+    node_values as node_values,
+)
 from dano.objects._mass import checked_inertia as checked_inertia, MassProperties as MassProperties
 from dano.objects._object import MassModel as MassModel, NeuralObject as NeuralObject
 from dano.objects._quadrature import Quadrature as Quadrature, surface_quadrature as surface_quadrature

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from dano.fields import AbstractField, GridField
-from dano.fields._base import Jet
+from dano.fields import AbstractField, GridField, Jet
 from dano.maths import checked_array, is_traced, Numbers
 
 Density = Callable[[Float[Array, "3"]], Float[Array, ""]]

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from dano.fields import AbstractField, AbstractShape, GridField, SignedDistanceGrid
-from dano.fields._signed_distance import spread_distances
+from dano.fields import AbstractField, AbstractShape, GridField, SignedDistanceGrid, spread_distances
 from dano.objects._mass import host_jet
 from dano.objects._samples import Lattice, Region
 

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.identify import Identification, Motion
+from dano.maths import quat_rotate
 from dano.report._page import png, table, video, warnings, write_page
 from dano.report._resample import frame_times, poses_at
-from dano.report._stage import camera_for, matrix, stage
+from dano.report._stage import camera_for, stage
 from dano.report._video import encoder, require, side_by_side
 from dano.scene import Scene, State, Trajectory
 from dano.vision import render
@@ -173,7 +174,7 @@ def _trajectory(fit: Identification, motion: Motion) -> Trajectory:
         places = _filled(motion.position[:, column], position[0, row])
         if motion.point == "origin":
             com = np.asarray(scene.bodies[row].com + scene.bodies[row].com_offset)
-            places = places + np.array([np.asarray(matrix(q)) @ com for q in turns])
+            places = places + quat_rotate(turns, com[None])
         position[:, row], orientation[:, row] = places, turns
     zero = jnp.zeros((n, len(scene.bodies), 3))
     states = State(jnp.asarray(position), jnp.asarray(orientation), zero, zero)

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from dano.maths import quat_slerp
 from dano.scene import Trajectory
 
 MOST_FRAMES = 100_000
@@ -55,19 +56,4 @@ def poses_at(
     first = np.clip(np.searchsorted(known, times, side="right") - 1, 0, len(known) - 2)
     share = np.clip((times - known[first]) / (known[first + 1] - known[first]), 0, 1)[:, None, None]
     moved = (1 - share) * position[first] + share * position[first + 1]
-    return moved, slerp(orientation[first], orientation[first + 1], share)
-
-
-def slerp(
-    p: Float[np.ndarray, "*batch 4"], q: Float[np.ndarray, "*batch 4"], share: Float[np.ndarray, "..."]
-) -> Float[np.ndarray, "*batch 4"]:
-    """Orientations on the shortest way from p to q, at constant angular velocity."""
-    cosine = np.sum(p * q, axis=-1, keepdims=True)
-    q = np.where(cosine < 0, -q, q)
-    angle = np.arccos(np.clip(np.abs(cosine), 0, 1))
-    small = angle < 1e-6
-    sine = np.sin(np.where(small, 1, angle))
-    a = np.where(small, 1 - share, np.sin((1 - share) * angle) / sine)
-    b = np.where(small, share, np.sin(share * angle) / sine)
-    mixed = a * p + b * q
-    return mixed / np.linalg.norm(mixed, axis=-1, keepdims=True)
+    return moved, quat_slerp(orientation[first], orientation[first + 1], share[..., 0])

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.engine import contact_patches, contact_wrenches
-from dano.maths import Pose
+from dano.maths import Pose, quat_to_matrix
 from dano.scene import Body, Scene, State, Trajectory
 from dano.vision import Camera, Item, LearnedField, PALETTE
 
@@ -34,7 +34,7 @@ class Stage(NamedTuple):
         """The items where the bodies are."""
         placed = []
         for item, row, com in zip(self.items, self.rows, self.offsets, strict=True):
-            rotation = matrix(orientation[row])
+            rotation = quat_to_matrix(orientation[row])
             pose = eqx.tree_at(
                 lambda p: (p.position, p.orientation),
                 item.pose,
@@ -88,13 +88,6 @@ def object_level(density_range: np.ndarray) -> float:
     return low**0.75 * high**0.25 if low > 0 else 0.1 * high
 
 
-def matrix(orientation: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation matrix of a unit quaternion, on the host."""
-    w, x, y, z = orientation
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + 2 * (w * cross + cross @ cross)
-
-
 def camera_for(scene: Scene, drawn: Stage, trajectory: Trajectory, width: int, height: int) -> Camera:
     """A camera that sees every bounded body all the time, from across the main direction of motion."""
     position = np.asarray(trajectory.states.position, dtype=np.float64)
@@ -107,7 +100,7 @@ def camera_for(scene: Scene, drawn: Stage, trajectory: Trajectory, width: int, h
         lower, upper = np.asarray(item.shape.bounds, dtype=np.float64)
         corners = np.where(np.array(list(np.ndindex(2, 2, 2))) == 1, upper, lower)
         for step in steps[:1] if scene.bodies[row].fixed else steps:
-            centres.append(position[step, row] + (corners - com) @ matrix(orientation[step, row]).T)
+            centres.append(position[step, row] + (corners - com) @ quat_to_matrix(orientation[step, row]).T)
         if not scene.bodies[row].fixed:
             moving.append(position[steps, row, :2])
     if not centres:

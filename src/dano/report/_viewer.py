@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, PosedShape, Sphere
-from dano.maths import Pose
+from dano.maths import Pose, quat_to_matrix
 from dano.report._object import normal_colours
 from dano.report._resample import poses_at
-from dano.report._stage import matrix, Touches, touches
+from dano.report._stage import Touches, touches
 from dano.report._video import require
 from dano.scene import Body, Scene, Trajectory
 from dano.vision import checked_colour, Item, PALETTE, placement
@@ -94,7 +94,7 @@ class Viewer:
             for i, (handle, com) in enumerate(zip(self._handles, self._offsets, strict=True)):
                 if com is not None:
                     handle.wxyz = orientation[0, i]
-                    handle.position = position[0, i] - matrix(orientation[0, i]) @ com
+                    handle.position = position[0, i] - quat_to_matrix(orientation[0, i]) @ com
             self._show_forces()
 
     def _show_forces(self) -> None:

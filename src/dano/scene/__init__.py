@@ -7,4 +7,9 @@ from dano.scene._contacts import (
     pressing_pairs as pressing_pairs,
 )
 from dano.scene._scene import Scene as Scene
-from dano.scene._states import Control as Control, State as State, Trajectory as Trajectory
+from dano.scene._states import (
+    Control as Control,
+    State as State,
+    STATE_SIZES as STATE_SIZES,
+    Trajectory as Trajectory,
+)

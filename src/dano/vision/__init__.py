@@ -1,46 +1,55 @@
 """Cameras, photographs and what is learned from them, pictures of fields. Knows nothing of physics."""
 
-from dano.vision._appearance import Appearance as Appearance, Network as Network
-from dano.vision._camera import (
+from dano.vision.capture import (
     AbstractCamera as AbstractCamera,
+    background_mask as background_mask,
+    Box as Box,
     Camera as Camera,
+    Capture as Capture,
+    hull_distance as hull_distance,
+    Light as Light,
+    load_capture as load_capture,
     PosedCamera as PosedCamera,
+    Rays as Rays,
+    View as View,
+    with_masks as with_masks,
 )
-from dano.vision._capture import Capture as Capture, View as View
-from dano.vision._capture_files import load_capture as load_capture
-from dano.vision._composed import compose as compose
-from dano.vision._hash_model import HashModel as HashModel
-from dano.vision._hull import Box as Box, hull_distance as hull_distance
-from dano.vision._item import (
+from dano.vision.drawing import (
     checked_colour as checked_colour,
+    compose as compose,
     Item as Item,
     level_surface as level_surface,
     PALETTE as PALETTE,
     placement as placement,
+    render as render,
 )
-from dano.vision._learned import LearnedField as LearnedField
-from dano.vision._light import Light as Light
-from dano.vision._masks import background_mask as background_mask, with_masks as with_masks
-from dano.vision._metrics import mask_iou as mask_iou, psnr as psnr, ssim as ssim
-from dano.vision._models import (
+from dano.vision.radiance import (
     AbstractMedium as AbstractMedium,
     AbstractModel as AbstractModel,
+    Appearance as Appearance,
     DensityModel as DensityModel,
-    Rays as Rays,
+    HashModel as HashModel,
+    LearnedField as LearnedField,
+    Network as Network,
+    OSF as OSF,
+    Picture as Picture,
+    picture as picture,
     Sampling as Sampling,
     see as see,
     Seen as Seen,
     SurfaceModel as SurfaceModel,
 )
-from dano.vision._options import TrainOptions as TrainOptions
-from dano.vision._osf import OSF as OSF
-from dano.vision._picture import Picture as Picture, picture as picture
-from dano.vision._render import render as render
-from dano.vision._score import Score as Score, score as score
-from dano.vision._survey import Survey as Survey, survey as survey
-from dano.vision._train import (
+from dano.vision.training import (
+    mask_iou as mask_iou,
     Progress as Progress,
+    psnr as psnr,
+    Score as Score,
+    score as score,
+    ssim as ssim,
+    Survey as Survey,
+    survey as survey,
     train as train,
     Trained as Trained,
+    TrainOptions as TrainOptions,
     volume as volume,
 )

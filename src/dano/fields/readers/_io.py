@@ -1,0 +1,202 @@
+"""Reading fields from files of many kinds, and writing grids."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dano.archive import write_archive
+from dano.fields._base import AbstractField
+from dano.fields._callable import checked_bounds
+from dano.fields._compose import Posed, Scaled
+from dano.fields._grid import GridField
+from dano.fields._mesh import mesh_field
+from dano.fields._shapes import AbstractShape
+from dano.fields._signed_distance import SignedDistanceGrid
+from dano.fields.readers._arrays import load_npy, load_npz, load_object
+from dano.fields.readers._instant_ngp import load_snapshot
+from dano.fields.readers._nerfacto import load_checkpoint
+from dano.fields.readers._splats import is_splats, load_splats
+from dano.fields.readers._torch_module import load_callable, load_module
+from dano.fields.readers._vdb import load_vdb
+from dano.maths import Numbers, Pose
+from dano.names import did_you_mean
+
+
+class _Reader(NamedTuple):
+    """How a kind of file is read.
+
+    Attributes:
+        read: Takes the path and the options.
+        options: Names of the options.
+        crops: Whether it takes `crop` itself.
+    """
+
+    read: Callable[..., AbstractField]
+    options: tuple[str, ...] = ()
+    crops: bool = False
+
+
+_CHECKPOINT = (
+    "undo_transform",
+    "average_init_density",
+    "base_res",
+    "max_res",
+    "hidden_dim",
+    "num_layers",
+    "num_levels",
+    "features_per_level",
+    "log2_hashmap_size",
+    "disable_scene_contraction",
+)
+_MESH = _Reader(mesh_field, ("resolution", "interpolation", "edge"))
+_SPLATS = _Reader(load_splats, ("min_width",), crops=True)
+_READERS: dict[str, _Reader] = {
+    ".npz": _Reader(load_npz, ("interpolation",)),
+    ".npy": _Reader(load_npy, ("spacing", "origin", "interpolation", "signed_distance")),
+    ".dano": _Reader(load_object, ("interpolation",)),
+    **dict.fromkeys((".obj", ".stl", ".ply", ".off", ".glb", ".gltf"), _MESH),
+    ".ckpt": _Reader(load_checkpoint, _CHECKPOINT, crops=True),
+    **dict.fromkeys((".ingp", ".msgpack"), _Reader(load_snapshot, ("cascade", "interpolation"), crops=True)),
+    **dict.fromkeys((".vdb", ".nvdb"), _Reader(load_vdb, ("grid", "interpolation"), crops=True)),
+    **dict.fromkeys((".pt", ".pth", ".pt2"), _Reader(load_module, ("module",), crops=True)),
+}
+
+
+def load_field(
+    path: str | Path,
+    *,
+    crop: Numbers | None = None,
+    scale: float = 1.0,
+    pose: Pose | None = None,
+    **options: Any,
+) -> AbstractField:
+    """Read a field from a file; nothing is ever unpickled.
+
+    - `.npz`: `values` (nx, ny, nz), or signed `distances`, with `origin` (3,) and `spacing`; option
+      `interpolation`.
+    - `.npy`: voxels (nx, ny, nz), booleans or densities; options `spacing`, `origin`, `interpolation`, and
+      `signed_distance=True` if they are distances, negative inside.
+    - `.obj`, `.stl`, `.off`, `.glb`, `.gltf`, `.ply`: a watertight triangle mesh; options of `mesh_field`.
+    - `.ply` with Gaussian splats: their occupancy; option `min_width`, the least standard deviation of a
+      Gaussian.
+    - `.ckpt`: a nerfstudio checkpoint (nerfacto, splatfacto); option `undo_transform`, and nerfacto's sizes
+      where no config.yml tells them.
+    - `.ingp`, `.msgpack`: the density grid of an instant-ngp snapshot; options `cascade`, `interpolation`.
+    - `.vdb`, `.nvdb`: a fog volume or level set of OpenVDB or NanoVDB; options `grid` (its name),
+      `interpolation`.
+    - `.pt2`, `.pt`, `.pth`: a module (n, 3) → (n,) of torch.export or TorchScript, or weights for the one
+      that option `module` = "package.module:name" makes; `crop` is required.
+    - `"package.module:name"` instead of a file: that function (n, 3) → (n,); `crop` is required.
+    - `.dano`: the grid stored in a neural object; option `interpolation`.
+
+    Args:
+        path: The file.
+        crop: Lower and upper corner, shape (2, 3), of the part to be kept, in the frame and units of the
+            file; for densities. Grids keep the nodes within.
+        scale: Length [m] of a unit of the file, applied after `crop`, about the origin. Densities keep their
+            values.
+        pose: Moves the scaled field into the frame F that you want.
+        **options: See above. `spacing` and `origin` (centre of the first voxel) place an .npy array, which is
+            otherwise centred on the origin with its longest side 1.
+
+    Returns:
+        A `GridField` for densities on a grid, a `SignedDistanceGrid` for signed distances and meshes, else a
+        field that evaluates what the file holds: `dano.bake` it for simulation. A `pose` wraps it in a
+        `PosedField` or `PosedShape`.
+
+    Raises:
+        ValueError: If the file is missing, of an unknown kind, truncated, or does not hold what its kind
+            promises, or an option is not known; the message names the file and what was expected.
+        ImportError: If reading it needs a package that is not installed, or a function cannot be imported.
+    """
+    if not (np.isfinite(scale) and scale > 0):
+        raise ValueError(f"scale must be finite and > 0, got {scale}")
+    if pose is not None and not isinstance(pose, Pose):
+        raise ValueError(f"pose must be a dano.maths.Pose, got {type(pose).__name__}")
+    box = None if crop is None else np.asarray(checked_bounds(crop), np.float64)
+    field = _read(path, box, options)
+    field = Scaled(field, scale) if scale != 1 else field
+    return field if pose is None else Posed(field, pose)
+
+
+def _read(path: str | Path, crop: np.ndarray | None, options: dict[str, Any]) -> AbstractField:
+    if (
+        isinstance(path, str)
+        and re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", path)
+        and not Path(path).exists()
+    ):
+        _check_options(path, "function", options, ())
+        return load_callable(path, crop=crop)
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in _READERS:
+        raise ValueError(
+            f"{path}: unknown kind of field {suffix!r}; expected one of {', '.join(_READERS)}"
+            + did_you_mean(suffix, _READERS)
+        )
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "no such file"
+        raise ValueError(f"{path}: {what}; expected a field ({', '.join(_READERS)})")
+    reader = _SPLATS if suffix == ".ply" and is_splats(path) else _READERS[suffix]
+    _check_options(path, f"{suffix} file", options, reader.options)
+    if reader.crops:
+        return reader.read(path, crop=crop, **options)
+    field = reader.read(path, **options)
+    return field if crop is None else _cropped(field, crop, path)
+
+
+def _check_options(what: object, kind: str, options: dict[str, Any], known: tuple[str, ...]) -> None:
+    if unknown := sorted(set(options) - set(known)):
+        raise ValueError(
+            f"{what}: unknown options {unknown} for a {kind}; it takes {list(known)}"
+            + did_you_mean(unknown[0], known)
+        )
+
+
+def _cropped(field: AbstractField, crop: np.ndarray, path: Path) -> GridField:
+    """The nodes of a grid within a box."""
+    if isinstance(field, AbstractShape) or not isinstance(field, GridField):
+        raise ValueError(f"{path}: crop applies to densities, got a {type(field).__name__}")
+    origin, spacing = np.asarray(field.origin, np.float64), np.asarray(field.spacing, np.float64)
+    first = np.maximum(np.ceil((crop[0] - origin) / spacing - 1e-9), 0).astype(int)
+    last = np.minimum(np.floor((crop[1] - origin) / spacing + 1e-9), np.array(field.shape) - 1).astype(int)
+    if np.any(last - first < 1):
+        raise ValueError(f"{path}: crop must hold two nodes an axis or more, got {crop.tolist()}")
+    box = tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))
+    try:
+        return GridField(field.values[box], origin + first * spacing, spacing, field.interpolation)
+    except ValueError as error:
+        raise ValueError(f"{path}: within crop {crop.tolist()}: {error}") from error
+
+
+def save_field(field: GridField | SignedDistanceGrid, path: str | Path) -> None:
+    """Write a grid of densities or signed distances to an .npz file that `load_field` reads.
+
+    The file is written beside its place and then renamed: an existing file is replaced by a complete one or
+    not at all.
+
+    Args:
+        field: The grid; other fields are baked first (see `dano.bake`).
+        path: File name ending in .npz, in an existing folder.
+
+    Raises:
+        ValueError: If `field` is no grid, or `path` does not end in .npz, is a folder, or lies in none.
+    """
+    path = Path(path)
+    if not isinstance(field, (GridField, SignedDistanceGrid)):
+        raise ValueError(
+            f"field must be a GridField or SignedDistanceGrid to be saved, got {type(field).__name__}:"
+            " bake it first"
+        )
+    if path.suffix.lower() != ".npz":
+        raise ValueError(f"path must end in .npz, got {path}")
+    signed = isinstance(field, SignedDistanceGrid)
+    members = {"distances": field.distances} if signed else {"values": field.values}
+    if signed and field.edge is not None:
+        members["edge"] = field.edge
+    members |= {"origin": field.origin, "spacing": field.spacing}
+    arrays = {name: np.asarray(value) for name, value in members.items()}
+    write_archive(path, arrays | {"interpolation": np.asarray(field.interpolation)})

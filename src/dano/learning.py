@@ -1,0 +1,141 @@
+"""From photographs to a neural object: read, mask, train, integrate."""
+
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from dano.fields import bake, GridField
+from dano.objects import NeuralObject
+from dano.vision import (
+    Box,
+    Capture,
+    load_capture,
+    Progress,
+    train,
+    Trained,
+    TrainOptions,
+    volume,
+    with_masks,
+)
+
+
+class LearnedObject(NamedTuple):
+    """What photographs taught of an object.
+
+    Attributes:
+        made: The object.
+        trained: The field that it was made of, with scores and warnings.
+        grid: The field baked.
+        masks_given: Whether the photographs came with masks.
+    """
+
+    made: NeuralObject
+    trained: Trained
+    grid: GridField
+    masks_given: bool
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the object with its look to a .dano file, as `dano train` does.
+
+        Raises:
+            ValueError: If `path` is a directory or its parent does not exist.
+        """
+        self.made.save(path, look=self.trained.field.look)
+
+
+def train_object(
+    photographs: str | os.PathLike[str] | Capture,
+    options: TrainOptions | None = None,
+    *,
+    downscale: int = 1,
+    views: int | None = None,
+    network: str | os.PathLike[str] | None = None,
+    mass: float | None = None,
+    mass_density: float = 1000.0,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    previews: str | Path | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> LearnedObject:
+    """Learn a solid object from photographs with camera poses.
+
+    Args:
+        photographs: Folder or file (see `load_capture`), or what was read of one.
+        options: How to train; default `TrainOptions()`.
+        downscale: Average so many pixels a side into one; for files only.
+        views: Train on so many of the views only.
+        network: Segmentation network (ONNX) for photographs without masks; default: a plain background.
+        mass: Of the object [kg]; default: `mass_density` times its volume.
+        mass_density: Mass per volume [kg/m³].
+        checkpoint: File that the state of training is written to, also when interrupted.
+        resume: Go on from `checkpoint` if it exists.
+        previews: Folder for pictures of what has been learned so far.
+        progress: Called with what is being done, and the share of it that is done, between 0 and 1.
+
+    Returns:
+        The object, and the field that it was made of.
+
+    Raises:
+        ValueError: If an argument is out of range, or the photographs cannot be read or learned from.
+        ImportError: If a package is missing that reads photographs, makes masks or draws previews.
+        KeyboardInterrupt: When interrupted, after the state has been saved to `checkpoint`.
+    """
+    for name, value in (("mass", mass), ("mass_density", mass_density)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be positive and finite, got {value}")
+    options = TrainOptions() if options is None else options
+    say = progress or _silent
+    capture, given = _masked(photographs, downscale, network, say)
+    if views is not None:
+        capture = capture.thinned(views)
+
+    def show(done: Progress) -> None:
+        quality = "" if done.psnr is None else f"{done.psnr:.1f} dB "
+        say(f"training {quality}{done.rays_per_second / 1000:.0f}k rays/s", done.iteration / done.iterations)
+
+    say("visual hull", 0.0)
+    trained = train(capture, options, checkpoint=checkpoint, resume=resume, progress=show, previews=previews)
+    say("solid", 0.0)
+    made = NeuralObject.from_field(
+        trained.field,
+        mass_model="solid",
+        mass=mass_density * _volume(trained) if mass is None else mass,
+        progress=say,
+    )
+    return LearnedObject(made, trained, bake(trained.field, options.resolution).grid, given)
+
+
+def _silent(what: str, share: float) -> None:
+    del what, share
+
+
+def _masked(
+    photographs: str | os.PathLike[str] | Capture,
+    downscale: int,
+    network: str | os.PathLike[str] | None,
+    say: Callable[[str, float], None],
+) -> tuple[Capture, bool]:
+    """Photographs with masks, and whether they came with them."""
+    if isinstance(photographs, Capture):
+        if downscale != 1:
+            raise ValueError(f"downscale is for files, got {downscale} for a capture: load it so")
+        capture = photographs
+    else:
+        say("reading photographs", 0.0)
+        capture = load_capture(Path(photographs), downscale=downscale)
+    if capture.has_masks:
+        return capture, True
+    say("making masks", 0.0)
+    return with_masks(capture, None if network is None else Path(network)), False
+
+
+def _volume(trained: Trained) -> float:
+    """Volume [m³] of the solid."""
+    solid = trained.field.solid
+    distances = np.asarray(solid.distances, np.float64)
+    nx, ny, nz = distances.shape
+    return volume(distances, Box(np.asarray(solid.origin), float(solid.spacing[0]), (nx, ny, nz)))

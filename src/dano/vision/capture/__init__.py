@@ -1,0 +1,27 @@
+"""Photographs from known places: cameras, files, masks, silhouettes, and the rays that see an object."""
+
+from dano.vision.capture._box import Box as Box, resampled as resampled
+from dano.vision.capture._camera import (
+    AbstractCamera as AbstractCamera,
+    Camera as Camera,
+    PosedCamera as PosedCamera,
+)
+from dano.vision.capture._capture import Capture as Capture, View as View
+from dano.vision.capture._capture_files import load_capture as load_capture
+from dano.vision.capture._hull import (
+    hull_distance as hull_distance,
+    object_box as object_box,
+    viewed_ball as viewed_ball,
+)
+from dano.vision.capture._light import Light as Light
+from dano.vision.capture._masks import (
+    background_mask as background_mask,
+    check_masks as check_masks,
+    with_masks as with_masks,
+)
+from dano.vision.capture._ray_set import (
+    collect as collect,
+    rays_of as rays_of,
+    RaySet as RaySet,
+)
+from dano.vision.capture._rays import box_interval as box_interval, Rays as Rays

@@ -1,0 +1,11 @@
+"""Pictures of fields: solids, media and learned models under lamps and a sky."""
+
+from dano.vision.drawing._composed import compose as compose
+from dano.vision.drawing._item import (
+    checked_colour as checked_colour,
+    Item as Item,
+    level_surface as level_surface,
+    PALETTE as PALETTE,
+    placement as placement,
+)
+from dano.vision.drawing._render import render as render

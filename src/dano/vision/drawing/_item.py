@@ -1,0 +1,271 @@
+"""What a picture shows: fields made ready to be drawn, once, and then moved about."""
+
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from dano.fields import (
+    AbstractField,
+    AbstractShape,
+    bake,
+    GridField,
+    HalfSpace,
+    PosedShape,
+    redistanced,
+    SignedDistanceGrid,
+)
+from dano.maths import checked_array, Numbers, Pose, quat_to_matrix
+from dano.vision.radiance import AbstractModel, LearnedField, SurfaceModel
+
+PALETTE = ("#e07a3f", "#3d7ea6", "#5f9e6e", "#c9a227", "#8d6cab", "#c8553d", "#4aa3a2", "#7a8450")
+"""Colours for objects that state none, matte and different from each other in lightness too."""
+
+# Nodes along the longest side of the signed distance of a density: finer than a pixel needs at usual image
+# sizes.
+_MOST_NODES = 112
+_BAKE_NODES = 96
+
+
+M = TypeVar("M", bound=eqx.Module)
+
+
+class Item(eqx.Module):
+    """A field, where it is, and how it looks.
+
+    Attributes:
+        shape: What is drawn of a solid, in float32: the field itself if it is a shape, else the signed
+            distance of its level surface; None if it is translucent.
+        medium: The density that is drawn as a translucent medium of one colour, in float32, else None.
+        model: The look that photographs taught, else None.
+        sharpness: Of the model's surface [1/m], if it has one.
+        pose: Field frame → world.
+        colour: sRGB in [0, 1], shape (3,).
+        density_scale: Extinction [1/m] of a medium per unit of its density.
+        centre: Middle of a ball around the item [m, F]; zero for a half-space.
+        radius: Radius of that ball [m]; infinite for a half-space.
+    """
+
+    shape: AbstractShape | None
+    medium: GridField | None
+    model: AbstractModel | None
+    sharpness: float
+    pose: Pose
+    colour: Float[np.ndarray, "3"]
+    density_scale: float
+    centre: Float[np.ndarray, "3"]
+    radius: float
+
+    def __init__(
+        self,
+        field: AbstractField | AbstractModel,
+        pose: Pose | None = None,
+        colour: str | Numbers | None = None,
+        *,
+        level: int | float | None = None,
+        density_scale: int | float | None = None,
+        sharpness: int | float | None = None,
+    ):
+        """Make a field ready for drawing; what takes time happens here and not per picture.
+
+        Args:
+            field: A shape, which is drawn as it is, a density, or what was learned from photographs: a
+                `LearnedField` or a model, which keep their look unless a colour is given.
+            pose: Field frame → world; default the identity.
+            colour: "#rrggbb" or three numbers in [0, 1]; default: the first of `PALETTE`, white for a
+                half-space.
+            level: Density at which the surface of a solid lies; default: half the median of what the field
+                holds.
+            density_scale: If given, the field is no solid but a medium with extinction density_scale · φ
+                [1/m].
+            sharpness: Of the surface of a `SurfaceModel` [1/m]; default: its opacity rises over half a cell.
+
+        Raises:
+            ValueError: If the field is unbounded and no half-space, it nowhere reaches `level`, both
+                `level` and `density_scale` are given, or a number is out of range.
+        """
+        if not isinstance(field, AbstractField | AbstractModel):
+            raise ValueError(f"field must be a dano field (an AbstractField), got {type(field).__name__}")
+        if isinstance(field, AbstractModel) and (level is not None or density_scale is not None):
+            raise ValueError("level and density_scale are of fields, got one for a model with its own look")
+        if level is not None and density_scale is not None:
+            raise ValueError(
+                f"level (a solid) excludes density_scale (a medium), got {level} and {density_scale}"
+            )
+        for name, value in (
+            ("level", level),
+            ("density_scale", density_scale),
+            ("sharpness", sharpness),
+        ):
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be positive and finite, got {value}")
+        self.pose = Pose() if pose is None else pose
+        self.density_scale = 0.0 if density_scale is None else float(density_scale)
+        self.shape = self.medium = self.model = None
+        self.sharpness = 0.0
+        model, solid = _learned(field)
+        if model is not None and level is None and density_scale is None and colour is None:
+            self.model = _single(model)
+            self.sharpness = _drawn_sharpness(field) if sharpness is None else float(sharpness)
+        if isinstance(field, AbstractModel):
+            if solid is None and colour is not None:
+                raise ValueError(
+                    f"colour is of solids and fields, got {colour!r} for a {type(field).__name__}"
+                )
+            self.shape = solid if solid is None else _single(solid)
+            drawn = field if solid is None else solid
+        elif density_scale is not None:
+            self.medium = drawn = _single(_grid(field))
+        elif solid is not None and level is None:
+            self.shape = drawn = _single(solid)
+        elif isinstance(field, AbstractShape):
+            self.shape = drawn = _single(_without_moments(field))
+        else:
+            self.shape = drawn = _single(level_surface(_grid(field), level))
+        lower, upper = np.asarray(drawn.bounds, dtype=np.float64)
+        bounded = bool(np.all(np.isfinite([lower, upper])))
+        self.centre = 0.5 * (lower + upper) if bounded else np.zeros(3)
+        self.radius = 0.5 * float(np.linalg.norm(upper - lower)) if bounded else float("inf")
+        if colour is None:
+            colour = PALETTE[0] if self.plane is None else "#ffffff"
+        self.colour = checked_colour(colour)
+        if not bounded and self.plane is None:
+            raise ValueError(f"field must have finite bounds or be a half-space, got {type(field).__name__}")
+
+    def at(self, pose: Pose) -> "Item":
+        """The same item elsewhere."""
+        return eqx.tree_at(lambda item: item.pose, self, pose)
+
+    @property
+    def plane(self) -> Float[np.ndarray, "4"] | None:
+        """Unit normal and offset [m] of a half-space in the world; None for anything else."""
+        shape, pose = self.shape, self.pose
+        while isinstance(shape, PosedShape):
+            shape, pose = shape.shape, pose.compose(_as(shape.pose, pose.position.dtype))
+        if not isinstance(shape, HalfSpace):
+            return None
+        rotation, position = placement(pose)
+        normal = rotation @ np.asarray(shape.normal_direction, dtype=np.float64)
+        return np.append(normal, float(shape.offset) + normal @ position)
+
+    @property
+    def placed_ball(self) -> tuple[np.ndarray, float]:
+        """Centre [m, W] and radius [m] of a ball around the item."""
+        rotation, position = placement(self.pose)
+        return rotation @ self.centre + position, self.radius
+
+
+def placement(pose: Pose) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """Rotation matrix and translation of a pose on the host, where one picture needs them many times."""
+    rotation = quat_to_matrix(np.asarray(pose.orientation, dtype=np.float64))
+    return rotation, np.asarray(pose.position, dtype=np.float64)
+
+
+def checked_colour(colour: str | Numbers) -> Float[np.ndarray, "3"]:
+    """A colour as sRGB in [0, 1].
+
+    Raises:
+        ValueError: If it is neither "#rrggbb" nor three numbers in [0, 1].
+    """
+    if isinstance(colour, str):
+        digits = colour.removeprefix("#")
+        try:
+            value = np.array([int(digits[i : i + 2], 16) for i in (0, 2, 4)]) / 255
+        except ValueError:
+            value = None
+        if value is None or len(digits) != 6:
+            raise ValueError(f"colour must be '#rrggbb' or three numbers in [0, 1], got {colour!r}")
+        return value
+    value = np.asarray(checked_array("colour", colour, (3,)), dtype=np.float64)
+    if value.min() < 0 or value.max() > 1:
+        raise ValueError(f"colour must have numbers in [0, 1], got {value.tolist()}")
+    return value
+
+
+def level_surface(field: GridField, level: int | float | None = None) -> SignedDistanceGrid:
+    """The solid {φ ≥ level} of a grid as a signed distance, smooth enough to be shaded.
+
+    The density φ/(φ + level), which is ½ on the surface and blind to how dense the inside is, is blurred
+    by less than a cell; where it crosses ½ along the edges of the grid lie points of the surface, with
+    normals. A node's distance is that to the tangent plane of the nearest of them if it is near, else that
+    to the point.
+
+    Args:
+        field: The density.
+        level: Default: half the median of the positive densities above 5 % of the largest.
+
+    Raises:
+        ValueError: If the density nowhere reaches `level`.
+    """
+    values = np.asarray(field.values, dtype=np.float64)
+    spacing = np.asarray(field.spacing, dtype=np.float64)
+    if level is None:
+        level = 0.5 * float(np.median(values[values > 0.05 * values.max()]))
+    inside = np.argwhere(values >= level)
+    if len(inside) == 0:
+        raise ValueError(f"level must be at most the largest density {values.max():.6g}, got {level:.6g}")
+    low, high = np.maximum(inside.min(0) - 4, 0), inside.max(0) + 5
+    before = np.maximum(4 - inside.min(0), 0)
+    after = np.maximum(inside.max(0) + 5 - np.array(values.shape), 0)
+    values = values[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    values = np.pad(values, list(zip(before, after, strict=True)))
+    origin = np.asarray(field.origin, dtype=np.float64) + spacing * (low - before)
+    share = values / (values + level)
+    if max(share.shape) > _MOST_NODES:
+        factor = _MOST_NODES / max(share.shape)
+        target = np.maximum(np.ceil(np.array(share.shape) * factor).astype(int), 8)
+        step = (np.array(share.shape) - 1) / (target - 1)
+        share = ndimage.zoom(
+            ndimage.gaussian_filter(share, 0.4 * step), target / np.array(share.shape), order=1
+        )
+        spacing = spacing * step
+    share = ndimage.gaussian_filter(share, 0.8)
+    # A thin wall may not survive the blur; the surface then moves to where half of the peak is left.
+    peak = float(share.max())
+    middle = 0.5 if peak > 0.5 else 0.5 * peak
+    distance = redistanced(middle - share, spacing)
+    return SignedDistanceGrid(
+        distance.astype(np.float32), origin.astype(np.float32), spacing.astype(np.float32), edge=0.0
+    )
+
+
+def _learned(field: AbstractField | AbstractModel) -> tuple[AbstractModel | None, AbstractShape | None]:
+    """The look of what was learned from photographs, and its solid if it has one."""
+    if isinstance(field, LearnedField):
+        return field.model, field.solid
+    if isinstance(field, SurfaceModel):
+        box = field.box
+        return field, SignedDistanceGrid(field.distances, box.origin, box.spacing)
+    return (field, None) if isinstance(field, AbstractModel) else (None, None)
+
+
+def _drawn_sharpness(field: AbstractField | AbstractModel) -> float:
+    if isinstance(field, LearnedField):
+        return float(field.drawn_sharpness)
+    return 4 / float(field.spacing) if isinstance(field, SurfaceModel) else 0.0
+
+
+def _grid(field: AbstractField) -> GridField:
+    if isinstance(field, GridField):
+        return field
+    if not np.all(np.isfinite(np.asarray(field.bounds))):
+        raise ValueError(f"field must have finite bounds to be drawn, got {type(field).__name__}")
+    return bake(field, _BAKE_NODES).grid
+
+
+def _without_moments(shape: AbstractShape) -> AbstractShape:
+    if isinstance(shape, SignedDistanceGrid) and shape.moments is not None:
+        return eqx.tree_at(lambda s: s.moments, shape, None)
+    return shape
+
+
+def _single(module: M) -> M:
+    return _as(module, np.dtype(np.float32))
+
+
+def _as(module: M, dtype: np.dtype) -> M:
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), module)

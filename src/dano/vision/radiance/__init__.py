@@ -1,0 +1,24 @@
+"""What a photograph is explained by: radiance models, volume rendering, the field that is learned."""
+
+from dano.vision.radiance._appearance import Appearance as Appearance, Network as Network, Share as Share
+from dano.vision.radiance._hash_model import HashModel as HashModel
+from dano.vision.radiance._learned import LearnedField as LearnedField
+from dano.vision.radiance._models import (
+    AbstractMedium as AbstractMedium,
+    AbstractModel as AbstractModel,
+    AbstractSurface as AbstractSurface,
+    DensityModel as DensityModel,
+    DRAWING as DRAWING,
+    Sampling as Sampling,
+    see as see,
+    Seen as Seen,
+    SurfaceModel as SurfaceModel,
+)
+from dano.vision.radiance._osf import OSF as OSF
+from dano.vision.radiance._picture import Picture as Picture, picture as picture, tiles as tiles
+from dano.vision.radiance._volume import (
+    composite as composite,
+    importance_edges as importance_edges,
+    stratified_edges as stratified_edges,
+    transmittance as transmittance,
+)

@@ -1,0 +1,197 @@
+"""The field that photographs have taught: a solid to simulate, with the look that it was learned with."""
+
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.archive import LOOK, OBJECT, read_archive, write_archive
+from dano.fields import AbstractField, check_order, Jet, redistanced, SignedDistanceGrid, vmapped_jet
+from dano.maths import Numbers
+from dano.vision.capture import AbstractCamera
+from dano.vision.radiance._appearance import Appearance, Network
+from dano.vision.radiance._models import SurfaceModel
+from dano.vision.radiance._picture import Picture, picture
+
+FORMAT, VERSION = "dano-learned-field", 1
+
+_EDGE = 2.0
+"""Sharpness times spacing: φ falls from 0.9 to 0.1 over two cells, which a grid of that spacing can hold."""
+
+
+class LearnedField(AbstractField):
+    """An occupancy probability φ = 1/(1 + exp(s d)) ∈ [0, 1] around a learned signed distance d.
+
+    Attributes:
+        solid: The solid {d < 0}, d made a signed distance again after training.
+        sharpness: s [1/m].
+        model: What was trained, for pictures.
+        drawn_sharpness: Sharpness [1/m] of the model's surface in pictures.
+    """
+
+    solid: SignedDistanceGrid
+    sharpness: Float[Array, ""]
+    model: SurfaceModel
+    drawn_sharpness: Float[Array, ""]
+
+    @classmethod
+    def from_model(cls, model: SurfaceModel, drawn_sharpness: float) -> "LearnedField":
+        """Make a trained model a field.
+
+        Raises:
+            ValueError: If there is nothing inside.
+        """
+        box = model.box
+        distances = model.distances
+        if not np.any(distances < 0):
+            raise ValueError("the trained model holds no solid: nothing is inside")
+        # Outside of the box everything is empty, also if the surface has come close to its sides.
+        wide = np.pad(distances, 2, mode="edge")
+        border = np.ones(wide.shape, dtype=bool)
+        border[2:-2, 2:-2, 2:-2] = False
+        wide[border] = np.maximum(wide[border], 0.5 * box.spacing)
+        origin = box.origin - 2 * box.spacing
+        wide = redistanced(wide, box.spacing)
+        return cls(
+            SignedDistanceGrid(jnp.asarray(wide), origin, box.spacing),
+            jnp.asarray(_EDGE / box.spacing),
+            model,
+            jnp.asarray(drawn_sharpness),
+        )
+
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """Box [m] around the solid, as far out as φ is above 10⁻⁴."""
+        reach = jnp.broadcast_to(9.2 / self.sharpness, (3,))
+        return self.solid.solid_bounds + jnp.stack([-reach, reach]).astype(self.solid.solid_bounds.dtype)
+
+    def density(self, x: Float[Array, "3"]) -> Float[Array, ""]:
+        """φ at `x` [m]; zero outside of `bounds`."""
+        value = jax.nn.sigmoid(-self.sharpness.astype(x.dtype) * self.solid.sdf(x))
+        return jnp.where(self._within(x[:, None])[0], value, 0)
+
+    def jet(self, x: Float[Array, "3 n"], order: int) -> Jet:
+        """See `AbstractField.jet`; by the chain rule from the distance's."""
+        check_order(order)
+        if order == 2:
+            return vmapped_jet(self.density, x, order)
+        within, s = self._within(x), self.sharpness.astype(x.dtype)
+        if order == 0:
+            return jnp.where(within, jax.nn.sigmoid(-s * self.solid.sdf_jet(x, 0)), 0)
+        distance, gradient = self.solid.sdf_jet(x, 1)
+        value = jax.nn.sigmoid(-s * distance)
+        slope = -s * value * (1 - value)
+        return jnp.where(within, value, 0), jnp.where(within[None], slope[None] * gradient, 0)
+
+    def _within(self, x: Float[Array, "3 n"]) -> Array:
+        lower, upper = self.bounds.astype(x.dtype)
+        return jnp.all((x >= lower[:, None]) & (x <= upper[:, None]), axis=0)
+
+    def outward(self, x: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Gradient of the distance, defined also where φ is flat."""
+        return self.solid.outward(x)
+
+    @property
+    def occupied(self) -> np.ndarray:
+        """Nodes of the model's box that a ray must not skip."""
+        return self.model.distances < 2.5 * self.model.box.spacing
+
+    def picture(self, camera: AbstractCamera, light: Numbers | None = None) -> Picture:
+        """What a camera sees.
+
+        Args:
+            camera: From where.
+            light: Direction towards the light, or its position if the photographs gave that; needed if these
+                gave any.
+
+        Raises:
+            ValueError: If the look depends on light and there is none.
+        """
+        if self.model.appearance.lit and light is None:
+            raise ValueError("light must be given: the field was learned from photographs with known lights")
+        towards = None if light is None else np.asarray(light, np.float64)
+        if towards is not None and not self.model.appearance.near_light:
+            towards = towards / np.linalg.norm(towards)
+        return picture(
+            self.model, camera, towards, self.model.box, self.occupied, float(self.drawn_sharpness)
+        )
+
+    @property
+    def look(self) -> dict[str, np.ndarray]:
+        """All that the field is made of, as arrays: what a file of it, or of an object with it, holds."""
+        model, look = self.model, self.model.appearance
+        members = {
+            "distance": model.distance,
+            "origin": model.origin,
+            "spacing": model.spacing,
+            "scale": model.scale,
+            # Half precision is a thousandth, finer than colours of 8 bits.
+            "features": np.asarray(look.features, np.float16),
+            "features_origin": look.origin,
+            "features_spacing": look.spacing,
+            "lit": np.array(look.lit),
+            "near_light": np.array(look.near_light),
+            "layers": np.array(len(look.network.weights)),
+            "drawn_sharpness": self.drawn_sharpness,
+        }
+        for i, (weight, bias) in enumerate(zip(look.network.weights, look.network.biases, strict=True)):
+            members |= {f"weight_{i}": weight, f"bias_{i}": bias}
+        return {name: np.asarray(value) for name, value in members.items()}
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the field to one file (a zip of arrays, no pickle), replacing another only when complete.
+
+        Raises:
+            ValueError: If `path` is a directory or its parent does not exist.
+        """
+        write_archive(path, {"format": np.array(FORMAT), "version": np.array(VERSION), **self.look})
+
+    @classmethod
+    def load(cls, path: str | Path) -> "LearnedField":
+        """Read a field written by `save`.
+
+        Raises:
+            ValueError: If the file is missing, truncated, of another kind, or newer.
+        """
+        return cls._from_look(read_archive(path, FORMAT, VERSION), path)
+
+    @classmethod
+    def of_object(cls, path: str | Path) -> "LearnedField | None":
+        """The field that an object was made of, from the file that `dano train` wrote of the object.
+
+        Returns:
+            None if the object's file holds no look.
+
+        Raises:
+            ValueError: If the file is missing, truncated, of another kind, or newer.
+        """
+        data = read_archive(path, *OBJECT)
+        members = {name.removeprefix(LOOK): value for name, value in data.items() if name.startswith(LOOK)}
+        return cls._from_look(members, path) if members else None
+
+    @classmethod
+    def _from_look(cls, data: dict[str, np.ndarray], path: str | Path) -> "LearnedField":
+        try:
+            layers = range(int(data["layers"]))
+            network = Network(
+                tuple(jnp.asarray(data[f"weight_{i}"]) for i in layers),
+                tuple(jnp.asarray(data[f"bias_{i}"]) for i in layers),
+            )
+            look = Appearance(
+                jnp.asarray(data["features"].astype(np.float32)),
+                network,
+                jnp.asarray(data["features_origin"]),
+                jnp.asarray(data["features_spacing"]),
+                bool(data["lit"]),
+                bool(data["near_light"]),
+            )
+            model = SurfaceModel(
+                appearance=look,
+                **{name: jnp.asarray(data[name]) for name in ("distance", "origin", "spacing", "scale")},
+            )
+            return cls.from_model(model, float(data["drawn_sharpness"]))
+        except (KeyError, ValueError) as error:
+            raise ValueError(f"{path} is not a valid learned field: {error}") from error

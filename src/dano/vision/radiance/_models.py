@@ -1,0 +1,320 @@
+"""Radiance models: what a photograph is explained by. A surface, a density on a grid.
+
+A model answers two questions about points along rays: how opaque is it there, and what colour does it
+send. The renderer `see` needs no more, and training no more than that this is differentiable.
+"""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from dano.fields import CallableField
+from dano.vision.capture import Box, Rays
+from dano.vision.radiance._appearance import Appearance, Share
+from dano.vision.radiance._trilinear import value_and_slope_at, value_at
+from dano.vision.radiance._volume import (
+    composite,
+    density_alpha,
+    importance_edges,
+    section_weights,
+    stratified_edges,
+    surface_alpha,
+    surface_interest,
+)
+
+
+class Seen(NamedTuple):
+    """What rays see.
+
+    Attributes:
+        colour: Light of the object, without what is behind it, shape (rays, 3).
+        opacity: Share of the pixel that the object covers, shape (rays,).
+        depth: Mean distance of what is seen [m], shape (rays,); 0 where nothing is.
+        normal: Mean outward normal, shape (rays, 3), not of unit length.
+    """
+
+    colour: Float[Array, "rays 3"]
+    opacity: Float[Array, " rays"]
+    depth: Float[Array, " rays"]
+    normal: Float[Array, "rays 3"]
+
+
+class Sampling(NamedTuple):
+    """How finely rays are sampled (static).
+
+    Attributes:
+        coarse: Sections that look for the object, without derivatives.
+        fine: Sections around it, which give the opacity.
+        colours: Of these, those seen most, whose colour is computed.
+    """
+
+    coarse: int = 48
+    fine: int = 16
+    colours: int = 5
+
+
+DRAWING = Sampling(96, 32, 8)
+"""For pictures to look at and to measure errors by."""
+
+
+class AbstractModel(eqx.Module):
+    """Opacity and colour of an object."""
+
+    @property
+    @abc.abstractmethod
+    def bounds(self) -> Float[Array, "2 3"]:
+        """Lower and upper corner [m] of a box outside of which there is nothing."""
+
+    @abc.abstractmethod
+    def alpha(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays sections"]:
+        """Opacity of the sections between distances along rays."""
+
+    @abc.abstractmethod
+    def colour(
+        self,
+        points: Float[Array, "n 3"],
+        view: Float[Array, "n 3"],
+        light: Float[Array, "n 3"],
+        view_share: Share = 1.0,
+    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        """SRGB sent from points against directions of view, and unit outward normals there."""
+
+    def interest(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays sections"]:
+        """How much of what is seen is decided in sections: where to sample finely."""
+        return section_weights(self.alpha(rays, edges, sharpness))
+
+
+class AbstractMedium(AbstractModel):
+    """What has an extinction at every point."""
+
+    @abc.abstractmethod
+    def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Extinction [1/m] at points [m]."""
+
+    def alpha(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays sections"]:
+        """See `density_alpha`, with the density in the middle of each section."""
+        middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+        return density_alpha(self.density_at(rays.at(middle)).reshape(middle.shape), edges)
+
+    def field(self) -> CallableField:
+        """The density as a field, with gradients by automatic differentiation; bake it before simulating."""
+        return CallableField(_Density(self), self.bounds, "jax")
+
+
+class AbstractSurface(AbstractModel):
+    """What has a soft surface: a signed distance, and an opacity as in NeuS (Wang et al. 2021)."""
+
+    @abc.abstractmethod
+    def distance_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Signed distances [m] at points [m], negative inside."""
+
+    def alpha(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays sections"]:
+        """See `surface_alpha`."""
+        return surface_alpha(self.distance_at(rays.at(edges)).reshape(edges.shape), jnp.asarray(sharpness))
+
+    def interest(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays sections"]:
+        """See `surface_interest`; as blurred as sections are long, or the surface hides between two edges."""
+        length = jnp.maximum(rays.far - rays.near, 1e-9)
+        blurred = jnp.minimum(sharpness, 2 * (edges.shape[1] - 1) / length)[:, None]
+        return surface_interest(self.distance_at(rays.at(edges)).reshape(edges.shape), blurred)
+
+
+class _Density(eqx.Module):
+    model: AbstractMedium
+
+    def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        return self.model.density_at(points)
+
+
+def see(
+    model: AbstractModel,
+    rays: Rays,
+    sharpness: Share = 1.0,
+    *,
+    sampling: Sampling = DRAWING,
+    view_share: Share = 1.0,
+    key: PRNGKeyArray | None = None,
+) -> Seen:
+    """Render rays: coarse sections find the object, fine ones give its opacity, a few of these its colour.
+
+    Args:
+        model: What is seen.
+        rays: From where, whither.
+        sharpness: Of a surface: s [1/m], the inverse of the distance over which its opacity rises.
+        sampling: How finely.
+        view_share: See `Appearance`.
+        key: Random key for jitter of the sections; None for none.
+    """
+    keys = (None, None) if key is None else jax.random.split(key)
+    edges = stratified_edges(rays.near, rays.far, sampling.coarse, keys[0])
+    # Weights for sampling are not differentiated: `importance_edges` stops their gradient.
+    edges = importance_edges(edges, model.interest(rays, edges, sharpness), sampling.fine, keys[1])
+    weights = section_weights(model.alpha(rays, edges, sharpness))
+    middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+    _, chosen = jax.lax.top_k(jax.lax.stop_gradient(weights), sampling.colours)
+    some = jnp.take_along_axis(weights, chosen, axis=1)
+    at = rays.at(jnp.take_along_axis(middle, chosen, axis=1))
+    view, light = (jnp.repeat(x, sampling.colours, axis=0) for x in (rays.direction, rays.light))
+    colour, normal = model.colour(at, view, light, view_share)
+    opacity = jnp.sum(weights, axis=1)
+    # What is not looked at is taken to look as the rest of the ray does.
+    share = (opacity / jnp.maximum(jnp.sum(some, axis=1), 1e-6))[:, None]
+    shape = (len(rays.near), sampling.colours, 3)
+    return Seen(
+        colour=composite(some, colour.reshape(shape)) * share,
+        opacity=opacity,
+        depth=jnp.sum(weights * middle, axis=1) / jnp.maximum(opacity, 1e-6),
+        normal=composite(some, normal.reshape(shape)) * share,
+    )
+
+
+class _OnNodes(AbstractModel):
+    """What is learned at the nodes of a grid; its fields are those of whoever derives from it."""
+
+    origin: eqx.AbstractVar[Float[Array, "3"]]
+    spacing: eqx.AbstractVar[Float[Array, ""]]
+
+    @property
+    @abc.abstractmethod
+    def shape(self) -> tuple[int, int, int]:
+        """Number of nodes along each axis."""
+
+    @property
+    def bounds(self) -> Float[Array, "2 3"]:
+        """First and last node [m]."""
+        last = jnp.asarray(np.array(self.shape) - 1, self.origin.dtype)
+        return jnp.stack([self.origin, self.origin + self.spacing * last])
+
+    @property
+    def box(self) -> Box:
+        """The grid."""
+        return Box(np.asarray(self.origin, np.float64), float(self.spacing), self.shape)
+
+    def _index(self, points: Float[Array, "n 3"]) -> Float[Array, "3 n"]:
+        return ((points - self.origin[None]) / self.spacing).T
+
+
+class SurfaceModel(_OnNodes, AbstractSurface):
+    """A solid with a soft surface: a signed distance on a grid.
+
+    Attributes:
+        distance: Signed distance at the nodes in units of `scale`, negative inside, shape (nx, ny, nz).
+        appearance: What its surface looks like.
+        origin: Position [m] of node (0, 0, 0).
+        spacing: Distance between nodes [m].
+        scale: Half the longest side of the box [m], so that numbers to learn are of order one.
+    """
+
+    distance: Float[Array, "nx ny nz"]
+    appearance: Appearance
+    origin: Float[Array, "3"]
+    spacing: Float[Array, ""]
+    scale: Float[Array, ""]
+
+    @classmethod
+    def create(
+        cls, distance: Float[np.ndarray, "nx ny nz"], box: Box, appearance: Appearance
+    ) -> "SurfaceModel":
+        """A model that starts from signed distances [m] at the nodes of a box."""
+        scale = 0.5 * box.spacing * (max(box.shape) - 1)
+        return cls(
+            distance=jnp.asarray(distance / scale, jnp.float32),
+            appearance=appearance,
+            origin=jnp.asarray(box.origin, jnp.float32),
+            spacing=jnp.asarray(box.spacing, jnp.float32),
+            scale=jnp.asarray(scale, jnp.float32),
+        )
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Of the grid of distances."""
+        nx, ny, nz = self.distance.shape
+        return nx, ny, nz
+
+    @property
+    def distances(self) -> Float[np.ndarray, "nx ny nz"]:
+        """Signed distances at the nodes [m]."""
+        return np.asarray(self.distance, np.float64) * float(self.scale)
+
+    def distance_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Signed distances [m] at points [m]."""
+        return value_at(self.distance, self._index(points)) * self.scale
+
+    def colour(
+        self,
+        points: Float[Array, "n 3"],
+        view: Float[Array, "n 3"],
+        light: Float[Array, "n 3"],
+        view_share: Share = 1.0,
+    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        """See `AbstractModel.colour`; normals are the gradient of the distance."""
+        _, slope = value_and_slope_at(self.distance, self._index(points))
+        normal = slope.T * jax.lax.rsqrt(jnp.sum(slope * slope, axis=0) + 1e-12)[:, None]
+        return self.appearance(points, normal, view, light, view_share), normal
+
+
+class DensityModel(_OnNodes, AbstractMedium):
+    """A medium: extinction on a grid, as in a plain neural radiance field.
+
+    Attributes:
+        raw: Numbers whose softplus is the density in units of 1/`spacing`, shape (nx, ny, nz).
+        appearance: What it looks like.
+        origin: Position [m] of node (0, 0, 0).
+        spacing: Distance between nodes [m].
+    """
+
+    raw: Float[Array, "nx ny nz"]
+    appearance: Appearance
+    origin: Float[Array, "3"]
+    spacing: Float[Array, ""]
+
+    @classmethod
+    def create(cls, inside: np.ndarray, box: Box, appearance: Appearance, thickness: float) -> "DensityModel":
+        """A thin fog where nodes are `inside`, nothing elsewhere; `thickness` is its extinction per cell."""
+        raw = np.where(inside, np.log(np.expm1(thickness)), -12.0)
+        return cls(
+            raw=jnp.asarray(raw, jnp.float32),
+            appearance=appearance,
+            origin=jnp.asarray(box.origin, jnp.float32),
+            spacing=jnp.asarray(box.spacing, jnp.float32),
+        )
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Of the grid of densities."""
+        nx, ny, nz = self.raw.shape
+        return nx, ny, nz
+
+    def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Extinction [1/m] at points [m]."""
+        u = self._index(points)
+        return jax.nn.softplus(value_at(self.raw, u)) / self.spacing
+
+    def colour(
+        self,
+        points: Float[Array, "n 3"],
+        view: Float[Array, "n 3"],
+        light: Float[Array, "n 3"],
+        view_share: Share = 1.0,
+    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        """See `AbstractModel.colour`; a medium's normals are against the gradient of its density."""
+        u = self._index(points)
+        # Not learned through: fog has normals in all directions, and explaining shading by them makes noise.
+        _, slope = value_and_slope_at(jax.lax.stop_gradient(self.raw), u)
+        normal = -slope.T * jax.lax.rsqrt(jnp.sum(slope * slope, axis=0) + 1e-6)[:, None]
+        return self.appearance(points, normal, view, light, view_share), normal

@@ -1,0 +1,451 @@
+"""Training: from photographs with masks to a solid field.
+
+The solid starts as the visual hull of the masks, without the cavities that a fog finds in it, on a coarse
+grid; rendering is compared with random rays of the photographs (see `make_step`). Coarse first, finer later.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.vision.capture import Box, Capture, collect, object_box, RaySet, resampled, View
+from dano.vision.radiance import Appearance, LearnedField, picture, SurfaceModel
+from dano.vision.training import _checkpoint
+from dano.vision.training._adjustment import Adjustment
+from dano.vision.training._cavities import find_cavities, STEPS
+from dano.vision.training._doubt import with_doubts
+from dano.vision.training._metrics import mask_iou, psnr
+from dano.vision.training._options import TrainOptions
+from dano.vision.training._preview import checked_folder, write_preview
+from dano.vision.training._score import Score, score
+from dano.vision.training._steps import Learned, make_step, optimiser_of
+from dano.vision.training._survey import Survey, survey, unseen_share
+
+_WORTH_TRYING = 0.003
+"""Share of the hull that cavities must take for a surface without them to be tried."""
+
+_CLOSE = 0.2
+"""Blur [pixels] of a surface that starts without the cavities of the hull."""
+
+_TRIAL = 80
+"""Steps that tell whether a surface without cavities explains more."""
+
+_STILL, _COHERENT, _SHARP = 0.125, 0.6, 0.7
+"""Shares of the steps until which the surface stays where it is, so that looks do not push it about which are
+not learned yet (but cameras and surface are learned together); until its nodes move each on its own; and
+until it is sharp."""
+
+Stopped = Literal["finished", "converged", "geometry", "time", "diverged"]
+
+
+class Progress(NamedTuple):
+    """What is known during training.
+
+    Attributes:
+        iteration: Steps done.
+        iterations: Steps to do at most.
+        seconds: Time in steps so far, without compilation [s].
+        rays_per_second: Of the last steps.
+        loss: Of the last step.
+        psnr: Of held-out views, when last looked at [dB]; None before.
+        mask_iou: Of held-out views, when last looked at; None before.
+        volume: Of the solid [m³].
+    """
+
+    iteration: int
+    iterations: int
+    seconds: float
+    rays_per_second: float
+    loss: float
+    psnr: float | None
+    mask_iou: float | None
+    volume: float
+
+
+class Trained(NamedTuple):
+    """What comes out of training.
+
+    Attributes:
+        field: The field.
+        capture: The photographs as they were compared: at the resolution that was worked with, seen by
+            corrected cameras.
+        survey: What the silhouettes told, with the visual hull.
+        scores: By split: "test", "relight", or "train" (some of its views) if nothing was held out.
+        history: One entry per look at held-out views.
+        stopped: Why training ended.
+        seconds: From the start, with compilation and final measurements [s].
+        unseen: Share of the surface that fewer than two training views see.
+        warnings: Sentences for the user.
+    """
+
+    field: LearnedField
+    capture: Capture
+    survey: Survey
+    scores: dict[str, Score]
+    history: tuple[Progress, ...]
+    stopped: Stopped
+    seconds: float
+    unseen: float
+    warnings: tuple[str, ...]
+
+
+class _State(eqx.Module):
+    """What a checkpoint holds besides options."""
+
+    learned: Learned
+    optimiser: Any
+    iteration: int
+    blur: Float[Array, ""]
+
+    @property
+    def model(self) -> SurfaceModel:
+        return self.learned.model
+
+
+def train(
+    capture: Capture,
+    options: TrainOptions | None = None,
+    *,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+    previews: str | Path | None = None,
+) -> Trained:
+    """Learn a solid field from photographs with poses and masks (`with_masks` makes these).
+
+    Args:
+        capture: The photographs.
+        options: How; default `TrainOptions()`.
+        checkpoint: File that the state is written to at each look at held-out views, and when interrupted.
+        resume: Go on from `checkpoint` if it exists.
+        progress: Called after every few steps.
+        previews: Folder for a PNG per look at held-out views: photographs, and their renderings below.
+
+    Returns:
+        The field, and how good it is.
+
+    Raises:
+        ValueError: If the capture cannot be learned from (see `survey`), or the checkpoint is of another
+            training, or `previews` is no folder.
+        ImportError: If pillow is missing for previews.
+        KeyboardInterrupt: When interrupted, after the state has been saved to `checkpoint`.
+    """
+    start = time.perf_counter()
+    options = TrainOptions() if options is None else options
+    folder = None if previews is None else checked_folder(previews)
+    near = {view.light_is_near for view in capture.views if view.light is not None}
+    if len(near) > 1:
+        raise ValueError("lights must be given as directions or as positions, got some of each")
+    capture = _shrunk(capture, options)
+    capture, found = with_doubts(capture, survey(capture, options.resolution))
+    trainer = _Trainer(
+        capture, options, found, Path(checkpoint) if checkpoint is not None else None, progress, folder
+    )
+    state = trainer.resumed() if resume else None
+    state, stopped = trainer.run(state)
+    field = LearnedField.from_model(state.model, trainer.sharpness(options.iterations, options.blur[0]))
+    capture = trainer.with_corrected_cameras(state)
+    splits = [s for s in ("test", "relight") if capture.split(s)] or ["train"]
+    scores = {s: score(field, capture.split(s)[: 16 if s == "train" else None]) for s in splits}
+    unseen = unseen_share(state.model, capture.split("train"))
+    warnings = list(found.warnings)
+    if unseen > 0.05:
+        warnings.append(f"{100 * unseen:.0f} % of the surface is seen by fewer than two views: a guess")
+    if stopped == "diverged":
+        warnings.append("training met a number that is not finite; what it had before is kept")
+    return Trained(
+        field,
+        capture,
+        found,
+        scores,
+        tuple(trainer.history),
+        stopped,
+        time.perf_counter() - start,
+        unseen,
+        tuple(warnings),
+    )
+
+
+class _Trainer:
+    """One training; what is the same for all of its steps, and the record of how it went."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        options: TrainOptions,
+        found: Survey,
+        checkpoint: Path | None,
+        progress: Callable[[Progress], None] | None,
+        previews: Path | None,
+    ):
+        self.capture, self.options, self.found = capture, options, found
+        self.checkpoint, self.progress, self.previews = checkpoint, progress, previews
+        self.history: list[Progress] = []
+        self.key = jax.random.key(options.seed)
+        held = capture.split("test") or capture.split("train")
+        few = [held[i] for i in np.unique(np.linspace(0, len(held) - 1, 6).round().astype(int))]
+        self.checked = [view.resized(max(1, min(view.image.shape[:2]) // 96)) for view in few]
+        self.switch = options.iterations // 3
+        self.step = make_step(options, lit=capture.is_lit)
+        self.middle = 0.5 * (found.box.origin + found.box.upper)
+        self.pixel = pixel_at(capture.split("train"), self.middle)
+
+    def sharpness(self, iteration: int, first: float) -> float:
+        """Of the surface [1/m] at a step: geometric from the first blur to the last."""
+        last = self.options.blur[1]
+        share = min(1.0, iteration / (_SHARP * self.options.iterations))
+        return 1 / (max(self.pixel, 0.5 * self.found.box.spacing) * first * (last / first) ** share)
+
+    def box(self, iteration: int) -> Box:
+        """The grid of a step: coarse first."""
+        fine = self.found.box
+        if iteration >= self.switch:
+            return fine
+        return Box.around(fine.origin, fine.upper, max(16, 2 * self.options.resolution // 3))
+
+    def fresh(self, start: np.ndarray, blur: float) -> _State:
+        """A surface at signed distances [m] on the survey's box, grey all over and blurred [pixels]."""
+        views, box = self.capture.split("train"), self.box(0)
+        lit = self.capture.is_lit
+        look = Appearance.create(
+            box,
+            lit=lit,
+            near_light=lit and views[0].light_is_near,
+            n_features=self.options.features,
+            resolution=max(8, 2 * self.options.resolution // 3),
+            key=jax.random.fold_in(self.key, 1),
+        )
+        model = SurfaceModel.create(resampled(start, self.found.box, box), box, look)
+        cameras = Adjustment.create(views, self.middle)
+        return self._begun(Learned(model, cameras), 0, jnp.float32(blur))
+
+    def _begun(self, learned: Learned, iteration: int, blur: Float[Array, ""]) -> _State:
+        optimiser = optimiser_of(self.options, lit=self.capture.is_lit)
+        return _State(learned, optimiser.init(learned.parts), iteration, blur)
+
+    def refined(self, state: _State) -> _State:
+        """The state on the fine grid; the optimiser's memory starts anew."""
+        coarse, fine = state.model.box, self.found.box
+        distances = resampled(state.model.distances, coarse, fine)
+        model = SurfaceModel.create(distances, fine, state.model.appearance)
+        return self._begun(Learned(model, state.learned.cameras), state.iteration, state.blur)
+
+    def started(self) -> _State:
+        """The visual hull, or the hull without the cavities that a fog finds if that explains more."""
+        hull = self.fresh(self.found.hull, self.options.blur[0])
+        if not self.options.cavities:
+            return hull
+        found = find_cavities(
+            self.capture.split("train"),
+            self.found.hull,
+            self.found.box,
+            lit=self.capture.is_lit,
+            key=jax.random.fold_in(self.key, 0),
+            n_steps=min(STEPS, max(1, self.options.iterations // 2)),
+            progress=self._searched,
+        )
+        worth = [each for each in found if each.share > _WORTH_TRYING]
+        if not worth:
+            return hull
+        # Blur helps to find the way from a hull; a start that is close already would be filled up by it.
+        sharp = min(_CLOSE, self.options.blur[0])
+        rays = self._rays(0)
+        without, *starts = (
+            self.fresh(distance, sharp) for distance in (self.found.hull, *(each.distance for each in worth))
+        )
+        error = self._trial(without, rays)
+        errors = [self._trial(start, rays) for start in starts]
+        return starts[int(np.argmin(errors))] if min(errors) < error else hull
+
+    def _searched(self) -> None:
+        if self.progress is not None:
+            self.progress(_nothing_yet(0, self.options.iterations))
+
+    def _trial(self, state: _State, rays: RaySet) -> float:
+        """Mean loss of the last of a few steps: translucency deceives a fog, but not a surface."""
+        losses = []
+        for _ in range(max(1, min(_TRIAL, self.switch))):
+            state, loss = self.advanced(state, rays)
+            losses.append(loss)
+        return float(np.mean(losses[-max(1, len(losses) // 4) :]))
+
+    def advanced(self, state: _State, rays: RaySet) -> tuple[_State, float]:
+        """One step, and the loss before it."""
+        i, options = state.iteration, self.options
+        learned, optimiser, error = self.step(
+            state.learned,
+            state.optimiser,
+            rays,
+            jnp.float32(self.sharpness(i, float(state.blur))),
+            jnp.float32(0.1 ** (i / options.iterations)),
+            # First without highlights: what moves with the viewer must be explained by shape.
+            jnp.float32(i >= self.switch),
+            jnp.float32(max(0.0, 1 - i / (_COHERENT * options.iterations))),
+            jax.random.fold_in(self.key, 2 + i),
+        )
+        if i < _STILL * options.iterations and not options.cameras:
+            learned = learned.moved_to(state.model.distance)
+        return _State(learned, optimiser, i + 1, state.blur), float(error)
+
+    def run(self, state: _State | None) -> tuple[_State, Stopped]:
+        """All steps, or as many as it takes."""
+        state = self.started() if state is None else state
+        good, best, best_score = state, state, -np.inf
+        rays, spent, stopped = self._rays(state.iteration), 0.0, "finished"
+        options, since = self.options, time.perf_counter()
+        try:
+            while state.iteration < options.iterations:
+                if state.iteration == self.switch and state.model.distance.shape != self.found.box.shape:
+                    state = self.refined(state)
+                    rays = self._rays(state.iteration)
+                begin = time.perf_counter()
+                state, loss = self.advanced(state, rays)
+                if not np.isfinite(loss):
+                    return good, "diverged"
+                took = time.perf_counter() - begin
+                spent, speed = spent + took, options.batch / took
+                if state.iteration % options.check_every == 0 or state.iteration == options.iterations:
+                    entry = self._checked(state, spent, speed, loss)
+                    good = state
+                    self._save(state)
+                    merit = (entry.mask_iou or 0.0) + 0.002 * (entry.psnr or 0.0)
+                    if merit > best_score:
+                        best, best_score = state, merit
+                    if reason := reason_to_stop(self.history, self.found.residual):
+                        stopped = reason
+                        break
+                elif self.progress is not None and state.iteration % 5 == 0:
+                    last = self.history[-1] if self.history else _nothing_yet(0, options.iterations)
+                    now = {"iteration": state.iteration, "seconds": spent, "loss": loss}
+                    self.progress(last._replace(**now, rays_per_second=speed))
+                if options.seconds is not None and time.perf_counter() - since > options.seconds:
+                    stopped = "time"
+                    break
+        except KeyboardInterrupt:
+            self._save(state)
+            raise
+        return (best if stopped == "geometry" else state), stopped
+
+    def with_corrected_cameras(self, state: _State) -> Capture:
+        """The photographs, those held out corrected by what all cameras have in common."""
+        train, cameras = self.capture.split("train"), state.learned.cameras
+        other = [view for view in self.capture.views if view.split != "train"]
+        return Capture((*cameras.corrected(train), *cameras.corrected_lens(other)), self.capture.source)
+
+    def _rays(self, iteration: int) -> RaySet:
+        """Rays that may meet the hull: the same whenever training is resumed."""
+        box = self.box(iteration)
+        hull = resampled(self.found.hull, self.found.box, box)
+        # Wide enough that the surface can move outwards by as much as its blur.
+        return collect(self.capture.split("train"), box, hull < max(3 * box.spacing, 2 * self.pixel))
+
+    def _checked(self, state: _State, spent: float, speed: float, loss: float) -> Progress:
+        """Look at a few held-out views and at the solid."""
+        sharpness = self.sharpness(state.iteration, float(state.blur))
+        model, rows, pairs = state.model, [], []
+        occupied = model.distances < 3 * model.box.spacing
+        for view in state.learned.cameras.corrected_lens(self.checked):
+            light = view.light if model.appearance.lit else None
+            drawn = picture(model, view.camera, light, model.box, occupied, sharpness)
+            assert view.mask is not None
+            pairs.append((view.over(view.backdrop), drawn.over(view.backdrop)))
+            rows.append((psnr(pairs[-1][1], pairs[-1][0]), mask_iou(drawn.opacity, view.mask)))
+        if self.previews is not None:
+            write_preview(self.previews / f"{state.iteration:06d}.png", pairs)
+        quality, overlap = np.mean(rows, axis=0)
+        entry = Progress(
+            state.iteration,
+            self.options.iterations,
+            spent,
+            speed,
+            loss,
+            float(quality),
+            float(overlap),
+            volume(model.distances, model.box),
+        )
+        self.history.append(entry)
+        if self.progress is not None:
+            self.progress(entry)
+        return entry
+
+    def _save(self, state: _State) -> None:
+        if self.checkpoint is not None:
+            rows = [[np.nan if x is None else float(x) for x in entry] for entry in self.history]
+            name = _checkpoint.name_of(self.options, self.capture)
+            _checkpoint.save(
+                self.checkpoint, name, state.iteration, (state.learned, state.optimiser, state.blur), rows
+            )
+
+    def resumed(self) -> _State | None:
+        """The state in the checkpoint; None if there is no checkpoint.
+
+        Raises:
+            ValueError: If it is of another training, or damaged.
+        """
+        if self.checkpoint is None or not self.checkpoint.exists():
+            return None
+        stored = _checkpoint.load(self.checkpoint, _checkpoint.name_of(self.options, self.capture))
+        state = self.fresh(self.found.hull, self.options.blur[0])
+        if stored.iteration > self.switch or len(stored.leaves[0]) != len(state.model.distance):
+            state = self.refined(state)
+        learned, optimiser, blur = stored.filled((state.learned, state.optimiser, state.blur))
+        self.history = [
+            Progress(int(row[0]), int(row[1]), *(float(x) for x in row[2:])) for row in stored.history
+        ]
+        return _State(learned, optimiser, stored.iteration, blur)
+
+
+def reason_to_stop(history: Sequence[Progress], residual: float) -> Stopped | None:
+    """Whether the outlines of held-out views have become worse, or nothing changes any more.
+
+    Args:
+        history: All looks at held-out views.
+        residual: Share of the silhouettes that no solid explains (see `Survey`).
+    """
+    if len(history) < 4 or history[-1].iteration < _SHARP * history[-1].iterations:
+        # Until then the surface is still being made sharp.
+        return None
+    overlap = [entry.mask_iou or 0.0 for entry in history]
+    # Brighter pictures with worse outlines: training has begun to eat into the solid. Outlines that do not
+    # agree with one another cannot tell that any more exactly.
+    if max(overlap[:-2]) - max(overlap[-2:]) > max(0.004, 0.5 * residual):
+        return "geometry"
+    quality = [entry.psnr or 0.0 for entry in history]
+    volumes = [entry.volume for entry in history[-3:]]
+    settled = max(volumes) - min(volumes) < 5e-4 * volumes[-1]
+    return "converged" if settled and max(quality[-2:]) < max(quality[:-2]) + 0.03 else None
+
+
+def pixel_at(views: Sequence[View], point: Float[np.ndarray, "3"]) -> float:
+    """Width of a pixel [m] at a point [m, W], median over views."""
+    ranges = [np.linalg.norm(view.camera.position - point) for view in views]
+    return float(np.median(np.multiply([view.camera.pixel_angle for view in views], ranges)))
+
+
+def _shrunk(capture: Capture, options: TrainOptions) -> Capture:
+    """Photographs whose pixels are about as large as the cells of the finest grid, if they are smaller."""
+    views = capture.split("train")
+    if not capture.has_masks:
+        return capture
+    lower, upper = object_box(views)
+    cell = float((upper - lower).max()) / options.resolution
+    factor = max(1, round(cell / pixel_at(views, 0.5 * (lower + upper))))
+    return (
+        Capture([view.resized(factor) for view in capture.views], capture.source) if factor > 1 else capture
+    )
+
+
+def _nothing_yet(iteration: int, iterations: int) -> Progress:
+    return Progress(iteration, iterations, 0.0, 0.0, float("nan"), None, None, float("nan"))
+
+
+def volume(distances: Float[np.ndarray, "nx ny nz"], box: Box) -> float:
+    """Volume [m³] of {d < 0}, nodes near the surface counted in part."""
+    return float(np.sum(np.clip(0.5 - distances / box.spacing, 0, 1)) * box.spacing**3)

@@ -1,0 +1,65 @@
+"""What import-linter does not say: a module whose name begins with _ is known to its own package only."""
+
+import ast
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).resolve().parents[1] / "src"
+MODULES = sorted((SOURCE / "dano").rglob("*.py"))
+
+
+def private_imports(package: str, program: str) -> list[str]:
+    """Names with a leading _ that a module of `package` (such as "dano.vision.capture") takes from others."""
+    found = []
+    for statement in ast.walk(ast.parse(program)):
+        if isinstance(statement, ast.ImportFrom):
+            names = [f"{statement.module}.{alias.name}" for alias in statement.names]
+        elif isinstance(statement, ast.Import):
+            names = [alias.name for alias in statement.names]
+        else:
+            continue
+        found += [name for name in names if not _may_know(package, name)]
+    return found
+
+
+def _may_know(package: str, name: str) -> bool:
+    parts = name.split(".")
+    private = [i for i, part in enumerate(parts) if part.startswith("_") and not part.startswith("__")]
+    if parts[0] != "dano" or not private:
+        return True
+    owner = ".".join(parts[: private[0]])
+    return f"{package}.".startswith(f"{owner}.")
+
+
+@pytest.mark.parametrize(
+    ("program", "private"),
+    [
+        ("from dano.fields import GridField", False),
+        ("from dano import __version__", False),
+        ("from dano.vision.capture._hull import Box", False),  # its own
+        ("from dano.vision._shared import x", False),  # of a package around it
+        ("from jax._src import core", False),  # for others to judge
+        ("from dano.vision.radiance._models import see", True),
+        ("from dano.vision.radiance import _models", True),
+        ("import dano.fields._grid", True),
+        ("def f():\n    from dano.fields._grid import GridField", True),
+    ],
+)
+def test_a_private_import_is_found(program: str, private: bool):
+    assert bool(private_imports("dano.vision.capture", program)) is private
+
+
+def test_no_module_imports_what_is_private_to_another_package():
+    found = {}
+    for module in MODULES:
+        package = ".".join(module.relative_to(SOURCE).parts[:-1])
+        if names := private_imports(package, module.read_text(encoding="utf-8")):
+            found[str(module.relative_to(SOURCE))] = names
+    assert found == {}
+
+
+def test_a_folder_can_be_taken_in_at_a_glance():
+    sizes = Counter(str(module.parent.relative_to(SOURCE)) for module in MODULES)
+    assert {folder: size for folder, size in sizes.items() if size > 15} == {}  # 14 and __init__.py
