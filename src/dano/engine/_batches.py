@@ -334,8 +334,8 @@ def _say_unconverged(of_rollouts: Array | np.ndarray) -> None:
     if len(failed):
         warnings.warn(
             f"{len(failed)} of {len(first)} rollouts have steps that did not converge, first rollout "
-            f"{failed[0]} at step {first[failed[0]]}; try a smaller timestep, or where many points touch a larger "
-            "VariationalEngine(capacity=…); with CentroidLaw a smaller damper or smoothing",
+            f"{failed[0]} at step {first[failed[0]]}; try a smaller timestep, or where many points touch a "
+            "larger VariationalEngine(capacity=…); with CentroidLaw a smaller damper or smoothing",
             RuntimeWarning,
             stacklevel=3,
         )

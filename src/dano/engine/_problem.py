@@ -228,7 +228,9 @@ def _points(scene: Scene, prepared: Prepared, state: State):
         return None, None, None
     links, h = links_of(scene, state, scene.timestep), scene.timestep
     fixed = jax.lax.stop_gradient((prepared.geometry, links, prepared.impacts, h))
-    points, found = one_at_a_time(lambda *found_by: find(*found_by, prepared.capacity), *fixed)
+    points, found = one_at_a_time(
+        lambda geometry, links, impacts, h: find(geometry, links, impacts, h, prepared.capacity), *fixed
+    )
     found = jax.tree.map(lambda x: checkpoint_name(x, KEPT), found)
     numbers, whole = eqx.partition(points, eqx.is_inexact_array)
     points = eqx.combine(_listed(prepared.geometry, links, h, found, numbers), whole)

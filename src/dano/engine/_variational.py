@@ -153,7 +153,12 @@ def _solve(problem: Problem, found: Found | None, start, pairs: Pairs, options: 
 
     def find_root(problem, found, start):
         if problem.points is not None:
-            return one_at_a_time(lambda *given: _solve_points(*given, pairs, options), problem, found, start)
+            return one_at_a_time(
+                lambda problem, found, start: _solve_points(problem, found, start, pairs, options),
+                problem,
+                found,
+                start,
+            )
 
         def evaluate(point, softening):
             velocities = point.reshape(start.shape)
