@@ -12,7 +12,7 @@ PYTEST_ARGS = --numprocesses 2 --dist loadfile
 INSTALL = $(BIN)/python -m pip install --constraint constraints.txt
 PACKAGE := pyproject.toml constraints.txt
 
-.PHONY: help demo test check format docs clean
+.PHONY: help demo test check format docs bench-check clean
 
 help:
 	@echo "make demo     install dano and show a first simulation"
@@ -20,6 +20,7 @@ help:
 	@echo "make check    lint, format check, import layers, types"
 	@echo "make format   apply the formatter and the safe lint fixes"
 	@echo "make docs     build the documentation into site/"
+	@echo "make bench-check   which stored accuracies miss their targets, which tables are out of date"
 	@echo "make clean    remove .venv, caches and build products"
 
 demo: $(VENV)/.demo
@@ -40,6 +41,10 @@ format: $(VENV)/.dev
 
 docs: $(VENV)/.docs
 	$(BIN)/mkdocs build --strict
+
+bench-check: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.figures --check
+	$(BIN)/python -m benchmarks.check
 
 clean:
 	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache .import_linter_cache .hypothesis

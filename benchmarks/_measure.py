@@ -47,13 +47,13 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """`pass`, `short`, `skipped`, or nothing where there is no target."""
+        """`pass`, `misses target`, `skipped`, or nothing where there is no target."""
         if self.value is None:
             return "skipped"
         if self.target is None:
             return ""
         reached = self.value >= self.target if self.at_least else self.value <= self.target
-        return "pass" if reached else "short"
+        return "pass" if reached else "misses target"
 
 
 def skipped(group: str, name: str, reason: str) -> Row:
@@ -140,7 +140,7 @@ def report(
         "rows": [{**asdict(row), "verdict": row.verdict} for row in rows],
     }
     _print_table(rows)
-    counts = {word: sum(row.verdict == word for row in rows) for word in ("pass", "short", "skipped")}
+    counts = {word: sum(row.verdict == word for row in rows) for word in ("pass", "misses target", "skipped")}
     print("\n" + ", ".join(f"{n} {word}" for word, n in counts.items()) + f"   {result['machine']}")
     print(f"load average {result['load']}   {settings}")
     if file is not None:
@@ -162,7 +162,7 @@ def _print_table(rows: Sequence[Row]) -> None:
             print(f"\n{group}\n{'-' * len(group)}")
         value = "" if row.value is None else f"{row.value:.3g}"
         target = "" if row.target is None else f"{'≥' if row.at_least else '≤'} {row.target:g}"
-        line = f"{row.name:{width}}  {value:>9} {row.unit:8} {target:>8}  {row.verdict:7} {row.note}"
+        line = f"{row.name:{width}}  {value:>9} {row.unit:8} {target:>8}  {row.verdict:13} {row.note}"
         print(line.rstrip())
 
 
