@@ -30,6 +30,7 @@ from dano.contact._geometry import (
     Kind,
     Links,
     meeting,
+    Mixture,
     near_pairs,
     place,
     Side,
@@ -99,14 +100,14 @@ def find(
         jnp.zeros(room, dtype),
         jnp.zeros((), int),
     )
-    for number, kind in enumerate(geometry.kinds):
-        near = near_pairs(geometry, kind, links, h)
-        (active,) = jnp.nonzero(near, size=near.shape[0], fill_value=0)
+    pairs = geometry.mixture
+    near = jnp.concatenate([near_pairs(geometry, kind, links, h) for kind in geometry.kinds])
+    (active,) = jnp.nonzero(near, size=near.shape[0], fill_value=0)
 
-        def visit(k, carry, kind=kind, active=active, number=number):
-            return _visit(geometry, kind, number, active[k], links, impacts, h, carry)
+    def visit(k, carry):
+        return _visit(geometry, pairs, active[k], links, impacts, h, carry)
 
-        found = jax.lax.fori_loop(0, jnp.sum(near), visit, found)
+    found = jax.lax.fori_loop(0, jnp.sum(near), visit, found)
     rows = found.rows.reshape(12, room, CHUNK)
     where = Found(
         found.sample.reshape(room, CHUNK),
@@ -121,11 +122,11 @@ def find(
     return _assembled(geometry, links, where, rows), where
 
 
-def _visit(
-    geometry: Geometry, kind: Kind, number: int, index, links: Links, impacts: Impacts, h, carry: _List
-):
+def _visit(geometry: Geometry, kind: Mixture, index, links: Links, impacts: Impacts, h, carry: _List):
     """Add the points of one pair."""
     side = Side(*(x[index] for x in kind.sides))
+    before_kind = np.cumsum([0] + [each.sides.first.shape[0] for each in kind.kinds])[:-1]
+    place_in_kind = index - jnp.asarray(before_kind)[side.kind]
     share = meeting(geometry, kind, links, side, h)
     placed = place(geometry, kind, links, side, share, h)
     speed = jnp.sqrt(jnp.sum(placed.velocity**2))
@@ -158,8 +159,8 @@ def _visit(
         carry = carry._replace(
             rows=write(carry.rows, kept, at * CHUNK, axis=1),
             sample=write(carry.sample, names, at * CHUNK, axis=0),
-            group=write(carry.group, jnp.full(_CHUNKS, number), at, axis=0),
-            side=write(carry.side, jnp.full(_CHUNKS, index), at, axis=0),
+            group=write(carry.group, jnp.broadcast_to(side.kind, (_CHUNKS,)), at, axis=0),
+            side=write(carry.side, jnp.broadcast_to(place_in_kind, (_CHUNKS,)), at, axis=0),
             share=write(carry.share, jnp.broadcast_to(share, (_CHUNKS,)), at, axis=0),
             used=at + -(-n // CHUNK),
         )
@@ -175,11 +176,11 @@ def _visit(
 
 
 def _rows(
-    kind: Kind, turning, side: Side, placed, found: Float[Array, "6 n"], share, h
+    kind: Kind | Mixture, turning, side: Side, placed, found: Float[Array, "6 n"], share, h
 ) -> Float[Array, "12 n"]:
     """Arm [m, W], normal [W], moment [m, W], depth [m], rate [m/s] and area [m²] of samples: see `Points`."""
     x = matmul(placed.points[:, :3], found[:3]) + placed.points[:, 3:]
-    distance, gradient = kind.solid(side.member).sdf_jet(x, 1)
+    distance, gradient = kind.sdf_jet(side, x, 1)
     normal = unit(gradient)
     vectors = matmul(placed.vectors, found[3:])
     area = jnp.maximum(-dot(vectors, normal), 0)
@@ -191,7 +192,7 @@ def _rows(
     return jnp.concatenate([*turned, jnp.stack([depth, rate, side.share * area])])
 
 
-def _moment(kind: Kind, turning, placed, arm: Float[Array, "3 n"], normal: Float[Array, "3 n"]):
+def _moment(kind: Kind | Mixture, turning, placed, arm: Float[Array, "3 n"], normal: Float[Array, "3 n"]):
     """Moment of a unit pressure at each point.
 
     The surface of a ball that turns does not move. Samples that keep facing the other body feel what the
@@ -261,13 +262,17 @@ def points_of(geometry: Geometry, links: Links, where: Found, h: Float[Array, ""
     return _assembled(geometry, links, where, rows)
 
 
+def _names(side: Side):
+    return side.first, side.second, side.contact
+
+
 def _assembled(geometry: Geometry, links: Links, where: Found, rows: Float[Array, "12 c p"]) -> Points:
     sides = [
-        jnp.stack([x[jnp.where(where.group == number, where.side, 0)] for x in kind.sides[:4]])
+        jnp.stack([x[jnp.where(where.group == number, where.side, 0)] for x in _names(kind.sides)])
         for number, kind in enumerate(geometry.kinds)
     ]
     chosen = where.group[None] == jnp.arange(len(sides))[:, None]
-    first, second, _, contact = jnp.sum(jnp.where(chosen[:, None], jnp.stack(sides), 0), axis=0)
+    first, second, contact = jnp.sum(jnp.where(chosen[:, None], jnp.stack(sides), 0), axis=0)
     between = (links.position[first] - links.position[second]).T
     return Points(
         rows[:3],

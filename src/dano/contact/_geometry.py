@@ -1,8 +1,8 @@
 """What contact needs to know of all bodies, laid out so that code grows with their kinds, not their number.
 
 Surface samples of all bodies stand in one table of blocks. Solids are grouped by kind (the same class, the
-same array shapes); those of a kind are stacked, and all pairs whose second body is of that kind go through
-the same code. Sixty boxes compile like one.
+same array shapes), and those of a kind are stacked. All pairs go through the same code; only the distance to
+a solid is a branch for each kind. Sixty boxes compile like one, and another kind adds its distance.
 """
 
 from collections.abc import Sequence
@@ -32,6 +32,8 @@ _SINK = 0.01
 _THIN = 0.25
 # That moment is rounded down to such a fraction of a step.
 _SHARES = 32
+# Up to so many blocks the moment of meeting is found from samples, beyond from the centres of blocks.
+_FEW_BLOCKS = 16
 # Steps of the search for the moment when bodies meet.
 _ADVANCES = 12
 
@@ -90,7 +92,8 @@ class Side(NamedTuple):
     Attributes:
         first: Index of the sampled body.
         second: Index of the queried body.
-        member: Index of the second body's solid among those of its kind.
+        kind: Index of the kind of the second body's solid.
+        member: Index of that solid among those of its kind.
         contact: Index into the scene's contacts.
         share: Share of the contact's stiffness that this side carries.
         follows: 1 where points follow the second body, which rolls on the first, else 0.
@@ -100,6 +103,7 @@ class Side(NamedTuple):
 
     first: Any
     second: Any
+    kind: Any
     member: Any
     contact: Any
     share: Any
@@ -116,6 +120,7 @@ class Kind(eqx.Module):
         sides: The pairs, arrays of shape (s,).
         several: Whether leaves are stacked (static).
         widest: Most blocks of samples that a first body of these pairs has (static).
+        probes: Most probes that a first body of these pairs has (static).
         turns: Which ways of turning occur among the first bodies (static).
     """
 
@@ -123,13 +128,45 @@ class Kind(eqx.Module):
     sides: Side
     several: bool = eqx.field(static=True)
     widest: int = eqx.field(static=True)
+    probes: int = eqx.field(static=True)
     turns: tuple[int, ...] = eqx.field(static=True)
 
-    def solid(self, member) -> AbstractShape:
-        """One of the solids."""
-        if not self.several:
-            return self.solids
-        return jax.tree.map(lambda leaf: leaf[member], self.solids)
+    def sdf_jet(self, side: Side, x: Float[Array, "3 n"], order: int):
+        """Distance to the solid of a side, with order 1 its gradient, too: see `AbstractShape.sdf_jet`."""
+        solid = jax.tree.map(lambda leaf: leaf[side.member], self.solids) if self.several else self.solids
+        return solid.sdf_jet(x, order)
+
+
+class Mixture(NamedTuple):
+    """Pairs of several kinds, which all go through the same code up to the distances to their solids.
+
+    Attributes: as of `Kind`.
+    """
+
+    kinds: tuple[Kind, ...]
+    sides: Side
+
+    @property
+    def widest(self) -> int:
+        """Most blocks."""
+        return max(kind.widest for kind in self.kinds)
+
+    @property
+    def probes(self) -> int:
+        """Most probes."""
+        return max(kind.probes for kind in self.kinds)
+
+    @property
+    def turns(self) -> tuple[int, ...]:
+        """Ways of turning."""
+        return tuple(sorted({turn for kind in self.kinds for turn in kind.turns}))
+
+    def sdf_jet(self, side: Side, x: Float[Array, "3 n"], order: int):
+        """See `Kind.sdf_jet`."""
+        if len(self.kinds) == 1:
+            return self.kinds[0].sdf_jet(side, x, order)
+        branches = [lambda x, kind=kind: kind.sdf_jet(side, x, order) for kind in self.kinds]
+        return jax.lax.switch(side.kind, branches, x)
 
 
 class Geometry(eqx.Module):
@@ -141,6 +178,9 @@ class Geometry(eqx.Module):
         radii: Of these balls [m], shape (b,).
         start: First block of each body, shape (n,).
         blocks_of: How many blocks each body has, shape (n,).
+        probes: Points of all bodies that say how deep they are, coarsely if there are many samples [m, F].
+        probe_start: First probe of each body.
+        probes_of: How many probes each body has.
         scale: See `Part`, shape (n, 3).
         turning: See `TURNING`, shape (n,).
         middle: See `Part`, shape (n, 3).
@@ -153,11 +193,20 @@ class Geometry(eqx.Module):
     radii: Float[Array, " b"]
     start: Int[Array, " n"]
     blocks_of: Int[Array, " n"]
+    probes: Float[Array, "3 k"]
+    probe_start: Int[Array, " n"]
+    probes_of: Int[Array, " n"]
     scale: Float[Array, "n 3"]
     turning: Int[Array, " n"]
     middle: Float[Array, "n 3"]
     radius: Float[Array, " n"]
     kinds: tuple[Kind, ...]
+
+    @property
+    def mixture(self) -> Mixture:
+        """All pairs, those of the first kind first."""
+        sides = jax.tree.map(lambda *x: jnp.concatenate(x), *(kind.sides for kind in self.kinds))
+        return Mixture(self.kinds, sides)
 
 
 def gather_geometry(
@@ -176,15 +225,17 @@ def gather_geometry(
     """
     empty = SurfaceSet.none(dtype)
     sets = [part.surface if part.surface is not None else empty for part in parts]
-    first_of: dict[int, int] = {}
-    tables, start, blocks = [], [], 0
+    first_of: dict[int, tuple[int, int]] = {}
+    tables, probes, start, blocks, points = [], [], [], 0, 0
     for part, each in zip(parts, sets, strict=True):
         if part.twin not in first_of:
-            first_of[part.twin] = blocks
+            first_of[part.twin] = blocks, points
             tables.append(each)
-            blocks += each.radii.shape[0]
+            probes.append(_probes_of(each))
+            blocks, points = blocks + each.radii.shape[0], points + probes[-1].shape[1]
         start.append(first_of[part.twin])
-    # Reading a body's blocks takes as many rows as the widest body has.
+    # Reading a body's blocks, or probes, takes as many as the widest body has.
+    probes.append(jnp.zeros((3, max((each.shape[1] for each in probes), default=0)), dtype))
     tables.append(SurfaceSet.none(dtype, max((each.radii.shape[0] for each in sets), default=0)))
     rows = [
         jnp.concatenate([t.points[:3], t.vectors]).reshape(6, -1, BLOCK).transpose(1, 0, 2) for t in tables
@@ -193,8 +244,11 @@ def gather_geometry(
         jnp.concatenate(rows).astype(dtype),
         jnp.concatenate([t.centers for t in tables]).astype(dtype),
         jnp.concatenate([t.radii for t in tables]).astype(dtype),
-        jnp.asarray(start),
+        jnp.asarray([block for block, _ in start]),
         jnp.asarray([each.radii.shape[0] for each in sets]),
+        jnp.concatenate(probes, axis=1).astype(dtype),
+        jnp.asarray([probe for _, probe in start]),
+        jnp.asarray([_probes_of(each).shape[1] for each in sets]),
         jnp.stack([part.scale for part in parts]).astype(dtype),
         jnp.asarray([TURNING[each.turning] for each in sets]),
         jnp.stack([part.middle for part in parts]).astype(dtype),
@@ -203,13 +257,18 @@ def gather_geometry(
     )
 
 
+def _probes_of(surface: SurfaceSet) -> Float[Array, "3 k"]:
+    """Its samples, or where they are many the centres of their blocks."""
+    return surface.points[:3] if surface.radii.shape[0] <= _FEW_BLOCKS else surface.centers.T
+
+
 def _kinds(parts, sets, pairs, gravity_step, dtype):
     """Pairs grouped by the kind of the second body's solid."""
     both = {(first, second) for first, second, _ in pairs}
     groups: dict[Any, list[tuple[int, int, int]]] = {}
     for pair in pairs:
         groups.setdefault(_kind(parts[pair[1]].solid), []).append(pair)
-    for members in groups.values():
+    for number, members in enumerate(groups.values()):
         # A solid that several bodies share stands once.
         unique: dict[int, int] = {}
         solids, member = [], []
@@ -230,6 +289,7 @@ def _kinds(parts, sets, pairs, gravity_step, dtype):
             Side(
                 jnp.asarray(first),
                 jnp.asarray(second),
+                jnp.full(len(members), number),
                 jnp.asarray(member),
                 jnp.asarray(contact),
                 jnp.asarray([0.5 if (j, i) in both else 1.0 for i, j, _ in members], dtype),
@@ -239,6 +299,7 @@ def _kinds(parts, sets, pairs, gravity_step, dtype):
             ),
             several,
             max(sets[i].radii.shape[0] for i in first),
+            max(_probes_of(sets[i]).shape[1] for i in first),
             tuple(sorted({TURNING[sets[i].turning] for i in first})),
         )
 
@@ -278,7 +339,7 @@ class Placed(NamedTuple):
     stretch: Float[Array, ""]
 
 
-def place(geometry: Geometry, kind: Kind, links: Links, side: Side, share, h) -> Placed:
+def place(geometry: Geometry, kind: Kind | Mixture, links: Links, side: Side, share, h) -> Placed:
     """The pair of bodies of a side after a share of a step of length h at the old velocities."""
     i, j = side.first, side.second
     x_i, r_i = _moved(links, i, share, h)
@@ -312,7 +373,7 @@ def _moved(links: Links, i, share, h):
     return links.position[i] + share * h * links.velocity[i], quat_to_matrix(q)
 
 
-def _aligned(geometry: Geometry, kind: Kind, side: Side, turn, origin):
+def _aligned(geometry: Geometry, kind: Kind | Mixture, side: Side, turn, origin):
     """Maps of sample coordinates and vector areas into solid axes, with samples that face the solid.
 
     A ball looks the same from all sides, a cylinder from all around: samples that keep facing the other body
@@ -325,10 +386,9 @@ def _aligned(geometry: Geometry, kind: Kind, side: Side, turn, origin):
         return turn, turn, one
     i = side.first
     turning, scale = geometry.turning[i], geometry.scale[i]
-    solid = kind.solid(side.member)
 
     def facing(point):
-        _, gradient = solid.sdf_jet(point[:, None], 1)
+        _, gradient = kind.sdf_jet(side, point[:, None], 1)
         return _direction(-matvec(turn.T, gradient[:, 0]))
 
     toward = facing(origin)
@@ -387,36 +447,30 @@ def unit(gradient: Float[Array, "3 *n"]) -> Float[Array, "3 *n"]:
     return gradient / jnp.sqrt(jnp.maximum(jnp.sum(gradient * gradient, axis=0), 1e-12))[None]
 
 
-def block_clearance(geometry: Geometry, kind: Kind, side: Side, placed: Placed) -> Float[Array, " k"]:
+def block_clearance(
+    geometry: Geometry, kind: Kind | Mixture, side: Side, placed: Placed
+) -> Float[Array, " k"]:
     """Lower bound on the distance [m] of each block of the first body from the solid."""
     start = geometry.start[side.first]
     centers = jax.lax.dynamic_slice_in_dim(geometry.centers, start, kind.widest)
     radii = jax.lax.dynamic_slice_in_dim(geometry.radii, start, kind.widest)
     x = matmul(placed.points[:, :3], centers.T) + placed.points[:, 3:]
-    distance = kind.solid(side.member).sdf_jet(x, 0) - radii * placed.stretch
+    distance = kind.sdf_jet(side, x, 0) - radii * placed.stretch
     return jnp.where(np.arange(kind.widest) < geometry.blocks_of[side.first], distance, jnp.inf)
 
 
-# Up to so many blocks the moment of meeting is found from samples, beyond from the centres of blocks.
-_FEW_BLOCKS = 16
-
-
-def _probes(geometry: Geometry, kind: Kind, side: Side, placed: Placed):
+def _probed(geometry: Geometry, kind: Kind | Mixture, side: Side, placed: Placed):
     """Points of the first body in the solid frame, and distance and normal of the solid there."""
-    start = geometry.start[side.first]
-    mine = np.arange(kind.widest) < geometry.blocks_of[side.first]
-    if kind.widest <= _FEW_BLOCKS:
-        blocks = jax.lax.dynamic_slice_in_dim(geometry.blocks, start, kind.widest)
-        local = blocks[:, :3].transpose(1, 0, 2).reshape(3, -1)
-        mine = jnp.repeat(mine, BLOCK)
-    else:
-        local = jax.lax.dynamic_slice_in_dim(geometry.centers, start, kind.widest).T
+    local = jax.lax.dynamic_slice_in_dim(
+        geometry.probes, geometry.probe_start[side.first], kind.probes, axis=1
+    )
     x = matmul(placed.points[:, :3], local) + placed.points[:, 3:]
-    distance, gradient = kind.solid(side.member).sdf_jet(x, 1)
+    distance, gradient = kind.sdf_jet(side, x, 1)
+    mine = np.arange(kind.probes) < geometry.probes_of[side.first]
     return x, jnp.where(mine, distance, jnp.inf), unit(gradient)
 
 
-def meeting(geometry: Geometry, kind: Kind, links: Links, side: Side, h) -> Float[Array, ""]:
+def meeting(geometry: Geometry, kind: Kind | Mixture, links: Links, side: Side, h) -> Float[Array, ""]:
     """Share of a step after which the geometry of a pair is taken.
 
     One, the end of the step, unless a body would be driven deeper into the other than `Side.sink` by then: on
@@ -427,7 +481,7 @@ def meeting(geometry: Geometry, kind: Kind, links: Links, side: Side, h) -> Floa
 
     def limit(share):
         placed = place(geometry, kind, links, side, share, h)
-        x, distance, normal = _probes(geometry, kind, side, placed)
+        x, distance, normal = _probed(geometry, kind, side, placed)
         # Samples that keep facing the other body do not turn with theirs.
         spin = jnp.where(geometry.turning[side.first] == FIXED, placed.spin, 0)
         arms = x - placed.com[:, None]
