@@ -278,6 +278,15 @@ def test_interrupt_leaves_nothing(run, scene, tmp_path, monkeypatch):
     assert sorted(tmp_path.iterdir()) == before
 
 
+@pytest.fixture
+def interruptible():
+    """Interrupts raise, also where tests run in the background of a shell, which has them ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_that_was_swallowed_still_ends_the_command(run, scene, tmp_path, monkeypatch):
     def swallowing(*given, **options):
         with contextlib.suppress(KeyboardInterrupt):
@@ -293,6 +302,7 @@ def test_an_interrupt_that_was_swallowed_still_ends_the_command(run, scene, tmp_
     assert run("simulate", scene, "-o", tmp_path / "run.npz", "--steps", 400).code == 0
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_interrupting_the_page_is_an_interrupt(run, scene, tmp_path, monkeypatch):
     out = tmp_path / "run.npz"
     assert run("simulate", scene, "-o", out).code == 0
