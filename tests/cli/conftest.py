@@ -1,5 +1,6 @@
 """A small object, made once by `dano build`, and the command line as a function."""
 
+import signal
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,14 @@ def ellipsoid_values() -> np.ndarray:
     x = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in (18, 16, 14)), indexing="ij"), axis=-1)
     radius = np.linalg.norm(x / np.array([6.0, 5.0, 4.0]), axis=-1)
     return 100 * np.clip(0.5 - 2.5 * (radius - 1), 0, 1)
+
+
+@pytest.fixture
+def interruptible():
+    """Interrupts raise, also where tests run in the background of a shell, which has them ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="session")

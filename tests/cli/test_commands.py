@@ -278,14 +278,6 @@ def test_interrupt_leaves_nothing(run, scene, tmp_path, monkeypatch):
     assert sorted(tmp_path.iterdir()) == before
 
 
-@pytest.fixture
-def interruptible():
-    """Interrupts raise, also where tests run in the background of a shell, which has them ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_that_was_swallowed_still_ends_the_command(run, scene, tmp_path, monkeypatch):
     def swallowing(*given, **options):

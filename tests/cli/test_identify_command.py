@@ -120,6 +120,7 @@ def test_motions_that_cannot_be_used(files, run):
     refused([names, *turned], "(x, y, z, w)")
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupted_search_keeps_its_best_and_says_so(files, run, monkeypatch):
     def search(self, x, *given, **options):
         calls = []
