@@ -68,7 +68,9 @@ def finish(processes: list[subprocess.Popen]) -> list[str]:
 
 def same(found: dict, expected: dict) -> None:
     for name, value in expected.items():
-        np.testing.assert_allclose(found[name], value, rtol=1e-12, atol=1e-12, err_msg=name)
+        # What is left of a solved step is rounding, and another program rounds otherwise.
+        atol = 1e-7 if name == "residual" else 1e-12
+        np.testing.assert_allclose(found[name], value, rtol=1e-12, atol=atol, err_msg=name)
 
 
 def test_equals_single_rollouts(runs: dano.Rollouts, single: list[dano.Trajectory]):
