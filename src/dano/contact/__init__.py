@@ -30,9 +30,9 @@ from dano.contact._overlap import overlap as overlap, Patch as Patch
 from dano.contact._points import (
     CHUNK as CHUNK,
     cross as cross,
-    dot as dot,
     Found as Found,
     Motion as Motion,
+    motion_at as motion_at,
     point_motion as point_motion,
     Points as Points,
 )

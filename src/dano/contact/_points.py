@@ -89,11 +89,29 @@ class Motion(NamedTuple):
 
 def point_motion(velocity: Float[Array, "n 3"], spin: Float[Array, "n 3"], points: Points) -> Motion:
     """Motion of points at the velocities of all bodies, see `relative_twist`."""
-    u, w = relative_twist(velocity, spin, points)
-    u, w = (jnp.broadcast_to(x[:, :, None], points.arm.shape) for x in (u, w))
-    full = u + cross(w, points.arm)
-    slip = full - points.normal * dot(points.normal, full)[None]
-    return Motion(dot(points.normal, u) + dot(points.moment, w), slip)
+    u, w = (x[:, :, None] for x in relative_twist(velocity, spin, points))
+    return motion_at(points.arm, points.normal, points.moment, u, w)
+
+
+def motion_at(
+    arm: Float[Array, "3 *#batch"],
+    normal: Float[Array, "3 *#batch"],
+    moment: Float[Array, "3 *#batch"],
+    u: Float[Array, "3 *#batch"],
+    w: Float[Array, "3 *#batch"],
+) -> Motion:
+    """Motion of points from a relative twist; axes after the first broadcast.
+
+    Args:
+        arm: See `Points`, as are the next two.
+        normal: Unit normals.
+        moment: Moments of a unit pressure.
+        u: Velocity at the first body's centre of mass, relative to the second body [m/s, W].
+        w: Relative spin [rad/s, W].
+    """
+    full = u + cross(w, arm)
+    slip = full - normal * dot(normal, full)[None]
+    return Motion(dot(normal, u) + dot(moment, w), slip)
 
 
 def relative_twist(

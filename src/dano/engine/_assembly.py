@@ -16,13 +16,13 @@ from dano.contact import (
     Constants,
     constants,
     cross,
-    dot,
     Duals,
     first_duals,
     Linear,
     linearized,
     Material,
     Motion,
+    motion_at,
     Points,
     Pressure,
     updated,
@@ -31,9 +31,8 @@ from dano.contact import (
 # Chunks of points that a batch takes together in short lists, and in longer ones: a batch costs some 60
 # operations, however small it is.
 _FEW, _MANY, _SHORT = 4, 16, 64
-# Rows of `Table.numbers` before those of the constants, and in all.
+# Rows of `Table.numbers` before those of the constants.
 _GEOMETRY = 10
-_NUMBERS = _GEOMETRY + len(Constants._fields)
 # Rows of a memory: the duals, their change by the whole step, and the law at the point tried last.
 _DUALS, _LAW = 4, 19
 _MEMORY = 2 * _DUALS + _LAW
@@ -213,9 +212,7 @@ def _motions(numbers, between: Float[Array, "3 c"], a: Float[Array, "6 2 c"], b:
     u = (a[:3] - b[:3] - cross(b[3:], apart))[..., None]
     w = (a[3:] - b[3:])[..., None]
     arm, normal, moment = (numbers[k : k + 3, None] for k in (0, 3, 6))
-    rate = dot(normal, u) + dot(moment, w)
-    full = u + cross(w, arm)
-    slip = full - normal * dot(normal, full)[None]
+    rate, slip = motion_at(arm, normal, moment, u, w)
     return Motion(rate[0], slip[:, 0]), Motion(rate[1], slip[:, 1])
 
 

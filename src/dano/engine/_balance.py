@@ -75,8 +75,7 @@ def whole_residual(velocities: Float[Array, "m 6"], problem: Problem, pairs: Pai
     total = (
         problem.timestep * total.at[rows[points.first]].add(first).at[rows[points.second]].add(second)[:-1]
     )
-    torque = jax.vmap(lambda r, t: matvec(r.T, t))(problem.rotation, total[:, 3:])
-    return residual - to_velocity(problem) * jnp.concatenate([total[:, :3], torque], axis=1).ravel()
+    return residual - to_velocity(problem) * to_body(problem, total).ravel()
 
 
 def contact_wrenches(velocities: Float[Array, "m 6"], problem: Problem, pairs: Pairs, softening: Softening):
@@ -114,6 +113,12 @@ def to_world(problem: Problem, velocities: Float[Array, "m 6"]) -> Float[Array, 
     """Velocities with the spins turned from B into W."""
     spins = jax.vmap(matvec)(problem.rotation, velocities[:, 3:])
     return jnp.concatenate([velocities[:, :3], spins], axis=1)
+
+
+def to_body(problem: Problem, rows: Float[Array, "m 6"]) -> Float[Array, "m 6"]:
+    """Velocities, or wrenches, with the spins or torques turned from W into B."""
+    turned = jax.vmap(lambda r, w: matvec(r.T, w))(problem.rotation, rows[:, 3:])
+    return jnp.concatenate([rows[:, :3], turned], axis=1)
 
 
 def to_velocity(problem: Problem) -> Float[Array, " n"]:

@@ -130,6 +130,7 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
 
 
 def structure_of(scene: Scene) -> Pairs:
+    """Which bodies move, and which of them each contact with a patch law joins."""
     moving = tuple(i for i, body in enumerate(scene.bodies) if not body.fixed)
     position = {scene.bodies[i].name: k for k, i in enumerate(moving)}
     of_contact = tuple(
@@ -144,6 +145,15 @@ def structure_of(scene: Scene) -> Pairs:
 def build_problem(
     scene: Scene, prepared: Prepared, state: State, control: Control | None, pairs: Pairs
 ) -> tuple[Problem, Found | None]:
+    """What a step from a state has to solve, and where its point contacts were found; None without any.
+
+    Args:
+        scene: The scene.
+        prepared: From `prepare`.
+        state: State at the start of the step.
+        control: Forces and torques of the step.
+        pairs: From `structure_of`.
+    """
     rows, h = pairs.moving, scene.timestep
     bodies = [scene.bodies[i] for i in rows]
     rotations = tuple(quat_to_matrix(q) for q in state.orientation)
@@ -184,6 +194,7 @@ def build_problem(
 
 
 def find_patches(scene: Scene, state: State, rotations: tuple[Float[Array, "3 3"], ...]) -> tuple[Patch, ...]:
+    """Overlap of each contact with a patch law; `rotations` turn bodies into the world."""
     items = [
         (c.law, *colliders(scene.bodies, c, state, rotations))
         for c in scene.contacts
@@ -257,6 +268,7 @@ def _(primals, tangents):
 
 
 def links_of(scene: Scene, state: State, h) -> Links:
+    """Where all bodies are and how they move during a step of length h [s]."""
     moves = np.array([not body.fixed for body in scene.bodies])
     rotation = jax.vmap(quat_to_matrix)(state.orientation)
     ahead = jnp.where(moves[:, None], turned(state.orientation, state.omega, h), state.orientation)

@@ -30,6 +30,7 @@ from dano.engine._balance import (
     contact_wrenches,
     momentum_jacobian,
     momentum_residual,
+    to_body,
     to_velocity,
     to_world,
     whole_residual,
@@ -120,9 +121,8 @@ def _volumes(scene: Scene, prepared: Prepared, state: State) -> list[Patch]:
     points, _ = find(prepared.geometry, links, prepared.impacts, scene.timestep, prepared.capacity)
     place = state.position[points.first].T[:, :, None] + points.arm
     volume = points.area * jnp.maximum(points.depth, 0)
-    ends = [(scene.index(c.a), scene.index(c.b)) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
     found = []
-    for k, (a, _) in enumerate(ends):
+    for k, a in enumerate(_first_bodies(scene)):
         mine = (points.contact == k)[:, None]
         share = jnp.where(mine, volume, 0)
         total = jnp.sum(share)
@@ -139,13 +139,17 @@ def _point_wrenches(scene: Scene, problem: Problem, velocities, pairs: Pairs) ->
     if points is None or material is None:
         return []
     wrenches, opposite = chunk_wrenches(problem, velocities, pairs)
-    ends = [(scene.index(c.a), scene.index(c.b)) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
     result = []
-    for k, (a, _) in enumerate(ends):
+    for k, a in enumerate(_first_bodies(scene)):
         direct = ((points.contact == k) & (points.first == a))[:, None]
         reverse = ((points.contact == k) & (points.first != a))[:, None]
         result.append(jnp.sum(jnp.where(direct, wrenches, 0) + jnp.where(reverse, opposite, 0), axis=0))
     return result
+
+
+def _first_bodies(scene: Scene) -> list[int]:
+    """Index of the first body of each contact with a point law."""
+    return [scene.index(c.a) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
 
 
 def _solve(problem: Problem, found: Found | None, start, pairs: Pairs, options: SolverOptions):
@@ -205,7 +209,7 @@ def _solve_points(problem: Problem, found, start: Float[Array, "m 6"], pairs: Pa
     def own(world):
         """Balance of each body alone: residual (m, 6) and jacobian (m, 6, 6)."""
         h = problem.timestep
-        omega = jax.vmap(lambda r, w: matvec(r.T, w))(rotation, world[:, 3:])
+        omega = to_body(problem, world)[:, 3:]
         angular = jax.vmap(angular_momentum, (0, 0, None, None))(omega, problem.inertia, h, 1)
         inertial = jax.vmap(angular_jacobian, (0, 0, None))(omega, problem.inertia, h)
         missing = jax.vmap(matvec)(rotation, angular - problem.impulse[:, 3:])
@@ -220,8 +224,7 @@ def _solve_points(problem: Problem, found, start: Float[Array, "m 6"], pairs: Pa
     def balance(world):
         if not problem.patches:
             return Balance(*own(world), None)
-        omega = jax.vmap(lambda r, w: matvec(r.T, w))(rotation, world[:, 3:])
-        velocities = jnp.concatenate([world[:, :3], omega], axis=1)
+        velocities = to_body(problem, world)
         residual, slopes = momentum_residual(velocities, problem, pairs, Softening())
         jacobian = momentum_jacobian(velocities, problem, pairs, slopes)
         residual = jax.vmap(matvec)(turn, residual.reshape(m, 6) / scale)
@@ -235,9 +238,7 @@ def _solve_points(problem: Problem, found, start: Float[Array, "m 6"], pairs: Pa
     table = tabulate(problem.points, problem.material, found.count, jnp.asarray(pairs.rows), problem.timestep)
     velocities, jacobian, report = primal_dual(balance, table, world, scale, size, options)
     back = jnp.einsum("iba,ibjc,jcd->iajd", turn, jacobian.reshape(m, 6, m, 6), turn).reshape(6 * m, 6 * m)
-    omega = jax.vmap(lambda r, w: matvec(r.T, w))(rotation, velocities[:, 3:])
-    velocities = jnp.concatenate([velocities[:, :3], omega], axis=1)
-    return velocities, scale.ravel()[:, None] * back, report
+    return to_body(problem, velocities), scale.ravel()[:, None] * back, report
 
 
 def _advance(state: State, velocities: Float[Array, "m 6"], h: Float[Array, ""], pairs: Pairs) -> State:
