@@ -83,7 +83,7 @@ def warm_up() -> None:
 def compiled(function: Callable, *args) -> tuple[Callable, float]:
     """A function traced and compiled for these arguments, and the CPU time that this took [s]."""
     start = time.process_time()
-    executable = jax.jit(function).lower(*args).compile()
+    executable = jax.jit(function, compiler_options=dano.compiler_options()).lower(*args).compile()
     return executable, time.process_time() - start
 
 

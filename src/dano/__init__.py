@@ -39,12 +39,15 @@ from dano.scene import (
     Body as Body,
     Contact as Contact,
     Control as Control,
+    Frames as Frames,
+    Joint as Joint,
     Scene as Scene,
     State as State,
     Trajectory as Trajectory,
 )
 from dano.engine import (
     AbstractEngine as AbstractEngine,
+    compiler_options as compiler_options,
     contact_patches as contact_patches,
     contact_wrenches as contact_wrenches,
     linearize as linearize,

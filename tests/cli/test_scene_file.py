@@ -431,3 +431,75 @@ def test_byte_order_mark(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text("n_steps = 1\n" + BODY, encoding="utf-8-sig")
     assert load_scene(path).scene.names == ("ball",)
+
+
+JOINTED = """
+timestep = 0.005
+n_steps = 3
+[[bodies]]
+name = "door"
+shape = "box"
+half_extents = [0.04, 0.01, 0.05]
+mass = 0.2
+q = -0.4
+v = 3.0
+[[bodies]]
+name = "knob"
+shape = "sphere"
+radius = 0.01
+mass = 0.01
+[[bodies]]
+name = "floor"
+shape = "half_space"
+fixed = true
+[[joints]]
+child = "door"
+anchor = [-0.04, 0, 0]
+position = [0, 0, 0.06]
+damping = 0.1
+[[joints]]
+parent = "door"
+child = "knob"
+kind = "weld"
+position = [0.03, 0.02, 0]
+[[controls]]
+body = "door"
+effort = 0.5
+"""
+
+
+def test_joints_of_a_scene_file(tmp_path):
+    """Places, coordinates, efforts; bodies that are joined do not touch."""
+    path = tmp_path / "door.toml"
+    path.write_text(JOINTED)
+    loaded = load_scene(path)
+    assert loaded.state.q is not None
+    assert loaded.state.v is not None
+    assert (float(loaded.state.q[0]), float(loaded.state.v[0])) == (-0.4, 3.0)
+    np.testing.assert_allclose(
+        loaded.state.position[0], [-0.04 + 0.04 * np.cos(0.4), -0.04 * np.sin(0.4), 0.06], atol=1e-12
+    )
+    pairs = {frozenset((contact.a, contact.b)) for contact in loaded.scene.contacts}
+    assert pairs == {frozenset(("door", "floor")), frozenset(("knob", "floor"))}
+    assert loaded.controls is not None
+    effort = loaded.controls(loaded.state, jnp.zeros(())).effort
+    assert effort is not None
+    np.testing.assert_allclose(effort, [0.5])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('child = "knob"', 'child = "nob"', "'nob'; did you mean 'knob'"),
+        ('kind = "weld"', 'kind = "ball"', "kind must be one of 'hinge', 'slide', 'weld', got 'ball'"),
+        ("damping = 0.1", "damping = -1", "damping of the joint of 'door' must be ≥ 0"),
+        ('body = "door"', 'body = "knob"', "effort needs a body on a hinge or a slide"),
+        ("q = -0.4", "position = [0, 0, 1]", "must be given by .'q', 'v'., for it hangs on a joint"),
+        ("q = -0.4", 'q = "open"', "q must be a finite number"),
+    ],
+)
+def test_wrong_joints_of_a_scene_file(tmp_path, old, new, message):
+    path = tmp_path / "door.toml"
+    path.write_text(JOINTED.replace(old, new))
+    with pytest.raises(ValueError, match=message):
+        load_scene(path)

@@ -1,5 +1,7 @@
 """Gradients of the final pose: forward = reverse = differences, on slide, bounce, tumble and a hit."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -211,3 +213,21 @@ def test_single_precision():
     assert run.states.position.dtype == jnp.float32
     assert bool(run.converged.all())
     np.testing.assert_allclose(run.states.position, reference.states.position, atol=2e-3)
+
+
+def test_compiler_options_do_not_stand_in_the_way():
+    """A step gives the same alone, in a user's compilation, in a derivative, and with the options outside."""
+    scene = dano.Scene.create([dano.Body("ball", dano.Sphere(0.1), mass=1.0)], timestep=0.01)
+    state = scene.initial_state(ball=dict(velocity=(1.0, 2.0, 3.0)))
+
+    def fallen(height):
+        start = dataclasses.replace(state, position=state.position.at[0, 2].set(height))
+        return dano.step(scene, start).position[0, 2]
+
+    at = jnp.asarray(2.0)
+    alone = float(fallen(at))
+    assert alone == pytest.approx(2.03 - 9.81e-4)
+    for run in (jax.jit(fallen), jax.jit(fallen, compiler_options=dano.compiler_options())):
+        assert float(run(at)) == alone
+    assert float(jax.vmap(fallen)(at[None])[0]) == alone
+    assert float(jax.grad(fallen)(at)) == 1.0

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from engine.trees import coordinates
 
 import dano
 from dano.identify._parameters import space_of
@@ -523,3 +524,26 @@ def test_an_interrupt_returns_the_best_so_far(truth):
         fit = dano.identify(ball_scene(), truth, [FRICTION], progress=stop)
     assert not fit.converged and "interrupted" in fit.stop.value
     assert fit.loss_history[-1] < fit.loss_history[0]
+
+
+def test_joint_from_the_motion_of_its_body():
+    """Damping of a hinge, and how the body began to swing, from noisy poses of the body."""
+    lid = dano.Body("lid", dano.Box((0.1, 0.08, 0.01)), mass=0.4)
+    hinge = dano.Joint(None, "lid", axis=(1, 0, 0), anchor=(0, -0.08, 0), damping=0.004)
+    scene = dano.Scene.create([lid], joints=[hinge], timestep=0.01)
+    truth = dano.simulate(scene, scene.initial_state(lid=dict(q=1.2, v=-2.0)), 80)
+    random = np.random.default_rng(0)
+    position = np.asarray(truth.states.position) + 1e-3 * random.standard_normal((81, 1, 3))
+    turned = truth.states.orientation
+    observed = dano.Motion.create(truth.times, ["lid"], position=position, orientation=turned)
+    found = dano.identify(
+        scene.replace_joint("lid", damping=0.02),
+        observed,
+        [dano.Parameter("damping", lambda s: s.joints[0].damping, 0.0, 0.1)],
+        initial="states",
+        noise={"position": 1e-3, "orientation": 0.01},
+    )
+    np.testing.assert_allclose(found.values["damping"], 0.004, rtol=0.02)
+    assert abs(found.values["damping"] - 0.004) <= 4 * found.standard_errors["damping"]
+    q, v = coordinates(found.initial_states)
+    np.testing.assert_allclose((q[0, 0], v[0, 0]), (1.2, -2.0), atol=0.02)

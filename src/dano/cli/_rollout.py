@@ -14,7 +14,15 @@ from jaxtyping import Array
 from dano.cli._console import Progress, put, say
 from dano.engine import simulate
 from dano.report import contact_history
-from dano.scene import Scene, State, Trajectory
+from dano.scene import (
+    JOINT_QUANTITIES,
+    Layout,
+    Scene,
+    State,
+    state_arrays,
+    STATE_SIZES,
+    Trajectory,
+)
 from dano.scene_file import SceneFile
 
 # A rollout is run in so many pieces: progress can be shown, and an interrupt is heard, between two of them.
@@ -80,7 +88,8 @@ def describe(rollout: Rollout, scene: Scene) -> dict[str, Any]:
     """A rollout in numbers and lists, in SI units."""
     trajectory = rollout.trajectory
     failed = np.flatnonzero(~np.asarray(trajectory.converged))
-    last = {name: np.asarray(getattr(trajectory.states, name)[-1]) for name in State.__dataclass_fields__}
+    last = {name: np.asarray(value[-1]) for name, value in state_arrays(trajectory.states).items()}
+    layout = scene.layout
     return {
         "steps": len(trajectory.converged),
         "timestep": float(scene.timestep),
@@ -94,12 +103,20 @@ def describe(rollout: Rollout, scene: Scene) -> dict[str, Any]:
             {
                 "name": body.name,
                 "fixed": body.fixed,
-                **{key: value[i].tolist() for key, value in last.items()},
+                **{key: last[key][i].tolist() for key in STATE_SIZES},
+                **_joint_numbers(layout, i, last),
             }
             for i, body in enumerate(scene.bodies)
         ],
         "contacts": _contacts(trajectory, scene),
     }
+
+
+def _joint_numbers(layout: Layout, body: int, last: dict[str, np.ndarray]) -> dict[str, float]:
+    """Coordinates q and v of the joint on which a body hangs, if there is one with coordinates."""
+    joint = layout.joint_of(body)
+    place = -1 if joint is None else layout.coordinates[joint]
+    return {} if place < 0 else {key: float(last[key][place]) for key in JOINT_QUANTITIES}
 
 
 def _contacts(trajectory: Trajectory, scene: Scene) -> list[dict[str, Any]]:

@@ -6,6 +6,7 @@ from dano.engine._batches import (
     rollouts as rollouts,
     StoredRollouts as StoredRollouts,
 )
+from dano.engine._compiling import compiled as compiled, compiler_options as compiler_options
 from dano.engine._devices import device_mesh as device_mesh, gather as gather, map_rows as map_rows
 from dano.engine._newton import Report as Report
 from dano.engine._rollout import (

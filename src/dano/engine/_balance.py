@@ -21,29 +21,55 @@ _SIGNS = (1, -1)
 
 
 def momentum_residual(velocities: Float[Array, "m 6"], problem: Problem, pairs: Pairs, softening: Softening):
-    """R(V⁺), shape (6 m,), and the derivative of each contact's wrench with respect to its twist."""
-    h = problem.timestep
-    linear = problem.mass[:, None] * velocities[:, :3]
-    angular = jax.vmap(angular_momentum, (0, 0, None, None))(velocities[:, 3:], problem.inertia, h, 1)
-    rows = list(jnp.concatenate([linear, angular], axis=1) - problem.impulse)
-    wrenches = contact_wrenches(velocities, problem, pairs, softening)
-    for (wrench, _), arms, joined in zip(wrenches, problem.arms, pairs.of_contact, strict=True):
-        for sign, arm, i in zip(_SIGNS, arms, joined, strict=True):
-            if i >= 0:
-                torque = jnp.cross(arm, wrench[:3]) + wrench[3:]
-                in_body = matvec(problem.rotation[i].T, torque)
-                rows[i] = rows[i] - sign * h * jnp.concatenate([wrench[:3], in_body])
-    return to_velocity(problem) * jnp.concatenate(rows), [slope for _, slope in wrenches]
+    """R(V⁺) without points, shape (6 m,), and the derivative of each contact's wrench by its twist."""
+    own, _ = own_momenta(velocities, problem)
+    patches, slopes = patch_momenta(velocities, problem, pairs, softening)
+    return to_velocity(problem) * (own - patches).ravel(), slopes
 
 
 def momentum_jacobian(
     velocities: Float[Array, "m 6"], problem: Problem, pairs: Pairs, slopes
 ) -> Float[Array, "n n"]:
     """∂R/∂V⁺, shape (6 m, 6 m), in closed form."""
-    h, m = problem.timestep, len(pairs.moving)
+    _, own = own_momenta(velocities, problem)
+    blocks = {(i, i): block for i, block in enumerate(own)}
+    return to_velocity(problem)[:, None] * patch_jacobian(problem, pairs, slopes, blocks)
+
+
+def own_momenta(velocities: Float[Array, "m 6"], problem: Problem):
+    """Momentum that each body gains in the step beyond gravity and controls [B], and its derivative.
+
+    Shapes (m, 6) and (m, 6, 6).
+    """
+    h, m = problem.timestep, velocities.shape[0]
+    linear = problem.mass[:, None] * velocities[:, :3]
+    angular = jax.vmap(angular_momentum, (0, 0, None, None))(velocities[:, 3:], problem.inertia, h, 1)
+    turning = jax.vmap(angular_jacobian, (0, 0, None))(velocities[:, 3:], problem.inertia, h)
     eye, zero = jnp.eye(3, dtype=velocities.dtype), jnp.zeros((3, 3), velocities.dtype)
-    inertial = jax.vmap(angular_jacobian, (0, 0, None))(velocities[:, 3:], problem.inertia, h)
-    blocks = {(i, i): _corners(problem.mass[i] * eye, zero, zero, inertial[i]) for i in range(m)}
+    slopes = jnp.stack([_corners(problem.mass[i] * eye, zero, zero, turning[i]) for i in range(m)])
+    return jnp.concatenate([linear, angular], axis=1) - problem.impulse, slopes
+
+
+def patch_momenta(velocities: Float[Array, "m 6"], problem: Problem, pairs: Pairs, softening: Softening):
+    """Momentum that patches give each body [B], shape (m, 6), and the derivatives of their wrenches."""
+    h = problem.timestep
+    rows = [jnp.zeros(6, velocities.dtype)] * velocities.shape[0]
+    wrenches = contact_wrenches(velocities, problem, pairs, softening)
+    for (wrench, _), arms, joined in zip(wrenches, problem.arms, pairs.of_contact, strict=True):
+        for sign, arm, i in zip(_SIGNS, arms, joined, strict=True):
+            if i >= 0:
+                torque = jnp.cross(arm, wrench[:3]) + wrench[3:]
+                in_body = matvec(problem.rotation[i].T, torque)
+                rows[i] = rows[i] + sign * h * jnp.concatenate([wrench[:3], in_body])
+    return jnp.stack(rows), [slope for _, slope in wrenches]
+
+
+def patch_jacobian(
+    problem: Problem, pairs: Pairs, slopes, blocks: dict[tuple[int, int], Float[Array, "6 6"]]
+) -> Float[Array, "n n"]:
+    """Minus the derivative of `patch_momenta` by velocities [B], shape (6 m, 6 m), added to some blocks."""
+    h, m = problem.timestep, len(pairs.moving)
+    eye, zero = jnp.eye(3, dtype=problem.mass.dtype), jnp.zeros((3, 3), problem.mass.dtype)
     # Without barriers XLA computes a law again inside each of the many small products that read it.
     slopes = jax.lax.optimization_barrier(slopes)
     for slope, arms, joined in zip(slopes, problem.arms, pairs.of_contact, strict=True):
@@ -58,24 +84,48 @@ def momentum_jacobian(
             for j, column in maps.items():
                 block = matmul(half, column)
                 blocks[i, j] = blocks[i, j] - block if (i, j) in blocks else -block
-    empty = jnp.zeros((6, 6), velocities.dtype)
+    empty = jnp.zeros((6, 6), problem.mass.dtype)
     rows = [jnp.concatenate([blocks.get((i, j), empty) for j in range(m)], axis=1) for i in range(m)]
-    return to_velocity(problem)[:, None] * jnp.concatenate(rows)
+    return jnp.concatenate(rows)
 
 
 def whole_residual(velocities: Float[Array, "m 6"], problem: Problem, pairs: Pairs) -> Float[Array, " n"]:
     """R(V⁺) with the law as it is, spins and angular momenta in B."""
     residual = momentum_residual(velocities, problem, pairs, Softening())[0]
-    points, material = problem.points, problem.material
-    if points is None or material is None:
+    if problem.points is None:
         return residual
-    first, second = chunk_wrenches(problem, velocities, pairs)
-    rows = jnp.asarray(pairs.rows)
-    total = jnp.zeros((len(pairs.moving) + 1, 6), velocities.dtype)
-    total = (
-        problem.timestep * total.at[rows[points.first]].add(first).at[rows[points.second]].add(second)[:-1]
-    )
-    return residual - to_velocity(problem) * to_body(problem, total).ravel()
+    pressed = point_momenta(problem, to_world(problem, velocities), pairs)
+    return residual - to_velocity(problem) * to_body(problem, pressed).ravel()
+
+
+def world_momenta(problem: Problem, world: Float[Array, "m 6"]):
+    """`own_momenta` with velocities and momenta in W."""
+    m, h, rotation = world.shape[0], problem.timestep, problem.rotation
+    omega = to_body(problem, world)[:, 3:]
+    angular = jax.vmap(angular_momentum, (0, 0, None, None))(omega, problem.inertia, h, 1)
+    inertial = jax.vmap(angular_jacobian, (0, 0, None))(omega, problem.inertia, h)
+    missing = jax.vmap(matvec)(rotation, angular - problem.impulse[:, 3:])
+    turned_back = jax.vmap(lambda r, j: matmul(matmul(r, j), r.T))(rotation, inertial)
+    linear = problem.mass[:, None] * world[:, :3] - problem.impulse[:, :3]
+    jacobian = jnp.zeros((m, 6, 6), world.dtype)
+    jacobian = jacobian.at[:, :3, :3].set(problem.mass[:, None, None] * jnp.eye(3, dtype=world.dtype)[None])
+    return jnp.concatenate([linear, missing], axis=1), jacobian.at[:, 3:, 3:].set(turned_back)
+
+
+def world_patches(problem: Problem, world: Float[Array, "m 6"], pairs: Pairs, softening: Softening):
+    """`patch_momenta` with velocities and momenta in W, and minus its derivative, shape (m, 6, m, 6)."""
+    m, turn = world.shape[0], to_world_matrices(problem)
+    momenta, slopes = patch_momenta(to_body(problem, world), problem, pairs, softening)
+    jacobian = patch_jacobian(problem, pairs, slopes, {}).reshape(m, 6, m, 6)
+    jacobian = jnp.einsum("iab,ibjc,jdc->iajd", turn, jacobian, turn)
+    return jax.vmap(matvec)(turn, momenta), jacobian
+
+
+def to_world_matrices(problem: Problem) -> Float[Array, "m 6 6"]:
+    """What turns spins, or moments, of a body from B into W."""
+    m, dtype = problem.mass.shape[0], problem.mass.dtype
+    turn = jnp.zeros((m, 6, 6), dtype).at[:, :3, :3].set(jnp.eye(3, dtype=dtype))
+    return turn.at[:, 3:, 3:].set(problem.rotation)
 
 
 def contact_wrenches(velocities: Float[Array, "m 6"], problem: Problem, pairs: Pairs, softening: Softening):
@@ -94,11 +144,13 @@ def contact_wrenches(velocities: Float[Array, "m 6"], problem: Problem, pairs: P
     return grouped(lambda item: item[0].wrench(*item[1:], softening), items)
 
 
-def chunk_wrenches(problem: Problem, velocities: Float[Array, "m 6"], pairs: Pairs):
-    """Wrenches [N, N m, W] of each chunk on its first and its second body, about their centres of mass."""
+def chunk_wrenches(problem: Problem, world: Float[Array, "m 6"], pairs: Pairs):
+    """Wrenches [N, N m, W] of each chunk on its first and its second body, about their centres of mass.
+
+    Velocities of the bodies that move are in W.
+    """
     points, material = problem.points, problem.material
     assert points is not None and material is not None
-    world = to_world(problem, velocities)
     bodies = jnp.concatenate([world, jnp.zeros((1, 6), world.dtype)])[np.array(pairs.rows)]
     pressure, friction = traction(material, points, point_motion(bodies[:, :3], bodies[:, 3:], points))
     wrench = sum_wrenches(
@@ -107,6 +159,16 @@ def chunk_wrenches(problem: Problem, velocities: Float[Array, "m 6"], pairs: Pai
     force = wrench[:, :3].T
     moment = wrench[:, 3:].T + cross(points.between, force)
     return wrench, -jnp.concatenate([force, moment]).T
+
+
+def point_momenta(problem: Problem, world: Float[Array, "m 6"], pairs: Pairs) -> Float[Array, "m 6"]:
+    """Momentum that points give each body in the step [W]."""
+    assert problem.points is not None
+    first, second = chunk_wrenches(problem, world, pairs)
+    rows = jnp.asarray(pairs.rows)
+    total = jnp.zeros((len(pairs.moving) + 1, 6), world.dtype)
+    total = total.at[rows[problem.points.first]].add(first).at[rows[problem.points.second]].add(second)
+    return problem.timestep * total[:-1]
 
 
 def to_world(problem: Problem, velocities: Float[Array, "m 6"]) -> Float[Array, "m 6"]:

@@ -54,8 +54,10 @@ class Job:
         state = self.inputs.state
         dtype = jax.dtypes.canonicalize_dtype(state.position.dtype)
 
+        many = state.position.ndim - 2
+
         def states(leaf):
-            return np.zeros((n, len(self.steps), *leaf.shape[-2:]), dtype)
+            return np.zeros((n, len(self.steps), *leaf.shape[many:]), dtype)
 
         counts = np.zeros(n, np.int32)
         return Kept(

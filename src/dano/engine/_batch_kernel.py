@@ -10,6 +10,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int
 
+from dano.engine._compiling import compiled
 from dano.engine._devices import map_rows
 from dano.engine._rollout import AbstractEngine
 from dano.scene import Control, Scene, State
@@ -51,7 +52,7 @@ class Inputs(NamedTuple):
     engine: AbstractEngine
 
 
-@eqx.filter_jit
+@compiled
 def simulate_rows(program: Program, shared: Any, rows: Any, batch_size: int, mesh: Mesh) -> Kept:
     """Simulate rows.
 
@@ -73,7 +74,7 @@ def _rollout(inputs: Inputs, program: Program) -> Kept:
     scene, controls, engine = inputs.scene, inputs.controls, inputs.engine
     if not isinstance(scene, Scene):
         scene = scene(inputs.parameters)
-    start, prepared = inputs.state, engine.prepare(scene)
+    start, prepared = scene.filled(inputs.state), engine.prepare(scene)
     policy = None if controls is None or isinstance(controls, Control) else controls
 
     def advance(carry, step):

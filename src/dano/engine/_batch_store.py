@@ -12,7 +12,7 @@ import numpy as np
 from dano.archive import checked_output
 from dano.engine._batch_input import Job
 from dano.engine._batch_kernel import Kept
-from dano.scene import STATE_SIZES
+from dano.scene import state_arrays
 
 FORMAT, VERSION = "dano-rollouts", 1
 _COMPLETE = "complete"
@@ -98,6 +98,10 @@ class RolloutStore:
             self._group[name][place] = values
         self._group[_COMPLETE][chunk] = 1
 
+    def has(self, name: str) -> bool:
+        """Whether there is an array of this name."""
+        return name in self._group
+
     def read(self, name: str, rows: slice) -> np.ndarray:
         """Rows of an array."""
         return np.asarray(self._group[name][rows])
@@ -105,7 +109,7 @@ class RolloutStore:
 
 def named(kept: Kept) -> dict[str, np.ndarray]:
     """The arrays of the group."""
-    states = {name: getattr(kept.states, name) for name in STATE_SIZES}
+    states = {name: np.asarray(value) for name, value in state_arrays(kept.states).items()}
     return {**states, **{name: getattr(kept, name) for name in Kept._fields[1:]}}
 
 

@@ -18,7 +18,7 @@ from dano.engine._batch_kernel import Kept, simulate_rows
 from dano.engine._batch_store import RolloutStore
 from dano.engine._devices import device_mesh, gather, meet, put_rows, put_whole, take_rows
 from dano.engine._rollout import AbstractEngine, Policy, VariationalEngine
-from dano.scene import Control, Scene, State, STATE_SIZES
+from dano.scene import Control, JOINT_QUANTITIES, Scene, State, STATE_SIZES
 
 Progress = Callable[[str, float], None]
 
@@ -102,7 +102,8 @@ class StoredRollouts:
                 f"rows must be complete: rollout {first} of {self.path} is not there yet; "
                 "call rollouts with the same arguments to go on"
             )
-        states = State(*(jnp.asarray(self._store.read(name, rows)) for name in STATE_SIZES))
+        names = [*STATE_SIZES, *(name for name in JOINT_QUANTITIES if self._store.has(name))]
+        states = State(**{name: jnp.asarray(self._store.read(name, rows)) for name in names})
         kept = Kept(states, *(self._store.read(name, rows) for name in Kept._fields[1:]))
         return _result(kept, self.steps, self.names)
 

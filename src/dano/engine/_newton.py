@@ -268,7 +268,7 @@ _UNROLLED = 12
 
 
 def solve_small(matrix: Float[Array, "n n"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """Solution of a small dense system with k right-hand sides; n is a multiple of three.
+    """Solution of a small dense system with k right-hand sides.
 
     Up to 12 unknowns by Gauss–Jordan elimination with 3×3 pivots (a body's translation, its rotation) and
     without exchanges, LAPACK beyond. The matrices here are inertia plus dissipation: their symmetric part is
@@ -277,6 +277,11 @@ def solve_small(matrix: Float[Array, "n n"], right: Float[Array, "n k"]) -> Floa
     n = matrix.shape[0]
     if n > _UNROLLED:
         return jnp.linalg.solve(matrix, right)
+    if extra := -n % 3:
+        # Unknowns that nothing depends on fill the last pivot.
+        eye = jnp.eye(n + extra, dtype=matrix.dtype)
+        matrix = eye.at[:n, :n].set(matrix)
+        return solve_small(matrix, jnp.pad(right, ((0, extra), (0, 0))))[:n]
     augmented = jnp.concatenate([matrix, right], axis=1)
     for start in range(0, n, 3):
         rows = slice(start, start + 3)

@@ -42,28 +42,28 @@ _SOFT_TOLERANCE = 1e-3
 
 
 class Balance(NamedTuple):
-    """Momentum balance of all bodies at some velocities, without contact at points.
+    """Momentum balance at some velocities, without contact at points.
 
     Attributes:
-        residual: Momentum [kg m/s; kg m²/s, W], shape (m, 6).
-        own: Its derivative by the velocities of the same body [W], shape (m, 6, 6).
-        coupled: What else depends on velocities, shape (m, 6, m, 6); None if nothing does.
+        residual: Momentum [kg m/s; kg m²/s, W], shape (m, 6) of free bodies; with joints generalised, (k,).
+        own: Its derivative by the velocities of the same body [W], shape (m, 6, 6); None with joints.
+        coupled: What else depends on velocities, shape (m, 6, m, 6) or (k, k); None if nothing does.
     """
 
-    residual: Float[Array, "m 6"]
-    own: Float[Array, "m 6 6"]
-    coupled: Float[Array, "m 6 m 6"] | None
+    residual: Array
+    own: Float[Array, "m 6 6"] | None
+    coupled: Array | None
 
 
 class _Iterate(NamedTuple):
     """Carry of the loop.
 
     Attributes:
-        velocities: V at the accepted point, shape (m, 6).
+        velocities: Velocities at the accepted point, shape (k,).
         memory: What the sums over points keep: see `assemble`.
         fresh: Whether the point tried last was accepted.
         search: The step from the accepted point, and how much of it is tried next.
-        jacobian: ∂R/∂V at the point before, shape (6 m, 6 m).
+        jacobian: ∂R/∂V at the point before, shape (k, k).
         residual: Largest residual over mass or inertia at the accepted point.
         solved: Whether that was small enough.
         iteration: Passes.
@@ -71,11 +71,11 @@ class _Iterate(NamedTuple):
         budget: Passes left in it.
     """
 
-    velocities: Float[Array, "m 6"]
+    velocities: Float[Array, " k"]
     memory: Float[Array, "27 c p"]
     fresh: Bool[Array, ""]
     search: Search
-    jacobian: Float[Array, "n n"]
+    jacobian: Float[Array, "k k"]
     residual: Float[Array, ""]
     solved: Bool[Array, ""]
     iteration: Int[Array, ""]
@@ -84,45 +84,58 @@ class _Iterate(NamedTuple):
 
 
 def primal_dual(
-    balance: Callable[[Float[Array, "m 6"]], Balance],
+    balance: Callable[[Float[Array, " k"]], Balance],
     table: Table,
-    start: Float[Array, "m 6"],
-    scale: Float[Array, "m 6"],
+    start: Float[Array, " k"],
+    scale: Float[Array, " k"],
     size: Float[Array, ""],
     options: SolverOptions,
-) -> tuple[Float[Array, "m 6"], Float[Array, "n n"], Report]:
+    spread: tuple[Float[Array, "n k"], Float[Array, " n"]] | None = None,
+) -> tuple[Float[Array, " k"], Float[Array, "k k"], Report]:
     """Velocities at the end of a step.
 
     Args:
         balance: Momentum balance without the points.
         table: The points.
-        start: Velocities to start from [m/s; rad/s, W].
+        start: Velocities to start from [m/s; rad/s, W]: six of each body, or with joints generalised ones.
         scale: Turns momenta into velocities [1/kg; 1/(kg m²)].
         size: Magnitude of the terms in the residual [m/s], to which rounding in it is relative.
         options: When to stop.
+        spread: With joints: J and c of the twists J y + c of the bodies at generalised velocities y.
 
     Returns:
         The velocities, the Jacobian there, and the report.
     """
-    m = start.shape[0]
+    n = start.shape[0] if spread is None else spread[1].shape[0]
+    m = n // 6
     epsilon = float(jnp.finfo(start.dtype).eps)
     relative = epsilon**0.75 if options.tolerance is None else options.tolerance
     softnesses, shares = (jnp.asarray([tier[k] for tier in _TIERS], start.dtype) for k in (0, 1))
     searches = jnp.asarray([tier[2] for tier in _TIERS])
     budgets = jnp.asarray([tier[3] for tier in _TIERS])
 
+    def turns(v):
+        """Twists of bodies, or changes of them, in proportion to (generalised) velocities."""
+        return (v if spread is None else spread[0] @ v).reshape(m, 6)
+
+    def twists(v):
+        return turns(v) if spread is None else turns(v) + spread[1].reshape(m, 6)
+
     def evaluate(v, it: _Iterate, softness):
         """Residual and Jacobian as momenta, whether the duals fit, and the memory."""
         free = balance(v)
-        step = it.search.direction.reshape(m, 6)
-        sums = assemble(
-            table, it.memory, it.fresh, v, step, it.search.length, softness, _without_points(free)
-        )
-        residual = -jnp.sum(sums.blocks[:m, :, :, 6], axis=1)
-        jacobian = -sums.blocks[:m, :m, :, :6].transpose(0, 2, 1, 3)
-        jacobian = jacobian if free.coupled is None else jacobian + free.coupled
+        step, length = it.search.direction, it.search.length
+        begin = _without_points(free, m)
+        sums = assemble(table, it.memory, it.fresh, twists(v), turns(step), length, softness, begin)
+        residual = -jnp.sum(sums.blocks[:m, :, :, 6], axis=1).ravel()
+        jacobian = -sums.blocks[:m, :m, :, :6].transpose(0, 2, 1, 3).reshape(n, n)
+        if spread is not None:
+            residual = free.residual + spread[0].T @ residual
+            jacobian = spread[0].T @ jacobian @ spread[0]
+        if free.coupled is not None:
+            jacobian = jacobian + free.coupled.reshape(jacobian.shape)
         fits = sums.unfit[0] <= epsilon**_FIT * sums.unfit[1]
-        return residual, jacobian.reshape(6 * m, 6 * m), fits, sums.memory
+        return residual, jacobian, fits, sums.memory
 
     def unfinished(it: _Iterate):
         return ~it.solved & (it.iteration < options.max_iterations) & (it.level < len(_TIERS))
@@ -130,13 +143,13 @@ def primal_dual(
     def advance(it: _Iterate):
         level = jnp.minimum(it.level, len(_TIERS) - 1)
         softness, share = softnesses[level], shares[level]
-        velocities = it.velocities + it.search.length * it.search.direction.reshape(m, 6)
+        velocities = it.velocities + it.search.length * it.search.direction
         residual, jacobian, fits, memory = evaluate(velocities, it, softness)
-        work = jnp.sum(it.search.direction * residual.ravel())
+        work = jnp.sum(it.search.direction * residual)
         accept = it.search.accepts(work) | ~searches[level]
         error = jnp.max(jnp.abs(scale * residual))
-        scaled = scale.ravel()[:, None] * jacobian
-        rounding = 16 * epsilon * jnp.max(jnp.sum(jnp.abs(scaled * velocities.ravel()[None]), axis=1))
+        scaled = scale[:, None] * jacobian
+        rounding = 16 * epsilon * jnp.max(jnp.sum(jnp.abs(scaled * velocities[None]), axis=1))
         tolerance = jnp.maximum(relative * (1 + size), rounding)
         hard = softness == 1
         enough = jnp.where(hard, tolerance, jnp.maximum(tolerance, _SOFT_TOLERANCE * 1e-7 * softness))
@@ -146,10 +159,10 @@ def primal_dual(
         solved = small & hard & (fits | (it.residual <= enough))
         # Once the residual falls as it should, there is nothing to be damped.
         fell = error < 0.5 * it.residual
-        step = jnp.where(fell, 1, share) * solve_small(scaled, -(scale * residual).reshape(-1, 1))[:, 0]
+        step = jnp.where(fell, 1, share) * solve_small(scaled, -(scale * residual)[:, None])[:, 0]
         step = jnp.where(accept, step, it.search.direction)
         pick = lambda new, old: jnp.where(accept, new, old)  # noqa: E731
-        search = Search.start(step, jnp.sum(step * residual.ravel()))
+        search = Search.start(step, jnp.sum(step * residual))
         harder = accept & ((small & ~hard) | (~small & (it.budget <= 0)))
         next_level = jnp.where(harder, it.level + 1, it.level)
         return _Iterate(
@@ -167,10 +180,10 @@ def primal_dual(
 
     initial = _Iterate(
         start,
-        first_memory(table, start),
+        first_memory(table, twists(start)),
         jnp.asarray(False),
-        Search.start(jnp.zeros_like(start).ravel(), jnp.zeros((), start.dtype)),
-        jnp.eye(6 * m, dtype=start.dtype),
+        Search.start(jnp.zeros_like(start), jnp.zeros((), start.dtype)),
+        jnp.eye(start.shape[0], dtype=start.dtype),
         jnp.asarray(jnp.inf, start.dtype),
         jnp.asarray(False),
         jnp.asarray(0),
@@ -181,8 +194,10 @@ def primal_dual(
     return last.velocities, last.jacobian, Report(last.residual, last.iteration, last.solved)
 
 
-def _without_points(free: Balance) -> Float[Array, "b b 6 7"]:
+def _without_points(free: Balance, m: int) -> Float[Array, "b b 6 7"]:
     """The sums of `assemble` before points are added."""
-    m = free.own.shape[0]
+    empty = jnp.zeros((m + 1, m + 1, 6, 7), free.residual.dtype)
+    if free.own is None:
+        return empty
     own = -jnp.concatenate([free.own, free.residual[:, :, None]], axis=2)
-    return jnp.zeros((m + 1, m + 1, 6, 7), own.dtype).at[np.arange(m), np.arange(m)].set(own)
+    return empty.at[np.arange(m), np.arange(m)].set(own)

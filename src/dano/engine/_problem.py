@@ -1,5 +1,6 @@
 """What a step has to solve: bodies, their momenta before contact, patches and points of contact."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -29,8 +30,9 @@ from dano.contact import (
 from dano.engine._newton import inverse3
 from dano.engine._rigid import angular_momentum, turned
 from dano.engine._sequential import one_at_a_time
+from dano.engine._trees import build_tree, Tree, tree_mobilities
 from dano.maths import matmul, matvec, quat_to_matrix
-from dano.scene import colliders, Control, pressing_pairs, Scene, State
+from dano.scene import colliders, Control, Poses, pressing_pairs, Scene, State, step_twists
 
 # Chunks of points that a step has room for: of each body that moves, and more of one with many samples.
 _CHUNKS_A_BODY = 24
@@ -69,6 +71,7 @@ class Problem(eqx.Module):
         laws: Law of each of them.
         points: Point contacts, or None if no contact has a point law.
         material: Of their chunks.
+        tree: What joints allow, or None if there are none: then all bodies that move are free.
     """
 
     mass: Float[Array, " m"]
@@ -82,6 +85,7 @@ class Problem(eqx.Module):
     laws: tuple[AbstractPatchLaw, ...]
     points: Points | None
     material: Material | None
+    tree: Tree | None
 
 
 class Pairs(NamedTuple):
@@ -131,7 +135,7 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
 
 def structure_of(scene: Scene) -> Pairs:
     """Which bodies move, and which of them each contact with a patch law joins."""
-    moving = tuple(i for i, body in enumerate(scene.bodies) if not body.fixed)
+    moving = scene.layout.moving
     position = {scene.bodies[i].name: k for k, i in enumerate(moving)}
     of_contact = tuple(
         (position.get(c.a, -1), position.get(c.b, -1))
@@ -176,7 +180,8 @@ def build_problem(
         )
         for contact, patch in zip(contacts, overlaps, strict=True)
     )
-    points, material, found = _points(scene, prepared, state)
+    tree, ahead = (None, None) if not scene.joints else build_tree(scene, state, control)
+    points, material, found = _points(scene, prepared, state, tree, ahead)
     problem = Problem(
         mass,
         inertia,
@@ -189,6 +194,7 @@ def build_problem(
         laws,
         points,
         material,
+        tree,
     )
     return problem, found
 
@@ -233,11 +239,14 @@ def grouped(function, items: list):
     return tuple(results)
 
 
-def _points(scene: Scene, prepared: Prepared, state: State):
+def _points(scene: Scene, prepared: Prepared, state: State, tree: Tree | None, ahead: Poses | None):
     """Point contacts, the material of their chunks, and where they were found; None if there are none."""
     if prepared.geometry is None or prepared.impacts is None:
         return None, None, None
-    links, h = links_of(scene, state, scene.timestep), scene.timestep
+    h = scene.timestep
+    links = links_of(scene, state, h)
+    if tree is not None and ahead is not None:
+        links = _on_joints(links, tree, ahead, h)
     fixed = jax.lax.stop_gradient((prepared.geometry, links, prepared.impacts, h))
     points, found = one_at_a_time(
         lambda geometry, links, impacts, h: find(geometry, links, impacts, h, prepared.capacity), *fixed
@@ -268,7 +277,7 @@ def _(primals, tangents):
 
 
 def links_of(scene: Scene, state: State, h) -> Links:
-    """Where all bodies are and how they move during a step of length h [s]."""
+    """Where all bodies are and how they move during a step of length h [s], if they move freely."""
     moves = np.array([not body.fixed for body in scene.bodies])
     rotation = jax.vmap(quat_to_matrix)(state.orientation)
     ahead = jnp.where(moves[:, None], turned(state.orientation, state.omega, h), state.orientation)
@@ -285,6 +294,25 @@ def links_of(scene: Scene, state: State, h) -> Links:
         com,
         jnp.where(moves, 1 / mass, 0),
         jnp.where(moves[:, None, None], inverse, 0),
+    )
+
+
+def _on_joints(links: Links, tree: Tree, ahead: Poses, h) -> Links:
+    """The links with the motion of bodies on joints, and with what they are to those who push them."""
+    layout = tree.chains.layout
+    moving, hanging = np.array(layout.moving), np.array(layout.children)
+    rotation = jax.vmap(quat_to_matrix)(links.orientation)
+    velocity, omega = step_twists((links.position, links.orientation), ahead[:2], h)
+    mass = 1 / links.lightness[moving]
+    inertia = jax.vmap(inverse3)(links.mobility[moving])
+    lightness, mobility = tree_mobilities(tree, mass, inertia)
+    return dataclasses.replace(
+        links,
+        ahead=links.ahead.at[hanging].set(ahead.orientation[hanging]),
+        velocity=links.velocity.at[hanging].set(velocity[hanging]),
+        spin=links.spin.at[hanging].set(jax.vmap(matvec)(rotation, omega)[hanging]),
+        lightness=links.lightness.at[moving].set(lightness),
+        mobility=links.mobility.at[moving].set(mobility),
     )
 
 

@@ -1,6 +1,7 @@
 """The verbs: one step, many steps, a step's linearisation, the forces of a step."""
 
 import abc
+import dataclasses
 import math
 import warnings
 from collections.abc import Callable
@@ -14,8 +15,9 @@ from jaxtyping import Array, Float
 
 from dano.contact import KEPT, Patch
 from dano.engine import _problem, _variational
+from dano.engine._compiling import compiled
 from dano.engine._newton import Report, SolverOptions
-from dano.maths import is_traced, quat_conjugate, quat_multiply, safe_norm
+from dano.maths import is_traced, quat_conjugate, quat_exp, quat_multiply
 from dano.scene import Control, Scene, State, Trajectory
 
 Policy = Callable[[State, Float[Array, ""]], Control]
@@ -159,11 +161,13 @@ def linearize(
     """Linearise a step: δz⁺ = A δz + B δu.
 
     Coordinates of a body are (position [m, W], rotation vector [rad, B], velocity [m/s, W], omega [rad/s,
-    B]), those of its control (force [N, W], torque [N m, W]); bodies that move are stacked in the scene's
-    order. A rotation vector θ stands for q ⊗ exp(θ).
+    B]), those of its control (force [N, W], torque [N m, W]); bodies that move freely are stacked in the
+    scene's order. A rotation vector θ stands for q ⊗ exp(θ). After all bodies follow q and then v of the
+    joints, and their efforts [N m or N].
 
     Returns:
-        A, shape (12 k, 12 k), and B, shape (12 k, 6 k), for k bodies that move.
+        A, shape (12 k + 2 j, 12 k + 2 j), and B, shape (12 k + 2 j, 6 k + j), for k bodies that move freely
+        and j joint coordinates.
 
     Raises:
         ValueError: If the state or control does not fit the scene.
@@ -206,14 +210,14 @@ def contact_patches(scene: Scene, states: State) -> tuple[Patch, ...]:
     return _jitted_patches(scene, states)
 
 
-@eqx.filter_jit
+@compiled
 def _jitted_step(engine, scene, state, control):
-    return engine.step(scene, engine.prepare(scene), state, control)
+    return engine.step(scene, engine.prepare(scene), scene.filled(state), control)
 
 
-@eqx.filter_jit
+@compiled
 def _jitted_rollout(engine, scene, state, controls, n_steps, segment):
-    prepared = engine.prepare(scene)
+    prepared, state = engine.prepare(scene), scene.filled(state)
 
     def advance(state, inputs):
         index, control = inputs
@@ -246,37 +250,50 @@ def _jitted_rollout(engine, scene, state, controls, n_steps, segment):
     return states, report
 
 
-@eqx.filter_jit
+@compiled
 def _jitted_linearize(engine, scene, state, control):
-    rows = np.array([i for i, body in enumerate(scene.bodies) if not body.fixed])
+    layout, dtype = scene.layout, state.position.dtype
+    rows, n, k = np.array(layout.free, int), len(layout.free), layout.n_joints
     if control is None:
         control = Control(jnp.zeros_like(state.position), jnp.zeros_like(state.position))
     prepared = engine.prepare(scene)
-    nominal, _ = engine.step(scene, prepared, state, control)
+    nominal, _ = engine.step(scene, prepared, scene.filled(state), control)
 
     def perturbed(change, input_change):
-        moved = retract(state, rows, change)
-        force = control.force.at[rows].add(input_change[:, :3])
-        torque = control.torque.at[rows].add(input_change[:, 3:])
-        following, _ = engine.step(scene, prepared, moved, Control(force, torque))
-        return difference(nominal, following, rows)
+        of_bodies, *of_joints = jnp.split(change, [12 * n, 12 * n + k])
+        moved = _with_joints(retract(state, rows, of_bodies.reshape(n, 12)), *of_joints)
+        pushes = input_change[: 6 * n].reshape(n, 6)
+        force = control.force.at[rows].add(pushes[:, :3])
+        torque = control.torque.at[rows].add(pushes[:, 3:])
+        effort = control.effort
+        if k:
+            effort = input_change[6 * n :] + (0 if effort is None else effort)
+        following, _ = engine.step(scene, prepared, scene.filled(moved), Control(force, torque, effort))
+        gone = difference(nominal, following, rows).ravel()
+        if nominal.q is None or nominal.v is None:
+            return gone
+        return jnp.concatenate([gone, following.q - nominal.q, following.v - nominal.v])
 
-    n = len(rows)
-    zero = jnp.zeros((n, 12), state.position.dtype), jnp.zeros((n, 6), state.position.dtype)
-    a, b = jax.jacfwd(perturbed, argnums=(0, 1))(*zero)
-    return a.reshape(12 * n, 12 * n), b.reshape(12 * n, 6 * n)
+    zero = jnp.zeros(12 * n + 2 * k, dtype), jnp.zeros(6 * n + k, dtype)
+    return jax.jacfwd(perturbed, argnums=(0, 1))(*zero)
+
+
+def _with_joints(state: State, q_change: Float[Array, " j"], v_change: Float[Array, " j"]) -> State:
+    if state.q is None or state.v is None:
+        return state
+    return dataclasses.replace(state, q=state.q + q_change, v=state.v + v_change)
 
 
 def retract(state: State, rows: np.ndarray, change: Float[Array, "k 12"]) -> State:
     """A state moved by a change of the bodies `rows` in the coordinates of `linearize`."""
-    half = 0.5 * change[:, 3:6]
-    angle = safe_norm(half)[:, None]
-    turn = jnp.concatenate([jnp.cos(angle), half * jnp.sinc(angle / jnp.pi)], axis=1)
-    return State(
-        state.position.at[rows].add(change[:, :3]),
-        state.orientation.at[rows].set(quat_multiply(state.orientation[rows], turn)),
-        state.velocity.at[rows].add(change[:, 6:9]),
-        state.omega.at[rows].add(change[:, 9:]),
+    return dataclasses.replace(
+        state,
+        position=state.position.at[rows].add(change[:, :3]),
+        orientation=state.orientation.at[rows].set(
+            quat_multiply(state.orientation[rows], quat_exp(change[:, 3:6]))
+        ),
+        velocity=state.velocity.at[rows].add(change[:, 6:9]),
+        omega=state.omega.at[rows].add(change[:, 9:]),
     )
 
 
@@ -294,7 +311,7 @@ def difference(nominal: State, state: State, rows: np.ndarray) -> Float[Array, "
     )
 
 
-@eqx.filter_jit
+@compiled
 def _jitted_wrenches(scene, states):
     before = jax.tree.map(lambda x: x[:-1], states)
     after = jax.tree.map(lambda x: x[1:], states)
@@ -302,7 +319,7 @@ def _jitted_wrenches(scene, states):
     return jax.lax.map(lambda pair: _variational.wrenches(scene, prepared, *pair), (before, after))
 
 
-@eqx.filter_jit
+@compiled
 def _jitted_patches(scene, states):
     prepared = _problem.prepare(scene, None)
     return jax.lax.map(lambda state: _variational.patches(scene, prepared, state), states)
@@ -318,6 +335,9 @@ def _check_control(scene: Scene, control: Control | None, leading: tuple[int, ..
             raise ValueError(f"control.{name} must have shape {expected}, got {value.shape}")
         if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
             raise ValueError(f"control.{name} must be finite")
+    if control.effort is not None and control.effort.shape != (*leading, scene.layout.n_joints):
+        expected = (*leading, scene.layout.n_joints)
+        raise ValueError(f"control.effort must have shape {expected}, got {control.effort.shape}")
 
 
 def _say_unconverged(converged, residual) -> None:

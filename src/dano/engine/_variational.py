@@ -1,42 +1,23 @@
-"""First-order variational integrator for free rigid bodies in contact, one implicit solve a step.
+"""First-order variational integrator for rigid bodies in contact, one implicit solve a step.
 
-Unknowns of a step are the end-of-step velocities V⁺ = (v⁺, ω⁺) of all bodies that move (see `_rigid`).
-Velocities in the contact laws are the unknown ones. Patch laws take geometry at the old configuration, point
-laws at the predicted one (see `dano.contact.find`). Each step solves R(V⁺; θ) = 0, by Newton with a line
-search where all contacts are patches, else by a primal–dual Newton method, and is differentiated by the
-implicit function theorem, never through the iterations. R is in velocity units: momenta over mass and mean
-inertia.
+Unknowns of a step are the end-of-step velocities V⁺ = (v⁺, ω⁺) of all bodies that move (see `_rigid`), or
+with joints generalised velocities (see `_trees`). Velocities in the contact laws are the unknown ones. Patch
+laws take geometry at the old configuration, point laws at the predicted one (see `dano.contact.find`). Each
+step solves R(V⁺; θ) = 0, by Newton with a line search where all contacts are patches, else by a primal–dual
+Newton method. It is differentiated by the implicit function theorem, never through the iterations (see
+`_roots`). R is in velocity units: momenta over mass and mean inertia.
 """
 
-import equinox as eqx
+import dataclasses
+
 import jax
 import jax.numpy as jnp
-from jax.ad_checkpoint import checkpoint_name
+import numpy as np
 from jaxtyping import Array, Float
 
-from dano.contact import (
-    AbstractPatchLaw,
-    by_autodiff,
-    DistributedLaw,
-    find,
-    Found,
-    KEPT,
-    Patch,
-    Softening,
-)
-from dano.engine._assembly import tabulate
-from dano.engine._balance import (
-    chunk_wrenches,
-    contact_wrenches,
-    momentum_jacobian,
-    momentum_residual,
-    to_body,
-    to_velocity,
-    to_world,
-    whole_residual,
-)
-from dano.engine._newton import newton, Report, solve_small, SolverOptions
-from dano.engine._primal_dual import Balance, primal_dual
+from dano.contact import AbstractPatchLaw, DistributedLaw, find, Patch, Softening
+from dano.engine._balance import chunk_wrenches, contact_wrenches, to_body, to_world
+from dano.engine._newton import Report, SolverOptions
 from dano.engine._problem import (
     build_problem,
     find_patches,
@@ -47,9 +28,10 @@ from dano.engine._problem import (
     rows_of,
     structure_of,
 )
-from dano.engine._rigid import angular_jacobian, angular_momentum, too_fast, turned
-from dano.engine._sequential import one_at_a_time
-from dano.maths import matmul, matvec, quat_to_matrix, safe_normalize
+from dano.engine._rigid import too_fast, turned
+from dano.engine._roots import solve
+from dano.engine._trees import advance_tree, generalised, turns_too_far
+from dano.maths import quat_to_matrix, safe_normalize
 from dano.scene import Control, Scene, State
 
 
@@ -61,13 +43,20 @@ def step(
     if not pairs.moving:
         return state, Report(jnp.zeros((), state.position.dtype), jnp.asarray(0), jnp.asarray(True))
     problem, found = build_problem(scene, prepared, state, control, pairs)
-    start = rows_of(jnp.concatenate([state.velocity, state.omega], axis=1), pairs.moving)
-    velocities, report = _solve(problem, found, start, pairs, options)
-    fast = jnp.any(too_fast(velocities[:, 3:], scene.timestep))
+    h, tree = scene.timestep, problem.tree
+    start = _unknowns(scene, state, pairs)
+    solution, report = solve(problem, found, start, pairs, options)
+    if tree is None:
+        following = _advance(state, solution, h, pairs)
+    else:
+        following = advance_tree(scene, tree, state, solution, h)
+    fast = jnp.any(too_fast(following.omega[np.array(pairs.moving)], h))
+    if tree is not None:
+        fast = fast | turns_too_far(tree, solution, h)
     report = report._replace(converged=report.converged & ~fast)
     if found is not None:
         report = report._replace(converged=report.converged & ~found.overflow)
-    return _advance(state, velocities, scene.timestep, pairs), jax.lax.stop_gradient(report)
+    return following, jax.lax.stop_gradient(report)
 
 
 def wrenches(scene: Scene, prepared: Prepared, state: State, following: State) -> Float[Array, "contacts 6"]:
@@ -84,11 +73,15 @@ def wrenches(scene: Scene, prepared: Prepared, state: State, following: State) -
     """
     pairs = structure_of(scene)
     problem, _ = build_problem(scene, prepared, state, None, pairs)
-    velocities = rows_of(jnp.concatenate([following.velocity, following.omega], axis=1), pairs.moving)
+    if problem.tree is None:
+        world = to_world(problem, _unknowns(scene, following, pairs))
+    else:
+        world = problem.tree.twists(generalised(scene, following, state.orientation))
+    velocities = to_body(problem, world)
     centroids = [patch.centroid for patch in patches(scene, prepared, state)]
     of_patches = iter(contact_wrenches(velocities, problem, pairs, Softening()))
     at = iter(problem.patches)
-    of_points = iter(_point_wrenches(scene, problem, velocities, pairs))
+    of_points = iter(_point_wrenches(scene, problem, world, pairs))
     rows = []
     for contact, centroid in zip(scene.contacts, centroids, strict=True):
         if isinstance(contact.law, AbstractPatchLaw):
@@ -116,7 +109,7 @@ def _volumes(scene: Scene, prepared: Prepared, state: State) -> list[Patch]:
     """Volume, centroid and normal of each contact with a point law, where the bodies are."""
     if prepared.geometry is None or prepared.impacts is None:
         return []
-    still = State(state.position, state.orientation, 0 * state.velocity, 0 * state.omega)
+    still = dataclasses.replace(state, velocity=0 * state.velocity, omega=0 * state.omega)
     links = links_of(scene, still, scene.timestep)
     points, _ = find(prepared.geometry, links, prepared.impacts, scene.timestep, prepared.capacity)
     place = state.position[points.first].T[:, :, None] + points.arm
@@ -133,12 +126,12 @@ def _volumes(scene: Scene, prepared: Prepared, state: State) -> list[Patch]:
     return found
 
 
-def _point_wrenches(scene: Scene, problem: Problem, velocities, pairs: Pairs) -> list[Float[Array, "6"]]:
+def _point_wrenches(scene: Scene, problem: Problem, world, pairs: Pairs) -> list[Float[Array, "6"]]:
     """Wrench on the first body of each contact with a point law, about its centre of mass."""
     points, material = problem.points, problem.material
     if points is None or material is None:
         return []
-    wrenches, opposite = chunk_wrenches(problem, velocities, pairs)
+    wrenches, opposite = chunk_wrenches(problem, world, pairs)
     result = []
     for k, a in enumerate(_first_bodies(scene)):
         direct = ((points.contact == k) & (points.first == a))[:, None]
@@ -152,93 +145,11 @@ def _first_bodies(scene: Scene) -> list[int]:
     return [scene.index(c.a) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
 
 
-def _solve(problem: Problem, found: Found | None, start, pairs: Pairs, options: SolverOptions):
-    """Root of the residual, with the derivative that the implicit function theorem gives it."""
-
-    def find_root(problem, found, start):
-        if problem.points is not None:
-            return one_at_a_time(
-                lambda problem, found, start: _solve_points(problem, found, start, pairs, options),
-                problem,
-                found,
-                start,
-            )
-
-        def evaluate(point, softening):
-            velocities = point.reshape(start.shape)
-            residual, slopes = momentum_residual(velocities, problem, pairs, softening)
-            return residual, momentum_jacobian(velocities, problem, pairs, slopes)
-
-        scale = to_velocity(problem)
-        size = jnp.max(jnp.abs(scale * problem.impulse.ravel()))
-        softens = any(law.stiction for law in problem.laws)
-        point, jacobian, report = newton(evaluate, start.ravel(), scale, size, options, softens=softens)
-        return point.reshape(start.shape), jacobian, report
-
-    @eqx.filter_custom_jvp
-    def root(problem, found, start):
-        velocities, _, report = find_root(problem, found, start)
-        return velocities, report
-
-    @root.def_jvp
-    def _(primals, tangents):
-        problem, found, start = primals
-        velocities, jacobian, report = find_root(problem, found, start)
-        # The inverse, not a solve: the tangent must be linear in `change` for reverse mode to transpose it.
-        inverse = solve_small(jacobian, jnp.eye(jacobian.shape[0], dtype=jacobian.dtype))
-        velocities, inverse = (checkpoint_name(value, KEPT) for value in (velocities, inverse))
-        d_problem = tangents[0]
-        d_report = jax.tree.map(lambda _: None, report)
-        if not jax.tree.leaves(d_problem):
-            return (velocities, report), (jnp.zeros_like(velocities), d_report)
-        of_problem = lambda p: whole_residual(velocities, p, pairs)  # noqa: E731
-        _, change = by_autodiff(of_problem, (problem,), (d_problem,))
-        return (velocities, report), (-matvec(inverse, change).reshape(velocities.shape), d_report)
-
-    return root(problem, found, start)
-
-
-def _solve_points(problem: Problem, found, start: Float[Array, "m 6"], pairs: Pairs, options: SolverOptions):
-    """Velocities by the primal–dual method, the Jacobian of R with spins in B, and the report."""
-    m = start.shape[0]
-    rotation = problem.rotation
-    scale = to_velocity(problem).reshape(m, 6)
-    turn = jnp.zeros((m, 6, 6), start.dtype).at[:, :3, :3].set(jnp.eye(3, dtype=start.dtype))
-    turn = turn.at[:, 3:, 3:].set(rotation)  # spins and moments from B into W
-
-    def own(world):
-        """Balance of each body alone: residual (m, 6) and jacobian (m, 6, 6)."""
-        h = problem.timestep
-        omega = to_body(problem, world)[:, 3:]
-        angular = jax.vmap(angular_momentum, (0, 0, None, None))(omega, problem.inertia, h, 1)
-        inertial = jax.vmap(angular_jacobian, (0, 0, None))(omega, problem.inertia, h)
-        missing = jax.vmap(matvec)(rotation, angular - problem.impulse[:, 3:])
-        turned_back = jax.vmap(lambda r, j: matmul(matmul(r, j), r.T))(rotation, inertial)
-        linear = problem.mass[:, None] * world[:, :3] - problem.impulse[:, :3]
-        jacobian = jnp.zeros((m, 6, 6), world.dtype)
-        jacobian = jacobian.at[:, :3, :3].set(
-            problem.mass[:, None, None] * jnp.eye(3, dtype=world.dtype)[None]
-        )
-        return jnp.concatenate([linear, missing], axis=1), jacobian.at[:, 3:, 3:].set(turned_back)
-
-    def balance(world):
-        if not problem.patches:
-            return Balance(*own(world), None)
-        velocities = to_body(problem, world)
-        residual, slopes = momentum_residual(velocities, problem, pairs, Softening())
-        jacobian = momentum_jacobian(velocities, problem, pairs, slopes)
-        residual = jax.vmap(matvec)(turn, residual.reshape(m, 6) / scale)
-        jacobian = (jacobian / scale.ravel()[:, None]).reshape(m, 6, m, 6)
-        jacobian = jnp.einsum("iab,ibjc,jdc->iajd", turn, jacobian, turn)
-        return Balance(residual, jnp.zeros((m, 6, 6), world.dtype), jacobian)
-
-    size = jnp.max(jnp.abs(scale * problem.impulse))
-    world = to_world(problem, start)
-    assert problem.points is not None and problem.material is not None
-    table = tabulate(problem.points, problem.material, found.count, jnp.asarray(pairs.rows), problem.timestep)
-    velocities, jacobian, report = primal_dual(balance, table, world, scale, size, options)
-    back = jnp.einsum("iba,ibjc,jcd->iajd", turn, jacobian.reshape(m, 6, m, 6), turn).reshape(6 * m, 6 * m)
-    return to_body(problem, velocities), scale.ravel()[:, None] * back, report
+def _unknowns(scene: Scene, state: State, pairs: Pairs):
+    """What a step solves for, at a state: generalised velocities, or those of free bodies, shape (m, 6)."""
+    if scene.joints:
+        return generalised(scene, state, state.orientation)
+    return rows_of(jnp.concatenate([state.velocity, state.omega], axis=1), pairs.moving)
 
 
 def _advance(state: State, velocities: Float[Array, "m 6"], h: Float[Array, ""], pairs: Pairs) -> State:

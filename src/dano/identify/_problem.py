@@ -14,6 +14,7 @@ from dano.engine import AbstractEngine, device_mesh
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Space
 from dano.identify._residuals import Linearized, linearized, Model, moved
+from dano.identify._starts import Start
 from dano.identify._windows import draw_velocities, plan_windows
 from dano.scene import Control, Scene, State
 from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
@@ -73,7 +74,8 @@ class Problem:
         self.plan = self._planned()
         self.measured = True
         dtype = scene.timestep.dtype
-        self.private = 3 * len(self.plan.bodies) * len(initial)
+        self.start = _start_of(scene, self.plan.bodies, initial)
+        self.private = self.start.size
         unknowns = len(space.start) + self.private
         n_windows = len(self.plan.rows)
         self.freedom = self.plan.n_data - len(space.start) - n_windows * self.private
@@ -94,7 +96,7 @@ class Problem:
             # Velocities that were not observed may miss by what would move a window's end by the noise.
             for slow, fast in (("position", "velocity"), ("orientation", "omega")):
                 usual[fast] = min(usual[fast], usual[slow] / rate)
-            self.jumps = jnp.asarray([usual[key] for key in QUANTITIES], dtype)
+            self.jumps = jnp.asarray(self.start.widths([usual[key] for key in QUANTITIES]), dtype)
         self.model = Model(
             scene,
             policy,
@@ -106,7 +108,7 @@ class Problem:
             space.selections,
             self.plan.bodies,
             self.plan.quantities,
-            initial,
+            self.start,
             self.plan.n_steps,
             reverse,
             batch or (1 if on_cpu else _BATCH),
@@ -122,11 +124,14 @@ class Problem:
                 "after must be a fit of the same motions in the same windows: "
                 f"{here[0]} windows of {here[1]} bodies, got {there[0]} of {there[1]}"
             )
-        taken = [key for key in self.model.initial if key in estimated]
+        taken = [key for key in self.start.initial if key in estimated]
+        if self.start.turning:
+            poses = any(key in taken for key in ("position", "orientation"))
+            taken += [name for name, mine in (("q", poses), ("v", "velocity" in taken)) if mine]
         fitted = {key: jnp.asarray(getattr(states, key), start.position.dtype) for key in taken}
         self.plan = dataclasses.replace(self.plan, start=dataclasses.replace(start, **fitted))
         # Windows that were fitted have left the wrong basins that measured velocities may begin in.
-        self.measured = len(taken) < len(QUANTITIES)
+        self.measured = not set(QUANTITIES) <= set(taken)
 
     def simulate(self, x: np.ndarray, start: State) -> Linearized:
         """All windows at coordinates and initial states; those as last time are not simulated again."""
@@ -179,7 +184,7 @@ class Problem:
         if self.model.jumps is not None:
             change = _unchained(change, self.plan.owner, self.private)
         rows = jnp.asarray(change.reshape(n, self.private), self.model.scene.timestep.dtype)
-        return moved(start, rows, self.plan.bodies, self.model.initial)
+        return moved(start, rows, self.start)
 
     def points(self, starts: int) -> list[np.ndarray]:
         """Where to start: the given start, and the best by loss of many others in the bounds."""
@@ -246,10 +251,10 @@ class Problem:
         """
         for _ in range(_SWEEPS):
             found = self.simulate(solution.x, solution.blocks)
-            missed = np.asarray(found.jump) * _widths(self.model.jumps, found.jump.shape[1])
+            missed = np.asarray(found.jump) * np.asarray(self.model.jumps)
             change = np.concatenate([np.zeros_like(missed[:1]), missed[:-1]])
             ends = jnp.asarray(change, self.model.scene.timestep.dtype)
-            begin = moved(solution.blocks, ends, self.plan.bodies, self.model.initial)
+            begin = moved(solution.blocks, ends, self.start)
             poor = np.bincount(self.plan.owner, self._fits_poorly(found)) > 0
             # One or two motions may be wrong for the most part.
             mine = poor[self.plan.owner] if len(poor) > 2 else np.ones(len(self.plan.rows), bool)
@@ -332,7 +337,7 @@ def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> Normal
         b[i, tail, tail] = 1.0
     losses = _by_owner(owner, loss, jump)
     # The jump falls one to one as the next window's beginning moves towards the end of this one.
-    step = 1 / _widths(jumps, jump.shape[1])
+    step = 1 / np.asarray(jumps)
     for w, (i, j) in enumerate(zip(owner, place, strict=True)):
         mine = slice(j * k, (j + 1) * k)
         g[i, mine] += gradient[w, p:]
@@ -360,17 +365,23 @@ def _by_owner(owner: np.ndarray, loss: np.ndarray, jump: np.ndarray) -> np.ndarr
 def _different(states: tuple[State, State], others: tuple[State, State]) -> np.ndarray:
     """Which windows have other states."""
     pairs = zip(jax.tree.leaves(states), jax.tree.leaves(others), strict=True)
-    return np.any([np.any(np.asarray(a) != np.asarray(b), axis=(1, 2)) for a, b in pairs], axis=0)
+    return np.any(
+        [(np.asarray(a) != np.asarray(b)).reshape(len(a), -1).any(axis=1) for a, b in pairs], axis=0
+    )
 
 
 def _where(windows: np.ndarray, one: State, other: State) -> State:
-    pick = jnp.asarray(windows)[:, None, None]
-    return jax.tree.map(lambda a, b: jnp.where(pick, a, b), one, other)
+    pick = jnp.asarray(windows)
+    return jax.tree.map(lambda a, b: jnp.where(pick.reshape(-1, *[1] * (a.ndim - 1)), a, b), one, other)
 
 
-def _widths(jumps, size: int) -> np.ndarray:
-    """Standard deviation of each number of a jump of all bodies."""
-    return np.tile(np.repeat(np.asarray(jumps), 3), size // 12)
+def _start_of(scene: Scene, bodies: Sequence[int], initial: tuple[str, ...]) -> Start:
+    """What is estimated of initial states when some bodies were observed."""
+    layout = scene.layout
+    kinds = [scene.joints[j].kind for j in layout.with_coordinates]
+    on_joints = any(i in layout.children for i in bodies)
+    free = tuple(i for i in bodies if i in layout.free)
+    return Start(free, tuple(kind == "hinge" for kind in kinds) if on_joints else (), initial)
 
 
 def _unchained(change: np.ndarray, owner: np.ndarray, k: int) -> np.ndarray:

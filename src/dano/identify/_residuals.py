@@ -1,5 +1,6 @@
 """Residuals of windows, and their normal equations, in one compiled program each."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,9 +10,9 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.engine import AbstractEngine, difference, gather, map_rows, retract, simulate
-from dano.identify._motion import QUANTITIES
+from dano.engine import AbstractEngine, compiled, gather, map_rows, simulate
 from dano.identify._parameters import Selection, with_values
+from dano.identify._starts import Start
 from dano.identify._windows import Windows
 from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
 from dano.scene import Control, Scene, State
@@ -26,12 +27,12 @@ class Model(NamedTuple):
         engine: What simulates.
         windows: The windows.
         huber: Length of a residual, in standard deviations, from which it counts linearly; None: never.
-        jumps: Standard deviations of position, orientation, velocity and spin by which a window may miss the
-            beginning of the next, shape (4,), or None.
+        jumps: Standard deviations by which a window may miss the beginning of the next, of the numbers of
+            `Start.jump`, or None.
         selections: The parameters.
         bodies: Which bodies were observed.
         quantities: Which quantities count.
-        initial: Quantities of the initial states that are estimated.
+        start: What of the initial states is estimated.
         n_steps: Steps of each window.
         reverse: Whether Jacobians are taken in reverse mode.
         batch: How many windows a device simulates at once.
@@ -43,11 +44,11 @@ class Model(NamedTuple):
     engine: AbstractEngine
     windows: Windows
     huber: Float[Array, ""] | None
-    jumps: Float[Array, "4"] | None
+    jumps: Float[Array, " c"] | None
     selections: tuple[Selection, ...]
     bodies: tuple[int, ...]
     quantities: tuple[str, ...]
-    initial: tuple[str, ...]
+    start: Start
     n_steps: int
     reverse: bool
     batch: int
@@ -123,7 +124,7 @@ def linearized(
     return jax.tree.map(lambda leaf: jnp.asarray(leaf[:n]), gather(found))
 
 
-@eqx.filter_jit
+@compiled
 def _linearized(
     model: Model, x: Float[Array, " p"], start: State, following: State, wanted: Bool[Array, " w"]
 ) -> Linearized:
@@ -167,7 +168,7 @@ def _nothing(model: Model, state: State, p: int) -> Linearized:
     """Zeros in place of a window."""
     frames, bodies = model.windows.frame[0].shape[1], len(model.bodies)
     unknowns = p + len(_no_change(model))
-    jumps = 1 if model.jumps is None else 12 * bodies
+    jumps = 1 if model.jumps is None else len(model.jumps)
 
     def zeros(*shape: int) -> Array:
         return jnp.zeros(shape, model.scene.timestep.dtype)
@@ -178,31 +179,25 @@ def _nothing(model: Model, state: State, p: int) -> Linearized:
         zeros(unknowns, unknowns),
         zeros(jumps),
         zeros(jumps, unknowns),
-        jax.tree.map(lambda leaf: zeros(frames, *leaf.shape), state),
+        jax.tree.map(lambda leaf: zeros(frames, *leaf.shape), _rows_of(state)),
         zeros(frames, bodies, len(model.quantities)),
         jnp.zeros((), int),
     )
 
 
-@eqx.filter_jit
-def moved(
-    start: State, change: Float[Array, "w k"], bodies: tuple[int, ...], initial: tuple[str, ...]
-) -> State:
+@compiled
+def moved(start: State, change: Float[Array, "w k"], unknowns: Start) -> State:
     """Initial states moved by a change of what is estimated of them."""
-    return jax.vmap(lambda s, c: retract(s, np.array(bodies), _spread(c, len(bodies), initial)))(
-        start, change
-    )
+    return jax.vmap(unknowns.moved)(start, change)
 
 
-def _spread(change: Float[Array, " k"], n: int, initial: tuple[str, ...]) -> Float[Array, "n 12"]:
-    """Changes of all that `retract` moves, from those of what is estimated."""
-    given = iter(jnp.split(change.reshape(n, -1), len(initial), axis=1)) if initial else iter(())
-    zero = jnp.zeros((n, 3), change.dtype)
-    return jnp.concatenate([next(given) if key in initial else zero for key in QUANTITIES], axis=1)
+def _rows_of(state: State) -> State:
+    """The part of a state that bodies are observed in."""
+    return dataclasses.replace(state, q=None, v=None)
 
 
 def _no_change(model: Model) -> Float[Array, " k"]:
-    return jnp.zeros(3 * len(model.bodies) * len(model.initial), model.scene.timestep.dtype)
+    return jnp.zeros(model.start.size, model.scene.timestep.dtype)
 
 
 def _bodies(model: Model) -> np.ndarray:
@@ -217,8 +212,7 @@ def _residuals(model: Model, window: Windows, start: State, following: State, x,
         controls = _Late(with_values(model.selections, "controls", model.policy, x), window.begin)
     elif controls is not None:
         controls = with_values(model.selections, "controls", controls, x)
-    if model.initial:
-        start = retract(start, _bodies(model), _spread(change, len(model.bodies), model.initial))
+    start = model.start.moved(start, change)
     trajectory = simulate(
         scene,
         _shifted(scene, start, window.origins, 1),
@@ -238,8 +232,7 @@ def _residuals(model: Model, window: Windows, start: State, following: State, x,
     if model.jumps is not None:
         last = _shifted(scene, _at(states, tuple(part[None] for part in window.end)), window.origins, -1)
         last = jax.tree.map(lambda leaf: leaf[0], last)
-        missed = difference(following, last, _bodies(model)) / jnp.repeat(model.jumps, 3)[None]
-        jump = window.chained * missed.ravel()
+        jump = window.chained * model.start.jump(following, last) / model.jumps
     used = jnp.arange(model.n_steps) <= jnp.max(window.frame[0])
     unconverged = jnp.sum(used & ~trajectory.converged)
     return rows, jump, predicted, unconverged
@@ -248,10 +241,12 @@ def _residuals(model: Model, window: Windows, start: State, following: State, x,
 def _at(states: State, where) -> State:
     """States between steps: positions and velocities in proportion, orientations normalised."""
     step, share = where
-    share = share[:, None, None]
-    before = jax.tree.map(lambda leaf: leaf[step], states)
-    after = jax.tree.map(lambda leaf: leaf[step + 1], states)
-    mixed = jax.tree.map(lambda a, b: a + share * (b - a), before, after)
+
+    def mix(leaf):
+        before, after = leaf[step], leaf[step + 1]
+        return before + share.reshape(-1, *[1] * (leaf.ndim - 1)) * (after - before)
+
+    mixed = jax.tree.map(mix, states)
     return eqx.tree_at(lambda s: s.orientation, mixed, quat_normalize(mixed.orientation))
 
 
@@ -260,11 +255,10 @@ def _shifted(scene: Scene, state: State, origins, sign: int) -> State:
     arm = jnp.stack([body.com + body.com_offset for body in scene.bodies])
     arm = jnp.where(origins[:, None], sign * arm, 0).astype(state.position.dtype)
     arm = jnp.broadcast_to(arm, state.position.shape)
-    return State(
-        state.position + quat_rotate(state.orientation, arm),
-        state.orientation,
-        state.velocity + quat_rotate(state.orientation, jnp.cross(state.omega, arm)),
-        state.omega,
+    return dataclasses.replace(
+        state,
+        position=state.position + quat_rotate(state.orientation, arm),
+        velocity=state.velocity + quat_rotate(state.orientation, jnp.cross(state.omega, arm)),
     )
 
 

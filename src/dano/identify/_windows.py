@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.identify._motion import Motion, QUANTITIES, SMOOTHING_FRAMES
+from dano.maths import quat_rotate
 from dano.scene import Control, Scene, State
 
 _CONFIGURATION = ("position", "orientation")
@@ -162,7 +163,10 @@ def plan_windows(
         _control_rows(scene, forces, first_step, n_steps),
     )
     start = State(
-        *(jnp.asarray(np.stack([piece["start"][key] for piece in pieces]), dtype) for key in QUANTITIES)
+        **{
+            key: jnp.asarray(np.stack([piece["start"][key] for piece in pieces]), dtype)
+            for key in pieces[0]["start"]
+        }
     )
     return Plan(
         windows,
@@ -232,7 +236,7 @@ def _cut(
         first += int(ready[0])
         last = n if window is None else min(first + window, n)
         if last - first >= 2:
-            start = _initial(scene, motion, full, smooth, state, first, h, what)
+            start = _initial(scene, motion, full, smooth, state, first, h, what, origins)
             pieces.append(
                 {
                     "owner": number,
@@ -273,7 +277,7 @@ def _says_where(scene, motion, full, has_state: bool, moving) -> np.ndarray:
     return ready
 
 
-def _initial(scene, motion, full, smooth, state, first: int, h: float, what: str):
+def _initial(scene, motion, full, smooth, state, first: int, h: float, what: str, origins):
     """Initial state of the window that begins at a frame, as a dict of arrays (n, ·)."""
     start = {}
     unseen = [i for i, body in enumerate(scene.bodies) if not body.fixed and body.name not in motion.names]
@@ -293,7 +297,27 @@ def _initial(scene, motion, full, smooth, state, first: int, h: float, what: str
         known = np.isfinite(found).all(axis=-1)
         value[known] = found[known]
         start[key] = value
-    return start
+    return {**start, **_joint_start(scene, motion, start, state, origins)} if scene.joints else start
+
+
+def _joint_start(scene, motion, start, state, origins) -> dict[str, np.ndarray]:
+    """Coordinates and velocities of the joints: those of observed bodies from their poses, others stated."""
+    layout = scene.layout
+    com = np.stack([np.asarray(body.com + body.com_offset) for body in scene.bodies])
+    arms = quat_rotate(start["orientation"], np.where(origins[:, None], com, 0.0))
+    turning = quat_rotate(start["orientation"], start["omega"])
+    dtype = scene.timestep.dtype
+    rows = State(
+        jnp.asarray(start["position"] + arms, dtype),
+        jnp.asarray(start["orientation"], dtype),
+        jnp.asarray(start["velocity"] + np.cross(turning, arms), dtype),
+        jnp.asarray(start["omega"], dtype),
+    )
+    found = scene.joint_values(rows)
+    seen = [scene.joints[j].child in motion.names for j in layout.with_coordinates]
+    given = found if state is None else (state.q, state.v)
+    q, v = (np.where(seen, np.asarray(f), np.asarray(g)) for f, g in zip(found, given, strict=True))
+    return {"q": q, "v": v}
 
 
 def _earlier(motion: Motion, values: np.ndarray, first: int, h: float) -> np.ndarray:
@@ -327,14 +351,16 @@ def _control_rows(scene: Scene, controls: list[Control | None], first_step, n_st
     """Rows of each window, zero after the last one that is given."""
     if all(control is None for control in controls):
         return None
-    shape = (n_steps, len(scene.bodies), 3)
+    bodies = (len(scene.bodies), 3)
 
-    def rows(name: str) -> Array:
-        table = np.zeros((len(controls), *shape))
+    def rows(name: str, shape: tuple[int, ...]) -> Array:
+        table = np.zeros((len(controls), n_steps, *shape))
         for row, control, first in zip(table, controls, first_step, strict=True):
-            if control is not None:
+            if control is not None and getattr(control, name) is not None:
                 part = np.asarray(getattr(control, name))[first : first + n_steps]
                 row[: len(part)] = part
         return jnp.asarray(table, scene.timestep.dtype)
 
-    return Control(rows("force"), rows("torque"))
+    driven = any(control is not None and control.effort is not None for control in controls)
+    effort = rows("effort", (scene.layout.n_joints,)) if driven else None
+    return Control(rows("force", bodies), rows("torque", bodies), effort)

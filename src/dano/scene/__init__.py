@@ -6,10 +6,22 @@ from dano.scene._contacts import (
     Contact as Contact,
     pressing_pairs as pressing_pairs,
 )
+from dano.scene._frames import (
+    Chains as Chains,
+    filled as filled,
+    Frames as Frames,
+    link_jacobian as link_jacobian,
+    place_links as place_links,
+    Poses as Poses,
+    step_twists as step_twists,
+)
+from dano.scene._joints import joined as joined, Joint as Joint, JOINT_KINDS as JOINT_KINDS, Layout as Layout
 from dano.scene._scene import Scene as Scene
 from dano.scene._states import (
     Control as Control,
+    JOINT_QUANTITIES as JOINT_QUANTITIES,
     State as State,
+    state_arrays as state_arrays,
     STATE_SIZES as STATE_SIZES,
     Trajectory as Trajectory,
 )

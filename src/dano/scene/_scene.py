@@ -1,5 +1,6 @@
 """Scenes: bodies, the contacts between them, a timestep and gravity."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -12,7 +13,9 @@ from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
 from dano.objects import checked_inertia
 from dano.scene._bodies import Body
 from dano.scene._contacts import Contact, prepared
-from dano.scene._states import Control, State, STATE_SIZES
+from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
+from dano.scene._joints import Joint, Layout, layout_of
+from dano.scene._states import Control, JOINT_QUANTITIES, State, STATE_SIZES
 
 
 class Scene(eqx.Module):
@@ -25,6 +28,7 @@ class Scene(eqx.Module):
         gravity: [m/s², W].
         twins: For each body the first that is made of the same object: its samples and its solid stand once
             in memory (static).
+        joints: What hangs on what.
     """
 
     bodies: tuple[Body, ...]
@@ -32,6 +36,7 @@ class Scene(eqx.Module):
     timestep: Float[Array, ""]
     gravity: Float[Array, "3"]
     twins: tuple[int, ...] = eqx.field(static=True, default=())
+    joints: tuple[Joint, ...] = ()
 
     @classmethod
     def create(
@@ -39,22 +44,32 @@ class Scene(eqx.Module):
         bodies: Sequence[Body],
         contacts: Sequence[Contact] = (),
         *,
+        joints: Sequence[Joint] = (),
         timestep: Numbers = 0.01,
         gravity: Numbers = (0.0, 0.0, -9.81),
     ) -> "Scene":
         """Check the parts against each other and resolve defaults that depend on both bodies of a contact.
 
+        Args:
+            bodies: The bodies, in the order that states index.
+            contacts: Which pairs may touch.
+            joints: What hangs on what, in the order of the coordinates q.
+            timestep: h [s].
+            gravity: [m/s², W].
+
         Raises:
             ValueError: If there is no body, two have one name, a contact names an unknown body, joins two
-                fixed ones or a pair twice, a pair cannot overlap, or a number is out of range.
+                fixed ones or a pair twice, a pair cannot overlap, joints make no trees, or a number is out
+                of range.
         """
-        bodies, contacts = tuple(bodies), tuple(contacts)
+        bodies, contacts, joints = tuple(bodies), tuple(contacts), tuple(joints)
         names = [body.name for body in bodies]
         if not bodies:
             raise ValueError("bodies must hold at least one body, got none")
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"bodies must have different names, got {name!r} {names.count(name)} times")
+        layout = layout_of(*_structure(bodies, joints))
         timestep = checked_array("timestep", timestep, ())
         if not is_traced(timestep) and not float(timestep) > 0:
             raise ValueError(f"timestep must be > 0 s, got {float(timestep)}")
@@ -68,6 +83,7 @@ class Scene(eqx.Module):
                     f"contacts must join each pair once, got ({contact.a!r}, {contact.b!r}) twice"
                 )
             seen.add(frozenset((contact.a, contact.b)))
+            _check_apart(layout, names, contact)
         gravity = checked_array("gravity", gravity, (3,))
         # Before the bodies are prepared, which makes new ones.
         objects = [body.object for body in bodies]
@@ -76,7 +92,18 @@ class Scene(eqx.Module):
             for i, o in enumerate(objects)
         )
         bodies, contacts = prepared(bodies, contacts, gravity)
-        return cls(bodies, contacts, timestep, gravity, twins)
+        return cls(bodies, contacts, timestep, gravity, twins, joints)
+
+    @property
+    def layout(self) -> Layout:
+        """Which numbers say how the bodies stand and move."""
+        return layout_of(*_structure(self.bodies, self.joints))
+
+    @property
+    def chains(self) -> Chains:
+        """The trees that bodies and joints make, as arrays."""
+        com = jnp.stack([body.com + body.com_offset for body in self.bodies])
+        return chains_of(self.layout, self.joints, com.astype(self.timestep.dtype))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -168,16 +195,39 @@ class Scene(eqx.Module):
                 checked_inertia(key, value)
         return eqx.tree_at(lambda s: [getattr(s.bodies[i], key) for key in keys], self, values)
 
+    def replace_joint(self, child: str, **changes: Numbers) -> "Scene":
+        """The scene with some of a joint's `axis, anchor, position, orientation, damping` changed.
+
+        Args:
+            child: Name of the body that hangs on the joint.
+            **changes: See `Joint`.
+
+        Raises:
+            ValueError: If no joint carries the body, a property is unknown, or a value is out of range.
+        """
+        children = [joint.child for joint in self.joints]
+        if child not in children:
+            raise ValueError(f"joint must carry one of {children}, got {child!r}")
+        valid = ["axis", "anchor", "position", "orientation", "damping"]
+        for key in changes:
+            if key not in valid:
+                raise ValueError(f"joint property must be one of {valid}, got {key!r}")
+        i = children.index(child)
+        joints = (*self.joints[:i], dataclasses.replace(self.joints[i], **changes), *self.joints[i + 1 :])
+        return dataclasses.replace(self, joints=joints)
+
     def initial_state(self, /, **bodies: dict[str, Numbers]) -> State:
         """A state: bodies by keyword, each a dict of `position, orientation, velocity, omega`.
 
-        Bodies that are not named rest at the origin. Orientations are normalised.
+        Bodies on joints have `q` and `v` instead: angle [rad] and rate, or length [m] and rate. Bodies that
+        are not named rest at the origin, or at q = 0. Orientations are normalised.
 
         Raises:
             ValueError: If a body or quantity is unknown, a shape is wrong, a number is not finite, a
                 quaternion is zero, or a body spins faster than the timestep resolves (|ω| ≥ 2/h).
         """
         rows: dict[str, list[Array]] = {name: [] for name in STATE_SIZES}
+        layout = self.layout
         for name in bodies:
             self.index(name)
         default: dict[str, Numbers] = {
@@ -186,18 +236,59 @@ class Scene(eqx.Module):
             "velocity": (0.0,) * 3,
             "omega": (0.0,) * 3,
         }
-        for name in self.names:
+        for i, name in enumerate(self.names):
             given = bodies.get(name, {})
+            valid = _state_keys(layout, i)
             for key in given:
-                if key not in STATE_SIZES:
-                    raise ValueError(f"state of {name!r} must be given by {list(STATE_SIZES)}, got {key!r}")
+                if key not in valid:
+                    why = "" if layout.joint_of(i) is None else ", for it hangs on a joint"
+                    raise ValueError(f"state of {name!r} must be given by {valid}{why}, got {key!r}")
             for key, size in STATE_SIZES.items():
                 label, value = f"{key} of {name!r}", given[key] if key in given else default[key]
                 check = checked_quaternion(label, value) if size == 4 else checked_array(label, value, (3,))
                 rows[key].append(check.astype(self.timestep.dtype))
         state = State(*(jnp.stack(rows[key]) for key in STATE_SIZES))
+        if self.joints:
+            state = self.filled(dataclasses.replace(state, **self._joint_values(bodies, JOINT_QUANTITIES)))
         self.check_state(state)
         return state
+
+    def filled(self, state: State) -> State:
+        """The state with the rows of bodies on joints as `q` and `v` say; for one state.
+
+        What starts a simulation does this itself: it is for those who change `q` or `v` and look at poses.
+        """
+        return filled(self.chains, state, self.timestep)
+
+    def joint_values(self, state: State) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+        """Coordinates q and velocities v of the joints that poses and velocities of the bodies have.
+
+        Angles are between −π and π; what the joints do not allow is left out.
+        """
+        return joint_values(self.chains, state)
+
+    def frames(self, state: State) -> Frames:
+        """Pose, twist and Jacobian of every body, for one state.
+
+        Of bodies on joints only `q` and `v` count. Velocities are those of this moment, where those of a
+        state are those of the step that ended there.
+
+        Raises:
+            ValueError: If the state does not fit the scene.
+        """
+        self.check_state(state)
+        return frames_of(self.chains, state)
+
+    def _joint_values(self, bodies: dict[str, dict[str, Numbers]], keys: Sequence[str]) -> dict[str, Array]:
+        """Numbers of the joints that have a coordinate, given by their bodies' names; zero by default."""
+        names = [self.joints[j].child for j in self.layout.with_coordinates]
+        dtype = self.timestep.dtype
+        return {
+            key: jnp.asarray(
+                [checked_array(f"{key} of {n!r}", bodies.get(n, {}).get(key, 0.0), ()) for n in names]
+            ).astype(dtype)
+            for key in keys
+        }
 
     def check_state(self, state: State) -> None:
         """Check a concrete state against the scene; traced values pass.
@@ -212,6 +303,16 @@ class Scene(eqx.Module):
                 raise ValueError(
                     f"state.{key} must have shape (…, {len(self.bodies)}, {size}), got {value.shape}"
                 )
+            if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
+                raise ValueError(f"state.{key} must be finite, got {np.asarray(value).tolist()}")
+        for key in JOINT_QUANTITIES:
+            value = getattr(state, key)
+            if not self.joints and value is None:
+                continue
+            expected = (*state.position.shape[:-2], self.layout.n_joints)
+            if value is None or value.shape != expected:
+                got = None if value is None else value.shape
+                raise ValueError(f"state.{key} must have shape {expected}, got {got}")
             if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
                 raise ValueError(f"state.{key} must be finite, got {np.asarray(value).tolist()}")
         if not is_traced(state.orientation):
@@ -232,21 +333,61 @@ class Scene(eqx.Module):
     def control(self, /, **bodies: dict[str, Numbers]) -> Control:
         """Control for one step: bodies by keyword, each a dict of `force` [N, W] and `torque` [N m, W].
 
+        Bodies on joints may have `effort`, the torque [N m] or force [N] of the joint.
+
         Raises:
             ValueError: If a body or quantity is unknown or a shape is wrong.
         """
         rows: dict[str, list[Array]] = {"force": [], "torque": []}
         for name in bodies:
             self.index(name)
-        for name in self.names:
+        layout = self.layout
+        for i, name in enumerate(self.names):
             given = bodies.get(name, {})
+            joint = layout.joint_of(i)
+            driven = joint is not None and layout.coordinates[joint] >= 0
+            valid = [*rows, *(["effort"] if driven else [])]
             for key in given:
-                if key not in rows:
-                    raise ValueError(f"control of {name!r} must be given by {list(rows)}, got {key!r}")
+                if key not in valid:
+                    raise ValueError(f"control of {name!r} must be given by {valid}, got {key!r}")
             for key, values in rows.items():
                 value = checked_array(f"{key} of {name!r}", given.get(key, (0.0,) * 3), (3,))
                 values.append(value.astype(self.timestep.dtype))
-        return Control(jnp.stack(rows["force"]), jnp.stack(rows["torque"]))
+        effort = self._joint_values(bodies, ["effort"])["effort"] if self.joints else None
+        return Control(jnp.stack(rows["force"]), jnp.stack(rows["torque"]), effort)
+
+
+def _structure(bodies: Sequence[Body], joints: Sequence[Joint]):
+    """Arguments of `layout_of`."""
+    return (
+        tuple(body.name for body in bodies),
+        tuple(body.fixed for body in bodies),
+        tuple((joint.parent, joint.child, joint.kind) for joint in joints),
+    )
+
+
+def _state_keys(layout: Layout, body: int) -> list[str]:
+    """What the state of a body is given by."""
+    joint = layout.joint_of(body)
+    if joint is None:
+        return list(STATE_SIZES)
+    return list(JOINT_QUANTITIES) if layout.coordinates[joint] >= 0 else []
+
+
+def _check_apart(layout: Layout, names: list[str], contact: Contact) -> None:
+    """Check that joints let the bodies of a contact move against each other.
+
+    Raises:
+        ValueError: If they are welded together.
+    """
+    a, b = names.index(contact.a), names.index(contact.b)
+    same_root = layout.roots[a] == layout.roots[b]
+    hang = {a, b} <= {*layout.children, *layout.free}
+    if layout.children and same_root and hang and layout.moved_by[a] == layout.moved_by[b]:
+        raise ValueError(
+            f"contact must join bodies that can move against each other, got {contact.a!r} and "
+            f"{contact.b!r}, which are welded together"
+        )
 
 
 def _as_leaf(value: Array, like: Array) -> Array:

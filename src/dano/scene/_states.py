@@ -1,6 +1,7 @@
 """What moves: states, controls, trajectories."""
 
 import os
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,6 +13,8 @@ from dano.archive import read_archive, write_archive
 _REPORTED = ("residuals", "iterations", "converged")
 STATE_SIZES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 """Quantities of a state, and how many numbers each has per body."""
+JOINT_QUANTITIES = ("q", "v")
+"""Quantities of a state that joints have, one number each."""
 
 
 class State(eqx.Module):
@@ -22,24 +25,38 @@ class State(eqx.Module):
         orientation: Unit quaternion wxyz, body → world, shape (n, 4).
         velocity: Velocity of the centre of mass [m/s, W], shape (n, 3).
         omega: Angular velocity [rad/s, B], shape (n, 3).
+        q: Coordinates of the joints [rad or m], shape (k,); None in a scene without joints. They say where
+            bodies on joints are; the rows of these bodies above follow from them (`Scene.filled`).
+        v: Velocities of the joints [rad/s or m/s], shape (k,).
     """
 
     position: Float[Array, "*t n 3"]
     orientation: Float[Array, "*t n 4"]
     velocity: Float[Array, "*t n 3"]
     omega: Float[Array, "*t n 3"]
+    q: Float[Array, "*t k"] | None = None
+    v: Float[Array, "*t k"] | None = None
+
+
+def state_arrays(states: State) -> dict[str, Array]:
+    """The arrays of states by name; those of joints where there are some."""
+    names = (*STATE_SIZES, *(JOINT_QUANTITIES if states.q is not None else ()))
+    return {name: getattr(states, name) for name in names}
 
 
 class Control(eqx.Module):
-    """External force and torque on each body, constant over a step.
+    """External force and torque on each body, and what drives the joints; constant over a step.
 
     Attributes:
         force: At the centre of mass [N, W], shape (n, 3).
         torque: [N m, W], shape (n, 3).
+        effort: Torque [N m] or force [N] of each joint between the bodies that it joins, shape (k,); None
+            for none.
     """
 
     force: Float[Array, "*t n 3"]
     torque: Float[Array, "*t n 3"]
+    effort: Float[Array, "*t k"] | None = None
 
 
 class Trajectory(eqx.Module):
@@ -79,7 +96,7 @@ class Trajectory(eqx.Module):
                 "version": np.array(1),
                 "names": np.array(self.names),
                 "times": np.asarray(self.times),
-                **{name: np.asarray(getattr(self.states, name)) for name in STATE_SIZES},
+                **{name: np.asarray(value) for name, value in state_arrays(self.states).items()},
                 **{name: np.asarray(getattr(self, name)) for name in _REPORTED},
                 **({} if source is None else {"source": np.array(source)}),
             },
@@ -96,6 +113,8 @@ class Trajectory(eqx.Module):
         try:
             arrays = {name: jnp.asarray(data[name]) for name in ("times", *_REPORTED)}
             states = State(*(jnp.asarray(data[name]) for name in STATE_SIZES))
+            if "q" in data:
+                states = replace(states, **{name: jnp.asarray(data[name]) for name in JOINT_QUANTITIES})
             return cls(states=states, names=tuple(str(name) for name in data["names"]), **arrays)
         except KeyError as error:
             raise ValueError(f"{path} is not a valid dano trajectory: it lacks {error}") from error

@@ -17,7 +17,7 @@ from dano.maths import Pose
 from dano.memory import memory_limit
 from dano.names import did_you_mean
 from dano.objects import MassModel, NeuralObject
-from dano.scene import Body, Contact, Scene, State
+from dano.scene import Body, Contact, joined, Joint, JOINT_KINDS, JOINT_QUANTITIES, Scene, State
 from dano.scene_file._objects import asset_look, build_asset, build_object, Progress
 from dano.scene_file._schedule import read_schedule, Schedule
 from dano.scene_file._table import located, Table
@@ -38,7 +38,8 @@ SHAPES: dict[str, tuple[type[AbstractShape], dict[str, int]]] = {
 _REQUIRED = {"radius", "half_extents", "half_length", "semi_axes"}
 _STATE = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 _GEOMETRY = ("object", "field", "asset", "shape")
-_BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE)
+_BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE, *JOINT_QUANTITIES)
+_JOINT = {"axis": 3, "anchor": 3, "position": 3, "orientation": 4}
 _BUILD = ("samples", "density_range", "mass_model", "mass_scale", "resolution", "length", "seed", "floaters")
 _PARAMS = tuple(ContactParams.__dataclass_fields__)
 _OF_CENTROIDS = (
@@ -73,7 +74,17 @@ _FLAGS = ("adhesive", "compliant")
 _CONTACT = ("law", "edge", *dict.fromkeys(key for _, keys in _LAWS.values() for key in keys))
 _BYTES_PER_STEP = 500
 """Of a body in memory: state, joined pieces, and contact forces."""
-_TOP = ("timestep", "gravity", "duration", "n_steps", "bodies", "contacts", "default_contact", "controls")
+_TOP = (
+    "timestep",
+    "gravity",
+    "duration",
+    "n_steps",
+    "bodies",
+    "joints",
+    "contacts",
+    "default_contact",
+    "controls",
+)
 
 
 @dataclass(frozen=True)
@@ -198,10 +209,12 @@ def parse_scene(
     built: dict[object, NeuralObject] = {}
     rows = [Table(f"{path}: [[bodies]] {i + 1}", table, None) for i, table in enumerate(tables)]
     bodies = [_body(row, path.parent, built, progress) for row in rows]
-    contacts = _contacts(top, bodies, default_law)
+    joints = _joints(top, [body.name for body in bodies])
+    contacts = _contacts(top, bodies, joints, default_law)
     with located(str(path)):
-        scene = Scene.create(bodies, contacts, timestep=h, gravity=gravity)
-        start = {row["name"]: {key: row[key] for key in _STATE if key in row} for row in tables}
+        scene = Scene.create(bodies, contacts, joints=joints, timestep=h, gravity=gravity)
+        given = (*_STATE, *JOINT_QUANTITIES)
+        start = {row["name"]: {key: row[key] for key in given if key in row} for row in tables}
         state = scene.initial_state(**start)
     objects = {
         row["name"]: row["asset"] if "asset" in row else path.parent / Path(row["object"]).expanduser()
@@ -237,6 +250,9 @@ def _body(row: Table, folder: Path, built: dict[object, NeuralObject], progress:
     for key, n in _STATE.items():
         if key in row:
             row.vector(key, n)
+    for key in JOINT_QUANTITIES:
+        if key in row:
+            row.number(key)
     with located(row.where):
         if kinds == ["shape"]:
             return Body(name, _shape(row), **options)
@@ -298,16 +314,35 @@ def _from_field_file(path: Path, build: Table, *, weighed: bool, progress: Progr
     return build_object(load_field(path), weighed=weighed, progress=progress, **options)
 
 
-def _contacts(top: Table, bodies: Sequence[Body], default_law: str) -> list[Contact]:
+def _joints(top: Table, names: Sequence[str]) -> list[Joint]:
+    joints = []
+    for i, row in enumerate(top.tables("joints")):
+        table = Table(
+            f"{top.where}: [[joints]] {i + 1}", row, ("parent", "child", "kind", *_JOINT, "damping")
+        )
+        child = table.word("child", names)
+        table.where += f" ({child!r})"
+        parent = table.word("parent", names) if "parent" in table else None
+        options: dict[str, Any] = {key: table.vector(key, n) for key, n in _JOINT.items() if key in table}
+        with located(table.where):
+            kind = table.word("kind", JOINT_KINDS, "hinge")
+            joints.append(Joint(parent, child, kind, damping=table.number("damping", 0.0), **options))
+    return joints
+
+
+def _contacts(top: Table, bodies: Sequence[Body], joints: Sequence[Joint], default_law: str) -> list[Contact]:
     default = top.table("default_contact", _CONTACT)
     default.where = f"{top.where}: [default_contact]"
     usual = _law_name(default, default_law)
     if top.data.get("contacts", "all") == "all":
         pairs = itertools.combinations(bodies, 2)
+        apart = joined(joints)
         return [
             _contact(default, usual, a.name, b.name)
             for a, b in pairs
-            if a.name != b.name and _can_touch(a, b, presses=_LAWS[usual][0]().presses)
+            if a.name != b.name
+            and not apart(a.name, b.name)
+            and _can_touch(a, b, presses=_LAWS[usual][0]().presses)
         ]
     if isinstance(top.data["contacts"], str):
         raise top.wrong("contacts", "'all' or written as [[contacts]] tables")

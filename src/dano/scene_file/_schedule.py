@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int
 from dano.scene import Control, Scene, State
 from dano.scene_file._table import located, Table
 
-_CONTROL = ("body", "force", "torque", "target", "stiffness", "damping", "from", "to")
+_CONTROL = ("body", "force", "torque", "effort", "target", "stiffness", "damping", "from", "to")
 
 
 class Schedule(eqx.Module):
@@ -22,6 +22,8 @@ class Schedule(eqx.Module):
         end: [s], shape (m,).
         force: Constant force f at the centre of mass [N, W], shape (m, 3).
         torque: τ [N m, W], shape (m, 3).
+        effort: Of the body's joint [N m or N], shape (m,).
+        joint: Place of that joint among the coordinates q, shape (m,).
         target: Where a spring pulls the centre of mass to [m, W], shape (m, 3).
         stiffness: k of that spring [N/m], shape (m,).
         damping: c [N s/m], shape (m,).
@@ -34,6 +36,8 @@ class Schedule(eqx.Module):
     end: Float[Array, " m"]
     force: Float[Array, "m 3"]
     torque: Float[Array, "m 3"]
+    effort: Float[Array, " m"]
+    joint: Int[Array, " m"]
     target: Float[Array, "m 3"]
     stiffness: Float[Array, " m"]
     damping: Float[Array, " m"]
@@ -47,7 +51,12 @@ class Schedule(eqx.Module):
         pull = self.stiffness[:, None] * (self.target - state.position[self.body])
         force = self.force + pull - self.damping[:, None] * state.velocity[self.body]
         none = jnp.zeros_like(state.position)
-        return Control(none.at[self.body].add(acts * force), none.at[self.body].add(acts * self.torque))
+        effort = None
+        if state.q is not None:
+            effort = jnp.zeros_like(state.q).at[self.joint].add(acts[:, 0] * self.effort)
+        return Control(
+            none.at[self.body].add(acts * force), none.at[self.body].add(acts * self.torque), effort
+        )
 
     def starting_at(self, time: float) -> "Schedule":
         """The same schedule for a rollout that begins at `time` [s]."""
@@ -62,8 +71,21 @@ def read_schedule(top: Table, scene: Scene) -> Schedule | None:
     if not rows:
         return None
     columns: dict[str, list] = {
-        key: [] for key in ("body", "start", "end", "force", "torque", "target", "stiffness", "damping")
+        key: []
+        for key in (
+            "body",
+            "joint",
+            "start",
+            "end",
+            "force",
+            "torque",
+            "target",
+            "effort",
+            "stiffness",
+            "damping",
+        )
     }
+    layout = scene.layout
     for row in rows:
         with located(row.where):
             index = scene.index(row.word("body"))
@@ -79,11 +101,17 @@ def read_schedule(top: Table, scene: Scene) -> Schedule | None:
             raise row.wrong("stiffness" if stiffness < 0 else "damping", "≥ 0")
         if ("target" in row) != ("stiffness" in row):
             raise ValueError(f"{row.where}: target [m] and stiffness [N/m] must be given together")
+        joint = layout.joint_of(index)
+        place = -1 if joint is None else layout.coordinates[joint]
+        if "effort" in row and place < 0:
+            raise ValueError(f"{row.where}: effort needs a body on a hinge or a slide")
         zero = (0.0, 0.0, 0.0)
-        values = (index, start, end, *(row.vector(key, 3, zero) for key in ("force", "torque", "target")))
-        for key, value in zip(columns, (*values, stiffness, damping), strict=True):
+        vectors = (row.vector(key, 3, zero) for key in ("force", "torque", "target"))
+        numbers = (row.number("effort", 0.0), stiffness, damping)
+        values = (index, max(place, 0), start, end, *vectors, *numbers)
+        for key, value in zip(columns, values, strict=True):
             columns[key].append(value)
     dtype = scene.timestep.dtype
-    body = jnp.asarray(columns.pop("body"), jnp.int32)
+    whole = {key: jnp.asarray(columns.pop(key), jnp.int32) for key in ("body", "joint")}
     arrays = {key: jnp.asarray(value, dtype) for key, value in columns.items()}
-    return Schedule(body=body, **arrays, timestep=scene.timestep, now=jnp.zeros((), dtype))
+    return Schedule(**whole, **arrays, timestep=scene.timestep, now=jnp.zeros((), dtype))

@@ -1,0 +1,179 @@
+"""The root of a step's equations, with the derivative that the implicit function theorem gives it."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Float
+
+from dano.contact import by_autodiff, Found, KEPT, Softening
+from dano.engine._assembly import Table, tabulate
+from dano.engine._balance import (
+    momentum_jacobian,
+    momentum_residual,
+    point_momenta,
+    to_body,
+    to_velocity,
+    to_world,
+    to_world_matrices,
+    whole_residual,
+    world_momenta,
+    world_patches,
+)
+from dano.engine._newton import newton, solve_small, SolverOptions
+from dano.engine._primal_dual import Balance, primal_dual
+from dano.engine._problem import Pairs, Problem
+from dano.engine._sequential import one_at_a_time
+from dano.engine._trees import mass_matrix, Tree, tree_balance
+from dano.maths import matmul, matvec
+
+
+def solve(problem: Problem, found: Found | None, start: Array, pairs: Pairs, options: SolverOptions):
+    """Velocities at the end of a step, and the report.
+
+    Args:
+        problem: The step.
+        found: Where its points were found.
+        start: Velocities to start from: of free bodies, shape (m, 6), spins in B; with joints generalised
+            ones, shape (k,), spins in W.
+        pairs: Static structure.
+        options: When to stop.
+    """
+
+    def find_root(problem, found, start):
+        find = _root_of_bodies if problem.tree is None else _root_of_trees
+        if problem.points is None:
+            return find(problem, found, start, pairs, options)
+        return one_at_a_time(
+            lambda problem, found, start: find(problem, found, start, pairs, options), problem, found, start
+        )
+
+    def residual(velocities, problem):
+        if problem.tree is None:
+            return whole_residual(velocities, problem, pairs)
+        return _tree_residual(velocities, problem, pairs)
+
+    @eqx.filter_custom_jvp
+    def root(problem, found, start):
+        velocities, _, report = find_root(problem, found, start)
+        return velocities, report
+
+    @root.def_jvp
+    def _(primals, tangents):
+        problem, found, start = primals
+        velocities, jacobian, report = find_root(problem, found, start)
+        # The inverse, not a solve: the tangent must be linear in `change` for reverse mode to transpose it.
+        inverse = solve_small(jacobian, jnp.eye(jacobian.shape[0], dtype=jacobian.dtype))
+        velocities, inverse = (checkpoint_name(value, KEPT) for value in (velocities, inverse))
+        d_problem = tangents[0]
+        d_report = jax.tree.map(lambda _: None, report)
+        if not jax.tree.leaves(d_problem):
+            return (velocities, report), (jnp.zeros_like(velocities), d_report)
+        _, change = by_autodiff(lambda p: residual(velocities, p), (problem,), (d_problem,))
+        return (velocities, report), (-matvec(inverse, change).reshape(velocities.shape), d_report)
+
+    return root(problem, found, start)
+
+
+def _root_of_bodies(
+    problem: Problem, found, start: Float[Array, "m 6"], pairs: Pairs, options: SolverOptions
+):
+    """Velocities of free bodies, the Jacobian of R with spins in B, and the report."""
+    m, scale = start.shape[0], to_velocity(problem)
+    size = jnp.max(jnp.abs(scale * problem.impulse.ravel()))
+    if problem.points is None:
+
+        def evaluate(point, softening):
+            velocities = point.reshape(start.shape)
+            residual, slopes = momentum_residual(velocities, problem, pairs, softening)
+            return residual, momentum_jacobian(velocities, problem, pairs, slopes)
+
+        softens = any(law.stiction for law in problem.laws)
+        point, jacobian, report = newton(evaluate, start.ravel(), scale, size, options, softens=softens)
+        return point.reshape(start.shape), jacobian, report
+
+    def balance(flat):
+        world = flat.reshape(m, 6)
+        own = world_momenta(problem, world)
+        if not problem.patches:
+            return Balance(*own, None)
+        momenta, jacobian = world_patches(problem, world, pairs, Softening())
+        return Balance(own[0] - momenta, own[1], jacobian)
+
+    world = to_world(problem, start)
+    velocities, jacobian, report = primal_dual(
+        balance, _table(problem, found, pairs), world.ravel(), scale, size, options
+    )
+    turn = to_world_matrices(problem)
+    back = jnp.einsum("iba,ibjc,jcd->iajd", turn, jacobian.reshape(m, 6, m, 6), turn).reshape(6 * m, 6 * m)
+    return to_body(problem, velocities.reshape(m, 6)), scale[:, None] * back, report
+
+
+def _root_of_trees(problem: Problem, found, start: Float[Array, " k"], pairs: Pairs, options: SolverOptions):
+    """Generalised velocities, the Jacobian of their residual, and the report."""
+    tree = problem.tree
+    assert tree is not None
+    m, scale = len(pairs.moving), _tree_scale(problem, tree)
+    size = jnp.max(
+        jnp.abs(scale * tree.pulled(jax.vmap(matvec)(to_world_matrices(problem), problem.impulse)))
+    )
+
+    def balance(y, softening):
+        residual, jacobian = _tree_momenta(problem, tree, y)
+        if not problem.patches:
+            return residual, jacobian
+        momenta, slopes = world_patches(problem, tree.twists(y), pairs, softening)
+        pulled = jnp.einsum("iak,iajb,jbl->kl", tree.jacobian, slopes, tree.jacobian)
+        return residual - tree.pulled(momenta), jacobian + pulled
+
+    if problem.points is None:
+
+        def evaluate(y, softening):
+            residual, jacobian = balance(y, softening)
+            return scale * residual, scale[:, None] * jacobian
+
+        softens = any(law.stiction for law in problem.laws)
+        return newton(evaluate, start, scale, size, options, softens=softens)
+
+    def without_points(y):
+        residual, jacobian = balance(y, Softening())
+        return Balance(residual, None, jacobian)
+
+    velocities, jacobian, report = primal_dual(
+        without_points,
+        _table(problem, found, pairs),
+        start,
+        scale,
+        size,
+        options,
+        spread=(tree.jacobian.reshape(6 * m, -1), tree.offset.ravel()),
+    )
+    return velocities, scale[:, None] * jacobian, report
+
+
+def _tree_residual(y: Float[Array, " k"], problem: Problem, pairs: Pairs) -> Float[Array, " k"]:
+    """What the equations of a step with joints miss, in velocities, with the laws as they are."""
+    tree = problem.tree
+    assert tree is not None
+    residual, _ = _tree_momenta(problem, tree, y)
+    given = jnp.zeros_like(tree.offset)
+    if problem.patches:
+        given = given + world_patches(problem, tree.twists(y), pairs, Softening())[0]
+    if problem.points is not None:
+        given = given + point_momenta(problem, tree.twists(y), pairs)
+    return _tree_scale(problem, tree) * (residual - tree.pulled(given))
+
+
+def _tree_momenta(problem: Problem, tree: Tree, y: Float[Array, " k"]):
+    return tree_balance(tree, y, lambda world: world_momenta(problem, world), problem.timestep)
+
+
+def _tree_scale(problem: Problem, tree: Tree) -> Float[Array, " k"]:
+    """Factors that turn generalised momenta into velocities."""
+    inertia = jax.vmap(lambda r, j: matmul(matmul(r, j), r.T))(problem.rotation, problem.inertia)
+    return 1 / jnp.diagonal(mass_matrix(tree, problem.mass, inertia))
+
+
+def _table(problem: Problem, found: Found | None, pairs: Pairs) -> Table:
+    assert problem.points is not None and problem.material is not None and found is not None
+    return tabulate(problem.points, problem.material, found.count, jnp.asarray(pairs.rows), problem.timestep)

@@ -1,0 +1,213 @@
+"""Bodies on joints: the integrator of free bodies, restricted to what the joints allow.
+
+Every body keeps the discrete Lagrangian that it has as a free body (see `_rigid`); its pose x_i(q) is that
+of its tree. With unknown generalised velocities y a step leads to q⁺ = q + h y, body i moves by the twist
+V_i(y) that takes x_i(q) to x_i(q⁺), and the sum of what free bodies would balance, projected on what the
+joints allow, vanishes:
+
+    Σ_i J_i(q)ᵀ (P_i(V_i(y)) − P_i⁻ − h f_i) − h τ + h d y = 0,        J_i = ∂x_i/∂q.
+
+These are the discrete Euler–Lagrange equations of the whole (the discrete null space method: Betsch and
+Leyendecker 2006), so bodies on joints have the order and the conservation of free ones, and joints hold
+exactly. Contact sees bodies move by J_i(q) y + c_i, which is V_i at the old velocities.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.engine._newton import inverse3
+from dano.engine._rigid import half_angle_root, turned
+from dano.maths import matmul, matvec, quat_to_matrix, skew
+from dano.scene import Chains, Control, link_jacobian, place_links, Poses, Scene, State, step_twists
+
+# Angle by which a joint may turn in a step [rad]: what `too_fast` allows free bodies.
+_LARGEST_TURN = 2.8
+
+
+class Tree(eqx.Module):
+    """What a step knows of joints; n bodies, m of which move, k generalised velocities.
+
+    Attributes:
+        chains: The trees.
+        position: Poses at the start of the step [m, W], shape (n, 3).
+        orientation: wxyz, shape (n, 4).
+        q: Joint coordinates at the start.
+        effort: Of the joints [N m or N].
+        jacobian: J at the start: twists [W] of the bodies that move per velocity, shape (m, 6, k).
+        offset: c: what they move by besides J y, shape (m, 6).
+    """
+
+    chains: Chains
+    position: Float[Array, "n 3"]
+    orientation: Float[Array, "n 4"]
+    q: Float[Array, " j"]
+    effort: Float[Array, " j"]
+    jacobian: Float[Array, "m 6 k"]
+    offset: Float[Array, "m 6"]
+
+    def twists(self, y: Float[Array, " k"]) -> Float[Array, "m 6"]:
+        """How bodies move as contact sees it [m/s; rad/s, W]."""
+        return jnp.einsum("mak,k->ma", self.jacobian, y) + self.offset
+
+    def pulled(self, momenta: Float[Array, "m 6"]) -> Float[Array, " k"]:
+        """Momenta of bodies [W] as generalised ones."""
+        return jnp.einsum("mak,ma->k", self.jacobian, momenta)
+
+
+def build_tree(scene: Scene, state: State, control: Control | None) -> tuple[Tree, Poses]:
+    """The tree of a step, and the poses at its end if the old velocities stay."""
+    chains, h = scene.chains, scene.timestep
+    assert state.q is not None
+    moving = np.array(scene.layout.moving)
+    now = place_links(chains, state.position, state.orientation, state.q)
+    jacobian = link_jacobian(chains, now)[moving]
+    effort = jnp.zeros_like(state.q) if control is None or control.effort is None else control.effort
+    tree = Tree(
+        chains,
+        state.position,
+        state.orientation,
+        state.q,
+        effort,
+        jacobian,
+        jnp.zeros(jacobian.shape[:2], h.dtype),
+    )
+    y = generalised(scene, state, state.orientation)
+    ahead = _ahead(tree, y, h)
+    moved = _world_twists(tree, ahead, h)
+    return eqx.tree_at(lambda t: t.offset, tree, moved - jnp.einsum("mak,k->ma", jacobian, y)), ahead
+
+
+def generalised(scene: Scene, state: State, orientation: Float[Array, "n 4"]) -> Float[Array, " k"]:
+    """Generalised velocities of a state: velocity and spin [W] of each free body, then those of joints.
+
+    Orientations are those at the start of the step that has the velocities.
+    """
+    assert state.v is not None
+    free = np.array(scene.layout.free, int)
+    spins = jax.vmap(matvec)(quat_to_matrix(orientation[free]), state.omega[free])
+    return jnp.concatenate([jnp.concatenate([state.velocity[free], spins], axis=1).ravel(), state.v])
+
+
+def tree_balance(tree: Tree, y: Float[Array, " k"], own, h: Float[Array, ""]):
+    """Left side of the equation above without contact, and its derivative by y, shapes (k,) and (k, k).
+
+    Args:
+        tree: The tree.
+        y: Generalised velocities at the end of the step.
+        own: From twists of all bodies that move [W], shape (m, 6), to P − P⁻ − h f of each as if it were
+            free, and its derivative, shape (m, 6, 6).
+        h: Timestep [s].
+    """
+    ahead = _ahead(tree, y, h)
+    momenta, slopes = own(_world_twists(tree, ahead, h))
+    roots = 6 * len(tree.chains.layout.free)
+    joints = np.array(tree.chains.layout.with_coordinates, int)
+    damping = tree.chains.damping[joints]
+    residual = tree.pulled(momenta).at[roots:].add(h * (damping * y[roots:] - tree.effort))
+    by_y = jnp.einsum("mab,mbk->mak", slopes, _twist_slopes(tree, ahead, y, h))
+    jacobian = jnp.einsum("mak,mal->kl", tree.jacobian, by_y)
+    places = np.arange(roots, len(y))
+    return residual, jacobian.at[places, places].add(h * damping)
+
+
+def mass_matrix(tree: Tree, mass: Float[Array, " m"], inertia: Float[Array, "m 3 3"]) -> Float[Array, "k k"]:
+    """Generalised mass at the start of the step, from masses and inertias [W] of the bodies that move."""
+    linear, angular = tree.jacobian[:, :3], tree.jacobian[:, 3:]
+    return jnp.einsum("m,mak,mal->kl", mass, linear, linear) + jnp.einsum(
+        "mak,mab,mbl->kl", angular, inertia, angular
+    )
+
+
+def tree_mobilities(tree: Tree, mass: Float[Array, " m"], inertia: Float[Array, "m 3 3"]):
+    """How easily each body that moves can be pushed [1/kg] and turned [1/(kg m²), W], shapes (m,), (m, 3, 3).
+
+    Arguments are those of `mass_matrix`. A push has one number for all directions, the root mean square: that
+    is 1/m for a free body.
+    """
+    inverse = jnp.linalg.inv(mass_matrix(tree, mass, inertia))
+    both = jnp.einsum("mak,kl,mbl->mab", tree.jacobian, inverse, tree.jacobian)
+    push = both[:, :3, :3]
+    return jnp.sqrt(jnp.sum(push * push, axis=(1, 2)) / 3), both[:, 3:, 3:]
+
+
+def advance_tree(scene: Scene, tree: Tree, state: State, y: Float[Array, " k"], h: Float[Array, ""]) -> State:
+    """The state at the end of a step with generalised velocities y."""
+    layout = tree.chains.layout
+    roots, free, hanging = 6 * len(layout.free), np.array(layout.free, int), np.array(layout.children)
+    ahead = _ahead(tree, y, h)
+    velocity, omega = step_twists((tree.position, tree.orientation), ahead[:2], h)
+    speeds = y[:roots].reshape(-1, 6)
+    spins = jax.vmap(lambda r, w: matvec(r.T, w))(quat_to_matrix(state.orientation[free]), speeds[:, 3:])
+    return State(
+        state.position.at[hanging].set(ahead.position[hanging]).at[free].set(ahead.position[free]),
+        state.orientation.at[hanging].set(ahead.orientation[hanging]).at[free].set(ahead.orientation[free]),
+        state.velocity.at[hanging].set(velocity[hanging]).at[free].set(speeds[:, :3]),
+        state.omega.at[hanging].set(omega[hanging]).at[free].set(spins),
+        tree.q + h * y[roots:],
+        y[roots:],
+    )
+
+
+def turns_too_far(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]) -> Array:
+    """Whether joints turn a body by more than a step can tell from a turn the other way."""
+    layout = tree.chains.layout
+    hinges = np.array([tree.chains.kinds[j] == "hinge" for j in layout.with_coordinates], bool)
+    turns = jnp.where(hinges, jnp.abs(h * y[6 * len(layout.free) :]), 0)
+    moved_by = np.array(layout.moved_by, float).reshape(layout.bodies, -1)
+    return jnp.any(jnp.asarray(moved_by, y.dtype) @ turns > _LARGEST_TURN)
+
+
+def _ahead(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]) -> Poses:
+    """Poses after a step with generalised velocities y."""
+    layout = tree.chains.layout
+    roots, free = 6 * len(layout.free), np.array(layout.free, int)
+    speeds = y[:roots].reshape(-1, 6)
+    spins = jax.vmap(lambda r, w: matvec(r.T, w))(quat_to_matrix(tree.orientation[free]), speeds[:, 3:])
+    position = tree.position.at[free].add(h * speeds[:, :3])
+    orientation = tree.orientation.at[free].set(turned(tree.orientation[free], spins, h))
+    return place_links(tree.chains, position, orientation, tree.q + h * y[roots:])
+
+
+def _world_twists(tree: Tree, ahead: Poses, h: Float[Array, ""]) -> Float[Array, "m 6"]:
+    """Twists [W] of the bodies that move which lead to poses at the end of the step."""
+    moving = np.array(tree.chains.layout.moving)
+    velocity, omega = step_twists(
+        (tree.position[moving], tree.orientation[moving]),
+        (ahead.position[moving], ahead.orientation[moving]),
+        h,
+    )
+    spins = jax.vmap(matvec)(quat_to_matrix(tree.orientation[moving]), omega)
+    return jnp.concatenate([velocity, spins], axis=1)
+
+
+def _twist_slopes(
+    tree: Tree, ahead: Poses, y: Float[Array, " k"], h: Float[Array, ""]
+) -> Float[Array, "m 6 k"]:
+    """Derivative of `_world_twists` by y.
+
+    Turning the end of a step by a small angle a [W] changes the spin by R A(ω) Rᵀ a with
+    A(ω) = ½ (s(ω) − [ω]×), where R is the orientation at the start.
+    """
+    layout = tree.chains.layout
+    moving, free = np.array(layout.moving), np.array(layout.free, int)
+    rotations = quat_to_matrix(tree.orientation[moving])
+    _, omega = step_twists(
+        (tree.position[moving], tree.orientation[moving]),
+        (ahead.position[moving], ahead.orientation[moving]),
+        h,
+    )
+    eye = jnp.eye(3, dtype=y.dtype)
+    halves = 0.5 * (half_angle_root(omega, h)[:, None, None] * eye[None] - jax.vmap(skew)(omega))
+    turns = jax.vmap(lambda r, a: matmul(matmul(r, a), r.T))(rotations, halves)
+    slopes = link_jacobian(tree.chains, ahead)[moving]
+    # Generalised velocities act for h; spins of roots turn the end of the step by the inverse of the above.
+    columns = [slopes[:, :, 6 * len(layout.free) :] * h]
+    for place, body in reversed(list(enumerate(free))):
+        mine = slopes[:, :, 6 * place : 6 * place + 6]
+        inverse = inverse3(turns[layout.moving.index(int(body))])
+        columns = [mine[:, :, :3] * h, jnp.einsum("mab,bc->mac", mine[:, :, 3:], inverse), *columns]
+    slopes = jnp.concatenate(columns, axis=2)
+    return jnp.concatenate([slopes[:, :3] / h, jnp.einsum("mab,mbk->mak", turns, slopes[:, 3:])], axis=1)
