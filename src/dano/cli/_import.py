@@ -40,11 +40,7 @@ def import_field(command: Import) -> None:
     kind, error = type(field).__name__, None
     if not isinstance(field, (GridField, SignedDistanceGrid)):
         interpolation = command.interpolation or "quadratic"
-
-        def baking(done: int, total: int) -> None:
-            progress("sampling the field", done / total)
-
-        field, error = bake(field, nodes, interpolation=interpolation, progress=baking)
+        field, error = bake(field, nodes, interpolation=interpolation, progress=progress)
     filled = 0.0
     if splats and not command.hollow and isinstance(field, GridField):
         field, before = fill_hollows(field)
