@@ -19,7 +19,7 @@ class BuildOptions:
         mass: Total mass [kg], instead of the mass scale.
         resolution: Cells along the longest axis for mass integrals and sampling.
         length: Scale the field so that the object's longest extent is this [m].
-        floaters: Let parts apart from the largest one feel contact, too; those of meshes always do.
+        floaters: Parts that are separate from the largest one feel contact, too; those of meshes always do.
         seed: Seed of the random samples.
     """
 

@@ -22,20 +22,20 @@ class Train:
         images: Folder with transforms.json or anno_train.json, or one of these files.
         output: Where to write the object, *.dano.
         resolution: Nodes along the longest side of the object.
-        iterations: Training steps at most.
+        iterations: Largest number of training steps.
         batch: Rays per step.
         seconds: Stop training after this time [s].
-        views: Train on so many of the views only.
+        views: Number of views to train on; default: all.
         downscale: Average so many pixels a side into one.
         network: Segmentation network (.onnx) for photographs without masks; default: what differs from the
             background.
         mass: Mass of the object [kg].
-        mass_density: Else: mass per volume [kg/m³].
-        resume: Go on with a training that was interrupted.
+        mass_density: Mass per volume [kg/m³], used if no mass is given.
+        resume: Continue a training that was interrupted.
         no_report: Write no report.
-        seed: Seed of everything random.
+        seed: Seed of all random numbers.
         json: Write figures of merit and mass properties to this file.
-        previews: Folder for pictures of what has been learned so far, beside photographs held out.
+        previews: Folder for pictures of the training: held-out photographs beside what is learned so far.
     """
 
     images: Positional[Path]
@@ -64,7 +64,7 @@ class Train:
 
 @dataclass(frozen=True)
 class Data:
-    """Check photographs before training: poses, masks, coverage; and draw the cameras.
+    """Check photographs before training: poses, masks, coverage. Draw the cameras.
 
     Attributes:
         images: Folder with transforms.json or anno_train.json, or one of these files.
@@ -122,21 +122,22 @@ class Import:
             OpenVDB or NanoVDB grid (.vdb, .nvdb), PyTorch module (.pt2, .pt, .pth), voxels (.npy, .npz),
             mesh (.obj, .stl, .ply, .off, .glb, .gltf), or a function as package.module:name.
         output: Where to write the grid (.npz).
-        crop: Lowest x y z and highest x y z to be kept, in the file's frame and units.
+        crop: Box to keep: lowest x y z, highest x y z, in the file's frame and units.
         scale: Length of a unit of the file [m].
         position: Moves the scaled field [m].
         orientation: Turns the scaled field before it is moved; quaternion w x y z.
-        resolution: Nodes along the longest axis of what is not a grid already; default 128, and for meshes as
-            many as their walls need.
-        interpolation: Between nodes.
-        hollow: Leave what Gaussian splats enclose empty. Splats are shells; otherwise it is filled.
+        resolution: Nodes along the longest axis, for files that hold no grid; default 128, for meshes as many
+            as their walls need.
+        interpolation: How the grid is interpolated between its nodes; default: as the format has it.
+        hollow: Gaussian splats: do not fill the inside. Splats lie on surfaces, so their inside is empty.
         spacing: Voxels (.npy): distance between voxels in the file's units; default: longest side 1.
         origin: Voxels (.npy): centre of the first voxel.
         signed_distance: Voxels (.npy) are signed distances, negative inside.
         grid: OpenVDB, NanoVDB: name of the grid.
         cascade: instant-ngp: which cascade of the density grid; 0 is the finest.
-        module: Weights (.pt, .pth): package.module:name of what makes their torch.nn.Module. Its code runs.
-        keep_transform: nerfstudio: stay in the frame of training instead of that of the data set.
+        module: Weights (.pt, .pth): package.module:name of the class or function that makes their
+            torch.nn.Module. Its code runs.
+        keep_transform: nerfstudio: keep the frame of training; default: the frame of the data set.
         json: Print one JSON object instead of text.
     """
 
@@ -197,8 +198,8 @@ class Simulate:
         output: Where to write the trajectory, usually *.npz.
         video: Where to write a video (.mp4).
         strip: Where to write a picture of several moments side by side (.png).
-        steps: Number of steps, instead of the scene's.
-        timestep: Timestep [s], instead of the scene's.
+        steps: Number of steps; default: the scene's.
+        timestep: Timestep [s]; default: the scene's.
         slow_motion: Video seconds per simulated second.
         json: Print one JSON object instead of text.
     """
@@ -221,28 +222,31 @@ class Simulate:
 
 @dataclass(frozen=True)
 class Identify:
-    """Find parameters of a scene with which its bodies move as observed, with error bars.
+    """Find the parameters of a scene from observed motions of its bodies, with error bars.
 
     Attributes:
         scene: Scene file (.toml).
-        motions: Observed motions (.npz, .csv): times [s], positions [m], quaternions, see docs.
-        parameter: What is unknown, with bounds and where to start, e.g. soap,table.sliding_friction:0:1,
-            soap,table.sliding_friction:0:1:0.3 or soap.mass_scale:0.2:5; several after each other.
+        motions: Observed motions (.npz, .csv): times [s], positions [m], quaternions. The guide
+            "Identification" lists the columns.
+        parameter: Unknown parameters, each as NAME:LOWER:UPPER or NAME:LOWER:UPPER:START, e.g.
+            soap,table.sliding_friction:0:1 or soap.mass_scale:0.2:5:1.
         output: Where to write the result (.json).
         report: Where to write a page with the motions, residuals, losses and a film (.html).
-        body: Which body the motions are of, if they do not say.
-        initial: What to estimate of the initial states: nothing (given), velocities, or all (states).
+        body: Name of the body that moved, for files that do not name it.
+        initial: What to estimate of the initial states: nothing (given), velocities, or all (states);
+            default: velocities if the motions have none, else nothing.
         position_noise: Standard deviation of observed positions [m].
         rotation_noise: Standard deviation of observed orientations [rad].
-        huber: Residuals count linearly from so many standard deviations on.
-        window: Frames of the windows that motions are cut into; default: whole.
-        continuity: How far windows may miss the beginning of the next, in standard deviations; default: any.
-        starts: Points in the bounds to start from.
-        held_out: Motions not to fit, to measure the error on.
-        order: Of the quaternions in the files.
+        huber: Number of standard deviations beyond which residuals count linearly.
+        window: Cut motions into windows of this many frames; default: do not cut.
+        continuity: Allowed gap between a window's end and the next one's start, in standard deviations;
+            default: any.
+        starts: Number of points within the bounds to start from.
+        held_out: Motions that are not fitted; the error on them is measured.
+        order: Order of the quaternions in the files.
         point: What positions refer to: centre of mass (com) or origin of the field's frame (origin).
-        rate: Frames a second, if the files have no times.
-        timestep: Of the simulation [s], instead of the file's.
+        rate: Frames per second, for files without times.
+        timestep: Timestep of the simulation [s]; default: the scene's.
         json: Print one JSON object instead of text.
     """
 
@@ -279,7 +283,7 @@ class View:
 
     Attributes:
         run: A trajectory written by `dano simulate`.
-        port: Where to serve the page on this computer.
+        port: Port of the page on this computer.
     """
 
     run: Positional[Path]

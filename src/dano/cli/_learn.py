@@ -144,7 +144,7 @@ def train(command: Train) -> None:
         # An older checkpoint counts only if this training went on from it.
         kept = checkpoint.exists() and (command.resume or _written_at(checkpoint) != before)
         rest = (
-            f"`--resume` goes on from {checkpoint}" if kept else "too early for a checkpoint to resume from"
+            f"`--resume` continues from {checkpoint}" if kept else "there is no checkpoint yet to resume from"
         )
         raise KeyboardInterrupt(rest) from None
     progress.close()
