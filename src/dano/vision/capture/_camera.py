@@ -320,7 +320,8 @@ def distorted(x: Slopes, y: Slopes, coefficients: Slopes) -> tuple[Slopes, Slope
 
 
 def _distorted(slopes: Float[np.ndarray, "n 2"], coefficients: np.ndarray) -> Float[np.ndarray, "n 2"]:
-    return np.stack(distorted(*slopes.T, coefficients), axis=1)
+    x, y = slopes.T
+    return np.stack(distorted(x, y, coefficients), axis=1)
 
 
 def _undistorted(image: Float[np.ndarray, "n 2"], coefficients: np.ndarray) -> Float[np.ndarray, "n 2"]:
