@@ -21,7 +21,6 @@ from dano.vision import (
     HashModel,
     load_capture,
     OSF,
-    Progress,
     Rays,
     Sampling,
     see,
@@ -82,23 +81,20 @@ def quality_rows(capture: Capture, *, quick: bool) -> list[Row]:
     """CPU time of `train` until held-out views reach 28 dB, with survey and compilation."""
     if quick:
         return [skipped(TO_QUALITY, "surface grid", "not with --quick")]
-    reached: dict[str, float] = {}
+    options = TrainOptions(check_every=20)
     start, wall = time.process_time(), time.perf_counter()
+    passed: dict[int, tuple[float, float]] = {}
 
-    def look(done: Progress) -> None:
-        if done.psnr is not None and done.psnr >= _QUALITY:
-            reached.update(
-                cpu=time.process_time() - start, wall=time.perf_counter() - wall, steps=done.iteration
-            )
-            raise StopIteration
+    def watch(description: str, share: float) -> None:
+        if description.startswith("training"):
+            step = round(share * options.iterations)
+            passed[step] = time.process_time() - start, time.perf_counter() - wall
 
-    try:
-        train(capture, TrainOptions(check_every=20), progress=look)
-    except StopIteration:
-        note = (
-            f"{reached['steps']:.0f} steps, with survey and compilation; {reached['wall']:.1f} s on the clock"
-        )
-        return [Row(TO_QUALITY, "surface grid", reached["cpu"], "s", note=note)]
+    for entry in train(capture, options, progress=watch).history:
+        if entry.psnr >= _QUALITY:
+            cpu, clock = passed[entry.iteration]
+            note = f"{entry.iteration} steps, with survey and compilation; {clock:.1f} s on the clock"
+            return [Row(TO_QUALITY, "surface grid", cpu, "s", note=note)]
     return [skipped(TO_QUALITY, "surface grid", f"{_QUALITY} dB not reached")]
 
 

@@ -2,7 +2,6 @@
 
 import math
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,11 +9,11 @@ import numpy as np
 
 from dano.fields import bake, GridField
 from dano.objects import NeuralObject
+from dano.progress import Progress
 from dano.vision import (
-    Box,
     Capture,
     load_capture,
-    Progress,
+    NodeGrid,
     train,
     Trained,
     TrainOptions,
@@ -59,7 +58,7 @@ def train_object(
     checkpoint: str | Path | None = None,
     resume: bool = False,
     previews: str | Path | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> LearnedObject:
     """Learn a solid object from photographs with camera poses.
 
@@ -93,12 +92,8 @@ def train_object(
     if views is not None:
         capture = capture.thinned(views)
 
-    def show(done: Progress) -> None:
-        quality = "" if done.psnr is None else f"{done.psnr:.1f} dB "
-        say(f"training {quality}{done.rays_per_second / 1000:.0f}k rays/s", done.iteration / done.iterations)
-
     say("visual hull", 0.0)
-    trained = train(capture, options, checkpoint=checkpoint, resume=resume, progress=show, previews=previews)
+    trained = train(capture, options, checkpoint=checkpoint, resume=resume, progress=say, previews=previews)
     say("solid", 0.0)
     made = NeuralObject.from_field(
         trained.field,
@@ -117,7 +112,7 @@ def _masked(
     photographs: str | os.PathLike[str] | Capture,
     downscale: int,
     network: str | os.PathLike[str] | None,
-    say: Callable[[str, float], None],
+    say: Progress,
 ) -> tuple[Capture, bool]:
     """Photographs with masks, and whether they came with them."""
     if isinstance(photographs, Capture):
@@ -138,4 +133,4 @@ def _volume(trained: Trained) -> float:
     solid = trained.field.solid
     distances = np.asarray(solid.distances, np.float64)
     nx, ny, nz = distances.shape
-    return volume(distances, Box(np.asarray(solid.origin), float(solid.spacing[0]), (nx, ny, nz)))
+    return volume(distances, NodeGrid(np.asarray(solid.origin), float(solid.spacing[0]), (nx, ny, nz)))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.vision import AbstractMedium, Appearance, Box, SurfaceModel
+from dano.vision import AbstractMedium, Appearance, NodeGrid, SurfaceModel
 
 
 class Fog(AbstractMedium):
@@ -32,7 +32,7 @@ class Fog(AbstractMedium):
 
 def learned(*, lit: bool = True, near: bool = False) -> SurfaceModel:
     """A ball with a bump, in colours that depend on everything."""
-    box = Box.around(np.full(3, -0.5), np.full(3, 0.5), 40)
+    box = NodeGrid.around(np.full(3, -0.5), np.full(3, 0.5), 40)
     look = Appearance.create(box, lit=lit, near_light=near, resolution=8, key=jax.random.key(0))
     x = box.nodes
     ball, bump = (

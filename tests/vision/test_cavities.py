@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from vision.photographs import pose
 
-from dano.vision import Box, Capture, PosedCamera, survey, View
+from dano.vision import Capture, NodeGrid, PosedCamera, survey, View
 from dano.vision.training._cavities import carve, find_cavities, without_cavities, witnesses
 
 RADIUS, HEIGHT, WALL = 0.05, 0.06, 0.014  # [m]
@@ -24,11 +24,11 @@ def hull_of_cup(x: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def box() -> Box:
-    return Box.around(np.array([-0.06, -0.06, -0.04]), np.array([0.06, 0.06, 0.04]), 48)
+def box() -> NodeGrid:
+    return NodeGrid.around(np.array([-0.06, -0.06, -0.04]), np.array([0.06, 0.06, 0.04]), 48)
 
 
-def everywhere(box: Box) -> np.ndarray:
+def everywhere(box: NodeGrid) -> np.ndarray:
     return np.ones(box.shape, bool)
 
 
@@ -36,7 +36,7 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sum(a & b) / np.sum(a | b))
 
 
-def test_a_ball_rolls_into_the_cup_but_not_through_a_pore(box: Box):
+def test_a_ball_rolls_into_the_cup_but_not_through_a_pore(box: NodeGrid):
     true, hull = (f(box.nodes).reshape(box.shape) for f in (cup_distance, hull_of_cup))
     opacity = np.clip(0.5 - true / box.spacing, 0, 1)
     # Crumbs in the air, a hollow inside the bottom with a pore: what fogs leave.
@@ -52,7 +52,7 @@ def test_a_ball_rolls_into_the_cup_but_not_through_a_pore(box: Box):
     assert found.share == pytest.approx(1 - np.sum(true < 0) / np.sum(hull < 0), abs=0.03)
 
 
-def test_a_solid_without_cavities_stays_as_it_is(box: Box):
+def test_a_solid_without_cavities_stays_as_it_is(box: NodeGrid):
     hull = hull_of_cup(box.nodes).reshape(box.shape)
     found = carve((hull < 0).astype(float), everywhere(box), box, hull, box, 0.0, 0.5)
     assert found is not None and found.share < 0.01
@@ -60,7 +60,7 @@ def test_a_solid_without_cavities_stays_as_it_is(box: Box):
     assert carve(nothing, everywhere(box), box, hull, box, 0.0, 0.5) is None
 
 
-def test_what_no_camera_looks_into_stays_solid(box: Box):
+def test_what_no_camera_looks_into_stays_solid(box: NodeGrid):
     # A shell that is open below, as fog leaves a solid on a table that is seen from above only.
     hull = hull_of_cup(box.nodes).reshape(box.shape)
     below = box.nodes * [1, 1, -1]

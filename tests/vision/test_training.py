@@ -11,10 +11,10 @@ from vision.photographs import capture, CENTRE, SEMI_AXES
 from dano import NeuralObject
 from dano.fields import redistanced
 from dano.vision import (
-    Box,
     Capture,
     hull_distance,
     LearnedField,
+    NodeGrid,
     survey,
     train,
     Trained,
@@ -22,7 +22,7 @@ from dano.vision import (
     View,
 )
 from dano.vision.capture._hull import object_box, silhouettes
-from dano.vision.training._train import Progress, reason_to_stop
+from dano.vision.training._train import HistoryEntry, reason_to_stop
 
 VOLUME = 4 / 3 * np.pi * float(np.prod(SEMI_AXES))
 QUICK = TrainOptions(resolution=32, iterations=150, batch=512, features=4, check_every=50, cavities=False)
@@ -43,7 +43,7 @@ def test_the_hull_is_the_solid_to_a_tenth_of_a_pixel(photos: Capture):
     lower, upper = object_box(views)
     assert np.all(lower < CENTRE - SEMI_AXES) and np.all(upper > CENTRE + SEMI_AXES)
     assert np.all(upper - lower < 2.6 * SEMI_AXES)
-    box = Box.around(lower - 0.004, upper + 0.004, 40)
+    box = NodeGrid.around(lower - 0.004, upper + 0.004, 40)
     hull = hull_distance(views, box)
     share = np.clip(0.5 - hull / box.spacing, 0, 1)
     # A pixel is 4.3 mm wide there; a tenth of it all around is 3 % of the volume.
@@ -56,7 +56,7 @@ def test_the_hull_is_the_solid_to_a_tenth_of_a_pixel(photos: Capture):
 
 
 def test_redistancing_restores_a_signed_distance():
-    box = Box(np.full(3, -1.2), 0.1, (25, 25, 25))
+    box = NodeGrid(np.full(3, -1.2), 0.1, (25, 25, 25))
     radius = np.linalg.norm(box.nodes, axis=1).reshape(box.shape)
     distance = redistanced(radius**3 - 0.8**3, box.spacing)
     near = np.abs(radius - 0.8) < 0.2
@@ -110,8 +110,8 @@ def test_a_saved_field_draws_the_same_picture(trained: Trained, photos: Capture,
 def test_an_interrupted_training_resumes_where_it_was(trained: Trained, photos: Capture, tmp_path: Path):
     file = tmp_path / "state.npz"
 
-    def interrupt(progress):
-        if progress.iteration >= 100:
+    def interrupt(description, share):
+        if description.startswith("training") and share * QUICK.iterations >= 100:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -201,11 +201,11 @@ def test_bad_masks_are_refused(photos: Capture):
         survey(with_mask(None), 32)
 
 
-def looks(psnr: list[float], iou: list[float], volume: list[float]) -> list[Progress]:
+def looks(psnr: list[float], iou: list[float], volume: list[float]) -> list[HistoryEntry]:
     """Looks at held-out views, the last of them after all steps."""
     n = len(psnr)
     rows = zip(psnr, iou, volume, strict=True)
-    return [Progress(100 * (i + 1), 100 * n, 0.0, 0.0, 0.0, *row) for i, row in enumerate(rows)]
+    return [HistoryEntry(100 * (i + 1), 100 * n, 0.0, 0.0, 0.0, *row) for i, row in enumerate(rows)]
 
 
 def test_training_stops_when_outlines_become_worse_or_nothing_changes():

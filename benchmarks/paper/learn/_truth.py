@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from benchmarks._measure import REPOSITORY
-from dano.vision import Box
+from dano.vision import NodeGrid
 
 _NODES = 160
 
@@ -21,7 +21,7 @@ class Truth(NamedTuple):
         size: Longest side of its bounding box [m].
     """
 
-    box: Box
+    box: NodeGrid
     distance: np.ndarray
     size: float
 
@@ -53,7 +53,7 @@ def truth(name: str) -> Truth:
     mesh = trimesh.Trimesh(*getattr(solids, f"{name}_mesh")(), process=True)
     lower, upper = mesh.bounds
     margin = 3 * float((upper - lower).max()) / (_NODES - 7)
-    box = Box.around(lower - margin, upper + margin, _NODES)
+    box = NodeGrid.around(lower - margin, upper + margin, _NODES)
     if known := getattr(solids, f"{name}_distance", None):
         distance = known(box.nodes)
     else:
@@ -63,7 +63,7 @@ def truth(name: str) -> Truth:
     return Truth(box, np.asarray(distance).reshape(box.shape), float((upper - lower).max()))
 
 
-def off(true: Truth, distance: np.ndarray, box: Box) -> Off:
+def off(true: Truth, distance: np.ndarray, box: NodeGrid) -> Off:
     """Compare signed distances [m] at the nodes of a box with the truth, on the truth's finer nodes."""
     index = (true.box.nodes - box.origin).T / box.spacing
     got = ndimage.map_coordinates(distance, index, order=1, mode="nearest").reshape(true.box.shape)
@@ -76,7 +76,7 @@ def off(true: Truth, distance: np.ndarray, box: Box) -> Off:
     )
 
 
-def bounds(distance: np.ndarray, box: Box) -> np.ndarray:
+def bounds(distance: np.ndarray, box: NodeGrid) -> np.ndarray:
     """Box [m] around {d < 0}, shape (2, 3), by linear interpolation between nodes."""
     sides = []
     for axis in range(3):
@@ -89,7 +89,7 @@ def bounds(distance: np.ndarray, box: Box) -> np.ndarray:
     return np.stack(sides, axis=1)
 
 
-def _mass(distance: np.ndarray, box: Box) -> tuple[np.ndarray, np.ndarray]:
+def _mass(distance: np.ndarray, box: NodeGrid) -> tuple[np.ndarray, np.ndarray]:
     """Centre of mass [m] and principal inertias per mass [m²]; cells at the surface count in part."""
     weight = np.clip(0.5 - distance / box.spacing, 0, 1).ravel()
     weight = weight / weight.sum()

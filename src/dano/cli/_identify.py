@@ -2,7 +2,6 @@
 
 import json
 import warnings
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +9,11 @@ import numpy as np
 
 from dano import scene_file
 from dano.archive import checked_output, replacing
+from dano.cli._arguments import Identify
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import missing_for_pictures
-from dano.identify import Identification, identify as fit_parameters, load_motion, Parameter
+from dano.identify import Identification, identify as fit_parameters, load_motion, Motion, Parameter
 from dano.names import did_you_mean
 from dano.scene import Scene
 from dano.solvers import Stop
@@ -21,22 +21,9 @@ from dano.solvers import Stop
 _OF_BODIES = ("mass_scale", "com_offset", "inertia", "mass", "com")
 
 
-def identify(
-    scene: Path,
-    motions: Sequence[Path],
-    parameters: Sequence[str],
-    *,
-    output: Path | None,
-    report: Path | None,
-    body: str | None,
-    held_out: Sequence[Path],
-    timestep: float | None,
-    as_json: bool,
-    noise: Mapping[str, float | None],
-    reading: Mapping[str, Any],
-    options: Mapping[str, Any],
-) -> None:
+def identify(command: Identify) -> None:
     """See `dano identify --help`."""
+    scene, output, report = command.scene, command.output, command.report
     for label, file, suffix in (("output", output, ".json"), ("report", report, ".html")):
         if file is not None:
             if file.suffix.lower() != suffix:
@@ -44,15 +31,17 @@ def identify(
             checked_output(file)
     if report is not None and (missing := missing_for_pictures(video=True)):
         raise ImportError(missing)
-    if not motions:
+    if not command.motions:
         raise ValueError("motions must name at least one file, got none")
     # An interrupted search returns its best so far.
     progress = Progress(stops=False)
-    loaded = scene_file.load_scene(scene, timestep=timestep, progress=progress)
-    chosen = [_parameter(text, loaded.scene) for text in parameters]
-    name = body or _only_free_body(loaded.scene)
-    found = [_motion(path, name, body is not None, reading) for path in motions]
-    others = [_motion(path, name, body is not None, reading) for path in held_out]
+    loaded = scene_file.load_scene(scene, timestep=command.timestep, progress=progress)
+    chosen = [_parameter(text, loaded.scene) for text in command.parameter]
+    found, others = (
+        [_motion(path, command, loaded.scene) for path in paths]
+        for paths in (command.motions, command.held_out)
+    )
+    noise = {"position": command.position_noise, "orientation": command.rotation_noise}
     given = {key: value for key, value in noise.items() if value is not None}
     with warnings.catch_warnings():
         # They are in the result, and said at the end.
@@ -66,10 +55,14 @@ def identify(
             noise=given or None,
             held_out=others,
             progress=progress,
-            **options,
+            initial=command.initial,
+            huber=command.huber,
+            window=command.window,
+            continuity=command.continuity,
+            starts=command.starts,
         )
     progress.close()
-    result = {"scene": str(scene), "motions": [str(path) for path in motions], **fit.to_dict()}
+    result = {"scene": str(scene), "motions": [str(path) for path in command.motions], **fit.to_dict()}
     if output is not None:
         with replacing(output) as file:
             file.write((json.dumps(result, indent=2, ensure_ascii=False) + "\n").encode())
@@ -80,7 +73,7 @@ def identify(
         progress("drawing", 0.0)
         write_identification_report(report, fit, title=f"Identification: {scene.name}")
         progress.close()
-    if as_json:
+    if command.json:
         put_json(result)
     else:
         _print(fit)
@@ -139,9 +132,11 @@ def _only_free_body(scene: Scene) -> str | None:
     return free[0] if len(free) == 1 else None
 
 
-def _motion(path: Path, name: str | None, force: bool, reading: Mapping[str, Any]):
+def _motion(path: Path, command: Identify, scene: Scene) -> Motion:
     """A motion, of the bodies that the file names unless one was asked for."""
-    if not force:
+    reading: dict[str, Any] = {"order": command.order, "point": command.point, "rate": command.rate}
+    name = command.body or _only_free_body(scene)
+    if command.body is None:
         try:
             return load_motion(path, **reading)
         except ValueError as error:

@@ -1,12 +1,12 @@
 """`dano import`."""
 
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dano.cli._arguments import Import
 from dano.cli._console import numbers, Progress, put, put_json
 from dano.cli._outputs import check_output
 from dano.fields import bake, GridField, is_splats, load_field, save_field, SignedDistanceGrid
@@ -17,28 +17,17 @@ _USUAL = (1e-3, 20.0)
 """Widths [m] of a field beyond which its file is rather in other units than so small or large."""
 
 
-def import_field(
-    file: str,
-    output: Path,
-    *,
-    crop: tuple[float, ...] | None,
-    scale: float,
-    position: tuple[float, float, float],
-    orientation: tuple[float, float, float, float],
-    resolution: int | None,
-    hollow: bool,
-    options: Mapping[str, Any],
-    as_json: bool,
-) -> None:
+def import_field(command: Import) -> None:
     """See `dano import --help`."""
+    file, output, resolution, scale = command.file, command.output, command.resolution, command.scale
     check_output(output, Path(file), suffix=".npz")
     if resolution is not None and not 4 <= resolution <= 1024:
         raise ValueError(f"resolution must lie between 4 and 1024 nodes, got {resolution}")
-    moved = np.any(position) or tuple(orientation) != (1.0, 0.0, 0.0, 0.0)
-    pose = Pose(position, orientation) if moved else None
+    moved = np.any(command.position) or command.orientation != (1.0, 0.0, 0.0, 0.0)
+    pose = Pose(command.position, command.orientation) if moved else None
     progress = Progress()
     progress("reading the field", 0.0)
-    box = None if crop is None else np.reshape(crop, (2, 3))
+    box = None if command.crop is None else np.reshape(command.crop, (2, 3))
     splats, sampled = _kind(file) == "splats", {}
     nodes = 128 if resolution is None else resolution
     if _kind(file) == "mesh":
@@ -47,17 +36,13 @@ def import_field(
         # Gaussians thinner than the distance between nodes would fall between them: a shell full of pores.
         lower, upper = np.asarray(load_field(file, crop=box).bounds)
         sampled = {"min_width": 0.5 * float(np.max(upper - lower)) / (nodes - 1)}
-    field = load_field(file, crop=box, scale=scale, pose=pose, **sampled, **options)
+    field = load_field(file, crop=box, scale=scale, pose=pose, **sampled, **_of_format(command))
     kind, error = type(field).__name__, None
     if not isinstance(field, (GridField, SignedDistanceGrid)):
-        interpolation = options.get("interpolation", "quadratic")
-
-        def baking(done: int, total: int) -> None:
-            progress("sampling the field", done / total)
-
-        field, error = bake(field, nodes, interpolation=interpolation, progress=baking)
+        interpolation = command.interpolation or "quadratic"
+        field, error = bake(field, nodes, interpolation=interpolation, progress=progress)
     filled = 0.0
-    if splats and not hollow and isinstance(field, GridField):
+    if splats and not command.hollow and isinstance(field, GridField):
         field, before = fill_hollows(field)
         filled = float(before.cavity)
     progress.close()
@@ -71,7 +56,22 @@ def import_field(
             " its unit [m] (0.001 for millimetres)",
             stacklevel=2,
         )
-    put_json(report) if as_json else _print(report)
+    put_json(report) if command.json else _print(report)
+
+
+def _of_format(command: Import) -> dict[str, Any]:
+    """Options of single formats that were given; `load_field` says which ones the file's format has."""
+    options = {
+        "interpolation": command.interpolation,
+        "spacing": command.spacing,
+        "origin": command.origin,
+        "signed_distance": command.signed_distance or None,
+        "grid": command.grid,
+        "cascade": command.cascade,
+        "module": command.module,
+        "undo_transform": False if command.keep_transform else None,
+    }
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _kind(file: str) -> str:

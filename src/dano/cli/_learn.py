@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dano.archive import replacing
+from dano.cli._arguments import Data, Train
 from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
 from dano.fields import save_field
@@ -25,11 +26,10 @@ from dano.vision import (
 )
 
 
-def data(
-    images: Path, *, png: Path | None, draw: bool, downscale: int, network: Path | None, as_json: bool
-) -> None:
+def data(command: Data) -> None:
     """See `dano data --help`."""
-    picture = (png or Path(f"{images.resolve().stem}.png")) if draw else None
+    png = command.png
+    picture = None if command.no_png else png or Path(f"{command.images.resolve().stem}.png")
     if picture is not None:
         check_output(picture, suffix=".png")
         if missing := missing_for_pictures(video=False):
@@ -39,11 +39,11 @@ def data(
             picture = None
     progress = Progress()
     progress("reading photographs", 0.0)
-    capture = load_capture(images, downscale=downscale)
+    capture = load_capture(command.images, downscale=command.downscale)
     given = capture.has_masks
     if not given:
         progress("making masks", 0.2)
-        capture = with_masks(capture, network)
+        capture = with_masks(capture, command.network)
     progress("visual hull", 0.4)
     found = survey(capture, 64)
     progress.close()
@@ -53,7 +53,7 @@ def data(
 
         draw_capture(capture, found, picture)
         report["picture"] = str(picture)
-    if as_json:
+    if command.json:
         put_json(report)
         return
     _print_data(report)
@@ -108,54 +108,47 @@ def _print_data(report: dict[str, Any]) -> None:
         put(f"drawn in {report['picture']}")
 
 
-def train(
-    images: Path,
-    output: Path,
-    *,
-    options: TrainOptions,
-    downscale: int,
-    views: int | None,
-    network: Path | None,
-    mass: float | None,
-    mass_density: float,
-    resume: bool,
-    report: bool,
-    json_file: Path | None,
-    previews: Path | None,
-) -> None:
+def train(command: Train) -> None:
     """See `dano train --help`."""
-    outputs = _outputs(output)
+    options = TrainOptions(
+        resolution=command.resolution,
+        iterations=command.iterations,
+        batch=command.batch,
+        seconds=command.seconds,
+        seed=command.seed,
+    )
+    outputs = _outputs(command.output)
     for path in outputs.values():
         check_output(path)
-    if json_file is not None:
-        check_output(json_file)
-    check_distinct(**outputs, json=json_file)
+    if command.json is not None:
+        check_output(command.json)
+    check_distinct(**outputs, json=command.json)
     checkpoint = outputs["checkpoint"]
     before = _written_at(checkpoint)
     progress = Progress()
     try:
         learned = train_object(
-            images,
+            command.images,
             options,
-            downscale=downscale,
-            views=views,
-            network=network,
-            mass=mass,
-            mass_density=mass_density,
+            downscale=command.downscale,
+            views=command.views,
+            network=command.network,
+            mass=command.mass,
+            mass_density=command.mass_density,
             checkpoint=checkpoint,
-            resume=resume,
-            previews=previews,
+            resume=command.resume,
+            previews=command.previews,
             progress=progress,
         )
     except KeyboardInterrupt:
         # An older checkpoint counts only if this training went on from it.
-        kept = checkpoint.exists() and (resume or _written_at(checkpoint) != before)
+        kept = checkpoint.exists() and (command.resume or _written_at(checkpoint) != before)
         rest = (
-            f"`--resume` goes on from {checkpoint}" if kept else "too early for a checkpoint to resume from"
+            f"`--resume` continues from {checkpoint}" if kept else "there is no checkpoint yet to resume from"
         )
         raise KeyboardInterrupt(rest) from None
     progress.close()
-    _write(learned, outputs, report=report, json_file=json_file)
+    _write(learned, outputs, report=not command.no_report, json_file=command.json)
 
 
 def _write(learned: LearnedObject, outputs: dict[str, Path], *, report: bool, json_file: Path | None) -> None:

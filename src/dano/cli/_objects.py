@@ -8,52 +8,28 @@ from typing import Any
 
 import numpy as np
 
+from dano.cli._arguments import Build, Inspect
 from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._outputs import check_output, missing_for_pictures
 from dano.fields import load_field
-from dano.objects import Interior, MassModel, NeuralObject
+from dano.objects import Interior, NeuralObject
 from dano.scene_file import build_object
 
 
-def build(
-    field: Path,
-    output: Path,
-    *,
-    samples: int,
-    density_range: tuple[float, float] | None,
-    mass_model: MassModel,
-    mass_scale: float | None,
-    mass: float | None,
-    resolution: int,
-    length: float | None,
-    floaters: bool,
-    seed: int,
-    as_json: bool,
-) -> None:
+def build(command: Build) -> None:
     """See `dano build --help`."""
-    if mass is not None and mass_scale is not None:
-        raise ValueError(f"give either --mass or --mass-scale, got {mass} and {mass_scale}")
-    check_output(output, field)
+    output, options = command.output, command.options
+    if options.mass is not None and options.mass_scale is not None:
+        raise ValueError(f"give either --mass or --mass-scale, got {options.mass} and {options.mass_scale}")
+    check_output(output, command.field)
     progress = Progress()
     progress("reading the field", 0.0)
-    made = build_object(
-        load_field(field),
-        n_samples=samples,
-        density_range=density_range,
-        mass_model=mass_model,
-        mass_scale=mass_scale,
-        mass=mass,
-        resolution=resolution,
-        length=length,
-        floaters=floaters,
-        seed=seed,
-        dashes="--",
-        progress=progress,
-    )
+    field = load_field(command.field)
+    made = build_object(field, **options.keywords(), dashes="--", progress=progress)
     progress.close()
     made.save(output)
     report = describe(made, output)
-    if as_json:
+    if command.json:
         put_json(report)
         return
     print_object(report)
@@ -61,9 +37,10 @@ def build(
     put(f"wrote {output}; `dano inspect {output}` draws it, `dano simulate {output} -o RUN.npz` drops it")
 
 
-def inspect(path: Path, *, png: Path | None, draw: bool, as_json: bool) -> None:
+def inspect(command: Inspect) -> None:
     """See `dano inspect --help`."""
-    picture = (png or path.with_suffix(".png")) if draw else None
+    path, png = command.object, command.png
+    picture = None if command.no_png else png or path.with_suffix(".png")
     if picture is not None:
         check_output(picture, path, suffix=".png")
         if missing := missing_for_pictures(video=False):
@@ -78,7 +55,7 @@ def inspect(path: Path, *, png: Path | None, draw: bool, as_json: bool) -> None:
 
         draw_object(made, picture, title=path.stem)
         report["picture"] = str(picture)
-    if as_json:
+    if command.json:
         put_json(report)
         return
     print_object(report)

@@ -11,6 +11,7 @@ from typing import Any
 from dano import scene_file
 from dano.archive import replacing
 from dano.cli import _rollout
+from dano.cli._arguments import Demo, Simulate, View
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
 from dano.objects import NeuralObject
@@ -20,37 +21,28 @@ DEMO_FPS, DEMO_SIZE = 24, (560, 350)
 """Coarser than the default: the demo should take a minute on an old laptop, too."""
 
 
-def simulate(
-    scene: Path,
-    output: Path,
-    *,
-    video: Path | None,
-    strip: Path | None,
-    steps: int | None,
-    timestep: float | None,
-    slow_motion: float,
-    as_json: bool,
-) -> None:
+def simulate(command: Simulate) -> None:
     """See `dano simulate --help`."""
+    scene, output, video, strip = command.scene, command.output, command.video, command.strip
     check_output(output, scene)
     for picture, suffix in ((video, ".mp4"), (strip, ".png")):
         if picture is not None:
             check_output(picture, scene, suffix=suffix)
             if missing := missing_for_pictures(video=suffix == ".mp4"):
                 raise ImportError(missing)
-    if not slow_motion > 0:
-        raise ValueError(f"slow_motion must be > 0, got {slow_motion}")
+    if not command.slow_motion > 0:
+        raise ValueError(f"slow_motion must be > 0, got {command.slow_motion}")
     check_distinct(output=output, video=video, strip=strip)
-    loaded = _load(scene, steps, timestep)
+    loaded = _load(scene, command.steps, command.timestep)
     for path in (output, video, strip):
         if path is not None:
             check_output(path, *loaded.inputs())
     if video is not None or strip is not None:
         from dano.report import frame_count
 
-        frame_count(loaded.n_steps * float(loaded.scene.timestep), slow_motion)
-    report = _run(loaded, output, video, strip, slow_motion)
-    if as_json:
+        frame_count(loaded.n_steps * float(loaded.scene.timestep), command.slow_motion)
+    report = _run(loaded, command)
+    if command.json:
         put_json({"scene": str(scene), **report})
     else:
         _rollout.print_rollout(report)
@@ -60,20 +52,21 @@ def simulate(
     _rollout.warn_unconverged(report)
 
 
-def view(run: Path, *, port: int) -> None:
+def view(command: View) -> None:
     """See `dano view --help`."""
-    if not 0 < port < 65536:
-        raise ValueError(f"port must lie between 1 and 65535, got {port}")
+    if not 0 < command.port < 65536:
+        raise ValueError(f"port must lie between 1 and 65535, got {command.port}")
     progress = Progress()
-    loaded = scene_file.load_run(run, progress=progress)
+    loaded = scene_file.load_run(command.run, progress=progress)
     progress.close()
     from dano.report import view as show
 
-    show(loaded.scene, loaded.trajectory, port=port)
+    show(loaded.scene, loaded.trajectory, port=command.port)
 
 
-def demo(name: str, folder: Path, *, as_json: bool) -> None:
+def demo(command: Demo) -> None:
     """See `dano demo --help`."""
+    folder = command.output
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"output path must be a folder, got the file {folder}")
     folder.mkdir(parents=True, exist_ok=True)
@@ -83,9 +76,9 @@ def demo(name: str, folder: Path, *, as_json: bool) -> None:
     began = time.monotonic()
     reports: dict[str, dict[str, Any]] = {}
     with _Artist(draws=missing is None) as artist:
-        for scene in SCENES if name == "all" else (name,):
+        for scene in SCENES if command.name == "all" else (command.name,):
             reports[scene] = _demo_scene(scene, folder, artist)
-            if not as_json:
+            if not command.json:
                 put(f"== {scene} ==")
                 _rollout.print_rollout(reports[scene])
                 put()
@@ -95,7 +88,7 @@ def demo(name: str, folder: Path, *, as_json: bool) -> None:
         with replacing(folder / f"{scene}.json") as file:
             file.write(json.dumps(report, indent=2).encode())
     seconds = time.monotonic() - began
-    if as_json:
+    if command.json:
         put_json({"folder": str(folder), "seconds": seconds, "scenes": reports})
         return
     for made in sorted({path for report in reports.values() for path in report["objects"].values()}):
@@ -203,11 +196,10 @@ def _load(path: Path, steps: int | None, timestep: float | None) -> scene_file.S
     return loaded
 
 
-def _run(
-    loaded: scene_file.SceneFile, output: Path, video: Path | None, strip: Path | None, slow_motion: float
-) -> dict[str, Any]:
+def _run(loaded: scene_file.SceneFile, command: Simulate) -> dict[str, Any]:
     """Simulate, save and draw; what came out in numbers."""
-    rollout, report = _simulated(loaded, output)
+    video, strip = command.video, command.strip
+    rollout, report = _simulated(loaded, command.output)
     if video is not None or strip is not None:
         from dano.report import render_trajectory
 
@@ -217,7 +209,7 @@ def _run(
             rollout.trajectory,
             video,
             strip=strip,
-            slow_motion=slow_motion,
+            slow_motion=command.slow_motion,
             looks=loaded.looks(),
             progress=progress,
         )

@@ -13,6 +13,7 @@ from dano.fields._base import AbstractField
 from dano.fields._grid import GridField
 from dano.fields._spline import degree_of
 from dano.memory import check_nodes
+from dano.progress import Progress
 
 _BYTES_PER_NODE = 64
 """Samples, and what finding their spline takes."""
@@ -55,7 +56,7 @@ def bake(
     interpolation: str = "quadratic",
     batch_size: int = 65_536,
     key: PRNGKeyArray | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Baked:
     """Sample a field on a regular grid that interpolates it, and measure the error.
 
@@ -68,7 +69,7 @@ def bake(
         interpolation: "linear", "quadratic" or "cubic".
         batch_size: Points evaluated at once; lower it for fields that need much memory a point.
         key: Random key of the held-out points; None uses a fixed one, so that baking is reproducible.
-        progress: Called after every batch with the points done and their total.
+        progress: Called after every batch with a description and the share done.
 
     Returns:
         The grid and its error at 20,000 random points in the grid's bounds.
@@ -100,7 +101,7 @@ def bake(
 
     def report(done: int) -> None:
         if progress is not None:
-            progress(min(done, n_nodes), n_nodes)
+            progress("sampling the field", min(done / n_nodes, 1.0))
 
     def nodes(rows: np.ndarray) -> np.ndarray:
         return origin[:, None] + spacing * np.stack(np.unravel_index(rows, shape))

@@ -12,7 +12,7 @@ from dano.fields import GridField
 from dano.objects import MassProperties, NeuralObject
 from dano.report._page import image, table, warnings, write_page
 from dano.report._video import require
-from dano.vision import Capture, Progress, psnr, ssim, Trained, View
+from dano.vision import Capture, HistoryEntry, psnr, ssim, Trained, View
 
 _SHOWN = 6
 """Most views drawn of each split."""
@@ -138,15 +138,15 @@ def _views(trained: Trained, views: Sequence[View]) -> str:
     return f'<div class="views">{"".join(figures)}</div>'
 
 
-def _curves(history: Sequence[Progress]) -> str:
+def _curves(history: Sequence[HistoryEntry]) -> str:
     """PSNR, mask IoU and volume over the steps, as one table and a line of PSNR."""
     rows = [
         (
             str(p.iteration),
             f"{p.seconds:.0f}",
             f"{p.rays_per_second:,.0f}",
-            f"{p.psnr:.2f}" if p.psnr is not None else "",
-            f"{p.mask_iou:.4f}" if p.mask_iou is not None else "",
+            f"{p.psnr:.2f}",
+            f"{p.mask_iou:.4f}",
             f"{1e6 * p.volume:.2f}",
         )
         for p in history

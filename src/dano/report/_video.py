@@ -10,13 +10,12 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dano.archive import checked_output, replacing
+from dano.progress import Progress
 from dano.report._overlay import draw_touches
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import camera_for, stage, touches
 from dano.scene import Scene, Trajectory
 from dano.vision import Camera, LearnedField, render
-
-Progress = Callable[[str, float], None]
 
 _STRIP_MOMENTS = 6
 

@@ -47,12 +47,12 @@ class NormalEquations(NamedTuple):
 class Stop(enum.Enum):
     """Why a minimisation ended."""
 
-    LOSS = "the loss cannot fall further by more than is asked for"
-    STEP = "the steps became negligible"
-    PERFECT = "the residuals vanish, but for rounding"
-    STUCK = "no step reduces the loss, although its gradient says that it could fall: it is rough here"
-    ITERATIONS = "the largest number of iterations was reached"
-    INTERRUPTED = "it was interrupted; this is the best point so far"
+    LOSS = "converged: predicted decrease below tolerance"
+    STEP = "converged: negligible steps"
+    PERFECT = "converged: the residuals are zero up to rounding"
+    STUCK = "no step reduces the loss, although its gradient is not zero: the loss is rough here"
+    ITERATIONS = "the limit of iterations was reached"
+    INTERRUPTED = "interrupted: this is the best point so far"
 
     @property
     def converged(self) -> bool:
@@ -84,7 +84,7 @@ _DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-15, 1e12
 # Relative change of x that is none.
 _NEGLIGIBLE = 1e-10
-# A loss that should fall by so many tolerances, but does not, is said to be rough.
+# If the loss should fall by so many tolerances and does not, it is called rough.
 _ROUGH = 100
 # Curvature over a parameter's range, as a share of the largest there is, that may be rounding: a parameter
 # with less stays about where it is instead of running off.
@@ -94,7 +94,8 @@ _SUFFICIENT = 1e-4
 # A step that brings less than this share is poor: blocks whose loss grew try again, damped more and more.
 _POOR = 0.25
 _AGAIN = (0.1, 1.0, 10.0)
-# So many such steps in a row that bring less than what is asked for are the end.
+# So many poor steps in a row that reduce the loss by less than the tolerance end the search: what the model
+# still promises lies in blocks that bend too much to get there.
 _SLOW = 3
 
 
@@ -131,25 +132,12 @@ def bounded_least_squares(
         ValueError: If shapes differ, a bound is NaN or crossed, the start lies outside, or the loss is not
             finite there.
     """
-    x = np.array(start, dtype=float)
-    lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
-    if x.ndim != 1 or lower.shape != x.shape or upper.shape != x.shape:
-        raise ValueError(
-            "start, lower and upper must be vectors of one length, got "
-            f"{x.shape}, {lower.shape}, {upper.shape}"
-        )
-    if not np.all(lower <= upper):
-        raise ValueError(f"lower must be ≤ upper, got {lower.tolist()} and {upper.tolist()}")
-    if not np.all((lower <= x) & (x <= upper)):
-        raise ValueError(f"start must lie between {lower.tolist()} and {upper.tolist()}, got {x.tolist()}")
+    x, lower, upper = _checked(start, lower, upper)
     blocks, normal = start_blocks, linearize(x, start_blocks)
     if not np.isfinite(normal.loss):
         raise ValueError(f"loss must be finite at the start {x.tolist()}, got {normal.loss}")
-    losses, damping, growth = [float(normal.loss)], _DAMPING, 2.0
-    evaluations, slow = 1, 0
-    spread = _scales(normal)
-    width = upper - lower
-    span = np.where(np.isfinite(width) & (width > 0), width, np.maximum(np.abs(x), 1.0))
+    losses, damping, growth, evaluations, slow = [float(normal.loss)], _DAMPING, 2.0, 1, 0
+    spread, span = _scales(normal), _span(x, lower, upper)
     try:
         for iteration in range(max_iterations + 1):
             if progress is not None:
@@ -168,8 +156,7 @@ def bounded_least_squares(
             while True:
                 change, block_change, promised = _step(normal, damping, floor, spread, *box)
                 if promised <= tolerance * losses[-1] or damping > _MOST_DAMPING:
-                    rough = hoped > _ROUGH * tolerance * losses[-1]
-                    stop = Stop.STUCK if rough else Stop.LOSS
+                    stop = _without_step(hoped, tolerance * losses[-1])
                     return _solution(x, blocks, normal, stop, losses, evaluations)
                 at = np.clip(x + change, lower, upper)
                 trial = functools.partial(_tried, linearize, retract, normal, at, blocks)
@@ -180,9 +167,7 @@ def bounded_least_squares(
                     break
                 damping, growth = damping * growth, 2 * growth
             if best is first:
-                # Nielsen's rule: less damping the better the model was.
-                damping = max(damping * max(1 / 10, 1 - (2 * best.gain - 1) ** 3), _LEAST_DAMPING)
-                growth, slow = 2.0, 0
+                damping, growth, slow = _relaxed(damping, best.gain), 2.0, 0
             else:
                 damping, growth = damping * growth, 2 * growth
                 slow = slow + 1 if normal.loss - best.normal.loss <= tolerance * normal.loss else 0
@@ -190,11 +175,46 @@ def bounded_least_squares(
             spread = tuple(np.maximum(new, old) for new, old in zip(_scales(normal), spread, strict=True))
             losses.append(float(normal.loss))
             if slow == _SLOW:
-                # The model promises more, in blocks that bend too much to get there.
                 return _solution(x, blocks, normal, Stop.LOSS, losses, evaluations)
     except KeyboardInterrupt:
         return _solution(x, blocks, normal, Stop.INTERRUPTED, losses, evaluations)
     return _solution(x, blocks, normal, Stop.ITERATIONS, losses, evaluations)
+
+
+def _checked(start: Any, lower: Any, upper: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Start and bounds as vectors of one length.
+
+    Raises:
+        ValueError: If they are not, a bound is NaN or crossed, or the start lies outside.
+    """
+    x = np.array(start, dtype=float)
+    lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+    if x.ndim != 1 or lower.shape != x.shape or upper.shape != x.shape:
+        raise ValueError(
+            "start, lower and upper must be vectors of one length, got "
+            f"{x.shape}, {lower.shape}, {upper.shape}"
+        )
+    if not np.all(lower <= upper):
+        raise ValueError(f"lower must be ≤ upper, got {lower.tolist()} and {upper.tolist()}")
+    if not np.all((lower <= x) & (x <= upper)):
+        raise ValueError(f"start must lie between {lower.tolist()} and {upper.tolist()}, got {x.tolist()}")
+    return x, lower, upper
+
+
+def _span(x: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """The range of each unknown: between its bounds or, without bounds, its size."""
+    width = upper - lower
+    return np.where(np.isfinite(width) & (width > 0), width, np.maximum(np.abs(x), 1.0))
+
+
+def _relaxed(damping: float, gain: float) -> float:
+    """Nielsen's rule: less damping the better the model was."""
+    return max(damping * max(1 / 10, 1 - (2 * gain - 1) ** 3), _LEAST_DAMPING)
+
+
+def _without_step(hoped: float, negligible: float) -> Stop:
+    """Why no step reduces the loss: a minimum, unless the model without damping promises much more."""
+    return Stop.STUCK if hoped > _ROUGH * negligible else Stop.LOSS
 
 
 class _Trial(NamedTuple):

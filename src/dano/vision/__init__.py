@@ -3,12 +3,12 @@
 from dano.vision.capture import (
     AbstractCamera as AbstractCamera,
     background_mask as background_mask,
-    Box as Box,
     Camera as Camera,
     Capture as Capture,
     hull_distance as hull_distance,
     Light as Light,
     load_capture as load_capture,
+    NodeGrid as NodeGrid,
     PosedCamera as PosedCamera,
     Rays as Rays,
     View as View,
@@ -40,8 +40,8 @@ from dano.vision.radiance import (
     SurfaceModel as SurfaceModel,
 )
 from dano.vision.training import (
+    HistoryEntry as HistoryEntry,
     mask_iou as mask_iou,
-    Progress as Progress,
     psnr as psnr,
     Score as Score,
     score as score,

@@ -1,6 +1,5 @@
 """Photographs from known places: cameras, files, masks, silhouettes, and the rays that see an object."""
 
-from dano.vision.capture._box import Box as Box, resampled as resampled
 from dano.vision.capture._camera import (
     AbstractCamera as AbstractCamera,
     Camera as Camera,
@@ -19,6 +18,7 @@ from dano.vision.capture._masks import (
     check_masks as check_masks,
     with_masks as with_masks,
 )
+from dano.vision.capture._node_grid import NodeGrid as NodeGrid, resampled as resampled
 from dano.vision.capture._ray_set import (
     collect as collect,
     rays_of as rays_of,

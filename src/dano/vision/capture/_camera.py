@@ -2,13 +2,15 @@
 
 import abc
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from dano.maths import checked_array, is_traced, Numbers
+
+Slopes = TypeVar("Slopes", np.ndarray, Array)
 
 _ROTATION_TOLERANCE = 1e-3
 """By which the columns of a pose may fail to be orthonormal: what files with four digits round off."""
@@ -248,8 +250,9 @@ class PosedCamera(AbstractCamera):
             raise ValueError(f"width and height must be ≥ 1 pixel, got {width} × {height}")
         if np.any(self.distortion):
             corners = np.array([[0, 0], [self.width, 0], [0, self.height], [self.width, self.height]])
-            slopes = self._undistorted((corners - self.centre) / self.focal)
-            if not np.allclose(self._distorted(slopes) * self.focal + self.centre, corners, atol=0.01):
+            slopes = _undistorted((corners - self.centre) / self.focal, self.distortion)
+            again = _distorted(slopes, self.distortion) * self.focal + self.centre
+            if not np.allclose(again, corners, atol=0.01):
                 raise ValueError(
                     "distortion must be invertible over the whole image, got"
                     f" {self.distortion.tolist()} for {self.width} × {self.height} pixels"
@@ -264,7 +267,7 @@ class PosedCamera(AbstractCamera):
         """See `AbstractCamera.directions`."""
         slopes = (np.asarray(pixels, dtype=np.float64) - self.centre) / self.focal
         if np.any(self.distortion):
-            slopes = self._undistorted(slopes)
+            slopes = _undistorted(slopes, self.distortion)
         right, up, forward = self.axes
         towards = forward + slopes[:, :1] * right - slopes[:, 1:] * up
         return towards / np.linalg.norm(towards, axis=1, keepdims=True)
@@ -275,7 +278,7 @@ class PosedCamera(AbstractCamera):
         depth = np.where(local[:, 2] > 0, local[:, 2], np.nan)
         slopes = np.stack([local[:, 0], -local[:, 1]], axis=1) / depth[:, None]
         if np.any(self.distortion):
-            slopes = self._distorted(slopes)
+            slopes = _distorted(slopes, self.distortion)
         return np.concatenate([slopes * self.focal + self.centre, depth[:, None]], axis=1)
 
     @property
@@ -295,40 +298,54 @@ class PosedCamera(AbstractCamera):
         }
         return PosedCamera(**{**own, **arguments})
 
-    def _distorted(self, slopes: np.ndarray) -> np.ndarray:
-        k1, k2, k3, p1, p2 = self.distortion
-        x, y = slopes.T
-        square = x * x + y * y
-        radial = 1 + square * (k1 + square * (k2 + square * k3))
-        return np.stack(
+
+def distorted(x: Slopes, y: Slopes, coefficients: Slopes) -> tuple[Slopes, Slopes]:
+    """What a lens makes of slopes, as `PosedCamera` says; for arrays of NumPy and of JAX.
+
+    Args:
+        x: Slopes to the right, of any shape.
+        y: Slopes downwards, of the same shape.
+        coefficients: k₁, k₂, k₃, p₁, p₂.
+
+    Returns:
+        The slopes x_d, y_d of the image.
+    """
+    k1, k2, k3, p1, p2 = coefficients
+    square = x * x + y * y
+    radial = 1 + square * (k1 + square * (k2 + square * k3))
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
+        y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def _distorted(slopes: Float[np.ndarray, "n 2"], coefficients: np.ndarray) -> Float[np.ndarray, "n 2"]:
+    x, y = slopes.T
+    return np.stack(distorted(x, y, coefficients), axis=1)
+
+
+def _undistorted(image: Float[np.ndarray, "n 2"], coefficients: np.ndarray) -> Float[np.ndarray, "n 2"]:
+    """Newton's method with a Jacobian by differences, from the distorted slopes."""
+    step = 1e-6
+    slopes = image.copy()
+    for _ in range(8):
+        miss = _distorted(slopes, coefficients) - image
+        a, b = (
+            (_distorted(slopes + step * axis, coefficients) - _distorted(slopes - step * axis, coefficients))
+            / (2 * step)
+            for axis in np.eye(2)
+        )
+        determinant = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        # Beyond the fold of a strong distortion there is no solution; the constructor has checked.
+        determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+        slopes = slopes - np.stack(
             [
-                x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
-                y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
+                (b[:, 1] * miss[:, 0] - b[:, 0] * miss[:, 1]) / determinant,
+                (a[:, 0] * miss[:, 1] - a[:, 1] * miss[:, 0]) / determinant,
             ],
             axis=1,
         )
-
-    def _undistorted(self, distorted: np.ndarray) -> np.ndarray:
-        """Newton's method with a Jacobian by differences, from the distorted slopes."""
-        step = 1e-6
-        slopes = distorted.copy()
-        for _ in range(8):
-            miss = self._distorted(slopes) - distorted
-            a, b = (
-                (self._distorted(slopes + step * axis) - self._distorted(slopes - step * axis)) / (2 * step)
-                for axis in np.eye(2)
-            )
-            determinant = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-            # Beyond the fold of a strong distortion there is no solution; the constructor has checked.
-            determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
-            slopes = slopes - np.stack(
-                [
-                    (b[:, 1] * miss[:, 0] - b[:, 0] * miss[:, 1]) / determinant,
-                    (a[:, 0] * miss[:, 1] - a[:, 1] * miss[:, 0]) / determinant,
-                ],
-                axis=1,
-            )
-        return slopes
+    return slopes
 
 
 def view_axes(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from dano.fields import large_parts, redistanced
-from dano.vision.capture._box import Box
-from dano.vision.capture._camera import PosedCamera
+from dano.vision.capture._camera import distorted, PosedCamera
 from dano.vision.capture._capture import View
+from dano.vision.capture._node_grid import NodeGrid
 
 LOST = 0.02
 """Share of the views that may miss a point of the object: one bad mask does not cut a hole into it."""
@@ -77,15 +77,8 @@ def sampled(
     position, axes, focal, centre, distortion, size = camera
     local = axes @ (points - position[:, None])
     ahead = local[2] > 1e-9
-    x, y = (local[i] / jnp.where(ahead, local[2], 1) for i in (0, 1))
-    y = -y
-    k1, k2, k3, p1, p2 = distortion
-    square = x * x + y * y
-    radial = 1 + square * (k1 + square * (k2 + square * k3))
-    x, y = (
-        x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
-        y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
-    )
+    right, up = (local[i] / jnp.where(ahead, local[2], 1) for i in (0, 1))
+    x, y = distorted(right, -up, distortion)
     x, y = x * focal[0] + centre[0], y * focal[1] + centre[1]
     inside = ahead & (x >= 0) & (x <= size[0]) & (y >= 0) & (y <= size[1])
     x, y = jnp.clip(x - 0.5, 0, size[0] - 1), jnp.clip(y - 0.5, 0, size[1] - 1)
@@ -117,7 +110,7 @@ def object_box(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     centre, radius = viewed_ball(views)
     lower, upper = centre - radius, centre + radius
     for _ in range(6):
-        box = Box.around(lower, upper, 64)
+        box = NodeGrid.around(lower, upper, 64)
         seen, cover = silhouettes(box.nodes, views)
         # Half a cell may hide a thin part: anything near a silhouette counts.
         inside = ((cover > 0.5) & (seen >= 0.5 * len(views))).reshape(box.shape)
@@ -148,7 +141,7 @@ def viewed_ball(views: Sequence[View]) -> tuple[np.ndarray, float]:
     return centre, float(np.linalg.norm(positions - centre, axis=1).min())
 
 
-def hull_distance(views: Sequence[View], box: Box, lost: float = LOST) -> Float[np.ndarray, "nx ny nz"]:
+def hull_distance(views: Sequence[View], box: NodeGrid, lost: float = LOST) -> Float[np.ndarray, "nx ny nz"]:
     """Signed distance [m] of the visual hull at the nodes of a grid, accurate to a fraction of a cell.
 
     The least mask value over the views crosses ½ on the hull; where it does along the grid's edges lie points

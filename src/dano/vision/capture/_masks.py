@@ -8,9 +8,9 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from dano.fields import largest_part
-from dano.vision.capture._box import Box
 from dano.vision.capture._capture import Capture, View
 from dano.vision.capture._hull import object_box, silhouettes
+from dano.vision.capture._node_grid import NodeGrid
 from dano.vision.capture._ray_set import rays_of
 
 _BORDER = 0.03
@@ -70,7 +70,7 @@ def _agreed(capture: Capture) -> list[np.ndarray]:
     except ValueError:
         # Poses or masks are wrong, which `survey` says in words.
         return everything
-    box = Box.around(lower, upper, 64)
+    box = NodeGrid.around(lower, upper, 64)
     _, cover = silhouettes(box.nodes, train, _DOUBTED)
     near = ndimage.binary_dilation((cover > 0.5).reshape(box.shape), iterations=2)
     kept, beside = [], []

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from dano.vision.capture._box import Box
 from dano.vision.capture._camera import AbstractCamera
 from dano.vision.capture._capture import View
+from dano.vision.capture._node_grid import NodeGrid
 from dano.vision.capture._rays import box_interval, Rays
 
 _STEPS = 160
@@ -43,7 +43,7 @@ class RaySet(NamedTuple):
 
 
 def rays_of(
-    camera: AbstractCamera, light: np.ndarray | None, box: Box, occupied: Bool[np.ndarray, "nx ny nz"]
+    camera: AbstractCamera, light: np.ndarray | None, box: NodeGrid, occupied: Bool[np.ndarray, "nx ny nz"]
 ) -> tuple[Int[np.ndarray, " n"], Rays]:
     """The rays through a camera's pixels that pass an occupied cell of a box.
 
@@ -106,7 +106,7 @@ def _span(occupied, lowest, spacing, origin, directions):
     return jnp.maximum(near, 0), far
 
 
-def collect(views: Sequence[View], box: Box, occupied: Bool[np.ndarray, "nx ny nz"]) -> RaySet:
+def collect(views: Sequence[View], box: NodeGrid, occupied: Bool[np.ndarray, "nx ny nz"]) -> RaySet:
     """All rays of some views with masks that may meet the object.
 
     Raises:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from dano.vision.capture import Box
+from dano.vision.capture import NodeGrid
 from dano.vision.radiance._trilinear import rows_at
 
 Share = float | Float[Array, ""]
@@ -65,7 +65,7 @@ class Appearance(eqx.Module):
     @classmethod
     def create(
         cls,
-        box: Box,
+        box: NodeGrid,
         *,
         lit: bool,
         near_light: bool = False,
@@ -86,7 +86,7 @@ class Appearance(eqx.Module):
             key: Random key.
         """
         first, second = jax.random.split(key)
-        coarse = Box.around(box.origin, box.upper, resolution)
+        coarse = NodeGrid.around(box.origin, box.upper, resolution)
         n_inputs = n_features + 6 + (7 if lit else 0)
         network = Network.create((n_inputs, width, width, 3), second)
         # What depends on the view starts at nothing: where it is left out at first, it would else come in as

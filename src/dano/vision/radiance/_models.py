@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.fields import CallableField
-from dano.vision.capture import Box, Rays
+from dano.vision.capture import NodeGrid, Rays
 from dano.vision.radiance._appearance import Appearance, Share
 from dano.vision.radiance._trilinear import value_and_slope_at, value_at
 from dano.vision.radiance._volume import (
@@ -201,9 +201,9 @@ class _OnNodes(AbstractModel):
         return jnp.stack([self.origin, self.origin + self.spacing * last])
 
     @property
-    def box(self) -> Box:
+    def box(self) -> NodeGrid:
         """The grid."""
-        return Box(np.asarray(self.origin, np.float64), float(self.spacing), self.shape)
+        return NodeGrid(np.asarray(self.origin, np.float64), float(self.spacing), self.shape)
 
     def _index(self, points: Float[Array, "n 3"]) -> Float[Array, "3 n"]:
         return ((points - self.origin[None]) / self.spacing).T
@@ -228,7 +228,7 @@ class SurfaceModel(_OnNodes, AbstractSurface):
 
     @classmethod
     def create(
-        cls, distance: Float[np.ndarray, "nx ny nz"], box: Box, appearance: Appearance
+        cls, distance: Float[np.ndarray, "nx ny nz"], box: NodeGrid, appearance: Appearance
     ) -> "SurfaceModel":
         """A model that starts from signed distances [m] at the nodes of a box."""
         scale = 0.5 * box.spacing * (max(box.shape) - 1)
@@ -284,7 +284,9 @@ class DensityModel(_OnNodes, AbstractMedium):
     spacing: Float[Array, ""]
 
     @classmethod
-    def create(cls, inside: np.ndarray, box: Box, appearance: Appearance, thickness: float) -> "DensityModel":
+    def create(
+        cls, inside: np.ndarray, box: NodeGrid, appearance: Appearance, thickness: float
+    ) -> "DensityModel":
         """A thin fog where nodes are `inside`, nothing elsewhere; `thickness` is its extinction per cell."""
         raw = np.where(inside, np.log(np.expm1(thickness)), -12.0)
         return cls(

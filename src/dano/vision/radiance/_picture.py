@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from dano.vision.capture import AbstractCamera, Box, Rays, rays_of
+from dano.vision.capture import AbstractCamera, NodeGrid, Rays, rays_of
 from dano.vision.radiance._models import AbstractModel, DRAWING, Sampling, see
 
 _CHUNK = 4096
@@ -40,7 +40,7 @@ def picture(
     model: AbstractModel,
     camera: AbstractCamera,
     light: np.ndarray | None,
-    box: Box,
+    box: NodeGrid,
     occupied: np.ndarray,
     sharpness: float = 1.0,
     *,

@@ -5,7 +5,7 @@ from dano.vision.training._options import TrainOptions as TrainOptions
 from dano.vision.training._score import Score as Score, score as score
 from dano.vision.training._survey import Survey as Survey, survey as survey
 from dano.vision.training._train import (
-    Progress as Progress,
+    HistoryEntry as HistoryEntry,
     train as train,
     Trained as Trained,
     volume as volume,

@@ -16,7 +16,7 @@ says that it is not. Looking through the fog does not tell, as its walls leak. S
 second time only where cameras look past the walls that stopped it the first time.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,7 +27,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy import ndimage
 
 from dano.fields import large_parts, largest_part, redistanced
-from dano.vision.capture import Box, collect, RaySet, resampled, View
+from dano.progress import Progress
+from dano.vision.capture import collect, NodeGrid, RaySet, resampled, View
 from dano.vision.radiance import Appearance, DensityModel, Sampling, see
 from dano.vision.training._adam import adam, updates_of
 
@@ -72,12 +73,12 @@ class Cavities(NamedTuple):
 def find_cavities(
     views: Sequence[View],
     hull: Float[np.ndarray, "nx ny nz"],
-    box: Box,
+    box: NodeGrid,
     *,
     lit: bool,
     key: PRNGKeyArray,
     n_steps: int = STEPS,
-    progress: Callable[[], None] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Cavities, ...]:
     """Look for cavities of the visual hull.
 
@@ -96,7 +97,7 @@ def find_cavities(
     Returns:
         Readings of the fog that leave something of the hull.
     """
-    coarse = Box.around(box.origin, box.upper, min(_RESOLUTION, max(box.shape)))
+    coarse = NodeGrid.around(box.origin, box.upper, min(_RESOLUTION, max(box.shape)))
     opacity = _fog(views, resampled(hull, box, coarse), coarse, lit, key, n_steps, progress)
     found = (without_cavities(opacity, coarse, views, hull, box, reading) for reading in _READINGS)
     return tuple(each for each in found if each is not None)
@@ -104,10 +105,10 @@ def find_cavities(
 
 def without_cavities(
     opacity: Float[np.ndarray, "mx my mz"],
-    coarse: Box,
+    coarse: NodeGrid,
     views: Sequence[View],
     hull: Float[np.ndarray, "nx ny nz"],
-    box: Box,
+    box: NodeGrid,
     reading: tuple[float, float],
 ) -> Cavities | None:
     """What `carve` leaves of the hull, rolling the ball only where cameras look past what it left at first.
@@ -127,7 +128,7 @@ def without_cavities(
 
 
 def witnesses(
-    opacity: Float[np.ndarray, "mx my mz"], coarse: Box, views: Sequence[View]
+    opacity: Float[np.ndarray, "mx my mz"], coarse: NodeGrid, views: Sequence[View]
 ) -> Int[np.ndarray, "mx my mz"]:
     """Number of cameras that see each node past cells of given opacities, but for those around the node."""
     thickness = jnp.asarray(-np.log1p(-np.clip(opacity, 0, 0.999)), jnp.float32)
@@ -166,9 +167,9 @@ def _thickness_before(
 def carve(
     opacity: Float[np.ndarray, "mx my mz"],
     known: Bool[np.ndarray, "mx my mz"],
-    coarse: Box,
+    coarse: NodeGrid,
     hull: Float[np.ndarray, "nx ny nz"],
-    box: Box,
+    box: NodeGrid,
     width: float,
     solid: float,
 ) -> Cavities | None:
@@ -232,7 +233,7 @@ def _fog(views, distance, box, lit, key, n_steps, progress) -> np.ndarray:
         model, state, loss = _step(model, state, rays, allowed, decay, jax.random.fold_in(key, 1 + i))
         if progress is not None and i % 5 == 0:
             loss.block_until_ready()
-            progress()
+            progress("cavities", i / n_steps)
     opacity = -np.expm1(-np.asarray(jax.nn.softplus(model.raw), np.float64))
     return np.where(inside & np.isfinite(opacity), opacity, 0)
 

@@ -9,7 +9,7 @@ likely: they are left open, and what the other photographs show decides.
 import numpy as np
 from scipy import ndimage
 
-from dano.vision.capture import Box, Capture, hull_distance, rays_of, View
+from dano.vision.capture import Capture, hull_distance, NodeGrid, rays_of, View
 from dano.vision.training._survey import silhouette_residual, Survey, survey
 
 _CONSISTENT = 0.015
@@ -60,7 +60,7 @@ def with_doubts(capture: Capture, found: Survey) -> tuple[Capture, Survey]:
     return doubted, again._replace(residual=found.residual, warnings=(*found.warnings, told))
 
 
-def _doubted(view: View, box: Box, hull: np.ndarray) -> View:
+def _doubted(view: View, box: NodeGrid, hull: np.ndarray) -> View:
     """A view whose mask is doubted where it leaves out more than a rim of a hull's silhouette."""
     if view.mask is None or view.background is None:
         return view

@@ -16,6 +16,8 @@ What single rays say of single nodes is mostly noise, and what many agree on is 
 So the derivative with respect to distances is spread over neighbouring nodes at first (`coherence`).
 """
 
+import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -45,6 +47,12 @@ _RATE_CAMERAS = 0.02
 
 _STATED = 1e-4
 """Weight of squared corrections [pixels²]: what photographs leave open stays as stated."""
+
+
+_OF_THE_LOOP = ("iterations", "features", "cavities", "blur", "check_every", "seconds", "seed")
+"""Options that only the loop around the steps reads."""
+
+_DEFAULT = TrainOptions()
 
 
 class Learned(eqx.Module):
@@ -100,6 +108,13 @@ def make_step(options: TrainOptions, *, lit: bool) -> Callable[..., tuple[Learne
         is spread over neighbours, and key, which returns the first two anew and the mean error of colours and
         masks.
     """
+    # What steps do not read is set to one value: trainings that differ only there share the compiled step.
+    read = dataclasses.replace(options, **{name: getattr(_DEFAULT, name) for name in _OF_THE_LOOP})
+    return _made_step(read, lit)
+
+
+@functools.lru_cache(maxsize=2)
+def _made_step(options: TrainOptions, lit: bool) -> Callable[..., tuple[Learned, Any, Array]]:
     import optax
 
     sampling = Sampling(48, 16, 5)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dano.vision.capture import Box, Capture, check_masks, hull_distance, object_box, View, viewed_ball
+from dano.vision.capture import Capture, check_masks, hull_distance, NodeGrid, object_box, View, viewed_ball
 from dano.vision.radiance import Appearance, picture, Sampling, SurfaceModel
 from dano.vision.training._metrics import mask_iou
 
@@ -21,6 +21,9 @@ around and above, leave 90°."""
 
 _MARGIN = 0.04
 """Kept free around the hull, as a share of its longest side."""
+
+
+Corners = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 
 
 class Survey(NamedTuple):
@@ -36,7 +39,7 @@ class Survey(NamedTuple):
         warnings: Sentences for the user.
     """
 
-    box: Box
+    box: NodeGrid
     hull: Float[np.ndarray, "nx ny nz"]
     residual: float
     gap: float
@@ -44,12 +47,14 @@ class Survey(NamedTuple):
     warnings: tuple[str, ...]
 
 
-def survey(capture: Capture, resolution: int = 96) -> Survey:
+def survey(capture: Capture, resolution: int = 96, *, corners: Corners | None = None) -> Survey:
     """Check that a capture with masks fits together, and build the visual hull.
 
     Args:
         capture: Photographs with masks.
         resolution: Nodes along the longest side of the object's box.
+        corners: Lower and upper corner of that box [m, W]; default: what the silhouettes of the training
+            views leave.
 
     Raises:
         ValueError: If masks are missing, empty or full, or the silhouettes have no point in common.
@@ -59,17 +64,17 @@ def survey(capture: Capture, resolution: int = 96) -> Survey:
         names = [view.name for view in views if view.mask is None]
         raise ValueError(f"every view must have a mask, but {len(names)} have none: {', '.join(names[:4])}")
     check_masks(capture.views)
-    lower, upper = object_box(views)
+    lower, upper = object_box(views) if corners is None else corners
     margin = _MARGIN * float((upper - lower).max())
-    box = Box.around(lower - margin, upper + margin, resolution)
+    box = NodeGrid.around(lower - margin, upper + margin, resolution)
     hull = hull_distance(views, box)
     residual = silhouette_residual(views, box, hull)
     gap, direction = widest_gap(views)
     warnings = []
     if residual > BAD_RESIDUAL:
         warnings.append(
-            f"the silhouettes do not fit together: {100 * residual:.1f} % of them is not explained by any"
-            " shape (below 2 % is usual); check the focal length, the poses and the masks"
+            f"the silhouettes do not fit together: no shape explains {100 * residual:.1f} % of them"
+            " (below 2 % is usual); check the focal length, the poses and the masks"
         )
     if gap > _ONE_SIDE:
         warnings.append(
@@ -79,14 +84,14 @@ def survey(capture: Capture, resolution: int = 96) -> Survey:
     elif gap > np.pi / 3:
         warnings.append(
             f"no view within {np.degrees(gap):.0f}° of the direction {np.round(direction, 2).tolist()}:"
-            " what faces there is known by its outline only"
+            " surfaces that face it are known by their outline only"
         )
     if len(views) < 8:
         warnings.append(f"only {len(views)} views to train on: expect a coarse shape")
     return Survey(box, hull, residual, gap, direction, tuple(warnings))
 
 
-def silhouette_residual(views: Sequence[View], box: Box, hull: np.ndarray, most: int = 16) -> float:
+def silhouette_residual(views: Sequence[View], box: NodeGrid, hull: np.ndarray, most: int = 16) -> float:
     """1 − mean intersection over union of the hull's silhouettes with the masks, over up to `most` views."""
     look = Appearance.create(box, lit=False, n_features=1, resolution=4, width=1, key=jax.random.key(0))
     model = SurfaceModel.create(hull, box, look)

@@ -5,7 +5,7 @@ grid; rendering is compared with random rays of the photographs (see `make_step`
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.vision.capture import Box, Capture, collect, object_box, RaySet, resampled, View
+from dano.progress import Progress
+from dano.vision.capture import Capture, collect, NodeGrid, object_box, RaySet, resampled, View
 from dano.vision.radiance import Appearance, LearnedField, picture, SurfaceModel
 from dano.vision.training import _checkpoint
 from dano.vision.training._adjustment import Adjustment
@@ -26,7 +27,7 @@ from dano.vision.training._options import TrainOptions
 from dano.vision.training._preview import checked_folder, write_preview
 from dano.vision.training._score import Score, score
 from dano.vision.training._steps import Learned, make_step, optimiser_of
-from dano.vision.training._survey import Survey, survey, unseen_share
+from dano.vision.training._survey import Corners, Survey, survey, unseen_share
 
 _WORTH_TRYING = 0.003
 """Share of the hull that cavities must take for a surface without them to be tried."""
@@ -45,8 +46,8 @@ until it is sharp."""
 Stopped = Literal["finished", "converged", "geometry", "time", "diverged"]
 
 
-class Progress(NamedTuple):
-    """What is known during training.
+class HistoryEntry(NamedTuple):
+    """What a look at held-out views tells during training.
 
     Attributes:
         iteration: Steps done.
@@ -54,8 +55,8 @@ class Progress(NamedTuple):
         seconds: Time in steps so far, without compilation [s].
         rays_per_second: Of the last steps.
         loss: Of the last step.
-        psnr: Of held-out views, when last looked at [dB]; None before.
-        mask_iou: Of held-out views, when last looked at; None before.
+        psnr: Of held-out views [dB].
+        mask_iou: Of held-out views.
         volume: Of the solid [m³].
     """
 
@@ -64,8 +65,8 @@ class Progress(NamedTuple):
     seconds: float
     rays_per_second: float
     loss: float
-    psnr: float | None
-    mask_iou: float | None
+    psnr: float
+    mask_iou: float
     volume: float
 
 
@@ -89,7 +90,7 @@ class Trained(NamedTuple):
     capture: Capture
     survey: Survey
     scores: dict[str, Score]
-    history: tuple[Progress, ...]
+    history: tuple[HistoryEntry, ...]
     stopped: Stopped
     seconds: float
     unseen: float
@@ -115,7 +116,7 @@ def train(
     *,
     checkpoint: str | Path | None = None,
     resume: bool = False,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Progress | None = None,
     previews: str | Path | None = None,
 ) -> Trained:
     """Learn a solid field from photographs with poses and masks (`with_masks` makes these).
@@ -125,7 +126,7 @@ def train(
         options: How; default `TrainOptions()`.
         checkpoint: File that the state is written to at each look at held-out views, and when interrupted.
         resume: Go on from `checkpoint` if it exists.
-        progress: Called after every few steps.
+        progress: Called after every few steps, while cavities are looked for and during training.
         previews: Folder for a PNG per look at held-out views: photographs, and their renderings below.
 
     Returns:
@@ -143,8 +144,8 @@ def train(
     near = {view.light_is_near for view in capture.views if view.light is not None}
     if len(near) > 1:
         raise ValueError("lights must be given as directions or as positions, got some of each")
-    capture = _shrunk(capture, options)
-    capture, found = with_doubts(capture, survey(capture, options.resolution))
+    capture, corners = _shrunk(capture, options)
+    capture, found = with_doubts(capture, survey(capture, options.resolution, corners=corners))
     trainer = _Trainer(
         capture, options, found, Path(checkpoint) if checkpoint is not None else None, progress, folder
     )
@@ -157,9 +158,9 @@ def train(
     unseen = unseen_share(state.model, capture.split("train"))
     warnings = list(found.warnings)
     if unseen > 0.05:
-        warnings.append(f"{100 * unseen:.0f} % of the surface is seen by fewer than two views: a guess")
+        warnings.append(f"{100 * unseen:.0f} % of the surface is seen by fewer than two views and is a guess")
     if stopped == "diverged":
-        warnings.append("training met a number that is not finite; what it had before is kept")
+        warnings.append("training reached a number that is not finite; the result is the state before")
     return Trained(
         field,
         capture,
@@ -182,12 +183,12 @@ class _Trainer:
         options: TrainOptions,
         found: Survey,
         checkpoint: Path | None,
-        progress: Callable[[Progress], None] | None,
+        progress: Progress | None,
         previews: Path | None,
     ):
         self.capture, self.options, self.found = capture, options, found
         self.checkpoint, self.progress, self.previews = checkpoint, progress, previews
-        self.history: list[Progress] = []
+        self.history: list[HistoryEntry] = []
         self.key = jax.random.key(options.seed)
         held = capture.split("test") or capture.split("train")
         few = [held[i] for i in np.unique(np.linspace(0, len(held) - 1, 6).round().astype(int))]
@@ -203,12 +204,12 @@ class _Trainer:
         share = min(1.0, iteration / (_SHARP * self.options.iterations))
         return 1 / (max(self.pixel, 0.5 * self.found.box.spacing) * first * (last / first) ** share)
 
-    def box(self, iteration: int) -> Box:
+    def box(self, iteration: int) -> NodeGrid:
         """The grid of a step: coarse first."""
         fine = self.found.box
         if iteration >= self.switch:
             return fine
-        return Box.around(fine.origin, fine.upper, max(16, 2 * self.options.resolution // 3))
+        return NodeGrid.around(fine.origin, fine.upper, max(16, 2 * self.options.resolution // 3))
 
     def fresh(self, start: np.ndarray, blur: float) -> _State:
         """A surface at signed distances [m] on the survey's box, grey all over and blurred [pixels]."""
@@ -249,7 +250,7 @@ class _Trainer:
             lit=self.capture.is_lit,
             key=jax.random.fold_in(self.key, 0),
             n_steps=min(STEPS, max(1, self.options.iterations // 2)),
-            progress=self._searched,
+            progress=self.progress,
         )
         worth = [each for each in found if each.share > _WORTH_TRYING]
         if not worth:
@@ -264,9 +265,12 @@ class _Trainer:
         errors = [self._trial(start, rays) for start in starts]
         return starts[int(np.argmin(errors))] if min(errors) < error else hull
 
-    def _searched(self) -> None:
+    def _tell(self, iteration: int, speed: float) -> None:
+        """Say how far training is; `speed` is that of the last steps [rays/s]."""
         if self.progress is not None:
-            self.progress(_nothing_yet(0, self.options.iterations))
+            quality = f"{self.history[-1].psnr:.1f} dB " if self.history else ""
+            share = iteration / self.options.iterations
+            self.progress(f"training {quality}{speed / 1000:.0f}k rays/s", share)
 
     def _trial(self, state: _State, rays: RaySet) -> float:
         """Mean loss of the last of a few steps: translucency deceives a fog, but not a surface."""
@@ -315,16 +319,14 @@ class _Trainer:
                     entry = self._checked(state, spent, speed, loss)
                     good = state
                     self._save(state)
-                    merit = (entry.mask_iou or 0.0) + 0.002 * (entry.psnr or 0.0)
+                    merit = entry.mask_iou + 0.002 * entry.psnr
                     if merit > best_score:
                         best, best_score = state, merit
                     if reason := reason_to_stop(self.history, self.found.residual):
                         stopped = reason
                         break
-                elif self.progress is not None and state.iteration % 5 == 0:
-                    last = self.history[-1] if self.history else _nothing_yet(0, options.iterations)
-                    now = {"iteration": state.iteration, "seconds": spent, "loss": loss}
-                    self.progress(last._replace(**now, rays_per_second=speed))
+                elif state.iteration % 5 == 0:
+                    self._tell(state.iteration, speed)
                 if options.seconds is not None and time.perf_counter() - since > options.seconds:
                     stopped = "time"
                     break
@@ -346,7 +348,7 @@ class _Trainer:
         # Wide enough that the surface can move outwards by as much as its blur.
         return collect(self.capture.split("train"), box, hull < max(3 * box.spacing, 2 * self.pixel))
 
-    def _checked(self, state: _State, spent: float, speed: float, loss: float) -> Progress:
+    def _checked(self, state: _State, spent: float, speed: float, loss: float) -> HistoryEntry:
         """Look at a few held-out views and at the solid."""
         sharpness = self.sharpness(state.iteration, float(state.blur))
         model, rows, pairs = state.model, [], []
@@ -360,7 +362,7 @@ class _Trainer:
         if self.previews is not None:
             write_preview(self.previews / f"{state.iteration:06d}.png", pairs)
         quality, overlap = np.mean(rows, axis=0)
-        entry = Progress(
+        entry = HistoryEntry(
             state.iteration,
             self.options.iterations,
             spent,
@@ -371,13 +373,12 @@ class _Trainer:
             volume(model.distances, model.box),
         )
         self.history.append(entry)
-        if self.progress is not None:
-            self.progress(entry)
+        self._tell(state.iteration, speed)
         return entry
 
     def _save(self, state: _State) -> None:
         if self.checkpoint is not None:
-            rows = [[np.nan if x is None else float(x) for x in entry] for entry in self.history]
+            rows = [[float(x) for x in entry] for entry in self.history]
             name = _checkpoint.name_of(self.options, self.capture)
             _checkpoint.save(
                 self.checkpoint, name, state.iteration, (state.learned, state.optimiser, state.blur), rows
@@ -397,12 +398,12 @@ class _Trainer:
             state = self.refined(state)
         learned, optimiser, blur = stored.filled((state.learned, state.optimiser, state.blur))
         self.history = [
-            Progress(int(row[0]), int(row[1]), *(float(x) for x in row[2:])) for row in stored.history
+            HistoryEntry(int(row[0]), int(row[1]), *(float(x) for x in row[2:])) for row in stored.history
         ]
         return _State(learned, optimiser, stored.iteration, blur)
 
 
-def reason_to_stop(history: Sequence[Progress], residual: float) -> Stopped | None:
+def reason_to_stop(history: Sequence[HistoryEntry], residual: float) -> Stopped | None:
     """Whether the outlines of held-out views have become worse, or nothing changes any more.
 
     Args:
@@ -412,12 +413,12 @@ def reason_to_stop(history: Sequence[Progress], residual: float) -> Stopped | No
     if len(history) < 4 or history[-1].iteration < _SHARP * history[-1].iterations:
         # Until then the surface is still being made sharp.
         return None
-    overlap = [entry.mask_iou or 0.0 for entry in history]
+    overlap = [entry.mask_iou for entry in history]
     # Brighter pictures with worse outlines: training has begun to eat into the solid. Outlines that do not
     # agree with one another cannot tell that any more exactly.
     if max(overlap[:-2]) - max(overlap[-2:]) > max(0.004, 0.5 * residual):
         return "geometry"
-    quality = [entry.psnr or 0.0 for entry in history]
+    quality = [entry.psnr for entry in history]
     volumes = [entry.volume for entry in history[-3:]]
     settled = max(volumes) - min(volumes) < 5e-4 * volumes[-1]
     return "converged" if settled and max(quality[-2:]) < max(quality[:-2]) + 0.03 else None
@@ -429,23 +430,23 @@ def pixel_at(views: Sequence[View], point: Float[np.ndarray, "3"]) -> float:
     return float(np.median(np.multiply([view.camera.pixel_angle for view in views], ranges)))
 
 
-def _shrunk(capture: Capture, options: TrainOptions) -> Capture:
-    """Photographs whose pixels are about as large as the cells of the finest grid, if they are smaller."""
+def _shrunk(capture: Capture, options: TrainOptions) -> tuple[Capture, Corners | None]:
+    """Photographs whose pixels are about as large as the cells of the finest grid, if they are smaller.
+
+    Returns:
+        The photographs, and the corners of the object's box if these photographs told them.
+    """
     views = capture.split("train")
     if not capture.has_masks:
-        return capture
+        return capture, None
     lower, upper = object_box(views)
     cell = float((upper - lower).max()) / options.resolution
     factor = max(1, round(cell / pixel_at(views, 0.5 * (lower + upper))))
-    return (
-        Capture([view.resized(factor) for view in capture.views], capture.source) if factor > 1 else capture
-    )
+    if factor == 1:
+        return capture, (lower, upper)
+    return Capture([view.resized(factor) for view in capture.views], capture.source), None
 
 
-def _nothing_yet(iteration: int, iterations: int) -> Progress:
-    return Progress(iteration, iterations, 0.0, 0.0, float("nan"), None, None, float("nan"))
-
-
-def volume(distances: Float[np.ndarray, "nx ny nz"], box: Box) -> float:
+def volume(distances: Float[np.ndarray, "nx ny nz"], box: NodeGrid) -> float:
     """Volume [m³] of {d < 0}, nodes near the surface counted in part."""
     return float(np.sum(np.clip(0.5 - distances / box.spacing, 0, 1)) * box.spacing**3)

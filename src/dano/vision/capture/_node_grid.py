@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy import ndimage
 
 
-class Box(NamedTuple):
+class NodeGrid(NamedTuple):
     """A regular grid of nodes around the object.
 
     Attributes:
@@ -21,7 +21,7 @@ class Box(NamedTuple):
     shape: tuple[int, int, int]
 
     @classmethod
-    def around(cls, lower: np.ndarray, upper: np.ndarray, resolution: int) -> "Box":
+    def around(cls, lower: np.ndarray, upper: np.ndarray, resolution: int) -> "NodeGrid":
         """`resolution` nodes along the longest side of a box [m]."""
         spacing = float((upper - lower).max()) / (resolution - 1)
         shape = np.maximum(np.ceil((upper - lower) / spacing - 1e-6).astype(int) + 1, 4)
@@ -40,7 +40,9 @@ class Box(NamedTuple):
         return self.origin + self.spacing * (np.array(self.shape) - 1)
 
 
-def resampled(values: Float[np.ndarray, "nx ny nz"], old: Box, new: Box) -> Float[np.ndarray, "mx my mz"]:
+def resampled(
+    values: Float[np.ndarray, "nx ny nz"], old: NodeGrid, new: NodeGrid
+) -> Float[np.ndarray, "mx my mz"]:
     """Values at the nodes of another box, trilinear between the old nodes, constant beyond them."""
     index = (new.nodes - old.origin).T / old.spacing
     return ndimage.map_coordinates(values, index, order=1, mode="nearest").reshape(new.shape)

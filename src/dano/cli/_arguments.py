@@ -1,0 +1,317 @@
+"""The commands' arguments, one class a command, and nothing that is slow to import."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import arg, Positional
+
+from dano.building import BuildOptions
+
+Output = Annotated[Path, arg(aliases=["-o"])]
+
+
+@dataclass(frozen=True)
+class Train:
+    """Learn a solid neural object from photographs with known poses.
+
+    Writes the object, and beside it the learned field (.field.npz), its density grid (.grid.npz) and a report
+    (.html).
+
+    Attributes:
+        images: Folder with transforms.json or anno_train.json, or one of these files.
+        output: Where to write the object, *.dano.
+        resolution: Nodes along the longest side of the object.
+        iterations: Largest number of training steps.
+        batch: Rays per step.
+        seconds: Stop training after this time [s].
+        views: Number of views to train on; default: all.
+        downscale: Average so many pixels a side into one.
+        network: Segmentation network (.onnx) for photographs without masks; default: what differs from the
+            background.
+        mass: Mass of the object [kg].
+        mass_density: Mass per volume [kg/m³], used if no mass is given.
+        resume: Continue a training that was interrupted.
+        no_report: Write no report.
+        seed: Seed of all random numbers.
+        json: Write figures of merit and mass properties to this file.
+        previews: Folder for pictures of the training: held-out photographs beside what is learned so far.
+    """
+
+    images: Positional[Path]
+    output: Output
+    resolution: int = 96
+    iterations: int = 800
+    batch: int = 4096
+    seconds: float | None = None
+    views: int | None = None
+    downscale: int = 1
+    network: Path | None = None
+    mass: float | None = None
+    mass_density: float = 1000.0
+    resume: bool = False
+    no_report: bool = False
+    seed: int = 0
+    json: Path | None = None
+    previews: Path | None = None
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import _learn
+
+        _learn.train(self)
+
+
+@dataclass(frozen=True)
+class Data:
+    """Check photographs before training: poses, masks, coverage. Draw the cameras.
+
+    Attributes:
+        images: Folder with transforms.json or anno_train.json, or one of these files.
+        png: Where to draw; default: the folder's name in the current folder.
+        no_png: Draw nothing.
+        downscale: Average so many pixels a side into one.
+        network: Segmentation network (.onnx) for photographs without masks.
+        json: Print one JSON object instead of text.
+    """
+
+    images: Positional[Path]
+    png: Path | None = None
+    no_png: bool = False
+    downscale: int = 1
+    network: Path | None = None
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import _learn
+
+        _learn.data(self)
+
+
+@dataclass(frozen=True)
+class Build:
+    """Make a neural object of a density field: mass, centre of mass, inertia, contact samples.
+
+    Attributes:
+        field: Density grid (.npz with values, origin, spacing), voxels (.npy), mesh (.obj, .stl, …), object
+            (.dano), or what `dano import` reads.
+        output: Where to write the object, usually *.dano.
+        options: How to make it.
+        json: Print one JSON object instead of text.
+    """
+
+    field: Positional[Path]
+    output: Output
+    options: Annotated[BuildOptions, arg(name="")] = BuildOptions()
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import _objects
+
+        _objects.build(self)
+
+
+@dataclass(frozen=True)
+class Import:
+    """Read a field of another program and write it as a grid that dano reads.
+
+    Attributes:
+        file: nerfstudio checkpoint (.ckpt), instant-ngp snapshot (.ingp, .msgpack), Gaussian splats (.ply),
+            OpenVDB or NanoVDB grid (.vdb, .nvdb), PyTorch module (.pt2, .pt, .pth), voxels (.npy, .npz),
+            mesh (.obj, .stl, .ply, .off, .glb, .gltf), or a function as package.module:name.
+        output: Where to write the grid (.npz).
+        crop: Box to keep: lowest x y z, highest x y z, in the file's frame and units.
+        scale: Length of a unit of the file [m].
+        position: Moves the scaled field [m].
+        orientation: Turns the scaled field before it is moved; quaternion w x y z.
+        resolution: Nodes along the longest axis, for files that hold no grid; default 128, for meshes as many
+            as their walls need.
+        interpolation: How the grid is interpolated between its nodes; default: as the format has it.
+        hollow: Gaussian splats: do not fill the inside. Splats lie on surfaces, so their inside is empty.
+        spacing: Voxels (.npy): distance between voxels in the file's units; default: longest side 1.
+        origin: Voxels (.npy): centre of the first voxel.
+        signed_distance: Voxels (.npy) are signed distances, negative inside.
+        grid: OpenVDB, NanoVDB: name of the grid.
+        cascade: instant-ngp: which cascade of the density grid; 0 is the finest.
+        module: Weights (.pt, .pth): package.module:name of the class or function that makes their
+            torch.nn.Module. Its code runs.
+        keep_transform: nerfstudio: keep the frame of training; default: the frame of the data set.
+        json: Print one JSON object instead of text.
+    """
+
+    file: Positional[str]
+    output: Output
+    crop: tuple[float, float, float, float, float, float] | None = None
+    scale: float = 1.0
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    resolution: int | None = None
+    interpolation: Literal["linear", "quadratic", "cubic"] | None = None
+    hollow: bool = False
+    spacing: float | None = None
+    origin: tuple[float, float, float] | None = None
+    signed_distance: bool = False
+    grid: str | None = None
+    cascade: int | None = None
+    module: str | None = None
+    keep_transform: bool = False
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import _import
+
+        _import.import_field(self)
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """Print an object's mass properties and samples, and draw it.
+
+    Attributes:
+        object: A neural object (.dano).
+        png: Where to draw it; default: beside the object.
+        no_png: Draw nothing.
+        json: Print one JSON object instead of text.
+    """
+
+    object: Positional[Path]
+    png: Path | None = None
+    no_png: bool = False
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import _objects
+
+        _objects.inspect(self)
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Simulate a scene, or drop an object onto a floor.
+
+    Attributes:
+        scene: A scene file (.toml), or a neural object (.dano) that is dropped onto a floor.
+        output: Where to write the trajectory, usually *.npz.
+        video: Where to write a video (.mp4).
+        strip: Where to write a picture of several moments side by side (.png).
+        steps: Number of steps; default: the scene's.
+        timestep: Timestep [s]; default: the scene's.
+        slow_motion: Video seconds per simulated second.
+        json: Print one JSON object instead of text.
+    """
+
+    scene: Positional[Path]
+    output: Output
+    video: Path | None = None
+    strip: Path | None = None
+    steps: int | None = None
+    timestep: float | None = None
+    slow_motion: float = 1.0
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import _scenes
+
+        _scenes.simulate(self)
+
+
+@dataclass(frozen=True)
+class Identify:
+    """Find the parameters of a scene from observed motions of its bodies, with error bars.
+
+    Attributes:
+        scene: Scene file (.toml).
+        motions: Observed motions (.npz, .csv): times [s], positions [m], quaternions. The guide
+            "Identification" lists the columns.
+        parameter: Unknown parameters, each as NAME:LOWER:UPPER or NAME:LOWER:UPPER:START, e.g.
+            soap,table.sliding_friction:0:1 or soap.mass_scale:0.2:5:1.
+        output: Where to write the result (.json).
+        report: Where to write a page with the motions, residuals, losses and a film (.html).
+        body: Name of the body that moved, for files that do not name it.
+        initial: What to estimate of the initial states: nothing (given), velocities, or all (states);
+            default: velocities if the motions have none, else nothing.
+        position_noise: Standard deviation of observed positions [m].
+        rotation_noise: Standard deviation of observed orientations [rad].
+        huber: Number of standard deviations beyond which residuals count linearly.
+        window: Cut motions into windows of this many frames; default: do not cut.
+        continuity: Allowed gap between a window's end and the next one's start, in standard deviations;
+            default: any.
+        starts: Number of points within the bounds to start from.
+        held_out: Motions that are not fitted; the error on them is measured.
+        order: Order of the quaternions in the files.
+        point: What positions refer to: centre of mass (com) or origin of the field's frame (origin).
+        rate: Frames per second, for files without times.
+        timestep: Timestep of the simulation [s]; default: the scene's.
+        json: Print one JSON object instead of text.
+    """
+
+    scene: Positional[Path]
+    motions: Positional[tuple[Path, ...]]
+    parameter: Annotated[tuple[str, ...], arg(aliases=["-p"])]
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    report: Path | None = None
+    body: str | None = None
+    initial: Literal["given", "velocities", "states"] | None = None
+    position_noise: float | None = None
+    rotation_noise: float | None = None
+    huber: float | None = None
+    window: int | None = None
+    continuity: float | None = None
+    starts: int = 1
+    held_out: tuple[Path, ...] = ()
+    order: Literal["wxyz", "xyzw"] = "wxyz"
+    point: Literal["com", "origin"] | None = None
+    rate: float | None = None
+    timestep: float | None = None
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import _identify
+
+        _identify.identify(self)
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a saved run in the browser.
+
+    Attributes:
+        run: A trajectory written by `dano simulate`.
+        port: Port of the page on this computer.
+    """
+
+    run: Positional[Path]
+    port: int = 8080
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import _scenes
+
+        _scenes.view(self)
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Build the shipped objects, simulate scenes of them, and draw everything.
+
+    Attributes:
+        name: drop: a bunny, a bar of soap and a ball fall. collision: a ball hits two bunnies. all: both.
+        output: Folder for everything that is written.
+        json: Print one JSON object instead of text.
+    """
+
+    name: Positional[Literal["all", "drop", "collision"]] = "all"
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("dano-demo")
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import _scenes
+
+        _scenes.demo(self)
