@@ -9,6 +9,7 @@ import tyro
 from tyro.conf import arg, FlagCreatePairsOff, Positional
 
 from dano import __version__
+from dano.cli._compare import compare
 from dano.cli._export import export
 from dano.names import did_you_mean
 
@@ -28,7 +29,7 @@ def parse(argv: Sequence[str]) -> Callable[[], None]:
     if list(argv) == ["--version"]:
         print(f"dano {__version__}")
         raise SystemExit(0)
-    functions = (train, data, build, import_, inspect, simulate, identify, view, export, demo)
+    functions = (train, data, build, import_, inspect, simulate, identify, view, export, compare, demo)
     commands = {function.__name__.rstrip("_"): function for function in functions}
     if not argv[0].startswith("-") and argv[0] not in commands:
         raise ValueError(

@@ -20,3 +20,4 @@ from dano.exchange._triangles import (
     solid_triangles as solid_triangles,
     Triangles as Triangles,
 )
+from dano.exchange._wavefront import write_obj as write_obj
