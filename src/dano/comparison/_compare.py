@@ -313,7 +313,7 @@ def _own_row(bench: _Bench) -> Row:
     errors = _errors(bench, enclosed(surface), np.asarray(mass.com), np.asarray(mass.inertia))
     if bench.truth is None:
         errors = {}  # It is the reference.
-    return Row("neural object", "dano", **errors)
+    return Row("neural object", "dano")._replace(**errors)
 
 
 def _mesh_row(
