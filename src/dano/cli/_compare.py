@@ -17,6 +17,7 @@ def compare(
     truth_scale: float = 1.0,
     levels: tuple[float, ...] = (),
     drops: int = 3,
+    no_decomposition: bool = False,
     seed: int = 0,
     json: bool = False,
 ) -> Callable[[], None]:
@@ -32,11 +33,17 @@ def compare(
         truth_scale: Length of a unit of its file [m].
         levels: Densities of the surfaces; default: five from near nothing to the density inside.
         drops: Random orientations to drop from.
+        no_decomposition: Leave out convex pieces, which take many minutes for a ragged surface.
         seed: Of these.
         json: Print one JSON object instead of text.
     """
     files = {"field": field, "truth": truth, "truth_scale": truth_scale}
-    options = {"levels": levels or None, "drops": drops, "seed": seed}
+    options = {
+        "levels": levels or None,
+        "drops": drops,
+        "decomposed": not no_decomposition,
+        "seed": seed,
+    }
     return functools.partial(_run, object, output, files, options, json)
 
 

@@ -150,6 +150,7 @@ def compare(
     truth: AbstractShape | None = None,
     levels: Sequence[float] | None = None,
     drops: int = 3,
+    decomposed: bool = True,
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
 ) -> Comparison:
@@ -169,6 +170,8 @@ def compare(
             the object.
         levels: Densities of the surfaces; default: shares of the density near the object's surface.
         drops: Number of random orientations, from 1 to 100.
+        decomposed: Whether to cut the best surface into convex pieces, which takes many minutes if it is
+            ragged.
         seed: Of these and of the probes.
         progress: Called with a description and the share done.
 
@@ -190,7 +193,7 @@ def compare(
     say("reference", 0.0)
     bench = _bench(thing, truth, drops, seed)
     best = best_level(grid, bench.solid.moments.volume)
-    missing = _missing()
+    missing = _missing(decomposed)
     say("the object itself", 0.02)
     rows, scenery = [], []
     begin = time.perf_counter()
@@ -209,7 +212,7 @@ def compare(
     _mesh_row(bench, mesh, "best surface: signed distance", hull_of, MuJoCo, rows, scenery, as_distance=True)
     if has_pybullet():
         _mesh_row(bench, mesh, "best surface: hull", hull_of, PyBullet, rows, scenery)
-    if importlib.util.find_spec("coacd") is not None:
+    if decomposed and importlib.util.find_spec("coacd") is not None:
         say("convex pieces", 0.65)
         pieces = pieces_of(grid, mesh)
         engines = (MuJoCo, PyBullet) if has_pybullet() else (MuJoCo,)
@@ -220,9 +223,11 @@ def compare(
     return Comparison(rows, scenery, reference, bench.solid.size, chosen, best, drops, missing)
 
 
-def _missing() -> list[str]:
+def _missing(decomposed: bool) -> list[str]:
     found = []
-    if importlib.util.find_spec("coacd") is None:
+    if not decomposed:
+        found.append("Convex decomposition is left out, as asked.")
+    elif importlib.util.find_spec("coacd") is None:
         found.append("Convex decomposition is left out: pip install 'dano[export]'.")
     if not has_pybullet():
         found.append(

@@ -80,7 +80,7 @@ def write_comparison_report(
         warnings(comparison.missing),
         _figure(comparison.scenery, comparison.size),
         "<h2>Measured</h2>",
-        "<div style='overflow-x:auto;font-size:.75rem;white-space:nowrap'>",
+        "<div style='overflow-x:auto;font-size:.65rem;white-space:nowrap'>",
         table(["route", "engine", "φ", *(name for name, _ in _COLUMNS)], list(map(_cells, comparison.rows))),
         "</div>",
         *(f"<p>{html.escape(_failure(row))}</p>" for row in comparison.rows if row.note),
