@@ -68,5 +68,6 @@ from dano.identify import (
     save_motion as save_motion,
 )
 from dano.scene_file import load_scene as load_scene
+from dano.exchange import export_object as export_object
 
 __version__ = "0.1.0"

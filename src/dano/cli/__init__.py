@@ -1,4 +1,4 @@
-"""The command line: `dano train | data | import | build | inspect | simulate | identify | view | demo`."""
+"""The command line: `dano train | data | import | build | inspect | simulate | …`, see `dano --help`."""
 
 import contextlib
 import sys

@@ -297,6 +297,85 @@ class View:
 
 
 @dataclass(frozen=True)
+class Export:
+    """Write an object as a folder that other simulators load.
+
+    Mass, centre of mass and inertia are the object's; what is seen has the learned colours; what touches are
+    convex pieces. README.md in the folder says what the format cannot hold.
+
+    Attributes:
+        object: A neural object (.dano).
+        output: The folder; new, empty, or of an earlier export, which is replaced.
+        to: Formats, one or several: mjcf (MuJoCo), urdf (PyBullet, ROS), usd (Isaac), obj (meshes only).
+        name: Of the body and the files; default: the object's file's.
+        collision: coacd: convex decomposition; hull: convex hull; auto: the first if coacd is installed.
+        concavity: How deep a convex piece may cut across, as a share of the size.
+        max_pieces: Most convex pieces; default: as many as it takes.
+        friction: Sliding friction.
+        restitution: Coefficient of restitution, where the format has one.
+        resolution: Nodes along the longest axis for the visible surface.
+        texture_size: Texels along the picture with the colours.
+        json: Print one JSON object instead of text.
+    """
+
+    object: Positional[Path]
+    output: Output
+    to: tuple[Literal["mjcf", "urdf", "usd", "obj"], ...] = ("mjcf",)
+    name: str | None = None
+    collision: Literal["auto", "coacd", "hull"] = "auto"
+    concavity: float = 0.05
+    max_pieces: int | None = None
+    friction: float = 0.2
+    restitution: float | None = None
+    resolution: int = 64
+    texture_size: int = 1024
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import _export
+
+        _export.export(self)
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Measure meshes of an object in MuJoCo and PyBullet against the object itself.
+
+    Writes a page with pictures of what lies on the floor and a table of errors and times.
+
+    Attributes:
+        object: A neural object (.dano).
+        output: The page (.html).
+        field: The density that meshes are made of; default: the object's own, which has no floaters left.
+        truth: The true solid (a closed mesh, or a signed distance), in the frame of the object.
+        truth_scale: Length of a unit of its file [m].
+        levels: Densities of the surfaces; default: five from near nothing to the density inside.
+        drops: Random orientations to drop from.
+        no_decomposition: Leave out convex pieces, which take many minutes for a ragged surface.
+        seed: Of these orientations.
+        json: Print one JSON object instead of text.
+    """
+
+    object: Positional[Path]
+    output: Output
+    field: Path | None = None
+    truth: Path | None = None
+    truth_scale: float = 1.0
+    levels: tuple[float, ...] = ()
+    drops: int = 3
+    no_decomposition: bool = False
+    seed: int = 0
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import _compare
+
+        _compare.compare(self)
+
+
+@dataclass(frozen=True)
 class Demo:
     """Build the shipped objects, simulate scenes of them, and draw everything.
 

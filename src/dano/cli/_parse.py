@@ -6,7 +6,19 @@ import tyro
 from tyro.conf import FlagCreatePairsOff
 
 from dano import __version__
-from dano.cli._arguments import Build, Data, Demo, Identify, Import, Inspect, Simulate, Train, View
+from dano.cli._arguments import (
+    Build,
+    Compare,
+    Data,
+    Demo,
+    Export,
+    Identify,
+    Import,
+    Inspect,
+    Simulate,
+    Train,
+    View,
+)
 from dano.names import did_you_mean
 
 _COMMANDS = {
@@ -18,6 +30,8 @@ _COMMANDS = {
     "simulate": Simulate,
     "identify": Identify,
     "view": View,
+    "export": Export,
+    "compare": Compare,
     "demo": Demo,
 }
 

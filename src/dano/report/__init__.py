@@ -1,6 +1,10 @@
 """Pictures for people: videos of trajectories, figures of objects, an interactive viewer."""
 
 from dano.report._capture import draw_capture as draw_capture
+from dano.report._comparison import (
+    verdict as verdict,
+    write_comparison_report as write_comparison_report,
+)
 from dano.report._identification import write_identification_report as write_identification_report
 from dano.report._object import draw_object as draw_object
 from dano.report._resample import frame_count as frame_count

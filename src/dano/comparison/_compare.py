@@ -1,0 +1,439 @@
+"""The verb: an object in our engine beside what meshes of it do in others."""
+
+import importlib.util
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dano.comparison._bodies import GRAVITY, Path, Probes, Rigid, rotation_of, Solid, Start, together
+from dano.comparison._mujoco import MuJoCo
+from dano.comparison._own import Own
+from dano.comparison._pybullet import has_pybullet, PyBullet
+from dano.comparison._rest import nearest_rest, stable_directions
+from dano.comparison._routes import best_level, Grid, hull_of, level_mesh, Mesh, pieces_of
+from dano.exchange import convex_hull, enclosed, Moments, signed_distances, solid_triangles, Triangles
+from dano.fields import AbstractField, AbstractShape, bake, GridField
+from dano.objects import NeuralObject, node_values
+
+TIMESTEP = 0.002
+"""Of all engines [s]."""
+
+SHARES = (0.03, 0.25, 0.5, 0.75, 1.0)
+"""Default levels, as shares of the density that the object has near its surface."""
+
+_ABOVE = 0.25
+"""Height of the lowest point at the start, as a share of the size."""
+_SETTLED = 20.0
+"""Time until a drop is over, in units of √(size/g): 2.2 s for 12 cm."""
+_COUNTS = 0.01
+"""What a probe must be clear, or go in, to count, as a share of the size."""
+_N_PROBES, _PROBE = 400, 0.04
+_RESOLUTION = 96
+
+
+class Row(NamedTuple):
+    """One way to simulate the object, measured. Shares and errors are 1, not per cent; NaN: not measured.
+
+    Attributes:
+        route: What was made of the object.
+        engine: Where it was simulated.
+        level: Density of the surface; NaN for the object itself.
+        preparation: Time for surface, pieces and loading [s].
+        triangles: Of the surface.
+        pieces: Convex pieces that touch; 0 where contact is not with pieces.
+        parts: Parts of the surface that hang together.
+        open_edges: Edges without two faces; 0: watertight.
+        volume_error: Relative.
+        com_error: Distance over the size.
+        inertia_error: Largest difference of a principal moment, relative.
+        tilt: Largest angle between a rest and the nearest stable pose of the reference [°].
+        gap: Of all rests, the height of the reference's lowest point over the floor that is largest in size,
+            over the size of the reference; negative: below the floor.
+        phantom: Share of clear probes that touch.
+        phantom_gap: Largest clearance of one of them, over the size.
+        missed: Share of probes inside that do not touch.
+        step_time: At rest [s].
+        motion_error: Largest distance between the same point of it and of the truth soon after the first
+            contact, over the size; mean over the drops.
+        moving: Largest speed at the end, over √(size · g).
+        note: What else there is to say.
+    """
+
+    route: str
+    engine: str
+    level: float = math.nan
+    preparation: float = math.nan
+    triangles: int = 0
+    pieces: int = 0
+    parts: int = 0
+    open_edges: int = 0
+    volume_error: float = math.nan
+    com_error: float = math.nan
+    inertia_error: float = math.nan
+    tilt: float = math.nan
+    gap: float = math.nan
+    phantom: float = math.nan
+    phantom_gap: float = math.nan
+    missed: float = math.nan
+    step_time: float = math.nan
+    motion_error: float = math.nan
+    moving: float = math.nan
+    note: str = ""
+
+
+class Scenery(NamedTuple):
+    """What is drawn of a row: the first drop at rest.
+
+    Attributes:
+        row: Which.
+        meshes: What touches, or the surface where that is the object itself [m, F].
+        surface: Level surface that the pieces stand for [m, F].
+        rotation: F → W at the end, shape (3, 3).
+        origin: Of F at the end [m, W], shape (3,).
+    """
+
+    row: Row
+    meshes: list[Triangles]
+    surface: Triangles
+    rotation: Float[np.ndarray, "3 3"]
+    origin: Float[np.ndarray, "3"]
+
+
+class Comparison(NamedTuple):
+    """What `compare` found.
+
+    Attributes:
+        rows: The object itself first.
+        scenery: What to draw of them, in the same order; without those that could not be simulated.
+        reference: What errors are measured against: "the truth" or "the neural object".
+        size: Of the reference [m].
+        levels: Densities that were tried.
+        best: The one whose cleaned surface has the volume of the reference.
+        drops: Number of drops.
+        missing: Sentences on what is not installed.
+    """
+
+    rows: list[Row]
+    scenery: list[Scenery]
+    reference: str
+    size: float
+    levels: list[float]
+    best: float
+    drops: int
+    missing: list[str]
+
+
+_Engine = Own | MuJoCo | PyBullet
+
+
+class _Bench(NamedTuple):
+    """What all rows share."""
+
+    thing: NeuralObject
+    solid: Solid
+    stable: Float[np.ndarray, "n 3"]
+    starts: list[Start]
+    n_steps: int
+    probes: Probes
+    truth: NeuralObject | None
+    true_paths: dict[str, list[Path]]
+
+
+def compare(
+    thing: NeuralObject,
+    *,
+    field: AbstractField | None = None,
+    truth: AbstractShape | None = None,
+    levels: Sequence[float] | None = None,
+    drops: int = 3,
+    decomposed: bool = True,
+    seed: int = 0,
+    progress: Callable[[str, float], None] | None = None,
+) -> Comparison:
+    """Measure the mesh route against the neural object itself.
+
+    Level surfaces of the density by marching cubes, as they are and cleaned (largest part, cavities
+    filled), go as convex hulls into MuJoCo. The cleaned surface of the best level, the one with the volume of
+    the reference, goes also as hull into PyBullet, as convex pieces (CoACD) into both, and as MuJoCo's signed
+    distance of a mesh. Each is dropped on a plane from the same random orientations, and probed with small
+    spheres. Every mesh has the mass of the object, spread evenly.
+
+    Args:
+        thing: The object; must have a density grid and a solid.
+        field: The density that meshes are made of; default: the object's own grid, which has lost its
+            floaters already.
+        truth: The true solid, in the frame of the object. Errors are measured against it; default: against
+            the object.
+        levels: Densities of the surfaces; default: shares of the density near the object's surface.
+        drops: Number of random orientations, from 1 to 100.
+        decomposed: Whether to cut the best surface into convex pieces, which takes many minutes if it is
+            ragged.
+        seed: Of these and of the probes.
+        progress: Called with a description and the share done.
+
+    Returns:
+        The measurements. What is not installed (CoACD, PyBullet) is left out and said.
+
+    Raises:
+        ImportError: If mujoco or libigl is missing.
+        ValueError: If the object has no grid or no solid, or an option is out of range.
+    """
+    if thing.grid is None or thing.solid is None:
+        raise ValueError("object must have a density grid to be meshed, got one made of samples alone")
+    if not 1 <= drops <= 100:
+        raise ValueError(f"drops must lie between 1 and 100, got {drops}")
+    grid = _grid(thing.grid if field is None else field)
+    top = float(grid.values.max())
+    chosen = _checked_levels(thing, levels, top)
+    say = progress or (lambda description, share: None)
+    say("reference", 0.0)
+    bench = _bench(thing, truth, drops, seed)
+    best = best_level(grid, bench.solid.moments.volume)
+    missing = _missing(decomposed)
+    say("the object itself", 0.02)
+    rows, scenery = [], []
+    begin = time.perf_counter()
+    own = Own(thing, TIMESTEP)
+    _measured(bench, own, _own_row(bench), [], _surface(thing), rows, scenery, begin)
+    jobs = [(level, cleaned) for level in chosen for cleaned in (False, True)]
+    for i, (level, cleaned) in enumerate(jobs):
+        say(f"surface at {level:.3g}", 0.1 + 0.4 * i / len(jobs))
+        mesh = level_mesh(grid, level, cleaned=cleaned)
+        route = "hull of the cleaned surface" if cleaned else "hull of the surface as it is"
+        _mesh_row(bench, mesh, route, hull_of, MuJoCo, rows, scenery)
+    say("best surface", 0.5)
+    mesh = level_mesh(grid, best, cleaned=True)
+    _mesh_row(bench, mesh, "best surface: hull", hull_of, MuJoCo, rows, scenery)
+    say("its signed distance", 0.55)
+    _mesh_row(bench, mesh, "best surface: signed distance", hull_of, MuJoCo, rows, scenery, as_distance=True)
+    if has_pybullet():
+        _mesh_row(bench, mesh, "best surface: hull", hull_of, PyBullet, rows, scenery)
+    if decomposed and importlib.util.find_spec("coacd") is not None:
+        say("convex pieces", 0.65)
+        pieces = pieces_of(grid, mesh)
+        engines = (MuJoCo, PyBullet) if has_pybullet() else (MuJoCo,)
+        for engine in engines:
+            _mesh_row(bench, mesh, "best surface: CoACD", lambda _: pieces, engine, rows, scenery)
+    say("done", 1.0)
+    reference = "the neural object" if truth is None else "the truth"
+    return Comparison(rows, scenery, reference, bench.solid.size, chosen, best, drops, missing)
+
+
+def _missing(decomposed: bool) -> list[str]:
+    found = []
+    if not decomposed:
+        found.append("Convex decomposition is left out, as asked.")
+    elif importlib.util.find_spec("coacd") is None:
+        found.append("Convex decomposition is left out: pip install 'dano[export]'.")
+    if not has_pybullet():
+        found.append(
+            "PyBullet is left out: pip install 'dano[pybullet]', which has wheels up to Python 3.11."
+        )
+    return found
+
+
+def _grid(field: AbstractField) -> Grid:
+    if not isinstance(field, GridField):
+        field, _ = bake(field, _RESOLUTION)
+    return Grid(
+        np.maximum(np.asarray(node_values(field), np.float64), 0),
+        np.asarray(field.origin, np.float64),
+        np.asarray(field.spacing, np.float64),
+    )
+
+
+def _checked_levels(thing: NeuralObject, levels: Sequence[float] | None, top: float) -> list[float]:
+    if levels is None:
+        dense = float(np.median(np.asarray(thing.samples.density)))
+        if thing.interior is not None:
+            dense = max(float(thing.interior.wall), 2 * float(thing.interior.level))
+        return [share * min(dense, 0.95 * top) for share in SHARES]
+    for level in levels:
+        if not (math.isfinite(level) and 0 < level < top):
+            raise ValueError(f"levels must lie between 0 and the largest density {top:.4g}, got {level}")
+    if len(levels) == 0:
+        raise ValueError("levels must name at least one density, got none")
+    return [float(level) for level in levels]
+
+
+def _surface(thing: NeuralObject) -> Triangles:
+    assert thing.solid is not None
+    return solid_triangles(thing.solid, _RESOLUTION)[0]
+
+
+def _bench(thing: NeuralObject, truth: AbstractShape | None, drops: int, seed: int) -> _Bench:
+    true = None
+    if truth is not None:
+        true = NeuralObject.from_field(truth, mass=float(thing.mass.mass))
+    shape = thing.solid if truth is None else truth
+    assert shape is not None
+    mesh, normals = solid_triangles(shape, _RESOLUTION)
+    hull = convex_hull(mesh.vertices)
+    size = float(np.ptp(mesh.vertices, axis=0).max())
+    solid = Solid(enclosed(mesh), mesh.vertices, normals, hull, size)
+    com = np.asarray((thing if true is None else true).mass.com, np.float64)
+    random = np.random.default_rng(seed)
+    starts = [_start(hull.vertices, size, random) for _ in range(drops)]
+    chosen = random.choice(len(mesh.vertices), min(_N_PROBES, len(mesh.vertices)), replace=False)
+    radius = _PROBE * size
+    clear = random.uniform(-0.5 * _PROBE, 0.1, len(chosen)) * size
+    centres = mesh.vertices[chosen] + (radius + clear)[:, None] * normals[chosen]
+    # Not `clear`: another part of the surface may be nearer.
+    clearance = signed_distances(shape, centres)[0] - radius
+    probes = Probes(centres, radius, clearance)
+    n_steps = round(_SETTLED * math.sqrt(size / GRAVITY) / TIMESTEP)
+    stable = stable_directions(hull, com)
+    return _Bench(thing, solid, stable, starts, n_steps, probes, true, {})
+
+
+def _start(points: Float[np.ndarray, "n 3"], size: float, random: np.random.Generator) -> Start:
+    """A random orientation, slowly turning, the lowest point a quarter of the size over the floor."""
+    orientation = random.normal(size=4)
+    orientation /= np.linalg.norm(orientation)
+    start = Start(np.zeros(3), orientation, 0.3 * math.sqrt(GRAVITY / size) * random.normal(size=3))
+    lowest = float((points @ rotation_of(start)[2]).min())
+    return start._replace(origin=np.array([0.0, 0.0, _ABOVE * size - lowest]))
+
+
+def _errors(bench: _Bench, moments: Moments, com: np.ndarray, inertia: np.ndarray) -> dict[str, float]:
+    """Of volume, centre of mass and inertia (of the object's mass), against the reference."""
+    reference = bench.thing if bench.truth is None else bench.truth
+    true = np.linalg.eigvalsh(np.asarray(reference.mass.inertia))
+    true *= float(bench.thing.mass.mass) / float(reference.mass.mass)
+    away = np.linalg.norm(com - np.asarray(reference.mass.com))
+    return {
+        "volume_error": moments.volume / bench.solid.moments.volume - 1,
+        "com_error": float(away) / bench.solid.size,
+        "inertia_error": float(np.abs(np.linalg.eigvalsh(inertia) / true - 1).max()),
+    }
+
+
+def _own_row(bench: _Bench) -> Row:
+    surface = _surface(bench.thing)
+    mass = bench.thing.mass
+    errors = _errors(bench, enclosed(surface), np.asarray(mass.com), np.asarray(mass.inertia))
+    if bench.truth is None:
+        errors = {}  # It is the reference.
+    return Row("neural object", "dano")._replace(**errors)
+
+
+def _mesh_row(
+    bench: _Bench,
+    mesh: Mesh,
+    route: str,
+    touch: Callable[[Mesh], tuple[list[Triangles], float]],
+    engine: type[MuJoCo] | type[PyBullet],
+    rows: list[Row],
+    scenery: list[Scenery],
+    *,
+    as_distance: bool = False,
+) -> None:
+    """Measure one mesh in one engine and append what was found, or why it could not be."""
+    triangles = mesh.triangles
+    row = Row(
+        route,
+        engine.name,
+        mesh.level,
+        triangles=len(triangles.faces),
+        parts=mesh.parts,
+        open_edges=triangles.open_edges,
+    )
+    begin = time.perf_counter()
+    try:
+        pieces, seconds = touch(mesh)
+        moments, note = mesh.moments, ""
+        if "CoACD" in route:
+            moments = together(pieces)
+        inertia = _inertia(bench, moments)
+        if inertia is None:
+            moments, note = enclosed(pieces[0]), "weighed by its hull: the mesh encloses no volume"
+            inertia = _inertia(bench, moments)
+        if inertia is None:
+            raise ValueError("its hull encloses no volume")
+        rigid = Rigid(pieces, float(bench.thing.mass.mass), moments.com, inertia)
+        rigid = rigid._replace(surface=triangles if as_distance else None)
+        begin = time.perf_counter() - mesh.seconds - seconds
+        made = engine(rigid, TIMESTEP)
+    except ValueError as error:
+        rows.append(row._replace(note=" ".join(str(error).split())))
+        return
+    row = row._replace(
+        pieces=0 if as_distance else len(pieces),
+        note=note,
+        **_errors(bench, mesh.moments, moments.com, inertia),
+    )
+    _measured(bench, made, row, pieces, triangles, rows, scenery, begin)
+
+
+def _inertia(bench: _Bench, moments: Moments) -> Float[np.ndarray, "3 3"] | None:
+    """Of the object's mass spread evenly; None if no solid has it."""
+    if not moments.volume > 0:
+        return None
+    inertia = float(bench.thing.mass.mass) / moments.volume * moments.inertia
+    least, middle, most = np.linalg.eigvalsh(inertia)
+    return inertia if least > 0 and least + middle > most else None
+
+
+def _measured(
+    bench: _Bench,
+    engine: _Engine,
+    row: Row,
+    pieces: list[Triangles],
+    surface: Triangles,
+    rows: list[Row],
+    scenery: list[Scenery],
+    begin: float,
+) -> None:
+    """Drop and probe; append the row and what is drawn of it. `begin`: when its preparation began [s]."""
+    prepared = time.perf_counter() - begin
+    paths = [engine.drop(start, bench.n_steps) for start in bench.starts]
+    phantom, largest, missed = bench.probes.judged(engine.touching(bench.probes), _COUNTS * bench.solid.size)
+    engine.close()
+    size, last = bench.solid.size, [(path.rotation[-1], path.origin[-1]) for path in paths]
+    gaps = [float((bench.solid.points @ turn[2]).min() + at[2]) / size for turn, at in last]
+    ends = [path.of(bench.solid.hull.vertices)[-10:] for path in paths]
+    speeds = [np.linalg.norm(end[-1] - end[0], axis=-1).max() / (9 * TIMESTEP) for end in ends]
+    if unsolved := sum(path.unsolved for path in paths):
+        row = row._replace(note=f"{unsolved} of {bench.n_steps * len(paths)} steps were not solved")
+    row = row._replace(
+        preparation=prepared,
+        tilt=max(nearest_rest(turn[2], bench.stable) for turn, _ in last),
+        gap=max(gaps, key=abs),
+        phantom=phantom,
+        phantom_gap=largest / size,
+        missed=missed,
+        step_time=min(path.step_time for path in paths),
+        motion_error=_motion_error(bench, engine.name, paths),
+        moving=float(max(speeds)) / math.sqrt(size * GRAVITY),
+    )
+    rows.append(row)
+    scenery.append(Scenery(row, pieces or [surface], surface, *last[0]))
+
+
+def _motion_error(bench: _Bench, engine: str, paths: list[Path]) -> float:
+    """Against the true solid in the same engine: on a plane its hull is as good as itself."""
+    if bench.truth is None:
+        return math.nan
+    if engine not in bench.true_paths:
+        mass = bench.truth.mass
+        if engine == Own.name:
+            true: _Engine = Own(bench.truth, TIMESTEP)
+        else:
+            rigid = Rigid(
+                [bench.solid.hull], float(mass.mass), np.asarray(mass.com), np.asarray(mass.inertia)
+            )
+            true = (MuJoCo if engine == MuJoCo.name else PyBullet)(rigid, TIMESTEP)
+        bench.true_paths[engine] = [true.drop(start, bench.n_steps) for start in bench.starts]
+        true.close()
+    # Three times the time to the floor: later, what is chaotic is larger than what is wrong.
+    until = round(3 * math.sqrt(2 * _ABOVE * bench.solid.size / GRAVITY) / TIMESTEP)
+    points = bench.solid.hull.vertices
+    apart = [
+        np.linalg.norm(path.of(points, until) - true.of(points, until), axis=-1).max()
+        for path, true in zip(paths, bench.true_paths[engine], strict=True)
+    ]
+    return float(np.mean(apart)) / bench.solid.size
