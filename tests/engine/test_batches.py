@@ -17,7 +17,7 @@ from engine import batch_cases
 from engine.batch_cases import arrays, case, fit, N, N_STEPS, SIZES
 
 import dano
-from dano.engine._batch_input import checked_job
+from dano.engine.batches._input import checked_job
 
 SOURCES = Path(dano.__file__).parents[1]
 SECONDS = 240

@@ -1,9 +1,9 @@
 """`dano compare`."""
 
+from dano import comparison
 from dano.cli._arguments import Compare
 from dano.cli._console import Progress, put, put_json
 from dano.cli._outputs import check_output
-from dano.comparison import compare as measure
 from dano.fields import AbstractShape, load_field
 from dano.objects import NeuralObject
 from dano.report import verdict, write_comparison_report
@@ -23,7 +23,7 @@ def compare(arguments: Compare) -> None:
     field = None if arguments.field is None else load_field(arguments.field)
     made = NeuralObject.load(arguments.object)
     progress = Progress()
-    found = measure(
+    found = comparison.compare(
         made,
         field=field,
         truth=truth,

@@ -1,11 +1,5 @@
 """Engines: from a scene and a state to the next one, and everything built on that."""
 
-from dano.engine._batches import (
-    load_rollouts as load_rollouts,
-    Rollouts as Rollouts,
-    rollouts as rollouts,
-    StoredRollouts as StoredRollouts,
-)
 from dano.engine._compiling import compiled as compiled, compiler_options as compiler_options
 from dano.engine._devices import device_mesh as device_mesh, gather as gather, map_rows as map_rows
 from dano.engine._newton import Report as Report
@@ -20,4 +14,10 @@ from dano.engine._rollout import (
     simulate as simulate,
     step as step,
     VariationalEngine as VariationalEngine,
+)
+from dano.engine.batches import (
+    load_rollouts as load_rollouts,
+    Rollouts as Rollouts,
+    rollouts as rollouts,
+    StoredRollouts as StoredRollouts,
 )

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from dano.archive import checked_output
-from dano.engine._batch_input import Job
-from dano.engine._batch_kernel import Kept
+from dano.engine.batches._input import Job
+from dano.engine.batches._kernel import Kept
 from dano.scene import state_arrays
 
 FORMAT, VERSION = "dano-rollouts", 1

@@ -13,11 +13,11 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.engine._batch_input import checked_job, Job
-from dano.engine._batch_kernel import Kept, simulate_rows
-from dano.engine._batch_store import RolloutStore
 from dano.engine._devices import device_mesh, gather, meet, put_rows, put_whole, take_rows
 from dano.engine._rollout import AbstractEngine, Policy, VariationalEngine
+from dano.engine.batches._input import checked_job, Job
+from dano.engine.batches._kernel import Kept, simulate_rows
+from dano.engine.batches._store import RolloutStore
 from dano.scene import Control, JOINT_QUANTITIES, Scene, State, STATE_SIZES
 
 Progress = Callable[[str, float], None]

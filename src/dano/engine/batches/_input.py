@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dano.engine._batch_kernel import Inputs, Kept, Program
 from dano.engine._rollout import _check_control, AbstractEngine
+from dano.engine.batches._kernel import Inputs, Kept, Program
 from dano.maths import is_traced
 from dano.scene import Control, Scene, State
 

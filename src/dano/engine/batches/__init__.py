@@ -1,0 +1,8 @@
+"""Many rollouts at once: what they start from, how they are compiled, and where they are kept."""
+
+from dano.engine.batches._rollouts import (
+    load_rollouts as load_rollouts,
+    Rollouts as Rollouts,
+    rollouts as rollouts,
+    StoredRollouts as StoredRollouts,
+)
