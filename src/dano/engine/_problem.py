@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from dano.contact import (
     AbstractPatchLaw,
     by_autodiff,
+    CHUNK,
     ContactParams,
     DistributedLaw,
     find,
@@ -33,11 +34,6 @@ from dano.engine._sequential import one_at_a_time
 from dano.engine._trees import build_tree, Tree, tree_mobilities
 from dano.maths import matmul, matvec, quat_to_matrix
 from dano.scene import colliders, Control, Poses, pressing_pairs, Scene, State, step_twists
-
-# Chunks of points that a step has room for: of each body that moves, and more of one with many samples.
-_CHUNKS_A_BODY = 24
-_CHUNKS_OF_MANY = 48
-_MANY_SAMPLES = 1000
 
 
 class Prepared(eqx.Module):
@@ -126,9 +122,11 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
     ]
     geometry = gather_geometry(parts, pairs, gravity * h * h, h.dtype)
     if capacity is None:
-        moving = [body for body in scene.bodies if not body.fixed]
-        many = [b for b in moving if b.surface is not None and b.surface.points.shape[1] >= _MANY_SAMPLES]
-        capacity = _CHUNKS_A_BODY * len(moving) + (_CHUNKS_OF_MANY - _CHUNKS_A_BODY) * len(many)
+        capacity = scene.room
+    if capacity is None:
+        # Room for all samples, where it is not known how many can touch at once.
+        sampled = [body.surface.points.shape[1] for body in scene.bodies if body.surface is not None]
+        capacity = -(-sum(sampled) // CHUNK)
     impacts = Impacts(material.instant > 0, material.bounce)
     return Prepared(geometry, material, impacts, capacity)
 

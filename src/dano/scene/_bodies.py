@@ -14,6 +14,12 @@ from dano.objects import checked_inertia, MassProperties, NeuralObject
 ORIENTATIONS = 256
 
 
+# Faces that a body may lie on are looked for among the normals of so many samples.
+FACES = 256
+# Samples within this share of the size above the lowest may touch: bodies sink by 0.5 %, and edges are round.
+LAYER = 0.02
+
+
 class Body(eqx.Module):
     """A rigid body: geometry, mass properties, and a name.
 
@@ -163,6 +169,19 @@ class Body(eqx.Module):
         depths = np.maximum(depth - (heights - heights.min(axis=1, keepdims=True)), 0)
         facing = np.maximum(-up @ vectors, 0)
         return float(np.median(np.sum(depths * facing, axis=1)))
+
+    def most_touching(self) -> int:
+        """How many samples meet a floor at once, when the body lies as flat as it can."""
+        assert self.surface is not None
+        points, vectors = np.asarray(self.surface.points[:3]), np.asarray(self.surface.vectors)
+        n = points.shape[1]
+        if self.surface.turning != "fixed":
+            return n
+        down = vectors[:, :: max(1, n // FACES)]
+        down = down / np.maximum(np.linalg.norm(down, axis=0), 1e-300)
+        heights = -down.T @ points
+        layer = LAYER * (points.max(axis=1) - points.min(axis=1)).max()
+        return int(np.max(np.sum(heights <= heights.min(axis=1, keepdims=True) + layer, axis=1)))
 
     @property
     def scale(self) -> Float[Array, "3"]:

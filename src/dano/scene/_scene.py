@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.contact import checked_parameter, ContactParams
+from dano.contact import checked_parameter, CHUNK, ContactParams
 from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
 from dano.objects import checked_inertia
 from dano.scene._bodies import Body
@@ -16,6 +16,9 @@ from dano.scene._contacts import Contact, prepared
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
 from dano.scene._joints import Joint, Layout, layout_of
 from dano.scene._states import Control, JOINT_QUANTITIES, State, STATE_SIZES
+
+# Room for what a body touches besides the floor that it lies on, and for chunks that are not full.
+CHUNKS_A_BODY = 24
 
 
 class Scene(eqx.Module):
@@ -29,6 +32,7 @@ class Scene(eqx.Module):
         twins: For each body the first that is made of the same object: its samples and its solid stand once
             in memory (static).
         joints: What hangs on what.
+        room: Chunks of point contacts that a step has room for (static); None leaves it to the engine.
     """
 
     bodies: tuple[Body, ...]
@@ -37,6 +41,7 @@ class Scene(eqx.Module):
     gravity: Float[Array, "3"]
     twins: tuple[int, ...] = eqx.field(static=True, default=())
     joints: tuple[Joint, ...] = ()
+    room: int | None = eqx.field(static=True, default=None)
 
     @classmethod
     def create(
@@ -92,7 +97,7 @@ class Scene(eqx.Module):
             for i, o in enumerate(objects)
         )
         bodies, contacts = prepared(bodies, contacts, gravity)
-        return cls(bodies, contacts, timestep, gravity, twins, joints)
+        return cls(bodies, contacts, timestep, gravity, twins, joints, _room(bodies))
 
     @property
     def layout(self) -> Layout:
@@ -364,6 +369,16 @@ def _structure(bodies: Sequence[Body], joints: Sequence[Joint]):
         tuple(body.fixed for body in bodies),
         tuple((joint.parent, joint.child, joint.kind) for joint in joints),
     )
+
+
+def _room(bodies: Sequence[Body]) -> int | None:
+    """Chunks of point contacts for bodies that lie as flat as they can; None where samples are traced."""
+    pressing = [body for body in bodies if not body.fixed and body.surface is not None]
+    if is_traced([body.surface for body in pressing], [body.scale for body in pressing]):
+        return None
+    n_moving = sum(not body.fixed for body in bodies)
+    flat = [-(-body.most_touching() // CHUNK) for body in pressing if body.object is not None]
+    return CHUNKS_A_BODY * n_moving + sum(flat)
 
 
 def _state_keys(layout: Layout, body: int) -> list[str]:
