@@ -71,3 +71,13 @@ def test_linearize_and_control():
     assert answer["largest_offset"] > 0.01
     assert answer["final_offset"] < 1e-3
     assert answer["final_spin"] < 0.01
+
+
+def test_door():
+    answer = run("07_door")
+    assert answer["unconverged_steps"] == 0
+    # Half of the approaching speed is left; the rest of the ball's speed comes from the door.
+    assert answer["ball_after"] > 0.2
+    assert 0 < answer["door_after"] < answer["door_before"]
+    assert answer["momentum_drift"] < 1e-3
+    assert 0.5 < answer["energy_left"] < 1

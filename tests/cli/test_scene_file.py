@@ -422,7 +422,8 @@ def test_documented_scene_loads(tmp_path):
     page = (Path(__file__).resolve().parents[2] / "docs" / "scenes.md").read_text(encoding="utf-8")
     text = "\n".join(block.split("```")[0] for block in page.split("```toml\n")[1:])
     loaded = parse_scene(text, tmp_path / "soap.toml")
-    assert loaded.scene.names == ("soap", "ball", "floor")
+    assert loaded.scene.names == ("soap", "ball", "floor", "door")
+    assert [joint.child for joint in loaded.scene.joints] == ["door"]
     assert loaded.n_steps == 300
     assert loaded.controls is not None
 

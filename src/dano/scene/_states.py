@@ -38,7 +38,7 @@ class State(eqx.Module):
     v: Float[Array, "*t k"] | None = None
 
 
-def state_arrays(states: State) -> dict[str, Array]:
+def state_arrays(states: State) -> dict[str, Array | np.ndarray]:
     """The arrays of states by name; those of joints where there are some."""
     names = (*STATE_SIZES, *(JOINT_QUANTITIES if states.q is not None else ()))
     return {name: getattr(states, name) for name in names}
