@@ -1,6 +1,9 @@
 """The distributed law: pressure and friction at every surface sample."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -91,28 +94,38 @@ class DistributedLaw(AbstractContactLaw):
             friction_pressure=1000.0,
         )
 
-    def material(
-        self, params: ContactParams, timestep: Float[Array, ""], gravity: Float[Array, ""]
-    ) -> Material:
-        """What points of a contact with these parameters feel.
 
-        Args:
-            params: Complete parameters.
-            timestep: h [s].
-            gravity: Its magnitude [m/s²].
-        """
-        one = jnp.ones_like(timestep)
-        return Material(
-            params.stiffness,
-            params.restitution,
-            params.restitution_velocity,
-            params.hysteresis,
-            params.sliding_friction,
-            params.friction_fading,
-            params.friction_pressure,
-            self.stiction_velocity.astype(timestep.dtype),
-            self.implicitness.astype(timestep.dtype) * timestep,
-            timestep,
-            0 * one if self.compliant else one,
-            params.restitution_velocity + gravity * timestep,
-        )
+def materials(
+    laws: Sequence[DistributedLaw],
+    params: Sequence[ContactParams],
+    timestep: Float[Array, ""],
+    gravity: Float[Array, ""],
+) -> Material:
+    """What points of contacts feel, as arrays over the contacts.
+
+    Args:
+        laws: Of each contact.
+        params: Their complete parameters.
+        timestep: h [s].
+        gravity: Its magnitude [m/s²].
+    """
+
+    def column(values: Sequence[Array]) -> Float[Array, " n"]:
+        return jnp.stack([jnp.asarray(x) for x in values]).astype(timestep.dtype)
+
+    stacked: ContactParams = jax.tree.map(lambda *x: column(x), *params)
+    ends_at_once = [0.0 if law.compliant else 1.0 for law in laws]
+    return Material(
+        stacked.stiffness,
+        stacked.restitution,
+        stacked.restitution_velocity,
+        stacked.hysteresis,
+        stacked.sliding_friction,
+        stacked.friction_fading,
+        stacked.friction_pressure,
+        column([law.stiction_velocity for law in laws]),
+        column([law.implicitness for law in laws]) * timestep,
+        jnp.broadcast_to(timestep, (len(laws),)),
+        jnp.asarray(ends_at_once, timestep.dtype),
+        stacked.restitution_velocity + gravity * timestep,
+    )

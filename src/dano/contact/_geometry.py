@@ -45,20 +45,15 @@ class Part(NamedTuple):
         surface: Samples, or None.
         scale: Semi-axes that directions on the unit ball are multiplied with [m]; ones for other surfaces.
         solid: What the samples of others press on, or None.
-        middle: Centre of a ball around the body [m, F].
-        radius: Radius of that ball [m], infinite for a half-space.
-        size: Largest extent [m].
-        thickness: Largest depth below the surface [m].
+        extent: Centre of a ball around the body [m, F], its radius [m] (infinite for a half-space), the
+            body's largest extent and its largest depth below the surface [m].
         twin: Index of the first body with the same samples and solid.
     """
 
     surface: SurfaceSet | None
     scale: Float[Array, "3"]
     solid: AbstractShape | None
-    middle: Float[Array, "3"]
-    radius: Float[Array, ""]
-    size: Float[Array, ""]
-    thickness: Float[Array, ""]
+    extent: Float[Array, "6"]
     twin: int
 
 
@@ -183,8 +178,8 @@ class Geometry(eqx.Module):
         probes_of: How many probes each body has.
         scale: See `Part`, shape (n, 3).
         turning: See `TURNING`, shape (n,).
-        middle: See `Part`, shape (n, 3).
-        radius: See `Part`, shape (n,).
+        middle: Centres of balls around the bodies [m, F], shape (n, 3).
+        radius: Of these balls, shape (n,).
         kinds: Pairs by the kind of solid that is pressed on.
     """
 
@@ -237,6 +232,7 @@ def gather_geometry(
     # Reading a body's blocks, or probes, takes as many as the widest body has.
     probes.append(jnp.zeros((3, max((each.shape[1] for each in probes), default=0)), dtype))
     tables.append(SurfaceSet.none(dtype, max((each.radii.shape[0] for each in sets), default=0)))
+    extents = jnp.stack([part.extent for part in parts]).astype(dtype)
     rows = [
         jnp.concatenate([t.points[:3], t.vectors]).reshape(6, -1, BLOCK).transpose(1, 0, 2) for t in tables
     ]
@@ -251,9 +247,9 @@ def gather_geometry(
         jnp.asarray([_probes_of(each).shape[1] for each in sets]),
         jnp.stack([part.scale for part in parts]).astype(dtype),
         jnp.asarray([TURNING[each.turning] for each in sets]),
-        jnp.stack([part.middle for part in parts]).astype(dtype),
-        jnp.stack([part.radius for part in parts]).astype(dtype),
-        tuple(_kinds(parts, sets, pairs, gravity_step, dtype)),
+        extents[:, :3],
+        extents[:, 3],
+        tuple(_kinds(parts, sets, pairs, extents[:, 4:], gravity_step, dtype)),
     )
 
 
@@ -262,8 +258,8 @@ def _probes_of(surface: SurfaceSet) -> Float[Array, "3 k"]:
     return surface.points[:3] if surface.radii.shape[0] <= _FEW_BLOCKS else surface.centers.T
 
 
-def _kinds(parts, sets, pairs, gravity_step, dtype):
-    """Pairs grouped by the kind of the second body's solid."""
+def _kinds(parts, sets, pairs, sizes: Float[Array, "n 2"], gravity_step, dtype):
+    """Pairs grouped by the kind of the second body's solid; `sizes` are extents and depths of the bodies."""
     both = {(first, second) for first, second, _ in pairs}
     groups: dict[Any, list[tuple[int, int, int]]] = {}
     for pair in pairs:
@@ -281,8 +277,7 @@ def _kinds(parts, sets, pairs, gravity_step, dtype):
         several = len(solids) > 1
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *solids) if several else solids[0]
         first, second, contact = (np.array(x) for x in zip(*members, strict=True))
-        size = jnp.stack([jnp.minimum(parts[i].size, parts[j].size) for i, j, _ in members]).astype(dtype)
-        thickness = jnp.stack([jnp.minimum(parts[i].thickness, parts[j].thickness) for i, j, _ in members])
+        size, thickness = jnp.minimum(sizes[first], sizes[second]).T
         smooth = [sets[i].turning != "fixed" for i in range(len(sets))]
         yield Kind(
             stacked,
@@ -294,7 +289,7 @@ def _kinds(parts, sets, pairs, gravity_step, dtype):
                 jnp.asarray(contact),
                 jnp.asarray([0.5 if (j, i) in both else 1.0 for i, j, _ in members], dtype),
                 jnp.asarray([float(smooth[j] and not smooth[i]) for i, j, _ in members], dtype),
-                jnp.minimum(_SINK * size, _THIN * thickness.astype(dtype)),
+                jnp.minimum(_SINK * size, _THIN * thickness),
                 _MARGIN * size + 2 * gravity_step.astype(dtype),
             ),
             several,

@@ -24,6 +24,7 @@ from dano.contact import (
     KEPT,
     Links,
     Material,
+    materials,
     Patch,
     Points,
     points_of,
@@ -105,15 +106,13 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
         scene: The scene.
         capacity: Chunks of point contacts that a step has room for; None chooses by the bodies.
     """
-    laws = [(c.law, c.params) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
-    if not laws:
+    pressing = [(c.law, c.params) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
+    if not pressing:
         return Prepared(None, None, None, 0)
     h = scene.timestep
     gravity = jnp.sqrt(jnp.sum(scene.gravity**2))
-    materials = [law.material(params, h, gravity) for law, params in laws]
-    material = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v).astype(h.dtype) for v in x]), *materials)
-    order = [k for k, c in enumerate(scene.contacts) if isinstance(c.law, DistributedLaw)]
-    pairs = [(i, j, order.index(k)) for i, j, k in pressing_pairs(scene.bodies, scene.contacts)]
+    material = materials(*zip(*pressing, strict=True), h, gravity)
+    pairs = pressing_pairs(scene.bodies, scene.contacts)
     used = {i for pair in pairs for i in pair[:2]}
     twins = scene.twins or tuple(range(len(scene.bodies)))
     parts = [

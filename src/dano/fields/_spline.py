@@ -192,12 +192,15 @@ def _weights(f: Float[Array, "3 n"], degree: int, order: int) -> list[list[Array
 def _gather_blocks(
     coefficients: Float[Array, "nx ny nz"], base: Int[Array, "3 n"], taps: int
 ) -> Float[Array, "taps taps taps n"]:
+    # Point by point, and apart from what reads the block: XLA's CPU code without fusion emitters is three to
+    # eight times slower where it gathers tap by tap.
     dimensions = lax.GatherDimensionNumbers(
-        offset_dims=(0, 1, 2), collapsed_slice_dims=(), start_index_map=(0, 1, 2)
+        offset_dims=(1, 2, 3), collapsed_slice_dims=(), start_index_map=(0, 1, 2)
     )
-    return lax.gather(
+    block = lax.gather(
         coefficients, base.T, dimensions, (taps, taps, taps), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS
     )
+    return lax.optimization_barrier(block).transpose(1, 2, 3, 0)
 
 
 def interpolating_coefficients(samples: np.ndarray, degree: int) -> np.ndarray:

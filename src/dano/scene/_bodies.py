@@ -222,8 +222,7 @@ class Body(eqx.Module):
     def part(self, twin: int) -> Part:
         """The body as distributed contact sees it; `twin` is the first body with the same geometry."""
         assert self.extent is not None
-        middle, (radius, size, thickness) = self.extent[:3], self.extent[3:]
-        return Part(self.surface, self.scale, self.solid, middle, radius, size, thickness, twin)
+        return Part(self.surface, self.scale, self.solid, self.extent, twin)
 
     def collider(self, position: Float[Array, "3"], rotation: Float[Array, "3 3"]) -> Collider:
         """The body as a contact of shared mass sees it.

@@ -1,7 +1,7 @@
 """Contacts between bodies, and what a scene fills in for them."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -93,20 +93,26 @@ def prepared(
         ValueError: If a pair cannot touch.
     """
     by_name = {body.name: body for body in bodies}
+    # Measured once: pairs are many.
+    sizes = {body.name: body.size for body in bodies}
     for contact in contacts:
         if contact.law.presses:
             for name in (contact.a, contact.b):
                 by_name[name] = _with_extent(by_name[name])
-        for name in _needs_samples(contact, by_name[contact.a], by_name[contact.b]):
+        for name in _needs_samples(contact, by_name[contact.a], by_name[contact.b], sizes):
             by_name[name] = _with_samples(by_name[name], presses=contact.law.presses)
     masses = [body.mass * body.mass_scale for body in bodies if not body.fixed]
     load = functools.reduce(jnp.maximum, masses, floating(0.0))
+    strength = jnp.sqrt(jnp.sum(gravity**2))
+    strength = jnp.where(strength > 0, strength, STANDARD_GRAVITY)
+    support = functools.cache(lambda name, sinking: by_name[name].typical_support(sinking * sizes[name]))
     completed = []
     for contact in contacts:
         a, b = by_name[contact.a], by_name[contact.b]
-        params = contact.law.complete(contact.params, _setting(a, b, gravity, load))
-        contact = eqx.tree_at(lambda c: c.params, contact, params)
-        completed.append(_with_edge(contact, a, b))
+        stiffness = functools.partial(_stiffness, a, b, load * strength, support)
+        setting = Setting(min(sizes[a.name], sizes[b.name]), strength, stiffness)
+        contact = eqx.tree_at(lambda c: c.params, contact, contact.law.complete(contact.params, setting))
+        completed.append(contact if contact.law.presses else _with_edge(contact, a, b))
     return tuple(by_name[body.name] for body in bodies), tuple(completed)
 
 
@@ -137,15 +143,15 @@ def colliders(
 def pressing_pairs(bodies: Sequence[Body], contacts: Sequence[Contact]) -> list[tuple[int, int, int]]:
     """Pairs (first, second, contact) of which the first body's samples press on the second's solid.
 
+    Contacts are counted among those with point laws.
+
     Both bodies' samples do where both have some. Against a ball or an ellipsoid a box's do not: the ball's
     own lie where it comes closest, and are enough.
     """
-    names = [body.name for body in bodies]
+    place = {body.name: i for i, body in enumerate(bodies)}
     pairs = []
-    for k, contact in enumerate(contacts):
-        if not contact.law.presses:
-            continue
-        ends = names.index(contact.a), names.index(contact.b)
+    for k, contact in enumerate(contact for contact in contacts if contact.law.presses):
+        ends = place[contact.a], place[contact.b]
         for i, j in (ends, ends[::-1]):
             first, second = bodies[i], bodies[j]
             if first.surface is None or second.solid is None:
@@ -169,7 +175,7 @@ def _none(x: Any) -> bool:
     return x is None
 
 
-def _needs_samples(contact: Contact, a: Body, b: Body) -> set[str]:
+def _needs_samples(contact: Contact, a: Body, b: Body, sizes: dict[str, float]) -> set[str]:
     """Names of the shapes that need contact samples for this pair.
 
     Raises:
@@ -183,7 +189,7 @@ def _needs_samples(contact: Contact, a: Body, b: Body) -> set[str]:
         _check_objects(contact, a.object, b.object)
         return set()
     if contact.law.presses:
-        return {body.name for body in (a, b) if body.shape is not None and np.isfinite(body.size)}
+        return {body.name for body in (a, b) if body.shape is not None and np.isfinite(sizes[body.name])}
     if a.object is not None or b.object is not None:
         return set()
     if {type(a.shape), type(b.shape)} == {Sphere, HalfSpace}:
@@ -226,27 +232,35 @@ def _with_extent(body: Body) -> Body:
     return eqx.tree_at(lambda b: b.extent, body, body.measured(), is_leaf=_none)
 
 
-def _setting(a: Body, b: Body, gravity: Float[Array, "3"], load: Float[Array, ""]) -> Setting:
-    strength = jnp.sqrt(jnp.sum(gravity**2))
-    strength = jnp.where(strength > 0, strength, STANDARD_GRAVITY)
+def _stiffness(
+    a: Body, b: Body, weight: Float[Array, ""], support: Callable[[str, float], float], sinking: float
+) -> Float[Array, ""]:
+    """See `Setting.stiffness`.
 
-    def stiffness(sinking: float) -> Float[Array, ""]:
-        carried = []
-        for body, other in ((a, b), (b, a)):
-            if not body.fixed:
-                # An object made of samples may meet a body that has none.
-                sampled = body if body.surface is not None else other
-                support = sampled.typical_support(sinking * sampled.size)
-                if not support > 0:
-                    raise ValueError(
-                        f"stiffness and restitution_velocity of the contact between {a.name!r} and "
-                        f"{b.name!r} must be given, or law=CentroidLaw(): the size of {sampled.name!r}, "
-                        f"{sampled.size} m, gives none"
-                    )
-                carried.append(load * strength / support)
-        return jnp.max(jnp.stack(carried))
+    Args:
+        a: First body.
+        b: Second body.
+        weight: Of the heaviest body of the scene [N].
+        support: `Body.typical_support` of a body at a share of its size.
+        sinking: That share.
 
-    return Setting(min(a.size, b.size), strength, stiffness)
+    Raises:
+        ValueError: If a body is so small that its support vanishes.
+    """
+    least = np.inf
+    for body, other in ((a, b), (b, a)):
+        if body.fixed:
+            continue
+        # An object made of samples may meet a body that has none.
+        sampled = body if body.surface is not None else other
+        carried = support(sampled.name, sinking)
+        if not carried > 0:
+            raise ValueError(
+                f"stiffness and restitution_velocity of the contact between {a.name!r} and {b.name!r} must "
+                f"be given, or law=CentroidLaw(): the size of {sampled.name!r}, {sampled.size} m, gives none"
+            )
+        least = min(least, carried)
+    return weight / least
 
 
 def _with_edge(contact: Contact, a: Body, b: Body) -> Contact:
