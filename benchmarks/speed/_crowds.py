@@ -87,11 +87,8 @@ def crowd_case(crowd: Crowd) -> Case:
         for i, member in enumerate(crowd.members)
     ]
     bodies.append(dano.Body("floor", dano.HalfSpace(), fixed=True))
-    params, law = dano.ContactParams(sliding_friction=FRICTION), dano.DistributedLaw()
-    contacts = [
-        dano.Contact(b.name, a.name, params, law=law) for i, a in enumerate(bodies) for b in bodies[:i]
-    ]
-    scene = dano.Scene.create(bodies, contacts, timestep=TIMESTEP)
+    material = dano.ContactParams(sliding_friction=FRICTION)
+    scene = dano.Scene.create(bodies, others=material, timestep=TIMESTEP)
     starts: dict[str, dict[str, Any]] = {
         f"b{i}": {"position": member.position, "orientation": member.orientation}
         for i, member in enumerate(crowd.members)
@@ -124,7 +121,7 @@ def _case(group: str, name: str, scene: dano.Scene, state: dano.State, n_steps: 
     run, seconds = compiled(rollout, arrays, state)
     done = jax.block_until_ready(run(arrays, state))
     iterations, failed = np.asarray(done.iterations), int((~np.asarray(done.converged)).sum())
-    note = f"{len(scene.contacts)} pairs, {iterations.mean():.1f} iterations"
+    note = f"{len(scene.pairs)} pairs, {iterations.mean():.1f} iterations"
     note += f", {failed} steps NOT converged" if failed else ""
     return Case(
         group,

@@ -41,6 +41,7 @@ from dano.scene import (
     Control as Control,
     Frames as Frames,
     Joint as Joint,
+    Others as Others,
     Scene as Scene,
     State as State,
     Trajectory as Trajectory,
@@ -48,6 +49,7 @@ from dano.scene import (
 from dano.engine import (
     AbstractEngine as AbstractEngine,
     compiler_options as compiler_options,
+    contact_history as contact_history,
     contact_patches as contact_patches,
     contact_wrenches as contact_wrenches,
     linearize as linearize,

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.cli._console import Progress, put, say
-from dano.engine import simulate
-from dano.report import contact_history
+from dano.engine import contact_history, simulate
 from dano.scene import (
     JOINT_QUANTITIES,
     Layout,
@@ -121,16 +120,16 @@ def _joint_numbers(layout: Layout, body: int, last: dict[str, np.ndarray]) -> di
 
 def _contacts(trajectory: Trajectory, scene: Scene) -> list[dict[str, Any]]:
     """When the bodies of each pair touched, and how hard."""
-    if not scene.contacts or not np.all([np.isfinite(x).all() for x in jax.tree.leaves(trajectory.states)]):
-        return [{"a": contact.a, "b": contact.b} for contact in scene.contacts]
+    if not scene.pairs or not np.all([np.isfinite(x).all() for x in jax.tree.leaves(trajectory.states)]):
+        return [{"a": a, "b": b} for a, b in scene.pairs]
     force = np.linalg.norm(contact_history(scene, trajectory.states).forces, axis=-1)
     rows = []
-    for contact, history in zip(scene.contacts, force.T, strict=True):
+    for (a, b), history in zip(scene.pairs, force.T, strict=True):
         touching = np.flatnonzero(history)
         rows.append(
             {
-                "a": contact.a,
-                "b": contact.b,
+                "a": a,
+                "b": b,
                 "first_touch": float(trajectory.times[touching[0]]) if len(touching) else None,
                 "steps_in_contact": len(touching),
                 "largest_force": float(history.max()),

@@ -8,7 +8,11 @@ from dano.contact._colliders import (
     SurfaceSet as SurfaceSet,
 )
 from dano.contact._derivatives import by_autodiff as by_autodiff, KEPT as KEPT
-from dano.contact._distributed import DistributedLaw as DistributedLaw, materials as materials
+from dano.contact._distributed import (
+    combined as combined,
+    DistributedLaw as DistributedLaw,
+    materials as materials,
+)
 from dano.contact._finding import find as find, Impacts as Impacts, points_of as points_of
 from dano.contact._geometry import (
     gather_geometry as gather_geometry,

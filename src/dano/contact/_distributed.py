@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from dano.contact._laws import AbstractContactLaw, ContactParams, non_negative, positive, Setting
@@ -95,26 +96,46 @@ class DistributedLaw(AbstractContactLaw):
         )
 
 
+def combined(a: ContactParams, b: ContactParams) -> ContactParams:
+    """Complete parameters of pairs from those of their bodies, arrays over the pairs.
+
+    The sliding friction is √(μ_a μ_b). Of restitution, stiffness, hysteresis and fading the larger counts, of
+    `restitution_velocity` and `friction_pressure` the smaller.
+    """
+
+    def of(name: str) -> Array:
+        x, y = getattr(a, name), getattr(b, name)
+        if name == "sliding_friction":
+            product = x * y
+            slips = product > 0
+            return jnp.where(slips, jnp.sqrt(jnp.where(slips, product, 1)), 0)
+        return (jnp.minimum if name in ("restitution_velocity", "friction_pressure") else jnp.maximum)(x, y)
+
+    names = [name for name in a.__dataclass_fields__ if getattr(a, name) is not None]
+    return eqx.tree_at(lambda p: [getattr(p, name) for name in names], a, [of(name) for name in names])
+
+
 def materials(
-    laws: Sequence[DistributedLaw],
-    params: Sequence[ContactParams],
+    groups: Sequence[tuple[DistributedLaw, ContactParams]],
     timestep: Float[Array, ""],
     gravity: Float[Array, ""],
 ) -> Material:
-    """What points of contacts feel, as arrays over the contacts.
+    """What points of contacts feel, as arrays over all contacts.
 
     Args:
-        laws: Of each contact.
-        params: Their complete parameters.
+        groups: Laws, and complete parameters of one contact, or arrays over several.
         timestep: h [s].
         gravity: Its magnitude [m/s²].
     """
+    sizes = [params.sliding_friction.size for _, params in groups]
 
     def column(values: Sequence[Array]) -> Float[Array, " n"]:
-        return jnp.stack([jnp.asarray(x) for x in values]).astype(timestep.dtype)
+        every = [jnp.broadcast_to(x, (n,)) for x, n in zip(values, sizes, strict=True)]
+        return jnp.concatenate(every).astype(timestep.dtype)
 
-    stacked: ContactParams = jax.tree.map(lambda *x: column(x), *params)
-    ends_at_once = [0.0 if law.compliant else 1.0 for law in laws]
+    stacked: ContactParams = jax.tree.map(lambda *x: column(x), *(params for _, params in groups))
+    laws = [law for law, _ in groups]
+    n = sum(sizes)
     return Material(
         stacked.stiffness,
         stacked.restitution,
@@ -125,7 +146,7 @@ def materials(
         stacked.friction_pressure,
         column([law.stiction_velocity for law in laws]),
         column([law.implicitness for law in laws]) * timestep,
-        jnp.broadcast_to(timestep, (len(laws),)),
-        jnp.asarray(ends_at_once, timestep.dtype),
+        jnp.broadcast_to(timestep, (n,)),
+        jnp.asarray(np.repeat([0.0 if law.compliant else 1.0 for law in laws], sizes), timestep.dtype),
         stacked.restitution_velocity + gravity * timestep,
     )

@@ -2,11 +2,15 @@
 
 from dano.engine._compiling import compiled as compiled, compiler_options as compiler_options
 from dano.engine._devices import device_mesh as device_mesh, gather as gather, map_rows as map_rows
+from dano.engine._history import (
+    contact_history as contact_history,
+    contact_patches as contact_patches,
+    contact_wrenches as contact_wrenches,
+    ContactHistory as ContactHistory,
+)
 from dano.engine._newton import Report as Report
 from dano.engine._rollout import (
     AbstractEngine as AbstractEngine,
-    contact_patches as contact_patches,
-    contact_wrenches as contact_wrenches,
     difference as difference,
     linearize as linearize,
     Policy as Policy,

@@ -106,13 +106,15 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
         scene: The scene.
         capacity: Chunks of point contacts that a step has room for; None chooses by the bodies.
     """
-    pressing = [(c.law, c.params) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
-    if not pressing:
+    groups = [(c.law, c.params) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
+    if scene.others is not None:
+        groups.append((scene.others.law, scene.others.pair_params))
+    if not groups:
         return Prepared(None, None, None, 0)
     h = scene.timestep
     gravity = jnp.sqrt(jnp.sum(scene.gravity**2))
-    material = materials(*zip(*pressing, strict=True), h, gravity)
-    pairs = pressing_pairs(scene.bodies, scene.contacts)
+    material = materials(groups, h, gravity)
+    pairs = pressing_pairs(scene.bodies, scene.point_pairs)
     used = {i for pair in pairs for i in pair[:2]}
     twins = scene.twins or tuple(range(len(scene.bodies)))
     parts = [

@@ -39,6 +39,24 @@ class AbstractEngine(eqx.Module):
     ) -> tuple[State, Report]:
         """One timestep; the report says whether the step's equations were solved."""
 
+    def touch(self, scene: Scene, prepared: Any, state: State) -> Patch:
+        """Overlap of every pair that may touch at a state, arrays in the order of `scene.pairs`.
+
+        Raises:
+            ValueError: If the engine does not say.
+        """
+        raise ValueError(f"engine must say where bodies touch, got {type(self).__name__}, which does not")
+
+    def wrenches(
+        self, scene: Scene, prepared: Any, before: State, after: State, about: Float[Array, "contacts 3"]
+    ) -> Float[Array, "contacts 6"]:
+        """Force [N] and torque about points [N m] on the first body of every pair [W] during a step.
+
+        Raises:
+            ValueError: If the engine does not say.
+        """
+        raise ValueError(f"engine must say contact forces, got {type(self).__name__}, which does not")
+
 
 class VariationalEngine(AbstractEngine):
     """The variational integrator with an implicit solve per step (see `dano.engine._variational`).
@@ -75,6 +93,16 @@ class VariationalEngine(AbstractEngine):
         """See `AbstractEngine.step`."""
         options = SolverOptions(self.tolerance, self.max_iterations)
         return _variational.step(scene, prepared, state, control, options)
+
+    def touch(self, scene: Scene, prepared: Any, state: State) -> Patch:
+        """See `AbstractEngine.touch`."""
+        return _variational.touch(scene, prepared, state)
+
+    def wrenches(
+        self, scene: Scene, prepared: Any, before: State, after: State, about: Float[Array, "contacts 3"]
+    ) -> Float[Array, "contacts 6"]:
+        """See `AbstractEngine.wrenches`."""
+        return _variational.wrenches(scene, prepared, before, after, about)
 
 
 def step(
@@ -177,39 +205,6 @@ def linearize(
     return _jitted_linearize(engine or VariationalEngine(), scene, state, control)
 
 
-def contact_wrenches(scene: Scene, states: State) -> Float[Array, "steps contacts 6"]:
-    """Contact forces along a trajectory.
-
-    Args:
-        scene: The scene.
-        states: Consecutive states, leaves of shape (n_steps + 1, n_bodies, ·), as in `Trajectory.states`.
-
-    Returns:
-        Force [N] and torque about the centroid [N m] on the first body of each contact [W], for each step.
-
-    Raises:
-        ValueError: If the states do not fit the scene or the scene has no contacts.
-    """
-    scene.check_state(states)
-    if not scene.contacts:
-        raise ValueError("scene must have at least one contact, got none")
-    return _jitted_wrenches(scene, states)
-
-
-def contact_patches(scene: Scene, states: State) -> tuple[Patch, ...]:
-    """Overlap (ψ, χ, n) of each contact at each state, in the order of `scene.contacts`.
-
-    Args:
-        scene: The scene.
-        states: States with any leading axis, leaves of shape (n, n_bodies, ·).
-
-    Raises:
-        ValueError: If the states do not fit the scene.
-    """
-    scene.check_state(states)
-    return _jitted_patches(scene, states)
-
-
 @compiled
 def _jitted_step(engine, scene, state, control):
     return engine.step(scene, engine.prepare(scene), scene.filled(state), control)
@@ -309,20 +304,6 @@ def difference(nominal: State, state: State, rows: np.ndarray) -> Float[Array, "
         ],
         axis=1,
     )
-
-
-@compiled
-def _jitted_wrenches(scene, states):
-    before = jax.tree.map(lambda x: x[:-1], states)
-    after = jax.tree.map(lambda x: x[1:], states)
-    prepared = _problem.prepare(scene, None)
-    return jax.lax.map(lambda pair: _variational.wrenches(scene, prepared, *pair), (before, after))
-
-
-@compiled
-def _jitted_patches(scene, states):
-    prepared = _problem.prepare(scene, None)
-    return jax.lax.map(lambda state: _variational.patches(scene, prepared, state), states)
 
 
 def _check_control(scene: Scene, control: Control | None, leading: tuple[int, ...]) -> None:

@@ -9,13 +9,15 @@ Newton method. It is differentiated by the implicit function theorem, never thro
 """
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from dano.contact import AbstractPatchLaw, DistributedLaw, find, Patch, Softening
+from dano.contact import AbstractPatchLaw, find, Patch, Points, Softening
 from dano.engine._balance import chunk_wrenches, contact_wrenches, to_body, to_world
 from dano.engine._newton import Report, SolverOptions
 from dano.engine._problem import (
@@ -59,17 +61,29 @@ def step(
     return following, jax.lax.stop_gradient(report)
 
 
-def wrenches(scene: Scene, prepared: Prepared, state: State, following: State) -> Float[Array, "contacts 6"]:
-    """Force [N] and torque about the centroid [N m] on the first body of each contact [W] during a step.
+def touch(scene: Scene, prepared: Prepared, state: State) -> Patch:
+    """Overlap of every pair that may touch at a state, arrays in the order of `scene.pairs`.
+
+    Overlap of a pair with a point law is the volume Σ A d [m³].
+    """
+    found = find_patches(scene, state, tuple(quat_to_matrix(q) for q in state.orientation))
+    return _in_order(scene, found, _volumes(scene, prepared, state))
+
+
+def wrenches(
+    scene: Scene, prepared: Prepared, state: State, following: State, about: Float[Array, "contacts 3"]
+) -> Float[Array, "contacts 6"]:
+    """Force [N] and torque about a point [N m] on the first body of each pair [W] during a step.
 
     Args:
         scene: The scene.
         prepared: From `prepare`.
         state: State at the start of the step, which gives the geometry.
         following: State at its end, which gives the velocities.
+        about: The points [m, W].
 
     Returns:
-        One row per contact, in the order of `scene.contacts`.
+        One row per pair, in the order of `scene.pairs`.
     """
     pairs = structure_of(scene)
     problem, _ = build_problem(scene, prepared, state, None, pairs)
@@ -77,72 +91,62 @@ def wrenches(scene: Scene, prepared: Prepared, state: State, following: State) -
         world = to_world(problem, _unknowns(scene, following, pairs))
     else:
         world = problem.tree.twists(generalised(scene, following, state.orientation))
-    velocities = to_body(problem, world)
-    centroids = [patch.centroid for patch in patches(scene, prepared, state)]
-    of_patches = iter(contact_wrenches(velocities, problem, pairs, Softening()))
-    at = iter(problem.patches)
-    of_points = iter(_point_wrenches(scene, problem, world, pairs))
-    rows = []
-    for contact, centroid in zip(scene.contacts, centroids, strict=True):
-        if isinstance(contact.law, AbstractPatchLaw):
-            wrench, point = next(of_patches)[0], next(at).point
-        else:
-            wrench, point = next(of_points), state.position[scene.index(contact.a)]
-        shift = jnp.where(jnp.any(wrench != 0), point - centroid, 0)
-        rows.append(wrench.at[3:].add(jnp.cross(shift, wrench[:3])))
-    return jnp.stack(rows)
+    of_patches = contact_wrenches(to_body(problem, world), problem, pairs, Softening())
+    found = [(wrench, patch.point) for (wrench, _), patch in zip(of_patches, problem.patches, strict=True)]
+    wrench, point = _in_order(scene, found, _point_wrenches(scene, problem, world, state, pairs))
+    shift = jnp.where(jnp.any(wrench != 0, axis=1, keepdims=True), point - about, 0)
+    return wrench.at[:, 3:].add(jnp.cross(shift, wrench[:, :3]))
 
 
-def patches(scene: Scene, prepared: Prepared, state: State) -> tuple[Patch, ...]:
-    """Overlap of every contact of a scene at a state, in the order of `scene.contacts`.
+def _in_order(scene: Scene, of_patches: Sequence[Any], of_points: Any) -> Any:
+    """What each contact with a patch law has, and arrays over the others, in the order of `scene.pairs`."""
+    singles = [jax.tree.map(lambda x: x[None], each) for each in of_patches]
+    groups = [*singles, *([] if of_points is None else [of_points])]
+    joined = jax.tree.map(lambda *x: jnp.concatenate(x), *groups)
+    patch = np.array([isinstance(c.law, AbstractPatchLaw) for c in scene.contacts], bool)
+    rest = np.full(len(scene.pairs) - len(patch), False)
+    patch = np.concatenate([patch, rest])
+    order = np.where(patch, np.cumsum(patch) - 1, len(singles) + np.cumsum(~patch) - 1)
+    return jax.tree.map(lambda x: x[order], joined)
 
-    Overlap of a contact with a point law is the volume Σ A d [m³].
-    """
-    of_patches = iter(find_patches(scene, state, tuple(quat_to_matrix(q) for q in state.orientation)))
-    of_points = iter(_volumes(scene, prepared, state))
-    return tuple(
-        next(of_patches) if isinstance(c.law, AbstractPatchLaw) else next(of_points) for c in scene.contacts
-    )
 
-
-def _volumes(scene: Scene, prepared: Prepared, state: State) -> list[Patch]:
-    """Volume, centroid and normal of each contact with a point law, where the bodies are."""
+def _volumes(scene: Scene, prepared: Prepared, state: State) -> Patch | None:
+    """Volume, centroid and normal of each pair with a point law, where the bodies are."""
     if prepared.geometry is None or prepared.impacts is None:
-        return []
+        return None
     still = dataclasses.replace(state, velocity=0 * state.velocity, omega=0 * state.omega)
     links = links_of(scene, still, scene.timestep)
     points, _ = find(prepared.geometry, links, prepared.impacts, scene.timestep, prepared.capacity)
     place = state.position[points.first].T[:, :, None] + points.arm
     volume = points.area * jnp.maximum(points.depth, 0)
-    found = []
-    for k, a in enumerate(_first_bodies(scene)):
-        mine = (points.contact == k)[:, None]
-        share = jnp.where(mine, volume, 0)
-        total = jnp.sum(share)
-        sign = jnp.where(points.first == a, 1, -1).astype(share.dtype)[:, None]
-        centroid = jnp.sum(share[None] * place, axis=(1, 2)) / jnp.where(total > 0, total, 1)
-        normal = jnp.sum((sign * share)[None] * points.normal, axis=(1, 2))
-        found.append(Patch(total, centroid, safe_normalize(normal)))
-    return found
+    sign = jnp.where(_lie_on_first(scene, points), 1, -1).astype(volume.dtype)
+    sums = jnp.concatenate(
+        [
+            jnp.sum(volume, axis=1)[None],
+            jnp.sum(volume[None] * place, axis=2),
+            sign[None] * jnp.sum(volume[None] * points.normal, axis=2),
+        ]
+    )
+    total, *rest = jax.ops.segment_sum(sums.T, points.contact, len(scene.point_pairs)).T
+    centroid = jnp.stack(rest[:3], axis=1) / jnp.where(total > 0, total, 1)[:, None]
+    normal = jnp.stack(rest[3:], axis=1)
+    return jax.vmap(lambda *x: Patch(x[0], x[1], safe_normalize(x[2])))(total, centroid, normal)
 
 
-def _point_wrenches(scene: Scene, problem: Problem, world, pairs: Pairs) -> list[Float[Array, "6"]]:
-    """Wrench on the first body of each contact with a point law, about its centre of mass."""
-    points, material = problem.points, problem.material
-    if points is None or material is None:
-        return []
+def _point_wrenches(scene: Scene, problem: Problem, world, state: State, pairs: Pairs):
+    """Wrench on the first body of each pair with a point law, and its centre of mass, which it is about."""
+    points = problem.points
+    if points is None:
+        return None
     wrenches, opposite = chunk_wrenches(problem, world, pairs)
-    result = []
-    for k, a in enumerate(_first_bodies(scene)):
-        direct = ((points.contact == k) & (points.first == a))[:, None]
-        reverse = ((points.contact == k) & (points.first != a))[:, None]
-        result.append(jnp.sum(jnp.where(direct, wrenches, 0) + jnp.where(reverse, opposite, 0), axis=0))
-    return result
+    on_first = jnp.where(_lie_on_first(scene, points)[:, None], wrenches, opposite)
+    total = jax.ops.segment_sum(on_first, points.contact, len(scene.point_pairs))
+    return total, state.position[np.array(scene.point_pairs)[:, 0]]
 
 
-def _first_bodies(scene: Scene) -> list[int]:
-    """Index of the first body of each contact with a point law."""
-    return [scene.index(c.a) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
+def _lie_on_first(scene: Scene, points: Points) -> Bool[Array, " c"]:
+    """Whether the points of each chunk lie on the first body of its pair."""
+    return points.first == jnp.asarray(np.array(scene.point_pairs)[:, 0])[points.contact]
 
 
 def _unknowns(scene: Scene, state: State, pairs: Pairs):

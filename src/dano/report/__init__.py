@@ -8,7 +8,6 @@ from dano.report._comparison import (
 from dano.report._identification import write_identification_report as write_identification_report
 from dano.report._object import draw_object as draw_object
 from dano.report._resample import frame_count as frame_count
-from dano.report._stage import contact_history as contact_history, ContactHistory as ContactHistory
 from dano.report._training import (
     mass_estimates as mass_estimates,
     MassEstimates as MassEstimates,

@@ -4,14 +4,12 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from dano.engine import contact_patches, contact_wrenches
+from dano.engine import contact_history
 from dano.maths import Pose, quat_to_matrix
-from dano.scene import Body, Scene, State, Trajectory
+from dano.scene import Body, Scene, Trajectory
 from dano.vision import Camera, Item, LearnedField, PALETTE
 
 
@@ -129,45 +127,6 @@ def _main_direction(centres: np.ndarray, moving: list[np.ndarray]) -> np.ndarray
     return right if right[0] >= 0 else -right
 
 
-class ContactHistory(NamedTuple):
-    """What every contact of a scene did in every step of a trajectory.
-
-    Attributes:
-        points: Centroids of the overlaps [m, W] at the starts of the steps, (steps, contacts, 3).
-        overlaps: Overlaps there, (steps, contacts): ψ [kg], or a volume [m³] of the distributed law.
-        forces: On the first body of each contact [N, W], (steps, contacts, 3).
-    """
-
-    points: Float[np.ndarray, "steps contacts 3"]
-    overlaps: Float[np.ndarray, "steps contacts"]
-    forces: Float[np.ndarray, "steps contacts 3"]
-
-
-def contact_history(scene: Scene, states: State) -> ContactHistory:
-    """`contact_wrenches` and `contact_patches` of consecutive states at the price of one compilation.
-
-    Raises:
-        ValueError: If the states do not fit the scene or the scene has no contacts.
-    """
-    arrays = _contacts(scene, states)
-    return ContactHistory(*(np.asarray(array, dtype=np.float64) for array in arrays))
-
-
-@eqx.filter_jit
-def _contacts(scene: Scene, states: State) -> tuple[Array, Array, Array]:
-    def one(step: tuple[State, State]) -> tuple[Array, Array, Array]:
-        start = jax.tree.map(lambda x: x[None], step[0])
-        both = jax.tree.map(lambda x, y: jnp.stack([x, y]), *step)
-        # The wrenches need the same overlaps: the compiler finds that out and keeps one of the two.
-        patches = contact_patches(scene, start)
-        points = jnp.stack([patch.centroid[0] for patch in patches])
-        overlaps = jnp.stack([patch.overlap[0] for patch in patches])
-        return points, overlaps, contact_wrenches(scene, both)[0, :, :3]
-
-    before, after = (jax.tree.map(lambda x, s=s: x[s], states) for s in (slice(-1), slice(1, None)))
-    return jax.lax.map(one, (before, after))
-
-
 class Touches(NamedTuple):
     """Contact forces at the times of frames.
 
@@ -184,7 +143,7 @@ class Touches(NamedTuple):
 
 def touches(scene: Scene, trajectory: Trajectory, times: Float[np.ndarray, " frames"]) -> Touches | None:
     """Contact points and forces of the steps that the times fall into; None without contacts in the scene."""
-    if not scene.contacts:
+    if not scene.pairs:
         return None
     history = contact_history(scene, trajectory.states)
     known = np.asarray(trajectory.times, dtype=np.float64)

@@ -16,6 +16,7 @@ from dano.scene._frames import (
     step_twists as step_twists,
 )
 from dano.scene._joints import joined as joined, Joint as Joint, JOINT_KINDS as JOINT_KINDS, Layout as Layout
+from dano.scene._others import Others as Others
 from dano.scene._scene import Scene as Scene
 from dano.scene._states import (
     Control as Control,

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.contact import Collider, Part, SampleSet, Support, SurfaceSet
+from dano.contact import Collider, ContactParams, Part, SampleSet, Support, SurfaceSet
 from dano.fields import AbstractField, AbstractShape, Ellipsoid, SignedDistanceGrid, Sphere
 from dano.maths import checked_array, floating, is_traced, Numbers
 from dano.objects import checked_inertia, MassProperties, NeuralObject
@@ -40,6 +40,7 @@ class Body(eqx.Module):
         com: Centre of mass in the field frame [m, F].
         mass_scale: Multiplies mass and inertia [1].
         com_offset: Moves the centre of mass [m, F].
+        material: Contact parameters for pairs that no contact of a scene names; None: the scene's.
         fixed: Whether the body never moves.
     """
 
@@ -56,6 +57,7 @@ class Body(eqx.Module):
     com: Float[Array, "3"]
     mass_scale: Float[Array, ""]
     com_offset: Float[Array, "3"]
+    material: ContactParams | None
     fixed: bool = eqx.field(static=True)
 
     def __init__(
@@ -68,6 +70,7 @@ class Body(eqx.Module):
         com: Numbers | None = None,
         mass_scale: Numbers = 1.0,
         com_offset: Numbers = (0.0, 0.0, 0.0),
+        material: ContactParams | None = None,
         fixed: bool = False,
     ):
         """A body from a neural object (which brings its mass) or a shape (homogeneous, of the given mass).
@@ -81,6 +84,7 @@ class Body(eqx.Module):
             com: Centre of mass [m, F]; default from the geometry.
             mass_scale: Multiplies mass and inertia.
             com_offset: Moves the centre of mass [m, F].
+            material: Contact parameters of this body in a scene with `others`, instead of the scene's own.
             fixed: Whether the body never moves; then it needs no mass.
 
         Raises:
@@ -91,6 +95,7 @@ class Body(eqx.Module):
             raise ValueError(f"name must be a non-empty string, got {name!r}")
         self.name = name
         self.fixed = bool(fixed)
+        self.material = material
         self.samples = self.support = self.surface = self.extent = self.object = self.shape = None
         self.density_scale = floating(1.0)
         if isinstance(geometry, NeuralObject):

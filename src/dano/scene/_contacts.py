@@ -96,20 +96,24 @@ def prepared(
     # Measured once: pairs are many.
     sizes = {body.name: body.size for body in bodies}
     for contact in contacts:
-        if contact.law.presses:
-            for name in (contact.a, contact.b):
-                by_name[name] = _with_extent(by_name[name])
-        for name in _needs_samples(contact, by_name[contact.a], by_name[contact.b], sizes):
-            by_name[name] = _with_samples(by_name[name], presses=contact.law.presses)
-    masses = [body.mass * body.mass_scale for body in bodies if not body.fixed]
-    load = functools.reduce(jnp.maximum, masses, floating(0.0))
-    strength = jnp.sqrt(jnp.sum(gravity**2))
-    strength = jnp.where(strength > 0, strength, STANDARD_GRAVITY)
+        a, b = by_name[contact.a], by_name[contact.b]
+        if a.fixed and b.fixed:
+            raise ValueError(
+                f"contact must join at least one body that moves, got fixed {a.name!r} and {b.name!r}"
+            )
+        if a.object is not None and b.object is not None:
+            check_objects(contact, a.object, b.object)
+        for body in (a, b):
+            if contact.law.presses:
+                by_name[body.name] = with_surface(body)
+            elif _needs_samples(a, b) and not body.fixed:
+                by_name[body.name] = _with_samples(body)
+    weight, strength = heaviest(bodies, gravity)
     support = functools.cache(lambda name, sinking: by_name[name].typical_support(sinking * sizes[name]))
     completed = []
     for contact in contacts:
         a, b = by_name[contact.a], by_name[contact.b]
-        stiffness = functools.partial(_stiffness, a, b, load * strength, support)
+        stiffness = functools.partial(_stiffness, a, b, weight, support)
         setting = Setting(min(sizes[a.name], sizes[b.name]), strength, stiffness)
         contact = eqx.tree_at(lambda c: c.params, contact, contact.law.complete(contact.params, setting))
         completed.append(contact if contact.law.presses else _with_edge(contact, a, b))
@@ -140,19 +144,19 @@ def colliders(
     return sides[0], sides[1]
 
 
-def pressing_pairs(bodies: Sequence[Body], contacts: Sequence[Contact]) -> list[tuple[int, int, int]]:
+def pressing_pairs(bodies: Sequence[Body], ends: Sequence[tuple[int, int]]) -> list[tuple[int, int, int]]:
     """Pairs (first, second, contact) of which the first body's samples press on the second's solid.
 
-    Contacts are counted among those with point laws.
+    Args:
+        bodies: All bodies.
+        ends: Indices of the bodies of each contact with a point law.
 
     Both bodies' samples do where both have some. Against a ball or an ellipsoid a box's do not: the ball's
     own lie where it comes closest, and are enough.
     """
-    place = {body.name: i for i, body in enumerate(bodies)}
     pairs = []
-    for k, contact in enumerate(contact for contact in contacts if contact.law.presses):
-        ends = place[contact.a], place[contact.b]
-        for i, j in (ends, ends[::-1]):
+    for k, pair in enumerate(ends):
+        for i, j in (pair, pair[::-1]):
             first, second = bodies[i], bodies[j]
             if first.surface is None or second.solid is None:
                 continue
@@ -175,30 +179,22 @@ def _none(x: Any) -> bool:
     return x is None
 
 
-def _needs_samples(contact: Contact, a: Body, b: Body, sizes: dict[str, float]) -> set[str]:
-    """Names of the shapes that need contact samples for this pair.
+def heaviest(bodies: Sequence[Body], gravity: Float[Array, "3"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Weight of the heaviest body [N], and the strength of gravity that it is taken with [m/s²]."""
+    masses = [body.mass * body.mass_scale for body in bodies if not body.fixed]
+    strength = jnp.sqrt(jnp.sum(gravity**2))
+    strength = jnp.where(strength > 0, strength, STANDARD_GRAVITY)
+    return functools.reduce(jnp.maximum, masses, floating(0.0)) * strength, strength
 
-    Raises:
-        ValueError: If the pair cannot touch.
-    """
-    if a.fixed and b.fixed:
-        raise ValueError(
-            f"contact must join at least one body that moves, got fixed {a.name!r} and {b.name!r}"
-        )
-    if a.object is not None and b.object is not None:
-        _check_objects(contact, a.object, b.object)
-        return set()
-    if contact.law.presses:
-        return {body.name for body in (a, b) if body.shape is not None and np.isfinite(sizes[body.name])}
+
+def _needs_samples(a: Body, b: Body) -> bool:
+    """Whether a patch law needs samples of the shapes of a pair; a fixed shape has no mass to carry any."""
     if a.object is not None or b.object is not None:
-        return set()
-    if {type(a.shape), type(b.shape)} == {Sphere, HalfSpace}:
-        return set()
-    # A fixed shape has no mass that its samples could carry; the moving side's samples find it.
-    return {body.name for body in (a, b) if not body.fixed}
+        return False
+    return {type(a.shape), type(b.shape)} != {Sphere, HalfSpace}
 
 
-def _check_objects(contact: Contact, a: NeuralObject, b: NeuralObject) -> None:
+def check_objects(contact: Contact, a: NeuralObject, b: NeuralObject) -> None:
     """Check that the samples of one object have something to meet in the other.
 
     Raises:
@@ -213,23 +209,24 @@ def _check_objects(contact: Contact, a: NeuralObject, b: NeuralObject) -> None:
         )
 
 
-def _with_samples(body: Body, *, presses: bool) -> Body:
-    """The shape with contact samples, so that it can meet other shapes."""
+def _with_samples(body: Body) -> Body:
+    """The shape with samples of mass, so that it can meet other shapes."""
     assert body.shape is not None
-    if presses and body.surface is None:
-        surface = SurfaceSet.create(*surface_quadrature(body.shape))
-        return eqx.tree_at(lambda b: b.surface, body, surface, is_leaf=_none)
-    if not presses and body.samples is None:
-        drawn = surface_samples(body.shape, SHAPE_SAMPLES)
-        samples = SampleSet.create(drawn.points, drawn.density)
-        return eqx.tree_at(lambda b: b.samples, body, samples, is_leaf=_none)
-    return body
-
-
-def _with_extent(body: Body) -> Body:
-    if body.extent is not None:
+    if body.samples is not None:
         return body
-    return eqx.tree_at(lambda b: b.extent, body, body.measured(), is_leaf=_none)
+    drawn = surface_samples(body.shape, SHAPE_SAMPLES)
+    samples = SampleSet.create(drawn.points, drawn.density)
+    return eqx.tree_at(lambda b: b.samples, body, samples, is_leaf=_none)
+
+
+def with_surface(body: Body) -> Body:
+    """The body with its extent and, unless it has no end, samples of its surface."""
+    if body.extent is None:
+        body = eqx.tree_at(lambda b: b.extent, body, body.measured(), is_leaf=_none)
+    if body.surface is None and body.shape is not None and np.isfinite(body.size):
+        surface = SurfaceSet.create(*surface_quadrature(body.shape))
+        body = eqx.tree_at(lambda b: b.surface, body, surface, is_leaf=_none)
+    return body
 
 
 def _stiffness(
@@ -256,11 +253,17 @@ def _stiffness(
         carried = support(sampled.name, sinking)
         if not carried > 0:
             raise ValueError(
-                f"stiffness and restitution_velocity of the contact between {a.name!r} and {b.name!r} must "
-                f"be given, or law=CentroidLaw(): the size of {sampled.name!r}, {sampled.size} m, gives none"
+                too_small(
+                    sampled, f"stiffness and restitution_velocity of the contact of {a.name!r} and {b.name!r}"
+                )
             )
         least = min(least, carried)
     return weight / least
+
+
+def too_small(body: Body, what: str) -> str:
+    """Why a body gives no default for some parameters."""
+    return f"{what} must be given, or law=CentroidLaw(): the size of {body.name!r}, {body.size} m, gives none"
 
 
 def _with_edge(contact: Contact, a: Body, b: Body) -> Contact:

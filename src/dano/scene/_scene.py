@@ -15,6 +15,7 @@ from dano.scene._bodies import Body
 from dano.scene._contacts import Contact, prepared
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
 from dano.scene._joints import Joint, Layout, layout_of
+from dano.scene._others import Others, others_of
 from dano.scene._states import Control, JOINT_QUANTITIES, State, STATE_SIZES
 
 # Room for what a body touches besides the floor that it lies on, and for chunks that are not full.
@@ -32,6 +33,7 @@ class Scene(eqx.Module):
         twins: For each body the first that is made of the same object: its samples and its solid stand once
             in memory (static).
         joints: What hangs on what.
+        others: Pairs of bodies that no contact names; None if they do not touch.
         room: Chunks of point contacts that a step has room for (static); None leaves it to the engine.
     """
 
@@ -41,6 +43,7 @@ class Scene(eqx.Module):
     gravity: Float[Array, "3"]
     twins: tuple[int, ...] = eqx.field(static=True, default=())
     joints: tuple[Joint, ...] = ()
+    others: Others | None = None
     room: int | None = eqx.field(static=True, default=None)
 
     @classmethod
@@ -50,6 +53,8 @@ class Scene(eqx.Module):
         contacts: Sequence[Contact] = (),
         *,
         joints: Sequence[Joint] = (),
+        others: ContactParams | None = None,
+        apart: Sequence[tuple[str, str]] = (),
         timestep: Numbers = 0.01,
         gravity: Numbers = (0.0, 0.0, -9.81),
     ) -> "Scene":
@@ -57,15 +62,19 @@ class Scene(eqx.Module):
 
         Args:
             bodies: The bodies, in the order that states index.
-            contacts: Which pairs may touch.
+            contacts: Which pairs may touch, and how.
             joints: What hangs on what, in the order of the coordinates q.
+            others: Lets all other pairs touch, too, by `DistributedLaw`: parameters of bodies that have no
+                `Body.material` of their own. Those of a pair follow from its two bodies, see
+                `Others.pair_params`. What a joint joins does not touch.
+            apart: Names of pairs that do not touch although `others` is given.
             timestep: h [s].
             gravity: [m/s², W].
 
         Raises:
             ValueError: If there is no body, two have one name, a contact names an unknown body, joins two
-                fixed ones or a pair twice, a pair cannot overlap, joints make no trees, or a number is out
-                of range.
+                fixed ones or a pair twice, a pair cannot overlap, joints make no trees, a body has a material
+                that nothing reads, or a number is out of range.
         """
         bodies, contacts, joints = tuple(bodies), tuple(contacts), tuple(joints)
         names = [body.name for body in bodies]
@@ -97,7 +106,11 @@ class Scene(eqx.Module):
             for i, o in enumerate(objects)
         )
         bodies, contacts = prepared(bodies, contacts, gravity)
-        return cls(bodies, contacts, timestep, gravity, twins, joints, _room(bodies))
+        rest = None
+        if others is not None:
+            bodies, rest = others_of(bodies, contacts, joints, apart, others, gravity)
+        _check_materials(bodies, others, apart)
+        return cls(bodies, contacts, timestep, gravity, twins, joints, rest, _room(bodies))
 
     @property
     def layout(self) -> Layout:
@@ -114,6 +127,20 @@ class Scene(eqx.Module):
     def names(self) -> tuple[str, ...]:
         """Names of the bodies, in order."""
         return tuple(body.name for body in self.bodies)
+
+    @property
+    def point_pairs(self) -> tuple[tuple[int, int], ...]:
+        """Indices of the bodies of each contact with a point law, then of the other pairs that may touch."""
+        place = {name: i for i, name in enumerate(self.names)}
+        named = tuple((place[c.a], place[c.b]) for c in self.contacts if c.law.presses)
+        return named if self.others is None else (*named, *self.others.pairs)
+
+    @property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """Names of the bodies of all pairs that may touch: those of `contacts`, then those of `others`."""
+        rest = () if self.others is None else self.others.pairs
+        named = tuple((contact.a, contact.b) for contact in self.contacts)
+        return (*named, *((self.names[i], self.names[j]) for i, j in rest))
 
     def index(self, name: str) -> int:
         """Index of a body.
@@ -173,6 +200,27 @@ class Scene(eqx.Module):
             values,
             is_leaf=lambda x: x is None,
         )
+
+    def replace_material(self, name: str, **changes: Numbers) -> "Scene":
+        """The scene with some parameters of a body's material changed, e.g. ``sliding_friction=0.3``.
+
+        It concerns the pairs of `others`.
+
+        Raises:
+            ValueError: If the scene has no `others`, there is no such body or parameter, or a value is out of
+                range.
+        """
+        i = self.index(name)
+        if self.others is None:
+            raise ValueError(
+                f"scene must be created with others=… to have materials, got a change of {name!r}"
+            )
+        for key in changes:
+            if key not in self.others.law.reads:
+                raise ValueError(f"material must be changed in {list(self.others.law.reads)}, got {key!r}")
+        params = self.others.params
+        values = [getattr(params, k).at[i].set(checked_parameter(k, value)) for k, value in changes.items()]
+        return eqx.tree_at(lambda s: [getattr(s.others.params, key) for key in changes], self, values)
 
     def replace_body(self, name: str, **changes: Numbers) -> "Scene":
         """The scene with some of a body's `mass, inertia, com, mass_scale, com_offset` changed.
@@ -369,6 +417,26 @@ def _structure(bodies: Sequence[Body], joints: Sequence[Joint]):
         tuple(body.fixed for body in bodies),
         tuple((joint.parent, joint.child, joint.kind) for joint in joints),
     )
+
+
+def _check_materials(
+    bodies: Sequence[Body], others: ContactParams | None, apart: Sequence[tuple[str, str]]
+) -> None:
+    """Check that nothing is given that only `others` reads.
+
+    Raises:
+        ValueError: If there is.
+    """
+    if others is not None:
+        return
+    if apart:
+        raise ValueError(f"apart must be empty without others, got {list(apart)}")
+    for body in bodies:
+        if body.material is not None:
+            raise ValueError(
+                f"material of body {body.name!r} is read by pairs that contacts does not name: "
+                "give others=ContactParams(…), too"
+            )
 
 
 def _room(bodies: Sequence[Body]) -> int | None:

@@ -1,0 +1,109 @@
+"""Where bodies touched along a trajectory, and how hard."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.contact import Patch
+from dano.engine._compiling import compiled
+from dano.engine._rollout import AbstractEngine, VariationalEngine
+from dano.scene import Scene, State
+
+
+class ContactHistory(NamedTuple):
+    """What every pair of bodies of `Scene.pairs` did in every step of a trajectory.
+
+    Attributes:
+        points: Centroids of the overlaps [m, W] at the starts of the steps, (steps, pairs, 3).
+        overlaps: Overlaps there, (steps, pairs): a volume [m³], or ψ [kg] of the centroid law.
+        forces: On the first body of each pair [N, W], (steps, pairs, 3).
+    """
+
+    points: Float[np.ndarray, "steps pairs 3"]
+    overlaps: Float[np.ndarray, "steps pairs"]
+    forces: Float[np.ndarray, "steps pairs 3"]
+
+
+def contact_history(scene: Scene, states: State, *, engine: AbstractEngine | None = None) -> ContactHistory:
+    """`contact_wrenches` and `contact_patches` of consecutive states at the price of one compilation.
+
+    Args:
+        scene: The scene.
+        states: Consecutive states, leaves of shape (n_steps + 1, n_bodies, ·), as in `Trajectory.states`.
+        engine: The one that made them; default `VariationalEngine()`.
+
+    Raises:
+        ValueError: If the states do not fit the scene or nothing in the scene may touch.
+    """
+    arrays = _checked_steps(engine, scene, states)
+    patches, wrenches = (jax.tree.map(lambda x: np.asarray(x, np.float64), part) for part in arrays)
+    return ContactHistory(patches.centroid, patches.overlap, wrenches[:, :, :3])
+
+
+def contact_wrenches(
+    scene: Scene, states: State, *, engine: AbstractEngine | None = None
+) -> Float[Array, "steps pairs 6"]:
+    """Contact forces along a trajectory.
+
+    Args:
+        scene: The scene.
+        states: Consecutive states, leaves of shape (n_steps + 1, n_bodies, ·), as in `Trajectory.states`.
+        engine: The one that made them; default `VariationalEngine()`.
+
+    Returns:
+        Force [N] and torque about the centroid [N m] on the first body of each pair of `scene.pairs` [W],
+        for each step.
+
+    Raises:
+        ValueError: If the states do not fit the scene or nothing in the scene may touch.
+    """
+    return _checked_steps(engine, scene, states)[1]
+
+
+def contact_patches(
+    scene: Scene, states: State, *, engine: AbstractEngine | None = None
+) -> tuple[Patch, ...]:
+    """Overlap (ψ, χ, n) of each pair that may touch at each state, in the order of `scene.pairs`.
+
+    Args:
+        scene: The scene.
+        states: States with any leading axis, leaves of shape (n, n_bodies, ·).
+        engine: The one that made them; default `VariationalEngine()`.
+
+    Raises:
+        ValueError: If the states do not fit the scene.
+    """
+    scene.check_state(states)
+    if not scene.pairs:
+        return ()
+    found = _jitted_patches(engine or VariationalEngine(), scene, states)
+    return tuple(jax.tree.map(lambda x, k=k: x[:, k], found) for k in range(len(scene.pairs)))
+
+
+def _checked_steps(engine: AbstractEngine | None, scene: Scene, states: State):
+    scene.check_state(states)
+    if not scene.pairs:
+        raise ValueError("scene must have at least one contact, got none")
+    return _jitted_steps(engine or VariationalEngine(), scene, states)
+
+
+@compiled
+def _jitted_steps(engine: AbstractEngine, scene: Scene, states: State):
+    before = jax.tree.map(lambda x: x[:-1], states)
+    after = jax.tree.map(lambda x: x[1:], states)
+    prepared = engine.prepare(scene)
+
+    def one(pair: tuple[State, State]):
+        patch = engine.touch(scene, prepared, pair[0])
+        return patch, engine.wrenches(scene, prepared, *pair, jnp.asarray(patch.centroid))
+
+    return jax.lax.map(one, (before, after))
+
+
+@compiled
+def _jitted_patches(engine: AbstractEngine, scene: Scene, states: State):
+    prepared = engine.prepare(scene)
+    return jax.lax.map(lambda state: engine.touch(scene, prepared, state), states)

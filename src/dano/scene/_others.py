@@ -1,0 +1,123 @@
+"""Pairs of bodies that no contact names: what may touch, and what the bodies are made of."""
+
+import functools
+import itertools
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.contact import combined, ContactParams, DistributedLaw, Setting
+from dano.scene._bodies import Body
+from dano.scene._contacts import check_objects, Contact, heaviest, too_small, with_surface
+from dano.scene._joints import joined, Joint
+
+
+class Others(eqx.Module):
+    """All pairs of bodies that no contact of a scene names.
+
+    Parameters of a pair follow from those of its two bodies, see `pair_params`.
+
+    Attributes:
+        params: Of each body of the scene, arrays of shape (n,).
+        law: Of all these pairs.
+        pairs: Indices of the bodies of each pair (static).
+    """
+
+    params: ContactParams
+    law: DistributedLaw
+    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
+
+    @property
+    def pair_params(self) -> ContactParams:
+        """Parameters of each pair, arrays of shape (k,).
+
+        √(μ_a μ_b) of the sliding frictions; of restitution, stiffness, hysteresis and fading the larger; of
+        `restitution_velocity` and `friction_pressure` the smaller.
+        """
+        first, second = np.array(self.pairs, int).reshape(-1, 2).T
+        a, b = (jax.tree.map(lambda x, rows=rows: x[rows], self.params) for rows in (first, second))
+        return combined(a, b)
+
+
+def others_of(
+    bodies: Sequence[Body],
+    contacts: Sequence[Contact],
+    joints: Sequence[Joint],
+    apart: Sequence[tuple[str, str]],
+    params: ContactParams,
+    gravity: Float[Array, "3"],
+) -> tuple[tuple[Body, ...], Others | None]:
+    """The bodies with what contact needs of them, and the pairs that are left; None if there are none.
+
+    Args:
+        bodies: All bodies of a scene.
+        contacts: Pairs that are named.
+        joints: What joins needs not touch.
+        apart: Names of further pairs that do not touch.
+        params: What bodies without a material of their own are made of.
+        gravity: [m/s², W].
+
+    Raises:
+        ValueError: If `apart` names an unknown body, or objects cannot touch.
+    """
+    names = [body.name for body in bodies]
+    for pair in apart:
+        for name in pair:
+            if name not in names:
+                raise ValueError(f"apart must name bodies of the scene {names}, got {name!r}")
+    left_out = {frozenset(pair) for pair in apart} | {frozenset((c.a, c.b)) for c in contacts}
+    neighbours = joined(joints)
+    finite = [bool(np.isfinite(body.size)) for body in bodies]
+    pairs = []
+    for (i, a), (j, b) in itertools.combinations(enumerate(bodies), 2):
+        if (a.fixed and b.fixed) or frozenset((a.name, b.name)) in left_out or neighbours(a.name, b.name):
+            continue
+        if a.object is not None and b.object is not None:
+            check_objects(Contact(a.name, b.name), a.object, b.object)
+        if finite[i] or finite[j]:
+            pairs.append((i, j))
+    if not pairs:
+        return tuple(bodies), None
+    law = DistributedLaw()
+    law.check(params)
+    touching = {i for pair in pairs for i in pair}
+    bodies = tuple(with_surface(body) if i in touching else body for i, body in enumerate(bodies))
+    return bodies, Others(_stacked(bodies, touching, law, params, gravity), law, tuple(pairs))
+
+
+def _stacked(
+    bodies: Sequence[Body],
+    touching: set[int],
+    law: DistributedLaw,
+    usual: ContactParams,
+    gravity: Float[Array, "3"],
+) -> ContactParams:
+    """Complete parameters of all bodies as arrays.
+
+    What does not move or has no end presses as softly, and is as large, as what it may meet: the other body
+    decides.
+    """
+    weight, strength = heaviest(bodies, gravity)
+    moving = [i for i in touching if not bodies[i].fixed]
+    largest = max(bodies[i].size for i in moving)
+
+    @functools.cache
+    def stiffness(i: int, sinking: float) -> Float[Array, ""]:
+        support = bodies[i].typical_support(sinking * bodies[i].size)
+        if not support > 0:
+            raise ValueError(too_small(bodies[i], "stiffness and restitution_velocity in others"))
+        return weight / support
+
+    def rule(i: int) -> Callable[[float], Float[Array, ""]]:
+        decide = [i] if i in moving else moving
+        return lambda sinking: functools.reduce(jnp.minimum, [stiffness(k, sinking) for k in decide])
+
+    complete = []
+    for i, body in enumerate(bodies):
+        given = usual if body.material is None else body.material
+        complete.append(law.complete(given, Setting(min(body.size, largest), strength, rule(i))))
+    return jax.tree.map(lambda *x: jnp.stack(x), *complete)
