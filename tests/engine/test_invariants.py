@@ -1,5 +1,7 @@
 """What no parameter may change: momentum, energy, the third law, and rest under balanced forces."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -149,6 +151,32 @@ def test_uneven_steps_are_reported():
         run = dano.simulate(scene, start, 3, engine=dano.VariationalEngine(max_iterations=1))
     assert not bool(run.converged[0])
     assert float(run.residuals[0]) > 1e-6
+
+
+def test_a_spin_beyond_the_step_is_said_with_its_body():
+    bodies = [
+        dano.Body("top", dano.Box((0.02, 0.05, 0.1)), mass=1.0),
+        dano.Body("rest", dano.Sphere(1.0), mass=1.0),
+    ]
+    scene = dano.Scene.create(bodies, timestep=0.01, gravity=(0, 0, 0))
+    start = scene.initial_state(top=dict(omega=(0, 0, 195.0)))
+    push = scene.control(top=dict(torque=(0.0, 0.0, 10.0)))
+    with pytest.warns(RuntimeWarning, match=r"'top' spins by more than a step can turn.* 200 rad/s"):
+        dano.step(scene, start, push)
+
+
+def test_steps_that_are_too_long_for_a_body_are_said():
+    bodies = [
+        dano.Body("pea", dano.Sphere(0.004), mass=1e-3),
+        dano.Body("floor", dano.HalfSpace(), fixed=True),
+    ]
+    contact = dano.Contact("pea", "floor")
+    with pytest.warns(RuntimeWarning, match=r"timestep 1 s is long.*'pea'.*take at most 0\.0064 s") as said:
+        dano.Scene.create(bodies, [contact], timestep=1.0)
+    assert said[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dano.Scene.create(bodies, [contact], timestep=0.0064)
 
 
 def test_checkpointed_rollout_is_the_same():

@@ -17,6 +17,7 @@ from dano.contact import KEPT, Patch
 from dano.engine import _problem, _variational
 from dano.engine._compiling import compiled
 from dano.engine._newton import Report, SolverOptions
+from dano.engine._rigid import too_fast
 from dano.maths import is_traced, quat_conjugate, quat_exp, quat_multiply
 from dano.scene import Control, Scene, State, Trajectory
 
@@ -126,7 +127,7 @@ def step(
     scene.check_state(state)
     _check_control(scene, control, ())
     following, report = _jitted_step(engine or VariationalEngine(), scene, state, control)
-    _say_unconverged(report.converged, report.residual)
+    _say_unconverged(scene, following, report)
     return following
 
 
@@ -178,7 +179,7 @@ def simulate(
     states, report = _jitted_rollout(
         engine or VariationalEngine(), scene, state, controls, n_steps, checkpoint_every
     )
-    _say_unconverged(report.converged, report.residual)
+    _say_unconverged(scene, jax.tree.map(lambda x: x[1:], states), report)
     times = scene.timestep * jnp.arange(n_steps + 1, dtype=scene.timestep.dtype)
     return Trajectory(times, states, report.residual, report.iterations, report.converged, scene.names)
 
@@ -321,15 +322,26 @@ def _check_control(scene: Scene, control: Control | None, leading: tuple[int, ..
         raise ValueError(f"control.effort must have shape {expected}, got {control.effort.shape}")
 
 
-def _say_unconverged(converged, residual) -> None:
-    if is_traced(converged) or bool(jnp.all(converged)):
+def _say_unconverged(scene: Scene, following: State, report: Report) -> None:
+    """Warn of steps that did not converge, and of the bodies that spin faster than a step can turn."""
+    converged = report.converged
+    if is_traced(converged, scene.timestep) or bool(jnp.all(converged)):
         return
     failed = np.flatnonzero(~np.atleast_1d(np.asarray(converged)))
-    worst = float(np.nanmax(np.atleast_1d(np.asarray(residual))[failed], initial=0.0))
+    worst = float(np.nanmax(np.atleast_1d(np.asarray(report.residual))[failed], initial=0.0))
+    omega = np.asarray(following.omega).reshape(-1, len(scene.bodies), 3)[failed]
+    fast = np.any(np.asarray(too_fast(jnp.asarray(omega), scene.timestep)), axis=0)
+    spinning = [repr(scene.names[i]) for i in np.flatnonzero(fast)]
+    why = (
+        f"{', '.join(spinning)} spins by more than a step can turn, 2/timestep = "
+        f"{2 / float(scene.timestep):.3g} rad/s; take a smaller timestep"
+        if spinning
+        else "try a smaller timestep, or where many points touch a larger VariationalEngine(capacity=…); "
+        "with CentroidLaw a smaller damper or smoothing"
+    )
     warnings.warn(
         f"{len(failed)} of {np.size(converged)} steps did not converge, first step {failed[0]}, "
-        f"largest residual {worst:.3g} m/s; try a smaller timestep, or where many points touch a larger "
-        "VariationalEngine(capacity=…); with CentroidLaw a smaller damper or smoothing",
+        f"largest residual {worst:.3g} m/s; {why}",
         RuntimeWarning,
         stacklevel=3,
     )

@@ -1,6 +1,7 @@
 """Scenes: bodies, the contacts between them, a timestep and gravity."""
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -18,6 +19,9 @@ from dano.scene._joints import Joint, Layout, layout_of
 from dano.scene._others import Others, others_of
 from dano.scene._states import Control, JOINT_QUANTITIES, State, STATE_SIZES
 
+# Share of the smallest body's size by which gravity may move it in a step before a warning says so, and the
+# share that the warning asks for.
+LONGEST_FALL, SHORT_FALL = 0.5, 0.05
 # Room for what a body touches besides the floor that it lies on, and for chunks that are not full.
 CHUNKS_A_BODY = 24
 
@@ -110,6 +114,8 @@ class Scene(eqx.Module):
         if others is not None:
             bodies, rest = others_of(bodies, contacts, joints, apart, others, gravity)
         _check_materials(bodies, others, apart)
+        if contacts or rest is not None:
+            _warn_of_long_steps(bodies, timestep, gravity)
         return cls(bodies, contacts, timestep, gravity, twins, joints, rest, _room(bodies))
 
     @property
@@ -437,6 +443,25 @@ def _check_materials(
                 f"material of body {body.name!r} is read by pairs that contacts does not name: "
                 "give others=ContactParams(…), too"
             )
+
+
+def _warn_of_long_steps(
+    bodies: Sequence[Body], timestep: Float[Array, ""], gravity: Float[Array, "3"]
+) -> None:
+    """Warn if gravity alone moves the smallest body by a good part of its size in a step."""
+    if is_traced(timestep, gravity, [body.extent for body in bodies]):
+        return
+    sizes = [(body.size, body.name) for body in bodies if not body.fixed]
+    h, strength = float(timestep), float(np.linalg.norm(np.asarray(gravity)))
+    if not sizes or h * h * strength <= LONGEST_FALL * min(sizes)[0]:
+        return
+    size, name = min(sizes)
+    warnings.warn(
+        f"timestep {h:.3g} s is long: gravity moves bodies by {h * h * strength:.3g} m in a step, and "
+        f"{name!r} is {size:.3g} m large; take at most {(SHORT_FALL * size / strength) ** 0.5:.2g} s",
+        RuntimeWarning,
+        stacklevel=3,
+    )
 
 
 def _room(bodies: Sequence[Body]) -> int | None:
