@@ -9,8 +9,9 @@ directions of slip have settled: 4–15 passes where following the root from sof
 A solve ends when the residual is small and λ and s fit the velocities, so that the Jacobian is that of the
 law, too: sums of forces may balance before those of single points do.
 
-Full steps can cycle. A solve that has not converged within a few passes goes on in smaller steps, then with a
-line search, then from softer friction in levels (`_TIERS`).
+Full steps can cycle. A solve that has not converged within a few passes takes shares of steps, smaller after each
+step that made the residual larger; then it goes on with a line search, then from softer friction in levels
+(`_TIERS`). What does not converge ends where its residual was smallest.
 """
 
 from collections.abc import Callable
@@ -27,14 +28,15 @@ from dano.engine._newton import Report, Search, solve_small, SolverOptions
 # Softness of stiction, in multiples of the stiction velocity, share of a step that is taken, and passes, of
 # the levels of a solve. The first is friction as it is.
 _TIERS = (
-    (1.0, 1.0, False, 6),
-    (1.0, 0.7, False, 30),
-    (1.0, 0.4, False, 40),
+    (1.0, 1.0, False, 100),
     (1.0, 1.0, True, 30),
     *((float(x), 1.0, True, 8) for x in np.geomspace(1e5, 10, 5)),
     (1.0, 1.0, True, 30),
     (1.0, 0.4, False, 100),
 )
+# In the first level steps are whole for so many passes, then shares that grow and shrink by these factors and are
+# no less than the last: on recorded piles of 8 to 64 bodies half the passes of fixed shares, or as many.
+_WHOLE, _GROWS, _SHRINKS, _LEAST = 4, 1.1, 0.8, 0.2
 # Duals fit when what they miss is less than this power of the rounding, in shares of all pressure.
 _FIT = 0.375
 # Residual to which soft levels are solved, per stiction velocity of theirs [m/s].
@@ -69,6 +71,8 @@ class _Iterate(NamedTuple):
         iteration: Passes.
         level: Row of `_TIERS`.
         budget: Passes left in it.
+        share: Of a step that is taken in the first level.
+        best: Velocities where the residual was smallest, with friction as it is, and that residual in a last row.
     """
 
     velocities: Float[Array, " k"]
@@ -81,6 +85,8 @@ class _Iterate(NamedTuple):
     iteration: Int[Array, ""]
     level: Int[Array, ""]
     budget: Int[Array, ""]
+    share: Float[Array, ""]
+    best: Float[Array, " l"]
 
 
 def primal_dual(
@@ -157,9 +163,13 @@ def primal_dual(
         accept = accept | small
         # Where rounding keeps duals from fitting, a second small residual has to do.
         solved = small & hard & (fits | (it.residual <= enough))
+        best = jnp.append(velocities, error)
+        best = jnp.where(hard & (error < it.best[-1]), best, it.best)
+        adapted = jnp.clip(it.share * jnp.where(error < it.residual, _GROWS, _SHRINKS), _LEAST, 1)
+        adapted = jnp.where((level > 0) | (it.iteration < _WHOLE), 1, adapted)
         # Once the residual falls as it should, there is nothing to be damped.
         fell = error < 0.5 * it.residual
-        step = jnp.where(fell, 1, share) * solve_small(scaled, -(scale * residual)[:, None])[:, 0]
+        step = jnp.where(fell, 1, share * adapted) * solve_small(scaled, -(scale * residual)[:, None])[:, 0]
         step = jnp.where(accept, step, it.search.direction)
         pick = lambda new, old: jnp.where(accept, new, old)  # noqa: E731
         search = Search.start(step, jnp.sum(step * residual))
@@ -176,6 +186,8 @@ def primal_dual(
             it.iteration + 1,
             next_level,
             jnp.where(harder, budgets[jnp.minimum(next_level, len(_TIERS) - 1)], it.budget - 1),
+            adapted,
+            best,
         )
 
     initial = _Iterate(
@@ -189,9 +201,13 @@ def primal_dual(
         jnp.asarray(0),
         jnp.asarray(0),
         budgets[0],
+        jnp.ones((), start.dtype),
+        jnp.append(start, jnp.inf),
     )
     last = jax.lax.while_loop(unfinished, advance, initial)
-    return last.velocities, last.jacobian, Report(last.residual, last.iteration, last.solved)
+    velocities = jnp.where(last.solved, last.velocities, last.best[:-1])
+    residual = jnp.where(last.solved, last.residual, last.best[-1])
+    return velocities, last.jacobian, Report(residual, last.iteration, last.solved)
 
 
 def _without_points(free: Balance, m: int) -> Float[Array, "b b 6 7"]:
