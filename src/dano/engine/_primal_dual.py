@@ -9,8 +9,8 @@ directions of slip have settled: 4–15 passes where following the root from sof
 A solve ends when the residual is small and λ and s fit the velocities, so that the Jacobian is that of the
 law, too: sums of forces may balance before those of single points do.
 
-Full steps can cycle. A solve that has not converged within a few passes takes shares of steps, smaller after each
-step that made the residual larger; then it goes on with a line search, then from softer friction in levels
+Full steps can cycle. A solve that has not converged within a few passes takes shares of steps, smaller after
+each step that made the residual larger; then it goes on with a line search, then from softer friction in levels
 (`_TIERS`). What does not converge ends where its residual was smallest.
 """
 
@@ -34,8 +34,8 @@ _TIERS = (
     (1.0, 1.0, True, 30),
     (1.0, 0.4, False, 100),
 )
-# In the first level steps are whole for so many passes, then shares that grow and shrink by these factors and are
-# no less than the last: on recorded piles of 8 to 64 bodies half the passes of fixed shares, or as many.
+# In the first level steps are whole for so many passes, then shares that grow and shrink by these factors and
+# are no less than the last: on recorded piles of 8 to 64 bodies half the passes of fixed shares, or as many.
 _WHOLE, _GROWS, _SHRINKS, _LEAST = 4, 1.1, 0.8, 0.2
 # Duals fit when what they miss is less than this power of the rounding, in shares of all pressure.
 _FIT = 0.375
@@ -72,7 +72,7 @@ class _Iterate(NamedTuple):
         level: Row of `_TIERS`.
         budget: Passes left in it.
         share: Of a step that is taken in the first level.
-        best: Velocities where the residual was smallest, with friction as it is, and that residual in a last row.
+        best: Velocities where the residual was smallest, with friction as it is; then that residual.
     """
 
     velocities: Float[Array, " k"]
