@@ -10,8 +10,8 @@ A solve ends when the residual is small and λ and s fit the velocities, so that
 law, too: sums of forces may balance before those of single points do.
 
 Full steps can cycle. A solve that has not converged within a few passes takes shares of steps, smaller after
-each step that made the residual larger; then it goes on with a line search, then from softer friction in levels
-(`_TIERS`). What does not converge ends where its residual was smallest.
+each step that made the residual larger; then it goes on with a line search, then from softer friction in
+levels (`_TIERS`). What does not converge ends where its residual was smallest.
 """
 
 from collections.abc import Callable
