@@ -52,15 +52,14 @@ def rows(*, quick: bool) -> list[Row]:
 
 
 def pile_rows(*, quick: bool) -> list[Row]:
-    """A pile of mixed shapes at rest, all pairs of which may touch: minutes to compile where pairs cost."""
+    """A pile of mixed shapes at rest, all pairs of which may touch."""
     n = 6 if quick else PILE
     kinds = [PIECES[name] for name in ("ball", "box", "capsule", "cylinder", "ellipsoid")]
     pieces = [kinds[i % len(kinds)] for i in range(n)]
     bodies = [dano.Body(f"b{i}", geometry(piece), mass=1.0) for i, piece in enumerate(pieces)]
     bodies.append(dano.Body("floor", dano.HalfSpace(), fixed=True))
-    pairs = [(f"b{i}", f"b{j}") for i in range(n) for j in range(i + 1, n)]
-    pairs += [(f"b{i}", "floor") for i in range(n)]
-    scene = scene_of(bodies, pairs, TIMESTEP, sliding_friction=0.3)
+    material = dano.ContactParams(sliding_friction=0.3)
+    scene = dano.Scene.create(bodies, others=material, timestep=TIMESTEP)
     # Layers of two, each turned at random and with room for every rotation.
     random = np.random.default_rng(0)
     room = 1.05 * max(piece.radius for piece in pieces)

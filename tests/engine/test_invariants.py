@@ -171,9 +171,8 @@ def test_steps_that_are_too_long_for_a_body_are_said():
         dano.Body("floor", dano.HalfSpace(), fixed=True),
     ]
     contact = dano.Contact("pea", "floor")
-    with pytest.warns(RuntimeWarning, match=r"timestep 1 s is long.*'pea'.*take at most 0\.0064 s") as said:
+    with pytest.warns(RuntimeWarning, match=r"timestep 1 s is long.*'pea'.*take at most 0\.0064 s"):
         dano.Scene.create(bodies, [contact], timestep=1.0)
-    assert said[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         dano.Scene.create(bodies, [contact], timestep=0.0064)

@@ -252,11 +252,8 @@ def _stiffness(
         sampled = body if body.surface is not None else other
         carried = support(sampled.name, sinking)
         if not carried > 0:
-            raise ValueError(
-                too_small(
-                    sampled, f"stiffness and restitution_velocity of the contact of {a.name!r} and {b.name!r}"
-                )
-            )
+            of_pair = f"of the contact between {a.name!r} and {b.name!r}"
+            raise ValueError(too_small(sampled, f"stiffness and restitution_velocity {of_pair}"))
         least = min(least, carried)
     return weight / least
 
