@@ -144,6 +144,7 @@ def test_bad_outputs(run, egg, field, scene, tmp_path):
         (("--steps", "100000000000"), "steps of 2 bodies, got 1e+11 of 0.002 s"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:timestep 2.5 s is long")
 def test_bad_options(options, message, run, scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     files = {scene.name: scene.read_bytes()}
