@@ -124,6 +124,8 @@ def test_wrong_arguments(arguments: dict[str, Any], message: str):
 def test_a_material_that_nothing_reads():
     with pytest.raises(ValueError, match="material of body 'cube'"):
         dano.Scene.create(bodies(cube=PARAMS))
+    with pytest.raises(ValueError, match="does not read spring"):
+        dano.Scene.create(bodies(cube=dano.ContactParams(spring=1.0)), others=PARAMS)
     scene = dano.Scene.create(bodies(), others=PARAMS)
     with pytest.raises(ValueError, match="material must be changed in"):
         scene.replace_material("cube", damper=1.0)

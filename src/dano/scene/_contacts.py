@@ -109,11 +109,11 @@ def prepared(
             elif _needs_samples(a, b) and not body.fixed:
                 by_name[body.name] = _with_samples(body)
     weight, strength = heaviest(bodies, gravity)
-    support = functools.cache(lambda name, sinking: by_name[name].typical_support(sinking * sizes[name]))
+    carried = functools.cache(lambda name, sinking: by_name[name].typical_support(sinking * sizes[name]))
     completed = []
     for contact in contacts:
         a, b = by_name[contact.a], by_name[contact.b]
-        stiffness = functools.partial(_stiffness, a, b, weight, support)
+        stiffness = functools.partial(_stiffness, a, b, weight, carried)
         setting = Setting(min(sizes[a.name], sizes[b.name]), strength, stiffness)
         contact = eqx.tree_at(lambda c: c.params, contact, contact.law.complete(contact.params, setting))
         completed.append(contact if contact.law.presses else _with_edge(contact, a, b))
@@ -230,7 +230,7 @@ def with_surface(body: Body) -> Body:
 
 
 def _stiffness(
-    a: Body, b: Body, weight: Float[Array, ""], support: Callable[[str, float], float], sinking: float
+    a: Body, b: Body, weight: Float[Array, ""], carried: Callable[[str, float], float], sinking: float
 ) -> Float[Array, ""]:
     """See `Setting.stiffness`.
 
@@ -238,29 +238,29 @@ def _stiffness(
         a: First body.
         b: Second body.
         weight: Of the heaviest body of the scene [N].
-        support: `Body.typical_support` of a body at a share of its size.
+        carried: `Body.typical_support` of a body at a share of its size.
         sinking: That share.
 
     Raises:
         ValueError: If a body is so small that its support vanishes.
     """
-    least = np.inf
-    for body, other in ((a, b), (b, a)):
-        if body.fixed:
-            continue
-        # An object made of samples may meet a body that has none.
-        sampled = body if body.surface is not None else other
-        carried = support(sampled.name, sinking)
-        if not carried > 0:
-            of_pair = f"of the contact between {a.name!r} and {b.name!r}"
-            raise ValueError(too_small(sampled, f"stiffness and restitution_velocity {of_pair}"))
-        least = min(least, carried)
-    return weight / least
+    # An object made of samples may meet a body that has none.
+    sampled = [x if x.surface is not None else y for x, y in ((a, b), (b, a)) if not x.fixed]
+    whose = f"of the contact between {a.name!r} and {b.name!r} must be given, or law=CentroidLaw()"
+    return weight / min(checked_support(body, carried(body.name, sinking), whose) for body in sampled)
 
 
-def too_small(body: Body, what: str) -> str:
-    """Why a body gives no default for some parameters."""
-    return f"{what} must be given, or law=CentroidLaw(): the size of {body.name!r}, {body.size} m, gives none"
+def checked_support(body: Body, support: float, whose: str) -> float:
+    """The support of a body, from which its default stiffness follows.
+
+    Raises:
+        ValueError: If the body is so small that there is none.
+    """
+    if not support > 0:
+        raise ValueError(
+            f"stiffness and restitution_velocity {whose}: the size of {body.name!r}, {body.size} m, gives none"
+        )
+    return support
 
 
 def _with_edge(contact: Contact, a: Body, b: Body) -> Contact:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from dano.contact import combined, ContactParams, DistributedLaw, Setting
 from dano.scene._bodies import Body
-from dano.scene._contacts import check_objects, Contact, heaviest, too_small, with_surface
+from dano.scene._contacts import check_objects, checked_support, Contact, heaviest, with_surface
 from dano.scene._joints import joined, Joint
 
 
@@ -62,8 +62,13 @@ def others_of(
         gravity: [m/s², W].
 
     Raises:
-        ValueError: If `apart` names an unknown body, or objects cannot touch.
+        ValueError: If `apart` names an unknown body, objects cannot touch, or a material has a parameter that
+            the law does not read.
     """
+    law = DistributedLaw()
+    for given in (params, *(body.material for body in bodies)):
+        if given is not None:
+            law.check(given)
     names = [body.name for body in bodies]
     for pair in apart:
         for name in pair:
@@ -82,8 +87,6 @@ def others_of(
             pairs.append((i, j))
     if not pairs:
         return tuple(bodies), None
-    law = DistributedLaw()
-    law.check(params)
     touching = {i for pair in pairs for i in pair}
     bodies = tuple(with_surface(body) if i in touching else body for i, body in enumerate(bodies))
     return bodies, Others(_stacked(bodies, touching, law, params, gravity), law, tuple(pairs))
@@ -108,9 +111,7 @@ def _stacked(
     @functools.cache
     def stiffness(i: int, sinking: float) -> Float[Array, ""]:
         support = bodies[i].typical_support(sinking * bodies[i].size)
-        if not support > 0:
-            raise ValueError(too_small(bodies[i], "stiffness and restitution_velocity in others"))
-        return weight / support
+        return weight / checked_support(bodies[i], support, "in others must be given")
 
     def rule(i: int) -> Callable[[float], Float[Array, ""]]:
         decide = [i] if i in moving else moving
