@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.robust._draw import Material, Structure, WALL_HEIGHT
+from benchmarks.robust._draw import Material, Structure, WALL_HEIGHT, WALL_WIDTH
 from benchmarks.robust._shapes import Probe
 
 GRAVITY = 9.81
@@ -106,8 +106,10 @@ def _fallen(structure: Structure, material: Material, motion: Motion) -> tuple[s
                 continue
             first = int(np.argmax(beyond))
             way = material.timestep * np.abs(velocity[max(first - 1, 0) : first + 1, wall.axis]).max()
-            # What flies over a wall, or is about to, did not pass through it.
-            if position[first, 2] < WALL_HEIGHT - piece.radius and wall.thickness >= 0.5 * way:
+            # What flies over a wall, or is about to, or passes beside it, did not pass through it.
+            over = position[first, 2] >= WALL_HEIGHT - piece.radius
+            beside = abs(position[first, 1 - wall.axis]) >= 0.5 * WALL_WIDTH - piece.radius
+            if not over and not beside and wall.thickness >= 0.5 * way:
                 names.append(piece.name)
                 break
     return tuple(names)

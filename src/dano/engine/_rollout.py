@@ -19,7 +19,7 @@ from dano.engine._compiling import compiled
 from dano.engine._newton import Report, SolverOptions
 from dano.engine._rigid import too_fast
 from dano.maths import is_traced, quat_conjugate, quat_exp, quat_multiply
-from dano.scene import Control, Scene, State, Trajectory
+from dano.scene import Control, RESOLVED, Scene, State, Trajectory
 
 Policy = Callable[[State, Float[Array, ""]], Control]
 
@@ -127,7 +127,7 @@ def step(
     scene.check_state(state)
     _check_control(scene, control, ())
     following, report = _jitted_step(engine or VariationalEngine(), scene, state, control)
-    _say_unconverged(scene, following, report)
+    _say(scene, following, report)
     return following
 
 
@@ -179,7 +179,7 @@ def simulate(
     states, report = _jitted_rollout(
         engine or VariationalEngine(), scene, state, controls, n_steps, checkpoint_every
     )
-    _say_unconverged(scene, jax.tree.map(lambda x: x[1:], states), report)
+    _say(scene, jax.tree.map(lambda x: x[1:], states), report)
     times = scene.timestep * jnp.arange(n_steps + 1, dtype=scene.timestep.dtype)
     return Trajectory(times, states, report.residual, report.iterations, report.converged, scene.names)
 
@@ -322,26 +322,29 @@ def _check_control(scene: Scene, control: Control | None, leading: tuple[int, ..
         raise ValueError(f"control.effort must have shape {expected}, got {control.effort.shape}")
 
 
-def _say_unconverged(scene: Scene, following: State, report: Report) -> None:
-    """Warn of steps that did not converge, and of the bodies that spin faster than a step can turn."""
-    converged = report.converged
-    if is_traced(converged, scene.timestep) or bool(jnp.all(converged)):
+def _say(scene: Scene, following: State, report: Report) -> None:
+    """Warn of steps that did not converge, and of bodies that spin faster than a step resolves."""
+    if is_traced(report.converged, scene.timestep):
         return
-    failed = np.flatnonzero(~np.atleast_1d(np.asarray(converged)))
-    worst = float(np.nanmax(np.atleast_1d(np.asarray(report.residual))[failed], initial=0.0))
-    omega = np.asarray(following.omega).reshape(-1, len(scene.bodies), 3)[failed]
-    fast = np.any(np.asarray(too_fast(jnp.asarray(omega), scene.timestep)), axis=0)
-    spinning = [repr(scene.names[i]) for i in np.flatnonzero(fast)]
-    why = (
-        f"{', '.join(spinning)} spins by more than a step can turn, 2/timestep = "
-        f"{2 / float(scene.timestep):.3g} rad/s; take a smaller timestep"
-        if spinning
-        else "try a smaller timestep, or where many points touch a larger VariationalEngine(capacity=…); "
-        "with CentroidLaw a smaller damper or smoothing"
-    )
-    warnings.warn(
-        f"{len(failed)} of {np.size(converged)} steps did not converge, first step {failed[0]}, "
-        f"largest residual {worst:.3g} m/s; {why}",
-        RuntimeWarning,
-        stacklevel=3,
-    )
+    converged = np.atleast_1d(np.asarray(report.converged))
+    if not converged.all():
+        failed = np.flatnonzero(~converged)
+        worst = float(np.nanmax(np.atleast_1d(np.asarray(report.residual))[failed], initial=0.0))
+        warnings.warn(
+            f"{len(failed)} of {converged.size} steps did not converge, first step {failed[0]}, "
+            f"largest residual {worst:.3g} m/s; try a smaller timestep, or where many points touch a larger "
+            "VariationalEngine(capacity=…); with CentroidLaw a smaller damper or smoothing",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+    omega = following.omega.reshape(-1, len(scene.bodies), 3)
+    fast = np.asarray(too_fast(omega, scene.timestep))
+    if fast.any():
+        spins = np.linalg.norm(np.asarray(omega), axis=2)
+        names = ", ".join(repr(scene.names[i]) for i in np.flatnonzero(fast.any(axis=0)))
+        warnings.warn(
+            f"{names} turns by more than 60° in a step, first in step {np.flatnonzero(fast.any(axis=1))[0]}: the "
+            f"spin is kept, precession is not resolved; a timestep of {2 * RESOLVED / spins.max():.2g} s would do",
+            RuntimeWarning,
+            stacklevel=3,
+        )

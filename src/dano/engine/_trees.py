@@ -19,11 +19,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.engine._newton import inverse3
-from dano.engine._rigid import half_angle_root, turned
-from dano.maths import matmul, matvec, quat_to_matrix, skew
+from dano.engine._rigid import turn_slopes, turned
+from dano.maths import matmul, matvec, quat_to_matrix
 from dano.scene import Chains, Control, link_jacobian, place_links, Poses, Scene, State, step_twists
 
-# Angle by which a joint may turn in a step [rad]: what `too_fast` allows free bodies.
+# Angle by which joints may turn a body in a step [rad]: from 180° on a turn reads as one the other way.
 _LARGEST_TURN = 2.8
 
 
@@ -76,7 +76,7 @@ def build_tree(scene: Scene, state: State, control: Control | None) -> tuple[Tre
     )
     y = generalised(scene, state, state.orientation)
     ahead = _ahead(tree, y, h)
-    moved = _world_twists(tree, ahead, h)
+    moved = _world_twists(tree, ahead, y, h)
     return eqx.tree_at(lambda t: t.offset, tree, moved - jnp.einsum("mak,k->ma", jacobian, y)), ahead
 
 
@@ -102,7 +102,7 @@ def tree_balance(tree: Tree, y: Float[Array, " k"], own, h: Float[Array, ""]):
         h: Timestep [s].
     """
     ahead = _ahead(tree, y, h)
-    momenta, slopes = own(_world_twists(tree, ahead, h))
+    momenta, slopes = own(_world_twists(tree, ahead, y, h))
     roots = 6 * len(tree.chains.layout.free)
     joints = np.array(tree.chains.layout.with_coordinates, int)
     damping = tree.chains.damping[joints]
@@ -171,16 +171,22 @@ def _ahead(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]) -> Poses:
     return place_links(tree.chains, position, orientation, tree.q + h * y[roots:])
 
 
-def _world_twists(tree: Tree, ahead: Poses, h: Float[Array, ""]) -> Float[Array, "m 6"]:
-    """Twists [W] of the bodies that move which lead to poses at the end of the step."""
-    moving = np.array(tree.chains.layout.moving)
+def _world_twists(
+    tree: Tree, ahead: Poses, y: Float[Array, " k"], h: Float[Array, ""]
+) -> Float[Array, "m 6"]:
+    """Twists [W] of the bodies that move with generalised velocities y, which lead to poses `ahead`."""
+    layout = tree.chains.layout
+    moving = np.array(layout.moving)
     velocity, omega = step_twists(
         (tree.position[moving], tree.orientation[moving]),
         (ahead.position[moving], ahead.orientation[moving]),
         h,
     )
     spins = jax.vmap(matvec)(quat_to_matrix(tree.orientation[moving]), omega)
-    return jnp.concatenate([velocity, spins], axis=1)
+    twists = jnp.concatenate([velocity, spins], axis=1)
+    # A pose tells turns up to 180° only; those of free bodies are known.
+    free = np.array([layout.moving.index(i) for i in layout.free], int)
+    return twists.at[free].set(y[: 6 * len(layout.free)].reshape(-1, 6))
 
 
 def _twist_slopes(
@@ -188,8 +194,8 @@ def _twist_slopes(
 ) -> Float[Array, "m 6 k"]:
     """Derivative of `_world_twists` by y.
 
-    Turning the end of a step by a small angle a [W] changes the spin by R A(ω) Rᵀ a with
-    A(ω) = ½ (s(ω) − [ω]×), where R is the orientation at the start.
+    Turning the end of a step by a small angle a [W] changes the spin by R A(ω) Rᵀ a with A of `turn_slopes`,
+    where R is the orientation at the start.
     """
     layout = tree.chains.layout
     moving, free = np.array(layout.moving), np.array(layout.free, int)
@@ -199,8 +205,7 @@ def _twist_slopes(
         (ahead.position[moving], ahead.orientation[moving]),
         h,
     )
-    eye = jnp.eye(3, dtype=y.dtype)
-    halves = 0.5 * (half_angle_root(omega, h)[:, None, None] * eye[None] - jax.vmap(skew)(omega))
+    halves = jax.vmap(turn_slopes, (0, None))(omega, h)
     turns = jax.vmap(lambda r, a: matmul(matmul(r, a), r.T))(rotations, halves)
     slopes = link_jacobian(tree.chains, ahead)[moving]
     # Generalised velocities act for h; spins of roots turn the end of the step by the inverse of the above.

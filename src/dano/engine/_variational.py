@@ -30,7 +30,7 @@ from dano.engine._problem import (
     rows_of,
     structure_of,
 )
-from dano.engine._rigid import too_fast, turned
+from dano.engine._rigid import turned
 from dano.engine._roots import solve
 from dano.engine._trees import advance_tree, generalised, turns_too_far
 from dano.maths import quat_to_matrix, safe_normalize
@@ -52,10 +52,8 @@ def step(
         following = _advance(state, solution, h, pairs)
     else:
         following = advance_tree(scene, tree, state, solution, h)
-    fast = jnp.any(too_fast(following.omega[np.array(pairs.moving)], h))
     if tree is not None:
-        fast = fast | turns_too_far(tree, solution, h)
-    report = report._replace(converged=report.converged & ~fast)
+        report = report._replace(converged=report.converged & ~turns_too_far(tree, solution, h))
     if found is not None:
         report = report._replace(converged=report.converged & ~found.overflow)
     return following, jax.lax.stop_gradient(report)

@@ -13,6 +13,7 @@ from dano.scene._frames import (
     link_jacobian as link_jacobian,
     place_links as place_links,
     Poses as Poses,
+    RESOLVED as RESOLVED,
     step_twists as step_twists,
 )
 from dano.scene._joints import joined as joined, Joint as Joint, JOINT_KINDS as JOINT_KINDS, Layout as Layout

@@ -13,6 +13,9 @@ from dano.maths import quat_conjugate, quat_exp, quat_multiply, quat_rotate
 from dano.scene._joints import Joint, Layout
 from dano.scene._states import State
 
+RESOLVED = 0.5
+"""h |ω|/2 up to which a step resolves how a body spins: a turn of 60°. Beyond 90° momentum would fall with the spin."""
+
 
 class Frames(eqx.Module):
     """Pose, twist and Jacobian of all n bodies of a scene.
@@ -174,11 +177,17 @@ def step_twists(
 ) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 3"]]:
     """Velocity [m/s, W] and spin [rad/s, B] with which a step of length h leads from a pose to another.
 
-    They are what `dano.step` calls velocity and omega: x⁺ = x + h v and q⁺ = q ⊗ (h/2)(s, ω).
+    They are what `dano.step` calls velocity and omega: x⁺ = x + h v and q⁺ = q ⊗ (cos a, sin a ω/|ω|), where
+    h |ω|/2 is sin a up to `RESOLVED`, and grows like a from there. Turns are at most 180°.
     """
     velocity = (after[0] - before[0]) / h
     turn = quat_multiply(quat_conjugate(before[1]), after[1])
-    return velocity, 2 / h * jnp.where(turn[..., :1] < 0, -1, 1) * turn[..., 1:]
+    sine = jnp.where(turn[..., :1] < 0, -1, 1) * turn[..., 1:]
+    squared = jnp.sum(sine * sine, axis=-1, keepdims=True)
+    fast = squared > RESOLVED**2
+    size = jnp.sqrt(jnp.where(fast, squared, 1))
+    angle = jnp.arctan2(size, jnp.abs(turn[..., :1]))
+    return velocity, 2 / h * jnp.where(fast, (RESOLVED + angle - np.arcsin(RESOLVED)) / size, 1) * sine
 
 
 def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:

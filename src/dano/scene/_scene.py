@@ -282,8 +282,8 @@ class Scene(eqx.Module):
         are not named rest at the origin, or at q = 0. Orientations are normalised.
 
         Raises:
-            ValueError: If a body or quantity is unknown, a shape is wrong, a number is not finite, a
-                quaternion is zero, or a body spins faster than the timestep resolves (|ω| ≥ 2/h).
+            ValueError: If a body or quantity is unknown, a shape is wrong, a number is not finite, or a
+                quaternion is zero.
         """
         rows: dict[str, list[Array]] = {name: [] for name in STATE_SIZES}
         layout = self.layout
@@ -353,8 +353,7 @@ class Scene(eqx.Module):
         """Check a concrete state against the scene; traced values pass.
 
         Raises:
-            ValueError: If a shape is wrong, a number is not finite, a quaternion is not of unit length, or
-                |ω| ≥ 2/h.
+            ValueError: If a shape is wrong, a number is not finite, or a quaternion is not of unit length.
         """
         for key, size in STATE_SIZES.items():
             value = getattr(state, key)
@@ -378,16 +377,6 @@ class Scene(eqx.Module):
             norms = np.linalg.norm(np.asarray(state.orientation), axis=-1)
             if np.any(np.abs(norms - 1) > 1e-3):
                 raise ValueError(f"state.orientation must hold unit quaternions, got norms {norms.tolist()}")
-        if not is_traced(state.omega, self.timestep):
-            fastest, limit = (
-                float(np.linalg.norm(np.asarray(state.omega), axis=-1).max()),
-                2 / float(self.timestep),
-            )
-            if fastest >= limit:
-                raise ValueError(
-                    f"state.omega must be below 2/timestep = {limit:.6g} rad/s, got {fastest:.6g}; "
-                    "take a smaller timestep"
-                )
 
     def control(self, /, **bodies: dict[str, Numbers]) -> Control:
         """Control for one step: bodies by keyword, each a dict of `force` [N, W] and `torque` [N m, W].
