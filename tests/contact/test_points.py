@@ -1,5 +1,7 @@
 """The list of point contacts: what is found, its derivatives, and the linearised law."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,9 +105,19 @@ def test_one_line_of_action_for_both_bodies():
 def test_list_that_overflows_is_said():
     scene, state = pressing(*CASES["box on plane"])
     engine = dano.VariationalEngine(capacity=1)
-    with pytest.warns(RuntimeWarning, match="did not converge"):
+    with pytest.warns(RuntimeWarning, match="did not converge.* more points touch than there is room for"):
         run = dano.simulate(scene, state, 3, engine=engine)
     assert not bool(jnp.any(run.converged))
+
+
+def test_a_list_that_is_too_short_is_made_longer():
+    scene, state = pressing(*CASES["box on plane"])
+    short = dataclasses.replace(scene, room=1)
+    run, truth = dano.simulate(short, state, 3), dano.simulate(scene, state, 3)
+    assert bool(jnp.all(run.converged))
+    np.testing.assert_allclose(run.states.velocity, truth.states.velocity, atol=1e-9)
+    step = dano.step(short, state)
+    np.testing.assert_allclose(step.velocity[0], truth.states.velocity[1, 0], atol=1e-9)
 
 
 # With a stiction velocity that differences of 1e-6 m/s resolve.

@@ -20,11 +20,12 @@ class SolverOptions(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What the solver says of a step: see `Trajectory`."""
+    """What the solver says of a step: see `Trajectory`; and whether its list of points was too short."""
 
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
     converged: Bool[Array, ""]
+    overflow: Bool[Array, ""] | None = None
 
 
 # A step is accepted when what the residual does along it fell to this share; when the bracket around the zero

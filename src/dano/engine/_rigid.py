@@ -1,12 +1,13 @@
 """The integrator of free rigid bodies: momenta, their derivative, and the way of a step.
 
     translation   m (v⁺ − v) = h m g + h f + impulses,                              x⁺ = x + h v⁺
-    rotation      P(ω⁺) − P⁻(ω) = h Rᵀτ + impulses (body frame),                    q⁺ = q ⊗ (cos a, sin a ω⁺/|ω⁺|)
-    with          P(ω) = m(x) J ω + g(x) (h/2) ω × Jω,  P⁻(ω) = m(x) J ω − g(x) (h/2) ω × Jω,  x = h |ω|/2
+    rotation      P(ω⁺) − P⁻(ω) = h Rᵀτ + impulses (body frame),       q⁺ = q ⊗ (cos a, sin a ω⁺/|ω⁺|)
+    with          P, P⁻ = m(x) J ω ± g(x) (h/2) ω × Jω,                 x = h |ω|/2
 
-Up to x = 1/2, a turn of 60° in a step, m = √(1 − x²), g = 1 and sin a = x (Dojo, eq. 5–9): P(ω⁺) is the body's
-angular momentum seen from its old orientation, P⁻(ω) the one it came with, so free motion conserves momentum
-to rounding. By itself this ends at |ω| = 2/h, and no ω has a momentum above J/h. So faster spins go on
+Up to x = 1/2, a turn of 60° in a step, m = √(1 − x²), g = 1 and sin a = x (Dojo, eq. 5–9): P(ω⁺) is the
+angular momentum of the body seen from its old orientation, P⁻(ω) the one it came with, so free motion
+conserves momentum to rounding. By itself this ends at |ω| = 2/h, and no ω has a momentum above J/h. So
+faster spins go on with
 
     m x = c + x − (1 − c′) w (1 − e^(−y/w)),    g = e^(−(y/w)²),    a = a(1/2) + y,    y = x − 1/2
 
@@ -52,7 +53,7 @@ def _shares(omega: Float[Array, "*n 3"], h: Float[Array, ""]):
 
 
 def angular_momentum(omega: Float[Array, "3"], inertia: Float[Array, "3 3"], h: Float[Array, ""], sign: int):
-    """m J ω ± g (h/2) ω × Jω [B]: seen from the orientation at the start (+) or the end (−) of a step."""
+    """M J ω ± g (h/2) ω × Jω [B]: seen from the orientation at the start (+) or the end (−) of a step."""
     share, _, torque, _ = _shares(omega, h)
     spin = matvec(inertia, omega)
     return share * spin + (0.5 * sign * h * torque) * jnp.cross(omega, spin)
@@ -92,7 +93,7 @@ def turn_slopes(omega: Float[Array, "3"], h: Float[Array, ""]) -> Float[Array, "
 
 
 def _turn(omega: Float[Array, "*n 3"], h: Float[Array, ""]):
-    """cos a and sin a / x, shapes (*n, 1)."""
+    """Cos a and sin a / x, shapes (*n, 1)."""
     squared = 0.25 * h**2 * jnp.sum(omega * omega, axis=-1, keepdims=True)
     fast = squared > RESOLVED**2
     root = jnp.sqrt(1 - jnp.where(fast, RESOLVED**2, squared))

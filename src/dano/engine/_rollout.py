@@ -40,6 +40,10 @@ class AbstractEngine(eqx.Module):
     ) -> tuple[State, Report]:
         """One timestep; the report says whether the step's equations were solved."""
 
+    def enlarged(self, scene: Scene, factor: int) -> "AbstractEngine | None":
+        """The engine with `factor` times the room for contacts that it chose; None if it did not choose."""
+        return None
+
     def touch(self, scene: Scene, prepared: Any, state: State) -> Patch:
         """Overlap of every pair that may touch at a state, arrays in the order of `scene.pairs`.
 
@@ -67,8 +71,9 @@ class VariationalEngine(AbstractEngine):
             this times (1 + its largest velocity) [m/s, rad/s]; default: the dtype's resolution to the power
             3/4 (2e-12, 6e-6).
         max_iterations: Newton and line search passes after which a step is reported as not converged.
-        capacity: Chunks of 16 point contacts that a step has room for; default by the number of bodies. A
-            step with more is reported as not converged.
+        capacity: Chunks of 16 point contacts that a step has room for. A step with more is reported as not
+            converged. Default: by the bodies; and where `dano.step` and `dano.simulate` find more, they
+            compile and run again with room for all (outside of `jax.jit`).
     """
 
     tolerance: float | None = eqx.field(static=True, default=None)
@@ -87,6 +92,12 @@ class VariationalEngine(AbstractEngine):
     def prepare(self, scene: Scene) -> _problem.Prepared:
         """See `AbstractEngine.prepare`."""
         return _problem.prepare(scene, self.capacity)
+
+    def enlarged(self, scene: Scene, factor: int) -> "VariationalEngine | None":
+        """See `AbstractEngine.enlarged`."""
+        if self.capacity is not None or scene.room is None:
+            return None
+        return VariationalEngine(self.tolerance, self.max_iterations, factor * scene.room)
 
     def step(
         self, scene: Scene, prepared: Any, state: State, control: Control | None
@@ -126,7 +137,7 @@ def step(
     """
     scene.check_state(state)
     _check_control(scene, control, ())
-    following, report = _jitted_step(engine or VariationalEngine(), scene, state, control)
+    following, report = _with_room(engine, scene, lambda engine: _jitted_step(engine, scene, state, control))
     _say(scene, following, report)
     return following
 
@@ -176,8 +187,10 @@ def simulate(
         raise ValueError(f"checkpoint_every must be ≥ 1, got {checkpoint_every}")
     if checkpoint_every is None and n_steps > CHECKPOINT_FROM:
         checkpoint_every = math.isqrt(n_steps)
-    states, report = _jitted_rollout(
-        engine or VariationalEngine(), scene, state, controls, n_steps, checkpoint_every
+    states, report = _with_room(
+        engine,
+        scene,
+        lambda engine: _jitted_rollout(engine, scene, state, controls, n_steps, checkpoint_every),
     )
     _say(scene, jax.tree.map(lambda x: x[1:], states), report)
     times = scene.timestep * jnp.arange(n_steps + 1, dtype=scene.timestep.dtype)
@@ -307,6 +320,24 @@ def difference(nominal: State, state: State, rows: np.ndarray) -> Float[Array, "
     )
 
 
+def _with_room(
+    engine: AbstractEngine | None, scene: Scene, run: Callable[[AbstractEngine], tuple[State, Report]]
+) -> tuple[State, Report]:
+    """Run, and run again with room for more contacts as long as there were more, if the engine may choose."""
+    current = chosen = engine or VariationalEngine()
+    factor = 1
+    while True:
+        states, report = run(current)
+        full = report.overflow
+        if full is None or is_traced(full) or not bool(jnp.any(full)):
+            return states, report
+        factor *= 2
+        larger = chosen.enlarged(scene, factor)
+        if larger is None:
+            return states, report
+        current = larger
+
+
 def _check_control(scene: Scene, control: Control | None, leading: tuple[int, ...]) -> None:
     if control is None:
         return
@@ -322,6 +353,13 @@ def _check_control(scene: Scene, control: Control | None, leading: tuple[int, ..
         raise ValueError(f"control.effort must have shape {expected}, got {control.effort.shape}")
 
 
+def _way_out(report: Report, failed: np.ndarray) -> str:
+    """What may help steps that did not converge."""
+    if report.overflow is not None and np.atleast_1d(np.asarray(report.overflow))[failed].all():
+        return "more points touch than there is room for: take a larger VariationalEngine(capacity=…)"
+    return "try a smaller timestep, or with CentroidLaw a smaller damper or smoothing"
+
+
 def _say(scene: Scene, following: State, report: Report) -> None:
     """Warn of steps that did not converge, and of bodies that spin faster than a step resolves."""
     if is_traced(report.converged, scene.timestep):
@@ -332,8 +370,7 @@ def _say(scene: Scene, following: State, report: Report) -> None:
         worst = float(np.nanmax(np.atleast_1d(np.asarray(report.residual))[failed], initial=0.0))
         warnings.warn(
             f"{len(failed)} of {converged.size} steps did not converge, first step {failed[0]}, "
-            f"largest residual {worst:.3g} m/s; try a smaller timestep, or where many points touch a larger "
-            "VariationalEngine(capacity=…); with CentroidLaw a smaller damper or smoothing",
+            f"largest residual {worst:.3g} m/s; {_way_out(report, failed)}",
             RuntimeWarning,
             stacklevel=3,
         )
@@ -343,8 +380,9 @@ def _say(scene: Scene, following: State, report: Report) -> None:
         spins = np.linalg.norm(np.asarray(omega), axis=2)
         names = ", ".join(repr(scene.names[i]) for i in np.flatnonzero(fast.any(axis=0)))
         warnings.warn(
-            f"{names} turns by more than 60° in a step, first in step {np.flatnonzero(fast.any(axis=1))[0]}: the "
-            f"spin is kept, precession is not resolved; a timestep of {2 * RESOLVED / spins.max():.2g} s would do",
+            f"{names} turns by more than 60° in a step, first in step {np.flatnonzero(fast.any(axis=1))[0]}: "
+            "the spin is kept, precession is not resolved; "
+            f"a timestep of {2 * RESOLVED / spins.max():.2g} s would do",
             RuntimeWarning,
             stacklevel=3,
         )

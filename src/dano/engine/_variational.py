@@ -55,7 +55,7 @@ def step(
     if tree is not None:
         report = report._replace(converged=report.converged & ~turns_too_far(tree, solution, h))
     if found is not None:
-        report = report._replace(converged=report.converged & ~found.overflow)
+        report = report._replace(converged=report.converged & ~found.overflow, overflow=found.overflow)
     return following, jax.lax.stop_gradient(report)
 
 

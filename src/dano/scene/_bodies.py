@@ -175,8 +175,12 @@ class Body(eqx.Module):
         facing = np.maximum(-up @ vectors, 0)
         return float(np.median(np.sum(depths * facing, axis=1)))
 
-    def most_touching(self) -> int:
-        """How many samples meet a floor at once, when the body lies as flat as it can."""
+    def most_touching(self, margin: float) -> int:
+        """How many samples meet a floor at once, when the body lies as flat as it can.
+
+        Args:
+            margin: Distance from which samples are listed because a step may bring them into contact [m].
+        """
         assert self.surface is not None
         points, vectors = np.asarray(self.surface.points[:3]), np.asarray(self.surface.vectors)
         n = points.shape[1]
@@ -185,7 +189,7 @@ class Body(eqx.Module):
         down = vectors[:, :: max(1, n // FACES)]
         down = down / np.maximum(np.linalg.norm(down, axis=0), 1e-300)
         heights = -down.T @ points
-        layer = LAYER * (points.max(axis=1) - points.min(axis=1)).max()
+        layer = LAYER * (points.max(axis=1) - points.min(axis=1)).max() + margin
         return int(np.max(np.sum(heights <= heights.min(axis=1, keepdims=True) + layer, axis=1)))
 
     @property

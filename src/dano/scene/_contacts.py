@@ -258,7 +258,8 @@ def checked_support(body: Body, support: float, whose: str) -> float:
     """
     if not support > 0:
         raise ValueError(
-            f"stiffness and restitution_velocity {whose}: the size of {body.name!r}, {body.size} m, gives none"
+            f"stiffness and restitution_velocity {whose}: "
+            f"the size of {body.name!r}, {body.size} m, gives none"
         )
     return support
 

@@ -14,7 +14,7 @@ from dano.scene._joints import Joint, Layout
 from dano.scene._states import State
 
 RESOLVED = 0.5
-"""h |ω|/2 up to which a step resolves how a body spins: a turn of 60°. Beyond 90° momentum would fall with the spin."""
+"""h |ω|/2 up to which a step resolves how a body spins: a turn of 60°."""
 
 
 class Frames(eqx.Module):

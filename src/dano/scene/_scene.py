@@ -116,7 +116,7 @@ class Scene(eqx.Module):
         _check_materials(bodies, others, apart)
         if contacts or rest is not None:
             _warn_of_long_steps(bodies, timestep, gravity)
-        return cls(bodies, contacts, timestep, gravity, twins, joints, rest, _room(bodies))
+        return cls(bodies, contacts, timestep, gravity, twins, joints, rest, _room(bodies, timestep, gravity))
 
     @property
     def layout(self) -> Layout:
@@ -453,13 +453,14 @@ def _warn_of_long_steps(
     )
 
 
-def _room(bodies: Sequence[Body]) -> int | None:
-    """Chunks of point contacts for bodies that lie as flat as they can; None where samples are traced."""
+def _room(bodies: Sequence[Body], timestep: Float[Array, ""], gravity: Float[Array, "3"]) -> int | None:
+    """Chunks of point contacts for bodies that lie as flat as they can; None where something is traced."""
     pressing = [body for body in bodies if not body.fixed and body.surface is not None]
-    if is_traced([body.surface for body in pressing], [body.scale for body in pressing]):
+    if is_traced([body.surface for body in pressing], [body.scale for body in pressing], timestep, gravity):
         return None
+    margin = 2 * float(timestep) ** 2 * float(np.linalg.norm(np.asarray(gravity)))
     n_moving = sum(not body.fixed for body in bodies)
-    flat = [-(-body.most_touching() // CHUNK) for body in pressing if body.object is not None]
+    flat = [-(-body.most_touching(margin) // CHUNK) for body in pressing if body.object is not None]
     return CHUNKS_A_BODY * n_moving + sum(flat)
 
 
