@@ -98,5 +98,5 @@ def _turn(omega: Float[Array, "*n 3"], h: Float[Array, ""]):
     fast = squared > RESOLVED**2
     root = jnp.sqrt(1 - jnp.where(fast, RESOLVED**2, squared))
     x = jnp.sqrt(jnp.where(fast, squared, 1))
-    angle = np.arcsin(RESOLVED) + x - RESOLVED
+    angle = x + (float(np.arcsin(RESOLVED)) - RESOLVED)
     return jnp.where(fast, jnp.cos(angle), root), jnp.where(fast, jnp.sin(angle) / x, 1)

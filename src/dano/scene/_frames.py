@@ -187,7 +187,7 @@ def step_twists(
     fast = squared > RESOLVED**2
     size = jnp.sqrt(jnp.where(fast, squared, 1))
     angle = jnp.arctan2(size, jnp.abs(turn[..., :1]))
-    return velocity, 2 / h * jnp.where(fast, (RESOLVED + angle - np.arcsin(RESOLVED)) / size, 1) * sine
+    return velocity, 2 / h * jnp.where(fast, (RESOLVED - float(np.arcsin(RESOLVED)) + angle) / size, 1) * sine
 
 
 def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:
