@@ -128,6 +128,13 @@ def to_world_matrices(problem: Problem) -> Float[Array, "m 6 6"]:
     return turn.at[:, 3:, 3:].set(problem.rotation)
 
 
+def jacobian_in_bodies(problem: Problem, jacobian: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """A derivative of momenta by velocities [W] as one of R, spins and angular momenta in B."""
+    m, turn = problem.mass.shape[0], to_world_matrices(problem)
+    back = jnp.einsum("iba,ibjc,jcd->iajd", turn, jacobian.reshape(m, 6, m, 6), turn)
+    return to_velocity(problem)[:, None] * back.reshape(6 * m, 6 * m)
+
+
 def contact_wrenches(velocities: Float[Array, "m 6"], problem: Problem, pairs: Pairs, softening: Softening):
     """Wrench and its derivative with respect to the relative twist, for every contact at given velocities."""
     spins = [matvec(r, w) for r, w in zip(problem.rotation, velocities[:, 3:], strict=True)]

@@ -30,8 +30,8 @@ class Report(NamedTuple):
 
 # A step is accepted when what the residual does along it fell to this share; when the bracket around the zero
 # of that is narrower than this share of the step, it is accepted as it is.
-_ENOUGH = 0.5
-_GIVE_UP = 0.01
+ENOUGH = 0.5
+GIVE_UP = 0.01
 
 # Softness of stiction in the course of a solve, as multiples of the stiction velocity (1e-7 m/s): as it is;
 # if that does not converge, from a million times softer downwards in steps of √10; if that does not either,
@@ -112,10 +112,10 @@ class Search(NamedTuple):
     def accepts(self, work) -> Bool[Array, ""]:
         """Whether the point at `length`, where the residual does this work, is good enough."""
         start, _, low, _, high, _ = self.numbers
-        limit = _ENOUGH * jnp.abs(start)
+        limit = ENOUGH * jnp.abs(start)
         bracketed = high > 0
         misses = (work > limit) | (bracketed & (work < -limit)) | jnp.isnan(work)
-        narrow = bracketed & (high - low < _GIVE_UP)
+        narrow = bracketed & (high - low < GIVE_UP)
         return ~misses | narrow | (start >= 0)
 
     def narrowed(self, work) -> "Search":

@@ -11,7 +11,7 @@ law, too: sums of forces may balance before those of single points do.
 
 Full steps can cycle. A solve that has not converged within a few passes takes shares of steps, smaller after
 each step that made the residual larger; then it goes on with a line search, then from softer friction in
-levels (`_TIERS`). What does not converge ends where its residual was smallest.
+levels (`TIERS`). What does not converge ends where its residual was smallest.
 """
 
 from collections.abc import Callable
@@ -23,11 +23,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.engine._assembly import assemble, first_memory, Table
-from dano.engine._newton import Report, Search, solve_small, SolverOptions
+from dano.engine._newton import ENOUGH, GIVE_UP, Report, Search, solve_small, SolverOptions
+from dano.engine._rigid import FADE
+from dano.scene import RESOLVED
 
 # Softness of stiction, in multiples of the stiction velocity, share of a step that is taken, and passes, of
 # the levels of a solve. The first is friction as it is.
-_TIERS = (
+TIERS = (
     (1.0, 1.0, False, 100),
     (1.0, 1.0, True, 30),
     *((float(x), 1.0, True, 8) for x in np.geomspace(1e5, 10, 5)),
@@ -41,6 +43,8 @@ _WHOLE, _GROWS, _SHRINKS, _LEAST = 4, 1.1, 0.8, 0.2
 _FIT = 0.375
 # Residual to which soft levels are solved, per stiction velocity of theirs [m/s].
 _SOFT_TOLERANCE = 1e-3
+RULES = (_WHOLE, _GROWS, _SHRINKS, _LEAST, _FIT, _SOFT_TOLERANCE, ENOUGH, GIVE_UP, RESOLVED, FADE)
+"""Constants of the loop, in the order in which `dano.native` reads them."""
 
 
 class Balance(NamedTuple):
@@ -69,7 +73,7 @@ class _Iterate(NamedTuple):
         residual: Largest residual over mass or inertia at the accepted point.
         solved: Whether that was small enough.
         iteration: Passes.
-        level: Row of `_TIERS`.
+        level: Row of `TIERS`.
         budget: Passes left in it.
         share: Of a step that is taken in the first level.
         best: Velocities where the residual was smallest, with friction as it is; then that residual.
@@ -116,9 +120,9 @@ def primal_dual(
     m = n // 6
     epsilon = float(jnp.finfo(start.dtype).eps)
     relative = epsilon**0.75 if options.tolerance is None else options.tolerance
-    softnesses, shares = (jnp.asarray([tier[k] for tier in _TIERS], start.dtype) for k in (0, 1))
-    searches = jnp.asarray([tier[2] for tier in _TIERS])
-    budgets = jnp.asarray([tier[3] for tier in _TIERS])
+    softnesses, shares = (jnp.asarray([tier[k] for tier in TIERS], start.dtype) for k in (0, 1))
+    searches = jnp.asarray([tier[2] for tier in TIERS])
+    budgets = jnp.asarray([tier[3] for tier in TIERS])
 
     def turns(v):
         """Twists of bodies, or changes of them, in proportion to (generalised) velocities."""
@@ -144,10 +148,10 @@ def primal_dual(
         return residual, jacobian, fits, sums.memory
 
     def unfinished(it: _Iterate):
-        return ~it.solved & (it.iteration < options.max_iterations) & (it.level < len(_TIERS))
+        return ~it.solved & (it.iteration < options.max_iterations) & (it.level < len(TIERS))
 
     def advance(it: _Iterate):
-        level = jnp.minimum(it.level, len(_TIERS) - 1)
+        level = jnp.minimum(it.level, len(TIERS) - 1)
         softness, share = softnesses[level], shares[level]
         velocities = it.velocities + it.search.length * it.search.direction
         residual, jacobian, fits, memory = evaluate(velocities, it, softness)
@@ -185,7 +189,7 @@ def primal_dual(
             solved,
             it.iteration + 1,
             next_level,
-            jnp.where(harder, budgets[jnp.minimum(next_level, len(_TIERS) - 1)], it.budget - 1),
+            jnp.where(harder, budgets[jnp.minimum(next_level, len(TIERS) - 1)], it.budget - 1),
             adapted,
             best,
         )

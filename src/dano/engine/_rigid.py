@@ -23,7 +23,7 @@ from dano.maths import matmul, matvec, quat_multiply, skew
 from dano.scene import RESOLVED
 
 # Over how much of x the momentum of fast spins tends to Jω: a tenth of a turn.
-_FADE = 0.15
+FADE = 0.15
 _ROOT = float(np.sqrt(1 - RESOLVED**2))
 _SLOPE = _ROOT - RESOLVED**2 / _ROOT
 
@@ -40,15 +40,15 @@ def _shares(omega: Float[Array, "*n 3"], h: Float[Array, ""]):
     root = jnp.sqrt(1 - jnp.where(fast, RESOLVED**2, squared))
     x = jnp.sqrt(jnp.where(fast, squared, 1))
     y = x - RESOLVED
-    fading = jnp.exp(-y / _FADE)
-    product = RESOLVED * _ROOT + y - (1 - _SLOPE) * _FADE * (1 - fading)
+    fading = jnp.exp(-y / FADE)
+    product = RESOLVED * _ROOT + y - (1 - _SLOPE) * FADE * (1 - fading)
     slope = 1 - (1 - _SLOPE) * fading
-    torque = jnp.exp(-((y / _FADE) ** 2))
+    torque = jnp.exp(-((y / FADE) ** 2))
     return (
         jnp.where(fast, product / x, root),
         jnp.where(fast, (slope - product / x) / x**2, -1 / root),
         jnp.where(fast, torque, 1),
-        jnp.where(fast, -2 * y / (_FADE**2 * x) * torque, 0),
+        jnp.where(fast, -2 * y / (FADE**2 * x) * torque, 0),
     )
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from dano.contact import by_autodiff, Found, KEPT, Softening
 from dano.engine._assembly import Table, tabulate
 from dano.engine._balance import (
+    jacobian_in_bodies,
     momentum_jacobian,
     momentum_residual,
     point_momenta,
@@ -20,6 +21,7 @@ from dano.engine._balance import (
     world_momenta,
     world_patches,
 )
+from dano.engine._kernels import is_native, native_root
 from dano.engine._newton import newton, solve_small, SolverOptions
 from dano.engine._primal_dual import Balance, primal_dual
 from dano.engine._problem import Pairs, Problem
@@ -40,8 +42,10 @@ def solve(problem: Problem, found: Found | None, start: Array, pairs: Pairs, opt
         options: When to stop.
     """
 
-    def find_root(problem, found, start):
+    def find_root(problem, found, start, derivatives: bool):
         find = _root_of_bodies if problem.tree is None else _root_of_trees
+        if is_native(problem, pairs):
+            return native_root(problem, found, start, pairs, options, derivatives=derivatives)
         if problem.points is None:
             return find(problem, found, start, pairs, options)
         return one_at_a_time(
@@ -55,13 +59,13 @@ def solve(problem: Problem, found: Found | None, start: Array, pairs: Pairs, opt
 
     @eqx.filter_custom_jvp
     def root(problem, found, start):
-        velocities, _, report = find_root(problem, found, start)
+        velocities, _, report = find_root(problem, found, start, derivatives=False)
         return velocities, report
 
     @root.def_jvp
     def _(primals, tangents):
         problem, found, start = primals
-        velocities, jacobian, report = find_root(problem, found, start)
+        velocities, jacobian, report = find_root(problem, found, start, derivatives=True)
         # The inverse, not a solve: the tangent must be linear in `change` for reverse mode to transpose it.
         inverse = solve_small(jacobian, jnp.eye(jacobian.shape[0], dtype=jacobian.dtype))
         velocities, inverse = (checkpoint_name(value, KEPT) for value in (velocities, inverse))
@@ -104,9 +108,7 @@ def _root_of_bodies(
     velocities, jacobian, report = primal_dual(
         balance, _table(problem, found, pairs), world.ravel(), scale, size, options
     )
-    turn = to_world_matrices(problem)
-    back = jnp.einsum("iba,ibjc,jcd->iajd", turn, jacobian.reshape(m, 6, m, 6), turn).reshape(6 * m, 6 * m)
-    return to_body(problem, velocities.reshape(m, 6)), scale[:, None] * back, report
+    return to_body(problem, velocities.reshape(m, 6)), jacobian_in_bodies(problem, jacobian), report
 
 
 def _root_of_trees(problem: Problem, found, start: Float[Array, " k"], pairs: Pairs, options: SolverOptions):

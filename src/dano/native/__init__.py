@@ -1,0 +1,18 @@
+"""Kernels in machine code for CPUs: functions that Numba compiles, called from JAX programs without Python.
+
+Numba takes half a second to import and kernels some seconds to compile, the first time on a machine. So a
+kernel's module is imported when its name is asked for.
+"""
+
+import functools
+
+import numpy as np
+from jaxtyping import DTypeLike
+
+
+@functools.cache
+def solver_name(dtype: DTypeLike) -> str:
+    """Name for `jax.ffi.ffi_call` of the solver of a step, for numbers of a floating type."""
+    from dano.native._solver import define
+
+    return define(np.dtype(dtype).name)

@@ -1,0 +1,573 @@
+"""The velocities of free bodies that press on each other at points: `dano.engine`'s primal–dual Newton method.
+
+XLA runs a pass of that method as some hundred operations on small arrays, each with a cost of its own; here a
+pass is a loop over the points that press. Every step has the same equations and, but for rounding, the same
+passes as there.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+from dano.native._blocks import elimination, solve_blocks
+from dano.native._compiling import kernel
+from dano.native._ffi import (
+    cube,
+    inputs,
+    outputs,
+    register,
+    shape_of,
+    SIGNATURE,
+    table,
+    tells_version,
+    vector,
+)
+from dano.native._law import (
+    ALONG,
+    ARM,
+    COLUMNS,
+    FALL,
+    fit_duals,
+    follow,
+    FOUND_FRICTION,
+    GRIP,
+    LEAN,
+    linearize,
+    MOMENT,
+    NORMAL,
+    PRESSURE,
+    set_constants,
+    SHIFT,
+    SLACK,
+    TURN,
+    WEIGHT,
+)
+
+# Columns of the table of bodies: mass; inertia [B]; rotation; momentum before contact, its rotation in B.
+_MASS, _INERTIA, _ROTATION, _IMPULSE, BODY_COLUMNS = 0, 1, 10, 19, 25
+# Rows of what is found at points: arm, normal, moment, depth, rate, area.
+_DEPTH_ROW, _RATE_ROW, _AREA_ROW, POINT_ROWS = 9, 10, 11, 12
+# Settings: h, tolerance over (1 + size), size, rounding of the dtype, then the tiers.
+_H, _RELATIVE, _SIZE, _EPSILON, SETTINGS = 0, 1, 2, 3, 4
+# Columns of the tiers: softness, share of a step, whether a line search runs, passes.
+TIER_COLUMNS = 4
+# Constants of `dano.engine._primal_dual`, `_newton.Search` and `_rigid`, given by them: see `Rules`.
+RULES = 12
+_WHOLE, _GROWS, _SHRINKS, _LEAST, _FIT, _SOFT_TOLERANCE, _ENOUGH, _GIVE_UP, _RESOLVED, _FADE = range(10)
+
+
+@kernel
+def _shares(squared, resolved, fade):
+    """m, m′/x, g and g′/x of `dano.engine._rigid` at x² = (h |ω|/2)²."""
+    if squared <= resolved * resolved:
+        root = math.sqrt(1.0 - squared)
+        return root, -1.0 / root, 1.0, 0.0
+    root = math.sqrt(1.0 - resolved * resolved)
+    first_slope = root - resolved * resolved / root
+    x = math.sqrt(squared)
+    y = x - resolved
+    fading = math.exp(-y / fade)
+    product = resolved * root + y - (1.0 - first_slope) * fade * (1.0 - fading)
+    slope = 1.0 - (1.0 - first_slope) * fading
+    torque = math.exp(-((y / fade) ** 2))
+    return product / x, (slope - product / x) / squared, torque, -2.0 * y / (fade * fade * x) * torque
+
+
+@kernel
+def _add_own(body, velocity, h, rules, residual, block):
+    """Momentum that a body gains in the step beyond gravity and controls [W], and its derivative."""
+    rotation, inertia = np.empty((3, 3)), np.empty((3, 3))
+    for k in range(9):
+        rotation[k // 3, k % 3], inertia[k // 3, k % 3] = body[_ROTATION + k], body[_INERTIA + k]
+    omega, spin, missing = np.empty(3), np.empty(3), np.empty(3)
+    inner, half = np.empty((3, 3)), np.empty((3, 3))
+    mass = body[_MASS]
+    for k in range(3):
+        residual[k] = mass * velocity[k] - body[_IMPULSE + k]
+        omega[k] = rotation[0, k] * velocity[3] + rotation[1, k] * velocity[4] + rotation[2, k] * velocity[5]
+        block[k, k] = mass
+    squared = omega[0] * omega[0] + omega[1] * omega[1] + omega[2] * omega[2]
+    share, share_slope, torque, torque_slope = _shares(0.25 * h * h * squared, rules[_RESOLVED], rules[_FADE])
+    for k in range(3):
+        spin[k] = inertia[k, 0] * omega[0] + inertia[k, 1] * omega[1] + inertia[k, 2] * omega[2]
+    for k in range(3):
+        a, b = (k + 1) % 3, (k + 2) % 3
+        crossed = omega[a] * spin[b] - omega[b] * spin[a]
+        missing[k] = share * spin[k] + 0.5 * h * torque * crossed - body[_IMPULSE + 3 + k]
+        along = share_slope * spin[k] + 0.5 * h * torque_slope * crossed
+        for c in range(3):
+            gyroscopic = omega[a] * inertia[b, c] - omega[b] * inertia[a, c]
+            inner[k, c] = share * inertia[k, c] + 0.25 * h * h * along * omega[c]
+            inner[k, c] += 0.5 * h * torque * gyroscopic
+    # minus the cross product matrix of J ω
+    for k in range(3):
+        a, b = (k + 1) % 3, (k + 2) % 3
+        inner[k, a] += 0.5 * h * torque * spin[b]
+        inner[k, b] -= 0.5 * h * torque * spin[a]
+    for r in range(3):
+        s = 0.0
+        for t in range(3):
+            s += rotation[r, t] * missing[t]
+        residual[3 + r] = s
+        for c in range(3):
+            s = 0.0
+            for t in range(3):
+                s += rotation[r, t] * inner[t, c]
+            half[r, c] = s
+    for r in range(3):
+        for c in range(3):
+            s = 0.0
+            for t in range(3):
+                s += half[r, t] * rotation[c, t]
+            block[3 + r, 3 + c] = s
+
+
+@kernel
+def _tabulate(rows, chunks, n, material, stiffness, between, h):
+    """Points with area in a table, grouped by runs of chunks that join the same bodies.
+
+    Args:
+        rows: Arm, normal, moment, depth, rate and area, shape (12, c, p).
+        chunks: Row of the first and of the second body of each chunk, shape (2, c).
+        n: Chunks in use.
+        material: Of chunks, shape (12, c).
+        stiffness: Of impacts, shape (c,).
+        between: From the second body's centre of mass to the first's, shape (3, c).
+        h: Timestep [s].
+
+    Returns:
+        The table; for each group where its points begin, then where they end, and its bodies, shape (g, 4);
+        and the vectors between these, shape (g, 3).
+    """
+    width = rows.shape[2]
+    points = np.empty((n * width, COLUMNS))
+    groups, apart = np.empty((n, 4), np.int64), np.empty((n, 3))
+    here, used, g = np.empty(12), 0, -1
+    for c in range(n):
+        new = g < 0 or groups[g, 2] != chunks[0, c] or groups[g, 3] != chunks[1, c]
+        if new:
+            g += 1
+            groups[g, 0] = used
+            groups[g, 2], groups[g, 3] = chunks[0, c], chunks[1, c]
+            for k in range(3):
+                apart[g, k] = between[k, c]
+        for k in range(12):
+            here[k] = material[k, c]
+        for p in range(width):
+            area = rows[_AREA_ROW, c, p]
+            if area > 0.0:
+                row = points[used]
+                for k in range(9):
+                    row[k] = rows[k, c, p]
+                row[WEIGHT] = h * area
+                set_constants(row, here, h, rows[_DEPTH_ROW, c, p], rows[_RATE_ROW, c, p], stiffness[c])
+                used += 1
+        groups[g, 1] = used
+    return points[:used], groups[: g + 1], apart[: g + 1]
+
+
+@kernel
+def _relative(velocities, a, b, apart, twist):
+    """Twist at the first body's centre of mass relative to the second body [W]; a or b may not move."""
+    m = velocities.shape[0]
+    for k in range(6):
+        twist[k] = velocities[a, k] if a < m else 0.0
+    if b < m:
+        v = velocities[b]
+        twist[0] -= v[0] + v[4] * apart[2] - v[5] * apart[1]
+        twist[1] -= v[1] + v[5] * apart[0] - v[3] * apart[2]
+        twist[2] -= v[2] + v[3] * apart[1] - v[4] * apart[0]
+        for k in range(3, 6):
+            twist[k] -= v[k]
+
+
+@kernel
+def _motion(row, twist):
+    """Separating speed and slip of a point, see `dano.contact.motion_at`."""
+    x = twist[0] + twist[4] * row[ARM + 2] - twist[5] * row[ARM + 1]
+    y = twist[1] + twist[5] * row[ARM] - twist[3] * row[ARM + 2]
+    z = twist[2] + twist[3] * row[ARM + 1] - twist[4] * row[ARM]
+    along = x * row[NORMAL] + y * row[NORMAL + 1] + z * row[NORMAL + 2]
+    rate = twist[0] * row[NORMAL] + twist[1] * row[NORMAL + 1] + twist[2] * row[NORMAL + 2]
+    rate += twist[3] * row[MOMENT] + twist[4] * row[MOMENT + 1] + twist[5] * row[MOMENT + 2]
+    return rate, x - along * row[NORMAL], y - along * row[NORMAL + 1], z - along * row[NORMAL + 2]
+
+
+@kernel
+def _six(row, column, out):
+    """A vector at a point and its moment."""
+    for k in range(3):
+        a, b = (k + 1) % 3, (k + 2) % 3
+        out[k] = row[column + k]
+        out[3 + k] = row[ARM + a] * row[column + b] - row[ARM + b] * row[column + a]
+
+
+@kernel
+def _add_point(row, slope, wrench, six):
+    """Add a point's wrench and its derivative by the twist at the first body's centre of mass.
+
+    With a6 = (a, r × a) and n6 = (n, moment) that is
+
+        w (lean6 n6ᵀ − f n6 n6ᵀ − l6 û6ᵀ − g (Σ_k e6_k e6_kᵀ − (n, r × n) (n, r × n)ᵀ)).
+    """
+    weight = row[WEIGHT]
+    lean, turn, along, across, force, normal = six[0], six[1], six[2], six[3], six[4], six[5]
+    for k in range(6):
+        normal[k] = row[NORMAL + k] if k < 3 else row[MOMENT + k - 3]
+    _six(row, LEAN, lean)
+    _six(row, TURN, turn)
+    _six(row, ALONG, along)
+    _six(row, NORMAL, across)
+    for k in range(3):
+        a, b = (k + 1) % 3, (k + 2) % 3
+        x = row[FOUND_FRICTION + k] + row[SLACK + k]
+        y = row[FOUND_FRICTION + a] + row[SLACK + a]
+        z = row[FOUND_FRICTION + b] + row[SLACK + b]
+        force[k] = x
+        force[3 + k] = row[ARM + a] * z - row[ARM + b] * y
+    p, fall, grip = weight * row[PRESSURE], row[FALL], weight * row[GRIP]
+    for r in range(6):
+        wrench[r] += p * normal[r] + weight * force[r]
+        left, second, third = weight * (lean[r] - fall * normal[r]), -weight * turn[r], grip * across[r]
+        for c in range(6):
+            slope[r, c] += left * normal[c] + second * along[c] + third * across[c]
+    # Σ_k e6_k e6_kᵀ = [[1, −X], [X, −X²]] with X v = r × v
+    x, y, z = row[ARM], row[ARM + 1], row[ARM + 2]
+    for k in range(3):
+        slope[k, k] -= grip
+    slope[0, 4] -= grip * z
+    slope[0, 5] += grip * y
+    slope[1, 3] += grip * z
+    slope[1, 5] -= grip * x
+    slope[2, 3] -= grip * y
+    slope[2, 4] += grip * x
+    slope[4, 0] -= grip * z
+    slope[5, 0] += grip * y
+    slope[3, 1] += grip * z
+    slope[5, 1] -= grip * x
+    slope[3, 2] -= grip * y
+    slope[4, 2] += grip * x
+    slope[3, 3] -= grip * (y * y + z * z)
+    slope[4, 4] -= grip * (x * x + z * z)
+    slope[5, 5] -= grip * (x * x + y * y)
+    slope[3, 4] += grip * x * y
+    slope[4, 3] += grip * x * y
+    slope[3, 5] += grip * x * z
+    slope[5, 3] += grip * x * z
+    slope[4, 5] += grip * y * z
+    slope[5, 4] += grip * y * z
+
+
+@kernel
+def _scatter(slope, wrench, apart, a, b, residual, matrix):
+    """Take a group's wrench, and its derivative, from the balance of both bodies.
+
+    The twist of the second body at the first's centre of mass is T V with T = [[1, −D], [0, 1]] and
+    D v = between × v, so it feels −Tᵀ times the wrench on the first.
+    """
+    m = residual.shape[0]
+    x, y, z = apart[0], apart[1], apart[2]
+    if b < m:
+        # columns by the second body: S T, whose last columns are S₂ − S₁ D
+        by_second = np.empty((6, 6))
+        for r in range(6):
+            p, q, s = slope[r, 0], slope[r, 1], slope[r, 2]
+            by_second[r, 0], by_second[r, 1], by_second[r, 2] = p, q, s
+            by_second[r, 3] = slope[r, 3] - (q * z - s * y)
+            by_second[r, 4] = slope[r, 4] - (s * x - p * z)
+            by_second[r, 5] = slope[r, 5] - (p * y - q * x)
+        for c in range(6):
+            for r in range(3):
+                residual_row = by_second[r, c]
+                matrix[b, b, r, c] -= residual_row
+                if a < m:
+                    matrix[a, b, r, c] += residual_row
+                    matrix[b, a, r, c] += slope[r, c]
+            for k in range(3):
+                i, j = (k + 1) % 3, (k + 2) % 3
+                moved = by_second[3 + k, c] + apart[i] * by_second[j, c] - apart[j] * by_second[i, c]
+                matrix[b, b, 3 + k, c] -= moved
+                if a < m:
+                    matrix[a, b, 3 + k, c] += by_second[3 + k, c]
+                    matrix[b, a, 3 + k, c] += slope[3 + k, c] + apart[i] * slope[j, c] - apart[j] * slope[i, c]
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            residual[b, k] += wrench[k]
+            residual[b, 3 + k] += wrench[3 + k] + apart[i] * wrench[j] - apart[j] * wrench[i]
+    if a < m:
+        for r in range(6):
+            residual[a, r] -= wrench[r]
+            for c in range(6):
+                matrix[a, a, r, c] -= slope[r, c]
+
+
+@kernel
+def _assemble(bodies, velocities, points, groups, apart, length, softness, h, rules, residual, matrix, used):
+    """Residual and Jacobian as momenta, how far duals are from fitting, and all pressure [N s]."""
+    m = bodies.shape[0]
+    for i in range(m):
+        for j in range(m):
+            if used[i, j]:
+                _clear(matrix[i, j])
+        _add_own(bodies[i], velocities[i], h, rules, residual[i], matrix[i, i])
+    slope, wrench, twist, six = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty((6, 6))
+    unfit = push = 0.0
+    for g in range(groups.shape[0]):
+        a, b = groups[g, 2], groups[g, 3]
+        _relative(velocities, a, b, apart[g], twist)
+        presses = False
+        for p in range(groups[g, 0], groups[g, 1]):
+            row = points[p]
+            rate, x, y, z = _motion(row, twist)
+            if linearize(row, rate, x, y, z, length, softness):
+                if not presses:
+                    _clear(slope)
+                    for k in range(6):
+                        wrench[k] = 0.0
+                    presses = True
+                _add_point(row, slope, wrench, six)
+                weight = row[WEIGHT]
+                slack = abs(row[SLACK]) + abs(row[SLACK + 1]) + abs(row[SLACK + 2])
+                unfit += weight * (slack + abs(row[SHIFT]))
+                push += weight * row[PRESSURE]
+        if presses:
+            _scatter(slope, wrench, apart[g], a, b, residual, matrix)
+    return unfit, push
+
+
+@kernel
+def _clear(block):
+    for r in range(6):
+        for c in range(6):
+            block[r, c] = 0.0
+
+
+@kernel
+def _copy(source, target):
+    for i in range(source.shape[0]):
+        for k in range(source.shape[1]):
+            target[i, k] = source[i, k]
+
+
+@kernel
+def _follow_all(points, groups, apart, step):
+    """Accept the duals tried last; find their change along a step."""
+    twist = np.empty(6)
+    for g in range(groups.shape[0]):
+        _relative(step, groups[g, 2], groups[g, 3], apart[g], twist)
+        for p in range(groups[g, 0], groups[g, 1]):
+            rate, x, y, z = _motion(points[p], twist)
+            follow(points[p], rate, x, y, z)
+
+
+@kernel
+def _fit_all(points, groups, apart, velocities):
+    twist = np.empty(6)
+    for g in range(groups.shape[0]):
+        _relative(velocities, groups[g, 2], groups[g, 3], apart[g], twist)
+        for p in range(groups[g, 0], groups[g, 1]):
+            rate, x, y, z = _motion(points[p], twist)
+            fit_duals(points[p], rate, x, y, z)
+
+
+@kernel
+def _pattern(groups, m):
+    coupled = np.empty((m, m), np.bool_)
+    for i in range(m):
+        for j in range(m):
+            coupled[i, j] = i == j
+    for g in range(groups.shape[0]):
+        a, b = groups[g, 2], groups[g, 3]
+        if a < m and b < m:
+            coupled[a, b] = coupled[b, a] = True
+    return coupled
+
+
+@kernel
+def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iterations, whole):
+    """The loop of `dano.engine._primal_dual.primal_dual`.
+
+    Args:
+        bodies: Table of bodies that move, shape (m, 25).
+        points: Table of points.
+        groups: Their groups.
+        apart: Vectors between the bodies of groups.
+        start: Velocities to start from [W], shape (m, 6); they become the solution.
+        settings: See `SETTINGS`.
+        tiers: Levels of the solve, shape (t, 4).
+        rules: Constants.
+        max_iterations: Passes.
+        whole: The Jacobian there, shape (6 m, 6 m), written to; or of size 0.
+
+    Returns:
+        Residual, passes, whether it converged.
+    """
+    m = bodies.shape[0]
+    h, epsilon = settings[_H], settings[_EPSILON]
+    used = _pattern(groups, m)
+    order, count, later = elimination(used)
+    matrix, work_matrix = np.empty((m, m, 6, 6)), np.empty((m, m, 6, 6))
+    residual, step, best = np.empty((m, 6)), np.empty((m, 6)), np.empty((m, 6))
+    accepted, tried, scale = np.empty((m, 6)), np.empty((m, 6)), np.empty((m, 6))
+    _copy(start, accepted)
+    _copy(start, best)
+    for i in range(m):
+        for k in range(6):
+            step[i, k] = 0.0
+        trace = bodies[i, _INERTIA] + bodies[i, _INERTIA + 4] + bodies[i, _INERTIA + 8]
+        for k in range(6):
+            scale[i, k] = 1.0 / bodies[i, _MASS] if k < 3 else 3.0 / trace
+    _fit_all(points, groups, apart, start)
+    fit = epsilon ** rules[_FIT]
+    level, budget, iteration = 0, tiers[0, 3], 0
+    share, solved = 1.0, False
+    before, best_error = np.inf, np.inf
+    # The line search: work at the accepted point, share to try, the bracket and the works at its ends.
+    begun, length, low, low_work, high, high_work = 0.0, 1.0, 0.0, 0.0, 0.0, 0.0
+    while not solved and iteration < max_iterations and level < tiers.shape[0]:
+        softness, searches = tiers[level, 0], tiers[level, 2] > 0.0
+        for i in range(m):
+            for k in range(6):
+                tried[i, k] = accepted[i, k] + length * step[i, k]
+        unfit, push = _assemble(
+            bodies, tried, points, groups, apart, length, softness, h, rules, residual, matrix, used
+        )
+        work = error = rounding = 0.0
+        for i in range(m):
+            for r in range(6):
+                work += step[i, r] * residual[i, r]
+                missed = abs(scale[i, r] * residual[i, r])
+                error = missed if missed > error or math.isnan(missed) else error
+                size = 0.0
+                for j in range(m):
+                    if used[i, j]:
+                        for c in range(6):
+                            size += abs(matrix[i, j, r, c] * tried[j, c])
+                rounding = max(rounding, scale[i, r] * size)
+        limit = rules[_ENOUGH] * abs(begun)
+        bracketed = high > 0.0
+        misses = work > limit or (bracketed and work < -limit) or math.isnan(work)
+        narrow = bracketed and high - low < rules[_GIVE_UP]
+        accept = not misses or narrow or begun >= 0.0 or not searches
+        tolerance = max(settings[_RELATIVE] * (1.0 + settings[_SIZE]), 16.0 * epsilon * rounding)
+        hard = softness == 1.0
+        enough = tolerance if hard else max(tolerance, rules[_SOFT_TOLERANCE] * 1e-7 * softness)
+        small = error <= enough
+        accept = accept or small
+        solved = small and hard and (unfit <= fit * push or before <= enough)
+        if hard and error < best_error:
+            best_error = error
+            _copy(tried, best)
+        adapted = share * (rules[_GROWS] if error < before else rules[_SHRINKS])
+        adapted = min(max(adapted, rules[_LEAST]), 1.0)
+        if level > 0 or iteration < rules[_WHOLE]:
+            adapted = 1.0
+        fell = error < 0.5 * before
+        harder = accept and ((small and not hard) or (not small and budget <= 0))
+        if accept:
+            _copy(tried, accepted)
+            if not solved:
+                for i in range(m):
+                    for k in range(6):
+                        step[i, k] = -residual[i, k]
+                        for j in range(m):
+                            if used[i, j]:
+                                work_matrix[i, j, k] = matrix[i, j, k]
+                solve_blocks(work_matrix, step, order, count, later)
+                part = 1.0 if fell else tiers[level, 1] * adapted
+                begun = 0.0
+                for i in range(m):
+                    for k in range(6):
+                        step[i, k] *= part
+                        begun += step[i, k] * residual[i, k]
+                _follow_all(points, groups, apart, step)
+            length, low, low_work, high, high_work = 1.0, 0.0, begun, 0.0, 0.0
+            before = error
+        else:
+            far = not work < 0.0
+            new_low, new_high = (low, length) if far else (length, high)
+            new_low_work = 0.5 * low_work if far else work
+            new_high_work = work if far else high_work if high == 0.0 else 0.5 * high_work
+            portion = -new_low_work / (new_high_work - new_low_work)
+            portion = min(max(portion, 0.1), 0.9) if not math.isnan(portion) else 0.1
+            low, low_work, high, high_work = new_low, new_low_work, new_high, new_high_work
+            length = low + portion * (high - low)
+        if harder:
+            level += 1
+            budget = tiers[min(level, tiers.shape[0] - 1), 3]
+        else:
+            budget -= 1
+        share = adapted
+        iteration += 1
+    _copy(accepted if solved else best, start)
+    if whole.size > 0:
+        for i in range(m):
+            for j in range(m):
+                for r in range(6):
+                    for c in range(6):
+                        whole[6 * i + r, 6 * j + c] = matrix[i, j, r, c] if used[i, j] else 0.0
+    return before if solved else best_error, iteration, solved
+
+
+@kernel
+def _doubles(source):
+    result = np.empty(source.shape)
+    for i in range(source.shape[0]):
+        for k in range(source.shape[1]):
+            result[i, k] = source[i, k]
+    return result
+
+
+@kernel
+def _answer(frame, dtype):
+    """Solve what a call frame holds; see `dano.engine` for the order of its buffers."""
+    given, found = inputs(frame), outputs(frame)
+    start, settings = _doubles(table(given[1], dtype)), _doubles(table(given[6], dtype))[0]
+    chunks, limits = table(given[9], numba.int32), vector(given[10], numba.int32)
+    rows, material = cube(given[2], dtype), table(given[3], dtype)
+    points, groups, apart = _tabulate(
+        rows,
+        chunks,
+        min(limits[0], chunks.shape[1]),
+        material,
+        vector(given[4], dtype),
+        table(given[5], dtype),
+        settings[_H],
+    )
+    n = shape_of(found[1])[0]
+    whole = np.empty((n, n))
+    residual, iterations, solved = solve(
+        _doubles(table(given[0], dtype)),
+        points,
+        groups,
+        apart,
+        start,
+        settings,
+        _doubles(table(given[7], dtype)),
+        _doubles(table(given[8], dtype))[0],
+        limits[1],
+        whole,
+    )
+    _copy(start, table(found[0], dtype))
+    _copy(whole, table(found[1], dtype))
+    report = vector(found[2], dtype)
+    report[0], report[1], report[2] = residual, iterations, solved
+    return 0
+
+
+def define(dtype: str) -> str:
+    """Compile or load the solver for "float64" or "float32", make it known to JAX and return its name."""
+    if dtype == "float64":
+
+        @numba.cfunc(SIGNATURE, cache=True)
+        def handler(frame):
+            return 0 if tells_version(frame) else _answer(frame, numba.float64)
+
+    else:
+
+        @numba.cfunc(SIGNATURE, cache=True)
+        def handler(frame):
+            return 0 if tells_version(frame) else _answer(frame, numba.float32)
+
+    return register(f"dano_solve_{dtype}", handler)
