@@ -11,6 +11,7 @@ os.environ["XLA_FLAGS"] = f"{FAST_COMPILING} {os.environ.get('XLA_FLAGS', '')}".
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
 
 # The library follows its inputs' dtype. Tests compare in float64 and let no silent cast or broadcast pass.
 jax.config.update("jax_enable_x64", True)
@@ -21,6 +22,10 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 MANY_MAPS = 15_000
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+
+# Shapes and types are checked while tracing; kernels are compiled by Numba, which takes plain functions only.
+CHECKED = [path.stem for path in (REPOSITORY / "src" / "dano").iterdir() if path.stem != "native"]
+install_import_hook([f"dano.{name}" for name in CHECKED], "beartype.beartype")
 
 
 @pytest.fixture(scope="module", autouse=True)

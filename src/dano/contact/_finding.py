@@ -23,9 +23,11 @@ from jaxtyping import Array, Float, Int
 
 from dano.contact._colliders import BLOCK
 from dano.contact._geometry import (
+    ADVANCES,
     AXIS,
     BALL,
     block_clearance,
+    FROM_Z,
     Geometry,
     Kind,
     Links,
@@ -33,9 +35,12 @@ from dano.contact._geometry import (
     Mixture,
     near_pairs,
     place,
+    POLE,
+    SHARES,
     Side,
     unit,
 )
+from dano.contact._kernels import find_natively
 from dano.contact._points import CHUNK, cross, dot, Found, Points, ROUND
 from dano.maths import matmul, matvec
 
@@ -90,6 +95,13 @@ def find(
     dtype = links.position.dtype
     # A batch is written whole, so the list has room for one more; and it is read in parts.
     room = -(-(capacity + _CHUNKS) // ROUND) * ROUND
+    if geometry.tables is not None:
+        hits = jnp.stack([impacts.instant.astype(dtype), impacts.speed.astype(dtype)], axis=1)
+        constants = jnp.asarray([_IMPACT, SHARES, ADVANCES, *POLE, *FROM_Z.ravel()], dtype)
+        settings = jnp.append(h.astype(dtype), constants)
+        return find_natively(
+            geometry.tables, geometry.blocks, geometry.probes, links, hits, settings, capacity, room
+        )
     whole = jnp.zeros(room, int)
     found = _List(
         jnp.zeros((12, room * CHUNK), dtype),
@@ -275,12 +287,7 @@ def _assembled(geometry: Geometry, links: Links, where: Found, rows: Float[Array
     first, second, contact = jnp.sum(jnp.where(chosen[:, None], jnp.stack(sides), 0), axis=0)
     between = (links.position[first] - links.position[second]).T
     return Points(
-        rows[:3],
-        rows[3:6],
-        rows[6:9],
-        rows[9],
-        rows[10],
-        rows[11],
+        rows,
         where.stiffness,
         between,
         first,

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, DTypeLike, Float, Int
 
 from dano.contact._colliders import BLOCK, SurfaceSet
+from dano.contact._kernels import Tables, tables_of
 from dano.contact._points import cross
 from dano.fields import AbstractShape, HalfSpace
 from dano.maths import matmul, matvec, quat_to_matrix, skew
@@ -31,11 +32,11 @@ _SINK = 0.01
 # … and by this share of the thinner one's half thickness.
 _THIN = 0.25
 # That moment is rounded down to such a fraction of a step.
-_SHARES = 32
+SHARES = 32
 # Up to so many blocks the moment of meeting is found from samples, beyond from the centres of blocks.
 _FEW_BLOCKS = 16
 # Steps of the search for the moment when bodies meet.
-_ADVANCES = 12
+ADVANCES = 12
 
 
 class Part(NamedTuple):
@@ -181,6 +182,7 @@ class Geometry(eqx.Module):
         middle: Centres of balls around the bodies [m, F], shape (n, 3).
         radius: Of these balls, shape (n,).
         kinds: Pairs by the kind of solid that is pressed on.
+        tables: The same for the search in machine code, None where XLA searches.
     """
 
     blocks: Float[Array, "b 6 w"]
@@ -196,6 +198,7 @@ class Geometry(eqx.Module):
     middle: Float[Array, "n 3"]
     radius: Float[Array, " n"]
     kinds: tuple[Kind, ...]
+    tables: Tables | None = None
 
     @property
     def mixture(self) -> Mixture:
@@ -236,7 +239,7 @@ def gather_geometry(
     rows = [
         jnp.concatenate([t.points[:3], t.vectors]).reshape(6, -1, BLOCK).transpose(1, 0, 2) for t in tables
     ]
-    return Geometry(
+    geometry = Geometry(
         jnp.concatenate(rows).astype(dtype),
         jnp.concatenate([t.centers for t in tables]).astype(dtype),
         jnp.concatenate([t.radii for t in tables]).astype(dtype),
@@ -251,6 +254,7 @@ def gather_geometry(
         extents[:, 3],
         tuple(_kinds(parts, sets, pairs, extents[:, 4:], gravity_step, dtype)),
     )
+    return eqx.tree_at(lambda g: g.tables, geometry, tables_of(geometry, dtype), is_leaf=lambda x: x is None)
 
 
 def _probes_of(surface: SurfaceSet) -> Float[Array, "3 k"]:
@@ -418,23 +422,23 @@ def _direction(v: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 # Where `towards` is not smooth: a direction that bodies set upright do not press in.
-_POLE = np.array([0.36, -0.48, 0.8])
+POLE = np.array([0.36, -0.48, 0.8])
 # A rotation that takes z to the opposite of the pole.
-_FROM_Z = np.array([[0.8, 0.48, -0.36], [0.6, -0.64, 0.48], [0.0, -0.6, -0.8]])
+FROM_Z = np.array([[0.8, 0.48, -0.36], [0.6, -0.64, 0.48], [0.0, -0.6, -0.8]])
 
 
 def towards(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """A rotation that takes z to a unit vector, as a function that is smooth except at `_POLE`.
+    """A rotation that takes z to a unit vector, as a function that is smooth except at `POLE`.
 
     No such function is smooth everywhere. A seam along a circle, as usual formulas have it, would be crossed
     by any ball that rolls: its samples would jump, and derivatives would not see it.
     """
-    pole = jnp.asarray(-_POLE, normal.dtype)
+    pole = jnp.asarray(-POLE, normal.dtype)
     axis = cross(pole, normal)
     square = axis[:, None] * axis[None] - jnp.sum(axis * axis) * jnp.eye(3, dtype=normal.dtype)
     beyond = jnp.maximum(1 + jnp.sum(pole * normal), 1e-12)
     turn = jnp.eye(3, dtype=normal.dtype) + skew(axis) + square / beyond
-    return matmul(turn, jnp.asarray(_FROM_Z, normal.dtype))
+    return matmul(turn, jnp.asarray(FROM_Z, normal.dtype))
 
 
 def unit(gradient: Float[Array, "3 *n"]) -> Float[Array, "3 *n"]:
@@ -490,7 +494,7 @@ def meeting(geometry: Geometry, kind: Kind | Mixture, links: Links, side: Side, 
 
     def unfinished(carry):
         share, last, k = carry
-        return (share < 1) & (last > 0.01) & (k < _ADVANCES)
+        return (share < 1) & (last > 0.01) & (k < ADVANCES)
 
     def advance(carry):
         share, _, k = carry
@@ -510,7 +514,7 @@ def meeting(geometry: Geometry, kind: Kind | Mixture, links: Links, side: Side, 
     first = jnp.where(slow, one, 0)
     share, _, _ = jax.lax.while_loop(unfinished, advance, (first, one, jnp.zeros((), int)))
     # In steps, so that derivatives may hold it fixed: they are those of what is computed.
-    return jnp.floor(share * _SHARES) / _SHARES
+    return jnp.floor(share * SHARES) / SHARES
 
 
 def near_pairs(geometry: Geometry, kind: Kind, links: Links, h):

@@ -23,13 +23,8 @@ class Points(eqx.Module):
     along with the first body's centre of mass, so that forces act on one line for both bodies.
 
     Attributes:
-        arm: From the first body's centre of mass to the point [m, W].
-        normal: Unit normal out of the second body, toward the first [W].
-        moment: Moment of a unit pressure about the first body's centre of mass [m, W]: arm × normal, without
-            what a body that rolls on a smooth surface would feel of single samples.
-        depth: Depth below the second body's surface at the end of the step if nothing moved in it [m].
-        rate: Separating speed at the old velocities [m/s].
-        area: Area that faces the second body [m²]; zero where a chunk is not full.
+        rows: `arm`, `normal`, `moment`, `depth`, `rate` and `area`, one below the other: one array, because
+            machine code that writes and reads it needs no copies.
         stiffness: Of an impact that must end within the step: pressure per depth [Pa/m]; zero elsewhere,
             where the material's own holds. Shape (c,).
         between: From the second body's centre of mass to the first's, at the start of the step [m, W].
@@ -38,17 +33,45 @@ class Points(eqx.Module):
         contact: Index into the scene's contacts.
     """
 
-    arm: Float[Array, "3 c p"]
-    normal: Float[Array, "3 c p"]
-    moment: Float[Array, "3 c p"]
-    depth: Float[Array, "c p"]
-    rate: Float[Array, "c p"]
-    area: Float[Array, "c p"]
+    rows: Float[Array, "12 c p"]
     stiffness: Float[Array, " c"]
     between: Float[Array, "3 c"]
     first: Int[Array, " c"]
     second: Int[Array, " c"]
     contact: Int[Array, " c"]
+
+    @property
+    def arm(self) -> Float[Array, "3 c p"]:
+        """From the first body's centre of mass to the point [m, W]."""
+        return self.rows[:3]
+
+    @property
+    def normal(self) -> Float[Array, "3 c p"]:
+        """Unit normal out of the second body, toward the first [W]."""
+        return self.rows[3:6]
+
+    @property
+    def moment(self) -> Float[Array, "3 c p"]:
+        """Moment of a unit pressure about the first body's centre of mass [m, W].
+
+        It is arm × normal, without what a body that rolls on a smooth surface would feel of single samples.
+        """
+        return self.rows[6:9]
+
+    @property
+    def depth(self) -> Float[Array, "c p"]:
+        """Depth below the second body's surface at the end of the step if nothing moved in it [m]."""
+        return self.rows[9]
+
+    @property
+    def rate(self) -> Float[Array, "c p"]:
+        """Separating speed at the old velocities [m/s]."""
+        return self.rows[10]
+
+    @property
+    def area(self) -> Float[Array, "c p"]:
+        """Area that faces the second body [m²]; zero where a chunk is not full."""
+        return self.rows[11]
 
 
 class Found(eqx.Module):

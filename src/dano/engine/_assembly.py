@@ -99,8 +99,7 @@ def tabulate(
     """
     shape = points.depth.shape
     fixed = [jnp.broadcast_to(x, shape) for x in constants(material, points)]
-    vectors = jnp.concatenate([points.arm, points.normal, points.moment])
-    numbers = jnp.concatenate([vectors, jnp.stack([h * points.area, *fixed])])
+    numbers = jnp.concatenate([points.rows[:9], jnp.stack([h * points.area, *fixed])])
     return Table(
         jax.lax.optimization_barrier(numbers),
         points.between,

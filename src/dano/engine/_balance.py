@@ -156,10 +156,12 @@ def chunk_wrenches(problem: Problem, world: Float[Array, "m 6"], pairs: Pairs):
 
     Velocities of the bodies that move are in W.
     """
-    points, material = problem.points, problem.material
-    assert points is not None and material is not None
+    points = problem.points
+    assert points is not None
     bodies = jnp.concatenate([world, jnp.zeros((1, 6), world.dtype)])[np.array(pairs.rows)]
-    pressure, friction = traction(material, points, point_motion(bodies[:, :3], bodies[:, 3:], points))
+    pressure, friction = traction(
+        problem.chunk_material, points, point_motion(bodies[:, :3], bodies[:, 3:], points)
+    )
     wrench = sum_wrenches(
         points.arm, points.normal, points.moment, points.area * pressure, points.area[None] * friction
     )

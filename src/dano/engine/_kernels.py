@@ -38,7 +38,6 @@ def native_root(
         problem.rotation.reshape(m, 9),
         problem.impulse,
     ]
-    rows = [points.arm, points.normal, points.moment, jnp.stack([points.depth, points.rate, points.area])]
     body_rows = jnp.asarray(pairs.rows, jnp.int32)
     epsilon = float(jnp.finfo(dtype).eps)
     relative = epsilon**0.75 if options.tolerance is None else options.tolerance
@@ -55,14 +54,15 @@ def native_root(
     )(
         jnp.concatenate(bodies, axis=1),
         to_world(problem, start),
-        jnp.concatenate(rows),
-        jnp.stack(material),
+        points.rows,
+        material,
         points.stiffness,
         points.between,
         jnp.stack([problem.timestep, jnp.asarray(relative, dtype), size, jnp.asarray(epsilon, dtype)])[None],
         jnp.asarray(TIERS, dtype),
         jnp.asarray([RULES], dtype),
-        jnp.stack([body_rows[points.first], body_rows[points.second]]),
+        jnp.stack([points.first, points.second, points.contact]).astype(jnp.int32),
+        body_rows,
         jnp.stack([found.count.astype(jnp.int32), jnp.asarray(options.max_iterations, jnp.int32)]),
     )
     residual, passes, solved = report

@@ -42,13 +42,13 @@ class Prepared(eqx.Module):
 
     Attributes:
         geometry: Tables of all bodies that press at points; None if there are none.
-        material: Of the contacts with point laws, arrays over them.
+        material: Of the contacts with point laws, the fields of `Material` one below the other.
         impacts: How they treat impacts.
         capacity: Chunks of points that a step has room for (static).
     """
 
     geometry: Geometry | None
-    material: Material | None
+    material: Float[Array, "12 k"] | None
     impacts: Impacts | None
     capacity: int = eqx.field(static=True)
 
@@ -67,7 +67,7 @@ class Problem(eqx.Module):
         params: Parameters of each of these contacts.
         laws: Law of each of them.
         points: Point contacts, or None if no contact has a point law.
-        material: Of their chunks.
+        material: Of the contacts, the fields of `Material` one below the other.
         tree: What joints allow, or None if there are none: then all bodies that move are free.
     """
 
@@ -81,8 +81,14 @@ class Problem(eqx.Module):
     params: tuple[ContactParams, ...]
     laws: tuple[AbstractPatchLaw, ...]
     points: Points | None
-    material: Material | None
+    material: Float[Array, "12 k"] | None
     tree: Tree | None
+
+    @property
+    def chunk_material(self) -> Material:
+        """Of the chunks of points."""
+        assert self.points is not None and self.material is not None
+        return Material(*jnp.take(self.material, self.points.contact, axis=1))
 
 
 class Pairs(NamedTuple):
@@ -129,7 +135,7 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
         sampled = [body.surface.points.shape[1] for body in scene.bodies if body.surface is not None]
         capacity = -(-sum(sampled) // CHUNK)
     impacts = Impacts(material.instant > 0, material.bounce)
-    return Prepared(geometry, material, impacts, capacity)
+    return Prepared(geometry, jnp.stack(material), impacts, capacity)
 
 
 def structure_of(scene: Scene) -> Pairs:
@@ -180,7 +186,7 @@ def build_problem(
         for contact, patch in zip(contacts, overlaps, strict=True)
     )
     tree, ahead = (None, None) if not scene.joints else build_tree(scene, state, control)
-    points, material, found = _points(scene, prepared, state, tree, ahead)
+    points, found = _points(scene, prepared, state, tree, ahead)
     problem = Problem(
         mass,
         inertia,
@@ -192,7 +198,7 @@ def build_problem(
         tuple(contact.params for contact in contacts),
         laws,
         points,
-        material,
+        prepared.material,
         tree,
     )
     return problem, found
@@ -239,9 +245,9 @@ def grouped(function, items: list):
 
 
 def _points(scene: Scene, prepared: Prepared, state: State, tree: Tree | None, ahead: Poses | None):
-    """Point contacts, the material of their chunks, and where they were found; None if there are none."""
+    """Point contacts, and where they were found; None if there are none."""
     if prepared.geometry is None or prepared.impacts is None:
-        return None, None, None
+        return None, None
     h = scene.timestep
     links = links_of(scene, state, h)
     if tree is not None and ahead is not None:
@@ -252,9 +258,7 @@ def _points(scene: Scene, prepared: Prepared, state: State, tree: Tree | None, a
     )
     found = jax.tree.map(lambda x: checkpoint_name(x, KEPT), found)
     numbers, whole = eqx.partition(points, eqx.is_inexact_array)
-    points = eqx.combine(_listed(prepared.geometry, links, h, found, numbers), whole)
-    material = jax.tree.map(lambda x: x[points.contact], prepared.material)
-    return points, material, found
+    return eqx.combine(_listed(prepared.geometry, links, h, found, numbers), whole), found
 
 
 @eqx.filter_custom_jvp

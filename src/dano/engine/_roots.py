@@ -177,5 +177,7 @@ def _tree_scale(problem: Problem, tree: Tree) -> Float[Array, " k"]:
 
 
 def _table(problem: Problem, found: Found | None, pairs: Pairs) -> Table:
-    assert problem.points is not None and problem.material is not None and found is not None
-    return tabulate(problem.points, problem.material, found.count, jnp.asarray(pairs.rows), problem.timestep)
+    assert problem.points is not None and found is not None
+    return tabulate(
+        problem.points, problem.chunk_material, found.count, jnp.asarray(pairs.rows), problem.timestep
+    )

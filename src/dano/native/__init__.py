@@ -9,10 +9,23 @@ import functools
 import numpy as np
 from jaxtyping import DTypeLike
 
+HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER, ELLIPSOID, GRID = range(7)
+"""Kinds of solids that the search for contact knows."""
+RUN = 8
+"""Blocks of samples that the search looks at together first."""
+
 
 @functools.cache
 def solver_name(dtype: DTypeLike) -> str:
     """Name for `jax.ffi.ffi_call` of the solver of a step, for numbers of a floating type."""
     from dano.native._solver import define
+
+    return define(np.dtype(dtype).name)
+
+
+@functools.cache
+def finder_name(dtype: DTypeLike) -> str:
+    """Name for `jax.ffi.ffi_call` of the search for contact, for numbers of a floating type."""
+    from dano.native._finding import define
 
     return define(np.dtype(dtype).name)

@@ -1,9 +1,9 @@
 """Linear systems of 6 × 6 blocks, most of which are empty: bodies that touch few others.
 
-Elimination without exchanges between blocks, in an order that fills in little: always the body next that is
-coupled with the fewest. Matrices of a step are inertia plus dissipation, whose pivots stay away from singular.
+Elimination without exchanges between blocks. The next body is always one that is coupled with the fewest
+others, so that little is filled in (minimum degree). Matrices of a step are inertia plus dissipation: their
+pivots stay away from singular.
 """
-
 
 import numpy as np
 

@@ -116,9 +116,7 @@ def linearize(row, rate, slip_x, slip_y, slip_z, length, softness):
     stiction = row[STICTION] * softness
     speed = math.sqrt(slip_x * slip_x + slip_y * slip_y + slip_z * slip_z)
     slow = max(speed, stiction)
-    size = math.sqrt(
-        row[FOUND_FRICTION] ** 2 + row[FOUND_FRICTION + 1] ** 2 + row[FOUND_FRICTION + 2] ** 2
-    )
+    size = math.sqrt(row[FOUND_FRICTION] ** 2 + row[FOUND_FRICTION + 1] ** 2 + row[FOUND_FRICTION + 2] ** 2)
     shrink = limit / size if size > limit else 1.0
     slides = speed > stiction
     for k in range(3):

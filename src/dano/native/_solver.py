@@ -1,8 +1,8 @@
-"""The velocities of free bodies that press on each other at points: `dano.engine`'s primal–dual Newton method.
+"""Velocities of free bodies that press on each other at points.
 
+The method is that of `dano.engine`, primal–dual Newton, with the same passes but for rounding.
 XLA runs a pass of that method as some hundred operations on small arrays, each with a cost of its own; here a
-pass is a loop over the points that press. Every step has the same equations and, but for rounding, the same
-passes as there.
+pass is a loop over the points that press.
 """
 
 import math
@@ -124,14 +124,15 @@ def _add_own(body, velocity, h, rules, residual, block):
 
 
 @kernel
-def _tabulate(rows, chunks, n, material, stiffness, between, h):
+def _tabulate(rows, chunks, n, body_rows, material, stiffness, between, h):
     """Points with area in a table, grouped by runs of chunks that join the same bodies.
 
     Args:
         rows: Arm, normal, moment, depth, rate and area, shape (12, c, p).
-        chunks: Row of the first and of the second body of each chunk, shape (2, c).
+        chunks: First body, second body and contact of each chunk, shape (3, c).
         n: Chunks in use.
-        material: Of chunks, shape (12, c).
+        body_rows: Row of each body among those that move, or their number.
+        material: Of contacts, shape (12, k).
         stiffness: Of impacts, shape (c,).
         between: From the second body's centre of mass to the first's, shape (3, c).
         h: Timestep [s].
@@ -145,15 +146,14 @@ def _tabulate(rows, chunks, n, material, stiffness, between, h):
     groups, apart = np.empty((n, 4), np.int64), np.empty((n, 3))
     here, used, g = np.empty(12), 0, -1
     for c in range(n):
-        new = g < 0 or groups[g, 2] != chunks[0, c] or groups[g, 3] != chunks[1, c]
-        if new:
+        a, b, contact = body_rows[chunks[0, c]], body_rows[chunks[1, c]], chunks[2, c]
+        if g < 0 or groups[g, 2] != a or groups[g, 3] != b:
             g += 1
-            groups[g, 0] = used
-            groups[g, 2], groups[g, 3] = chunks[0, c], chunks[1, c]
+            groups[g, 0], groups[g, 2], groups[g, 3] = used, a, b
             for k in range(3):
                 apart[g, k] = between[k, c]
         for k in range(12):
-            here[k] = material[k, c]
+            here[k] = material[k, contact]
         for p in range(width):
             area = rows[_AREA_ROW, c, p]
             if area > 0.0:
@@ -290,7 +290,9 @@ def _scatter(slope, wrench, apart, a, b, residual, matrix):
                 matrix[b, b, 3 + k, c] -= moved
                 if a < m:
                     matrix[a, b, 3 + k, c] += by_second[3 + k, c]
-                    matrix[b, a, 3 + k, c] += slope[3 + k, c] + apart[i] * slope[j, c] - apart[j] * slope[i, c]
+                    matrix[b, a, 3 + k, c] += (
+                        slope[3 + k, c] + apart[i] * slope[j, c] - apart[j] * slope[i, c]
+                    )
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3
             residual[b, k] += wrench[k]
@@ -524,12 +526,13 @@ def _answer(frame, dtype):
     """Solve what a call frame holds; see `dano.engine` for the order of its buffers."""
     given, found = inputs(frame), outputs(frame)
     start, settings = _doubles(table(given[1], dtype)), _doubles(table(given[6], dtype))[0]
-    chunks, limits = table(given[9], numba.int32), vector(given[10], numba.int32)
+    chunks, limits = table(given[9], numba.int32), vector(given[11], numba.int32)
     rows, material = cube(given[2], dtype), table(given[3], dtype)
     points, groups, apart = _tabulate(
         rows,
         chunks,
         min(limits[0], chunks.shape[1]),
+        vector(given[10], numba.int32),
         material,
         vector(given[4], dtype),
         table(given[5], dtype),
