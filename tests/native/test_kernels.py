@@ -13,17 +13,20 @@ from dano.engine._kernels import native_root
 from dano.engine._newton import SolverOptions
 from dano.engine._problem import build_problem, links_of, prepare, structure_of
 from dano.engine._roots import _root_of_bodies
+from dano.fields import SignedDistanceGrid
 from dano.maths import Pose
+from dano.native._blocks import elimination as kernel_elimination, solve_blocks as kernel_solve
+from dano.native._solids import distance as kernel_distance
 
 H = 0.005
 
 
-def grid(interpolation: str) -> dano.SignedDistanceGrid:
+def grid(interpolation: str) -> SignedDistanceGrid:
     """A ball of 4 cm, sampled."""
     axis = np.linspace(-0.06, 0.06, 25)
     x = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"))
     distances = np.linalg.norm(x, axis=0) - 0.04
-    return dano.SignedDistanceGrid(distances, (-0.06,) * 3, axis[1] - axis[0], interpolation)
+    return SignedDistanceGrid(distances, (-0.06,) * 3, axis[1] - axis[0], interpolation)
 
 
 SOLIDS = {
@@ -78,10 +81,6 @@ def through_kernel(tables, point):
     value, alone, *gradient = distance_and_gradient(*tables, *point)
     assert abs(alone - value) < 1e-15
     return np.array([value, *gradient])
-
-
-from dano.native._blocks import elimination as kernel_elimination, solve_blocks as kernel_solve  # noqa: E402
-from dano.native._solids import distance as kernel_distance  # noqa: E402
 
 
 @numba.njit
@@ -160,7 +159,7 @@ def listed(points, found):
     rows = [*np.asarray(points.rows)[:, chunk, lane], *(np.asarray(x)[chunk] for x in per_chunk)]
     names = [np.asarray(points.first)[chunk], np.asarray(points.second)[chunk]]
     names.append(np.asarray(found.sample)[chunk, lane])
-    return {key: row for key, row in zip(zip(*names, strict=True), np.stack(rows, axis=1), strict=True)}
+    return dict(zip(zip(*names, strict=True), np.stack(rows, axis=1), strict=True))
 
 
 def test_solves_steps_alike(heap):
