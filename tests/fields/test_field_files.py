@@ -187,6 +187,24 @@ def test_saving_refuses_bad_places_and_never_destroys(tmp_path, monkeypatch):
     assert sorted(os.listdir(tmp_path)) == ["folder.npz", "grid.npz"]
 
 
+def test_grids_say_what_they_are(tmp_path):
+    save_field(field(), tmp_path / "grid.npz")
+    with np.load(tmp_path / "grid.npz") as data:
+        members = dict(data)
+    assert (str(members["format"]), int(members["version"])) == archive_module.FIELD
+    for changed, message in (
+        ({"version": 99}, r"newer.npz: expected a grid: .* it has version 99, and this dano reads up to"),
+        ({"format": "dano-motion"}, r"newer.npz: .* it must be a dano-field file, got a dano-motion file"),
+        ({"version": 1.5}, "must state its version as a whole number, got 1.5"),
+    ):
+        np.savez(tmp_path / "newer.npz", **members | changed)
+        with pytest.raises(ValueError, match=message):
+            load_field(tmp_path / "newer.npz")
+    # Another program's words are not dano's business, and files from before had none.
+    np.savez(tmp_path / "foreign.npz", **members | {"format": "voxels", "version": "a"})
+    np.testing.assert_array_equal(load_grid(tmp_path / "foreign.npz").values, VALUES)
+
+
 def test_shapes_are_not_saved_as_grids(tmp_path):
     with pytest.raises((ValueError, TypeError), match="(bake it first|GridField)"):
         save_field(Sphere(0.1), tmp_path / "ball.npz")  # pyright: ignore[reportArgumentType]

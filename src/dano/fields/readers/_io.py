@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dano.archive import write_archive
+from dano.archive import FIELD, write_archive
 from dano.fields._base import AbstractField
 from dano.fields._callable import checked_bounds
 from dano.fields._compose import Posed, Scaled
@@ -199,4 +199,5 @@ def save_field(field: GridField | SignedDistanceGrid, path: str | Path) -> None:
         members["edge"] = field.edge
     members |= {"origin": field.origin, "spacing": field.spacing}
     arrays = {name: np.asarray(value) for name, value in members.items()}
-    write_archive(path, arrays | {"interpolation": np.asarray(field.interpolation)})
+    words = {"format": FIELD[0], "version": FIELD[1], "interpolation": field.interpolation}
+    write_archive(path, arrays | {name: np.asarray(word) for name, word in words.items()})
