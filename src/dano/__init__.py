@@ -69,7 +69,7 @@ from dano.identify import (
     Parameter as Parameter,
     save_motion as save_motion,
 )
-from dano.scene_file import load_scene as load_scene
+from dano.scene_file import load_object as load_object, load_scene as load_scene
 from dano.exchange import export_object as export_object
 
 __version__ = "0.1.0"

@@ -1,5 +1,7 @@
 """Motions: files, smoothing, and what contradicts itself."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -156,12 +158,14 @@ def test_newer_motions_and_other_files_are_refused(tmp_path):
     motion = dano.Motion.create(TIMES, "a", position=np.zeros((20, 3)))
     dano.save_motion(tmp_path / "m.npz", motion)
     with np.load(tmp_path / "m.npz") as data:
-        members = dict(data)
-    np.savez(tmp_path / "newer.npz", **members | {"version": 2})
-    with pytest.raises(ValueError, match=r"newer.npz .* it has version 2, and this dano reads up to version 1"):
+        members: dict[str, Any] = dict(data)
+    np.savez(tmp_path / "newer.npz", **{**members, "version": 2})
+    with pytest.raises(
+        ValueError, match=r"newer.npz .* it has version 2, and this dano reads up to version 1"
+    ):
         dano.load_motion(tmp_path / "newer.npz")
-    np.savez(tmp_path / "other.npz", **members | {"format": "dano-object"})
+    np.savez(tmp_path / "other.npz", **{**members, "format": "dano-object"})
     with pytest.raises(ValueError, match="must be a dano-motion or dano-trajectory file, got a dano-object"):
         dano.load_motion(tmp_path / "other.npz")
-    np.savez(tmp_path / "foreign.npz", **members | {"format": "tracker", "version": "3b"})
+    np.savez(tmp_path / "foreign.npz", **{**members, "format": "tracker", "version": "3b"})
     np.testing.assert_array_equal(dano.load_motion(tmp_path / "foreign.npz").position, motion.position)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.archive import LOOK, OBJECT, read_archive, write_archive
 from dano.fields import AbstractField, AbstractShape, GridField, SignedDistanceGrid
-from dano.maths import checked_array, floating, is_traced, Numbers
+from dano.maths import checked_array, checked_count, checked_key, floating, is_traced, Numbers
 from dano.objects._interior import examine, Interior, sealed
 from dano.objects._mass import checked_density, integrate, MassProperties, Progress
 from dano.objects._samples import (
@@ -108,9 +108,8 @@ class NeuralObject(eqx.Module):
         """
         if mass_model not in get_args(MassModel):
             raise ValueError(f"mass_model must be one of {get_args(MassModel)}, got {mass_model!r}")
-        if n_samples < 1:
-            raise ValueError(f"n_samples must be ≥ 1, got {n_samples}")
-        key = jax.random.key(0) if key is None else key
+        n_samples = checked_count("n_samples", n_samples)
+        key = checked_key(key)
         sampling_key, mass_key = jax.random.split(key)
         density = checked_density(field)
         lattice = Lattice.create(density, field.bounds, resolution)

@@ -72,11 +72,20 @@ class Contact(eqx.Module):
             edge: Width of the smooth occupancy of a primitive in this pair [m], for the centroid law.
 
         Raises:
-            ValueError: If the two names are equal, the edge is negative, or the law does not read a parameter
-                that was given.
+            ValueError: If the two names are equal, the edge is negative, an argument is of another type, or
+                the law does not read a parameter that was given.
         """
+        for what, name in (("a", a), ("b", b)):
+            if not isinstance(name, str):
+                raise ValueError(f"{what} must be the name of a body, got {name!r}")
         if a == b:
             raise ValueError(f"contact must join two different bodies, got {a!r} twice")
+        if params is not None and not isinstance(params, ContactParams):
+            raise ValueError(
+                f"params must be dano.ContactParams(…), e.g. sliding_friction=0.3, got {params!r}"
+            )
+        if law is not None and not isinstance(law, AbstractContactLaw):
+            raise ValueError(f"law must be dano.DistributedLaw() or dano.CentroidLaw(), got {law!r}")
         self.a, self.b = a, b
         self.params = ContactParams() if params is None else params
         self.law = DistributedLaw() if law is None else law

@@ -11,8 +11,9 @@ from jaxtyping import Array, Float
 
 from dano.contact import checked_parameter, CHUNK, ContactParams
 from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
+from dano.names import did_you_mean
 from dano.objects import checked_inertia
-from dano.scene._bodies import Body
+from dano.scene._bodies import Body, checked_parts
 from dano.scene._contacts import Contact, prepared
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
 from dano.scene._joints import Joint, Layout, layout_of
@@ -80,7 +81,9 @@ class Scene(eqx.Module):
                 fixed ones or a pair twice, a pair cannot overlap, joints make no trees, a body has a material
                 that nothing reads, or a number is out of range.
         """
-        bodies, contacts, joints = tuple(bodies), tuple(contacts), tuple(joints)
+        bodies = checked_parts("bodies", bodies, Body)
+        contacts = checked_parts("contacts", contacts, Contact)
+        joints = checked_parts("joints", joints, Joint)
         names = [body.name for body in bodies]
         if not bodies:
             raise ValueError("bodies must hold at least one body, got none")
@@ -95,7 +98,10 @@ class Scene(eqx.Module):
         for contact in contacts:
             for name in (contact.a, contact.b):
                 if name not in names:
-                    raise ValueError(f"contact must name bodies of the scene {names}, got {name!r}")
+                    raise ValueError(
+                        f"contact must name bodies of the scene {names}, got {name!r}"
+                        + did_you_mean(name, names)
+                    )
             if frozenset((contact.a, contact.b)) in seen:
                 raise ValueError(
                     f"contacts must join each pair once, got ({contact.a!r}, {contact.b!r}) twice"

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,6 +66,10 @@ _READERS: dict[str, _Reader] = {
 }
 
 
+SHIPPED = ("bunny", "soap")
+"""Density grids in the package, by name."""
+
+
 def load_field(
     path: str | Path,
     *,
@@ -90,6 +95,7 @@ def load_field(
     - `.pt2`, `.pt`, `.pth`: a module (n, 3) → (n,) of torch.export or TorchScript, or weights for the one
       that option `module` = "package.module:name" makes; `crop` is required.
     - `"package.module:name"` instead of a file: that function (n, 3) → (n,); `crop` is required.
+    - `"bunny"`, `"soap"` instead of a file: a density grid that dano ships.
     - `.dano`: the grid stored in a neural object; option `interpolation`.
 
     Args:
@@ -123,6 +129,9 @@ def load_field(
 
 
 def _read(path: str | Path, crop: np.ndarray | None, options: dict[str, Any]) -> AbstractField:
+    if path in SHIPPED and not Path(path).exists():
+        with as_file(files("dano") / "assets" / f"{path}.npz") as shipped:
+            return _read(shipped, crop, options)
     if (
         isinstance(path, str)
         and re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", path)
