@@ -84,7 +84,11 @@ HEADLINES = (
                 ("bunny", "training, compiling included"),
             ),
         ),
-        Cell("visual hull: inertia {:.1f} % off", "learn-cpu", (("bunny", "principal inertias of the hull, off"),)),
+        Cell(
+            "visual hull: inertia {:.1f} % off",
+            "learn-cpu",
+            (("bunny", "principal inertias of the hull, off"),),
+        ),
     ),
     Headline(
         "a step of a bunny on a floor, paper's law: slides, rests",

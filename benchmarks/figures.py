@@ -5,9 +5,14 @@ A table stands between two comments,
     <!-- figures: FILE.json | GROUP | GROUP … -->
     <!-- end of figures -->
 
-with the groups of rows to show, all without any; or `<!-- figures: headlines -->`, the rows that
-`benchmarks/_headlines.py` lists, each with a file of its own. `python -m benchmarks.figures` rewrites them all; with
-`--check` it changes nothing and fails where one is out of date.
+with the groups of rows to show, all without any. Two other forms:
+
+    <!-- figures: cases FILE.json FILE.json | NAME | NAME … -->
+    <!-- figures: headlines -->
+
+The first has a row for each group of its files and a column for each name. The second has the rows that
+`benchmarks/_headlines.py` lists. `python -m benchmarks.figures` rewrites all tables; with `--check` it changes
+nothing and fails where one is out of date.
 """
 
 import argparse
@@ -16,7 +21,7 @@ import re
 import sys
 from pathlib import Path
 
-from benchmarks._headlines import Cell, HEADLINES
+from benchmarks._headlines import Cell, Headline as Headline, HEADLINES
 from benchmarks._measure import REPOSITORY, Row
 
 RESULTS = REPOSITORY / "benchmarks" / "results"
@@ -41,7 +46,24 @@ def updated(text: str) -> str:
 
 
 def _table(what: str) -> str:
-    return _headlines() if what == "headlines" else _stored(what)
+    if what == "headlines":
+        return _headlines()
+    return _cases(what.removeprefix("cases ")) if what.startswith("cases ") else _stored(what)
+
+
+def _cases(what: str) -> str:
+    files, *names = (word.strip() for word in what.split("|"))
+    lines = ["| | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    for file in files.split():
+        rows = _result(file)["rows"]
+        for group in dict.fromkeys(row["group"] for row in rows):
+            found = {row["name"]: stored_row(row) for row in rows if row["group"] == group}
+            missing = [name for name in names if name not in found]
+            if missing:
+                raise ValueError(f"{file} must have rows {names} for {group!r}, {missing[0]!r} is not there")
+            cells = [f"{found[name].value:.3g} {found[name].unit}".strip() for name in names]
+            lines.append(f"| {group} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n\n"
 
 
 def _headlines() -> str:
