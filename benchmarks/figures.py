@@ -11,8 +11,8 @@ with the groups of rows to show, all without any. Two other forms:
     <!-- figures: headlines -->
 
 The first has a row for each group of its files and a column for each name. The second has the rows that
-`benchmarks/_headlines.py` lists. `python -m benchmarks.figures` rewrites all tables; with `--check` it changes
-nothing and fails where one is out of date.
+`benchmarks/_headlines.py` lists. `python -m benchmarks.figures` rewrites all tables; with `--check` it
+changes nothing and fails where one is out of date.
 """
 
 import argparse

@@ -14,11 +14,11 @@ from dano.fields import (
     HalfSpace as HalfSpace,
     load_field as load_field,
     mesh_field as mesh_field,
-    Posed as Posed,
+    posed as posed,
     save_field as save_field,
-    Scaled as Scaled,
+    scaled as scaled,
     Sphere as Sphere,
-    Union as Union,
+    union as union,
 )
 from dano.objects import (
     ContactSamples as ContactSamples,

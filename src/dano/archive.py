@@ -192,7 +192,7 @@ def read_array(path: str | os.PathLike[str]) -> np.ndarray:
     with open(source, "rb") as file:
         if (start := file.read(6)) != b"\x93NUMPY":
             kinds = {b"\x80": _PICKLED, b"P": "it is a zip of arrays, not a single one"}
-            raise ValueError(kinds.get(start[:1], "it is no array of NumPy"))
+            raise ValueError(kinds.get(start[:1], "it is not a NumPy array"))
         file.seek(0)
         try:
             _checked_size(file, "the array", source.stat().st_size, memory_limit())

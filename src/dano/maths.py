@@ -110,7 +110,7 @@ def quat_from_matrix(matrix: Float[Q, "*batch 3 3"]) -> Float[Q, "*batch 4"]:
     """Unit quaternion (w ≥ 0) of a rotation matrix.
 
     The matrix gives 4 q qᵀ without a root. Its row with the largest diagonal entry, which is at least 1, is
-    normalised (Shepperd 1978).
+    normalised (after Shepperd 1978, who divides by a root instead).
     """
     xp = _library(matrix)
     m = [[matrix[..., i, j] for j in range(3)] for i in range(3)]

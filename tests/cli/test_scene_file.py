@@ -144,7 +144,7 @@ SHAPES = {
     'shape = "capsule"\nradius = 0.1\nhalf_length = 0.2\nedge = 0.001': dano.Capsule(0.1, 0.2, edge=0.001),
     'shape = "cylinder"\nradius = 0.1\nhalf_length = 0.2': dano.Cylinder(0.1, 0.2),
     'shape = "ellipsoid"\nsemi_axes = [0.1, 0.2, 0.3]': dano.Ellipsoid((0.1, 0.2, 0.3)),
-    'shape = "sphere"\nradius = 0.1\npose = {position = [0, 0.1, 0]}': dano.Posed(
+    'shape = "sphere"\nradius = 0.1\npose = {position = [0, 0.1, 0]}': dano.posed(
         dano.Sphere(0.1), dano.Pose((0, 0.1, 0))
     ),
 }

@@ -98,14 +98,7 @@ class MassProperties(eqx.Module):
             ValueError: If the bounds are not finite, the density is negative, not finite or nowhere positive,
                 or a number is out of range.
         """
-        density = checked_density(field)
-        if isinstance(field, GridField):
-            check_scale(mass_scale, mass)
-            moments = field.moments()
-            total = mass_scale * float(moments.integral) if mass is None else mass
-            second = np.asarray(moments.second_moment) * (total / float(moments.integral))
-            return cls(total, moments.centroid, np.trace(second) * np.eye(3) - second)
-        return integrate(density, field.bounds, mass_scale, mass, resolution, key, progress)
+        return integrated(field, mass_scale, mass, resolution, key, progress)
 
 
 def checked_inertia(name: str, value: Numbers) -> Float[Array, "3 3"]:
@@ -206,6 +199,18 @@ def cells(bounds: Float[Array, "2 3"], resolution: int) -> tuple[np.ndarray, np.
     extent = np.asarray(bounds[1] - bounds[0], dtype=np.float64)
     count = np.maximum(np.ceil(extent / extent.max() * resolution - 1e-9).astype(int), 1)
     return count, extent / count
+
+
+def integrated(field: AbstractField, mass_scale, mass, resolution, key, progress) -> MassProperties:
+    """See `MassProperties.from_field`."""
+    density = checked_density(field)
+    if isinstance(field, GridField):
+        check_scale(mass_scale, mass)
+        moments = field.moments()
+        total = mass_scale * float(moments.integral) if mass is None else mass
+        second = np.asarray(moments.second_moment) * (total / float(moments.integral))
+        return MassProperties(total, moments.centroid, np.trace(second) * np.eye(3) - second)
+    return integrate(density, field.bounds, mass_scale, mass, resolution, key, progress)
 
 
 def integrate(density, bounds, mass_scale, mass, resolution, key, progress) -> MassProperties:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.fields import AbstractField, AbstractShape, GridField
-from dano.maths import floating
+from dano.maths import checked_key, floating
 from dano.objects._mass import cells, checked_density, Density, evaluate, host_random
 from dano.objects._surface import farthest_points
 
@@ -213,7 +213,7 @@ def draw_samples(
     return points[chosen], values[chosen]
 
 
-def surface_samples(shape: AbstractShape, n: int, key: PRNGKeyArray | None = None) -> ContactSamples:
+def draw_contact_samples(shape: AbstractShape, n: int, key: PRNGKeyArray | None = None) -> ContactSamples:
     """Even contact samples inside the smooth edge of a shape.
 
     Args:
@@ -228,11 +228,23 @@ def surface_samples(shape: AbstractShape, n: int, key: PRNGKeyArray | None = Non
     lattice = Lattice.create(density, shape.bounds, 48)
     low, high = surface_range(lattice.values)
     region = Region.create(lattice, low, floaters=True)
-    points, values = draw_samples(
-        density, lattice, region, low, high, n, jax.random.key(0) if key is None else key
-    )
+    return contact_samples(shape, density, lattice, region, low, high, n, checked_key(key))
+
+
+def contact_samples(
+    field: AbstractField,
+    density: Density,
+    lattice: Lattice,
+    region: Region,
+    low: float,
+    high: float,
+    n: int,
+    key: PRNGKeyArray,
+) -> ContactSamples:
+    """Contact samples of a field in a region: see `draw_samples`."""
+    points, values = draw_samples(density, lattice, region, low, high, n, key)
     return ContactSamples(
-        floating(points), floating(values), floating(outward_normals(shape, points, region))
+        floating(points), floating(values), floating(outward_normals(field, points, region))
     )
 
 

@@ -21,7 +21,7 @@ from dano.contact import (
 )
 from dano.fields import AbstractShape, HalfSpace, PosedShape, Sphere
 from dano.maths import floating, Numbers
-from dano.objects import NeuralObject, surface_quadrature, surface_samples
+from dano.objects import draw_contact_samples, NeuralObject, surface_quadrature
 from dano.scene._bodies import Body
 from dano.scene._states import State
 
@@ -223,7 +223,7 @@ def _with_samples(body: Body) -> Body:
     assert body.shape is not None
     if body.samples is not None:
         return body
-    drawn = surface_samples(body.shape, SHAPE_SAMPLES)
+    drawn = draw_contact_samples(body.shape, SHAPE_SAMPLES)
     samples = SampleSet.create(drawn.points, drawn.density)
     return eqx.tree_at(lambda b: b.samples, body, samples, is_leaf=_none)
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.building import BuildOptions
-from dano.fields import AbstractField, AbstractShape, load_field, Scaled
+from dano.fields import AbstractField, AbstractShape, load_field, scaled
 from dano.memory import check_nodes
 from dano.names import did_you_mean
 from dano.objects import NeuralObject
@@ -82,7 +82,7 @@ def build_object(
             raise ValueError(f"length must be finite and > 0 m, got {chosen.length}")
         # A coarse object tells how much of the field is object, to half a per cent.
         coarse = NeuralObject.from_field(field, n_samples=1000, resolution=64, **common)
-        field = Scaled(field, chosen.length / coarse.size)
+        field = scaled(field, chosen.length / coarse.size)
     made = NeuralObject.from_field(
         field,
         n_samples=chosen.samples,

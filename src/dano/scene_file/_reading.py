@@ -14,7 +14,7 @@ from typing import Any, cast, get_args, TYPE_CHECKING
 from dano.archive import checked_input
 from dano.building import BuildOptions
 from dano.contact import AbstractContactLaw, CentroidLaw, ContactParams, DistributedLaw
-from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSpace, load_field, Posed, Sphere
+from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSpace, load_field, posed, Sphere
 from dano.maths import Pose
 from dano.memory import memory_limit
 from dano.names import did_you_mean
@@ -283,7 +283,7 @@ def _shape(row: Table) -> AbstractShape:
         return shape
     pose = row.table("pose", ("position", "orientation"))
     where = Pose(pose.vector("position", 3, (0.0,) * 3), pose.vector("orientation", 4, (1.0, 0.0, 0.0, 0.0)))
-    return cast(AbstractShape, Posed(shape, where))
+    return cast(AbstractShape, posed(shape, where))
 
 
 def _object(
