@@ -86,6 +86,10 @@ CASES = {
     "negative density": (lambda: built(Spoilt(-2.0)), "densities ≥ 0, got -2.0"),
     "empty field": (lambda: built(Nothing(0.0)), "positive density somewhere"),
     "no sample": (lambda: built(grid(), density_range=(60.0, 70.0)), "density_range"),
+    "thin plate": (
+        lambda: built(dano.Box((0.1, 0.1, 0.001)), resolution=24),
+        "it is 0.003 m thin: try resolution=268, got 24",
+    ),
     "range reversed": (lambda: built(grid(), density_range=(2.0, 1.0)), "0 ≤ low < high, got (2.0, 1.0)"),
     "unbounded field": (lambda: built(dano.HalfSpace()), "finite bounds"),
     "body without mass": (lambda: dano.Body("x", dano.Sphere(0.1)), "mass of body 'x' must be given"),
