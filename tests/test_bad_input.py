@@ -144,6 +144,10 @@ CASES = {
     "unknown quantity": (lambda: state(speed=(0.0, 0.0, 0.0)), "got 'speed'"),
     "simulate NaN": (lambda: dano.simulate(scene(), with_state("velocity", np.nan), 3), "state.velocity"),
     "step NaN": (lambda: dano.step(scene(), with_state("position", np.inf)), "state.position must be finite"),
+    "single precision": (
+        lambda: dano.simulate(scene(), jax.tree.map(lambda x: x.astype(jnp.float32), state()), 3),
+        "state.position must have the dtype of the scene, float64, got float32: cast it with jax.tree.map",
+    ),
     "no steps": (lambda: dano.simulate(scene(), state(), 0), "n_steps must be ≥ 1, got 0"),
     "replaced friction": (
         lambda: scene().replace_contact("ball", "floor", sliding_friction=-1.0),

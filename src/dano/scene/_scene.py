@@ -18,7 +18,7 @@ from dano.scene._contacts import Contact, prepared
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
 from dano.scene._joints import Joint, Layout, layout_of
 from dano.scene._others import Others, others_of
-from dano.scene._states import Control, JOINT_QUANTITIES, State, STATE_SIZES
+from dano.scene._states import check_precision, Control, JOINT_QUANTITIES, State, STATE_SIZES
 
 # Share of the smallest body's size by which gravity may move it in a step before a warning says so, and the
 # share that the warning asks for.
@@ -359,8 +359,10 @@ class Scene(eqx.Module):
         """Check a concrete state against the scene; traced values pass.
 
         Raises:
-            ValueError: If a shape is wrong, a number is not finite, or a quaternion is not of unit length.
+            ValueError: If a shape or dtype is wrong, a number is not finite, or a quaternion is not of unit
+                length.
         """
+        check_precision(state, self.timestep.dtype)
         for key, size in STATE_SIZES.items():
             value = getattr(state, key)
             if value.shape[-2:] != (len(self.bodies), size):

@@ -44,6 +44,20 @@ def state_arrays(states: State) -> dict[str, Array | np.ndarray]:
     return {name: getattr(states, name) for name in names}
 
 
+def check_precision(state: State, dtype: np.dtype) -> None:
+    """Check that the JAX arrays of a state have the dtype of their scene; NumPy's are converted later.
+
+    Raises:
+        ValueError: If one has another.
+    """
+    for name, value in state_arrays(state).items():
+        if isinstance(value, Array) and value.dtype != dtype:
+            raise ValueError(
+                f"state.{name} must have the dtype of the scene, {dtype}, got {value.dtype}: cast it with"
+                f" jax.tree.map(lambda x: x.astype('{dtype}'), state)"
+            )
+
+
 class Control(eqx.Module):
     """External force and torque on each body, and what drives the joints; constant over a step.
 
