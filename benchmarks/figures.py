@@ -5,8 +5,14 @@ A table stands between two comments,
     <!-- figures: FILE.json | GROUP | GROUP … -->
     <!-- end of figures -->
 
-with the groups of rows to show, all without any. `python -m benchmarks.figures` rewrites them all; with
-`--check` it changes nothing and fails where one is out of date.
+with the groups of rows to show, all without any. Two other forms:
+
+    <!-- figures: cases FILE.json FILE.json | NAME | NAME … -->
+    <!-- figures: headlines -->
+
+The first has a row for each group of its files and a column for each name. The second has the rows that
+`benchmarks/_headlines.py` lists. `python -m benchmarks.figures` rewrites all tables; with `--check` it
+changes nothing and fails where one is out of date.
 """
 
 import argparse
@@ -15,6 +21,7 @@ import re
 import sys
 from pathlib import Path
 
+from benchmarks._headlines import Cell, Headline as Headline, HEADLINES
 from benchmarks._measure import REPOSITORY, Row
 
 RESULTS = REPOSITORY / "benchmarks" / "results"
@@ -39,11 +46,45 @@ def updated(text: str) -> str:
 
 
 def _table(what: str) -> str:
+    if what == "headlines":
+        return _headlines()
+    return _cases(what.removeprefix("cases ")) if what.startswith("cases ") else _stored(what)
+
+
+def _cases(what: str) -> str:
+    files, *names = (word.strip() for word in what.split("|"))
+    lines = ["| | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    for file in files.split():
+        rows = _result(file)["rows"]
+        for group in dict.fromkeys(row["group"] for row in rows):
+            found = {row["name"]: stored_row(row) for row in rows if row["group"] == group}
+            missing = [name for name in names if name not in found]
+            if missing:
+                raise ValueError(f"{file} must have rows {names} for {group!r}, {missing[0]!r} is not there")
+            cells = [f"{found[name].value:.3g} {found[name].unit}".strip() for name in names]
+            lines.append(f"| {group} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n\n"
+
+
+def _headlines() -> str:
+    lines = ["| | dano | beside it |", "|---|---|---|"]
+    lines += [f"| {row.what} | {_cell(row.figure)} | {_cell(row.beside)} |" for row in HEADLINES]
+    return "\n".join(lines) + "\n\n"
+
+
+def _cell(cell: Cell) -> str:
+    if not cell.rows:
+        return cell.words
+    stored = {(row["group"], row["name"]): row["value"] for row in _result(f"{cell.file}.json")["rows"]}
+    missing = [row for row in cell.rows if stored.get(row) is None]
+    if missing:
+        raise ValueError(f"{cell.file}.json must hold a value of {missing[0]}")
+    return cell.words.format(*(stored[row] for row in cell.rows))
+
+
+def _stored(what: str) -> str:
     name, *groups = (word.strip() for word in what.split("|"))
-    file = RESULTS / name
-    if not file.is_file():
-        raise ValueError(f"a table must name a file in {RESULTS}, got {name!r}")
-    result = json.loads(file.read_text())
+    result = _result(name)
     there = list(dict.fromkeys(row["group"] for row in result["rows"]))
     missing = [group for group in groups if group not in there]
     if missing:
@@ -53,6 +94,13 @@ def _table(what: str) -> str:
         lines.append(f"| **{group}** | | | |")
         lines += [_line(row) for row in result["rows"] if row["group"] == group]
     return "\n".join(lines) + "\n\n"
+
+
+def _result(name: str) -> dict:
+    file = RESULTS / name
+    if not file.is_file():
+        raise ValueError(f"a table must name a file in {RESULTS}, got {name!r}")
+    return json.loads(file.read_text())
 
 
 def _source(result: dict) -> str:

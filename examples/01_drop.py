@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 
 import dano
-from dano.scene_file import build_asset
 
 
 def main(quick: bool = False, strip: str | None = None) -> dict[str, float]:
     """Simulate 1.2 s; `strip` is a file name (.png) for pictures of the motion."""
-    bunny = build_asset("bunny")  # 12 cm, 1 kg, from a density grid with a hollow core and floaters
+    bunny = dano.load_object("bunny")  # 12 cm, 1 kg, from a density grid with a hollow core and floaters
     params = dano.ContactParams(sliding_friction=0.3, restitution=0.3)
     scene = dano.Scene.create(
         [dano.Body("bunny", bunny), dano.Body("floor", dano.HalfSpace(), fixed=True)],

@@ -7,13 +7,12 @@ import jax
 import jax.numpy as jnp
 
 import dano
-from dano.scene_file import build_asset
 
 SPEED, FRICTION = 0.7, 0.25
 
 
 def main(quick: bool = False) -> dict[str, float]:
-    bunny = build_asset("bunny")
+    bunny = dano.load_object("bunny")
     scene = dano.Scene.create(
         [dano.Body("bunny", bunny), dano.Body("floor", dano.HalfSpace(), fixed=True)],
         [dano.Contact("bunny", "floor", dano.ContactParams(sliding_friction=FRICTION))],

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 
 import dano
 from dano.maths import quat_rotate
-from dano.scene_file import build_asset
 
 
 def angular_momentum(scene: dano.Scene, states: dano.State):
@@ -24,7 +23,7 @@ def angular_momentum(scene: dano.Scene, states: dano.State):
 
 
 def main(quick: bool = False) -> dict[str, float]:
-    bunny = build_asset("bunny")
+    bunny = dano.load_object("bunny")
     scene = dano.Scene.create(
         [dano.Body("left", bunny), dano.Body("right", bunny, mass=2.0)],
         [dano.Contact("left", "right", dano.ContactParams(sliding_friction=0.3))],

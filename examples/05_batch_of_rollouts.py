@@ -7,13 +7,12 @@ import jax
 import jax.numpy as jnp
 
 import dano
-from dano.scene_file import build_asset
 
 SPEED = 0.5
 
 
 def main(quick: bool = False) -> dict[str, Any]:
-    bunny = build_asset("bunny")
+    bunny = dano.load_object("bunny")
     # The paper's law: one wrench a pair is what runs fastest under vmap. Its friction moments are lengths.
     params = dano.ContactParams(sliding_drag=0.0, rolling_friction=1e-3, torsional_friction=1e-3)
     scene = dano.Scene.create(

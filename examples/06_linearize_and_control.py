@@ -7,13 +7,12 @@ from scipy.linalg import solve_discrete_are
 
 import dano
 from dano.maths import quat_conjugate, quat_multiply
-from dano.scene_file import build_asset
 
 HOME = (0.0, 0.0, 0.5)  # [m]
 
 
 def main(quick: bool = False) -> dict[str, float]:
-    bunny = build_asset("bunny")
+    bunny = dano.load_object("bunny")
     alone = dano.Scene.create([dano.Body("bunny", bunny)], timestep=0.002)
     goal = alone.initial_state(bunny={"position": HOME})
     weight = 9.81 * float(bunny.mass.mass)

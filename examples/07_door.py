@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 
 import dano
-from dano.scene_file import build_asset
 
 
 def main(quick: bool = False, strip: str | None = None) -> dict[str, float]:
     """Simulate 0.3 s; `strip` is a file name (.png) for pictures of the motion."""
-    door = dano.Body("door", build_asset("soap"))
+    door = dano.Body("door", dano.load_object("soap"))
     ball = dano.Body("ball", dano.Sphere(0.02), mass=0.05)
     edge = (-0.045, 0.0, 0.0)
     hinge = dano.Joint(None, "door", "hinge", axis=(0, 0, 1), anchor=edge, position=(0.0, 0.0, 0.05))

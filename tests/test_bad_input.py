@@ -1,5 +1,9 @@
 """Bad input through the Python interface: an error before any work starts, which names what is wrong."""
 
+import json
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -82,6 +86,10 @@ CASES = {
     "negative density": (lambda: built(Spoilt(-2.0)), "densities ≥ 0, got -2.0"),
     "empty field": (lambda: built(Nothing(0.0)), "positive density somewhere"),
     "no sample": (lambda: built(grid(), density_range=(60.0, 70.0)), "density_range"),
+    "thin plate": (
+        lambda: built(dano.Box((0.1, 0.1, 0.001)), resolution=24),
+        "it is 0.003 m thin: try resolution=268, got 24",
+    ),
     "range reversed": (lambda: built(grid(), density_range=(2.0, 1.0)), "0 ≤ low < high, got (2.0, 1.0)"),
     "unbounded field": (lambda: built(dano.HalfSpace()), "finite bounds"),
     "body without mass": (lambda: dano.Body("x", dano.Sphere(0.1)), "mass of body 'x' must be given"),
@@ -91,6 +99,18 @@ CASES = {
     "unknown body": (
         lambda: dano.Scene.create([ball(), FLOOR], [dano.Contact("ball", "flor")]),
         "['ball', 'floor'], got 'flor'",
+    ),
+    "nearly the name": (
+        lambda: dano.Scene.create([ball(), FLOOR], [dano.Contact("ball", "flor")]),
+        "did you mean 'floor'?",
+    ),
+    "inertia of no body": (
+        lambda: dano.MassProperties(1.0, (0, 0, 0), np.diag([1.0, 1.0, 5.0])),
+        "no principal moment may exceed the sum of the other two, got [1.0, 1.0, 5.0] kg m²",
+    ),
+    "inertia of a body": (
+        lambda: dano.Body("x", dano.Sphere(0.1), mass=1.0, inertia=np.diag([5.0, 1.0, 1.0])),
+        "no principal moment may exceed",
     ),
     "two names": (lambda: dano.Scene.create([ball(), ball()]), "different names, got 'ball' 2 times"),
     "pair twice": (
@@ -124,6 +144,10 @@ CASES = {
     "unknown quantity": (lambda: state(speed=(0.0, 0.0, 0.0)), "got 'speed'"),
     "simulate NaN": (lambda: dano.simulate(scene(), with_state("velocity", np.nan), 3), "state.velocity"),
     "step NaN": (lambda: dano.step(scene(), with_state("position", np.inf)), "state.position must be finite"),
+    "single precision": (
+        lambda: dano.simulate(scene(), jax.tree.map(lambda x: x.astype(jnp.float32), state()), 3),
+        "state.position must have the dtype of the scene, float64, got float32: cast it with jax.tree.map",
+    ),
     "no steps": (lambda: dano.simulate(scene(), state(), 0), "n_steps must be ≥ 1, got 0"),
     "replaced friction": (
         lambda: scene().replace_contact("ball", "floor", sliding_friction=-1.0),
@@ -131,6 +155,12 @@ CASES = {
     ),
     "replaced pair": (lambda: scene().replace_contact("ball", "wall", spring=1.0), "('ball', 'wall')"),
 }
+
+
+def test_keys_of_both_kinds_and_flat_plates_are_taken():
+    new, old = (built(grid(), key=key) for key in (jax.random.key(3), jax.random.PRNGKey(3)))
+    np.testing.assert_array_equal(new.samples.points, old.samples.points)
+    dano.MassProperties(1.0, np.zeros(3, np.float32), np.diag(np.array([0.3, 0.4, 0.7], np.float32)))
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -211,3 +241,56 @@ def test_a_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
         made.save(path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+WRONG_TYPES = {
+    'dano.Contact("ball", "floor", law="distributed")': (
+        "law must be dano.DistributedLaw() or dano.CentroidLaw(), got 'distributed'"
+    ),
+    'dano.Contact("ball", "floor", 0.3)': (
+        "params must be dano.ContactParams(…), e.g. sliding_friction=0.3, got 0.3"
+    ),
+    'dano.Contact(0, "floor")': "a must be the name of a body, got 0",
+    'dano.Scene.create([ball], [("ball", "floor")])': (
+        "contacts must hold dano.Contact objects only, got ('ball', 'floor') of type tuple"
+    ),
+    'dano.Scene.create(["ball"])': "bodies must hold dano.Body objects only, got 'ball' of type str",
+    "dano.NeuralObject.from_field(np.zeros((8, 8, 8)))": (
+        "field must be a dano field, got ndarray; dano.GridField(values, origin, spacing) makes one"
+    ),
+    "dano.NeuralObject.from_field(sphere, key=0)": (
+        "key must be one random key such as jax.random.key(0), got 0"
+    ),
+    "dano.NeuralObject.from_field(sphere, n_samples=300.0)": "n_samples must be a whole number, got 300.0",
+    "dano.NeuralObject.from_field(sphere, resolution=16.5)": "resolution must be a whole number, got 16.5",
+}
+"""What users write who have not read the signature, and what they are told."""
+
+PROGRAM = """
+import json, sys
+import numpy as np
+import dano
+sphere = dano.Sphere(0.1)
+ball = dano.Body("ball", sphere, mass=1.0)
+said = []
+for line in json.load(sys.stdin):
+    try:
+        exec(line)
+        said.append("nothing")
+    except Exception as error:
+        said.append(f"{type(error).__name__}: {error}")
+print(json.dumps(said))
+"""
+
+
+def test_wrong_types():
+    # In a process of its own: the tests' hook would check the types before dano does.
+    answer = subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        input=json.dumps(list(WRONG_TYPES)),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    for told, (line, message) in zip(json.loads(answer.stdout), WRONG_TYPES.items(), strict=True):
+        assert told.startswith(f"ValueError: {message}"), line

@@ -23,14 +23,20 @@ PACKAGES = [p for p in sorted((REPOSITORY / "src" / "dano").glob("*/__init__.py"
 @pytest.mark.parametrize("page", PROGRAMS)
 def test_python_blocks_run(page: str, tmp_path: Path):
     # One process a page, its blocks joined: a page may change JAX's configuration, as its reader would.
-    # Paths in the README start at the root of the repository.
-    (tmp_path / "src").symlink_to(REPOSITORY / "src")
     command = [sys.executable, "-c", PROGRAMS[page]]
     # A page runs each program briefly, so code without LLVM's optimisations is done sooner.
     flags = f"{os.environ['XLA_FLAGS']} --xla_backend_optimization_level=0"
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY / "src"), "XLA_FLAGS": flags}
     answer = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert answer.returncode == 0, answer.stderr
+    if page == "README.md":
+        # The README says what its program prints, and what a central difference gives.
+        text = (REPOSITORY / page).read_text(encoding="utf-8").replace("−", "-")
+        told = re.findall(r"It prints ([-.\d]+) and ([-.\d]+):", text)[0]
+        difference = re.findall(r"difference of step 0\.01 gives ([-.\d]+)\.", text)[0]
+        printed = answer.stdout.split()
+        assert [float(number) for number in printed] == pytest.approx([float(t) for t in told], rel=5e-3)
+        assert float(printed[1]) == pytest.approx(float(difference), rel=0.05)
 
 
 @pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.parent.name)
@@ -45,3 +51,9 @@ def test_every_public_name_is_documented(package: Path):
     page = REPOSITORY / "docs" / "api" / f"{package.parent.name}.md"
     documented = set(re.findall(r"^ {8}- (\w+)$", page.read_text(encoding="utf-8"), re.MULTILINE))
     assert documented == exported
+
+
+def test_the_index_leads_to_every_page():
+    docs = REPOSITORY / "docs"
+    linked = set(re.findall(r"\]\(([\w/]+\.md)", (docs / "index.md").read_text(encoding="utf-8")))
+    assert linked == {str(page.relative_to(docs)) for page in docs.rglob("*.md")} - {"index.md"}

@@ -40,3 +40,34 @@ def test_a_table_follows_its_file(tmp_path, monkeypatch):
     for wrong in ("none.json", "run.json | Size"):
         with pytest.raises(ValueError, match=r"must name a file|has the groups"):
             figures.updated(f"<!-- figures: {wrong} -->\n<!-- end of figures -->")
+
+
+def stored(folder, name: str, values: dict[tuple[str, str], float]) -> None:
+    rows = [
+        {"group": group, "name": row, "value": value, "unit": "m", "target": None, "at_least": False}
+        for (group, row), value in values.items()
+    ]
+    (folder / name).write_text(json.dumps({"rows": rows}))
+
+
+def test_headlines_follow_their_files(tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "RESULTS", tmp_path)
+    cell = figures.Cell("{:.1f} to {:.0f} m", "run", (("A", "low"), ("A", "high")))
+    monkeypatch.setattr(figures, "HEADLINES", (figures.Headline("ways", cell, figures.Cell("theirs: 3")),))
+    text = "<!-- figures: headlines -->\nold\n<!-- end of figures -->"
+    stored(tmp_path, "run.json", {("A", "low"): 0.5, ("A", "high"): 9.0})
+    assert "| ways | 0.5 to 9 m | theirs: 3 |" in figures.updated(text)
+    stored(tmp_path, "run.json", {("A", "low"): 0.5})
+    with pytest.raises(ValueError, match="must hold a value of"):
+        figures.updated(text)
+
+
+def test_cases_are_rows(tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "RESULTS", tmp_path)
+    stored(tmp_path, "a.json", {("mug", "way"): 2.0, ("mug", "time"): 3.0})
+    stored(tmp_path, "b.json", {("cup", "way"): 4.0})
+    text = "<!-- figures: cases {} | way -->\n<!-- end of figures -->"
+    table = figures.updated(text.format("a.json b.json"))
+    assert "| | way |\n|---|---|\n| mug | 2 m |\n| cup | 4 m |" in table
+    with pytest.raises(ValueError, match=r"b.json must have rows \['way', 'time'\] for 'cup', 'time' is not"):
+        figures.updated(text.format("b.json").replace("| way", "| way | time"))

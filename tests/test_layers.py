@@ -1,6 +1,7 @@
 """What import-linter does not say: a module whose name begins with _ is known to its own package only."""
 
 import ast
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -63,3 +64,19 @@ def test_no_module_imports_what_is_private_to_another_package():
 def test_a_folder_can_be_taken_in_at_a_glance():
     sizes = Counter(str(module.parent.relative_to(SOURCE)) for module in MODULES)
     assert {folder: size for folder, size in sizes.items() if size > 15} == {}  # 14 and __init__.py
+
+
+def test_the_map_of_contributing_leads_somewhere():
+    text = (SOURCE.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = text.split("## Where is what")[1].split("## Rules")[0]
+    rows = [line for line in table.splitlines() if line.startswith("| ") and "`" in line]
+    assert len(rows) >= 9
+    root = SOURCE / "dano"
+    for row in rows:
+        folder = root
+        for place in re.findall(r"`([\w/]+(?:\.py|/))`", row):
+            # A file without a folder lies in the one named before.
+            here = folder / place
+            path = here if "/" not in place and here.exists() else root / place
+            assert path.exists(), row
+            folder = path if path.is_dir() else path.parent

@@ -188,7 +188,8 @@ def test_five_measured_tosses(validation, parameters):
         section = found["dano"][step]
         assert 0 < section["position_percent"] < 30
         assert 0 < section["rotation_deg"] < 60
-        assert 0 <= section["right_face_share"] <= 1
+        # 94 % of all tosses: of five hardly ever less than three.
+        assert section["right_face_share"] >= 0.6
         assert section["position_percent_sd"] > 0
     tails = validation.tails(parameters["world"]["half_side"], 2.0)
     assert len(tails) > 50 and tails.lengths.min() >= 8

@@ -14,11 +14,11 @@ from dano.fields import (
     HalfSpace as HalfSpace,
     load_field as load_field,
     mesh_field as mesh_field,
-    Posed as Posed,
+    posed as posed,
     save_field as save_field,
-    Scaled as Scaled,
+    scaled as scaled,
     Sphere as Sphere,
-    Union as Union,
+    union as union,
 )
 from dano.objects import (
     ContactSamples as ContactSamples,
@@ -69,7 +69,7 @@ from dano.identify import (
     Parameter as Parameter,
     save_motion as save_motion,
 )
-from dano.scene_file import load_scene as load_scene
+from dano.scene_file import load_object as load_object, load_scene as load_scene
 from dano.exchange import export_object as export_object
 
 __version__ = "0.1.0"

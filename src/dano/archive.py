@@ -20,6 +20,15 @@ from dano.memory import in_bytes, memory_limit
 OBJECT = "dano-object", 2
 """Format and newest version of files that hold a neural object."""
 
+FIELD = "dano-field", 1
+"""The same of a grid of densities or signed distances."""
+
+TRAJECTORY = "dano-trajectory", 1
+"""The same of a simulated trajectory."""
+
+MOTION = "dano-motion", 1
+"""The same of an observed motion."""
+
 LOOK = "look_"
 """What the names of their members start with that say how the object looks."""
 
@@ -183,7 +192,7 @@ def read_array(path: str | os.PathLike[str]) -> np.ndarray:
     with open(source, "rb") as file:
         if (start := file.read(6)) != b"\x93NUMPY":
             kinds = {b"\x80": _PICKLED, b"P": "it is a zip of arrays, not a single one"}
-            raise ValueError(kinds.get(start[:1], "it is no array of NumPy"))
+            raise ValueError(kinds.get(start[:1], "it is not a NumPy array"))
         file.seek(0)
         try:
             _checked_size(file, "the array", source.stat().st_size, memory_limit())
@@ -246,9 +255,34 @@ def read_archive(path: str | os.PathLike[str], form: str, version: int) -> dict[
             data = {name: archive[name] for name in archive.names}
     except (ValueError, OSError) as error:
         raise ValueError(f"{source} is not a readable {form} file: {error}") from error
-    found = str(data.get("format", "of no stated format"))
-    if found != form:
-        raise ValueError(f"{source} must be a {form} file, got one that is {found}")
-    if int(data["version"]) > version:
-        raise ValueError(f"{source} has version {int(data['version'])}; this dano reads up to {version}")
+    if "format" not in data:
+        raise ValueError(f"{source} must be a {form} file, got one of no stated format")
+    try:
+        check_format(str(data["format"]), data.get("version"), {form: version})
+    except ValueError as error:
+        raise ValueError(f"{source} cannot be read: {error}") from error
     return data
+
+
+def check_format(form: str, version: np.ndarray | None, known: Mapping[str, int]) -> None:
+    """Refuse a file whose members `format` and `version` say that it cannot be read.
+
+    Args:
+        form: Its member `format`.
+        version: Its member `version`; None if it has none.
+        known: Newest version that the caller understands, by format.
+
+    Raises:
+        ValueError: If the file is of another kind, newer, or does not state its version.
+    """
+    if form not in known:
+        raise ValueError(f"it must be a {' or '.join(known)} file, got a {form} file")
+    if version is None or np.ndim(version) > 0 or np.asarray(version).dtype.kind not in "iu":
+        raise ValueError(f"it must state its version as a whole number, got {version}")
+    if int(version) > known[form]:
+        raise ValueError(f"it has version {int(version)}, and this dano reads up to version {known[form]}")
+
+
+def is_own(form: str) -> bool:
+    """Whether a member `format` is one of dano's; other programs may call a member so, too."""
+    return form.startswith("dano-")

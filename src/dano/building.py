@@ -1,7 +1,6 @@
 """How to make a neural object of a field: what `dano build`, scene files and Python let one choose."""
 
 import dataclasses
-from typing import Any
 
 from dano.objects import MassModel
 
@@ -32,8 +31,3 @@ class BuildOptions:
     length: float | None = None
     floaters: bool = False
     seed: int = 0
-
-    def keywords(self) -> dict[str, Any]:
-        """The options as arguments of `dano.scene_file.build_object`, which calls the samples `n_samples`."""
-        values = dataclasses.asdict(self)
-        return {"n_samples": values.pop("samples"), **values}

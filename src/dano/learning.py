@@ -43,7 +43,7 @@ class LearnedObject(NamedTuple):
         Raises:
             ValueError: If `path` is a directory or its parent does not exist.
         """
-        self.made.save(path, look=self.trained.field.look)
+        self.made.save(path, look=self.trained.field.arrays)
 
 
 def train_object(

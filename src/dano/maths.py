@@ -6,6 +6,7 @@ quaternions compute NumPy arrays with NumPy, on the host and in their own dtype,
 """
 
 import functools
+import operator
 from collections.abc import Sequence
 from types import ModuleType
 from typing import Any, TypeVar
@@ -15,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 Numbers = ArrayLike | Sequence[Any]
 """What constructors take for an array: an array, a number, or (nested) lists and tuples of numbers."""
@@ -109,7 +110,7 @@ def quat_from_matrix(matrix: Float[Q, "*batch 3 3"]) -> Float[Q, "*batch 4"]:
     """Unit quaternion (w ≥ 0) of a rotation matrix.
 
     The matrix gives 4 q qᵀ without a root. Its row with the largest diagonal entry, which is at least 1, is
-    normalised (Shepperd 1978).
+    normalised (after Shepperd 1978, who divides by a root instead).
     """
     xp = _library(matrix)
     m = [[matrix[..., i, j] for j in range(3)] for i in range(3)]
@@ -331,3 +332,35 @@ def floating(value: Numbers) -> Array:
     if dtype is not None and jnp.issubdtype(dtype, jnp.floating):
         return jnp.asarray(value)
     return jnp.asarray(value, dtype=jnp.result_type(float))
+
+
+def checked_count(name: str, value: object, least: int = 1) -> int:
+    """`value` as a whole number.
+
+    Raises:
+        ValueError: If it is none, such as 300.0, or smaller than `least`.
+    """
+    try:
+        count = operator.index(value)  # pyright: ignore[reportArgumentType]
+    except TypeError:
+        raise ValueError(f"{name} must be a whole number, got {value!r}") from None
+    if count < least:
+        raise ValueError(f"{name} must be ≥ {least}, got {count}")
+    return count
+
+
+def checked_key(key: PRNGKeyArray | None) -> PRNGKeyArray:
+    """A random key; None stands for `jax.random.key(0)`.
+
+    Raises:
+        ValueError: If it is no single key of JAX.
+    """
+    if key is None:
+        return jax.random.key(0)
+    dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
+    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
+    # What `jax.random.PRNGKey` makes.
+    old = dtype == np.uint32 and shape == (2,)
+    if not (typed or old):
+        raise ValueError(f"key must be one random key such as jax.random.key(0), got {key!r}")
+    return key

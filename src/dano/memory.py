@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 _LARGEST = 8 << 30
+"""8 GiB: a grid of 1000³ nodes in float64 (convention)."""
 
 
 def memory_limit() -> int:

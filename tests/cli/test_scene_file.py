@@ -144,7 +144,7 @@ SHAPES = {
     'shape = "capsule"\nradius = 0.1\nhalf_length = 0.2\nedge = 0.001': dano.Capsule(0.1, 0.2, edge=0.001),
     'shape = "cylinder"\nradius = 0.1\nhalf_length = 0.2': dano.Cylinder(0.1, 0.2),
     'shape = "ellipsoid"\nsemi_axes = [0.1, 0.2, 0.3]': dano.Ellipsoid((0.1, 0.2, 0.3)),
-    'shape = "sphere"\nradius = 0.1\npose = {position = [0, 0.1, 0]}': dano.Posed(
+    'shape = "sphere"\nradius = 0.1\npose = {position = [0, 0.1, 0]}': dano.posed(
         dano.Sphere(0.1), dano.Pose((0, 0.1, 0))
     ),
 }
@@ -233,6 +233,7 @@ def _velocities(run):
 def test_assets_are_real():
     soap = build_asset("soap")
     assert build_asset("soap") is soap
+    assert dano.load_object("soap") is soap
     np.testing.assert_allclose(np.ptp(soap.samples.points, axis=0), (0.09, 0.06, 0.03), atol=0.003)
     # A bar of uniform density weighs m/12 (b² + c²) about its long axis; rounded edges take 5 %.
     assert float(soap.mass.mass) == pytest.approx(0.15)
@@ -503,3 +504,24 @@ def test_wrong_joints_of_a_scene_file(tmp_path, old, new, message):
     path.write_text(JOINTED.replace(old, new))
     with pytest.raises(ValueError, match=message):
         load_scene(path)
+
+
+def test_objects_by_name_or_file(egg, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.testing.assert_array_equal(dano.load_object(egg).mass.com, dano.NeuralObject.load(egg).mass.com)
+    with pytest.raises(
+        ValueError, match=r"source must be a \.dano file or one of \['bunny', .*; did you mean 'bunny'"
+    ):
+        dano.load_object("buny")
+    with pytest.raises(ValueError, match="must be an existing file, got none.dano"):
+        dano.load_object("none.dano")
+    # A file of the user's goes before what is shipped.
+    (tmp_path / "soap").write_bytes(egg.read_bytes())
+    np.testing.assert_array_equal(dano.load_object("soap").mass.com, dano.load_object(egg).mass.com)
+
+
+def test_a_place_is_said_once():
+    text = 'n_steps = 1\n[[bodies]]\nname = "a"\nshape = "sphere"\nraduis = 0.1\n'
+    with pytest.raises(ValueError, match="unknown key 'raduis'") as caught:
+        parse_scene(text, Path("s.toml"))
+    assert str(caught.value).count("s.toml: [[bodies]]") == 1

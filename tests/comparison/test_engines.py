@@ -21,7 +21,7 @@ MARGIN = 1.5e-3  # of PyBullet, and a bit
 
 @pytest.fixture(scope="module")
 def thing() -> dano.NeuralObject:
-    shape = dano.Posed(dano.Box(tuple(HALF), edge=1e-3), Pose(tuple(CENTRE)))
+    shape = dano.posed(dano.Box(tuple(HALF), edge=1e-3), Pose(tuple(CENTRE)))
     return dano.NeuralObject.from_field(shape, mass=MASS, n_samples=300, resolution=40)
 
 
@@ -72,7 +72,7 @@ def test_spheres_touch_where_they_reach_in(engine):
 @pytest.fixture(scope="module")
 def comparison(thing):
     pytest.importorskip("mujoco")
-    truth = dano.Posed(dano.Box(tuple(HALF), edge=1e-3), Pose(tuple(CENTRE)))
+    truth = dano.posed(dano.Box(tuple(HALF), edge=1e-3), Pose(tuple(CENTRE)))
     return compare(thing, truth=truth, levels=[0.5, 0.9], drops=1)
 
 

@@ -57,7 +57,7 @@ def test_cube_in_sphere_and_box():
     shapes = [
         (dano.Sphere(0.2), 4 / 3 * np.pi * 0.2**3),
         (dano.Box((0.2, 0.15, 0.1)), 8 * 0.2 * 0.15 * 0.1),
-        (dano.Posed(dano.Cylinder(0.15, 0.2), lying), np.pi * 0.15**2 * 0.4),
+        (dano.posed(dano.Cylinder(0.15, 0.2), lying), np.pi * 0.15**2 * 0.4),
     ]
     for shape, volume in shapes:
         patch = dano.overlap(cube, dano.Collider(shape, pose=place))
@@ -66,7 +66,7 @@ def test_cube_in_sphere_and_box():
 
 
 def test_tilted_half_space_and_pose_agree():
-    """A half-space tilted by its normal, by its body's pose, and by `Posed` are the same plane."""
+    """A half-space tilted by its normal, by its body's pose, and by `posed` are the same plane."""
     rng = np.random.default_rng(3)
     samples = SampleSet.create(rng.uniform(-0.5, 0.5, (500, 3)), rng.uniform(0.1, 1, 500))
     cube = dano.Collider(None, samples, pose=dano.Pose((0.2, 0.1, 0.3), (1.0, 0.2, -0.4, 0.3)))
@@ -75,7 +75,7 @@ def test_tilted_half_space_and_pose_agree():
     planes = [
         dano.Collider(dano.HalfSpace(normal, 0.1, edge=0.05)),
         dano.Collider(dano.HalfSpace(edge=0.05), pose=dano.Pose(0.1 * np.array(normal), turn)),
-        dano.Collider(dano.Posed(dano.HalfSpace(edge=0.05), dano.Pose(0.1 * np.array(normal), turn))),
+        dano.Collider(dano.posed(dano.HalfSpace(edge=0.05), dano.Pose(0.1 * np.array(normal), turn))),
     ]
     first, *others = [dano.overlap(cube, plane) for plane in planes]
     assert first.overlap > 0.05

@@ -9,9 +9,9 @@ from dano.maths import Pose
 
 def angle() -> dano.AbstractField:
     """Two bars of 10 × 4 × 4 and 4 × 4 × 9 cm that form an L, somewhere off the origin."""
-    long = dano.Posed(dano.Box((0.05, 0.02, 0.02), edge=1e-3), Pose((0.1, 0.02, 0.03)))
-    up = dano.Posed(dano.Box((0.02, 0.02, 0.045), edge=1e-3), Pose((0.07, 0.02, 0.055)))
-    return dano.Union(long, up)
+    long = dano.posed(dano.Box((0.05, 0.02, 0.02), edge=1e-3), Pose((0.1, 0.02, 0.03)))
+    up = dano.posed(dano.Box((0.02, 0.02, 0.045), edge=1e-3), Pose((0.07, 0.02, 0.055)))
+    return dano.union(long, up)
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dano.fields import AbstractField, GridField, Posed, PosedField, Sphere, Union, UnionField
+from dano.fields import AbstractField, GridField, posed, PosedField, Sphere, union, UnionField
 from dano.maths import Pose, quat_from_axis_angle, quat_to_matrix
 
 N = 200
@@ -58,7 +58,7 @@ def test_default_jet_and_normal_of_a_gaussian():
 
 
 def test_posed_grid_is_the_grid_at_the_moved_points():
-    moved, x = Posed(GRID, POSE), points()
+    moved, x = posed(GRID, POSE), points()
     assert isinstance(moved, PosedField)
     world = jnp.asarray(ROTATION @ x + np.asarray(POSE.position)[:, None])
     value, (_, gradient), (_, _, hessian) = evaluate(moved, world)
@@ -73,7 +73,7 @@ def test_posed_grid_is_the_grid_at_the_moved_points():
 
 
 def test_posed_bounds_hold_all_corners():
-    lower, upper = np.asarray(Posed(GRID, POSE).bounds)
+    lower, upper = np.asarray(posed(GRID, POSE).bounds)
     box = np.asarray(GRID.bounds)
     corners = np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3) @ ROTATION.T + np.asarray(POSE.position)
     np.testing.assert_allclose(lower, corners.min(0))
@@ -82,7 +82,7 @@ def test_posed_bounds_hold_all_corners():
 
 def test_union_of_a_grid_and_a_shape_is_the_larger_density():
     ball = Sphere(0.2, edge=0.1)
-    both, x = Union(GRID, ball), jnp.asarray(points())
+    both, x = union(GRID, ball), jnp.asarray(points())
     assert isinstance(both, UnionField)
     results = [evaluate(field, x) for field in (both, GRID, ball)]
     densest = np.argmax([results[1][0], results[2][0]], axis=0)
@@ -97,8 +97,8 @@ def test_union_of_a_grid_and_a_shape_is_the_larger_density():
 
 def test_bad_compositions():
     with pytest.raises(ValueError, match="at least one field"):
-        Union()
+        union()
     with pytest.raises(ValueError, match="edge applies to a union of shapes only"):
-        Union(GRID, Sphere(0.1), edge=0.1)
+        union(GRID, Sphere(0.1), edge=0.1)
     with pytest.raises(ValueError, match="order must be 0"):
-        Posed(GRID, POSE).jet(jnp.zeros((3, 1)), 3)
+        posed(GRID, POSE).jet(jnp.zeros((3, 1)), 3)

@@ -4,6 +4,7 @@ import io
 import os
 import pickle
 import zipfile
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -185,6 +186,36 @@ def test_saving_refuses_bad_places_and_never_destroys(tmp_path, monkeypatch):
         save_field(field("linear"), path)
     assert path.read_bytes() == before
     assert sorted(os.listdir(tmp_path)) == ["folder.npz", "grid.npz"]
+
+
+def test_shipped_grids_have_names(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert load_grid("bunny").shape == (96, 78, 95)
+    # 9 × 6 × 3 cm of soap, and air for floaters on all sides.
+    assert np.all(np.ptp(load_grid("soap").bounds, axis=0) > (0.1, 0.07, 0.04))
+    (tmp_path / "soap").mkdir()
+    with pytest.raises(ValueError, match="unknown kind of field"):
+        load_field("soap")
+    with pytest.raises(ValueError, match="unknown kind of field"):
+        load_field("bunni")
+
+
+def test_grids_say_what_they_are(tmp_path):
+    save_field(field(), tmp_path / "grid.npz")
+    with np.load(tmp_path / "grid.npz") as data:
+        members: dict[str, Any] = dict(data)
+    assert (str(members["format"]), int(members["version"])) == archive_module.FIELD
+    for changed, message in (
+        ({"version": 99}, r"newer.npz: expected a grid: .* it has version 99, and this dano reads up to"),
+        ({"format": "dano-motion"}, r"newer.npz: .* it must be a dano-field file, got a dano-motion file"),
+        ({"version": 1.5}, "must state its version as a whole number, got 1.5"),
+    ):
+        np.savez(tmp_path / "newer.npz", **{**members, **changed})
+        with pytest.raises(ValueError, match=message):
+            load_field(tmp_path / "newer.npz")
+    # Another program's words are not dano's business, and files from before had none.
+    np.savez(tmp_path / "foreign.npz", **{**members, "format": "voxels", "version": "a"})
+    np.testing.assert_array_equal(load_grid(tmp_path / "foreign.npz").values, VALUES)
 
 
 def test_shapes_are_not_saved_as_grids(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from dano import fields
-from dano.fields import Box, Capsule, Cylinder, Ellipsoid, HalfSpace, occupancy, Posed, Sphere, Union
+from dano.fields import Box, Capsule, Cylinder, Ellipsoid, HalfSpace, occupancy, posed, Sphere, union
 from dano.maths import Pose, quat_from_axis_angle, quat_to_matrix
 
 CORE = np.array([0.07, 0.10, 0.15])
@@ -44,7 +44,7 @@ CASES = {
     ),
     "ellipsoid": (Ellipsoid(AXES, edge=EDGE), lambda x: np.sum((x / AXES) ** 2, -1) <= 1, np.zeros(3)),
     "posed": (
-        Posed(Box(CORE + 0.05, 0.05, edge=EDGE), POSE),
+        posed(Box(CORE + 0.05, 0.05, edge=EDGE), POSE),
         posed_inside,
         np.asarray(POSE.position),
     ),
@@ -204,7 +204,7 @@ def test_occupancy_is_a_smoothstep_and_hard_without_an_edge():
 
 def test_the_default_edge_is_half_a_percent_of_the_size_and_hard_for_a_half_space():
     np.testing.assert_allclose(Box((0.1, 0.2, 0.3)).edge_width, 0.003)
-    np.testing.assert_allclose(Posed(Box((0.1, 0.2, 0.3)), POSE).edge_width, 0.003)
+    np.testing.assert_allclose(posed(Box((0.1, 0.2, 0.3)), POSE).edge_width, 0.003)
     assert HalfSpace().edge is None and HalfSpace().edge_width == 0
     assert HalfSpace(edge=0.02).edge_width == 0.02
     assert HalfSpace().density(jnp.asarray([0.0, 0.0, -1e-9])) == 1
@@ -216,7 +216,7 @@ def test_half_space():
     np.testing.assert_allclose(plane.outward(jnp.zeros(3)), [0, 0.6, 0.8])
     assert plane.solid_moments() is None
     assert not np.any(np.isfinite(plane.bounds))
-    moved = Posed(plane, POSE)
+    moved = posed(plane, POSE)
     assert not np.any(np.isfinite(moved.bounds)) and not np.any(np.isnan(moved.bounds))
 
 
@@ -254,15 +254,15 @@ def test_parameters_differentiate():
 
 
 def test_union_of_shapes_is_the_least_distance(rng):
-    left, right = Sphere(0.1), Posed(Sphere(0.1), Pose((0.3, 0.0, 0.0)))
-    both = Union(left, right)
+    left, right = Sphere(0.1), posed(Sphere(0.1), Pose((0.3, 0.0, 0.0)))
+    both = union(left, right)
     assert isinstance(both, fields.AbstractShape) and both.solid_moments() is None
     np.testing.assert_allclose(both.bounds, [[-0.1005, -0.1005, -0.1005], [0.4005, 0.1005, 0.1005]])
     x = points(both, rng)
     nearer = np.minimum(np.linalg.norm(x, axis=1), np.linalg.norm(x - [0.3, 0, 0], axis=1)) - 0.1
     np.testing.assert_allclose(eqx.filter_jit(both.sdf_jet)(jnp.asarray(x.T), 0), nearer, atol=1e-14)
     np.testing.assert_allclose(both.edge_width, 0.005 * both.size)
-    assert Union(Sphere(0.1, edge=0.01), Sphere(0.2, edge=0.0)).edge_width == 0.01
+    assert union(Sphere(0.1, edge=0.01), Sphere(0.2, edge=0.0)).edge_width == 0.01
 
 
 BAD = {
@@ -276,7 +276,7 @@ BAD = {
     "half length": (lambda: Capsule(0.1, 0.0), "half_length must be positive"),
     "semi-axes": (lambda: Ellipsoid((1.0, -1.0, 1.0)), "semi_axes must be positive"),
     "order": (lambda: Sphere(0.1).jet(jnp.zeros((3, 1)), 3), "order must be 0"),
-    "empty union": (lambda: Union(), "at least one field"),
+    "empty union": (lambda: union(), "at least one field"),
 }
 
 

@@ -1,5 +1,7 @@
 """Motions: files, smoothing, and what contradicts itself."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -150,3 +152,20 @@ def test_bad_files(tmp_path):
         dano.load_motion(tmp_path / "o.npz")
     with pytest.raises(ValueError, match=r"\.npz or \.csv"):
         dano.save_motion(tmp_path / "m.txt", dano.load_motion(tmp_path / "o.npz", names="a"))
+
+
+def test_newer_motions_and_other_files_are_refused(tmp_path):
+    motion = dano.Motion.create(TIMES, "a", position=np.zeros((20, 3)))
+    dano.save_motion(tmp_path / "m.npz", motion)
+    with np.load(tmp_path / "m.npz") as data:
+        members: dict[str, Any] = dict(data)
+    np.savez(tmp_path / "newer.npz", **{**members, "version": 2})
+    with pytest.raises(
+        ValueError, match=r"newer.npz .* it has version 2, and this dano reads up to version 1"
+    ):
+        dano.load_motion(tmp_path / "newer.npz")
+    np.savez(tmp_path / "other.npz", **{**members, "format": "dano-object"})
+    with pytest.raises(ValueError, match="must be a dano-motion or dano-trajectory file, got a dano-object"):
+        dano.load_motion(tmp_path / "other.npz")
+    np.savez(tmp_path / "foreign.npz", **{**members, "format": "tracker", "version": "3b"})
+    np.testing.assert_array_equal(dano.load_motion(tmp_path / "foreign.npz").position, motion.position)

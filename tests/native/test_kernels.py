@@ -40,8 +40,8 @@ SOLIDS = {
     "linear grid": grid("linear"),
     "quadratic grid": grid("quadratic"),
     "cubic grid": grid("cubic"),
-    "posed and enlarged": dano.Scaled(
-        dano.Posed(dano.Box((0.05, 0.04, 0.03)), Pose((0.01, 0.0, 0.02), (0.9, 0.1, 0.3, 0.2))), 1.2
+    "posed and enlarged": dano.scaled(
+        dano.posed(dano.Box((0.05, 0.04, 0.03)), Pose((0.01, 0.0, 0.02), (0.9, 0.1, 0.3, 0.2))), 1.2
     ),
 }
 
@@ -197,7 +197,7 @@ def test_single_precision(heap):
 
 def test_shapes_that_kernels_do_not_know():
     """They are searched by XLA, and solved alike."""
-    two = dano.Union(dano.Box((0.05, 0.05, 0.03)), dano.Posed(dano.Sphere(0.03), Pose((0.0, 0.0, 0.04))))
+    two = dano.union(dano.Box((0.05, 0.05, 0.03)), dano.posed(dano.Sphere(0.03), Pose((0.0, 0.0, 0.04))))
     bodies = [dano.Body("two", two, mass=1.0), dano.Body("floor", dano.HalfSpace(), fixed=True)]
     scene = dano.Scene.create(bodies, [dano.Contact("two", "floor")], timestep=H)
     geometry = prepare(scene, None).geometry

@@ -13,7 +13,7 @@ SHAPES = {
     "cylinder": lambda: dano.Cylinder(0.05, 0.1),
     "capsule": lambda: dano.Capsule(0.05, 0.1),
     "ellipsoid": lambda: dano.Ellipsoid((0.1, 0.07, 0.05)),
-    "posed box": lambda: dano.Posed(
+    "posed box": lambda: dano.posed(
         dano.Box((0.1, 0.07, 0.05)), dano.Pose((0.3, -0.1, 0.2), (1.0, 0.4, 0.2, -0.3))
     ),
 }
@@ -86,7 +86,7 @@ def test_sampled_integral_of_a_grid_agrees_with_the_exact_one():
     """The Monte Carlo rule on the same density, seen as an anonymous function, within its own error."""
     grid = gaussian_grid()
     low, high = np.asarray(grid.bounds)
-    posed = dano.Posed(grid, dano.Pose())
+    posed = dano.posed(grid, dano.Pose())
     exact, sampled = (
         dano.MassProperties.from_field(grid),
         dano.MassProperties.from_field(posed, resolution=32),

@@ -144,8 +144,8 @@ def test_a_sampled_shape_is_taken_as_it_is():
 
 
 def test_parts_of_a_shape_that_are_dropped_leave_its_solid():
-    far = dano.Posed(dano.Sphere(0.1), dano.Pose((0.7, 0.0, 0.0)))
-    pair = dano.Union(dano.Sphere(0.3), far)
+    far = dano.posed(dano.Sphere(0.1), dano.Pose((0.7, 0.0, 0.0)))
+    pair = dano.union(dano.Sphere(0.3), far)
     for floaters in (True, False):
         made = build(pair, floaters=floaters, resolution=32)
         assert (solid_of(made).sdf(jnp.array([0.7, 0.0, 0.0])) < 0) == floaters

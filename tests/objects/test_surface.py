@@ -34,7 +34,7 @@ AREAS = {
     "box": (dano.Box(HALF), box_area(HALF)),
     "cube": (dano.Box((0.5, 0.5, 0.5)), box_area((0.5, 0.5, 0.5))),
     "plate": (dano.Box((0.5, 0.4, 0.015)), box_area((0.5, 0.4, 0.015))),
-    "turned box": (dano.Posed(dano.Box(HALF), dano.Pose((1, 2, 3), (0.9, 0.1, 0.2, 0.3))), box_area(HALF)),
+    "turned box": (dano.posed(dano.Box(HALF), dano.Pose((1, 2, 3), (0.9, 0.1, 0.2, 0.3))), box_area(HALF)),
     # Rounding by r: the parallel body at r of the core.
     "capsule": (
         dano.Capsule(0.2, 0.3),

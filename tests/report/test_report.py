@@ -73,7 +73,7 @@ def test_a_film_shows_what_an_object_has_learned_to_look_like(cube, tmp_path):
         lambda f: f.model.appearance.network.biases[-1], field, jnp.full_like(network.biases[-1], -20)
     )
     made = dano.NeuralObject.from_field(field, n_samples=200, resolution=24, mass=1.0)
-    made.save(tmp_path / "black.dano", look=field.look)
+    made.save(tmp_path / "black.dano", look=field.arrays)
     cube.save(tmp_path / "cube.dano")
     assert LearnedField.of_object(tmp_path / "cube.dano") is None
     again = LearnedField.of_object(tmp_path / "black.dano")

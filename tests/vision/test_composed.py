@@ -193,12 +193,12 @@ def test_pictures_lie_over_any_background():
         (lambda: Light(), "either a direction or a position"),
         (lambda: Light((0, 0, 0)), "must not be zero"),
         (lambda: Light((0, 0, 1), intensity=-1), "must be finite and ≥ 0"),
-        (lambda: Light((0, 0, 1), reach=2.0), "reach is of lights with a position"),
+        (lambda: Light((0, 0, 1), reach=2.0), "reach applies to lights with a position"),
         (lambda: compose([Item(Sphere(0.1))], Camera((1, 0, 0)), []), "lights must hold"),
         (lambda: compose([], Camera((1, 0, 0)), ABOVE, item_lights={2: []}), r"got \[2\]"),
         (lambda: compose([], Camera((1, 0, 0)), ABOVE, ambient=2.0), "ambient must lie"),
-        (lambda: Item(learned(), level=3.0), "level and density_scale are of fields"),
-        (lambda: Item(Fog.create((0,) * 3, (1,) * 3, 1.0), colour="#ffffff"), "colour is of solids"),
+        (lambda: Item(learned(), level=3.0), "level and density_scale apply to fields"),
+        (lambda: Item(Fog.create((0,) * 3, (1,) * 3, 1.0), colour="#ffffff"), "colour applies to solids"),
     ],
 )
 def test_bad_input_is_refused(call, message):

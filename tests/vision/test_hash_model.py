@@ -8,7 +8,7 @@ import optax
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
-from dano.fields import HashGrid
+from dano.fields import HashGrid, load_field
 from dano.fields._hash_grid import rows_of
 from dano.vision import HashModel, Rays, Sampling, see
 
@@ -113,6 +113,8 @@ def test_it_is_seen_and_saved(tmp_path):
     assert jax.tree.structure(again) == jax.tree.structure(model)
     for a, b in zip(jax.tree.leaves(model), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
+    x = jnp.array([0.01, -0.02, 0.05], jnp.float32)
+    np.testing.assert_array_equal(load_field(tmp_path / "hash.npz").density(x), model.density_at(x[None])[0])
     (tmp_path / "cut.npz").write_bytes((tmp_path / "hash.npz").read_bytes()[:999])
     with pytest.raises(ValueError, match=r"cut\.npz"):
         HashModel.load(tmp_path / "cut.npz")

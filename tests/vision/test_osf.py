@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dano.fields import load_field
 from dano.vision import OSF, Rays, Sampling, see
 
 BOX = ((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3))
@@ -66,6 +67,13 @@ def test_saved_and_loaded(network: OSF, tmp_path: Path):
     again = OSF.load(tmp_path / "osf.npz")
     for a, b in zip(jax.tree.leaves(network), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
+    field, x = load_field(tmp_path / "osf.npz"), jnp.array([0.1, -0.2, 0.05])
+    np.testing.assert_array_equal(field.density(x), network.density_at(x[None])[0])
+    np.testing.assert_allclose(field.bounds, BOX, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"unknown options \['interpolation'\] for a dano-osf file"):
+        load_field(tmp_path / "osf.npz", interpolation="linear")
+    with pytest.raises(ValueError, match="OSF has a box of its own"):
+        load_field(tmp_path / "osf.npz", crop=BOX)
     (tmp_path / "cut.npz").write_bytes((tmp_path / "osf.npz").read_bytes()[:9999])
     with pytest.raises(ValueError, match=r"cut\.npz"):
         OSF.load(tmp_path / "cut.npz")

@@ -120,7 +120,8 @@ class Import:
     Attributes:
         file: nerfstudio checkpoint (.ckpt), instant-ngp snapshot (.ingp, .msgpack), Gaussian splats (.ply),
             OpenVDB or NanoVDB grid (.vdb, .nvdb), PyTorch module (.pt2, .pt, .pth), voxels (.npy, .npz),
-            mesh (.obj, .stl, .ply, .off, .glb, .gltf), or a function as package.module:name.
+            model of dano (.npz), mesh (.obj, .stl, .ply, .off, .glb, .gltf), or a function as
+            package.module:name.
         output: Where to write the grid (.npz).
         crop: Box to keep: lowest x y z, highest x y z, in the file's frame and units.
         scale: Length of a unit of the file [m].

@@ -9,6 +9,7 @@ from typing import Any
 from dano.cli._interrupt import interrupted
 
 BAR = 24
+"""Characters of a progress bar (convention)."""
 
 
 class Progress:

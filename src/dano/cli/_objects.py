@@ -20,12 +20,13 @@ def build(command: Build) -> None:
     """See `dano build --help`."""
     output, options = command.output, command.options
     if options.mass is not None and options.mass_scale is not None:
+        # Before a large field is read.
         raise ValueError(f"give either --mass or --mass-scale, got {options.mass} and {options.mass_scale}")
     check_output(output, command.field)
     progress = Progress()
     progress("reading the field", 0.0)
     field = load_field(command.field)
-    made = build_object(field, **options.keywords(), dashes="--", progress=progress)
+    made = build_object(field, options, dashes="--", progress=progress)
     progress.close()
     made.save(output)
     report = describe(made, output)

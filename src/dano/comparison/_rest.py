@@ -10,6 +10,7 @@ from dano.exchange import Triangles
 _TIPPED = math.radians(4.0)
 """A pose counts as stable if tipping it by this much raises the centre of mass, whichever way."""
 _WAYS = 16
+"""Directions in which a pose is tipped: one every 22.5° (convention)."""
 
 
 def stable_directions(hull: Triangles, com: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:

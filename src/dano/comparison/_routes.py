@@ -20,6 +20,7 @@ _LOWEST, _TRIED = 0.005, 48
 """Share of the largest density at which the search for the best level begins, and levels it tries."""
 
 _CONCAVITY = 0.05
+"""How deep a convex piece may cut across, as a share of the size: the default of `dano export`."""
 _COARSE = 20_000
 """Triangles above which a decomposition starts from a mesh of every other node."""
 

@@ -18,7 +18,9 @@ PLAIN = (0.85, 0.73, 0.61)
 _TILT = 0.7
 """Angle [rad] of the lamps to the normal: what is seen under them is neither glare nor shadow."""
 _N_LAMPS = 3
+"""The fewest that leave no side in shadow."""
 _AT_ONCE = 1 << 15
+"""Points per call: some MB of intermediates."""
 _LEAST_CELL = 6
 """Texels along the square that two triangles share."""
 

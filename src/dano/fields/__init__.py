@@ -9,13 +9,13 @@ from dano.fields._base import (
 )
 from dano.fields._callable import CallableField as CallableField
 from dano.fields._compose import (
-    Posed as Posed,
+    posed as posed,
     PosedField as PosedField,
     PosedShape as PosedShape,
-    Scaled as Scaled,
+    scaled as scaled,
     ScaledField as ScaledField,
     ScaledShape as ScaledShape,
-    Union as Union,
+    union as union,
     UnionField as UnionField,
     UnionShape as UnionShape,
 )

@@ -15,10 +15,10 @@ from dano.maths import checked_array, is_traced, Pose
 
 
 @overload
-def Posed(field: AbstractShape, pose: Pose) -> "PosedShape": ...
+def posed(field: AbstractShape, pose: Pose) -> "PosedShape": ...
 @overload
-def Posed(field: AbstractField, pose: Pose) -> "PosedShape | PosedField": ...
-def Posed(field: AbstractField, pose: Pose) -> "PosedShape | PosedField":  # noqa: N802 - reads as a constructor
+def posed(field: AbstractField, pose: Pose) -> "PosedShape | PosedField": ...
+def posed(field: AbstractField, pose: Pose) -> "PosedShape | PosedField":
     """`field` moved by `pose`, which maps the frame of `field` into the new one.
 
     Returns:
@@ -40,10 +40,10 @@ def Posed(field: AbstractField, pose: Pose) -> "PosedShape | PosedField":  # noq
 
 
 @overload
-def Scaled(field: AbstractShape, factor: ArrayLike) -> AbstractShape: ...
+def scaled(field: AbstractShape, factor: ArrayLike) -> AbstractShape: ...
 @overload
-def Scaled(field: AbstractField, factor: ArrayLike) -> AbstractField: ...
-def Scaled(field: AbstractField, factor: ArrayLike) -> AbstractField:  # noqa: N802 - reads as a constructor
+def scaled(field: AbstractField, factor: ArrayLike) -> AbstractField: ...
+def scaled(field: AbstractField, factor: ArrayLike) -> AbstractField:
     """`field` enlarged about its origin: its density at `factor` · x is that of `field` at x.
 
     Densities keep their values, so that the integral grows with the cube of the factor.
@@ -74,10 +74,10 @@ def Scaled(field: AbstractField, factor: ArrayLike) -> AbstractField:  # noqa: N
 
 
 @overload
-def Union(*fields: AbstractShape, edge: ArrayLike | None = None) -> "UnionShape": ...
+def union(*fields: AbstractShape, edge: ArrayLike | None = None) -> "UnionShape": ...
 @overload
-def Union(*fields: AbstractField, edge: ArrayLike | None = None) -> "UnionShape | UnionField": ...
-def Union(*fields: AbstractField, edge: ArrayLike | None = None) -> "UnionShape | UnionField":  # noqa: N802
+def union(*fields: AbstractField, edge: ArrayLike | None = None) -> "UnionShape | UnionField": ...
+def union(*fields: AbstractField, edge: ArrayLike | None = None) -> "UnionShape | UnionField":
     """The union of several fields.
 
     Args:
@@ -139,7 +139,7 @@ def _posed_jet(jet_of: Callable[[Array, int], Jet], pose: Pose, x: Float[Array, 
 
 
 class PosedField(AbstractField):
-    """A field moved by a pose; see `Posed`.
+    """A field moved by a pose; see `posed`.
 
     Attributes:
         field: The field, in its own frame.
@@ -168,7 +168,7 @@ class PosedField(AbstractField):
 
 
 class PosedShape(AbstractShape):
-    """A shape moved by a pose; see `Posed`.
+    """A shape moved by a pose; see `posed`.
 
     Attributes:
         shape: The shape, in its own frame.
@@ -231,7 +231,7 @@ def _scaled_jet(
 
 
 class ScaledField(AbstractField):
-    """A field enlarged about its origin; see `Scaled`.
+    """A field enlarged about its origin; see `scaled`.
 
     Attributes:
         field: The field, in its own units.
@@ -260,7 +260,7 @@ class ScaledField(AbstractField):
 
 
 class ScaledShape(AbstractShape):
-    """A shape enlarged about its origin; see `Scaled`.
+    """A shape enlarged about its origin; see `scaled`.
 
     Attributes:
         shape: The shape, in its own units.
@@ -317,7 +317,7 @@ def _joined_bounds(fields: tuple[AbstractField, ...]) -> Float[Array, "2 3"]:
 
 
 class UnionField(AbstractField):
-    """The largest density of several fields; see `Union`.
+    """The largest density of several fields; see `union`.
 
     Attributes:
         fields: The parts, all in the frame of this field.
@@ -356,7 +356,7 @@ class UnionField(AbstractField):
 
 
 class UnionShape(AbstractShape):
-    """The union of several shapes; see `Union`.
+    """The union of several shapes; see `union`.
 
     Attributes:
         shapes: The parts, all in the frame of this shape.

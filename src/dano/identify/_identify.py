@@ -13,18 +13,16 @@ from jaxtyping import Array
 from dano.engine import AbstractEngine, Policy, VariationalEngine
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Parameter, space_of, values_at, with_values
-from dano.identify._problem import Problem, Setup
+from dano.identify._problem import Problem
 from dano.identify._residuals import Linearized
 from dano.identify._scales import check_scales
+from dano.identify._settings import deviations, estimated, Noise, Search, Setup, Windowing
 from dano.identify._uncertainty import quantile, uncertainty
 from dano.identify._windows import Plan
 from dano.scene import Control, Scene, State, Trajectory
-from dano.solvers import Stop
+from dano.solvers import Solution, Stop
 
 Observed = Motion | Trajectory
-
-_INITIAL = {"given": (), "velocities": ("velocity", "omega"), "states": tuple(QUANTITIES)}
-_MOST_STARTS = 10_000
 
 
 class Errors(NamedTuple):
@@ -160,6 +158,7 @@ def identify(
     observed: Observed | Sequence[Any],
     parameters: Sequence[Parameter],
     *,
+    held_out: Observed | Sequence[Any] = (),
     state: State | Sequence[State | None] | None = None,
     controls: Control | Policy | Sequence[Control | None] | None = None,
     initial: str | Sequence[str] | None = None,
@@ -170,7 +169,6 @@ def identify(
     after: Identification | None = None,
     starts: int = 1,
     seed: int = 0,
-    held_out: Observed | Sequence[Any] = (),
     jacobian: str = "auto",
     max_iterations: int = 100,
     tolerance: float = 0.1,
@@ -183,19 +181,23 @@ def identify(
     Minimises ½ Σ ‖(x̂ − x)/σ‖² over frames, bodies and quantities (Sec. V-A of the paper, with W = 1/σ²) by
     Levenberg–Marquardt within the bounds, differentiating the simulation.
 
+    The arguments come in groups: what moved (`scene` to `initial`), the noise of observations (`noise`,
+    `huber`), windows (`window`, `continuity`, `after`), the search (`starts` to `batch`).
+
     Args:
         scene: The scene, with values for whatever is not a parameter.
         observed: One motion or several: simulated trajectories or `Motion`s, of any bodies, in any frames,
             with any gaps; frames need not lie on steps. Each begins at its own first complete frame.
         parameters: What is unknown.
+        held_out: Motions that are not fitted, to measure the error on.
         state: What a motion does not say of its beginning, e.g. where an unobserved or a fixed body is (by
             default fixed ones are at the origin); one for all motions or one for each.
         controls: Forces and torques [N, N m]: those of each step of each motion, or a policy as in `simulate`
             (whose time runs from the first frame of the motion).
         initial: What to estimate of the state in which each window begins: nothing ("given": it is as
-            observed), velocities and spins ("velocities"), all ("states": right for noisy poses, and
-            needed for honest standard errors then), or a list of quantities, e.g. ["velocity"]. Default:
-            "given" if velocities and spins are observed, "velocities" if not.
+            observed), velocities and spins ("velocities"), all ("states": right for noisy poses, and needed
+            for honest standard errors then), or a list of quantities, e.g. ["velocity"]. Default: "given" if
+            velocities and spins are observed, "velocities" if not.
         noise: Standard deviations by quantity: position [m], orientation [rad], velocity [m/s], omega
             [rad/s]. What is left out does not count. Default: positions and orientations, which weigh as if
             seen at the bodies' surface.
@@ -203,20 +205,19 @@ def identify(
             squared, e.g. 2: outliers then pull less.
         window: Frames of the windows that motions are cut into, each simulated from its own initial state
             (multiple shooting); default: no cuts. For long and for chaotic motions.
-        continuity: Standard deviation, as multiple of `noise`, by which the end of a window may miss the
-            beginning of the next; default: they need not meet. Needs `initial="states"`. A falling sequence
-            is searched with one after the other, each from where the last one ended: loose windows find
-            the way from afar, tight ones use all that the motion says.
+        continuity: Allowed gap between the end of a window and the beginning of the next, as multiple of
+            `noise`; default: any gap. Needs `initial="states"`. A falling sequence is searched with one value
+            after the other, each from where the last one ended: loose windows converge from far-off
+            parameters, tight ones use all of the motion.
         after: An earlier fit of the same motions in the same windows, from which this one goes on: from its
-            values, by name, instead of where parameters start, and from the initial states that it
-            estimated. To fit at a coarse timestep first, or with fewer unknowns.
+            values, by name, and from the initial states that it estimated. To fit at a coarse timestep first,
+            or with fewer unknowns.
         starts: Points to start from: the scene's values, and others in the bounds, the best of many by their
             loss. For losses with several minima.
         seed: Of everything random.
-        held_out: Motions that are not fitted, to measure the error on.
         jacobian: Forward mode costs one rollout per unknown, reverse mode several per observed number.
         max_iterations: Steps of each search.
-        tolerance: Stop when a step promises to move the parameters by less than this, in standard errors.
+        tolerance: Stop when the predicted move of the parameters is below this, in standard errors.
         batch: Windows that a device simulates at once; default one on a CPU, many on a GPU. All devices of
             this process, and all processes of `jax.distributed`, take a share of the windows.
         engine: Default `VariationalEngine()`.
@@ -241,74 +242,80 @@ def identify(
         parameters = [
             dataclasses.replace(each, start=after.values.get(each.name, each.start)) for each in parameters
         ]
-    space = space_of(scene, controls, parameters)
-    chosen = _initial(initial, motions)
-    ties = () if continuity is None else tuple(np.atleast_1d(np.asarray(continuity, float)).tolist())
-    _check_options(huber, window, ties, starts, chosen, jacobian, max_iterations, tolerance)
-    check_scales(scene, motions, window)
+    chosen = estimated(initial, motions)
     setup = Setup(
-        space,
+        space_of(scene, controls, parameters),
         scene,
         controls,
         chosen,
-        _noise(scene, motions, noise),
-        huber,
-        window,
-        ties,
-        jacobian,
+        Noise(deviations(scene, motions, noise), huber),
+        Windowing.create(window, continuity, chosen),
+        Search(starts, seed, jacobian, max_iterations, tolerance, batch),
         engine or VariationalEngine(),
-        batch,
-        seed,
     )
+    check_scales(scene, motions, window)
     problem = Problem(setup, motions, state)
     if after is not None:
         problem.begin_near(after.initial_states, after.initial)
     tell = progress or (lambda description, share: None)
     tell("compiling", 0.0)
+    solutions = _searched(problem, setup.search, tell)
+    held_errors = None
+    if held := _motions("held_out", held_out):
+        other = Problem(setup, held, state)
+        fixed = other.search(solutions[0].x, max_iterations, tolerance, None, free=False)
+        held_errors = _errors(other.plan, held, other.simulate(fixed.x, fixed.blocks))
+    found = _identification(setup, problem, motions, solutions, held_errors, began)
+    for message in found.messages:
+        warnings.warn(message, RuntimeWarning, stacklevel=2)
+    tell("done", 1.0)
+    return found
+
+
+def _searched(problem: Problem, search: Search, tell: Callable[[str, float], None]) -> list[Solution]:
+    """Where the search from each start ended, best first."""
     solutions = []
-    points = problem.points(starts)
+    points = problem.points(search.starts)
     for k, x in enumerate(points):
-        solutions.append(
-            problem.search(
-                x,
-                max_iterations,
-                tolerance,
-                lambda i, loss, k=k: tell(
-                    f"fitting, loss {loss:.6g}", (k + i / max_iterations) / len(points)
-                ),
-            )
-        )
+
+        def said(i: int, loss: float, k: int = k) -> None:
+            tell(f"fitting, loss {loss:.6g}", (k + i / search.max_iterations) / len(points))
+
+        solutions.append(problem.search(x, search.max_iterations, search.tolerance, said))
         if solutions[-1].stop is Stop.INTERRUPTED:
             break
-    solutions.sort(key=lambda s: s.normal.loss)
-    best = solutions[0]
+    return sorted(solutions, key=lambda s: s.normal.loss)
+
+
+def _identification(
+    setup: Setup,
+    problem: Problem,
+    motions: tuple[Motion, ...],
+    solutions: list[Solution],
+    held_errors: Errors | None,
+    began: float,
+) -> Identification:
+    """The result: values, how sure they are, and the motion that they give."""
+    best, space, scene, plan = solutions[0], setup.space, setup.scene, problem.plan
     at_best = problem.simulate(best.x, best.blocks)
-    at_start = problem.simulate(space.start, problem.plan.start)
+    at_start = problem.simulate(space.start, plan.start)
     known = np.asarray(at_best.lengths)
-    found = uncertainty(space, best.x, best.normal, known[known >= 0], huber, problem.plan.n_data, scene)
-    values, errors = values_at(space.selections, best.x, found.covariance)
-    messages = list(found.messages)
+    sure = uncertainty(space, best.x, best.normal, known[known >= 0], setup.noise.huber, plan.n_data, scene)
+    values, errors = values_at(space.selections, best.x, sure.covariance)
+    fit_errors = _errors(plan, motions, at_best)
+    messages = list(sure.messages)
     if failed := int(np.sum(np.asarray(at_best.unconverged))):
         messages.append(f"{failed} steps did not converge at the values found; try a smaller timestep")
     if not best.stop.converged:
         messages.append(f"the search did not end in a minimum: {best.stop.value}")
-    held = _motions("held_out", held_out)
-    held_errors = None
-    if held:
-        other = Problem(setup, held, state)
-        fixed = other.search(best.x, max_iterations, tolerance, None, free=False)
-        held_errors = _errors(other.plan, held, other.simulate(fixed.x, fixed.blocks))
-    fit_errors = _errors(problem.plan, motions, at_best)
     if missed := _missed(scene, motions, fit_errors):
         messages.append(missed)
-    for message in messages:
-        warnings.warn(message, RuntimeWarning, stacklevel=2)
-    tell("done", 1.0)
     x = jnp.asarray(best.x, scene.timestep.dtype)
+    controls = setup.controls
     return Identification(
         values=values,
         standard_errors=errors,
-        covariance=found.covariance,
+        covariance=sure.covariance,
         labels=tuple(space.labels),
         stop=best.stop,
         loss_history=best.losses,
@@ -316,17 +323,17 @@ def identify(
         errors=fit_errors,
         held_out_errors=held_errors,
         minima=tuple(
-            Minimum(values_at(space.selections, s.x, found.covariance)[0], s.normal.loss, s.stop)
+            Minimum(values_at(space.selections, s.x, sure.covariance)[0], s.normal.loss, s.stop)
             for s in solutions
         ),
         scene=with_values(space.selections, "scene", scene, x),
         controls=controls if controls is None else with_values(space.selections, "controls", controls, x),
-        initial=chosen,
+        initial=setup.initial,
         initial_states=best.blocks,
         motions=motions,
-        fitted=_as_motions(problem.plan, motions, at_best, scene),
-        guessed=_as_motions(problem.plan, motions, at_start, scene),
-        freedom=found.freedom,
+        fitted=_as_motions(plan, motions, at_best, scene),
+        guessed=_as_motions(plan, motions, at_start, scene),
+        freedom=sure.freedom,
         evaluations=problem.evaluations,
         seconds=time.perf_counter() - began,
     )
@@ -340,57 +347,6 @@ def _motions(name: str, observed: Observed | Sequence[Any]) -> tuple[Motion, ...
             raise ValueError(f"{name} must hold Motions or Trajectories, got {type(item).__name__}")
         found.append(item if isinstance(item, Motion) else Motion.from_trajectory(item))
     return tuple(found)
-
-
-def _initial(initial: str | Sequence[str] | None, motions: Sequence[Motion]) -> tuple[str, ...]:
-    if initial is None:
-        first = [np.concatenate([m.velocity, m.omega], axis=-1) for m in motions]
-        initial = "given" if all(np.isfinite(v).all() for v in first) else "velocities"
-    if isinstance(initial, str):
-        if initial not in _INITIAL:
-            raise ValueError(f"initial must be one of {list(_INITIAL)} or list quantities, got {initial!r}")
-        return _INITIAL[initial]
-    if wrong := [key for key in initial if key not in QUANTITIES]:
-        raise ValueError(f"initial must list some of {list(QUANTITIES)}, got {wrong[0]!r}")
-    return tuple(key for key in QUANTITIES if key in initial)
-
-
-def _check_options(huber, window, ties, starts, initial, jacobian, max_iterations, tolerance) -> None:
-    if huber is not None and not huber > 0:
-        raise ValueError(f"huber must be > 0, got {huber}")
-    if window is not None and window < 2:
-        raise ValueError(f"window must hold at least 2 frames, got {window}")
-    if ties:
-        if not all(tie > 0 for tie in ties) or any(b >= a for a, b in zip(ties, ties[1:], strict=False)):
-            raise ValueError(f"continuity must be > 0, and a sequence of it must fall, got {list(ties)}")
-        if window is None or len(initial) < len(QUANTITIES):
-            raise ValueError(
-                f"continuity needs window and initial='states', got window {window}, initial {list(initial)}"
-            )
-    if not 1 <= starts <= _MOST_STARTS:
-        raise ValueError(f"starts must be ≥ 1 and ≤ {_MOST_STARTS}, got {starts}")
-    if jacobian not in ("auto", "forward", "reverse"):
-        raise ValueError(f"jacobian must be 'auto', 'forward' or 'reverse', got {jacobian!r}")
-    if not tolerance > 0:
-        raise ValueError(f"tolerance must be > 0 standard errors, got {tolerance}")
-    if max_iterations < 1:
-        raise ValueError(f"max_iterations must be ≥ 1, got {max_iterations}")
-
-
-def _noise(scene: Scene, motions: Sequence[Motion], noise: Mapping[str, float] | None) -> dict[str, float]:
-    if noise is None:
-        sizes = [scene.body(name).size for m in motions for name in m.names if name in scene.names]
-        finite = [size for size in sizes if np.isfinite(size)] or [1.0]
-        # A thousandth of the size, seen at half the size from the middle.
-        return {"position": 1e-3 * float(np.mean(finite)), "orientation": 2e-3}
-    for key, value in noise.items():
-        if key not in QUANTITIES:
-            raise ValueError(f"noise must be given for some of {list(QUANTITIES)}, got {key!r}")
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"noise of {key} must be finite and > 0, got {value}")
-    if not noise:
-        raise ValueError(f"noise must be given for at least one of {list(QUANTITIES)}, got none")
-    return dict(noise)
 
 
 def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:

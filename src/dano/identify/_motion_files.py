@@ -7,7 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from dano.archive import Arrays, checked_input, checked_output, replacing, write_archive
+from dano.archive import (
+    Arrays,
+    check_format,
+    checked_input,
+    checked_output,
+    is_own,
+    MOTION,
+    replacing,
+    TRAJECTORY,
+    write_archive,
+)
 from dano.identify._motion import Motion, QUANTITIES
 
 _SYNONYMS = {
@@ -101,7 +111,8 @@ def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
     target = checked_output(path)
     if target.suffix.lower() == ".npz":
         arrays = {key: getattr(motion, key) for key in ("times", *QUANTITIES)}
-        words = {"format": "dano-motion", "version": 1, "names": motion.names, "point": motion.point}
+        form, version = MOTION
+        words = {"format": form, "version": version, "names": motion.names, "point": motion.point}
         words["lag"] = motion.lag
         write_archive(target, {**arrays, **{key: np.array(value) for key, value in words.items()}})
         return
@@ -122,6 +133,8 @@ def _read_npz(source: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
         with open(source, "rb") as file:
             archive = Arrays(file)
             data = {key: archive[key] for key in archive.names}
+            if is_own(form := str(data.get("format", ""))):
+                check_format(form, data.get("version"), dict((MOTION, TRAJECTORY)))
     except (OSError, ValueError) as error:
         raise ValueError(f"{source} is not a readable .npz file: {error}") from error
     arrays = {}
@@ -141,7 +154,7 @@ def _read_npz(source: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     for key in ("point", "lag"):
         if key in data:
             arrays[key] = data[key]
-    if str(data.get("format", "")) == "dano-trajectory":
+    if form == TRAJECTORY[0]:
         arrays["lag"] = np.array(0.5 * (arrays["times"][1] - arrays["times"][0]))
     return arrays, tuple(str(name) for name in np.atleast_1d(data.get("names", [])))
 

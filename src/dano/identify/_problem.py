@@ -3,17 +3,17 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dano.engine import AbstractEngine, device_mesh
+from dano.engine import device_mesh
 from dano.identify._motion import Motion, QUANTITIES
-from dano.identify._parameters import Space
 from dano.identify._residuals import Linearized, linearized, Model, moved
+from dano.identify._settings import Setup
 from dano.identify._starts import Start
 from dano.identify._windows import draw_velocities, plan_windows
 from dano.scene import Control, Scene, State
@@ -32,30 +32,14 @@ _NEAR = 3.0
 _BATCH = 1024
 
 
-class Setup(NamedTuple):
-    """Arguments of `identify`, checked, that do not depend on the motions."""
-
-    space: Space
-    scene: Scene
-    controls: Any
-    initial: tuple[str, ...]
-    noise: dict[str, float]
-    huber: float | None
-    window: int | None
-    ties: tuple[float, ...]
-    jacobian: str
-    engine: AbstractEngine
-    batch: int | None
-    seed: int
-
-
 class Problem:
     """The least squares problem of some motions: residuals of windows over parameters and initial states."""
 
     def __init__(self, setup: Setup, motions: Sequence[Motion], state: Any):
-        space, scene, controls, initial, noise = setup[:5]
-        huber, window, ties, jacobian, engine, batch, seed = setup[5:]
-        self.space, self.noise, self.ties, self.seed = space, noise, ties, seed
+        space, scene, controls, initial = setup.space, setup.scene, setup.controls, setup.initial
+        noise, huber, search = setup.noise.deviations, setup.noise.huber, setup.search
+        self.space, self.noise, self.seed = space, noise, search.seed
+        self.ties = setup.windows.continuity
         self.spacing = float(np.median(np.concatenate([np.diff(motion.times) for motion in motions])))
         self.simulations = 0
         self._last: tuple[Model, Array, tuple[State, State], Linearized] | None = None
@@ -68,7 +52,7 @@ class Problem:
             controls=[None] * len(motions) if policy is not None else _control_list(scene, controls, motions),
             noise=noise,
             initial=initial,
-            window=window,
+            window=setup.windows.frames,
             continuous=bool(self.ties),
         )
         self.plan = self._planned()
@@ -87,7 +71,8 @@ class Problem:
             )
         numbers = max(1, self.plan.n_data // n_windows)
         # A backward pass per observed number costs about four forward ones.
-        reverse = jacobian == "reverse" or (jacobian == "auto" and unknowns > 4 * numbers)
+        costly = unknowns > 4 * numbers
+        reverse = search.jacobian == "reverse" or (search.jacobian == "auto" and costly)
         on_cpu = jax.default_backend() == "cpu"
         self.jumps = None
         if self.ties:
@@ -100,7 +85,7 @@ class Problem:
         self.model = Model(
             scene,
             policy,
-            engine,
+            setup.engine,
             self.plan.windows,
             None if huber is None else jnp.asarray(huber, dtype),
             # Starts are compared as the first search sees them.
@@ -111,7 +96,7 @@ class Problem:
             self.start,
             self.plan.n_steps,
             reverse,
-            batch or (1 if on_cpu else _BATCH),
+            search.batch or (1 if on_cpu else _BATCH),
             device_mesh(),
         )
 

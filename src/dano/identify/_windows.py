@@ -107,32 +107,8 @@ def plan_windows(
     seen = [i for i in moving if any(scene.names[i] in motion.names for motion in motions)]
     if not seen:
         raise ValueError(f"observed must hold a body that moves, got only fixed ones of {list(scene.names)}")
-    longest = max(len(piece["rows"]) for piece in pieces)
-
-    def stacked(values: list[np.ndarray], fill: float = 0.0) -> np.ndarray:
-        padded = [
-            np.concatenate([v, np.full((longest - len(v), *v.shape[1:]), fill, v.dtype)]) for v in values
-        ]
-        return np.stack(padded)
-
     dtype = scene.timestep.dtype
-    observed, weights = {}, {}
-    for key in QUANTITIES:
-        values = stacked([piece[key] for piece in pieces], np.nan)
-        known = np.asarray(np.isfinite(values).all(axis=-1))
-        observed[key] = jnp.asarray(np.where(known[..., None], values, 0.0), dtype)
-        if key not in noise:
-            continue
-        counts = known.copy()
-        counts[:, :, [i for i in range(len(scene.bodies)) if i not in seen]] = False
-        if key not in initial:
-            counts[:, 0] = False
-        if counts.any():
-            weights[key] = jnp.asarray(counts / noise[key], dtype)
-    if not weights:
-        raise ValueError(
-            f"observed must hold frames after the first of one of {list(noise)}, got none that count"
-        )
+    observed, weights = _weighed(pieces, seen, noise, initial, dtype)
     sizes = {"position": 3, "orientation": 3, "velocity": 3, "omega": 3}
     n_data = sum(int(np.count_nonzero(np.asarray(w))) * sizes[key] for key, w in weights.items())
     elapsed = [piece["times"] - piece["times"][0] for piece in pieces]
@@ -146,8 +122,8 @@ def plan_windows(
     late = [np.maximum(e - lag + 0.5 * h, 0.0) for e, lag in zip(elapsed, lags, strict=True)]
     ends = [max(e[-1], u, v[-1]) for e, u, v in zip(elapsed, until, late, strict=True)]
     n_steps = max(1, _steps_to(max(ends), h))
-    frame = _located(stacked(elapsed) / h, n_steps)
-    moment = _located(stacked(late) / h, n_steps)
+    frame = _located(_stacked(elapsed) / h, n_steps)
+    moment = _located(_stacked(late) / h, n_steps)
     first_step = np.array([_steps_to(piece["times"][0] - piece["origin"], h) for piece in pieces])
     forces = [piece["control"] for piece in pieces]
     windows = Windows(
@@ -156,28 +132,52 @@ def plan_windows(
         jnp.asarray(np.stack([piece["origins"] for piece in pieces])),
         _arrays(frame, dtype),
         _arrays(moment, dtype),
-        State(**observed),
+        observed,
         weights,
         _arrays(_located(np.array(until) / h, n_steps), dtype),
         jnp.asarray(np.append(owner[1:] == owner[:-1], False), dtype),
         _control_rows(scene, forces, first_step, n_steps),
     )
-    start = State(
-        **{
-            key: jnp.asarray(np.stack([piece["start"][key] for piece in pieces]), dtype)
-            for key in pieces[0]["start"]
-        }
+    names = pieces[0]["start"]
+    start = {key: jnp.asarray(np.stack([piece["start"][key] for piece in pieces]), dtype) for key in names}
+    rows = [piece["rows"] for piece in pieces]
+    return Plan(windows, State(**start), n_steps, owner, rows, tuple(seen), tuple(weights), n_data)
+
+
+def _stacked(values: list[np.ndarray], fill: float = 0.0) -> np.ndarray:
+    """Arrays of different lengths as one, the short ones filled up."""
+    longest = max(len(v) for v in values)
+    return np.stack(
+        [np.concatenate([v, np.full((longest - len(v), *v.shape[1:]), fill, v.dtype)]) for v in values]
     )
-    return Plan(
-        windows,
-        start,
-        n_steps,
-        owner,
-        [piece["rows"] for piece in pieces],
-        tuple(seen),
-        tuple(weights),
-        n_data,
-    )
+
+
+def _weighed(
+    pieces: list[dict], seen: Sequence[int], noise: Mapping[str, float], initial: Sequence[str], dtype
+) -> tuple[State, dict[str, Array]]:
+    """What windows observe, and what each number counts: see `Windows`.
+
+    Raises:
+        ValueError: If nothing counts.
+    """
+    observed, weights = {}, {}
+    for key in QUANTITIES:
+        values = _stacked([piece[key] for piece in pieces], np.nan)
+        known = np.asarray(np.isfinite(values).all(axis=-1))
+        observed[key] = jnp.asarray(np.where(known[..., None], values, 0.0), dtype)
+        if key not in noise:
+            continue
+        counts = known.copy()
+        counts[:, :, [i for i in range(known.shape[2]) if i not in seen]] = False
+        if key not in initial:
+            counts[:, 0] = False
+        if counts.any():
+            weights[key] = jnp.asarray(counts / noise[key], dtype)
+    if not weights:
+        raise ValueError(
+            f"observed must hold frames after the first of one of {list(noise)}, got none that count"
+        )
+    return State(**observed), weights
 
 
 def draw_velocities(

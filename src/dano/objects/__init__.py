@@ -8,7 +8,10 @@ from dano.objects._interior import (
 from dano.objects._mass import checked_inertia as checked_inertia, MassProperties as MassProperties
 from dano.objects._object import MassModel as MassModel, NeuralObject as NeuralObject
 from dano.objects._quadrature import Quadrature as Quadrature, surface_quadrature as surface_quadrature
-from dano.objects._samples import ContactSamples as ContactSamples, surface_samples as surface_samples
+from dano.objects._samples import (
+    ContactSamples as ContactSamples,
+    draw_contact_samples as draw_contact_samples,
+)
 from dano.objects._surface import (
     draw_surface as draw_surface,
     SurfaceSamples as SurfaceSamples,

@@ -36,6 +36,19 @@ _SURROUNDED = 0.7
 less."""
 
 _BALL = np.ones((3, 3, 3))
+"""A node and its neighbours, those over corners included."""
+
+_NEAR_ONE, _OVERSHOOT = (0.8, 1.1), 1.3
+"""Limits of the density near the surface of an occupancy, and the most it reaches: splines through samples of
+an occupancy may overshoot by a fifth."""
+
+_HOLLOW, _SOLID = 0.25, (0.85, 1.15)
+"""Density deep inside over that near the surface: below the first the inside is hollow, between the others it
+is solid (convention)."""
+
+_UNEVEN, _CAVITY, _HAZE = 0.1, 0.02, 0.01
+"""Unevenness, share of hollow volume and share of density outside, from which mass does not follow density
+(convention)."""
 
 
 class Interior(eqx.Module):
@@ -70,27 +83,26 @@ class Interior(eqx.Module):
         """Why the density should not be read as mass density, in words; empty if it may be."""
         found = []
         deep, wall, largest = float(self.deep), float(self.wall), float(self.largest)
-        # Splines through samples of an occupancy may overshoot by a fifth.
-        if not 0.8 <= wall <= 1.1 or largest > 1.3:
+        if not _NEAR_ONE[0] <= wall <= _NEAR_ONE[1] or largest > _OVERSHOOT:
             found.append(
-                f"densities of {wall:.3g} near the surface and up to {largest:.3g} are no probability of"
-                " occupancy"
+                f"densities of {wall:.3g} near the surface and up to {largest:.3g} are not"
+                " probabilities of occupancy"
             )
-        if deep < 0.25:
+        if deep < _HOLLOW:
             found.append(f"it is hollow: deep inside {100 * deep:.0f} % of the density near the surface")
-        elif deep < 0.85:
+        elif deep < _SOLID[0]:
             found.append(f"its inside is foggy: {100 * deep:.0f} % of the density near the surface")
-        elif deep > 1.15:
+        elif deep > _SOLID[1]:
             found.append(f"deep inside it has {100 * deep:.0f} % of the density near the surface")
-        if float(self.spread) > 0.1:
+        if float(self.spread) > _UNEVEN:
             found.append(f"the density inside is uneven by {100 * float(self.spread):.0f} %")
-        if float(self.cavity) > 0.02 and not deep < 0.25:
+        if float(self.cavity) > _CAVITY and not deep < _HOLLOW:
             found.append(f"{100 * float(self.cavity):.0f} % of its volume is hollow")
         if float(self.gap) > 0:
             found.append(f"its surface had pores, closed up to {2 * float(self.gap):.0f} cells wide")
         if math.isnan(float(self.gap)):
             found.append("no watertight surface was found, so what is inside is uncertain")
-        if float(self.outside) > 0.01:
+        if float(self.outside) > _HAZE:
             found.append(f"{100 * float(self.outside):.0f} % of the density is haze or floaters")
         return found
 

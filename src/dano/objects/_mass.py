@@ -9,13 +9,16 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.fields import AbstractField, GridField, Jet
-from dano.maths import checked_array, is_traced, Numbers
+from dano.maths import checked_array, checked_count, is_traced, Numbers
 
 Density = Callable[[Float[Array, "3"]], Float[Array, ""]]
 Progress = Callable[[str, float], None]
 
 # Points evaluated at once: large enough to amortise a call, small enough for a few MB of intermediates.
 BATCH = 1 << 16
+# Share by which a moment may exceed the sum of the other two: rounding of float32, and of files with four
+# digits.
+_TRIANGLE = 1e-3
 
 
 class MassProperties(eqx.Module):
@@ -95,21 +98,14 @@ class MassProperties(eqx.Module):
             ValueError: If the bounds are not finite, the density is negative, not finite or nowhere positive,
                 or a number is out of range.
         """
-        density = checked_density(field)
-        if isinstance(field, GridField):
-            check_scale(mass_scale, mass)
-            moments = field.moments()
-            total = mass_scale * float(moments.integral) if mass is None else mass
-            second = np.asarray(moments.second_moment) * (total / float(moments.integral))
-            return cls(total, moments.centroid, np.trace(second) * np.eye(3) - second)
-        return integrate(density, field.bounds, mass_scale, mass, resolution, key, progress)
+        return integrated(field, mass_scale, mass, resolution, key, progress)
 
 
 def checked_inertia(name: str, value: Numbers) -> Float[Array, "3 3"]:
     """`value` as a symmetric positive definite 3×3 tensor.
 
     Raises:
-        ValueError: If it is not.
+        ValueError: If it is not, or no body has it.
     """
     inertia = checked_array(name, value, (3, 3))
     if not is_traced(inertia):
@@ -120,6 +116,13 @@ def checked_inertia(name: str, value: Numbers) -> Float[Array, "3 3"]:
             raise ValueError(
                 f"{name} must be positive definite, got eigenvalues {np.linalg.eigvalsh(matrix).tolist()}"
             )
+        low, middle, high = np.linalg.eigvalsh(matrix)
+        # That of a flat plate is the sum, to rounding.
+        if high > (1 + _TRIANGLE) * (low + middle):
+            raise ValueError(
+                f"{name} must be that of some body: no principal moment may exceed the sum of the other two,"
+                f" got {[float(f'{moment:.6g}') for moment in (low, middle, high)]} kg m²"
+            )
     return inertia
 
 
@@ -129,6 +132,11 @@ def checked_density(field: AbstractField) -> Density:
     Raises:
         ValueError: If they are not.
     """
+    if not isinstance(field, AbstractField):
+        raise ValueError(
+            f"field must be a dano field, got {type(field).__name__}; dano.GridField(values, origin, spacing)"
+            " makes one of an array, dano.CallableField(function, bounds) of a function"
+        )
     bounds = np.asarray(field.bounds)
     if not np.all(np.isfinite(bounds)):
         raise ValueError(f"field must have finite bounds to become an object, got {bounds.tolist()}")
@@ -187,11 +195,22 @@ def _compiled_jet(jet, points):
 
 def cells(bounds: Float[Array, "2 3"], resolution: int) -> tuple[np.ndarray, np.ndarray]:
     """Number of cells (3,) and their sides [m] (3,) of a grid of `resolution` cells on the longest axis."""
-    if resolution < 4:
-        raise ValueError(f"resolution must be ≥ 4, got {resolution}")
+    resolution = checked_count("resolution", resolution, least=4)
     extent = np.asarray(bounds[1] - bounds[0], dtype=np.float64)
     count = np.maximum(np.ceil(extent / extent.max() * resolution - 1e-9).astype(int), 1)
     return count, extent / count
+
+
+def integrated(field: AbstractField, mass_scale, mass, resolution, key, progress) -> MassProperties:
+    """See `MassProperties.from_field`."""
+    density = checked_density(field)
+    if isinstance(field, GridField):
+        check_scale(mass_scale, mass)
+        moments = field.moments()
+        total = mass_scale * float(moments.integral) if mass is None else mass
+        second = np.asarray(moments.second_moment) * (total / float(moments.integral))
+        return MassProperties(total, moments.centroid, np.trace(second) * np.eye(3) - second)
+    return integrate(density, field.bounds, mass_scale, mass, resolution, key, progress)
 
 
 def integrate(density, bounds, mass_scale, mass, resolution, key, progress) -> MassProperties:

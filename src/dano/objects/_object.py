@@ -13,16 +13,15 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.archive import LOOK, OBJECT, read_archive, write_archive
 from dano.fields import AbstractField, AbstractShape, GridField, SignedDistanceGrid
-from dano.maths import checked_array, floating, is_traced, Numbers
+from dano.maths import checked_array, checked_count, checked_key, floating, is_traced, Numbers
 from dano.objects._interior import examine, Interior, sealed
-from dano.objects._mass import checked_density, integrate, MassProperties, Progress
+from dano.objects._mass import checked_density, Density, integrate, integrated, MassProperties, Progress
 from dano.objects._samples import (
     baked,
     contact_grid,
+    contact_samples,
     ContactSamples,
-    draw_samples,
     Lattice,
-    outward_normals,
     Region,
     surface_level,
 )
@@ -108,52 +107,30 @@ class NeuralObject(eqx.Module):
         """
         if mass_model not in get_args(MassModel):
             raise ValueError(f"mass_model must be one of {get_args(MassModel)}, got {mass_model!r}")
-        if n_samples < 1:
-            raise ValueError(f"n_samples must be ≥ 1, got {n_samples}")
-        key = jax.random.key(0) if key is None else key
+        say = progress or (lambda description, share: None)
+        n_samples = checked_count("n_samples", n_samples)
+        key = checked_key(key)
         sampling_key, mass_key = jax.random.split(key)
-        density = checked_density(field)
-        lattice = Lattice.create(density, field.bounds, resolution)
-        interior, inside = examine(lattice)
-        level = float(interior.level)
-        model, reason = _weighed(field, interior, mass_model)
         original = field
-        if float(interior.gap) > 0:
-            # A porous surface: contact, too, is with the solid whose pores are closed.
-            field = sealed(lattice, interior, inside)
-            density = checked_density(field)
-            lattice = Lattice.create(density, field.bounds, resolution)
+        field, density, lattice, interior = _closed(original, resolution)
+        level = float(interior.level)
+        model, reason = _weighed(original, interior, mass_model)
         low, high = (level, 1.8 * level) if density_range is None else density_range
         if not 0 <= low < high:
             raise ValueError(f"density_range must satisfy 0 ≤ low < high, got ({low}, {high})")
         body = Region.create(lattice, low, floaters=floaters)
-        if progress is not None:
-            progress("samples", 0.0)
-        points, values = draw_samples(density, lattice, body, low, high, n_samples, sampling_key)
-        samples = ContactSamples(
-            floating(points), floating(values), floating(outward_normals(field, points, body))
-        )
-        if progress is not None:
-            progress("surface", 0.0)
+        say("samples", 0.0)
+        samples = contact_samples(field, density, lattice, body, low, high, n_samples, sampling_key)
+        say("surface", 0.0)
         grid, error = baked(field, resolution)
         filled = field_solid(field, grid, level, floaters=floaters)
         surface = draw_surface(filled, n_samples, key=jax.random.fold_in(key, 2))
-        if model == "density":
-            properties = MassProperties.from_field(
-                original,
-                mass_scale=mass_scale,
-                mass=mass,
-                resolution=resolution,
-                key=mass_key,
-                progress=progress,
-            )
-        else:
-            homogeneous = Region.create(lattice, level, floaters=False).solid(density)
-            properties = integrate(
-                homogeneous, field.bounds, mass_scale, mass, resolution, mass_key, progress
-            )
-        if progress is not None:
-            progress("done", 1.0)
+        solid = Region.create(lattice, level, floaters=False).solid(density)
+        how = (mass_scale, mass, resolution, mass_key, progress)
+        properties = (
+            integrated(original, *how) if model == "density" else integrate(solid, field.bounds, *how)
+        )
+        say("done", 1.0)
         return cls(
             samples=samples,
             surface=surface,
@@ -243,7 +220,7 @@ class NeuralObject(eqx.Module):
         Args:
             path: The file.
             look: Arrays that say what the object looks like, kept beside its physics for those who draw it:
-                `dano.vision.LearnedField.look`.
+                `dano.vision.LearnedField.arrays`.
 
         Raises:
             ValueError: If `path` is a directory or its parent does not exist.
@@ -336,6 +313,21 @@ class NeuralObject(eqx.Module):
             )
         except (KeyError, ValueError) as error:
             raise ValueError(f"{path} is not a valid dano object: {error}") from error
+
+
+def _closed(field: AbstractField, resolution: int) -> tuple[AbstractField, Density, Lattice, Interior]:
+    """A field whose surface has no pores, its density, the lattice it is sampled on, and its inside.
+
+    Contact, too, is with the solid whose pores are closed.
+    """
+    density = checked_density(field)
+    lattice = Lattice.create(density, field.bounds, resolution)
+    interior, inside = examine(lattice)
+    if float(interior.gap) > 0:
+        field = sealed(lattice, interior, inside)
+        density = checked_density(field)
+        lattice = Lattice.create(density, field.bounds, resolution)
+    return field, density, lattice, interior
 
 
 def _weighed(field: AbstractField, interior: Interior, wanted: MassModel) -> tuple[str, str]:

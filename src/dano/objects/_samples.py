@@ -1,5 +1,7 @@
 """Contact samples: where an object feels contact, drawn evenly between two densities."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,13 +9,15 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.fields import AbstractField, AbstractShape, GridField
-from dano.maths import floating
+from dano.maths import checked_key, floating
 from dano.objects._mass import cells, checked_density, Density, evaluate, host_random
 from dano.objects._surface import farthest_points
 
 # Candidates per sample that the even selection chooses from, and random draws per candidate before giving up.
 CANDIDATES = 4
 DRAWS = 400
+# Cells across the thinnest side of a field's bounds with which its inside is found wherever the lattice lies.
+_CELLS_ACROSS = 4
 
 
 class ContactSamples(eqx.Module):
@@ -59,13 +63,27 @@ class Lattice(eqx.Module):
         if values.max() <= 0:
             raise ValueError(
                 f"field must have a positive density somewhere, got none at {values.size} points"
+                + _finer(side * count, resolution)
             )
         return cls(values, origin, side)
+
+    @property
+    def extent(self) -> np.ndarray:
+        """Sides [m] of the box that it fills, shape (3,)."""
+        return self.side * (np.array(self.values.shape) - 1)
 
     def nearest(self, points: np.ndarray) -> tuple[np.ndarray, ...]:
         """Index of the lattice point nearest to each point (n, 3) [m, F]."""
         index = np.rint((points - self.origin) / self.side).astype(int)
         return tuple(np.clip(index, 0, np.array(self.values.shape) - 1).T)
+
+
+def _finer(extent: np.ndarray, resolution: int) -> str:
+    """Which resolution to try for a field whose bounds [m] are thin; nothing where it is fine enough."""
+    wanted = math.ceil(_CELLS_ACROSS * float(extent.max() / extent.min()))
+    if wanted <= resolution:
+        return ""
+    return f"; it is {float(extent.min()):.3g} m thin: try resolution={wanted}, got {resolution}"
 
 
 class Region(eqx.Module):
@@ -208,12 +226,13 @@ def draw_samples(
             f"density_range ({low:.6g}, {high:.6g}) must contain at least n_samples = {n} points of the "
             f"object, found {len(points)} in {drawn} draws; "
             f"the field's densities reach {lattice.values.max():.6g}"
+            + _finer(lattice.extent, round(float(np.max(lattice.extent / lattice.side))))
         )
     chosen = farthest_points(points[:wanted], n)
     return points[chosen], values[chosen]
 
 
-def surface_samples(shape: AbstractShape, n: int, key: PRNGKeyArray | None = None) -> ContactSamples:
+def draw_contact_samples(shape: AbstractShape, n: int, key: PRNGKeyArray | None = None) -> ContactSamples:
     """Even contact samples inside the smooth edge of a shape.
 
     Args:
@@ -228,11 +247,23 @@ def surface_samples(shape: AbstractShape, n: int, key: PRNGKeyArray | None = Non
     lattice = Lattice.create(density, shape.bounds, 48)
     low, high = surface_range(lattice.values)
     region = Region.create(lattice, low, floaters=True)
-    points, values = draw_samples(
-        density, lattice, region, low, high, n, jax.random.key(0) if key is None else key
-    )
+    return contact_samples(shape, density, lattice, region, low, high, n, checked_key(key))
+
+
+def contact_samples(
+    field: AbstractField,
+    density: Density,
+    lattice: Lattice,
+    region: Region,
+    low: float,
+    high: float,
+    n: int,
+    key: PRNGKeyArray,
+) -> ContactSamples:
+    """Contact samples of a field in a region: see `draw_samples`."""
+    points, values = draw_samples(density, lattice, region, low, high, n, key)
     return ContactSamples(
-        floating(points), floating(values), floating(outward_normals(shape, points, region))
+        floating(points), floating(values), floating(outward_normals(field, points, region))
     )
 
 

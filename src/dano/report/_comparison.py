@@ -16,10 +16,13 @@ from dano.report._video import require
 from dano.vision import checked_colour, PALETTE
 
 _WIDTH, _HEIGHT = 300, 250
+"""Of a picture [pixels] (convention)."""
 _FINE = 2
 """Pixels a side that are averaged into one of the picture."""
 _MOST_POINTS = 1_500_000
+"""Points drawn of a surface: more do not change a picture of this size."""
 _FLOOR, _PAPER = 0.86, 1.0
+"""Grey values (convention)."""
 _LIGHT = np.array([-0.4, 0.65, 0.65])
 """Towards the lamp: along the picture, towards the viewer, up."""
 _FLAT, _FLOATS = 1.0, 0.01

@@ -18,6 +18,7 @@ from dano.vision import render
 
 _WIDTH = 960  # CSS pixels
 _PANEL, _FPS = (352, 264), 24
+"""Size of a panel [pixels], and frames a second of the film (convention)."""
 # A short motion is shown so slowly that it lasts about this long [s].
 _LASTS = 3.0
 _COLOURS = {"observed": "#22262b", "fitted": "#2f7ed8", "initial guess": "#c3c9cf"}

@@ -7,6 +7,7 @@ from dano.maths import quat_slerp
 from dano.scene import Trajectory
 
 MOST_FRAMES = 100_000
+"""An hour of video at 28 frames a second (convention)."""
 
 
 def frame_times(

@@ -18,6 +18,7 @@ from dano.scene import Scene, Trajectory
 from dano.vision import Camera, LearnedField, render
 
 _STRIP_MOMENTS = 6
+"""Moments in a picture strip: two rows of three (convention)."""
 
 
 def render_trajectory(

@@ -19,6 +19,7 @@ from dano.scene import Body, Scene, Trajectory
 from dano.vision import checked_colour, Item, PALETTE, placement
 
 _TICK = 1 / 30
+"""Time between frames [s] (convention)."""
 
 
 class Viewer:

@@ -1,5 +1,8 @@
 """Bodies: geometry, mass properties, and a name."""
 
+from collections.abc import Iterable
+from typing import TypeVar
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +12,8 @@ from dano.contact import Collider, ContactParams, Part, SampleSet, Support, Surf
 from dano.fields import AbstractField, AbstractShape, Ellipsoid, SignedDistanceGrid, Sphere
 from dano.maths import checked_array, floating, is_traced, Numbers
 from dano.objects import checked_inertia, MassProperties, NeuralObject
+
+P = TypeVar("P")
 
 # Orientations over which the support of a body is sampled.
 ORIENTATIONS = 256
@@ -272,3 +277,20 @@ def _homogeneous(name: str, shape: AbstractShape, mass: float) -> MassProperties
         return MassProperties.from_field(shape, mass=mass)
     second = np.asarray(moments.second_moment) * (mass / float(moments.volume))
     return MassProperties(mass, moments.centroid, np.trace(second) * np.eye(3) - second)
+
+
+def checked_parts(name: str, parts: Iterable[object], kind: type[P]) -> tuple[P, ...]:
+    """What a scene is made of, if all of it is of one kind.
+
+    Raises:
+        ValueError: If something else is among it.
+    """
+    found = []
+    for part in parts:
+        if not isinstance(part, kind):
+            raise ValueError(
+                f"{name} must hold dano.{kind.__name__} objects only,"
+                f" got {part!r} of type {type(part).__name__}"
+            )
+        found.append(part)
+    return tuple(found)

@@ -21,7 +21,7 @@ from dano.contact import (
 )
 from dano.fields import AbstractShape, HalfSpace, PosedShape, Sphere
 from dano.maths import floating, Numbers
-from dano.objects import NeuralObject, surface_quadrature, surface_samples
+from dano.objects import draw_contact_samples, NeuralObject, surface_quadrature
 from dano.scene._bodies import Body
 from dano.scene._states import State
 
@@ -72,11 +72,20 @@ class Contact(eqx.Module):
             edge: Width of the smooth occupancy of a primitive in this pair [m], for the centroid law.
 
         Raises:
-            ValueError: If the two names are equal, the edge is negative, or the law does not read a parameter
-                that was given.
+            ValueError: If the two names are equal, the edge is negative, an argument is of another type, or
+                the law does not read a parameter that was given.
         """
+        for what, name in (("a", a), ("b", b)):
+            if not isinstance(name, str):
+                raise ValueError(f"{what} must be the name of a body, got {name!r}")
         if a == b:
             raise ValueError(f"contact must join two different bodies, got {a!r} twice")
+        if params is not None and not isinstance(params, ContactParams):
+            raise ValueError(
+                f"params must be dano.ContactParams(…), e.g. sliding_friction=0.3, got {params!r}"
+            )
+        if law is not None and not isinstance(law, AbstractContactLaw):
+            raise ValueError(f"law must be dano.DistributedLaw() or dano.CentroidLaw(), got {law!r}")
         self.a, self.b = a, b
         self.params = ContactParams() if params is None else params
         self.law = DistributedLaw() if law is None else law
@@ -214,7 +223,7 @@ def _with_samples(body: Body) -> Body:
     assert body.shape is not None
     if body.samples is not None:
         return body
-    drawn = surface_samples(body.shape, SHAPE_SAMPLES)
+    drawn = draw_contact_samples(body.shape, SHAPE_SAMPLES)
     samples = SampleSet.create(drawn.points, drawn.density)
     return eqx.tree_at(lambda b: b.samples, body, samples, is_leaf=_none)
 

@@ -11,13 +11,14 @@ from jaxtyping import Array, Float
 
 from dano.contact import checked_parameter, CHUNK, ContactParams
 from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
+from dano.names import did_you_mean
 from dano.objects import checked_inertia
-from dano.scene._bodies import Body
+from dano.scene._bodies import Body, checked_parts
 from dano.scene._contacts import Contact, prepared
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
 from dano.scene._joints import Joint, Layout, layout_of
 from dano.scene._others import Others, others_of
-from dano.scene._states import Control, JOINT_QUANTITIES, State, STATE_SIZES
+from dano.scene._states import check_precision, Control, JOINT_QUANTITIES, State, STATE_SIZES
 
 # Share of the smallest body's size by which gravity may move it in a step before a warning says so, and the
 # share that the warning asks for.
@@ -80,7 +81,9 @@ class Scene(eqx.Module):
                 fixed ones or a pair twice, a pair cannot overlap, joints make no trees, a body has a material
                 that nothing reads, or a number is out of range.
         """
-        bodies, contacts, joints = tuple(bodies), tuple(contacts), tuple(joints)
+        bodies = checked_parts("bodies", bodies, Body)
+        contacts = checked_parts("contacts", contacts, Contact)
+        joints = checked_parts("joints", joints, Joint)
         names = [body.name for body in bodies]
         if not bodies:
             raise ValueError("bodies must hold at least one body, got none")
@@ -95,7 +98,10 @@ class Scene(eqx.Module):
         for contact in contacts:
             for name in (contact.a, contact.b):
                 if name not in names:
-                    raise ValueError(f"contact must name bodies of the scene {names}, got {name!r}")
+                    raise ValueError(
+                        f"contact must name bodies of the scene {names}, got {name!r}"
+                        + did_you_mean(name, names)
+                    )
             if frozenset((contact.a, contact.b)) in seen:
                 raise ValueError(
                     f"contacts must join each pair once, got ({contact.a!r}, {contact.b!r}) twice"
@@ -353,8 +359,10 @@ class Scene(eqx.Module):
         """Check a concrete state against the scene; traced values pass.
 
         Raises:
-            ValueError: If a shape is wrong, a number is not finite, or a quaternion is not of unit length.
+            ValueError: If a shape or dtype is wrong, a number is not finite, or a quaternion is not of unit
+                length.
         """
+        check_precision(state, self.timestep.dtype)
         for key, size in STATE_SIZES.items():
             value = getattr(state, key)
             if value.shape[-2:] != (len(self.bodies), size):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.archive import read_archive, write_archive
+from dano.archive import read_archive, TRAJECTORY, write_archive
 
 _REPORTED = ("residuals", "iterations", "converged")
 STATE_SIZES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
@@ -42,6 +42,20 @@ def state_arrays(states: State) -> dict[str, Array | np.ndarray]:
     """The arrays of states by name; those of joints where there are some."""
     names = (*STATE_SIZES, *(JOINT_QUANTITIES if states.q is not None else ()))
     return {name: getattr(states, name) for name in names}
+
+
+def check_precision(state: State, dtype: np.dtype) -> None:
+    """Check that the JAX arrays of a state have the dtype of their scene; NumPy's are converted later.
+
+    Raises:
+        ValueError: If one has another.
+    """
+    for name, value in state_arrays(state).items():
+        if isinstance(value, Array) and value.dtype != dtype:
+            raise ValueError(
+                f"state.{name} must have the dtype of the scene, {dtype}, got {value.dtype}: cast it with"
+                f" jax.tree.map(lambda x: x.astype('{dtype}'), state)"
+            )
 
 
 class Control(eqx.Module):
@@ -92,8 +106,8 @@ class Trajectory(eqx.Module):
         write_archive(
             path,
             {
-                "format": np.array("dano-trajectory"),
-                "version": np.array(1),
+                "format": np.array(TRAJECTORY[0]),
+                "version": np.array(TRAJECTORY[1]),
                 "names": np.array(self.names),
                 "times": np.asarray(self.times),
                 **{name: np.asarray(value) for name, value in state_arrays(self.states).items()},
@@ -109,12 +123,23 @@ class Trajectory(eqx.Module):
         Raises:
             ValueError: If the file is missing, truncated or not a dano trajectory.
         """
-        data = read_archive(path, "dano-trajectory", 1)
+        return cls.load_with_source(path)[0]
+
+    @classmethod
+    def load_with_source(cls, path: str | os.PathLike[str]) -> "tuple[Trajectory, str | None]":
+        """Read a trajectory and the text `source` that `save` kept with it; None if it kept none.
+
+        Raises:
+            ValueError: As `load`.
+        """
+        data = read_archive(path, *TRAJECTORY)
         try:
             arrays = {name: jnp.asarray(data[name]) for name in ("times", *_REPORTED)}
             states = State(*(jnp.asarray(data[name]) for name in STATE_SIZES))
             if "q" in data:
                 states = replace(states, **{name: jnp.asarray(data[name]) for name in JOINT_QUANTITIES})
-            return cls(states=states, names=tuple(str(name) for name in data["names"]), **arrays)
+            names = tuple(str(name) for name in data["names"])
+            source = str(data["source"]) if "source" in data else None
+            return cls(states=states, names=names, **arrays), source
         except KeyError as error:
             raise ValueError(f"{path} is not a valid dano trajectory: it lacks {error}") from error

@@ -8,6 +8,7 @@ from dano.scene_file._objects import (
     ASSETS as ASSETS,
     build_asset as build_asset,
     build_object as build_object,
+    load_object as load_object,
     Progress as Progress,
 )
 from dano.scene_file._reading import (

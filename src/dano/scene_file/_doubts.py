@@ -10,10 +10,10 @@ _SHORT, _LONG = 1e-3, 5.0
 
 
 def mass_doubt(made: NeuralObject, dashes: str) -> str:
-    """What to say of a mass that nobody gave."""
+    """What to say where no mass was given."""
     return (
-        f"nobody gave a mass: {float(made.mass.mass):.3g} kg follow from 1 kg per unit of density and cubic"
-        f" metre; give {dashes}mass or {dashes}mass{'-' if dashes else '_'}scale"
+        f"no mass was given: the object has {float(made.mass.mass):.3g} kg by the default, 1 kg per unit of"
+        f" density and cubic metre; give {dashes}mass or {dashes}mass{'-' if dashes else '_'}scale"
     )
 
 

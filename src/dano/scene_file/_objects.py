@@ -1,19 +1,22 @@
 """Neural objects from fields with the options of scene files and the command line, and the shipped ones."""
 
 import math
+import os
 import warnings
 from collections.abc import Callable
 from importlib.resources import as_file, files
+from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dano.fields import AbstractField, AbstractShape, load_field, Scaled
+from dano.building import BuildOptions
+from dano.fields import AbstractField, AbstractShape, load_field, scaled
 from dano.memory import check_nodes
 from dano.names import did_you_mean
-from dano.objects import MassModel, NeuralObject
+from dano.objects import NeuralObject
 from dano.scene_file._doubts import border_doubts, mass_doubt, size_doubts
 
 if TYPE_CHECKING:
@@ -37,16 +40,8 @@ _built: dict[tuple[str, str], NeuralObject] = {}
 
 def build_object(
     field: AbstractField,
+    options: BuildOptions | None = None,
     *,
-    n_samples: int = 5000,
-    density_range: tuple[float, float] | None = None,
-    mass_model: MassModel = "auto",
-    mass_scale: float | None = None,
-    mass: float | None = None,
-    resolution: int = 96,
-    length: float | None = None,
-    floaters: bool = False,
-    seed: int = 0,
     weighed: bool = False,
     dashes: str = "",
     progress: Progress | None = None,
@@ -58,54 +53,73 @@ def build_object(
 
     Args:
         field: Density with finite bounds.
-        n_samples: See `NeuralObject.from_field`, as for all that is not described here.
-        density_range: See there.
-        mass_model: See there.
-        mass_scale: See there; default 1.
-        mass: See there.
-        resolution: See there.
-        length: Longest extent that the object shall have [m]: the field is scaled about its origin. Fields
-            learned from images seldom know their scale.
-        floaters: See there; parts of shapes, such as meshes, are always kept.
-        seed: Of the random samples.
-        weighed: Whether the mass is said elsewhere, so that it is no matter here.
+        options: How to make it; default `BuildOptions()`. A `length` scales the field about its origin.
+        weighed: Whether the mass is stated elsewhere, so that no warning is needed.
         dashes: What names of options begin with in warnings.
         progress: See there.
 
     Raises:
-        ValueError: As `NeuralObject.from_field`, or if `length` is not positive, or samples or resolution
-            take more time or memory than anybody means to spend.
+        ValueError: As `NeuralObject.from_field`, or if the length is not positive, mass and mass scale are
+            both given, or samples or resolution need too much time or memory.
     """
-    if n_samples > MOST_SAMPLES:
-        raise ValueError(f"samples must be at most {MOST_SAMPLES}, got {n_samples}")
-    check_nodes(np.ptp(np.asarray(field.bounds), axis=0), resolution, _BYTES_PER_NODE)
-    options: dict[str, Any] = {
-        "density_range": density_range,
+    chosen = BuildOptions() if options is None else options
+    if chosen.mass is not None and chosen.mass_scale is not None:
+        raise ValueError(
+            f"give either {dashes}mass or {dashes}mass{'-' if dashes else '_'}scale,"
+            f" got {chosen.mass} and {chosen.mass_scale}"
+        )
+    if chosen.samples > MOST_SAMPLES:
+        raise ValueError(f"samples must be at most {MOST_SAMPLES}, got {chosen.samples}")
+    check_nodes(np.ptp(np.asarray(field.bounds), axis=0), chosen.resolution, _BYTES_PER_NODE)
+    common: dict[str, Any] = {
+        "density_range": chosen.density_range,
         # Parts of a shape are meant, those of a radiance field are seldom.
-        "floaters": floaters or isinstance(field, AbstractShape),
-        "key": jax.random.key(seed),
+        "floaters": chosen.floaters or isinstance(field, AbstractShape),
+        "key": jax.random.key(chosen.seed),
     }
-    if length is not None:
-        if not (math.isfinite(length) and length > 0):
-            raise ValueError(f"length must be finite and > 0 m, got {length}")
+    if chosen.length is not None:
+        if not (math.isfinite(chosen.length) and chosen.length > 0):
+            raise ValueError(f"length must be finite and > 0 m, got {chosen.length}")
         # A coarse object tells how much of the field is object, to half a per cent.
-        coarse = NeuralObject.from_field(field, n_samples=1000, resolution=64, **options)
-        field = Scaled(field, length / coarse.size)
+        coarse = NeuralObject.from_field(field, n_samples=1000, resolution=64, **common)
+        field = scaled(field, chosen.length / coarse.size)
     made = NeuralObject.from_field(
         field,
-        n_samples=n_samples,
-        mass_model=mass_model,
-        mass_scale=1.0 if mass_scale is None else mass_scale,
-        mass=mass,
-        resolution=resolution,
+        n_samples=chosen.samples,
+        mass_model=chosen.mass_model,
+        mass_scale=1.0 if chosen.mass_scale is None else chosen.mass_scale,
+        mass=chosen.mass,
+        resolution=chosen.resolution,
         progress=progress,
-        **options,
+        **common,
     )
-    found = [] if weighed or mass is not None or mass_scale is not None else [mass_doubt(made, dashes)]
-    found += [] if length is not None else size_doubts(made.size, f"{dashes}length")
+    stated = weighed or chosen.mass is not None or chosen.mass_scale is not None
+    found = [] if stated else [mass_doubt(made, dashes)]
+    found += [] if chosen.length is not None else size_doubts(made.size, f"{dashes}length")
     for text in (*found, *border_doubts(field, np.asarray(made.surface.points))):
         warnings.warn(text, stacklevel=2)
     return made
+
+
+def load_object(source: str | os.PathLike[str], *, progress: Progress | None = None) -> NeuralObject:
+    """A shipped object by its name, or one from a file.
+
+    Args:
+        source: "bunny", "soap", "trained_bunny", "trained_soap" (see `build_asset`), or a .dano file. A file
+            of one of these names goes before.
+        progress: Called with a description and the share done while a shipped object is built.
+
+    Raises:
+        ValueError: If there is neither such a file nor such a name, or the file is not a neural object.
+    """
+    if str(source) in ASSETS and not os.path.exists(source):
+        return build_asset(str(source), progress=progress)
+    if not os.path.exists(source) and not Path(source).suffix:
+        raise ValueError(
+            f"source must be a .dano file or one of {list(ASSETS)}, got {str(source)!r}"
+            + did_you_mean(str(source), ASSETS)
+        )
+    return NeuralObject.load(source)
 
 
 def build_asset(name: str, *, progress: Progress | None = None) -> NeuralObject:
@@ -127,10 +141,11 @@ def build_asset(name: str, *, progress: Progress | None = None) -> NeuralObject:
     if key not in _built:
         look = asset_look(name)
         if look is not None:
-            _built[key] = build_object(look, mass=ASSETS[name], mass_model="solid", progress=progress)
+            options = BuildOptions(mass=ASSETS[name], mass_model="solid")
+            _built[key] = build_object(look, options, progress=progress)
         else:
-            with as_file(files("dano") / "assets" / f"{name}.npz") as path:
-                _built[key] = build_object(load_field(path), mass=ASSETS[name], progress=progress)
+            options = BuildOptions(mass=ASSETS[name])
+            _built[key] = build_object(load_field(name), options, progress=progress)
     return _built[key]
 
 

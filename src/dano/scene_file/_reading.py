@@ -1,5 +1,6 @@
 """Reading scene files. Their keys are described in docs/scenes.md."""
 
+import dataclasses
 import itertools
 import json
 import math
@@ -11,8 +12,9 @@ from pathlib import Path
 from typing import Any, cast, get_args, TYPE_CHECKING
 
 from dano.archive import checked_input
+from dano.building import BuildOptions
 from dano.contact import AbstractContactLaw, CentroidLaw, ContactParams, DistributedLaw
-from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSpace, load_field, Posed, Sphere
+from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSpace, load_field, posed, Sphere
 from dano.maths import Pose
 from dano.memory import memory_limit
 from dano.names import did_you_mean
@@ -40,7 +42,8 @@ _STATE = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 _GEOMETRY = ("object", "field", "asset", "shape")
 _BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE, *JOINT_QUANTITIES)
 _JOINT = {"axis": 3, "anchor": 3, "position": 3, "orientation": 4}
-_BUILD = ("samples", "density_range", "mass_model", "mass_scale", "resolution", "length", "seed", "floaters")
+# The mass of a body is a key of the body.
+_BUILD = tuple(field.name for field in dataclasses.fields(BuildOptions) if field.name != "mass")
 _PARAMS = tuple(ContactParams.__dataclass_fields__)
 _OF_CENTROIDS = (
     "spring",
@@ -280,7 +283,7 @@ def _shape(row: Table) -> AbstractShape:
         return shape
     pose = row.table("pose", ("position", "orientation"))
     where = Pose(pose.vector("position", 3, (0.0,) * 3), pose.vector("orientation", 4, (1.0, 0.0, 0.0, 0.0)))
-    return cast(AbstractShape, Posed(shape, where))
+    return cast(AbstractShape, posed(shape, where))
 
 
 def _object(
@@ -304,14 +307,20 @@ def _object(
 
 
 def _from_field_file(path: Path, build: Table, *, weighed: bool, progress: Progress | None) -> NeuralObject:
-    options: dict[str, Any] = {"n_samples": build.integer("samples", 5000), "seed": build.integer("seed", 0)}
-    options["resolution"] = build.integer("resolution", 96)
-    options["floaters"] = build.boolean("floaters", False)
-    options["mass_model"] = build.word("mass_model", get_args(MassModel), "auto")
-    options |= {key: build.number(key) for key in ("mass_scale", "length") if key in build}
-    if "density_range" in build:
-        options["density_range"] = build.vector("density_range", 2)
-    return build_object(load_field(path), weighed=weighed, progress=progress, **options)
+    usual = BuildOptions()
+    options = BuildOptions(
+        samples=build.integer("samples", usual.samples),
+        density_range=cast(tuple[float, float], build.vector("density_range", 2))
+        if "density_range" in build
+        else None,
+        mass_model=cast(MassModel, build.word("mass_model", get_args(MassModel), usual.mass_model)),
+        mass_scale=build.number("mass_scale") if "mass_scale" in build else None,
+        resolution=build.integer("resolution", usual.resolution),
+        length=build.number("length") if "length" in build else None,
+        floaters=build.boolean("floaters", usual.floaters),
+        seed=build.integer("seed", usual.seed),
+    )
+    return build_object(load_field(path), options, weighed=weighed, progress=progress)
 
 
 def _joints(top: Table, names: Sequence[str]) -> list[Joint]:

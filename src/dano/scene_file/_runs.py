@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dano.archive import checked_input, read_archive
+from dano.archive import checked_input
 from dano.maths import Pose
 from dano.objects import NeuralObject
 from dano.scene import Scene, Trajectory
@@ -84,14 +84,13 @@ def load_run(path: str | os.PathLike[str], *, progress: Progress | None = None) 
     Raises:
         ValueError: If the file is missing, truncated, not a dano trajectory, or was saved without its scene.
     """
-    trajectory = Trajectory.load(path)
-    data = read_archive(path, "dano-trajectory", 1)
-    if "source" not in data:
+    trajectory, kept = Trajectory.load_with_source(path)
+    if kept is None:
         raise ValueError(
             f"{path} must be a run that `dano simulate` saved: this one does not say which scene it is of"
         )
     try:
-        source = json.loads(str(data["source"]))
+        source = json.loads(kept)
         text, origin = str(source["scene"]), Path(source["path"])
         law = str(source.get("default_law", _LAW_BEFORE))
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:

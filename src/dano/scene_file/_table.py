@@ -87,8 +87,10 @@ def is_number(value: object) -> bool:
 
 @contextlib.contextmanager
 def located(where: str) -> Iterator[None]:
-    """Put the place in front of the library's own complaints."""
+    """Put the place in front of the library's own complaints, once."""
     try:
         yield
     except ValueError as error:
+        if str(error).startswith(where):
+            raise
         raise ValueError(f"{where}: {error}") from error

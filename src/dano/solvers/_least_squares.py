@@ -80,6 +80,7 @@ class Solution(NamedTuple):
     evaluations: int
 
 
+# At the start, and its limits: shares of the diagonal of the normal equations, from rounding to "no step".
 _DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-15, 1e12
 # Relative change of x that is none.

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dano.archive import Arrays, read_array
+from dano.archive import Arrays, check_format, FIELD, is_own, OBJECT, read_array
 from dano.fields._grid import checked_spacing, GridField
 from dano.fields._signed_distance import extended_distances, SignedDistanceGrid
 from dano.maths import Numbers
@@ -16,6 +16,16 @@ _REAL = "buif"
 def load_npz(path: Path, *, interpolation: str | None = None) -> GridField | SignedDistanceGrid:
     """`values`, or `distances`, with `origin` and `spacing`; see `load_field`."""
     return _grid_from_npz(path, "", interpolation, "a grid: values (nx, ny, nz), origin (3,) and spacing")
+
+
+def format_of(path: Path) -> str:
+    """What an archive says that it holds; "" if it says nothing or cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            archive = Arrays(file)
+            return str(archive["format"]) if "format" in archive.names else ""
+    except (OSError, ValueError):
+        return ""
 
 
 def load_object(path: Path, *, interpolation: str | None = None) -> GridField | SignedDistanceGrid:
@@ -86,6 +96,9 @@ def _grid_from_npz(
     try:
         with open(path, "rb") as file:
             archive = Arrays(file)
+            if "format" in archive.names and is_own(form := str(archive["format"])):
+                version = archive["version"] if "version" in archive.names else None
+                check_format(form, version, dict((OBJECT if prefix else FIELD,)))
             signed = not prefix and "distances" in archive.names and "values" not in archive.names
             names = [prefix + name for name in ("distances" if signed else "values", "origin", "spacing")]
             if missing := [name for name in names if name not in archive.names]:

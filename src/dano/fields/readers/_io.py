@@ -1,21 +1,23 @@
 """Reading fields from files of many kinds, and writing grids."""
 
+import importlib
 import re
 from collections.abc import Callable
+from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dano.archive import write_archive
+from dano.archive import FIELD, write_archive
 from dano.fields._base import AbstractField
 from dano.fields._callable import checked_bounds
-from dano.fields._compose import Posed, Scaled
+from dano.fields._compose import posed, scaled
 from dano.fields._grid import GridField
 from dano.fields._mesh import mesh_field
 from dano.fields._shapes import AbstractShape
 from dano.fields._signed_distance import SignedDistanceGrid
-from dano.fields.readers._arrays import load_npy, load_npz, load_object
+from dano.fields.readers._arrays import format_of, load_npy, load_npz, load_object
 from dano.fields.readers._instant_ngp import load_snapshot
 from dano.fields.readers._nerfacto import load_checkpoint
 from dano.fields.readers._splats import is_splats, load_splats
@@ -65,6 +67,14 @@ _READERS: dict[str, _Reader] = {
 }
 
 
+_MODELS = {"dano-osf": "OSF", "dano-hash-model": "HashModel", "dano-learned-field": "LearnedField"}
+"""Classes of `dano.vision` by the format of their files. By name, because `vision` lies above `fields`: it is
+imported only when such a file is read."""
+
+SHIPPED = ("bunny", "soap")
+"""Density grids in the package, by name."""
+
+
 def load_field(
     path: str | Path,
     *,
@@ -76,7 +86,8 @@ def load_field(
     """Read a field from a file; nothing is ever unpickled.
 
     - `.npz`: `values` (nx, ny, nz), or signed `distances`, with `origin` (3,) and `spacing`; option
-      `interpolation`.
+      `interpolation`. Or what the models of `dano.vision` write: `LearnedField` (`dano train` does), `OSF`,
+      `HashModel`.
     - `.npy`: voxels (nx, ny, nz), booleans or densities; options `spacing`, `origin`, `interpolation`, and
       `signed_distance=True` if they are distances, negative inside.
     - `.obj`, `.stl`, `.off`, `.glb`, `.gltf`, `.ply`: a watertight triangle mesh; options of `mesh_field`.
@@ -90,6 +101,7 @@ def load_field(
     - `.pt2`, `.pt`, `.pth`: a module (n, 3) → (n,) of torch.export or TorchScript, or weights for the one
       that option `module` = "package.module:name" makes; `crop` is required.
     - `"package.module:name"` instead of a file: that function (n, 3) → (n,); `crop` is required.
+    - `"bunny"`, `"soap"` instead of a file: a density grid that dano ships.
     - `.dano`: the grid stored in a neural object; option `interpolation`.
 
     Args:
@@ -118,11 +130,14 @@ def load_field(
         raise ValueError(f"pose must be a dano.maths.Pose, got {type(pose).__name__}")
     box = None if crop is None else np.asarray(checked_bounds(crop), np.float64)
     field = _read(path, box, options)
-    field = Scaled(field, scale) if scale != 1 else field
-    return field if pose is None else Posed(field, pose)
+    field = scaled(field, scale) if scale != 1 else field
+    return field if pose is None else posed(field, pose)
 
 
 def _read(path: str | Path, crop: np.ndarray | None, options: dict[str, Any]) -> AbstractField:
+    if path in SHIPPED and not Path(path).exists():
+        with as_file(files("dano") / "assets" / f"{path}.npz") as shipped:
+            return _read(shipped, crop, options)
     if (
         isinstance(path, str)
         and re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", path)
@@ -140,12 +155,23 @@ def _read(path: str | Path, crop: np.ndarray | None, options: dict[str, Any]) ->
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "no such file"
         raise ValueError(f"{path}: {what}; expected a field ({', '.join(_READERS)})")
+    if suffix == ".npz" and (form := format_of(path)) in _MODELS:
+        _check_options(path, f"{form} file", options, ())
+        return _of_model(path, _MODELS[form], crop)
     reader = _SPLATS if suffix == ".ply" and is_splats(path) else _READERS[suffix]
     _check_options(path, f"{suffix} file", options, reader.options)
     if reader.crops:
         return reader.read(path, crop=crop, **options)
     field = reader.read(path, **options)
     return field if crop is None else _cropped(field, crop, path)
+
+
+def _of_model(path: Path, name: str, crop: np.ndarray | None) -> AbstractField:
+    """The density of a model of `dano.vision` that was saved."""
+    if crop is not None:
+        raise ValueError(f"{path}: {name} has a box of its own, got crop {crop.tolist()}")
+    model = getattr(importlib.import_module("dano.vision"), name).load(path)
+    return model if isinstance(model, AbstractField) else model.field()
 
 
 def _check_options(what: object, kind: str, options: dict[str, Any], known: tuple[str, ...]) -> None:
@@ -199,4 +225,5 @@ def save_field(field: GridField | SignedDistanceGrid, path: str | Path) -> None:
         members["edge"] = field.edge
     members |= {"origin": field.origin, "spacing": field.spacing}
     arrays = {name: np.asarray(value) for name, value in members.items()}
-    write_archive(path, arrays | {"interpolation": np.asarray(field.interpolation)})
+    words = {"format": FIELD[0], "version": FIELD[1], "interpolation": field.interpolation}
+    write_archive(path, arrays | {name: np.asarray(word) for name, word in words.items()})

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from dano.fields._base import AbstractField
 from dano.fields._callable import CallableField
-from dano.fields._compose import Posed, Scaled
+from dano.fields._compose import posed, scaled
 from dano.fields._hash_grid import HashGrid
 from dano.fields.readers._checkpoint import read_weights
 from dano.fields.readers._splats import splat_field
@@ -292,4 +292,4 @@ def _undone(field: AbstractField, transforms: Path) -> AbstractField:
             f"{transforms}: expected transform (3, 4) and scale, or undo_transform=False; {error}"
         ) from error
     pose = Pose(matrix[:, 3], quat_from_matrix(jnp.asarray(rotation)))
-    return Posed(Scaled(field, 1 / scale), pose.inverse())
+    return posed(scaled(field, 1 / scale), pose.inverse())

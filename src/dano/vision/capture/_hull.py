@@ -15,6 +15,7 @@ from dano.vision.capture._node_grid import NodeGrid
 LOST = 0.02
 """Share of the views that may miss a point of the object: one bad mask does not cut a hole into it."""
 
+# Points per call, and the multiple to which the last call is filled, so that few sizes are compiled.
 _CHUNK = 1 << 18
 _GRANULE = 1 << 14
 

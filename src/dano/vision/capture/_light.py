@@ -64,7 +64,7 @@ class Light(eqx.Module):
         if not reach > 0:
             raise ValueError(f"reach must be > 0 m, got {reach}")
         if not self.near and np.isfinite(reach):
-            raise ValueError(f"reach is of lights with a position, got {reach} m for one with a direction")
+            raise ValueError(f"reach applies to lights with a position, got {reach} m for a direction")
         self.place = place.astype(np.float32)
         self.colour = power.astype(np.float32)
         self.reach = float(reach)

@@ -13,6 +13,7 @@ from dano.vision.capture._capture import View
 from dano.vision.capture._node_grid import NodeGrid
 from dano.vision.capture._rays import box_interval, Rays
 
+# Steps along a ray through the box, of a cell each at the default resolution; rays per call.
 _STEPS = 160
 _CHUNK = 1 << 15
 

@@ -46,6 +46,7 @@ _BLUR = 3.0
 """Sharpness of a painted solid times the width of a pixel on it."""
 
 _GONE = 1e-6
+"""Opacity below which nothing is seen; keeps a division finite."""
 
 
 class Part(eqx.Module):
@@ -144,7 +145,7 @@ class PaintedSolid(AbstractSurface):
         _, slope = self.shape.sdf_jet(points.T, 1)
         normal = slope.T * jax.lax.rsqrt(jnp.sum(slope * slope, axis=0) + 1e-12)[:, None]
         facing = jnp.maximum(jnp.sum(normal * light, axis=1), 0)
-        return _srgb(facing[:, None] * self.albedo[None]), normal
+        return _encoded(facing[:, None] * self.albedo[None]), normal
 
 
 class PaintedMedium(AbstractMedium):
@@ -177,7 +178,7 @@ class PaintedMedium(AbstractMedium):
         view_share: Share = 1.0,
     ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
         """The albedo as sRGB; no normals."""
-        return jnp.broadcast_to(_srgb(self.albedo)[None], points.shape), jnp.zeros_like(points)
+        return jnp.broadcast_to(_encoded(self.albedo)[None], points.shape), jnp.zeros_like(points)
 
 
 def compose(
@@ -314,7 +315,7 @@ def _composed(parts, planes, lamps, origin, directions, ambient, sampling):
             facing = jnp.maximum(towards @ plane.normal, 0)
             reached = _reaching(parts, points, towards, away)
             light = light + (facing * reached)[:, None] * power
-        colour = colour + share[:, None] * _srgb(light * plane.albedo[None])
+        colour = colour + share[:, None] * _encoded(light * plane.albedo[None])
         depth = depth + share * t
         shares.append(share)
     stacked = jnp.stack(shares) if shares else jnp.zeros((1, n), jnp.float32)
@@ -430,13 +431,13 @@ def radiance(parts, i, lamps, world, local, view, ambient):
             # Nothing is added up: a learned colour just below 0 or above 1 stays what it is.
             return sent * arriving ** (1 / GAMMA)
         total = total + jnp.maximum(sent, 0) ** GAMMA * arriving
-    return _srgb(total)
+    return _encoded(total)
 
 
 def as_learned(part, lamp, towards, world):
     """A lamp as a model was taught to see it: a direction, or a position [m], in its own frame."""
-    look = getattr(part.model, "appearance", None)
-    if look is not None and look.near_light:
+    appearance = getattr(part.model, "appearance", None)
+    if appearance is not None and appearance.near_light:
         bounds = part.model.bounds
         far = 100 * jnp.max(bounds[1] - bounds[0]).astype(world.dtype)
         place = jnp.asarray(lamp.place)[None] if lamp.near else world + far * towards
@@ -475,6 +476,6 @@ def _to_plane(plane: Plane, origins: Array, directions: Array) -> Float[Array, "
     return jnp.where((height > 0) & (fall > 1e-6), height / jnp.maximum(fall, 1e-6), jnp.inf)
 
 
-def _srgb(linear: Array) -> Array:
+def _encoded(linear: Array) -> Array:
     # Zero has no derivative; no picture shows the difference.
     return jnp.maximum(linear, 1e-12) ** (1 / GAMMA)

@@ -91,7 +91,7 @@ class Item(eqx.Module):
         if not isinstance(field, AbstractField | AbstractModel):
             raise ValueError(f"field must be a dano field (an AbstractField), got {type(field).__name__}")
         if isinstance(field, AbstractModel) and (level is not None or density_scale is not None):
-            raise ValueError("level and density_scale are of fields, got one for a model with its own look")
+            raise ValueError("level and density_scale apply to fields, got one for a model")
         if level is not None and density_scale is not None:
             raise ValueError(
                 f"level (a solid) excludes density_scale (a medium), got {level} and {density_scale}"
@@ -114,7 +114,7 @@ class Item(eqx.Module):
         if isinstance(field, AbstractModel):
             if solid is None and colour is not None:
                 raise ValueError(
-                    f"colour is of solids and fields, got {colour!r} for a {type(field).__name__}"
+                    f"colour applies to solids and fields, got {colour!r} for a {type(field).__name__}"
                 )
             self.shape = solid if solid is None else _single(solid)
             drawn = field if solid is None else solid

@@ -23,6 +23,7 @@ MISSED, HIT, ON_ITS_WAY = np.int32(0), np.int32(1), np.int32(2)
 """What has become of a ray."""
 
 _MEDIUM_STEPS = 128
+"""Steps along a ray through a medium: a cell of the shipped grids each, nearly."""
 
 # Heights above a point, as shares of the reach, at which its surroundings are probed, and their weights.
 _HEIGHTS = (0.12, 0.3, 0.6, 1.0)

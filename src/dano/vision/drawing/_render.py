@@ -31,7 +31,7 @@ from dano.vision.drawing._rays import (
     Placed,
     transmitted,
 )
-from dano.vision.drawing._shade import backdrop, floor_tint, GAMMA, lamps_of, Look, shade, to_srgb
+from dano.vision.drawing._shade import backdrop, floor_tint, GAMMA, lamps_of, shade, Surroundings, to_picture
 from dano.vision.radiance import Sampling, tiles
 
 # Half the angular width of the lamp [rad]: shadows are crisp where things touch and soft a length away.
@@ -71,9 +71,15 @@ class _Empty(NamedTuple):
 class _View:
     """One picture in the making: what is in it, and where the light comes from (host only)."""
 
-    def __init__(self, items: Sequence[Item], camera: AbstractCamera, look: Look, floor: bool | int | float):
+    def __init__(
+        self,
+        items: Sequence[Item],
+        camera: AbstractCamera,
+        surroundings: Surroundings,
+        floor: bool | int | float,
+    ):
         self.origin = camera.position.astype(np.float32)
-        self.look = look
+        self.surroundings = surroundings
         self.planes = [(item.plane, item.colour) for item in items if item.plane is not None]
         self.solids = [item for item in items if item.shape is not None and item.plane is None]
         self.media = [item for item in items if item.medium is not None]
@@ -89,7 +95,7 @@ class _View:
             i: part_of(item, camera) for i, item in enumerate(self.solids) if item.model is not None
         }
         self.cloud_parts = tuple(part_of(item, camera) for item in self.clouds)
-        self.lamps = lamps_of(look)
+        self.lamps = lamps_of(surroundings)
 
 
 def _frame(item: Item) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
@@ -127,11 +133,11 @@ def render(
             raise ValueError(
                 f"items[{i}] must be an Item (a field made ready for drawing), got {type(item).__name__}"
             )
-    view = _View(items, camera, _look(camera, _focus(camera, items), light, background), floor)
+    view = _View(items, camera, _surroundings(camera, _focus(camera, items), light, background), floor)
     empty = _empty(view, camera)
     colour, touched = _radiance(view, empty.directions, empty.depth, empty.which, empty.colour)
     picture = empty.picture.copy()
-    picture[empty.order[touched]] = to_srgb(colour[:, touched].T)
+    picture[empty.order[touched]] = to_picture(colour[:, touched].T)
     if antialias and len(touched):
         edges = _edges(picture, empty.order[touched], camera.width, camera.height)
         for start in range(0, len(edges), _AT_ONCE):
@@ -140,13 +146,13 @@ def render(
             directions = camera.directions(points.reshape(-1, 2)).T.astype(np.float32)
             colour, _ = _radiance(view, directions, *_background(view, directions))
             # Averaged after the transfer curve: before it, bright pixels would eat into dark edges.
-            picture[part] = np.rint(to_srgb(colour.T).reshape(-1, 4, 3).mean(axis=1)).astype(np.uint8)
+            picture[part] = np.rint(to_picture(colour.T).reshape(-1, 4, 3).mean(axis=1)).astype(np.uint8)
     return picture.reshape(camera.height, camera.width, 3)
 
 
-def _look(
+def _surroundings(
     camera: AbstractCamera, focus: np.ndarray, light: Numbers | None, background: str | Numbers | None
-) -> Look:
+) -> Surroundings:
     right, up, forward = camera.axes
     if light is None:
         ahead = np.array([forward[0], forward[1], 0.0])
@@ -159,7 +165,7 @@ def _look(
             raise ValueError("light must be a direction other than zero, got (0, 0, 0)")
     horizon = checked_colour("#eef0f2" if background is None else background)
     distance = float(np.linalg.norm(focus - camera.position))
-    return Look.create(towards, horizon, focus, distance, camera.pixel_angle)
+    return Surroundings.create(towards, horizon, focus, distance, camera.pixel_angle)
 
 
 def _focus(camera: AbstractCamera, items: Sequence[Item]) -> np.ndarray:
@@ -178,7 +184,7 @@ _kept: dict[tuple, _Empty] = {}
 def _empty(view: _View, camera: AbstractCamera) -> _Empty:
     """The empty picture, kept from the last call if camera, floor and light are the same."""
     frame = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], float)
-    numbers = [camera.position, camera.axes, camera.directions(frame), *view.look]
+    numbers = [camera.position, camera.axes, camera.directions(frame), *view.surroundings]
     for plane, tint in view.planes:
         numbers += [plane, tint]
     key = (camera.width, camera.height, *(np.asarray(x, dtype=np.float64).tobytes() for x in numbers))
@@ -189,7 +195,7 @@ def _empty(view: _View, camera: AbstractCamera) -> _Empty:
         directions = np.ascontiguousarray(camera.directions(points).T, dtype=np.float32)
         depth, which, colour = _background(view, directions)
         picture = np.empty((len(order), 3), dtype=np.uint8)
-        picture[order] = to_srgb(colour.T)
+        picture[order] = to_picture(colour.T)
         kept = _Empty(order, directions, depth, which, colour, picture)
         # One is enough: pictures come in series from one camera.
         _kept.clear()
@@ -201,7 +207,7 @@ def _background(view, d):
     """Distance, index and linear colour of planes and sky along rays, before anything casts a shadow."""
     n = d.shape[1]
     depth, which = np.full(n, np.inf, dtype=np.float32), np.full(n, -1, dtype=np.int32)
-    colour = backdrop(view.look, d)
+    colour = backdrop(view.surroundings, d)
     for j, (plane, _) in enumerate(view.planes):
         normal = plane[:3].astype(np.float32)
         height, fall = normal @ view.origin - np.float32(plane[3]), -(normal @ d)
@@ -240,7 +246,7 @@ def _radiance(view, d, depth, which, colour):
     """Linear colour (3, n) that arrives along rays, and which of them see more than empty surroundings."""
     depth, which, colour = depth.copy(), which.copy(), colour.copy()
     normals = np.zeros((3, d.shape[1]), dtype=np.float32)
-    pixel, hits = np.float32(view.look.pixel), []
+    pixel, hits = np.float32(view.surroundings.pixel), []
     for i, placed in enumerate(view.placed):
         index = _towards_ball(view.centres[i] - view.origin, view.radii[i], d)
         index, t = _first_hits(placed, view.origin, d, depth, index, pixel)
@@ -276,10 +282,12 @@ def _lit(view, d, depth, which, normals, lamp, ambient):
     for j, (plane, tint) in enumerate(view.planes):
         own = np.flatnonzero(which == j)
         normals[:, own] = plane[:3].astype(np.float32)[:, None]
-        albedo[:, own], fade[own] = floor_tint(view.look, plane, tint, points[:, own], d[:, own], depth[own])
+        albedo[:, own], fade[own] = floor_tint(
+            view.surroundings, plane, tint, points[:, own], d[:, own], depth[own]
+        )
     for i, item in enumerate(view.solids):
         albedo[:, which == len(view.planes) + i] = (item.colour.astype(np.float32) ** GAMMA)[:, None]
-    colour = shade(view.look, albedo, normals, d, lamp, ambient, which < len(view.planes), fade)
+    colour = shade(view.surroundings, albedo, normals, d, lamp, ambient, which < len(view.planes), fade)
     for i, part in view.learned.items():
         own = np.flatnonzero(which == len(view.planes) + i)
         if len(own):
@@ -383,10 +391,12 @@ def _lamp_share(placed, points, light, bias):
 
 def _light_at(view, points, normals, kind):
     """Shares of lamp light and of ambient light that all solids and planes leave to points."""
-    light = view.look.light
+    light = view.surroundings.light
     lamp = np.ones(points.shape[1], dtype=np.float32)
     ambient = np.ones_like(lamp)
-    near_focus = np.sum((points - view.look.focus[:, None]) ** 2, axis=0) < view.look.fade_end**2
+    near_focus = (
+        np.sum((points - view.surroundings.focus[:, None]) ** 2, axis=0) < view.surroundings.fade_end**2
+    )
     faces_lamp = light @ normals > 0
     for i, placed in enumerate(view.placed):
         radius = view.radii[i]
@@ -433,7 +443,7 @@ def _lay_over(view, i, item, d, depth, colour):
     )
     albedo = np.broadcast_to((item.colour.astype(np.float32) ** GAMMA)[:, None], (3, len(index)))
     one, no = np.ones(len(index), dtype=np.float32), np.zeros(len(index), dtype=bool)
-    own = shade(view.look, albedo, normal, d[:, index], one, one, no, 0 * one)
+    own = shade(view.surroundings, albedo, normal, d[:, index], one, one, no, 0 * one)
     colour[:, index] += opacity * (own - colour[:, index])
     return index
 

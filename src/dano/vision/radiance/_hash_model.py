@@ -16,7 +16,7 @@ from dano.vision.radiance._appearance import Network, Share
 from dano.vision.radiance._models import AbstractMedium
 
 FORMAT, VERSION = "dano-hash-model", 1
-_WIDTH, _CODE = 64, 16
+_WIDTH, _CODE = 64, 16  # as Müller et al.
 
 
 class HashModel(AbstractMedium):

@@ -1,4 +1,4 @@
-"""The field that photographs have taught: a solid to simulate, with the look that it was learned with."""
+"""The field that photographs have taught: a solid to simulate, with its appearance for pictures."""
 
 import os
 from pathlib import Path
@@ -108,7 +108,7 @@ class LearnedField(AbstractField):
                 gave any.
 
         Raises:
-            ValueError: If the look depends on light and there is none.
+            ValueError: If the appearance depends on light and none is given.
         """
         if self.model.appearance.lit and light is None:
             raise ValueError("light must be given: the field was learned from photographs with known lights")
@@ -120,24 +120,26 @@ class LearnedField(AbstractField):
         )
 
     @property
-    def look(self) -> dict[str, np.ndarray]:
-        """All that the field is made of, as arrays: what a file of it, or of an object with it, holds."""
-        model, look = self.model, self.model.appearance
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All that the field is made of: what a file of it, or of an object with it, holds."""
+        model, appearance = self.model, self.model.appearance
         members = {
             "distance": model.distance,
             "origin": model.origin,
             "spacing": model.spacing,
             "scale": model.scale,
             # Half precision is a thousandth, finer than colours of 8 bits.
-            "features": np.asarray(look.features, np.float16),
-            "features_origin": look.origin,
-            "features_spacing": look.spacing,
-            "lit": np.array(look.lit),
-            "near_light": np.array(look.near_light),
-            "layers": np.array(len(look.network.weights)),
+            "features": np.asarray(appearance.features, np.float16),
+            "features_origin": appearance.origin,
+            "features_spacing": appearance.spacing,
+            "lit": np.array(appearance.lit),
+            "near_light": np.array(appearance.near_light),
+            "layers": np.array(len(appearance.network.weights)),
             "drawn_sharpness": self.drawn_sharpness,
         }
-        for i, (weight, bias) in enumerate(zip(look.network.weights, look.network.biases, strict=True)):
+        for i, (weight, bias) in enumerate(
+            zip(appearance.network.weights, appearance.network.biases, strict=True)
+        ):
             members |= {f"weight_{i}": weight, f"bias_{i}": bias}
         return {name: np.asarray(value) for name, value in members.items()}
 
@@ -147,7 +149,7 @@ class LearnedField(AbstractField):
         Raises:
             ValueError: If `path` is a directory or its parent does not exist.
         """
-        write_archive(path, {"format": np.array(FORMAT), "version": np.array(VERSION), **self.look})
+        write_archive(path, {"format": np.array(FORMAT), "version": np.array(VERSION), **self.arrays})
 
     @classmethod
     def load(cls, path: str | Path) -> "LearnedField":
@@ -156,31 +158,31 @@ class LearnedField(AbstractField):
         Raises:
             ValueError: If the file is missing, truncated, of another kind, or newer.
         """
-        return cls._from_look(read_archive(path, FORMAT, VERSION), path)
+        return cls._from_arrays(read_archive(path, FORMAT, VERSION), path)
 
     @classmethod
     def of_object(cls, path: str | Path) -> "LearnedField | None":
         """The field that an object was made of, from the file that `dano train` wrote of the object.
 
         Returns:
-            None if the object's file holds no look.
+            None if the object's file holds none.
 
         Raises:
             ValueError: If the file is missing, truncated, of another kind, or newer.
         """
         data = read_archive(path, *OBJECT)
         members = {name.removeprefix(LOOK): value for name, value in data.items() if name.startswith(LOOK)}
-        return cls._from_look(members, path) if members else None
+        return cls._from_arrays(members, path) if members else None
 
     @classmethod
-    def _from_look(cls, data: dict[str, np.ndarray], path: str | Path) -> "LearnedField":
+    def _from_arrays(cls, data: dict[str, np.ndarray], path: str | Path) -> "LearnedField":
         try:
             layers = range(int(data["layers"]))
             network = Network(
                 tuple(jnp.asarray(data[f"weight_{i}"]) for i in layers),
                 tuple(jnp.asarray(data[f"bias_{i}"]) for i in layers),
             )
-            look = Appearance(
+            appearance = Appearance(
                 jnp.asarray(data["features"].astype(np.float32)),
                 network,
                 jnp.asarray(data["features_origin"]),
@@ -189,7 +191,7 @@ class LearnedField(AbstractField):
                 bool(data["near_light"]),
             )
             model = SurfaceModel(
-                appearance=look,
+                appearance=appearance,
                 **{name: jnp.asarray(data[name]) for name in ("distance", "origin", "spacing", "scale")},
             )
             return cls.from_model(model, float(data["drawn_sharpness"]))

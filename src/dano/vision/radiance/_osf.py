@@ -22,6 +22,7 @@ from dano.vision.radiance._appearance import Share
 from dano.vision.radiance._models import AbstractMedium
 
 FORMAT, VERSION = "dano-osf", 1
+# The architecture of michguo/osf, as above.
 _DEPTH, _WIDTH, _SKIP, _HEAD = 8, 256, 4, 128
 _POSITION_FREQUENCIES, _DIRECTION_FREQUENCIES = 10, 4
 

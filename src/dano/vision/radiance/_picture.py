@@ -12,6 +12,7 @@ from dano.vision.capture import AbstractCamera, NodeGrid, Rays, rays_of
 from dano.vision.radiance._models import AbstractModel, DRAWING, Sampling, see
 
 _CHUNK = 4096
+"""Rays per call: some tens of MB of intermediates."""
 
 
 class Picture(NamedTuple):

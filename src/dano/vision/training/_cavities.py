@@ -36,16 +36,19 @@ _RESOLUTION = 64
 """Nodes of the fog along the longest side, at most."""
 
 _BATCH = 2048
+"""Rays a step: half of what training takes, as the fog needs less detail."""
 
 STEPS = 400
 """Steps that the fog takes to clear."""
 
 _SAMPLING = Sampling(48, 32, 12)
+"""More samples than training takes: a fog has no surface to find (chosen)."""
 
 _THICKNESS = 0.01
 """Extinction of the fog at the start, per cell: across the whole object most of the light gets through."""
 
 _MASK_WEIGHT, _CLEAR_WEIGHT, _EVEN_WEIGHT = 0.01, 0.01, 0.005
+"""Weights of mask, clear and even fog beside the error of colours (chosen; no benchmark varies them)."""
 
 _BALL = 2.5
 """Radius in cells of the ball that must fit into a cavity: a pore in a wall is none."""
@@ -215,7 +218,7 @@ def _fog(views, distance, box, lit, key, n_steps, progress) -> np.ndarray:
     """Opacity of each cell after fitting the photographs."""
     inside = distance < 0.5 * box.spacing
     rays = collect(views, box, distance < 1.5 * box.spacing)
-    look = Appearance.create(
+    appearance = Appearance.create(
         box,
         lit=lit,
         near_light=lit and views[0].light_is_near,
@@ -224,7 +227,7 @@ def _fog(views, distance, box, lit, key, n_steps, progress) -> np.ndarray:
         width=32,
         key=jax.random.fold_in(key, 0),
     )
-    model = DensityModel.create(inside, box, look, _THICKNESS)
+    model = DensityModel.create(inside, box, appearance, _THICKNESS)
     optimiser = _optimiser(lit)
     state = optimiser.init(_trainable(model))
     allowed = jnp.asarray(inside)

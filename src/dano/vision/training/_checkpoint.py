@@ -26,12 +26,12 @@ class Checkpoint(NamedTuple):
     Attributes:
         iteration: Steps done.
         leaves: Arrays of the model and the optimiser, in the order of the tree.
-        history: One row per look at held-out views.
+        history: One row per evaluation on held-out views.
     """
 
     iteration: int
     leaves: list[np.ndarray]
-    history: Float[np.ndarray, "looks numbers"]
+    history: Float[np.ndarray, "evaluations numbers"]
 
     def filled(self, tree: Any) -> Any:
         """A tree of the same structure as `tree`, with the arrays of the file.

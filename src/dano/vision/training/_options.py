@@ -24,7 +24,7 @@ class TrainOptions:
         cavities: Whether to look for cavities of the visual hull first (see `find_cavities`).
         cameras: Whether to correct poses and lenses by up to a few pixels.
         blur: Distance over which the surface is soft, in pixels, at the start and from 70 % of the steps on.
-        check_every: Steps between looks at held-out views, which decide when to stop.
+        check_every: Steps between evaluations on held-out views, which decide when to stop.
         seconds: Stop after this time [s]; None for no limit.
         seed: Of everything random.
     """

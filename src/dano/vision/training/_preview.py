@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from dano.archive import replacing
 
+# Height to which small pictures are enlarged, and space between pictures [pixels] (convention).
 _LEAST_HEIGHT = 96
 _GAP = 2
 

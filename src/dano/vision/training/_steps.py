@@ -69,8 +69,8 @@ class Learned(eqx.Module):
     @property
     def parts(self) -> Any:
         """Arrays that change: distances, features, network, cameras."""
-        look = self.model.appearance
-        return self.model.distance, look.features, look.network, self.cameras.correction
+        appearance = self.model.appearance
+        return self.model.distance, appearance.features, appearance.network, self.cameras.correction
 
     def replaced(self, parts: Any) -> "Learned":
         """With other values of `parts`."""

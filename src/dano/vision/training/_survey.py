@@ -27,7 +27,7 @@ Corners = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 
 
 class Survey(NamedTuple):
-    """What a look at the silhouettes tells before training.
+    """What the silhouettes tell before training.
 
     Attributes:
         box: Nodes around the object.
@@ -93,8 +93,8 @@ def survey(capture: Capture, resolution: int = 96, *, corners: Corners | None = 
 
 def silhouette_residual(views: Sequence[View], box: NodeGrid, hull: np.ndarray, most: int = 16) -> float:
     """1 − mean intersection over union of the hull's silhouettes with the masks, over up to `most` views."""
-    look = Appearance.create(box, lit=False, n_features=1, resolution=4, width=1, key=jax.random.key(0))
-    model = SurfaceModel.create(hull, box, look)
+    appearance = Appearance.create(box, lit=False, n_features=1, resolution=4, width=1, key=jax.random.key(0))
+    model = SurfaceModel.create(hull, box, appearance)
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, most).round().astype(int))]
     scores = []
     for view in chosen:

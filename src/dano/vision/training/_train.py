@@ -43,11 +43,21 @@ _STILL, _COHERENT, _SHARP = 0.125, 0.6, 0.7
 not learned yet (but cameras and surface are learned together); until its nodes move each on its own; and
 until it is sharp."""
 
+_PER_DECIBEL = 0.002
+"""What a decibel of PSNR counts beside mask IoU where the best state is chosen: 5 dB as much as 0.01."""
+
+_WORSE, _OF_RESIDUAL = 0.004, 0.5
+"""Loss of mask IoU on held-out views that stops training, at least this and this share of what no solid
+explains (chosen; no benchmark varies them)."""
+
+_STEADY_VOLUME, _STEADY_QUALITY = 5e-4, 0.03
+"""Relative change of volume, and gain of PSNR [dB], below which training has converged (chosen)."""
+
 Stopped = Literal["finished", "converged", "geometry", "time", "diverged"]
 
 
 class HistoryEntry(NamedTuple):
-    """What a look at held-out views tells during training.
+    """What held-out views tell during training.
 
     Attributes:
         iteration: Steps done.
@@ -79,7 +89,7 @@ class Trained(NamedTuple):
             corrected cameras.
         survey: What the silhouettes told, with the visual hull.
         scores: By split: "test", "relight", or "train" (some of its views) if nothing was held out.
-        history: One entry per look at held-out views.
+        history: One entry per evaluation on held-out views.
         stopped: Why training ended.
         seconds: From the start, with compilation and final measurements [s].
         unseen: Share of the surface that fewer than two training views see.
@@ -124,10 +134,10 @@ def train(
     Args:
         capture: The photographs.
         options: How; default `TrainOptions()`.
-        checkpoint: File that the state is written to at each look at held-out views, and when interrupted.
+        checkpoint: File that the state is written to at each evaluation, and when interrupted.
         resume: Go on from `checkpoint` if it exists.
         progress: Called after every few steps, while cavities are looked for and during training.
-        previews: Folder for a PNG per look at held-out views: photographs, and their renderings below.
+        previews: Folder for a PNG per evaluation: held-out photographs, and their renderings below.
 
     Returns:
         The field, and how good it is.
@@ -215,7 +225,7 @@ class _Trainer:
         """A surface at signed distances [m] on the survey's box, grey all over and blurred [pixels]."""
         views, box = self.capture.split("train"), self.box(0)
         lit = self.capture.is_lit
-        look = Appearance.create(
+        appearance = Appearance.create(
             box,
             lit=lit,
             near_light=lit and views[0].light_is_near,
@@ -223,7 +233,7 @@ class _Trainer:
             resolution=max(8, 2 * self.options.resolution // 3),
             key=jax.random.fold_in(self.key, 1),
         )
-        model = SurfaceModel.create(resampled(start, self.found.box, box), box, look)
+        model = SurfaceModel.create(resampled(start, self.found.box, box), box, appearance)
         cameras = Adjustment.create(views, self.middle)
         return self._begun(Learned(model, cameras), 0, jnp.float32(blur))
 
@@ -319,7 +329,7 @@ class _Trainer:
                     entry = self._checked(state, spent, speed, loss)
                     good = state
                     self._save(state)
-                    merit = entry.mask_iou + 0.002 * entry.psnr
+                    merit = entry.mask_iou + _PER_DECIBEL * entry.psnr
                     if merit > best_score:
                         best, best_score = state, merit
                     if reason := reason_to_stop(self.history, self.found.residual):
@@ -349,7 +359,7 @@ class _Trainer:
         return collect(self.capture.split("train"), box, hull < max(3 * box.spacing, 2 * self.pixel))
 
     def _checked(self, state: _State, spent: float, speed: float, loss: float) -> HistoryEntry:
-        """Look at a few held-out views and at the solid."""
+        """Evaluate a few held-out views and the solid."""
         sharpness = self.sharpness(state.iteration, float(state.blur))
         model, rows, pairs = state.model, [], []
         occupied = model.distances < 3 * model.box.spacing
@@ -407,7 +417,7 @@ def reason_to_stop(history: Sequence[HistoryEntry], residual: float) -> Stopped 
     """Whether the outlines of held-out views have become worse, or nothing changes any more.
 
     Args:
-        history: All looks at held-out views.
+        history: All evaluations on held-out views.
         residual: Share of the silhouettes that no solid explains (see `Survey`).
     """
     if len(history) < 4 or history[-1].iteration < _SHARP * history[-1].iterations:
@@ -416,12 +426,12 @@ def reason_to_stop(history: Sequence[HistoryEntry], residual: float) -> Stopped 
     overlap = [entry.mask_iou for entry in history]
     # Brighter pictures with worse outlines: training has begun to eat into the solid. Outlines that do not
     # agree with one another cannot tell that any more exactly.
-    if max(overlap[:-2]) - max(overlap[-2:]) > max(0.004, 0.5 * residual):
+    if max(overlap[:-2]) - max(overlap[-2:]) > max(_WORSE, _OF_RESIDUAL * residual):
         return "geometry"
     quality = [entry.psnr for entry in history]
     volumes = [entry.volume for entry in history[-3:]]
-    settled = max(volumes) - min(volumes) < 5e-4 * volumes[-1]
-    return "converged" if settled and max(quality[-2:]) < max(quality[:-2]) + 0.03 else None
+    settled = max(volumes) - min(volumes) < _STEADY_VOLUME * volumes[-1]
+    return "converged" if settled and max(quality[-2:]) < max(quality[:-2]) + _STEADY_QUALITY else None
 
 
 def pixel_at(views: Sequence[View], point: Float[np.ndarray, "3"]) -> float:

@@ -1,0 +1,167 @@
+"""What `identify` may be told, in groups: noise, windows, search."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dano.engine import AbstractEngine
+from dano.identify._motion import Motion, QUANTITIES
+from dano.identify._parameters import Space
+from dano.scene import Scene
+
+_MOST_STARTS = 10_000
+"""More starts than that would each cost several simulations of all windows: hours of work."""
+
+_INITIAL = {"given": (), "velocities": ("velocity", "omega"), "states": tuple(QUANTITIES)}
+
+
+@dataclass(frozen=True)
+class Noise:
+    """How far observations may be from the truth.
+
+    Attributes:
+        deviations: Standard deviation of each quantity that counts.
+        huber: Length of a residual, in standard deviations, from which it counts linearly; None: never.
+    """
+
+    deviations: dict[str, float]
+    huber: float | None
+
+    def __post_init__(self):
+        if self.huber is not None and not self.huber > 0:
+            raise ValueError(f"huber must be > 0, got {self.huber}")
+
+
+@dataclass(frozen=True)
+class Windowing:
+    """How motions are cut.
+
+    Attributes:
+        frames: Frames of a window; None: motions are not cut.
+        continuity: Allowed gaps between windows, in standard deviations, searched with one after the other;
+            empty: any gap.
+    """
+
+    frames: int | None
+    continuity: tuple[float, ...]
+
+    @classmethod
+    def create(
+        cls, window: int | None, continuity: float | Sequence[float] | None, initial: tuple[str, ...]
+    ) -> "Windowing":
+        """From the arguments of `identify`.
+
+        Raises:
+            ValueError: If they are out of range, or do not fit what is estimated of the initial states.
+        """
+        if window is not None and window < 2:
+            raise ValueError(f"window must hold at least 2 frames, got {window}")
+        gaps = () if continuity is None else tuple(np.atleast_1d(np.asarray(continuity, float)).tolist())
+        if gaps:
+            if not all(gap > 0 for gap in gaps) or any(b >= a for a, b in zip(gaps, gaps[1:], strict=False)):
+                raise ValueError(f"continuity must be > 0, and a sequence of it must fall, got {list(gaps)}")
+            if window is None or len(initial) < len(QUANTITIES):
+                raise ValueError(
+                    f"continuity needs window and initial='states', got window {window},"
+                    f" initial {list(initial)}"
+                )
+        return cls(window, gaps)
+
+
+@dataclass(frozen=True)
+class Search:
+    """How the minimum is looked for.
+
+    Attributes:
+        starts: Points to start from.
+        seed: Of everything random.
+        jacobian: "auto", "forward" or "reverse".
+        max_iterations: Steps of each search.
+        tolerance: Predicted move of the parameters, in standard errors, below which a search ends.
+        batch: Windows that a device simulates at once; None: by the device.
+    """
+
+    starts: int
+    seed: int
+    jacobian: str
+    max_iterations: int
+    tolerance: float
+    batch: int | None
+
+    def __post_init__(self):
+        if not 1 <= self.starts <= _MOST_STARTS:
+            raise ValueError(f"starts must be ≥ 1 and ≤ {_MOST_STARTS}, got {self.starts}")
+        if self.jacobian not in ("auto", "forward", "reverse"):
+            raise ValueError(f"jacobian must be 'auto', 'forward' or 'reverse', got {self.jacobian!r}")
+        if not self.tolerance > 0:
+            raise ValueError(f"tolerance must be > 0 standard errors, got {self.tolerance}")
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations must be ≥ 1, got {self.max_iterations}")
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Arguments of `identify`, checked, that do not depend on the motions.
+
+    Attributes:
+        space: The unknowns.
+        scene: The scene.
+        controls: As they were given.
+        initial: Quantities that are estimated of the state in which each window begins.
+        noise: See `Noise`.
+        windows: See `Windowing`.
+        search: See `Search`.
+        engine: What simulates.
+    """
+
+    space: Space
+    scene: Scene
+    controls: Any
+    initial: tuple[str, ...]
+    noise: Noise
+    windows: Windowing
+    search: Search
+    engine: AbstractEngine
+
+
+def estimated(initial: str | Sequence[str] | None, motions: Sequence[Motion]) -> tuple[str, ...]:
+    """Quantities of the initial states that are estimated, by the argument `initial` of `identify`.
+
+    Raises:
+        ValueError: If it is none of the known words, or lists something else than quantities.
+    """
+    if initial is None:
+        first = [np.concatenate([m.velocity, m.omega], axis=-1) for m in motions]
+        initial = "given" if all(np.isfinite(v).all() for v in first) else "velocities"
+    if isinstance(initial, str):
+        if initial not in _INITIAL:
+            raise ValueError(f"initial must be one of {list(_INITIAL)} or list quantities, got {initial!r}")
+        return _INITIAL[initial]
+    if wrong := [key for key in initial if key not in QUANTITIES]:
+        raise ValueError(f"initial must list some of {list(QUANTITIES)}, got {wrong[0]!r}")
+    return tuple(key for key in QUANTITIES if key in initial)
+
+
+def deviations(
+    scene: Scene, motions: Sequence[Motion], noise: Mapping[str, float] | None
+) -> dict[str, float]:
+    """Standard deviations by quantity, by the argument `noise` of `identify`.
+
+    Raises:
+        ValueError: If one is not positive, or there is none.
+    """
+    if noise is None:
+        sizes = [scene.body(name).size for m in motions for name in m.names if name in scene.names]
+        finite = [size for size in sizes if np.isfinite(size)] or [1.0]
+        # A thousandth of the size, seen at half the size from the middle.
+        return {"position": 1e-3 * float(np.mean(finite)), "orientation": 2e-3}
+    for key, value in noise.items():
+        if key not in QUANTITIES:
+            raise ValueError(f"noise must be given for some of {list(QUANTITIES)}, got {key!r}")
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"noise of {key} must be finite and > 0, got {value}")
+    if not noise:
+        raise ValueError(f"noise must be given for at least one of {list(QUANTITIES)}, got none")
+    return dict(noise)
