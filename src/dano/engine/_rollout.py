@@ -18,7 +18,7 @@ from dano.engine import _problem, _variational
 from dano.engine._compiling import compiled
 from dano.engine._newton import Report, SolverOptions
 from dano.engine._rigid import too_fast
-from dano.maths import is_traced, quat_conjugate, quat_exp, quat_multiply
+from dano.maths import checked_count, is_traced, quat_conjugate, quat_exp, quat_multiply
 from dano.scene import Control, RESOLVED, Scene, State, Trajectory
 
 Policy = Callable[[State, Float[Array, ""]], Control]
@@ -181,8 +181,7 @@ def simulate(
         if n_steps is None:
             n_steps = rows
         _check_control(scene, controls, (n_steps,))
-    if n_steps is None or n_steps < 1:
-        raise ValueError(f"n_steps must be ≥ 1, got {n_steps}")
+    n_steps = checked_count("n_steps", n_steps)
     if checkpoint_every is not None and checkpoint_every < 1:
         raise ValueError(f"checkpoint_every must be ≥ 1, got {checkpoint_every}")
     if checkpoint_every is None and n_steps > CHECKPOINT_FROM:
