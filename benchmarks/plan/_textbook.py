@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dano.engine import compiler_options
 from dano.solvers import optimal_trajectory, TrajectoryConstraint, TrajectoryOptions, TrajectoryProblem
 
 Numbers = Sequence[Any]
@@ -138,7 +139,7 @@ def _parking() -> Case:
 
 
 def _quadrotor() -> Case:
-    h, n_steps, mass, arm, drag, g = 0.05, 50, 0.5, 0.17, 0.03, 9.81
+    h, n_steps, mass, arm, drag, g = 0.05, 36, 0.5, 0.17, 0.03, 9.81
     inertia = (0.0023, 0.0023, 0.004)
     goal, window = (3.0, 0.0, 1.0), (1.5, 0.8, 1.6)
 
@@ -192,7 +193,7 @@ def _quadrotor() -> Case:
         ),
         final_cost=lambda x: 0.0 * x[0],
         lower=(0.0,) * 4,
-        upper=(2.0 * hover,) * 4,
+        upper=(1.35 * hover,) * 4,
         guess=np.full((n_steps, 4), hover),
         final_equalities=lambda x: [x[0] - goal[0], x[1] - goal[1], x[2] - goal[2], *x[4:7], *x[7:13]],
         inequalities=outside,
@@ -264,7 +265,9 @@ def solved(case: Case, **choices):
     problem = trajectory_problem(case, **choices)
     states = None if case.guessed_states is None else jnp.asarray(case.guessed_states)
     start, guess = jnp.array(case.start), jnp.asarray(case.guess)
-    return optimal_trajectory(problem, start, guess, states=states, options=case.options)
+    return optimal_trajectory(
+        problem, start, guess, states=states, options=case.options, compiler_options=compiler_options()
+    )
 
 
 def solved_by_ipopt(case: Case, guesses: int = 1, seed: int = 0) -> tuple[float, str]:

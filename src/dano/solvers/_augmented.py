@@ -1,7 +1,8 @@
 """The outer loop: multipliers and penalties around the inner minimum."""
 
+import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,10 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.solvers._ilqr import (
-    compiled_minimise,
     CONVERGED,
     first_iterate,
     Iterate,
+    minimise,
     Multipliers,
     rolled,
     RUNNING,
@@ -52,6 +53,7 @@ def optimal_trajectory(
     multipliers: Sequence[Array] | None = None,
     options: TrajectoryOptions | None = None,
     callback: Callable[[Progress], object] | None = None,
+    compiler_options: Mapping[str, bool] | None = None,
 ) -> TrajectorySolution:
     """Solve a problem of optimal control (see the top of `dano.solvers._trajectory`).
 
@@ -65,6 +67,7 @@ def optimal_trajectory(
         options: See `TrajectoryOptions`.
         callback: Called after every iteration; if it returns True the optimisation stops. Ctrl-C does too,
             between iterations.
+        compiler_options: For `jax.jit` of the inner minimum, which is a long program.
 
     Returns:
         The best trajectory found, with the reason why the search ended. Constraints that cannot be met are a
@@ -85,7 +88,7 @@ def optimal_trajectory(
             "controls must lead to finite states and costs, got others: start from smaller ones, "
             "or give states"
         )
-    watch = _Watch(problem, options, callback, began)
+    watch = _Watch(problem, options, callback, began, _compiled(tuple((compiler_options or {}).items())))
     return _solved(problem, dual, iterate, options, watch)
 
 
@@ -137,8 +140,9 @@ def _solved(problem, dual: Multipliers, iterate: Iterate, options: TrajectoryOpt
 class _Watch:
     """Runs inner minima, and stops them when a callback, the clock or an interrupt says so."""
 
-    def __init__(self, problem, options: TrajectoryOptions, callback, began: float):
+    def __init__(self, problem, options: TrajectoryOptions, callback, began: float, minimise: Callable):
         self.problem, self.options, self.callback, self.began = problem, options, callback, began
+        self.minimise = minimise
 
     def minimised(self, dual, iterate: Iterate, tolerance: float, update: int):
         """The inner minimum, and why it was cut short, if it was."""
@@ -148,7 +152,7 @@ class _Watch:
         try:
             while int(iterate.status) == RUNNING and int(iterate.iterations) < end:
                 most = 1 if watched else end - int(iterate.iterations)
-                iterate = compiled_minimise(self.problem, dual, iterate, precision, jnp.asarray(most))
+                iterate = self.minimise(self.problem, dual, iterate, precision, jnp.asarray(most))
                 if self.callback is not None and self.callback(self._told(iterate, update)):
                     return iterate, TrajectoryStop.STOPPED
                 limit = self.options.max_seconds
@@ -186,6 +190,12 @@ class _Watch:
             iterate.states,
             iterate.controls,
         )
+
+
+@functools.cache
+def _compiled(options: tuple[tuple[str, bool], ...]) -> Callable[..., Iterate]:
+    jit: Any = eqx.filter_jit  # whose signature does not list the options that it hands on
+    return jit(minimise, compiler_options=dict(options)) if options else jit(minimise)
 
 
 @eqx.filter_jit

@@ -5,7 +5,6 @@ Letters are those at the top of `dano.solvers._trajectory`.
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -163,33 +162,27 @@ def _iteration(problem: TrajectoryProblem, multipliers: Multipliers, i: Iterate,
     promise = -(slope + 0.5 * bend)
     merit = i.value + weight * gap
 
-    def trial(alpha):
-        states, controls = _forward(problem, i.states, i.controls, model.gaps, policy, alpha)
-        return states, controls, lagrangian(problem, multipliers, states, controls)
-
-    def poor(search):
-        alpha, _, _, value, n = search
+    def enough(alpha, value):
         hoped = -(alpha * slope + 0.5 * alpha**2 * bend)
-        enough = merit - (value + (1 - alpha) * weight * gap) >= _SUFFICIENT * jnp.maximum(hoped, 0)
-        return ~enough & (n < _TRIALS)
+        return merit - (value + (1 - alpha) * weight * gap) >= _SUFFICIENT * jnp.maximum(hoped, 0)
 
     def shorter(search):
-        alpha = 0.5 * search[0]
-        return (alpha, *trial(alpha), search[-1] + 1)
+        alpha, _, _, _, n = search
+        states, controls = _forward(problem, i.states, i.controls, model.gaps, policy, 0.5 * alpha)
+        value = lagrangian(problem, multipliers, states, controls)
+        return 0.5 * alpha, states, controls, value, n + 1
 
     small = promise <= tolerance * (1 + jnp.abs(i.value))
     worth = good & ~small & jnp.isfinite(promise)
-    one = jnp.ones((), i.value.dtype)
-    none = (one, i.states, i.controls, jnp.full((), jnp.inf, i.value.dtype), jnp.asarray(_TRIALS))
-    first = jax.lax.cond(worth, lambda: (one, *trial(one), jnp.asarray(0)), lambda: none)
-    found = jax.lax.while_loop(poor, shorter, first)
-    taken = worth & ~_poor_end(found, poor)
+    # One program for all trials: the first halves α = 2.
+    two, nothing = jnp.full((), 2.0, i.value.dtype), jnp.full((), jnp.inf, i.value.dtype)
+    found = jax.lax.while_loop(
+        lambda search: worth & ~enough(search[0], search[3]) & (search[-1] < _TRIALS),
+        shorter,
+        (two, i.states, i.controls, nothing, jnp.asarray(0)),
+    )
+    taken = worth & enough(found[0], found[3])
     return _updated(i, model, policy, found, taken, good & small, weight, merit, gap, tolerance)
-
-
-def _poor_end(found, poor) -> Array:
-    """Whether even the last trial was poor."""
-    return poor((*found[:4], jnp.asarray(0)))
 
 
 def _updated(i: Iterate, model, policy, found, taken, small, weight, merit, gap, tolerance) -> Iterate:
@@ -371,6 +364,3 @@ def _forward(problem: TrajectoryProblem, states, controls, gaps, policy: Policy,
     start = indexed(states, 0)
     _, (rest, moved) = jax.lax.scan(step, start, inputs)
     return jax.tree.map(lambda first, others: jnp.concatenate([first[None], others]), start, rest), moved
-
-
-compiled_minimise = eqx.filter_jit(minimise)
