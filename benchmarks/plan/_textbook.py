@@ -304,7 +304,7 @@ def solved_by_ipopt(case: Case, guesses: int = 1, seed: int = 0) -> tuple[float,
         spread = 0.0 if attempt == 0 else 0.3
         opti.set_initial(X, (x_guess + spread * rng.standard_normal(x_guess.shape)).T)
         opti.set_initial(U, (case.guess + spread * rng.standard_normal(case.guess.shape)).T)
-        opti.solver("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes", "max_iter": 2000})
+        opti.solver("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes", "max_iter": 400})
         try:
             best = min(best, float(opti.solve().value(opti.f)))
         except RuntimeError:

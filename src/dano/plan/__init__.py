@@ -4,6 +4,7 @@ from dano.plan._execution import Execution as Execution, follow as follow, Repla
 from dano.plan._plan import (
     GoalError as GoalError,
     load_controls as load_controls,
+    Method as Method,
     METHODS as METHODS,
     OPTIONS as OPTIONS,
     Plan as Plan,
@@ -15,6 +16,7 @@ from dano.plan._softening import softened as softened
 from dano.plan._task import (
     Actuator as Actuator,
     Goal as Goal,
+    KINDS as KINDS,
     Limit as Limit,
     QUANTITIES as QUANTITIES,
     Task as Task,

@@ -19,14 +19,14 @@ from dano.maths import floating
 from dano.plan._problem import problem_of, Scales, VIOLATION
 from dano.plan._sampling import sampled, SamplingOptions
 from dano.plan._softening import softened
-from dano.plan._task import Task
+from dano.plan._task import Limit, Task
 from dano.scene import Control, Scene, State, state_arrays, Trajectory
 from dano.solvers import optimal_trajectory, TrajectoryOptions, TrajectorySolution, TrajectoryStop
 
 Method = Literal["ilqr", "cem", "mppi"]
 METHODS = ("ilqr", "cem", "mppi")
 OPTIONS = TrajectoryOptions(
-    tolerance=1e-5, constraint_tolerance=VIOLATION, max_iterations=60, max_updates=20, penalty=10.0
+    tolerance=1e-4, constraint_tolerance=VIOLATION, max_iterations=40, max_updates=20, penalty=10.0
 )
 """Of plans through contact, whose last digits tell nothing."""
 
@@ -71,6 +71,8 @@ class Plan:
         message: Why the search ended, in words.
         method: Of the search.
         seconds: Time it took, with compilation [s].
+        distances: Length of every goal's error over time [unit of its quantity; rad], by its name, shape
+            (T + 1,).
         solution: What the solver says; None from sampling.
     """
 
@@ -85,6 +87,7 @@ class Plan:
     message: str
     method: str
     seconds: float
+    distances: dict[str, np.ndarray]
     solution: TrajectorySolution | None = None
 
     def describe(self) -> str:
@@ -271,49 +274,74 @@ def _plan(scene, state, task, scales, engine, w, solution, message, method, bega
     lower, upper = task.bounds()
     # The last digit of a scaled bound may lie beyond it.
     values = jnp.clip(values, lower, upper)
-    controls = task.controls(scene, values)
+    controls = eqx.filter_jit(task.controls)(scene, values)
     with warnings.catch_warnings():
         # Steps that were not solved are in the trajectory, and the plan says so.
         warnings.simplefilter("ignore", RuntimeWarning)
         trajectory = simulate(scene, state, controls=controls, engine=engine)
     n = 12 * len(scene.layout.free) + 2 * scene.layout.n_joints
     gains = jnp.zeros((*values.shape, n)) if solution is None else solution.gains * scales.width[:, None]
-    goals = goal_errors(scene, task, jax.tree.map(lambda x: x[-1], trajectory.states))
-    limits = tuple(_worst(scene, limit, trajectory) for limit in task.limits)
+    problem = problem_of(scene, task, engine)
+    cost, errors, excesses = _judged(problem, task, scene, trajectory.states, scales.scaled(values))
+    goals = _goal_errors(task, [np.asarray(error[-1]) for error in errors])
+    limits = tuple(_worst(limit, excess) for limit, excess in zip(task.limits, excesses, strict=True))
     met = all(goal.reached for goal in goals if goal.required)
     met = met and all(excess <= VIOLATION for _, excess, _ in limits)
-    cost = float(_cost(problem_of(scene, task, engine), trajectory.states, scales.scaled(values)))
+    rows = zip(task.goals, errors, strict=True)
+    distances = {goal.name: np.linalg.norm(np.asarray(error), axis=1) for goal, error in rows}
     seconds = time.perf_counter() - began
     return Plan(
-        controls, values, trajectory, gains, cost, goals, limits, met, message, method, seconds, solution
+        controls,
+        values,
+        trajectory,
+        gains,
+        float(cost),
+        goals,
+        limits,
+        met,
+        message,
+        method,
+        seconds,
+        distances,
+        solution,
     )
 
 
+
 @eqx.filter_jit
-def _cost(problem, states, w) -> Array:
-    inner = jax.tree.map(lambda x: x[:-1], states)
+def _judged(problem, task: Task, scene: Scene, states: State, w: Array):
+    """J, errors of all goals and excesses over all limits at every state."""
+    inner, last = jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[-1], states)
     stages = jax.vmap(problem.stage_cost)(inner, w, jnp.arange(w.shape[0]))
-    return jnp.sum(stages) + problem.final_cost(jax.tree.map(lambda x: x[-1], states))
+    errors = [jax.vmap(lambda state, goal=goal: goal.error(scene, state))(states) for goal in task.goals]
+    excesses = [jax.vmap(lambda state, each=each: each.excess(scene, state))(inner) for each in task.limits]
+    return jnp.sum(stages) + problem.final_cost(last), errors, excesses
 
 
 def goal_errors(scene: Scene, task: Task, state: State) -> tuple[GoalError, ...]:
     """How each goal of a task is reached at a state."""
-    found = []
-    for goal in task.goals:
-        error = np.asarray(goal.error(scene, state))
-        found.append(
-            GoalError(
-                goal.name,
-                float(np.linalg.norm(error)),
-                float(np.max(np.abs(error))),
-                float(goal.within),
-                goal.required,
-            )
+    return _goal_errors(task, [np.asarray(error) for error in _errors(scene, task, state)])
+
+
+@eqx.filter_jit
+def _errors(scene: Scene, task: Task, state: State) -> list[Array]:
+    return [goal.error(scene, state) for goal in task.goals]
+
+
+def _goal_errors(task: Task, errors: list[np.ndarray]) -> tuple[GoalError, ...]:
+    return tuple(
+        GoalError(
+            goal.name,
+            float(np.linalg.norm(error)),
+            float(np.max(np.abs(error))),
+            float(goal.within),
+            goal.required,
         )
-    return tuple(found)
+        for goal, error in zip(task.goals, errors, strict=True)
+    )
 
 
-def _worst(scene: Scene, limit, trajectory: Trajectory) -> tuple[str, float, int]:
-    excess = np.asarray(jax.vmap(lambda s: limit.excess(scene, s))(trajectory.states))
-    step = int(np.argmax(excess.max(axis=1)))
-    return limit.name, float(max(0.0, excess.max())), step
+def _worst(limit: Limit, excess: Array) -> tuple[str, float, int]:
+    table = np.asarray(excess)
+    step = int(np.argmax(table.max(axis=1)))
+    return limit.name, float(max(0.0, table.max())), step

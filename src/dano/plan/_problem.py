@@ -39,7 +39,10 @@ class Chart(eqx.Module):
 
 
 class Retract(Chart):
-    """The state that a change leads to."""
+    """The state that a change leads to.
+
+    Rows of bodies on joints stay: what reads them fills them in itself, which is dear to compile.
+    """
 
     def __call__(self, state: State, change: Float[Array, " n"]) -> State:
         """See `TrajectoryProblem.retract`."""
@@ -48,7 +51,7 @@ class Retract(Chart):
         moved = retract(state, self.rows, of_bodies.reshape(n, 12)) if n else state
         if moved.q is None or moved.v is None:
             return moved
-        return self.scene.filled(dataclasses.replace(moved, q=moved.q + q, v=moved.v + v))
+        return dataclasses.replace(moved, q=moved.q + q, v=moved.v + v)
 
 
 class Difference(Chart):
@@ -106,6 +109,7 @@ class Dynamics(eqx.Module):
         control = self.task.control(self.scene, self.scales.physical(w))
 
         def step(state):
+            state = self.scene.filled(state) if self.scene.joints else state
             return self.engine.step(self.scene, self.prepared, state, control)[0]
 
         return jax.lax.cond(t < self.remaining, step, lambda state: state, state)

@@ -328,6 +328,8 @@ def _difference(scene: Scene, state: State, body: str, quantity: str, value: Arr
         assert joint is not None and numbers is not None
         place = layout.coordinates[joint]
         return numbers[place : place + 1] - value
+    if layout.joint_of(i) is not None:
+        state = scene.filled(state)
     if quantity == "orientation":
         error = quat_log(quat_multiply(quat_conjugate(value), state.orientation[i]))
     else:

@@ -77,7 +77,7 @@ def optimal_trajectory(
         ValueError: If bounds are crossed or NaN, shapes do not fit, or the first trajectory is not finite.
     """
     began, options = time.perf_counter(), options or TrajectoryOptions()
-    controls = _checked(problem, start, controls, states)
+    controls, states_given = _checked(problem, start, controls, states), states is not None
     if states is None:
         states = _rolled(problem, start, controls)
     held_values = _first_multipliers(problem, states, controls, multipliers)
@@ -88,7 +88,8 @@ def optimal_trajectory(
             "controls must lead to finite states and costs, got others: start from smaller ones, "
             "or give states"
         )
-    watch = _Watch(problem, options, callback, began, _compiled(tuple((compiler_options or {}).items())))
+    # Without given states there are no gaps, and no need of a program that looks for them.
+    watch = _Watch(states_given, problem, options, callback, began, _compiled(tuple((compiler_options or {}).items())))
     return _solved(problem, dual, iterate, options, watch)
 
 
@@ -140,9 +141,9 @@ def _solved(problem, dual: Multipliers, iterate: Iterate, options: TrajectoryOpt
 class _Watch:
     """Runs inner minima, and stops them when a callback, the clock or an interrupt says so."""
 
-    def __init__(self, problem, options: TrajectoryOptions, callback, began: float, minimise: Callable):
+    def __init__(self, gapped: bool, problem, options: TrajectoryOptions, callback, began: float, minimise: Callable):
         self.problem, self.options, self.callback, self.began = problem, options, callback, began
-        self.minimise = minimise
+        self.minimise, self.gapped = minimise, gapped
 
     def minimised(self, dual, iterate: Iterate, tolerance: float, update: int):
         """The inner minimum, and why it was cut short, if it was."""
@@ -164,7 +165,7 @@ class _Watch:
 
     def looked(self, iterate: Iterate) -> tuple[float, tuple[Violation, ...]]:
         """J, and all violations, the worst first."""
-        cost, rows = _looked(self.problem, iterate.states, iterate.controls)
+        cost, rows = _looked(self.problem, iterate.states, iterate.controls, self.gapped)
         n_steps = iterate.controls.shape[0]
         names = [c.name for c in self.problem.constraints] + ["dynamics"]
         ends = [c.final for c in self.problem.constraints] + [False]
@@ -209,7 +210,7 @@ def _first(problem, dual, states, controls):
 
 
 @eqx.filter_jit
-def _looked(problem: TrajectoryProblem, states, controls):
+def _looked(problem: TrajectoryProblem, states, controls, gapped: bool):
     values = constraint_values(problem, states, controls)
     rows = [violated(c, value) for c, value in zip(problem.constraints, values, strict=True)]
     inner, following = (jax.tree.map(lambda x: x[s], states) for s in (slice(None, -1), slice(1, None)))
@@ -218,6 +219,8 @@ def _looked(problem: TrajectoryProblem, states, controls):
         x, y, u, t = inputs
         return jnp.abs(problem.difference(y, problem.dynamics(x, u, t)))
 
+    if not gapped:
+        return total_cost(problem, states, controls), (*rows, jnp.zeros((1, 1), controls.dtype))
     inputs = (inner, following, controls, jnp.arange(controls.shape[0]))
     gaps = jax.vmap(gap)(inputs) if problem.parallel else jax.lax.map(gap, inputs)
     return total_cost(problem, states, controls), (*rows, gaps)

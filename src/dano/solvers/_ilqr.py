@@ -261,15 +261,15 @@ def _linear(problem: TrajectoryProblem, inner, following, controls, steps):
 
     def one(inputs):
         x, y, u, t = inputs
-        nominal = problem.dynamics(x, u, t)
         n = jax.eval_shape(problem.difference, x, y).shape[0]
 
         def moved(change):
             after = problem.dynamics(problem.retract(x, change[:n]), u + change[n:], t)
-            return problem.difference(jax.lax.stop_gradient(nominal), after)
+            gone = problem.difference(y, after)
+            return gone, gone
 
-        slopes = jax.jacfwd(moved)(jnp.zeros(n + u.size, u.dtype))
-        return slopes[:, :n], slopes[:, n:], problem.difference(y, nominal)
+        slopes, gap = jax.jacfwd(moved, has_aux=True)(jnp.zeros(n + u.size, u.dtype))
+        return slopes[:, :n], slopes[:, n:], gap
 
     inputs = (inner, following, controls, steps)
     return jax.vmap(one)(inputs) if problem.parallel else jax.lax.map(one, inputs)
@@ -277,12 +277,16 @@ def _linear(problem: TrajectoryProblem, inner, following, controls, steps):
 
 def _quadratic(cost, constraints: list[tuple[TrajectoryConstraint, Any]], values, mu, zero, convex: bool):
     """Gradient and Hessian of a cost and its constraints; of constraints as Gauss and Newton take them."""
-    gradient, hessian = jax.grad(cost)(zero), jax.hessian(cost)(zero)
+    def slope(change):
+        gradient = jax.grad(cost)(change)
+        return gradient, gradient
+
+    hessian, gradient = jax.jacfwd(slope, has_aux=True)(zero)
     if not convex:
         eigenvalues, vectors = jnp.linalg.eigh(0.5 * (hessian + hessian.T))
         hessian = (vectors * jnp.maximum(eigenvalues, 0)) @ vectors.T
     for (constraint, function), multiplier in zip(constraints, values, strict=True):
-        value, J = function(zero), jax.jacfwd(function)(zero)
+        J, value = jax.jacfwd(lambda d, f=function: (f(d),) * 2, has_aux=True)(zero)
         pressure = pressed(constraint, value, multiplier, mu)
         active = jnp.ones_like(value) if constraint.equality else (pressure > 0).astype(value.dtype)
         gradient = gradient + J.T @ pressure

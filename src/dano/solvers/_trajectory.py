@@ -14,7 +14,7 @@ States may lie on a manifold. A state moves by a change in n coordinates, x ⊞ 
 y ⊟ x = difference(x, y) is the change that takes x to y; for vectors these are sums and differences. All
 derivatives are taken in these coordinates:
 
-    A_t = ∂(f(x_t ⊞ δ, u_t) ⊟ f(x_t, u_t))/∂δ,  B_t = ∂(f(x_t, u_t) …)/∂u        (n, n), (n, m)
+    A_t = ∂(f(x_t ⊞ δ, u_t, t) ⊟ x_{t+1})/∂δ,  B_t = ∂(f(x_t, u_t, t) ⊟ x_{t+1})/∂u_t        (n, n), (n, m)
 
 The method (Howell, Jackson, Manchester, "ALTRO", IROS 2019, with bounds as in Tassa, Mansard, Todorov,
 ICRA 2014, and shooting gaps as in Mastalli et al., "Crocoddyl", ICRA 2020).
