@@ -270,8 +270,16 @@ def solved(case: Case, **choices):
     )
 
 
-def solved_by_ipopt(case: Case, guesses: int = 1, seed: int = 0) -> tuple[float, str]:
+def solved_by_ipopt(
+    case: Case, guesses: int = 1, seed: int = 0, known: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[float, str]:
     """The least cost that IPOPT finds by multiple shooting from several guesses, and its version.
+
+    Args:
+        case: The case.
+        guesses: How many: the case's own, and others around it.
+        seed: Of the others.
+        known: States (T + 1, n) and controls (T, m) from which to start, too.
 
     Raises:
         ImportError: Without CasADi.
@@ -285,7 +293,7 @@ def solved_by_ipopt(case: Case, guesses: int = 1, seed: int = 0) -> tuple[float,
     n, m, T = len(case.start), len(case.lower), case.n_steps
     rng, best = np.random.default_rng(seed), np.inf
     x_guess = np.tile(case.start, (T + 1, 1)) if case.guessed_states is None else case.guessed_states
-    for attempt in range(guesses):
+    for attempt in range(guesses if known is None else guesses + 1):
         opti = casadi.Opti()
         X, U = opti.variable(n, T + 1), opti.variable(m, T)
         cost, rows = 0, lambda M, t, k: [M[i, t] for i in range(k)]
@@ -302,8 +310,10 @@ def solved_by_ipopt(case: Case, guesses: int = 1, seed: int = 0) -> tuple[float,
             opti.subject_to(casadi.vertcat(*case.final_equalities(end)) == 0)
         opti.minimize(cost + case.final_cost(end))
         spread = 0.0 if attempt == 0 else 0.3
-        opti.set_initial(X, (x_guess + spread * rng.standard_normal(x_guess.shape)).T)
-        opti.set_initial(U, (case.guess + spread * rng.standard_normal(case.guess.shape)).T)
+        x, u = (x_guess, case.guess) if attempt < guesses or known is None else known
+        spread = 0.0 if attempt == guesses else spread
+        opti.set_initial(X, (x + spread * rng.standard_normal(x.shape)).T)
+        opti.set_initial(U, (u + spread * rng.standard_normal(u.shape)).T)
         opti.solver("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes", "max_iter": 400})
         try:
             best = min(best, float(opti.solve().value(opti.f)))

@@ -106,7 +106,7 @@ def follow(
             seconds = time.perf_counter() - started
             replans.append(Replan(step, solution.reached, seconds))
             values = scales.physical(solution.controls)
-            gains = solution.gains * scales.width[:, None]
+            gains = solution.gains * scales.width[None, :, None]
             nominal = jax.tree.map(lambda x: x[:-1], solution.states)
         n = min(length, n_steps - step)
         at = slice(step, step + n) if every is None or not step else slice(0, n)

@@ -273,14 +273,14 @@ def _plan(scene, state, task, scales, engine, w, solution, message, method, bega
     values = scales.physical(jnp.asarray(w))
     lower, upper = task.bounds()
     # The last digit of a scaled bound may lie beyond it.
-    values = jnp.clip(values, lower, upper)
+    values = jnp.clip(values, *(jnp.broadcast_to(bound, values.shape) for bound in (lower, upper)))
     controls = eqx.filter_jit(task.controls)(scene, values)
     with warnings.catch_warnings():
         # Steps that were not solved are in the trajectory, and the plan says so.
         warnings.simplefilter("ignore", RuntimeWarning)
         trajectory = simulate(scene, state, controls=controls, engine=engine)
     n = 12 * len(scene.layout.free) + 2 * scene.layout.n_joints
-    gains = jnp.zeros((*values.shape, n)) if solution is None else solution.gains * scales.width[:, None]
+    gains = jnp.zeros((*values.shape, n)) if solution is None else solution.gains * scales.width[None, :, None]
     problem = problem_of(scene, task, engine)
     cost, errors, excesses = _judged(problem, task, scene, trajectory.states, scales.scaled(values))
     goals = _goal_errors(task, [np.asarray(error[-1]) for error in errors])

@@ -91,6 +91,7 @@ def sampled(
     began = time.perf_counter()
     n_steps, m = controls.shape
     lift = _lines(n_steps, min(options.knots, n_steps))
+    assert problem.lower is not None and problem.upper is not None
     least, most = problem.lower, problem.upper
     mean = jnp.asarray(np.linalg.lstsq(lift, np.asarray(controls), rcond=None)[0])
     spread = jnp.full_like(mean, options.deviation)
@@ -101,10 +102,10 @@ def sampled(
     try:
         for turn, price in enumerate(prices):
             key, draw = jax.random.split(key)
-            knots = mean + spread * jax.random.normal(draw, (options.samples, *mean.shape), mean.dtype)
+            knots = mean[None] + spread[None] * jax.random.normal(draw, (options.samples, *mean.shape), mean.dtype)
             knots = knots.at[0].set(mean)
             sequences = jnp.einsum("tk,skm->stm", jnp.asarray(lift), knots)
-            sequences = jnp.clip(sequences, least, most) if least is not None else sequences
+            sequences = jnp.clip(sequences, *(jnp.broadcast_to(b, sequences.shape) for b in (least, most)))
             sequences = sequences.at[1].set(best)
             cost, violation = (np.asarray(x) for x in rate(problem, start, sequences))
             priced = np.nan_to_num(cost + 0.5 * price * violation, nan=np.inf)

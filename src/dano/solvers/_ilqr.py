@@ -284,7 +284,7 @@ def _quadratic(cost, constraints: list[tuple[TrajectoryConstraint, Any]], values
     hessian, gradient = jax.jacfwd(slope, has_aux=True)(zero)
     if not convex:
         eigenvalues, vectors = jnp.linalg.eigh(0.5 * (hessian + hessian.T))
-        hessian = (vectors * jnp.maximum(eigenvalues, 0)) @ vectors.T
+        hessian = (vectors * jnp.maximum(eigenvalues, 0)[None]) @ vectors.T
     for (constraint, function), multiplier in zip(constraints, values, strict=True):
         J, value = jax.jacfwd(lambda d, f=function: (f(d),) * 2, has_aux=True)(zero)
         pressure = pressed(constraint, value, multiplier, mu)

@@ -266,8 +266,8 @@ def violated(constraint: TrajectoryConstraint, value: Array) -> Array:
 
 def held(lower: Array | None, upper: Array | None, u: Array) -> Array:
     """Controls moved into their bounds."""
-    u = u if lower is None else jnp.maximum(u, lower)
-    return u if upper is None else jnp.minimum(u, upper)
+    u = u if lower is None else jnp.maximum(u, jnp.broadcast_to(lower, u.shape))
+    return u if upper is None else jnp.minimum(u, jnp.broadcast_to(upper, u.shape))
 
 
 def total_cost(problem: TrajectoryProblem, states: Any, controls: Array) -> Float[Array, ""]:
