@@ -128,7 +128,7 @@ class Outcome:
     sampled: float | None
 
 
-EVERY = 3  # steps between new plans
+EVERY = 6  # steps between new plans
 
 
 def outcome(seed: int, planned: dano.Scene, plants: tuple[dano.Scene, dano.Scene], *, baseline: bool) -> Outcome:
@@ -143,7 +143,7 @@ def outcome(seed: int, planned: dano.Scene, plants: tuple[dano.Scene, dano.Scene
             follow(plant, given.state, given.task, made, substeps=4, feedback=feedback).goals[0].error
             for plant, feedback in ((finer, False), (rougher, False), (rougher, True))
         ]
-        mpc = follow(rougher, given.state, given.task, made, substeps=4, scene=planned, every=EVERY)
+        mpc = follow(rougher, given.state, given.task, made, substeps=4, scene=planned, feedback=False, every=EVERY)
     replans = sorted(replan.seconds for replan in mpc.replans)
     errors = [goal.error for goal in made.goals]
     return Outcome(

@@ -16,7 +16,7 @@ REFERENCE = Path(__file__).parent / "textbook.json"
 TEXTBOOK = "Textbook optima: cost beside IPOPT's"
 PUSH = "Push-and-slide, random starts and goals"
 DRAWER = "Drawer, a neural object on a slide joint"
-GUESSES = 3
+GUESSES = 2
 
 
 def references() -> dict[str, float]:

@@ -136,7 +136,7 @@ def _again(scene, now, task, engine, values, solution, step, options) -> Any:
     """A plan for the steps that are left, at the front of the arrays."""
     problem = problem_of(scene, task, engine, task.n_steps - step)
     if options is None:
-        options = OPTIONS._replace(max_updates=3, max_iterations=15)
+        options = OPTIONS._replace(max_updates=4, max_iterations=10)
     multipliers = None
     if solution is not None:
         options = options._replace(penalty=min(solution.penalty, options.max_penalty))
