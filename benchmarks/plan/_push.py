@@ -131,7 +131,9 @@ class Outcome:
 EVERY = 6  # steps between new plans
 
 
-def outcome(seed: int, planned: dano.Scene, plants: tuple[dano.Scene, dano.Scene], *, baseline: bool) -> Outcome:
+def outcome(
+    seed: int, planned: dano.Scene, plants: tuple[dano.Scene, dano.Scene], *, baseline: bool
+) -> Outcome:
     """Plan one case, and execute the plan in two other scenes."""
     given = case(planned, seed)
     made = dano.plan(planned, given.state, given.task, controls=given.guess)
@@ -143,7 +145,9 @@ def outcome(seed: int, planned: dano.Scene, plants: tuple[dano.Scene, dano.Scene
             follow(plant, given.state, given.task, made, substeps=4, feedback=feedback).goals[0].error
             for plant, feedback in ((finer, False), (rougher, False), (rougher, True))
         ]
-        mpc = follow(rougher, given.state, given.task, made, substeps=4, scene=planned, feedback=False, every=EVERY)
+        mpc = follow(
+            rougher, given.state, given.task, made, substeps=4, scene=planned, feedback=False, every=EVERY
+        )
     replans = sorted(replan.seconds for replan in mpc.replans)
     errors = [goal.error for goal in made.goals]
     return Outcome(
@@ -186,5 +190,3 @@ def outcomes(seeds: range, *, baseline: bool, say) -> list[Outcome]:
         found.append(outcome(seed, planned, plants, baseline=baseline))
         say(found[-1])
     return found
-
-

@@ -57,7 +57,8 @@ def _write_reference() -> None:
         cases[name] = {"cost": cost}
         print(name, cost, flush=True)
     text = {
-        "source": f"{version}, multiple shooting, least of {GUESSES} guesses and of a start from dano's solution; "
+        "source": f"{version}, multiple shooting, least of {GUESSES} guesses and of a start from dano's "
+        "solution; "
         "python -m benchmarks.plan --reference",
         "date": datetime.date.today().isoformat(),
         "cases": cases,

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -133,8 +132,9 @@ def _parking() -> Case:
         upper=(1.5, 1.0),
         guess=np.tile([0.3, 0.1], (60, 1)),
         final_equalities=lambda x: [x[0] - 2.5, x[1] - 0.5, x[2] - np.pi / 2, x[3], x[4]],
-        inequalities=lambda x, u: [r * r - (x[0] - a) ** 2 - (x[1] - b) ** 2 for a, b, r in obstacles]
-        + [x[4] - 0.6, -0.6 - x[4]],
+        inequalities=lambda x, u: (
+            [r * r - (x[0] - a) ** 2 - (x[1] - b) ** 2 for a, b, r in obstacles] + [x[4] - 0.6, -0.6 - x[4]]
+        ),
     )
 
 
@@ -184,12 +184,14 @@ def _quadrotor() -> Case:
         n_steps=n_steps,
         start=start,
         dynamics=dynamics,
-        stage_cost=lambda x, u: 0.5
-        * h
-        * (
-            0.1 * sum(a * a for a in x[7:10])
-            + 0.1 * sum(a * a for a in x[10:13])
-            + sum((a - hover) ** 2 for a in u)
+        stage_cost=lambda x, u: (
+            0.5
+            * h
+            * (
+                0.1 * sum(a * a for a in x[7:10])
+                + 0.1 * sum(a * a for a in x[10:13])
+                + sum((a - hover) ** 2 for a in u)
+            )
         ),
         final_cost=lambda x: 0.0 * x[0],
         lower=(0.0,) * 4,
@@ -322,5 +324,3 @@ def solved_by_ipopt(
     if not np.isfinite(best):
         raise ValueError(f"IPOPT must solve {case.name!r}, got no solution from {guesses} guesses")
     return best, f"CasADi {casadi.__version__} with IPOPT"
-
-

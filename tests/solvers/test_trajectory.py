@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("benchmarks.plan._textbook", reason="benchmarks are in a clone only")
-from benchmarks.plan import _textbook  # noqa: E402
-
-from dano.solvers import (  # noqa: E402
+from benchmarks.plan import _textbook
+from dano.solvers import (
     box_minimum,
     optimal_trajectory,
     TrajectoryConstraint,
@@ -26,7 +25,6 @@ A = np.array([[1.0, H], [0.0, 1.0]])
 B = np.array([[0.5 * H * H], [H]])
 START, GOAL = np.array([1.0, 0.3]), np.array([0.0, 0.0])
 REFERENCE = Path(_textbook.__file__).with_name("textbook.json")
-
 
 
 def effort(x, u, t):

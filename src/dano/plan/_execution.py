@@ -153,7 +153,7 @@ def _again(scene, now, task, engine, values, solution, step, options) -> Any:
 
 @eqx.filter_jit
 def _run(plant: Scene, task: Task, engine, start: State, rows, feedback, substeps: int):
-    """Some steps of the plan in the plant: states of all substeps, controls used, and whether all were solved."""
+    """Some steps in the plant: states of all substeps, controls used, and whether all were solved."""
     prepared, difference = engine.prepare(plant), Difference(plant)
     lower, upper = task.bounds()
 
@@ -174,7 +174,9 @@ def _run(plant: Scene, task: Task, engine, start: State, rows, feedback, substep
     return flat, used, jnp.all(good)
 
 
-def _check(plant: Scene, state: State, task: Task, plan: Plan, scene: Scene | None, substeps: int, every) -> None:
+def _check(
+    plant: Scene, state: State, task: Task, plan: Plan, scene: Scene | None, substeps: int, every
+) -> None:
     plant.check_state(state)
     task.check(plant)
     if substeps < 1 or (every is not None and every < 1):

@@ -62,8 +62,8 @@ class Plan:
         controls: For `dano.simulate`, leaves of shape (T, …).
         values: Controls of the task's actuators [N, N m], shape (T, m).
         trajectory: What the scene does under them.
-        gains: K [N or N m per unit of a state's coordinate], shape (T, m, n): feedback that holds the bodies on
-            the trajectory. Zero from sampling.
+        gains: K [N or N m per unit of a state's coordinate], shape (T, m, n): feedback that holds the bodies
+            on the trajectory. Zero from sampling.
         cost: J, without what constraints cost.
         goals: How each goal was reached at the end of `trajectory`.
         limits: Name, worst excess and its step of each limit of the task.
@@ -93,7 +93,10 @@ class Plan:
     def describe(self) -> str:
         """The plan in a few lines."""
         verdict = "reaches all that is required" if self.reached else "does NOT reach all that is required"
-        lines = [f"the plan {verdict}; cost {self.cost:.4g}, {self.seconds:.1f} s ({self.method})", self.message]
+        lines = [
+            f"the plan {verdict}; cost {self.cost:.4g}, {self.seconds:.1f} s ({self.method})",
+            self.message,
+        ]
         for goal in self.goals:
             need = "required" if goal.required else "wished"
             word = "reached" if goal.reached else "missed"
@@ -166,8 +169,8 @@ def plan(
     """Find controls that do a task.
 
     With `method="ilqr"`: augmented-Lagrangian iLQR with the derivatives of the scene's steps by the implicit
-    function theorem (see docs/plan.md). With "cem" or "mppi": by sampling rollouts, which needs no derivatives
-    and is much less exact.
+    function theorem (see docs/plan.md). With "cem" or "mppi": by sampling rollouts, which needs no
+    derivatives and is much less exact.
 
     Args:
         scene: The scene.
@@ -280,7 +283,9 @@ def _plan(scene, state, task, scales, engine, w, solution, message, method, bega
         warnings.simplefilter("ignore", RuntimeWarning)
         trajectory = simulate(scene, state, controls=controls, engine=engine)
     n = 12 * len(scene.layout.free) + 2 * scene.layout.n_joints
-    gains = jnp.zeros((*values.shape, n)) if solution is None else solution.gains * scales.width[None, :, None]
+    gains = (
+        jnp.zeros((*values.shape, n)) if solution is None else solution.gains * scales.width[None, :, None]
+    )
     problem = problem_of(scene, task, engine)
     cost, errors, excesses = _judged(problem, task, scene, trajectory.states, scales.scaled(values))
     goals = _goal_errors(task, [np.asarray(error[-1]) for error in errors])
@@ -305,7 +310,6 @@ def _plan(scene, state, task, scales, engine, w, solution, message, method, bega
         distances,
         solution,
     )
-
 
 
 @eqx.filter_jit

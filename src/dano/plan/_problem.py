@@ -1,7 +1,7 @@
 """From a scene and a task to a problem of optimal control.
 
-Controls of the problem are shares of their bounds' half-widths, u = middle + width w, so that all are of order
-one. Costs of rates are multiplied by the timestep: a plan is the same at half the step.
+Controls of the problem are shares of their bounds' half-widths, u = middle + width w, so that all are of
+order one. Costs of rates are multiplied by the timestep: a plan is the same at half the step.
 """
 
 import dataclasses
@@ -83,11 +83,11 @@ class Scales(eqx.Module):
         return cls(middle, jnp.where(spans, jnp.maximum(-lower, upper), 0.5 * (upper - lower)))
 
     def physical(self, w: Float[Array, "*T m"]) -> Float[Array, "*T m"]:
-        """u [N, N m]."""
+        """U [N, N m]."""
         return jnp.broadcast_to(self.middle, w.shape) + jnp.broadcast_to(self.width, w.shape) * w
 
     def scaled(self, u: Float[Array, "*T m"]) -> Float[Array, "*T m"]:
-        """w."""
+        """W."""
         return (u - jnp.broadcast_to(self.middle, u.shape)) / jnp.broadcast_to(self.width, u.shape)
 
 
@@ -171,14 +171,18 @@ class Kept(eqx.Module):
         return self.limit.excess(self.scene, state)
 
 
-def problem_of(scene: Scene, task: Task, engine: AbstractEngine, remaining: int | None = None) -> TrajectoryProblem:
+def problem_of(
+    scene: Scene, task: Task, engine: AbstractEngine, remaining: int | None = None
+) -> TrajectoryProblem:
     """The problem of a scene and a task; the steps after `remaining` are left out."""
     left = jnp.asarray(task.n_steps if remaining is None else remaining)
     scales = Scales.of(task)
     prepared = eqx.filter_jit(engine.prepare)(scene)
     lower, upper = task.bounds()
     constraints = [
-        TrajectoryConstraint(goal.name, Reached(scene, goal), True, True) for goal in task.goals if goal.required
+        TrajectoryConstraint(goal.name, Reached(scene, goal), True, True)
+        for goal in task.goals
+        if goal.required
     ]
     constraints += [TrajectoryConstraint(limit.name, Kept(scene, limit)) for limit in task.limits]
     return TrajectoryProblem(

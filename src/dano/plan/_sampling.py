@@ -102,7 +102,9 @@ def sampled(
     try:
         for turn, price in enumerate(prices):
             key, draw = jax.random.split(key)
-            knots = mean[None] + spread[None] * jax.random.normal(draw, (options.samples, *mean.shape), mean.dtype)
+            knots = mean[None] + spread[None] * jax.random.normal(
+                draw, (options.samples, *mean.shape), mean.dtype
+            )
             knots = knots.at[0].set(mean)
             sequences = jnp.einsum("tk,skm->stm", jnp.asarray(lift), knots)
             sequences = jnp.clip(sequences, *(jnp.broadcast_to(b, sequences.shape) for b in (least, most)))

@@ -8,8 +8,11 @@ _STIFF = ("stiffness", "spring", "damper")
 
 
 def softened(scene: Scene, factor: float) -> Scene:
-    """The scene with the stiffness (distributed law), or spring and damper (centroid law), of all contacts
-    multiplied by a factor: bodies sink deeper into each other, and forces change less abruptly.
+    """The scene with softer contacts: bodies sink deeper into each other, and forces change less abruptly.
+
+    Args:
+        scene: The scene.
+        factor: What the stiffness (distributed law), or spring and damper (centroid law), is multiplied with.
 
     Raises:
         ValueError: If the factor is not positive.

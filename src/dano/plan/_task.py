@@ -8,7 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.maths import checked_array, checked_quaternion, is_traced, Numbers, quat_conjugate, quat_log, quat_multiply
+from dano.maths import (
+    checked_array,
+    checked_quaternion,
+    is_traced,
+    Numbers,
+    quat_conjugate,
+    quat_log,
+    quat_multiply,
+)
 from dano.names import did_you_mean
 from dano.scene import Control, Scene, State
 
@@ -61,11 +69,13 @@ class Actuator(eqx.Module):
             cost: Price of its squares.
 
         Raises:
-            ValueError: If the kind or an axis is unknown, the bounds are missing, not finite or crossed, or the
-                cost is negative.
+            ValueError: If the kind or an axis is unknown, the bounds are missing, not finite or crossed, or
+                the cost is negative.
         """
         if kind not in KINDS:
-            raise ValueError(f"kind of the actuator of {body!r} must be one of {', '.join(KINDS)}, got {kind!r}")
+            raise ValueError(
+                f"kind of the actuator of {body!r} must be one of {', '.join(KINDS)}, got {kind!r}"
+            )
         self.body, self.kind = body, kind
         self.axes = "" if kind == "effort" else _checked_axes(axes, f"the {kind} of {body!r}")
         what = f"of the {kind} of {body!r}"
@@ -161,7 +171,9 @@ class Goal(eqx.Module):
         for name, number in (("running", running), ("final", final), ("within", within)):
             checked = checked_array(f"{name} of the goal of {body!r}", number, ())
             least = "> 0" if name == "within" else "≥ 0"
-            if not is_traced(checked) and not (float(checked) > 0 or (name != "within" and float(checked) == 0)):
+            if not is_traced(checked) and not (
+                float(checked) > 0 or (name != "within" and float(checked) == 0)
+            ):
                 raise ValueError(f"{name} of the goal of {body!r} must be {least}, got {float(checked)}")
             setattr(self, name, checked)
 
@@ -171,7 +183,7 @@ class Goal(eqx.Module):
         return f"{self.quantity} of {self.body}"
 
     def error(self, scene: Scene, state: State) -> Float[Array, " p"]:
-        """e at a state, shape (number of axes,)."""
+        """E at a state, shape (number of axes,)."""
         return _difference(scene, state, self.body, self.quantity, self.value, self.axes)
 
 
@@ -193,7 +205,13 @@ class Limit(eqx.Module):
     axes: str = eqx.field(static=True)
 
     def __init__(
-        self, body: str, quantity: str, *, lower: Numbers = -np.inf, upper: Numbers = np.inf, axes: str = _AXES
+        self,
+        body: str,
+        quantity: str,
+        *,
+        lower: Numbers = -np.inf,
+        upper: Numbers = np.inf,
+        axes: str = _AXES,
     ):
         """See the class.
 
@@ -211,7 +229,9 @@ class Limit(eqx.Module):
         n = 1 if QUANTITIES[quantity] == 1 else len(self.axes)
         bounds = [np.asarray(each, float) for each in (lower, upper)]
         if any(b.shape not in ((), (n,)) or np.any(np.isnan(b)) for b in bounds):
-            raise ValueError(f"bounds of the limit of {body!r} must be one number or {n}, got {lower}, {upper}")
+            raise ValueError(
+                f"bounds of the limit of {body!r} must be one number or {n}, got {lower}, {upper}"
+            )
         self.lower, self.upper = (jnp.asarray(np.broadcast_to(b, (n,))) for b in bounds)
         if not np.all(self.lower <= self.upper):
             raise ValueError(f"lower of the limit of {body!r} must be ≤ upper, got {lower} and {upper}")
@@ -267,7 +287,9 @@ class Task(eqx.Module):
         driven = [(a.body, a.kind, axis) for a in self.actuators for axis in a.axes or "q"]
         for place in driven:
             if driven.count(place) > 1:
-                raise ValueError(f"actuators must drive different things, got the {place[1]} of {place[0]!r} twice")
+                raise ValueError(
+                    f"actuators must drive different things, got the {place[1]} of {place[0]!r} twice"
+                )
 
     def check(self, scene: Scene) -> None:
         """Raise a ValueError unless bodies and joints that the task names are those of a scene."""
@@ -282,7 +304,9 @@ class Task(eqx.Module):
             i = scene.index(part.body)
             joint = layout.joint_of(i)
             if kind in ("effort", "q", "v") and (joint is None or layout.coordinates[joint] < 0):
-                raise ValueError(f"{kind} of {part.body!r} must be that of a joint with a coordinate, got a body without")
+                raise ValueError(
+                    f"{kind} of {part.body!r} must be that of a joint with a coordinate, got a body without"
+                )
             if isinstance(part, Actuator) and i not in layout.moving:
                 raise ValueError(f"actuator must drive a body that moves, got the fixed {part.body!r}")
 

@@ -154,4 +154,3 @@ def draw_controls(task: Task, plan: Plan, path: str | os.PathLike[str]) -> None:
     axes[-1].set_xlabel("time [s]")
     with replacing(output) as file:
         figure.savefig(file, format="png", dpi=120)
-

@@ -89,7 +89,9 @@ def optimal_trajectory(
             "or give states"
         )
     # Without given states there are no gaps, and no need of a program that looks for them.
-    watch = _Watch(states_given, problem, options, callback, began, _compiled(tuple((compiler_options or {}).items())))
+    watch = _Watch(
+        states_given, problem, options, callback, began, _compiled(tuple((compiler_options or {}).items()))
+    )
     return _solved(problem, dual, iterate, options, watch)
 
 
@@ -141,7 +143,9 @@ def _solved(problem, dual: Multipliers, iterate: Iterate, options: TrajectoryOpt
 class _Watch:
     """Runs inner minima, and stops them when a callback, the clock or an interrupt says so."""
 
-    def __init__(self, gapped: bool, problem, options: TrajectoryOptions, callback, began: float, minimise: Callable):
+    def __init__(
+        self, gapped: bool, problem, options: TrajectoryOptions, callback, began: float, minimise: Callable
+    ):
         self.problem, self.options, self.callback, self.began = problem, options, callback, began
         self.minimise, self.gapped = minimise, gapped
 
@@ -213,7 +217,7 @@ def _first(problem, dual, states, controls):
 def _looked(problem: TrajectoryProblem, states, controls, gapped: bool):
     values = constraint_values(problem, states, controls)
     rows = [violated(c, value) for c, value in zip(problem.constraints, values, strict=True)]
-    inner, following = (jax.tree.map(lambda x: x[s], states) for s in (slice(None, -1), slice(1, None)))
+    inner, following = (jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states))
 
     def gap(inputs):
         x, y, u, t = inputs

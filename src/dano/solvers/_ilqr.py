@@ -44,8 +44,8 @@ class Model(NamedTuple):
     Q: Float[Array, "T n n"]
     R: Float[Array, "T m m"]
     H: Float[Array, "T m n"]
-    final_q: Float[Array, " n"]
-    final_Q: Float[Array, "n n"]
+    end_gradient: Float[Array, " n"]
+    end_hessian: Float[Array, "n n"]
     gaps: Float[Array, "T n"]
 
 
@@ -128,7 +128,17 @@ def first_iterate(problem: TrajectoryProblem, multipliers: Multipliers, states, 
     zero, none = jnp.zeros((), dtype), jnp.asarray(0)
     value = lagrangian(problem, multipliers, states, controls)
     return Iterate(
-        states, controls, value, model, policy, zero, zero, jnp.asarray(False), none, none, jnp.asarray(RUNNING)
+        states,
+        controls,
+        value,
+        model,
+        policy,
+        zero,
+        zero,
+        jnp.asarray(False),
+        none,
+        none,
+        jnp.asarray(RUNNING),
     )
 
 
@@ -150,9 +160,7 @@ def minimise(
 
 def _iteration(problem: TrajectoryProblem, multipliers: Multipliers, i: Iterate, tolerance) -> Iterate:
     # A step that failed leaves the trajectory, so also its model, as it is.
-    model = jax.lax.cond(
-        i.fresh, lambda: i.model, lambda: _model(problem, multipliers, i.states, i.controls)
-    )
+    model = jax.lax.cond(i.fresh, lambda: i.model, lambda: _model(problem, multipliers, i.states, i.controls))
     policy, good = _backward(problem, model, i.controls, i.policy.k, i.rho)
     slope, bend = _promise(model, policy)
     gap = jnp.sum(jnp.abs(model.gaps))
@@ -218,7 +226,7 @@ def _updated(i: Iterate, model, policy, found, taken, small, weight, merit, gap,
 
 def _model(problem: TrajectoryProblem, multipliers: Multipliers, states, controls) -> Model:
     n_steps, m = controls.shape
-    inner, following = (jax.tree.map(lambda x: x[s], states) for s in (slice(None, -1), slice(1, None)))
+    inner, following = (jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states))
     steps = jnp.arange(n_steps)
     A, B, gaps = _linear(problem, inner, following, controls, steps)
     n = A.shape[1]
@@ -243,7 +251,7 @@ def _model(problem: TrajectoryProblem, multipliers: Multipliers, states, control
 
     g, G = jax.vmap(stage)(inner, controls, steps, rows)
     last = indexed(states, -1)
-    final_q, final_Q = _quadratic(
+    end_gradient, end_hessian = _quadratic(
         lambda d: problem.final_cost(problem.retract(last, d)),
         [(c, lambda d, c=c: c.function(problem.retract(last, d))) for c in ends],
         [value for value, here in zip(multipliers.values, at, strict=True) if not here],
@@ -252,7 +260,7 @@ def _model(problem: TrajectoryProblem, multipliers: Multipliers, states, control
         problem.convex,
     )
     return Model(
-        A, B, g[:, :n], g[:, n:], G[:, :n, :n], G[:, n:, n:], G[:, n:, :n], final_q, final_Q, gaps
+        A, B, g[:, :n], g[:, n:], G[:, :n, :n], G[:, n:, n:], G[:, n:, :n], end_gradient, end_hessian, gaps
     )
 
 
@@ -277,6 +285,7 @@ def _linear(problem: TrajectoryProblem, inner, following, controls, steps):
 
 def _quadratic(cost, constraints: list[tuple[TrajectoryConstraint, Any]], values, mu, zero, convex: bool):
     """Gradient and Hessian of a cost and its constraints; of constraints as Gauss and Newton take them."""
+
     def slope(change):
         gradient = jax.grad(cost)(change)
         return gradient, gradient
@@ -295,7 +304,7 @@ def _quadratic(cost, constraints: list[tuple[TrajectoryConstraint, Any]], values
 
 
 def _backward(problem: TrajectoryProblem, model: Model, controls, warm, rho) -> tuple[Policy, Array]:
-    """k and K from the end to the beginning, and whether all Q_uu were positive definite."""
+    """K and K from the end to the beginning, and whether all Q_uu were positive definite."""
 
     def step(carry, inputs):
         v, V = carry
@@ -322,7 +331,7 @@ def _backward(problem: TrajectoryProblem, model: Model, controls, warm, rho) -> 
     lower, upper = _bounds(problem, controls)
     rows = (model.A, model.B, model.q, model.r, model.Q, model.R, model.H, model.gaps)
     inputs = (*rows, controls, warm, lower, upper)
-    _, (k, K) = jax.lax.scan(step, (model.final_q, model.final_Q), inputs, reverse=True)
+    _, (k, K) = jax.lax.scan(step, (model.end_gradient, model.end_hessian), inputs, reverse=True)
     good = jnp.all(jnp.isfinite(k)) & jnp.all(jnp.isfinite(K))
     return Policy(jnp.where(good, k, 0), jnp.where(good, K, 0)), good
 
@@ -348,8 +357,8 @@ def _promise(model: Model, policy: Policy) -> tuple[Array, Array]:
         return A @ x + B @ u + d, (slope, bend)
 
     rows = (model.A, model.B, model.q, model.r, model.Q, model.R, model.H, model.gaps, *policy)
-    x, (slopes, bends) = jax.lax.scan(step, jnp.zeros_like(model.final_q), rows)
-    return jnp.sum(slopes) + model.final_q @ x, jnp.sum(bends) + x @ (model.final_Q @ x)
+    x, (slopes, bends) = jax.lax.scan(step, jnp.zeros_like(model.end_gradient), rows)
+    return jnp.sum(slopes) + model.end_gradient @ x, jnp.sum(bends) + x @ (model.end_hessian @ x)
 
 
 def _forward(problem: TrajectoryProblem, states, controls, gaps, policy: Policy, alpha):

@@ -14,7 +14,7 @@ States may lie on a manifold. A state moves by a change in n coordinates, x ⊞ 
 y ⊟ x = difference(x, y) is the change that takes x to y; for vectors these are sums and differences. All
 derivatives are taken in these coordinates:
 
-    A_t = ∂(f(x_t ⊞ δ, u_t, t) ⊟ x_{t+1})/∂δ,  B_t = ∂(f(x_t, u_t, t) ⊟ x_{t+1})/∂u_t        (n, n), (n, m)
+    A_t = ∂(f(x_t ⊞ δ, u_t, t) ⊟ x_{t+1})/∂δ,  B_t = ∂(f(x_t, u_t, t) ⊟ x_{t+1})/∂u_t
 
 The method (Howell, Jackson, Manchester, "ALTRO", IROS 2019, with bounds as in Tassa, Mansard, Todorov,
 ICRA 2014, and shooting gaps as in Mastalli et al., "Crocoddyl", ICRA 2020).
@@ -141,7 +141,9 @@ class TrajectoryStop(enum.Enum):
 
     OPTIMAL = "a minimum that meets the constraints"
     STUCK = "no step reduces the cost any more; the constraints are met, a minimum is not certain"
-    INFEASIBLE = "the constraints are not met, and larger penalties do not help: they may contradict each other"
+    INFEASIBLE = (
+        "the constraints are not met, and larger penalties do not help: they may contradict each other"
+    )
     ITERATIONS = "the largest number of iterations or of multiplier updates was reached"
     TIME = "the time limit was reached"
     STOPPED = "stopped by the callback or interrupted: this is the trajectory so far"
@@ -244,7 +246,7 @@ def indexed(tree: Any, t: Any) -> Any:
 
 
 def constraint_values(problem: TrajectoryProblem, states: Any, controls: Array) -> tuple[Array, ...]:
-    """c of every constraint, shapes (T, p), or (p,) at the end."""
+    """C of every constraint, shapes (T, p), or (p,) at the end."""
     n_steps = controls.shape[0]
     inner, last = jax.tree.map(lambda x: x[:-1], states), indexed(states, -1)
     return tuple(
