@@ -137,7 +137,6 @@ def outcome(
     """Plan one case, and execute the plan in two other scenes."""
     given = case(planned, seed)
     made = dano.plan(planned, given.state, given.task, controls=given.guess)
-    seconds = made.seconds
     finer, rougher = plants
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
@@ -149,18 +148,20 @@ def outcome(
             rougher, given.state, given.task, made, substeps=4, scene=planned, feedback=False, every=EVERY
         )
     replans = sorted(replan.seconds for replan in mpc.replans)
-    errors = [goal.error for goal in made.goals]
     return Outcome(
         seed,
-        bool(max(errors) <= NEAR and _in_bounds(made, given.task)),
-        *errors,
-        seconds,
-        made.solution.iterations if made.solution is not None else 0,
-        made.message,
-        *runs,
-        mpc.goals[0].error,
-        replans[len(replans) // 2],
-        _sampled(planned, given, seconds) if baseline else None,
+        reached=bool(max(goal.error for goal in made.goals) <= NEAR and _in_bounds(made, given.task)),
+        bunny=made.goals[0].error,
+        ball=made.goals[1].error,
+        seconds=made.seconds,
+        iterations=made.solution.iterations if made.solution is not None else 0,
+        message=made.message,
+        finer=runs[0],
+        rougher=runs[1],
+        held=runs[2],
+        mpc=mpc.goals[0].error,
+        mpc_seconds=replans[len(replans) // 2],
+        sampled=_sampled(planned, given, made.seconds) if baseline else None,
     )
 
 

@@ -49,7 +49,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 
 def _write_reference() -> None:
-    cases = {}
+    cases, version = {}, ""
     for name, make in _textbook.CASES.items():
         found = _textbook.solved(make())
         known = np.asarray(found.states), np.asarray(found.controls)

@@ -4,6 +4,7 @@ Formulas take lists of numbers and a table of functions (`sin`, `cos`, `sqrt`), 
 exactly the same problem and only the method differs.
 """
 
+import importlib.metadata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -230,7 +231,7 @@ def trajectory_problem(case: Case, *, bounds_as_constraints: bool = False) -> Tr
     if bounds_as_constraints:
         limits = TrajectoryConstraint("bounds", lambda x, u, t: jnp.concatenate([u - upper, lower - u]))
         constraints.append(limits)
-    moves = {} if case.quaternion is None else _on_manifold(case.quaternion)
+    moves = () if case.quaternion is None else _on_manifold(case.quaternion)
     return TrajectoryProblem(
         lambda x, u, t: jnp.stack(case.dynamics(x, u, IN_JAX)),
         lambda x, u, t: case.stage_cost(x, u),
@@ -238,11 +239,11 @@ def trajectory_problem(case: Case, *, bounds_as_constraints: bool = False) -> Tr
         tuple(constraints),
         None if bounds_as_constraints else lower,
         None if bounds_as_constraints else upper,
-        **moves,
+        *moves,
     )
 
 
-def _on_manifold(place: int) -> dict[str, Callable]:
+def _on_manifold(place: int) -> tuple[Callable, Callable]:
     """`retract` and `difference` of a state that holds a unit quaternion."""
     from dano.maths import quat_conjugate, quat_exp, quat_multiply
 
@@ -259,7 +260,7 @@ def _on_manifold(place: int) -> dict[str, Callable]:
         before, after = x[:place] - nominal[:place], x[place + 4 :] - nominal[place + 4 :]
         return jnp.concatenate([before, turn, after])
 
-    return {"retract": retract, "difference": difference}
+    return retract, difference
 
 
 def solved(case: Case, **choices):
@@ -323,4 +324,4 @@ def solved_by_ipopt(
             continue
     if not np.isfinite(best):
         raise ValueError(f"IPOPT must solve {case.name!r}, got no solution from {guesses} guesses")
-    return best, f"CasADi {casadi.__version__} with IPOPT"
+    return best, f"CasADi {importlib.metadata.version('casadi')} with IPOPT"

@@ -1,5 +1,7 @@
 """Plans: closed forms of free motion, a joint, pushing through contact, files, messages."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -118,7 +120,9 @@ def test_a_drawer_is_opened_and_stays_within_its_travel():
     )
     made = dano.plan(scene, scene.initial_state(), task)
     assert made.reached, made.describe()
-    q, v = made.trajectory.states.q[:, 0], made.trajectory.states.v[:, 0]
+    states = made.trajectory.states
+    assert states.q is not None and states.v is not None
+    q, v = states.q[:, 0], states.v[:, 0]
     assert abs(q[-1] - 0.18) < 1e-4
     # Without the limit it would have to reach 1.5 times the mean speed.
     assert 0.2 < np.max(v) < 0.25 + 2e-3
@@ -247,8 +251,9 @@ def test_a_task_of_another_scene_is_said(puck):
     jointless = dano.Task(3, [dano.Actuator("puck", "effort", limit=1.0)], [dano.Goal("puck", q=0.0)])
     with pytest.raises(ValueError, match="effort of 'puck' must be that of a joint"):
         dano.plan(puck, state, jointless)
+    strange_method: Any = "pso"
     with pytest.raises(ValueError, match="method must be one of ilqr, cem, mppi, got 'pso'"):
-        dano.plan(puck, state, drive(position=(0, 0, 0)), method="pso")
+        dano.plan(puck, state, drive(position=(0, 0, 0)), method=strange_method)
     with pytest.raises(ValueError, match="controls must be finite numbers of shape"):
         dano.plan(puck, state, drive(position=(0, 0, 0)), controls=np.zeros((3, 1)))
     with pytest.raises(ValueError, match="softening must hold factors between 0 and 1, got 2"):

@@ -3,6 +3,7 @@
 import itertools
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +44,7 @@ def reaches(goal, x):
     return x - goal
 
 
-def integrator(goal=GOAL, bound=None, limits=()):
+def integrator(goal: Any = GOAL, bound=None, limits=()):
     """Least effort that brings a double integrator to a goal."""
     goal = TrajectoryConstraint("goal", jax.tree_util.Partial(reaches, jnp.asarray(goal)), True, True)
     bounds = (None, None) if bound is None else (jnp.array([-bound]), jnp.array([bound]))

@@ -237,9 +237,9 @@ def plan(
 def _optimised(scene, state, task, engine, guess, softening, warm, options, tell) -> TrajectorySolution:
     multipliers = None if warm is None or warm.solution is None else warm.solution.multipliers
     began = time.perf_counter()
-    for factor in (*softening, None):
-        stage = scene if factor is None else softened(scene, factor)
-        name = "optimising" if factor is None else f"optimising with {factor:g} of the stiffness"
+    stages = [(f"optimising with {f:g} of the stiffness", softened(scene, f)) for f in softening]
+    solution = None
+    for name, stage in (*stages, ("optimising", scene)):
         limit = options.max_seconds
         left = None if limit is None else max(0.0, limit - (time.perf_counter() - began))
         solution = optimal_trajectory(
@@ -254,6 +254,7 @@ def _optimised(scene, state, task, engine, guess, softening, warm, options, tell
         guess, multipliers = solution.controls, solution.multipliers
         if solution.stop is TrajectoryStop.STOPPED:
             break
+    assert solution is not None
     return solution
 
 

@@ -85,7 +85,7 @@ def sampled(
         method: "cem" or "mppi".
         options: See `SamplingOptions`.
         key: Of the random numbers.
-        progress: Called with the pass and the best cost so far.
+        progress: Called with the pass and the best cost so far; if it returns True, the search stops.
         compiler_options: For `jax.jit`.
     """
     began = time.perf_counter()
@@ -115,8 +115,9 @@ def sampled(
             best, best_terms = sequences[top], (float(cost[top]), float(violation[top]))
             history.append(priced[top])
             mean, spread = _moved(knots, jnp.asarray(priced), mean, method, options)
-            if progress is not None:
-                progress(turn, float(priced[top]))
+            if progress is not None and progress(turn, float(priced[top])):
+                interrupted = True
+                break
             if options.max_seconds is not None and time.perf_counter() - began > options.max_seconds:
                 interrupted = turn + 1 < options.passes
                 break

@@ -109,7 +109,9 @@ def _ghosts(scene: Scene, task: Task, plan: Plan, drawn: Stage) -> list[Item]:
             continue
         placed.add(row)
     shown = [i for i, row in enumerate(drawn.rows) if row in placed]
-    part = Stage(*([column[i] for i in shown] for column in drawn))
+    part = Stage(
+        [drawn.items[i] for i in shown], [drawn.rows[i] for i in shown], [drawn.offsets[i] for i in shown]
+    )
     return part.posed(position, orientation)
 
 

@@ -123,7 +123,8 @@ def first_iterate(problem: TrajectoryProblem, multipliers: Multipliers, states, 
     shapes = [(n, n), (n, m), (n,), (m,), (n, n), (m, m), (m, n)]
     rows = [jnp.zeros((n_steps, *shape), dtype) for shape in shapes]
     gaps = jnp.zeros((n_steps, n), dtype)
-    model = Model(*rows, jnp.zeros(n, dtype), jnp.zeros((n, n), dtype), gaps)
+    end = [jnp.zeros(n, dtype), jnp.zeros((n, n), dtype)]
+    model = Model._make([*rows, *end, gaps])
     policy = Policy(jnp.zeros((n_steps, m), dtype), jnp.zeros((n_steps, m, n), dtype))
     zero, none = jnp.zeros((), dtype), jnp.asarray(0)
     value = lagrangian(problem, multipliers, states, controls)

@@ -25,8 +25,8 @@ Constraints c with multipliers λ and a penalty μ enter an augmented Lagrangian
 
 which is minimised over the controls for fixed λ and μ; then λ ← λ + μ c (not below 0 for inequalities), and μ
 grows where c has not become small enough. Around a trajectory with gaps d_t = f(x_t, u_t) ⊟ x_{t+1} the terms
-of L have gradients q, r and Hessians Q, R, H (states, controls, mixed). The value function V(δ) = vᵀδ + ½ δᵀVδ
-runs back from the end:
+of L have gradients q, r and Hessians Q, R, H (states, controls, mixed). The value function
+V(δ) = vᵀδ + ½ δᵀVδ runs back from the end:
 
     v' = v + V d
     Q_x = q + Aᵀv',    Q_u = r + Bᵀv'
