@@ -205,7 +205,7 @@ def test_a_problem_of_other_numbers_compiles_nothing_anew():
         (dict(controls=np.full((N_STEPS, 1), 1e200)), "controls must lead to finite states and costs"),
         (dict(states=np.zeros((N_STEPS, 2))), r"states must have leaves of shape \(31, 2\)"),
         (dict(states=np.ones((N_STEPS + 1, 2))), "states must begin with start"),
-        (dict(multipliers=[np.zeros(3)]), r"multipliers must have shapes \[\(2,\)\], got \[\(3,\)\]"),
+        (dict(multipliers=[jnp.zeros(3)]), r"multipliers must have shapes \[\(2,\)\], got \[\(3,\)\]"),
     ],
 )
 def test_bad_input_is_said(change, message):

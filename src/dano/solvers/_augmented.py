@@ -47,7 +47,7 @@ _HOPELESS = 3
 def optimal_trajectory(
     problem: TrajectoryProblem,
     start: Any,
-    controls: Float[Array, "T m"],
+    controls: Float[Array, "..."],
     *,
     states: Any = None,
     multipliers: Sequence[Array] | None = None,
