@@ -155,7 +155,7 @@ def plan(
     state: State,
     task: Task,
     *,
-    method: Method = "ilqr",
+    method: str = "ilqr",
     controls: Float[Array, "T m"] | np.ndarray | None = None,
     explore: int = 0,
     softening: Sequence[float] = (),
@@ -176,7 +176,7 @@ def plan(
         scene: The scene.
         state: Where it begins.
         task: What shall be done.
-        method: How to search.
+        method: How to search: "ilqr", "cem" or "mppi".
         controls: First guess [N, N m], shape (T, m); default: none of the actuators does anything.
         explore: Passes of CEM with which the first guess is improved: where the bodies do not touch yet,
             derivatives do not say that they should.
