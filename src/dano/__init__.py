@@ -69,6 +69,17 @@ from dano.identify import (
     Parameter as Parameter,
     save_motion as save_motion,
 )
+from dano.plan import (
+    Actuator as Actuator,
+    Execution as Execution,
+    follow as follow,
+    Goal as Goal,
+    Limit as Limit,
+    Plan as Plan,
+    plan as plan,
+    SamplingOptions as SamplingOptions,
+    Task as Task,
+)
 from dano.scene_file import load_object as load_object, load_scene as load_scene
 from dano.exchange import export_object as export_object
 

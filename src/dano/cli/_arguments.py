@@ -279,6 +279,39 @@ class Identify:
 
 
 @dataclass(frozen=True)
+class Plan:
+    """Find forces that do a task: bring bodies to goals, through contact.
+
+    Attributes:
+        scene: Scene file (.toml).
+        task: Task file (.toml): actuators, goals, limits. The guide "Planning" lists its keys.
+        output: Where to write the plan (.npz).
+        video: Where to write a video with ghosts at the goals (.mp4).
+        strip: Where to write a picture of several moments side by side (.png).
+        controls: Where to write a picture of the controls over time (.png).
+        method: How to search; default: the task's, or ilqr.
+        slow_motion: Video seconds per simulated second.
+        json: Print one JSON object instead of text.
+    """
+
+    scene: Positional[Path]
+    task: Positional[Path]
+    output: Output
+    video: Path | None = None
+    strip: Path | None = None
+    controls: Path | None = None
+    method: Literal["ilqr", "cem", "mppi"] | None = None
+    slow_motion: float = 1.0
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import planning
+
+        planning.plan(self)
+
+
+@dataclass(frozen=True)
 class View:
     """Look at a saved run in the browser.
 

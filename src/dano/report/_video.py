@@ -74,7 +74,7 @@ def render_trajectory(
         image = render(drawn.posed(position[frame], orientation[frame]), camera, floor=False)
         return image if touched is None else draw_touches(image, camera, touched, frame, length)
 
-    moments = _moments(position, _STRIP_MOMENTS)
+    moments = moments_of(position, _STRIP_MOMENTS)
     frames = range(len(times)) if outputs[0] is not None else moments.tolist()
     kept = []
     with contextlib.ExitStack() as stack:
@@ -142,7 +142,7 @@ def encoder(file: Any, fps: int, width: int, height: int) -> Iterator[Callable[[
             container.mux(packet)
 
 
-def _moments(position: Float[np.ndarray, "frames bodies 3"], n: int) -> Int[np.ndarray, " moments"]:
+def moments_of(position: Float[np.ndarray, "frames bodies 3"], n: int) -> Int[np.ndarray, " moments"]:
     """Frames from the first to the last, closer together where much moves."""
     travel = np.linalg.norm(np.diff(position, axis=0), axis=-1).sum(axis=1)
     # A third of the way is time: a strip should say where everything rests, but not in half of its pictures.

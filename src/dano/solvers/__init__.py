@@ -1,9 +1,20 @@
-"""Solvers that know nothing of physics: bounded least squares."""
+"""Solvers that know nothing of physics: bounded least squares, and optimal trajectories."""
 
+from dano.solvers._augmented import optimal_trajectory as optimal_trajectory
+from dano.solvers._box import box_minimum as box_minimum, BoxMinimum as BoxMinimum
 from dano.solvers._least_squares import (
     bounded_least_squares as bounded_least_squares,
     eliminated as eliminated,
     NormalEquations as NormalEquations,
     Solution as Solution,
     Stop as Stop,
+)
+from dano.solvers._trajectory import (
+    Progress as Progress,
+    TrajectoryConstraint as TrajectoryConstraint,
+    TrajectoryOptions as TrajectoryOptions,
+    TrajectoryProblem as TrajectoryProblem,
+    TrajectorySolution as TrajectorySolution,
+    TrajectoryStop as TrajectoryStop,
+    Violation as Violation,
 )

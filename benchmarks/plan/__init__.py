@@ -1,0 +1,1 @@
+"""Plans: textbook optima, push-and-slide, a drawer."""

@@ -1,0 +1,23 @@
+"""Plans: controls that bring bodies to goals, through contact."""
+
+from dano.plan._execution import Execution as Execution, follow as follow, Replan as Replan
+from dano.plan._plan import (
+    GoalError as GoalError,
+    load_controls as load_controls,
+    Method as Method,
+    METHODS as METHODS,
+    OPTIONS as OPTIONS,
+    Plan as Plan,
+    plan as plan,
+)
+from dano.plan._problem import problem_of as problem_of
+from dano.plan._sampling import SamplingOptions as SamplingOptions
+from dano.plan._softening import softened as softened
+from dano.plan._task import (
+    Actuator as Actuator,
+    Goal as Goal,
+    KINDS as KINDS,
+    Limit as Limit,
+    QUANTITIES as QUANTITIES,
+    Task as Task,
+)

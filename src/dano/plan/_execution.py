@@ -1,0 +1,193 @@
+"""Carrying a plan out in another scene than the planned one, and planning again on the way."""
+
+import time
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.engine import AbstractEngine, compiler_options, VariationalEngine
+from dano.plan._plan import goal_errors, GoalError, OPTIONS, Plan
+from dano.plan._problem import Difference, problem_of, Scales
+from dano.plan._task import Task
+from dano.scene import Scene, State
+from dano.solvers import optimal_trajectory, TrajectoryOptions
+
+
+class Replan(NamedTuple):
+    """A new plan on the way.
+
+    Attributes:
+        step: Of the task.
+        reached: Whether it would have reached the goals.
+        seconds: Time it took [s].
+    """
+
+    step: int
+    reached: bool
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Execution:
+    """What came of a plan.
+
+    Attributes:
+        states: Leaves of shape (T · substeps + 1, …).
+        values: Controls [N, N m] of every step of the plan, shape (T, m).
+        goals: How each goal was reached.
+        converged: Whether every step was solved.
+        replans: New plans on the way.
+        seconds: Time it took, with compilation [s].
+    """
+
+    states: State
+    values: Float[Array, "T m"]
+    goals: tuple[GoalError, ...]
+    converged: bool
+    replans: tuple[Replan, ...]
+    seconds: float
+
+
+def follow(
+    plant: Scene,
+    state: State,
+    task: Task,
+    plan: Plan,
+    *,
+    scene: Scene | None = None,
+    substeps: int = 1,
+    feedback: bool = True,
+    every: int | None = None,
+    options: TrajectoryOptions | None = None,
+    engine: AbstractEngine | None = None,
+) -> Execution:
+    """Carry a plan out in a scene that may differ from the planned one.
+
+    Controls are held over a step of the plan: u_t + K_t (x ⊟ x_t) within their bounds, or u_t without
+    feedback. With `every`, the task is planned again after so many steps for those that are left, from where
+    the bodies are then and with the plan so far as first guess: model-predictive control.
+
+    Args:
+        plant: What really happens: the same bodies, other numbers; its timestep is that of the plan divided
+            by `substeps`.
+        state: Where it begins.
+        task: What shall be done.
+        plan: The plan.
+        scene: What new plans believe; needed with `every`.
+        substeps: Steps of `plant` in a step of the plan.
+        feedback: Whether to use the plan's gains.
+        every: Steps between new plans; None: no new plans.
+        options: Of new plans; default: few iterations.
+        engine: Default `VariationalEngine()`.
+
+    Raises:
+        ValueError: If timesteps do not fit, or `scene` is missing.
+    """
+    began, engine = time.perf_counter(), engine or VariationalEngine()
+    n_steps = task.n_steps
+    _check(plant, state, task, plan, scene, substeps, every)
+    scales, length = Scales.of(task), every or n_steps
+    nominal = jax.tree.map(lambda x: x[:-1], plan.trajectory.states)
+    now, values, gains = plant.filled(state), plan.values, plan.gains
+    pieces: list[State] = []
+    used: list[np.ndarray] = []
+    replans: list[Replan] = []
+    solved = True
+    solution = plan.solution
+    for step in range(0, n_steps, length):
+        if every is not None and step and scene is not None:
+            started = time.perf_counter()
+            solution = _again(scene, now, task, engine, values, solution, step, options)
+            seconds = time.perf_counter() - started
+            replans.append(Replan(step, solution.reached, seconds))
+            values = scales.physical(solution.controls)
+            gains = solution.gains * scales.width[None, :, None]
+            nominal = jax.tree.map(lambda x: x[:-1], solution.states)
+        n = min(length, n_steps - step)
+        at = slice(step, step + n) if every is None or not step else slice(0, n)
+        rows = jax.tree.map(lambda x, at=at: x[at], (nominal, values, gains))
+        run = _run(plant, task, engine, now, rows, jnp.asarray(1.0 if feedback else 0.0), substeps)
+        states, applied, good = run
+        now = jax.tree.map(lambda x: x[-1], states)
+        pieces.append(states)
+        used.append(np.asarray(applied))
+        solved = solved and bool(good)
+        if every is not None and step + n < n_steps:
+            # What is left of the plan moves to the front; nothing follows.
+            values = jnp.concatenate([values[n:], jnp.zeros_like(values[:n])]) if step or n else values
+    first = jax.tree.map(lambda x: x[None], plant.filled(state))
+    whole = jax.tree.map(lambda *parts: jnp.concatenate(parts), first, *pieces)
+    return Execution(
+        whole,
+        jnp.asarray(np.concatenate(used)),
+        goal_errors(plant, task, now),
+        solved,
+        tuple(replans),
+        time.perf_counter() - began,
+    )
+
+
+def _again(scene, now, task, engine, values, solution, step, options) -> Any:
+    """A plan for the steps that are left, at the front of the arrays."""
+    problem = problem_of(scene, task, engine, task.n_steps - step)
+    if options is None:
+        options = OPTIONS._replace(max_updates=4, max_iterations=10)
+    multipliers = None
+    if solution is not None:
+        options = options._replace(penalty=min(solution.penalty, options.max_penalty))
+        multipliers = solution.multipliers
+    return optimal_trajectory(
+        problem,
+        now,
+        Scales.of(task).scaled(values),
+        multipliers=multipliers,
+        options=options,
+        compiler_options=compiler_options(),
+    )
+
+
+@eqx.filter_jit
+def _run(plant: Scene, task: Task, engine, start: State, rows, feedback, substeps: int):
+    """Some steps in the plant: states of all substeps, controls used, and whether all were solved."""
+    prepared, difference = engine.prepare(plant), Difference(plant)
+    lower, upper = task.bounds()
+
+    def step(state, row):
+        nominal, u, K = row
+        u = jnp.clip(u + feedback * (K @ difference(nominal, state)), lower, upper)
+        control = task.control(plant, u)
+
+        def substep(state, _):
+            following, report = engine.step(plant, prepared, state, control)
+            return following, (following, report.converged)
+
+        state, (states, good) = jax.lax.scan(substep, state, None, length=substeps)
+        return state, (states, u, jnp.all(good))
+
+    _, (states, used, good) = jax.lax.scan(step, start, rows)
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states)
+    return flat, used, jnp.all(good)
+
+
+def _check(
+    plant: Scene, state: State, task: Task, plan: Plan, scene: Scene | None, substeps: int, every
+) -> None:
+    plant.check_state(state)
+    task.check(plant)
+    if substeps < 1 or (every is not None and every < 1):
+        raise ValueError(f"substeps and every must be ≥ 1, got {substeps} and {every}")
+    if every is not None and scene is None:
+        raise ValueError("scene must be given with every: new plans need one to believe in")
+    if len(plan.values) != task.n_steps:
+        raise ValueError(f"plan must have the task's {task.n_steps} steps, got {len(plan.values)}")
+    planned = float(plan.trajectory.times[1] - plan.trajectory.times[0])
+    given = float(plant.timestep) * substeps
+    if abs(given - planned) > 1e-9 * planned:
+        raise ValueError(
+            f"timestep of plant times substeps must be the plan's {planned:.6g} s, got {given:.6g} s"
+        )

@@ -1,0 +1,352 @@
+"""The verb: a plan for a scene and a task."""
+
+import os
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.archive import read_archive, write_archive
+from dano.engine import AbstractEngine, compiler_options, simulate, VariationalEngine
+from dano.maths import floating
+from dano.plan._problem import problem_of, Scales, VIOLATION
+from dano.plan._sampling import sampled, SamplingOptions
+from dano.plan._softening import softened
+from dano.plan._task import Limit, Task
+from dano.scene import Control, Scene, State, state_arrays, Trajectory
+from dano.solvers import optimal_trajectory, TrajectoryOptions, TrajectorySolution, TrajectoryStop
+
+Method = Literal["ilqr", "cem", "mppi"]
+METHODS = ("ilqr", "cem", "mppi")
+OPTIONS = TrajectoryOptions(
+    tolerance=1e-4, constraint_tolerance=VIOLATION, max_iterations=40, max_updates=20, penalty=10.0
+)
+"""Of plans through contact, whose last digits tell nothing."""
+
+
+class GoalError(NamedTuple):
+    """How a goal was reached.
+
+    Attributes:
+        name: Such as "position of bunny".
+        error: Length of what is missing [unit of the quantity; rad].
+        largest: Its largest component.
+        within: What counts as reached.
+        required: Whether it had to be.
+    """
+
+    name: str
+    error: float
+    largest: float
+    within: float
+    required: bool
+
+    @property
+    def reached(self) -> bool:
+        """Whether no component misses by more than `within`."""
+        return self.largest <= self.within * (1 + 1e-6)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Controls that do a task, what comes of them, and what does not.
+
+    Attributes:
+        controls: For `dano.simulate`, leaves of shape (T, …).
+        values: Controls of the task's actuators [N, N m], shape (T, m).
+        trajectory: What the scene does under them.
+        gains: K [N or N m per unit of a state's coordinate], shape (T, m, n): feedback that holds the bodies
+            on the trajectory. Zero from sampling.
+        cost: J, without what constraints cost.
+        goals: How each goal was reached at the end of `trajectory`.
+        limits: Name, worst excess and its step of each limit of the task.
+        reached: Whether all required goals and all limits are met.
+        message: Why the search ended, in words.
+        method: Of the search.
+        seconds: Time it took, with compilation [s].
+        distances: Length of every goal's error over time [unit of its quantity; rad], by its name, shape
+            (T + 1,).
+        solution: What the solver says; None from sampling.
+    """
+
+    controls: Control
+    values: Float[Array, "T m"]
+    trajectory: Trajectory
+    gains: Float[Array, "T m n"]
+    cost: float
+    goals: tuple[GoalError, ...]
+    limits: tuple[tuple[str, float, int], ...]
+    reached: bool
+    message: str
+    method: str
+    seconds: float
+    distances: dict[str, np.ndarray]
+    solution: TrajectorySolution | None = None
+
+    def describe(self) -> str:
+        """The plan in a few lines."""
+        verdict = "reaches all that is required" if self.reached else "does NOT reach all that is required"
+        lines = [
+            f"the plan {verdict}; cost {self.cost:.4g}, {self.seconds:.1f} s ({self.method})",
+            self.message,
+        ]
+        for goal in self.goals:
+            need = "required" if goal.required else "wished"
+            word = "reached" if goal.reached else "missed"
+            lines.append(f"{goal.name}: {word} by {goal.error:.3g} ({need} within {goal.within:.3g})")
+        for name, excess, step in self.limits:
+            kept = "kept" if excess <= VIOLATION else f"exceeded by {excess:.3g} at step {step}"
+            lines.append(f"{name}: {kept}")
+        failed = int(np.sum(~np.asarray(self.trajectory.converged)))
+        if failed:
+            lines.append(f"{failed} of {len(self.values)} steps were not solved")
+        return "\n".join(lines)
+
+    def save(self, path: str | os.PathLike[str], *, source: str | None = None) -> None:
+        """Write controls, gains and trajectory to an .npz file that `load_plan` reads.
+
+        Raises:
+            ValueError: If `path` is a directory or its parent does not exist.
+        """
+        states = {f"state_{name}": np.asarray(x) for name, x in state_arrays(self.trajectory.states).items()}
+        controls = {f"control_{k}": np.asarray(x) for k, x in vars(self.controls).items() if x is not None}
+        write_archive(
+            path,
+            {
+                "format": np.array("dano-plan"),
+                "version": np.array(1),
+                "names": np.array(self.trajectory.names),
+                "times": np.asarray(self.trajectory.times),
+                "values": np.asarray(self.values),
+                "gains": np.asarray(self.gains),
+                "cost": np.array(self.cost),
+                "reached": np.array(self.reached),
+                "message": np.array(self.message),
+                **states,
+                **controls,
+                **({} if source is None else {"source": np.array(source)}),
+            },
+        )
+
+
+def load_controls(path: str | os.PathLike[str]) -> Control:
+    """The controls of a plan that `Plan.save` wrote, for `dano.simulate`.
+
+    Raises:
+        ValueError: If the file is missing, truncated or not a plan.
+    """
+    data = read_archive(path, "dano-plan", 1)
+    try:
+        effort = jnp.asarray(data["control_effort"]) if "control_effort" in data else None
+        return Control(jnp.asarray(data["control_force"]), jnp.asarray(data["control_torque"]), effort)
+    except KeyError as error:
+        raise ValueError(f"{path} is not a valid plan: it lacks {error}") from error
+
+
+def plan(
+    scene: Scene,
+    state: State,
+    task: Task,
+    *,
+    method: str = "ilqr",
+    controls: Float[Array, "T m"] | np.ndarray | None = None,
+    explore: int = 0,
+    softening: Sequence[float] = (),
+    warm: Plan | None = None,
+    options: TrajectoryOptions | None = None,
+    sampling: SamplingOptions | None = None,
+    engine: AbstractEngine | None = None,
+    seed: int = 0,
+    callback: Callable[[str, int, float], object] | None = None,
+) -> Plan:
+    """Find controls that do a task.
+
+    With `method="ilqr"`: augmented-Lagrangian iLQR with the derivatives of the scene's steps by the implicit
+    function theorem (see docs/plan.md). With "cem" or "mppi": by sampling rollouts, which needs no
+    derivatives and is much less exact.
+
+    Args:
+        scene: The scene.
+        state: Where it begins.
+        task: What shall be done.
+        method: How to search: "ilqr", "cem" or "mppi".
+        controls: First guess [N, N m], shape (T, m); default: none of the actuators does anything.
+        explore: Passes of CEM with which the first guess is improved: where the bodies do not touch yet,
+            derivatives do not say that they should.
+        softening: Factors < 1 of the contacts' stiffness with which to plan first, each from the plan before.
+        warm: Plan of a similar problem: its controls and multipliers are the first guess.
+        options: Of iLQR; default `OPTIONS` of this module.
+        sampling: Of CEM and MPPI.
+        engine: Default `VariationalEngine()`.
+        seed: Of the samples.
+        callback: Called with the stage, the iteration and the cost; if it returns True, the search stops.
+
+    Returns:
+        The plan, which says whether it reaches the goals. A goal that cannot be reached is a result.
+
+    Raises:
+        ValueError: If the task does not fit the scene, a method is unknown, or a shape is wrong.
+    """
+    began = time.perf_counter()
+    scene.check_state(state)
+    task.check(scene)
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    if explore < 0:
+        raise ValueError(f"explore must be ≥ 0, got {explore}")
+    for factor in softening:
+        if not 0 < factor < 1:
+            raise ValueError(f"softening must hold factors between 0 and 1, got {factor}")
+    engine, state = engine or VariationalEngine(), scene.filled(state)
+    scales = Scales.of(task)
+    guess = scales.scaled(_first_guess(task, controls, warm))
+    problem = problem_of(scene, task, engine)
+    tell = callback or (lambda stage, iteration, cost: None)
+    search = sampling or SamplingOptions()
+    if method != "ilqr" or explore:
+        if method == "ilqr":
+            search = search._replace(passes=explore)
+        found = sampled(
+            problem,
+            state,
+            guess,
+            method="cem" if method == "ilqr" else method,
+            options=search,
+            key=jax.random.key(seed),
+            progress=lambda turn, cost: tell("sampling", turn, cost),
+            compiler_options=compiler_options(),
+        )
+        guess = found.controls
+        if method != "ilqr":
+            why = "interrupted" if found.interrupted else f"all {search.passes} passes of sampling were made"
+            return _plan(scene, state, task, scales, engine, guess, None, why, method, began)
+    solution = _optimised(scene, state, task, engine, guess, softening, warm, options or OPTIONS, tell)
+    message = solution.stop.value
+    if solution.stop is TrajectoryStop.INFEASIBLE:
+        message += _what_is_missed(solution)
+    return _plan(scene, state, task, scales, engine, solution.controls, solution, message, method, began)
+
+
+def _optimised(scene, state, task, engine, guess, softening, warm, options, tell) -> TrajectorySolution:
+    multipliers = None if warm is None or warm.solution is None else warm.solution.multipliers
+    began = time.perf_counter()
+    stages = [(f"optimising with {f:g} of the stiffness", softened(scene, f)) for f in softening]
+    solution = None
+    for name, stage in (*stages, ("optimising", scene)):
+        limit = options.max_seconds
+        left = None if limit is None else max(0.0, limit - (time.perf_counter() - began))
+        solution = optimal_trajectory(
+            problem_of(stage, task, engine),
+            state,
+            guess,
+            multipliers=multipliers,
+            options=options._replace(max_seconds=left),
+            callback=lambda p, name=name: tell(name, p.iteration, p.cost),
+            compiler_options=compiler_options(),
+        )
+        guess, multipliers = solution.controls, solution.multipliers
+        if solution.stop is TrajectoryStop.STOPPED:
+            break
+    assert solution is not None
+    return solution
+
+
+def _first_guess(task: Task, controls: Any, warm: Plan | None) -> Array:
+    lower, _ = task.bounds()
+    shape = (task.n_steps, lower.size)
+    if controls is None:
+        controls = np.zeros(shape) if warm is None else warm.values
+    if np.shape(controls) != shape or not np.all(np.isfinite(np.asarray(controls))):
+        raise ValueError(f"controls must be finite numbers of shape {shape}, got shape {np.shape(controls)}")
+    return floating(controls)
+
+
+def _what_is_missed(solution: TrajectorySolution) -> str:
+    missed = [v.name for v in solution.violations if v.amount > VIOLATION]
+    return f"; not met: {', '.join(missed)}" if missed else ""
+
+
+def _plan(scene, state, task, scales, engine, w, solution, message, method, began) -> Plan:
+    values = scales.physical(jnp.asarray(w))
+    lower, upper = task.bounds()
+    # The last digit of a scaled bound may lie beyond it.
+    values = jnp.clip(values, *(jnp.broadcast_to(bound, values.shape) for bound in (lower, upper)))
+    controls = eqx.filter_jit(task.controls)(scene, values)
+    with warnings.catch_warnings():
+        # Steps that were not solved are in the trajectory, and the plan says so.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        trajectory = simulate(scene, state, controls=controls, engine=engine)
+    n = 12 * len(scene.layout.free) + 2 * scene.layout.n_joints
+    gains = (
+        jnp.zeros((*values.shape, n)) if solution is None else solution.gains * scales.width[None, :, None]
+    )
+    problem = problem_of(scene, task, engine)
+    cost, errors, excesses = _judged(problem, task, scene, trajectory.states, scales.scaled(values))
+    goals = _goal_errors(task, [np.asarray(error[-1]) for error in errors])
+    limits = tuple(_worst(limit, excess) for limit, excess in zip(task.limits, excesses, strict=True))
+    met = all(goal.reached for goal in goals if goal.required)
+    met = met and all(excess <= VIOLATION for _, excess, _ in limits)
+    rows = zip(task.goals, errors, strict=True)
+    distances = {goal.name: np.linalg.norm(np.asarray(error), axis=1) for goal, error in rows}
+    seconds = time.perf_counter() - began
+    return Plan(
+        controls,
+        values,
+        trajectory,
+        gains,
+        float(cost),
+        goals,
+        limits,
+        met,
+        message,
+        method,
+        seconds,
+        distances,
+        solution,
+    )
+
+
+@eqx.filter_jit
+def _judged(problem, task: Task, scene: Scene, states: State, w: Array):
+    """J, errors of all goals and excesses over all limits at every state."""
+    inner, last = jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[-1], states)
+    stages = jax.vmap(problem.stage_cost)(inner, w, jnp.arange(w.shape[0]))
+    errors = [jax.vmap(lambda state, goal=goal: goal.error(scene, state))(states) for goal in task.goals]
+    excesses = [jax.vmap(lambda state, each=each: each.excess(scene, state))(inner) for each in task.limits]
+    return jnp.sum(stages) + problem.final_cost(last), errors, excesses
+
+
+def goal_errors(scene: Scene, task: Task, state: State) -> tuple[GoalError, ...]:
+    """How each goal of a task is reached at a state."""
+    return _goal_errors(task, [np.asarray(error) for error in _errors(scene, task, state)])
+
+
+@eqx.filter_jit
+def _errors(scene: Scene, task: Task, state: State) -> list[Array]:
+    return [goal.error(scene, state) for goal in task.goals]
+
+
+def _goal_errors(task: Task, errors: list[np.ndarray]) -> tuple[GoalError, ...]:
+    return tuple(
+        GoalError(
+            goal.name,
+            float(np.linalg.norm(error)),
+            float(np.max(np.abs(error))),
+            float(goal.within),
+            goal.required,
+        )
+        for goal, error in zip(task.goals, errors, strict=True)
+    )
+
+
+def _worst(limit: Limit, excess: Array) -> tuple[str, float, int]:
+    table = np.asarray(excess)
+    step = int(np.argmax(table.max(axis=1)))
+    return limit.name, float(max(0.0, table.max())), step

@@ -1,0 +1,198 @@
+"""From a scene and a task to a problem of optimal control.
+
+Controls of the problem are shares of their bounds' half-widths, u = middle + width w, so that all are of
+order one. Costs of rates are multiplied by the timestep: a plan is the same at half the step.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from dano.engine import AbstractEngine, difference, retract
+from dano.plan._task import Goal, Limit, Task
+from dano.scene import Scene, State
+from dano.solvers import TrajectoryConstraint, TrajectoryProblem
+
+VIOLATION = 1e-3
+"""The solver's violation of a goal that is missed by `Goal.within`."""
+
+
+class Chart(eqx.Module):
+    """Coordinates of changes of a state: those of `dano.linearize`."""
+
+    scene: Scene
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Bodies that move freely."""
+        return np.array(self.scene.layout.free, int)
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return 12 * len(self.rows) + 2 * self.scene.layout.n_joints
+
+
+class Retract(Chart):
+    """The state that a change leads to.
+
+    Rows of bodies on joints stay: what reads them fills them in itself, which is dear to compile.
+    """
+
+    def __call__(self, state: State, change: Float[Array, " n"]) -> State:
+        """See `TrajectoryProblem.retract`."""
+        n, k = len(self.rows), self.scene.layout.n_joints
+        of_bodies, q, v = jnp.split(change, [12 * n, 12 * n + k])
+        moved = retract(state, self.rows, of_bodies.reshape(n, 12)) if n else state
+        if moved.q is None or moved.v is None:
+            return moved
+        return dataclasses.replace(moved, q=moved.q + q, v=moved.v + v)
+
+
+class Difference(Chart):
+    """The change that leads from one state to another."""
+
+    def __call__(self, nominal: State, state: State) -> Float[Array, " n"]:
+        """See `TrajectoryProblem.difference`."""
+        # Of the two quaternions of an orientation the nearer.
+        near = jnp.sum(nominal.orientation * state.orientation, axis=1, keepdims=True) >= 0
+        state = dataclasses.replace(state, orientation=jnp.where(near, state.orientation, -state.orientation))
+        gone = difference(nominal, state, self.rows).ravel()
+        if state.q is None or state.v is None or nominal.q is None or nominal.v is None:
+            return gone
+        return jnp.concatenate([gone, state.q - nominal.q, state.v - nominal.v])
+
+
+class Scales(eqx.Module):
+    """From controls of the problem to those of the task."""
+
+    middle: Float[Array, " m"]
+    width: Float[Array, " m"]
+
+    @classmethod
+    def of(cls, task: Task) -> "Scales":
+        """Those of the task's bounds; symmetric where zero lies between them, so that zero stays zero."""
+        lower, upper = task.bounds()
+        spans = (lower <= 0) & (upper >= 0)
+        middle = jnp.where(spans, 0.0, 0.5 * (lower + upper))
+        return cls(middle, jnp.where(spans, jnp.maximum(-lower, upper), 0.5 * (upper - lower)))
+
+    def physical(self, w: Float[Array, "*T m"]) -> Float[Array, "*T m"]:
+        """U [N, N m]."""
+        return jnp.broadcast_to(self.middle, w.shape) + jnp.broadcast_to(self.width, w.shape) * w
+
+    def scaled(self, u: Float[Array, "*T m"]) -> Float[Array, "*T m"]:
+        """W."""
+        return (u - jnp.broadcast_to(self.middle, u.shape)) / jnp.broadcast_to(self.width, u.shape)
+
+
+class Dynamics(eqx.Module):
+    """A step of the scene; after `remaining` steps nothing happens any more.
+
+    So a plan with fewer steps left is the same program, and model-predictive control compiles once.
+    """
+
+    scene: Scene
+    task: Task
+    scales: Scales
+    engine: AbstractEngine
+    prepared: Any
+    remaining: Int[Array, ""]
+
+    def __call__(self, state: State, w: Float[Array, " m"], t: Int[Array, ""]) -> State:
+        """See `TrajectoryProblem.dynamics`."""
+        control = self.task.control(self.scene, self.scales.physical(w))
+
+        def step(state):
+            state = self.scene.filled(state) if self.scene.joints else state
+            return self.engine.step(self.scene, self.prepared, state, control)[0]
+
+        return jax.lax.cond(t < self.remaining, step, lambda state: state, state)
+
+
+class StageCost(eqx.Module):
+    """Costs of goals and controls during a step."""
+
+    scene: Scene
+    task: Task
+    scales: Scales
+    remaining: Int[Array, ""]
+
+    def __call__(self, state: State, w: Float[Array, " m"], t: Int[Array, ""]) -> Float[Array, ""]:
+        """See `TrajectoryProblem.stage_cost`."""
+        u = self.scales.physical(w)
+        total = 0.5 * jnp.sum(self.task.prices() * u * u)
+        away = jnp.zeros_like(total)
+        for goal in self.task.goals:
+            error = goal.error(self.scene, state)
+            away = away + 0.5 * goal.running * jnp.sum(error * error)
+        return self.scene.timestep * (total + jnp.where(t < self.remaining, away, 0))
+
+
+class FinalCost(eqx.Module):
+    """Costs of goals at the end."""
+
+    scene: Scene
+    task: Task
+
+    def __call__(self, state: State) -> Float[Array, ""]:
+        """See `TrajectoryProblem.final_cost`."""
+        total = jnp.zeros((), state.position.dtype)
+        for goal in self.task.goals:
+            error = goal.error(self.scene, state)
+            total = total + 0.5 * goal.final * jnp.sum(error * error)
+        return total
+
+
+class Reached(eqx.Module):
+    """A required goal as a constraint of the end."""
+
+    scene: Scene
+    goal: Goal
+
+    def __call__(self, state: State) -> Float[Array, " p"]:
+        """Its error, as `VIOLATION` says."""
+        return self.goal.error(self.scene, state) * (VIOLATION / self.goal.within)
+
+
+class Kept(eqx.Module):
+    """A limit as a constraint of every step."""
+
+    scene: Scene
+    limit: Limit
+
+    def __call__(self, state: State, w: Float[Array, " m"], t: Int[Array, ""]) -> Float[Array, " p"]:
+        """How far beyond it the state is."""
+        return self.limit.excess(self.scene, state)
+
+
+def problem_of(
+    scene: Scene, task: Task, engine: AbstractEngine, remaining: int | None = None
+) -> TrajectoryProblem:
+    """The problem of a scene and a task; the steps after `remaining` are left out."""
+    left = jnp.asarray(task.n_steps if remaining is None else remaining)
+    scales = Scales.of(task)
+    prepared = eqx.filter_jit(engine.prepare)(scene)
+    lower, upper = task.bounds()
+    constraints = [
+        TrajectoryConstraint(goal.name, Reached(scene, goal), True, True)
+        for goal in task.goals
+        if goal.required
+    ]
+    constraints += [TrajectoryConstraint(limit.name, Kept(scene, limit)) for limit in task.limits]
+    return TrajectoryProblem(
+        Dynamics(scene, task, scales, engine, prepared, left),
+        StageCost(scene, task, scales, left),
+        FinalCost(scene, task),
+        tuple(constraints),
+        scales.scaled(lower),
+        scales.scaled(upper),
+        Retract(scene),
+        Difference(scene),
+        parallel=False,
+    )

@@ -1,0 +1,182 @@
+"""Planning by sampling: the cross-entropy method and path integrals, on rollouts of the same problem.
+
+Both draw control sequences w ~ N(mean, deviation²) at a few knots with straight lines between them, roll all
+of them out, and move the mean: to that of the best (CEM; Rubinstein 1999), or to the average with weights
+exp(−cost/temperature) (MPPI; Williams et al. 2017). Constraints are priced: the cost is
+J + ½ p Σ violation², with a price p that grows from pass to pass.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.solvers import TrajectoryProblem
+
+
+class SamplingOptions(NamedTuple):
+    """How to sample.
+
+    Attributes:
+        passes: How often to draw.
+        samples: Sequences in a pass.
+        best: Share of them that CEM keeps.
+        knots: Moments at which controls are drawn.
+        deviation: First standard deviation, as a share of the bounds.
+        least: Deviation that is always left.
+        temperature: Of MPPI, as a share of the spread of costs.
+        price: First price of violations, and `last_price` the last.
+        last_price: See `price`.
+        max_seconds: Time after which to stop [s]; None: no limit.
+    """
+
+    passes: int = 30
+    samples: int = 64
+    best: float = 0.15
+    knots: int = 8
+    deviation: float = 0.4
+    least: float = 0.01
+    temperature: float = 0.1
+    price: float = 10.0
+    last_price: float = 1e3
+    max_seconds: float | None = None
+
+
+class Sampled(NamedTuple):
+    """The best sequence of a search.
+
+    Attributes:
+        controls: w, shape (T, m).
+        cost: Its priced cost.
+        history: Best priced cost after each pass.
+        seconds: [s].
+        interrupted: Whether Ctrl-C or the time limit ended it.
+    """
+
+    controls: Float[Array, "T m"]
+    cost: float
+    history: np.ndarray
+    seconds: float
+    interrupted: bool
+
+
+def sampled(
+    problem: TrajectoryProblem,
+    start: Any,
+    controls: Float[Array, "T m"],
+    *,
+    method: str,
+    options: SamplingOptions,
+    key: Array,
+    progress: Callable[[int, float], object] | None = None,
+    compiler_options: dict[str, bool] | None = None,
+) -> Sampled:
+    """Search by sampling around first controls.
+
+    Args:
+        problem: The problem.
+        start: x_0.
+        controls: First mean.
+        method: "cem" or "mppi".
+        options: See `SamplingOptions`.
+        key: Of the random numbers.
+        progress: Called with the pass and the best cost so far; if it returns True, the search stops.
+        compiler_options: For `jax.jit`.
+    """
+    began = time.perf_counter()
+    n_steps, m = controls.shape
+    lift = _lines(n_steps, min(options.knots, n_steps))
+    assert problem.lower is not None and problem.upper is not None
+    least, most = problem.lower, problem.upper
+    mean = jnp.asarray(np.linalg.lstsq(lift, np.asarray(controls), rcond=None)[0])
+    spread = jnp.full_like(mean, options.deviation)
+    prices = np.geomspace(options.price, options.last_price, options.passes)
+    jit: Any = eqx.filter_jit
+    rate = jit(_costs, compiler_options=compiler_options) if compiler_options else jit(_costs)
+    best, best_terms, history, interrupted = controls, None, [], False
+    try:
+        for turn, price in enumerate(prices):
+            key, draw = jax.random.split(key)
+            knots = mean[None] + spread[None] * jax.random.normal(
+                draw, (options.samples, *mean.shape), mean.dtype
+            )
+            knots = knots.at[0].set(mean)
+            sequences = jnp.einsum("tk,skm->stm", jnp.asarray(lift), knots)
+            sequences = jnp.clip(sequences, *(jnp.broadcast_to(b, sequences.shape) for b in (least, most)))
+            sequences = sequences.at[1].set(best)
+            cost, violation = (np.asarray(x) for x in rate(problem, start, sequences))
+            priced = np.nan_to_num(cost + 0.5 * price * violation, nan=np.inf)
+            top = int(np.argmin(priced))
+            best, best_terms = sequences[top], (float(cost[top]), float(violation[top]))
+            history.append(priced[top])
+            mean, spread = _moved(knots, jnp.asarray(priced), mean, method, options)
+            if progress is not None and progress(turn, float(priced[top])):
+                interrupted = True
+                break
+            if options.max_seconds is not None and time.perf_counter() - began > options.max_seconds:
+                interrupted = turn + 1 < options.passes
+                break
+    except KeyboardInterrupt:
+        interrupted = True
+    final = np.inf if best_terms is None else best_terms[0] + 0.5 * options.last_price * best_terms[1]
+    return Sampled(best, final, np.array(history), time.perf_counter() - began, interrupted)
+
+
+def _moved(knots: Array, priced: Array, mean: Array, method: str, options: SamplingOptions):
+    """The next mean and deviation."""
+    if method == "cem":
+        n = max(2, round(options.best * options.samples))
+        elite = knots[jnp.argsort(priced)[:n]]
+        return jnp.mean(elite, axis=0), jnp.maximum(jnp.std(elite, axis=0), options.least)
+    finite = jnp.isfinite(priced)
+    low = jnp.min(priced)
+    scale = jnp.median(jnp.where(finite, priced, low)) - low
+    weight = jnp.exp(-(priced - low) / (options.temperature * jnp.maximum(scale, 1e-12)))
+    weight = jnp.where(finite, weight, 0)
+    mean = jnp.einsum("s,skm->km", weight / jnp.sum(weight), knots)
+    return mean, jnp.full_like(mean, max(options.least, 0.5 * options.deviation))
+
+
+def _costs(problem: TrajectoryProblem, start: Any, sequences: Float[Array, "s T m"]):
+    """J and the sum of squares of violations of every sequence, one after the other."""
+
+    def one(w):
+        def advance(carry, inputs):
+            x, total, violation = carry
+            u, t = inputs
+            total = total + problem.stage_cost(x, u, t)
+            for c in problem.constraints:
+                if not c.final:
+                    violation = violation + _squared(c, c.function(x, u, t))
+            return (problem.dynamics(x, u, t), total, violation), None
+
+        zero = jnp.zeros((), w.dtype)
+        (last, total, violation), _ = jax.lax.scan(advance, (start, zero, zero), (w, jnp.arange(w.shape[0])))
+        for c in problem.constraints:
+            if c.final:
+                violation = violation + _squared(c, c.function(last))
+        return total + problem.final_cost(last), violation
+
+    # One after the other: steps loop until they are solved, and a batch would wait for its slowest.
+    return jax.lax.map(one, sequences)
+
+
+def _squared(constraint, value: Array) -> Array:
+    return jnp.sum((value if constraint.equality else jnp.maximum(value, 0)) ** 2)
+
+
+def _lines(n_steps: int, knots: int) -> Float[np.ndarray, "T k"]:
+    """Straight lines between knots at every step."""
+    at = np.linspace(0, knots - 1, n_steps) if knots > 1 else np.zeros(n_steps)
+    left = np.minimum(at.astype(int), max(knots - 2, 0))
+    share = at - left
+    rows = np.zeros((n_steps, knots))
+    rows[np.arange(n_steps), left] = 1 - share
+    if knots > 1:
+        rows[np.arange(n_steps), left + 1] += share
+    return rows

@@ -1,0 +1,158 @@
+"""Pictures of plans: a film with ghosts where the goals are, and the controls over time."""
+
+import contextlib
+import os
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import UInt8
+
+from dano.archive import checked_output, replacing
+from dano.plan import Plan, Task
+from dano.progress import Progress
+from dano.report._resample import frame_times, poses_at
+from dano.report._stage import camera_for, Stage, stage
+from dano.report._video import encoder, moments_of, require, side_by_side, write_png
+from dano.scene import Scene
+from dano.vision import Camera, Item, LearnedField, render
+
+# How much of a ghost is seen.
+_GHOST = 0.4
+_MOMENTS = 6
+
+
+def film_plan(
+    scene: Scene,
+    task: Task,
+    plan: Plan,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    strip: str | os.PathLike[str] | None = None,
+    fps: int = 30,
+    slow_motion: float = 1.0,
+    size: tuple[int, int] = (640, 400),
+    camera: Camera | None = None,
+    looks: Mapping[str, LearnedField] | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Film a plan, with a ghost of every body at the position or orientation that its goals ask for.
+
+    Args:
+        scene: The scene.
+        task: Whose goals are shown.
+        plan: The plan.
+        path: The video (.mp4), or None.
+        strip: A picture of some moments (.png), or None.
+        fps: Frames per second.
+        slow_motion: How many times slower than life the video plays.
+        size: Width and height [pixels], even numbers.
+        camera: From where; default: such that all bodies stay in view. Replaces `size`.
+        looks: What bodies have learned to look like, by name.
+        progress: Called with a description and the share done.
+
+    Raises:
+        ValueError: If neither output is given, or one cannot be written.
+        ImportError: If av or pillow is missing.
+    """
+    if path is None and strip is None:
+        raise ValueError("path or strip must be given, got None for both")
+    video = None if path is None else checked_output(path)
+    still = None if strip is None else checked_output(strip)
+    require("PIL", "pillow")
+    times = frame_times(plan.trajectory, fps, slow_motion)
+    drawn = stage(scene, None, looks)
+    camera = camera_for(scene, drawn, plan.trajectory, *size) if camera is None else camera
+    position, orientation = poses_at(plan.trajectory, times)
+    ghosts = _ghosts(scene, task, plan, drawn)
+
+    def picture(frame: int) -> UInt8[np.ndarray, "height width 3"]:
+        items = drawn.posed(position[frame], orientation[frame])
+        image = render(items, camera, floor=False)
+        if not ghosts:
+            return image
+        both = render([*items, *ghosts], camera, floor=False)
+        return np.round((1 - _GHOST) * image + _GHOST * both.astype(float)).astype(np.uint8)
+
+    moments = moments_of(position, _MOMENTS)
+    frames = range(len(times)) if video is not None else moments.tolist()
+    kept = []
+    with contextlib.ExitStack() as stack:
+        add = None
+        if video is not None:
+            file = stack.enter_context(replacing(video))
+            add = stack.enter_context(encoder(file, fps, camera.width, camera.height))
+        for count, frame in enumerate(frames):
+            image = picture(frame)
+            if add is not None:
+                add(image)
+            if frame in moments:
+                kept.append(image)
+            if progress is not None:
+                progress("drawing", (count + 1) / len(frames))
+    if still is not None:
+        write_png(still, side_by_side(kept))
+
+
+def _ghosts(scene: Scene, task: Task, plan: Plan, drawn: Stage) -> list[Item]:
+    """The bodies that a goal places, where it wants them; what it leaves open is as at the plan's end."""
+    position = np.array(plan.trajectory.states.position[-1], dtype=float)
+    orientation = np.array(plan.trajectory.states.orientation[-1], dtype=float)
+    placed = set()
+    for goal in task.goals:
+        row = scene.index(goal.body)
+        if goal.quantity == "position":
+            axes = ["xyz".index(axis) for axis in goal.axes]
+            position[row, axes] = np.asarray(goal.value)[axes]
+        elif goal.quantity == "orientation" and goal.axes == "xyz":
+            orientation[row] = np.asarray(goal.value)
+        else:
+            continue
+        placed.add(row)
+    shown = [i for i, row in enumerate(drawn.rows) if row in placed]
+    part = Stage(
+        [drawn.items[i] for i in shown], [drawn.rows[i] for i in shown], [drawn.offsets[i] for i in shown]
+    )
+    return part.posed(position, orientation)
+
+
+def draw_controls(task: Task, plan: Plan, path: str | os.PathLike[str]) -> None:
+    """Draw the controls of a plan over time, with their bounds, and how far the goals are.
+
+    Args:
+        task: The task.
+        plan: Its plan.
+        path: The picture (.png).
+
+    Raises:
+        ValueError: If the path cannot be written.
+        ImportError: If matplotlib is missing.
+    """
+    output = checked_output(path)
+    require("matplotlib")
+    from matplotlib.figure import Figure
+
+    times = np.asarray(plan.trajectory.times)
+    figure = Figure(figsize=(8, 2.2 * (len(task.actuators) + 1)), layout="constrained")
+    axes = figure.subplots(len(task.actuators) + 1, 1, sharex=True)
+    at = 0
+    units = {"force": "N", "torque": "N m", "effort": "N or N m"}
+    for axis, actuator in zip(axes, task.actuators, strict=False):
+        for j in range(actuator.size):
+            label = actuator.axes[j] if actuator.axes else None
+            axis.stairs(np.asarray(plan.values)[:, at + j], times, label=label, baseline=None)
+        bounds = [float(np.min(np.asarray(actuator.lower))), float(np.max(np.asarray(actuator.upper)))]
+        for bound in bounds:
+            axis.axhline(bound, color="0.7", linestyle=":", linewidth=1)
+        axis.set_ylabel(f"{actuator.kind} of\n{actuator.body} [{units[actuator.kind]}]")
+        if actuator.size > 1:
+            axis.legend(loc="upper right", ncols=3, fontsize="small")
+        at += actuator.size
+    for name, error in plan.distances.items():
+        # The axis is logarithmic.
+        axes[-1].plot(times, np.maximum(np.asarray(error), 1e-9), label=name)
+    axes[-1].set_ylabel("distance\nfrom the goal")
+    axes[-1].set_yscale("log")
+    axes[-1].legend(loc="lower left", fontsize="small")
+    axes[-1].set_xlabel("time [s]")
+    with replacing(output) as file:
+        figure.savefig(file, format="png", dpi=120)

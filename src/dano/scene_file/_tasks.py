@@ -1,0 +1,201 @@
+"""Reading task files: what a plan shall do. Their keys are described in docs/plan.md."""
+
+import math
+import os
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from dano.archive import checked_input
+from dano.names import did_you_mean
+from dano.plan import Actuator, Goal, KINDS, Limit, Method, METHODS, QUANTITIES, Task
+from dano.scene import Scene
+from dano.scene_file._table import is_number, located, Table
+
+_TOP = ("duration", "n_steps", "actuators", "goals", "limits", "search")
+_ACTUATOR = ("body", "kind", "limit", "lower", "upper", "axes", "cost", "start")
+_GOAL = ("body", *QUANTITIES, "running", "final", "required", "within", "axes")
+_LIMIT = ("body", "quantity", "lower", "upper", "axes")
+_SEARCH = ("method", "explore", "softening", "seed", "max_seconds", "max_iterations", "passes", "samples")
+
+
+@dataclass(frozen=True)
+class Search:
+    """How a task file wants its plan to be searched for.
+
+    Attributes:
+        method: See `dano.plan`.
+        explore: See `dano.plan`.
+        softening: See `dano.plan`.
+        seed: See `dano.plan`.
+        max_seconds: Time limit [s]; None: none.
+        max_iterations: Of an inner minimum; None: the default.
+        passes: Of sampling; None: the default.
+        samples: In a pass; None: the default.
+    """
+
+    method: Method
+    explore: int
+    softening: tuple[float, ...]
+    seed: int
+    max_seconds: float | None
+    max_iterations: int | None
+    passes: int | None
+    samples: int | None
+
+
+@dataclass(frozen=True)
+class TaskFile:
+    """What a task file says.
+
+    Attributes:
+        task: The task.
+        controls: First guess [N, N m], shape (T, m).
+        search: How to search.
+        path: The file.
+        text: Its text.
+    """
+
+    task: Task
+    controls: np.ndarray
+    search: Search
+    path: Path
+    text: str
+
+
+def load_task(path: str | os.PathLike[str], scene: Scene) -> TaskFile:
+    """Read a task file (TOML; its keys are described in docs/plan.md).
+
+    Args:
+        path: The file.
+        scene: The scene that the task is for.
+
+    Raises:
+        ValueError: If the file is missing or broken, a key is unknown or of the wrong type, or the task does
+            not fit the scene; the message names the file and the table.
+    """
+    source = checked_input(path)
+    try:
+        text = source.read_bytes().decode("utf-8-sig")
+        data = tomllib.loads(text)
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{source} must be a TOML task file, got one that is not text") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{source} must be a TOML task file: {error}") from error
+    top = Table(str(source), data, _TOP)
+    n_steps = _steps(top, float(scene.timestep))
+    read = [_actuator(table, scene) for table in _rows(top, "actuators", _ACTUATOR)]
+    goals = [_goal(table, scene) for table in _rows(top, "goals", _GOAL)]
+    limits = [_limit(table, scene) for table in _rows(top, "limits", _LIMIT)]
+    with located(str(source)):
+        task = Task(n_steps, [actuator for actuator, _ in read], goals, limits)
+        task.check(scene)
+    start = np.concatenate([first for _, first in read])
+    return TaskFile(task, np.tile(start, (n_steps, 1)), _search(top), source, text)
+
+
+def _rows(top: Table, name: str, valid: Sequence[str]) -> list[Table]:
+    return [Table(f"{top.where}: [[{name}]] {i + 1}", row, valid) for i, row in enumerate(top.tables(name))]
+
+
+def _steps(top: Table, timestep: float) -> int:
+    if ("duration" in top) == ("n_steps" in top):
+        raise ValueError(f"{top.where}: needs either duration [s] or n_steps")
+    if "n_steps" in top:
+        n_steps = top.integer("n_steps", 0)
+        if n_steps < 1:
+            raise top.wrong("n_steps", "≥ 1")
+        return n_steps
+    duration = top.number("duration")
+    if duration <= 0:
+        raise top.wrong("duration", "> 0 s")
+    return max(1, round(duration / timestep))
+
+
+def _body(table: Table, scene: Scene) -> str:
+    name = table.word("body")
+    table.where += f" ({name!r})"
+    if name not in scene.names:
+        raise ValueError(
+            f"{table.where}: body must be one of the scene's {list(scene.names)}, got {name!r}"
+            + did_you_mean(name, scene.names)
+        )
+    return name
+
+
+def _numbers(table: Table, key: str) -> Any:
+    """A number, or a list of numbers; `inf` is one, too."""
+    value = table.data[key]
+    listed = value if isinstance(value, list) else [value]
+    good = [is_number(x) or (isinstance(x, float) and math.isinf(x)) for x in listed]
+    if not listed or not all(good):
+        raise table.wrong(key, "a number or a list of numbers")
+    return tuple(float(x) for x in value) if isinstance(value, list) else float(value)
+
+
+def _actuator(table: Table, scene: Scene) -> tuple[Actuator, np.ndarray]:
+    body = _body(table, scene)
+    kind = table.word("kind", list(KINDS), "force")
+    if kind == "effort" and "axes" in table:
+        raise ValueError(f"{table.where}: an effort has no axes")
+    options = {key: _numbers(table, key) for key in ("limit", "lower", "upper") if key in table}
+    with located(table.where):
+        actuator = Actuator(
+            body, kind, axes=table.word("axes", None, "xyz"), cost=table.number("cost", 1e-4), **options
+        )
+        start = np.asarray(_numbers(table, "start") if "start" in table else 0.0)
+        if start.shape not in ((), (actuator.size,)):
+            raise table.wrong("start", f"a number or a list of {actuator.size}")
+        return actuator, np.broadcast_to(start, (actuator.size,))
+
+
+def _goal(table: Table, scene: Scene) -> Goal:
+    body = _body(table, scene)
+    quantities = [key for key in QUANTITIES if key in table]
+    if len(quantities) != 1:
+        raise ValueError(
+            f"{table.where}: needs exactly one of {', '.join(QUANTITIES)}, got {quantities or 'none'}"
+        )
+    name = quantities[0]
+    n = QUANTITIES[name]
+    value: Any = table.number(name) if n == 1 else table.vector(name, n)
+    numbers = {key: table.number(key) for key in ("running", "final", "within") if key in table}
+    with located(table.where):
+        axes, required = table.word("axes", None, "xyz"), table.boolean("required", True)
+        given: dict[str, Any] = {name: value}
+        return Goal(body, required=required, axes=axes, **numbers, **given)
+
+
+def _limit(table: Table, scene: Scene) -> Limit:
+    body = _body(table, scene)
+    bounds = {key: _numbers(table, key) for key in ("lower", "upper") if key in table}
+    if not bounds:
+        raise ValueError(f"{table.where}: needs lower, upper, or both")
+    with located(table.where):
+        return Limit(body, table.word("quantity"), axes=table.word("axes", None, "xyz"), **bounds)
+
+
+def _search(top: Table) -> Search:
+    table = top.table("search", _SEARCH)
+    counts: dict[str, int | None] = {}
+    for key in ("max_iterations", "passes", "samples"):
+        counts[key] = table.integer(key, 1) if key in table else None
+        least = 4 if key == "samples" else 1
+        if key in table and cast(int, counts[key]) < least:
+            raise table.wrong(key, f"≥ {least}")
+    explore = table.integer("explore", 0)
+    if explore < 0:
+        raise table.wrong("explore", "≥ 0")
+    softening = _numbers(table, "softening") if "softening" in table else ()
+    softening = softening if isinstance(softening, tuple) else (softening,)
+    if not all(0 < factor < 1 for factor in softening):
+        raise table.wrong("softening", "factors between 0 and 1")
+    seconds = table.number("max_seconds") if "max_seconds" in table else None
+    if seconds is not None and seconds <= 0:
+        raise table.wrong("max_seconds", "> 0 s")
+    method = cast(Method, table.word("method", METHODS, "ilqr"))
+    return Search(method, explore, softening, table.integer("seed", 0), seconds, **counts)

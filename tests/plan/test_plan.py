@@ -1,0 +1,259 @@
+"""Plans: closed forms of free motion, a joint, pushing through contact, files, messages."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dano
+from dano.plan import load_controls, problem_of, softened
+
+H, N_STEPS, MASS = 0.05, 20, 2.0
+
+
+@pytest.fixture(scope="module")
+def puck():
+    """A body that floats without gravity."""
+    body = dano.Body("puck", dano.Sphere(0.1), mass=MASS)
+    return dano.Scene.create([body], timestep=H, gravity=(0, 0, 0))
+
+
+def drive(position=(0.0, 0.0, 0.0), orientation=(1.0, 0.0, 0.0, 0.0)):
+    """To a pose, at rest there."""
+    return dano.Task(
+        N_STEPS,
+        [dano.Actuator("puck", limit=20.0, cost=1e-2), dano.Actuator("puck", "torque", limit=1.0, cost=1.0)],
+        [
+            dano.Goal("puck", position=position, within=1e-4),
+            dano.Goal("puck", orientation=orientation, within=1e-4),
+            dano.Goal("puck", velocity=(0, 0, 0), within=1e-4),
+        ],
+    )
+
+
+@pytest.fixture(scope="module")
+def driven(puck):
+    task = drive(position=(1.0, -0.5, 0.2))
+    return task, dano.plan(puck, puck.initial_state(), task)
+
+
+def test_a_free_body_takes_the_least_effort_of_the_closed_form(driven):
+    _, made = driven
+    # x⁺ = x + h v⁺, v⁺ = v + h f/m: rest to rest with forces of least norm, a linear system.
+    steps = np.arange(N_STEPS)
+    reach = H * H / MASS * (N_STEPS - steps)
+    both = np.stack([reach, np.full(N_STEPS, H / MASS)])
+    for axis, distance in enumerate((1.0, -0.5, 0.2)):
+        exact = both.T @ np.linalg.solve(both @ both.T, [distance, 0.0])
+        np.testing.assert_allclose(made.values[:, axis], exact, atol=2e-3)
+    assert made.reached and made.goals[0].error < 1e-4
+    assert np.abs(made.values[:, 3:]).max() < 1e-6
+    exact_cost = 0.5 * H * 1e-2 * float(np.sum(np.square(made.values[:, :3])))
+    np.testing.assert_allclose(made.cost, exact_cost, rtol=1e-4)
+
+
+def test_simulating_the_controls_gives_the_trajectory(puck, driven, tmp_path):
+    _, made = driven
+    made.save(tmp_path / "plan.npz")
+    controls = load_controls(tmp_path / "plan.npz")
+    run = dano.simulate(puck, puck.initial_state(), controls=controls)
+    np.testing.assert_allclose(run.states.position, made.trajectory.states.position, atol=1e-12)
+    (tmp_path / "other.npz").write_bytes(b"no plan")
+    with pytest.raises(ValueError, match="other.npz"):
+        load_controls(tmp_path / "other.npz")
+
+
+def test_an_orientation_is_reached_on_the_manifold(puck):
+    turn = (0.5, 0.5, 0.5, 0.5)
+    made = dano.plan(puck, puck.initial_state(), drive(orientation=turn))
+    assert made.reached, made.describe()
+    last = np.asarray(made.trajectory.states.orientation[-1, 0])
+    np.testing.assert_allclose(abs(last @ np.array(turn)), 1.0, atol=1e-6)
+    # Of a ball the torque of least norm is that of the rotation vector, here along (1, 1, 1).
+    torque = np.asarray(made.values[:, 3:])
+    np.testing.assert_allclose(torque, torque.mean(axis=1, keepdims=True).repeat(3, axis=1), atol=2e-3)
+
+
+def test_derivatives_are_those_of_linearize(puck):
+    task = drive(position=(1.0, 0.0, 0.0))
+    problem = problem_of(puck, task, dano.VariationalEngine())
+    state = puck.initial_state(puck=dict(orientation=(1, 0.2, 0, 0.1), omega=(1, 2, 3), velocity=(1, 0, 0)))
+    w = jnp.linspace(-0.5, 0.5, 6)
+    nominal = problem.dynamics(state, w, jnp.asarray(0))
+
+    @jax.jit
+    def gone(change):
+        return problem.difference(
+            nominal, problem.dynamics(problem.retract(state, change), w, jnp.asarray(0))
+        )
+
+    control = task.control(puck, task.bounds()[1] * w)
+    A, _ = dano.linearize(puck, state, control)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(gone))(jnp.zeros(12)), A, atol=1e-10)
+    for step in (1e-2, 1e-6):
+        column = np.asarray(gone(step * jnp.eye(12)[9])) / step
+        np.testing.assert_allclose(column, A[:, 9], atol=10 * step)
+
+
+def test_a_goal_out_of_reach_is_a_result_in_words(puck):
+    made = dano.plan(puck, puck.initial_state(), drive(position=(100.0, 0.0, 0.0)))
+    assert not made.reached
+    assert not made.goals[0].reached and made.goals[0].error > 80
+    text = made.describe()
+    assert "does NOT reach" in text and "position of puck: missed by" in text
+    assert "position of puck" in made.message
+    lower, upper = (np.asarray(bound) for bound in drive().bounds())
+    values = np.asarray(made.values)
+    assert np.all((values >= lower) & (values <= upper))
+
+
+@pytest.mark.slow
+def test_a_drawer_is_opened_and_stays_within_its_travel():
+    drawer = dano.Body("drawer", dano.Box((0.1, 0.1, 0.05)), mass=1.0)
+    slide = dano.Joint(None, "drawer", "slide", axis=(1, 0, 0), damping=1.0)
+    scene = dano.Scene.create([drawer], joints=[slide], timestep=H)
+    task = dano.Task(
+        N_STEPS,
+        [dano.Actuator("drawer", "effort", limit=3.0, cost=1e-2)],
+        [dano.Goal("drawer", q=0.18, within=1e-4), dano.Goal("drawer", v=0.0, within=1e-3)],
+        [dano.Limit("drawer", "v", upper=0.25)],
+    )
+    made = dano.plan(scene, scene.initial_state(), task)
+    assert made.reached, made.describe()
+    states = made.trajectory.states
+    assert states.q is not None and states.v is not None
+    q, v = states.q[:, 0], states.v[:, 0]
+    assert abs(q[-1] - 0.18) < 1e-4
+    # Without the limit it would have to reach 1.5 times the mean speed.
+    assert 0.2 < np.max(v) < 0.25 + 2e-3
+
+
+def cloud(half=0.1, n=7):
+    """A cube as a neural object of few samples on its surface."""
+    axis = np.linspace(-half, half, n)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    points = grid[np.any(np.isclose(np.abs(grid), half), axis=1)]
+    inertia = 2 / 3 * half**2 * np.eye(3)
+    return dano.NeuralObject.from_samples(
+        points=points, density=np.ones(len(points)), mass=1.0, com=(0, 0, 0), inertia=inertia
+    )
+
+
+@pytest.fixture(scope="module")
+def pushing():
+    """A hand that can push a cube, afloat; they do not touch yet."""
+    bodies = [dano.Body("cube", cloud()), dano.Body("hand", dano.Sphere(0.1, edge=0.02), mass=1.0)]
+    contact = dano.Contact("cube", "hand", dano.ContactParams(sliding_friction=0.2), dano.CentroidLaw())
+    scene = dano.Scene.create(bodies, [contact], timestep=0.02, gravity=(0, 0, 0))
+    state = scene.initial_state(hand=dict(position=(-0.25, 0.01, 0)))
+    task = dano.Task(
+        40,
+        [dano.Actuator("hand", limit=20.0, cost=1e-2)],
+        [dano.Goal("cube", position=(0.3, 0.05, 0.0), within=2e-3, running=0.1)],
+    )
+    return scene, state, task
+
+
+@pytest.fixture(scope="module")
+def pushed(pushing):
+    scene, state, task = pushing
+    guess = np.zeros((40, 3))
+    guess[:, 0] = 3.0
+    return dano.plan(scene, state, task, controls=guess)
+
+
+def test_a_cube_is_pushed_to_its_goal_through_contact(pushing, pushed):
+    assert pushed.reached, pushed.describe()
+    assert np.abs(pushed.values).max() <= 20.0
+    assert np.asarray(pushed.trajectory.converged).all()
+    # It is pushed: it stood still until the hand came.
+    way = np.linalg.norm(pushed.trajectory.states.position[:, 0], axis=1)
+    assert way[2] < 1e-6
+    assert np.linalg.norm(pushed.trajectory.states.position[-1, 0] - np.array([0.3, 0.05, 0])) < 3.5e-3
+    # What carries it there is the hand's momentum, and theirs together is that of the forces.
+    momentum = pushed.trajectory.states.velocity[-1].sum(axis=0)
+    np.testing.assert_allclose(momentum, 0.02 * pushed.values.sum(axis=0), atol=1e-6)
+
+
+def test_new_plans_on_the_way_make_up_for_another_mass(pushing, pushed):
+    scene, state, task = pushing
+    plant = scene.replace_body("cube", mass_scale=1.3)
+    blind = dano.follow(plant, state, task, pushed, feedback=False)
+    again = dano.follow(plant, state, task, pushed, scene=scene, every=10, feedback=False)
+    assert [replan.step for replan in again.replans] == [10, 20, 30]
+    assert again.goals[0].error < 0.5 * blind.goals[0].error
+    assert again.values.shape == pushed.values.shape and again.converged
+    same = dano.follow(scene, state, task, pushed)
+    np.testing.assert_allclose(same.states.position[-1], pushed.trajectory.states.position[-1], atol=1e-6)
+    with pytest.raises(ValueError, match="scene must be given with every"):
+        dano.follow(plant, state, task, pushed, every=5)
+    with pytest.raises(ValueError, match="timestep of plant times substeps"):
+        dano.follow(plant, state, task, pushed, substeps=2)
+
+
+def test_sampling_finds_contact_that_derivatives_do_not_show(pushing):
+    scene, state, task = pushing
+    few = dano.SamplingOptions(passes=6, samples=24)
+    for method in ("cem", "mppi"):
+        made = dano.plan(scene, state, task, method=method, sampling=few, seed=1)
+        # From no control at all, where the cube would stay 0.304 m away.
+        assert made.goals[0].error < 0.2, made.describe()
+        assert made.solution is None and method in made.describe()
+        assert np.abs(made.values).max() <= 20.0
+
+
+def test_softened_contact_has_that_share_of_the_stiffness(pushing):
+    scene, _, _ = pushing
+    soft = softened(scene, 0.1)
+    for before, after in zip(scene.contacts, soft.contacts, strict=True):
+        np.testing.assert_allclose(after.params.spring, 0.1 * before.params.spring)
+        np.testing.assert_allclose(after.params.damper, 0.1 * before.params.damper)
+        assert after.params.sliding_friction == before.params.sliding_friction
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: dano.Actuator("a", "push", limit=1.0), "must be one of force, torque, effort, got 'push'"),
+        (lambda: dano.Actuator("a"), "bounds of the force of 'a' must be given"),
+        (
+            lambda: dano.Actuator("a", lower=2.0, upper=1.0),
+            r"lower .* must be < upper, got \[2.0, 2.0, 2.0\]",
+        ),
+        (
+            lambda: dano.Actuator("a", limit=1.0, axes="xw"),
+            "axes of the force of 'a' must be different letters",
+        ),
+        (lambda: dano.Actuator("a", limit=1.0, cost=-1.0), "cost of the force of 'a' must be ≥ 0, got -1.0"),
+        (lambda: dano.Goal("a"), "must have one of position, orientation, .*, got none"),
+        (lambda: dano.Goal("a", positon=(0, 0, 0)), "did you mean 'position'"),
+        (lambda: dano.Goal("a", q=0.0, within=0.0), "within of the goal of 'a' must be > 0, got 0.0"),
+        (lambda: dano.Limit("a", "velocity", lower=1.0, upper=0.0), "must be ≤ upper, got 1.0 and 0.0"),
+        (lambda: dano.Limit("a", "orientation"), "must be about one of position, velocity"),
+        (lambda: dano.Task(0, [], []), "n_steps must be a whole number ≥ 1, got 0"),
+        (lambda: dano.Task(5, [], []), "at least one actuator and one goal"),
+        (
+            lambda: dano.Task(5, [dano.Actuator("a", limit=1.0)] * 2, [dano.Goal("a", q=0.0)]),
+            "got the force of 'a' twice",
+        ),
+    ],
+)
+def test_bad_parts_of_a_task_are_said(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_task_of_another_scene_is_said(puck):
+    state = puck.initial_state()
+    strange = dano.Task(3, [dano.Actuator("pukc", limit=1.0)], [dano.Goal("puck", velocity=(0, 0, 0))])
+    with pytest.raises(ValueError, match="did you mean 'puck'"):
+        dano.plan(puck, state, strange)
+    jointless = dano.Task(3, [dano.Actuator("puck", "effort", limit=1.0)], [dano.Goal("puck", q=0.0)])
+    with pytest.raises(ValueError, match="effort of 'puck' must be that of a joint"):
+        dano.plan(puck, state, jointless)
+    with pytest.raises(ValueError, match="method must be one of ilqr, cem, mppi, got 'pso'"):
+        dano.plan(puck, state, drive(position=(0, 0, 0)), method="pso")
+    with pytest.raises(ValueError, match="controls must be finite numbers of shape"):
+        dano.plan(puck, state, drive(position=(0, 0, 0)), controls=np.zeros((3, 1)))
+    with pytest.raises(ValueError, match="softening must hold factors between 0 and 1, got 2"):
+        dano.plan(puck, state, drive(position=(0, 0, 0)), softening=[2.0])
