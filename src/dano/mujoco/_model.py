@@ -70,13 +70,18 @@ def carry_compiled(mujoco: Any, model: Any, body: int, name: str, thing: Thing) 
     """Give a body of a compiled model an object's mass, and take its geoms out of contact.
 
     Raises:
-        ValueError: If it has no geom.
+        ValueError: If it has no geom, or was compiled for a symmetric mass.
     """
     first, count = model.body_geomadr[body], model.body_geomnum[body]
     if count < 1:
         raise ValueError(
             f"body {name!r} of a compiled model must have a geom, which stands for the object in contacts; it "
             "has none: attach to its MjSpec instead"
+        )
+    if model.body_simple[body]:
+        raise ValueError(
+            f"body {name!r} of a compiled model must have a mass that is not about its origin and axes: MuJoCo "
+            "counts on that symmetry once it is compiled; attach to its MjSpec instead"
         )
     model.geom_contype[first : first + count] = 0
     model.geom_conaffinity[first : first + count] = 0

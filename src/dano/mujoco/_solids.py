@@ -78,8 +78,9 @@ def ellipsoid(semi_axes: Float[np.ndarray, "3"]) -> Solid:
         normal /= np.maximum(np.linalg.norm(normal, axis=1), _TINY)[:, None]
         return np.einsum("ij,ij->i", x - closest, normal), normal
 
-    reach = float(semi_axes.max())
-    return Solid(lambda x: np.sqrt(np.einsum("ij,ij->i", x, x)) - reach, jet)
+    least = float(semi_axes.min())
+    # |x / r| grows by no more than 1 / min r along any way.
+    return Solid(lambda x: least * (np.linalg.norm(x / semi_axes, axis=1) - 1), jet)
 
 
 def cylinder(radius: float, half_length: float) -> Solid:
@@ -143,14 +144,7 @@ def hull(vertices: Vectors) -> Solid:
         face = heights.argmax(axis=1)
         return heights[np.arange(len(x)), face], normals[face]
 
-    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-    reach = float(np.linalg.norm(vertices - middle, axis=1).max())
-
-    def bound(x: Vectors):
-        away = x - middle
-        return np.sqrt(np.einsum("ij,ij->i", away, away)) - reach
-
-    return Solid(bound, jet)
+    return Solid(lambda x: (x @ normals.T + offsets).max(axis=1), jet)
 
 
 def height_field(heights: Float[np.ndarray, "rows columns"], size: Float[np.ndarray, "4"]) -> Solid:
