@@ -56,7 +56,9 @@ class Bridge:
         """
         self._mujoco = mujoco = library()
         if not isinstance(target, (mujoco.MjSpec, mujoco.MjModel)):
-            raise ValueError(f"target must be an mujoco.MjSpec or mujoco.MjModel, got {type(target).__name__}")
+            raise ValueError(
+                f"target must be an mujoco.MjSpec or mujoco.MjModel, got {type(target).__name__}"
+            )
         self.target = target
         self._choose = choose
         self._things: dict[str, Thing] = {}
@@ -199,14 +201,17 @@ class Bridge:
         mujoco = self._mujoco
         kind = mujoco.mjtObj.mjOBJ_BODY
         ours = (
-            mujoco.mj_name2id(model, kind, name) >= 0 or is_marked(mujoco, model, name) for name in self._things
+            mujoco.mj_name2id(model, kind, name) >= 0 or is_marked(mujoco, model, name)
+            for name in self._things
         )
         return self._checked(model) if any(ours) else None
 
     def _checked(self, model: Any) -> Table:
         mujoco = self._mujoco
         if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-            raise ValueError("model.opt.enableflags must not have mjENBL_SLEEP: contacts of objects wake nobody")
+            raise ValueError(
+                "model.opt.enableflags must not have mjENBL_SLEEP: contacts of objects wake nobody"
+            )
         both = int(getattr(mujoco.mjtDisableBit, "mjDSBL_PASSIVE", 0))
         if not both:
             both = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)

@@ -180,7 +180,9 @@ def height_field(heights: Float[np.ndarray, "rows columns"], size: Float[np.ndar
     return Solid(lambda x: x[:, 2] - top, jet)
 
 
-def grid(values: Float[np.ndarray, "nx ny nz"], origin: Vectors, spacing: Vectors) -> Solid:
+def grid(
+    values: Float[np.ndarray, "nx ny nz"], origin: Float[np.ndarray, "3"], spacing: Float[np.ndarray, "3"]
+) -> Solid:
     """Signed distances on a grid, trilinear between the nodes; outside the grid nothing touches."""
     last = np.array(values.shape) - 1
     steps = np.array([values.shape[1] * values.shape[2], values.shape[2], 1])

@@ -175,7 +175,9 @@ def body_index(mujoco: Any, model: Any, name: str) -> int:
 
 def _geom_of(model: Any, body: int, name: str) -> int:
     if model.body_geomnum[body] < 1:
-        raise ValueError(f"body {name!r} must have a geom, which stands for the object in contacts; it has none")
+        raise ValueError(
+            f"body {name!r} must have a geom, which stands for the object in contacts; it has none"
+        )
     return int(model.body_geomadr[body])
 
 

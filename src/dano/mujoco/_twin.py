@@ -67,6 +67,7 @@ class Twin:
         self._spec = spec = mujoco.MjSpec()
         # With the default integrator bodies that tumble gain energy without limit.
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT
+        spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0
         spec.option.timestep = float(scene.timestep)
         self._free = np.array([not body.fixed for body in scene.bodies])
         for body in scene.bodies:
