@@ -60,7 +60,7 @@ def thing(name: str) -> NeuralObject:
         return NeuralObject.from_field(Sphere(0.05), n_samples=2000, mass=0.5, key=jax.random.key(1))
     if name == "bunny":
         # Coarser than the shipped one is built, to be quick.
-        field = load_field(importlib.resources.files("dano") / "assets" / "bunny.npz")
+        field = load_field(str(importlib.resources.files("dano") / "assets" / "bunny.npz"))
         return NeuralObject.from_field(field, n_samples=2500, mass=1.0, resolution=48)
     return build_asset(name)
 

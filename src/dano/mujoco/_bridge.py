@@ -1,8 +1,8 @@
 """The bridge: neural objects on the bodies of a user's model, in plain `mj_step`.
 
 MuJoCo calls `mjcb_passive` between finding contacts and solving for them. There the bridge appends those of
-its objects to `mjData.contact` and has MuJoCo make its constraints anew, so that the forces are those of its own
-solver, implicit and coupled with everything else in the model.
+its objects to `mjData.contact` and has MuJoCo make its constraints anew, so that the forces are those of
+its own solver, implicit and coupled with everything else in the model.
 """
 
 import math
@@ -39,7 +39,7 @@ class Bridge:
     Within `with`, every model that has all the bodies with objects gets their contacts. MuJoCo's passive
     callback is one for the process; another one that is set when the block begins is called, too.
 
-    Models are compiled outside of the block, or by `compile`: MuJoCo's compiler cannot call a Python callback.
+    Models are compiled outside of the block, or by `compile`: MuJoCo's compiler cannot call Python.
     """
 
     def __init__(self, target: Any, *, choose: Chooser | None = None):
@@ -208,7 +208,7 @@ class Bridge:
 
     def _checked(self, model: Any) -> Table:
         mujoco = self._mujoco
-        if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        if model.opt.enableflags & int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)):
             raise ValueError(
                 "model.opt.enableflags must not have mjENBL_SLEEP: contacts of objects wake nobody"
             )
@@ -217,8 +217,8 @@ class Bridge:
             both = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
         if model.opt.disableflags & both == both:
             raise ValueError(
-                "model.opt.disableflags must not switch off springs and dampers: MuJoCo then skips the callback "
-                "by which objects get their contacts"
+                "model.opt.disableflags must not switch off springs and dampers: MuJoCo then skips the "
+                "callback by which objects get their contacts"
             )
         return Table(mujoco, model, self._things, self._choose)
 
@@ -228,6 +228,6 @@ class Bridge:
         strength = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         if h * h * strength > _LONGEST_FALL * size:
             raise ValueError(
-                f"model.opt.timestep must be at most {math.sqrt(_LONGEST_FALL * size / strength):.2g} s, in which "
-                f"gravity moves an object of {size:.3g} m by a tenth of its size, got {h:.3g}"
+                f"model.opt.timestep must be at most {math.sqrt(_LONGEST_FALL * size / strength):.2g} s, in "
+                f"which gravity moves an object of {size:.3g} m by a tenth of its size, got {h:.3g}"
             )

@@ -19,7 +19,7 @@ from dano.scene import Control, Scene, State
 
 
 class _Place(NamedTuple):
-    """Where the numbers of a step stand in one vector: shapes, which of them matter, and steps of differences."""
+    """Where the numbers of a step stand in one vector: shapes, which matter, and the step of differences."""
 
     shapes: tuple[tuple[int, ...], ...]
     used: tuple[int, ...]
@@ -33,7 +33,7 @@ class MuJoCoEngine(AbstractEngine):
     integrator "implicit", with which bodies that tumble gain no energy.
 
     Neural objects touch by their samples, as through `Bridge`. Of a contact's parameters the sliding friction
-    counts; MuJoCo has no coefficient of restitution, and its stiffness is its own. Shapes, samples and centres
+    counts; MuJoCo has no coefficient of restitution, and its stiffness is its own. Shapes, samples, centres
     of mass are those of the scene that the engine was made for, other numbers those of the scene that is
     stepped.
 
@@ -44,7 +44,7 @@ class MuJoCoEngine(AbstractEngine):
 
     Attributes:
         names: Bodies of the scene (static).
-        difference: Step of the differences in SI units, of masses, inertias and the timestep as a share (static).
+        difference: Step of the differences in SI units, of masses, inertias, timesteps a share (static).
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -60,8 +60,8 @@ class MuJoCoEngine(AbstractEngine):
 
         Raises:
             ImportError: If mujoco is missing.
-            ValueError: If the scene has joints, nothing that moves, or a shape that is no geom of MuJoCo's, or
-                the difference is not positive.
+            ValueError: If the scene has joints, nothing that moves, or a shape that is no geom of MuJoCo's,
+                or the difference is not positive.
         """
         if not difference > 0:
             raise ValueError(f"difference must be > 0, got {difference}")

@@ -75,13 +75,13 @@ def carry_compiled(mujoco: Any, model: Any, body: int, name: str, thing: Thing) 
     first, count = model.body_geomadr[body], model.body_geomnum[body]
     if count < 1:
         raise ValueError(
-            f"body {name!r} of a compiled model must have a geom, which stands for the object in contacts; it "
-            "has none: attach to its MjSpec instead"
+            f"body {name!r} of a compiled model must have a geom, which stands for the object in contacts; "
+            "it has none: attach to its MjSpec instead"
         )
     if model.body_simple[body]:
         raise ValueError(
-            f"body {name!r} of a compiled model must have a mass that is not about its origin and axes: MuJoCo "
-            "counts on that symmetry once it is compiled; attach to its MjSpec instead"
+            f"body {name!r} of a compiled model must have a mass that is not about its origin and axes: "
+            "MuJoCo counts on that symmetry once it is compiled; attach to its MjSpec instead"
         )
     model.geom_contype[first : first + count] = 0
     model.geom_conaffinity[first : first + count] = 0

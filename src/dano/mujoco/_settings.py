@@ -82,7 +82,7 @@ class Writer:
         self._friction, self._solref, self._solimp = contact.friction, contact.solref, contact.solimp
 
     def begin(self, settings: Settings, first: int, second: int) -> None:
-        """Say between which geoms the contacts are that follow; normals point from the first to the second."""
+        """Say between which geoms the next contacts are; normals point from the first to the second."""
         contact = self._contact
         contact.dim = settings.dim
         contact.geom1, contact.geom2 = first, second
@@ -93,7 +93,7 @@ class Writer:
         contact.includemargin = settings.margin - settings.gap
 
     def add(self, model: Any, data: Any, distance: float, position, frame) -> bool:
-        """Add one: distance [m], position between the surfaces [m, W], normal and two tangents; False: full."""
+        """Add one: distance [m], place between the surfaces [m, W], normal and two tangents; False: full."""
         contact = self._contact
         contact.dist = distance
         contact.exclude = int(distance >= contact.includemargin)

@@ -182,7 +182,7 @@ def _geom_of(model: Any, body: int, name: str) -> int:
 
 
 def _may_meet(mujoco: Any, model: Any, a: int, b: int) -> bool:
-    """Whether MuJoCo lets geoms of two bodies touch: not if welded, nor as parent and child, nor if excluded."""
+    """Whether MuJoCo lets two bodies touch: not if welded, nor as parent and child, nor if excluded."""
     weld, parent = model.body_weldid, model.body_parentid
     first, second = weld[a], weld[b]
     if first == second:

@@ -51,7 +51,7 @@ class Constants(NamedTuple):
 
 
 class Twin:
-    """The model of a scene. Its body frames are ours: axes of the field frame, origin at the centre of mass."""
+    """The model of a scene. Its body frames are ours: axes of the field frame at the centre of mass."""
 
     def __init__(self, scene: Scene):
         """Build it.
@@ -156,7 +156,7 @@ class Twin:
     def wrenches(
         self, before: Motion, after: Motion, constants: Constants, about: Float[np.ndarray, "p 3"]
     ) -> Float[np.ndarray, "p 6"]:
-        """Forces and torques about points on the first body of each pair during a step, by inverse dynamics."""
+        """Forces, and torques about points, on the first body of each pair in a step, by inverse dynamics."""
         mujoco, free = self._mujoco, self._free
         with self._lock:
             self._load(before, constants)
@@ -173,8 +173,8 @@ class Twin:
         total, six = np.zeros((len(about), 6)), np.zeros(6)
         for i in range(data.ncon):
             contact = data.contact[i]
-            bodies = tuple(int(model.geom_bodyid[geom]) for geom in contact.geom)
-            k, sign = self._pair_of[bodies]
+            first, second = (int(model.geom_bodyid[geom]) for geom in contact.geom)
+            k, sign = self._pair_of[first, second]
             self._mujoco.mj_contactForce(model, data, i, six)
             frame = contact.frame.reshape(3, 3)
             force, torque = sign * six[:3] @ frame, sign * six[3:] @ frame
