@@ -110,7 +110,7 @@ class MuJoCoEngine(AbstractEngine):
         self, scene: Scene, prepared: Any, before: State, after: State, about: Float[Array, "contacts 3"]
     ) -> Float[Array, "contacts 6"]:
         """See `AbstractEngine.wrenches`: MuJoCo's own forces, by its inverse dynamics of the step."""
-        constants = tuple(_constants(scene, None))
+        constants = _constants(scene, None)
         result = jax.ShapeDtypeStruct((len(scene.pairs), 6), about.dtype)
 
         def host(before, after, constants, about):
@@ -122,21 +122,23 @@ class MuJoCoEngine(AbstractEngine):
             )
             return found.astype(result.dtype)
 
-        arguments = tuple(_motion(before)), tuple(_motion(after)), constants, about
+        arguments = _motion(before), _motion(after), constants, about
         return jax.pure_callback(host, result, *arguments, vmap_method="sequential")
 
 
-def _motion(state: State) -> Motion:
-    return Motion(state.position, state.orientation, state.velocity, state.omega)  # pyright: ignore[reportArgumentType]
+def _motion(state: State) -> tuple[Array, ...]:
+    """The numbers of `Motion`."""
+    return state.position, state.orientation, state.velocity, state.omega
 
 
-def _constants(scene: Scene, control: Control | None) -> Constants:
+def _constants(scene: Scene, control: Control | None) -> tuple[Array, ...]:
+    """The numbers of `Constants`."""
     zero = jnp.zeros((len(scene.bodies), 3), scene.timestep.dtype)
     frictions = [contact.params.sliding_friction[None] for contact in scene.contacts]
     if scene.others is not None:
         frictions.append(scene.others.pair_params.sliding_friction)
     friction = jnp.concatenate(frictions) if frictions else jnp.zeros(0, zero.dtype)
-    return Constants(
+    return (
         zero if control is None else control.force,
         zero if control is None else control.torque,
         jnp.stack([body.mass * body.mass_scale for body in scene.bodies]),
@@ -144,7 +146,7 @@ def _constants(scene: Scene, control: Control | None) -> Constants:
         friction,
         scene.gravity,
         scene.timestep,
-    )  # pyright: ignore[reportArgumentType]
+    )
 
 
 def _used(scene: Scene, shapes: tuple[tuple[int, ...], ...]) -> tuple[int, ...]:
