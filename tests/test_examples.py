@@ -81,3 +81,20 @@ def test_door():
     assert 0 < answer["door_after"] < answer["door_before"]
     assert answer["momentum_drift"] < 1e-3
     assert 0.5 < answer["energy_left"] < 1
+
+
+def test_mujoco_kick():
+    pytest.importorskip("mujoco")
+    answer = run("08_mujoco_kick")
+    # It flies off and lies on the floor again.
+    assert answer["fastest"] > 0.5
+    assert answer["way"] > 0.03
+    assert 0.02 < answer["height"] < 0.08
+
+
+def test_mujoco_push():
+    pytest.importorskip("mujoco")
+    answer = run("09_mujoco_push")
+    assert answer["pushed"] > 0.03
+    assert answer["hand_contacts"] > 0
+    assert answer["joint_error"] < 0.1

@@ -1,0 +1,156 @@
+"""The trained bunny and soap on MuJoCo's geoms through the bridge, beside MuJoCo's own hull of them."""
+
+import contextlib
+import datetime
+import resource
+import time
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from benchmarks._measure import load_average, parse_arguments, report, Row
+from dano.exchange import solid_triangles
+from dano.mujoco import Bridge
+from dano.scene_file import build_asset
+
+SETTLE, WATCH = 4.0, 1.0
+MOST_CREEP = 1e-4
+"""Speed at rest that is asked for [m/s]."""
+LONG_RUN = 600.0
+LONG_TIMESTEP = 0.01
+TIMESTEP = 0.002
+TYPES = mujoco.mjtGeom
+LYING = (0.7071067811865476, 0.0, 0.7071067811865476, 0.0)
+SUPPORTS = ("plane", "box", "sphere", "capsule", "cylinder", "ellipsoid", "mesh", "height field")
+
+
+class Rest(NamedTuple):
+    """Largest speed at rest [m/s], creep [m/s], contacts, CPU time of a step [µs], warnings."""
+
+    speed: float
+    creep: float
+    contacts: int
+    microseconds: float
+    warnings: int
+
+
+def run() -> None:
+    arguments = parse_arguments("Measure neural objects on bodies of MuJoCo models.")
+    load = load_average()
+    rows = []
+    supports = SUPPORTS[:1] if arguments.quick else SUPPORTS
+    for name in ("trained_bunny", "trained_soap"):
+        for support in supports:
+            rows += _rest_rows(name, support, TIMESTEP)
+    for timestep in () if arguments.quick else (0.001, 0.005, 0.01):
+        rows += _rest_rows("trained_bunny", "plane", timestep)
+    rows.append(_memory_row(10.0 if arguments.quick else LONG_RUN))
+    settings = {
+        "date": datetime.datetime.now().isoformat(timespec="minutes"),
+        "mujoco": mujoco.__version__,
+        "settled": f"{SETTLE:g} s, then watched {WATCH:g} s",
+        "clock": "CPU time of the process, one thread",
+        "round supports": "sphere of 0.5 m, capsule and cylinder of 0.3 m, ellipsoid of 0.6, 0.5, 0.3 m",
+    }
+    report("bridge", rows, settings, load, arguments.json)
+
+
+def _rest_rows(name: str, support: str, timestep: float) -> list[Row]:
+    group = f"{name} on a {support}, {1000 * timestep:g} ms"
+    ours, theirs = (_rest(name, support, timestep, own) for own in (False, True))
+    budget = 1e6 * timestep
+    return [
+        Row(group, "largest speed at rest", ours.speed, "m/s", MOST_CREEP, note=f"{ours.contacts} contacts"),
+        Row(group, "the same, MuJoCo's hull", theirs.speed, "m/s", note=f"{theirs.contacts} contacts"),
+        Row(group, "creep", ours.creep, "m/s", max(theirs.creep, 1e-9), note=f"{ours.warnings} warnings"),
+        Row(group, "the same, MuJoCo's hull", theirs.creep, "m/s"),
+        Row(group, "time of a step", ours.microseconds, "µs", budget, note="target: real time"),
+        Row(group, "the same, MuJoCo's hull", theirs.microseconds, "µs"),
+    ]
+
+
+def _rest(name: str, support: str, timestep: float, own: bool) -> Rest:
+    model, bridge = _model(name, support, timestep, own)
+    data = mujoco.MjData(model)
+    body, speed = model.body("toy").id, np.zeros(6)
+    with bridge:
+        mujoco.mj_step(model, data, round(SETTLE / timestep))
+        start, fastest, n = data.xipos[body].copy(), 0.0, round(WATCH / timestep)
+        begin = time.process_time()
+        mujoco.mj_step(model, data, n)
+        taken = (time.process_time() - begin) / n
+        creep = float(np.linalg.norm(data.xipos[body] - start)) / WATCH
+        for _ in range(n):
+            mujoco.mj_step(model, data)
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, speed, 0)
+            fastest = max(fastest, float(np.linalg.norm(speed[3:])))
+    warnings = int(sum(warning.number for warning in data.warning))
+    return Rest(fastest, creep, int(data.ncon), 1e6 * taken, warnings)
+
+
+def _model(name: str, support: str, timestep: float, own: bool):
+    obj = build_asset(name)
+    spec = mujoco.MjSpec()
+    spec.option.timestep = timestep
+    spec.worldbody.add_geom(**_support(spec, support))
+    height = 0.065 if "bunny" in name else 0.02
+    body = spec.worldbody.add_body(name="toy", pos=[0, 0, height])
+    body.add_freejoint()
+    if not own:
+        bridge = Bridge(spec)
+        bridge.attach("toy", obj, look=False)
+        return bridge.compile(), bridge
+    assert obj.solid is not None
+    mesh, _ = solid_triangles(obj.solid, 40)
+    inertia = np.asarray(obj.mass.inertia)
+    body.mass, body.ipos = float(obj.mass.mass), np.asarray(obj.mass.com)
+    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    body.explicitinertial = True
+    spec.add_mesh(name="toy", uservert=mesh.vertices.ravel().tolist(), userface=mesh.faces.ravel().tolist())
+    body.add_geom(type=TYPES.mjGEOM_MESH, meshname="toy")
+    return spec.compile(), contextlib.nullcontext()
+
+
+def _support(spec, support: str) -> dict:
+    """A geom with its top at z = 0."""
+    match support:
+        case "plane":
+            return {"type": TYPES.mjGEOM_PLANE, "size": [5, 5, 1]}
+        case "box":
+            return {"type": TYPES.mjGEOM_BOX, "size": [0.2, 0.2, 0.1], "pos": [0, 0, -0.1]}
+        case "sphere":
+            return {"type": TYPES.mjGEOM_SPHERE, "size": [0.5, 0, 0], "pos": [0, 0, -0.5]}
+        case "capsule" | "cylinder":
+            kind = TYPES.mjGEOM_CAPSULE if support == "capsule" else TYPES.mjGEOM_CYLINDER
+            return {"type": kind, "size": [0.3, 0.3, 0], "pos": [0, 0, -0.3], "quat": LYING}
+        case "ellipsoid":
+            return {"type": TYPES.mjGEOM_ELLIPSOID, "size": [0.6, 0.5, 0.3], "pos": [0, 0, -0.3]}
+        case "mesh":
+            corners = np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.2, 0.2) for z in (-0.2, 0.0)])
+            spec.add_mesh(name="block", uservert=corners.ravel().tolist())
+            return {"type": TYPES.mjGEOM_MESH, "meshname": "block"}
+    x = np.linspace(-1, 1, 41)
+    heights = 1 - np.exp(-4 * (x[None] ** 2 + x[:, None] ** 2))
+    spec.add_hfield(name="hollow", nrow=41, ncol=41, size=[0.3, 0.3, 0.05, 0.05], userdata=heights.ravel())
+    return {"type": TYPES.mjGEOM_HFIELD, "hfieldname": "hollow"}
+
+
+def _memory_row(seconds: float) -> Row:
+    """What a long run adds to the process, with a reset every second of it."""
+    model, bridge = _model("trained_bunny", "plane", LONG_TIMESTEP, False)
+    data = mujoco.MjData(model)
+    each = round(1 / LONG_TIMESTEP)
+    with bridge:
+        mujoco.mj_step(model, data, 5 * each)
+        before = _resident()
+        for _ in range(round(seconds)):
+            mujoco.mj_resetData(model, data)
+            mujoco.mj_step(model, data, each)
+    name = f"growth of the process over {seconds:g} simulated seconds"
+    return Row("Memory", name, (_resident() - before) / 2**20, "MiB", 1.0)
+
+
+def _resident() -> int:
+    with open("/proc/self/statm", encoding="ascii") as file:
+        return int(file.read().split()[1]) * resource.getpagesize()

@@ -1,0 +1,233 @@
+"""The bridge: neural objects on the bodies of a user's model, in plain `mj_step`.
+
+MuJoCo calls `mjcb_passive` between finding contacts and solving for them. There the bridge appends those of
+its objects to `mjData.contact` and has MuJoCo make its constraints anew, so that the forces are those of
+its own solver, implicit and coupled with everything else in the model.
+"""
+
+import math
+import threading
+import weakref
+from typing import Any
+
+import numpy as np
+
+from dano.maths import checked_array, Numbers
+from dano.mujoco._model import carry, carry_compiled, is_marked, library, names_of, without_callback
+from dano.mujoco._settings import Writer
+from dano.mujoco._table import body_index, Chooser, Table
+from dano.mujoco._things import Thing, thing_of
+from dano.names import did_you_mean
+from dano.objects import NeuralObject
+
+_LONGEST_FALL = 0.1
+"""Way that gravity adds to a body's in a step, as a share of the body's size."""
+
+
+class Bridge:
+    """Neural objects on bodies of a MuJoCo model.
+
+    ```
+    bridge = Bridge(spec)                    # an MjSpec, or a compiled MjModel
+    bridge.attach("toy", bunny)
+    model = bridge.compile()                 # spec.compile()
+    data = mujoco.MjData(model)
+    with bridge:
+        mujoco.mj_step(model, data)          # or the viewer, or whatever calls it
+    ```
+
+    Within `with`, every model that has all the bodies with objects gets their contacts. MuJoCo's passive
+    callback is one for the process; another one that is set when the block begins is called, too.
+
+    Models are compiled outside of the block, or by `compile`: MuJoCo's compiler cannot call Python.
+    """
+
+    def __init__(self, target: Any, *, choose: Chooser | None = None):
+        """A bridge without objects.
+
+        Args:
+            target: An `mujoco.MjSpec` or `mujoco.MjModel`. It is changed by `attach`.
+            choose: From a model and two geoms (the second stands for an object) to the parameters of their
+                contacts, None for no contact; default: as MuJoCo mixes those of two geoms.
+
+        Raises:
+            ImportError: If mujoco is missing.
+            ValueError: If the target is neither.
+        """
+        self._mujoco = mujoco = library()
+        if not isinstance(target, (mujoco.MjSpec, mujoco.MjModel)):
+            raise ValueError(
+                f"target must be an mujoco.MjSpec or mujoco.MjModel, got {type(target).__name__}"
+            )
+        self.target = target
+        self._choose = choose
+        self._things: dict[str, Thing] = {}
+        self._tables: dict[int, tuple[Any, Table | None]] = {}
+        self._local = threading.local()
+        self._before: Any = None
+        self._depth = 0
+
+    def attach(
+        self,
+        body: str,
+        obj: NeuralObject,
+        *,
+        position: Numbers = (0.0, 0.0, 0.0),
+        orientation: Numbers = (1.0, 0.0, 0.0, 0.0),
+        contype: int = 1,
+        conaffinity: int = 1,
+        look: bool = True,
+    ) -> None:
+        """Put an object on a body.
+
+        The body gets the object's mass, centre of mass and inertia, and its own geoms stop colliding: what of
+        them is to go on belongs on a body of its own. Friction, solref, solimp, condim, margin, … of contacts
+        are those of the geom that stands for the object, the body's first: `model.body(name).geomadr`.
+
+        Args:
+            body: Name of a body.
+            obj: The object.
+            position: Origin of the object's field frame in the body frame [m].
+            orientation: Its axes, wxyz, field → body.
+            contype: Bits that say with what it collides, as MuJoCo's of a geom.
+            conaffinity: The same.
+            look: Whether a mesh that shows the object is added; an `MjSpec` only.
+
+        Raises:
+            ValueError: If there is no such body, it has an object, a compiled one has no geom, or the pose is
+                not one.
+            ImportError: If the look needs libigl and it is missing.
+        """
+        mujoco = self._mujoco
+        spec = isinstance(self.target, mujoco.MjSpec)
+        names = names_of(self.target, spec)
+        if body not in names or body == "world":
+            valid = [name for name in names if name and name != "world"]
+            raise ValueError(f"body must be one of {valid}, got {body!r}{did_you_mean(body, valid)}")
+        if body in self._things:
+            raise ValueError(f"body must not have an object yet, got {body!r} twice; use another body")
+        if not isinstance(obj, NeuralObject):
+            raise ValueError(f"obj must be a NeuralObject, got {type(obj).__name__}")
+        place = np.asarray(checked_array("position", position, (3,)), np.float64)
+        turn = np.asarray(checked_array("orientation", orientation, (4,)), np.float64)
+        if not np.linalg.norm(turn) > 0:
+            raise ValueError(f"orientation must not be zero, got {turn.tolist()}")
+        thing = thing_of(obj, place, turn / np.linalg.norm(turn), (contype, conaffinity))
+        if spec:
+            carry(mujoco, self.target, body, thing, obj if look else None)
+        else:
+            carry_compiled(mujoco, self.target, body_index(mujoco, self.target, body), body, thing)
+        self._things[body] = thing
+        self._tables.clear()
+
+    def compile(self) -> Any:
+        """Compile the spec, also within `with`.
+
+        Raises:
+            ValueError: If the target is a compiled model, a body with an object is gone, or MuJoCo refuses.
+        """
+        if not isinstance(self.target, self._mujoco.MjSpec):
+            raise ValueError("target must be an MjSpec to be compiled, got an MjModel")
+        with without_callback(self._mujoco):
+            model = self.target.compile()
+        self._tables[id(model)] = weakref.ref(model), self._checked(model)
+        return model
+
+    def __enter__(self) -> "Bridge":
+        if not self._things:
+            raise ValueError("bridge must have an object: attach one before it is entered")
+        if self._depth == 0:
+            self._before = self._mujoco.get_mjcb_passive()
+            self._mujoco.set_mjcb_passive(self._passive)
+        self._depth += 1
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self._mujoco.set_mjcb_passive(self._before)
+            self._before = None
+
+    def contacts(self, model: Any, data: Any) -> int:
+        """Append the contacts of the objects at the pose of `data`, and make MuJoCo's constraints anew.
+
+        What happens within `mj_step` in a `with` block; for those who call the parts of a step one by one,
+        between `mj_fwdPosition` and `mj_fwdVelocity`. Contacts that are there already are left alone.
+
+        Returns:
+            How many were appended.
+
+        Raises:
+            ValueError: If the model has some of the bodies but not all, or its timestep is too long.
+        """
+        mujoco, table = self._mujoco, self._table(model)
+        flags = mujoco.mjtDisableBit
+        if table is None or model.opt.disableflags & (flags.mjDSBL_CONTACT | flags.mjDSBL_CONSTRAINT):
+            return 0
+        self._check_timestep(model)
+        # Derivatives by differences go through here more than once at one pose.
+        if data.ncon and int(data.contact[data.ncon - 1].geom[1]) in table.geoms:
+            return 0
+        batches = table.find(model, data)
+        if not batches:
+            return 0
+        if not hasattr(self._local, "writer"):
+            self._local.writer = Writer(mujoco)
+        writer, n = self._local.writer, 0
+        for batch in batches:
+            writer.begin(batch.settings, batch.first, batch.second)
+            rows = zip(batch.distances.tolist(), batch.positions, batch.frames, strict=True)
+            n += sum(writer.add(model, data, *row) for row in rows)
+        mujoco.mj_makeConstraint(model, data)
+        mujoco.mj_island(model, data)
+        mujoco.mj_projectConstraint(model, data)
+        return n
+
+    def _passive(self, model: Any, data: Any) -> None:
+        if self._before is not None:
+            self._before(model, data)
+        self.contacts(model, data)
+
+    def _table(self, model: Any) -> Table | None:
+        """What is known of a model; None if it is none of ours."""
+        found = self._tables.get(id(model))
+        if found is None or found[0]() is not model:
+            # Models come and go; what is known of those that went is dropped.
+            self._tables = {key: value for key, value in self._tables.items() if value[0]() is not None}
+            self._tables[id(model)] = found = weakref.ref(model), self._looked_up(model)
+        return found[1]
+
+    def _looked_up(self, model: Any) -> Table | None:
+        mujoco = self._mujoco
+        kind = mujoco.mjtObj.mjOBJ_BODY
+        ours = (
+            mujoco.mj_name2id(model, kind, name) >= 0 or is_marked(mujoco, model, name)
+            for name in self._things
+        )
+        return self._checked(model) if any(ours) else None
+
+    def _checked(self, model: Any) -> Table:
+        mujoco = self._mujoco
+        if model.opt.enableflags & int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)):
+            raise ValueError(
+                "model.opt.enableflags must not have mjENBL_SLEEP: contacts of objects wake nobody"
+            )
+        both = int(getattr(mujoco.mjtDisableBit, "mjDSBL_PASSIVE", 0))
+        if not both:
+            both = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
+        if model.opt.disableflags & both == both:
+            raise ValueError(
+                "model.opt.disableflags must not switch off springs and dampers: MuJoCo then skips the "
+                "callback by which objects get their contacts"
+            )
+        return Table(mujoco, model, self._things, self._choose)
+
+    def _check_timestep(self, model: Any) -> None:
+        h, g = model.opt.timestep, model.opt.gravity
+        size = min(thing.size for thing in self._things.values())
+        strength = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+        if h * h * strength > _LONGEST_FALL * size:
+            raise ValueError(
+                f"model.opt.timestep must be at most {math.sqrt(_LONGEST_FALL * size / strength):.2g} s, in "
+                f"which gravity moves an object of {size:.3g} m by a tenth of its size, got {h:.3g}"
+            )

@@ -1,0 +1,112 @@
+"""What the bridge writes into a user's spec or compiled model."""
+
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from dano.exchange import solid_triangles
+from dano.mujoco._things import Thing
+from dano.objects import NeuralObject
+
+_MARK = "dano:"
+"""A text element of that name and the body's says that a model was compiled from a spec with the object."""
+_LOOK_GROUP = 2
+"""MuJoCo's custom: what is only seen."""
+_LOOK_NODES = 48
+_PLAIN = (0.85, 0.73, 0.61, 1.0)
+
+
+def library() -> Any:
+    """The module mujoco.
+
+    Raises:
+        ImportError: If it is missing.
+    """
+    try:
+        import mujoco
+    except ImportError as error:
+        raise ImportError("dano.mujoco needs mujoco: pip install 'dano[mujoco]'") from error
+    return mujoco
+
+
+def names_of(target: Any, spec: bool) -> list[str]:
+    """Names of the bodies of a spec or compiled model."""
+    if spec:
+        return [body.name for body in target.bodies]
+    return [target.body(i).name for i in range(target.nbody)]
+
+
+def carry(mujoco: Any, spec: Any, name: str, thing: Thing, look: NeuralObject | None) -> None:
+    """Give a body of a spec an object's mass, take its geoms out of contact, and show the object."""
+    body = next(body for body in spec.bodies if body.name == name)
+    mesh = None
+    if look is not None and look.solid is not None:
+        mesh, _ = solid_triangles(look.solid, _LOOK_NODES)
+    for geom in body.geoms:
+        geom.contype = geom.conaffinity = 0
+    body.mass, body.ipos, body.iquat = thing.mass, thing.com, [1, 0, 0, 0]
+    body.inertia = [0, 0, 0]
+    body.fullinertia = thing.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    body.explicitinertial = True
+    spec.add_text(name=f"{_MARK}{name}", data="neural object")
+    seen = {"contype": 0, "conaffinity": 0, "group": _LOOK_GROUP, "mass": 0.0, "rgba": _PLAIN}
+    if mesh is not None:
+        vertices = mesh.vertices @ thing.rotation.T + thing.origin
+        spec.add_mesh(
+            name=f"{_MARK}{name}",
+            uservert=vertices.ravel().tolist(),
+            userface=mesh.faces.ravel().tolist(),
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+        )
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"{_MARK}{name}", **seen)
+    elif not body.geoms:
+        # Something has to stand for the object in the list of contacts.
+        small = [0.01 * thing.size, 0, 0]
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=small, pos=thing.com, **seen)
+
+
+def carry_compiled(mujoco: Any, model: Any, body: int, name: str, thing: Thing) -> None:
+    """Give a body of a compiled model an object's mass, and take its geoms out of contact.
+
+    Raises:
+        ValueError: If it has no geom, or was compiled for a symmetric mass.
+    """
+    first, count = model.body_geomadr[body], model.body_geomnum[body]
+    if count < 1:
+        raise ValueError(
+            f"body {name!r} of a compiled model must have a geom, which stands for the object in contacts; "
+            "it has none: attach to its MjSpec instead"
+        )
+    if model.body_simple[body]:
+        raise ValueError(
+            f"body {name!r} of a compiled model must have a mass that is not about its origin and axes: "
+            "MuJoCo counts on that symmetry once it is compiled; attach to its MjSpec instead"
+        )
+    model.geom_contype[first : first + count] = 0
+    model.geom_conaffinity[first : first + count] = 0
+    model.body_contype[body] = model.body_conaffinity[body] = 0
+    moments, axes = np.linalg.eigh(thing.inertia)
+    axes = axes * np.sign(np.linalg.det(axes))
+    turn = np.zeros(4)
+    mujoco.mju_mat2Quat(turn, axes.ravel())
+    model.body_mass[body], model.body_ipos[body] = thing.mass, thing.com
+    model.body_inertia[body], model.body_iquat[body] = moments, turn
+    # Not the data of a user: only what follows from masses in the model.
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def is_marked(mujoco: Any, model: Any, name: str) -> bool:
+    """Whether a model was compiled from a spec whose body of that name has an object."""
+    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, f"{_MARK}{name}") >= 0
+
+
+@contextmanager
+def without_callback(mujoco: Any):
+    """Take the passive callback away: MuJoCo's compiler, which runs a step, cannot call one of Python."""
+    before = mujoco.get_mjcb_passive()
+    mujoco.set_mjcb_passive(None)
+    try:
+        yield
+    finally:
+        mujoco.set_mjcb_passive(before)
