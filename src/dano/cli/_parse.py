@@ -15,6 +15,7 @@ from dano.cli._arguments import (
     Identify,
     Import,
     Inspect,
+    Poses,
     Simulate,
     Train,
     View,
@@ -22,6 +23,7 @@ from dano.cli._arguments import (
 from dano.names import did_you_mean
 
 _COMMANDS = {
+    "poses": Poses,
     "train": Train,
     "data": Data,
     "build": Build,
