@@ -19,7 +19,8 @@ from solids import bunny_mesh
 SEED = 11
 WIDTH, HEIGHT, FOCAL = 640, 480, 620.0  # [pixels]
 TABLE_SIDE, TEXELS = 0.9, 3072  # [m], texels along it
-TAG_SIDE, TAG_ID = 0.06, 7  # [m], side of the black square of tag36h11
+TAG_TEXELS, TAG_ID = 205, 7  # side of the black square of tag36h11
+TAG_SIDE = TAG_TEXELS * TABLE_SIDE / TEXELS  # [m], 60.06 mm
 TAG_CENTRE = np.array([0.12, -0.03, 0.0])  # [m]
 
 
@@ -140,7 +141,7 @@ def tabletop() -> np.ndarray:
         colours += strength * cv2.resize(noise, (TEXELS, TEXELS), interpolation=cv2.INTER_CUBIC)
     per_metre = TEXELS / TABLE_SIDE
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    side = round(TAG_SIDE * per_metre)
+    side = TAG_TEXELS
     tag = cv2.aruco.generateImageMarker(family, TAG_ID, side)
     border = side // 5
     sheet = np.pad(tag, border, constant_values=255)[..., None] / 255 * 0.86 + 0.04

@@ -11,7 +11,7 @@ from dano.vision import PosedCamera
 
 TAG, TAG_SIDE, TAG_CENTRE = 3, 0.05, np.array([0.09, -0.04, 0.0])  # [m]
 BALL, RADIUS = np.array([0.0, 0.02, 0.04]), 0.04  # [m]
-FOCAL, WIDTH, HEIGHT = 330.0, 320, 240  # [pixels]
+FOCAL, WIDTH, HEIGHT = 250.0, 240, 180  # [pixels]
 _METRE = 1600
 """Texels a metre."""
 
@@ -63,28 +63,33 @@ def camera(
     return PosedCamera(pose, focal=focal * width / WIDTH, width=width, height=round(width * HEIGHT / WIDTH))
 
 
-def photograph(view: PosedCamera, top: np.ndarray, skin: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Grey values, 0 to 255, and where the ball is, 3 × 3 rays a pixel; without a skin there is no ball."""
+def photograph(view: PosedCamera, top: np.ndarray, skin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Grey values, 0 to 255, and where the ball is, 3 × 3 rays a pixel."""
     n = 3
     y, x = (np.mgrid[: n * view.height, : n * view.width] + 0.5) / n
     ray = view.directions(np.stack([x.ravel(), y.ravel()], axis=1))
     floor = view.position - view.position[2] / np.minimum(ray[:, 2:], -1e-6) * ray
-    grey = _sample(top, _texels(floor))
+    light = _sample(_light(top), _texels(floor))
     away = view.position - BALL
     b = ray @ away
     root = b * b - (away @ away - RADIUS**2)
-    hit = (root > 0) & (skin is not None)
-    if skin is not None:
-        normal = (away + (-b - np.sqrt(np.maximum(root, 0)))[:, None] * ray) / RADIUS
-        around = np.arctan2(normal[:, 1], normal[:, 0]) / (2 * np.pi) * 800
-        # Twice around is once around the seam, which lies behind.
-        place = np.stack([np.abs(around) * 1.2 + 20, (normal[:, 2] + 1) * 300 + 100 * (around > 0)], axis=1)
-        grey = np.where(hit, _sample(skin, place), grey)
+    hit = root > 0
+    normal = (away + (-b - np.sqrt(np.maximum(root, 0)))[:, None] * ray) / RADIUS
+    around = np.arctan2(normal[:, 1], normal[:, 0]) / (2 * np.pi) * 800
+    place = np.stack([np.abs(around) * 1.2 + 20, (normal[:, 2] + 1) * 300 + 100 * (around > 0)], axis=1)
+    light = np.where(hit, _sample(_light(skin), place), light)
 
     def averaged(values: np.ndarray) -> np.ndarray:
         return values.reshape(view.height, n, view.width, n).mean((1, 3))
 
-    return np.rint(255 * averaged(grey)).astype(np.uint8), averaged(hit * 1.0)
+    # Pixels average light, and are then written as brightness (sRGB).
+    light = averaged(light)
+    shown = np.where(light < 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.rint(255 * shown).astype(np.uint8), averaged(hit * 1.0)
+
+
+def _light(grey: np.ndarray) -> np.ndarray:
+    return np.where(grey < 0.04045, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4)
 
 
 def _sample(image: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -94,10 +99,10 @@ def _sample(image: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def write_pictures(
-    folder: Path, cameras: list[PosedCamera], *, seed: int = 0, first: int = 0, tag: bool = True, ball: bool = True
+    folder: Path, cameras: list[PosedCamera], *, seed: int = 0, first: int = 0, tag: bool = True
 ) -> None:
     """One PNG file for each camera."""
-    top, skin = table(seed, tag=tag), pattern(seed + 1) if ball else None
+    top, skin = table(seed, tag=tag), pattern(seed + 1)
     folder.mkdir(parents=True, exist_ok=True)
     for i, view in enumerate(cameras):
         Image.fromarray(photograph(view, top, skin)[0]).save(folder / f"{first + i:03d}.png")

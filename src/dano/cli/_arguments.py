@@ -84,7 +84,8 @@ class Poses:
         ends: Where its ends are in some photographs, as NAME:X,Y:X,Y [pixels].
         up: What shows where up is: a marker that lies flat, the plane of the table, cameras held level; auto:
             the first of these that can be had.
-        focal: Known focal length [pixels of the upright photograph]; default: estimated.
+        focal: Known focal length, or two, across and down [pixels of the upright photograph]; default:
+            estimated.
         centre: Known principal point [pixels]; default: the middle.
         distortion: Known k1 k2 p1 p2 of OpenCV's model.
         lens: What is estimated of the lens: radial (focal length and k1), pinhole (focal length), full (two
@@ -105,7 +106,7 @@ class Poses:
     length: float | None = None
     ends: tuple[str, ...] = ()
     up: Literal["auto", "marker", "plane", "cameras", "none"] = "auto"
-    focal: float | None = None
+    focal: tuple[float, ...] = ()
     centre: tuple[float, float] | None = None
     distortion: tuple[float, float, float, float] | None = None
     lens: Literal["radial", "pinhole", "full"] = "radial"

@@ -13,7 +13,7 @@ def poses(command: Poses) -> None:
     """See `dano poses --help`."""
     check_output(command.output, command.images, suffix=".json")
     options = PoseOptions(
-        focal=command.focal,
+        focal=_focal(command.focal),
         centre=command.centre,
         distortion=command.distortion,
         lens=command.lens,
@@ -43,6 +43,17 @@ def poses(command: Poses) -> None:
     _print(found)
     put()
     put(f"wrote {command.output}: next, `dano data {command.output}` and `dano train {command.output}`")
+
+
+def _focal(numbers: tuple[float, ...]) -> float | tuple[float, float] | None:
+    match numbers:
+        case ():
+            return None
+        case (focal,):
+            return focal
+        case (across, down):
+            return across, down
+    raise ValueError(f"focal must be one number or two [pixels], got {len(numbers)}")
 
 
 def _known_length(command: Poses) -> KnownLength | None:

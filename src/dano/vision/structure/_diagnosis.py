@@ -15,6 +15,9 @@ BLURRED = 0.55
 """Measure of blur from which on pictures rarely match."""
 
 _FEW_POINTS = 60
+_PLAIN = 4.0
+"""Standard deviation of grey levels in a picture that shows nothing."""
+
 _STILL = 1.0
 """Median motion between two pictures [pixels] below which nothing moves."""
 
@@ -55,7 +58,7 @@ def motion_fault(photographs: Sequence[Photograph], matches: Matches, options: P
             " sides, or give masks"
         )
     longest = max(max(photograph.size) for photograph in photographs)
-    focals = [options.focal] if options.focal else list(longest * np.geomspace(0.5, 4, 13))
+    focals = list(longest * np.geomspace(0.5, 4, 13)) if options.focals is None else [max(options.focals)]
     left = np.min([[_left_by_rotation(x, y, a, b, f) for x, y, a, b in points] for f in focals], axis=0)
     explained = left < np.minimum(_TURNED, np.maximum(_TURNED_SHARE * moved, 0.5))
     if explained.mean() < 0.8:
@@ -95,6 +98,11 @@ def _left_by_rotation(
 
 def why_none(photographs: Sequence[Photograph], matches: Matches) -> str:
     """Why no model of enough pictures came about."""
+    contrast = np.median([np.std(photograph.grey) for photograph in photographs])
+    if contrast < _PLAIN:
+        return (
+            f"the pictures are plain (their contrast is {contrast:.1f} of 255): there is nothing to recognise"
+        )
     blurred = np.array([photograph.blur for photograph in photographs])
     if np.median(blurred) > BLURRED:
         return (
@@ -118,9 +126,11 @@ def why_none(photographs: Sequence[Photograph], matches: Matches) -> str:
                 " a mirror, transparent, or moved between the pictures?"
             )
         return (
-            f"the pictures have too little in common ({linked} pairs share {FEWEST_MATCHES} points): take"
-            f" more, from"
-            " places closer to each other"
+            f"the pictures have too little in common ({linked} pairs share {FEWEST_MATCHES} points, though"
+            f" each shows"
+            f" {np.median(matches.points):.0f}): take more, from places closer to each other; a mirror or"
+            f" glass shows"
+            " something else from every place, give masks and features_on='surroundings' for such an object"
         )
     return (
         "matched points fit no cameras: is the object a mirror, transparent, or did it move against its"

@@ -5,7 +5,7 @@ here decides whether it succeeds: small pictures are enlarged, contrast is made 
 everywhere but at shadows), weak points are taken, too, and masks say where.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from dano.vision.structure._options import PoseOptions
 from dano.vision.structure._photographs import Photograph
 
 _SMALL, _LARGE = 640, 1600
-"""Longest side [pixels] that pictures are enlarged to, and reduced to."""
+"""Longest side [pixels] that pictures are enlarged to, but at most twice as large, and reduced to."""
 
 _WEAK = 0.002
 """Contrast of the weakest points, a third of COLMAP's; on plaster every second point is below that."""
@@ -34,7 +34,8 @@ _ALL_PAIRS = 150
 FEWEST_MATCHES = 12
 """Common points of two pictures below which they are taken for chance."""
 
-_CHUNK = 200
+_CHUNK, _PAIRS_CHUNK = 8, 200
+"""Pictures, and pairs of them, that are worked on between looks at the progress."""
 
 
 class Matches(NamedTuple):
@@ -61,7 +62,7 @@ class Matches(NamedTuple):
 def enlargement(photograph: Photograph) -> float:
     """By how much a picture is enlarged before points are looked for."""
     longest = max(photograph.size)
-    return min(_SMALL / longest, 4.0) if longest < _SMALL else min(_LARGE / longest, 1.0)
+    return min(_SMALL / longest, 2.0) if longest < _SMALL else min(_LARGE / longest, 1.0)
 
 
 def find_matches(
@@ -88,14 +89,28 @@ def find_matches(
     (folder / "masks").mkdir()
     database = folder / "database.db"
     names = [f"{i:05d}.png" for i in range(len(photographs))]
-    cameras: dict[tuple[Any, ...], int] = {}
     for i, (photograph, mask) in enumerate(zip(photographs, masks, strict=True)):
+        progress("looking for points", 0.2 * i / len(names))
         _write_prepared(photograph, mask, folder, names[i])
-        _extract(database, folder, names[i], photograph, options, cameras, progress, i / len(names))
+    done = 0
+    for members in _by_camera(photographs):
+        for start in range(0, len(members), _CHUNK):
+            chunk = members[start : start + _CHUNK]
+            share = 0.2 + 0.8 * done / len(names)
+            _extract(
+                folder,
+                [names[i] for i in chunk],
+                photographs[chunk[0]],
+                options,
+                _camera_of(database, names[members[0]]) if start else -1,
+                lambda share=share: progress("looking for points", share),
+            )
+            done += len(chunk)
     pairs = _pairs(len(names), ordered)
-    for start in range(0, len(pairs), _CHUNK):
-        _match(database, folder, [(names[a], names[b]) for a, b in pairs[start : start + _CHUNK]], options,
-               lambda start=start: progress("matching pictures", start / len(pairs)))  # fmt: skip
+    for start in range(0, len(pairs), _PAIRS_CHUNK):
+        chunk = [(names[a], names[b]) for a, b in pairs[start : start + _PAIRS_CHUNK]]
+        share = start / len(pairs)
+        _match(database, folder, chunk, options, lambda share=share: progress("matching pictures", share))
     return _read(database, photographs)
 
 
@@ -141,45 +156,52 @@ def where_points_count(mask: np.ndarray | None, on: str) -> np.ndarray | None:
     return (wide if on == "object" else ~ndimage.binary_dilation(wide, iterations=reach)).astype(np.float32)
 
 
+def _by_camera(photographs: Sequence[Photograph]) -> list[list[int]]:
+    """Pictures of one size and stated focal length, which one camera took."""
+    groups: dict[tuple[Any, ...], list[int]] = {}
+    for i, photograph in enumerate(photographs):
+        groups.setdefault((photograph.size, photograph.focal), []).append(i)
+    return list(groups.values())
+
+
 def _extract(
-    database: Path,
     folder: Path,
-    name: str,
-    photograph: Photograph,
+    names: list[str],
+    like: Photograph,
     options: PoseOptions,
-    cameras: dict[tuple[Any, ...], int],
-    progress: Progress,
-    share: float,
+    camera: int,
+    poll: Callable[[], None],
 ) -> None:
-    """Points of one picture; pictures of one size and stated focal length are of one camera."""
+    """Points of pictures of one camera; `camera`: its number if it has one already, −1 if not."""
     library = colmap()
     reader = library.ImageReaderOptions()
-    reader.camera_model, reader.camera_params = _camera(photograph, options)
-    if (folder / "masks" / f"{name}.png").exists():
+    reader.camera_model, reader.camera_params = _camera(like, options)
+    reader.existing_camera_id = camera
+    if any((folder / "masks").iterdir()):
         reader.mask_path = str(folder / "masks")
-    key = (photograph.size, photograph.focal)
-    reader.existing_camera_id = cameras.get(key, -1)
     settings = library.FeatureExtractionOptions()
     settings.use_gpu = False
     settings.sift.peak_threshold = _WEAK
     settings.sift.edge_threshold = 16
     settings.sift.max_num_features = options.features
     # Large pictures are not looked at enlarged: it takes long, and their smallest points are noise.
-    settings.sift.first_octave = 0 if enlargement(photograph) * max(photograph.size) > 1000 else -1
+    settings.sift.first_octave = 0 if enlargement(like) * max(like.size) > 1000 else -1
     interruptible(
         library.extract_features,
-        database,
+        folder / "database.db",
         folder / "pictures",
-        image_names=[name],
+        image_names=names,
         camera_mode=library.CameraMode.SINGLE,
         reader_options=reader,
         extraction_options=settings,
         device=library.Device.cpu,
-        poll=lambda: progress("looking for points", share),
+        poll=poll,
     )
-    with library.Database.open(database) as file:
-        if file.exists_image(name):
-            cameras[key] = file.read_image_with_name(name).camera_id
+
+
+def _camera_of(database: Path, name: str) -> int:
+    with colmap().Database.open(database) as file:
+        return file.read_image_with_name(name).camera_id
 
 
 def _camera(photograph: Photograph, options: PoseOptions) -> tuple[str, str]:
@@ -187,11 +209,11 @@ def _camera(photograph: Photograph, options: PoseOptions) -> tuple[str, str]:
     scale = enlargement(photograph)
     width, height = photograph.size
     x, y = options.centre or (0.5 * width, 0.5 * height)
-    focal = options.focal or photograph.focal or 1.2 * max(photograph.size)
-    if options.focal is not None:
+    if options.focals is not None:
         lens = options.distortion or (0.0, 0.0, 0.0, 0.0)
-        numbers = (focal * scale, focal * scale, x * scale, y * scale, *lens)
+        numbers = (*(focal * scale for focal in options.focals), x * scale, y * scale, *lens)
         return "OPENCV", ",".join(map(str, numbers))
+    focal = photograph.focal or 1.2 * max(photograph.size)
     place = (x * scale, y * scale)
     model, numbers = {
         "pinhole": ("SIMPLE_PINHOLE", (focal * scale, *place)),

@@ -20,7 +20,7 @@ from dano.vision.structure._options import PoseOptions
 _FEWEST_PICTURES = 3
 """Smallest model that is reported."""
 
-_THRESHOLDS = (
+_THRESHOLDS: tuple[dict[str, int | float], ...] = (
     # Common points to begin with, points and their share to add a picture with.
     {"init_min_num_inliers": 40, "abs_pose_min_num_inliers": 12, "abs_pose_min_inlier_ratio": 0.1},
     # COLMAP's own: when the first pair of pictures was a poor one, they begin elsewhere.
@@ -106,11 +106,15 @@ def find_models(
             best = found
         if best and best[0].num_reg_images() == len(scales):
             break
-    return [_model(r, scales, options, progress) for r in best if r.num_reg_images() >= _FEWEST_PICTURES]
+    return [_model(r, scales, options) for r in best if r.num_reg_images() >= _FEWEST_PICTURES]
 
 
 def _attempt(
-    matches: Matches, thresholds: dict[str, float], options: PoseOptions, folder: Path, progress: Progress
+    matches: Matches,
+    thresholds: dict[str, int | float],
+    options: PoseOptions,
+    folder: Path,
+    progress: Progress,
 ) -> list[Any]:
     library = colmap()
     folder.mkdir()
@@ -146,7 +150,7 @@ def _attempt(
     return list(found.values())
 
 
-def _model(reconstruction: Any, scales: list[float], options: PoseOptions, progress: Progress) -> Model:
+def _model(reconstruction: Any, scales: list[float], options: PoseOptions) -> Model:
     """A reconstruction of COLMAP in numbers."""
     images = sorted(
         (reconstruction.image(key) for key in reconstruction.reg_image_ids()), key=lambda image: image.name
@@ -166,7 +170,7 @@ def _model(reconstruction: Any, scales: list[float], options: PoseOptions, progr
         coordinates.append(where / scales[pictures[i]])
         residuals.append(np.linalg.norm(projected - where, axis=1) / scales[pictures[i]])
     errors = {} if options.focal is not None else _focal_errors(reconstruction)
-    freed, gain = (1.0, 1.0) if options.focal is None else _freed(reconstruction, progress)
+    freed, gain = (1.0, 1.0) if options.focal is None else _freed(reconstruction)
     return Model(
         pictures=pictures,
         cameras=np.array([image.cam_from_world().matrix() for image in images]),
@@ -199,12 +203,7 @@ def _lens(camera: Any, scale: float) -> Lens:
 def _focal_errors(reconstruction: Any) -> dict[int, float]:
     """Relative standard deviations of focal lengths by camera, if residuals are independent."""
     library = colmap()
-    options = library.BundleAdjustmentOptions()
-    settings = library.BundleAdjustmentConfig()
-    for key in reconstruction.reg_image_ids():
-        settings.add_image(key)
-    settings.fix_gauge(library.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = library.create_default_ceres_bundle_adjuster(options, settings, reconstruction)
+    adjuster = _adjuster(reconstruction, extra=True)
     wanted = library.BACovarianceOptions()
     wanted.params = library.BACovarianceOptionsParams.ALL
     covariance = library.estimate_ba_covariance(wanted, reconstruction, adjuster)
@@ -219,16 +218,27 @@ def _focal_errors(reconstruction: Any) -> dict[int, float]:
     return errors
 
 
-def _freed(reconstruction: Any, progress: Progress) -> tuple[float, float]:
+def _freed(reconstruction: Any) -> tuple[float, float]:
     """By what factors given focal lengths and the residuals change when they are estimated after all."""
-    library = colmap()
-    free = library.Reconstruction(reconstruction)
+    free = colmap().Reconstruction(reconstruction)
     before = {key: camera.mean_focal_length() for key, camera in free.cameras.items()}
-    options = library.BundleAdjustmentOptions()
-    options.refine_extra_params = False
+    free.update_point_3d_errors()
     error = free.compute_mean_reprojection_error()
-    interruptible(library.bundle_adjustment, free, options, poll=lambda: progress("checking the lens", 0.5))
+    _adjuster(free, extra=False).solve()
+    free.update_point_3d_errors()
     used = {image.camera_id for image in free.images.values() if image.has_pose}
     factors = [free.cameras[key].mean_focal_length() / before[key] for key in sorted(used)]
-    free.update_point_3d_errors()
     return float(np.median(factors)), error / max(free.compute_mean_reprojection_error(), 1e-9)
+
+
+def _adjuster(reconstruction: Any, *, extra: bool) -> Any:
+    """Bundle adjustment of everything, and of distortion if `extra`."""
+    library = colmap()
+    options = library.BundleAdjustmentOptions()
+    options.refine_extra_params = extra
+    options.print_summary = False
+    settings = library.BundleAdjustmentConfig()
+    for key in reconstruction.reg_image_ids():
+        settings.add_image(key)
+    settings.fix_gauge(library.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    return library.create_default_ceres_bundle_adjuster(options, settings, reconstruction)

@@ -50,7 +50,8 @@ class PoseOptions:
     """How to find cameras.
 
     Attributes:
-        focal: Known focal length [pixels of the upright picture], kept as it is; None: estimated.
+        focal: Known focal length, or two, across and down [pixels of the upright picture], kept as they are;
+            None: estimated.
         centre: Known principal point [pixels]; None: the middle of the picture.
         distortion: Known k₁, k₂, p₁, p₂ of OpenCV's model; only with `focal`.
         lens: What is estimated: "radial" (focal length and k₁), "pinhole" (focal length), "full" (two focal
@@ -69,7 +70,7 @@ class PoseOptions:
         seed: Of everything random.
     """
 
-    focal: float | None = None
+    focal: int | float | tuple[float, float] | None = None
     centre: tuple[float, float] | None = None
     distortion: tuple[float, float, float, float] | None = None
     lens: str = "radial"
@@ -97,10 +98,11 @@ class PoseOptions:
         ):
             if getattr(self, name) not in values:
                 raise ValueError(f"{name} must be one of {', '.join(values)}, got {getattr(self, name)!r}")
-        for name, unit in (("focal", "pixels"), ("marker_size", "m")):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be positive [{unit}], got {value}")
+        sizes = ("focal", "pixels", self.focals), ("marker_size", "m", (self.marker_size,))
+        for name, unit, values in sizes:
+            for value in values or ():
+                if value is not None and not (math.isfinite(value) and value > 0):
+                    raise ValueError(f"{name} must be positive [{unit}], got {value}")
         for name in ("centre", "distortion"):
             if getattr(self, name) is not None and self.focal is None:
                 raise ValueError(f"{name} needs focal: only a lens that is known as a whole is kept as it is")
@@ -114,3 +116,10 @@ class PoseOptions:
             raise ValueError(f"model must be ≥ 1, got {self.model}")
         if self.seed < 0:
             raise ValueError(f"seed must be ≥ 0, got {self.seed}")
+
+    @property
+    def focals(self) -> tuple[float, float] | None:
+        """The known focal lengths across and down [pixels]; None if they are estimated."""
+        if self.focal is None:
+            return None
+        return self.focal if isinstance(self.focal, tuple) else (float(self.focal), float(self.focal))

@@ -49,7 +49,7 @@ def triangulate(cameras: Sequence[PosedCamera], pixels: Float[np.ndarray, "camer
         step = np.linalg.solve(normal, np.einsum("n,nki,nk->i", weights, jacobian, miss))
         point = point - step
         jacobian, miss = _linearised(cameras, pixels, point, 1e-6 * scale)
-        if np.linalg.norm(step) < 1e-10 * scale:
+        if np.linalg.norm(step) < 1e-8 * scale:
             break
     normal = np.einsum("n,nki,nkj->ij", weights, jacobian, jacobian)
     return Triangulated(point, np.linalg.inv(normal), np.linalg.norm(miss, axis=1))
