@@ -10,7 +10,7 @@ import pytest
 from vision.tabletop import camera, FOCAL, TAG_SIDE, write_pictures
 
 from dano.cli._arguments import Poses
-from dano.cli._poses import _ends, _known_length
+from dano.cli._learn import _ends, _known_length
 from dano.vision import load_capture
 
 pytest.importorskip("pycolmap", reason="structure from motion needs the extra `poses`")
@@ -19,7 +19,7 @@ pytest.importorskip("pycolmap", reason="structure from motion needs the extra `p
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("photos")
-    write_pictures(folder, [camera(2 * math.pi * i / 7, 0.7) for i in range(7)])
+    write_pictures(folder, [camera(2 * math.pi * i / 9, 0.7) for i in range(9)])
     (folder / "999.png").write_bytes(b"broken")
     return folder
 
@@ -29,21 +29,21 @@ def test_the_table_says_what_was_found_and_the_file_can_be_trained_on(photos: Pa
     choices = "--marker-size", TAG_SIDE, "--focal", FOCAL, "--features", 900
     answer = run("poses", photos, "-o", output, *choices)
     assert answer.code == 0, answer.err
-    assert "registered          7 of 8 pictures" in answer.out
+    assert "registered          9 of 10 pictures" in answer.out
     assert "metres ± 0." in answer.out and "marker 3, side 50 mm" in answer.out
     assert "px, given" in answer.out and "lying flat" in answer.out
     assert "999.png: cannot be read" in answer.out
-    assert "warning: 7 pictures are few" in answer.err
-    assert len(load_capture(output).views) == 7
+    assert "warning: 9 pictures are few" in answer.err
+    assert len(load_capture(output).views) == 9
     assert [path.name for path in tmp_path.iterdir()] == ["transforms.json"]
 
 
 def test_json_holds_the_same_in_numbers_and_failures_end_in_a_line(photos: Path, run, tmp_path: Path):
     output = tmp_path / "transforms.json"
-    answer = run("poses", photos, "-o", output, "--json", "--features", 700, "--up", "plane", "--seed", 1)
+    answer = run("poses", photos, "-o", output, "--json", "--features", 900, "--up", "plane", "--seed", 1)
     assert answer.code == 0, answer.err
     report = json.loads(answer.out)
-    assert report["registered"] == 7 and report["pictures"] == 8 and report["models"] == [7]
+    assert report["registered"] == 9 and report["pictures"] == 10 and report["models"] == [9]
     assert report["metric"] is False and report["scale_relative_error"] is None
     assert report["up_error_degrees"] < 1 and report["left_out"][0]["file"] == "999.png"
     before = output.read_bytes()

@@ -118,9 +118,9 @@ class Poses:
 
     def __call__(self) -> None:
         """Run the command."""
-        from dano.cli import _poses
+        from dano.cli import _learn
 
-        _poses.poses(self)
+        _learn.poses(self)
 
 
 @dataclass(frozen=True)

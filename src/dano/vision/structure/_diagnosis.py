@@ -15,6 +15,7 @@ BLURRED = 0.55
 """Measure of blur from which on pictures rarely match."""
 
 _FEW_POINTS = 60
+_FEW_COMMON = 60
 _PLAIN = 4.0
 """Standard deviation of grey levels in a picture that shows nothing."""
 
@@ -131,6 +132,16 @@ def why_none(photographs: Sequence[Photograph], matches: Matches) -> str:
             f" {np.median(matches.points):.0f}): take more, from places closer to each other; a mirror or"
             f" glass shows"
             " something else from every place, give masks and features_on='surroundings' for such an object"
+        )
+    strongest = [
+        max((n for pair, n in zip(matches.pairs, verified, strict=True) if i in pair), default=0)
+        for i in range(len(photographs))
+    ]
+    if np.median(strongest) < _FEW_COMMON:
+        return (
+            f"even the pictures closest to each other share few points (usually {np.median(strongest):.0f}):"
+            f" take more,"
+            " from places closer to each other"
         )
     return (
         "matched points fit no cameras: is the object a mirror, transparent, or did it move against its"
