@@ -35,7 +35,8 @@ from dano.vision import (
 
 pytest.importorskip("pycolmap", reason="structure from motion needs the extra `poses`")
 
-FEW = {"features": 800}
+FEW = 800
+"""Points of a picture: quick."""
 CAMERAS = [camera(2 * math.pi * i / 8, 0.6 + 0.25 * (i % 2)) for i in range(8)]
 NEAR = [camera(0.25 * i, 0.6 + 0.1 * (i % 2)) for i in range(6)]
 UPRIGHT, LARGER, BROKEN, PLAIN = "001.jpg", "002.png", "050.png", "060.png"
@@ -132,7 +133,7 @@ def near(tmp_path_factory) -> Path:
 
 
 def test_an_unknown_scale_and_a_wrong_focal_length_are_said_and_runs_repeat(near: Path, tmp_path: Path):
-    options = PoseOptions(focal=1.3 * FOCAL, up="cameras", **FEW)
+    options = PoseOptions(focal=1.3 * FOCAL, up="cameras", features=FEW)
     found = estimate_poses(near, options)
     assert found.scale.metres is None and "not known" in found.scale.source
     said = "\n".join(found.warnings)
@@ -231,19 +232,19 @@ def test_captures_that_cannot_work_are_refused_in_words(
 ):
     make(tmp_path)
     with pytest.raises(ValueError, match=message):
-        estimate_poses(tmp_path, PoseOptions(**FEW))
+        estimate_poses(tmp_path, PoseOptions(features=FEW))
 
 
 def test_models_that_have_nothing_in_common_are_said(near: Path, tmp_path: Path):
     folder = tmp_path / "two"
     shutil.copytree(near, folder)
     write_pictures(folder, NEAR[:5], seed=50, first=20, tag=False)
-    first = estimate_poses(folder, PoseOptions(focal=FOCAL, **FEW))
+    first = estimate_poses(folder, PoseOptions(focal=FOCAL, features=FEW))
     assert first.models == (6, 5) and first.model == 0
     assert "2 models of 6, 5" in "\n".join(first.warnings)
     assert dict(first.left_out)["020.png"] == "it is in model 2 of 2, of 5 pictures"
     with pytest.raises(ValueError, match="needs a mask for every picture, 11 of 11"):
-        estimate_poses(folder, PoseOptions(features_on="object", **FEW))
+        estimate_poses(folder, PoseOptions(features_on="object", features=FEW))
 
 
 def test_an_interrupt_stops_the_work_at_once(near: Path):
@@ -252,7 +253,7 @@ def test_an_interrupt_stops_the_work_at_once(near: Path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        estimate_poses(near, PoseOptions(**FEW), progress=interrupted)
+        estimate_poses(near, PoseOptions(features=FEW), progress=interrupted)
 
 
 def film(path: Path, views: list[PosedCamera]) -> None:
@@ -270,7 +271,9 @@ def film(path: Path, views: list[PosedCamera]) -> None:
 
 def test_a_video_leaves_its_frames_or_nothing(tmp_path: Path):
     film(tmp_path / "walk.mp4", [camera(0.1 * i, 0.6) for i in range(12)])
-    found = estimate_poses(tmp_path / "walk.mp4", PoseOptions(frames=6, **FEW), frames=tmp_path / "frames")
+    found = estimate_poses(
+        tmp_path / "walk.mp4", PoseOptions(frames=6, features=FEW), frames=tmp_path / "frames"
+    )
     names = [picture.name for picture in found.pictures]
     assert len(names) == 6 and [int(name[:6]) // 2 for name in names] == list(range(6))
     assert sorted(file.name for file in (tmp_path / "frames").iterdir()) == names
@@ -280,7 +283,7 @@ def test_a_video_leaves_its_frames_or_nothing(tmp_path: Path):
         estimate_poses(tmp_path / "walk.mp4")
     film(tmp_path / "still.mp4", [CAMERAS[0]] * 6)
     with pytest.raises(ValueError, match="nothing moves"):
-        estimate_poses(tmp_path / "still.mp4", PoseOptions(frames=5, **FEW), frames=tmp_path / "none")
+        estimate_poses(tmp_path / "still.mp4", PoseOptions(frames=5, features=FEW), frames=tmp_path / "none")
     (tmp_path / "broken.mp4").write_bytes(b"no film")
     with pytest.raises(ValueError, match="cannot be read as a video"):
         estimate_poses(tmp_path / "broken.mp4", frames=tmp_path / "none")
