@@ -304,3 +304,25 @@ def test_an_upright_video_is_turned(tmp_path: Path):
     assert turned.shape == (3, 2, 3)
     # A quarter turn against the clock: the last column becomes the first row.
     np.testing.assert_array_equal(turned[0], Frame().to_ndarray("rgb24")[:, -1])
+
+
+def test_where_points_are_looked_for_follows_from_what_is_around_the_object(tmp_path: Path):
+    from dano.vision.structure._estimate import _features_on
+    from dano.vision.structure._photographs import read_photograph
+
+    walk, turntable, backdrop = [], [], []
+    top, skin, wall = table(), pattern(1), np.rint(255 * pattern(7)[:180, :240]).astype(np.uint8)
+    for i, view in enumerate(NEAR[:4]):
+        grey, mask = photograph(view, top, skin)
+        on = mask[..., None] > 0.5
+        alpha = np.rint(255 * mask).astype(np.uint8)[..., None]
+        for kind, around in ((walk, grey), (turntable, wall), (backdrop, np.full_like(grey, 4))):
+            colours = np.where(on, grey[..., None], around[..., None]).repeat(3, axis=2)
+            file = tmp_path / f"{i}.png"
+            Image.fromarray(np.concatenate([colours, alpha], axis=2)).save(file)
+            kind.append(read_photograph(file, None))
+    assert _features_on(walk, "auto") == "surroundings"
+    assert _features_on(turntable, "auto") == "object"
+    assert _features_on(backdrop, "auto") == "object"
+    assert _features_on(walk, "everything") == "everything"
+    assert _features_on([*walk[:2], walk[2]._replace(mask=None)], "auto") == "everything"

@@ -207,7 +207,9 @@ def _surroundings(photograph: Photograph) -> tuple[np.ndarray, np.ndarray]:
     grey = photograph.grey[::step, ::step].astype(np.float64)
     assert photograph.mask is not None
     far = ~ndimage.binary_dilation(photograph.mask[::step, ::step] > 0.1, iterations=3)
-    return grey - ndimage.gaussian_filter(grey, 8), far
+    # Averages of what is around the object only: its own brightness must not reach into a dark background.
+    near = ndimage.gaussian_filter(np.where(far, grey, 0.0), 8)
+    return grey - near / np.maximum(ndimage.gaussian_filter(far.astype(np.float64), 8), 1e-3), far
 
 
 def _posed(lens: Lens, world_to_camera: np.ndarray, size: tuple[int, int]) -> PosedCamera:
