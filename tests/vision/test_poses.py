@@ -81,7 +81,8 @@ def test_cameras_scale_and_up_are_right(found: EstimatedPoses):
         *("000.png", UPRIGHT, LARGER, "003.png", "004.png", "005.png", "006.png", "007.png")
     ]
     errors = pose_errors([picture.camera for picture in found.pictures], CAMERAS, scaled=False)
-    assert errors.position.max() < 0.006 and errors.angle.max() < math.radians(0.2)
+    # Eight pictures of 240 pixels, an eighth of a turn apart: 0.3° is a pixel.
+    assert errors.position.max() < 0.006 and errors.angle.max() < math.radians(0.3)
     assert abs(errors.scale) < 0.005 and abs(errors.scale) < 4 * found.scale.error < 0.02
     # W has its origin in the tag's centre and z up, without any alignment.
     for picture, true in zip(found.pictures, CAMERAS, strict=True):
