@@ -63,6 +63,67 @@ class Train:
 
 
 @dataclass(frozen=True)
+class Poses:
+    """Find where photographs were taken from: structure from motion. For `dano data` and `dano train`.
+
+    Lengths are metres only if a printed marker or a measured length says so. Without either the result says
+    that the scale is not known.
+
+    Attributes:
+        images: Folder of photographs (or one with `images` in it), or a video, whose frames are written
+            beside the output.
+        output: Where to write the cameras, such as transforms.json.
+        masks: Folder with a mask for each photograph, bright where the object is; default: `masks` in or
+            beside the folder of photographs, or their alpha channel.
+        features_on: Where points are looked for, if there are masks: object for turntables, surroundings for
+            walks around an object; auto: the object if what is around it is plain or stands still, the
+            surroundings otherwise.
+        marker_size: Side of the black square of printed markers [m].
+        marker_family: Their dictionary, by OpenCV's name, such as DICT_APRILTAG_36h11 or DICT_4X4_50.
+        length: A measured length [m], between --ends.
+        ends: Where its ends are in some photographs, as NAME:X,Y:X,Y [pixels].
+        up: What shows where up is: a marker that lies flat, the plane of the table, cameras held level; auto:
+            the first of these that can be had.
+        focal: Known focal length, or two, across and down [pixels of the upright photograph]; default:
+            estimated.
+        centre: Known principal point [pixels]; default: the middle.
+        distortion: Known k1 k2 p1 p2 of OpenCV's model.
+        lens: What is estimated of the lens: radial (focal length and k1), pinhole (focal length), full (two
+            focal lengths, k1, k2, p1, p2).
+        frames: Most frames of a video.
+        features: Most points of a photograph.
+        model: Which model to write if photographs fall into several, from 1, the largest.
+        seed: Seed of all random numbers.
+        json: Print one JSON object instead of text.
+    """
+
+    images: Positional[Path]
+    output: Output
+    masks: Path | None = None
+    features_on: Literal["auto", "everything", "object", "surroundings"] = "auto"
+    marker_size: float | None = None
+    marker_family: str = "DICT_APRILTAG_36h11"
+    length: float | None = None
+    ends: tuple[str, ...] = ()
+    up: Literal["auto", "marker", "plane", "cameras", "none"] = "auto"
+    focal: tuple[float, ...] = ()
+    centre: tuple[float, float] | None = None
+    distortion: tuple[float, float, float, float] | None = None
+    lens: Literal["radial", "pinhole", "full"] = "radial"
+    frames: int = 80
+    features: int = 3000
+    model: int = 1
+    seed: int = 0
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import _learn
+
+        _learn.poses(self)
+
+
+@dataclass(frozen=True)
 class Data:
     """Check photographs before training: poses, masks, coverage. Draw the cameras.
 

@@ -16,6 +16,7 @@ from dano.cli._arguments import (
     Import,
     Inspect,
     Plan,
+    Poses,
     Simulate,
     Train,
     View,
@@ -23,6 +24,7 @@ from dano.cli._arguments import (
 from dano.names import did_you_mean
 
 _COMMANDS = {
+    "poses": Poses,
     "train": Train,
     "data": Data,
     "build": Build,

@@ -39,6 +39,19 @@ from dano.vision.radiance import (
     Seen as Seen,
     SurfaceModel as SurfaceModel,
 )
+from dano.vision.structure import (
+    estimate_poses as estimate_poses,
+    EstimatedPoses as EstimatedPoses,
+    KnownLength as KnownLength,
+    PlacedMarker as PlacedMarker,
+    pose_errors as pose_errors,
+    PosedPicture as PosedPicture,
+    PoseErrors as PoseErrors,
+    PoseOptions as PoseOptions,
+    save_transforms as save_transforms,
+    Scale as Scale,
+    Up as Up,
+)
 from dano.vision.training import (
     HistoryEntry as HistoryEntry,
     mask_iou as mask_iou,

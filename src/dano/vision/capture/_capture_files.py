@@ -108,8 +108,7 @@ def _views(path: Path) -> list[View]:
     found = sorted(p.name for p in path.iterdir())[:8]
     raise ValueError(
         f"{path}: no transforms.json, transforms_train.json, anno.json or anno_train.json in it, only"
-        f" {found}; photographs without poses need structure from motion first (COLMAP, or nerfstudio's"
-        " ns-process-data)"
+        f" {found}; photographs without poses need `dano poses` first"
     )
 
 
@@ -123,6 +122,14 @@ def _read_transforms(path: Path) -> list[View]:
     if not isinstance(frames, list):
         raise ValueError(f"{path}: it must have a list of frames, got {sorted(content)[:12]}")
     _check_model(path, content)
+    if content.get("units") == "arbitrary":
+        warnings.warn(
+            f"{path}: the scale of its cameras is not known, so lengths are not metres; `dano poses` takes"
+            f" it from"
+            " a printed marker or a measured length",
+            RuntimeWarning,
+            stacklevel=4,
+        )
     named = {str(name): split for split in SPLITS for name in content.get(f"{split}_filenames", ())}
     views = []
     for i, frame in enumerate(frames):

@@ -1,0 +1,381 @@
+"""From pictures to cameras: the whole way."""
+
+import math
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from dano.progress import Progress
+from dano.vision.capture import PosedCamera
+from dano.vision.structure._colmap import colmap, opencv, quiet
+from dano.vision.structure._diagnosis import doubts, motion_fault, too_few, why_left_out, why_none
+from dano.vision.structure._features import enlargement, find_matches, Matches, where_points_count
+from dano.vision.structure._gauge import (
+    cameras_up,
+    length_scale,
+    marker_scale,
+    marker_up,
+    plane_up,
+    Scale,
+    UNKNOWN_SCALE,
+    UNKNOWN_UP,
+    Up,
+    world_frame,
+)
+from dano.vision.structure._mapping import find_models, Lens, Model
+from dano.vision.structure._markers import detect_markers, place_markers, PlacedMarker
+from dano.vision.structure._options import FEWEST, PoseOptions
+from dano.vision.structure._photographs import mask_folder, Photograph, picture_files, read_photograph
+from dano.vision.structure._similarity import Similarity
+from dano.vision.structure._video import is_video, write_frames
+
+_PLAIN = 6.0
+"""Contrast [grey levels] below which surroundings are plain."""
+
+_STANDS_STILL = 0.8
+"""Correlation between the surroundings of two pictures from which on they stand still."""
+
+
+class PosedPicture(NamedTuple):
+    """A picture with its camera.
+
+    Attributes:
+        name: Of the file.
+        file: The file.
+        mask_file: Its mask's; None if there is none.
+        camera: In W.
+        error: Root mean square reprojection error of its points [pixels].
+        n_points: Their number.
+    """
+
+    name: str
+    file: Path
+    mask_file: Path | None
+    camera: PosedCamera
+    error: float
+    n_points: int
+
+
+class EstimatedPoses(NamedTuple):
+    """What structure from motion found.
+
+    Attributes:
+        pictures: Those with a camera.
+        left_out: Name and reason of the others.
+        models: Number of pictures of each model that was found, largest first.
+        model: Which of them this is, from 0.
+        error: Root mean square reprojection error [pixels].
+        focal_error: Standard deviation of the focal length, as a share of it; 0 where it was given.
+        triangulation_angle: Largest angle between two rays to a point, median over points [rad].
+        n_points: Number of points in space.
+        features_on: Where points were looked for.
+        scale: Of the model, with its uncertainty.
+        up: Where up is, in W if it is known (0, 0, 1), with its uncertainty.
+        markers: Printed markers that were found, in units of the model.
+        warnings: What to know before using it.
+    """
+
+    pictures: tuple[PosedPicture, ...]
+    left_out: tuple[tuple[str, str], ...]
+    models: tuple[int, ...]
+    model: int
+    error: float
+    focal_error: float
+    triangulation_angle: float
+    n_points: int
+    features_on: str
+    scale: Scale
+    up: Up
+    markers: tuple[PlacedMarker, ...]
+    warnings: tuple[str, ...]
+
+
+def estimate_poses(
+    images: str | Path | Sequence[Path],
+    options: PoseOptions | None = None,
+    *,
+    masks: str | Path | None = None,
+    frames: str | Path | None = None,
+    progress: Progress | None = None,
+) -> EstimatedPoses:
+    """Find where pictures were taken from, by structure from motion.
+
+    Args:
+        images: A folder of pictures (or one with `images` in it), a list of pictures, or a video.
+        options: How; see there.
+        masks: Folder with a mask for each picture, bright where the object is; default: `masks` in or beside
+            the folder of pictures, or their alpha channel.
+        frames: New folder for the frames of a video; it is removed again if no cameras are found.
+        progress: Called with what is being done and how far it is; what it raises stops the work.
+
+    Returns:
+        Cameras in W, where lengths are metres if a marker or a known length says so, and z is up.
+
+    Raises:
+        ValueError: If there are too few pictures, or they show no cameras; says why.
+        ImportError: If pycolmap, OpenCV or, for a video, av is missing.
+    """
+    options = PoseOptions() if options is None else options
+    told = (lambda _what, _share: None) if progress is None else progress
+    # What is missing is said before work starts.
+    colmap()
+    opencv()
+    if isinstance(images, (str, Path)) and is_video(Path(images)):
+        if frames is None:
+            raise ValueError("frames must be a folder for the frames of the video, got None")
+        files = write_frames(Path(images), Path(frames), options.frames, told)
+        try:
+            return _from_files(files, options, masks, told, ordered=True)
+        except BaseException:
+            shutil.rmtree(frames, ignore_errors=True)
+            raise
+    listed = Path(images) if isinstance(images, (str, Path)) else [Path(file) for file in images]
+    return _from_files(picture_files(listed), options, masks, told, ordered=False)
+
+
+def _from_files(
+    files: list[Path], options: PoseOptions, masks: str | Path | None, told: Progress, *, ordered: bool
+) -> EstimatedPoses:
+    photographs, left_out = _read(files, masks, told)
+    if len(photographs) < FEWEST:
+        raise ValueError(too_few(len(photographs), left_out))
+    on = _features_on(photographs, options.features_on)
+    counted = [where_points_count(photograph.mask, on) for photograph in photographs]
+    with tempfile.TemporaryDirectory(prefix="dano-poses-") as folder, quiet():
+        matches = find_matches(photographs, counted, options, Path(folder), ordered=ordered, progress=told)
+        if fault := motion_fault(photographs, matches, options):
+            raise ValueError(f"no cameras: {fault}")
+        scales = [enlargement(photograph) for photograph in photographs]
+        models = find_models(matches, scales, options, Path(folder), told)
+    if not models or len(models[0].pictures) < FEWEST:
+        raise ValueError(f"no cameras: {why_none(photographs, matches)}")
+    if options.model > len(models):
+        raise ValueError(f"model must be at most {len(models)}, the number of models, got {options.model}")
+    return _result(photographs, left_out, matches, models, options, on, told)
+
+
+def _read(
+    files: list[Path], masks: str | Path | None, told: Progress
+) -> tuple[list[Photograph], list[tuple[str, str]]]:
+    photographs, left_out = [], []
+    folder = mask_folder(files[0], None if masks is None else Path(masks)) if files else None
+    for i, file in enumerate(files):
+        told("reading pictures", i / len(files))
+        try:
+            photographs.append(read_photograph(file, folder))
+        except ValueError as error:
+            left_out.append((file.name, str(error)))
+    return photographs, left_out
+
+
+def _features_on(photographs: Sequence[Photograph], asked: str) -> str:
+    """Where to look for points: see `PoseOptions.features_on`.
+
+    Raises:
+        ValueError: If it needs masks and there are none.
+    """
+    masked = [photograph for photograph in photographs if photograph.mask is not None]
+    if len(masked) < len(photographs):
+        if asked in ("object", "surroundings"):
+            raise ValueError(
+                f"features_on={asked!r} needs a mask for every picture, {len(photographs) - len(masked)} of"
+                f" {len(photographs)} have none"
+            )
+        return "everything"
+    if asked != "auto":
+        return asked
+    around = [_surroundings(photograph) for photograph in masked]
+    contrast = [float(np.std(values[seen])) if seen.any() else 0.0 for values, seen in around]
+    if np.median(contrast) < _PLAIN:
+        return "object"
+    alike = [
+        float(np.corrcoef(a[both], b[both])[0, 1])
+        for (a, in_a), (b, in_b) in zip(around, around[1:], strict=False)
+        if a.shape == b.shape and (both := in_a & in_b).sum() > 50 and min(a[both].std(), b[both].std()) > 0
+    ]
+    return "object" if alike and np.median(alike) > _STANDS_STILL else "surroundings"
+
+
+def _surroundings(photograph: Photograph) -> tuple[np.ndarray, np.ndarray]:
+    """A picture without its slow changes of brightness, reduced; and where it does not show the object."""
+    step = max(1, max(photograph.size) // 160)
+    grey = photograph.grey[::step, ::step].astype(np.float64)
+    assert photograph.mask is not None
+    far = ~ndimage.binary_dilation(photograph.mask[::step, ::step] > 0.1, iterations=3)
+    # Averages of what is around the object only: its own brightness must not reach into a dark background.
+    near = ndimage.gaussian_filter(np.where(far, grey, 0.0), 8)
+    return grey - near / np.maximum(ndimage.gaussian_filter(far.astype(np.float64), 8), 1e-3), far
+
+
+def _posed(lens: Lens, world_to_camera: np.ndarray, size: tuple[int, int]) -> PosedCamera:
+    rotation = world_to_camera[:, :3].T
+    # To the right, downwards, forwards → to the right, upwards, backwards.
+    axes = rotation * np.array([1.0, -1.0, -1.0])
+    pose = np.concatenate([axes, -rotation @ world_to_camera[:, 3:]], axis=1)
+    k1, k2, p1, p2 = lens.distortion
+    return PosedCamera(
+        pose,
+        focal=lens.focal,
+        centre=lens.centre,
+        width=size[0],
+        height=size[1],
+        distortion=(k1, k2, 0.0, p1, p2),
+    )
+
+
+def _result(
+    photographs: list[Photograph],
+    left_out: list[tuple[str, str]],
+    matches: Matches,
+    models: list[Model],
+    options: PoseOptions,
+    on: str,
+    told: Progress,
+) -> EstimatedPoses:
+    chosen = options.model - 1
+    model = models[chosen]
+    shown = [photographs[i] for i in model.pictures]
+    cameras = [
+        _posed(lens, pose, photograph.size)
+        for lens, pose, photograph in zip(model.lenses, model.cameras, shown, strict=True)
+    ]
+    markers = _markers(shown, cameras, options, told)
+    warnings = doubts(photographs, models, chosen, options)
+    scale = _scale(shown, cameras, markers, options, warnings)
+    up = _up(shown, cameras, markers, model, options, warnings)
+    frame = world_frame(cameras, scale, up, markers)
+    return EstimatedPoses(
+        pictures=_pictures(shown, cameras, model, frame),
+        left_out=tuple(
+            left_out
+            + [
+                (photograph.name, why_left_out(i, photographs, matches, models, chosen))
+                for i, photograph in enumerate(photographs)
+                if i not in model.pictures
+            ]
+        ),
+        models=tuple(len(m.pictures) for m in models),
+        model=chosen,
+        error=model.error,
+        focal_error=float(np.max(model.focal_error)),
+        triangulation_angle=model.triangulation_angle,
+        n_points=len(model.points),
+        features_on=on,
+        scale=scale,
+        up=up._replace(direction=None if up.direction is None else np.array([0.0, 0.0, 1.0])),
+        markers=tuple(markers),
+        warnings=tuple(warnings),
+    )
+
+
+def _pictures(
+    shown: list[Photograph], cameras: list[PosedCamera], model: Model, frame: Similarity
+) -> tuple[PosedPicture, ...]:
+    pictures = []
+    for i, (photograph, camera) in enumerate(zip(shown, cameras, strict=True)):
+        residuals = model.residuals[model.seen[:, 0] == i]
+        error = float(np.sqrt(np.mean(residuals**2))) if len(residuals) else math.inf
+        pictures.append(
+            PosedPicture(
+                photograph.name,
+                photograph.file,
+                photograph.mask_file,
+                frame.camera(camera),
+                error,
+                len(residuals),
+            )
+        )
+    return tuple(pictures)
+
+
+def _markers(
+    shown: list[Photograph], cameras: list[PosedCamera], options: PoseOptions, told: Progress
+) -> list[PlacedMarker]:
+    if options.marker_size is None:
+        return []
+    seen = []
+    for i, photograph in enumerate(shown):
+        told("looking for markers", i / len(shown))
+        seen.append(detect_markers(photograph.grey, options.marker_family))
+    return place_markers(cameras, seen)
+
+
+def _scale(
+    shown: list[Photograph],
+    cameras: list[PosedCamera],
+    markers: list[PlacedMarker],
+    options: PoseOptions,
+    warnings: list[str],
+) -> Scale:
+    """The most exact of the answers, compared with the other."""
+    answers = []
+    if options.marker_size is not None:
+        if markers:
+            answers.append(marker_scale(markers, options.marker_size))
+        else:
+            warnings.append(
+                f"no marker of {options.marker_family} is seen in three pictures: is the family right, has"
+                f" the"
+                " sheet a white border?"
+            )
+    if options.known_length is not None:
+        named = {p.name: camera for p, camera in zip(shown, cameras, strict=True)}
+        answers.append(length_scale(options.known_length, named))
+    if not answers:
+        warnings.append("the scale is not known, lengths are in units of the cameras' mean distance")
+        return UNKNOWN_SCALE
+    best, *others = sorted(answers, key=lambda answer: answer.error)
+    for other in others:
+        assert best.metres is not None and other.metres is not None
+        apart = abs(other.metres / best.metres - 1)
+        if apart > 3 * math.hypot(best.error, other.error):
+            warnings.append(f"{other.source} and {best.source} differ by {100 * apart:.1f} %")
+    if best.error > 0.02:
+        warnings.append(f"the scale is known to {100 * best.error:.1f} % only")
+    return best
+
+
+def _up(
+    shown: list[Photograph],
+    cameras: list[PosedCamera],
+    markers: list[PlacedMarker],
+    model: Model,
+    options: PoseOptions,
+    warnings: list[str],
+) -> Up:
+    """The first that can be had of those asked for."""
+    if options.up == "none":
+        return UNKNOWN_UP
+    if options.up in ("auto", "marker"):
+        if up := marker_up(markers, cameras):
+            return up
+        if options.up == "marker":
+            raise ValueError("up='marker', but no marker is seen lying flat in three pictures")
+    if options.up in ("auto", "plane"):
+        if up := plane_up(_around_object(shown, model), cameras, options.seed):
+            return up
+        if options.up == "plane":
+            raise ValueError("up='plane', but no plane below the cameras holds a quarter of the points")
+    up = cameras_up(cameras)
+    warnings.append(f"up is only taken from how the cameras were held, to {math.degrees(up.error):.1f}°")
+    return up
+
+
+def _around_object(shown: list[Photograph], model: Model) -> np.ndarray:
+    """Points that most pictures show beside the object; all where there are no masks."""
+    inside, count = np.zeros(len(model.points)), np.zeros(len(model.points))
+    for i, photograph in enumerate(shown):
+        if photograph.mask is None:
+            continue
+        mine = model.seen[:, 0] == i
+        x, y = model.coordinates[mine].astype(int).T
+        height, width = photograph.mask.shape
+        on = photograph.mask[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] > 0.5
+        np.add.at(inside, model.seen[mine, 1], on)
+        np.add.at(count, model.seen[mine, 1], 1)
+    return model.points[inside <= 0.5 * count]

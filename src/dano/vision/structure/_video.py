@@ -1,0 +1,106 @@
+"""Frames of a video: as many as asked for, spread evenly, of each stretch the sharpest."""
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dano.progress import Progress
+from dano.vision.structure._photographs import VIDEOS
+from dano.vision.structure._sharpness import blur
+
+_REDUCED = 640
+"""Longest side [pixels] at which frames are compared."""
+
+
+def is_video(path: Path) -> bool:
+    """Whether the name says that a file is a video."""
+    return path.suffix.lower() in VIDEOS
+
+
+def write_frames(video: Path, folder: Path, count: int, progress: Progress) -> list[Path]:
+    """Write frames of a video as PNG files, upright, named by their number.
+
+    The folder appears when all are written.
+
+    Args:
+        video: The file.
+        folder: New, or empty.
+        count: Most frames.
+        progress: Told how far it is.
+
+    Returns:
+        The files, in order.
+
+    Raises:
+        ValueError: If the video cannot be read, or the folder holds something.
+        ImportError: If av is missing.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"frames must be a new or empty folder, got {folder}")
+    if not video.is_file():
+        raise ValueError(f"images must be a folder of pictures or a video, got {video}")
+    if not folder.parent.is_dir():
+        raise ValueError(f"frames must be in an existing folder, got {folder}")
+    from PIL import Image
+
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
+        partial = Path(temporary) / "frames"
+        partial.mkdir()
+        names = []
+        for number, pixels in _sharpest(video, count, progress):
+            names.append(f"{number:06d}.png")
+            Image.fromarray(pixels).save(partial / names[-1])
+        if folder.exists():
+            folder.rmdir()
+        shutil.move(str(partial), str(folder))
+    return [folder / name for name in names]
+
+
+def _sharpest(video: Path, count: int, progress: Progress) -> Iterator[tuple[int, np.ndarray]]:
+    """Number and pixels of the sharpest frame of each of `count` stretches of equal length."""
+    total = sum(1 for _ in _decoded(video))
+    if total == 0:
+        raise ValueError(f"{video}: there is no frame in it")
+    stretch = max(total / count, 1.0)
+    best: tuple[float, int, np.ndarray] | None = None
+    for number, frame in enumerate(_decoded(video)):
+        progress("reading frames", number / total)
+        pixels = _upright(frame)
+        measure = blur(_grey(pixels))
+        if best is not None and int(number / stretch) != int((best[1]) / stretch):
+            yield best[1:]
+            best = None
+        if best is None or measure < best[0]:
+            best = measure, number, pixels
+    if best is not None:
+        yield best[1:]
+
+
+def _decoded(video: Path) -> Iterator[Any]:
+    try:
+        import av
+        from av.error import FFmpegError
+    except ImportError as error:
+        raise ImportError("reading videos needs av: pip install 'dano[view]'") from error
+    try:
+        with av.open(str(video)) as container:
+            if not container.streams.video:
+                raise ValueError("it has no pictures")
+            yield from container.decode(container.streams.video[0])
+    except (FFmpegError, ValueError) as error:
+        raise ValueError(f"{video}: cannot be read as a video ({error})") from error
+
+
+def _upright(frame: Any) -> np.ndarray:
+    """Phones note how they were held instead of turning the pixels."""
+    pixels = frame.to_ndarray(format="rgb24")
+    return np.ascontiguousarray(np.rot90(pixels, round(getattr(frame, "rotation", 0) / 90)))
+
+
+def _grey(pixels: np.ndarray) -> np.ndarray:
+    step = max(1, max(pixels.shape) // _REDUCED)
+    return pixels[::step, ::step].mean(axis=2).astype(np.uint8)
