@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -149,7 +150,10 @@ CASES = {
         "state.position must have the dtype of the scene, float64, got float32: cast it with jax.tree.map",
     ),
     "no steps": (lambda: dano.simulate(scene(), state(), 0), "n_steps must be ≥ 1, got 0"),
-    "half a step": (lambda: dano.simulate(scene(), state(), 2.5), "n_steps must be a whole number, got 2.5"),
+    "half a step": (
+        lambda: dano.simulate(scene(), state(), cast(Any, 2.5)),
+        "n_steps must be a whole number, got 2.5",
+    ),
     "replaced friction": (
         lambda: scene().replace_contact("ball", "floor", sliding_friction=-1.0),
         "≥ 0, got -1.0",

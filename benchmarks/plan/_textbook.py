@@ -231,7 +231,7 @@ def trajectory_problem(case: Case, *, bounds_as_constraints: bool = False) -> Tr
     if bounds_as_constraints:
         limits = TrajectoryConstraint("bounds", lambda x, u, t: jnp.concatenate([u - upper, lower - u]))
         constraints.append(limits)
-    moves = () if case.quaternion is None else _on_manifold(case.quaternion)
+    moves: dict[str, Any] = {} if case.quaternion is None else _on_manifold(case.quaternion)
     return TrajectoryProblem(
         lambda x, u, t: jnp.stack(case.dynamics(x, u, IN_JAX)),
         lambda x, u, t: case.stage_cost(x, u),
@@ -239,11 +239,11 @@ def trajectory_problem(case: Case, *, bounds_as_constraints: bool = False) -> Tr
         tuple(constraints),
         None if bounds_as_constraints else lower,
         None if bounds_as_constraints else upper,
-        *moves,
+        **moves,
     )
 
 
-def _on_manifold(place: int) -> tuple[Callable, Callable]:
+def _on_manifold(place: int) -> dict[str, Callable]:
     """`retract` and `difference` of a state that holds a unit quaternion."""
     from dano.maths import quat_conjugate, quat_exp, quat_multiply
 
@@ -260,7 +260,7 @@ def _on_manifold(place: int) -> tuple[Callable, Callable]:
         before, after = x[:place] - nominal[:place], x[place + 4 :] - nominal[place + 4 :]
         return jnp.concatenate([before, turn, after])
 
-    return retract, difference
+    return {"retract": retract, "difference": difference}
 
 
 def solved(case: Case, **choices):

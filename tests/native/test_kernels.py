@@ -1,5 +1,7 @@
 """Machine code against what it replaces: the same contact, the same velocities, the same derivatives."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -117,7 +119,7 @@ def heap():
         timestep=H,
     )
     random = np.random.default_rng(2)
-    starts = {
+    starts: dict[str, dict[str, Any]] = {
         name: dict(
             position=(*random.uniform(-0.04, 0.04, 2), 0.07 + 0.08 * k),
             orientation=random.normal(size=4),
@@ -139,7 +141,7 @@ def test_finds_the_same_points(heap):
     assert geometry is not None and geometry.tables is not None and impacts is not None
     slow = eqx.tree_at(lambda g: g.tables, geometry, None)
     searches = [
-        jax.jit(lambda links, g=g: find(g, links, impacts, scene.timestep, prepared.capacity))
+        jax.jit(lambda links, g=g, i=impacts: find(g, links, i, scene.timestep, prepared.capacity))
         for g in (geometry, slow)
     ]
     n_points = 0

@@ -65,7 +65,8 @@ def tables_of(geometry, dtype: DTypeLike) -> Tables | None:
     """The tables of a `Geometry`; None where a kind of solid is not known there, or there is no CPU."""
     if jax.default_backend() != "cpu" or not all(_is_known(kind.solids) for kind in geometry.kinds):
         return None
-    solids, wholes, pieces, names, sides = [], [], [np.zeros(0)], [], []
+    solids, wholes, names, sides = [], [], [], []
+    pieces: list[Array] = [jnp.zeros(0, dtype)]
     n_solids = n_coefficients = 0
     for number, kind in enumerate(geometry.kinds):
         stacked = (
