@@ -289,7 +289,7 @@ def solved_by_ipopt(
         ValueError: If IPOPT fails from every guess.
     """
     try:
-        import casadi
+        import casadi  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError("IPOPT needs casadi: pip install 'dano[plan-bench]'") from error
     ops = SimpleNamespace(sin=casadi.sin, cos=casadi.cos, sqrt=casadi.sqrt)
