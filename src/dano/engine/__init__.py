@@ -1,7 +1,6 @@
 """Engines: from a scene and a state to the next one, and everything built on that."""
 
 from dano.engine._compiling import compiled as compiled, compiler_options as compiler_options
-from dano.engine._devices import device_mesh as device_mesh, gather as gather, map_rows as map_rows
 from dano.engine._history import (
     contact_history as contact_history,
     contact_patches as contact_patches,
@@ -20,7 +19,10 @@ from dano.engine._rollout import (
     VariationalEngine as VariationalEngine,
 )
 from dano.engine.batches import (
+    device_mesh as device_mesh,
+    gather as gather,
     load_rollouts as load_rollouts,
+    map_rows as map_rows,
     Rollouts as Rollouts,
     rollouts as rollouts,
     StoredRollouts as StoredRollouts,

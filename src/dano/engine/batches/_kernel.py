@@ -11,8 +11,8 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int
 
 from dano.engine._compiling import compiled
-from dano.engine._devices import map_rows
 from dano.engine._rollout import AbstractEngine
+from dano.engine.batches._devices import map_rows
 from dano.scene import Control, Scene, State
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.engine._devices import device_mesh, gather, meet, put_rows, put_whole, take_rows
 from dano.engine._rollout import AbstractEngine, Policy, VariationalEngine
+from dano.engine.batches._devices import device_mesh, gather, meet, put_rows, put_whole, take_rows
 from dano.engine.batches._input import checked_job, Job
 from dano.engine.batches._kernel import Kept, simulate_rows
 from dano.engine.batches._store import RolloutStore
