@@ -341,7 +341,7 @@ def _distance_of(placed, x, y, z, solid, whole, atlas, scratch):
 
 
 @kernel
-def _sample(a, turning, solid, whole, atlas, placed, block, lane, half, lead, found, scratch):
+def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, found, scratch):
     """Arm, normal, moment [W], depth, rate and area of a sample into `found`; whether it faces the solid."""
     _apply(placed, _POINTS, block[0, lane], block[1, lane], block[2, lane], scratch, 30)
     x = scratch[30] + placed[_ORIGIN]
@@ -374,6 +374,58 @@ def _sample(a, turning, solid, whole, atlas, placed, block, lane, half, lead, fo
     _apply(placed, _WORLD, mx, my, mz, found, 6)
     found[9], found[10], found[11] = lead * rate - d, rate, half * area
     return True
+
+
+@kernel
+def _list_block(
+    a,
+    turning,
+    solid,
+    whole,
+    atlas,
+    placed,
+    blocks,
+    n,
+    side,
+    share,
+    h,
+    numbers,
+    samples,
+    used,
+    filled,
+    sums,
+    scratch,
+):
+    """List the samples of a block that may press; returns the full chunks and the places of the next one.
+
+    Added to `sums`, over samples that sink in: area; then load, and rate, arm and normal weighted by it.
+    """
+    room, width = numbers.shape[1], numbers.shape[2]
+    found = scratch[80:92]
+    # Where geometry is taken early, what is about to touch has sunk in by no more than this, or nearly does.
+    layer = side[_SINK] if share < 1.0 else 0.0
+    for lane in range(blocks.shape[2]):
+        facing = _sample(
+            turning, solid, whole, atlas, placed, blocks[n], lane, side[_SHARE], share * h, found, scratch
+        )
+        if not facing or not found[9] - h * found[10] > -side[_MARGIN]:
+            continue
+        depth = found[9] - share * h * found[10] + layer
+        if depth > 0.0:
+            weight = found[11] * depth
+            sums[0] += found[11]
+            sums[1] += weight
+            sums[2] += weight * found[10]
+            for k in range(6):
+                sums[3 + k] += weight * found[k]
+        if used < room:
+            for k in range(12):
+                numbers[k, used, filled] = found[k]
+            samples[used, filled] = n * blocks.shape[2] + lane
+        filled += 1
+        if filled == width:
+            used, filled = used + 1, 0
+    return used, filled
 
 
 @kernel
@@ -438,9 +490,9 @@ def _find(
     """
     numbers, of_chunk = points
     labels, samples = where
-    room, width, block_width = numbers.shape[1], numbers.shape[2], blocks.shape[2]
+    room = numbers.shape[1]
     left = np.empty(max(1, counts[:, _PROBES].max()), np.int64)
-    placed, scratch, found, sums = np.empty(_PLACED), np.empty(100), np.empty(12), np.empty(9)
+    placed, scratch, sums = np.empty(_PLACED), np.empty(100), np.empty(9)
     used = 0
     for s in range(sides.shape[0]):
         name, side = names[s], sides[s]
@@ -455,7 +507,6 @@ def _find(
         _place(a, b, turning, side, share, settings, solid, whole, atlas, placed, scratch)
         reach = _length(placed, _MOVES) + _length(placed, _TURNS) * 2.0 * a[_RADIUS]
         reach = side[_MARGIN] + (1.0 - share) * h * reach
-        layer = side[_SINK] if share < 1.0 else 0.0
         for k in range(9):
             sums[k] = 0.0
         first, lane_to = used, 0
@@ -472,38 +523,25 @@ def _find(
             d = _distance_of(placed, balls[n, 0], balls[n, 1], balls[n, 2], solid, whole, atlas, scratch)
             if d - balls[n, 3] * placed[_STRETCH] > reach:
                 continue
-            for lane in range(block_width):
-                facing = _sample(
-                    a,
-                    turning,
-                    solid,
-                    whole,
-                    atlas,
-                    placed,
-                    blocks[n],
-                    lane,
-                    side[_SHARE],
-                    share * h,
-                    found,
-                    scratch,
-                )
-                if not facing or not found[9] - h * found[10] > -side[_MARGIN]:
-                    continue
-                depth = found[9] - share * h * found[10] + layer
-                if depth > 0.0:
-                    weight = found[11] * depth
-                    sums[0] += found[11]
-                    sums[1] += weight
-                    sums[2] += weight * found[10]
-                    for k in range(6):
-                        sums[3 + k] += weight * found[k]
-                if used < room:
-                    for k in range(12):
-                        numbers[k, used, lane_to] = found[k]
-                    samples[used, lane_to] = n * block_width + lane
-                lane_to += 1
-                if lane_to == width:
-                    used, lane_to = used + 1, 0
+            used, lane_to = _list_block(
+                a,
+                turning,
+                solid,
+                whole,
+                atlas,
+                placed,
+                blocks,
+                n,
+                side,
+                share,
+                h,
+                numbers,
+                samples,
+                used,
+                lane_to,
+                sums,
+                scratch,
+            )
         if lane_to > 0:
             used += 1
         contact = name[_CONTACT]

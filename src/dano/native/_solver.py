@@ -387,6 +387,72 @@ def _pattern(groups, m):
 
 
 @kernel
+def _measure(matrix, residual, step, velocities, scale, used):
+    """Work of the residual along the step, largest residual [m/s], and the size of its terms [m/s]."""
+    error = rounding = 0.0
+    m = residual.shape[0]
+    for i in range(m):
+        for r in range(6):
+            missed = abs(scale[i, r] * residual[i, r])
+            error = missed if missed > error or math.isnan(missed) else error
+            size = 0.0
+            for j in range(m):
+                if used[i, j]:
+                    for c in range(6):
+                        size += abs(matrix[i, j, r, c] * velocities[j, c])
+            rounding = max(rounding, scale[i, r] * size)
+    return _work(step, residual), error, rounding
+
+
+@kernel
+def _work(step, residual):
+    work = 0.0
+    for i in range(step.shape[0]):
+        for k in range(6):
+            work += step[i, k] * residual[i, k]
+    return work
+
+
+@kernel
+def _find_step(matrix, spare, residual, step, used, part, order, count, later):
+    """A share of the Newton step; `spare` is used up."""
+    m = residual.shape[0]
+    for i in range(m):
+        for k in range(6):
+            step[i, k] = -residual[i, k]
+        for j in range(m):
+            if used[i, j]:
+                _copy(matrix[i, j], spare[i, j])
+    solve_blocks(spare, step, order, count, later)
+    for i in range(m):
+        for k in range(6):
+            step[i, k] *= part
+
+
+@kernel
+def _spread(matrix, used, whole):
+    """Blocks as one matrix."""
+    m = matrix.shape[0]
+    for i in range(m):
+        for j in range(m):
+            for r in range(6):
+                for c in range(6):
+                    whole[6 * i + r, 6 * j + c] = matrix[i, j, r, c] if used[i, j] else 0.0
+
+
+@kernel
+def _narrowed(work, length, low, low_work, high, high_work):
+    """Bracket and next share of a line search after a miss, see `Search.narrowed` of `dano.engine`."""
+    far = not work < 0.0
+    new_low, new_high = (low, length) if far else (length, high)
+    new_low_work = 0.5 * low_work if far else work
+    new_high_work = work if far else high_work if high == 0.0 else 0.5 * high_work
+    portion = -new_low_work / (new_high_work - new_low_work)
+    portion = min(max(portion, 0.1), 0.9) if not math.isnan(portion) else 0.1
+    return new_low, new_low_work, new_high, new_high_work, new_low + portion * (new_high - new_low)
+
+
+@kernel
 def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iterations, whole):
     """The loop of `dano.engine._primal_dual.primal_dual`.
 
@@ -409,7 +475,7 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
     h, epsilon = settings[_H], settings[_EPSILON]
     used = _pattern(groups, m)
     order, count, later = elimination(used)
-    matrix, work_matrix = np.empty((m, m, 6, 6)), np.empty((m, m, 6, 6))
+    matrix, spare = np.empty((m, m, 6, 6)), np.empty((m, m, 6, 6))
     residual, step, best = np.empty((m, 6)), np.empty((m, 6)), np.empty((m, 6))
     accepted, tried, scale = np.empty((m, 6)), np.empty((m, 6)), np.empty((m, 6))
     _copy(start, accepted)
@@ -435,18 +501,7 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
         unfit, push = _assemble(
             bodies, tried, points, groups, apart, length, softness, h, rules, residual, matrix, used
         )
-        work = error = rounding = 0.0
-        for i in range(m):
-            for r in range(6):
-                work += step[i, r] * residual[i, r]
-                missed = abs(scale[i, r] * residual[i, r])
-                error = missed if missed > error or math.isnan(missed) else error
-                size = 0.0
-                for j in range(m):
-                    if used[i, j]:
-                        for c in range(6):
-                            size += abs(matrix[i, j, r, c] * tried[j, c])
-                rounding = max(rounding, scale[i, r] * size)
+        work, error, rounding = _measure(matrix, residual, step, tried, scale, used)
         limit = rules[_ENOUGH] * abs(begun)
         bracketed = high > 0.0
         misses = work > limit or (bracketed and work < -limit) or math.isnan(work)
@@ -470,31 +525,14 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
         if accept:
             _copy(tried, accepted)
             if not solved:
-                for i in range(m):
-                    for k in range(6):
-                        step[i, k] = -residual[i, k]
-                        for j in range(m):
-                            if used[i, j]:
-                                work_matrix[i, j, k] = matrix[i, j, k]
-                solve_blocks(work_matrix, step, order, count, later)
                 part = 1.0 if fell else tiers[level, 1] * adapted
-                begun = 0.0
-                for i in range(m):
-                    for k in range(6):
-                        step[i, k] *= part
-                        begun += step[i, k] * residual[i, k]
+                _find_step(matrix, spare, residual, step, used, part, order, count, later)
+                begun = _work(step, residual)
                 _follow_all(points, groups, apart, step)
             length, low, low_work, high, high_work = 1.0, 0.0, begun, 0.0, 0.0
             before = error
         else:
-            far = not work < 0.0
-            new_low, new_high = (low, length) if far else (length, high)
-            new_low_work = 0.5 * low_work if far else work
-            new_high_work = work if far else high_work if high == 0.0 else 0.5 * high_work
-            portion = -new_low_work / (new_high_work - new_low_work)
-            portion = min(max(portion, 0.1), 0.9) if not math.isnan(portion) else 0.1
-            low, low_work, high, high_work = new_low, new_low_work, new_high, new_high_work
-            length = low + portion * (high - low)
+            low, low_work, high, high_work, length = _narrowed(work, length, low, low_work, high, high_work)
         if harder:
             level += 1
             budget = tiers[min(level, tiers.shape[0] - 1), 3]
@@ -504,11 +542,7 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
         iteration += 1
     _copy(accepted if solved else best, start)
     if whole.size > 0:
-        for i in range(m):
-            for j in range(m):
-                for r in range(6):
-                    for c in range(6):
-                        whole[6 * i + r, 6 * j + c] = matrix[i, j, r, c] if used[i, j] else 0.0
+        _spread(matrix, used, whole)
     return before if solved else best_error, iteration, solved
 
 
