@@ -11,7 +11,7 @@ from jaxtyping import DTypeLike
 
 HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER, ELLIPSOID, GRID = range(7)
 """Kinds of solids that the search for contact knows."""
-RUN = 8
+RUN = 4
 """Blocks of samples that the search looks at together first."""
 
 

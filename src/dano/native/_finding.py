@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from dano.native import HALF_SPACE, RUN
-from dano.native._compiling import kernel
+from dano.native._compiling import fingerprint, kernel
 from dano.native._ffi import (
     cube,
     inputs,
@@ -607,16 +607,19 @@ def _doubles(source):
 
 def define(dtype: str) -> str:
     """Compile or load the search for "float64" or "float32", make it known to JAX and return its name."""
+    sources = fingerprint()
     if dtype == "float64":
 
         @numba.cfunc(SIGNATURE, cache=True)
         def handler(frame):
+            _ = sources
             return 0 if tells_version(frame) else _answer(frame, numba.float64)
 
     else:
 
         @numba.cfunc(SIGNATURE, cache=True)
         def handler(frame):
+            _ = sources
             return 0 if tells_version(frame) else _answer(frame, numba.float32)
 
     return register(f"dano_find_{dtype}", handler)

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from dano.native._blocks import elimination, solve_blocks
-from dano.native._compiling import kernel
+from dano.native._compiling import fingerprint, kernel
 from dano.native._ffi import (
     cube,
     inputs,
@@ -595,16 +595,19 @@ def _answer(frame, dtype):
 
 def define(dtype: str) -> str:
     """Compile or load the solver for "float64" or "float32", make it known to JAX and return its name."""
+    sources = fingerprint()
     if dtype == "float64":
 
         @numba.cfunc(SIGNATURE, cache=True)
         def handler(frame):
+            _ = sources
             return 0 if tells_version(frame) else _answer(frame, numba.float64)
 
     else:
 
         @numba.cfunc(SIGNATURE, cache=True)
         def handler(frame):
+            _ = sources
             return 0 if tells_version(frame) else _answer(frame, numba.float32)
 
     return register(f"dano_solve_{dtype}", handler)
