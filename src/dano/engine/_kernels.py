@@ -11,7 +11,7 @@ from dano.engine._primal_dual import RULES, TIERS
 from dano.engine._problem import Pairs, Problem
 
 
-def is_native(problem: Problem, pairs: Pairs) -> bool:
+def is_native(problem: Problem) -> bool:
     """Whether a step is solved in machine code: on a CPU, for free bodies that touch at points only."""
     free = problem.tree is None and not problem.patches
     return free and problem.points is not None and jax.default_backend() == "cpu"

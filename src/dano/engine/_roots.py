@@ -44,7 +44,7 @@ def solve(problem: Problem, found: Found | None, start: Array, pairs: Pairs, opt
 
     def find_root(problem, found, start, derivatives: bool):
         find = _root_of_bodies if problem.tree is None else _root_of_trees
-        if is_native(problem, pairs):
+        if is_native(problem):
             return native_root(problem, found, start, pairs, options, derivatives=derivatives)
         if problem.points is None:
             return find(problem, found, start, pairs, options)

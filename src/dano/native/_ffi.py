@@ -10,6 +10,7 @@ import ctypes
 
 import jax
 import numba
+import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
@@ -92,6 +93,17 @@ def table(buffer, dtype):
     """Numbers of a buffer with two axes."""
     shape = shape_of(buffer)
     return numba.carray(_pointer(_words(buffer, _BUFFER_WORDS)[_DATA], dtype), (shape[0], shape[1]))
+
+
+@kernel
+def doubles(buffer, dtype):
+    """A copy of `table` of 64-bit numbers."""
+    source = table(buffer, dtype)
+    result = np.empty(source.shape)
+    for i in range(source.shape[0]):
+        for k in range(source.shape[1]):
+            result[i, k] = source[i, k]
+    return result
 
 
 @kernel

@@ -9,6 +9,7 @@ from dano.native import HALF_SPACE, RUN
 from dano.native._compiling import fingerprint, kernel
 from dano.native._ffi import (
     cube,
+    doubles,
     inputs,
     outputs,
     register,
@@ -22,7 +23,7 @@ from dano.native._solids import distance, KIND
 # Columns of the table of bodies: position, orientation (wxyz), orientation at the end of the step, velocity,
 # spin, centre of mass [F], 1 / mass, inverse of the inertia [W]; then scale, and the ball around the body.
 _POSITION, _ORIENTATION, _AHEAD, _VELOCITY, _SPIN, _COM, _LIGHTNESS, _MOBILITY = 0, 3, 7, 11, 14, 17, 20, 21
-_SCALE, _MIDDLE, _RADIUS, BODY_COLUMNS = 30, 33, 36, 37
+_SCALE, _MIDDLE, _RADIUS = 30, 33, 36
 # Of their whole numbers: first block, blocks, first probe, probes, how samples turn.
 _START, _BLOCKS, _PROBE_START, _PROBES, _TURNING = range(5)
 _AXIS, _BALL = 1, 2
@@ -33,7 +34,6 @@ _SHARE, _FOLLOWS, _SINK, _MARGIN = range(4)
 _FIRST, _SECOND, _SOLID, _CONTACT, _GROUP, _PLACE = range(6)
 # Settings: h, what `dano.contact` calls IMPACT, SHARES and ADVANCES, its pole, its rotation from z.
 _H, _IMPACT, _SHARES, _ADVANCES, _POLE, _FROM_Z = 0, 1, 2, 3, 4, 7
-SETTINGS = 16
 # A pair at a moment, see `dano.contact.Placed`: samples to solid frame and origin, vector areas, solid axes
 # to world, centre of mass, velocity, spin, drift, lowest, axis, stretch.
 _POINTS, _ORIGIN, _VECTORS, _WORLD, _CENTRE, _MOVES, _TURNS = 0, 9, 12, 21, 30, 33, 36
@@ -235,7 +235,7 @@ def _is_near(a, b, margin, h, solid, whole, atlas, scratch):
     """Whether two bodies may meet within the step, by the balls around them."""
     _matrix(a, _ORIENTATION, scratch, 30)
     _matrix(b, _ORIENTATION, scratch, 40)
-    lever_a = lever_b = way = 0.0
+    way = 0.0
     for k in range(3):
         scratch[50 + k], scratch[53 + k] = a[_MIDDLE + k] - a[_COM + k], b[_MIDDLE + k] - b[_COM + k]
         way += (a[_VELOCITY + k] - b[_VELOCITY + k]) ** 2
@@ -486,7 +486,7 @@ def _find(
         wholes: Of their whole numbers.
         atlas: Spline coefficients.
         impacts: Whether contacts end impacts within the step, and from which speed, shape (k, 2).
-        settings: See `SETTINGS`.
+        settings: h, then what `dano.contact` states, see `_H` and those beside it.
         points: Arm, normal, moment, depth, rate, area, shape (12, c, p); share and stiffness, shape (2, c).
         where: First body, second body, contact, group and place, shape (5, c); samples, shape (c, p).
     """
@@ -576,7 +576,7 @@ def _answer(frame, dtype):
     for c in range(of_chunk.shape[1]):
         of_chunk[0, c] = 1.0
     used = _find(
-        _doubles(table(given[0], dtype)),
+        doubles(given[0], dtype),
         table(given[1], numba.int32),
         cube(given[2], dtype),
         table(given[3], dtype),
@@ -584,11 +584,11 @@ def _answer(frame, dtype):
         table(given[5], dtype),
         table(given[6], dtype),
         table(given[7], numba.int32),
-        _doubles(table(given[8], dtype)),
+        doubles(given[8], dtype),
         table(given[9], numba.int32),
         vector(given[10], dtype),
         table(given[11], dtype),
-        _doubles(table(given[12], dtype))[0],
+        doubles(given[12], dtype)[0],
         (numbers, of_chunk),
         (labels, samples),
     )
@@ -596,30 +596,13 @@ def _answer(frame, dtype):
     return 0
 
 
-@kernel
-def _doubles(source):
-    result = np.empty(source.shape)
-    for i in range(source.shape[0]):
-        for k in range(source.shape[1]):
-            result[i, k] = source[i, k]
-    return result
-
-
 def define(dtype: str) -> str:
     """Compile or load the search for "float64" or "float32", make it known to JAX and return its name."""
-    sources = fingerprint()
-    if dtype == "float64":
+    sources, real = fingerprint(), numba.from_dtype(np.dtype(dtype))
 
-        @numba.cfunc(SIGNATURE, cache=True)
-        def handler(frame):
-            _ = sources
-            return 0 if tells_version(frame) else _answer(frame, numba.float64)
-
-    else:
-
-        @numba.cfunc(SIGNATURE, cache=True)
-        def handler(frame):
-            _ = sources
-            return 0 if tells_version(frame) else _answer(frame, numba.float32)
+    @numba.cfunc(SIGNATURE, cache=True)
+    def handler(frame):
+        _ = sources  # makes it part of the key on disk
+        return 0 if tells_version(frame) else _answer(frame, real)
 
     return register(f"dano_find_{dtype}", handler)

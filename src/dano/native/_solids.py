@@ -10,9 +10,9 @@ from dano.native._compiling import kernel
 # Columns of the table of solids: size, position and rotation of the solid in its field's frame (x = s R y + p
 # for y in the solid's own), then what the kind has: normal and offset; radius; half extents and rounding;
 # radius and half length; semi-axes; origin and spacing.
-FACTOR, POSITION, ROTATION, OWN, SOLID_COLUMNS = 0, 1, 4, 13, 19
+FACTOR, POSITION, ROTATION, OWN = 0, 1, 4, 13
 # Columns of the table of their whole numbers: kind, first coefficient, nodes along each axis, degree.
-KIND, FIRST, NODES, DEGREE, SOLID_INTEGERS = 0, 1, 2, 5, 6
+KIND, FIRST, NODES, DEGREE = 0, 1, 2, 5
 
 _BISECTIONS, _STEPS = 5, 7  # of the search for the closest point of an ellipsoid, see `Ellipsoid`
 _EPSILON = 2.220446049250313e-16

@@ -14,6 +14,7 @@ from dano.native._blocks import elimination, solve_blocks
 from dano.native._compiling import fingerprint, kernel
 from dano.native._ffi import (
     cube,
+    doubles,
     inputs,
     outputs,
     register,
@@ -45,15 +46,12 @@ from dano.native._law import (
 )
 
 # Columns of the table of bodies: mass; inertia [B]; rotation; momentum before contact, its rotation in B.
-_MASS, _INERTIA, _ROTATION, _IMPULSE, BODY_COLUMNS = 0, 1, 10, 19, 25
+_MASS, _INERTIA, _ROTATION, _IMPULSE = 0, 1, 10, 19
 # Rows of what is found at points: arm, normal, moment, depth, rate, area.
-_DEPTH_ROW, _RATE_ROW, _AREA_ROW, POINT_ROWS = 9, 10, 11, 12
-# Settings: h, tolerance over (1 + size), size, rounding of the dtype, then the tiers.
-_H, _RELATIVE, _SIZE, _EPSILON, SETTINGS = 0, 1, 2, 3, 4
-# Columns of the tiers: softness, share of a step, whether a line search runs, passes.
-TIER_COLUMNS = 4
-# Constants of `dano.engine._primal_dual`, `_newton.Search` and `_rigid`, given by them: see `Rules`.
-RULES = 12
+_DEPTH_ROW, _RATE_ROW, _AREA_ROW = 9, 10, 11
+# Settings: h, tolerance over (1 + size), size, rounding of the dtype.
+_H, _RELATIVE, _SIZE, _EPSILON = range(4)
+# Rules: constants that `dano.engine` states, in the order of its `RULES`.
 _WHOLE, _GROWS, _SHRINKS, _LEAST, _FIT, _SOFT_TOLERANCE, _ENOUGH, _GIVE_UP, _RESOLVED, _FADE = range(10)
 
 
@@ -279,10 +277,10 @@ def _scatter(slope, wrench, apart, a, b, residual, matrix):
             by_second[r, 5] = slope[r, 5] - (p * y - q * x)
         for c in range(6):
             for r in range(3):
-                residual_row = by_second[r, c]
-                matrix[b, b, r, c] -= residual_row
+                here = by_second[r, c]
+                matrix[b, b, r, c] -= here
                 if a < m:
-                    matrix[a, b, r, c] += residual_row
+                    matrix[a, b, r, c] += here
                     matrix[b, a, r, c] += slope[r, c]
             for k in range(3):
                 i, j = (k + 1) % 3, (k + 2) % 3
@@ -462,8 +460,8 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
         groups: Their groups.
         apart: Vectors between the bodies of groups.
         start: Velocities to start from [W], shape (m, 6); they become the solution.
-        settings: See `SETTINGS`.
-        tiers: Levels of the solve, shape (t, 4).
+        settings: h, tolerance over (1 + size), size and rounding.
+        tiers: Softness, share of a step, whether a line search runs, and passes of each level, shape (t, 4).
         rules: Constants.
         max_iterations: Passes.
         whole: The Jacobian there, shape (6 m, 6 m), written to; or of size 0.
@@ -547,19 +545,10 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
 
 
 @kernel
-def _doubles(source):
-    result = np.empty(source.shape)
-    for i in range(source.shape[0]):
-        for k in range(source.shape[1]):
-            result[i, k] = source[i, k]
-    return result
-
-
-@kernel
 def _answer(frame, dtype):
     """Solve what a call frame holds; see `dano.engine` for the order of its buffers."""
     given, found = inputs(frame), outputs(frame)
-    start, settings = _doubles(table(given[1], dtype)), _doubles(table(given[6], dtype))[0]
+    start, settings = doubles(given[1], dtype), doubles(given[6], dtype)[0]
     chunks, limits = table(given[9], numba.int32), vector(given[11], numba.int32)
     rows, material = cube(given[2], dtype), table(given[3], dtype)
     points, groups, apart = _tabulate(
@@ -575,14 +564,14 @@ def _answer(frame, dtype):
     n = shape_of(found[1])[0]
     whole = np.empty((n, n))
     residual, iterations, solved = solve(
-        _doubles(table(given[0], dtype)),
+        doubles(given[0], dtype),
         points,
         groups,
         apart,
         start,
         settings,
-        _doubles(table(given[7], dtype)),
-        _doubles(table(given[8], dtype))[0],
+        doubles(given[7], dtype),
+        doubles(given[8], dtype)[0],
         limits[1],
         whole,
     )
@@ -595,19 +584,11 @@ def _answer(frame, dtype):
 
 def define(dtype: str) -> str:
     """Compile or load the solver for "float64" or "float32", make it known to JAX and return its name."""
-    sources = fingerprint()
-    if dtype == "float64":
+    sources, real = fingerprint(), numba.from_dtype(np.dtype(dtype))
 
-        @numba.cfunc(SIGNATURE, cache=True)
-        def handler(frame):
-            _ = sources
-            return 0 if tells_version(frame) else _answer(frame, numba.float64)
-
-    else:
-
-        @numba.cfunc(SIGNATURE, cache=True)
-        def handler(frame):
-            _ = sources
-            return 0 if tells_version(frame) else _answer(frame, numba.float32)
+    @numba.cfunc(SIGNATURE, cache=True)
+    def handler(frame):
+        _ = sources  # makes it part of the key on disk
+        return 0 if tells_version(frame) else _answer(frame, real)
 
     return register(f"dano_solve_{dtype}", handler)
