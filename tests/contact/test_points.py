@@ -53,6 +53,7 @@ CASES = {
     "ellipsoid on plane": (dano.Ellipsoid((0.05, 0.04, 0.03)), dano.HalfSpace(), 0.0315),
     "cylinder on plane": (dano.Cylinder(0.04, 0.03), dano.HalfSpace(), 0.036),
     "box on ellipsoid": (dano.Box((0.05, 0.04, 0.03)), dano.Ellipsoid((0.1, 0.08, 0.05)), 0.078),
+    "box deep in box": (dano.Box((0.05, 0.04, 0.03)), dano.Box((0.05, 0.05, 0.04)), 0.012),
 }
 
 
@@ -134,6 +135,7 @@ MATERIAL = {
     "timestep": 0.01,
     "instant": 0.0,
     "bounce": 0.1,
+    "uplift": 0.4,
 }
 
 

@@ -237,6 +237,28 @@ def test_a_heap_gains_no_energy():
     assert np.mean(np.asarray(run.converged)) > 0.98
 
 
+@pytest.mark.parametrize(
+    ("shape", "offset"),
+    [
+        (dano.Sphere(0.05), (0.025, 0.005, 0.0025)),
+        (dano.Box((0.05, 0.04, 0.03)), (0.025, 0.005, 0.0025)),
+    ],
+    ids=["balls", "boxes"],
+)
+def test_bodies_set_deep_into_each_other_separate_slowly(shape, offset):
+    """Also where all surfaces that are inside face the other way."""
+    bodies = [dano.Body(name, shape, mass=1.0) for name in "ab"]
+    scene = dano.Scene.create(bodies, [dano.Contact("a", "b")], timestep=0.005, gravity=(0, 0, 0))
+    run = dano.simulate(scene, scene.initial_state(a={}, b={"position": offset}), 300)
+    assert bool(jnp.all(run.converged))
+    apart = jnp.linalg.norm(run.states.position[:, 1] - run.states.position[:, 0], axis=1)
+    assert float(apart[-1]) > 0.1
+    speed = jnp.linalg.norm(run.states.velocity[:, 1] - run.states.velocity[:, 0], axis=1)
+    # √(g d)/5 along each normal; those that push lie up to 60° off the way.
+    assert 0.01 < float(speed.max()) < 3 * 0.2 * np.sqrt(9.81 * 0.05)
+    np.testing.assert_allclose(jnp.sum(run.states.velocity[-1], axis=0), 0, atol=1e-9)
+
+
 def test_collision_conserves_momentum():
     """Two boxes in free space, each with samples in the other: action is reaction, about any point."""
     bodies = [dano.Body(name, dano.Box((0.1, 0.06, 0.04)), mass=m) for name, m in (("a", 1.0), ("b", 2.0))]

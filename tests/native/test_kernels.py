@@ -135,7 +135,11 @@ def heap():
     }
     run = dano.simulate(scene, scene.initial_state(**starts), 100)
     states = [jax.tree.map(lambda x, k=k: x[k], run.states) for k in (3, 20, 40, 60, 95)]
-    return scene, states
+    # Two pairs deep in each other.
+    deep = states[0].position
+    deep = deep.at[1].set(deep[0] + jnp.array([0.01, 0.004, 0.006]))
+    deep = deep.at[3].set(deep[2] + jnp.array([0.01, -0.004, 0.008]))
+    return scene, [*states, eqx.tree_at(lambda s: s.position, states[0], deep)]
 
 
 def test_finds_the_same_points(heap):

@@ -28,6 +28,7 @@ from dano.contact._laws import (
     HARD as HARD,
     non_negative as non_negative,
     Setting as Setting,
+    STANDARD_GRAVITY as STANDARD_GRAVITY,
     Softening as Softening,
 )
 from dano.contact._overlap import overlap as overlap, Patch as Patch

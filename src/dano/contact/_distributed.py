@@ -8,13 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.contact._laws import AbstractContactLaw, ContactParams, non_negative, positive, Setting
+from dano.contact._laws import AbstractContactLaw, ContactParams, non_negative, positive, Setting, STANDARD_GRAVITY
 from dano.contact._pressure import Material
 from dano.maths import is_traced, Numbers
 
 # Share of its size by which a body sinks under the heaviest load of the scene in a typical orientation, at
 # default stiffness.
 SINKING = 0.005
+# Velocities within which restitution ends at default: so many times √(g · depth of the heaviest load).
+_SLOW = 0.2
 
 
 class DistributedLaw(AbstractContactLaw):
@@ -27,7 +29,7 @@ class DistributedLaw(AbstractContactLaw):
         D = d ((ρ − σ) s(v_n/v_e) + σ c(v_n/v_s))  or  θ h v_n,  whichever is larger,
 
     with ρ = 1 and s(x) = x up to its limits ±1 (with `compliant`: ρ = (1 − e²)/(1 + e²), s(x) = x/√(1 + x²)),
-    c(x) = x/max(|x|, 1) and μ(p) = μ (1 − φ p/(p + p₀)); A is the part of the sample's area that faces the
+    c(x) = x/max(|x|, 1), v_e not below √(g d)/5, and μ(p) = μ (1 − φ p/(p + p₀)); A is the part of the sample's area that faces the
     other body (see `ContactParams` for the parameters). Velocities are those at the end of the step.
     Torsional and rolling resistance come out of the geometry. Where both bodies have samples, each set
     carries half.
@@ -89,7 +91,7 @@ class DistributedLaw(AbstractContactLaw):
             params = params.filled(stiffness=setting.stiffness(SINKING))
         return params.filled(
             restitution=0.0,
-            restitution_velocity=0.2 * (setting.gravity * SINKING * setting.size) ** 0.5,
+            restitution_velocity=_SLOW * (setting.gravity * SINKING * setting.size) ** 0.5,
             hysteresis=0.35,
             friction_fading=0.0,
             friction_pressure=1000.0,
@@ -149,4 +151,5 @@ def materials(
         jnp.broadcast_to(timestep, (n,)),
         jnp.asarray(np.repeat([0.0 if law.compliant else 1.0 for law in laws], sizes), timestep.dtype),
         stacked.restitution_velocity + gravity * timestep,
+        jnp.broadcast_to(_SLOW**2 * jnp.where(gravity > 0, gravity, STANDARD_GRAVITY), (n,)).astype(timestep.dtype),
     )

@@ -43,6 +43,7 @@ from dano.contact._geometry import (
 from dano.contact._kernels import find_natively
 from dano.contact._points import CHUNK, cross, dot, Found, Points, ROUND
 from dano.maths import matmul, matvec
+from dano.native import TURNED
 
 # Blocks whose samples are looked at together.
 _TOGETHER = 8
@@ -82,6 +83,10 @@ def find(
 ) -> tuple[Points, Found]:
     """All points that may press within a step of length h.
 
+    A sample presses where it faces the other body: its own normal and that of the other's surface oppose each
+    other. Bodies so deep in each other that samples which face the other way have the larger load (the sum of
+    area times depth) are pressed apart by these as well, each along its own normal, as in a fluid.
+
     Args:
         geometry: Samples, solids and pairs.
         links: Where the bodies are.
@@ -117,9 +122,11 @@ def find(
     (active,) = jnp.nonzero(near, size=near.shape[0], fill_value=0)
 
     def visit(k, carry):
-        return _visit(geometry, pairs, active[k], links, impacts, h, carry)
+        found, deep = carry
+        return _visit(geometry, pairs, active[k // 2], links, impacts, h, found, deep, k % 2 > 0)
 
-    found = jax.lax.fori_loop(0, jnp.sum(near), visit, found)
+    # Each pair twice: the second time for samples that face the other way.
+    found, _ = jax.lax.fori_loop(0, 2 * jnp.sum(near), visit, (found, jnp.zeros((), bool)))
     rows = found.rows.reshape(12, room, CHUNK)
     where = Found(
         found.sample.reshape(room, CHUNK),
@@ -134,8 +141,14 @@ def find(
     return _assembled(geometry, links, where, rows), where
 
 
-def _visit(geometry: Geometry, kind: Mixture, index, links: Links, impacts: Impacts, h, carry: _List):
-    """Add the points of one pair."""
+def _visit(
+    geometry: Geometry, kind: Mixture, index, links: Links, impacts: Impacts, h, carry: _List, deep, turned
+):
+    """Add the points of one pair; with `turned` those that face the other way, if the bodies are deep.
+
+    Returns:
+        The list, and whether they are.
+    """
     side = Side(*(x[index] for x in kind.sides))
     before_kind = np.cumsum([0] + [each.sides.first.shape[0] for each in kind.kinds])[:-1]
     place_in_kind = index - jnp.asarray(before_kind)[side.kind]
@@ -147,7 +160,7 @@ def _visit(geometry: Geometry, kind: Mixture, index, links: Links, impacts: Impa
     near = block_clearance(geometry, kind, side, placed) <= reach
     size = kind.widest + -kind.widest % _TOGETHER
     (blocks,) = jnp.nonzero(near, size=size, fill_value=0)
-    n_near = jnp.sum(near)
+    n_near = jnp.where(turned & ~deep, 0, jnp.sum(near))
     before = carry.used
 
     # Where geometry is taken early, what is about to touch has sunk in by no more than this, or nearly does.
@@ -157,7 +170,7 @@ def _visit(geometry: Geometry, kind: Mixture, index, links: Links, impacts: Impa
         carry, sums = state
         mine = jax.lax.dynamic_slice_in_dim(blocks, k * _TOGETHER, _TOGETHER) + geometry.start[side.first]
         found = jnp.take(geometry.blocks, mine, axis=0, mode="clip").transpose(1, 0, 2).reshape(6, -1)
-        rows = _rows(kind, geometry.turning[side.first], side, placed, found, share, h)
+        rows = _rows(kind, geometry.turning[side.first], side, placed, found, share, h, turned)
         ahead = rows[9] - h * rows[10]  # depth at the end of the step at the old velocity
         real = np.arange(_BATCH) < (n_near - k * _TOGETHER) * BLOCK
         listed = real & (rows[11] > 0) & (ahead > -side.margin)
@@ -176,26 +189,40 @@ def _visit(geometry: Geometry, kind: Mixture, index, links: Links, impacts: Impa
             share=write(carry.share, jnp.broadcast_to(share, (_CHUNKS,)), at, axis=0),
             used=at + -(-n // CHUNK),
         )
-        return carry, sums + _impact_sums(kept, kept[9] - share * h * kept[10] + layer)
+        sunk = jnp.where(turned, 0, kept[9] - share * h * kept[10] + layer)
+        others = jnp.sum(jnp.where(real, jnp.maximum(-rows[11], 0) * (rows[9] - share * h * rows[10]), 0))
+        return carry, sums + jnp.append(_impact_sums(kept, sunk), others)
 
-    sums = jnp.zeros(9, links.position.dtype)
+    sums = jnp.zeros(10, links.position.dtype)
     carry, sums = jax.lax.fori_loop(0, -(-n_near // _TOGETHER), batch, (carry, sums))
     stiffness = _impact_stiffness(links, side, placed, sums, impacts, h)
     mine = (np.arange(carry.stiffness.shape[0]) >= before) & (
         np.arange(carry.stiffness.shape[0]) < carry.used
     )
-    return carry._replace(stiffness=jnp.where(mine, stiffness, carry.stiffness))
+    return carry._replace(stiffness=jnp.where(mine, stiffness, carry.stiffness)), sums[9] > sums[1]
 
 
 def _rows(
-    kind: Kind | Mixture, turning, side: Side, placed, found: Float[Array, "6 n"], share, h
+    kind: Kind | Mixture, turning, side: Side, placed, found: Float[Array, "6 n"], share, h, turned
 ) -> Float[Array, "12 n"]:
-    """Arm [m, W], normal [W], moment [m, W], depth [m], rate [m/s] and area [m²] of samples: see `Points`."""
+    """Arm [m, W], normal [W], moment [m, W], depth [m], rate [m/s] and area [m²] of samples: see `Points`.
+
+    Samples across the solid's surface have no area; those in it that face the other way have a negative one,
+    or with `turned` only they have one, see `find`. With None all have one: it was decided before.
+    """
     x = matmul(placed.points[:, :3], found[:3]) + placed.points[:, 3:]
     distance, gradient = kind.sdf_jet(side, x, 1)
     normal = unit(gradient)
     vectors = matmul(placed.vectors, found[3:])
-    area = jnp.maximum(-dot(vectors, normal), 0)
+    area = -dot(vectors, normal)
+    size = jnp.sqrt(jnp.maximum(dot(vectors, vectors), 1e-30))
+    other = (distance < 0) & (area < -TURNED * size)
+    area = jnp.maximum(area, 0)
+    if turned is None:
+        area = jnp.where(other, size, area)
+    else:
+        area = jnp.where(turned, jnp.where(other, size, 0), jnp.where(other, -size, area))
+    normal = jnp.where(other[None], -vectors / size[None], normal)
     arm = x - (placed.com - placed.drift)[:, None]
     moment = _moment(kind, turning, placed, arm, normal)
     rate = jnp.sum(placed.velocity[:, None] * normal + placed.spin[:, None] * moment, axis=0)
@@ -264,7 +291,7 @@ def points_of(geometry: Geometry, links: Links, where: Found, h: Float[Array, ""
             side = Side(*(x[index] for x in kind.sides))
             placed = place(geometry, kind, links, side, share, h)
             flat = geometry.blocks.transpose(0, 2, 1).reshape(-1, 6)
-            return _rows(kind, geometry.turning[side.first], side, placed, flat[sample].T, share, h)
+            return _rows(kind, geometry.turning[side.first], side, placed, flat[sample].T, share, h, None)
 
         # Chunks of other kinds read a sample of this kind's, so that they divide by nothing that is zero.
         own = geometry.start[kind.sides.first[0]] * BLOCK

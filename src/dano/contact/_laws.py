@@ -119,6 +119,10 @@ def checked_parameter(name: str, value: Numbers) -> Float[Array, ""]:
     return array
 
 
+STANDARD_GRAVITY = 9.81
+"""What contacts are chosen for where a scene has no gravity [m/s²]."""
+
+
 class Setting(NamedTuple):
     """What default parameters are derived from.
 

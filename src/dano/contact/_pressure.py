@@ -35,6 +35,7 @@ class Material(NamedTuple):
         timestep: h [s].
         instant: 1 where impacts end within the step, 0 where they are left to the spring.
         bounce: Slowest rebound of an impact [m/s].
+        uplift: An overlap of depth d separates at most at √(uplift · d), if that exceeds v_e [m/s²].
     """
 
     stiffness: Float[Array, " *n"]
@@ -49,6 +50,7 @@ class Material(NamedTuple):
     timestep: Float[Array, " *n"]
     instant: Float[Array, " *n"]
     bounce: Float[Array, " *n"]
+    uplift: Float[Array, " *n"]
 
 
 class Constants(NamedTuple):
@@ -61,7 +63,7 @@ class Constants(NamedTuple):
         lost: σ d⁺ [m].
         ahead: θ h [s].
         sharp: 1 where the damping has its full size from v_e on, so that bodies are pushed apart no faster.
-        restitution_velocity: v_e [m/s].
+        restitution_velocity: v_e, or the speed at which a deep overlap may separate, if larger [m/s].
         friction: μ [1].
         fading: φ [1].
         friction_pressure: p₀ [Pa].
@@ -74,7 +76,7 @@ class Constants(NamedTuple):
     lost: Float[Array, "c p"]
     ahead: Float[Array, "c #p"]
     sharp: Float[Array, "c #p"]
-    restitution_velocity: Float[Array, "c #p"]
+    restitution_velocity: Float[Array, "c p"]
     friction: Float[Array, "c #p"]
     fading: Float[Array, "c #p"]
     friction_pressure: Float[Array, "c #p"]
@@ -95,6 +97,7 @@ def constants(material: Material, points: Points) -> Constants:
     loss = jnp.where(material.instant > 0, 1, (1 - material.restitution**2) / (1 + material.restitution**2))
     kept = jnp.minimum(material.hysteresis, loss)
     sunk = jnp.where(hit, 0, jnp.maximum(points.depth, 0))
+    apart = jnp.sqrt(jnp.maximum(material.restitution_velocity**2, material.uplift * sunk))
     return Constants(
         stiffness=jnp.where(hit, points.stiffness[:, None], material.stiffness),
         depth=jnp.where(hit, goal, points.depth),
@@ -102,7 +105,7 @@ def constants(material: Material, points: Points) -> Constants:
         lost=kept * sunk,
         ahead=jnp.where(hit, material.timestep, material.ahead),
         sharp=material.instant,
-        restitution_velocity=material.restitution_velocity,
+        restitution_velocity=apart,
         friction=material.friction,
         fading=material.friction_fading,
         friction_pressure=material.friction_pressure,
@@ -151,7 +154,7 @@ def pressure(
       ρ = (1 − e²)/(1 + e²): the force going in exceeds that going out by 1/e² whatever the path, so an impact
       returns e² of its energy. Slower than v_e all but the share σ ≤ ρ becomes a damper; σ is lost however
       slow the motion, which stops rolling and rocking. Where impacts end within the step, ρ = 1 and s(x) is
-      x up to its limits ±1: nothing is pushed out faster than v_e, however deep it is;
+      x up to its limits ±1, and v_e grows with the depth: nothing is pushed out faster;
     - θ h v_n: the depth at the end of the step, or in its middle, instead of its start, which makes the
       spring implicit.
 

@@ -48,7 +48,7 @@ class Prepared(eqx.Module):
     """
 
     geometry: Geometry | None
-    material: Float[Array, "12 k"] | None
+    material: Float[Array, "13 k"] | None
     impacts: Impacts | None
     capacity: int = eqx.field(static=True)
 
@@ -81,7 +81,7 @@ class Problem(eqx.Module):
     params: tuple[ContactParams, ...]
     laws: tuple[AbstractPatchLaw, ...]
     points: Points | None
-    material: Float[Array, "12 k"] | None
+    material: Float[Array, "13 k"] | None
     tree: Tree | None
 
     @property

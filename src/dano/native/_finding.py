@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-from dano.native import HALF_SPACE, RUN
+from dano.native import HALF_SPACE, RUN, TURNED
 from dano.native._compiling import fingerprint, kernel
 from dano.native._ffi import (
     cube,
@@ -343,8 +343,13 @@ def _distance_of(placed, x, y, z, solid, whole, atlas, scratch):
 
 
 @kernel
-def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, found, scratch):
-    """Arm, normal, moment [W], depth, rate and area of a sample into `found`; whether it faces the solid."""
+def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, turned, found, scratch):
+    """Arm, normal, moment [W], depth, rate and area of a sample into `found`; whether it may press.
+
+    Returns:
+        1 if it faces the solid, or with `turned` if it lies in it and faces the other way; else 0, or -1 if
+        it is one that `turned` would take, with nothing but depth and area found. See `dano.contact.find`.
+    """
     _apply(placed, _POINTS, block[0, lane], block[1, lane], block[2, lane], scratch, 30)
     x = scratch[30] + placed[_ORIGIN]
     y = scratch[31] + placed[_ORIGIN + 1]
@@ -354,8 +359,15 @@ def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, found
     nx, ny, nz = scratch[0] / length, scratch[1] / length, scratch[2] / length
     _apply(placed, _VECTORS, block[3, lane], block[4, lane], block[5, lane], scratch, 33)
     area = -(scratch[33] * nx + scratch[34] * ny + scratch[35] * nz)
-    if not area > 0.0:
-        return False
+    if turned or not area > 0.0:
+        whole_area = _length(scratch, 33)
+        if not (d < 0.0 and -area > TURNED * whole_area):
+            return 0
+        if not turned:
+            found[9], found[11] = -d, half * whole_area
+            return -1
+        area = whole_area
+        nx, ny, nz = -scratch[33] / area, -scratch[34] / area, -scratch[35] / area
     rx = scratch[30] + placed[_ORIGIN] - placed[_CENTRE] + placed[_DRIFT]
     ry = scratch[31] + placed[_ORIGIN + 1] - placed[_CENTRE + 1] + placed[_DRIFT + 1]
     rz = scratch[32] + placed[_ORIGIN + 2] - placed[_CENTRE + 2] + placed[_DRIFT + 2]
@@ -375,7 +387,7 @@ def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, found
     _apply(placed, _WORLD, nx, ny, nz, found, 3)
     _apply(placed, _WORLD, mx, my, mz, found, 6)
     found[9], found[10], found[11] = lead * rate - d, rate, half * area
-    return True
+    return 1
 
 
 @kernel
@@ -391,6 +403,7 @@ def _list_block(
     side,
     share,
     h,
+    turned,
     numbers,
     samples,
     used,
@@ -400,7 +413,8 @@ def _list_block(
 ):
     """List the samples of a block that may press; returns the full chunks and the places of the next one.
 
-    Added to `sums`, over samples that sink in: area; then load, and rate, arm and normal weighted by it.
+    Added to `sums`, over samples that sink in: area; then load, and rate, arm and normal weighted by it; then
+    the load of those that lie in the solid and face the other way.
     """
     room, width = numbers.shape[1], numbers.shape[2]
     found = scratch[80:92]
@@ -408,12 +422,25 @@ def _list_block(
     layer = side[_SINK] if share < 1.0 else 0.0
     for lane in range(blocks.shape[2]):
         facing = _sample(
-            turning, solid, whole, atlas, placed, blocks[n], lane, side[_SHARE], share * h, found, scratch
+            turning,
+            solid,
+            whole,
+            atlas,
+            placed,
+            blocks[n],
+            lane,
+            side[_SHARE],
+            share * h,
+            turned,
+            found,
+            scratch,
         )
-        if not facing or not found[9] - h * found[10] > -side[_MARGIN]:
+        if facing < 0:
+            sums[9] += found[11] * found[9]
+        if facing <= 0 or not found[9] - h * found[10] > -side[_MARGIN]:
             continue
         depth = found[9] - share * h * found[10] + layer
-        if depth > 0.0:
+        if depth > 0.0 and not turned:
             weight = found[11] * depth
             sums[0] += found[11]
             sums[1] += weight
@@ -494,7 +521,7 @@ def _find(
     labels, samples = where
     room = numbers.shape[1]
     left = np.empty(max(1, counts[:, _PROBES].max()), np.int64)
-    placed, scratch, sums = np.empty(_PLACED), np.empty(100), np.empty(9)
+    placed, scratch, sums = np.empty(_PLACED), np.empty(100), np.empty(10)
     used = 0
     for s in range(sides.shape[0]):
         name, side = names[s], sides[s]
@@ -509,43 +536,48 @@ def _find(
         _place(a, b, turning, side, share, settings, solid, whole, atlas, placed, scratch)
         reach = _length(placed, _MOVES) + _length(placed, _TURNS) * 2.0 * a[_RADIUS]
         reach = side[_MARGIN] + (1.0 - share) * h * reach
-        for k in range(9):
+        for k in range(10):
             sums[k] = 0.0
-        first, lane_to = used, 0
-        end, beyond = count[_START] + count[_BLOCKS], count[_START]
-        for n in range(count[_START], end):
-            if n < beyond:
+        first = used
+        end = count[_START] + count[_BLOCKS]
+        for turned in range(2):
+            if turned and not sums[9] > sums[1]:
                 continue
-            # Where a run of blocks is out of reach, all of them are.
-            if (n - count[_START]) % RUN == 0:
-                d = _distance_of(placed, runs[n, 0], runs[n, 1], runs[n, 2], solid, whole, atlas, scratch)
-                if d - STEEPEST * runs[n, 3] * placed[_STRETCH] > reach:
-                    beyond = n + RUN
+            lane_to, beyond = 0, count[_START]
+            for n in range(count[_START], end):
+                if n < beyond:
                     continue
-            d = _distance_of(placed, balls[n, 0], balls[n, 1], balls[n, 2], solid, whole, atlas, scratch)
-            if d - balls[n, 3] * placed[_STRETCH] > reach:
-                continue
-            used, lane_to = _list_block(
-                a,
-                turning,
-                solid,
-                whole,
-                atlas,
-                placed,
-                blocks,
-                n,
-                side,
-                share,
-                h,
-                numbers,
-                samples,
-                used,
-                lane_to,
-                sums,
-                scratch,
-            )
-        if lane_to > 0:
-            used += 1
+                # Where a run of blocks is out of reach, all of them are.
+                if (n - count[_START]) % RUN == 0:
+                    d = _distance_of(placed, runs[n, 0], runs[n, 1], runs[n, 2], solid, whole, atlas, scratch)
+                    if d - STEEPEST * runs[n, 3] * placed[_STRETCH] > reach:
+                        beyond = n + RUN
+                        continue
+                d = _distance_of(placed, balls[n, 0], balls[n, 1], balls[n, 2], solid, whole, atlas, scratch)
+                if d - balls[n, 3] * placed[_STRETCH] > reach:
+                    continue
+                used, lane_to = _list_block(
+                    a,
+                    turning,
+                    solid,
+                    whole,
+                    atlas,
+                    placed,
+                    blocks,
+                    n,
+                    side,
+                    share,
+                    h,
+                    turned > 0,
+                    numbers,
+                    samples,
+                    used,
+                    lane_to,
+                    sums,
+                    scratch,
+                )
+            if lane_to > 0:
+                used += 1
         contact = name[_CONTACT]
         stiffness = _impact(a, b, sums, impacts[contact, 1], impacts[contact, 0], settings)
         for c in range(first, min(used, room)):

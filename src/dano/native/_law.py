@@ -23,7 +23,7 @@ def set_constants(row, material, h, depth, rate, stiffness):
 
     Args:
         row: Of the table, written to.
-        material: Fields of `Material` in their order, shape (12,).
+        material: Fields of `Material` in their order, shape (13,).
         h: Timestep [s].
         depth: d [m].
         rate: Separating speed at the old velocities [m/s].
@@ -43,7 +43,7 @@ def set_constants(row, material, h, depth, rate, stiffness):
     row[LOST] = kept * sunk
     row[AHEAD] = h if hit else material[8]
     row[SHARP] = instant
-    row[RESTITUTION_VELOCITY] = material[2]
+    row[RESTITUTION_VELOCITY] = math.sqrt(max(material[2] * material[2], material[12] * sunk))
     row[FRICTION] = material[4]
     row[FADING] = material[5]
     row[FRICTION_PRESSURE] = material[6]

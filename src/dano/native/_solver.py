@@ -130,7 +130,7 @@ def _tabulate(rows, chunks, n, body_rows, material, stiffness, between, h):
         chunks: First body, second body and contact of each chunk, shape (3, c).
         n: Chunks in use.
         body_rows: Row of each body among those that move, or their number.
-        material: Of contacts, shape (12, k).
+        material: Of contacts, shape (13, k).
         stiffness: Of impacts, shape (c,).
         between: From the second body's centre of mass to the first's, shape (3, c).
         h: Timestep [s].
@@ -142,7 +142,7 @@ def _tabulate(rows, chunks, n, body_rows, material, stiffness, between, h):
     width = rows.shape[2]
     points = np.empty((n * width, COLUMNS))
     groups, apart = np.empty((n, 4), np.int64), np.empty((n, 3))
-    here, used, g = np.empty(12), 0, -1
+    here, used, g = np.empty(material.shape[0]), 0, -1
     for c in range(n):
         a, b, contact = body_rows[chunks[0, c]], body_rows[chunks[1, c]], chunks[2, c]
         if g < 0 or groups[g, 2] != a or groups[g, 3] != b:
@@ -150,7 +150,7 @@ def _tabulate(rows, chunks, n, body_rows, material, stiffness, between, h):
             groups[g, 0], groups[g, 2], groups[g, 3] = used, a, b
             for k in range(3):
                 apart[g, k] = between[k, c]
-        for k in range(12):
+        for k in range(here.shape[0]):
             here[k] = material[k, contact]
         for p in range(width):
             area = rows[_AREA_ROW, c, p]

@@ -23,9 +23,9 @@ _THIN = 0.1
 _CORNER = 1.13
 # Gauss points along a side of a face, and points along an edge between its corners.
 _FACE, _EDGE = 4, 5
-# Rings of directions on a ball from where it touches to the far side, and directions a ring.
-_RINGS, _SPOKES = 16, 8
-# Rows of samples around a cylinder's axis, and rings on its ends.
+# Rings of directions on a ball around where it touches, and directions a ring.
+_RINGS, _SPOKES = 15, 8
+# Rows of samples around a cylinder's axis are one less, so that one lies where it touches; rings on its ends.
 _ROWS, _END_RINGS = 24, 3
 # Where nothing better is known.
 _DRAWN = 1000
@@ -96,25 +96,22 @@ def _at(axis: int, u: int, v: int, x: float, a: float, b: float) -> np.ndarray:
     return point
 
 
-def _polar() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges and middles of rings of polar angle, dense towards zero, and the directions of a ring."""
-    edges = np.pi * np.linspace(0, 1, _RINGS + 1) ** 2
-    return edges, 0.5 * (edges[1:] + edges[:-1]), (np.arange(_SPOKES) + 0.5) * 2 * np.pi / _SPOKES
-
-
 def _directions() -> tuple[np.ndarray, np.ndarray]:
-    """Directions over the unit ball, dense towards −z, and their vector areas."""
-    edges, middle, spokes = _polar()
-    angle, turn = np.repeat(middle, _SPOKES), np.tile(spokes, _RINGS)
+    """Directions over the unit ball, −z and rings around it, dense towards it, and their vector areas."""
+    edges = np.pi * np.linspace(0, 1, _RINGS + 2)[1:] ** 2
+    middle, spokes = 0.5 * (edges[1:] + edges[:-1]), (np.arange(_SPOKES) + 0.5) * 2 * np.pi / _SPOKES
+    angle = np.concatenate([[0.0], np.repeat(middle, _SPOKES)])
+    turn = np.concatenate([[0.0], np.tile(spokes, _RINGS)])
     direction = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), -np.cos(angle)], axis=1)
-    share = np.repeat(2 * np.pi * (np.cos(edges[:-1]) - np.cos(edges[1:])) / _SPOKES, _SPOKES)
+    rings = np.repeat(2 * np.pi * (np.cos(edges[:-1]) - np.cos(edges[1:])) / _SPOKES, _SPOKES)
+    share = np.concatenate([[2 * np.pi * (1 - np.cos(edges[0]))], rings])
     return direction, share[:, None] * direction
 
 
 def _around() -> tuple[np.ndarray, np.ndarray]:
-    """Directions about the z axis, dense towards x, and the angle that each stands for."""
-    half = np.pi * np.linspace(0, 1, _ROWS // 2 + 1) ** 2
-    edges = np.concatenate([-half[:0:-1], half])
+    """Directions about the z axis, x and others dense towards it, and the angle that each stands for."""
+    half = np.pi * np.linspace(0, 1, _ROWS // 2 + 1)[1:] ** 2
+    edges = np.concatenate([-half[::-1], half])
     angles = 0.5 * (edges[1:] + edges[:-1])
     return np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1), np.diff(edges)
 

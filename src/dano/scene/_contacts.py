@@ -17,6 +17,7 @@ from dano.contact import (
     non_negative,
     SampleSet,
     Setting,
+    STANDARD_GRAVITY,
     SurfaceSet,
 )
 from dano.fields import AbstractShape, HalfSpace, PosedShape, Sphere
@@ -29,8 +30,6 @@ from dano.scene._states import State
 # right, 0.1 % did not.
 EDGE_SHARE = 0.005
 SHAPE_SAMPLES = 2000
-# Where there is no gravity, contacts are as stiff as on Earth [m/s²].
-STANDARD_GRAVITY = 9.81
 
 
 class Contact(eqx.Module):
