@@ -74,9 +74,7 @@ def _measured(
         params = {"sliding_friction": FRICTION, **LOSSLESS}
         scene = on_floor(geometry, h, mass=roller.mass, properties=properties, **params)
         stiffness = stiffer * float(scene.contacts[0].params.stiffness)
-        scene = on_floor(
-            geometry, h, mass=roller.mass, properties=properties, stiffness=stiffness, **params
-        )
+        scene = on_floor(geometry, h, mass=roller.mass, properties=properties, stiffness=stiffness, **params)
         motion = play(scene, seconds, body=roller.start(*start))
         position, rotation, _ = roller.roll(*start, motion.times)
         value = error(position, rotation, motion.position[:, 0], motion.rotation[:, 0])

@@ -77,11 +77,14 @@ def test_points_are_found_again_with_derivatives(name):
         listed = points_of(geometry, links_of(scene, moved), where, scene.timestep)
         real = where.filled
         return jnp.stack(
-            [jnp.where(real, x, 0) for x in (*listed.arm, *listed.normal, *listed.moment, listed.depth)]
+            [
+                jnp.where(real, x, 0)
+                for x in (*listed.arm, *listed.normal, *listed.moment, listed.depth, *listed.drift)
+            ]
         )
 
     zero = jnp.zeros(13)
-    rows = (*points.arm, *points.normal, *points.moment, points.depth)
+    rows = (*points.arm, *points.normal, *points.moment, points.depth, *points.drift)
     np.testing.assert_allclose(
         again(zero), np.where(where.filled, np.stack([np.asarray(x) for x in rows]), 0), atol=1e-13
     )

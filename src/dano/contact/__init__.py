@@ -28,8 +28,8 @@ from dano.contact._laws import (
     HARD as HARD,
     non_negative as non_negative,
     Setting as Setting,
-    STANDARD_GRAVITY as STANDARD_GRAVITY,
     Softening as Softening,
+    STANDARD_GRAVITY as STANDARD_GRAVITY,
 )
 from dano.contact._overlap import overlap as overlap, Patch as Patch
 from dano.contact._points import (

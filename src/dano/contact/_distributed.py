@@ -8,7 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.contact._laws import AbstractContactLaw, ContactParams, non_negative, positive, Setting, STANDARD_GRAVITY
+from dano.contact._laws import (
+    AbstractContactLaw,
+    ContactParams,
+    non_negative,
+    positive,
+    Setting,
+    STANDARD_GRAVITY,
+)
 from dano.contact._pressure import Material
 from dano.maths import is_traced, Numbers
 
@@ -29,8 +36,9 @@ class DistributedLaw(AbstractContactLaw):
         D = d ((ρ − σ) s(v_n/v_e) + σ c(v_n/v_s))  or  θ h v_n,  whichever is larger,
 
     with ρ = 1 and s(x) = x up to its limits ±1 (with `compliant`: ρ = (1 − e²)/(1 + e²), s(x) = x/√(1 + x²)),
-    c(x) = x/max(|x|, 1), v_e not below √(g d)/5, and μ(p) = μ (1 − φ p/(p + p₀)); A is the part of the sample's area that faces the
-    other body (see `ContactParams` for the parameters). Velocities are those at the end of the step.
+    c(x) = x/max(|x|, 1), v_e not below √(g d)/5, and μ(p) = μ (1 − φ p/(p + p₀)); A is the part of the
+    sample's area that faces the other body (see `ContactParams` for the parameters). Velocities are those at
+    the end of the step.
     Torsional and rolling resistance come out of the geometry. Where both bodies have samples, each set
     carries half.
 
@@ -138,6 +146,7 @@ def materials(
     stacked: ContactParams = jax.tree.map(lambda *x: column(x), *(params for _, params in groups))
     laws = [law for law, _ in groups]
     n = sum(sizes)
+    strength = jnp.where(gravity > 0, gravity, STANDARD_GRAVITY)
     return Material(
         stacked.stiffness,
         stacked.restitution,
@@ -151,5 +160,5 @@ def materials(
         jnp.broadcast_to(timestep, (n,)),
         jnp.asarray(np.repeat([0.0 if law.compliant else 1.0 for law in laws], sizes), timestep.dtype),
         stacked.restitution_velocity + gravity * timestep,
-        jnp.broadcast_to(_SLOW**2 * jnp.where(gravity > 0, gravity, STANDARD_GRAVITY), (n,)).astype(timestep.dtype),
+        jnp.broadcast_to(_SLOW**2 * strength, (n,)).astype(timestep.dtype),
     )

@@ -27,6 +27,7 @@ from dano.contact._geometry import (
     AXIS,
     BALL,
     block_clearance,
+    FIXED,
     FROM_Z,
     Geometry,
     Kind,
@@ -69,7 +70,7 @@ class Impacts(NamedTuple):
 class _List(NamedTuple):
     """Carry of the search: what was found so far."""
 
-    rows: Float[Array, "12 n"]
+    rows: Float[Array, "15 n"]
     sample: Int[Array, " n"]
     group: Int[Array, " c"]
     side: Int[Array, " c"]
@@ -109,7 +110,7 @@ def find(
         )
     whole = jnp.zeros(room, int)
     found = _List(
-        jnp.zeros((12, room * CHUNK), dtype),
+        jnp.zeros((15, room * CHUNK), dtype),
         jnp.zeros(room * CHUNK, int),
         whole,
         whole,
@@ -127,7 +128,7 @@ def find(
 
     # Each pair twice: the second time for samples that face the other way.
     found, _ = jax.lax.fori_loop(0, 2 * jnp.sum(near), visit, (found, jnp.zeros((), bool)))
-    rows = found.rows.reshape(12, room, CHUNK)
+    rows = found.rows.reshape(15, room, CHUNK)
     where = Found(
         found.sample.reshape(room, CHUNK),
         rows[11] > 0,
@@ -204,8 +205,8 @@ def _visit(
 
 def _rows(
     kind: Kind | Mixture, turning, side: Side, placed, found: Float[Array, "6 n"], share, h, turned
-) -> Float[Array, "12 n"]:
-    """Arm [m, W], normal [W], moment [m, W], depth [m], rate [m/s] and area [m²] of samples: see `Points`.
+) -> Float[Array, "15 n"]:
+    """Arm [m, W], normal [W], moment [m, W], depth, rate, area and drift [m/s, W] of samples: see `Points`.
 
     Samples across the solid's surface have no area; those in it that face the other way have a negative one,
     or with `turned` only they have one, see `find`. With None all have one: it was decided before.
@@ -223,12 +224,30 @@ def _rows(
     else:
         area = jnp.where(turned, jnp.where(other, size, 0), jnp.where(other, -size, area))
     normal = jnp.where(other[None], -vectors / size[None], normal)
-    arm = x - (placed.com - placed.drift)[:, None]
+    arm = matmul(placed.arms[:, :3], found[:3]) + placed.arms[:, 3:]
     moment = _moment(kind, turning, placed, arm, normal)
     rate = jnp.sum(placed.velocity[:, None] * normal + placed.spin[:, None] * moment, axis=0)
     depth = -distance + share * h * rate
-    turned = [matmul(placed.rotation, part) for part in (arm, normal, moment)]
-    return jnp.concatenate([*turned, jnp.stack([depth, rate, side.share * area])])
+    drift = jnp.zeros_like(arm)
+    if kind.turns != (FIXED,):
+        drift = jnp.where(turning == FIXED, 0, _drift(placed, x - placed.com[:, None], arm, normal))
+    turned = [matmul(placed.rotation, part) for part in (arm, normal, moment, drift)]
+    return jnp.concatenate([*turned[:3], jnp.stack([depth, rate, side.share * area]), turned[3]])
+
+
+def _drift(placed, ahead: Float[Array, "3 n"], arm: Float[Array, "3 n"], normal: Float[Array, "3 n"]):
+    """See `Points.drift`; at most the slip at the predicted place, so that friction gives no energy."""
+
+    def across(v):
+        return v - normal * dot(normal, v)[None]
+
+    spin = jnp.broadcast_to(placed.spin[:, None], arm.shape)
+    drift = across(cross(spin, 0.5 * (ahead - arm)))
+    slip = across(placed.velocity[:, None] + cross(spin, ahead))
+    squared, most = dot(drift, drift), dot(slip, slip)
+    over = squared > most
+    part = jnp.sqrt(jnp.where(over & (most > 0), most, 1) / jnp.where(over, squared, 1))
+    return jnp.where(over & (most == 0), 0, part)[None] * drift
 
 
 def _moment(kind: Kind | Mixture, turning, placed, arm: Float[Array, "3 n"], normal: Float[Array, "3 n"]):
@@ -243,12 +262,12 @@ def _moment(kind: Kind | Mixture, turning, placed, arm: Float[Array, "3 n"], nor
         axis = jnp.broadcast_to(placed.axis[:, None], arm.shape)
         moment = jnp.where(turning == AXIS, moment - axis * dot(axis, moment)[None], moment)
     if BALL in kind.turns:
-        lowest = jnp.broadcast_to((placed.lowest + placed.drift)[:, None], arm.shape)
+        lowest = jnp.broadcast_to(placed.lowest[:, None], arm.shape)
         moment = jnp.where(turning == BALL, cross(lowest, normal), moment)
     return moment
 
 
-def _impact_sums(rows: Float[Array, "12 n"], depth: Float[Array, " n"]) -> Float[Array, "9"]:
+def _impact_sums(rows: Float[Array, "15 n"], depth: Float[Array, " n"]) -> Float[Array, "9"]:
     """Sums over samples that sink in: area; then load, and rate, arm and normal weighted by it."""
     weight = rows[11] * jnp.maximum(depth, 0)
     area = jnp.sum(jnp.where(depth > 0, rows[11], 0))
@@ -282,7 +301,7 @@ def _impact_stiffness(links: Links, side: Side, placed, sums, impacts: Impacts, 
 def points_of(geometry: Geometry, links: Links, where: Found, h: Float[Array, ""]) -> Points:
     """The points of `find` again, as a function that can be differentiated."""
     dtype = links.position.dtype
-    rows = jnp.zeros((12, *where.sample.shape), dtype)
+    rows = jnp.zeros((15, *where.sample.shape), dtype)
     for number, kind in enumerate(geometry.kinds):
         mine = where.group == number
         index = jnp.where(mine, where.side, 0)
@@ -305,7 +324,7 @@ def _names(side: Side):
     return side.first, side.second, side.contact
 
 
-def _assembled(geometry: Geometry, links: Links, where: Found, rows: Float[Array, "12 c p"]) -> Points:
+def _assembled(geometry: Geometry, links: Links, where: Found, rows: Float[Array, "15 c p"]) -> Points:
     sides = [
         jnp.stack([x[jnp.where(where.group == number, where.side, 0)] for x in _names(kind.sides)])
         for number, kind in enumerate(geometry.kinds)

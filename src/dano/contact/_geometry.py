@@ -319,9 +319,10 @@ class Placed(NamedTuple):
         velocity: Of the first body's centre of mass relative to the second body [m/s].
         spin: Of the first body relative to the second [rad/s].
         between: From the second body's centre of mass to the first's at the start [m, W].
-        drift: How far points are moved along with the body that they follow [m].
-        lowest: Where a ball's or an ellipsoid's densest samples lie, from its centre of mass [m].
-        axis: The first body's z axis.
+        arms: Sample coordinates → arms from the first body's centre of mass, shape (3, 4). Those of samples
+            that keep facing the solid are those of the start of the step.
+        lowest: The arm of a ball's or an ellipsoid's densest samples [m].
+        axis: The first body's z axis, then.
         stretch: Largest factor by which `points` enlarges.
     """
 
@@ -332,7 +333,7 @@ class Placed(NamedTuple):
     velocity: Float[Array, "3"]
     spin: Float[Array, "3"]
     between: Float[Array, "3"]
-    drift: Float[Array, "3"]
+    arms: Float[Array, "3 4"]
     lowest: Float[Array, "3"]
     axis: Float[Array, "3"]
     stretch: Float[Array, ""]
@@ -349,7 +350,17 @@ def place(geometry: Geometry, kind: Kind | Mixture, links: Links, side: Side, sh
     com = matvec(inverse, x_i - x_j) + links.com[j]
     turn = matmul(inverse, r_i)
     origin = com - matvec(turn, links.com[i])
-    points, vectors, stretch = _aligned(geometry, kind, side, turn, origin)
+    points, vectors, stretch, facing = _aligned(geometry, kind, side, turn, origin)
+    if kind.turns == (FIXED,):
+        arms, before, at = points, turn, origin - com
+    else:
+        # What touches a plane with the same normal at the start: forces act there, and depths are those of
+        # the end. Together they are SHAKE's way with a constraint, which neither damps nor drives rolling.
+        moves = geometry.turning[i] != FIXED
+        before = jnp.where(moves, matmul(inverse, quat_to_matrix(links.orientation[i])), turn)
+        arms, _, _ = _turned(geometry, kind, side, before, matvec(before.T, matvec(turn, facing)))
+        at = -matvec(before, links.com[i])
+    at = at + matvec(inverse, side.follows * share * h * (links.velocity[i] - links.velocity[j]))
     return Placed(
         jnp.concatenate([points, origin[:, None]], axis=1),
         vectors,
@@ -358,9 +369,9 @@ def place(geometry: Geometry, kind: Kind | Mixture, links: Links, side: Side, sh
         matvec(inverse, velocity),
         matvec(inverse, links.spin[i] - links.spin[j]),
         between,
-        matvec(inverse, side.follows * share * h * (links.velocity[i] - links.velocity[j])),
-        origin - com - points[:, 2],
-        turn[:, 2],
+        jnp.concatenate([arms, at[:, None]], axis=1),
+        at - arms[:, 2],
+        before[:, 2],
         stretch,
     )
 
@@ -379,20 +390,32 @@ def _aligned(geometry: Geometry, kind: Kind | Mixture, side: Side, turn, origin)
     let it roll smoothly. Directions d on a unit ball become points S Q d of an ellipsoid with semi-axes S,
     and areas a become det(S) S⁻¹ Q a, with Q such that the densest samples lie where the ellipsoid comes
     closest.
+
+    Returns:
+        Both maps, the largest factor by which points are stretched, and the direction that they face [F].
     """
-    one = jnp.ones((), turn.dtype)
     if kind.turns == (FIXED,):
-        return turn, turn, one
+        return turn, turn, jnp.ones((), turn.dtype), turn[0]
     i = side.first
-    turning, scale = geometry.turning[i], geometry.scale[i]
 
     def facing(point):
         _, gradient = kind.sdf_jet(side, point[:, None], 1)
         return _direction(-matvec(turn.T, gradient[:, 0]))
 
     toward = facing(origin)
+    if BALL in kind.turns:
+        # Once more from where it comes closest: the solid may be small, or curved.
+        ball = geometry.turning[i] == BALL
+        lowest = geometry.scale[i] * _direction(geometry.scale[i] * toward)
+        toward = jnp.where(ball, facing(origin + matvec(turn, jnp.where(ball, lowest, 0))), toward)
+    return *_turned(geometry, kind, side, turn, toward), toward
+
+
+def _turned(geometry: Geometry, kind: Kind | Mixture, side: Side, turn, toward):
+    """See `_aligned`: maps that face a direction of the body; `turn` takes its axes to those of the solid."""
+    turning, scale = geometry.turning[side.first], geometry.scale[side.first]
     points = vectors = turn
-    stretch = one
+    stretch = jnp.ones((), turn.dtype)
     if AXIS in kind.turns:
         x, y = toward[0], toward[1]
         # A cylinder that stands on its end faces no way more than another.
@@ -403,17 +426,13 @@ def _aligned(geometry: Geometry, kind: Kind | Mixture, side: Side, turn, origin)
             / across
         )
         about = jnp.where(x * x + y * y > 1e-12, about, jnp.eye(3, dtype=x.dtype))
-        axis = turning == AXIS
-        points = vectors = jnp.where(axis, matmul(turn, about), turn)
+        points = vectors = jnp.where(turning == AXIS, matmul(turn, about), turn)
     if BALL in kind.turns:
-        # Once more from where it comes closest: the solid may be small, or curved.
         ball = turning == BALL
-        lowest = scale * _direction(scale * toward)
-        toward = _direction(scale * facing(origin + matvec(turn, jnp.where(ball, lowest, 0))))
-        facing_all = towards(-toward)
+        facing_all = towards(-_direction(scale * toward))
         points = jnp.where(ball, matmul(turn * scale[None], facing_all), points)
         vectors = jnp.where(ball, matmul(turn * (jnp.prod(scale) / scale)[None], facing_all), vectors)
-        stretch = jnp.where(ball, jnp.max(scale), one)
+        stretch = jnp.where(ball, jnp.max(scale), stretch)
     return points, vectors, stretch
 
 

@@ -189,7 +189,7 @@ def find_natively(
         tables.bodies,
     ]
     shapes = [
-        ((12, room, CHUNK), dtype),
+        ((15, room, CHUNK), dtype),
         ((2, room), dtype),
         ((5, room), np.int32),
         ((room, CHUNK), np.int32),

@@ -23,8 +23,8 @@ class Points(eqx.Module):
     along with the first body's centre of mass, so that forces act on one line for both bodies.
 
     Attributes:
-        rows: `arm`, `normal`, `moment`, `depth`, `rate` and `area`, one below the other: one array, because
-            machine code that writes and reads it needs no copies.
+        rows: `arm`, `normal`, `moment`, `depth`, `rate`, `area` and `drift`, one below the other: one array,
+            because machine code that writes and reads it needs no copies.
         stiffness: Of an impact that must end within the step: pressure per depth [Pa/m]; zero elsewhere,
             where the material's own holds. Shape (c,).
         between: From the second body's centre of mass to the first's, at the start of the step [m, W].
@@ -33,7 +33,7 @@ class Points(eqx.Module):
         contact: Index into the scene's contacts.
     """
 
-    rows: Float[Array, "12 c p"]
+    rows: Float[Array, "15 c p"]
     stiffness: Float[Array, " c"]
     between: Float[Array, "3 c"]
     first: Int[Array, " c"]
@@ -72,6 +72,14 @@ class Points(eqx.Module):
     def area(self) -> Float[Array, "c p"]:
         """Area that faces the second body [m²]; zero where a chunk is not full."""
         return self.rows[11]
+
+    @property
+    def drift(self) -> Float[Array, "3 c p"]:
+        """Added to the slip [m/s, W]: half of what the slip at the old velocities changes by within the step.
+
+        Zero but for samples that keep facing the second body: what touches is another place each time.
+        """
+        return self.rows[12:]
 
 
 class Found(eqx.Module):
@@ -113,7 +121,8 @@ class Motion(NamedTuple):
 def point_motion(velocity: Float[Array, "n 3"], spin: Float[Array, "n 3"], points: Points) -> Motion:
     """Motion of points at the velocities of all bodies, see `relative_twist`."""
     u, w = (x[:, :, None] for x in relative_twist(velocity, spin, points))
-    return motion_at(points.arm, points.normal, points.moment, u, w)
+    rate, slip = motion_at(points.arm, points.normal, points.moment, u, w)
+    return Motion(rate, slip + points.drift)
 
 
 def motion_at(

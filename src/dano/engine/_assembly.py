@@ -32,7 +32,7 @@ from dano.contact import (
 # operations, however small it is.
 _FEW, _MANY, _SHORT = 4, 16, 64
 # Rows of `Table.numbers` before those of the constants.
-_GEOMETRY = 10
+_GEOMETRY = 13
 # Rows of a memory: the duals, their change by the whole step, and the law at the point tried last.
 _DUALS, _LAW = 4, 19
 _MEMORY = 2 * _DUALS + _LAW
@@ -42,14 +42,14 @@ class Table(NamedTuple):
     """The points of a step as the sums read them.
 
     Attributes:
-        numbers: Arm, normal, moment, h times area, and the rows of `Constants`, shape (21, c, p).
+        numbers: Arm, normal, moment, h times area, drift, and the rows of `Constants`, shape (24, c, p).
         between: See `Points`, shape (3, c).
         first: Row in V of each chunk's first body; as many as there are bodies for one that does not move.
         second: Of its second body.
         n_chunks: Chunks in use.
     """
 
-    numbers: Float[Array, "21 c p"]
+    numbers: Float[Array, "24 c p"]
     between: Float[Array, "3 c"]
     first: Int[Array, " c"]
     second: Int[Array, " c"]
@@ -99,9 +99,9 @@ def tabulate(
     """
     shape = points.depth.shape
     fixed = [jnp.broadcast_to(x, shape) for x in constants(material, points)]
-    numbers = jnp.concatenate([points.rows[:9], jnp.stack([h * points.area, *fixed])])
+    numbers = [points.rows[:9], h * points.area[None], points.drift, jnp.stack(fixed)]
     return Table(
-        jax.lax.optimization_barrier(numbers),
+        jax.lax.optimization_barrier(jnp.concatenate(numbers)),
         points.between,
         rows[points.first],
         rows[points.second],
@@ -194,7 +194,7 @@ def _batch(table: Table, k):
     return numbers, take(table.between, 1), take(table.first, 0), take(table.second, 0)
 
 
-def _constants(numbers: Float[Array, "21 c p"]) -> Constants:
+def _constants(numbers: Float[Array, "24 c p"]) -> Constants:
     return Constants(*numbers[_GEOMETRY:])
 
 
@@ -206,13 +206,13 @@ def _ends(velocities: Float[Array, "m 6"], step: Float[Array, "m 6"], first, sec
 
 
 def _motions(numbers, between: Float[Array, "3 c"], a: Float[Array, "6 2 c"], b: Float[Array, "6 2 c"]):
-    """Motion of points at two sets of velocities, see `dano.contact.point_motion`."""
+    """Motion of points at velocities, and its change, see `dano.contact.point_motion`."""
     apart = jnp.broadcast_to(between[:, None], b[3:].shape)
     u = (a[:3] - b[:3] - cross(b[3:], apart))[..., None]
     w = (a[3:] - b[3:])[..., None]
     arm, normal, moment = (numbers[k : k + 3, None] for k in (0, 3, 6))
     rate, slip = motion_at(arm, normal, moment, u, w)
-    return Motion(rate[0], slip[:, 0]), Motion(rate[1], slip[:, 1])
+    return Motion(rate[0], slip[:, 0] + numbers[10:_GEOMETRY]), Motion(rate[1], slip[:, 1])
 
 
 def _packed(linear: Linear, duals: Duals) -> Float[Array, "19 c p"]:

@@ -35,9 +35,9 @@ _FIRST, _SECOND, _SOLID, _CONTACT, _GROUP, _PLACE = range(6)
 # Settings: h, what `dano.contact` calls IMPACT, SHARES and ADVANCES, its pole, its rotation from z.
 _H, _IMPACT, _SHARES, _ADVANCES, _POLE, _FROM_Z = 0, 1, 2, 3, 4, 7
 # A pair at a moment, see `dano.contact.Placed`: samples to solid frame and origin, vector areas, solid axes
-# to world, centre of mass, velocity, spin, drift, lowest, axis, stretch.
+# to world, centre of mass, velocity, spin, lowest, axis, stretch, samples to arms and their offset.
 _POINTS, _ORIGIN, _VECTORS, _WORLD, _CENTRE, _MOVES, _TURNS = 0, 9, 12, 21, 30, 33, 36
-_DRIFT, _LOWEST, _AXIS_AT, _STRETCH, _PLACED = 39, 42, 45, 48, 49
+_LOWEST, _AXIS_AT, _STRETCH, _ARMS, _ARM_ORIGIN, _PLACED = 39, 42, 45, 46, 55, 58
 # Sampled distances may grow faster than true ones: near the shipped objects a hundredth of the space has
 # gradients above 1.2, a thousandth above 1.45.
 STEEPEST = 1.5
@@ -163,7 +163,6 @@ def _place(a, b, turning, side, share, settings, solid, whole, atlas, out, scrat
     for k in range(3):
         out[_CENTRE + k] += b[_COM + k]
         out[_ORIGIN + k] = out[_CENTRE + k] - out[_ORIGIN + k]
-        out[_AXIS_AT + k] = out[_POINTS + 3 * k + 2]
         scratch[90 + k] = a[_POSITION + k] - b[_POSITION + k]
     x, y, z = scratch[90], scratch[91], scratch[92]
     sx, sy, sz = b[_SPIN], b[_SPIN + 1], b[_SPIN + 2]
@@ -172,36 +171,41 @@ def _place(a, b, turning, side, share, settings, solid, whole, atlas, out, scrat
     vz = a[_VELOCITY + 2] - b[_VELOCITY + 2]
     _apply(scratch, 80, vx - (sy * z - sz * y), vy - (sz * x - sx * z), vz - (sx * y - sy * x), out, _MOVES)
     _apply(scratch, 80, a[_SPIN] - sx, a[_SPIN + 1] - sy, a[_SPIN + 2] - sz, out, _TURNS)
-    part = side[_FOLLOWS] * share * h
-    _apply(scratch, 80, part * vx, part * vy, part * vz, out, _DRIFT)
-    _align(a, turning, settings, solid, whole, atlas, out, scratch)
+    out[_STRETCH] = 1.0
+    for k in range(9):
+        out[_VECTORS + k] = out[_ARMS + k] = out[_POINTS + k]
+    if turning == 0:
+        part = side[_FOLLOWS] * share * h
+        _apply(scratch, 80, part * vx, part * vy, part * vz, out, _ARM_ORIGIN)
+        for k in range(3):
+            out[_ARM_ORIGIN + k] += out[_ORIGIN + k] - out[_CENTRE + k]
+        return
+    _face_solid(a, turning, solid, whole, atlas, out, scratch)
+    _apply(out, _POINTS, scratch[30], scratch[31], scratch[32], scratch, 90)
+    _align(a, turning, settings, scratch[30], scratch[31], scratch[32], out, _POINTS, _VECTORS, scratch)
+    # The same at the start: arms of what then touches a plane with the normal of the other moment.
+    _matrix(a, _ORIENTATION, scratch, 43)
+    _product(scratch, 80, scratch, 43, out, _ARMS)
+    _apply(out, _ARMS, -a[_COM], -a[_COM + 1], -a[_COM + 2], out, _ARM_ORIGIN)
     for k in range(3):
-        out[_LOWEST + k] = out[_ORIGIN + k] - out[_CENTRE + k] - out[_POINTS + 3 * k + 2]
+        out[_AXIS_AT + k] = out[_ARMS + 3 * k + 2]
+    _apply_transposed(out, _ARMS, scratch[90], scratch[91], scratch[92], scratch, 30)
+    _align(a, turning, settings, scratch[30], scratch[31], scratch[32], out, _ARMS, -1, scratch)
+    for k in range(3):
+        out[_LOWEST + k] = out[_ARM_ORIGIN + k] - out[_ARMS + 3 * k + 2]
 
 
 @kernel
-def _align(a, turning, settings, solid, whole, atlas, out, scratch):
-    """Turn samples that keep facing the solid; out[_POINTS:] holds the rotation of their body."""
-    out[_STRETCH] = 1.0
-    for k in range(9):
-        out[_VECTORS + k] = out[_POINTS + k]
-    if turning == 0:
-        return
-    x, y, z = out[_ORIGIN], out[_ORIGIN + 1], out[_ORIGIN + 2]
-    _face(out, solid, whole, atlas, x, y, z, scratch)
-    x, y, z = scratch[30], scratch[31], scratch[32]
+def _face_solid(a, turning, solid, whole, atlas, out, scratch):
+    """Direction from where bodies touch to the solid in the axes of the samples' body, to scratch[30:33]."""
+    _face(out, solid, whole, atlas, out[_ORIGIN], out[_ORIGIN + 1], out[_ORIGIN + 2], scratch)
     if turning == _AXIS:
-        if x * x + y * y > 1e-12:
-            across = math.sqrt(x * x + y * y)
-            for r in range(3):
-                p, q = out[_VECTORS + 3 * r], out[_VECTORS + 3 * r + 1]
-                out[_POINTS + 3 * r] = (p * x + q * y) / across
-                out[_POINTS + 3 * r + 1] = (q * x - p * y) / across
-            for k in range(9):
-                out[_VECTORS + k] = out[_POINTS + k]
         return
+    # Once more from where it comes closest: the solid may be small, or curved.
     p, q, r = a[_SCALE], a[_SCALE + 1], a[_SCALE + 2]
-    scratch[30], scratch[31], scratch[32] = p * x, q * y, r * z
+    scratch[30] *= p
+    scratch[31] *= q
+    scratch[32] *= r
     _direct(scratch, 30)
     _apply(out, _POINTS, p * scratch[30], q * scratch[31], r * scratch[32], scratch, 33)
     _face(
@@ -214,19 +218,39 @@ def _align(a, turning, settings, solid, whole, atlas, out, scratch):
         out[_ORIGIN + 2] + scratch[35],
         scratch,
     )
-    scratch[30] *= p
-    scratch[31] *= q
-    scratch[32] *= r
+
+
+@kernel
+def _align(a, turning, settings, x, y, z, out, to, areas, scratch):
+    """Turn samples that face a direction (x, y, z) of their body; out[to:] holds the body's rotation.
+
+    The map of vector areas goes to out[areas:], unless that is negative.
+    """
+    for k in range(9):
+        scratch[50 + k] = out[to + k]
+    if turning == _AXIS:
+        if x * x + y * y > 1e-12:
+            across = math.sqrt(x * x + y * y)
+            for r in range(3):
+                p, q = scratch[50 + 3 * r], scratch[50 + 3 * r + 1]
+                out[to + 3 * r] = (p * x + q * y) / across
+                out[to + 3 * r + 1] = (q * x - p * y) / across
+        if areas >= 0:
+            for k in range(9):
+                out[areas + k] = out[to + k]
+        return
+    p, q, r = a[_SCALE], a[_SCALE + 1], a[_SCALE + 2]
+    scratch[30], scratch[31], scratch[32] = p * x, q * y, r * z
     _direct(scratch, 30)
     _towards(settings, -scratch[30], -scratch[31], -scratch[32], scratch, 40, scratch, 60)
     volume = p * q * r
-    for k in range(3):
-        for c in range(3):
-            scale = p if c == 0 else q if c == 1 else r
-            scratch[60 + 3 * k + c] = out[_VECTORS + 3 * k + c] * scale
-            scratch[70 + 3 * k + c] = out[_VECTORS + 3 * k + c] * (volume / scale)
-    _product(scratch, 60, scratch, 40, out, _POINTS)
-    _product(scratch, 70, scratch, 40, out, _VECTORS)
+    for k in range(9):
+        scale = p if k % 3 == 0 else q if k % 3 == 1 else r
+        scratch[60 + k] = scratch[50 + k] * scale
+        scratch[70 + k] = scratch[50 + k] * (volume / scale)
+    _product(scratch, 60, scratch, 40, out, to)
+    if areas >= 0:
+        _product(scratch, 70, scratch, 40, out, areas)
     out[_STRETCH] = max(p, max(q, r))
 
 
@@ -344,7 +368,7 @@ def _distance_of(placed, x, y, z, solid, whole, atlas, scratch):
 
 @kernel
 def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, turned, found, scratch):
-    """Arm, normal, moment [W], depth, rate and area of a sample into `found`; whether it may press.
+    """Arm, normal, moment [W], depth, rate, area and drift of a sample into `found`; whether it may press.
 
     Returns:
         1 if it faces the solid, or with `turned` if it lies in it and faces the other way; else 0, or -1 if
@@ -368,14 +392,13 @@ def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, turne
             return -1
         area = whole_area
         nx, ny, nz = -scratch[33] / area, -scratch[34] / area, -scratch[35] / area
-    rx = scratch[30] + placed[_ORIGIN] - placed[_CENTRE] + placed[_DRIFT]
-    ry = scratch[31] + placed[_ORIGIN + 1] - placed[_CENTRE + 1] + placed[_DRIFT + 1]
-    rz = scratch[32] + placed[_ORIGIN + 2] - placed[_CENTRE + 2] + placed[_DRIFT + 2]
+    _apply(placed, _ARMS, block[0, lane], block[1, lane], block[2, lane], scratch, 36)
+    rx = scratch[36] + placed[_ARM_ORIGIN]
+    ry = scratch[37] + placed[_ARM_ORIGIN + 1]
+    rz = scratch[38] + placed[_ARM_ORIGIN + 2]
     lx, ly, lz = rx, ry, rz
     if turning == _BALL:
-        lx = placed[_LOWEST] + placed[_DRIFT]
-        ly = placed[_LOWEST + 1] + placed[_DRIFT + 1]
-        lz = placed[_LOWEST + 2] + placed[_DRIFT + 2]
+        lx, ly, lz = placed[_LOWEST], placed[_LOWEST + 1], placed[_LOWEST + 2]
     mx, my, mz = ly * nz - lz * ny, lz * nx - lx * nz, lx * ny - ly * nx
     if turning == _AXIS:
         ax, ay, az = placed[_AXIS_AT], placed[_AXIS_AT + 1], placed[_AXIS_AT + 2]
@@ -387,7 +410,41 @@ def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, turne
     _apply(placed, _WORLD, nx, ny, nz, found, 3)
     _apply(placed, _WORLD, mx, my, mz, found, 6)
     found[9], found[10], found[11] = lead * rate - d, rate, half * area
+    found[12] = found[13] = found[14] = 0.0
+    if turning > 0:
+        _find_drift(
+            placed,
+            x - placed[_CENTRE],
+            y - placed[_CENTRE + 1],
+            z - placed[_CENTRE + 2],
+            rx,
+            ry,
+            rz,
+            nx,
+            ny,
+            nz,
+            found,
+            scratch,
+        )
     return 1
+
+
+@kernel
+def _find_drift(placed, x, y, z, rx, ry, rz, nx, ny, nz, found, scratch):
+    """Half of what the slip changes by from the start to the predicted place, see `dano.contact.Points`."""
+    sx, sy, sz = placed[_TURNS], placed[_TURNS + 1], placed[_TURNS + 2]
+    dx, dy, dz = 0.5 * (x - rx), 0.5 * (y - ry), 0.5 * (z - rz)
+    wx, wy, wz = sy * dz - sz * dy, sz * dx - sx * dz, sx * dy - sy * dx
+    along = wx * nx + wy * ny + wz * nz
+    wx, wy, wz = wx - along * nx, wy - along * ny, wz - along * nz
+    ux = placed[_MOVES] + sy * z - sz * y
+    uy = placed[_MOVES + 1] + sz * x - sx * z
+    uz = placed[_MOVES + 2] + sx * y - sy * x
+    along = ux * nx + uy * ny + uz * nz
+    ux, uy, uz = ux - along * nx, uy - along * ny, uz - along * nz
+    squared, most = wx * wx + wy * wy + wz * wz, ux * ux + uy * uy + uz * uz
+    part = math.sqrt(most / squared) if squared > most else 1.0
+    _apply(placed, _WORLD, part * wx, part * wy, part * wz, found, 12)
 
 
 @kernel
@@ -417,7 +474,7 @@ def _list_block(
     the load of those that lie in the solid and face the other way.
     """
     room, width = numbers.shape[1], numbers.shape[2]
-    found = scratch[80:92]
+    found = scratch[80:95]
     # Where geometry is taken early, what is about to touch has sunk in by no more than this, or nearly does.
     layer = side[_SINK] if share < 1.0 else 0.0
     for lane in range(blocks.shape[2]):
@@ -448,7 +505,7 @@ def _list_block(
             for k in range(6):
                 sums[3 + k] += weight * found[k]
         if used < room:
-            for k in range(12):
+            for k in range(15):
                 numbers[k, used, filled] = found[k]
             samples[used, filled] = n * blocks.shape[2] + lane
         filled += 1
@@ -514,7 +571,7 @@ def _find(
         atlas: Spline coefficients.
         impacts: Whether contacts end impacts within the step, and from which speed, shape (k, 2).
         settings: h, then what `dano.contact` states, see `_H` and those beside it.
-        points: Arm, normal, moment, depth, rate, area, shape (12, c, p); share and stiffness, shape (2, c).
+        points: Arm, normal, moment, depth, rate, area, drift, shape (15, c, p); share and stiffness (2, c).
         where: First body, second body, contact, group and place, shape (5, c); samples, shape (c, p).
     """
     numbers, of_chunk = points

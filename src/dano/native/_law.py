@@ -14,7 +14,9 @@ DUALS, CHANGES = 21, 25
 # change that makes s fit, grip; pressure, −∂p/∂v_n, and the change of the pressure that comes with s.
 FOUND_FRICTION, SLACK, TURN, ALONG, LEAN = 29, 32, 35, 38, 41
 GOING, SLOPE, MISS, GRIP, PRESSURE, FALL, SHIFT = 44, 45, 46, 47, 48, 49, 50
-COLUMNS = 51
+# Then what is added to the slip, see `dano.contact.Points`.
+DRIFT = 51
+COLUMNS = 54
 
 
 @kernel

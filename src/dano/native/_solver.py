@@ -28,6 +28,7 @@ from dano.native._law import (
     ALONG,
     ARM,
     COLUMNS,
+    DRIFT,
     FALL,
     fit_duals,
     follow,
@@ -47,8 +48,8 @@ from dano.native._law import (
 
 # Columns of the table of bodies: mass; inertia [B]; rotation; momentum before contact, its rotation in B.
 _MASS, _INERTIA, _ROTATION, _IMPULSE = 0, 1, 10, 19
-# Rows of what is found at points: arm, normal, moment, depth, rate, area.
-_DEPTH_ROW, _RATE_ROW, _AREA_ROW = 9, 10, 11
+# Rows of what is found at points: arm, normal, moment, depth, rate, area, drift.
+_DEPTH_ROW, _RATE_ROW, _AREA_ROW, _DRIFT_ROW = 9, 10, 11, 12
 # Settings: h, tolerance over (1 + size), size, rounding of the dtype.
 _H, _RELATIVE, _SIZE, _EPSILON = range(4)
 # Rules: constants that `dano.engine` states, in the order of its `RULES`.
@@ -126,7 +127,7 @@ def _tabulate(rows, chunks, n, body_rows, material, stiffness, between, h):
     """Points with area in a table, grouped by runs of chunks that join the same bodies.
 
     Args:
-        rows: Arm, normal, moment, depth, rate and area, shape (12, c, p).
+        rows: Arm, normal, moment, depth, rate, area and drift, shape (15, c, p).
         chunks: First body, second body and contact of each chunk, shape (3, c).
         n: Chunks in use.
         body_rows: Row of each body among those that move, or their number.
@@ -159,6 +160,8 @@ def _tabulate(rows, chunks, n, body_rows, material, stiffness, between, h):
                 for k in range(9):
                     row[k] = rows[k, c, p]
                 row[WEIGHT] = h * area
+                for k in range(3):
+                    row[DRIFT + k] = rows[_DRIFT_ROW + k, c, p]
                 set_constants(row, here, h, rows[_DEPTH_ROW, c, p], rows[_RATE_ROW, c, p], stiffness[c])
                 used += 1
         groups[g, 1] = used
@@ -182,7 +185,7 @@ def _relative(velocities, a, b, apart, twist):
 
 @kernel
 def _motion(row, twist):
-    """Separating speed and slip of a point, see `dano.contact.motion_at`."""
+    """Separating speed and slip of a point without its drift, see `dano.contact.motion_at`."""
     x = twist[0] + twist[4] * row[ARM + 2] - twist[5] * row[ARM + 1]
     y = twist[1] + twist[5] * row[ARM] - twist[3] * row[ARM + 2]
     z = twist[2] + twist[3] * row[ARM + 1] - twist[4] * row[ARM]
@@ -320,6 +323,7 @@ def _assemble(bodies, velocities, points, groups, apart, length, softness, h, ru
         for p in range(groups[g, 0], groups[g, 1]):
             row = points[p]
             rate, x, y, z = _motion(row, twist)
+            x, y, z = x + row[DRIFT], y + row[DRIFT + 1], z + row[DRIFT + 2]
             if linearize(row, rate, x, y, z, length, softness):
                 if not presses:
                     _clear(slope)
@@ -367,8 +371,9 @@ def _fit_all(points, groups, apart, velocities):
     for g in range(groups.shape[0]):
         _relative(velocities, groups[g, 2], groups[g, 3], apart[g], twist)
         for p in range(groups[g, 0], groups[g, 1]):
-            rate, x, y, z = _motion(points[p], twist)
-            fit_duals(points[p], rate, x, y, z)
+            row = points[p]
+            rate, x, y, z = _motion(row, twist)
+            fit_duals(row, rate, x + row[DRIFT], y + row[DRIFT + 1], z + row[DRIFT + 2])
 
 
 @kernel
