@@ -230,7 +230,9 @@ def _igl() -> Any:
 
 def _load_solid(mesh: "str | Path | trimesh.Trimesh", scale: float) -> "trimesh.Trimesh":
     """A watertight mesh with outward faces, in metres."""
-    trimesh = optional("trimesh", "reading meshes needs trimesh", "mesh")
+    optional("trimesh", "reading meshes needs trimesh", "mesh")
+    import trimesh
+
     name = "mesh"
     if isinstance(mesh, (str, Path)):
         name = str(mesh)
