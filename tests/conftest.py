@@ -23,6 +23,10 @@ MANY_MAPS = 15_000
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
+# Files whose programs compile longer than they run. Compiling takes half as long without optimizing, but
+# photographs that are rendered and trained on would then take twice as long.
+COMPILES_LONG = ("engine/test_gradients.py",)
+
 # Shapes and types are checked while tracing; kernels are compiled by Numba, which takes plain functions only.
 CHECKED = [path.stem for path in (REPOSITORY / "src" / "dano").iterdir() if path.stem != "native"]
 install_import_hook([f"dano.{name}" for name in CHECKED], "beartype.beartype")
@@ -36,6 +40,12 @@ def few_programs():
     if maps.is_file() and maps.read_bytes().count(b"\n") > MANY_MAPS:
         jax.clear_caches()
         gc.collect()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def optimized(request: pytest.FixtureRequest):
+    """Whether programs of a module are optimized: see `COMPILES_LONG`."""
+    jax.config.update("jax_disable_most_optimizations", "/".join(request.path.parts[-2:]) in COMPILES_LONG)
 
 
 @pytest.fixture(scope="session")

@@ -152,7 +152,7 @@ def test_bad_options(options, message, run, scene, tmp_path, monkeypatch):
 
 
 def test_pictures_without_their_packages(run, egg, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("dano.cli._outputs.find_spec", lambda name: None)
+    monkeypatch.setattr("dano.cli._outputs.is_installed", lambda name: False)
     files = {scene.name: scene.read_bytes()}
     answer = run("simulate", scene, "-o", tmp_path / "run.npz", "--video", tmp_path / "run.mp4")
     assert_refused(answer, "pip install 'dano[view]'", tmp_path, files)

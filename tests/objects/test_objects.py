@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 import dano
+from dano.objects import field_size
 
 N = 48
 AXIS = np.linspace(-0.6, 0.6, N)
@@ -47,6 +48,26 @@ def test_samples_lie_between_the_thresholds_on_the_surface(solid_ball):
     radius = np.linalg.norm(solid_ball.samples.points, axis=1)
     assert np.all(np.abs(radius - 0.4) < 0.05)
     assert len(np.unique(np.asarray(solid_ball.samples.points), axis=0)) == 1500
+
+
+def test_size_of_a_field_is_that_of_its_object(solid_ball, messy_ball):
+    assert field_size(grid(soft_wall(ball()))) == pytest.approx(0.8, rel=2e-3)
+    assert solid_ball.size == pytest.approx(0.8, rel=0.02)
+    # Without its floater, as the object; with it, out to the corner.
+    surface = (50.0, 90.0)
+    assert field_size(messy_ball, density_range=surface) == pytest.approx(0.8, rel=2e-3)
+    assert field_size(messy_ball, density_range=surface, floaters=True) == pytest.approx(0.95, rel=5e-3)
+    # A shape whose axes are turned against the lattice.
+    half, angle = np.array([0.06, 0.04, 0.03]), 0.4
+    pose = dano.Pose(jnp.zeros(3), jnp.array([np.cos(angle / 2), 0, 0, np.sin(angle / 2)]))
+    turned = dano.posed(dano.Ellipsoid(half), pose)
+    expected = 2 * np.hypot(half[0] * np.cos(angle), half[1] * np.sin(angle))
+    assert field_size(turned) == pytest.approx(expected, rel=2e-3)
+    # A higher density lies further inside, where the interpolated density says.
+    line = np.linspace(0, 0.5, 2001)
+    along = jax.vmap(grid(soft_wall(ball())).density)(jnp.zeros((2001, 3)).at[:, 0].set(line))
+    inner = field_size(grid(soft_wall(ball())), density_range=(90.0, 95.0))
+    assert inner == pytest.approx(2 * line[np.asarray(along) >= 90].max(), rel=2e-3)
 
 
 def test_samples_cover_evenly(solid_ball):

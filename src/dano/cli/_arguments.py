@@ -437,7 +437,7 @@ class Export:
 class Compare:
     """Measure meshes of an object in MuJoCo and PyBullet against the object itself.
 
-    Writes a page with pictures of what lies on the floor and a table of errors and times.
+    Writes a page with pictures of the objects at rest on the floor and a table of errors and times.
 
     Attributes:
         object: A neural object (.dano).

@@ -1,9 +1,9 @@
 """Checks before any work starts: where results go, and whether what draws them is installed."""
 
-from importlib.util import find_spec
 from pathlib import Path
 
 from dano.archive import checked_output
+from dano.extras import is_installed
 
 
 def check_output(path: Path, *inputs: Path, suffix: str | None = None) -> None:
@@ -47,6 +47,6 @@ def check_distinct(**outputs: Path | None) -> None:
 def missing_for_pictures(*, video: bool) -> str | None:
     """What to install before pictures, or videos, can be made; None if all is there."""
     packages = ["matplotlib", "PIL", *(["av"] if video else [])]
-    if missing := [name for name in packages if find_spec(name) is None]:
+    if missing := [name for name in packages if not is_installed(name)]:
         return f"pictures need {', '.join(missing)}: pip install 'dano[view]'"
     return None

@@ -1,6 +1,5 @@
 """The verb: an object in our engine beside what meshes of it do in others."""
 
-import importlib.util
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -16,6 +15,7 @@ from dano.comparison._pybullet import has_pybullet, PyBullet
 from dano.comparison._rest import nearest_rest, stable_directions
 from dano.comparison._routes import best_level, Grid, hull_of, level_mesh, Mesh, pieces_of
 from dano.exchange import convex_hull, enclosed, Moments, signed_distances, solid_triangles, Triangles
+from dano.extras import is_installed
 from dano.fields import AbstractField, AbstractShape, bake, GridField
 from dano.objects import NeuralObject, node_values
 
@@ -215,7 +215,7 @@ def compare(
     _mesh_row(bench, mesh, "best surface: signed distance", hull_of, MuJoCo, rows, scenery, as_distance=True)
     if has_pybullet():
         _mesh_row(bench, mesh, "best surface: hull", hull_of, PyBullet, rows, scenery)
-    if decomposed and importlib.util.find_spec("coacd") is not None:
+    if decomposed and is_installed("coacd"):
         say("convex pieces", 0.65)
         pieces = pieces_of(grid, mesh)
         engines = (MuJoCo, PyBullet) if has_pybullet() else (MuJoCo,)
@@ -230,7 +230,7 @@ def _missing(decomposed: bool) -> list[str]:
     found = []
     if not decomposed:
         found.append("Convex decomposition is left out, as asked.")
-    elif importlib.util.find_spec("coacd") is None:
+    elif not is_installed("coacd"):
         found.append("Convex decomposition is left out: pip install 'dano[export]'.")
     if not has_pybullet():
         found.append(

@@ -1,12 +1,14 @@
 """MuJoCo's side."""
 
 import time
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from dano.comparison._bodies import FRICTION, GRAVITY, Path, Probes, Rigid, rotation_of, Start
 from dano.exchange import Triangles
+from dano.extras import optional
 from dano.maths import quat_to_matrix
 
 _TIMED = 400
@@ -96,9 +98,5 @@ def _words(numbers: Float[np.ndarray, "..."]) -> str:
     return " ".join(f"{x:.12g}" for x in np.ravel(numbers))
 
 
-def _mujoco():
-    try:
-        import mujoco
-    except ImportError as error:
-        raise ImportError("the comparison needs mujoco: pip install 'dano[mujoco]'") from error
-    return mujoco
+def _mujoco() -> Any:
+    return optional("mujoco", "the comparison needs mujoco", "mujoco")

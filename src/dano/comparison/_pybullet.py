@@ -2,7 +2,6 @@
 
 import contextlib
 import ctypes
-import importlib.util
 import os
 import sys
 import tempfile
@@ -16,6 +15,7 @@ from jaxtyping import Bool
 
 from dano.comparison._bodies import FRICTION, GRAVITY, Path, Probes, Rigid, rotation_of, Start
 from dano.exchange import write_obj
+from dano.extras import is_installed
 from dano.maths import quat_from_matrix, quat_to_matrix
 
 _TIMED = 400
@@ -24,7 +24,7 @@ _TIMED = 400
 
 def has_pybullet() -> bool:
     """Whether PyBullet is installed."""
-    return importlib.util.find_spec("pybullet") is not None
+    return is_installed("pybullet")
 
 
 class PyBullet:

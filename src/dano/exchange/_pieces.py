@@ -1,12 +1,12 @@
 """Convex pieces that stand for an object in engines whose contacts know convex shapes only."""
 
-import importlib.util
-from typing import get_args, Literal
+from typing import Any, get_args, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from dano.exchange._triangles import Triangles
+from dano.extras import is_installed, optional
 
 Collision = Literal["auto", "coacd", "hull"]
 
@@ -20,9 +20,9 @@ def chosen_collision(collision: str) -> Literal["coacd", "hull"]:
     """
     if collision not in get_args(Collision):
         raise ValueError(f"collision must be one of {list(get_args(Collision))}, got {collision!r}")
-    installed = importlib.util.find_spec("coacd") is not None
+    installed = is_installed("coacd")
     if collision == "coacd" and not installed:
-        raise ImportError("a convex decomposition needs coacd: pip install 'dano[export]'")
+        _coacd()
     return "hull" if collision == "hull" or not installed else "coacd"
 
 
@@ -59,10 +59,7 @@ def decomposition(mesh: Triangles, threshold: float, most: int | None) -> list[T
     Raises:
         ImportError: If coacd is missing.
     """
-    try:
-        import coacd  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError("a convex decomposition needs coacd: pip install 'dano[export]'") from error
+    coacd = _coacd()
     coacd.set_log_level("error")
     parts = coacd.run_coacd(
         coacd.Mesh(mesh.vertices, mesh.faces),
@@ -72,3 +69,7 @@ def decomposition(mesh: Triangles, threshold: float, most: int | None) -> list[T
     )
     # Its own triangles may be turned inside out.
     return [convex_hull(np.asarray(vertices, np.float64)) for vertices, _ in parts]
+
+
+def _coacd() -> Any:
+    return optional("coacd", "a convex decomposition needs coacd", "export")

@@ -1,12 +1,13 @@
 """Triangles: level surfaces of densities and of signed distances, and the volume that they enclose."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from dano.extras import optional
 from dano.fields import AbstractShape
 
 _MARGIN = 2
@@ -224,9 +225,5 @@ def largest_part(values: Float[np.ndarray, "nx ny nz"], level: float) -> Bool[np
     return ndimage.binary_fill_holes(labels == int(np.argmax(count)))
 
 
-def _igl():
-    try:
-        import igl
-    except ImportError as error:
-        raise ImportError("triangles of a field need libigl: pip install 'dano[export]'") from error
-    return igl
+def _igl() -> Any:
+    return optional("igl", "triangles of a field need libigl", "export")

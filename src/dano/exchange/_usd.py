@@ -1,12 +1,12 @@
 """Universal Scene Description with its physics schema, as Isaac Sim and Newton read it."""
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
 
 from dano.exchange._contents import Contents, VISUAL
 from dano.exchange._look import PLAIN
+from dano.extras import optional
 from dano.maths import quat_from_matrix
 
 NOTES = (
@@ -21,8 +21,7 @@ def check_usd() -> None:
     Raises:
         ImportError: If usd-core is missing.
     """
-    if importlib.util.find_spec("pxr") is None:
-        raise ImportError("USD needs usd-core: pip install 'dano[usd]'")
+    optional("pxr", "USD needs usd-core", "usd")
 
 
 def write_usd(folder: Path, contents: Contents) -> list[str]:

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from dano.exchange._look import Texture
 from dano.exchange._triangles import Triangles
+from dano.extras import optional
 
 
 def write_obj(
@@ -57,8 +58,5 @@ def write_image(path: Path, texture: Texture) -> None:
     Raises:
         ImportError: If pillow is missing.
     """
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError("textures need pillow: pip install 'dano[export]'") from error
-    Image.fromarray(texture.image).save(path, "PNG", optimize=True)
+    picture = optional("PIL.Image", "textures need pillow", "export")
+    picture.fromarray(texture.image).save(path, "PNG", optimize=True)

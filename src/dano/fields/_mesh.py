@@ -2,11 +2,12 @@
 
 import warnings
 from pathlib import Path
-from typing import NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
 
+from dano.extras import optional
 from dano.fields._redistance import spread_distances
 from dano.fields._shapes import SolidMoments
 from dano.fields._signed_distance import SignedDistanceGrid
@@ -223,20 +224,15 @@ def _arrays(solid: "trimesh.Trimesh") -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _igl():
-    try:
-        import igl
-    except ImportError as error:
-        raise ImportError("signed distances of meshes need libigl: pip install 'dano[mesh]'") from error
-    return igl
+def _igl() -> Any:
+    return optional("igl", "signed distances of meshes need libigl", "mesh")
 
 
 def _load_solid(mesh: "str | Path | trimesh.Trimesh", scale: float) -> "trimesh.Trimesh":
     """A watertight mesh with outward faces, in metres."""
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError("reading meshes needs trimesh: pip install 'dano[mesh]'") from error
+    optional("trimesh", "reading meshes needs trimesh", "mesh")
+    import trimesh
+
     name = "mesh"
     if isinstance(mesh, (str, Path)):
         name = str(mesh)

@@ -19,14 +19,15 @@ from dano.identify._windows import draw_velocities, plan_windows
 from dano.scene import Control, Scene, State
 from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
 
-# Of each start that is refined, so many are only looked at.
+# Points whose loss is computed for each start that is refined.
 _LOOKS = 4
-# How much worse than most a window fits that should begin anew, and by how much a motion's loss must fall.
+# Windows that fit worse than most by the first factor are restarted. The result is kept if the loss of their
+# motion falls by the second.
 _POOR, _BETTER = 2.0, 5.0
-# How often windows may begin anew where those before them end; then with velocities from so few frames, which
-# are noisier, but no further than a frame from an impact do they know of it; then at so many draws of these.
+# Restarts of badly fitting windows: so often from where the windows before end; then with velocities from so
+# few frames, which are noisier, but wrong only within a frame of an impact; then from so many draws of these.
 _SWEEPS, _NARROW, _DRAWS = 2, 3, 8
-# Standard errors to which searches before the last one are near enough.
+# Tolerance [standard errors] of all searches but the last.
 _NEAR = 3.0
 # Windows simulated at once on an accelerator; a CPU is fastest one by one.
 _BATCH = 1024
@@ -275,11 +276,11 @@ class Problem:
         begin: State,
         minimise: Callable[..., Solution],
     ) -> tuple[Solution, bool]:
-        """The solution, `found` there, with other beginnings of windows, for motions that fit better then."""
+        """The solution in which the motions that fit better from other initial states start there."""
         if solution.stop is Stop.INTERRUPTED or not windows.any():
             return solution, False
-        # Where most windows fit, the parameters are good enough to tell which beginning is better; and only
-        # motions that begin anew are simulated.
+        # Where most windows fit, the parameters are good enough to compare initial states. With fixed
+        # parameters only the restarted motions are simulated.
         held = bool(np.mean(windows) <= 0.5)
         other = minimise(solution.x, _where(windows, begin, solution.blocks), held=held)
         if other.stop is Stop.INTERRUPTED:

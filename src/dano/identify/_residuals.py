@@ -66,7 +66,7 @@ class Linearized(NamedTuple):
         hessian: Gauss–Newton's.
         jump: By which a window misses the beginning of the next, in standard deviations; one zero if it may.
         jump_slope: Its derivative.
-        predicted: States at the frames, positions and velocities of what was observed.
+        predicted: States at the frames: positions and velocities that correspond to the observed ones.
         lengths: Of the residuals in standard deviations; −1 where nothing was observed.
         unconverged: Steps that did not converge.
     """
@@ -187,7 +187,7 @@ def _nothing(model: Model, state: State, p: int) -> Linearized:
 
 @compiled
 def moved(start: State, change: Float[Array, "w k"], unknowns: Start) -> State:
-    """Initial states moved by a change of what is estimated of them."""
+    """Initial states after a change of their estimated parts."""
     return jax.vmap(unknowns.moved)(start, change)
 
 

@@ -1,7 +1,7 @@
 """The bridge: neural objects on the bodies of a user's model, in plain `mj_step`.
 
 MuJoCo calls `mjcb_passive` between finding contacts and solving for them. There the bridge appends those of
-its objects to `mjData.contact` and has MuJoCo make its constraints anew, so that the forces are those of
+its objects to `mjData.contact` and lets MuJoCo make its constraints again, so that the forces are those of
 its own solver, implicit and coupled with everything else in the model.
 """
 
@@ -149,7 +149,7 @@ class Bridge:
             self._before = None
 
     def contacts(self, model: Any, data: Any) -> int:
-        """Append the contacts of the objects at the pose of `data`, and make MuJoCo's constraints anew.
+        """Append the contacts of the objects at the pose of `data`, and make MuJoCo's constraints again.
 
         What happens within `mj_step` in a `with` block; for those who call the parts of a step one by one,
         between `mj_fwdPosition` and `mj_fwdVelocity`. Contacts that are there already are left alone.

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from dano.exchange import solid_triangles
+from dano.extras import optional
 from dano.mujoco._things import Thing
 from dano.objects import NeuralObject
 
@@ -23,11 +24,7 @@ def library() -> Any:
     Raises:
         ImportError: If it is missing.
     """
-    try:
-        import mujoco
-    except ImportError as error:
-        raise ImportError("dano.mujoco needs mujoco: pip install 'dano[mujoco]'") from error
-    return mujoco
+    return optional("mujoco", "dano.mujoco needs mujoco", "mujoco")
 
 
 def names_of(target: Any, spec: bool) -> list[str]:

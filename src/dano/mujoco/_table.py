@@ -54,7 +54,7 @@ class Batch(NamedTuple):
 
 
 class Table:
-    """What the search needs of a model. Sizes, frictions and heights are read anew in every step."""
+    """What the search needs of a model. Sizes, frictions and heights are read in every step."""
 
     def __init__(self, mujoco: Any, model: Any, things: Mapping[str, Thing], choose: Chooser | None = None):
         """Look the bodies up.

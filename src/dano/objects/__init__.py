@@ -6,7 +6,11 @@ from dano.objects._interior import (
     node_values as node_values,
 )
 from dano.objects._mass import checked_inertia as checked_inertia, MassProperties as MassProperties
-from dano.objects._object import MassModel as MassModel, NeuralObject as NeuralObject
+from dano.objects._object import (
+    field_size as field_size,
+    MassModel as MassModel,
+    NeuralObject as NeuralObject,
+)
 from dano.objects._quadrature import Quadrature as Quadrature, surface_quadrature as surface_quadrature
 from dano.objects._samples import (
     ContactSamples as ContactSamples,

@@ -270,7 +270,7 @@ class NeuralObject(eqx.Module):
     def load(cls, path: str | os.PathLike[str]) -> "NeuralObject":
         """Read an object written by `save`.
 
-        Files of version 1 hold no solid and no surface samples: these are made anew from the grid, in some
+        Files of version 1 hold no solid and no surface samples: these are computed from the grid, in some
         seconds, or from the contact samples as `from_samples` does where there is no grid.
 
         Raises:
@@ -313,6 +313,30 @@ class NeuralObject(eqx.Module):
             )
         except (KeyError, ValueError) as error:
             raise ValueError(f"{path} is not a valid dano object: {error}") from error
+
+
+def field_size(
+    field: AbstractField,
+    *,
+    density_range: tuple[float, float] | None = None,
+    resolution: int = 64,
+    floaters: bool = False,
+) -> float:
+    """Longest extent [m] of the object that `NeuralObject.from_field` makes of a field, without making it.
+
+    Args:
+        field: Density with finite bounds.
+        density_range: See there; its lower end bounds the object.
+        resolution: Cells along the longest axis. The ends of the object are found within them.
+        floaters: See there.
+
+    Raises:
+        ValueError: If the field is empty, has a negative or non-finite density or unbounded support, or does
+            not reach the density range.
+    """
+    _, density, lattice, interior = _closed(field, resolution)
+    low = float(interior.level) if density_range is None else density_range[0]
+    return float(Region.create(lattice, low, floaters=floaters).extents(density).max())
 
 
 def _closed(field: AbstractField, resolution: int) -> tuple[AbstractField, Density, Lattice, Interior]:

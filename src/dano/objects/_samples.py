@@ -18,6 +18,8 @@ CANDIDATES = 4
 DRAWS = 400
 # Cells across the thinnest side of a field's bounds with which its inside is found wherever the lattice lies.
 _CELLS_ACROSS = 4
+# Of a cell, to find where the density crosses a level: to a thousandth of it.
+_HALVINGS = 10
 
 
 class ContactSamples(eqx.Module):
@@ -140,6 +142,26 @@ class Region(eqx.Module):
         outside = ~(self.occupied | self.cavity)
         to_outside = ndimage.distance_transform_edt(~outside, sampling=self.lattice.side)
         return self.near(1) & (to_outside < to_cavity)
+
+    def extents(self, density: Density) -> Float[np.ndarray, "3"]:
+        """Sides [m] of the box around the region, each end where a line of the lattice crosses the level."""
+        return np.array([self._end(density, axis, 1) - self._end(density, axis, -1) for axis in range(3)])
+
+    def _end(self, density: Density, axis: int, sign: int) -> float:
+        """Largest (sign 1) or smallest (−1) coordinate of the region [m, F]."""
+        index = np.argwhere(self.occupied)
+        last = sign * np.max(sign * index[:, axis])
+        # Where the last layer is a single point, a line beside it may reach further.
+        start = index[sign * (last - index[:, axis]) <= 1]
+        step = np.zeros(3)
+        step[axis] = sign * self.lattice.side[axis]
+        inside = self.lattice.origin + start * self.lattice.side
+        below, above = np.zeros(len(inside)), np.ones(len(inside))
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (below + above)
+            solid = evaluate(density, inside + middle[:, None] * step) >= self.level
+            below, above = np.where(solid, middle, below), np.where(solid, above, middle)
+        return float(sign * np.max(sign * (inside + below[:, None] * step)[:, axis]))
 
     def solid(self, density: Density) -> Density:
         """Mean occupied density inside the filled region, zero outside; sharp at the level."""

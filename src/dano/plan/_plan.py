@@ -28,7 +28,7 @@ METHODS = ("ilqr", "cem", "mppi")
 OPTIONS = TrajectoryOptions(
     tolerance=1e-4, constraint_tolerance=VIOLATION, max_iterations=40, max_updates=20, penalty=10.0
 )
-"""Of plans through contact, whose last digits tell nothing."""
+"""Of plans through contact, whose last digits mean nothing."""
 
 
 class GoalError(NamedTuple):
@@ -36,7 +36,7 @@ class GoalError(NamedTuple):
 
     Attributes:
         name: Such as "position of bunny".
-        error: Length of what is missing [unit of the quantity; rad].
+        error: Length of the difference to the goal [unit of the quantity; rad].
         largest: Its largest component.
         within: What counts as reached.
         required: Whether it had to be.
@@ -175,12 +175,13 @@ def plan(
     Args:
         scene: The scene.
         state: Where it begins.
-        task: What shall be done.
+        task: Goals, limits and actuators.
         method: How to search: "ilqr", "cem" or "mppi".
-        controls: First guess [N, N m], shape (T, m); default: none of the actuators does anything.
-        explore: Passes of CEM with which the first guess is improved: where the bodies do not touch yet,
-            derivatives do not say that they should.
-        softening: Factors < 1 of the contacts' stiffness with which to plan first, each from the plan before.
+        controls: First guess [N, N m], shape (T, m); default: zero.
+        explore: Passes of CEM that improve the first guess. Where bodies do not touch yet, derivatives do not
+            lead to contact.
+        softening: Factors < 1 of the contacts' stiffness to plan with first; each plan starts from the one
+            before.
         warm: Plan of a similar problem: its controls and multipliers are the first guess.
         options: Of iLQR; default `OPTIONS` of this module.
         sampling: Of CEM and MPPI.
@@ -197,13 +198,7 @@ def plan(
     began = time.perf_counter()
     scene.check_state(state)
     task.check(scene)
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
-    if explore < 0:
-        raise ValueError(f"explore must be ≥ 0, got {explore}")
-    for factor in softening:
-        if not 0 < factor < 1:
-            raise ValueError(f"softening must hold factors between 0 and 1, got {factor}")
+    _check_search(method, explore, softening)
     engine, state = engine or VariationalEngine(), scene.filled(state)
     scales = Scales.of(task)
     guess = scales.scaled(_first_guess(task, controls, warm))
@@ -232,6 +227,16 @@ def plan(
     if solution.stop is TrajectoryStop.INFEASIBLE:
         message += _what_is_missed(solution)
     return _plan(scene, state, task, scales, engine, solution.controls, solution, message, method, began)
+
+
+def _check_search(method: str, explore: int, softening: Sequence[float]) -> None:
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    if explore < 0:
+        raise ValueError(f"explore must be ≥ 0, got {explore}")
+    for factor in softening:
+        if not 0 < factor < 1:
+            raise ValueError(f"softening must hold factors between 0 and 1, got {factor}")
 
 
 def _optimised(scene, state, task, engine, guess, softening, warm, options, tell) -> TrajectorySolution:

@@ -57,7 +57,7 @@ _COLUMNS = (
 def write_comparison_report(
     path: str | os.PathLike[str], comparison: Comparison, *, title: str = "Meshes and the neural object"
 ) -> None:
-    """Write a page with the measurements and pictures of what lies on the floor.
+    """Write a page with the measurements and pictures of the objects at rest on the floor.
 
     Args:
         path: Where to; written whole or not at all.

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dano.archive import checked_output, replacing
+from dano.extras import optional
 from dano.progress import Progress
 from dano.report._overlay import draw_touches
 from dano.report._resample import frame_times, poses_at
@@ -177,9 +178,4 @@ def require(module: str, package: str | None = None) -> Any:
     Raises:
         ImportError: If it is missing; names the extra that brings it.
     """
-    import importlib
-
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(f"this needs {package or module}: pip install 'dano[view]'") from error
+    return optional(module, f"this needs {package or module}", "view")

@@ -16,7 +16,7 @@ from dano.building import BuildOptions
 from dano.fields import AbstractField, AbstractShape, load_field, scaled
 from dano.memory import check_nodes
 from dano.names import did_you_mean
-from dano.objects import NeuralObject
+from dano.objects import field_size, NeuralObject
 from dano.scene_file._doubts import border_doubts, mass_doubt, size_doubts
 
 if TYPE_CHECKING:
@@ -80,9 +80,8 @@ def build_object(
     if chosen.length is not None:
         if not (math.isfinite(chosen.length) and chosen.length > 0):
             raise ValueError(f"length must be finite and > 0 m, got {chosen.length}")
-        # A coarse object tells how much of the field is object, to half a per cent.
-        coarse = NeuralObject.from_field(field, n_samples=1000, resolution=64, **common)
-        field = scaled(field, chosen.length / coarse.size)
+        extent = field_size(field, density_range=chosen.density_range, floaters=common["floaters"])
+        field = scaled(field, chosen.length / extent)
     made = NeuralObject.from_field(
         field,
         n_samples=chosen.samples,

@@ -20,7 +20,7 @@ from dano.solvers._trajectory import (
     TrajectoryProblem,
 )
 
-# A step is taken when it brings this share of what the model promises.
+# A step is accepted if it reduces the cost by at least this share of the model's prediction.
 _SUFFICIENT = 1e-4
 # Halvings of α before ρ grows.
 _TRIALS = 10

@@ -90,7 +90,7 @@ _ROUGH = 100
 # Curvature over a parameter's range, as a share of the largest there is, that may be rounding: a parameter
 # with less stays about where it is instead of running off.
 _FLAT = 1e-10
-# A step is accepted when it brings this share of what the model promises.
+# A step is accepted if it reduces the loss by at least this share of the model's prediction.
 _SUFFICIENT = 1e-4
 # A step that brings less than this share is poor: blocks whose loss grew try again, damped more and more.
 _POOR = 0.25

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from dano.extras import optional
 from dano.fields._grid import GridField
 from dano.maths import Numbers
 from dano.memory import decompressed
@@ -79,12 +80,7 @@ def load_snapshot(
 
 
 def _content(path: Path) -> Any:
-    try:
-        import msgpack
-    except ImportError as error:
-        raise ImportError(
-            "reading instant-ngp snapshots needs msgpack: pip install 'dano[import]'"
-        ) from error
+    msgpack = optional("msgpack", "reading instant-ngp snapshots needs msgpack", "import")
     data = path.read_bytes()
     try:
         if data[:2] == b"\x1f\x8b" or data[:1] == b"\x78":

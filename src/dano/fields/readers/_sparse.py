@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from dano.extras import optional
+
 
 class Block(NamedTuple):
     """A cube of a sparse grid: its first voxel, and its values (8, 8, 8) or the one value of its tile."""
@@ -80,10 +82,7 @@ def corner(origin: tuple[int, int, int], n: int, side: int, size: int) -> tuple[
 
 
 def unblosc(data: bytes) -> bytes:
-    try:
-        import blosc
-    except ImportError as error:
-        raise ImportError("reading this VDB file needs blosc: pip install 'dano[import]'") from error
+    blosc = optional("blosc", "reading this VDB file needs blosc", "import")
     try:
         return blosc.decompress(data)
     except Exception as error:  # of a class that blosc does not export

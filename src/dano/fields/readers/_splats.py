@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from dano.extras import optional
 from dano.fields._callable import CallableField
 from dano.maths import Numbers, quat_to_matrix
 
@@ -49,10 +50,7 @@ def load_splats(path: Path, *, crop: Numbers | None, min_width: float = 0.0) -> 
             Gaussian or numbers that are not finite.
         ImportError: If plyfile is missing.
     """
-    try:
-        import plyfile
-    except ImportError as error:
-        raise ImportError("reading Gaussian splats needs plyfile: pip install 'dano[import]'") from error
+    plyfile = optional("plyfile", "reading Gaussian splats needs plyfile", "import")
     try:
         vertices = plyfile.PlyData.read(str(path))["vertex"].data
         names = vertices.dtype.names

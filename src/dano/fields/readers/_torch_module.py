@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from dano.extras import optional
 from dano.fields._callable import CallableField
 from dano.fields.readers._checkpoint import read_weights
 from dano.maths import Numbers
@@ -126,11 +127,7 @@ def _required(crop: Numbers | None, what: object) -> Numbers:
 
 
 def _torch() -> Any:
-    try:
-        import torch  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError("PyTorch modules need torch: pip install 'dano[torch]'") from error
-    return torch
+    return optional("torch", "PyTorch modules need torch", "torch")
 
 
 def _state(weights: dict[str, Any], wanted: dict[str, Any], torch: Any) -> dict[str, Any]:
