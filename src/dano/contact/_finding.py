@@ -242,12 +242,13 @@ def _drift(placed, ahead: Float[Array, "3 n"], arm: Float[Array, "3 n"], normal:
         return v - normal * dot(normal, v)[None]
 
     spin = jnp.broadcast_to(placed.spin[:, None], arm.shape)
-    drift = across(cross(spin, 0.5 * (ahead - arm)))
+    change = cross(spin, 0.5 * (ahead - arm))
+    drift = across(change)
     slip = across(placed.velocity[:, None] + cross(spin, ahead))
     squared, most = dot(drift, drift), dot(slip, slip)
     over = squared > most
     part = jnp.sqrt(jnp.where(over & (most > 0), most, 1) / jnp.where(over, squared, 1))
-    return jnp.where(over & (most == 0), 0, part)[None] * drift
+    return change - drift + jnp.where(over & (most == 0), 0, part)[None] * drift
 
 
 def _moment(kind: Kind | Mixture, turning, placed, arm: Float[Array, "3 n"], normal: Float[Array, "3 n"]):
@@ -270,10 +271,9 @@ def _moment(kind: Kind | Mixture, turning, placed, arm: Float[Array, "3 n"], nor
 def _impact_sums(rows: Float[Array, "15 n"], depth: Float[Array, " n"]) -> Float[Array, "9"]:
     """Sums over samples that sink in: area; then load, and rate, arm and normal weighted by it."""
     weight = rows[11] * jnp.maximum(depth, 0)
+    rate = rows[10] - dot(rows[3:6], rows[12:])
     area = jnp.sum(jnp.where(depth > 0, rows[11], 0))
-    return jnp.concatenate(
-        [jnp.stack([area, jnp.sum(weight), jnp.sum(weight * rows[10])]), rows[:6] @ weight]
-    )
+    return jnp.concatenate([jnp.stack([area, jnp.sum(weight), jnp.sum(weight * rate)]), rows[:6] @ weight])
 
 
 def _impact_stiffness(links: Links, side: Side, placed, sums, impacts: Impacts, h) -> Float[Array, ""]:

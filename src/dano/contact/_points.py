@@ -75,11 +75,23 @@ class Points(eqx.Module):
 
     @property
     def drift(self) -> Float[Array, "3 c p"]:
-        """Added to the slip [m/s, W]: half of what the slip at the old velocities changes by within the step.
+        """Half of what the velocity of a point at the old motion changes by within the step [m/s, W].
 
-        Zero but for samples that keep facing the second body: what touches is another place each time.
+        Zero but for samples that keep facing the second body: what touches is another place each time. The
+        part along the surface is added to the slip. The other is taken off `rate` to tell how bodies that
+        touch approached, half a step before.
         """
         return self.rows[12:]
+
+    @property
+    def approach(self) -> Float[Array, "c p"]:
+        """Separating speed with which the step begins [m/s]."""
+        return self.rate - dot(self.normal, self.drift)
+
+    @property
+    def creep(self) -> Float[Array, "3 c p"]:
+        """What is added to the slip [m/s, W]."""
+        return self.drift - self.normal * dot(self.normal, self.drift)[None]
 
 
 class Found(eqx.Module):
@@ -122,7 +134,7 @@ def point_motion(velocity: Float[Array, "n 3"], spin: Float[Array, "n 3"], point
     """Motion of points at the velocities of all bodies, see `relative_twist`."""
     u, w = (x[:, :, None] for x in relative_twist(velocity, spin, points))
     rate, slip = motion_at(points.arm, points.normal, points.moment, u, w)
-    return Motion(rate, slip + points.drift)
+    return Motion(rate, slip + points.creep)
 
 
 def motion_at(

@@ -91,7 +91,7 @@ def constants(material: Material, points: Points) -> Constants:
     """
     material = Material(*(x[:, None] for x in material))
     hit = points.stiffness[:, None] > 0
-    rebound = -material.restitution * points.rate
+    rebound = -material.restitution * points.approach
     goal = jnp.where(rebound > material.bounce, material.timestep * rebound, jnp.minimum(points.depth, 0))
     # Impacts that end within the step have had their restitution: what presses on gives nothing back.
     loss = jnp.where(material.instant > 0, 1, (1 - material.restitution**2) / (1 + material.restitution**2))

@@ -431,12 +431,12 @@ def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, turne
 
 @kernel
 def _find_drift(placed, x, y, z, rx, ry, rz, nx, ny, nz, found, scratch):
-    """Half of what the slip changes by from the start to the predicted place, see `dano.contact.Points`."""
+    """Half of what the velocity changes by until the predicted place, see `dano.contact.Points.drift`."""
     sx, sy, sz = placed[_TURNS], placed[_TURNS + 1], placed[_TURNS + 2]
     dx, dy, dz = 0.5 * (x - rx), 0.5 * (y - ry), 0.5 * (z - rz)
     wx, wy, wz = sy * dz - sz * dy, sz * dx - sx * dz, sx * dy - sy * dx
-    along = wx * nx + wy * ny + wz * nz
-    wx, wy, wz = wx - along * nx, wy - along * ny, wz - along * nz
+    nearing = wx * nx + wy * ny + wz * nz
+    wx, wy, wz = wx - nearing * nx, wy - nearing * ny, wz - nearing * nz
     ux = placed[_MOVES] + sy * z - sz * y
     uy = placed[_MOVES + 1] + sz * x - sx * z
     uz = placed[_MOVES + 2] + sx * y - sy * x
@@ -444,7 +444,8 @@ def _find_drift(placed, x, y, z, rx, ry, rz, nx, ny, nz, found, scratch):
     ux, uy, uz = ux - along * nx, uy - along * ny, uz - along * nz
     squared, most = wx * wx + wy * wy + wz * wz, ux * ux + uy * uy + uz * uz
     part = math.sqrt(most / squared) if squared > most else 1.0
-    _apply(placed, _WORLD, part * wx, part * wy, part * wz, found, 12)
+    wx, wy, wz = part * wx + nearing * nx, part * wy + nearing * ny, part * wz + nearing * nz
+    _apply(placed, _WORLD, wx, wy, wz, found, 12)
 
 
 @kernel
@@ -501,7 +502,9 @@ def _list_block(
             weight = found[11] * depth
             sums[0] += found[11]
             sums[1] += weight
-            sums[2] += weight * found[10]
+            sums[2] += weight * (
+                found[10] - found[3] * found[12] - found[4] * found[13] - found[5] * found[14]
+            )
             for k in range(6):
                 sums[3 + k] += weight * found[k]
         if used < room:

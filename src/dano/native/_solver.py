@@ -160,9 +160,13 @@ def _tabulate(rows, chunks, n, body_rows, material, stiffness, between, h):
                 for k in range(9):
                     row[k] = rows[k, c, p]
                 row[WEIGHT] = h * area
+                nearing = 0.0
                 for k in range(3):
-                    row[DRIFT + k] = rows[_DRIFT_ROW + k, c, p]
-                set_constants(row, here, h, rows[_DEPTH_ROW, c, p], rows[_RATE_ROW, c, p], stiffness[c])
+                    nearing += row[NORMAL + k] * rows[_DRIFT_ROW + k, c, p]
+                for k in range(3):
+                    row[DRIFT + k] = rows[_DRIFT_ROW + k, c, p] - nearing * row[NORMAL + k]
+                rate = rows[_RATE_ROW, c, p] - nearing
+                set_constants(row, here, h, rows[_DEPTH_ROW, c, p], rate, stiffness[c])
                 used += 1
         groups[g, 1] = used
     return points[:used], groups[: g + 1], apart[: g + 1]
