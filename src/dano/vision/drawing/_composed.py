@@ -28,6 +28,7 @@ from dano.vision.radiance import (
     importance_edges,
     Picture,
     Sampling,
+    section_weights,
     Share,
     stratified_edges,
     tiles,
@@ -362,6 +363,8 @@ def shared_weights(
     """
     if not edges:
         return [], jnp.ones(n_rays, jnp.float32)
+    if len(edges) == 1:
+        return [section_weights(alphas[0])], transmittance(alphas[0])
     owner = np.concatenate([np.full(e.shape[1], i) for i, e in enumerate(edges)])
     joined = jnp.concatenate(edges, axis=1)
     order = jnp.argsort(joined, axis=1, stable=True)
