@@ -8,11 +8,14 @@ from jaxtyping import Float
 from dano.vision.tracking._refine import Refined
 from dano.vision.tracking._subject import Subject
 
-_SHAPE_DOUBT = 2.0e-3
-"""Share of its size by which a learned object is off, all over alike: no frame shows it, all share it."""
+_PLACE_DOUBT = 2.0e-3
+"""Share of its size by which a learned object lies beside the true one: no frame shows it, all share it."""
 
-_TURN_DOUBT = 1.5e-3
-"""The same of its orientation [rad]."""
+_SCALE_DOUBT = 1.5e-3
+"""Share by which it is too large or too small: it then seems to be nearer or further by that share."""
+
+_TURN_DOUBT = 3e-3
+"""By which it is turned [rad]."""
 
 _INFLATED = 1.5
 """By which variances by tiles are too small: the light's errors hang together over larger areas."""
@@ -31,16 +34,20 @@ def _observed(found: Refined) -> tuple[np.ndarray, np.ndarray]:
     return 6 / np.sqrt(np.maximum(values, 1e-9)), vectors
 
 
-def covariance_of(found: Refined, subject: Subject) -> Float[np.ndarray, "6 6"]:
-    """Covariance of position [m, W] and rotation vector [rad, F]."""
+def covariance_of(
+    found: Refined, subject: Subject, eye: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "6 6"]:
+    """Covariance of position [m, W] and rotation vector [rad, F], seen from a point [m, W]."""
     covariance = _INFLATED * found.covariance
     deviations, directions = _observed(found)
     for deviation, direction in zip(deviations, directions.T, strict=True):
         if deviation > _OPEN:
             covariance = covariance + _FREE_TURN**2 * np.outer(direction, direction)
     scale = np.diag(np.repeat([subject.radius, 1.0], 3))
-    doubt = np.repeat([(_SHAPE_DOUBT * subject.size) ** 2, _TURN_DOUBT**2], 3)
-    result = scale @ covariance @ scale + np.diag(doubt)
+    result = scale @ covariance @ scale
+    away = subject.middle(found.place) - eye
+    result[:3, :3] += _SCALE_DOUBT**2 * np.outer(away, away)
+    result += np.diag(np.repeat([(_PLACE_DOUBT * subject.size) ** 2, _TURN_DOUBT**2], 3))
     return 0.5 * (result + result.T)
 
 

@@ -334,7 +334,7 @@ class _Walk:
         for i, found in enumerate(self._found):
             if found is not None:
                 position[i], orientation[i] = found.place
-                covariance[i] = covariance_of(found, self._subject)
+                covariance[i] = covariance_of(found, self._subject, self._camera.position)
                 quality[i], colour[i] = found.overlap, found.colour_error
                 overlays[i] = Overlay(found.window, found.silhouette)
         known = [found for found in self._found if found is not None]
