@@ -1,7 +1,7 @@
 """Renders films of known motions: the painted bunny and the soap slide and tumble on a patterned table.
 
-Path tracing by Mitsuba 3 (`pip install mitsuba mujoco trimesh libigl opencv-python-headless pillow av`), under a
-sun and a sky that the photographs in `images/` do not have. Slides are closed forms, x = v t − ½ μ g t²; what
+Path tracing by Mitsuba 3 (`pip install mitsuba mujoco trimesh libigl opencv-python-headless pillow av`), under
+a sun and a sky that the photographs in `images/` do not have. Slides are closed forms, x = v t − ½ μ g t²; what
 tumbles is moved by MuJoCo, as the convex hull of its mesh. Each film gets a folder with `frames/`, `masks/`
 (the object's true silhouettes), `film.mp4`, `empty.png` (the table without the object) and `truth.json`: the
 camera in nerfstudio's convention, and times [s], positions [m] and orientations (wxyz) of the object's frame.

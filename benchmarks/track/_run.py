@@ -56,7 +56,9 @@ def run() -> None:
     cases = []
     for name in FILMS:
         if arguments.films is None or not (arguments.films / name / "truth.json").is_file():
-            rows.append(skipped(name, "poses", "no films: python assets/render_videos.py DIR, then --films DIR"))
+            rows.append(
+                skipped(name, "poses", "no films: python assets/render_videos.py DIR, then --films DIR")
+            )
             continue
         cases.append(_case(arguments.films / name))
     for case in cases[: 1 if arguments.quick else None]:

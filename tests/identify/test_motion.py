@@ -61,7 +61,9 @@ def test_files_keep_covariances(tmp_path):
     back = dano.load_motion(tmp_path / "m.npz")
     np.testing.assert_array_equal(back.covariance, covariance)
     np.testing.assert_array_equal(back.part(2, 6).covariance, covariance[2:6])
-    np.testing.assert_array_equal(dano.load_motion(tmp_path / "m.npz", names="b").covariance, covariance[:, 1:])
+    np.testing.assert_array_equal(
+        dano.load_motion(tmp_path / "m.npz", names="b").covariance, covariance[:, 1:]
+    )
 
 
 def test_reads_common_names_other_orders_and_rates(tmp_path):

@@ -35,7 +35,7 @@ def write_video(path, frames, stamps=None):
 
 
 def turn_display(path):
-    """Note in the track's header that it is to be shown turned by 90° clockwise, as a phone held upright does."""
+    """Note in the track's header that it is to be shown turned by 90° clockwise, as phones do."""
     data = bytearray(path.read_bytes())
     at = data.index(b"tkhd") + 4 + 40
     data[at : at + 36] = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, H << 16, 0, 1 << 30)

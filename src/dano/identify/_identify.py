@@ -376,7 +376,9 @@ def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:
 
 def _away(plan: Plan, predicted: State, key: str) -> np.ndarray:
     """By how much positions [m] or orientations [rad] are off, shape (windows, frames, bodies)."""
-    here, seen = (np.asarray(getattr(s, key))[:, :, list(plan.bodies)] for s in (predicted, plan.windows.observed))
+    here, seen = (
+        np.asarray(getattr(s, key))[:, :, list(plan.bodies)] for s in (predicted, plan.windows.observed)
+    )
     if key == "position":
         return np.linalg.norm(here - seen, axis=-1)
     return np.linalg.norm(quat_log(quat_multiply(quat_conjugate(seen), here)), axis=-1)

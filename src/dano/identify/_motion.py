@@ -76,8 +76,8 @@ class Motion:
         Raises:
             ValueError: If there are fewer than two frames, times do not increase, a shape is wrong, nothing
                 was observed, an entry is infinite, a quaternion is not of unit length, or orientations
-                contradict the angular velocities (as they do in another order than wxyz), or a covariance is not
-                symmetric and positive definite.
+                contradict the angular velocities (as they do in another order than wxyz), or a covariance is
+                not symmetric and positive definite.
         """
         names = (names,) if isinstance(names, str) else tuple(names)
         if not names or len(set(names)) < len(names) or not all(names):
@@ -199,8 +199,8 @@ def _covariances(value: Numbers, n_frames: int, n_bodies: int) -> np.ndarray:
         matrix = scaled[frame, body]
         if np.abs(matrix - matrix.T).max() > 1e-6 or np.linalg.eigvalsh(matrix).min() <= 0:
             raise ValueError(
-                "covariance must be symmetric and positive definite, or NaN where it is unknown; that of frame"
-                f" {frame} is not"
+                "covariance must be symmetric and positive definite, or NaN where it is unknown; that of"
+                f" frame {frame} is not"
             )
     return array
 

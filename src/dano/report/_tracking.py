@@ -45,7 +45,7 @@ def draw_tracked(film: Film, tracked: Tracked, index: int) -> UInt8[np.ndarray, 
 
 
 def write_tracking_report(path: str | os.PathLike[str], film: Film, tracked: Tracked, *, title: str) -> None:
-    """Write a page with the silhouettes over the frames, as pictures and as a film, and numbers of each frame.
+    """Write a page with outlines over the frames, as pictures and as a film, and numbers of each frame.
 
     Args:
         path: Where to; written whole or not at all.
@@ -74,8 +74,8 @@ def write_tracking_report(path: str | os.PathLike[str], film: Film, tracked: Tra
             warnings(tracked.messages),
             _film(film, tracked),
             f'<h2>Frames</h2><div class="views">{pictures}</div>',
-            "<h2>Poses</h2><p>Position of the object's origin and its standard deviation, standard deviation of"
-            " the orientation, overlap of mask and silhouette, usual difference of colours.</p>",
+            "<h2>Poses</h2><p>Position of the object's origin and its standard deviation, standard deviation"
+            " of the orientation, overlap of mask and silhouette, usual difference of colours.</p>",
             _poses(tracked),
         ],
     )

@@ -33,9 +33,7 @@ def track(command: Track) -> None:
     check_distinct(output=command.output, report=command.report)
     _check_camera(command)
     field = _field(command.object)
-    options = TrackOptions(
-        masks=command.mask_source, loss=command.loss, rays=command.rays, seed=command.seed
-    )
+    options = TrackOptions(masks=command.mask_source, loss=command.loss, rays=command.rays, seed=command.seed)
     progress = Progress()
     film = read_film(
         command.video,
@@ -140,7 +138,9 @@ def _numbers(command: Track, found: Tracked) -> dict[str, Any]:
         "tracked": found.n_tracked,
         "duration": float(found.times[-1]),
         "quality": float(np.median(found.quality[seen])),
-        "colour_error": float(np.nanmedian(found.colour_error)) if np.isfinite(found.colour_error).any() else None,
+        "colour_error": float(np.nanmedian(found.colour_error))
+        if np.isfinite(found.colour_error).any()
+        else None,
         "position_deviation": float(np.median(np.linalg.norm(spread[seen, :3], axis=1))),
         "rotation_deviation": float(np.median(np.linalg.norm(spread[seen, 3:], axis=1))),
         "ambiguity": found.ambiguity,
@@ -150,7 +150,9 @@ def _numbers(command: Track, found: Tracked) -> dict[str, Any]:
 
 
 def _print(numbers: dict[str, Any], command: Track) -> None:
-    put(f"tracked             {numbers['tracked']} of {numbers['frames']} frames, {numbers['duration']:.3g} s")
+    put(
+        f"tracked             {numbers['tracked']} of {numbers['frames']} frames, {numbers['duration']:.3g} s"
+    )
     put(f"silhouettes fit     to {100 * numbers['quality']:.1f} % (intersection over union, median)")
     if numbers["colour_error"] is not None:
         put(f"colours fit         to {numbers['colour_error']:.3f} of their range")

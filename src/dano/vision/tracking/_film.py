@@ -106,7 +106,9 @@ def read_film(
     times = times - times[0]
     if not np.all(np.diff(times) > 0):
         bad = int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1
-        raise ValueError(f"{source}: times of frames must increase, that of frame {names[bad]} does not: give rate")
+        raise ValueError(
+            f"{source}: times of frames must increase, that of frame {names[bad]} does not: give rate"
+        )
     shrunk = -(-max(pixels.shape[:2]) // _LONGEST)
     given = _masks("masks", masks, len(images), images[0].shape[:2], shrunk, every)
     return Film(
@@ -114,7 +116,8 @@ def read_film(
         times,
         images,
         given or alphas,
-        _masks("occluders", occluders, len(images), images[0].shape[:2], shrunk, every) or [None] * len(images),
+        _masks("occluders", occluders, len(images), images[0].shape[:2], shrunk, every)
+        or [None] * len(images),
         shrunk,
         tuple(_notes(times, slow_motion, shrunk)),
     )
@@ -164,7 +167,9 @@ def _picture(file: Path) -> np.ndarray:
         raise ValueError(f"{file}: cannot be read as a picture ({error})") from error
 
 
-def read_picture(file: str | Path, shape: tuple[int, int], shrunk: int) -> Float[np.ndarray, "height width 3"]:
+def read_picture(
+    file: str | Path, shape: tuple[int, int], shrunk: int
+) -> Float[np.ndarray, "height width 3"]:
     """A picture of the place without the object, as frames of a film are read, in [0, 1].
 
     Raises:

@@ -33,7 +33,9 @@ class Masking:
         if options.masks == "auto":
             self.source = "given" if given else "plain" if self._is_plain() else "object"
         if self.source == "given" and not given:
-            raise ValueError("masks: there are none (a folder of masks, or frames with alpha), though masks='given'")
+            raise ValueError(
+                "masks: there are none (a folder of masks, or frames with alpha), though masks='given'"
+            )
         if self.source in ("static", "object"):
             width, height = film.size
             if background is not None:
@@ -41,8 +43,8 @@ class Masking:
             else:
                 self._place = Place.of_film(film.images)
                 self.notes.append(
-                    "masks: what is behind the object is taken from the median of all frames; a picture of the"
-                    " place without it (background) is better"
+                    "masks: what is behind the object is taken from the median of all frames; a picture of"
+                    " the place without it (background) is better"
                 )
 
     def _is_plain(self) -> bool:

@@ -250,7 +250,9 @@ def _rows(subject: Subject, target: Target, place: Placement, lamps, index: np.n
         # Costs of different noise can be compared only with what the noise itself costs.
         total += float(np.mean(np.where(inside, cost + np.log(noise / _COLOUR_NOISE), 0)))
         residual = np.concatenate([residual, rows / np.sqrt(3)], axis=1)
-        slope = np.concatenate([slope, np.where(inside[:, None, None], change / noise / np.sqrt(3), 0)], axis=1)
+        slope = np.concatenate(
+            [slope, np.where(inside[:, None, None], change / noise / np.sqrt(3), 0)], axis=1
+        )
         weights = np.concatenate([weights, np.repeat(light[:, None], 3, axis=1)], axis=1)
     return _Rows(residual, slope, weights, total, error)
 
@@ -287,7 +289,9 @@ def _normal(rows: _Rows) -> tuple[np.ndarray, np.ndarray]:
     return gradient, np.einsum("nki,nkj->ij", weighted, rows.slope)
 
 
-def _refined(subject, target: Target, lamps, place: Placement, rows: _Rows, index: np.ndarray) -> Refined | None:
+def _refined(
+    subject, target: Target, lamps, place: Placement, rows: _Rows, index: np.ndarray
+) -> Refined | None:
     _, hessian = _normal(rows)
     window = window_of(subject, place, target.camera)
     if window is None:

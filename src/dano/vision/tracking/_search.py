@@ -15,7 +15,7 @@ from dano.maths import quat_conjugate, quat_from_matrix, quat_log, quat_multiply
 from dano.vision.capture import Light
 from dano.vision.tracking._light import LAMPS, LightFit
 from dano.vision.tracking._options import TrackOptions
-from dano.vision.tracking._refine import pixels_of, refine, Refined, silhouette, Target, window_of
+from dano.vision.tracking._refine import pixels_of, refine, Refined, Target
 from dano.vision.tracking._subject import Placement, Subject
 
 _SIDE = 32
@@ -65,7 +65,14 @@ def search(
     refined = []
     for guess in guesses[: 2 * options.candidates]:
         found = refine(
-            subject, coarse, guess.place, _headlight(target), loss="silhouette", steps=4, rays=700, random=random
+            subject,
+            coarse,
+            guess.place,
+            _headlight(target),
+            loss="silhouette",
+            steps=4,
+            rays=700,
+            random=random,
         )
         if found is not None:
             refined.append(found)
@@ -243,5 +250,3 @@ def _different(guesses: list[_Guess], count: int) -> list[_Guess]:
         if all(angle > _DIFFERENT for angle in angles):
             chosen.append(guess)
     return chosen
-
-

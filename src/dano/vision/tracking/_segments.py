@@ -83,7 +83,9 @@ class Palette:
         return self._log[index[..., 0], index[..., 1], index[..., 2]]
 
 
-def unlike_place(image: Float[np.ndarray, "height width 3"], place: Place) -> Float[np.ndarray, "height width"]:
+def unlike_place(
+    image: Float[np.ndarray, "height width 3"], place: Place
+) -> Float[np.ndarray, "height width"]:
     """What differs from the place by more than a shadow, its largest part."""
     # The object may have any colour: density one.
     ratio = ndimage.gaussian_filter(np.clip(-place.log_likelihood(image), -8, 8), 1.0)

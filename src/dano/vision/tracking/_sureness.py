@@ -34,9 +34,7 @@ def _observed(found: Refined) -> tuple[np.ndarray, np.ndarray]:
     return 6 / np.sqrt(np.maximum(values, 1e-9)), vectors
 
 
-def covariance_of(
-    found: Refined, subject: Subject, eye: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "6 6"]:
+def covariance_of(found: Refined, subject: Subject, eye: Float[np.ndarray, "3"]) -> Float[np.ndarray, "6 6"]:
     """Covariance of position [m, W] and rotation vector [rad, F], seen from a point [m, W]."""
     covariance = _INFLATED * found.covariance
     deviations, directions = _observed(found)

@@ -17,8 +17,8 @@ from dano.vision.tracking._masking import Masking
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._refine import aligned, refine, Refined, window_of
 from dano.vision.tracking._search import learn_light, score, search, Start
-from dano.vision.tracking._sureness import covariance_of, unobservable
 from dano.vision.tracking._subject import Placement, Subject
+from dano.vision.tracking._sureness import covariance_of, unobservable
 
 _COARSE = 24
 """Size of the object [pixels] at the coarsest level of the pyramid."""
@@ -149,7 +149,9 @@ def _check_size(film: Film, camera: PosedCamera) -> None:
 class _Walk:
     """A film half tracked (host)."""
 
-    def __init__(self, film: Film, field: LearnedField, camera: PosedCamera, options: TrackOptions, background):
+    def __init__(
+        self, film: Film, field: LearnedField, camera: PosedCamera, options: TrackOptions, background
+    ):
         self._film, self._options = film, options
         self._subject = Subject(field)
         self._camera = film.camera(camera)
@@ -249,7 +251,7 @@ class _Walk:
         return found, TRACKED
 
     def _refined(self, i: int, before: Placement, light: LightFit) -> Refined | None:
-        """The pose near an expected one, coarse to fine; from beside it, too, if that fits worse than usual."""
+        """The pose near an expected one, coarse to fine; also from beside it if that fits worse than usual."""
         found = self._from_coarse(i, before, light)
         usual = [other.overlap for other in self._found if other is not None]
         if found is not None and usual and found.overlap < np.median(usual) - _WORSE:
@@ -323,8 +325,8 @@ class _Walk:
         """
         if not any(self._found):
             raise ValueError(
-                f"video: the object was found in none of {len(self._found)} frames: it must be in the picture,"
-                " of the size that camera and object say, and masks must show it (see docs/track.md)"
+                f"video: the object was found in none of {len(self._found)} frames: it must be in the"
+                " picture, of the size that camera and object say, and masks must show it (see docs/track.md)"
             )
         n = len(self._found)
         position, orientation = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
@@ -363,7 +365,9 @@ class _Walk:
         ):
             names = [n for n, s in zip(self._film.names, self._status, strict=True) if s == status]
             if names:
-                texts.append(f"{words} in {len(names)} frames: {', '.join(names[:6])}{' …' * (len(names) > 6)}")
+                texts.append(
+                    f"{words} in {len(names)} frames: {', '.join(names[:6])}{' …' * (len(names) > 6)}"
+                )
         if self._ambiguity < 1.15:
             texts.append(
                 "another orientation explains the first frame nearly as well: the object may be turned by a"
