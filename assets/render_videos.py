@@ -1,10 +1,11 @@
 """Renders films of known motions: the painted bunny and the soap slide and tumble on a patterned table.
 
-Path tracing by Mitsuba 3 (`pip install mitsuba mujoco trimesh libigl opencv-python-headless pillow av`), under
-a sun and a sky that the photographs in `images/` do not have. Slides are closed forms, x = v t − ½ μ g t²; what
-tumbles is moved by MuJoCo, as the convex hull of its mesh. Each film gets a folder with `frames/`, `masks/`
-(the object's true silhouettes), `film.mp4`, `empty.png` (the table without the object) and `truth.json`: the
-camera in nerfstudio's convention, and times [s], positions [m] and orientations (wxyz) of the object's frame.
+Path tracing by Mitsuba 3 (`pip install mitsuba mujoco trimesh libigl opencv-python-headless pillow av`), in
+sunlight and a sky that the photographs in `images/` do not have. Slides are closed forms,
+x = v t − ½ μ g t²; what tumbles is moved by MuJoCo, as the convex hull of its mesh. Each film gets a folder
+with `frames/`, `masks/` (the object's true silhouettes), `film.mp4`, `empty.png` (the table without the
+object) and `truth.json`: the camera in nerfstudio's convention, and times [s], positions [m] and orientations
+(wxyz) of the object's frame.
 Nothing of it is shipped: it is what `dano track` is measured with.
 
 Usage: python assets/render_videos.py FOLDER [soap_slide bunny_slide soap_tumble bunny_tumble] [--paths 24]

@@ -21,8 +21,10 @@ from dano.vision.drawing import (
     Item as Item,
     level_surface as level_surface,
     PALETTE as PALETTE,
+    Part as Part,
     placement as placement,
     render as render,
+    through as through,
 )
 from dano.vision.radiance import (
     AbstractMedium as AbstractMedium,

@@ -37,6 +37,10 @@ _AREA = 40.0
 """Pixels that a mask must have for a search."""
 
 
+_SPECKLE = 1.2
+"""Standard deviation of the blur that takes the noise of pixels away [pixels]."""
+
+
 class Start(NamedTuple):
     """A pose that explains a picture.
 
@@ -92,6 +96,27 @@ def search(
             _learn(subject, coarse, found, light)
             starts.append(Start(found, light, score(found)))
     return sorted(starts, key=lambda s: s.score)
+
+
+def half_turns(subject: Subject, place: Placement) -> list[Placement]:
+    """A pose turned by 180° about each axis of the object's box, by which many things look nearly alike."""
+    middle = subject.middle(place)
+    turns = np.eye(4)[1:]
+    return [subject.around(middle, quat_multiply(place.orientation, turn)) for turn in turns]
+
+
+def unlikeness(subject: Subject, target: Target, start: Start) -> float:
+    """Root mean square difference of colours where the object is, noise of single pixels averaged out."""
+    window = start.refined.window
+    shape, colour = silhouette(subject, start.refined.place, start.light.lamps, target.camera, window)
+    inside = (shape > 0.95) & (target.mask[window] > 0.7) & target.seen[window]
+    inside = ndimage.binary_erosion(inside, iterations=2)
+    if inside.sum() < _AREA:
+        return float("inf")
+    away = np.where(inside[..., None], colour / np.maximum(shape, 0.5)[..., None] - target.image[window], 0)
+    share = np.maximum(ndimage.gaussian_filter(inside.astype(float), _SPECKLE), 1e-3)
+    smooth = ndimage.gaussian_filter(away, (_SPECKLE, _SPECKLE, 0)) / share[..., None]
+    return float(np.sqrt(np.mean(smooth[inside] ** 2)))
 
 
 def score(refined: Refined) -> float:

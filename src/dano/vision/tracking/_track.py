@@ -15,8 +15,8 @@ from dano.vision.tracking._film import Film
 from dano.vision.tracking._light import LightFit
 from dano.vision.tracking._masking import Masking
 from dano.vision.tracking._options import TrackOptions
-from dano.vision.tracking._refine import aligned, refine, Refined, window_of
-from dano.vision.tracking._search import learn_light, score, search, Start
+from dano.vision.tracking._refine import aligned, refine, Refined, Target, window_of
+from dano.vision.tracking._search import half_turns, learn_light, score, search, Start, unlikeness
 from dano.vision.tracking._subject import Placement, Subject
 from dano.vision.tracking._sureness import covariance_of, unobservable
 
@@ -28,6 +28,15 @@ _LIGHT_EVERY = 4
 
 _FOUND = 0.75
 """Overlap from which a search has found the object."""
+
+_ALIKE = 0.02
+"""By which overlaps of starts may differ for colours to decide."""
+
+_OTHER = np.radians(12)
+"""Angle from which a start is another one."""
+
+_CLEAR = 1.05
+"""Ratio of how starts fit up to which a message says so."""
 
 _BLIND = 0.5
 """Share of the silhouette that must not be hidden."""
@@ -67,8 +76,8 @@ class Tracked(NamedTuple):
         quality: Overlap of each mask with the silhouette, as intersection over union, shape (T,).
         colour_error: Usual difference of colours of each frame, in sRGB, shape (T,).
         lamps: Light that the film is under.
-        ambiguity: Score of the second-best start over that of the best one; ∞ without any. Near 1 the
-            start may be another one.
+        ambiguity: How well the next-best orientation explains the first frame: its difference of colours over
+            that of the best; ∞ if none has a silhouette that fits as well. Near 1 the start may be another.
         overlays: Silhouettes at these poses, None where there is none.
         messages: What a user should know, in sentences.
         seconds: Time a frame took [s], the search at the start not included.
@@ -223,18 +232,49 @@ class _Walk:
         if target is None:
             return None
         starts = search(self._subject, target, self._options, self._random)
-        finished = [self._finished(i, start) for start in starts[:3]]
+        finished = [self._finished(i, start.refined.place, start.light) for start in starts[:3]]
         finer = sorted((s for s in finished if s is not None), key=lambda s: s.score)
         if not finer or finer[0].refined.overlap < _FOUND:
             return None
+        turned = [
+            self._finished(i, place, finer[0].light)
+            for place in half_turns(self._subject, finer[0].refined.place)
+        ]
+        best, ambiguity = self._likeliest(target, [*finer, *(s for s in turned if s is not None)])
         if not self._light.known:
-            self._ambiguity = finer[1].score / max(finer[0].score, 1e-9) if len(finer) > 1 else np.inf
-        self._light = finer[0].light
-        return finer[0].refined
+            self._ambiguity = ambiguity
+        self._light = best.light
+        return best.refined
 
-    def _finished(self, i: int, start: Start) -> Start | None:
-        found = self._fine(i, start.refined.place, start.light)
-        return None if found is None else Start(found, start.light, score(found))
+    def _likeliest(self, target: Target, starts: list[Start]) -> tuple[Start, float]:
+        """Of starts whose silhouettes fit alike, the one whose colours fit best; and how clearly."""
+        most = max(start.refined.overlap for start in starts)
+        alike = [start for start in starts if start.refined.overlap > most - _ALIKE]
+        if self._options.loss != "photometric":
+            alike = sorted(alike, key=lambda s: s.score)
+            values = [start.score for start in alike]
+        else:
+            found = [(unlikeness(self._subject, target, start), start) for start in alike]
+            found.sort(key=lambda pair: pair[0])
+            values, alike = [value for value, _ in found], [start for _, start in found]
+        turned = quat_conjugate(alike[0].refined.place.orientation)
+        others = [
+            value / max(values[0], 1e-9)
+            for value, start in zip(values, alike, strict=True)
+            if np.linalg.norm(quat_log(quat_multiply(turned, start.refined.place.orientation))) > _OTHER
+        ]
+        return alike[0], min(others, default=np.inf)
+
+    def _finished(self, i: int, place: Placement, light: LightFit) -> Start | None:
+        """A start at full resolution, under the light that it implies itself."""
+        found = self._fine(i, place, light)
+        if found is None:
+            return None
+        own = LightFit(self._subject)
+        target = self._masking.near(i, self._subject, found.place, light.lamps, self._camera, 2)
+        if target is not None and self._options.loss == "photometric":
+            learn_light(self._subject, target, found.place, found.window, found.silhouette, own)
+        return Start(found, own if own.known else light, score(found))
 
     def _followed(self, i: int, before: Placement) -> tuple[Refined | None, str]:
         window = window_of(self._subject, before, self._camera)
@@ -251,7 +291,7 @@ class _Walk:
         return found, TRACKED
 
     def _refined(self, i: int, before: Placement, light: LightFit) -> Refined | None:
-        """The pose near an expected one, coarse to fine; also from beside it if that fits worse than usual."""
+        """The pose near an expected one; also from beside it if that fits worse than usual."""
         found = self._from_coarse(i, before, light)
         usual = [other.overlap for other in self._found if other is not None]
         if found is not None and usual and found.overlap < np.median(usual) - _WORSE:
@@ -368,7 +408,7 @@ class _Walk:
                 texts.append(
                     f"{words} in {len(names)} frames: {', '.join(names[:6])}{' …' * (len(names) > 6)}"
                 )
-        if self._ambiguity < 1.15:
+        if self._ambiguity < _CLEAR:
             texts.append(
                 "another orientation explains the first frame nearly as well: the object may be turned by a"
                 " symmetry of its shape; give start if it is"
