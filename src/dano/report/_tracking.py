@@ -59,7 +59,7 @@ def write_tracking_report(path: str | os.PathLike[str], film: Film, tracked: Tra
     """
     require("PIL", "pillow")
     require("av")
-    shown = np.unique(np.linspace(0, len(tracked.times) - 1, _SHOWN).astype(int))
+    shown = np.unique(np.linspace(0, len(tracked.times) - 1, _SHOWN).astype(int)).tolist()
     pictures = "".join(
         f"<figure>{image(draw_tracked(film, tracked, i) / 255, _WIDTH)}<figcaption>"
         f"{tracked.times[i]:.3f} s, {tracked.status[i]}</figcaption></figure>"

@@ -59,8 +59,8 @@ class Film(NamedTuple):
 def read_film(
     path: str | Path,
     *,
-    rate: float | None = None,
-    slow_motion: float = 1.0,
+    rate: int | float | None = None,
+    slow_motion: int | float = 1.0,
     every: int = 1,
     masks: str | Path | None = None,
     occluders: str | Path | None = None,
@@ -123,7 +123,7 @@ def read_film(
     )
 
 
-def _notes(times: np.ndarray, slow_motion: float, shrunk: int) -> list[str]:
+def _notes(times: np.ndarray, slow_motion: int | float, shrunk: int) -> list[str]:
     steps = np.diff(times)
     notes = []
     if np.ptp(steps) > _UNEVEN * np.median(steps):
@@ -138,7 +138,7 @@ def _notes(times: np.ndarray, slow_motion: float, shrunk: int) -> list[str]:
     return notes
 
 
-def _frames(source: Path, rate: float | None) -> Iterator[tuple[str, float, np.ndarray]]:
+def _frames(source: Path, rate: int | float | None) -> Iterator[tuple[str, float, np.ndarray]]:
     if source.is_dir():
         if rate is None:
             raise ValueError(f"{source}: a folder of frames has no times: give rate [frames/s]")

@@ -15,8 +15,8 @@ from dano.maths import quat_conjugate, quat_from_matrix, quat_log, quat_multiply
 from dano.vision.capture import Light
 from dano.vision.tracking._light import LAMPS, LightFit
 from dano.vision.tracking._options import TrackOptions
-from dano.vision.tracking._refine import pixels_of, refine, Refined, Target
-from dano.vision.tracking._subject import Placement, Subject
+from dano.vision.tracking._refine import pixels_of, refine, Refined, silhouette, Target
+from dano.vision.tracking._subject import CHUNK, Placement, Subject
 
 _SIDE = 32
 """Pixels a side of rendered views: a chunk of rays."""
@@ -90,7 +90,7 @@ def search(
             continue
         _learn(subject, coarse, first, light)
         found = refine(
-            subject, coarse, first.place, light.lamps, loss="photometric", steps=5, rays=900, random=random
+            subject, coarse, first.place, light.lamps, loss="photometric", steps=5, rays=CHUNK, random=random
         )
         if found is not None:
             _learn(subject, coarse, found, light)
@@ -122,7 +122,7 @@ def unlikeness(subject: Subject, target: Target, start: Start) -> float:
 def score(refined: Refined) -> float:
     """See `Start.score`."""
     error = 0.0 if np.isnan(refined.colour_error) else refined.colour_error
-    return 3 * (1 - refined.overlap) + 5 * error
+    return float(3 * (1 - refined.overlap) + 5 * error)
 
 
 def _learn(subject: Subject, target: Target, refined: Refined, light: LightFit) -> None:

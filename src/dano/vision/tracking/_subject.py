@@ -13,7 +13,7 @@ from dano.vision.capture import AbstractCamera, Light
 from dano.vision.drawing import Part, through
 from dano.vision.radiance import LearnedField, Sampling
 
-CHUNK = 1024
+CHUNK = 512
 """Rays at once: one size, one compilation."""
 
 SAMPLING = Sampling(48, 12, 2)

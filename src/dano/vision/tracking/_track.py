@@ -17,7 +17,7 @@ from dano.vision.tracking._masking import Masking
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._refine import aligned, refine, Refined, Target, window_of
 from dano.vision.tracking._search import half_turns, learn_light, score, search, Start, unlikeness
-from dano.vision.tracking._subject import Placement, Subject
+from dano.vision.tracking._subject import CHUNK, Placement, Subject
 from dano.vision.tracking._sureness import covariance_of, unobservable
 
 _COARSE = 24
@@ -195,7 +195,11 @@ class _Walk:
             self._missed = 0
             count = self._status.count(TRACKED)
             if searched or count % _LIGHT_EVERY == 0:
+                known = self._light.known
                 self._learn(i, found)
+                if self._light.known and not known:
+                    # Colours count only now.
+                    found = self._fine(i, found.place, self._light) or found
         else:
             self._missed += 1
         self._found.append(found)
@@ -271,7 +275,7 @@ class _Walk:
         if found is None:
             return None
         own = LightFit(self._subject)
-        target = self._masking.near(i, self._subject, found.place, light.lamps, self._camera, 2)
+        target = self._masking.near(i, self._subject, found.place, light.lamps, self._camera, 2.0)
         if target is not None and self._options.loss == "photometric":
             learn_light(self._subject, target, found.place, found.window, found.silhouette, own)
         return Start(found, own if own.known else light, score(found))
@@ -311,7 +315,7 @@ class _Walk:
         last = self._loss(light)
         for loss in ("silhouette", last) if last == "photometric" else (last,):
             found = refine(
-                self._subject, coarse, place, light.lamps, loss=loss, steps=5, rays=900, random=self._random
+                self._subject, coarse, place, light.lamps, loss=loss, steps=4, rays=CHUNK, random=self._random
             )
             if found is None:
                 return None
@@ -319,7 +323,7 @@ class _Walk:
         return found
 
     def _fine(self, i: int, place: Placement, light: LightFit) -> Refined | None:
-        target = self._masking.near(i, self._subject, place, light.lamps, self._camera, 2)
+        target = self._masking.near(i, self._subject, place, light.lamps, self._camera, 2.0)
         if target is None:
             return None
         return refine(
@@ -328,7 +332,7 @@ class _Walk:
             place,
             light.lamps,
             loss=self._loss(light),
-            steps=5,
+            steps=4,
             rays=self._options.rays,
             random=self._random,
         )
@@ -352,7 +356,7 @@ class _Walk:
     def _learn(self, i: int, found: Refined) -> None:
         if self._options.loss != "photometric":
             return
-        target = self._masking.near(i, self._subject, found.place, self._light.lamps, self._camera, 2)
+        target = self._masking.near(i, self._subject, found.place, self._light.lamps, self._camera, 2.0)
         if target is not None:
             learn_light(self._subject, target, found.place, found.window, found.silhouette, self._light)
             self._masking.learn(target, found.window, found.silhouette)
