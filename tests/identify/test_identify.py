@@ -596,4 +596,4 @@ def test_covariances_weigh_as_generalised_least_squares_does():
     other = dano.identify(
         scene, plain, [gravity], state=start, noise={"position": 1e-3}, initial=["velocity"], tolerance=1e-4
     )
-    assert np.any(np.abs(np.asarray(other.values["g"]) - expected) > errors)
+    assert np.any(np.abs(np.asarray(other.values["g"]) - expected) > 0.3 * errors)
