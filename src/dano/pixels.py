@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.engine import AbstractEngine, Policy, simulate
-from dano.maths import checked_array, checked_count, Numbers, quat_normalize, quat_rotate, quat_to_matrix
+from dano.maths import checked_count, Numbers, quat_normalize, quat_rotate, quat_to_matrix
 from dano.scene import Control, Scene, State
-from dano.vision import AbstractCamera, LearnedField, Light, Part, Sampling, through
+from dano.vision import AbstractCamera, AbstractModel, LearnedField, Light, Part, Sampling, through
 
 FILM_SAMPLING = Sampling(48, 16, 3)
 """How finely rays are sampled: a picture to compare, not one to look at."""
@@ -77,49 +77,72 @@ def film(
         engine: As in `simulate`.
 
     Raises:
-        ValueError: If a look is of no body, there is none, there is no light, or `every` is no divisor that
-            leaves a frame.
+        ValueError: If a look is of no body, there is none, there is no light, `every` is < 1, or the
+            background has another shape.
     """
     _check(scene, looks, lights)
     every = checked_count("every", every)
     trajectory = simulate(scene, state, n_steps, controls=controls, engine=engine)
-    at = np.arange(0, n_steps + 1, every)
     if pixels is None:
         y, x = np.mgrid[: camera.height, : camera.width] + 0.5
         pixels = np.stack([x.ravel(), y.ravel()], axis=1)
-    directions = jnp.asarray(camera.directions(np.asarray(pixels, np.float64)), jnp.float32)
-    origin = jnp.asarray(camera.position, jnp.float32)
-    behind = np.asarray(background, np.float32)
-    if behind.ndim == 1:
-        behind = np.broadcast_to(
-            np.asarray(checked_array("background", background, (3,)), np.float32), directions.shape
-        )
-    names = list(looks)
-    rows = [scene.index(name) for name in names]
-    arms = jnp.stack([(scene.bodies[i].com + scene.bodies[i].com_offset) for i in rows])
-    models = [jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), looks[name].model) for name in names]
-    sharpest = [float(looks[name].drawn_sharpness) for name in names]
-
-    @jax.checkpoint
-    def drawn(pose: tuple[Array, Array]) -> tuple[Array, Array]:
-        position, orientation = pose
-        parts = []
-        for i, model in enumerate(models):
-            place = position[i] - quat_rotate(orientation[i], arms[i].astype(position.dtype))
-            place = place.astype(jnp.float32)
-            away = jax.lax.stop_gradient(jnp.linalg.norm(place - origin))
-            sharpness = jnp.minimum(_EDGE / (np.float32(camera.pixel_angle) * away), np.float32(sharpest[i]))
-            parts.append(Part(model, quat_to_matrix(orientation[i]).astype(jnp.float32), place, sharpness))
-        origins = jnp.broadcast_to(origin, directions.shape)
-        limit = jnp.full(len(directions), jnp.inf, jnp.float32)
-        lamps = (tuple(lights),) * len(parts)
-        colour, _, _, clear = through(tuple(parts), lamps, origins, directions, limit, 0.0, sampling)
-        return colour + clear[:, None] * behind, 1 - clear
-
-    states = trajectory.states
-    poses = states.position[at][:, rows], quat_normalize(states.orientation[at][:, rows])
-    colour, opacity = jax.lax.map(drawn, poses)
+    view = _View(
+        [jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), look.model) for look in looks.values()],
+        [float(look.drawn_sharpness) for look in looks.values()],
+        camera,
+        camera.directions(np.asarray(pixels, np.float64)).astype(np.float32),
+        _backdrop(background, len(pixels)),
+        tuple(lights),
+        sampling,
+    )
+    at = np.arange(0, n_steps + 1, every)
+    rows = np.array([scene.index(name) for name in looks])
+    orientation = quat_normalize(trajectory.states.orientation[at][:, rows])
+    arms = jnp.stack([scene.bodies[i].com + scene.bodies[i].com_offset for i in rows])
+    arms = jnp.broadcast_to(arms.astype(orientation.dtype), (*orientation.shape[:2], 3))
+    position = trajectory.states.position[at][:, rows] - quat_rotate(orientation, arms)
+    drawn = jax.checkpoint(lambda pose: _drawn(view, *pose))
+    colour, opacity = jax.lax.map(drawn, (position.astype(jnp.float32), orientation.astype(jnp.float32)))
     return Frames(colour, opacity, trajectory.times[at])
+
+
+class _View(NamedTuple):
+    """What is the same in all frames: what is seen, how sharp it may be, from where, and in which light."""
+
+    models: list[AbstractModel]
+    sharpest: list[float]
+    camera: AbstractCamera
+    directions: np.ndarray
+    behind: np.ndarray
+    lights: tuple[Light, ...]
+    sampling: Sampling
+
+
+def _drawn(
+    view: _View, position: Float[Array, "n 3"], orientation: Float[Array, "n 4"]
+) -> tuple[Array, Array]:
+    """Colour and opacity of one frame, of bodies whose field frames are at these poses."""
+    origin = jnp.asarray(view.camera.position, jnp.float32)
+    parts = []
+    for i, model in enumerate(view.models):
+        # How soft an edge is drawn says nothing about where it is.
+        away = jax.lax.stop_gradient(jnp.linalg.norm(position[i] - origin))
+        softest = _EDGE / (np.float32(view.camera.pixel_angle) * away)
+        sharpness = jnp.minimum(softest, np.float32(view.sharpest[i]))
+        parts.append(Part(model, quat_to_matrix(orientation[i]), position[i], sharpness))
+    origins = jnp.broadcast_to(origin, view.directions.shape)
+    limit = jnp.full(len(view.directions), jnp.inf, jnp.float32)
+    lamps = (view.lights,) * len(parts)
+    directions = jnp.asarray(view.directions)
+    colour, _, _, clear = through(tuple(parts), lamps, origins, directions, limit, 0.0, view.sampling)
+    return colour + clear[:, None] * view.behind, 1 - clear
+
+
+def _backdrop(background: Numbers, n_pixels: int) -> np.ndarray:
+    colours = np.asarray(background, np.float32)
+    if colours.shape not in ((3,), (n_pixels, 3)):
+        raise ValueError(f"background must have shape (3,) or ({n_pixels}, 3), got {colours.shape}")
+    return np.broadcast_to(colours, (n_pixels, 3))
 
 
 def _check(scene: Scene, looks: Mapping[str, LearnedField], lights: Sequence[Light]) -> None:

@@ -325,8 +325,25 @@ def _composed(parts, planes, lamps, origin, directions, ambient, sampling):
     return colour, opacity, depth / jnp.maximum(opacity, _GONE), which
 
 
-def through(parts, lamps, origins, directions, limit, ambient, sampling):
-    """What rays [W] see of parts before they end.
+def through(
+    parts: tuple[Part, ...],
+    lamps: Sequence[tuple[Light, ...]],
+    origins: Float[Array, "n 3"],
+    directions: Float[Array, "n 3"],
+    limit: Float[Array, " n"],
+    ambient: float | Float[Array, ""],
+    sampling: Sampling,
+) -> tuple[Float[Array, "n 3"], Float[Array, " n"], list[Float[Array, " n"]], Float[Array, " n"]]:
+    """What rays [W] see of parts before they end; differentiable.
+
+    Args:
+        parts: What is there.
+        lamps: Light that each of them is under.
+        origins: Where rays begin [m].
+        directions: Unit vectors.
+        limit: Distances at which rays end [m].
+        ambient: Light from all around on what is painted.
+        sampling: How finely rays are sampled.
 
     Returns:
         SRGB over black (n, 3), mean distance times opacity [m] (n,), the share of every part, each (n,), and
