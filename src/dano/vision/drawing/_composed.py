@@ -334,14 +334,14 @@ def through(
     ambient: float | Float[Array, ""],
     sampling: Sampling,
 ) -> tuple[Float[Array, "n 3"], Float[Array, " n"], list[Float[Array, " n"]], Float[Array, " n"]]:
-    """What rays [W] see of parts before they end; differentiable.
+    """What rays [W] see of parts before they end.
 
     Args:
         parts: What is there.
         lamps: Light that each of them is under.
         origins: Where rays begin [m].
         directions: Unit vectors.
-        limit: Distances at which rays end [m].
+        limit: How far rays go [m].
         ambient: Light from all around on what is painted.
         sampling: How finely rays are sampled.
 
@@ -378,10 +378,9 @@ def shared_weights(
         alphas: Opacity of the sections by themselves.
         n_rays: Number of rays.
     """
-    if not edges:
-        return [], jnp.ones(n_rays, jnp.float32)
-    if len(edges) == 1:
-        return [section_weights(alphas[0])], transmittance(alphas[0])
+    if len(edges) < 2:
+        clear = transmittance(alphas[0]) if alphas else jnp.ones(n_rays, jnp.float32)
+        return [section_weights(alpha) for alpha in alphas], clear
     owner = np.concatenate([np.full(e.shape[1], i) for i, e in enumerate(edges)])
     joined = jnp.concatenate(edges, axis=1)
     order = jnp.argsort(joined, axis=1, stable=True)

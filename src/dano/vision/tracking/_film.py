@@ -88,7 +88,7 @@ def read_film(
     if every < 1:
         raise ValueError(f"every must be ≥ 1, got {every}")
     tell = progress or (lambda text, share: None)
-    names, stamps, images, alphas = [], [], [], []
+    names, stamps, images, alphas, shrunk = [], [], [], [], 1
     for i, (name, stamp, pixels) in enumerate(_frames(source, rate)):
         if i % every:
             continue
@@ -109,7 +109,6 @@ def read_film(
         raise ValueError(
             f"{source}: times of frames must increase, that of frame {names[bad]} does not: give rate"
         )
-    shrunk = -(-max(pixels.shape[:2]) // _LONGEST)
     given = _masks("masks", masks, len(images), images[0].shape[:2], shrunk, every)
     return Film(
         tuple(names),

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from dano.maths import quat_exp, quat_multiply, quat_to_matrix
 from dano.vision.capture import AbstractCamera, Light
 from dano.vision.drawing import Part, through
-from dano.vision.radiance import LearnedField, Sampling
+from dano.vision.radiance import LearnedField, Sampling, SurfaceModel
 
 CHUNK = 512
 """Rays at once: one size, one compilation."""
@@ -112,16 +112,17 @@ class Subject:
             some = directions[start : start + CHUNK].astype(np.float32)
             # Rays that only fill the chunk look away from the object.
             filled = np.concatenate([some, np.tile(-some[:1], (CHUNK - len(some), 1))])
-            found = (_linearized if slopes else _seen)(
+            looking = _Looking(
                 self._model,
                 jnp.asarray(place.position, jnp.float32),
                 jnp.asarray(place.orientation, jnp.float32),
-                jnp.float32(self.radius),
+                jnp.asarray(self.radius, jnp.float32),
                 sharpness,
                 lamps,
                 jnp.asarray(origin, jnp.float32),
                 jnp.asarray(filled),
             )
+            found = _linearized(looking) if slopes else _seen(looking)
             parts.append([np.asarray(x, np.float64)[: len(some)] for x in found] + rows[len(found) :])
         return Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
@@ -132,24 +133,40 @@ class Subject:
         return self.see(place, lamps, camera.position, camera.directions(pixels), camera.pixel_angle)
 
 
-def _view(model, position, orientation, radius, sharpness, lamps, origin, directions, change):
-    turned = quat_multiply(orientation, quat_exp(change[3:]))
-    part = Part(model, quat_to_matrix(turned), position + radius * change[:3], sharpness)
-    origins = jnp.broadcast_to(origin, directions.shape)
-    limit = jnp.full(len(directions), jnp.inf, jnp.float32)
-    colour, _, (opacity,), _ = through((part,), (lamps,), origins, directions, limit, 0.0, SAMPLING)
-    return opacity, colour
+class _Looking(NamedTuple):
+    """A model somewhere, and rays from one point."""
+
+    model: SurfaceModel
+    position: Array
+    orientation: Array
+    radius: Array
+    sharpness: np.float32
+    lamps: tuple[Light, ...]
+    origin: Array
+    directions: Array
+
+    def moved(self, change: Array) -> tuple[Array, Array]:
+        """Opacity and colour that rays see after a change of the pose, as in `Placement.moved`."""
+        turned = quat_multiply(self.orientation, quat_exp(change[3:]))
+        place = self.position + self.radius * change[:3]
+        part = Part(self.model, quat_to_matrix(turned), place, jnp.asarray(self.sharpness))
+        origins = jnp.broadcast_to(self.origin, self.directions.shape)
+        limit = jnp.full(len(self.directions), jnp.inf, jnp.float32)
+        colour, _, (opacity,), _ = through(
+            (part,), (self.lamps,), origins, self.directions, limit, 0.0, SAMPLING
+        )
+        return opacity, colour
 
 
 @eqx.filter_jit
-def _seen(*arguments) -> tuple[Array, Array]:
-    return _view(*arguments, jnp.zeros(6, jnp.float32))
+def _seen(looking: _Looking) -> tuple[Array, Array]:
+    return looking.moved(jnp.zeros(6, jnp.float32))
 
 
 @eqx.filter_jit
-def _linearized(*arguments) -> tuple[Array, Array, Array, Array]:
+def _linearized(looking: _Looking) -> tuple[Array, Array, Array, Array]:
     def both(change: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        found = _view(*arguments, change)
+        found = looking.moved(change)
         return found, found
 
     slope, (opacity, colour) = jax.jacfwd(both, has_aux=True)(jnp.zeros(6, jnp.float32))
