@@ -16,7 +16,7 @@ def friction_of(name: str, found: Tracked) -> tuple[float, float]:
             dano.Body("table", dano.HalfSpace(), fixed=True),
         ],
         contacts=[dano.Contact(name, "table", dano.ContactParams(sliding_friction=0.5))],
-        timestep=1 / 240,
+        timestep=1 / 120,
     )
     motion = Motion.create(
         found.times,
@@ -29,5 +29,5 @@ def friction_of(name: str, found: Tracked) -> tuple[float, float]:
     friction = dano.Parameter("mu", lambda s: s.contact(name, "table").sliding_friction, 0.02, 1.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        fit = identify(scene, motion, [friction], initial="states")
+        fit = identify(scene, motion, [friction], initial="velocities")
     return float(fit.values["mu"]), float(fit.standard_errors["mu"])
