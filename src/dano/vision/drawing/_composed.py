@@ -331,7 +331,7 @@ def through(
     origins: Float[Array, "n 3"],
     directions: Float[Array, "n 3"],
     limit: Float[Array, " n"],
-    ambient: float | Float[Array, ""],
+    ambient: float | Float[Array, ""] | None,
     sampling: Sampling,
 ) -> tuple[Float[Array, "n 3"], Float[Array, " n"], list[Float[Array, " n"]], Float[Array, " n"]]:
     """What rays [W] see of parts before they end.
@@ -342,7 +342,7 @@ def through(
         origins: Where rays begin [m].
         directions: Unit vectors.
         limit: How far rays go [m].
-        ambient: Light from all around on what is painted.
+        ambient: Light from all around on what is painted; None if nothing is.
         sampling: How finely rays are sampled.
 
     Returns:
