@@ -547,3 +547,53 @@ def test_joint_from_the_motion_of_its_body():
     assert abs(found.values["damping"] - 0.004) <= 4 * found.standard_errors["damping"]
     q, v = coordinates(found.initial_states)
     np.testing.assert_allclose((q[0, 0], v[0, 0]), (1.2, -2.0), atol=0.02)
+
+
+def test_covariances_equal_to_the_noise_change_nothing(observed):
+    rng = np.random.default_rng(3)
+    seen = noisy(observed, rng)
+    covariance = np.tile(np.diag(np.repeat([1e-4, 2e-3], 3) ** 2), (len(seen.times), 1, 1))
+    known = dataclasses.replace(seen, covariance=covariance[:, None])
+    plain, weighed = (
+        dano.identify(ball_scene(), motion, [FRICTION], noise=NOISE, initial="velocities")
+        for motion in (seen, known)
+    )
+    assert weighed.values["mu"] == pytest.approx(plain.values["mu"], rel=1e-6)
+    assert weighed.standard_errors["mu"] == pytest.approx(plain.standard_errors["mu"], rel=1e-5)
+    assert weighed.errors == pytest.approx(plain.errors, rel=1e-4)
+
+
+def test_covariances_weigh_as_generalised_least_squares_does():
+    """Noise along an oblique line, much of it in some frames: gravity of a flight has a closed form."""
+    rng = np.random.default_rng(5)
+    scene = ball_scene()
+    start = scene.initial_state(ball={"position": (0, 0, 3), "velocity": (0.5, 0.2, 1.0)})
+    flight = dano.Motion.from_trajectory(dano.simulate(scene, start, 30), bodies=["ball"], every=2)
+    times, n = flight.times, len(flight.times)
+    line = np.array([0.8, 0.0, 0.6])
+    sizes = np.where(np.arange(n) % 3 == 1, 5e-3, 5e-4)
+    covariance = np.array([s**2 * np.outer(line, line) + 1e-8 * np.eye(3) for s in sizes])
+    noise = np.array([rng.multivariate_normal(np.zeros(3), c) for c in covariance])
+    noise[0] = 0
+    whole = np.tile(1e-6 * np.eye(6), (n, 1, 1, 1))
+    whole[:, 0, :3, :3] = covariance
+    position = flight.position[:, 0] + noise
+    seen = dano.Motion.create(times, "ball", position=position, covariance=whole)
+    gravity = dano.Parameter("g", lambda s: s.gravity, np.full(3, -20.0), np.full(3, 20.0))
+    fit = dano.identify(
+        scene, seen, [gravity], state=start, noise={"position": 1e-3}, initial=["velocity"], tolerance=1e-4
+    )
+    # x = v t + ½ g t (t + h): the integrator's own sum.
+    factors = np.stack([times, 0.5 * times * (times + H)], axis=1)[1:]
+    design = np.einsum("tk,ij->tikj", factors, np.eye(3)).reshape(n - 1, 3, 6)
+    inverse = np.linalg.inv(covariance[1:])
+    normal = np.einsum("tki,tkl,tlj->ij", design, inverse, design)
+    right = np.einsum("tki,tkl,tl->i", design, inverse, position[1:] - position[0])
+    expected, errors = np.linalg.solve(normal, right)[3:], np.sqrt(np.diag(np.linalg.inv(normal)))[3:]
+    assert np.all(np.abs(np.asarray(fit.values["g"]) - expected) < 0.02 * errors)
+    # Without the covariances it comes out elsewhere, so that the comparison says something.
+    plain = dataclasses.replace(seen, covariance=None)
+    other = dano.identify(
+        scene, plain, [gravity], state=start, noise={"position": 1e-3}, initial=["velocity"], tolerance=1e-4
+    )
+    assert np.any(np.abs(np.asarray(other.values["g"]) - expected) > 0.3 * errors)

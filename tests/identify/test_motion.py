@@ -50,6 +50,22 @@ def test_files_keep_everything(tmp_path, suffix, names):
         np.testing.assert_allclose(getattr(back, key), getattr(motion, key), rtol=0, atol=1e-15)
 
 
+def test_files_keep_covariances(tmp_path):
+    place, _ = parabola()
+    covariance = np.tile(np.diag([1.0, 2, 3, 4, 5, 6]), (20, 2, 1, 1))
+    covariance[4, 1] = np.nan
+    motion = dano.Motion.create(
+        TIMES, ("a", "b"), position=np.stack([place, place], axis=1), covariance=covariance
+    )
+    dano.save_motion(tmp_path / "m.npz", motion)
+    back = dano.load_motion(tmp_path / "m.npz")
+    np.testing.assert_array_equal(back.covariance, covariance)
+    np.testing.assert_array_equal(back.part(2, 6).covariance, covariance[2:6])
+    np.testing.assert_array_equal(
+        dano.load_motion(tmp_path / "m.npz", names="b").covariance, covariance[:, 1:]
+    )
+
+
 def test_reads_common_names_other_orders_and_rates(tmp_path):
     turns, _ = spinning()
     place, _ = parabola()
@@ -110,6 +126,8 @@ def test_conventions_that_contradict_the_spin_are_found(change, match):
         ({"names": ("a", "a")}, "different non-empty names"),
         ({"point": "middle"}, "'com' or 'origin'"),
         ({"lag": -1.0}, "lag must be finite"),
+        ({"covariance": np.zeros((20, 3, 3))}, r"covariance must have shape \(20, 1, 6, 6\)"),
+        ({"covariance": np.tile(-np.eye(6), (20, 1, 1))}, "positive definite.*frame 0"),
         ({"position": None}, "at least one observed frame"),
     ],
 )

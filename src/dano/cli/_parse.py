@@ -21,6 +21,7 @@ from dano.cli._arguments import (
     Train,
     View,
 )
+from dano.cli.tracking import Track
 from dano.names import did_you_mean
 
 _COMMANDS = {
@@ -31,6 +32,7 @@ _COMMANDS = {
     "import": Import,
     "inspect": Inspect,
     "simulate": Simulate,
+    "track": Track,
     "identify": Identify,
     "plan": Plan,
     "view": View,

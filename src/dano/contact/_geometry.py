@@ -19,6 +19,7 @@ from dano.contact._kernels import Tables, tables_of
 from dano.contact._points import cross
 from dano.fields import AbstractShape, HalfSpace
 from dano.maths import matmul, matvec, quat_to_matrix, skew
+from dano.native import FASTEST
 
 FIXED, AXIS, BALL = 0, 1, 2
 """How the samples of a surface turn with its body: with it; about its z axis they keep facing the other body;
@@ -356,8 +357,10 @@ def place(geometry: Geometry, kind: Kind | Mixture, links: Links, side: Side, sh
     else:
         # What touches a plane with the same normal at the start: forces act there, and depths are those of
         # the end. Together they are SHAKE's way with a constraint, which neither damps nor drives rolling.
+        # The faster a body spins, the nearer to the end: arms far from where depths are would miss impacts.
         moves = geometry.turning[i] != FIXED
-        before = jnp.where(moves, matmul(inverse, quat_to_matrix(links.orientation[i])), turn)
+        fast = jnp.minimum(jnp.sum(links.spin[i] ** 2) * (h / FASTEST) ** 2, 1)
+        before = jnp.where(moves, matmul(inverse, _moved(links, i, fast * share, h)[1]), turn)
         arms, _, _ = _turned(geometry, kind, side, before, matvec(before.T, matvec(turn, facing)))
         at = -matvec(before, links.com[i])
     at = at + matvec(inverse, side.follows * share * h * (links.velocity[i] - links.velocity[j]))

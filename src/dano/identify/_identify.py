@@ -19,6 +19,7 @@ from dano.identify._scales import check_scales
 from dano.identify._settings import deviations, estimated, Noise, Search, Setup, Windowing
 from dano.identify._uncertainty import quantile, uncertainty
 from dano.identify._windows import Plan
+from dano.maths import quat_conjugate, quat_log, quat_multiply
 from dano.scene import Control, Scene, State, Trajectory
 from dano.solvers import Solution, Stop
 
@@ -200,7 +201,8 @@ def identify(
             velocities and spins are observed, "velocities" if not.
         noise: Standard deviations by quantity: position [m], orientation [rad], velocity [m/s], omega
             [rad/s]. What is left out does not count. Default: positions and orientations, which weigh as if
-            seen at the bodies' surface.
+            seen at the bodies' surface. Poses with a covariance (`Motion.covariance`) weigh by that instead;
+            this then only says which quantities count.
         huber: Length of a residual, in those standard deviations, from which it counts linearly instead of
             squared, e.g. 2: outliers then pull less.
         window: Frames of the windows that motions are cut into, each simulated from its own initial state
@@ -358,7 +360,7 @@ def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:
             means[key] = finals[key] = float("nan")
             continue
         weight = weights[key][:, :, list(plan.bodies)]
-        size = lengths[..., plan.quantities.index(key)] / np.where(weight > 0, weight, 1)
+        size = _away(plan, found.predicted, key)
         means[key] = float(np.mean(size[weight > 0]))
         last = []
         for i in range(len(motions)):
@@ -370,6 +372,16 @@ def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:
     known = lengths[lengths >= 0]
     rms = float(np.sqrt(np.sum(known**2) / plan.n_data))
     return Errors(means["position"], finals["position"], means["orientation"], finals["orientation"], rms)
+
+
+def _away(plan: Plan, predicted: State, key: str) -> np.ndarray:
+    """By how much positions [m] or orientations [rad] are off, shape (windows, frames, bodies)."""
+    here, seen = (
+        np.asarray(getattr(s, key))[:, :, list(plan.bodies)] for s in (predicted, plan.windows.observed)
+    )
+    if key == "position":
+        return np.linalg.norm(here - seen, axis=-1)
+    return np.linalg.norm(quat_log(quat_multiply(quat_conjugate(seen), here)), axis=-1)
 
 
 def _missed(scene: Scene, motions: Sequence[Motion], errors: Errors) -> str | None:
@@ -398,5 +410,5 @@ def _as_motions(plan: Plan, motions: Sequence[Motion], found: Linearized, scene:
             rows = plan.rows[w]
             for key in QUANTITIES:
                 arrays[key][rows] = predicted[key][w, : len(rows)][:, bodies]
-        result.append(dataclasses.replace(motion, **arrays))
+        result.append(dataclasses.replace(motion, **arrays, covariance=None))
     return tuple(result)

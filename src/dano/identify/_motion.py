@@ -31,6 +31,9 @@ class Motion:
         point: Whether positions are those of the centres of mass or of the origins of the field frames (F).
         lag: How long before a frame its velocities hold [s]: half a timestep in a `Trajectory`, because
             x⁺ = x + h v⁺; 0 for measured ones.
+        covariance: Of each pose, or None if no more is known than one noise for all: of the position [m, W],
+            then of the rotation vector [rad, B] by which the true orientation follows the observed one,
+            shape (T, n, 6, 6); NaN where it is unknown.
     """
 
     times: np.ndarray
@@ -41,6 +44,7 @@ class Motion:
     names: tuple[str, ...]
     point: str = "com"
     lag: float = 0.0
+    covariance: np.ndarray | None = None
 
     @classmethod
     def create(
@@ -54,6 +58,7 @@ class Motion:
         omega: Numbers | None = None,
         point: str = "com",
         lag: float = 0.0,
+        covariance: Numbers | None = None,
     ) -> "Motion":
         """A motion from arrays of shape (T, n, ·), or (T, ·) for a single body.
 
@@ -66,11 +71,13 @@ class Motion:
             omega: [rad/s, B].
             point: What positions and velocities refer to: "com" or "origin".
             lag: How long before a frame its velocities hold [s].
+            covariance: Of each pose, as a tracker gives it, shape (T, n, 6, 6), or (T, 6, 6) for one body.
 
         Raises:
             ValueError: If there are fewer than two frames, times do not increase, a shape is wrong, nothing
                 was observed, an entry is infinite, a quaternion is not of unit length, or orientations
-                contradict the angular velocities (as they do in another order than wxyz).
+                contradict the angular velocities (as they do in another order than wxyz), or a covariance is
+                not symmetric and positive definite.
         """
         names = (names,) if isinstance(names, str) else tuple(names)
         if not names or len(set(names)) < len(names) or not all(names):
@@ -92,6 +99,9 @@ class Motion:
                 raise ValueError(f"motion of {name!r} must hold at least one observed frame, got none")
         arrays["orientation"] = _unit_quaternions(arrays["orientation"])
         motion = cls(stamps, **arrays, names=names, point=point, lag=float(lag))
+        if covariance is not None:
+            matrices = _covariances(covariance, len(stamps), len(names))
+            motion = dataclasses.replace(motion, covariance=matrices)
         _check_rotation(motion)
         return motion
 
@@ -127,6 +137,8 @@ class Motion:
         """Frames from `first` up to, not including, `last`; times stay as they are."""
         rows = slice(first, last)
         cut = {name: getattr(self, name)[rows] for name in ("times", *QUANTITIES)}
+        if self.covariance is not None:
+            cut["covariance"] = self.covariance[rows]
         return dataclasses.replace(self, **cut)
 
     def with_velocities(self, frames: int = SMOOTHING_FRAMES) -> "Motion":
@@ -169,6 +181,27 @@ def _frames(name: str, value: Numbers | None, n_frames: int, n_bodies: int) -> n
         raise ValueError(f"{name} must be finite, or NaN where it is unknown; frame {frame} is infinite")
     # A frame that is known in part is of no use.
     array[~np.isfinite(array).all(axis=-1)] = np.nan
+    return array
+
+
+def _covariances(value: Numbers, n_frames: int, n_bodies: int) -> np.ndarray:
+    shape = (n_frames, n_bodies, 6, 6)
+    array = np.array(value, dtype=float)
+    if array.ndim == 3 and n_bodies == 1:
+        array = array[:, None]
+    if array.shape != shape:
+        raise ValueError(f"covariance must have shape {shape} (frames, bodies, 6, 6), got {array.shape}")
+    known = np.isfinite(array).all(axis=(-2, -1))
+    array[~known] = np.nan
+    sizes = np.sqrt(np.abs(np.diagonal(array, axis1=-2, axis2=-1)))
+    scaled = array / np.maximum(sizes[..., :, None] * sizes[..., None, :], 1e-300)
+    for frame, body in np.argwhere(known):
+        matrix = scaled[frame, body]
+        if np.abs(matrix - matrix.T).max() > 1e-6 or np.linalg.eigvalsh(matrix).min() <= 0:
+            raise ValueError(
+                "covariance must be symmetric and positive definite, or NaN where it is unknown; that of"
+                f" frame {frame} is not"
+            )
     return array
 
 

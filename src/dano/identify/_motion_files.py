@@ -46,7 +46,8 @@ def load_motion(
     """Read a motion.
 
     .npz: what `save_motion` or `Trajectory.save` wrote, or arrays `times` (T,), `position`, `orientation`,
-    `velocity`, `omega` of shape (T, ·) or (T, n, ·) (also `time`, `pos`, `quat`, `vel`, …), and `names`.
+    `velocity`, `omega` of shape (T, ·) or (T, n, ·) (also `time`, `pos`, `quat`, `vel`, …), and `names`;
+    `covariance` of shape (T, 6, 6) or (T, n, 6, 6), as `Motion` has it.
     .csv: a header with `time`, `x, y, z`, `qw, qx, qy, qz`, `vx, vy, vz`, `wx, wy, wz`, each optional but the
     time; with several bodies `bunny.x` and so on. An empty cell is an unknown number. Units as in `Motion`.
 
@@ -74,8 +75,9 @@ def load_motion(
         raise ValueError(f"{source} does not name its bodies: give names")
     if found and names is not None and set(chosen) <= set(found):
         rows = [found.index(name) for name in chosen]
+        dimensions = {**dict.fromkeys(QUANTITIES, 3), "covariance": 4}
         arrays = {
-            key: value[:, rows] if key in QUANTITIES and value.ndim == 3 else value
+            key: value[:, rows] if value.ndim == dimensions.get(key) else value
             for key, value in arrays.items()
         }
     if "times" not in arrays:
@@ -95,6 +97,7 @@ def load_motion(
             **{key: arrays.get(key) for key in QUANTITIES},
             point="origin" if "origin" in (stated, point) else "com",
             lag=float(arrays.get("lag", 0.0)),
+            covariance=arrays.get("covariance"),
         )
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error
@@ -103,7 +106,7 @@ def load_motion(
 def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
     """Write a motion to an .npz or .csv file, replacing an existing one only when complete.
 
-    A .csv does not keep `point` and `lag`.
+    A .csv does not keep `point`, `lag` and `covariance`.
 
     Raises:
         ValueError: If the suffix is another, `path` is a directory or its parent does not exist.
@@ -114,6 +117,8 @@ def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
         form, version = MOTION
         words = {"format": form, "version": version, "names": motion.names, "point": motion.point}
         words["lag"] = motion.lag
+        if motion.covariance is not None:
+            arrays["covariance"] = motion.covariance
         write_archive(target, {**arrays, **{key: np.array(value) for key, value in words.items()}})
         return
     if target.suffix.lower() != ".csv":
@@ -151,7 +156,7 @@ def _read_npz(source: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
         raise ValueError(
             f"{source} must hold one of {list(QUANTITIES)} as arrays, got members {sorted(data)}"
         )
-    for key in ("point", "lag"):
+    for key in ("point", "lag", "covariance"):
         if key in data:
             arrays[key] = data[key]
     if form == TRAJECTORY[0]:

@@ -227,6 +227,8 @@ def _residuals(model: Model, window: Windows, start: State, following: State, x,
         scene, State(places.position, places.orientation, speeds.velocity, speeds.omega), window.origins, -1
     )
     rows = jnp.stack([_row(model, window, predicted, key) for key in model.quantities], axis=2)
+    if window.whitening is not None:
+        rows = _whitened(model, rows, window.whitening[:, _bodies(model)])
     # Not empty: mapping in batches cannot put empty arrays together.
     jump = jnp.zeros(1, rows.dtype)
     if model.jumps is not None:
@@ -271,6 +273,19 @@ def _row(model: Model, window: Windows, predicted: State, key: str) -> Float[Arr
         seen = jnp.where(weight > 0, seen, found)
         return weight * quat_log(quat_multiply(quat_conjugate(seen), found))
     return weight * (found - seen)
+
+
+def _whitened(model: Model, rows: Float[Array, "f b q 3"], whitening: Float[Array, "f b 6 6"]) -> Array:
+    """Residuals of poses as independent ones of variance one; others as they are."""
+    poses = [key for key in ("position", "orientation") if key in model.quantities]
+    if not poses:
+        return rows
+    index = [model.quantities.index(key) for key in poses]
+    numbers = np.concatenate([3 * ("position", "orientation").index(key) + np.arange(3) for key in poses])
+    part = whitening[:, :, numbers][..., numbers]
+    flat = rows[:, :, np.array(index)].reshape(*rows.shape[:2], len(numbers))
+    white = jnp.einsum("fbij,fbj->fbi", part, flat)
+    return rows.at[:, :, np.array(index)].set(white.reshape(*rows.shape[:2], len(index), 3))
 
 
 def _robust(model: Model, rows: Float[Array, "f b q 3"]):

@@ -27,6 +27,9 @@ class Windows(eqx.Module):
         observed: What was seen, zero where nothing was; leaves (w, frames, bodies, ·).
         weights: One over the standard deviation of each number, zero where nothing was seen, by quantity;
             shape (w, frames, bodies).
+        whitening: What makes residuals of pose with these weights, position then orientation, independent and
+            of variance one, by the motions' covariances, shape (w, frames, bodies, 6, 6); None if no motion
+            has any.
         end: Where the next window of the same motion begins, as `frame` has it.
         chained: Whether there is such a window, 1 or 0.
         controls: Forces and torques of each step, or None.
@@ -39,6 +42,7 @@ class Windows(eqx.Module):
     moment: tuple[Int[Array, "w f"], Float[Array, "w f"]]
     observed: State
     weights: dict[str, Float[Array, "w f n"]]
+    whitening: Float[Array, "w f n 6 6"] | None
     end: tuple[Int[Array, " w"], Float[Array, " w"]]
     chained: Float[Array, " w"]
     controls: Control | None
@@ -134,6 +138,7 @@ def plan_windows(
         _arrays(moment, dtype),
         observed,
         weights,
+        _whitening(pieces, weights, dtype),
         _arrays(_located(np.array(until) / h, n_steps), dtype),
         jnp.asarray(np.append(owner[1:] == owner[:-1], False), dtype),
         _control_rows(scene, forces, first_step, n_steps),
@@ -180,6 +185,31 @@ def _weighed(
     return State(**observed), weights
 
 
+def _whitening(pieces: list[dict], weights: Mapping[str, Array], dtype) -> Array | None:
+    """See `Windows`."""
+    if all(piece["covariance"] is None for piece in pieces):
+        return None
+    shape = next(iter(weights.values())).shape
+    result = np.tile(np.eye(6), (*shape, 1, 1))
+    # Standard deviations by which residuals have been divided, where they count.
+    sizes = np.zeros((*shape, 6))
+    for first, key in ((0, "position"), (3, "orientation")):
+        if key in weights:
+            weight = np.asarray(weights[key])
+            sizes[..., first : first + 3] = np.where(weight > 0, 1 / np.maximum(weight, 1e-300), 0)[..., None]
+    for w, piece in enumerate(pieces):
+        if piece["covariance"] is None:
+            continue
+        for f, n in np.argwhere(np.isfinite(piece["covariance"]).all(axis=(-2, -1))):
+            on = np.flatnonzero(sizes[w, f, n] > 0)
+            if len(on) == 0:
+                continue
+            scale = sizes[w, f, n, on]
+            scaled = piece["covariance"][f, n][np.ix_(on, on)] / np.outer(scale, scale)
+            result[w, f, n][np.ix_(on, on)] = np.linalg.inv(np.linalg.cholesky(scaled))
+    return jnp.asarray(result, dtype)
+
+
 def draw_velocities(
     start: State,
     bodies: Sequence[int],
@@ -219,6 +249,14 @@ def _on_all_bodies(scene: Scene, motion: Motion, what: str) -> dict[str, np.ndar
     return full
 
 
+def _covariance_on_all_bodies(scene: Scene, motion: Motion, first: int, last: int) -> np.ndarray | None:
+    if motion.covariance is None:
+        return None
+    full = np.full((last - first, len(scene.bodies), 6, 6), np.nan)
+    full[:, [scene.index(name) for name in motion.names]] = motion.covariance[first:last]
+    return full
+
+
 def _cut(
     scene, motion: Motion, full, state, control, number: int, window: int | None, smoothing: int, what: str
 ):
@@ -247,6 +285,7 @@ def _cut(
                     "origins": origins,
                     "start": start,
                     "control": control,
+                    "covariance": _covariance_on_all_bodies(scene, motion, first, last),
                     **{key: full[key][first:last] for key in QUANTITIES},
                 }
             )

@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-from dano.native import HALF_SPACE, RUN, TURNED
+from dano.native import FASTEST, HALF_SPACE, RUN, TURNED
 from dano.native._compiling import fingerprint, kernel
 from dano.native._ffi import (
     cube,
@@ -184,7 +184,8 @@ def _place(a, b, turning, side, share, settings, solid, whole, atlas, out, scrat
     _apply(out, _POINTS, scratch[30], scratch[31], scratch[32], scratch, 90)
     _align(a, turning, settings, scratch[30], scratch[31], scratch[32], out, _POINTS, _VECTORS, scratch)
     # The same at the start: arms of what then touches a plane with the normal of the other moment.
-    _matrix(a, _ORIENTATION, scratch, 43)
+    turn = h * _length(a, _SPIN) / FASTEST
+    _moved(a, min(turn * turn, 1.0) * share, h, scratch[40:])
     _product(scratch, 80, scratch, 43, out, _ARMS)
     _apply(out, _ARMS, -a[_COM], -a[_COM + 1], -a[_COM + 2], out, _ARM_ORIGIN)
     for k in range(3):
@@ -502,9 +503,8 @@ def _list_block(
             weight = found[11] * depth
             sums[0] += found[11]
             sums[1] += weight
-            sums[2] += weight * (
-                found[10] - found[3] * found[12] - found[4] * found[13] - found[5] * found[14]
-            )
+            nearing = found[3] * found[12] + found[4] * found[13] + found[5] * found[14]
+            sums[2] += weight * (found[10] - nearing)
             for k in range(6):
                 sums[3 + k] += weight * found[k]
         if used < room:

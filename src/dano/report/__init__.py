@@ -9,6 +9,10 @@ from dano.report._identification import write_identification_report as write_ide
 from dano.report._object import draw_object as draw_object
 from dano.report._plan import draw_controls as draw_controls, film_plan as film_plan
 from dano.report._resample import frame_count as frame_count
+from dano.report._tracking import (
+    draw_tracked as draw_tracked,
+    write_tracking_report as write_tracking_report,
+)
 from dano.report._training import (
     mass_estimates as mass_estimates,
     MassEstimates as MassEstimates,

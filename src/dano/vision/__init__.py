@@ -7,6 +7,7 @@ from dano.vision.capture import (
     Capture as Capture,
     hull_distance as hull_distance,
     Light as Light,
+    load_camera as load_camera,
     load_capture as load_capture,
     NodeGrid as NodeGrid,
     PosedCamera as PosedCamera,
@@ -20,8 +21,10 @@ from dano.vision.drawing import (
     Item as Item,
     level_surface as level_surface,
     PALETTE as PALETTE,
+    Part as Part,
     placement as placement,
     render as render,
+    through as through,
 )
 from dano.vision.radiance import (
     AbstractMedium as AbstractMedium,
@@ -51,6 +54,14 @@ from dano.vision.structure import (
     save_transforms as save_transforms,
     Scale as Scale,
     Up as Up,
+)
+from dano.vision.tracking import (
+    Film as Film,
+    Overlay as Overlay,
+    read_film as read_film,
+    track as track,
+    Tracked as Tracked,
+    TrackOptions as TrackOptions,
 )
 from dano.vision.training import (
     HistoryEntry as HistoryEntry,

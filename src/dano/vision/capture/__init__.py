@@ -6,7 +6,7 @@ from dano.vision.capture._camera import (
     PosedCamera as PosedCamera,
 )
 from dano.vision.capture._capture import Capture as Capture, View as View
-from dano.vision.capture._capture_files import load_capture as load_capture
+from dano.vision.capture._capture_files import load_camera as load_camera, load_capture as load_capture
 from dano.vision.capture._hull import (
     hull_distance as hull_distance,
     object_box as object_box,

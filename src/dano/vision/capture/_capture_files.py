@@ -69,6 +69,34 @@ def load_capture(path: str | Path, *, hold_out: int | None = None, downscale: in
     return Capture(views, path)
 
 
+def load_camera(path: str | Path, width: int, height: int) -> PosedCamera:
+    """Read one camera that stands still, for pictures of a size.
+
+    Args:
+        path: A .json file in nerfstudio's convention: fl_x (or camera_angle_x), w, h, cx, cy, k1 …, and
+            transform_matrix, of itself or of its only frame. Without w and h the intrinsics are those of
+            pictures of the size asked for.
+        width: Of the pictures [pixels].
+        height: Of the pictures [pixels].
+
+    Raises:
+        ValueError: If the file is missing or lacks something, holds several frames, or the pictures have
+            another shape.
+    """
+    source = Path(path)
+    content = _json(source)
+    frames = content.get("frames", [])
+    if "transform_matrix" not in content:
+        if not isinstance(frames, list) or len(frames) != 1:
+            raise ValueError(
+                f"{source}: camera must have one transform_matrix, or a single frame that has it, got"
+                f" {len(frames)} frames"
+            )
+        content = {**content, **frames[0]}
+    _check_model(source, {**content, "frames": []})
+    return _camera(source, source.name, {"transform_matrix": None, **content}, (height, width))
+
+
 def _cut_out(views: Sequence[View]) -> list[View]:
     """Objects without plain backgrounds; says where that has completed masks."""
     cut = [cut_out(view) for view in views]

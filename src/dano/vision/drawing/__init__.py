@@ -1,6 +1,6 @@
 """Pictures of fields: solids, media and learned models under lamps and a sky."""
 
-from dano.vision.drawing._composed import compose as compose
+from dano.vision.drawing._composed import compose as compose, Part as Part, through as through
 from dano.vision.drawing._item import (
     checked_colour as checked_colour,
     Item as Item,
@@ -9,3 +9,4 @@ from dano.vision.drawing._item import (
     placement as placement,
 )
 from dano.vision.drawing._render import render as render
+from dano.vision.drawing._shade import GAMMA as GAMMA

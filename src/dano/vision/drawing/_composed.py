@@ -28,6 +28,7 @@ from dano.vision.radiance import (
     importance_edges,
     Picture,
     Sampling,
+    section_weights,
     Share,
     stratified_edges,
     tiles,
@@ -324,8 +325,25 @@ def _composed(parts, planes, lamps, origin, directions, ambient, sampling):
     return colour, opacity, depth / jnp.maximum(opacity, _GONE), which
 
 
-def through(parts, lamps, origins, directions, limit, ambient, sampling):
+def through(
+    parts: tuple[Part, ...],
+    lamps: Sequence[tuple[Light, ...]],
+    origins: Float[Array, "n 3"],
+    directions: Float[Array, "n 3"],
+    limit: Float[Array, " n"],
+    ambient: float | Float[Array, ""] | None,
+    sampling: Sampling,
+) -> tuple[Float[Array, "n 3"], Float[Array, " n"], list[Float[Array, " n"]], Float[Array, " n"]]:
     """What rays [W] see of parts before they end.
+
+    Args:
+        parts: What is there.
+        lamps: Light that each of them is under.
+        origins: Where rays begin [m].
+        directions: Unit vectors.
+        limit: How far rays go [m].
+        ambient: Light from all around on what is painted; None if nothing is.
+        sampling: How finely rays are sampled.
 
     Returns:
         SRGB over black (n, 3), mean distance times opacity [m] (n,), the share of every part, each (n,), and
@@ -360,8 +378,9 @@ def shared_weights(
         alphas: Opacity of the sections by themselves.
         n_rays: Number of rays.
     """
-    if not edges:
-        return [], jnp.ones(n_rays, jnp.float32)
+    if len(edges) < 2:
+        clear = transmittance(alphas[0]) if alphas else jnp.ones(n_rays, jnp.float32)
+        return [section_weights(alpha) for alpha in alphas], clear
     owner = np.concatenate([np.full(e.shape[1], i) for i, e in enumerate(edges)])
     joined = jnp.concatenate(edges, axis=1)
     order = jnp.argsort(joined, axis=1, stable=True)

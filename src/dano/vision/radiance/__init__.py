@@ -19,6 +19,7 @@ from dano.vision.radiance._picture import Picture as Picture, picture as picture
 from dano.vision.radiance._volume import (
     composite as composite,
     importance_edges as importance_edges,
+    section_weights as section_weights,
     stratified_edges as stratified_edges,
     transmittance as transmittance,
 )

@@ -80,6 +80,26 @@ def _sharpest(video: Path, count: int, progress: Progress) -> Iterator[tuple[int
         yield best[1:]
 
 
+def timed_frames(video: Path) -> Iterator[tuple[float, np.ndarray]]:
+    """Times [s] and pixels of all frames of a video, upright, in the order in which they are shown.
+
+    Frames of a variable rate keep the times that they have. One without a time follows the one before at the
+    stated rate.
+
+    Raises:
+        ValueError: If the video cannot be read, says so by name.
+        ImportError: If av is missing.
+    """
+    last = None
+    for frame in _decoded(video):
+        stated = frame.time
+        if stated is None:
+            rate = float(getattr(frame, "rate", None) or 30.0)
+            stated = 0.0 if last is None else last + 1 / rate
+        last = float(stated)
+        yield last, _upright(frame)
+
+
 def _decoded(video: Path) -> Iterator[Any]:
     try:
         import av

@@ -1,0 +1,207 @@
+"""Poses in rendered films against the true ones: errors, regions, starts, time, and friction from them."""
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from benchmarks._measure import load_average, parse_arguments, report, Row, skipped
+from benchmarks.track._friction import friction_of
+from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate
+from dano.scene_file import asset_look
+from dano.vision import Film, LearnedField, load_camera, PosedCamera, read_film, track, Tracked, TrackOptions
+
+FILMS = ("soap_slide", "bunny_slide", "soap_tumble", "bunny_tumble")
+
+_RIGHT = 0.05, np.radians(5)
+"""Error, as a share of the size and [rad], up to which a start is right: tracking goes on from there."""
+
+_TURNED = {"soap": np.eye(4)[1:]}
+"""Half turns that leave an object as it is but for the word carved into one face."""
+
+
+class Case(NamedTuple):
+    """A film with its truth.
+
+    Attributes:
+        name: Of the film.
+        film: Its frames, with the true masks.
+        camera: Which took it.
+        field: The object.
+        position: True positions of its frame [m], shape (T, 3).
+        orientation: True orientations, shape (T, 4).
+        friction: Of the table.
+        background: Picture of the table alone.
+    """
+
+    name: str
+    film: Film
+    camera: PosedCamera
+    field: LearnedField
+    position: np.ndarray
+    orientation: np.ndarray
+    friction: float
+    background: Path
+
+
+def run() -> None:
+    """Measure, print and report."""
+    arguments = parse_arguments("Track objects in rendered films and compare with the truth.", _options)
+    load, rows = load_average(), []
+    cases = []
+    for name in FILMS:
+        if arguments.films is None or not (arguments.films / name / "truth.json").is_file():
+            rows.append(
+                skipped(name, "poses", "no films: python assets/render_videos.py DIR, then --films DIR")
+            )
+            continue
+        cases.append(_case(arguments.films / name))
+    for case in cases[: 1 if arguments.quick else None]:
+        for source in arguments.masks:
+            rows += _tracked(case, source)
+    if cases and arguments.starts and not arguments.quick:
+        rows.append(_starts(cases, arguments.starts))
+    settings: dict[str, object] = {"quick": arguments.quick, "options": str(TrackOptions())}
+    report("track", rows, settings, load, arguments.json)
+
+
+def _options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--films", type=Path, metavar="DIR", help="what assets/render_videos.py wrote")
+    parser.add_argument("--masks", nargs="+", default=["given", "object"], help="where masks come from")
+    parser.add_argument("--starts", type=int, default=20, help="searches without a start; 0: none")
+
+
+def _case(folder: Path) -> Case:
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    film = read_film(folder / "film.mp4", masks=folder / "masks")
+    field = asset_look(f"trained_{folder.name.split('_')[0]}")
+    assert field is not None
+    return Case(
+        folder.name,
+        film,
+        load_camera(folder / "truth.json", *film.size),
+        field,
+        np.array(truth["position"]),
+        np.array(truth["orientation"]),
+        truth["friction"],
+        folder / "empty.png",
+    )
+
+
+def _tracked(case: Case, source: str) -> list[Row]:
+    """One film, with masks from one source."""
+    group = f"{case.name}, masks: {source}"
+    film = case.film if source == "given" else case.film._replace(masks=[None] * len(case.film.masks))
+    began = time.process_time()
+    background = None if source == "given" else case.background
+    found = track(film, case.field, case.camera, TrackOptions(masks=source), background=background)
+    processor = (time.process_time() - began) / len(film.times)
+    place, turn, distance = _errors(case, found)
+    known = np.isfinite(place)
+    held = distance[known] < chi2.ppf(0.95, 6)
+    last = len(film.times)
+    rows = [
+        Row(group, "frames tracked", found.n_tracked, "", last, at_least=True, note=f"of {last}"),
+        Row(
+            group,
+            "position, median error",
+            100 * float(np.median(place[known])),
+            "% size",
+            1.0,
+            note=f"largest {100 * place[known].max():.2f}",
+        ),
+        Row(
+            group,
+            "orientation, median error",
+            float(np.degrees(np.median(turn[known]))),
+            "°",
+            1.0,
+            note=f"largest {np.degrees(turn[known].max()):.2f}",
+        ),
+        Row(group, "95 % regions that hold the truth", 100 * float(held.mean()), "%", note="wanted 90 to 99"),
+        Row(
+            group,
+            "time a frame, after the first",
+            found.seconds,
+            "s",
+            2.0,
+            note=f"processor {processor:.1f} s with compilation and start; load {os.getloadavg()[0]:.1f}",
+        ),
+    ]
+    if "slide" in case.name and found.n_tracked > 8:
+        value, error = friction_of(case.name.split("_")[0], found)
+        off = 100 * abs(value / case.friction - 1)
+        rows.append(
+            Row(
+                group,
+                "friction from the poses, error",
+                off,
+                "%",
+                5.0,
+                note=f"{value:.4f} ± {error:.4f}, truth {case.friction}",
+            )
+        )
+    return rows
+
+
+def _errors(case: Case, found: Tracked) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each frame: position as a share of the size, at the object's middle; orientation; Mahalanobis²."""
+    lower, upper = np.asarray(case.field.solid.solid_bounds, np.float64)
+    middle = 0.5 * (lower + upper)
+    turns = quat_log(quat_multiply(quat_conjugate(found.orientation), case.orientation))
+    shift = case.position - found.position
+    arms = quat_rotate(case.orientation, np.broadcast_to(middle, shift.shape))
+    arms = arms - quat_rotate(found.orientation, np.broadcast_to(middle, shift.shape))
+    both = np.concatenate([shift, turns], axis=1)
+    distance = np.full(len(both), np.nan)
+    for i in np.flatnonzero(np.isfinite(both).all(axis=1)):
+        distance[i] = both[i] @ np.linalg.solve(found.covariance[i], both[i])
+    size = float((upper - lower).max())
+    return np.linalg.norm(shift + arms, axis=1) / size, np.linalg.norm(turns, axis=1), distance
+
+
+def _starts(cases: list[Case], count: int) -> Row:
+    """Searches in single frames, spread over the films; a film of two frames is the shortest."""
+    right, up_to_symmetry, missed = 0, 0, []
+    for k in range(count):
+        case = cases[k % len(cases)]
+        i = round((k // len(cases) + 0.5) * (len(case.film.times) - 2) / -(-count // len(cases)))
+        film, rows = case.film, slice(i, i + 2)
+        part = Film(
+            film.names[rows],
+            film.times[rows],
+            film.images[rows],
+            film.masks[rows],
+            film.occluders[rows],
+            film.shrunk,
+            (),
+        )
+        cut = case._replace(film=part, position=case.position[rows], orientation=case.orientation[rows])
+        try:
+            found = track(part, case.field, case.camera, TrackOptions(masks="given"))
+        except ValueError:
+            missed.append(f"{case.name} {i}")
+            continue
+        if _is_right(cut, found):
+            right += 1
+        elif any(
+            _is_right(cut._replace(orientation=quat_multiply(cut.orientation, np.tile(turn, (2, 1)))), found)
+            for turn in _TURNED.get(case.name.split("_")[0], ())
+        ):
+            up_to_symmetry += 1
+        else:
+            missed.append(f"{case.name} {i}")
+    note = f"of {count}; {up_to_symmetry} more but for the carved word"
+    if missed:
+        note += f"; wrong: {', '.join(missed)}"
+    return Row("starts from nothing", "right", right + up_to_symmetry, "", 19, at_least=True, note=note)
+
+
+def _is_right(case: Case, found: Tracked) -> bool:
+    place, turn, _ = _errors(case, found)
+    return bool(place[0] < _RIGHT[0] and turn[0] < _RIGHT[1])

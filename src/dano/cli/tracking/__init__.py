@@ -1,0 +1,3 @@
+"""`dano track`."""
+
+from dano.cli.tracking._arguments import Track as Track

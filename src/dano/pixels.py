@@ -1,0 +1,157 @@
+"""From parameters and forces to pixels: rollout and renderer as one differentiable function.
+
+Physics moves the bodies, their learned looks are rendered at the poses, and what comes out can be
+differentiated with respect to everything that goes in: leaves of the scene such as friction, the initial
+state, controls, and light. Where a silhouette moves, derivatives are those of a soft edge that is about a
+pixel wide.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.engine import AbstractEngine, Policy, simulate
+from dano.maths import checked_count, Numbers, quat_normalize, quat_rotate, quat_to_matrix
+from dano.scene import Control, Scene, State
+from dano.vision import AbstractCamera, AbstractModel, LearnedField, Light, Part, Sampling, through
+
+FILM_SAMPLING = Sampling(48, 16, 3)
+"""How finely rays are sampled: a picture to compare, not one to look at."""
+
+_EDGE = 4.0
+"""Sharpness of a silhouette times the width of a pixel at the object."""
+
+
+class Frames(NamedTuple):
+    """Pictures of a rollout.
+
+    Attributes:
+        colour: sRGB of the pixels over the background, shape (frames, pixels, 3).
+        opacity: Share of each pixel that bodies cover, shape (frames, pixels).
+        times: Of the frames since the beginning of the rollout [s], shape (frames,).
+    """
+
+    colour: Float[Array, "frames pixels 3"]
+    opacity: Float[Array, "frames pixels"]
+    times: Float[Array, " frames"]
+
+
+def film(
+    scene: Scene,
+    state: State,
+    n_steps: int,
+    looks: Mapping[str, LearnedField],
+    camera: AbstractCamera,
+    lights: Sequence[Light],
+    *,
+    controls: Control | Policy | None = None,
+    every: int = 1,
+    pixels: Float[np.ndarray, "n 2"] | None = None,
+    background: Numbers = (0.0, 0.0, 0.0),
+    sampling: Sampling = FILM_SAMPLING,
+    engine: AbstractEngine | None = None,
+) -> Frames:
+    """Simulate a scene and render some of its bodies, differentiably.
+
+    Differentiate with respect to leaves of `scene`, `state`, `controls` or `lights`, forward or in reverse;
+    under `jax.jit` close over the rest. Frames are rendered one after the other and again in the reverse
+    pass, so that memory is that of one frame, beside the rollout's.
+
+    Args:
+        scene: Bodies and contacts.
+        state: Initial state.
+        n_steps: Steps of the rollout.
+        looks: Learned looks of the bodies that are seen, by their names; others are not drawn.
+        camera: From where.
+        lights: Lamps, fixed in the world while bodies turn.
+        controls: As in `simulate`.
+        every: Steps between frames; the first frame shows the initial state.
+        pixels: Image coordinates (x to the right, y downwards) of the pixels wanted; default: all, row by
+            row. Fewer cost less, e.g. those near silhouettes.
+        background: sRGB behind the bodies, of one colour (3,) or of every pixel (n, 3).
+        sampling: How finely rays are sampled.
+        engine: As in `simulate`.
+
+    Raises:
+        ValueError: If a look is of no body, there is none, there is no light, `every` is < 1, or the
+            background has another shape.
+    """
+    _check(scene, looks, lights)
+    every = checked_count("every", every)
+    trajectory = simulate(scene, state, n_steps, controls=controls, engine=engine)
+    if pixels is None:
+        y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+        pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    view = _View(
+        [jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), look.model) for look in looks.values()],
+        [float(look.drawn_sharpness) for look in looks.values()],
+        camera,
+        camera.directions(np.asarray(pixels, np.float64)).astype(np.float32),
+        _backdrop(background, len(pixels)),
+        tuple(lights),
+        sampling,
+    )
+    at = np.arange(0, n_steps + 1, every)
+    rows = np.array([scene.index(name) for name in looks])
+    orientation = quat_normalize(trajectory.states.orientation[at][:, rows])
+    arms = jnp.stack([scene.bodies[i].com + scene.bodies[i].com_offset for i in rows])
+    arms = jnp.broadcast_to(arms.astype(orientation.dtype), (*orientation.shape[:2], 3))
+    position = trajectory.states.position[at][:, rows] - quat_rotate(orientation, arms)
+    drawn = jax.checkpoint(lambda pose: _drawn(view, *pose))
+    colour, opacity = jax.lax.map(drawn, (position.astype(jnp.float32), orientation.astype(jnp.float32)))
+    return Frames(colour, opacity, trajectory.times[at])
+
+
+class _View(NamedTuple):
+    """What is the same in all frames: what is seen, how sharp it may be, from where, and in which light."""
+
+    models: list[AbstractModel]
+    sharpest: list[float]
+    camera: AbstractCamera
+    directions: np.ndarray
+    behind: np.ndarray
+    lights: tuple[Light, ...]
+    sampling: Sampling
+
+
+def _drawn(
+    view: _View, position: Float[Array, "n 3"], orientation: Float[Array, "n 4"]
+) -> tuple[Array, Array]:
+    """Colour and opacity of one frame, of bodies whose field frames are at these poses."""
+    origin = jnp.asarray(view.camera.position, jnp.float32)
+    parts = []
+    for i, model in enumerate(view.models):
+        # How soft an edge is drawn says nothing about where it is.
+        away = jax.lax.stop_gradient(jnp.linalg.norm(position[i] - origin))
+        softest = _EDGE / (np.float32(view.camera.pixel_angle) * away)
+        sharpness = jnp.minimum(softest, np.float32(view.sharpest[i]))
+        parts.append(Part(model, quat_to_matrix(orientation[i]), position[i], sharpness))
+    origins = jnp.broadcast_to(origin, view.directions.shape)
+    limit = jnp.full(len(view.directions), jnp.inf, jnp.float32)
+    lamps = (view.lights,) * len(parts)
+    directions = jnp.asarray(view.directions)
+    colour, _, _, clear = through(tuple(parts), lamps, origins, directions, limit, 0.0, view.sampling)
+    return colour + clear[:, None] * view.behind, 1 - clear
+
+
+def _backdrop(background: Numbers, n_pixels: int) -> np.ndarray:
+    colours = np.asarray(background, np.float32)
+    if colours.shape not in ((3,), (n_pixels, 3)):
+        raise ValueError(f"background must have shape (3,) or ({n_pixels}, 3), got {colours.shape}")
+    return np.broadcast_to(colours, (n_pixels, 3))
+
+
+def _check(scene: Scene, looks: Mapping[str, LearnedField], lights: Sequence[Light]) -> None:
+    if not looks:
+        raise ValueError("looks must hold the look of at least one body, got none")
+    for name, look in looks.items():
+        if name not in scene.names:
+            raise ValueError(f"looks must be of bodies of the scene {list(scene.names)}, got {name!r}")
+        if not isinstance(look, LearnedField):
+            raise ValueError(f"looks must be LearnedFields, got {type(look).__name__} for {name!r}")
+    if not lights:
+        raise ValueError("lights must hold a Light, got none: everything would be black")

@@ -1,0 +1,216 @@
+"""A film as pictures with times: a video or a folder of frames, with masks if there are any."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from dano.progress import Progress
+from dano.vision.capture import PosedCamera
+from dano.vision.structure import picture_files, timed_frames, VIDEOS
+
+_LONGEST = 800
+"""Longest side of frames that are tracked [pixels]: larger ones are averaged, which costs no accuracy that
+noise and lens would not."""
+
+_FEWEST = 2
+"""Frames that make a motion."""
+
+_UNEVEN = 0.2
+"""Share by which times between frames may differ before the rate is called variable."""
+
+
+class Film(NamedTuple):
+    """Frames that show the object.
+
+    Attributes:
+        names: Of the frames: files, or numbers in the video.
+        times: Real ones [s], increasing, shape (T,).
+        images: sRGB, each (height, width, 3).
+        masks: Given ones or alpha, 0 to 1, each (height, width); None where there is none.
+        occluders: Where something else stands in front of the object, likewise.
+        shrunk: Pixels of the original a side that were averaged into one.
+        notes: Sentences about times and sizes.
+    """
+
+    names: tuple[str, ...]
+    times: Float[np.ndarray, " T"]
+    images: list[UInt8[np.ndarray, "height width 3"]]
+    masks: list[Float[np.ndarray, "height width"] | None]
+    occluders: list[Float[np.ndarray, "height width"] | None]
+    shrunk: int
+    notes: tuple[str, ...]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [pixels]."""
+        return self.images[0].shape[1], self.images[0].shape[0]
+
+    def camera(self, original: PosedCamera) -> PosedCamera:
+        """The camera of the averaged frames, from that of the original ones."""
+        k = self.shrunk
+        return original.replaced(
+            focal=original.focal / k, centre=original.centre / k, width=self.size[0], height=self.size[1]
+        )
+
+
+def read_film(
+    path: str | Path,
+    *,
+    rate: int | float | None = None,
+    slow_motion: int | float = 1.0,
+    every: int = 1,
+    masks: str | Path | None = None,
+    occluders: str | Path | None = None,
+    progress: Progress | None = None,
+) -> Film:
+    """Read the frames of a video, or the pictures of a folder in the order of their names.
+
+    Args:
+        path: The video or the folder.
+        rate: Frames a second, real ones. Needed for folders; for videos it replaces the times in the file.
+        slow_motion: How many times slower the video plays than it was filmed.
+        every: Take every so many-th frame.
+        masks: Folder with a mask a frame, bright where the object is, in the order of their names.
+        occluders: The same of what stands in front of the object, such as a hand.
+        progress: Told how far it is.
+
+    Raises:
+        ValueError: If the film is missing, broken, or too short, or masks do not fit it.
+        ImportError: If av (videos) or pillow (pictures) is missing.
+    """
+    source = Path(path)
+    for name, value in (("rate", rate), ("slow_motion", slow_motion)):
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be finite and > 0, got {value}")
+    if every < 1:
+        raise ValueError(f"every must be ≥ 1, got {every}")
+    tell = progress or (lambda text, share: None)
+    names, stamps, images, alphas, shrunk = [], [], [], [], 1
+    for i, (name, stamp, pixels) in enumerate(_frames(source, rate)):
+        if i % every:
+            continue
+        tell("reading frames", 0.0)
+        shrunk = -(-max(pixels.shape[:2]) // _LONGEST)
+        names.append(name)
+        stamps.append(i / rate if rate is not None else stamp)
+        images.append(_averaged(pixels[..., :3], shrunk))
+        alphas.append(None if pixels.shape[2] == 3 else _averaged(pixels[..., 3], shrunk) / np.float32(255))
+    if len(images) < _FEWEST:
+        raise ValueError(f"{source}: a film must have at least {_FEWEST} frames, got {len(images)}")
+    if wrong := [n for n, im in zip(names, images, strict=True) if im.shape != images[0].shape]:
+        raise ValueError(f"{source}: all frames must have one size, {wrong[0]} has another than {names[0]}")
+    times = np.array(stamps) / slow_motion
+    times = times - times[0]
+    if not np.all(np.diff(times) > 0):
+        bad = int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1
+        raise ValueError(
+            f"{source}: times of frames must increase, that of frame {names[bad]} does not: give rate"
+        )
+    given = _masks("masks", masks, len(images), images[0].shape[:2], shrunk, every)
+    return Film(
+        tuple(names),
+        times,
+        images,
+        given or alphas,
+        _masks("occluders", occluders, len(images), images[0].shape[:2], shrunk, every)
+        or [None] * len(images),
+        shrunk,
+        tuple(_notes(times, slow_motion, shrunk)),
+    )
+
+
+def _notes(times: np.ndarray, slow_motion: int | float, shrunk: int) -> list[str]:
+    steps = np.diff(times)
+    notes = []
+    if np.ptp(steps) > _UNEVEN * np.median(steps):
+        notes.append(
+            f"the frame rate varies ({1 / steps.max():.3g} to {1 / steps.min():.3g} frames/s): the times in"
+            " the file are used"
+        )
+    if slow_motion != 1.0:
+        notes.append(f"slow motion: times are those of the video divided by {slow_motion:g}")
+    if shrunk > 1:
+        notes.append(f"frames are large: {shrunk} × {shrunk} pixels are averaged into one")
+    return notes
+
+
+def _frames(source: Path, rate: int | float | None) -> Iterator[tuple[str, float, np.ndarray]]:
+    if source.is_dir():
+        if rate is None:
+            raise ValueError(f"{source}: a folder of frames has no times: give rate [frames/s]")
+        for file in picture_files(source):
+            yield file.name, 0.0, _picture(file)
+        return
+    if not source.is_file():
+        raise ValueError(f"video must be a video or a folder of frames, got {source}, which does not exist")
+    if source.suffix.lower() not in VIDEOS:
+        raise ValueError(f"video must be one of *{', *'.join(VIDEOS)} or a folder, got {source}")
+    for i, (time, pixels) in enumerate(timed_frames(source)):
+        yield str(i), time, pixels
+
+
+def _picture(file: Path) -> np.ndarray:
+    """Pixels with 8 bits a channel, upright, with alpha if there is any."""
+    try:
+        from PIL import Image, ImageOps
+    except ImportError as error:
+        raise ImportError("reading pictures needs pillow: pip install 'dano[train]'") from error
+    try:
+        with Image.open(file) as picture:
+            upright = ImageOps.exif_transpose(picture)
+            return np.asarray(upright.convert("RGBA" if "A" in upright.mode else "RGB"))
+    except Exception as error:  # each of pillow's readers raises its own kinds
+        raise ValueError(f"{file}: cannot be read as a picture ({error})") from error
+
+
+def read_picture(
+    file: str | Path, shape: tuple[int, int], shrunk: int
+) -> Float[np.ndarray, "height width 3"]:
+    """A picture of the place without the object, as frames of a film are read, in [0, 1].
+
+    Raises:
+        ValueError: If it cannot be read or has another size than the frames.
+    """
+    pixels = _averaged(_picture(Path(file))[..., :3], shrunk)
+    if pixels.shape[:2] != shape:
+        raise ValueError(
+            f"background must have the size of the frames, {shape[1] * shrunk} × {shape[0] * shrunk},"
+            f" got {pixels.shape[1] * shrunk} × {pixels.shape[0] * shrunk}"
+        )
+    return pixels.astype(np.float32) / 255
+
+
+def _averaged(pixels: np.ndarray, k: int) -> np.ndarray:
+    if k == 1:
+        return pixels
+    h, w = pixels.shape[0] // k, pixels.shape[1] // k
+    blocks = pixels[: h * k, : w * k].reshape(h, k, w, k, *pixels.shape[2:])
+    return np.rint(blocks.mean(axis=(1, 3))).astype(pixels.dtype)
+
+
+def _masks(
+    name: str, folder: str | Path | None, count: int, shape: Sequence[int], shrunk: int, every: int
+) -> list[np.ndarray | None]:
+    """Masks of the frames of a film; empty if there is no folder."""
+    if folder is None:
+        return []
+    files = picture_files(Path(folder))
+    if len(files) >= count * every - every + 1:
+        files = files[::every]
+    if len(files) != count:
+        raise ValueError(f"{name} must be as many as frames, {count}, got {len(files)} in {folder}")
+    found: list[np.ndarray | None] = []
+    for file in files:
+        pixels = _picture(file)
+        values = pixels[..., 3] if pixels.shape[2] == 4 else pixels[..., :3].max(axis=2)
+        values = _averaged(values, shrunk)
+        if values.shape != tuple(shape):
+            raise ValueError(
+                f"{name} must have the size of the frames, {shape[1] * shrunk} × {shape[0] * shrunk}, but"
+                f" {file.name} has {values.shape[1] * shrunk} × {values.shape[0] * shrunk}"
+            )
+        found.append(values.astype(np.float32) / 255)
+    return found

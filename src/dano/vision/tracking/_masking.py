@@ -1,0 +1,134 @@
+"""The masks of a film, from wherever its options say."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from dano.vision.capture import background_mask, Light, PosedCamera, View
+from dano.vision.tracking._film import Film, read_picture
+from dano.vision.tracking._options import TrackOptions
+from dano.vision.tracking._refine import silhouette, Target, window_of
+from dano.vision.tracking._segments import like_object, Palette, Place, unlike_place
+from dano.vision.tracking._subject import Placement, Subject
+
+
+class Masking:
+    """Masks of the frames of a film (host).
+
+    Attributes:
+        source: Where they come from: "given", "static", "plain" or "object".
+        notes: Sentences about that.
+    """
+
+    def __init__(self, film: Film, options: TrackOptions, background: str | Path | None):
+        self._film = film
+        self._palette: Palette | None = None
+        self._colours: list[np.ndarray] = []
+        self._place: Place | None = None
+        self._last: tuple[int, np.ndarray] | None = None
+        self.notes: list[str] = []
+        given = any(mask is not None for mask in film.masks)
+        self.source = options.masks
+        if options.masks == "auto":
+            self.source = "given" if given else "plain" if self._is_plain() else "object"
+        if self.source == "given" and not given:
+            raise ValueError(
+                "masks: there are none (a folder of masks, or frames with alpha), though masks='given'"
+            )
+        if self.source in ("static", "object"):
+            width, height = film.size
+            if background is not None:
+                self._place = Place(read_picture(background, (height, width), film.shrunk), film.images)
+            else:
+                self._place = Place.of_film(film.images)
+                self.notes.append(
+                    "masks: what is behind the object is taken from the median of all frames; a picture of"
+                    " the place without it (background) is better"
+                )
+
+    def _is_plain(self) -> bool:
+        try:
+            background_mask(self._view(0))
+        except ValueError:
+            return False
+        return True
+
+    def _view(self, i: int) -> View:
+        height, width = self._film.images[i].shape[:2]
+        anywhere = PosedCamera(np.eye(4)[:3], focal=float(width), width=width, height=height)
+        return View(name=self._film.names[i], camera=anywhere, image=self._image(i), mask=None)
+
+    def _image(self, i: int) -> Float[np.ndarray, "height width 3"]:
+        return self._film.images[i].astype(np.float32) / 255
+
+    def _seen(self, i: int) -> np.ndarray:
+        occluder = self._film.occluders[i]
+        if occluder is None:
+            return np.ones(self._film.images[i].shape[:2], bool)
+        return occluder < 0.05
+
+    def hidden(self, i: int, window: tuple[slice, slice]) -> float:
+        """Share of a window that something else hides."""
+        return 1 - float(self._seen(i)[window].mean())
+
+    def alone(self, i: int, camera: PosedCamera) -> Target | None:
+        """A frame with a mask that needs no pose; None if there is none for it."""
+        mask = self._alone(i)
+        if mask is None:
+            return None
+        seen = self._seen(i)
+        return Target(camera, self._image(i).astype(np.float64), mask * seen, seen)
+
+    def _alone(self, i: int) -> np.ndarray | None:
+        if self._last is not None and self._last[0] == i:
+            return self._last[1]
+        if self.source == "given":
+            return self._film.masks[i]
+        if self.source == "plain":
+            try:
+                mask = background_mask(self._view(i))
+            except ValueError:
+                return None
+        else:
+            assert self._place is not None
+            mask = unlike_place(self._image(i), self._place)
+        self._last = i, mask
+        return mask
+
+    def near(
+        self,
+        i: int,
+        subject: Subject,
+        place: Placement,
+        lamps: tuple[Light, ...],
+        camera: PosedCamera,
+        blur: float,
+    ) -> Target | None:
+        """A frame with a mask, for an object near an expected pose.
+
+        Args:
+            i: The frame.
+            subject: The object.
+            place: Where it is expected.
+            lamps: Light.
+            camera: From where.
+            blur: By how much the pose may be off [pixels].
+        """
+        if self.source != "object":
+            return self.alone(i, camera)
+        window = window_of(subject, place, camera, 1.5)
+        if window is None:
+            return None
+        expected, _ = silhouette(subject, place, lamps, camera, window)
+        image = self._image(i)
+        mask = np.zeros(image.shape[:2], np.float32)
+        mask[window] = like_object(image[window], expected, blur, self._palette, self._place, window)
+        return Target(camera, image.astype(np.float64), mask, self._seen(i))
+
+    def learn(self, target: Target, window: tuple[slice, slice], shape: np.ndarray) -> None:
+        """Take the object's colours in a frame into account, where it surely is."""
+        inside = (shape > 0.95) & (target.mask[window] > 0.5) & target.seen[window]
+        if inside.sum() > 100:
+            self._colours = [*self._colours, target.image[window][inside]][-4:]
+            self._palette = Palette(np.concatenate(self._colours))

@@ -1,0 +1,320 @@
+"""Gauss–Newton on SE(3): the pose at which an object looks as it does in a frame.
+
+Residuals are rendered opacity less mask, and rendered less photographed colour, each over its own standard
+deviation and weighted robustly; derivatives are the renderer's. Levenberg's damping takes care of steps that
+went too far.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from dano.vision.capture import Light, PosedCamera
+from dano.vision.tracking._segments import overlap
+from dano.vision.tracking._subject import Placement, Seen, Subject
+
+_MASK_NOISE = 0.12
+"""Standard deviation of a mask at the edge, least."""
+
+_COLOUR_NOISE = 0.025
+"""Standard deviation of a colour, in sRGB, least: a learned look is not better."""
+
+_OUTLIER = 3.0
+"""Standard deviations from which residuals lose weight (Geman and McClure)."""
+
+_BAND = 4
+"""Pixels on each side of an edge that take part."""
+
+_TILE = 6
+"""Side of the tiles [pixels] within which errors of neighbouring pixels are taken to be one."""
+
+_BLUR = 3.0
+"""Standard deviation of the blur B of the paper's second term [pixels]."""
+
+_SMALL = 0.02
+"""Predicted move [pixels] that ends the search."""
+
+
+class Target(NamedTuple):
+    """What a frame shows, at one level of its pyramid.
+
+    Attributes:
+        camera: Of the reduced picture.
+        image: sRGB in [0, 1].
+        mask: Where the object is, 0 to 1.
+        seen: Where nothing else stands in front of it.
+    """
+
+    camera: PosedCamera
+    image: Float[np.ndarray, "height width 3"]
+    mask: Float[np.ndarray, "height width"]
+    seen: Bool[np.ndarray, "height width"]
+
+    def reduced(self, factor: int) -> "Target":
+        """The same with so many pixels a side averaged into one."""
+        if factor == 1:
+            return self
+        h, w = self.mask.shape[0] // factor, self.mask.shape[1] // factor
+
+        def mean(x: np.ndarray) -> np.ndarray:
+            x = x[: h * factor, : w * factor]
+            return x.reshape(h, factor, w, factor, *x.shape[2:]).mean(axis=(1, 3))
+
+        camera = self.camera.replaced(
+            focal=self.camera.focal / factor, centre=self.camera.centre / factor, width=w, height=h
+        )
+        return Target(camera, mean(self.image), mean(self.mask), mean(self.seen.astype(float)) > 0.99)
+
+
+class Refined(NamedTuple):
+    """A pose, and how it fits.
+
+    Attributes:
+        place: The pose.
+        cost: Mean robust cost of a pixel.
+        overlap: Of mask and silhouette.
+        colour_error: Usual difference of colours, in sRGB; NaN without colours.
+        hessian: Gauss–Newton's, of the six numbers of `Placement.moved`, in 1/variances.
+        covariance: Of these numbers.
+        window: Part of the picture that was looked at.
+        silhouette: Rendered there.
+    """
+
+    place: Placement
+    cost: float
+    overlap: float
+    colour_error: float
+    hessian: Float[np.ndarray, "6 6"]
+    covariance: Float[np.ndarray, "6 6"]
+    window: tuple[slice, slice]
+    silhouette: Float[np.ndarray, "_ _"]
+
+
+class _Rows(NamedTuple):
+    """Weighted residuals and derivatives of some pixels."""
+
+    residual: np.ndarray  # (n, k)
+    slope: np.ndarray  # (n, k, 6)
+    weight: np.ndarray  # (n, k)
+    cost: float
+    colour_error: float
+
+
+def window_of(
+    subject: Subject, place: Placement, camera: PosedCamera, margin: float = 1.25
+) -> tuple[slice, slice] | None:
+    """The part of a picture that shows the object's ball; None if it lies outside or behind."""
+    middle = camera.project(subject.middle(place)[None])[0]
+    if not np.isfinite(middle).all() or middle[2] < 1.05 * subject.radius:
+        return None
+    reach = margin * subject.radius / middle[2] * float(camera.focal.mean()) + _BAND
+    low, high = np.floor(middle[:2] - reach).astype(int), np.ceil(middle[:2] + reach).astype(int)
+    low, high = np.maximum(low, 0), np.minimum(high, [camera.width, camera.height])
+    if np.any(high - low < 4):
+        return None
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def pixels_of(window: tuple[slice, slice]) -> Float[np.ndarray, "n 2"]:
+    """Image coordinates of the middles of the pixels of a window, row by row."""
+    y, x = np.mgrid[window]
+    return np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
+
+
+def silhouette(
+    subject: Subject, place: Placement, lamps: tuple[Light, ...], camera: PosedCamera, window
+) -> tuple[np.ndarray, np.ndarray]:
+    """Opacity and colour over black of the pixels of a window."""
+    seen = subject.picture(place, lamps, camera, pixels_of(window))
+    shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
+    return seen.opacity.reshape(shape), seen.colour.reshape(*shape, 3)
+
+
+def aligned(subject: Subject, target: Target, place: Placement, lamps: tuple[Light, ...]) -> Placement:
+    """A pose moved across the line of sight so that its silhouette lies where the mask does."""
+    window = window_of(subject, place, target.camera)
+    if window is None or target.mask.sum() < 4:
+        return place
+    shape, _ = silhouette(subject, place, lamps, target.camera, window)
+    y, x = np.mgrid[: target.mask.shape[0], : target.mask.shape[1]]
+    # A silhouette that something hides in part is not centred.
+    if shape.sum() < 4 or not target.seen[window].all():
+        return place
+    given = np.array([(target.mask * v).sum() for v in (x, y)]) / target.mask.sum()
+    here = np.array([(shape * v[window]).sum() for v in (x, y)]) / shape.sum()
+    depth = float((subject.middle(place) - target.camera.position) @ target.camera.axes[2])
+    right, up, _ = target.camera.axes
+    shift = (given - here) * depth / target.camera.focal
+    return Placement(place.position + shift[0] * right - shift[1] * up, place.orientation)
+
+
+def refine(
+    subject: Subject,
+    target: Target,
+    place: Placement,
+    lamps: tuple[Light, ...],
+    *,
+    loss: str,
+    steps: int,
+    rays: int,
+    random: np.random.Generator,
+) -> Refined | None:
+    """Find the pose near a given one that explains a picture best.
+
+    Args:
+        subject: The object.
+        target: The picture.
+        place: Where to begin.
+        lamps: Light.
+        loss: As in `TrackOptions`.
+        steps: Most steps.
+        rays: Most pixels.
+        random: Which pixels are taken if there are more.
+
+    Returns:
+        None if the object is out of the picture.
+    """
+    window = window_of(subject, place, target.camera)
+    if window is None:
+        return None
+    opacity, _ = silhouette(subject, place, lamps, target.camera, window)
+    index = _chosen(opacity, target, window, rays, random)
+    if len(index) < 24:
+        return None
+    damping, best, change = 1e-3, None, np.zeros(6)
+    pixel = target.camera.pixel_angle
+    for _ in range(steps + 1):
+        moved = place if best is None else best[0].moved(change, subject.radius)
+        rows = _rows(subject, target, moved, lamps, index, loss)
+        if best is None or rows.cost < best[1].cost:
+            best, damping = (moved, rows), max(0.3 * damping, 1e-6)
+        else:
+            damping = 20 * damping
+        gradient, hessian = _normal(best[1])
+        scale = np.diag(np.diagonal(hessian)) + 1e-9 * np.trace(hessian) * np.eye(6)
+        change = -np.linalg.solve(hessian + damping * scale, gradient)
+        change *= min(1.0, 0.35 / max(float(np.abs(change).max()), 1e-9))
+        away = np.linalg.norm(subject.middle(best[0]) - target.camera.position)
+        if np.abs(change).max() * subject.radius < _SMALL * pixel * away:
+            break
+    assert best is not None
+    return _refined(subject, target, lamps, *best, index)
+
+
+def _chosen(opacity, target: Target, window, rays: int, random: np.random.Generator) -> np.ndarray:
+    """Rows and columns of the pixels that take part: edges first, of the inside as many as fit."""
+    mask, seen = target.mask[window], target.seen[window]
+    solid, given = opacity > 0.5, mask > 0.5
+    edge = np.zeros(mask.shape, bool)
+    for shape in (solid, given):
+        edge |= ndimage.binary_dilation(shape, iterations=_BAND) & ~ndimage.binary_erosion(
+            shape, iterations=_BAND, border_value=1
+        )
+    inner = solid & ~edge
+    picked = []
+    for part, most in ((edge & seen, (2 * rays) // 3), (inner & seen, rays)):
+        some = np.argwhere(part)
+        most = min(most, rays - sum(map(len, picked)))
+        if len(some) > most:
+            some = some[np.sort(random.choice(len(some), most, replace=False))]
+        picked.append(some)
+    return np.concatenate(picked) + [window[0].start, window[1].start]
+
+
+def _rows(subject: Subject, target: Target, place: Placement, lamps, index: np.ndarray, loss: str) -> _Rows:
+    y, x = index.T
+    pixels = np.stack([x, y], axis=1) + 0.5
+    camera = target.camera
+    seen = subject.see(
+        place, lamps, camera.position, camera.directions(pixels), camera.pixel_angle, slopes=True
+    )
+    if loss == "paper":
+        return _paper_rows(target, seen, index)
+    sigma = _MASK_NOISE
+    residual = ((seen.opacity - target.mask[y, x]) / sigma)[:, None]
+    slope = (seen.opacity_slope / sigma)[:, None]
+    weight, cost = _robust(np.abs(residual[:, 0]))
+    total, weights, error = float(cost.mean()), weight[:, None], float("nan")
+    if loss == "photometric":
+        inside = (seen.opacity > 0.9) & (target.mask[y, x] > 0.5)
+        away = seen.colour / np.maximum(seen.opacity, 0.5)[:, None] - target.image[y, x]
+        lengths = np.sqrt(np.mean(away**2, axis=1))
+        error = float(np.median(lengths[inside])) if inside.any() else float("nan")
+        noise = max(1.2 * error, _COLOUR_NOISE) if inside.any() else 1.0
+        rows = np.where(inside[:, None], away / noise, 0)
+        ratio = seen.colour / np.maximum(seen.opacity, 0.5)[:, None]
+        change = seen.colour_slope - ratio[..., None] * seen.opacity_slope[:, None]
+        light, cost = _robust(np.where(inside, lengths / noise, 0))
+        # Costs of different noise can be compared only with what the noise itself costs.
+        total += float(np.mean(np.where(inside, cost + np.log(noise / _COLOUR_NOISE), 0)))
+        residual = np.concatenate([residual, rows / np.sqrt(3)], axis=1)
+        slope = np.concatenate(
+            [slope, np.where(inside[:, None, None], change / noise / np.sqrt(3), 0)], axis=1
+        )
+        weights = np.concatenate([weights, np.repeat(light[:, None], 3, axis=1)], axis=1)
+    return _Rows(residual, slope, weights, total, error)
+
+
+def _robust(lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weights and costs of residuals of some lengths [standard deviations]."""
+    square = (lengths / _OUTLIER) ** 2
+    return 1 / (1 + square) ** 2, 0.5 * _OUTLIER**2 * square / (1 + square)
+
+
+def _paper_rows(target: Target, seen: Seen, index: np.ndarray) -> _Rows:
+    """T − M and B(T) − B(M), on the pixels that take part; elsewhere both are taken to be equal."""
+    low, high = index.min(axis=0), index.max(axis=0) + 1
+    y, x = (index - low).T
+    shape = tuple(high - low)
+
+    def blurred(values: np.ndarray) -> np.ndarray:
+        grid = np.zeros(shape)
+        grid[y, x] = values
+        return ndimage.gaussian_filter(grid, _BLUR, mode="constant")[y, x]
+
+    away = seen.opacity - target.mask[index[:, 0], index[:, 1]]
+    residual = np.stack([away, blurred(away)], axis=1) / _MASK_NOISE
+    slopes = np.stack([blurred(column) for column in seen.opacity_slope.T], axis=1)
+    slope = np.stack([seen.opacity_slope, slopes], axis=1) / _MASK_NOISE
+    cost = float(0.5 * np.mean(np.sum(residual**2, axis=1)))
+    return _Rows(residual, slope, np.ones_like(residual), cost, float("nan"))
+
+
+def _normal(rows: _Rows) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient and Gauss–Newton's Hessian."""
+    weighted = rows.weight[..., None] * rows.slope
+    gradient = np.einsum("nki,nk->i", weighted, rows.residual)
+    return gradient, np.einsum("nki,nkj->ij", weighted, rows.slope)
+
+
+def _refined(
+    subject, target: Target, lamps, place: Placement, rows: _Rows, index: np.ndarray
+) -> Refined | None:
+    _, hessian = _normal(rows)
+    window = window_of(subject, place, target.camera)
+    if window is None:
+        return None
+    shape, _ = silhouette(subject, place, lamps, target.camera, window)
+    beside = target.mask.sum() - target.mask[window].sum()
+    fit = overlap(target.mask[window], shape, target.seen[window])
+    # What the mask has elsewhere does not fit either.
+    fit *= target.mask[window].sum() / max(target.mask[window].sum() + beside, 1e-9)
+    return Refined(
+        place, rows.cost, fit, rows.colour_error, hessian, _covariance(rows, hessian, index), window, shape
+    )
+
+
+def _covariance(rows: _Rows, hessian: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """H⁻¹ (Σ gₜ gₜᵀ) H⁻¹ over tiles of pixels t, whose errors hang together (Huber's sandwich, clustered)."""
+    tiles = index // _TILE
+    _, tile = np.unique(tiles[:, 0] * 100003 + tiles[:, 1], return_inverse=True)
+    each = np.einsum("nki,nk->ni", rows.weight[..., None] * rows.slope, rows.residual)
+    sums = np.zeros((tile.max() + 1, 6))
+    np.add.at(sums, tile, each)
+    values, vectors = np.linalg.eigh(hessian)
+    # Directions that change nothing get a variance as large as it makes sense, not an infinite one.
+    inverse = (vectors / np.maximum(values, 1e-9 * values.max() + 1e-12)) @ vectors.T
+    count = len(sums)
+    return inverse @ (sums.T @ sums) @ inverse * (count / max(count - 6, 1))

@@ -1,0 +1,277 @@
+"""Where a known object is in a picture, from nothing: all orientations are looked at and compared.
+
+The object is rendered from directions spread over the sphere; a silhouette's middle and area say where it
+lies for each, and turns about the line of sight are made by turning pictures. The best are refined, lit as
+the picture says, and compared again.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from dano.maths import quat_conjugate, quat_from_matrix, quat_log, quat_multiply
+from dano.vision.capture import Light
+from dano.vision.tracking._light import LAMPS, LightFit
+from dano.vision.tracking._options import TrackOptions
+from dano.vision.tracking._refine import pixels_of, refine, Refined, silhouette, Target
+from dano.vision.tracking._subject import CHUNK, Placement, Subject
+
+_SIDE = 32
+"""Pixels a side of rendered views: a chunk of rays."""
+
+_GRID = 24
+"""Points a side at which pictures are compared."""
+
+_REACH = 1.7
+"""Half the side of that grid, in roots of the silhouette's area."""
+
+_DIFFERENT = np.radians(18)
+"""Least angle between candidates."""
+
+_COARSE = 26
+"""Size of the object [pixels] at which candidates are refined."""
+
+_AREA = 40.0
+"""Pixels that a mask must have for a search."""
+
+
+_SPECKLE = 1.2
+"""Standard deviation of the blur that takes the noise of pixels away [pixels]."""
+
+
+class Start(NamedTuple):
+    """A pose that explains a picture.
+
+    Attributes:
+        refined: The pose, and how it fits.
+        light: Light that it implies.
+        score: 3 (1 − overlap) + 5 times the colours' usual error: less is better.
+    """
+
+    refined: Refined
+    light: LightFit
+    score: float
+
+
+class _Guess(NamedTuple):
+    place: Placement
+    score: float
+
+
+def search(
+    subject: Subject, target: Target, options: TrackOptions, random: np.random.Generator
+) -> list[Start]:
+    """Poses that explain a picture, best first; none if the mask is empty or nothing fits."""
+    guesses = _guesses(subject, target, options)
+    coarse = target.reduced(max(1, round(_size(subject, guesses, target) / _COARSE)) if guesses else 1)
+    refined = []
+    for guess in guesses[: 2 * options.candidates]:
+        found = refine(
+            subject,
+            coarse,
+            guess.place,
+            _headlight(target),
+            loss="silhouette",
+            steps=4,
+            rays=700,
+            random=random,
+        )
+        if found is not None:
+            refined.append(found)
+    # By silhouettes alone several may fit alike; colours decide.
+    refined = sorted(refined, key=lambda r: -r.overlap)[: options.candidates]
+    starts = []
+    for first in refined:
+        light = LightFit(subject)
+        if options.loss != "photometric":
+            starts.append(Start(first, light, score(first)))
+            continue
+        _learn(subject, coarse, first, light)
+        found = refine(
+            subject, coarse, first.place, light.lamps, loss="photometric", steps=5, rays=CHUNK, random=random
+        )
+        if found is not None:
+            _learn(subject, coarse, found, light)
+            starts.append(Start(found, light, score(found)))
+    return sorted(starts, key=lambda s: s.score)
+
+
+def half_turns(subject: Subject, place: Placement) -> list[Placement]:
+    """A pose turned by 180° about each axis of the object's box, by which many things look nearly alike."""
+    middle = subject.middle(place)
+    turns = np.eye(4)[1:]
+    return [subject.around(middle, quat_multiply(place.orientation, turn)) for turn in turns]
+
+
+def unlikeness(subject: Subject, target: Target, start: Start) -> float:
+    """Root mean square difference of colours where the object is, noise of single pixels averaged out."""
+    window = start.refined.window
+    shape, colour = silhouette(subject, start.refined.place, start.light.lamps, target.camera, window)
+    inside = (shape > 0.95) & (target.mask[window] > 0.7) & target.seen[window]
+    inside = ndimage.binary_erosion(inside, iterations=2)
+    if inside.sum() < _AREA:
+        return float("inf")
+    away = np.where(inside[..., None], colour / np.maximum(shape, 0.5)[..., None] - target.image[window], 0)
+    share = np.maximum(ndimage.gaussian_filter(inside.astype(float), _SPECKLE), 1e-3)
+    smooth = ndimage.gaussian_filter(away, (_SPECKLE, _SPECKLE, 0)) / share[..., None]
+    return float(np.sqrt(np.mean(smooth[inside] ** 2)))
+
+
+def score(refined: Refined) -> float:
+    """See `Start.score`."""
+    error = 0.0 if np.isnan(refined.colour_error) else refined.colour_error
+    return float(3 * (1 - refined.overlap) + 5 * error)
+
+
+def _learn(subject: Subject, target: Target, refined: Refined, light: LightFit) -> None:
+    learn_light(subject, target, refined.place, refined.window, refined.silhouette, light)
+
+
+def learn_light(subject: Subject, target: Target, place: Placement, window, shape, light: LightFit) -> None:
+    """Fit the light to pixels of a picture that show the object and nothing else."""
+    inside = (shape > 0.95) & (target.mask[window] > 0.7) & target.seen[window]
+    # The edge itself may be mixed with what is behind.
+    core = ndimage.binary_erosion(inside)
+    inside = core if core.sum() > 60 else inside
+    pixels = pixels_of(window)[inside.ravel()]
+    light.add(place, target.camera, pixels, target.image[window][inside])
+
+
+def _size(subject: Subject, guesses: list[_Guess], target: Target) -> float:
+    away = np.linalg.norm(subject.middle(guesses[0].place) - target.camera.position)
+    return subject.size / float(away) / target.camera.pixel_angle
+
+
+def _headlight(target: Target) -> tuple[Light, ...]:
+    """White lamps beside the camera."""
+    right, up, forward = target.camera.axes
+    places = (up - 0.3 * forward, right - 0.5 * forward, -right - 0.5 * forward)
+    return tuple(Light(place, intensity=0.4) for place in places[:LAMPS])
+
+
+def _guesses(subject: Subject, target: Target, options: TrackOptions) -> list[_Guess]:
+    """Different poses, best first by how pictures compare."""
+    area = float(target.mask.sum())
+    if area < _AREA:
+        return []
+    y, x = np.mgrid[: target.mask.shape[0], : target.mask.shape[1]] + 0.5
+    middle = np.array([(target.mask * x).sum(), (target.mask * y).sum()]) / area
+    root = np.sqrt(area)
+    steps = np.linspace(-_REACH, _REACH, _GRID)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    at = (middle + root * grid - 0.5).T[::-1]
+    smooth = max(root * 2 * _REACH / _GRID / 2.5, 0.1)
+    mask = ndimage.map_coordinates(ndimage.gaussian_filter(target.mask, smooth), at, order=1)
+    image = _sampled(target.image, smooth, at)
+    guesses = []
+    for axes in _views(options.views):
+        opacity, colour, width = _view(subject, axes)
+        for turn, value, centre, size in _compared(opacity, colour, mask, image, grid, options):
+            place = _placed(subject, target, axes, turn, middle, root, centre * width, size * width)
+            guesses.append(_Guess(place, value))
+    guesses.sort(key=lambda g: g.score)
+    return _different(guesses, 2 * options.candidates)
+
+
+def _sampled(image: np.ndarray, smooth: float, at: np.ndarray) -> np.ndarray:
+    channels = [
+        ndimage.map_coordinates(ndimage.gaussian_filter(image[..., c], smooth), at, order=1) for c in range(3)
+    ]
+    return np.stack(channels, axis=1)
+
+
+def _views(count: int) -> Float[np.ndarray, "views 3 3"]:
+    """Axes of cameras around the object (F): rows to the right, downwards, forwards."""
+    z = 1 - 2 * (np.arange(count) + 0.5) / count
+    angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    flat = np.sqrt(1 - z**2)
+    forward = -np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
+    aside = np.where(np.abs(forward[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[0.0, 1.0, 0.0]])
+    right = np.cross(forward, aside)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+def _view(subject: Subject, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Opacity, colour, and slope of a pixel, of the object seen from four radii away."""
+    away = 5 * subject.radius
+    width = 2 * 1.05 * subject.radius / np.sqrt(away**2 - subject.radius**2) / _SIDE
+    steps = (np.arange(_SIDE) + 0.5 - 0.5 * _SIDE) * width
+    b, a = np.meshgrid(steps, steps, indexing="ij")
+    directions = axes[2] + a.reshape(-1, 1) * axes[0] + b.reshape(-1, 1) * axes[1]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    places = (-axes[1] - 0.3 * axes[2], axes[0] - 0.5 * axes[2], -axes[0] - 0.5 * axes[2])
+    lamps = tuple(Light(place, intensity=0.4) for place in places)
+    here = Placement(np.zeros(3), np.array([1.0, 0, 0, 0]))
+    seen = subject.see(here, lamps, subject.centre - away * axes[2], directions, width)
+    colour = seen.colour / np.maximum(seen.opacity, 0.3)[:, None]
+    return seen.opacity.reshape(_SIDE, _SIDE), colour.reshape(_SIDE, _SIDE, 3), width
+
+
+def _compared(opacity, colour, mask, image, grid, options: TrackOptions):
+    """The two best turns of a view, what they cost, and the middle and size of its silhouette."""
+    y, x = np.mgrid[:_SIDE, :_SIDE] + 0.5 - 0.5 * _SIDE
+    area = opacity.sum()
+    centre = np.array([(opacity * x).sum(), (opacity * y).sum()]) / area
+    root = np.sqrt(area)
+    turns = 2 * np.pi * np.arange(options.turns) / options.turns
+    c, s = np.cos(turns), np.sin(turns)
+    turned = np.einsum("tij,nj->tni", np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1), grid)
+    at = (centre + root * turned + 0.5 * _SIDE - 0.5).reshape(-1, 2).T[::-1]
+    shape = ndimage.map_coordinates(opacity, at, order=1).reshape(len(turns), -1)
+    both = np.minimum(shape, mask).sum(axis=1)
+    costs = 3 * (1 - both / np.maximum(shape, mask).sum(axis=1))
+    if options.loss == "photometric":
+        look = np.stack([ndimage.map_coordinates(colour[..., k], at, order=1) for k in range(3)], axis=-1)
+        costs = costs + 5 * _unlike(look.reshape(*shape.shape, 3), image, (shape > 0.8) * (mask > 0.8))
+    best = np.argsort(costs)[:2]
+    return [(turns[i], float(costs[i]), centre, float(root)) for i in best]
+
+
+def _unlike(look: np.ndarray, image: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Root mean square difference of colours after the best gain and offset of each channel."""
+    total = np.maximum(weight.sum(axis=1), 1)[:, None]
+    mean_a = np.einsum("tn,tnc->tc", weight, look) / total
+    mean_b = np.einsum("tn,nc->tc", weight, image) / total
+    a, b = look - mean_a[:, None], image[None] - mean_b[:, None]
+    aa = np.einsum("tn,tnc->tc", weight, a * a) / total
+    ab = np.einsum("tn,tnc->tc", weight, a * b) / total
+    bb = np.einsum("tn,tnc->tc", weight, b * b) / total
+    gain = np.clip(ab / np.maximum(aa, 1e-6), 0.2, 3)
+    return np.sqrt(np.mean(np.maximum(bb - 2 * gain * ab + gain**2 * aa, 0), axis=1))
+
+
+def _placed(subject: Subject, target: Target, axes, turn, middle, root, centre, size) -> Placement:
+    """The pose at which a view, turned, has the silhouette's middle and area."""
+    camera = target.camera
+    focal = float(camera.focal.mean())
+    c, s = np.cos(turn), np.sin(turn)
+    back = np.array([[c, s], [-s, c]])
+    at = middle - root * (back @ centre) / size
+    forward = camera.directions(at[None])[0]
+    away = 5 * subject.radius * size * focal / root
+    right = camera.axes[0] - (camera.axes[0] @ forward) * forward
+    right /= np.linalg.norm(right)
+    basis = np.stack([right, np.cross(forward, right), forward])
+    turning = np.eye(3)
+    turning[:2, :2] = back
+    rotation = basis.T @ turning @ axes
+    # Away along the axis, not along the line of sight.
+    away = away / max(float(forward @ camera.axes[2]), 0.2)
+    return subject.around(camera.position + away * forward, quat_from_matrix(rotation))
+
+
+def _different(guesses: list[_Guess], count: int) -> list[_Guess]:
+    chosen: list[_Guess] = []
+    for guess in guesses:
+        if len(chosen) == count:
+            break
+        turned = quat_conjugate(guess.place.orientation)
+        angles = [
+            np.linalg.norm(quat_log(quat_multiply(turned, other.place.orientation))) for other in chosen
+        ]
+        if all(angle > _DIFFERENT for angle in angles):
+            chosen.append(guess)
+    return chosen

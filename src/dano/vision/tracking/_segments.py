@@ -1,0 +1,151 @@
+"""Masks of films: what is unlike the place, and like the object where it is expected."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from dano.fields import largest_part
+
+_BINS = 16
+"""Bins of each colour channel of what the object looks like."""
+
+_SHADES = (1.0, 0.85, 0.7, 0.55, 0.4)
+"""By which a cast shadow may darken the place."""
+
+_SHADOW_PRIOR = 0.4
+"""How likely that is beside no shadow."""
+
+_OFTEN = 40
+"""Frames that the median of the place is taken of."""
+
+_STILL = 0.05
+"""Usual change of a pixel over a film, in sRGB, up to which the camera stands still."""
+
+_LEAST_AREA = 24
+"""Pixels below which a mask says nothing."""
+
+
+class Place:
+    """What is seen where the object is not.
+
+    Attributes:
+        colours: sRGB of every pixel.
+        noise: Standard deviation of a frame from it, in sRGB.
+    """
+
+    def __init__(self, colours: Float[np.ndarray, "height width 3"], images: list[np.ndarray]):
+        some = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), 5)).astype(int)]
+        away = [np.abs(image.astype(np.float32) / 255 - colours) for image in some]
+        self.colours = colours.astype(np.float32)
+        self.noise = max(1.48 * float(np.median(away)), 0.008)
+
+    @classmethod
+    def of_film(cls, images: list[np.ndarray]) -> "Place":
+        """The median of a film.
+
+        Raises:
+            ValueError: If the camera moves.
+        """
+        rows = np.linspace(0, len(images) - 1, min(len(images), _OFTEN)).astype(int)
+        stack = np.stack([images[i] for i in rows])
+        middle = np.median(stack, axis=0).astype(np.float32)
+        usual = float(np.median(np.abs(stack - middle[None])) / 255)
+        if usual > _STILL:
+            raise ValueError(
+                f"masks: the background is not static (a pixel usually changes by {usual:.2f} of the range of"
+                " colours): give masks, or film from a tripod"
+            )
+        return cls(middle / 255, list(stack))
+
+    def log_likelihood(self, image: Float[np.ndarray, "*shape 3"], window=()) -> Float[np.ndarray, "*shape"]:
+        """Logarithm of the density of colours of the place, lit or in a shadow."""
+        colours = self.colours[window]
+        best = np.full(image.shape[:2], -np.inf)
+        for shade in _SHADES:
+            square = np.sum((image - shade * colours) ** 2, axis=2) / (2 * (1.5 * self.noise) ** 2)
+            best = np.maximum(best, -square + (0 if shade == 1.0 else np.log(_SHADOW_PRIOR)))
+        return best - 1.5 * np.log(2 * np.pi) - 3 * np.log(1.5 * self.noise)
+
+
+class Palette:
+    """Densities of colours, learned from pixels."""
+
+    def __init__(self, colours: Float[np.ndarray, "n 3"]):
+        counts, _ = np.histogramdd(colours, bins=_BINS, range=[(0, 1)] * 3)
+        smooth = ndimage.gaussian_filter(counts, 0.7, mode="nearest")
+        # A share of everything is possible: 3 % of all colours alike.
+        density = 0.97 * smooth / max(smooth.sum(), 1e-9) + 0.03 / _BINS**3
+        self._log = np.log(density * _BINS**3)
+
+    def log_likelihood(self, image: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape"]:
+        """Logarithm of the density of colours."""
+        index = np.clip((image * _BINS).astype(int), 0, _BINS - 1)
+        return self._log[index[..., 0], index[..., 1], index[..., 2]]
+
+
+def unlike_place(
+    image: Float[np.ndarray, "height width 3"], place: Place
+) -> Float[np.ndarray, "height width"]:
+    """What differs from the place by more than a shadow, its largest part."""
+    # The object may have any colour: density one.
+    ratio = ndimage.gaussian_filter(np.clip(-place.log_likelihood(image), -8, 8), 1.0)
+    return _main(ratio)
+
+
+def like_object(
+    image: Float[np.ndarray, "height width 3"],
+    expected: Float[np.ndarray, "height width"],
+    blur: float,
+    palette: Palette | None,
+    place: Place | None,
+    window: tuple[slice, slice],
+) -> Float[np.ndarray, "height width"]:
+    """What looks like the object near where it is expected, and unlike what is around it.
+
+    Args:
+        image: A part of a frame.
+        expected: Rendered silhouette at the expected pose.
+        blur: By how much that may be off [pixels].
+        palette: Colours of the object; None: those of this frame where it is expected.
+        place: What is seen where it is not; None: the colours around it.
+        window: Where in the frame the part lies.
+    """
+    core, near = expected > 0.9, ndimage.binary_dilation(expected > 0.1, iterations=int(np.ceil(blur)) + 1)
+    if palette is None:
+        inner = ndimage.binary_erosion(core, iterations=int(np.ceil(blur)))
+        palette = Palette(image[inner if inner.sum() > _LEAST_AREA else core])
+    around = Palette(image[~near]) if (~near).sum() > _LEAST_AREA else None
+    other = None if place is None else place.log_likelihood(image, window)
+    if other is None:
+        other = np.zeros(image.shape[:2]) if around is None else around.log_likelihood(image)
+    ratio = ndimage.gaussian_filter(np.clip(palette.log_likelihood(image) - other, -6, 6), 0.8)
+    prior = np.clip(ndimage.gaussian_filter(expected, blur), 0.02, 0.98)
+    return _main(ratio + np.log(prior / (1 - prior)))
+
+
+def _main(log_ratio: np.ndarray) -> np.ndarray:
+    """Probabilities, of the largest part only, its holes filled."""
+    solid = log_ratio > 0
+    if solid.sum() < _LEAST_AREA:
+        return np.zeros(log_ratio.shape, np.float32)
+    solid = ndimage.binary_opening(solid) if solid.sum() > 10 * _LEAST_AREA else solid
+    if not solid.any():
+        return np.zeros(log_ratio.shape, np.float32)
+    whole = ndimage.binary_fill_holes(largest_part(solid))
+    assert whole is not None
+    soft = 1 / (1 + np.exp(-np.clip(log_ratio, -12, 12)))
+    near = ndimage.binary_dilation(whole)
+    core = ndimage.binary_erosion(whole)
+    return np.where(core, 1.0, np.where(near, soft, 0.0)).astype(np.float32)
+
+
+def overlap(
+    mask: Float[np.ndarray, "*shape"],
+    silhouette: Float[np.ndarray, "*shape"],
+    seen: Bool[np.ndarray, "*shape"] | None = None,
+) -> float:
+    """Intersection over union of two soft silhouettes where something can be seen: 1 if they are equal."""
+    if seen is not None:
+        mask, silhouette = mask * seen, silhouette * seen
+    union = float(np.maximum(mask, silhouette).sum())
+    return float(np.minimum(mask, silhouette).sum()) / union if union > 0 else 0.0

@@ -1,0 +1,420 @@
+"""The verb: the pose of a known object in every frame of a film."""
+
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply
+from dano.progress import Progress
+from dano.vision.capture import Light, PosedCamera
+from dano.vision.radiance import LearnedField
+from dano.vision.tracking._film import Film
+from dano.vision.tracking._light import LightFit
+from dano.vision.tracking._masking import Masking
+from dano.vision.tracking._options import TrackOptions
+from dano.vision.tracking._refine import aligned, refine, Refined, Target, window_of
+from dano.vision.tracking._search import half_turns, learn_light, score, search, Start, unlikeness
+from dano.vision.tracking._subject import CHUNK, Placement, Subject
+from dano.vision.tracking._sureness import covariance_of, unobservable
+
+_COARSE = 24
+"""Size of the object [pixels] at the coarsest level of the pyramid."""
+
+_LIGHT_EVERY = 4
+"""Frames after which the light is fitted again; exposure and clouds change slower."""
+
+_FOUND = 0.75
+"""Overlap from which a search has found the object."""
+
+_ALIKE = 0.02
+"""By which overlaps of starts may differ for colours to decide."""
+
+_OTHER = np.radians(12)
+"""Angle from which a start is another one."""
+
+_CLEAR = 1.05
+"""Ratio of how starts fit up to which a message says so."""
+
+_BLIND = 0.5
+"""Share of the silhouette that must not be hidden."""
+
+_WORSE = 0.03
+"""By how much less than usually a silhouette must overlap for other poses to be tried."""
+
+_ASIDE = np.radians(15)
+"""By how much these are turned."""
+
+TRACKED, LOST, OUTSIDE, HIDDEN = "tracked", "lost", "outside", "hidden"
+"""What became of a frame."""
+
+
+class Overlay(NamedTuple):
+    """A silhouette in a frame.
+
+    Attributes:
+        window: Rows and columns of the frame.
+        opacity: Rendered there.
+    """
+
+    window: tuple[slice, slice]
+    opacity: Float[np.ndarray, "_ _"]
+
+
+class Tracked(NamedTuple):
+    """Poses of an object in the frames of a film. What was not seen is NaN.
+
+    Attributes:
+        times: Of the frames [s], shape (T,).
+        position: Of the origin of the object's frame [m, W], shape (T, 3).
+        orientation: Unit quaternions wxyz, object → world, shape (T, 4).
+        covariance: Of each pose: of the position [m, W], then of the rotation vector [rad, object's frame],
+            shape (T, 6, 6).
+        status: Of each frame: "tracked", "lost", "outside" the picture, or "hidden".
+        quality: Overlap of each mask with the silhouette, as intersection over union, shape (T,).
+        colour_error: Usual difference of colours of each frame, in sRGB, shape (T,).
+        lamps: Light that the film is under.
+        ambiguity: How well the next-best orientation explains the first frame: its difference of colours over
+            that of the best; ∞ if none has a silhouette that fits as well. Near 1 the start may be another.
+        overlays: Silhouettes at these poses, None where there is none.
+        messages: What a user should know, in sentences.
+        seconds: Time a frame took [s], the search at the start not included.
+    """
+
+    times: Float[np.ndarray, " T"]
+    position: Float[np.ndarray, "T 3"]
+    orientation: Float[np.ndarray, "T 4"]
+    covariance: Float[np.ndarray, "T 6 6"]
+    status: tuple[str, ...]
+    quality: Float[np.ndarray, " T"]
+    colour_error: Float[np.ndarray, " T"]
+    lamps: tuple[Light, ...]
+    ambiguity: float
+    overlays: tuple[Overlay | None, ...]
+    messages: tuple[str, ...]
+    seconds: float
+
+    @property
+    def n_tracked(self) -> int:
+        """Frames with a pose."""
+        return sum(status == TRACKED for status in self.status)
+
+
+def track(
+    film: Film,
+    field: LearnedField,
+    camera: PosedCamera,
+    options: TrackOptions | None = None,
+    *,
+    background: str | Path | None = None,
+    start: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "4"]] | None = None,
+    progress: Progress | None = None,
+) -> Tracked:
+    """Find the pose of a known object in every frame of a film.
+
+    The first pose comes from a search over all orientations, the others from the ones before at constant
+    velocity. Each is refined by Gauss–Newton on SE(3) through the renderer's derivatives, over a pyramid.
+
+    Args:
+        film: The frames.
+        field: The object, as photographs taught it.
+        camera: Which took the film, standing still; of the size of the original frames.
+        options: How.
+        background: A picture of the place without the object, by the same camera.
+        start: Position [m, W] and orientation (wxyz) in the first frame, roughly; default: they are searched.
+        progress: Told how far it is.
+
+    Raises:
+        ValueError: If the camera does not fit the film, there is no mask to be had, or the object is in no
+            frame.
+    """
+    chosen = options or TrackOptions()
+    _check_size(film, camera)
+    walk = _Walk(film, field, camera, chosen, background)
+    first = None if start is None else Placement(*(np.asarray(x, np.float64) for x in start))
+    if first is not None:
+        walk.begin(first)
+    tell = progress or (lambda text, share: None)
+    for i in range(len(film.times)):
+        tell(f"tracking, frame {film.names[i]}", i / len(film.times))
+        walk.step(i)
+    return walk.result()
+
+
+def _check_size(film: Film, camera: PosedCamera) -> None:
+    width, height = film.size
+    near = (camera.width // film.shrunk, camera.height // film.shrunk)
+    if (width, height) == near:
+        return
+    turned = ", as if the film were turned: photographs for poses must be held like the film"
+    raise ValueError(
+        f"camera must be of the size of the film, {width * film.shrunk} × {height * film.shrunk} pixels, got"
+        f" {camera.width} × {camera.height}" + (turned if (height, width) == near else "")
+    )
+
+
+class _Walk:
+    """A film half tracked (host)."""
+
+    def __init__(
+        self, film: Film, field: LearnedField, camera: PosedCamera, options: TrackOptions, background
+    ):
+        self._film, self._options = film, options
+        self._subject = Subject(field)
+        self._camera = film.camera(camera)
+        self._masking = Masking(film, options, background)
+        self._light = LightFit(self._subject)
+        self._random = np.random.default_rng(options.seed)
+        self._found: list[Refined | None] = []
+        self._status: list[str] = []
+        self._given: Placement | None = None
+        self._missed = 0
+        self._ambiguity = np.inf
+        self._seconds: list[float] = []
+
+    def begin(self, place: Placement) -> None:
+        """Take a pose for the one in the first frame."""
+        self._given = place
+
+    def step(self, i: int) -> None:
+        """Track the next frame."""
+        began = time.perf_counter()
+        before = self._expected(i)
+        searched = before is None
+        if before is None:
+            found, status = self._searched(i), LOST
+        else:
+            found, status = self._followed(i, before)
+            self._seconds.append(time.perf_counter() - began)
+            if found is None and status == LOST and self._missed == 0:
+                found, searched = self._searched(i), True
+        if found is not None:
+            status = TRACKED
+            self._missed = 0
+            count = self._status.count(TRACKED)
+            if searched or count % _LIGHT_EVERY == 0:
+                known = self._light.known
+                self._learn(i, found)
+                if self._light.known and not known:
+                    # Colours count only now.
+                    found = self._fine(i, found.place, self._light) or found
+        else:
+            self._missed += 1
+        self._found.append(found)
+        self._status.append(status)
+
+    def _expected(self, i: int) -> Placement | None:
+        """The pose at constant velocity; None if there is nothing to go by."""
+        if i == 0:
+            return self._given
+        seen = [j for j in range(i) if self._found[j] is not None]
+        if not seen or self._missed > self._options.search_every:
+            return None
+        times, last = self._film.times, self._place(seen[-1])
+        if len(seen) < 2 or seen[-1] - seen[-2] > 3:
+            return last
+        share = (times[i] - times[seen[-1]]) / (times[seen[-1]] - times[seen[-2]])
+        earlier = self._place(seen[-2])
+        turn = quat_log(quat_multiply(quat_conjugate(earlier.orientation), last.orientation))
+        return Placement(
+            last.position + share * (last.position - earlier.position),
+            quat_multiply(last.orientation, quat_exp(share * turn)),
+        )
+
+    def _place(self, i: int) -> Placement:
+        found = self._found[i]
+        assert found is not None
+        return found.place
+
+    def _searched(self, i: int) -> Refined | None:
+        """Look for the object in all orientations; now and then only."""
+        if self._missed % self._options.search_every:
+            return None
+        target = self._masking.alone(i, self._camera)
+        if target is None:
+            return None
+        starts = search(self._subject, target, self._options, self._random)
+        finished = [self._finished(i, start.refined.place, start.light) for start in starts[:3]]
+        finer = sorted((s for s in finished if s is not None), key=lambda s: s.score)
+        if not finer or finer[0].refined.overlap < _FOUND:
+            return None
+        turned = [
+            self._finished(i, place, finer[0].light)
+            for place in half_turns(self._subject, finer[0].refined.place)
+        ]
+        best, ambiguity = self._likeliest(target, [*finer, *(s for s in turned if s is not None)])
+        if not self._light.known:
+            self._ambiguity = ambiguity
+        self._light = best.light
+        return best.refined
+
+    def _likeliest(self, target: Target, starts: list[Start]) -> tuple[Start, float]:
+        """Of starts whose silhouettes fit alike, the one whose colours fit best; and how clearly."""
+        most = max(start.refined.overlap for start in starts)
+        alike = [start for start in starts if start.refined.overlap > most - _ALIKE]
+        if self._options.loss != "photometric":
+            alike = sorted(alike, key=lambda s: s.score)
+            values = [start.score for start in alike]
+        else:
+            found = [(unlikeness(self._subject, target, start), start) for start in alike]
+            found.sort(key=lambda pair: pair[0])
+            values, alike = [value for value, _ in found], [start for _, start in found]
+        turned = quat_conjugate(alike[0].refined.place.orientation)
+        others = [
+            value / max(values[0], 1e-9)
+            for value, start in zip(values, alike, strict=True)
+            if np.linalg.norm(quat_log(quat_multiply(turned, start.refined.place.orientation))) > _OTHER
+        ]
+        return alike[0], min(others, default=np.inf)
+
+    def _finished(self, i: int, place: Placement, light: LightFit) -> Start | None:
+        """A start at full resolution, under the light that it implies itself."""
+        found = self._fine(i, place, light)
+        if found is None:
+            return None
+        own = LightFit(self._subject)
+        target = self._masking.near(i, self._subject, found.place, light.lamps, self._camera, 2.0)
+        if target is not None and self._options.loss == "photometric":
+            learn_light(self._subject, target, found.place, found.window, found.silhouette, own)
+        return Start(found, own if own.known else light, score(found))
+
+    def _followed(self, i: int, before: Placement) -> tuple[Refined | None, str]:
+        window = window_of(self._subject, before, self._camera)
+        middle = self._camera.project(self._subject.middle(before)[None])[0]
+        if window is None or not (
+            0 <= middle[0] <= self._camera.width and 0 <= middle[1] <= self._camera.height
+        ):
+            return None, OUTSIDE
+        if self._masking.hidden(i, window) > 1 - _BLIND:
+            return None, HIDDEN
+        found = self._refined(i, before, self._light)
+        if found is None or found.overlap < self._options.lost:
+            return None, LOST
+        return found, TRACKED
+
+    def _refined(self, i: int, before: Placement, light: LightFit) -> Refined | None:
+        """The pose near an expected one; also from beside it if that fits worse than usual."""
+        found = self._from_coarse(i, before, light)
+        usual = [other.overlap for other in self._found if other is not None]
+        if found is not None and usual and found.overlap < np.median(usual) - _WORSE:
+            around = [self._from_coarse(i, place, light) for place in self._beside(before)]
+            known = [other for other in [found, *around] if other is not None]
+            found = min(known, key=score)
+        return None if found is None else self._fine(i, found.place, light)
+
+    def _from_coarse(self, i: int, before: Placement, light: LightFit) -> Refined | None:
+        """By silhouettes first, which are seen from further away; then by colours."""
+        size = self._size(before)
+        target = self._masking.near(i, self._subject, before, light.lamps, self._camera, 0.06 * size)
+        if target is None:
+            return None
+        coarse = target.reduced(max(1, round(size / _COARSE)))
+        place, found = aligned(self._subject, coarse, before, light.lamps), None
+        last = self._loss(light)
+        for loss in ("silhouette", last) if last == "photometric" else (last,):
+            found = refine(
+                self._subject, coarse, place, light.lamps, loss=loss, steps=4, rays=CHUNK, random=self._random
+            )
+            if found is None:
+                return None
+            place = found.place
+        return found
+
+    def _fine(self, i: int, place: Placement, light: LightFit) -> Refined | None:
+        target = self._masking.near(i, self._subject, place, light.lamps, self._camera, 2.0)
+        if target is None:
+            return None
+        return refine(
+            self._subject,
+            target,
+            place,
+            light.lamps,
+            loss=self._loss(light),
+            steps=4,
+            rays=self._options.rays,
+            random=self._random,
+        )
+
+    def _loss(self, light: LightFit) -> str:
+        return "silhouette" if self._options.loss == "photometric" and not light.known else self._options.loss
+
+    def _size(self, place: Placement) -> float:
+        """Size of the object in the picture [pixels]."""
+        away = np.linalg.norm(self._subject.middle(place) - self._camera.position)
+        return self._subject.size / float(away) / self._camera.pixel_angle
+
+    def _beside(self, place: Placement) -> list[Placement]:
+        """Other poses to begin at: the object turned both ways about each of its axes."""
+        turns = [_ASIDE * sign * axis for axis in np.eye(3) for sign in (1, -1)]
+        middle = self._subject.middle(place)
+        return [
+            self._subject.around(middle, quat_multiply(place.orientation, quat_exp(turn))) for turn in turns
+        ]
+
+    def _learn(self, i: int, found: Refined) -> None:
+        if self._options.loss != "photometric":
+            return
+        target = self._masking.near(i, self._subject, found.place, self._light.lamps, self._camera, 2.0)
+        if target is not None:
+            learn_light(self._subject, target, found.place, found.window, found.silhouette, self._light)
+            self._masking.learn(target, found.window, found.silhouette)
+
+    def result(self) -> Tracked:
+        """What was found.
+
+        Raises:
+            ValueError: If nothing was.
+        """
+        if not any(self._found):
+            raise ValueError(
+                f"video: the object was found in none of {len(self._found)} frames: it must be in the"
+                " picture, of the size that camera and object say, and masks must show it (see docs/track.md)"
+            )
+        n = len(self._found)
+        position, orientation = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
+        covariance = np.full((n, 6, 6), np.nan)
+        quality, colour = np.full(n, np.nan), np.full(n, np.nan)
+        overlays: list[Overlay | None] = [None] * n
+        for i, found in enumerate(self._found):
+            if found is not None:
+                position[i], orientation[i] = found.place
+                covariance[i] = covariance_of(found, self._subject, self._camera.position)
+                quality[i], colour[i] = found.overlap, found.colour_error
+                overlays[i] = Overlay(found.window, found.silhouette)
+        known = [found for found in self._found if found is not None]
+        return Tracked(
+            self._film.times,
+            position,
+            orientation,
+            covariance,
+            tuple(self._status),
+            quality,
+            colour,
+            self._light.lamps,
+            self._ambiguity,
+            tuple(overlays),
+            tuple(self._messages(known)),
+            float(np.mean(self._seconds)) if self._seconds else 0.0,
+        )
+
+    def _messages(self, known: list[Refined]) -> list[str]:
+        """What a user should know."""
+        texts = [*self._film.notes, *self._masking.notes, *unobservable(known, self._subject)]
+        for status, words in (
+            (LOST, "the object was lost (its mask does not fit the silhouette)"),
+            (OUTSIDE, "the object was out of the picture"),
+            (HIDDEN, "the object was hidden by more than half"),
+        ):
+            names = [n for n, s in zip(self._film.names, self._status, strict=True) if s == status]
+            if names:
+                texts.append(
+                    f"{words} in {len(names)} frames: {', '.join(names[:6])}{' …' * (len(names) > 6)}"
+                )
+        if self._ambiguity < _CLEAR:
+            texts.append(
+                "another orientation explains the first frame nearly as well: the object may be turned by a"
+                " symmetry of its shape; give start if it is"
+            )
+        return texts

@@ -1,0 +1,277 @@
+"""Tracking a learned object in films that are drawn of it, by another path than the tracker's own."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import ndimage
+
+from dano.cli import main
+from dano.identify import load_motion
+from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate, quat_to_matrix
+from dano.scene_file import asset_look
+from dano.vision import Film, Light, PosedCamera, track, TrackOptions
+from dano.vision.tracking._refine import Refined
+from dano.vision.tracking._segments import like_object, overlap, Place, unlike_place
+from dano.vision.tracking._subject import Placement, Subject
+from dano.vision.tracking._sureness import covariance_of, unobservable
+
+SIZE = (96, 72)
+LIGHT = np.array([-0.4, -0.5, 0.77])
+BACK = np.array([0.1, 0.6, 0.2])
+
+
+@pytest.fixture(scope="module")
+def bunny():
+    return asset_look("trained_bunny")
+
+
+@pytest.fixture(scope="module")
+def camera():
+    """Looks along +y at the origin from half a metre away, a little from above."""
+    eye, forward = np.array([0.0, -0.48, 0.2]), np.array([0.0, 0.48, -0.14])
+    forward = forward / np.linalg.norm(forward)
+    right = np.array([1.0, 0, 0])
+    up = np.cross(right, forward)
+    pose = np.stack([right, up, -forward, eye], axis=1)
+    return PosedCamera(pose, focal=200.0, width=SIZE[0], height=SIZE[1])
+
+
+def path(count, speed=(0.006, 0.002, 0.001), spin=(0.05, 0.08, 0.12)):
+    """Poses of a steady motion."""
+    start = quat_exp(np.array([0.2, -0.1, 0.8]))
+    position = np.array([-0.02, 0.0, 0.0]) + np.outer(np.arange(count), speed)
+    orientation = np.stack([quat_multiply(start, quat_exp(i * np.array(spin))) for i in range(count)])
+    return position, orientation
+
+
+def drawn(field, camera, position, orientation):
+    """Frame and mask: not the object is moved, but the camera, the other way, by the library's drawing."""
+    rotation = quat_to_matrix(orientation)
+    pose = rotation.T @ np.concatenate([camera.pose[:, :3], (camera.position - position)[:, None]], axis=1)
+    seen = field.picture(camera.replaced(camera_to_world=pose), rotation.T @ LIGHT)
+    return np.rint(255 * seen.over(BACK)).astype(np.uint8), seen.opacity
+
+
+def film_of(frames, masks, times=None):
+    n = len(frames)
+    stamps = np.arange(n) / 30 if times is None else times
+    names = tuple(map(str, range(n)))
+    return Film(names, stamps, list(frames), list(masks), [None] * n, 1, ())
+
+
+@pytest.fixture(scope="module")
+def filmed(bunny, camera):
+    position, orientation = path(4)
+    frames, masks = zip(
+        *(drawn(bunny, camera, p, q) for p, q in zip(position, orientation, strict=True)), strict=True
+    )
+    return position, orientation, frames, masks
+
+
+def errors(found, position, orientation, rows):
+    shift = np.linalg.norm(found.position[rows] - position[rows], axis=1) / 0.12
+    turned = quat_log(quat_multiply(quat_conjugate(found.orientation[rows]), orientation[rows]))
+    return shift, np.linalg.norm(turned, axis=1)
+
+
+ROUGH = TrackOptions(rays=700, views=24, turns=12, candidates=2)
+
+
+def test_slopes_are_differences_of_what_is_seen(bunny, camera):
+    subject = Subject(bunny)
+    position, orientation = path(1)
+    place = Placement(position[0], orientation[0])
+    y, x = np.mgrid[16:56:2, 30:66:2]
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
+    lamps = (Light(LIGHT), Light((1, 0, 0.5), intensity=0.3), Light((-1, 0, 0.2), intensity=0.2))
+    rays = camera.position, camera.directions(pixels), camera.pixel_angle
+    seen = subject.see(place, lamps, *rays, slopes=True)
+    for k in range(6):
+        # A step of half a pixel: what the eye could see.
+        step = np.zeros(6)
+        step[k] = 0.012
+        high, low = (subject.see(place.moved(s * step, subject.radius), lamps, *rays) for s in (1, -1))
+        # Colours jump where one part of the object hides another, which no derivative tells.
+        for slope, values, least in (
+            (seen.opacity_slope[:, k], (high.opacity - low.opacity) / 0.024, 0.85),
+            (seen.colour_slope[:, :, k], (high.colour - low.colour) / 0.024, 0.75),
+        ):
+            cosine = np.sum(slope * values) / np.linalg.norm(slope) / np.linalg.norm(values)
+            assert cosine > least
+            assert np.linalg.norm(slope) == pytest.approx(np.linalg.norm(values), rel=0.4)
+
+
+def test_a_film_is_tracked_and_its_end_lies_outside(bunny, camera, filmed):
+    position, orientation, frames, masks = filmed
+    empty = np.broadcast_to(np.rint(255 * BACK), frames[0].shape).astype(np.uint8)
+    film = film_of([*frames, empty], [*masks, np.zeros_like(masks[0])])
+    start = (
+        position[0] + [0.004, 0, -0.003],
+        quat_multiply(orientation[0], quat_exp(np.array([0.05, 0.05, 0]))),
+    )
+    found = track(film, bunny, camera, ROUGH, start=start)
+    assert found.status[:4] == ("tracked",) * 4
+    assert found.status[4] == "lost"
+    assert np.isnan(found.position[4]).all()
+    assert any("lost" in text and "frames: 4" in text for text in found.messages)
+    shift, turn = errors(found, position, orientation, slice(0, 4))
+    assert shift.max() < 0.02
+    assert np.degrees(turn.max()) < 2
+    assert found.quality[:4].min() > 0.93
+    assert found.colour_error[:4].max() < 0.06
+    # The truth lies within what the covariances say, far from which would be 22 (0.1 %).
+    for i in range(4):
+        off = np.append(position[i] - found.position[i], turn_of(found.orientation[i], orientation[i]))
+        assert off @ np.linalg.solve(found.covariance[i], off) < 22.5
+    outline = found.overlays[2]
+    assert outline is not None
+    assert overlap(masks[2][outline.window], outline.opacity) > 0.93
+
+
+def turn_of(p, q):
+    return quat_log(quat_multiply(quat_conjugate(p), q))
+
+
+def test_the_start_is_found_among_all_orientations(bunny, camera, filmed):
+    position, orientation, frames, _ = filmed
+    # No masks are given: the background is plain.
+    options = TrackOptions(rays=700, views=48, turns=16, candidates=3)
+    found = track(film_of(frames[:2], [None, None]), bunny, camera, options)
+    shift, turn = errors(found, position, orientation, slice(0, 2))
+    # Edges of masks by a threshold are not exact, which shows along the line of sight.
+    assert (np.degrees(turn.max()) < 5, shift.max() < 0.1) == (True, True), (turn, shift)
+
+
+def test_the_paper_s_loss_and_a_hand_in_front(bunny, camera, filmed):
+    position, orientation, frames, masks = filmed
+    hidden = [mask.copy() for mask in masks[:2]]
+    hand = np.zeros_like(masks[0])
+    hand[:, :40] = 1
+    covered = [np.where(hand[..., None] > 0, np.uint8(90), frame) for frame in frames[:2]]
+    for mask in hidden:
+        mask[hand > 0] = 0
+    film = film_of(covered, hidden)._replace(occluders=[hand, hand])
+    for loss in ("photometric", "paper"):
+        options = TrackOptions(rays=700, loss=loss)
+        found = track(film, bunny, camera, options, start=(position[0], orientation[0]))
+        shift, turn = errors(found, position, orientation, slice(0, 2))
+        assert shift.max() < 0.05
+        assert np.degrees(turn.max()) < 8
+
+
+def test_what_is_wrong_is_said(bunny, camera, filmed):
+    _, _, frames, masks = filmed
+    film = film_of(frames[:2], masks[:2])
+    wide = camera.replaced(width=SIZE[1], height=SIZE[0])
+    with pytest.raises(
+        ValueError, match="size of the film, 96 × 72 pixels, got 72 × 96, as if the film were turned"
+    ):
+        track(film, bunny, wide, ROUGH)
+    with pytest.raises(ValueError, match="masks='given'"):
+        track(film_of(frames[:2], [None, None]), bunny, camera, TrackOptions(masks="given"))
+    nothing = [np.zeros_like(m) for m in masks[:2]]
+    with pytest.raises(ValueError, match="found in none of 2 frames"):
+        track(film_of(frames[:2], nothing), bunny, camera, ROUGH)
+    shaky = [np.roll(np.tile(ramp(), (1, 1, 1)), 30 * i, axis=1) for i in range(4)]
+    with pytest.raises(ValueError, match="background is not static"):
+        track(film_of(shaky, [None] * 4), bunny, camera, TrackOptions(masks="static"))
+    with pytest.raises(ValueError, match="masks must be one of"):
+        TrackOptions(masks="magic")
+    with pytest.raises(ValueError, match="rays must be ≥ 256, got 3"):
+        TrackOptions(rays=3)
+
+
+def ramp():
+    values = np.random.default_rng(0).integers(0, 255, (SIZE[1], SIZE[0], 3))
+    return values.astype(np.uint8)
+
+
+def test_shadows_are_no_object_and_colours_tell_what_is():
+    rng = np.random.default_rng(2)
+    place = ndimage.gaussian_filter(rng.uniform(0.2, 0.8, (80, 100, 3)), (2, 2, 0))
+    truth = np.zeros((80, 100))
+    truth[20:50, 30:60] = 1
+    shadow = np.zeros((80, 100))
+    shadow[40:60, 50:85] = 1
+    image = place * (1 - 0.4 * shadow[..., None])
+    image = np.where(truth[..., None] > 0, [0.1, 0.3, 0.9], image) + 0.01 * rng.normal(size=(80, 100, 3))
+    frames = [np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)] * 2
+    known = Place(place, frames)
+    assert overlap(unlike_place(image, known), truth) > 0.9
+    expected = np.roll(truth, (3, -3), axis=(0, 1))
+    window = (slice(0, 80), slice(0, 100))
+    assert overlap(like_object(image, expected, 4.0, None, known, window), truth) > 0.93
+    assert overlap(like_object(image, expected, 4.0, None, None, window), truth) > 0.85
+
+
+def test_directions_that_are_not_seen_are_said_and_have_large_variances(bunny):
+    subject = Subject(bunny)
+    # Curvature as of a surface of revolution about y of the object's frame.
+    axis = np.array([0, 0, 0, 0, 1.0, 0])
+    hessian = 1e6 * (np.eye(6) - np.outer(axis, axis))
+    window = (slice(0, 1), slice(0, 1))
+    place = Placement(np.zeros(3), np.array([1.0, 0, 0, 0]))
+    blind = Refined(place, 0.0, 1.0, 0.0, hessian, 1e-8 * np.eye(6), window, np.zeros((1, 1)))
+    texts = unobservable([blind, blind], subject)
+    assert len(texts) == 1
+    assert "turns about the axis (0.00, 1.00, 0.00)" in texts[0]
+    eye = np.array([0, -0.5, 0])
+    covariance = covariance_of(blind, subject, eye)
+    assert np.sqrt(covariance[4, 4]) > 1.5
+    assert np.sqrt(covariance[3, 3]) < 0.01
+    # A scale that is not known shows along the line of sight.
+    assert covariance[1, 1] > 2 * covariance[0, 0]
+    seen = blind._replace(hessian=1e6 * np.eye(6))
+    assert unobservable([seen, seen], subject) == []
+
+
+def test_placements_turn_about_the_ball(bunny):
+    subject = Subject(bunny)
+    turn = quat_exp(np.array([0.3, 0.2, -0.5]))
+    place = subject.around(np.array([0.1, 0.2, 0.3]), turn)
+    np.testing.assert_allclose(subject.middle(place), [0.1, 0.2, 0.3], atol=1e-12)
+    moved = place.moved(np.array([0.5, 0, 0, 0, 0, 0.2]), subject.radius)
+    np.testing.assert_allclose(moved.position - place.position, [0.5 * subject.radius, 0, 0], atol=1e-12)
+    ahead = quat_rotate(quat_conjugate(turn), quat_rotate(moved.orientation, np.array([1.0, 0, 0])))
+    np.testing.assert_allclose(ahead, [np.cos(0.2), np.sin(0.2), 0], atol=1e-12)
+
+
+def test_the_command_writes_a_motion_and_a_page(tmp_path, camera, filmed, capsys):
+    position, orientation, frames, masks = filmed
+    for name, pictures in (("frames", frames[:2]), ("masks", [np.uint8(255 * m) for m in masks[:2]])):
+        (tmp_path / name).mkdir()
+        for i, pixels in enumerate(pictures):
+            Image.fromarray(pixels).save(tmp_path / name / f"{i}.png")
+    lens = {
+        "fl_x": 200.0,
+        "w": SIZE[0],
+        "h": SIZE[1],
+        "transform_matrix": [*camera.pose.tolist(), [0, 0, 0, 1]],
+    }
+    (tmp_path / "camera.json").write_text(json.dumps(lens))
+    command = ["track", str(tmp_path / "frames"), "trained_bunny", "-o", str(tmp_path / "m.npz")]
+    command += [
+        "--camera",
+        str(tmp_path / "camera.json"),
+        "--masks",
+        str(tmp_path / "masks"),
+        "--rays",
+        "700",
+    ]
+    command += ["--start", *(f"{x:.4f}" for x in (*position[0], *orientation[0]))]
+    with pytest.raises(SystemExit):
+        main(command)
+    assert "give rate" in capsys.readouterr().err
+    main([*command, "--rate", "30", "--report", str(tmp_path / "page.html"), "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert told["tracked"] == 2
+    motion = load_motion(tmp_path / "m.npz")
+    assert motion.names == ("trained_bunny",)
+    assert motion.point == "origin"
+    assert motion.covariance is not None
+    assert np.linalg.norm(motion.position[1, 0] - position[1]) < 0.0025
+    page = (tmp_path / "page.html").read_text()
+    assert page.count("<figure>") == 2
+    assert "tracked" in page
