@@ -11,6 +11,7 @@ import numpy as np
 from dano.cli._arguments import Build, Inspect
 from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._outputs import check_output, missing_for_pictures
+from dano.cli._robots import inspect_robot, SUFFIXES
 from dano.fields import load_field
 from dano.objects import Interior, NeuralObject
 from dano.scene_file import build_object
@@ -41,6 +42,10 @@ def build(command: Build) -> None:
 def inspect(command: Inspect) -> None:
     """See `dano inspect --help`."""
     path, png = command.object, command.png
+    if path.suffix.lower() in SUFFIXES:
+        if png is not None:
+            raise ValueError(f"--png draws neural objects only, got the robot {path}")
+        return inspect_robot(path, as_json=command.json)
     picture = None if command.no_png else png or path.with_suffix(".png")
     if picture is not None:
         check_output(picture, path, suffix=".png")
