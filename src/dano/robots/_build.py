@@ -2,12 +2,13 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dano.archive import checked_input
 from dano.fields import Sphere
-from dano.maths import Numbers, Pose, quat_multiply, quat_rotate
+from dano.maths import Pose, quat_multiply, quat_rotate
 from dano.robots._description import Connection, Description, Link, Placed
 from dano.robots._geometry import shape_of
 from dano.robots._mjcf import read_mjcf
@@ -223,7 +224,7 @@ def _joint(
     """A joint between bodies: places of links in their bodies are part of its own."""
     parent, position, orientation = frames[joint.parent]
     place = _moved((position, orientation), joint.place)
-    options: dict[str, Numbers] = {"damping": joint.damping}
+    options: dict[str, Any] = {"damping": joint.damping}
     if joint.kind in ("hinge", "slide"):
         leader = _leader(description, joint)
         if leader is not None:

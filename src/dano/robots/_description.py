@@ -166,14 +166,13 @@ class Description:
                     f"{where}: joint {joint.name!r} must mimic a joint with one coordinate, got {leader!r}, "
                     f"a {kinds[leader].kind}"
                 )
-            seen = {joint.name}
-            while kinds[leader].mimics is not None:
+            seen, follows = {joint.name}, kinds[leader].mimics
+            while follows is not None and leader in kinds:
                 if leader in seen:
                     raise ValueError(f"{where}: joints must not mimic each other in a circle, got {leader!r}")
                 seen.add(leader)
-                leader = kinds[leader].mimics[0]
-                if leader not in kinds:
-                    break
+                leader = follows[0]
+                follows = kinds[leader].mimics if leader in kinds else None
 
 
 def _unique(where: str, what: str, names: list[str]) -> list[str]:

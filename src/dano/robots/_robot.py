@@ -67,8 +67,8 @@ class Robot:
 
     def contacts_with(self, *others: str, params: ContactParams | None = None) -> list[Contact]:
         """Contacts of all bodies that have a shape with other bodies of the scene."""
-        given = () if params is None else (params,)
-        return [Contact(body, other, *given) for body in self.touching for other in others]
+        pairs = [(body, other) for body in self.touching for other in others]
+        return [Contact(*pair) if params is None else Contact(*pair, params) for pair in pairs]
 
     def start(
         self, q: Mapping[str, Numbers] | None = None, v: Mapping[str, Numbers] | None = None

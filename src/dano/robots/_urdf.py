@@ -72,7 +72,7 @@ class _Reader:
         self.where = f"{self.path}: joint {name!r}"
         if kind not in _KINDS:
             raise ValueError(f"{self.where}: type must be one of {', '.join(_KINDS)}, got {kind!r}")
-        ends = [self.needed(row, role).get("link", "") for role in ("parent", "child")]
+        parent, child = (self.needed(row, role).get("link", "") for role in ("parent", "child"))
         axis = row.find("axis")
         direction = (1.0, 0.0, 0.0) if axis is None else self.numbers(axis, "xyz", 3, (1.0, 0.0, 0.0))
         if kind in ("revolute", "prismatic", "continuous", "planar") and not any(direction):
@@ -92,7 +92,8 @@ class _Reader:
         return Connection(
             name,
             _KINDS[kind],
-            *ends,
+            parent,
+            child,
             self.place(row),
             direction if any(direction) else (1.0, 0.0, 0.0),
             limits=limits,

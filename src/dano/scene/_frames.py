@@ -93,7 +93,7 @@ def chains_of(layout: Layout, joints: Sequence[Joint], com: Float[Array, "n 3"])
     }
     for name, usual in (("ratio", 1.0), ("shift", 0.0)):
         given = [getattr(joint, name) if joint.mimics else jnp.asarray(usual) for joint in joints]
-        arrays[name] = jnp.stack(given) if joints else jnp.zeros(0)
+        arrays[name] = jnp.stack([x.astype(com.dtype) for x in given]) if joints else jnp.zeros(0)
     return Chains(
         layout,
         **{name: x.astype(com.dtype) for name, x in arrays.items()},

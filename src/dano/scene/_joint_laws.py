@@ -49,7 +49,7 @@ def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
         for j, _, place in layout.dofs:
             value = getattr(joints[j], name)
             if value is not None:
-                share = power(joints[j].ratio) if layout.follows[j] else jnp.ones(())
+                share = power(joints[j].ratio) if layout.follows[j] else jnp.ones_like(value)
                 values = values.at[place].add((share * value).astype(dtype))
         return values
 
@@ -57,7 +57,7 @@ def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
         return summed(name, power) if any(getattr(joint, name) is not None for joint in joints) else None
 
     def column(values: list[Array]) -> Array:
-        return jnp.stack(values).astype(dtype) if values else jnp.zeros(0, dtype)
+        return jnp.stack([x.astype(dtype) for x in values]) if values else jnp.zeros(0, dtype)
 
     limits = motor = None
     if any(joint.limits is not None for joint in owners):

@@ -1,0 +1,1 @@
+"""What neural objects on bodies of MuJoCo models cost, and how still they lie."""
