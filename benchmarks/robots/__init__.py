@@ -1,1 +1,1 @@
-"""What neural objects on bodies of MuJoCo models cost, and how still they lie."""
+"""What a step of a robot costs beside MuJoCo and frax, and how its free swing keeps its energy."""

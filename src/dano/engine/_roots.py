@@ -21,13 +21,13 @@ from dano.engine._balance import (
     world_momenta,
     world_patches,
 )
-from dano.engine._joint_forces import Rough
 from dano.engine._kernels import is_native, native_root
 from dano.engine._newton import newton, solve_small, SolverOptions
 from dano.engine._primal_dual import Balance, primal_dual
 from dano.engine._problem import Pairs, Problem
 from dano.engine._sequential import one_at_a_time
 from dano.engine._trees import mass_matrix, rough_of, Tree, tree_balance
+from dano.engine.joints import Rough
 from dano.maths import matmul, matvec
 
 

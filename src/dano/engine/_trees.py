@@ -7,8 +7,8 @@ joints allow, vanishes:
 
     Σ_i J_i(q)ᵀ (P_i(V_i(y)) − P_i⁻ − h f_i) + h g(y) = 0,        J_i = ∂x_i/∂q,
 
-with what acts on the joints themselves in g (see `_joint_forces`). A ball joint turns in a step by its part
-of y as a free body does by its spin; q⁺ is the rotation vector of what it has come to.
+with what acts on the joints themselves in g (see `dano.engine.joints`). A ball joint turns in a step by its
+part of y as a free body does by its spin; q⁺ is the rotation vector of what it has come to.
 
 These are the discrete Euler–Lagrange equations of the whole (the discrete null space method: Betsch and
 Leyendecker 2006), so bodies on joints have the order and the conservation of free ones, and joints hold
@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.engine._joint_forces import JointForces, Rough
 from dano.engine._newton import inverse3
 from dano.engine._rigid import turn_slopes, turned
+from dano.engine.joints import JointForces, Rough
 from dano.maths import matmul, matvec, quat_exp, quat_log, quat_to_matrix, safe_norm
 from dano.scene import (
     Chains,
