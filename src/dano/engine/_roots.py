@@ -30,6 +30,9 @@ from dano.engine._trees import mass_matrix, rough_of, Tree, tree_balance
 from dano.engine.joints import Rough
 from dano.maths import matmul, matvec
 
+# How many times the rounding of a pose a step's equations may miss, where the tolerance is its power 3/4.
+_POSES = 8.0
+
 
 def solve(problem: Problem, found: Found | None, start: Array, pairs: Pairs, options: SolverOptions):
     """Velocities at the end of a step, and the report.
@@ -120,6 +123,10 @@ def _root_of_trees(problem: Problem, found, start: Float[Array, " k"], pairs: Pa
     size = jnp.max(
         jnp.abs(velocity_scale * tree.pulled(jax.vmap(matvec)(to_world_matrices(problem), problem.impulse)))
     )
+    # Velocities come out of differences of poses: rounding in these counts 1/h times, and a light link feels
+    # that of heavy ones.
+    epsilon, reach = float(jnp.finfo(start.dtype).eps), 1 + jnp.max(jnp.abs(tree.position))
+    size = size + _POSES * epsilon**0.25 * reach / problem.timestep
     rough = _rough(problem, tree)
     spread, scale = tree.jacobian.reshape(6 * m, -1), velocity_scale
     if rough is not None:

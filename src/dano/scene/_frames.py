@@ -275,6 +275,7 @@ def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:
     # Where the roots were a step before.
     moves = np.zeros((layout.bodies, 1))
     moves[list(layout.free)] = 1
+    moves = jnp.asarray(moves, h.dtype)
     back = _small_turn(-h * moves * state.omega)
     q = state.q - h * state.v
     _, first = joints_of(layout, "ball")
