@@ -247,4 +247,5 @@ def test_float32(arm):
     after = dano.step(*single)
     assert coordinates(after)[0].dtype == np.float32
     exact = coordinates(dano.step(scene, state))[1]
-    np.testing.assert_allclose(coordinates(after)[1], exact, rtol=1e-3, atol=1e-4)
+    # Velocities are differences of poses over h: rounding counts 1/h times.
+    np.testing.assert_allclose(coordinates(after)[1], exact, rtol=1e-3, atol=2e-3)
