@@ -41,10 +41,24 @@ from dano.scene import (
     Control as Control,
     Frames as Frames,
     Joint as Joint,
+    Motor as Motor,
     Others as Others,
     Scene as Scene,
     State as State,
     Trajectory as Trajectory,
+)
+from dano.robots import (
+    bias_forces as bias_forces,
+    computed_torque as computed_torque,
+    gravity_forces as gravity_forces,
+    inverse_kinematics as inverse_kinematics,
+    InverseKinematics as InverseKinematics,
+    joint_control as joint_control,
+    load_mjcf as load_mjcf,
+    load_urdf as load_urdf,
+    mass_matrix as mass_matrix,
+    Robot as Robot,
+    Target as Target,
 )
 from dano.engine import (
     AbstractEngine as AbstractEngine,
@@ -66,6 +80,7 @@ from dano.identify import (
     identify as identify,
     load_motion as load_motion,
     Motion as Motion,
+    motion_of_joints as motion_of_joints,
     Parameter as Parameter,
     save_motion as save_motion,
 )

@@ -230,10 +230,10 @@ class Import:
 
 @dataclass(frozen=True)
 class Inspect:
-    """Print an object's mass properties and samples, and draw it.
+    """Print an object's mass properties and samples, and draw it; or a robot's tree and what is odd.
 
     Attributes:
-        object: A neural object (.dano).
+        object: A neural object (.dano), or a robot (.urdf, or a .xml of MuJoCo).
         png: Where to draw it; default: beside the object.
         no_png: Draw nothing.
         json: Print one JSON object instead of text.

@@ -13,7 +13,11 @@ from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._outputs import check_output, missing_for_pictures
 from dano.fields import load_field
 from dano.objects import Interior, NeuralObject
+from dano.robots import read_robot, robot_doubts, robot_tree
 from dano.scene_file import build_object
+
+# Names of files that hold robots end so.
+_ROBOTS = (".urdf", ".xml", ".mjcf")
 
 
 def build(command: Build) -> None:
@@ -41,6 +45,10 @@ def build(command: Build) -> None:
 def inspect(command: Inspect) -> None:
     """See `dano inspect --help`."""
     path, png = command.object, command.png
+    if path.suffix.lower() in _ROBOTS:
+        if png is not None:
+            raise ValueError(f"--png draws neural objects only, got the robot {path}")
+        return _inspect_robot(path, as_json=command.json)
     picture = None if command.no_png else png or path.with_suffix(".png")
     if picture is not None:
         check_output(picture, path, suffix=".png")
@@ -135,3 +143,34 @@ def _print_interior(interior: dict[str, float]) -> None:
         f"surface level       {interior['level']:.4g} of at most {interior['largest']:.4g};"
         f" half of it: volume +{100 * interior['growth']:.0f} %"
     )
+
+
+def _inspect_robot(path: Path, *, as_json: bool) -> None:
+    """Print the tree of a robot's file, and what is odd about it.
+
+    Raises:
+        ValueError: If the file is missing or broken.
+    """
+    robot = read_robot(path)
+    doubts, mass = robot_doubts(robot), sum(link.mass for link in robot.links)
+    moving = [joint for joint in robot.joints if joint.kind != "weld"]
+    if as_json:
+        put_json(
+            {
+                "file": str(path),
+                "name": robot.name,
+                "mass": mass,
+                "links": [link.name for link in robot.links],
+                "joints": {joint.name: joint.kind for joint in robot.joints},
+                "odd": doubts,
+            }
+        )
+        return
+    put(f"robot   {robot.name}, {len(robot.links)} links, {len(moving)} joints that move, {mass:.6g} kg")
+    put()
+    for line in robot_tree(robot):
+        put(line)
+    put()
+    put("nothing odd" if not doubts else "odd:")
+    for doubt in doubts:
+        put(f"  {doubt}")

@@ -111,11 +111,15 @@ def describe(rollout: Rollout, scene: Scene) -> dict[str, Any]:
     }
 
 
-def _joint_numbers(layout: Layout, body: int, last: dict[str, np.ndarray]) -> dict[str, float]:
+def _joint_numbers(layout: Layout, body: int, last: dict[str, np.ndarray]) -> dict[str, Any]:
     """Coordinates q and v of the joint on which a body hangs, if there is one with coordinates."""
     joint = layout.joint_of(body)
-    place = -1 if joint is None else layout.coordinates[joint]
-    return {} if place < 0 else {key: float(last[key][place]) for key in JOINT_QUANTITIES}
+    width = 0 if joint is None else layout.width(joint)
+    if joint is None or not width:
+        return {}
+    rows = slice(layout.coordinates[joint], layout.coordinates[joint] + width)
+    numbers = {key: last[key][rows].tolist() for key in JOINT_QUANTITIES}
+    return numbers if width > 1 else {key: value[0] for key, value in numbers.items()}
 
 
 def _contacts(trajectory: Trajectory, scene: Scene) -> list[dict[str, Any]]:

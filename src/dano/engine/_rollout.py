@@ -276,7 +276,8 @@ def _jitted_linearize(engine, scene, state, control):
         effort = control.effort
         if k:
             effort = input_change[6 * n :] + (0 if effort is None else effort)
-        following, _ = engine.step(scene, prepared, scene.filled(moved), Control(force, torque, effort))
+        given = Control(force, torque, effort, control.command)
+        following, _ = engine.step(scene, prepared, scene.filled(moved), given)
         gone = difference(nominal, following, rows).ravel()
         if nominal.q is None or nominal.v is None:
             return gone
@@ -347,9 +348,13 @@ def _check_control(scene: Scene, control: Control | None, leading: tuple[int, ..
             raise ValueError(f"control.{name} must have shape {expected}, got {value.shape}")
         if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
             raise ValueError(f"control.{name} must be finite")
-    if control.effort is not None and control.effort.shape != (*leading, scene.layout.n_joints):
-        expected = (*leading, scene.layout.n_joints)
-        raise ValueError(f"control.effort must have shape {expected}, got {control.effort.shape}")
+    expected = (*leading, scene.layout.n_joints)
+    for name in ("effort", "command"):
+        value = getattr(control, name)
+        if value is not None and value.shape != expected:
+            raise ValueError(f"control.{name} must have shape {expected}, got {value.shape}")
+    if control.command is not None and not scene.driven:
+        raise ValueError("control.command must be None in a scene whose joints have no motor")
 
 
 def _way_out(report: Report, failed: np.ndarray) -> str:

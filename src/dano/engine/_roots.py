@@ -26,8 +26,12 @@ from dano.engine._newton import newton, solve_small, SolverOptions
 from dano.engine._primal_dual import Balance, primal_dual
 from dano.engine._problem import Pairs, Problem
 from dano.engine._sequential import one_at_a_time
-from dano.engine._trees import mass_matrix, Tree, tree_balance
+from dano.engine._trees import mass_matrix, rough_of, Tree, tree_balance
+from dano.engine.joints import Rough
 from dano.maths import matmul, matvec
+
+# How many times the rounding of a pose a step's equations may miss, where the tolerance is its power 3/4.
+_POSES = 8.0
 
 
 def solve(problem: Problem, found: Found | None, start: Array, pairs: Pairs, options: SolverOptions):
@@ -115,42 +119,64 @@ def _root_of_trees(problem: Problem, found, start: Float[Array, " k"], pairs: Pa
     """Generalised velocities, the Jacobian of their residual, and the report."""
     tree = problem.tree
     assert tree is not None
-    m, scale = len(pairs.moving), _tree_scale(problem, tree)
+    m, k, velocity_scale = len(pairs.moving), start.shape[0], _tree_scale(problem, tree)
     size = jnp.max(
-        jnp.abs(scale * tree.pulled(jax.vmap(matvec)(to_world_matrices(problem), problem.impulse)))
+        jnp.abs(velocity_scale * tree.pulled(jax.vmap(matvec)(to_world_matrices(problem), problem.impulse)))
     )
+    # Velocities come out of differences of poses: rounding in these counts 1/h times, and a light link feels
+    # that of heavy ones.
+    epsilon, reach = float(jnp.finfo(start.dtype).eps), 1 + jnp.max(jnp.abs(tree.position))
+    size = size + _POSES * epsilon**0.25 * reach / problem.timestep
+    rough = _rough(problem, tree)
+    spread, scale = tree.jacobian.reshape(6 * m, -1), velocity_scale
+    if rough is not None:
+        start = rough.started(start)
+        spread = jnp.pad(spread, ((0, 0), (0, rough.rows.size)))
+        scale = jnp.concatenate([scale, jnp.broadcast_to(1 / problem.timestep, rough.rows.shape)])
 
-    def balance(y, softening):
+    def balance(unknowns, softening):
+        y = unknowns[:k]
         residual, jacobian = _tree_momenta(problem, tree, y)
-        if not problem.patches:
-            return residual, jacobian
-        momenta, slopes = world_patches(problem, tree.twists(y), pairs, softening)
-        pulled = jnp.einsum("iak,iajb,jbl->kl", tree.jacobian, slopes, tree.jacobian)
-        return residual - tree.pulled(momenta), jacobian + pulled
+        if problem.patches:
+            momenta, slopes = world_patches(problem, tree.twists(y), pairs, softening)
+            pulled = jnp.einsum("iak,iajb,jbl->kl", tree.jacobian, slopes, tree.jacobian)
+            residual, jacobian = residual - tree.pulled(momenta), jacobian + pulled
+        return (residual, jacobian) if rough is None else rough.extended(unknowns, residual, jacobian)
+
+    def evaluate(unknowns, softening):
+        residual, jacobian = balance(unknowns, softening)
+        return scale * residual, scale[:, None] * jacobian
 
     if problem.points is None:
-
-        def evaluate(y, softening):
-            residual, jacobian = balance(y, softening)
-            return scale * residual, scale[:, None] * jacobian
-
         softens = any(law.stiction for law in problem.laws)
-        return newton(evaluate, start, scale, size, options, softens=softens)
+        solution, jacobian, report = newton(evaluate, start, scale, size, options, softens=softens)
+        jacobian = jacobian / scale[:, None]
+    else:
 
-    def without_points(y):
-        residual, jacobian = balance(y, Softening())
-        return Balance(residual, None, jacobian)
+        def without_points(unknowns):
+            residual, jacobian = balance(unknowns, Softening())
+            return Balance(residual, None, jacobian)
 
-    velocities, jacobian, report = primal_dual(
-        without_points,
-        _table(problem, found, pairs),
-        start,
-        scale,
-        size,
-        options,
-        spread=(tree.jacobian.reshape(6 * m, -1), tree.offset.ravel()),
-    )
-    return velocities, scale[:, None] * jacobian, report
+        solution, jacobian, report = primal_dual(
+            without_points,
+            _table(problem, found, pairs),
+            start,
+            scale,
+            size,
+            options,
+            spread=(spread, tree.offset.ravel()),
+        )
+    if rough is not None:
+        solution, jacobian = rough.finished(solution, jacobian)
+    return solution, velocity_scale[:, None] * jacobian, report
+
+
+def _rough(problem: Problem, tree: Tree) -> Rough | None:
+    """The joint coordinates with kinks; None if there are none."""
+    if not tree.chains.laws.rough:
+        return None
+    mass = mass_matrix(tree, problem.mass, _world_inertia(problem))
+    return rough_of(tree, jnp.linalg.inv(mass), problem.timestep)
 
 
 def _tree_residual(y: Float[Array, " k"], problem: Problem, pairs: Pairs) -> Float[Array, " k"]:
@@ -163,7 +189,11 @@ def _tree_residual(y: Float[Array, " k"], problem: Problem, pairs: Pairs) -> Flo
         given = given + world_patches(problem, tree.twists(y), pairs, Softening())[0]
     if problem.points is not None:
         given = given + point_momenta(problem, tree.twists(y), pairs)
-    return _tree_scale(problem, tree) * (residual - tree.pulled(given))
+    missing = residual - tree.pulled(given)
+    rough = _rough(problem, tree)
+    if rough is not None:
+        missing = missing.at[rough.rows].add(problem.timestep * rough.ramps(y[rough.rows]))
+    return _tree_scale(problem, tree) * missing
 
 
 def _tree_momenta(problem: Problem, tree: Tree, y: Float[Array, " k"]):
@@ -172,8 +202,11 @@ def _tree_momenta(problem: Problem, tree: Tree, y: Float[Array, " k"]):
 
 def _tree_scale(problem: Problem, tree: Tree) -> Float[Array, " k"]:
     """Factors that turn generalised momenta into velocities."""
-    inertia = jax.vmap(lambda r, j: matmul(matmul(r, j), r.T))(problem.rotation, problem.inertia)
-    return 1 / jnp.diagonal(mass_matrix(tree, problem.mass, inertia))
+    return 1 / jnp.diagonal(mass_matrix(tree, problem.mass, _world_inertia(problem)))
+
+
+def _world_inertia(problem: Problem) -> Float[Array, "m 3 3"]:
+    return jax.vmap(lambda r, j: matmul(matmul(r, j), r.T))(problem.rotation, problem.inertia)
 
 
 def _table(problem: Problem, found: Found | None, pairs: Pairs) -> Table:

@@ -5,7 +5,10 @@ of its tree. With unknown generalised velocities y a step leads to q⁺ = q + h 
 V_i(y) that takes x_i(q) to x_i(q⁺), and the sum of what free bodies would balance, projected on what the
 joints allow, vanishes:
 
-    Σ_i J_i(q)ᵀ (P_i(V_i(y)) − P_i⁻ − h f_i) − h τ + h d y = 0,        J_i = ∂x_i/∂q.
+    Σ_i J_i(q)ᵀ (P_i(V_i(y)) − P_i⁻ − h f_i) + h g(y) = 0,        J_i = ∂x_i/∂q,
+
+with what acts on the joints themselves in g (see `dano.engine.joints`). A ball joint turns in a step by its
+part of y as a free body does by its spin; q⁺ is the rotation vector of what it has come to.
 
 These are the discrete Euler–Lagrange equations of the whole (the discrete null space method: Betsch and
 Leyendecker 2006), so bodies on joints have the order and the conservation of free ones, and joints hold
@@ -20,8 +23,20 @@ from jaxtyping import Array, Float
 
 from dano.engine._newton import inverse3
 from dano.engine._rigid import turn_slopes, turned
-from dano.maths import matmul, matvec, quat_to_matrix
-from dano.scene import Chains, Control, link_jacobian, place_links, Poses, Scene, State, step_twists
+from dano.engine.joints import JointForces, Rough
+from dano.maths import matmul, matvec, quat_exp, quat_log, quat_to_matrix, safe_norm
+from dano.scene import (
+    Chains,
+    Control,
+    joints_of,
+    link_jacobian,
+    place_links,
+    Poses,
+    Scene,
+    State,
+    step_twists,
+    triples,
+)
 
 # Angle by which joints may turn a body in a step [rad]: from 180° on a turn reads as one the other way.
 _LARGEST_TURN = 2.8
@@ -35,7 +50,7 @@ class Tree(eqx.Module):
         position: Poses at the start of the step [m, W], shape (n, 3).
         orientation: wxyz, shape (n, 4).
         q: Joint coordinates at the start.
-        effort: Of the joints [N m or N].
+        forces: What acts on them.
         jacobian: J at the start: twists [W] of the bodies that move per velocity, shape (m, 6, k).
         offset: c: what they move by besides J y, shape (m, 6).
     """
@@ -44,7 +59,7 @@ class Tree(eqx.Module):
     position: Float[Array, "n 3"]
     orientation: Float[Array, "n 4"]
     q: Float[Array, " j"]
-    effort: Float[Array, " j"]
+    forces: JointForces
     jacobian: Float[Array, "m 6 k"]
     offset: Float[Array, "m 6"]
 
@@ -60,17 +75,19 @@ class Tree(eqx.Module):
 def build_tree(scene: Scene, state: State, control: Control | None) -> tuple[Tree, Poses]:
     """The tree of a step, and the poses at its end if the old velocities stay."""
     chains, h = scene.chains, scene.timestep
-    assert state.q is not None
+    assert state.q is not None and state.v is not None
     moving = np.array(scene.layout.moving)
     now = place_links(chains, state.position, state.orientation, state.q)
     jacobian = link_jacobian(chains, now)[moving]
-    effort = jnp.zeros_like(state.q) if control is None or control.effort is None else control.effort
+    none = jnp.zeros_like(state.q)
+    effort = none if control is None or control.effort is None else control.effort
+    command = none if control is None or control.command is None else control.command
     tree = Tree(
         chains,
         state.position,
         state.orientation,
         state.q,
-        effort,
+        JointForces(chains.laws, state.q, state.v, effort, command, h),
         jacobian,
         jnp.zeros(jacobian.shape[:2], h.dtype),
     )
@@ -104,21 +121,38 @@ def tree_balance(tree: Tree, y: Float[Array, " k"], own, h: Float[Array, ""]):
     ahead = _ahead(tree, y, h)
     momenta, slopes = own(_world_twists(tree, ahead, y, h))
     roots = 6 * len(tree.chains.layout.free)
-    joints = np.array(tree.chains.layout.with_coordinates, int)
-    damping = tree.chains.damping[joints]
-    residual = tree.pulled(momenta).at[roots:].add(h * (damping * y[roots:] - tree.effort))
+    own, slope = tree.forces.smooth(y[roots:])
+    residual = tree.pulled(momenta).at[roots:].add(own)
     by_y = jnp.einsum("mab,mbk->mak", slopes, _twist_slopes(tree, ahead, y, h))
     jacobian = jnp.einsum("mak,mal->kl", tree.jacobian, by_y)
     places = np.arange(roots, len(y))
-    return residual, jacobian.at[places, places].add(h * damping)
+    return residual, jacobian.at[places, places].add(slope)
+
+
+def rough_of(tree: Tree, inverse_mass: Float[Array, "k k"], h: Float[Array, ""]) -> Rough:
+    """The coordinates of a step with kinks.
+
+    Args:
+        tree: The tree, some of whose laws have kinks.
+        inverse_mass: Inverse of the generalised mass.
+        h: Timestep [s].
+    """
+    rows = 6 * len(tree.chains.layout.free) + np.array(tree.chains.laws.rough, int)
+    weight = jax.lax.stop_gradient(1 / inverse_mass[rows, rows])
+    return Rough(tree.forces.ramps(weight), rows, weight / h, h)
 
 
 def mass_matrix(tree: Tree, mass: Float[Array, " m"], inertia: Float[Array, "m 3 3"]) -> Float[Array, "k k"]:
     """Generalised mass at the start of the step, from masses and inertias [W] of the bodies that move."""
     linear, angular = tree.jacobian[:, :3], tree.jacobian[:, 3:]
-    return jnp.einsum("m,mak,mal->kl", mass, linear, linear) + jnp.einsum(
+    mass_of = jnp.einsum("m,mak,mal->kl", mass, linear, linear) + jnp.einsum(
         "mak,mab,mbl->kl", angular, inertia, angular
     )
+    armature = tree.chains.laws.armature
+    if armature is None:
+        return mass_of
+    places = np.arange(mass_of.shape[0] - armature.shape[0], mass_of.shape[0])
+    return mass_of.at[places, places].add(armature)
 
 
 def tree_mobilities(tree: Tree, mass: Float[Array, " m"], inertia: Float[Array, "m 3 3"]):
@@ -146,7 +180,7 @@ def advance_tree(scene: Scene, tree: Tree, state: State, y: Float[Array, " k"], 
         state.orientation.at[hanging].set(ahead.orientation[hanging]).at[free].set(ahead.orientation[free]),
         state.velocity.at[hanging].set(velocity[hanging]).at[free].set(speeds[:, :3]),
         state.omega.at[hanging].set(omega[hanging]).at[free].set(spins),
-        tree.q + h * y[roots:],
+        _moved(tree, y, h),
         y[roots:],
     )
 
@@ -154,10 +188,30 @@ def advance_tree(scene: Scene, tree: Tree, state: State, y: Float[Array, " k"], 
 def turns_too_far(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]) -> Array:
     """Whether joints turn a body by more than a step can tell from a turn the other way."""
     layout = tree.chains.layout
-    hinges = np.array([tree.chains.kinds[j] == "hinge" for j in layout.with_coordinates], bool)
-    turns = jnp.where(hinges, jnp.abs(h * y[6 * len(layout.free) :]), 0)
+    moved = h * y[6 * len(layout.free) :]
+    turns = jnp.zeros((len(layout.dofs),), y.dtype)
+    for kind, part in (("hinge", 0), ("planar", 2)):
+        rows = [(d, k) for d, (j, i, k) in enumerate(layout.dofs) if layout.kinds[j] == kind and i == part]
+        at, places = np.array(rows, int).reshape(-1, 2).T
+        joints = np.array([layout.dofs[d][0] for d in at], int)
+        turns = turns.at[at].set(jnp.abs(tree.chains.ratio[joints] * moved[places]))
+    balls, first = joints_of(layout, "ball")
+    if balls.size:
+        at = np.array([d for d, (j, i, _) in enumerate(layout.dofs) if j in balls and i == 0], int)
+        turns = turns.at[at].set(safe_norm(moved[triples(first)]))
     moved_by = np.array(layout.moved_by, float).reshape(layout.bodies, -1)
     return jnp.any(jnp.asarray(moved_by, y.dtype) @ turns > _LARGEST_TURN)
+
+
+def _moved(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]) -> Float[Array, " j"]:
+    """Joint coordinates after a step with generalised velocities y."""
+    own = y[6 * len(tree.chains.layout.free) :]
+    q = tree.q + h * own
+    _, first = joints_of(tree.chains.layout, "ball")
+    if not first.size:
+        return q
+    places = triples(first)
+    return q.at[places].set(quat_log(turned(quat_exp(tree.q[places]), own[places], h)))
 
 
 def _ahead(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]) -> Poses:
@@ -168,7 +222,7 @@ def _ahead(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]) -> Poses:
     spins = jax.vmap(lambda r, w: matvec(r.T, w))(quat_to_matrix(tree.orientation[free]), speeds[:, 3:])
     position = tree.position.at[free].add(h * speeds[:, :3])
     orientation = tree.orientation.at[free].set(turned(tree.orientation[free], spins, h))
-    return place_links(tree.chains, position, orientation, tree.q + h * y[roots:])
+    return place_links(tree.chains, position, orientation, _moved(tree, y, h))
 
 
 def _world_twists(
@@ -209,10 +263,25 @@ def _twist_slopes(
     turns = jax.vmap(lambda r, a: matmul(matmul(r, a), r.T))(rotations, halves)
     slopes = link_jacobian(tree.chains, ahead)[moving]
     # Generalised velocities act for h; spins of roots turn the end of the step by the inverse of the above.
-    columns = [slopes[:, :, 6 * len(layout.free) :] * h]
+    own = slopes[:, :, 6 * len(layout.free) :]
+    columns = [_with_balls(tree, own, y[6 * len(layout.free) :], h)]
     for place, body in reversed(list(enumerate(free))):
         mine = slopes[:, :, 6 * place : 6 * place + 6]
         inverse = inverse3(turns[layout.moving.index(int(body))])
         columns = [mine[:, :, :3] * h, jnp.einsum("mab,bc->mac", mine[:, :, 3:], inverse), *columns]
     slopes = jnp.concatenate(columns, axis=2)
     return jnp.concatenate([slopes[:, :3] / h, jnp.einsum("mab,mbk->mak", turns, slopes[:, 3:])], axis=1)
+
+
+def _with_balls(tree: Tree, slopes: Float[Array, "m 6 j"], v: Float[Array, " j"], h: Float[Array, ""]):
+    """Derivative of the end of a step by the joints' velocities from the Jacobian there.
+
+    A ball's velocity ω turns the end by A(ω)⁻¹, seen from the start; the Jacobian is seen from the end.
+    """
+    columns = slopes * h
+    for place in joints_of(tree.chains.layout, "ball")[1]:
+        three = slice(int(place), int(place) + 3)
+        back = quat_to_matrix(turned(jnp.eye(4, dtype=v.dtype)[0], v[three], h)).T
+        turn = matmul(back, inverse3(turn_slopes(v[three], h)))
+        columns = columns.at[:, :, three].set(jnp.einsum("mab,bc->mac", slopes[:, :, three], turn))
+    return columns

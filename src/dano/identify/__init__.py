@@ -6,6 +6,7 @@ from dano.identify._identify import (
     identify as identify,
     Minimum as Minimum,
 )
+from dano.identify._joint_log import motion_of_joints as motion_of_joints
 from dano.identify._motion import Motion as Motion
 from dano.identify._motion_files import load_motion as load_motion, save_motion as save_motion
 from dano.identify._parameters import Parameter as Parameter

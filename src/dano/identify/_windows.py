@@ -400,6 +400,9 @@ def _control_rows(scene: Scene, controls: list[Control | None], first_step, n_st
                 row[: len(part)] = part
         return jnp.asarray(table, scene.timestep.dtype)
 
-    driven = any(control is not None and control.effort is not None for control in controls)
-    effort = rows("effort", (scene.layout.n_joints,)) if driven else None
-    return Control(rows("force", bodies), rows("torque", bodies), effort)
+    of_joints = {
+        name: rows(name, (scene.layout.n_joints,))
+        for name in ("effort", "command")
+        if any(control is not None and getattr(control, name) is not None for control in controls)
+    }
+    return Control(rows("force", bodies), rows("torque", bodies), **of_joints)

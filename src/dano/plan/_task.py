@@ -303,9 +303,9 @@ class Task(eqx.Module):
                 )
             i = scene.index(part.body)
             joint = layout.joint_of(i)
-            if kind in ("effort", "q", "v") and (joint is None or layout.coordinates[joint] < 0):
+            if kind in ("effort", "q", "v") and (joint is None or layout.width(joint) != 1):
                 raise ValueError(
-                    f"{kind} of {part.body!r} must be that of a joint with a coordinate, got a body without"
+                    f"{kind} of {part.body!r} must be that of a joint with one coordinate, got a body without"
                 )
             if isinstance(part, Actuator) and i not in layout.moving:
                 raise ValueError(f"actuator must drive a body that moves, got the fixed {part.body!r}")

@@ -10,13 +10,17 @@ from dano.scene._frames import (
     Chains as Chains,
     filled as filled,
     Frames as Frames,
+    joints_of as joints_of,
     link_jacobian as link_jacobian,
     place_links as place_links,
     Poses as Poses,
     RESOLVED as RESOLVED,
     step_twists as step_twists,
+    triples as triples,
 )
+from dano.scene._joint_laws import JointLaws as JointLaws
 from dano.scene._joints import joined as joined, Joint as Joint, JOINT_KINDS as JOINT_KINDS, Layout as Layout
+from dano.scene._motors import Motor as Motor, MOTOR_KINDS as MOTOR_KINDS
 from dano.scene._others import Others as Others
 from dano.scene._scene import Scene as Scene
 from dano.scene._states import (

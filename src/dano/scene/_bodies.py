@@ -114,7 +114,10 @@ class Body(eqx.Module):
             properties = geometry.mass
         elif isinstance(geometry, AbstractShape):
             self.shape = geometry
-            properties = None if mass is None else _homogeneous(name, geometry, float(np.asarray(mass)))
+            if mass is not None and inertia is not None and com is not None:
+                properties = MassProperties(mass, com, inertia)
+            else:
+                properties = None if mass is None else _homogeneous(name, geometry, float(np.asarray(mass)))
         else:
             raise ValueError(
                 f"geometry of body {name!r} must be a NeuralObject or a shape, "

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.maths import quat_conjugate, quat_exp, quat_multiply, quat_rotate
+from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
+from dano.scene._joint_laws import joint_laws, JointLaws
 from dano.scene._joints import Joint, Layout
 from dano.scene._states import State
 
@@ -41,23 +42,30 @@ class Chains(eqx.Module):
 
     Attributes:
         layout: The layout.
-        kinds: Of the joints.
-        axis: See `Joint`, as are the next four; shape (j, 3).
+        axis: See `Joint`, as are the next five; shape (j, 3).
         anchor: Points on the axes.
         position: Origins at q = 0.
         orientation: At q = 0.
-        damping: Shape (j,).
+        ratio: Of joints that mimic others; one of the others. Shape (j,).
+        shift: The same; zero of the others.
+        laws: What acts on the coordinates.
         com: Centres of mass of all bodies [m, F].
     """
 
     layout: Layout = eqx.field(static=True)
-    kinds: tuple[str, ...] = eqx.field(static=True)
     axis: Float[Array, "j 3"]
     anchor: Float[Array, "j 3"]
     position: Float[Array, "j 3"]
     orientation: Float[Array, "j 4"]
-    damping: Float[Array, " j"]
+    ratio: Float[Array, " j"]
+    shift: Float[Array, " j"]
+    laws: JointLaws
     com: Float[Array, "n 3"]
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Of the joints."""
+        return self.layout.kinds
 
 
 class Poses(NamedTuple):
@@ -83,14 +91,26 @@ def chains_of(layout: Layout, joints: Sequence[Joint], com: Float[Array, "n 3"])
         name: jnp.stack([getattr(joint, name) for joint in joints]) if joints else jnp.zeros((0, size))
         for name, size in names.items()
     }
-    damping = jnp.stack([joint.damping for joint in joints]) if joints else jnp.zeros(0)
+    for name, usual in (("ratio", 1.0), ("shift", 0.0)):
+        given = [getattr(joint, name) if joint.mimics else jnp.asarray(usual) for joint in joints]
+        arrays[name] = jnp.stack([x.astype(com.dtype) for x in given]) if joints else jnp.zeros(0)
     return Chains(
         layout,
-        tuple(joint.kind for joint in joints),
         **{name: x.astype(com.dtype) for name, x in arrays.items()},
-        damping=damping.astype(com.dtype),
+        laws=joint_laws(layout, joints, com.dtype),
         com=com,
     )
+
+
+def joints_of(layout: Layout, kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Which joints are of a kind, and the first coordinate of each."""
+    rows = [j for j, each in enumerate(layout.kinds) if each == kind]
+    return np.array(rows, int), np.array([layout.coordinates[j] for j in rows], int)
+
+
+def triples(places: np.ndarray) -> np.ndarray:
+    """Places of the three coordinates of ball or planar joints from their first ones, shape (m, 3)."""
+    return places[:, None] + np.arange(3)
 
 
 def place_links(
@@ -112,6 +132,18 @@ def place_links(
     moves = np.array([kind == "slide" for kind in chains.kinds], bool)
     # A weld reads some coordinate and counts it nought times.
     value = q[np.maximum(layout.coordinates, 0)] if layout.n_joints else jnp.zeros(len(turns), q.dtype)
+    if any(layout.follows):
+        value = chains.ratio * value + chains.shift
+    turn = jnp.where(turns, value, 0)[:, None] * chains.axis
+    path = jnp.where(moves, value, 0)[:, None] * chains.axis
+    balls, first = joints_of(layout, "ball")
+    if balls.size:
+        turn = turn.at[balls].set(q[triples(first)])
+    planes, first = joints_of(layout, "planar")
+    if planes.size:
+        own = q[triples(first)]
+        turn = turn.at[planes].set(own[:, 2:] * chains.axis[planes])
+        path = path.at[planes].set(jnp.einsum("ma,mab->mb", own[:, :2], _plane_axes(chains, planes)))
     # The world is the last row.
     origin = jnp.concatenate([position - quat_rotate(orientation, chains.com), jnp.zeros((1, 3), q.dtype)])
     turned = jnp.concatenate([orientation, jnp.array([[1.0, 0.0, 0.0, 0.0]], q.dtype)])
@@ -122,14 +154,12 @@ def place_links(
         parent = turned[parents]
         rest = quat_multiply(parent, chains.orientation[rows])
         along = quat_rotate(rest, chains.axis[rows])
-        path = jnp.where(moves[rows], value[rows], 0)[:, None] * along
-        angle = jnp.where(turns[rows], value[rows], 0)[:, None]
-        child = quat_multiply(rest, quat_exp(angle * chains.axis[rows]))
+        child = quat_multiply(rest, quat_exp(turn[rows]))
         point = (
             origin[parents]
             + quat_rotate(parent, chains.position[rows])
             + quat_rotate(rest, chains.anchor[rows])
-            + path
+            + quat_rotate(rest, path[rows])
         )
         turned = turned.at[children].set(child)
         origin = origin.at[children].set(point - quat_rotate(child, chains.anchor[rows]))
@@ -160,14 +190,55 @@ def link_jacobian(chains: Chains, poses: Poses) -> Float[Array, "n 6 k"]:
         # v = v₀ + ω₀ × arm
         crossed = jnp.cross(jnp.asarray(eye, dtype)[None], arm[:, None])
         roots = roots.at[bodies, :3, places, 3:].set(crossed.transpose(0, 2, 1))
-    rows = np.array(layout.with_coordinates, int)
-    turns = np.array([chains.kinds[j] == "hinge" for j in rows], bool)[None, :, None]
+    rows = np.array([j for j, _, _ in layout.dofs], int)
+    turns = np.array([_turns(layout, j, part) for j, part, _ in layout.dofs], bool)[None, :, None]
     moved = np.array(layout.moved_by, bool).reshape(n, len(rows), 1)
-    axis = poses.axis[rows][None]
+    axis = _directions(chains, poses)[None]
     levers = poses.position[:, None] - poses.pivot[rows][None]
     linear = jnp.where(turns, jnp.cross(axis, levers), axis)
     columns = jnp.concatenate([jnp.where(moved, linear, 0), jnp.where(moved & turns, axis, 0)], axis=2)
+    if any(layout.follows):
+        # What a coordinate moves by itself, and what moves with it.
+        places = np.array([place for _, _, place in layout.dofs])
+        share = jnp.zeros((len(rows), layout.n_joints), dtype)
+        share = share.at[np.arange(len(rows)), places].set(chains.ratio[rows])
+        columns = jnp.einsum("nda,dk->nka", columns, share)
     return jnp.concatenate([roots.reshape(n, 6, 6 * f), columns.transpose(0, 2, 1)], axis=2)
+
+
+def _turns(layout: Layout, joint: int, part: int) -> bool:
+    kind = layout.kinds[joint]
+    return kind in ("hinge", "ball") or (kind == "planar" and part == 2)
+
+
+def _directions(chains: Chains, poses: Poses) -> Float[Array, "d 3"]:
+    """Axis of each motion of the joints [W]."""
+    layout = chains.layout
+    directions = poses.axis[np.array([j for j, _, _ in layout.dofs], int)]
+    index = {(j, part): row for row, (j, part, _) in enumerate(layout.dofs)}
+    # A ball turns about the axes of its child.
+    for j in joints_of(layout, "ball")[0]:
+        q = poses.orientation[layout.children[j]]
+        axes = quat_rotate(q[None], jnp.eye(3, dtype=q.dtype))
+        directions = directions.at[np.array([index[j, part] for part in range(3)])].set(axes)
+    for j in joints_of(layout, "planar")[0]:
+        parent = layout.parents[j]
+        rest = chains.orientation[j]
+        if parent < layout.bodies:
+            rest = quat_multiply(poses.orientation[parent], rest)
+        axes = quat_rotate(rest[None], _plane_axes(chains, np.array([j]))[0])
+        directions = directions.at[np.array([index[j, part] for part in range(2)])].set(axes)
+    return directions
+
+
+def _plane_axes(chains: Chains, rows: np.ndarray) -> Float[Array, "m 2 3"]:
+    """`plane_axes` of planar joints, which may be traced."""
+    axis = chains.axis[rows]
+    eye = jnp.eye(3, dtype=axis.dtype)
+    start = jnp.where((jnp.abs(axis[:, 0]) < 0.99)[:, None], eye[:1], eye[1:2])
+    first = start - jnp.sum(axis * start, axis=1, keepdims=True) * axis
+    first = first / jnp.sqrt(jnp.sum(first * first, axis=1, keepdims=True))
+    return jnp.stack([first, jnp.cross(axis, first)], axis=1)
 
 
 def step_twists(
@@ -204,13 +275,19 @@ def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:
     # Where the roots were a step before.
     moves = np.zeros((layout.bodies, 1))
     moves[list(layout.free)] = 1
-    half = 0.5 * h * moves * state.omega
-    back = jnp.concatenate([jnp.sqrt(1 - jnp.sum(half * half, axis=-1, keepdims=True)), -half], axis=-1)
+    moves = jnp.asarray(moves, h.dtype)
+    back = _small_turn(-h * moves * state.omega)
+    q = state.q - h * state.v
+    _, first = joints_of(layout, "ball")
+    if first.size:
+        places = triples(first)
+        turned = quat_multiply(quat_exp(state.q[places]), _small_turn(-h * state.v[places]))
+        q = q.at[places].set(quat_log(turned))
     earlier = place_links(
         chains,
         state.position - h * moves * state.velocity,
         quat_multiply(state.orientation, back),
-        state.q - h * state.v,
+        q,
     )
     velocity, omega = step_twists(earlier[:2], now[:2], h)
     return dataclasses.replace(
@@ -222,6 +299,12 @@ def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:
     )
 
 
+def _small_turn(angle: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
+    """The turn of a step with h ω, as in `dano.step`."""
+    half = 0.5 * angle
+    return jnp.concatenate([jnp.sqrt(1 - jnp.sum(half * half, axis=-1, keepdims=True)), half], axis=-1)
+
+
 def joint_values(chains: Chains, state: State) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """Coordinates q and velocities v of the joints from the poses and velocities of bodies.
 
@@ -230,7 +313,6 @@ def joint_values(chains: Chains, state: State) -> tuple[Float[Array, " k"], Floa
     """
     layout = chains.layout
     rows = np.array(layout.with_coordinates, int)
-    turns = np.array([chains.kinds[j] == "hinge" for j in rows], bool)
     parents, children = np.array(layout.parents, int)[rows], np.array(layout.children, int)[rows]
     dtype = state.position.dtype
 
@@ -250,11 +332,24 @@ def joint_values(chains: Chains, state: State) -> tuple[Float[Array, " k"], Floa
     point = origin[children] + quat_rotate(turned[children], anchor)
     stands = origin[parents] + quat_rotate(turned[parents], chains.position[rows]) + quat_rotate(rest, anchor)
     along = quat_rotate(rest, axis)
-    length = jnp.sum(along * (point - stands), axis=1)
+    way = point - stands
     speeds = [velocity[body] + jnp.cross(spin[body], point - centre[body]) for body in (children, parents)]
-    rate = jnp.sum(along * (spin[children] - spin[parents]), axis=1)
-    sliding = jnp.sum(along * (speeds[0] - speeds[1]), axis=1)
-    return jnp.where(turns, angle, length), jnp.where(turns, rate, sliding)
+    turning, moving = spin[children] - spin[parents], speeds[0] - speeds[1]
+    turns = np.array([chains.kinds[j] != "slide" for j in rows], bool)
+    q = jnp.where(turns, angle, jnp.sum(along * way, axis=1))
+    v = jnp.where(turns, jnp.sum(along * turning, axis=1), jnp.sum(along * moving, axis=1))
+    _, first = joints_of(layout, "ball")
+    if first.size:
+        q = q.at[triples(first)].set(quat_log(relative[first]))
+        own = quat_rotate(quat_conjugate(turned[children[first]]), turning[first])
+        v = v.at[triples(first)].set(own)
+    planes, first = joints_of(layout, "planar")
+    if first.size:
+        axes = quat_rotate(rest[first][:, None], _plane_axes(chains, planes))
+        places = triples(first)[:, :2]
+        q = q.at[places].set(jnp.einsum("mab,mb->ma", axes, way[first]))
+        v = v.at[places].set(jnp.einsum("mab,mb->ma", axes, moving[first]))
+    return q, v
 
 
 def frames_of(chains: Chains, state: State) -> Frames:

@@ -10,26 +10,43 @@ from jaxtyping import Array, Float
 
 from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
 from dano.names import did_you_mean
+from dano.scene._motors import checked_limits, Motor
 
-JOINT_KINDS = ("hinge", "slide", "weld")
-"""What a joint lets its child do: turn about an axis, move along it, or nothing."""
+JOINT_KINDS = ("hinge", "slide", "weld", "ball", "planar")
+"""What a joint lets its child do: turn about an axis, move along it, nothing, turn about a point, slide on a
+plane and turn in it."""
+WIDTHS = {"hinge": 1, "slide": 1, "weld": 0, "ball": 3, "planar": 3}
+"""How many coordinates a joint of each kind has."""
 
 
 class Joint(eqx.Module):
     """A joint by which one body (child) hangs on another (parent) or on the world.
 
     A hinge has an angle [rad] as its coordinate q, a slide a length [m]; a weld has none, so that welded
-    bodies are one rigid body of several geometries.
+    bodies are one rigid body of several geometries. The q of a ball is a rotation vector [rad], from the
+    orientation at q = 0 to that of the child; its v is the child's spin against the parent [rad/s, F of the
+    child]. A planar joint has two lengths in the plane across its axis [m], and the angle about it [rad].
+    The lengths are along the projection of x on the plane (of y where the axis lies within 8° of x), and
+    along what completes it and the axis to a right-handed frame.
 
     Attributes:
         parent: Name of the body that carries the joint; None for the world.
         child: Name of the body that hangs on it.
-        kind: "hinge", "slide" or "weld".
-        axis: Unit direction of the axis [F of the child].
-        anchor: A point of the child on the axis [m, F of the child].
+        kind: "hinge", "slide", "weld", "ball" or "planar".
+        axis: Unit direction of the axis [F of the child]; a ball has none.
+        anchor: A point of the child on the axis, or the centre of the ball [m, F of the child].
         position: Origin of the child's field frame at q = 0 [m, F of the parent, or W].
         orientation: Of the child's field frame at q = 0, wxyz, to the parent's field frame or W.
         damping: Torque [N m s/rad] or force [N s/m] against the joint's speed, per speed.
+        limits: Least and largest q of a hinge or slide [rad or m], which stops there without a rebound.
+        friction: Torque [N m] or force [N] up to which the joint sticks, and with which it slips.
+        armature: Inertia [kg m²] or mass [kg] of what turns with the joint, such as rotors through gears.
+        stiffness: Of a spring [N m/rad or N/m], which pulls to `rest`.
+        rest: q at which the spring is slack [rad or m].
+        mimics: Child of the joint whose coordinate moves this one, too: q = ratio · q of that + shift.
+        ratio: See `mimics`.
+        shift: See `mimics` [rad or m].
+        motor: What turns commands into torques or forces.
     """
 
     parent: str | None = eqx.field(static=True)
@@ -40,6 +57,15 @@ class Joint(eqx.Module):
     position: Float[Array, "3"]
     orientation: Float[Array, "4"]
     damping: Float[Array, ""]
+    limits: Float[Array, "2"] | None
+    friction: Float[Array, ""] | None
+    armature: Float[Array, ""] | None
+    stiffness: Float[Array, ""] | None
+    rest: Float[Array, ""]
+    mimics: str | None = eqx.field(static=True)
+    ratio: Float[Array, ""]
+    shift: Float[Array, ""]
+    motor: Motor | None
 
     def __init__(
         self,
@@ -52,12 +78,21 @@ class Joint(eqx.Module):
         position: Numbers = (0.0, 0.0, 0.0),
         orientation: Numbers = (1.0, 0.0, 0.0, 0.0),
         damping: Numbers = 0.0,
+        limits: Numbers | None = None,
+        friction: Numbers | None = None,
+        armature: Numbers | None = None,
+        stiffness: Numbers | None = None,
+        rest: Numbers = 0.0,
+        mimics: str | None = None,
+        ratio: Numbers = 1.0,
+        shift: Numbers = 0.0,
+        motor: Motor | None = None,
     ):
         """A joint of two bodies of a scene; see the attributes.
 
         Raises:
             ValueError: If the kind is unknown, a body hangs on itself, the axis or the orientation is zero, a
-                shape is wrong, or the damping is negative.
+                shape is wrong, a number is out of range, or the kind has no such thing.
         """
         if kind not in JOINT_KINDS:
             raise ValueError(f"kind must be one of {', '.join(JOINT_KINDS)}, got {kind!r}")
@@ -73,9 +108,45 @@ class Joint(eqx.Module):
         self.anchor = checked_array(f"anchor {what}", anchor, (3,))
         self.position = checked_array(f"position {what}", position, (3,))
         self.orientation = checked_quaternion(f"orientation {what}", orientation)
-        self.damping = checked_array(f"damping {what}", damping, ())
-        if not is_traced(self.damping) and float(self.damping) < 0:
-            raise ValueError(f"damping {what} must be ≥ 0, got {float(self.damping)}")
+        self.damping = _not_negative(f"damping {what}", damping)
+        self.friction, self.armature, self.stiffness = (
+            None if value is None else _not_negative(f"{name} {what}", value)
+            for name, value in (("friction", friction), ("armature", armature), ("stiffness", stiffness))
+        )
+        self.limits = None if limits is None else checked_limits(f"limits {what}", limits)
+        self.rest = checked_array(f"rest {what}", rest, ())
+        self.ratio = checked_array(f"ratio {what}", ratio, ())
+        self.shift = checked_array(f"shift {what}", shift, ())
+        if motor is not None and not isinstance(motor, Motor):
+            raise ValueError(f"motor {what} must be a dano.Motor, got {type(motor).__name__}")
+        self.mimics, self.motor = mimics, motor
+        self._check_kind(what)
+
+    def _check_kind(self, what: str) -> None:
+        """Raise a ValueError if the joint has something that its kind, or one that follows, has not."""
+        given = [name for name in _LAWS if getattr(self, name) is not None]
+        single = WIDTHS[self.kind] == 1
+        if self.kind == "weld" and (given or self.mimics):
+            raise ValueError(f"joint of {self.child!r} is a weld, which has no {given or 'mimics'}")
+        if not single and (self.mimics or self.limits is not None or self.motor is not None):
+            raise ValueError(f"limits, mimics and motor {what} need a hinge or a slide, got a {self.kind}")
+        if self.mimics and (bad := [name for name in given if name not in ("friction", "armature")]):
+            raise ValueError(f"{bad[0]} {what} must be given to {self.mimics!r}, whose coordinate it mimics")
+
+    @property
+    def width(self) -> int:
+        """How many coordinates of its own the joint has."""
+        return 0 if self.mimics else WIDTHS[self.kind]
+
+
+_LAWS = ("limits", "friction", "armature", "stiffness", "motor")
+
+
+def _not_negative(name: str, value: Numbers) -> Float[Array, ""]:
+    array = checked_array(name, value, ())
+    if not is_traced(array) and float(array) < 0:
+        raise ValueError(f"{name} must be ≥ 0, got {float(array)}")
+    return array
 
 
 class Layout(NamedTuple):
@@ -91,10 +162,14 @@ class Layout(NamedTuple):
         free: Those of them that hang on no joint.
         parents: Of each joint the body that carries it; the number of bodies for the world.
         children: Of each joint the body that hangs on it.
-        coordinates: Of each joint its place among q, or −1 for a weld.
+        coordinates: Of each joint the first place of its own among q, or −1 for a weld; of one that mimics
+            another the place of that.
+        kinds: Of the joints.
+        follows: Whether each mimics another.
+        dofs: What joints let bodies do: joint, which of its motions, and place among q of each.
         levels: Joints by their distance from the root of their tree.
         roots: Of each body the place in `free` of the one that its tree stands on, or −1.
-        moved_by: Whether a joint moves a body: joints with coordinates as columns, shape (bodies, joints).
+        moved_by: Whether a motion of `dofs` moves a body, shape (bodies, dofs).
     """
 
     bodies: int
@@ -103,6 +178,9 @@ class Layout(NamedTuple):
     parents: tuple[int, ...]
     children: tuple[int, ...]
     coordinates: tuple[int, ...]
+    kinds: tuple[str, ...]
+    follows: tuple[bool, ...]
+    dofs: tuple[tuple[int, int, int], ...]
     levels: tuple[tuple[int, ...], ...]
     roots: tuple[int, ...]
     moved_by: tuple[tuple[bool, ...], ...]
@@ -110,7 +188,7 @@ class Layout(NamedTuple):
     @property
     def n_joints(self) -> int:
         """Number of joint coordinates q."""
-        return sum(k >= 0 for k in self.coordinates)
+        return 1 + max((place for _, _, place in self.dofs), default=-1)
 
     @property
     def n_velocities(self) -> int:
@@ -119,8 +197,16 @@ class Layout(NamedTuple):
 
     @property
     def with_coordinates(self) -> tuple[int, ...]:
-        """Joints that have a coordinate, in the order of q."""
-        return tuple(j for j, k in enumerate(self.coordinates) if k >= 0)
+        """The joint of each coordinate, in the order of q."""
+        owners: dict[int, int] = {}
+        for joint, _, place in self.dofs:
+            if not self.follows[joint]:
+                owners[place] = joint
+        return tuple(owners[place] for place in range(self.n_joints))
+
+    def width(self, joint: int) -> int:
+        """How many coordinates of its own a joint has."""
+        return 0 if self.follows[joint] else WIDTHS[self.kinds[joint]]
 
     def joint_of(self, body: int) -> int | None:
         """The joint on which a body hangs, or None."""
@@ -156,32 +242,32 @@ def joined(joints: Sequence[Joint]) -> Callable[[str, str], bool]:
 def layout_of(
     names: tuple[str, ...],
     fixed: tuple[bool, ...],
-    joints: tuple[tuple[str | None, str, str], ...],
+    joints: tuple[tuple[str | None, str, str, str | None], ...],
 ) -> Layout:
     """The layout of bodies and joints.
 
     Args:
         names: Names of the bodies.
         fixed: Whether each is fixed.
-        joints: Parent, child and kind of each joint.
+        joints: Parent, child and kind of each joint, and the child of the joint that it mimics.
 
     Raises:
         ValueError: If a joint names an unknown body, a body hangs on two joints or is fixed and hangs on one,
-            or bodies hang on each other in a circle.
+            bodies hang on each other in a circle, or a joint mimics none that has one coordinate.
     """
     index = {name: i for i, name in enumerate(names)}
-    for parent, child, _ in joints:
+    for parent, child, _, _ in joints:
         for name in (parent, child):
             if name is not None and name not in index:
                 hint = did_you_mean(name, names)
                 raise ValueError(f"joint must name bodies of the scene {list(names)}, got {name!r}{hint}")
         if fixed[index[child]]:
             raise ValueError(f"joint must carry a body that moves, got the fixed {child!r}")
-    children = tuple(index[child] for _, child, _ in joints)
+    children = tuple(index[child] for _, child, _, _ in joints)
     for i in children:
         if children.count(i) > 1:
             raise ValueError(f"body {names[i]!r} must hang on one joint, got {children.count(i)}")
-    parents = tuple(len(names) if parent is None else index[parent] for parent, _, _ in joints)
+    parents = tuple(len(names) if parent is None else index[parent] for parent, _, _, _ in joints)
     hangs = dict(zip(children, zip(parents, range(len(joints)), strict=True), strict=True))
     chains: list[list[int]] = []
     roots = []
@@ -197,13 +283,39 @@ def layout_of(
                 raise ValueError(f"joints must make trees, got a circle through {names[i]!r}")
         chains.append(chain)
         roots.append(free.index(at) if at in free else -1)
-    count = iter(range(len(joints)))
-    coordinates = tuple(-1 if kind == "weld" else next(count) for _, _, kind in joints)
-    numbered = [j for j, k in enumerate(coordinates) if k >= 0]
+    coordinates, dofs = _coordinates(joints)
     depth = [len(chains[child]) for child in children]
     levels = tuple(
         tuple(j for j in range(len(joints)) if depth[j] == level + 1)
         for level in range(max(depth, default=0))
     )
-    moved_by = tuple(tuple(j in chain for j in numbered) for chain in chains)
-    return Layout(len(names), moving, free, parents, children, coordinates, levels, tuple(roots), moved_by)
+    moved_by = tuple(tuple(j in chain for j, _, _ in dofs) for chain in chains)
+    kinds = tuple(kind for _, _, kind, _ in joints)
+    follows = tuple(bool(mimics) for *_, mimics in joints)
+    hanging = (parents, children, coordinates, kinds, follows, dofs)
+    return Layout(len(names), moving, free, *hanging, levels, tuple(roots), moved_by)
+
+
+def _coordinates(joints: Sequence[tuple[str | None, str, str, str | None]]):
+    """First coordinate of each joint, and all motions: joint, which of its own, place among q.
+
+    Raises:
+        ValueError: If a joint mimics none that has one coordinate.
+    """
+    first, count = [], 0
+    for _, _, kind, mimics in joints:
+        width = 0 if mimics else WIDTHS[kind]
+        first.append(count if width else -1)
+        count += width
+    leads = {c: j for j, (_, c, kind, mimics) in enumerate(joints) if WIDTHS[kind] == 1 and not mimics}
+    for j, (_, child, _, mimics) in enumerate(joints):
+        if not mimics:
+            continue
+        if mimics not in leads:
+            raise ValueError(
+                f"mimics of the joint of {child!r} must name one of {list(leads)}, whose joints have one "
+                f"coordinate of their own, got {mimics!r}"
+            )
+        first[j] = first[leads[mimics]]
+    dofs = tuple((j, k, first[j] + k) for j, joint in enumerate(joints) for k in range(WIDTHS[joint[2]]))
+    return tuple(first), dofs

@@ -17,6 +17,7 @@ from dano.scene._bodies import Body, checked_parts
 from dano.scene._contacts import Contact, prepared
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
 from dano.scene._joints import Joint, Layout, layout_of
+from dano.scene._motors import Motor
 from dano.scene._others import Others, others_of
 from dano.scene._states import check_precision, Control, JOINT_QUANTITIES, State, STATE_SIZES
 
@@ -134,6 +135,11 @@ class Scene(eqx.Module):
         """The trees that bodies and joints make, as arrays."""
         com = jnp.stack([body.com + body.com_offset for body in self.bodies])
         return chains_of(self.layout, self.joints, com.astype(self.timestep.dtype))
+
+    @property
+    def driven(self) -> bool:
+        """Whether a motor drives a joint."""
+        return any(joint.motor is not None for joint in self.joints)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -260,8 +266,8 @@ class Scene(eqx.Module):
                 checked_inertia(key, value)
         return eqx.tree_at(lambda s: [getattr(s.bodies[i], key) for key in keys], self, values)
 
-    def replace_joint(self, child: str, **changes: Numbers) -> "Scene":
-        """The scene with some of a joint's `axis, anchor, position, orientation, damping` changed.
+    def replace_joint(self, child: str, **changes: Numbers | Motor | None) -> "Scene":
+        """The scene with some of a joint's numbers changed: all but its bodies, its kind and what it mimics.
 
         Args:
             child: Name of the body that hangs on the joint.
@@ -273,7 +279,8 @@ class Scene(eqx.Module):
         children = [joint.child for joint in self.joints]
         if child not in children:
             raise ValueError(f"joint must carry one of {children}, got {child!r}")
-        valid = ["axis", "anchor", "position", "orientation", "damping"]
+        fixed = ("parent", "child", "kind", "mimics")
+        valid = [name for name in Joint.__dataclass_fields__ if name not in fixed]
         for key in changes:
             if key not in valid:
                 raise ValueError(f"joint property must be one of {valid}, got {key!r}")
@@ -284,8 +291,9 @@ class Scene(eqx.Module):
     def initial_state(self, /, **bodies: dict[str, Numbers]) -> State:
         """A state: bodies by keyword, each a dict of `position, orientation, velocity, omega`.
 
-        Bodies on joints have `q` and `v` instead: angle [rad] and rate, or length [m] and rate. Bodies that
-        are not named rest at the origin, or at q = 0. Orientations are normalised.
+        Bodies on joints have `q` and `v` instead: angle [rad] and rate, or length [m] and rate; three numbers
+        of a ball or a planar joint, see `Joint`. Bodies that are not named rest at the origin, or at q = 0.
+        Orientations are normalised.
 
         Raises:
             ValueError: If a body or quantity is unknown, a shape is wrong, a number is not finite, or a
@@ -345,13 +353,17 @@ class Scene(eqx.Module):
         return frames_of(self.chains, state)
 
     def _joint_values(self, bodies: dict[str, dict[str, Numbers]], keys: Sequence[str]) -> dict[str, Array]:
-        """Numbers of the joints that have a coordinate, given by their bodies' names; zero by default."""
-        names = [self.joints[j].child for j in self.layout.with_coordinates]
+        """Numbers of the joints that have coordinates, given by their bodies' names; zero by default."""
+        names = [(joint.child, joint.width) for joint in self.joints if joint.width]
         dtype = self.timestep.dtype
+
+        def numbers(key: str, name: str, width: int) -> Array:
+            shape = () if width == 1 else (width,)
+            given = bodies.get(name, {}).get(key, 0.0 if width == 1 else (0.0,) * width)
+            return jnp.atleast_1d(checked_array(f"{key} of {name!r}", given, shape)).astype(dtype)
+
         return {
-            key: jnp.asarray(
-                [checked_array(f"{key} of {n!r}", bodies.get(n, {}).get(key, 0.0), ()) for n in names]
-            ).astype(dtype)
+            key: jnp.concatenate([numbers(key, *name) for name in names] or [jnp.zeros(0, dtype)])
             for key in keys
         }
 
@@ -389,7 +401,8 @@ class Scene(eqx.Module):
     def control(self, /, **bodies: dict[str, Numbers]) -> Control:
         """Control for one step: bodies by keyword, each a dict of `force` [N, W] and `torque` [N m, W].
 
-        Bodies on joints may have `effort`, the torque [N m] or force [N] of the joint.
+        Bodies on joints may have `effort`, the torque [N m] or force [N] of the joint, and where a motor
+        drives it `command`. Those of a ball or a planar joint are three numbers.
 
         Raises:
             ValueError: If a body or quantity is unknown or a shape is wrong.
@@ -401,16 +414,21 @@ class Scene(eqx.Module):
         for i, name in enumerate(self.names):
             given = bodies.get(name, {})
             joint = layout.joint_of(i)
-            driven = joint is not None and layout.coordinates[joint] >= 0
+            driven = joint is not None and layout.width(joint) > 0
             valid = [*rows, *(["effort"] if driven else [])]
+            if joint is not None and self.joints[joint].motor is not None:
+                valid.append("command")
             for key in given:
                 if key not in valid:
                     raise ValueError(f"control of {name!r} must be given by {valid}, got {key!r}")
             for key, values in rows.items():
                 value = checked_array(f"{key} of {name!r}", given.get(key, (0.0,) * 3), (3,))
                 values.append(value.astype(self.timestep.dtype))
-        effort = self._joint_values(bodies, ["effort"])["effort"] if self.joints else None
-        return Control(jnp.stack(rows["force"]), jnp.stack(rows["torque"]), effort)
+        of_joints: dict[str, Array] = {}
+        if self.joints:
+            keys = ("effort", "command") if self.driven else ("effort",)
+            of_joints = self._joint_values(bodies, keys)
+        return Control(jnp.stack(rows["force"]), jnp.stack(rows["torque"]), **of_joints)
 
 
 def _structure(bodies: Sequence[Body], joints: Sequence[Joint]):
@@ -418,7 +436,7 @@ def _structure(bodies: Sequence[Body], joints: Sequence[Joint]):
     return (
         tuple(body.name for body in bodies),
         tuple(body.fixed for body in bodies),
-        tuple((joint.parent, joint.child, joint.kind) for joint in joints),
+        tuple((joint.parent, joint.child, joint.kind, joint.mimics) for joint in joints),
     )
 
 
@@ -477,7 +495,7 @@ def _state_keys(layout: Layout, body: int) -> list[str]:
     joint = layout.joint_of(body)
     if joint is None:
         return list(STATE_SIZES)
-    return list(JOINT_QUANTITIES) if layout.coordinates[joint] >= 0 else []
+    return list(JOINT_QUANTITIES) if layout.width(joint) else []
 
 
 def _check_apart(layout: Layout, names: list[str], contact: Contact) -> None:

@@ -14,7 +14,7 @@ _REPORTED = ("residuals", "iterations", "converged")
 STATE_SIZES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 """Quantities of a state, and how many numbers each has per body."""
 JOINT_QUANTITIES = ("q", "v")
-"""Quantities of a state that joints have, one number each."""
+"""Quantities of a state that joints have, one number for each coordinate."""
 
 
 class State(eqx.Module):
@@ -66,11 +66,13 @@ class Control(eqx.Module):
         torque: [N m, W], shape (n, 3).
         effort: Torque [N m] or force [N] of each joint between the bodies that it joins, shape (k,); None
             for none.
+        command: Of the motors, see `Motor`, at the places of their joints, shape (k,); None for zeros.
     """
 
     force: Float[Array, "*t n 3"]
     torque: Float[Array, "*t n 3"]
     effort: Float[Array, "*t k"] | None = None
+    command: Float[Array, "*t k"] | None = None
 
 
 class Trajectory(eqx.Module):

@@ -19,8 +19,10 @@ from dano.maths import Pose
 from dano.memory import memory_limit
 from dano.names import did_you_mean
 from dano.objects import MassModel, NeuralObject
+from dano.robots import Robot
 from dano.scene import Body, Contact, joined, Joint, JOINT_KINDS, JOINT_QUANTITIES, Scene, State
 from dano.scene_file._objects import asset_look, build_asset, build_object, Progress
+from dano.scene_file._robots import read_robots, robot_files
 from dano.scene_file._schedule import read_schedule, Schedule
 from dano.scene_file._table import located, Table
 
@@ -42,6 +44,7 @@ _STATE = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 _GEOMETRY = ("object", "field", "asset", "shape")
 _BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE, *JOINT_QUANTITIES)
 _JOINT = {"axis": 3, "anchor": 3, "position": 3, "orientation": 4}
+_JOINT_NUMBERS = ("damping", "friction", "armature", "stiffness", "rest", "ratio", "shift")
 # The mass of a body is a key of the body.
 _BUILD = tuple(field.name for field in dataclasses.fields(BuildOptions) if field.name != "mass")
 _PARAMS = tuple(ContactParams.__dataclass_fields__)
@@ -84,6 +87,7 @@ _TOP = (
     "n_steps",
     "bodies",
     "joints",
+    "robots",
     "contacts",
     "default_contact",
     "controls",
@@ -116,9 +120,12 @@ class SceneFile:
 
     def inputs(self) -> list[Path]:
         """Files that the scene is made of."""
-        rows = tomllib.loads(self.text)["bodies"]
+        data = tomllib.loads(self.text)
+        rows = data.get("bodies", [])
         named = [row[kind] for row in rows for kind in ("object", "field") if kind in row]
-        return [self.path, *(self.path.parent / Path(name).expanduser() for name in named)]
+        folder = self.path.parent
+        files = [folder / Path(name).expanduser() for name in named]
+        return [self.path, *files, *robot_files(data, folder)]
 
     def looks(self) -> dict[str, "LearnedField"]:
         """What bodies look like whose objects' files say so, by name: for pictures.
@@ -200,24 +207,30 @@ def parse_scene(
         raise ValueError(f"{path}: n_steps must be ≥ 1, got {steps}")
     gravity = top.vector("gravity", 3, (0.0, 0.0, -9.81))
     tables = top.tables("bodies")
-    if not tables:
+    robots = read_robots(top, path.parent)
+    if not tables and not robots:
         raise ValueError(f"{path}: needs at least one [[bodies]] table")
-    most = 2 * memory_limit() // (_BYTES_PER_STEP * len(tables))
+    n_bodies = len(tables) + sum(len(robot.bodies) for robot, _ in robots)
+    most = 2 * memory_limit() // (_BYTES_PER_STEP * n_bodies)
     if steps > most:
         raise ValueError(
-            f"{path}: duration and n_steps must make at most {most} steps of {len(tables)} bodies,"
+            f"{path}: duration and n_steps must make at most {most} steps of {n_bodies} bodies,"
             f" got {steps:.6g} of {h:.6g} s"
         )
 
     built: dict[object, NeuralObject] = {}
     rows = [Table(f"{path}: [[bodies]] {i + 1}", table, None) for i, table in enumerate(tables)]
     bodies = [_body(row, path.parent, built, progress) for row in rows]
-    joints = _joints(top, [body.name for body in bodies])
-    contacts = _contacts(top, bodies, joints, default_law)
+    bodies += [body for robot, _ in robots for body in robot.bodies]
+    joints = [joint for robot, _ in robots for joint in robot.joints]
+    joints += _joints(top, [body.name for body in bodies])
+    contacts = _contacts(top, bodies, joints, default_law, [robot for robot, _ in robots])
     with located(str(path)):
         scene = Scene.create(bodies, contacts, joints=joints, timestep=h, gravity=gravity)
         given = (*_STATE, *JOINT_QUANTITIES)
         start = {row["name"]: {key: row[key] for key in given if key in row} for row in tables}
+        for robot, q in robots:
+            start |= robot.start(q)
         state = scene.initial_state(**start)
     objects = {
         row["name"]: row["asset"] if "asset" in row else path.parent / Path(row["object"]).expanduser()
@@ -327,7 +340,9 @@ def _joints(top: Table, names: Sequence[str]) -> list[Joint]:
     joints = []
     for i, row in enumerate(top.tables("joints")):
         table = Table(
-            f"{top.where}: [[joints]] {i + 1}", row, ("parent", "child", "kind", *_JOINT, "damping")
+            f"{top.where}: [[joints]] {i + 1}",
+            row,
+            ("parent", "child", "kind", *_JOINT, "limits", *_JOINT_NUMBERS, "mimics"),
         )
         child = table.word("child", names)
         table.where += f" ({child!r})"
@@ -335,11 +350,18 @@ def _joints(top: Table, names: Sequence[str]) -> list[Joint]:
         options: dict[str, Any] = {key: table.vector(key, n) for key, n in _JOINT.items() if key in table}
         with located(table.where):
             kind = table.word("kind", JOINT_KINDS, "hinge")
-            joints.append(Joint(parent, child, kind, damping=table.number("damping", 0.0), **options))
+            options |= {key: table.number(key) for key in _JOINT_NUMBERS if key in table}
+            if "limits" in table:
+                options["limits"] = table.vector("limits", 2)
+            if "mimics" in table:
+                options["mimics"] = table.word("mimics", names)
+            joints.append(Joint(parent, child, kind, **options))
     return joints
 
 
-def _contacts(top: Table, bodies: Sequence[Body], joints: Sequence[Joint], default_law: str) -> list[Contact]:
+def _contacts(
+    top: Table, bodies: Sequence[Body], joints: Sequence[Joint], default_law: str, robots: Sequence[Robot]
+) -> list[Contact]:
     default = top.table("default_contact", _CONTACT)
     default.where = f"{top.where}: [default_contact]"
     usual = _law_name(default, default_law)
@@ -351,6 +373,7 @@ def _contacts(top: Table, bodies: Sequence[Body], joints: Sequence[Joint], defau
             for a, b in pairs
             if a.name != b.name
             and not apart(a.name, b.name)
+            and _may_meet(a.name, b.name, robots)
             and _can_touch(a, b, presses=_LAWS[usual][0]().presses)
         ]
     if isinstance(top.data["contacts"], str):
@@ -372,6 +395,15 @@ def _contacts(top: Table, bodies: Sequence[Body], joints: Sequence[Joint], defau
         table.data = {**inherited, **row}
         contacts.append(_contact(table, law, a, b))
     return contacts
+
+
+def _may_meet(a: str, b: str, robots: Sequence[Robot]) -> bool:
+    """Whether bodies have shapes to touch with, and are not links of one robot."""
+    for robot in robots:
+        own = [body.name for body in robot.bodies]
+        if (a in own and b in own) or any(x in own and x not in robot.touching for x in (a, b)):
+            return False
+    return True
 
 
 def _law_name(table: Table, default: str) -> str:

@@ -102,7 +102,7 @@ def read_schedule(top: Table, scene: Scene) -> Schedule | None:
         if ("target" in row) != ("stiffness" in row):
             raise ValueError(f"{row.where}: target [m] and stiffness [N/m] must be given together")
         joint = layout.joint_of(index)
-        place = -1 if joint is None else layout.coordinates[joint]
+        place = layout.coordinates[joint] if joint is not None and layout.width(joint) == 1 else -1
         if "effort" in row and place < 0:
             raise ValueError(f"{row.where}: effort needs a body on a hinge or a slide")
         zero = (0.0, 0.0, 0.0)

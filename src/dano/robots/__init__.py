@@ -1,0 +1,30 @@
+"""Robots: files of links and joints in, bodies and joints of a scene out; kinematics and dynamics."""
+
+from dano.robots._build import (
+    build_robot as build_robot,
+    load_mjcf as load_mjcf,
+    load_urdf as load_urdf,
+    read_robot as read_robot,
+)
+from dano.robots._description import (
+    Connection as Connection,
+    Description as Description,
+    Link as Link,
+    Placed as Placed,
+    Solid as Solid,
+)
+from dano.robots._dynamics import (
+    bias_forces as bias_forces,
+    computed_torque as computed_torque,
+    generalised_velocities as generalised_velocities,
+    gravity_forces as gravity_forces,
+    joint_control as joint_control,
+    mass_matrix as mass_matrix,
+)
+from dano.robots._inspect import robot_doubts as robot_doubts, robot_tree as robot_tree
+from dano.robots._inverse import (
+    inverse_kinematics as inverse_kinematics,
+    InverseKinematics as InverseKinematics,
+    Target as Target,
+)
+from dano.robots._robot import Robot as Robot

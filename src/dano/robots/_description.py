@@ -1,0 +1,184 @@
+"""What a robot's file says: links, what joins them, and what they look like; plain numbers."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from dano.names import did_you_mean
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A place in a frame: position [m] and orientation, wxyz."""
+
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)
+    orientation: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A geometry of a link.
+
+    Attributes:
+        kind: "box" (half extents), "sphere" (radius), "cylinder" and "capsule" (radius, half length),
+            "ellipsoid" (half axes), "mesh" (scales along its axes).
+        numbers: Its measures [m], or scales [1].
+        place: In the frame of the link.
+        path: Of a mesh.
+    """
+
+    kind: str
+    numbers: tuple[float, ...]
+    place: Placed = Placed()
+    path: Path | None = None
+
+
+@dataclass(frozen=True)
+class Link:
+    """A link of a robot.
+
+    Attributes:
+        name: Unique among links.
+        mass: [kg]; 0 for a link that is only a frame.
+        com: Centre of mass [m, frame of the link].
+        inertia: About it [kg m², axes of the link], shape (3, 3).
+        solids: What it touches with.
+        visuals: What it looks like.
+    """
+
+    name: str
+    mass: float = 0.0
+    com: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    inertia: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
+    solids: tuple[Solid, ...] = ()
+    visuals: tuple[Solid, ...] = ()
+
+
+@dataclass(frozen=True)
+class Connection:
+    """A joint of a robot.
+
+    Attributes:
+        name: Unique among joints.
+        kind: "hinge", "slide", "weld", "ball", "planar" or "floating".
+        parent: Link that carries it.
+        child: Link that hangs on it.
+        place: Of the child's frame at q = 0, in the parent's.
+        axis: In the child's frame.
+        anchor: A point of the axis [m, child's frame].
+        limits: Least and largest q [rad or m]; None without.
+        effort: Largest torque or force [N m or N]; infinite without.
+        damping: [N m s/rad or N s/m].
+        friction: [N m or N].
+        armature: [kg m² or kg].
+        stiffness: Of a spring [N m/rad or N/m].
+        rest: Where it is slack.
+        mimics: Name of the joint that it follows, ratio, shift; None if it does not.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    place: Placed = Placed()
+    axis: tuple[float, ...] = (0.0, 0.0, 1.0)
+    anchor: tuple[float, ...] = (0.0, 0.0, 0.0)
+    limits: tuple[float, float] | None = None
+    effort: float = float("inf")
+    damping: float = 0.0
+    friction: float = 0.0
+    armature: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
+    mimics: tuple[str, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Description:
+    """A robot's file.
+
+    Attributes:
+        name: Of the robot.
+        source: The file.
+        links: All links.
+        joints: All joints.
+    """
+
+    name: str
+    source: Path
+    links: tuple[Link, ...]
+    joints: tuple[Connection, ...]
+
+    def link(self, name: str) -> Link:
+        """A link by name."""
+        return next(link for link in self.links if link.name == name)
+
+    def checked(self) -> "Description":
+        """This description, if its joints make one tree of its links.
+
+        Raises:
+            ValueError: If names are missing, double or unknown, a link hangs on two joints, links hang on
+                each other in a circle, there are two roots, or a joint mimics none.
+        """
+        where = str(self.source)
+        names = _unique(where, "link", [link.name for link in self.links])
+        joints = _unique(where, "joint", [joint.name for joint in self.joints])
+        if not names:
+            raise ValueError(f"{where}: a robot needs at least one link, got none")
+        hangs: dict[str, str] = {}
+        for joint in self.joints:
+            for role in ("parent", "child"):
+                link = getattr(joint, role)
+                if link not in names:
+                    hint = did_you_mean(link, names)
+                    raise ValueError(
+                        f"{where}: {role} of joint {joint.name!r} must be a link, got {link!r}{hint}"
+                    )
+            if joint.child in hangs:
+                raise ValueError(f"{where}: link {joint.child!r} must hang on one joint, got two")
+            hangs[joint.child] = joint.parent
+        for name in names:
+            at, seen = name, 0
+            while at in hangs:
+                at, seen = hangs[at], seen + 1
+                if seen > len(names):
+                    raise ValueError(f"{where}: joints must make a tree, got a circle through link {name!r}")
+        roots = [name for name in names if name not in hangs]
+        if len(roots) > 1:
+            raise ValueError(
+                f"{where}: a robot must have one root link, got {len(roots)}: {', '.join(roots)}"
+            )
+        self._check_mimics(where, joints)
+        return self
+
+    def _check_mimics(self, where: str, names: list[str]) -> None:
+        kinds = {joint.name: joint for joint in self.joints}
+        for joint in self.joints:
+            if joint.mimics is None:
+                continue
+            leader = joint.mimics[0]
+            if leader not in names:
+                hint = did_you_mean(leader, names)
+                raise ValueError(f"{where}: joint {joint.name!r} must mimic a joint, got {leader!r}{hint}")
+            if kinds[leader].kind not in ("hinge", "slide") or joint.kind not in ("hinge", "slide"):
+                raise ValueError(
+                    f"{where}: joint {joint.name!r} must mimic a joint with one coordinate, got {leader!r}, "
+                    f"a {kinds[leader].kind}"
+                )
+            seen, follows = {joint.name}, kinds[leader].mimics
+            while follows is not None and leader in kinds:
+                if leader in seen:
+                    raise ValueError(f"{where}: joints must not mimic each other in a circle, got {leader!r}")
+                seen.add(leader)
+                leader = follows[0]
+                follows = kinds[leader].mimics if leader in kinds else None
+
+
+def _unique(where: str, what: str, names: list[str]) -> list[str]:
+    for name in names:
+        if not name:
+            raise ValueError(f"{where}: a {what} must have a name, got {name!r}")
+        if names.count(name) > 1:
+            raise ValueError(f"{where}: {what}s must have different names, got {name!r} twice")
+    return names

@@ -1,0 +1,140 @@
+"""Mass, bias and gravity of trees in their own coordinates, and torques that follow from them.
+
+With generalised velocities v (see `Frames`): M(q) v̇ + b(q, v) = τ, where b holds Coriolis, centrifugal and
+gravity terms. Springs, friction, damping, limits and motors of joints are no part of b.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.maths import Numbers, quat_exp, quat_log, quat_multiply
+from dano.scene import Control, joints_of, Scene, State, triples
+
+
+def mass_matrix(scene: Scene, state: State) -> Float[Array, "k k"]:
+    """Generalised mass M(q) [kg, kg m, kg m²], armature of joints included.
+
+    Raises:
+        ValueError: If the state does not fit the scene.
+    """
+    mass, inertia, rows = _masses(scene)
+    jacobian = scene.frames(state).jacobian[rows]
+    linear, angular = jacobian[:, :3], jacobian[:, 3:]
+    whole = jnp.einsum("m,mak,mal->kl", mass, linear, linear) + jnp.einsum(
+        "mak,mab,mbl->kl", angular, inertia, angular
+    )
+    armature = scene.chains.laws.armature
+    if armature is None:
+        return whole
+    places = np.arange(whole.shape[0] - armature.shape[0], whole.shape[0])
+    return whole.at[places, places].add(armature)
+
+
+def bias_forces(scene: Scene, state: State) -> Float[Array, " k"]:
+    """b(q, v) [N, N m]: what it takes to move on without acceleration.
+
+    Raises:
+        ValueError: If the state does not fit the scene.
+    """
+    scene.check_state(state)
+    mass, inertia, rows = _masses(scene)
+    speeds = generalised_velocities(scene, state)
+
+    def twists(share: Float[Array, ""]) -> tuple[Array, Array]:
+        frames = scene.frames(_drifted(scene, state, share))
+        moved = frames.jacobian @ speeds
+        return moved[:, :3], moved[:, 3:]
+
+    zero, one = jnp.zeros((), scene.timestep.dtype), jnp.ones((), scene.timestep.dtype)
+    (_, omega), (acceleration, turning) = jax.jvp(twists, (zero,), (one,))
+    jacobian = scene.frames(state).jacobian[rows]
+    force = mass[:, None] * (acceleration[rows] - scene.gravity[None])
+    spin = jnp.einsum("mab,mb->ma", inertia, omega[rows])
+    torque = jnp.einsum("mab,mb->ma", inertia, turning[rows]) + jnp.cross(omega[rows], spin)
+    return _pulled(jacobian, force, torque)
+
+
+def gravity_forces(scene: Scene, state: State) -> Float[Array, " k"]:
+    """What it takes to hold still against gravity [N, N m]: b(q, 0).
+
+    Raises:
+        ValueError: If the state does not fit the scene.
+    """
+    mass, _, rows = _masses(scene)
+    jacobian = scene.frames(state).jacobian[rows]
+    force = -mass[:, None] * scene.gravity[None]
+    return _pulled(jacobian, force, jnp.zeros_like(force))
+
+
+def computed_torque(scene: Scene, state: State, acceleration: Numbers) -> Float[Array, " k"]:
+    """Generalised forces that give accelerations: M(q) v̇ + b(q, v) [N, N m].
+
+    Args:
+        scene: The scene.
+        state: Where it is and how it moves.
+        acceleration: v̇ [m/s², rad/s²], shape (k,).
+
+    Raises:
+        ValueError: If the state does not fit the scene, or the accelerations are not k numbers.
+    """
+    wanted = jnp.asarray(acceleration, scene.timestep.dtype)
+    if wanted.shape != (scene.layout.n_velocities,):
+        raise ValueError(f"acceleration must have shape ({scene.layout.n_velocities},), got {wanted.shape}")
+    return mass_matrix(scene, state) @ wanted + bias_forces(scene, state)
+
+
+def joint_control(scene: Scene, effort: Float[Array, " k"]) -> Control:
+    """The control of a step with efforts of all joint coordinates [N m or N].
+
+    Args:
+        scene: The scene.
+        effort: Of the joints alone, or generalised forces, whose last entries are those of the joints.
+    """
+    still = jnp.zeros((len(scene.bodies), 3), scene.timestep.dtype)
+    return Control(still, still, effort[effort.shape[0] - scene.layout.n_joints :])
+
+
+def generalised_velocities(scene: Scene, state: State) -> Float[Array, " k"]:
+    """Velocity [m/s, W] and omega [rad/s, B] of the bodies that move freely, then v of the joints."""
+    free = np.array(scene.layout.free, int)
+    speeds = jnp.concatenate([state.velocity[free], state.omega[free]], axis=1).ravel()
+    return speeds if state.v is None else jnp.concatenate([speeds, state.v])
+
+
+def _masses(scene: Scene) -> tuple[Float[Array, " m"], Float[Array, "m 3 3"], np.ndarray]:
+    """Mass [kg] and inertia [kg m², B] of the bodies that move, and which they are."""
+    rows = np.array(scene.layout.moving, int)
+    bodies = [scene.bodies[i] for i in rows]
+    dtype = scene.timestep.dtype
+    mass = jnp.stack([body.mass * body.mass_scale for body in bodies]).astype(dtype)
+    inertia = jnp.stack([body.inertia * body.mass_scale for body in bodies]).astype(dtype)
+    return mass, inertia, rows
+
+
+def _pulled(jacobian: Float[Array, "m 6 k"], force: Array, torque: Array) -> Float[Array, " k"]:
+    return jnp.einsum("mak,ma->k", jacobian, jnp.concatenate([force, torque], axis=1))
+
+
+def _drifted(scene: Scene, state: State, share: Float[Array, ""]) -> State:
+    """The state after a short time [s] with its velocities, to first order."""
+    free = np.array(scene.layout.free, int)
+    moved = dataclasses.replace(
+        state,
+        position=state.position.at[free].add(share * state.velocity[free]),
+        orientation=state.orientation.at[free].set(
+            quat_multiply(state.orientation[free], quat_exp(share * state.omega[free]))
+        ),
+    )
+    if state.q is None or state.v is None:
+        return moved
+    q = state.q + share * state.v
+    _, first = joints_of(scene.layout, "ball")
+    if first.size:
+        places = triples(first)
+        turned = quat_multiply(quat_exp(state.q[places]), quat_exp(share * state.v[places]))
+        q = q.at[places].set(quat_log(turned))
+    return dataclasses.replace(moved, q=q)

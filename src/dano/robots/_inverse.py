@@ -1,0 +1,196 @@
+"""Inverse kinematics: joint coordinates within limits that bring links to where they should be."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.maths import checked_array, checked_quaternion, Numbers, quat_conjugate, quat_log, quat_multiply
+from dano.names import did_you_mean
+from dano.robots._robot import Robot
+from dano.scene import Scene, State
+from dano.solvers import bounded_least_squares, NormalEquations
+
+
+class Target(eqx.Module):
+    """Where a link should be; what is None is left free.
+
+    Attributes:
+        link: Name in the robot's file.
+        position: Of the link's frame [m, W].
+        orientation: wxyz.
+        weight: What a metre counts for, and 1/length [1/m] times a radian.
+        length: What turns angles into lengths [m].
+    """
+
+    link: str = eqx.field(static=True)
+    position: Float[Array, "3"] | None
+    orientation: Float[Array, "4"] | None
+    weight: Float[Array, ""]
+    length: Float[Array, ""]
+
+    def __init__(
+        self,
+        link: str,
+        position: Numbers | None = None,
+        orientation: Numbers | None = None,
+        *,
+        weight: Numbers = 1.0,
+        length: Numbers = 0.3,
+    ):
+        """A target; see the attributes.
+
+        Raises:
+            ValueError: If neither a position nor an orientation is given, or a number is wrong.
+        """
+        if position is None and orientation is None:
+            raise ValueError(f"target of link {link!r} must have a position or an orientation, got neither")
+        self.link = link
+        what = f"of link {link!r}"
+        self.position = None if position is None else checked_array(f"position {what}", position, (3,))
+        self.orientation = (
+            None if orientation is None else checked_quaternion(f"orientation {what}", orientation)
+        )
+        self.weight = checked_array(f"weight {what}", weight, ())
+        self.length = checked_array(f"length {what}", length, ())
+
+
+class InverseKinematics(NamedTuple):
+    """What inverse kinematics found.
+
+    Attributes:
+        state: The state, which rests.
+        reached: Whether all targets are met to 0.1 mm and 1e-3 rad.
+        position_errors: Distance of each target [m]; NaN where it has no position.
+        angle_errors: Angle of each target [rad]; NaN where it has no orientation.
+        at_limits: Coordinates that lie on a limit.
+        reason: Why the search ended.
+    """
+
+    state: State
+    reached: bool
+    position_errors: np.ndarray
+    angle_errors: np.ndarray
+    at_limits: tuple[int, ...]
+    reason: str
+
+
+def inverse_kinematics(
+    robot: Robot,
+    scene: Scene,
+    state: State,
+    targets: Sequence[Target],
+    *,
+    posture: Numbers | None = None,
+    posture_weight: float = 1e-4,
+    max_iterations: int = 100,
+) -> InverseKinematics:
+    """Joint coordinates that bring links to targets, within the joints' limits.
+
+    Minimises Σ (weight · distance)² + (weight · length · angle)² by bounded least squares. What the targets
+    leave free goes to the posture. It finds the minimum next to where it starts, and says what it missed.
+
+    Args:
+        robot: The robot.
+        scene: A scene with it.
+        state: Where to start. Bodies that move freely stay where they are.
+        targets: At least one.
+        posture: Coordinates q to stay near to, shape (k,); default those of `state`.
+        posture_weight: What a radian or metre away from the posture counts for; small against the targets.
+        max_iterations: Of the least squares.
+
+    Raises:
+        ValueError: If there is no target, a link is unknown, or a shape is wrong.
+    """
+    if not targets:
+        raise ValueError("targets must hold at least one, got none")
+    for target in targets:
+        if target.link not in robot.frames:
+            hint = did_you_mean(target.link, robot.frames)
+            raise ValueError(f"target must name one of {list(robot.frames)}, got {target.link!r}{hint}")
+    scene.check_state(state)
+    if state.q is None or not scene.layout.n_joints:
+        raise ValueError("scene must have joints with coordinates to move, got none")
+    k = scene.layout.n_joints
+    near = state.q if posture is None else checked_array("posture", posture, (k,))
+    lower, upper = _limits(scene)
+    start = np.clip(np.asarray(state.q, float), lower, upper)
+    resting = dataclasses.replace(state, v=jnp.zeros_like(state.q))
+    dtype = scene.timestep.dtype
+
+    def linearize(x: np.ndarray, blocks: object) -> NormalEquations:
+        q = jnp.asarray(x, dtype)
+        missed, slope = _linearized(robot.place, scene, resting, tuple(targets), q)
+        residual = np.concatenate([missed, posture_weight * (x - np.asarray(near, float))])
+        rows = np.concatenate([slope, posture_weight * np.eye(k)])
+        none = np.zeros((0, 0))
+        empty = (np.zeros((0, 0)), np.zeros((0, 0, 0)), np.zeros((0, 0, k)), none.ravel())
+        return NormalEquations(0.5 * float(residual @ residual), rows.T @ residual, rows.T @ rows, *empty)
+
+    solution = bounded_least_squares(
+        linearize, start, lower=lower, upper=upper, max_iterations=max_iterations, tolerance=1e-12
+    )
+    found = scene.filled(dataclasses.replace(resting, q=jnp.asarray(solution.x, dtype)))
+    errors = np.array([_errors(robot, scene, found, target) for target in targets])
+    tight = np.flatnonzero((solution.x <= lower) | (solution.x >= upper))
+    met = bool(np.nanmax(errors[:, 0], initial=0) <= 1e-4 and np.nanmax(errors[:, 1], initial=0) <= 1e-3)
+    return InverseKinematics(
+        found, met, errors[:, 0], errors[:, 1], tuple(map(int, tight)), solution.stop.value
+    )
+
+
+def _limits(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    limits = scene.chains.laws.limits
+    k = scene.layout.n_joints
+    if limits is None:
+        return np.full(k, -np.inf), np.full(k, np.inf)
+    lower, upper = np.asarray(limits, float).T
+    return lower, upper
+
+
+def _linearized(place, scene: Scene, state: State, targets: tuple[Target, ...], q):
+    """What is missed, and its derivative by q; as NumPy."""
+    missed, slope = _missed(place, scene, state, targets, q)
+    return np.asarray(missed, float), np.asarray(slope, float)
+
+
+@eqx.filter_jit
+def _missed(place, scene: Scene, state: State, targets: tuple[Target, ...], q):
+    def of(q):
+        return jnp.concatenate(
+            [
+                part
+                for target in targets
+                for part in _parts(place, scene, dataclasses.replace(state, q=q), target)
+            ]
+        )
+
+    return of(q), jax.jacfwd(of)(q)
+
+
+def _parts(place, scene: Scene, state: State, target: Target) -> list[Array]:
+    position, orientation, _ = place(scene, state, target.link)
+    dtype, parts = position.dtype, []
+    weight = target.weight.astype(dtype)
+    if target.position is not None:
+        parts.append(weight * (position - target.position.astype(dtype)))
+    if target.orientation is not None:
+        turn = quat_log(quat_multiply(quat_conjugate(target.orientation.astype(dtype)), orientation))
+        parts.append(weight * target.length.astype(dtype) * turn)
+    return parts
+
+
+def _errors(robot: Robot, scene: Scene, state: State, target: Target) -> tuple[float, float]:
+    position, orientation, _ = robot.place(scene, state, target.link)
+    distance = angle = float("nan")
+    if target.position is not None:
+        distance = float(jnp.linalg.norm(position - target.position))
+    if target.orientation is not None:
+        turn = quat_log(quat_multiply(quat_conjugate(target.orientation), orientation))
+        angle = float(jnp.linalg.norm(turn))
+    return distance, angle

@@ -1,0 +1,56 @@
+"""Robots of scene files."""
+
+from pathlib import Path
+from typing import Any
+
+from dano.maths import Pose
+from dano.robots import load_mjcf, load_urdf, Robot
+from dano.scene_file._table import is_number, located, Table
+
+_FORMATS = {"urdf": load_urdf, "mjcf": load_mjcf}
+_KEYS = (*_FORMATS, "base", "prefix", "collision", "joints")
+
+
+def read_robots(top: Table, folder: Path) -> list[tuple[Robot, dict[str, float]]]:
+    """The robots of a scene file, and where their joints start.
+
+    Raises:
+        ValueError: If a table is wrong, or a robot's file is.
+    """
+    return [
+        _robot(Table(f"{top.where}: [[robots]] {i + 1}", row, _KEYS), folder)
+        for i, row in enumerate(top.tables("robots"))
+    ]
+
+
+def robot_files(data: dict[str, Any], folder: Path) -> list[Path]:
+    """The files of the robots of a scene file."""
+    return [
+        folder / Path(row[kind]).expanduser()
+        for row in data.get("robots", [])
+        for kind in _FORMATS
+        if kind in row
+    ]
+
+
+def _robot(table: Table, folder: Path) -> tuple[Robot, dict[str, float]]:
+    kinds = [kind for kind in _FORMATS if kind in table]
+    if len(kinds) != 1:
+        raise ValueError(f"{table.where}: needs exactly one of {', '.join(_FORMATS)}, got {kinds or 'none'}")
+    path = folder / Path(table.word(kinds[0])).expanduser()
+    base: Pose | str | None = None
+    if isinstance(table.data.get("base"), str):
+        base = table.word("base", ("floating",))
+    elif "base" in table:
+        place = table.table("base", ("position", "orientation"))
+        base = Pose(
+            place.vector("position", 3, (0.0,) * 3), place.vector("orientation", 4, (1.0, 0.0, 0.0, 0.0))
+        )
+    prefix = table.word("prefix") if "prefix" in table else ""
+    with located(table.where):
+        robot = _FORMATS[kinds[0]](path, base=base, prefix=prefix, collision=table.boolean("collision", True))
+        joints = table.table("joints", list(robot.joint_names)).data
+        for name, value in joints.items():
+            if not is_number(value):
+                raise ValueError(f"joints: {name} must be a finite number [rad or m], got {value!r}")
+    return robot, {name: float(value) for name, value in joints.items()}
