@@ -1,0 +1,45 @@
+"""Bodies whose place of touch wanders, against rigid equations of rolling without slip at high order."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import dano
+from benchmarks.contact._no_slip import ellipsoid_contact, rim_contact, Roller
+
+RIGID = 1e6
+COIN = Roller(0.05, 0.05 * 0.03**2 * np.diag([0.2515, 0.2515, 0.5]), rim_contact(0.03, 0.002))
+AXES = (0.08, 0.02, 0.012)
+SKEW = Rotation.from_euler("z", np.radians(8.0)).as_matrix()
+STONE = Roller(0.1, SKEW @ (0.02 * np.diag([5.44e-4, 6.544e-3, 6.8e-3])) @ SKEW.T, ellipsoid_contact(AXES))
+
+
+@pytest.mark.parametrize(
+    ("roller", "shape", "tilt", "omega", "seconds", "tolerance"),
+    [
+        (COIN, dano.Cylinder(0.03, 0.002), np.pi / 2 - 0.25, (0.0, 0.0, 20.0), 0.4, 0.01),
+        (STONE, dano.Ellipsoid(AXES), 0.0, (0.2, 0.2, -5.0), 0.6, 0.03),
+    ],
+    ids=["coin", "rattleback"],
+)
+def test_rolls_as_rigid_equations_say(roller, shape, tilt, omega, seconds, tolerance):
+    """A coin in a narrowing circle, and a stone that comes to turn the other way round; steps of 2 ms."""
+    h = 0.002
+    body = dano.Body("body", shape, mass=roller.mass, inertia=roller.inertia, com=np.zeros(3))
+    floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
+
+    def scene_with(**params):
+        params = dano.ContactParams(sliding_friction=1.0, restitution=1.0, hysteresis=0.0, **params)
+        return dano.Scene.create([body, floor], [dano.Contact("body", "floor", params)], timestep=h)
+
+    stiffness = RIGID * float(scene_with().contacts[0].params.stiffness)
+    scene = scene_with(stiffness=stiffness)
+    start = Rotation.from_euler("y", tilt).as_matrix(), np.array(omega)
+    steps = round(seconds / h)
+    run = dano.simulate(scene, scene.initial_state(body=roller.start(*start)), steps)
+    assert bool(jnp.all(run.converged))
+    _, rotations, _ = roller.roll(*start, h * np.arange(steps + 1))
+    found = Rotation.from_quat(np.asarray(run.states.orientation[:, 0]), scalar_first=True)
+    turned = (Rotation.from_matrix(rotations).inv() * found).magnitude()
+    assert turned.max() < tolerance * np.pi
