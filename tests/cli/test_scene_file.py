@@ -492,7 +492,7 @@ def test_joints_of_a_scene_file(tmp_path):
     ("old", "new", "message"),
     [
         ('child = "knob"', 'child = "nob"', "'nob'; did you mean 'knob'"),
-        ('kind = "weld"', 'kind = "ball"', "kind must be one of 'hinge', 'slide', 'weld', got 'ball'"),
+        ('kind = "weld"', 'kind = "screw"', "kind must be one of 'hinge', .*, got 'screw'"),
         ("damping = 0.1", "damping = -1", "damping of the joint of 'door' must be ≥ 0"),
         ('body = "door"', 'body = "knob"', "effort needs a body on a hinge or a slide"),
         ("q = -0.4", "position = [0, 0, 1]", "must be given by .'q', 'v'., for it hangs on a joint"),

@@ -381,7 +381,10 @@ def _away(plan: Plan, predicted: State, key: str) -> np.ndarray:
     )
     if key == "position":
         return np.linalg.norm(here - seen, axis=-1)
-    return np.linalg.norm(quat_log(quat_multiply(quat_conjugate(seen), here)), axis=-1)
+    between = quat_multiply(quat_conjugate(seen), here)
+    # Frames without an observation hold zeros, which are no rotation.
+    between = np.where((between**2).sum(axis=-1, keepdims=True) > 0, between, np.array([1.0, 0, 0, 0]))
+    return np.linalg.norm(quat_log(between), axis=-1)
 
 
 def _missed(scene: Scene, motions: Sequence[Motion], errors: Errors) -> str | None:
