@@ -144,15 +144,7 @@ def rough_of(tree: Tree, inverse_mass: Float[Array, "k k"], h: Float[Array, ""])
 
 def mass_matrix(tree: Tree, mass: Float[Array, " m"], inertia: Float[Array, "m 3 3"]) -> Float[Array, "k k"]:
     """Generalised mass at the start of the step, from masses and inertias [W] of the bodies that move."""
-    linear, angular = tree.jacobian[:, :3], tree.jacobian[:, 3:]
-    mass_of = jnp.einsum("m,mak,mal->kl", mass, linear, linear) + jnp.einsum(
-        "mak,mab,mbl->kl", angular, inertia, angular
-    )
-    armature = tree.chains.laws.armature
-    if armature is None:
-        return mass_of
-    places = np.arange(mass_of.shape[0] - armature.shape[0], mass_of.shape[0])
-    return mass_of.at[places, places].add(armature)
+    return tree.chains.mass_matrix(tree.jacobian, mass, inertia)
 
 
 def tree_mobilities(tree: Tree, mass: Float[Array, " m"], inertia: Float[Array, "m 3 3"]):

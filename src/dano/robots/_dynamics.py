@@ -22,16 +22,7 @@ def mass_matrix(scene: Scene, state: State) -> Float[Array, "k k"]:
         ValueError: If the state does not fit the scene.
     """
     mass, inertia, rows = _masses(scene)
-    jacobian = scene.frames(state).jacobian[rows]
-    linear, angular = jacobian[:, :3], jacobian[:, 3:]
-    whole = jnp.einsum("m,mak,mal->kl", mass, linear, linear) + jnp.einsum(
-        "mak,mab,mbl->kl", angular, inertia, angular
-    )
-    armature = scene.chains.laws.armature
-    if armature is None:
-        return whole
-    places = np.arange(whole.shape[0] - armature.shape[0], whole.shape[0])
-    return whole.at[places, places].add(armature)
+    return scene.chains.mass_matrix(scene.frames(state).jacobian[rows], mass, inertia)
 
 
 def bias_forces(scene: Scene, state: State) -> Float[Array, " k"]:

@@ -67,6 +67,26 @@ class Chains(eqx.Module):
         """Of the joints."""
         return self.layout.kinds
 
+    def mass_matrix(
+        self, jacobian: Float[Array, "m 6 k"], mass: Float[Array, " m"], inertia: Float[Array, "m 3 3"]
+    ) -> Float[Array, "k k"]:
+        """Generalised mass, armature of joints included.
+
+        Args:
+            jacobian: Of the bodies that move, see `Frames`.
+            mass: Of these bodies [kg].
+            inertia: Theirs [kg m², W].
+        """
+        linear, angular = jacobian[:, :3], jacobian[:, 3:]
+        whole = jnp.einsum("m,mak,mal->kl", mass, linear, linear) + jnp.einsum(
+            "mak,mab,mbl->kl", angular, inertia, angular
+        )
+        armature = self.laws.armature
+        if armature is None:
+            return whole
+        places = np.arange(whole.shape[0] - armature.shape[0], whole.shape[0])
+        return whole.at[places, places].add(armature)
+
 
 class Poses(NamedTuple):
     """Poses of all bodies, and where the joints are.
