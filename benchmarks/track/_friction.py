@@ -18,14 +18,7 @@ def friction_of(name: str, found: Tracked) -> tuple[float, float]:
         contacts=[dano.Contact(name, "table", dano.ContactParams(sliding_friction=0.5))],
         timestep=1 / 120,
     )
-    motion = Motion.create(
-        found.times,
-        name,
-        position=found.position,
-        orientation=found.orientation,
-        covariance=found.covariance,
-        point="origin",
-    )
+    motion = Motion.from_tracked(found, name)
     friction = dano.Parameter("mu", lambda s: s.contact(name, "table").sliding_friction, 0.02, 1.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)

@@ -2,11 +2,15 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dano.maths import Numbers, quat_conjugate, quat_log, quat_multiply, quat_rotate
 from dano.scene import Trajectory
+
+if TYPE_CHECKING:
+    from dano.vision import Tracked
 
 QUANTITIES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 """What a motion may hold of each body and frame, and how many numbers it has."""
@@ -131,6 +135,18 @@ class Motion:
             velocity=np.asarray(states.velocity)[::every, rows],
             omega=np.asarray(states.omega)[::every, rows],
             lag=0.5 * float(times[1] - times[0]),
+        )
+
+    @classmethod
+    def from_tracked(cls, tracked: "Tracked", name: str) -> "Motion":
+        """Poses of an object that was tracked in a film, with their covariances, as those of a body."""
+        return cls.create(
+            tracked.times,
+            name,
+            position=tracked.position,
+            orientation=tracked.orientation,
+            covariance=tracked.covariance,
+            point="origin",
         )
 
     def part(self, first: int, last: int) -> "Motion":

@@ -58,7 +58,7 @@ def track(command: Track) -> None:
     )
     progress.close()
     name = command.body or Path(command.object).name.split(".")[0]
-    save_motion(command.output, _motion(found, name))
+    save_motion(command.output, Motion.from_tracked(found, name))
     if command.report is not None:
         from dano.report import write_tracking_report
 
@@ -68,17 +68,6 @@ def track(command: Track) -> None:
         put_json(numbers)
         return
     _print(numbers, command)
-
-
-def _motion(found: Tracked, name: str) -> Motion:
-    return Motion.create(
-        found.times,
-        name,
-        position=found.position,
-        orientation=found.orientation,
-        covariance=found.covariance,
-        point="origin",
-    )
 
 
 def _check_camera(command: Track) -> None:
