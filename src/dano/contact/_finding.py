@@ -27,6 +27,7 @@ from dano.contact._geometry import (
     AXIS,
     BALL,
     block_clearance,
+    FASTEST,
     FIXED,
     FROM_Z,
     Geometry,
@@ -44,7 +45,6 @@ from dano.contact._geometry import (
 from dano.contact._kernels import find_natively
 from dano.contact._points import CHUNK, cross, dot, Found, Points, ROUND
 from dano.maths import matmul, matvec
-from dano.native import TURNED
 
 # Blocks whose samples are looked at together.
 _TOGETHER = 8
@@ -53,6 +53,8 @@ _CHUNKS = _BATCH // CHUNK
 # An impact that is to end within the step presses as if a spring pushed the bodies' common mass apart with
 # this many times the stiffness that would turn its motion round in a step.
 _IMPACT = 1e3
+# A sample faces the other way if its normal and that of the solid differ by less than 60°: the cosine.
+_TURNED = 0.5
 
 
 class Impacts(NamedTuple):
@@ -103,7 +105,7 @@ def find(
     room = -(-(capacity + _CHUNKS) // ROUND) * ROUND
     if geometry.tables is not None:
         hits = jnp.stack([impacts.instant.astype(dtype), impacts.speed.astype(dtype)], axis=1)
-        constants = jnp.asarray([_IMPACT, SHARES, ADVANCES, *POLE, *FROM_Z.ravel()], dtype)
+        constants = jnp.asarray([_IMPACT, SHARES, ADVANCES, *POLE, *FROM_Z.ravel(), _TURNED, FASTEST], dtype)
         settings = jnp.append(h.astype(dtype), constants)
         return find_natively(
             geometry.tables, geometry.blocks, geometry.probes, links, hits, settings, capacity, room
@@ -217,7 +219,7 @@ def _rows(
     vectors = matmul(placed.vectors, found[3:])
     area = -dot(vectors, normal)
     size = jnp.sqrt(jnp.maximum(dot(vectors, vectors), 1e-30))
-    other = (distance < 0) & (area < -TURNED * size)
+    other = (distance < 0) & (area < -_TURNED * size)
     area = jnp.maximum(area, 0)
     if turned is None:
         area = jnp.where(other, size, area)

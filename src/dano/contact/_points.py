@@ -89,7 +89,7 @@ class Points(eqx.Module):
         return self.rate - dot(self.normal, self.drift)
 
     @property
-    def creep(self) -> Float[Array, "3 c p"]:
+    def extra_slip(self) -> Float[Array, "3 c p"]:
         """What is added to the slip [m/s, W]."""
         return self.drift - self.normal * dot(self.normal, self.drift)[None]
 
@@ -134,7 +134,7 @@ def point_motion(velocity: Float[Array, "n 3"], spin: Float[Array, "n 3"], point
     """Motion of points at the velocities of all bodies, see `relative_twist`."""
     u, w = (x[:, :, None] for x in relative_twist(velocity, spin, points))
     rate, slip = motion_at(points.arm, points.normal, points.moment, u, w)
-    return Motion(rate, slip + points.creep)
+    return Motion(rate, slip + points.extra_slip)
 
 
 def motion_at(

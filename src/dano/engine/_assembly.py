@@ -42,7 +42,7 @@ class Table(NamedTuple):
     """The points of a step as the sums read them.
 
     Attributes:
-        numbers: Arm, normal, moment, h times area, creep, and the rows of `Constants`, shape (24, c, p).
+        numbers: Arm, normal, moment, h times area, extra slip, and the rows of `Constants`, shape (24, c, p).
         between: See `Points`, shape (3, c).
         first: Row in V of each chunk's first body; as many as there are bodies for one that does not move.
         second: Of its second body.
@@ -99,7 +99,7 @@ def tabulate(
     """
     shape = points.depth.shape
     fixed = [jnp.broadcast_to(x, shape) for x in constants(material, points)]
-    numbers = [points.rows[:9], h * points.area[None], points.creep, jnp.stack(fixed)]
+    numbers = [points.rows[:9], h * points.area[None], points.extra_slip, jnp.stack(fixed)]
     return Table(
         jax.lax.optimization_barrier(jnp.concatenate(numbers)),
         points.between,

@@ -13,10 +13,6 @@ HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER, ELLIPSOID, GRID = range(7)
 """Kinds of solids that the search for contact knows."""
 RUN = 4
 """Blocks of samples that the search looks at together first."""
-FASTEST = 0.5
-"""Turn in a step [rad] from which arms are those of the predicted configuration for all samples."""
-TURNED = 0.5
-"""A sample faces the other way if its normal and that of the solid differ by less than 60°."""
 
 
 @functools.cache

@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-from dano.native import FASTEST, HALF_SPACE, RUN, TURNED
+from dano.native import HALF_SPACE, RUN
 from dano.native._compiling import fingerprint, kernel
 from dano.native._ffi import (
     cube,
@@ -32,12 +32,14 @@ _AXIS, _BALL = 1, 2
 # `dano.contact.Kind` counts them, number within the kind.
 _SHARE, _FOLLOWS, _SINK, _MARGIN = range(4)
 _FIRST, _SECOND, _SOLID, _CONTACT, _GROUP, _PLACE = range(6)
-# Settings: h, what `dano.contact` calls IMPACT, SHARES and ADVANCES, its pole, its rotation from z.
-_H, _IMPACT, _SHARES, _ADVANCES, _POLE, _FROM_Z = 0, 1, 2, 3, 4, 7
+# Settings: h, what `dano.contact` calls IMPACT, SHARES and ADVANCES, its pole, its rotation from z, and what
+# it calls TURNED and FASTEST.
+_H, _IMPACT, _SHARES, _ADVANCES, _POLE, _FROM_Z, _TURNED, _FASTEST = 0, 1, 2, 3, 4, 7, 16, 17
 # A pair at a moment, see `dano.contact.Placed`: samples to solid frame and origin, vector areas, solid axes
-# to world, centre of mass, velocity, spin, lowest, axis, stretch, samples to arms and their offset.
+# to world, centre of mass, velocity, spin, lowest, axis, stretch, samples to arms and their offset,
+# direction to the solid.
 _POINTS, _ORIGIN, _VECTORS, _WORLD, _CENTRE, _MOVES, _TURNS = 0, 9, 12, 21, 30, 33, 36
-_LOWEST, _AXIS_AT, _STRETCH, _ARMS, _ARM_ORIGIN, _PLACED = 39, 42, 45, 46, 55, 58
+_LOWEST, _AXIS_AT, _STRETCH, _ARMS, _ARM_ORIGIN, _FACING, _PLACED = 39, 42, 45, 46, 55, 58, 61
 # Sampled distances may grow faster than true ones: near the shipped objects a hundredth of the space has
 # gradients above 1.2, a thousandth above 1.45.
 STEEPEST = 1.5
@@ -138,7 +140,7 @@ def _towards(settings, x, y, z, out, to, scratch, at):
 
 
 @kernel
-def _place(a, b, turning, side, share, settings, solid, whole, atlas, out, scratch):
+def _place(a, b, turning, settings, share, solid, whole, atlas, out, scratch):
     """The pair of bodies after a share of the step at the old velocities, see `dano.contact.place`."""
     h = settings[_H]
     _moved(a, share, h, scratch[40:])
@@ -173,24 +175,39 @@ def _place(a, b, turning, side, share, settings, solid, whole, atlas, out, scrat
     _apply(scratch, 80, a[_SPIN] - sx, a[_SPIN + 1] - sy, a[_SPIN + 2] - sz, out, _TURNS)
     out[_STRETCH] = 1.0
     for k in range(9):
-        out[_VECTORS + k] = out[_ARMS + k] = out[_POINTS + k]
+        out[_VECTORS + k] = out[_POINTS + k]
+    if turning == 0:
+        return
+    _face_solid(a, turning, solid, whole, atlas, out, scratch)
+    _apply(out, _POINTS, scratch[30], scratch[31], scratch[32], out, _FACING)
+    _align(a, turning, settings, scratch[30], scratch[31], scratch[32], out, _POINTS, _VECTORS, scratch)
+
+
+@kernel
+def _place_arms(a, b, turning, side, share, settings, out, scratch):
+    """Arms of samples for a pair that `_place` has placed, see `dano.contact.place`."""
+    h = settings[_H]
     if turning == 0:
         part = side[_FOLLOWS] * share * h
-        _apply(scratch, 80, part * vx, part * vy, part * vz, out, _ARM_ORIGIN)
+        vx = part * (a[_VELOCITY] - b[_VELOCITY])
+        vy = part * (a[_VELOCITY + 1] - b[_VELOCITY + 1])
+        vz = part * (a[_VELOCITY + 2] - b[_VELOCITY + 2])
+        _apply_transposed(out, _WORLD, vx, vy, vz, out, _ARM_ORIGIN)
+        for k in range(9):
+            out[_ARMS + k] = out[_POINTS + k]
         for k in range(3):
             out[_ARM_ORIGIN + k] += out[_ORIGIN + k] - out[_CENTRE + k]
         return
-    _face_solid(a, turning, solid, whole, atlas, out, scratch)
-    _apply(out, _POINTS, scratch[30], scratch[31], scratch[32], scratch, 90)
-    _align(a, turning, settings, scratch[30], scratch[31], scratch[32], out, _POINTS, _VECTORS, scratch)
-    # The same at the start: arms of what then touches a plane with the normal of the other moment.
-    turn = h * _length(a, _SPIN) / FASTEST
+    turn = h * _length(a, _SPIN) / settings[_FASTEST]
     _moved(a, min(turn * turn, 1.0) * share, h, scratch[40:])
+    for r in range(3):
+        for c in range(3):
+            scratch[80 + 3 * r + c] = out[_WORLD + 3 * c + r]
     _product(scratch, 80, scratch, 43, out, _ARMS)
     _apply(out, _ARMS, -a[_COM], -a[_COM + 1], -a[_COM + 2], out, _ARM_ORIGIN)
     for k in range(3):
         out[_AXIS_AT + k] = out[_ARMS + 3 * k + 2]
-    _apply_transposed(out, _ARMS, scratch[90], scratch[91], scratch[92], scratch, 30)
+    _apply_transposed(out, _ARMS, out[_FACING], out[_FACING + 1], out[_FACING + 2], scratch, 30)
     _align(a, turning, settings, scratch[30], scratch[31], scratch[32], out, _ARMS, -1, scratch)
     for k in range(3):
         out[_LOWEST + k] = out[_ARM_ORIGIN + k] - out[_ARMS + 3 * k + 2]
@@ -298,7 +315,7 @@ def _meeting(a, b, counts, side, settings, solid, whole, atlas, probes, runs, le
         return 1.0
     share, last, k, n = 0.0, 1.0, 0, -1
     while share < 1.0 and last > 0.01 and k < settings[_ADVANCES]:
-        _place(a, b, counts[_TURNING], side, share, settings, solid, whole, atlas, placed, scratch)
+        _place(a, b, counts[_TURNING], settings, share, solid, whole, atlas, placed, scratch)
         if n < 0:
             n = _may_meet(counts, way - sink, solid, whole, atlas, probes, runs, left, placed, scratch)
         turns = 1.0 if counts[_TURNING] == 0 else 0.0
@@ -368,7 +385,7 @@ def _distance_of(placed, x, y, z, solid, whole, atlas, scratch):
 
 
 @kernel
-def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, turned, found, scratch):
+def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, same_way, turned, found, scratch):
     """Arm, normal, moment [W], depth, rate, area and drift of a sample into `found`; whether it may press.
 
     Returns:
@@ -386,7 +403,7 @@ def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, turne
     area = -(scratch[33] * nx + scratch[34] * ny + scratch[35] * nz)
     if turned or not area > 0.0:
         whole_area = _length(scratch, 33)
-        if not (d < 0.0 and -area > TURNED * whole_area):
+        if not (d < 0.0 and -area > same_way * whole_area):
             return 0
         if not turned:
             found[9], found[11] = -d, half * whole_area
@@ -451,7 +468,6 @@ def _find_drift(placed, x, y, z, rx, ry, rz, nx, ny, nz, found, scratch):
 
 @kernel
 def _list_block(
-    a,
     turning,
     solid,
     whole,
@@ -461,10 +477,9 @@ def _list_block(
     n,
     side,
     share,
-    h,
+    settings,
     turned,
-    numbers,
-    samples,
+    lists,
     used,
     filled,
     sums,
@@ -475,7 +490,8 @@ def _list_block(
     Added to `sums`, over samples that sink in: area; then load, and rate, arm and normal weighted by it; then
     the load of those that lie in the solid and face the other way.
     """
-    room, width = numbers.shape[1], numbers.shape[2]
+    numbers, samples = lists
+    h, room, width = settings[_H], numbers.shape[1], numbers.shape[2]
     found = scratch[80:95]
     # Where geometry is taken early, what is about to touch has sunk in by no more than this, or nearly does.
     layer = side[_SINK] if share < 1.0 else 0.0
@@ -490,6 +506,7 @@ def _list_block(
             lane,
             side[_SHARE],
             share * h,
+            settings[_TURNED],
             turned,
             found,
             scratch,
@@ -515,6 +532,60 @@ def _list_block(
         if filled == width:
             used, filled = used + 1, 0
     return used, filled
+
+
+@kernel
+def _list_pair(
+    count,
+    side,
+    share,
+    reach,
+    turned,
+    settings,
+    solid,
+    whole,
+    atlas,
+    placed,
+    surfaces,
+    lists,
+    used,
+    sums,
+    scratch,
+):
+    """List the samples of a body that may press, see `_list_block`; returns the chunks in use."""
+    blocks, balls, runs = surfaces
+    lane, beyond = 0, count[_START]
+    for n in range(count[_START], count[_START] + count[_BLOCKS]):
+        if n < beyond:
+            continue
+        # Where a run of blocks is out of reach, all of them are.
+        if (n - count[_START]) % RUN == 0:
+            d = _distance_of(placed, runs[n, 0], runs[n, 1], runs[n, 2], solid, whole, atlas, scratch)
+            if d - STEEPEST * runs[n, 3] * placed[_STRETCH] > reach:
+                beyond = n + RUN
+                continue
+        d = _distance_of(placed, balls[n, 0], balls[n, 1], balls[n, 2], solid, whole, atlas, scratch)
+        if d - balls[n, 3] * placed[_STRETCH] > reach:
+            continue
+        used, lane = _list_block(
+            count[_TURNING],
+            solid,
+            whole,
+            atlas,
+            placed,
+            blocks,
+            n,
+            side,
+            share,
+            settings,
+            turned,
+            lists,
+            used,
+            lane,
+            sums,
+            scratch,
+        )
+    return used + 1 if lane > 0 else used
 
 
 @kernel
@@ -593,51 +664,48 @@ def _find(
             a, b, count, side, settings, solid, whole, atlas, probes, runs, left, placed, scratch
         )
         turning = count[_TURNING]
-        _place(a, b, turning, side, share, settings, solid, whole, atlas, placed, scratch)
+        _place(a, b, turning, settings, share, solid, whole, atlas, placed, scratch)
+        _place_arms(a, b, turning, side, share, settings, placed, scratch)
         reach = _length(placed, _MOVES) + _length(placed, _TURNS) * 2.0 * a[_RADIUS]
         reach = side[_MARGIN] + (1.0 - share) * h * reach
         for k in range(10):
             sums[k] = 0.0
         first = used
-        end = count[_START] + count[_BLOCKS]
-        for turned in range(2):
-            if turned and not sums[9] > sums[1]:
-                continue
-            lane_to, beyond = 0, count[_START]
-            for n in range(count[_START], end):
-                if n < beyond:
-                    continue
-                # Where a run of blocks is out of reach, all of them are.
-                if (n - count[_START]) % RUN == 0:
-                    d = _distance_of(placed, runs[n, 0], runs[n, 1], runs[n, 2], solid, whole, atlas, scratch)
-                    if d - STEEPEST * runs[n, 3] * placed[_STRETCH] > reach:
-                        beyond = n + RUN
-                        continue
-                d = _distance_of(placed, balls[n, 0], balls[n, 1], balls[n, 2], solid, whole, atlas, scratch)
-                if d - balls[n, 3] * placed[_STRETCH] > reach:
-                    continue
-                used, lane_to = _list_block(
-                    a,
-                    turning,
-                    solid,
-                    whole,
-                    atlas,
-                    placed,
-                    blocks,
-                    n,
-                    side,
-                    share,
-                    h,
-                    turned > 0,
-                    numbers,
-                    samples,
-                    used,
-                    lane_to,
-                    sums,
-                    scratch,
-                )
-            if lane_to > 0:
-                used += 1
+        used = _list_pair(
+            count,
+            side,
+            share,
+            reach,
+            False,
+            settings,
+            solid,
+            whole,
+            atlas,
+            placed,
+            (blocks, balls, runs),
+            (numbers, samples),
+            used,
+            sums,
+            scratch,
+        )
+        if sums[9] > sums[1]:
+            used = _list_pair(
+                count,
+                side,
+                share,
+                reach,
+                True,
+                settings,
+                solid,
+                whole,
+                atlas,
+                placed,
+                (blocks, balls, runs),
+                (numbers, samples),
+                used,
+                sums,
+                scratch,
+            )
         contact = name[_CONTACT]
         stiffness = _impact(a, b, sums, impacts[contact, 1], impacts[contact, 0], settings)
         for c in range(first, min(used, room)):
