@@ -1,6 +1,7 @@
 """Importing dano has no side effects and stays light."""
 
 import json
+import os
 import subprocess
 import sys
 import tomllib
@@ -22,17 +23,22 @@ OPTIONAL |= {"torch", "trimesh", "viser", "zarr"}
 OPTIONAL |= {"scipy.ndimage", "scipy.optimize", "scipy.spatial", "scipy.special", "scipy.stats"}
 
 
-def import_in_new_process() -> dict:
-    answer = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
+def import_in_new_process(bytecode: Path) -> dict:
+    """What an import does and takes, with bytecode in a folder of its own, also where Python keeps none."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    environment["PYTHONPYCACHEPREFIX"] = str(bytecode)
+    answer = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, env=environment
+    )
     return json.loads(answer.stdout)
 
 
-def test_import_is_light_and_changes_nothing():
-    report = import_in_new_process()
+def test_import_is_light_and_changes_nothing(tmp_path):
+    report = import_in_new_process(tmp_path)
     assert report["changed"] == []
     assert OPTIONAL.isdisjoint(report["modules"])
-    # The first import of an installation also compiles bytecode: what counts is the second.
-    seconds = min(report["seconds"], import_in_new_process()["seconds"])
+    # The first import of an installation also compiles bytecode: what counts are later ones.
+    seconds = min(import_in_new_process(tmp_path)["seconds"] for _ in range(3))
     assert seconds < 1.0, f"import dano took {seconds:.2f} s of processor time beyond JAX"
 
 
