@@ -36,6 +36,7 @@ from dano.contact._geometry import (
     meeting,
     Mixture,
     near_pairs,
+    OUTSIDE,
     place,
     POLE,
     SHARES,
@@ -105,8 +106,8 @@ def find(
     room = -(-(capacity + _CHUNKS) // ROUND) * ROUND
     if geometry.tables is not None:
         hits = jnp.stack([impacts.instant.astype(dtype), impacts.speed.astype(dtype)], axis=1)
-        constants = jnp.asarray([_IMPACT, SHARES, ADVANCES, *POLE, *FROM_Z.ravel(), _TURNED, FASTEST], dtype)
-        settings = jnp.append(h.astype(dtype), constants)
+        constants = [_IMPACT, SHARES, ADVANCES, *POLE, *FROM_Z.ravel(), _TURNED, FASTEST, OUTSIDE]
+        settings = jnp.append(h.astype(dtype), jnp.asarray(constants, dtype))
         return find_natively(
             geometry.tables, geometry.blocks, geometry.probes, links, hits, settings, capacity, room
         )

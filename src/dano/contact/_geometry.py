@@ -24,6 +24,9 @@ FIXED, AXIS, BALL = 0, 1, 2
 """How the samples of a surface turn with its body: with it; about its z axis they keep facing the other body;
 or they keep facing it altogether."""
 TURNING = {"fixed": FIXED, "axis": AXIS, "ball": BALL}
+OUTSIDE = 8.0
+"""A ball's lowest point, d deep in a solid, is at most so many d beyond an edge that its centre faces; unless
+the centre faces it within 7° of one of the edge's sides."""
 
 # Samples count as near within this share of the smaller body's size, besides the way they go.
 _MARGIN = 0.001
@@ -403,15 +406,21 @@ def _aligned(geometry: Geometry, kind: Kind | Mixture, side: Side, turn, origin)
     i = side.first
 
     def facing(point):
-        _, gradient = kind.sdf_jet(side, point[:, None], 1)
-        return _direction(-matvec(turn.T, gradient[:, 0]))
+        distance, gradient = kind.sdf_jet(side, point[:, None], 1)
+        return distance[0], _direction(-matvec(turn.T, gradient[:, 0]))
 
-    toward = facing(origin)
+    apart, toward = facing(origin)
     if BALL in kind.turns:
-        # Once more from where it comes closest: the solid may be small, or curved.
+        # Again from where it comes closest, because the solid may be small or curved. Where that point lies
+        # in the solid, from one halfway out: inside, beside an edge, the nearest face is not what presses.
         ball = geometry.turning[i] == BALL
-        lowest = geometry.scale[i] * _direction(geometry.scale[i] * toward)
-        toward = jnp.where(ball, facing(origin + matvec(turn, jnp.where(ball, lowest, 0))), toward)
+        lowest = jnp.where(ball, geometry.scale[i] * _direction(geometry.scale[i] * toward), 0)
+        sunk, again = facing(origin + matvec(turn, lowest))
+        apart = jnp.maximum(apart, 0)
+        beyond = jnp.minimum(jnp.sqrt(jnp.sum(lowest * lowest)) - apart, -OUTSIDE * sunk)
+        share = apart / (apart + 2 * jnp.where(beyond > 0, beyond, 1))
+        _, outside = facing(origin + matvec(turn, share * lowest))
+        toward = jnp.where(ball, jnp.where(beyond > 0, outside, again), toward)
     return *_turned(geometry, kind, side, turn, toward), toward
 
 

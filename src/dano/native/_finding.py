@@ -33,8 +33,8 @@ _AXIS, _BALL = 1, 2
 _SHARE, _FOLLOWS, _SINK, _MARGIN = range(4)
 _FIRST, _SECOND, _SOLID, _CONTACT, _GROUP, _PLACE = range(6)
 # Settings: h, what `dano.contact` calls IMPACT, SHARES and ADVANCES, its pole, its rotation from z, and what
-# it calls TURNED and FASTEST.
-_H, _IMPACT, _SHARES, _ADVANCES, _POLE, _FROM_Z, _TURNED, _FASTEST = 0, 1, 2, 3, 4, 7, 16, 17
+# it calls TURNED, FASTEST and OUTSIDE.
+_H, _IMPACT, _SHARES, _ADVANCES, _POLE, _FROM_Z, _TURNED, _FASTEST, _OUTSIDE = 0, 1, 2, 3, 4, 7, 16, 17, 18
 # A pair at a moment, see `dano.contact.Placed`: samples to solid frame and origin, vector areas, solid axes
 # to world, centre of mass, velocity, spin, lowest, axis, stretch, samples to arms and their offset,
 # direction to the solid.
@@ -101,10 +101,11 @@ def _length(a, at):
 
 @kernel
 def _face(out, solid, whole, atlas, x, y, z, scratch):
-    """Direction from a point to the solid in the axes of the samples' body, into scratch[30:33]."""
-    distance(solid, whole, atlas, x, y, z, scratch, True)
+    """Direction from a point to the solid in the axes of the samples' body, into scratch[30:33]; distance."""
+    apart = distance(solid, whole, atlas, x, y, z, scratch, True)
     _apply_transposed(out, _POINTS, -scratch[0], -scratch[1], -scratch[2], scratch, 30)
     _direct(scratch, 30)
+    return apart
 
 
 @kernel
@@ -178,7 +179,7 @@ def _place(a, b, turning, settings, share, solid, whole, atlas, out, scratch):
         out[_VECTORS + k] = out[_POINTS + k]
     if turning == 0:
         return
-    _face_solid(a, turning, solid, whole, atlas, out, scratch)
+    _face_solid(a, turning, settings, solid, whole, atlas, out, scratch)
     _apply(out, _POINTS, scratch[30], scratch[31], scratch[32], out, _FACING)
     _align(a, turning, settings, scratch[30], scratch[31], scratch[32], out, _POINTS, _VECTORS, scratch)
 
@@ -214,28 +215,27 @@ def _place_arms(a, b, turning, side, share, settings, out, scratch):
 
 
 @kernel
-def _face_solid(a, turning, solid, whole, atlas, out, scratch):
+def _face_solid(a, turning, settings, solid, whole, atlas, out, scratch):
     """Direction from where bodies touch to the solid in the axes of the samples' body, to scratch[30:33]."""
-    _face(out, solid, whole, atlas, out[_ORIGIN], out[_ORIGIN + 1], out[_ORIGIN + 2], scratch)
+    x, y, z = out[_ORIGIN], out[_ORIGIN + 1], out[_ORIGIN + 2]
+    apart = max(_face(out, solid, whole, atlas, x, y, z, scratch), 0.0)
     if turning == _AXIS:
         return
-    # Once more from where it comes closest: the solid may be small, or curved.
+    # Again from where it comes closest, or from above it: see `dano.contact`, `_aligned`.
     p, q, r = a[_SCALE], a[_SCALE + 1], a[_SCALE + 2]
     scratch[30] *= p
     scratch[31] *= q
     scratch[32] *= r
     _direct(scratch, 30)
-    _apply(out, _POINTS, p * scratch[30], q * scratch[31], r * scratch[32], scratch, 33)
-    _face(
-        out,
-        solid,
-        whole,
-        atlas,
-        out[_ORIGIN] + scratch[33],
-        out[_ORIGIN + 1] + scratch[34],
-        out[_ORIGIN + 2] + scratch[35],
-        scratch,
-    )
+    u, v, w = p * scratch[30], q * scratch[31], r * scratch[32]
+    lowest = math.sqrt(u * u + v * v + w * w)
+    _apply(out, _POINTS, u, v, w, scratch, 33)
+    u, v, w = scratch[33], scratch[34], scratch[35]
+    sunk = _face(out, solid, whole, atlas, x + u, y + v, z + w, scratch)
+    beyond = min(lowest - apart, -settings[_OUTSIDE] * sunk)
+    if beyond > 0.0:
+        share = apart / (apart + 2.0 * beyond)
+        _face(out, solid, whole, atlas, x + share * u, y + share * v, z + share * w, scratch)
 
 
 @kernel
