@@ -259,6 +259,32 @@ def test_bodies_set_deep_into_each_other_separate_slowly(shape, offset):
     np.testing.assert_allclose(jnp.sum(run.states.velocity[-1], axis=0), 0, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "turn", [(1, 1, 0, 0), (1, 0.7, 0.5, 0), (1, 0.15, 0, 0)], ids=["edge", "corner", "rim"]
+)
+def test_ball_falls_on_an_edge(turn):
+    """A ball has samples, an edge has none: they face the edge also where it lies deep in the ball."""
+    half, radius = np.array([0.06, 0.04, 0.04]), 0.05
+    bodies = [
+        dano.Body("box", dano.Box(tuple(half)), fixed=True),
+        dano.Body("ball", dano.Sphere(radius), mass=1.0),
+    ]
+    scene = dano.Scene.create(bodies, [dano.Contact("box", "ball")], timestep=0.005)
+    orientation = np.asarray(turn) / np.linalg.norm(turn)
+    state = scene.initial_state(
+        box={"orientation": orientation}, ball={"position": (0.003, 0.035, 0.11), "velocity": (0, 0, -3)}
+    )
+    run = dano.simulate(scene, state, 40)
+    place = np.asarray(run.states.position[:, 1]) @ np.asarray(
+        dano.maths.quat_to_matrix(jnp.asarray(orientation))
+    )
+    # Distance of a point outside of a box: that to the nearest point of it.
+    apart = np.linalg.norm(place - np.clip(place, -half, half), axis=1)
+    assert apart.min() > radius - 0.05 * 2 * radius
+    assert apart.min() < radius
+    assert bool(jnp.all(run.converged))
+
+
 def test_collision_conserves_momentum():
     """Two boxes in free space, each with samples in the other: action is reaction, about any point."""
     bodies = [dano.Body(name, dano.Box((0.1, 0.06, 0.04)), mass=m) for name, m in (("a", 1.0), ("b", 2.0))]
