@@ -21,6 +21,7 @@ from dano.cli._arguments import (
     Train,
     View,
 )
+from dano.cli.checking import Check
 from dano.cli.tracking import Track
 from dano.names import did_you_mean
 
@@ -31,6 +32,7 @@ _COMMANDS = {
     "build": Build,
     "import": Import,
     "inspect": Inspect,
+    "check": Check,
     "simulate": Simulate,
     "track": Track,
     "identify": Identify,

@@ -33,7 +33,7 @@ def simulate(command: Simulate) -> None:
     if not command.slow_motion > 0:
         raise ValueError(f"slow_motion must be > 0, got {command.slow_motion}")
     check_distinct(output=output, video=video, strip=strip)
-    loaded = _load(scene, command.steps, command.timestep)
+    loaded = load(scene, command.steps, command.timestep)
     for path in (output, video, strip):
         if path is not None:
             check_output(path, *loaded.inputs())
@@ -106,7 +106,7 @@ def _demo_scene(name: str, folder: Path, artist: "_Artist") -> dict[str, Any]:
     path = folder / f"{name}.toml"
     with replacing(path) as file:
         file.write((files("dano") / "scenes" / path.name).read_bytes())
-    loaded = _load(path, None, None)
+    loaded = load(path, None, None)
     objects = {}
     for asset in scene_file.ASSETS:
         if f'asset = "{asset}"' in loaded.text:
@@ -183,7 +183,7 @@ class _Artist:
             self._progress(description, share)
 
 
-def _load(path: Path, steps: int | None, timestep: float | None) -> scene_file.SceneFile:
+def load(path: Path, steps: int | None, timestep: float | None) -> scene_file.SceneFile:
     """The scene in a file, or that of an object dropped onto a floor."""
     progress = Progress()
     if path.suffix.lower() == ".dano":
