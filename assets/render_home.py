@@ -134,6 +134,7 @@ def film(scene: dano.Scene, trajectory: dano.Trajectory, slow_motion: int) -> li
             slow_motion=slow_motion,
             camera=camera,
             contact_points=False,
+            clock=False,
             looks={"bunny": asset_look("trained_bunny")},
         )
         with av.open(str(path)) as container:
