@@ -124,6 +124,8 @@ def on_floor(friction: float = 0.3, ball: bool = False) -> dano.Scene:
 def film(scene: dano.Scene, trajectory: dano.Trajectory, slow_motion: int) -> list[np.ndarray]:
     """Frames of a trajectory with the learned look, from where the bunny fills half of the height."""
     camera = Camera((0.1, -0.62, 0.24), (0, 0, 0.07), vertical_fov=0.4, width=WIDTH, height=HEIGHT)
+    look = asset_look("trained_bunny")
+    assert look is not None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         render_trajectory(
@@ -135,7 +137,7 @@ def film(scene: dano.Scene, trajectory: dano.Trajectory, slow_motion: int) -> li
             camera=camera,
             contact_points=False,
             clock=False,
-            looks={"bunny": asset_look("trained_bunny")},
+            looks={"bunny": look},
         )
         with av.open(str(path)) as container:
             return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]

@@ -474,7 +474,7 @@ class Compare:
 
 @dataclass(frozen=True)
 class Demo:
-    """Build the shipped objects, simulate scenes of them, and draw everything.
+    """Build the shipped objects, simulate a scene of them, and draw everything.
 
     Attributes:
         name: drop: a bunny, a bar of soap and a ball fall. collision: a ball hits two bunnies. all: both.
@@ -482,7 +482,7 @@ class Demo:
         json: Print one JSON object instead of text.
     """
 
-    name: Positional[Literal["all", "drop", "collision"]] = "all"
+    name: Positional[Literal["all", "drop", "collision"]] = "drop"
     output: Output = Path("dano-demo")
     json: bool = False
 

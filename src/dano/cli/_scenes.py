@@ -120,14 +120,15 @@ def _demo_scene(name: str, folder: Path, artist: "_Artist", tell: Callable[[str]
     with replacing(path) as file:
         file.write((files("dano") / "scenes" / path.name).read_bytes())
     tell(f"{name}: building objects, {path} written")
-    loaded = load(path, None, None)
-    objects = {}
+    objects, text = {}, path.read_text(encoding="utf-8")
     for asset in scene_file.ASSETS:
-        if f'asset = "{asset}"' in loaded.text:
+        if f'asset = "{asset}"' in text:
+            # Before the scene is read, so that the first is drawn while the second is built.
             objects[asset] = str(folder / f"{asset}.dano")
             made = scene_file.build_asset(asset)
             made.save(folder / f"{asset}.dano")
             artist.draw(made, folder / f"{asset}.png")
+    loaded = load(path, None, None)
     tell(f"{name}: compiling and simulating {loaded.n_steps} steps")
     rollout, report = _simulated(loaded, path.with_suffix(".npz"))
     tell(f"{name}: simulated, {path.with_suffix('.npz')} written")
