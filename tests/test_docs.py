@@ -18,6 +18,8 @@ PROGRAMS = {
 }
 # Of the command line, the commands are what is public.
 PACKAGES = [p for p in sorted((REPOSITORY / "src" / "dano").glob("*/__init__.py")) if p.parent.name != "cli"]
+WIDEST = 90
+"""Columns of a code block that fit the pages without scrolling, on a screen of 1280 pixels."""
 
 
 @pytest.mark.parametrize("page", PROGRAMS)
@@ -51,6 +53,17 @@ def test_every_public_name_is_documented(package: Path):
     page = REPOSITORY / "docs" / "api" / f"{package.parent.name}.md"
     documented = set(re.findall(r"^ {8}- (\w+)$", page.read_text(encoding="utf-8"), re.MULTILINE))
     assert documented == exported
+
+
+@pytest.mark.parametrize("page", [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))])
+def test_no_code_block_scrolls_sideways(page: Path):
+    inside, wide = False, []
+    for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
+        if line.lstrip().startswith("```"):
+            inside = not inside
+        elif inside and len(line) > WIDEST:
+            wide.append(f"{page.name}:{number} has {len(line)} columns")
+    assert wide == []
 
 
 def test_the_index_leads_to_every_page():

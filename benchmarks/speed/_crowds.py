@@ -1,7 +1,7 @@
 """Scenes of several bodies that may all touch, in dano."""
 
 from dataclasses import dataclass
-from importlib.resources import as_file, files
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -100,9 +100,8 @@ DEMO = "Drop of the demo (bunny, soap, ball, floor), 320 steps of 5 ms, per step
 
 
 def demo_case() -> Case:
-    """What `dano demo drop` simulates: the shipped scene file."""
-    with as_file(files("dano") / "scenes" / "drop.toml") as path:
-        loaded = dano.load_scene(path)
+    """A drop as `dano demo` shows it: `drop.toml` beside this file, so that figures stay comparable."""
+    loaded = dano.load_scene(Path(__file__).with_name("drop.toml"))
     return _case(DEMO, "drop of the demo", loaded.scene, loaded.state, loaded.n_steps)
 
 

@@ -24,7 +24,7 @@ def mujoco_crowd_case(crowd: Crowd) -> Case:
 
 
 def mujoco_demo_case() -> Case:
-    """The demo's drop, as `scenes/drop.toml` has it: a hull, a box for the soap, a ball."""
+    """The demo's drop, as `drop.toml` beside this file has it: a hull, a box for the soap, a ball."""
     box = " ".join(str(x) for x in SOAP_HALF_EXTENTS)
     bodies = _body(
         Member("bunny", np.array([0.0, 0.0, 0.25]), np.array([0.924, 0.32, 0.2, 0.0])),

@@ -354,7 +354,7 @@ def test_demo(run, tmp_path, monkeypatch, small_scenes):
     monkeypatch.setattr("dano.report.draw_object", lambda *given, **_: drawn.append(given[1].name))
     monkeypatch.setattr("dano.report.render_trajectory", lambda *given, **_: drawn.append(given[2].name))
     folder = tmp_path / "demo"
-    answer = run("demo", "-o", folder, "--json")
+    answer = run("demo", "all", "-o", folder, "--json")
     assert answer.code == 0
     report = json.loads(answer.out)["scenes"]
     assert list(report) == list(_scenes.SCENES)
@@ -363,7 +363,12 @@ def test_demo(run, tmp_path, monkeypatch, small_scenes):
     written = {f"{name}.{suffix}" for name in _scenes.SCENES for suffix in ("toml", "npz", "json")}
     assert {path.name for path in folder.iterdir()} == {*written, "bunny.dano"}
     assert json.loads((folder / "drop.json").read_text(encoding="utf-8")) == report["drop"]
-    assert "== collision ==" in run("demo", "collision", "-o", folder).out
+    told = run("demo", "collision", "-o", folder).out
+    assert "== collision ==" in told
+    # What happens is said in the order in which it happens, with the time, also where nobody watches.
+    times = [float(line[1:].split(" s]")[0]) for line in told.splitlines() if line.startswith("[")]
+    assert len(times) >= 4 and times == sorted(times)
+    assert "bunny.png drawn" in told and "collision.mp4 drawn" in told
 
 
 def test_demo_says_what_its_pictures_lack(run, tmp_path, monkeypatch, small_scenes):

@@ -74,6 +74,8 @@ def test_friction_of_a_simulated_slide(truth):
     assert fit.loss_history[-1] < 1e-6 * fit.loss_history[0]
     assert float(fit.scene.contact("ball", "floor").sliding_friction) == fit.values["mu"]
     assert fit.to_dict()["values"]["mu"] == fit.values["mu"]
+    shown = fit._repr_html_()
+    assert f"{fit.values['mu']:.4g} ± " in shown and "<polyline" in shown
 
 
 def test_several_motions_of_different_length_rate_and_gaps(truth, observed):

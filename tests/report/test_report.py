@@ -223,3 +223,25 @@ def test_meshes_of_shapes_lie_on_their_surface():
         # Closed and outward: the volume is that of the solid, less what flat triangles cut off.
         volume = np.sum(np.linalg.det(vertices[faces].astype(np.float64))) / 6
         assert volume == pytest.approx(float(shape.solid_moments().volume), rel=0.03)
+
+
+def test_a_scale_is_a_round_length_below():
+    from dano.report._overlay import length_text, round_below
+
+    for x, below in ((0.37, 0.2), (0.5, 0.5), (9.9, 5.0), (1.0, 1.0), (0.0019, 0.001)):
+        assert round_below(x) == pytest.approx(below)
+    assert [length_text(x) for x in (2.0, 0.2, 0.05, 0.002)] == ["2 m", "20 cm", "5 cm", "2 mm"]
+
+
+def test_the_bar_is_as_long_as_what_it_stands_for():
+    from dano.report._overlay import draw_clock
+    from dano.vision import Camera
+
+    camera = Camera((0, -2, 0), (0, 0, 0), width=640, height=400)
+    grey = np.full((400, 640, 3), 200, np.uint8)
+    drawn = draw_clock(grey, camera, 0.25, 2.0)
+    # Dark runs in the rows of the bar.
+    row = drawn[400 - 400 // 30 - 1]
+    bar = np.flatnonzero((row < 100).all(axis=1) & (np.arange(640) > 320))
+    ends = camera.project(np.array([[0, 0, 0], [0.2, 0, 0]]))[:, 0]
+    assert len(bar) == pytest.approx(ends[1] - ends[0], abs=2)

@@ -48,6 +48,7 @@ def _run(argv: list[str], keep: bool) -> None:
     import jax
 
     from dano.cli._compiled import compiled_programs
+    from dano.cli._outputs import named
 
     jax.config.update("jax_enable_x64", True)
     # Called from another program, JAX's settings are that program's.
@@ -55,7 +56,7 @@ def _run(argv: list[str], keep: bool) -> None:
         warnings.showwarning = _say_warning
         # What dano says of its results is heard whatever the process makes of warnings, once.
         warnings.simplefilter("default", UserWarning)
-        command()
+        named(command)()
 
 
 def _say_warning(message: Warning | str, *_: object, **__: object) -> None:

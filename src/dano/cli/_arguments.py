@@ -8,6 +8,8 @@ from tyro.conf import arg, Positional
 
 from dano.building import BuildOptions
 
+UNNAMED = Path("<named after the input>")
+"""Stands for an output that nobody named, see `dano.cli._outputs.named`; help shows it as the default."""
 Output = Annotated[Path, arg(aliases=["-o"])]
 
 
@@ -39,7 +41,7 @@ class Train:
     """
 
     images: Positional[Path]
-    output: Output
+    output: Output = UNNAMED
     resolution: int = 96
     iterations: int = 800
     batch: int = 4096
@@ -98,7 +100,7 @@ class Poses:
     """
 
     images: Positional[Path]
-    output: Output
+    output: Output = UNNAMED
     masks: Path | None = None
     features_on: Literal["auto", "everything", "object", "surroundings"] = "auto"
     marker_size: float | None = None
@@ -163,7 +165,7 @@ class Build:
     """
 
     field: Positional[Path]
-    output: Output
+    output: Output = UNNAMED
     options: Annotated[BuildOptions, arg(name="")] = BuildOptions()
     json: bool = False
 
@@ -204,7 +206,7 @@ class Import:
     """
 
     file: Positional[str]
-    output: Output
+    output: Output = UNNAMED
     crop: tuple[float, float, float, float, float, float] | None = None
     scale: float = 1.0
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -267,7 +269,7 @@ class Simulate:
     """
 
     scene: Positional[Path]
-    output: Output
+    output: Output = UNNAMED
     video: Path | None = None
     strip: Path | None = None
     steps: int | None = None
@@ -357,7 +359,7 @@ class Plan:
 
     scene: Positional[Path]
     task: Positional[Path]
-    output: Output
+    output: Output = UNNAMED
     video: Path | None = None
     strip: Path | None = None
     controls: Path | None = None
@@ -414,7 +416,7 @@ class Export:
     """
 
     object: Positional[Path]
-    output: Output
+    output: Output = UNNAMED
     to: tuple[Literal["mjcf", "urdf", "usd", "obj"], ...] = ("mjcf",)
     name: str | None = None
     collision: Literal["auto", "coacd", "hull"] = "auto"
@@ -453,7 +455,7 @@ class Compare:
     """
 
     object: Positional[Path]
-    output: Output
+    output: Output = UNNAMED
     field: Path | None = None
     truth: Path | None = None
     truth_scale: float = 1.0
@@ -472,7 +474,7 @@ class Compare:
 
 @dataclass(frozen=True)
 class Demo:
-    """Build the shipped objects, simulate scenes of them, and draw everything.
+    """Build the shipped objects, simulate a scene of them, and draw everything.
 
     Attributes:
         name: drop: a bunny, a bar of soap and a ball fall. collision: a ball hits two bunnies. all: both.
@@ -480,8 +482,8 @@ class Demo:
         json: Print one JSON object instead of text.
     """
 
-    name: Positional[Literal["all", "drop", "collision"]] = "all"
-    output: Annotated[Path, arg(aliases=["-o"])] = Path("dano-demo")
+    name: Positional[Literal["all", "drop", "collision"]] = "drop"
+    output: Output = Path("dano-demo")
     json: bool = False
 
     def __call__(self) -> None:

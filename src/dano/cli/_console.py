@@ -57,7 +57,7 @@ def say(message: str) -> None:
 
 def put(text: str = "") -> None:
     """A line of the result."""
-    print(text)
+    print(text, flush=True)
 
 
 def put_json(result: Mapping[str, Any]) -> None:

@@ -1,9 +1,77 @@
 """Checks before any work starts: where results go, and whether what draws them is installed."""
 
+import dataclasses
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from dano.archive import checked_output
+from dano.cli._arguments import (
+    Build,
+    Compare,
+    Export,
+    Import,
+    Plan,
+    Poses,
+    Simulate,
+    Train,
+    UNNAMED,
+)
+from dano.cli._console import say
+from dano.cli.tracking import Track
 from dano.extras import is_installed
+
+_NAMED_AFTER: dict[type, tuple[str, str]] = {
+    Train: ("images", ".dano"),
+    Build: ("field", ".dano"),
+    Import: ("file", ".grid.npz"),
+    Simulate: ("scene", "_run.npz"),
+    Track: ("video", "_motion.npz"),
+    Plan: ("task", "_plan.npz"),
+    Export: ("object", "_export"),
+    Compare: ("object", "_meshes.html"),
+}
+"""Commands with the input that their output is named after, and what is appended to its name."""
+
+
+def named(command: Callable[[], None]) -> Callable[[], None]:
+    """The command with a name for its output, and a line that says it, if nobody gave one.
+
+    Outputs go to the current folder under the input's name; cameras go to their photographs, where
+    `dano train` looks for them. A number is appended where there is something of this name already, unless an
+    earlier training is to go on.
+    """
+    if getattr(command, "output", None) is not UNNAMED:
+        return command
+    fields: Any = command
+    if isinstance(command, Poses):
+        source = command.images
+        folder = source.parent if source.name == "images" else source
+        usual = folder / "transforms.json" if source.is_dir() else Path(f"{_stem(source)}_transforms.json")
+    else:
+        name, ending = _NAMED_AFTER[type(command)]
+        usual = Path(_stem(getattr(fields, name)) + ending)
+    output = usual if getattr(fields, "resume", False) else free_path(usual)
+    say(f"writing {output}" + ("" if output == usual else f", because {usual} is there already"))
+    return dataclasses.replace(fields, output=output)
+
+
+def free_path(path: Path) -> Path:
+    """The path, or the first of path_2, path_3, … at which there is nothing."""
+    stem, ending = path.name.split(".", 1)[0], path.name[len(path.name.split(".", 1)[0]) :]
+    free, number = path, 1
+    while free.exists() or free.is_symlink():
+        number += 1
+        free = path.with_name(f"{stem}_{number}{ending}")
+    return free
+
+
+def _stem(source: Path | str) -> str:
+    """Name of an input without its folder and endings; of a function package.module:name its name."""
+    path = Path(str(source).rpartition(":")[2])
+    if path.name in ("transforms.json", "anno_train.json"):
+        path = path.parent
+    return path.absolute().name.split(".", 1)[0] or "dano"
 
 
 def check_output(path: Path, *inputs: Path, suffix: str | None = None) -> None:

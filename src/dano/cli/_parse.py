@@ -1,6 +1,9 @@
 """From the words on the command line to the command that they ask for."""
 
+import inspect
+import textwrap
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import tyro
 from tyro.conf import FlagCreatePairsOff
@@ -21,25 +24,46 @@ from dano.cli._arguments import (
     Train,
     View,
 )
+from dano.cli.checking import Check
 from dano.cli.tracking import Track
 from dano.names import did_you_mean
 
-_COMMANDS = {
-    "poses": Poses,
-    "train": Train,
-    "data": Data,
-    "build": Build,
-    "import": Import,
-    "inspect": Inspect,
-    "simulate": Simulate,
-    "track": Track,
-    "identify": Identify,
-    "plan": Plan,
-    "view": View,
-    "export": Export,
-    "compare": Compare,
-    "demo": Demo,
+
+class _Row(NamedTuple):
+    """A command: its arguments, and what a user would type first."""
+
+    kind: type
+    example: str
+
+
+GROUPS: dict[str, dict[str, _Row]] = {
+    "Most used": {
+        "demo": _Row(Demo, "dano demo"),
+        "train": _Row(Train, "dano train photos/"),
+        "simulate": _Row(Simulate, "dano simulate mug.dano --video mug.mp4"),
+        "view": _Row(View, "dano view mug_run.npz"),
+        "inspect": _Row(Inspect, "dano inspect mug.dano"),
+    },
+    "From photographs and films": {
+        "poses": _Row(Poses, "dano poses photos/ --marker-size 0.05"),
+        "data": _Row(Data, "dano data photos/"),
+        "track": _Row(Track, "dano track throw.mp4 mug.dano --camera camera.json"),
+    },
+    "From fields, and to other programs": {
+        "build": _Row(Build, "dano build my_nerf.npz --length 0.12 --mass 0.35"),
+        "import": _Row(Import, "dano import step-000029999.ckpt --crop -1 -1 -1 1 1 1"),
+        "export": _Row(Export, "dano export mug.dano --to mjcf urdf"),
+        "compare": _Row(Compare, "dano compare mug.dano"),
+    },
+    "With scenes": {
+        "check": _Row(Check, "dano check scene.toml"),
+        "identify": _Row(Identify, "dano identify scene.toml throw.npz -p mug,table.sliding_friction:0:1"),
+        "plan": _Row(Plan, "dano plan scene.toml task.toml --video plan.mp4"),
+    },
 }
+"""Commands in the order in which `dano --help` shows them: most used first."""
+_COMMANDS = {name: row for group in GROUPS.values() for name, row in group.items()}
+_COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
 
 
 def parse(argv: Sequence[str]) -> Callable[[], None]:
@@ -50,23 +74,51 @@ def parse(argv: Sequence[str]) -> Callable[[], None]:
     Raises:
         ValueError: If there is no such command.
     """
-    if not argv:
-        argv = ["--help"]
-    if list(argv) == ["--version"]:
+    words = list(argv) or ["--help"]
+    if words == ["--version"]:
         print(f"dano {__version__}")
         raise SystemExit(0)
-    if not argv[0].startswith("-") and argv[0] not in _COMMANDS:
-        raise ValueError(
-            f"command must be one of {', '.join(_COMMANDS)}, got {argv[0]!r}"
-            + did_you_mean(argv[0], _COMMANDS)
+    if words[0] in ("-h", "--help"):
+        print(_overview())
+        raise SystemExit(0)
+    if words[0] in _COMPLETION:
+        kinds = {name: row.kind for name, row in _COMMANDS.items()}
+        return tyro.extras.subcommand_cli_from_dict(
+            kinds, prog="dano", args=words, config=(FlagCreatePairsOff,)
         )
-    return tyro.extras.subcommand_cli_from_dict(
-        _COMMANDS,
-        prog="dano",
-        description=(
-            "Simulate what robots see: neural density fields as rigid bodies.\n\n"
-            "`dano demo` shows it; `dano build` makes a body of your field."
-        ),
-        args=list(argv),
+    if words[0] not in _COMMANDS:
+        raise ValueError(
+            f"command must be one of {', '.join(_COMMANDS)}, got {words[0]!r}"
+            + did_you_mean(words[0], _COMMANDS)
+        )
+    row = _COMMANDS[words[0]]
+    return tyro.cli(
+        row.kind,
+        prog=f"dano {words[0]}",
+        description=f"{_about(row.kind)}\n\nExample: {row.example}",
+        args=words[1:],
         config=(FlagCreatePairsOff,),
     )
+
+
+def _about(kind: type) -> str:
+    """What a command does: its docstring without the arguments."""
+    return (inspect.getdoc(kind) or "").split("\nAttributes:")[0].strip()
+
+
+def _overview() -> str:
+    """What `dano --help` prints: every command with a line and an example, in groups."""
+    lines = [
+        "usage: dano COMMAND …       dano COMMAND --help says what a command takes",
+        "",
+        "Simulate what robots see: neural density fields as rigid bodies.",
+    ]
+    for title, group in GROUPS.items():
+        lines += ["", title]
+        for name, row in group.items():
+            summary = _about(row.kind).split("\n\n")[0]
+            text = textwrap.wrap(" ".join(summary.split()), 78)
+            lines += [f"  {name:<10}{text[0]}", *(f"{'':<12}{line}" for line in text[1:])]
+            lines.append(f"{'':<12}{row.example}")
+    lines += ["", "dano --version; completion for shells: dano --tyro-print-completion bash|zsh|tcsh"]
+    return "\n".join(lines)

@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from importlib.resources import files
 from pathlib import Path
@@ -33,7 +34,7 @@ def simulate(command: Simulate) -> None:
     if not command.slow_motion > 0:
         raise ValueError(f"slow_motion must be > 0, got {command.slow_motion}")
     check_distinct(output=output, video=video, strip=strip)
-    loaded = _load(scene, command.steps, command.timestep)
+    loaded = load(scene, command.steps, command.timestep)
     for path in (output, video, strip):
         if path is not None:
             check_output(path, *loaded.inputs())
@@ -75,14 +76,17 @@ def demo(command: Demo) -> None:
         say(f"warning: numbers only, {missing}")
     began = time.monotonic()
     reports: dict[str, dict[str, Any]] = {}
-    with _Artist(draws=missing is None) as artist:
+    tell = (lambda _: None) if command.json else _clock(began)
+    with _Artist(draws=missing is None, tell=tell) as artist:
         for scene in SCENES if command.name == "all" else (command.name,):
-            reports[scene] = _demo_scene(scene, folder, artist)
+            reports[scene] = _demo_scene(scene, folder, artist, tell)
             if not command.json:
+                put()
                 put(f"== {scene} ==")
                 _rollout.print_rollout(reports[scene])
                 put()
             _rollout.warn_unconverged(reports[scene])
+        tell("drawing films")
         artist.finish()
     for scene, report in reports.items():
         with replacing(folder / f"{scene}.json") as file:
@@ -101,20 +105,33 @@ def demo(command: Demo) -> None:
     put(f"took {seconds:.0f} s; change {first} and run it with `dano simulate {first} -o RUN.npz`")
 
 
-def _demo_scene(name: str, folder: Path, artist: "_Artist") -> dict[str, Any]:
+def _clock(began: float) -> Callable[[str], None]:
+    """Prints what happens when, in seconds of wall time since `began`, also where output goes to a file."""
+
+    def tell(what: str) -> None:
+        put(f"[{time.monotonic() - began:5.1f} s] {what}")
+
+    return tell
+
+
+def _demo_scene(name: str, folder: Path, artist: "_Artist", tell: Callable[[str], None]) -> dict[str, Any]:
     """Write a shipped scene, its objects and its run to a folder, and order the pictures."""
     path = folder / f"{name}.toml"
     with replacing(path) as file:
         file.write((files("dano") / "scenes" / path.name).read_bytes())
-    loaded = _load(path, None, None)
-    objects = {}
+    tell(f"{name}: building objects, {path} written")
+    objects, text = {}, path.read_text(encoding="utf-8")
     for asset in scene_file.ASSETS:
-        if f'asset = "{asset}"' in loaded.text:
+        if f'asset = "{asset}"' in text:
+            # Before the scene is read, so that the first is drawn while the second is built.
             objects[asset] = str(folder / f"{asset}.dano")
             made = scene_file.build_asset(asset)
             made.save(folder / f"{asset}.dano")
             artist.draw(made, folder / f"{asset}.png")
+    loaded = load(path, None, None)
+    tell(f"{name}: compiling and simulating {loaded.n_steps} steps")
     rollout, report = _simulated(loaded, path.with_suffix(".npz"))
+    tell(f"{name}: simulated, {path.with_suffix('.npz')} written")
     report = {"scene": str(path), "objects": objects, **report}
     report.update(artist.film(loaded, rollout, path.with_suffix(".mp4"), path.with_suffix(".png")))
     return report
@@ -123,8 +140,8 @@ def _demo_scene(name: str, folder: Path, artist: "_Artist") -> dict[str, Any]:
 class _Artist:
     """Makes the pictures of the demo in a second thread, while the next scene is simulated in the first."""
 
-    def __init__(self, *, draws: bool):
-        self._draws = draws
+    def __init__(self, *, draws: bool, tell: Callable[[str], None]):
+        self._draws, self._say = draws, tell
         self._thread = ThreadPoolExecutor(1, "dano artist")
         self._progress = Progress()
         self._orders: list[Future[None]] = []
@@ -144,7 +161,7 @@ class _Artist:
             from dano.report import draw_object
 
             self._drawn.add(path)
-            self._orders.append(self._thread.submit(draw_object, made, path, title=path.stem))
+            self._order(self._thread.submit(draw_object, made, path, title=path.stem), path)
 
     def film(
         self, loaded: scene_file.SceneFile, rollout: _rollout.Rollout, video: Path, strip: Path
@@ -165,8 +182,16 @@ class _Artist:
             size=DEMO_SIZE,
             progress=self._tell,
         )
-        self._orders.append(order)
+        self._order(order, video)
         return {"video": str(video), "strip": str(strip)}
+
+    def _order(self, order: Future[None], path: Path) -> None:
+        def tell(done: Future[None]) -> None:
+            if not done.cancelled() and done.exception() is None:
+                self._say(f"{path} drawn")
+
+        order.add_done_callback(tell)
+        self._orders.append(order)
 
     def finish(self) -> None:
         """Wait until everything is drawn."""
@@ -183,7 +208,7 @@ class _Artist:
             self._progress(description, share)
 
 
-def _load(path: Path, steps: int | None, timestep: float | None) -> scene_file.SceneFile:
+def load(path: Path, steps: int | None, timestep: float | None) -> scene_file.SceneFile:
     """The scene in a file, or that of an object dropped onto a floor."""
     progress = Progress()
     if path.suffix.lower() == ".dano":

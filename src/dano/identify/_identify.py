@@ -20,6 +20,7 @@ from dano.identify._settings import deviations, estimated, Noise, Search, Setup,
 from dano.identify._uncertainty import quantile, uncertainty
 from dano.identify._windows import Plan
 from dano.maths import quat_conjugate, quat_log, quat_multiply
+from dano.notebook import card, curves, numbers
 from dano.scene import Control, Scene, State, Trajectory
 from dano.solvers import Solution, Stop
 
@@ -100,6 +101,17 @@ class Identification:
     freedom: int
     evaluations: int
     seconds: float
+
+    def _repr_html_(self) -> str:
+        """What notebooks show: values with errors beside the loss."""
+        rows = [
+            (name, f"{numbers(np.ravel(value))} ± {numbers(np.ravel(self.standard_errors[name]))}")
+            for name, value in self.values.items()
+        ]
+        rows += [("stopped", str(self.stop)), *(("", message) for message in self.messages)]
+        loss = np.log10(np.maximum(np.asarray(self.loss_history, np.float64), 1e-300))
+        steps = np.arange(len(loss), dtype=np.float64)
+        return card("Identification", rows, curves(steps, {"loss": loss}, "log₁₀ of the loss"))
 
     @property
     def converged(self) -> bool:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dano.archive import LOOK, OBJECT, read_archive, write_archive
 from dano.fields import AbstractField, AbstractShape, GridField, SignedDistanceGrid
 from dano.maths import checked_array, checked_count, checked_key, floating, is_traced, Numbers
+from dano.notebook import card, cloud, numbers
 from dano.objects._interior import examine, Interior, sealed
 from dano.objects._mass import checked_density, Density, integrate, integrated, MassProperties, Progress
 from dano.objects._samples import (
@@ -63,6 +64,20 @@ class NeuralObject(eqx.Module):
     interior: Interior | None
     mass_model: str = eqx.field(static=True)
     mass_reason: str = eqx.field(static=True)
+
+    def _repr_html_(self) -> str:
+        """What notebooks show: mass properties beside a drawing of the surface samples."""
+        principal = np.linalg.eigvalsh(np.asarray(self.mass.inertia, np.float64))
+        rows = [
+            ("mass [kg]", numbers([float(self.mass.mass)])),
+            ("centre of mass [m]", numbers(np.asarray(self.mass.com))),
+            ("principal inertias [kg m²]", numbers(principal)),
+            ("longest extent [m]", numbers([self.size])),
+            ("samples", f"{len(self.samples.points)}, on the surface {len(self.surface.points)}"),
+            ("mass model", f"{self.mass_model}: {self.mass_reason}"),
+        ]
+        points, normals = (np.asarray(x, np.float64) for x in (self.surface.points, self.surface.normals))
+        return card("NeuralObject", rows, cloud(points, normals))
 
     @classmethod
     def from_field(

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dano.report._stage import Touches
-from dano.vision import Camera
+from dano.vision import AbstractCamera, Camera
 
 _DOT = (24, 26, 30)
 _ARROW = (214, 40, 57)
@@ -48,6 +48,47 @@ def draw_touches(
     for mask, colour in ((layer, _ARROW), (dots, _DOT)):
         result.paste(colour, mask=mask.resize(result.size, Image.Resampling.BOX))
     return np.asarray(result)
+
+
+def draw_clock(
+    picture: UInt8[np.ndarray, "height width 3"], camera: AbstractCamera, time: float, distance: float
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The picture with the time and a bar that says how long things are, in its lower corners.
+
+    Args:
+        picture: sRGB.
+        camera: From where it was taken.
+        time: Of the frame [s].
+        distance: From the camera at which the bar has its length [m].
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    result = Image.fromarray(picture)
+    draw = ImageDraw.Draw(result)
+    height = camera.height
+    font = ImageFont.load_default(size=max(10.0, height / 24))
+    margin, base = height / 30, height - height / 30
+    draw.text((margin, base), f"{time:.2f} s", font=font, fill=_DOT, anchor="ls")
+    metre = 1 / (camera.pixel_angle * distance)
+    length = round_below(camera.width / 5 / metre)
+    right, left = camera.width - margin, camera.width - margin - length * metre
+    draw.line([left, base, right, base], fill=_DOT, width=max(2, height // 200))
+    draw.text((right, base - height / 60), length_text(length), font=font, fill=_DOT, anchor="rs")
+    return np.asarray(result)
+
+
+def round_below(x: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not above x > 0."""
+    power = 10.0 ** np.floor(np.log10(x))
+    return float(max(k * power for k in (1, 2, 5) if k * power <= x * (1 + 1e-12)))
+
+
+def length_text(length: float) -> str:
+    """A length [m] with the unit that it is usually said in."""
+    for unit, name in ((1.0, "m"), (1e-2, "cm")):
+        if length >= unit * (1 - 1e-9):
+            return f"{length / unit:.4g} {name}"
+    return f"{length / 1e-3:.4g} mm"
 
 
 def _arrow(draw, tail: np.ndarray, head: np.ndarray, scale: float) -> None:

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, UInt8
 from dano.archive import checked_output, replacing
 from dano.extras import optional
 from dano.progress import Progress
-from dano.report._overlay import draw_touches
+from dano.report._overlay import draw_clock, draw_touches
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import camera_for, stage, touches
 from dano.scene import Scene, Trajectory
@@ -31,6 +31,7 @@ def render_trajectory(
     size: tuple[int, int] = (640, 400),
     slow_motion: int | float = 1.0,
     contact_points: bool = True,
+    clock: bool = True,
     strip: str | os.PathLike[str] | None = None,
     camera: Camera | None = None,
     colours: dict[str, str] | None = None,
@@ -49,6 +50,7 @@ def render_trajectory(
         size: Width and height [pixels], even numbers.
         slow_motion: How many times slower than life the video plays.
         contact_points: Whether to draw where bodies touch, and the contact force as an arrow.
+        clock: Whether to draw the time, and a bar that says how long things are in the middle of the motion.
         strip: A PNG with some moments of the motion, from left to right; None for none.
         camera: From where; default: chosen such that all bodies stay in view. Replaces `size`.
         colours: "#rrggbb" by body name, for those that shall have a certain one.
@@ -71,9 +73,14 @@ def render_trajectory(
     length = 0.55 * float(np.median([item.radius for item in drawn.items if item.plane is None] or [1.0]))
     position, orientation = poses_at(trajectory, times)
 
+    bounded = [row for row, item in zip(drawn.rows, drawn.items, strict=True) if item.plane is None]
+    middle = position[:, bounded or drawn.rows].mean(axis=(0, 1))
+    distance = max(float((middle - camera.position) @ camera.axes[2]), 1e-3)
+
     def picture(frame: int) -> UInt8[np.ndarray, "height width 3"]:
         image = render(drawn.posed(position[frame], orientation[frame]), camera, floor=False)
-        return image if touched is None else draw_touches(image, camera, touched, frame, length)
+        image = image if touched is None else draw_touches(image, camera, touched, frame, length)
+        return draw_clock(image, camera, float(times[frame]), distance) if clock else image
 
     moments = moments_of(position, _STRIP_MOMENTS)
     frames = range(len(times)) if outputs[0] is not None else moments.tolist()

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from dano.contact import checked_parameter, CHUNK, ContactParams
 from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
 from dano.names import did_you_mean
+from dano.notebook import card, cloud
 from dano.objects import checked_inertia
 from dano.scene._bodies import Body, checked_parts
 from dano.scene._contacts import Contact, prepared
@@ -124,6 +125,23 @@ class Scene(eqx.Module):
         if contacts or rest is not None:
             _warn_of_long_steps(bodies, timestep, gravity)
         return cls(bodies, contacts, timestep, gravity, twins, joints, rest, _room(bodies, timestep, gravity))
+
+    def _repr_html_(self) -> str:
+        """What notebooks show: bodies with mass and size, and what may touch."""
+        rows = []
+        for body in self.bodies[:12]:
+            drawing = ""
+            if body.surface is not None:
+                points = np.asarray(body.scale)[:, None] * np.asarray(body.surface.points[:3])
+                drawing = cloud(points.T, np.asarray(body.surface.vectors).T, 56, 150)
+            mass = "fixed" if body.fixed else f"{float(body.mass * body.mass_scale):.4g} kg"
+            rows.append((drawing, body.name, mass, f"{body.size:.4g} m"))
+        named = ", ".join(f"{a} – {b}" for a, b in self.pairs[:12])
+        title = (
+            f"Scene: {len(self.bodies)} bodies, {len(self.pairs)} pairs that may touch ({named});"
+            f" step {float(self.timestep):.4g} s"
+        )
+        return card(title, rows, head=("", "body", "mass", "size"))
 
     @property
     def layout(self) -> Layout:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.archive import read_archive, TRAJECTORY, write_archive
+from dano.notebook import card, curves, numbers
 
 _REPORTED = ("residuals", "iterations", "converged")
 STATE_SIZES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
@@ -94,6 +95,23 @@ class Trajectory(eqx.Module):
     iterations: Int[Array, " steps"]
     converged: Bool[Array, " steps"]
     names: tuple[str, ...] = eqx.field(static=True)
+
+    def _repr_html_(self) -> str:
+        """What notebooks show: how long, what was solved, heights over time."""
+        times = np.asarray(self.times, np.float64)
+        heights = np.asarray(self.states.position, np.float64)[..., 2]
+        if times.ndim != 1:
+            return card("Trajectories", [("shape", str(times.shape)), ("bodies", ", ".join(self.names))])
+        rows = [
+            ("steps", f"{len(times) - 1}, {times[-1]:.4g} s"),
+            ("not converged", str(int(np.sum(~np.asarray(self.converged))))),
+            *(
+                (f"{name} at the end [m]", numbers(np.asarray(self.states.position[-1, i])))
+                for i, name in enumerate(self.names[:8])
+            ),
+        ]
+        named = {name: heights[:, i] for i, name in enumerate(self.names)}
+        return card("Trajectory", rows, curves(times, named, "height [m]"))
 
     def save(self, path: str | os.PathLike[str], *, source: str | None = None) -> None:
         """Write the trajectory to an .npz file, replacing an existing one only when complete.

@@ -3,6 +3,14 @@
 A run remembers the text of the scene that it came from, so that it can be looked at again: see `save_run`.
 """
 
+from dano.scene_file._check import (
+    BodyLine as BodyLine,
+    check_scene as check_scene,
+    ContactLine as ContactLine,
+    Cost as Cost,
+    SceneCheck as SceneCheck,
+)
+from dano.scene_file._forecast import Finding as Finding
 from dano.scene_file._objects import (
     asset_look as asset_look,
     ASSETS as ASSETS,

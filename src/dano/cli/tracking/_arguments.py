@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from tyro.conf import arg, Positional
+from tyro.conf import Positional
 
-_Output = Annotated[Path, arg(aliases=["-o"])]
+from dano.cli._arguments import Output, UNNAMED
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Track:
 
     video: Positional[Path]
     object: Positional[str]
-    output: _Output
+    output: Output = UNNAMED
     report: Path | None = None
     camera: Path | None = None
     focal: tuple[float, ...] = ()

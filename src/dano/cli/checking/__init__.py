@@ -1,0 +1,3 @@
+"""`dano check`."""
+
+from dano.cli.checking._arguments import Check as Check

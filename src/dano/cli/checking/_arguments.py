@@ -1,0 +1,31 @@
+"""The command's arguments, and nothing that is slow to import."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class Check:
+    """Say what a scene will do before a long run: contact law, step, what is not resolved, what it costs.
+
+    Attributes:
+        scene: A scene file (.toml), or a neural object (.dano) that would be dropped onto a floor.
+        steps: Number of steps; default: the scene's.
+        timestep: Timestep [s]; default: the scene's.
+        seconds: Run steps for this long to measure them [s].
+        json: Print one JSON object instead of text.
+    """
+
+    scene: Positional[Path]
+    steps: int | None = None
+    timestep: float | None = None
+    seconds: float = 3.0
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli.checking import _run
+
+        _run.check(self)

@@ -1,0 +1,300 @@
+"""What the steps of a scene will not resolve, estimated before it is simulated.
+
+Speeds are bounded from the initial state: a body falls from where it starts to the lowest fixed body that it
+may touch, v = √(v₀² + 2 g H), or for all of the simulated time if there is none.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from dano.contact import CentroidLaw, DistributedLaw, Patch
+from dano.scene import Body, Contact, RESOLVED, Scene, State
+
+_STEPS_AN_IMPACT = 20
+"""Steps that a spring needs to turn an impact round (see `DistributedLaw`)."""
+_MASS_RATIO = 1e3
+"""Measured: a box on one of a 1000th of its mass is solved in two passes a step, on a 10,000th no longer."""
+_WAY_PER_WALL = 1e3
+"""Measured: the distributed law finds walls of a 2000th of the way in a step, and not of a 4000th."""
+_SINKING = 0.005
+"""Share of its size by which a body at rest sinks at default stiffness (see `DistributedLaw`)."""
+_INSIDE = 2e-3
+"""Share of its volume by which a body may start in another: ten times what it sinks by at rest, see above."""
+
+
+class Finding(NamedTuple):
+    """Something that a scene's steps do not resolve, or that is odd.
+
+    Attributes:
+        subject: start, support, impacts, spin, walls, masses, samples, timestep, file or solver.
+        text: What it is and what would help, in words.
+    """
+
+    subject: str
+    text: str
+
+
+class Bound(NamedTuple):
+    """Largest motion of a body, see the module.
+
+    Attributes:
+        speed: Of its centre of mass [m/s].
+        spin: [rad/s].
+        falls: Whether nothing that it may touch is fixed below it.
+    """
+
+    speed: float
+    spin: float
+    falls: bool
+
+
+def bounds(scene: Scene, state: State, duration: float) -> list[Bound]:
+    """Largest motion of each body, from the initial state and the height that it can fall."""
+    gravity = np.asarray(scene.gravity, np.float64)
+    strength = float(np.linalg.norm(gravity))
+    found = []
+    for i, body in enumerate(scene.bodies):
+        speed, spin = (float(np.linalg.norm(np.asarray(x[i]))) for x in (state.velocity, state.omega))
+        if body.fixed or i not in scene.layout.free or strength == 0.0:
+            found.append(Bound(0.0 if body.fixed else speed, 0.0 if body.fixed else spin, False))
+            continue
+        down = gravity / strength
+        heights = [h for other in _fixed_partners(scene, i) if (h := _height(scene, state, i, other, down))]
+        falls = not heights
+        gained = strength * duration if falls else 0.0
+        reached = speed + gained if falls else math.sqrt(speed**2 + 2 * strength * min(heights))
+        found.append(Bound(reached, spin, falls))
+    return found
+
+
+def _fixed_partners(scene: Scene, i: int) -> list[int]:
+    """Fixed bodies that a body may touch, itself or by way of others that it may touch."""
+    pairs = [(scene.index(a), scene.index(b)) for a, b in scene.pairs]
+    reached, front = {i}, [i]
+    while front:
+        j = front.pop()
+        # What is fixed carries, and passes nothing on.
+        for k in () if scene.bodies[j].fixed else (x for pair in pairs if j in pair for x in pair):
+            if k not in reached:
+                reached.add(k)
+                front.append(k)
+    return [j for j in sorted(reached) if scene.bodies[j].fixed]
+
+
+def _height(scene: Scene, state: State, i: int, other: int, down: np.ndarray) -> float | None:
+    """How far [m] a body's middle can fall to a fixed one; None if that is not below it."""
+    position = np.asarray(state.position, np.float64)
+    body = scene.bodies[other]
+    if np.isfinite(body.size):
+        way = float((position[other] - position[i]) @ down)
+        return way + 0.5 * body.size if way + body.size > 0 else None
+    solid, from_it = body.shape, position[i] - position[other]
+    assert solid is not None
+    inside, further = (
+        float(solid.sdf(jnp.asarray(from_it + s * down, scene.timestep.dtype))) for s in (0.0, 1.0)
+    )
+    closing = inside - further
+    return inside / closing if inside > 0 and closing > 0.05 else None
+
+
+def forecast(scene: Scene, state: State, limits: list[Bound]) -> list[Finding]:
+    """What will not be resolved, from numbers alone."""
+    return [
+        *_support(scene, limits),
+        *_spins(scene, limits),
+        *(finding for contact in scene.contacts for finding in _pair(scene, state, contact, limits)),
+        *_masses(scene),
+        *_samples(scene),
+    ]
+
+
+def _support(scene: Scene, limits: list[Bound]) -> list[Finding]:
+    touched = {name for pair in scene.pairs for name in pair}
+    found = []
+    for i in scene.layout.free:
+        name = scene.names[i]
+        if name not in touched:
+            found.append(Finding("support", f"{name!r} touches nothing: no contact names it"))
+        elif limits[i].falls:
+            text = f"nothing fixed that {name!r} may touch is below it: it may fall for ever"
+            found.append(Finding("support", text))
+    return found
+
+
+def _spins(scene: Scene, limits: list[Bound]) -> list[Finding]:
+    h = float(scene.timestep)
+    found = []
+    for body, limit in zip(scene.bodies, limits, strict=True):
+        if limit.spin * h > 2 * RESOLVED:
+            found.append(
+                Finding(
+                    "spin",
+                    f"{body.name!r} turns by {math.degrees(limit.spin * h):.0f}° in a step, more than 60°:"
+                    " its precession is not resolved; a timestep of"
+                    f" {2 * RESOLVED / limit.spin:.2g} s would do",
+                )
+            )
+    return found
+
+
+def _pair(scene: Scene, state: State, contact: Contact, limits: list[Bound]) -> list[Finding]:
+    a, b = scene.index(contact.a), scene.index(contact.b)
+    return [*_impact(scene, contact, limits[a].speed + limits[b].speed), *_wall(scene, contact, limits)]
+
+
+def _impact(scene: Scene, contact: Contact, speed: float) -> list[Finding]:
+    h, pair = float(scene.timestep), f"{contact.a!r} and {contact.b!r}"
+    law, params = contact.law, contact.params
+    if isinstance(law, CentroidLaw):
+        edge = float(contact.edge or 0.0)
+        if speed * h <= edge:
+            return []
+        return [
+            Finding(
+                "impacts",
+                f"{pair} meet at up to {speed:.2g} m/s and go {1e3 * speed * h:.2g} mm in a step, more"
+                f" than the edge ({1e3 * edge:.2g} mm): how hard they push depends on where in a step they"
+                f' meet; a timestep of {edge / speed:.1g} s, a wider edge or law = "distributed" would do',
+            )
+        ]
+    if not isinstance(law, DistributedLaw):
+        return []
+    if law.compliant:
+        period = _half_period(scene, contact, speed)
+        if period >= _STEPS_AN_IMPACT * h:
+            return []
+        return [
+            Finding(
+                "impacts",
+                f"an impact of {pair} lasts {period:.2g} s, {period / h:.2g} steps, and a spring"
+                f" (compliant) needs {_STEPS_AN_IMPACT}; a timestep of"
+                f" {period / _STEPS_AN_IMPACT:.1g} s would do",
+            )
+        ]
+    slow = float(params.restitution_velocity) + float(np.linalg.norm(np.asarray(scene.gravity))) * h
+    if float(params.restitution) == 0.0 or speed == 0.0 or speed > slow:
+        return []
+    return [
+        Finding(
+            "impacts",
+            f"{pair} meet at up to {speed:.2g} m/s and bounce by restitution only from {slow:.2g} m/s on:"
+            " they will bounce less; a smaller timestep or restitution_velocity would do",
+        )
+    ]
+
+
+def _half_period(scene: Scene, contact: Contact, speed: float) -> float:
+    """Time [s] in which the springs of a contact turn an impact at a speed [m/s] round: π √(m d/F).
+
+    d is the depth where ½ m v² = ½ F(d) d, and F(d) = k Σ A d of the samples that are so deep when the body
+    lies on a floor in a typical orientation.
+    """
+    bodies = [scene.body(name) for name in (contact.a, contact.b)]
+    mass = 1 / sum(1 / float(body.mass * body.mass_scale) for body in bodies if not body.fixed)
+    body = min((body for body in bodies if body.surface is not None), key=lambda body: body.size)
+    depths = body.size * np.geomspace(1e-6, 0.5, 40)
+    forces = float(contact.params.stiffness) * np.array([body.typical_support(d) for d in depths])
+    deepest = int(np.argmax(forces * depths >= mass * speed**2))
+    return math.pi * math.sqrt(mass * depths[deepest] / max(forces[deepest], 1e-300))
+
+
+def _wall(scene: Scene, contact: Contact, limits: list[Bound]) -> list[Finding]:
+    h = float(scene.timestep)
+    a, b = (scene.index(name) for name in (contact.a, contact.b))
+    way = (limits[a].speed + limits[b].speed) * h
+    depths = {scene.names[i]: _half_thickness(scene.bodies[i]) for i in (a, b)}
+    if isinstance(contact.law, DistributedLaw):
+        most = _WAY_PER_WALL * 2 * min(depths.values())
+    else:
+        # Beyond the middle of both, normals push to the far side.
+        most = 0.5 * sum(depths.values())
+    if way <= most:
+        return []
+    thin = min(depths, key=depths.__getitem__)
+    return [
+        Finding(
+            "walls",
+            f"{contact.a!r} and {contact.b!r} come up to {1e3 * way:.3g} mm closer in a step, and {thin!r} is"
+            f" {2e3 * depths[thin]:.2g} mm thick: one may pass through the other; a timestep of"
+            f" {h * most / way:.1g} s would do",
+        )
+    ]
+
+
+def _half_thickness(body: Body) -> float:
+    return float((body.measured() if body.extent is None else body.extent)[5])
+
+
+def _masses(scene: Scene) -> list[Finding]:
+    masses = {body.name: float(body.mass * body.mass_scale) for body in scene.bodies if not body.fixed}
+    found = []
+    for a, b in scene.pairs:
+        if a not in masses or b not in masses:
+            continue
+        light, heavy = sorted((a, b), key=masses.__getitem__)
+        ratio = masses[heavy] / masses[light]
+        if ratio > _MASS_RATIO:
+            found.append(
+                Finding(
+                    "masses",
+                    f"{heavy!r} has {ratio:.3g} times the mass of {light!r}: steps in which it lies on it"
+                    f" may not converge (up to {_MASS_RATIO:.0f} times they do)",
+                )
+            )
+    return found
+
+
+def _samples(scene: Scene) -> list[Finding]:
+    """Bodies whose samples are so far apart that a round body sinks deeper between them than it does at rest.
+
+    Between samples at a distance s a ball of diameter D reaches s²/(4 D) below the chord.
+    """
+    touched = {name for pair in scene.pairs for name in pair}
+    found = []
+    for body in scene.bodies:
+        if body.object is None or body.name not in touched:
+            continue
+        areas = np.asarray(body.object.surface.areas, np.float64)
+        spacing = math.sqrt(float(areas.sum()) / len(areas))
+        if spacing**2 / (4 * body.size) > _SINKING * body.size:
+            enough = math.ceil(float(areas.sum()) / (4 * _SINKING * body.size**2))
+            found.append(
+                Finding(
+                    "samples",
+                    f"{body.name!r} has {len(areas)} surface samples, {1e3 * spacing:.2g} mm apart: it will"
+                    f" lie on single ones; {enough} would do, {10 * enough} are better",
+                )
+            )
+    return found
+
+
+def starts(scene: Scene, patches: Sequence[Patch]) -> list[Finding]:
+    """Bodies that begin inside each other.
+
+    Args:
+        scene: The scene.
+        patches: Overlap of each pair at the initial state, arrays of shape (1,): `contact_patches`.
+    """
+    found = []
+    for k, ((a, b), patch) in enumerate(zip(scene.pairs, patches, strict=True)):
+        moving = [body for body in (scene.body(a), scene.body(b)) if not body.fixed]
+        # The distributed law gives a volume, the centroid law a mass.
+        volumes = k >= len(scene.contacts) or scene.contacts[k].law.presses
+        whole = min(_box_volume(body) if volumes else float(body.mass * body.mass_scale) for body in moving)
+        share = float(patch.overlap[0]) / whole
+        if share > _INSIDE:
+            text = f"{a!r} and {b!r} start inside each other, by {100 * share:.2g} % of the smaller one"
+            found.append(Finding("start", f"{text}: they will be pushed apart"))
+    return found
+
+
+def _box_volume(body: Body) -> float:
+    """Volume [m³] of the box around a body."""
+    if body.object is not None:
+        return float(np.prod(np.ptp(np.asarray(body.object.surface.points, np.float64), axis=0)))
+    assert body.shape is not None
+    return float(np.prod(np.ptp(np.asarray(body.shape.bounds, np.float64), axis=0)))
