@@ -78,6 +78,8 @@ class Problem:
         self.jumps = None
         if self.ties:
             usual = {**dict.fromkeys(QUANTITIES, np.inf), **noise}
+            if "q" in noise:
+                usual |= {key: min(usual[key], noise["q"]) for key in ("position", "orientation")}
             rate = max(1e-6, float(self.plan.n_steps * scene.timestep))
             # Velocities that were not observed may miss by what would move a window's end by the noise.
             for slow, fast in (("position", "velocity"), ("orientation", "omega")):
