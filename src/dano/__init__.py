@@ -98,6 +98,6 @@ from dano.plan import (
     Task as Task,
 )
 from dano.scene_file import load_object as load_object, load_scene as load_scene
-from dano.exchange import export_object as export_object
+from dano.exchange import export_object as export_object, export_robot as export_robot
 
 __version__ = "0.1.0"
