@@ -70,12 +70,12 @@ def test_arm_as_it_was_loaded(tmp_path, suffix):
         assert [body.name for body in again.bodies[1:]] == [body.name for body in robot.bodies[1:]]
         scenes = [(r.scene(), r) for r in (robot, again)]
         masses = [np.asarray(dano.mass_matrix(s, r.state(s, dict(bend=0.8)))) for s, r in scenes]
-        np.testing.assert_allclose(*masses, atol=1e-12)
+        np.testing.assert_allclose(masses[0], masses[1], atol=1e-12)
         ends = [np.stack([j.limits for j in r.joints if j.limits is not None]) for r in (robot, again)]
-        np.testing.assert_allclose(*ends, atol=1e-12)
+        np.testing.assert_allclose(ends[0], ends[1], atol=1e-12)
     q = dict(lift=0.6, bend=0.8, grip=0.02)
     places = [np.asarray(r.place(s := r.scene(), r.state(s, q), "tool")[0]) for r in (robot, again)]
-    np.testing.assert_allclose(*places, atol=1e-12)
+    np.testing.assert_allclose(places[0], places[1], atol=1e-12)
 
 
 def test_springs_and_armature(tmp_path):

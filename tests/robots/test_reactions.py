@@ -8,6 +8,7 @@ from robots.files import ARM, panda
 from robots.test_dynamics import theirs
 
 import dano
+from dano.maths import quat_rotate
 from dano.robots import drifted
 
 mujoco = pytest.importorskip("mujoco")
@@ -65,7 +66,7 @@ def test_reaction_along_the_axis_is_the_effort(moving):
     efforts = np.asarray(dano.computed_torque(scene, state, acceleration))
     orientation = np.asarray(scene.frames(state).orientation)
     for row, joint, effort in zip(found, scene.joints, efforts, strict=True):
-        axis = dano.maths.quat_rotate(orientation[scene.index(joint.child)], np.asarray(joint.axis))
+        axis = quat_rotate(orientation[scene.index(joint.child)], np.asarray(joint.axis))
         np.testing.assert_allclose(row[3:] @ np.asarray(axis), effort, atol=1e-9)
 
 

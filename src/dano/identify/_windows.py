@@ -190,7 +190,8 @@ def _weighed(
         if key == "q":
             counts[:, :, unmoved] = False
         else:
-            counts[np.ix_(from_joints, range(counts.shape[1]), list(layout.children))] = False
+            hanging = np.isin(np.arange(layout.bodies), layout.children)
+            counts &= ~(from_joints[:, None, None] & hanging[None, None])
         poses = ("position", "orientation")
         if not (any(each in initial for each in poses) if key == "q" else key in initial):
             counts[:, 0] = False
