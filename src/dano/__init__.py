@@ -54,9 +54,11 @@ from dano.robots import (
     inverse_kinematics as inverse_kinematics,
     InverseKinematics as InverseKinematics,
     joint_control as joint_control,
+    joint_reactions as joint_reactions,
     load_mjcf as load_mjcf,
     load_urdf as load_urdf,
     mass_matrix as mass_matrix,
+    operational_space_torque as operational_space_torque,
     Robot as Robot,
     Target as Target,
 )
@@ -96,6 +98,6 @@ from dano.plan import (
     Task as Task,
 )
 from dano.scene_file import load_object as load_object, load_scene as load_scene
-from dano.exchange import export_object as export_object
+from dano.exchange import export_object as export_object, export_robot as export_robot
 
 __version__ = "0.1.0"

@@ -1,4 +1,4 @@
-"""Objects in the formats of other simulators: meshes, MJCF, URDF, USD."""
+"""Objects, and robots, in the formats of other simulators: meshes, MJCF, URDF, USD."""
 
 from dano.exchange._export import (
     check_folder as check_folder,
@@ -11,6 +11,7 @@ from dano.exchange._pieces import (
     convex_hull as convex_hull,
     decomposition as decomposition,
 )
+from dano.exchange._robots import export_robot as export_robot
 from dano.exchange._triangles import (
     enclosed as enclosed,
     largest_part as largest_part,

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.engine import AbstractEngine, Policy, VariationalEngine
+from dano.identify._joint_log import joint_table
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Parameter, space_of, values_at, with_values
 from dano.identify._problem import Problem
@@ -421,9 +422,13 @@ def _as_motions(plan: Plan, motions: Sequence[Motion], found: Linearized, scene:
         arrays = {
             key: np.full((len(motion.times), len(bodies), size), np.nan) for key, size in QUANTITIES.items()
         }
+        q = None if motion.q is None else np.full_like(motion.q, np.nan)
         for w in np.flatnonzero(plan.owner == i):
             rows = plan.rows[w]
+            if q is not None:
+                table = joint_table(scene.layout, found.predicted.q[w])
+                q[rows] = np.asarray(table)[: len(rows), bodies]
             for key in QUANTITIES:
                 arrays[key][rows] = predicted[key][w, : len(rows)][:, bodies]
-        result.append(dataclasses.replace(motion, **arrays, covariance=None))
+        result.append(dataclasses.replace(motion, **arrays, covariance=None, q=q))
     return tuple(result)

@@ -5,15 +5,42 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from dano.identify._motion import Motion
+from dano.identify._motion import JOINT_NUMBERS, Motion
 from dano.maths import Numbers, quat_rotate
-from dano.scene import Scene, State
+from dano.scene import Layout, Scene, State
+
+
+def joint_table(layout: Layout, q: Float[Array, "t k"]) -> Float[Array, "t n 3"]:
+    """Joint coordinates by the bodies that hang on the joints, as `Motion.q` has them for all n bodies."""
+    bodies, parts = _places(layout)
+    return jnp.zeros((q.shape[0], layout.bodies, JOINT_NUMBERS), q.dtype).at[:, bodies, parts].set(q)
+
+
+def joint_numbers(layout: Layout, table: np.ndarray) -> np.ndarray:
+    """Joint coordinates (k,) from a row of `joint_table`, shape (n, 3)."""
+    return table[_places(layout)]
+
+
+def joint_widths(layout: Layout) -> np.ndarray:
+    """How many numbers of its own the joint of each body has, shape (n,)."""
+    return np.bincount(_places(layout)[0], minlength=layout.bodies)
+
+
+def _places(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """Body, and which of the coordinates of its joint, of each coordinate."""
+    joints = layout.with_coordinates
+    bodies = [layout.children[j] for j in joints]
+    parts = [place - layout.coordinates[j] for place, j in enumerate(joints)]
+    return np.array(bodies, int), np.array(parts, int)
 
 
 def motion_of_joints(scene: Scene, times: Numbers, q: Numbers, *, state: State | None = None) -> Motion:
     """The motion of a log of joint coordinates.
 
+    What `identify` compares are the coordinates. Poses of the bodies that hang on the joints follow from
+    them: each noisy coordinate moves all bodies after its joint, so these are no observations of their own.
     Positions are those of the field frames, so that they say nothing of centres of mass, which may be
     unknown.
 
@@ -47,4 +74,5 @@ def motion_of_joints(scene: Scene, times: Numbers, q: Numbers, *, state: State |
         position=np.asarray(origin)[:, hanging],
         orientation=np.asarray(frames.orientation)[:, hanging],
         point="origin",
+        q=np.asarray(joint_table(scene.layout, rows))[:, hanging],
     )

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 QUANTITIES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 """What a motion may hold of each body and frame, and how many numbers it has."""
 
+JOINT_NUMBERS = 3
+"""How many coordinates a joint has at most."""
+
 # Frames that a local parabola is fitted to for velocities: three on each side.
 SMOOTHING_FRAMES = 7
 # Finite differences of a motion and its own angular velocity differ by noise, but not by so large a share.
@@ -38,6 +41,9 @@ class Motion:
         covariance: Of each pose, or None if no more is known than one noise for all: of the position [m, W],
             then of the rotation vector [rad, B] by which the true orientation follows the observed one,
             shape (T, n, 6, 6); NaN where it is unknown.
+        q: Coordinates of the joint that each body hangs on [rad or m], or None if they were not observed,
+            shape (T, n, 3): as many numbers as the joint has, then zeros. Poses of such a motion follow from
+            them, and do not count beside them.
     """
 
     times: np.ndarray
@@ -49,6 +55,7 @@ class Motion:
     point: str = "com"
     lag: float = 0.0
     covariance: np.ndarray | None = None
+    q: np.ndarray | None = None
 
     @classmethod
     def create(
@@ -63,6 +70,7 @@ class Motion:
         point: str = "com",
         lag: float = 0.0,
         covariance: Numbers | None = None,
+        q: Numbers | None = None,
     ) -> "Motion":
         """A motion from arrays of shape (T, n, ·), or (T, ·) for a single body.
 
@@ -76,6 +84,7 @@ class Motion:
             point: What positions and velocities refer to: "com" or "origin".
             lag: How long before a frame its velocities hold [s].
             covariance: Of each pose, as a tracker gives it, shape (T, n, 6, 6), or (T, 6, 6) for one body.
+            q: Joint coordinates of each body, see the attribute; `motion_of_joints` makes them.
 
         Raises:
             ValueError: If there are fewer than two frames, times do not increase, a shape is wrong, nothing
@@ -106,6 +115,8 @@ class Motion:
         if covariance is not None:
             matrices = _covariances(covariance, len(stamps), len(names))
             motion = dataclasses.replace(motion, covariance=matrices)
+        if q is not None:
+            motion = dataclasses.replace(motion, q=_frames("q", q, len(stamps), len(names)))
         _check_rotation(motion)
         return motion
 
@@ -153,8 +164,9 @@ class Motion:
         """Frames from `first` up to, not including, `last`; times stay as they are."""
         rows = slice(first, last)
         cut = {name: getattr(self, name)[rows] for name in ("times", *QUANTITIES)}
-        if self.covariance is not None:
-            cut["covariance"] = self.covariance[rows]
+        for name in ("covariance", "q"):
+            value = getattr(self, name)
+            cut |= {} if value is None else {name: value[rows]}
         return dataclasses.replace(self, **cut)
 
     def with_velocities(self, frames: int = SMOOTHING_FRAMES) -> "Motion":
@@ -183,7 +195,7 @@ class Motion:
 
 
 def _frames(name: str, value: Numbers | None, n_frames: int, n_bodies: int) -> np.ndarray:
-    size = QUANTITIES[name]
+    size = QUANTITIES.get(name, JOINT_NUMBERS)
     shape = (n_frames, n_bodies, size)
     if value is None:
         return np.full(shape, np.nan)

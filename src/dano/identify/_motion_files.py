@@ -75,7 +75,7 @@ def load_motion(
         raise ValueError(f"{source} does not name its bodies: give names")
     if found and names is not None and set(chosen) <= set(found):
         rows = [found.index(name) for name in chosen]
-        dimensions = {**dict.fromkeys(QUANTITIES, 3), "covariance": 4}
+        dimensions = {**dict.fromkeys((*QUANTITIES, "q"), 3), "covariance": 4}
         arrays = {
             key: value[:, rows] if value.ndim == dimensions.get(key) else value
             for key, value in arrays.items()
@@ -98,6 +98,7 @@ def load_motion(
             point="origin" if "origin" in (stated, point) else "com",
             lag=float(arrays.get("lag", 0.0)),
             covariance=arrays.get("covariance"),
+            q=arrays.get("q"),
         )
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error
@@ -106,7 +107,7 @@ def load_motion(
 def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
     """Write a motion to an .npz or .csv file, replacing an existing one only when complete.
 
-    A .csv does not keep `point`, `lag` and `covariance`.
+    A .csv does not keep `point`, `lag`, `covariance` and `q`.
 
     Raises:
         ValueError: If the suffix is another, `path` is a directory or its parent does not exist.
@@ -117,8 +118,9 @@ def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
         form, version = MOTION
         words = {"format": form, "version": version, "names": motion.names, "point": motion.point}
         words["lag"] = motion.lag
-        if motion.covariance is not None:
-            arrays["covariance"] = motion.covariance
+        for name in ("covariance", "q"):
+            if getattr(motion, name) is not None:
+                arrays[name] = getattr(motion, name)
         write_archive(target, {**arrays, **{key: np.array(value) for key, value in words.items()}})
         return
     if target.suffix.lower() != ".csv":
@@ -156,7 +158,8 @@ def _read_npz(source: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
         raise ValueError(
             f"{source} must hold one of {list(QUANTITIES)} as arrays, got members {sorted(data)}"
         )
-    for key in ("point", "lag", "covariance"):
+    # A trajectory has joint coordinates in an order of its own.
+    for key in ("point", "lag", "covariance", *(["q"] if form == MOTION[0] else [])):
         if key in data:
             arrays[key] = data[key]
     if form == TRAJECTORY[0]:

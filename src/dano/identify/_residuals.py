@@ -11,6 +11,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.engine import AbstractEngine, compiled, gather, map_rows, simulate
+from dano.identify._joint_log import joint_table
 from dano.identify._parameters import Selection, with_values
 from dano.identify._starts import Start
 from dano.identify._windows import Windows
@@ -192,8 +193,8 @@ def moved(start: State, change: Float[Array, "w k"], unknowns: Start) -> State:
 
 
 def _rows_of(state: State) -> State:
-    """The part of a state that bodies are observed in."""
-    return dataclasses.replace(state, q=None, v=None)
+    """The part of a state that is observed."""
+    return dataclasses.replace(state, v=None)
 
 
 def _no_change(model: Model) -> Float[Array, " k"]:
@@ -223,9 +224,8 @@ def _residuals(model: Model, window: Windows, start: State, following: State, x,
     states = trajectory.states
     places = _at(states, window.frame)
     speeds = _at(states, window.moment)
-    predicted = _shifted(
-        scene, State(places.position, places.orientation, speeds.velocity, speeds.omega), window.origins, -1
-    )
+    mixed = dataclasses.replace(places, velocity=speeds.velocity, omega=speeds.omega, v=None)
+    predicted = _shifted(scene, mixed, window.origins, -1)
     rows = jnp.stack([_row(model, window, predicted, key) for key in model.quantities], axis=2)
     if window.whitening is not None:
         rows = _whitened(model, rows, window.whitening[:, _bodies(model)])
@@ -266,6 +266,10 @@ def _shifted(scene: Scene, state: State, origins, sign: int) -> State:
 
 def _row(model: Model, window: Windows, predicted: State, key: str) -> Float[Array, "f b 3"]:
     bodies = _bodies(model)
+    if key == "q":
+        assert predicted.q is not None and window.joints is not None
+        missed = joint_table(model.scene.layout, predicted.q) - window.joints
+        return window.weights[key][:, bodies, None] * missed[:, bodies]
     found, seen = getattr(predicted, key)[:, bodies], getattr(window.observed, key)[:, bodies]
     weight = window.weights[key][:, bodies, None]
     if key == "orientation":

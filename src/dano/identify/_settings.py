@@ -14,6 +14,8 @@ from dano.scene import Scene
 _MOST_STARTS = 10_000
 """More starts than that would each cost several simulations of all windows: hours of work."""
 
+_NOISE = (*QUANTITIES, "q")
+
 _INITIAL = {"given": (), "velocities": ("velocity", "omega"), "states": tuple(QUANTITIES)}
 
 
@@ -132,6 +134,8 @@ def estimated(initial: str | Sequence[str] | None, motions: Sequence[Motion]) ->
     Raises:
         ValueError: If it is none of the known words, or lists something else than quantities.
     """
+    if initial is None and any(m.q is not None for m in motions):
+        initial = "states"
     if initial is None:
         first = [np.concatenate([m.velocity, m.omega], axis=-1) for m in motions]
         initial = "given" if all(np.isfinite(v).all() for v in first) else "velocities"
@@ -150,18 +154,27 @@ def deviations(
     """Standard deviations by quantity, by the argument `noise` of `identify`.
 
     Raises:
-        ValueError: If one is not positive, or there is none.
+        ValueError: If one is not positive, there is none, or joint coordinates were observed and have none.
     """
+    joints = any(m.q is not None for m in motions)
+    if noise is None and all(m.q is not None for m in motions):
+        return {"q": 1e-3}
     if noise is None:
         sizes = [scene.body(name).size for m in motions for name in m.names if name in scene.names]
         finite = [size for size in sizes if np.isfinite(size)] or [1.0]
         # A thousandth of the size, seen at half the size from the middle.
-        return {"position": 1e-3 * float(np.mean(finite)), "orientation": 2e-3}
+        poses = {"position": 1e-3 * float(np.mean(finite)), "orientation": 2e-3}
+        return {**poses, "q": 1e-3} if joints else poses
     for key, value in noise.items():
-        if key not in QUANTITIES:
-            raise ValueError(f"noise must be given for some of {list(QUANTITIES)}, got {key!r}")
+        if key not in _NOISE:
+            raise ValueError(f"noise must be given for some of {list(_NOISE)}, got {key!r}")
         if not (np.isfinite(value) and value > 0):
             raise ValueError(f"noise of {key} must be finite and > 0, got {value}")
     if not noise:
-        raise ValueError(f"noise must be given for at least one of {list(QUANTITIES)}, got none")
+        raise ValueError(f"noise must be given for at least one of {list(_NOISE)}, got none")
+    if joints and "q" not in noise:
+        raise ValueError(
+            f"noise must be given for q [rad or m] where joint coordinates were observed, got {list(noise)}: "
+            "poses follow from them and do not count"
+        )
     return dict(noise)

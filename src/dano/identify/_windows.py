@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.identify._motion import Motion, QUANTITIES, SMOOTHING_FRAMES
+from dano.identify._joint_log import joint_numbers, joint_widths
+from dano.identify._motion import JOINT_NUMBERS, Motion, QUANTITIES, SMOOTHING_FRAMES
 from dano.maths import quat_rotate
-from dano.scene import Control, Scene, State
+from dano.scene import Control, Layout, Scene, State
 
 _CONFIGURATION = ("position", "orientation")
 
@@ -25,8 +26,9 @@ class Windows(eqx.Module):
         frame: Where in the rollout each frame lies: step, and share of the next one.
         moment: The same for velocities, which hold half a step before.
         observed: What was seen, zero where nothing was; leaves (w, frames, bodies, ·).
-        weights: One over the standard deviation of each number, zero where nothing was seen, by quantity;
-            shape (w, frames, bodies).
+        joints: The same for joint coordinates, see `Motion.q`; None if no motion has them.
+        weights: One over the standard deviation of each number, zero where nothing was seen, by quantity,
+            "q" for joint coordinates; shape (w, frames, bodies).
         whitening: What makes residuals of pose with these weights, position then orientation, independent and
             of variance one, by the motions' covariances, shape (w, frames, bodies, 6, 6); None if no motion
             has any.
@@ -41,6 +43,7 @@ class Windows(eqx.Module):
     frame: tuple[Int[Array, "w f"], Float[Array, "w f"]]
     moment: tuple[Int[Array, "w f"], Float[Array, "w f"]]
     observed: State
+    joints: Float[Array, "w f n 3"] | None
     weights: dict[str, Float[Array, "w f n"]]
     whitening: Float[Array, "w f n 6 6"] | None
     end: tuple[Int[Array, " w"], Float[Array, " w"]]
@@ -112,9 +115,9 @@ def plan_windows(
     if not seen:
         raise ValueError(f"observed must hold a body that moves, got only fixed ones of {list(scene.names)}")
     dtype = scene.timestep.dtype
-    observed, weights = _weighed(pieces, seen, noise, initial, dtype)
-    sizes = {"position": 3, "orientation": 3, "velocity": 3, "omega": 3}
-    n_data = sum(int(np.count_nonzero(np.asarray(w))) * sizes[key] for key, w in weights.items())
+    observed, joints, weights = _weighed(scene.layout, pieces, seen, noise, initial, dtype)
+    sizes = {key: np.full(len(scene.bodies), 3) for key in QUANTITIES} | {"q": joint_widths(scene.layout)}
+    n_data = sum(int(np.sum((np.asarray(w) > 0) * sizes[key])) for key, w in weights.items())
     elapsed = [piece["times"] - piece["times"][0] for piece in pieces]
     until = [
         piece["until"] - piece["times"][0] if continuous else e[-1]
@@ -137,6 +140,7 @@ def plan_windows(
         _arrays(frame, dtype),
         _arrays(moment, dtype),
         observed,
+        joints,
         weights,
         _whitening(pieces, weights, dtype),
         _arrays(_located(np.array(until) / h, n_steps), dtype),
@@ -158,23 +162,38 @@ def _stacked(values: list[np.ndarray], fill: float = 0.0) -> np.ndarray:
 
 
 def _weighed(
-    pieces: list[dict], seen: Sequence[int], noise: Mapping[str, float], initial: Sequence[str], dtype
-) -> tuple[State, dict[str, Array]]:
-    """What windows observe, and what each number counts: see `Windows`.
+    layout: Layout,
+    pieces: list[dict],
+    seen: Sequence[int],
+    noise: Mapping[str, float],
+    initial: Sequence[str],
+    dtype,
+) -> tuple[State, Array | None, dict[str, Array]]:
+    """What windows observe, of bodies and of joints, and what each number counts: see `Windows`.
 
     Raises:
         ValueError: If nothing counts.
     """
     observed, weights = {}, {}
-    for key in QUANTITIES:
-        values = _stacked([piece[key] for piece in pieces], np.nan)
+    from_joints = np.array([piece["q"] is not None for piece in pieces])
+    unseen = [i for i in range(layout.bodies) if i not in seen]
+    unmoved = np.flatnonzero(joint_widths(layout) == 0)
+    for key in [*QUANTITIES, *(["q"] if from_joints.any() else [])]:
+        blank = np.full((1, layout.bodies, JOINT_NUMBERS), np.nan)
+        values = _stacked([blank if piece[key] is None else piece[key] for piece in pieces], np.nan)
         known = np.asarray(np.isfinite(values).all(axis=-1))
         observed[key] = jnp.asarray(np.where(known[..., None], values, 0.0), dtype)
         if key not in noise:
             continue
         counts = known.copy()
-        counts[:, :, [i for i in range(known.shape[2]) if i not in seen]] = False
-        if key not in initial:
+        counts[:, :, unseen] = False
+        if key == "q":
+            counts[:, :, unmoved] = False
+        else:
+            hanging = np.isin(np.arange(layout.bodies), layout.children)
+            counts &= ~(from_joints[:, None, None] & hanging[None, None])
+        poses = ("position", "orientation")
+        if not (any(each in initial for each in poses) if key == "q" else key in initial):
             counts[:, 0] = False
         if counts.any():
             weights[key] = jnp.asarray(counts / noise[key], dtype)
@@ -182,7 +201,8 @@ def _weighed(
         raise ValueError(
             f"observed must hold frames after the first of one of {list(noise)}, got none that count"
         )
-    return State(**observed), weights
+    joints = observed.pop("q", None)
+    return State(**observed), joints, weights
 
 
 def _whitening(pieces: list[dict], weights: Mapping[str, Array], dtype) -> Array | None:
@@ -249,6 +269,14 @@ def _on_all_bodies(scene: Scene, motion: Motion, what: str) -> dict[str, np.ndar
     return full
 
 
+def _joints_on_all_bodies(scene: Scene, motion: Motion, first: int, last: int) -> np.ndarray | None:
+    if motion.q is None:
+        return None
+    full = np.full((last - first, len(scene.bodies), JOINT_NUMBERS), np.nan)
+    full[:, [scene.index(name) for name in motion.names]] = motion.q[first:last]
+    return full
+
+
 def _covariance_on_all_bodies(scene: Scene, motion: Motion, first: int, last: int) -> np.ndarray | None:
     if motion.covariance is None:
         return None
@@ -285,6 +313,7 @@ def _cut(
                     "origins": origins,
                     "start": start,
                     "control": control,
+                    "q": _joints_on_all_bodies(scene, motion, first, last),
                     "covariance": _covariance_on_all_bodies(scene, motion, first, last),
                     **{key: full[key][first:last] for key in QUANTITIES},
                 }
@@ -336,10 +365,10 @@ def _initial(scene, motion, full, smooth, state, first: int, h: float, what: str
         known = np.isfinite(found).all(axis=-1)
         value[known] = found[known]
         start[key] = value
-    return {**start, **_joint_start(scene, motion, start, state, origins)} if scene.joints else start
+    return {**start, **_joint_start(scene, motion, start, state, first, origins)} if scene.joints else start
 
 
-def _joint_start(scene, motion, start, state, origins) -> dict[str, np.ndarray]:
+def _joint_start(scene, motion, start, state, first: int, origins) -> dict[str, np.ndarray]:
     """Coordinates and velocities of the joints: those of observed bodies from their poses, others stated."""
     layout = scene.layout
     com = np.stack([np.asarray(body.com + body.com_offset) for body in scene.bodies])
@@ -356,6 +385,11 @@ def _joint_start(scene, motion, start, state, origins) -> dict[str, np.ndarray]:
     seen = [scene.joints[j].child in motion.names for j in layout.with_coordinates]
     given = found if state is None else (state.q, state.v)
     q, v = (np.where(seen, np.asarray(f), np.asarray(g)) for f, g in zip(found, given, strict=True))
+    logged = _joints_on_all_bodies(scene, motion, first, first + 1)
+    if logged is not None:
+        # Poses do not tell whole turns.
+        own = joint_numbers(layout, logged[0])
+        q = np.where(np.isfinite(own), own, q)
     return {"q": q, "v": v}
 
 

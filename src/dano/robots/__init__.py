@@ -16,9 +16,11 @@ from dano.robots._description import (
 from dano.robots._dynamics import (
     bias_forces as bias_forces,
     computed_torque as computed_torque,
+    drifted as drifted,
     generalised_velocities as generalised_velocities,
     gravity_forces as gravity_forces,
     joint_control as joint_control,
+    joint_reactions as joint_reactions,
     mass_matrix as mass_matrix,
 )
 from dano.robots._inspect import robot_doubts as robot_doubts, robot_tree as robot_tree
@@ -27,4 +29,5 @@ from dano.robots._inverse import (
     InverseKinematics as InverseKinematics,
     Target as Target,
 )
+from dano.robots._operational import operational_space_torque as operational_space_torque
 from dano.robots._robot import Robot as Robot

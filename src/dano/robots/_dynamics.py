@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.maths import Numbers, quat_exp, quat_log, quat_multiply
-from dano.scene import Control, joints_of, Scene, State, triples
+from dano.maths import Numbers, quat_exp, quat_log, quat_multiply, quat_rotate
+from dano.scene import Control, joints_of, place_links, Scene, State, triples
 
 
 def mass_matrix(scene: Scene, state: State) -> Float[Array, "k k"]:
@@ -31,22 +31,9 @@ def bias_forces(scene: Scene, state: State) -> Float[Array, " k"]:
     Raises:
         ValueError: If the state does not fit the scene.
     """
-    scene.check_state(state)
-    mass, inertia, rows = _masses(scene)
-    speeds = generalised_velocities(scene, state)
-
-    def twists(share: Float[Array, ""]) -> tuple[Array, Array]:
-        frames = scene.frames(_drifted(scene, state, share))
-        moved = frames.jacobian @ speeds
-        return moved[:, :3], moved[:, 3:]
-
-    zero, one = jnp.zeros((), scene.timestep.dtype), jnp.ones((), scene.timestep.dtype)
-    (_, omega), (acceleration, turning) = jax.jvp(twists, (zero,), (one,))
-    jacobian = scene.frames(state).jacobian[rows]
-    force = mass[:, None] * (acceleration[rows] - scene.gravity[None])
-    spin = jnp.einsum("mab,mb->ma", inertia, omega[rows])
-    torque = jnp.einsum("mab,mb->ma", inertia, turning[rows]) + jnp.cross(omega[rows], spin)
-    return _pulled(jacobian, force, torque)
+    still = jnp.zeros(scene.layout.n_velocities, scene.timestep.dtype)
+    force, torque, rows = _needed(scene, state, still)
+    return _pulled(scene.frames(state).jacobian[rows], force, torque)
 
 
 def gravity_forces(scene: Scene, state: State) -> Float[Array, " k"]:
@@ -72,10 +59,52 @@ def computed_torque(scene: Scene, state: State, acceleration: Numbers) -> Float[
     Raises:
         ValueError: If the state does not fit the scene, or the accelerations are not k numbers.
     """
-    wanted = jnp.asarray(acceleration, scene.timestep.dtype)
-    if wanted.shape != (scene.layout.n_velocities,):
-        raise ValueError(f"acceleration must have shape ({scene.layout.n_velocities},), got {wanted.shape}")
+    wanted = _checked_acceleration(scene, acceleration)
     return mass_matrix(scene, state) @ wanted + bias_forces(scene, state)
+
+
+def joint_reactions(
+    scene: Scene, state: State, acceleration: Numbers, *, wrenches: Numbers | None = None
+) -> Float[Array, "j 6"]:
+    """Force [N] and torque about a point of the joint [N m] that each joint gives its child, both in W.
+
+    What the child, and all that hangs on it, lacks for its motion by Newton's and Euler's equations passes
+    through the joint: what the joint holds, and what drives, springs and friction give along its axis. The
+    point is the joint's anchor.
+
+    Args:
+        scene: The scene.
+        state: Where it is and how it moves.
+        acceleration: v̇ [m/s², rad/s²], shape (k,); for two states a step apart the difference of their
+            velocities over the timestep.
+        wrenches: Force [N] and torque about the centre of mass [N m] on each body from elsewhere, such as
+            contacts [W], shape (n, 6). Default: none.
+
+    Raises:
+        ValueError: If the state does not fit the scene, a shape is wrong, or the scene has no joints.
+    """
+    layout, dtype = scene.layout, scene.timestep.dtype
+    if not scene.joints:
+        raise ValueError("scene must have joints, got none")
+    given = jnp.zeros((layout.bodies, 6), dtype) if wrenches is None else jnp.asarray(wrenches, dtype)
+    if given.shape != (layout.bodies, 6):
+        raise ValueError(f"wrenches must have shape ({layout.bodies}, 6), got {given.shape}")
+    scene.check_state(state)
+    assert state.q is not None
+    force, torque, rows = _needed(scene, state, _checked_acceleration(scene, acceleration))
+    poses = place_links(scene.chains, state.position, state.orientation, state.q)
+    turned = quat_rotate(poses.orientation[rows], torque)
+    lacking = (-given).at[rows].add(jnp.concatenate([force, turned], axis=1))
+    # About the origin torques simply add up, from the last bodies of the trees to the first.
+    moments = lacking[:, 3:] + jnp.cross(poses.position, lacking[:, :3])
+    whole = jnp.concatenate([lacking[:, :3], moments], axis=1)
+    whole = jnp.concatenate([whole, jnp.zeros((1, 6), dtype)])
+    for level in reversed(layout.levels):
+        children, parents = (np.array(part)[np.array(level)] for part in (layout.children, layout.parents))
+        whole = whole.at[parents].add(whole[children])
+    passed = whole[np.array(layout.children)]
+    about = passed[:, 3:] - jnp.cross(poses.pivot, passed[:, :3])
+    return jnp.concatenate([passed[:, :3], about], axis=1)
 
 
 def joint_control(scene: Scene, effort: Float[Array, " k"]) -> Control:
@@ -106,11 +135,37 @@ def _masses(scene: Scene) -> tuple[Float[Array, " m"], Float[Array, "m 3 3"], np
     return mass, inertia, rows
 
 
+def _checked_acceleration(scene: Scene, acceleration: Numbers) -> Float[Array, " k"]:
+    wanted = jnp.asarray(acceleration, scene.timestep.dtype)
+    if wanted.shape != (scene.layout.n_velocities,):
+        raise ValueError(f"acceleration must have shape ({scene.layout.n_velocities},), got {wanted.shape}")
+    return wanted
+
+
+def _needed(scene: Scene, state: State, acceleration: Float[Array, " k"]):
+    """Force [N, W] and torque [N m, B] that each body needs beside gravity, and which bodies they are."""
+    scene.check_state(state)
+    mass, inertia, rows = _masses(scene)
+    speeds = generalised_velocities(scene, state)
+
+    def twists(share: Float[Array, ""]) -> tuple[Array, Array]:
+        frames = scene.frames(drifted(scene, state, share))
+        moved = frames.jacobian @ (speeds + share * acceleration)
+        return moved[:, :3], moved[:, 3:]
+
+    zero, one = jnp.zeros((), scene.timestep.dtype), jnp.ones((), scene.timestep.dtype)
+    (_, omega), (gained, turning) = jax.jvp(twists, (zero,), (one,))
+    force = mass[:, None] * (gained[rows] - scene.gravity[None])
+    spin = jnp.einsum("mab,mb->ma", inertia, omega[rows])
+    torque = jnp.einsum("mab,mb->ma", inertia, turning[rows]) + jnp.cross(omega[rows], spin)
+    return force, torque, rows
+
+
 def _pulled(jacobian: Float[Array, "m 6 k"], force: Array, torque: Array) -> Float[Array, " k"]:
     return jnp.einsum("mak,ma->k", jacobian, jnp.concatenate([force, torque], axis=1))
 
 
-def _drifted(scene: Scene, state: State, share: Float[Array, ""]) -> State:
+def drifted(scene: Scene, state: State, share: Float[Array, ""]) -> State:
     """The state after a short time [s] with its velocities, to first order."""
     free = np.array(scene.layout.free, int)
     moved = dataclasses.replace(
