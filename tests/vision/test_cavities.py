@@ -114,6 +114,7 @@ def photographs(n: int, pixels: int) -> Capture:
     return Capture(views)
 
 
+@pytest.mark.slow
 def test_photographs_show_the_inside_of_a_cup():
     capture = photographs(40, 32)
     found = survey(capture, 32)
