@@ -7,6 +7,7 @@ import pytest
 from engine.scenes import angular_momentum
 
 import dano
+from dano.maths import quat_to_matrix
 
 G = 9.81
 PLATE = (0.05, 0.05, 0.02)
@@ -275,9 +276,7 @@ def test_ball_falls_on_an_edge(turn):
         box={"orientation": orientation}, ball={"position": (0.003, 0.035, 0.11), "velocity": (0, 0, -3)}
     )
     run = dano.simulate(scene, state, 40)
-    place = np.asarray(run.states.position[:, 1]) @ np.asarray(
-        dano.maths.quat_to_matrix(jnp.asarray(orientation))
-    )
+    place = np.asarray(run.states.position[:, 1]) @ np.asarray(quat_to_matrix(jnp.asarray(orientation)))
     # Distance of a point outside of a box: that to the nearest point of it.
     apart = np.linalg.norm(place - np.clip(place, -half, half), axis=1)
     assert apart.min() > radius - 0.05 * 2 * radius

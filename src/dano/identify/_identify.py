@@ -416,6 +416,7 @@ def _missed(scene: Scene, motions: Sequence[Motion], errors: Errors) -> str | No
 def _as_motions(plan: Plan, motions: Sequence[Motion], found: Linearized, scene: Scene) -> tuple[Motion, ...]:
     """Predictions at the frames of each motion, of its bodies; NaN for frames before its first window."""
     predicted = {key: np.asarray(getattr(found.predicted, key)) for key in QUANTITIES}
+    joints = found.predicted.q
     result = []
     for i, motion in enumerate(motions):
         bodies = [scene.index(name) for name in motion.names]
@@ -425,8 +426,8 @@ def _as_motions(plan: Plan, motions: Sequence[Motion], found: Linearized, scene:
         q = None if motion.q is None else np.full_like(motion.q, np.nan)
         for w in np.flatnonzero(plan.owner == i):
             rows = plan.rows[w]
-            if q is not None:
-                table = joint_table(scene.layout, found.predicted.q[w])
+            if q is not None and joints is not None:
+                table = joint_table(scene.layout, joints[w])
                 q[rows] = np.asarray(table)[: len(rows), bodies]
             for key in QUANTITIES:
                 arrays[key][rows] = predicted[key][w, : len(rows)][:, bodies]
