@@ -27,8 +27,6 @@ _POOR, _BETTER = 2.0, 5.0
 # Restarts of badly fitting windows: so often from where the windows before end; then with velocities from so
 # few frames, which are noisier, but wrong only within a frame of an impact; then from so many draws of these.
 _SWEEPS, _NARROW, _DRAWS = 2, 3, 8
-# Noise within which a state may begin elsewhere than observed, without data that say so.
-_KNOWN = 3.0
 # Tolerance [standard errors] of all searches but the last.
 _NEAR = 3.0
 # Windows simulated at once on an accelerator; a CPU is fastest one by one.
@@ -82,9 +80,6 @@ class Problem:
             # Velocities that were not observed may miss by what would move a window's end by the noise.
             span = max(1e-6, float(self.plan.n_steps * scene.timestep))
             self.jumps = jnp.asarray(self.start.widths(_usual(noise, span)), dtype)
-        known = self.start.estimated([_KNOWN * width for width in _usual(noise, self.spacing)])
-        # A joint that sticks forgets how fast it was: such a velocity must not run off.
-        self.floor = np.where(np.isfinite(known), known, np.inf) ** -2.0
         self.model = Model(
             scene,
             policy,
@@ -174,11 +169,6 @@ class Problem:
         rows = jnp.asarray(change.reshape(n, self.private), self.model.scene.timestep.dtype)
         return moved(start, rows, self.start)
 
-    def _floor(self) -> np.ndarray:
-        """Curvature that unknowns of a block at least have for a step."""
-        longest = int(np.bincount(self.plan.owner).max()) if self.model.jumps is not None else 1
-        return np.tile(self.floor, longest) if self.private else np.zeros(0)
-
     def points(self, starts: int) -> list[np.ndarray]:
         """Where to start: the given start, and the best by loss of many others in the bounds."""
         points = [self.space.start]
@@ -207,7 +197,6 @@ class Problem:
                 lower=x if held else self.space.lower,
                 upper=x if held else self.space.upper,
                 start_blocks=blocks,
-                block_floor=self._floor(),
                 retract=self.retract,
                 max_iterations=max_iterations,
                 # A step of δ standard errors reduces the loss ½ s² (N − p) by ½ s² δ².

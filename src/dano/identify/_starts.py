@@ -70,14 +70,6 @@ class Start(NamedTuple):
         assert nominal.q is not None and nominal.v is not None and state.q is not None and state.v is not None
         return jnp.concatenate([gone, state.q - nominal.q, state.v - nominal.v])
 
-    def estimated(self, usual: Sequence[float]) -> np.ndarray:
-        """Standard deviations of the unknowns from those of the four quantities."""
-        taken = [width for key, width in zip(QUANTITIES, usual, strict=True) if key in self.initial]
-        position, orientation, velocity, omega = usual
-        q = [orientation if turns else position for turns in self.turning] if self.poses else []
-        v = [omega if turns else velocity for turns in self.turning] if self.speeds else []
-        return np.concatenate([np.tile(np.repeat(taken, 3), len(self.free)), q, v])
-
     def widths(self, usual: Sequence[float]) -> np.ndarray:
         """Standard deviations of the numbers of a jump from those of the four quantities."""
         position, orientation, velocity, omega = usual

@@ -107,7 +107,6 @@ def bounded_least_squares(
     lower: np.ndarray,
     upper: np.ndarray,
     start_blocks: Any = None,
-    block_floor: np.ndarray | float = 0.0,
     retract: Callable[[Any, np.ndarray], Any] = lambda blocks, change: blocks,
     max_iterations: int = 50,
     tolerance: float = 1e-10,
@@ -123,8 +122,6 @@ def bounded_least_squares(
         lower: Bounds, shape (p,); may be −∞.
         upper: Bounds, shape (p,); may be ∞.
         start_blocks: First private unknowns, of any kind; `linearize` and `retract` understand it.
-        block_floor: Curvature that each private unknown at least has for a step, shape (k,): one that changes
-            next to nothing stays about where it is instead of running off. The minimum does not move by it.
         retract: Blocks moved by dz, shape (m, k).
         max_iterations: Accepted steps after which to give up.
         tolerance: Stop when the model promises to reduce the loss by less than this share of it.
@@ -141,7 +138,7 @@ def bounded_least_squares(
     if not np.isfinite(normal.loss):
         raise ValueError(f"loss must be finite at the start {x.tolist()}, got {normal.loss}")
     losses, damping, growth, evaluations, slow = [float(normal.loss)], _DAMPING, 2.0, 1, 0
-    spread, span = _scales(normal, block_floor), _span(x, lower, upper)
+    spread, span = _scales(normal), _span(x, lower, upper)
     try:
         for iteration in range(max_iterations + 1):
             if progress is not None:
@@ -176,9 +173,7 @@ def bounded_least_squares(
                 damping, growth = damping * growth, 2 * growth
                 slow = slow + 1 if normal.loss - best.normal.loss <= tolerance * normal.loss else 0
             x, blocks, normal = at, best.blocks, best.normal
-            spread = _Scales(
-                *(np.maximum(*pair) for pair in zip(_scales(normal, block_floor), spread, strict=True))
-            )
+            spread = tuple(np.maximum(new, old) for new, old in zip(_scales(normal), spread, strict=True))
             losses.append(float(normal.loss))
             if slow == _SLOW:
                 return _solution(x, blocks, normal, Stop.LOSS, losses, evaluations)
@@ -269,20 +264,11 @@ def _solution(x, blocks, normal, stop, losses, evaluations) -> Solution:
     return Solution(x, blocks, normal, stop, np.array(losses), evaluations)
 
 
-class _Scales(NamedTuple):
-    """Diagonals of the Hessians, which measure damping and slopes; and what blocks have besides."""
-
-    shared: np.ndarray
-    private: np.ndarray
-    floor: np.ndarray
-
-
-def _scales(normal: NormalEquations, floor: np.ndarray | float = 0.0) -> _Scales:
-    """See `_Scales`; 1 where there is no curvature."""
+def _scales(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
+    """Diagonals D of the Hessians, which measure damping and slopes; 1 where there is no curvature."""
     shared = np.diag(normal.hessian)
     private = np.diagonal(normal.block_hessian, axis1=1, axis2=2)
-    ones = np.where(shared > 0, shared, 1.0), np.where(private > 0, private, 1.0)
-    return _Scales(*ones, np.broadcast_to(floor, private.shape))
+    return np.where(shared > 0, shared, 1.0), np.where(private > 0, private, 1.0)
 
 
 def _negligible(change: np.ndarray, x: np.ndarray) -> bool:
@@ -295,8 +281,8 @@ def eliminated(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
     return gradient, hessian
 
 
-def _eliminate(normal: NormalEquations, damping: float, spread: _Scales):
-    hessian = normal.hessian + damping * np.diag(spread.shared)
+def _eliminate(normal: NormalEquations, damping: float, spread: tuple[np.ndarray, np.ndarray]):
+    hessian = normal.hessian + damping * np.diag(spread[0])
     if normal.block_gradient.size == 0:
         return normal.gradient, hessian, normal.block_gradient, normal.coupling
     blocks = _damped_blocks(normal, damping, spread)
@@ -308,9 +294,8 @@ def _eliminate(normal: NormalEquations, damping: float, spread: _Scales):
     return gradient, 0.5 * (hessian + hessian.T), shift, follow
 
 
-def _damped_blocks(normal: NormalEquations, damping: float, spread: _Scales) -> np.ndarray:
-    more = damping * spread.private + spread.floor
-    return normal.block_hessian + more[:, :, None] * np.eye(more.shape[1])
+def _damped_blocks(normal: NormalEquations, damping: float, spread) -> np.ndarray:
+    return normal.block_hessian + damping * spread[1][:, :, None] * np.eye(spread[1].shape[1])
 
 
 def _solve_blocks(blocks: np.ndarray, right: np.ndarray) -> np.ndarray:
