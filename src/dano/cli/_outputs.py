@@ -58,11 +58,11 @@ def named(command: Callable[[], None]) -> Callable[[], None]:
 
 def free_path(path: Path) -> Path:
     """The path, or the first of path_2, path_3, … at which there is nothing."""
-    stem, ending = path.name.split(".", 1)[0], path.name[len(path.name.split(".", 1)[0]) :]
+    stem, dot, ending = path.name.partition(".")
     free, number = path, 1
     while free.exists() or free.is_symlink():
         number += 1
-        free = path.with_name(f"{stem}_{number}{ending}")
+        free = path.with_name(f"{stem}_{number}{dot}{ending}")
     return free
 
 

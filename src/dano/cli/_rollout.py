@@ -1,8 +1,6 @@
 """A rollout with progress and timing, and what it came to in numbers."""
 
 import math
-import time
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,17 +10,16 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.cli._console import Progress, put, say
-from dano.engine import contact_history, simulate
+from dano.engine import contact_history
 from dano.scene import (
     JOINT_QUANTITIES,
     Layout,
     Scene,
-    State,
     state_arrays,
     STATE_SIZES,
     Trajectory,
 )
-from dano.scene_file import SceneFile
+from dano.scene_file import run_piece, SceneFile
 
 # A rollout is run in so many pieces: progress can be shown, and an interrupt is heard, between two of them.
 PIECES = 20
@@ -43,11 +40,11 @@ def roll_out(loaded: SceneFile, progress: Progress) -> Rollout:
     n_pieces = math.ceil(loaded.n_steps / length)
     h = float(loaded.scene.timestep)
     progress("compiling the simulation", 0.0)
-    warm_up = _piece(loaded, loaded.state, 0.0, length)[1]
+    warm_up = run_piece(loaded, loaded.state, 0.0, length)[1]
     state, pieces, seconds = loaded.state, [], []
     for i in range(n_pieces):
         # The last piece may run past the end: all have one length, so that only one program is compiled.
-        piece, took = _piece(loaded, state, i * length * h, length)
+        piece, took = run_piece(loaded, state, i * length * h, length)
         state = jax.tree.map(lambda x: x[-1], piece.states)
         pieces.append(piece)
         seconds.append(took)
@@ -55,17 +52,6 @@ def roll_out(loaded: SceneFile, progress: Progress) -> Rollout:
     progress.close()
     share = loaded.n_steps / (n_pieces * length)
     return Rollout(_joined(pieces, loaded), max(0.0, warm_up - seconds[0]), share * sum(seconds))
-
-
-def _piece(loaded: SceneFile, state: State, start: float, n_steps: int) -> tuple[Trajectory, float]:
-    controls = None if loaded.controls is None else loaded.controls.starting_at(start)
-    began = time.perf_counter()
-    with warnings.catch_warnings():
-        # Steps that did not converge are marked in the trajectory and reported at the end, all together.
-        warnings.simplefilter("ignore", RuntimeWarning)
-        piece = simulate(loaded.scene, state, n_steps, controls=controls)
-    jax.block_until_ready(piece.states)
-    return piece, time.perf_counter() - began
 
 
 def _joined(pieces: list[Trajectory], loaded: SceneFile) -> Trajectory:

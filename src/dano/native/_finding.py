@@ -671,30 +671,16 @@ def _find(
         for k in range(10):
             sums[k] = 0.0
         first = used
-        used = _list_pair(
-            count,
-            side,
-            share,
-            reach,
-            False,
-            settings,
-            solid,
-            whole,
-            atlas,
-            placed,
-            (blocks, balls, runs),
-            (numbers, samples),
-            used,
-            sums,
-            scratch,
-        )
-        if sums[9] > sums[1]:
+        for turned in (False, True):
+            # What faces the other way presses where its load is the larger one.
+            if turned and not sums[9] > sums[1]:
+                continue
             used = _list_pair(
                 count,
                 side,
                 share,
                 reach,
-                True,
+                turned,
                 settings,
                 solid,
                 whole,

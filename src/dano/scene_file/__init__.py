@@ -19,6 +19,7 @@ from dano.scene_file._objects import (
     load_object as load_object,
     Progress as Progress,
 )
+from dano.scene_file._pieces import run_piece as run_piece
 from dano.scene_file._reading import (
     load_scene as load_scene,
     parse_scene as parse_scene,

@@ -1,18 +1,17 @@
 """What a scene file asks for, what its steps will not resolve, and what they cost: said before a long run."""
 
 import math
-import time
-import warnings
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from dano.contact import AbstractContactLaw, CentroidLaw, CHUNK, ContactParams, DistributedLaw
-from dano.engine import contact_patches, simulate
+from dano.engine import contact_patches
 from dano.progress import Progress
 from dano.scene import Body, RESOLVED, Scene, State
 from dano.scene_file._forecast import bounds, Finding, forecast, starts
+from dano.scene_file._pieces import run_piece
 from dano.scene_file._reading import SceneFile
 
 _PIECE = 20
@@ -188,10 +187,10 @@ def _measured(loaded: SceneFile, seconds: float, progress: Progress | None) -> t
     h = float(loaded.scene.timestep)
     if progress is not None:
         progress("compiling the simulation", 0.0)
-    _, whole = _run(loaded, loaded.state, 0.0, n)
+    _, whole = run_piece(loaded, loaded.state, 0.0, n)
     state, spent, times, unsolved, ends = loaded.state, 0.0, [], 0, []
     while len(times) < n_pieces and spent < seconds:
-        piece, took = _run(loaded, state, len(times) * n * h, n)
+        piece, took = run_piece(loaded, state, len(times) * n * h, n)
         state = jax.tree.map(lambda x: x[-1], piece.states)
         ends.append(piece.states)
         unsolved += int(np.sum(~np.asarray(piece.converged)))
@@ -203,17 +202,6 @@ def _measured(loaded: SceneFile, seconds: float, progress: Progress | None) -> t
     steps = n * len(times)
     cost = Cost(max(0.0, whole - times[0]), steps, spent / steps, max(times) / n, unsolved, room)
     return cost, ends
-
-
-def _run(loaded: SceneFile, state: State, start: float, n: int):
-    controls = None if loaded.controls is None else loaded.controls.starting_at(start)
-    began = time.perf_counter()
-    with warnings.catch_warnings():
-        # Steps that did not converge, and spins, become findings.
-        warnings.simplefilter("ignore", RuntimeWarning)
-        piece = simulate(loaded.scene, state, n, controls=controls)
-    jax.block_until_ready(piece.states)
-    return piece, time.perf_counter() - began
 
 
 def _fast_spins(scene: Scene, pieces: list[State]) -> list[Finding]:
