@@ -171,6 +171,36 @@ def test_energy_never_grows(plate):
     assert np.all(energy[50:] <= energy[0])
 
 
+def test_friction_that_turns_the_slip_around_adds_no_energy():
+    """A rod that falls aslant with e = 0.9: Newton's restitution alone would add 4 and 2.5 %."""
+    rod = dano.Body("body", dano.Capsule(0.01, 0.1), mass=1.0)
+    scene = on_floor(rod, h=0.002, gravity=(0, 0, 0), sliding_friction=1.0, restitution=0.9)
+
+    @jax.vmap
+    def fall(lift):
+        half = 0.25 * jnp.pi - 0.5 * lift
+        orientation = jnp.stack([jnp.cos(half), 0 * half, jnp.sin(half), 0 * half])
+        start = scene.initial_state(
+            body={
+                "position": (0, 0, 0.112 * jnp.sin(lift)),
+                "orientation": orientation,
+                "velocity": (1, 0, -2),
+            }
+        )
+        run = dano.simulate(scene, start, 40)
+        return run.states, run.converged, dano.contact_wrenches(scene, run.states)[:, 0, :3]
+
+    states, converged, forces = fall(jnp.array([0.64, 0.86]))
+    assert jnp.all(converged)
+    velocity, omega = states.velocity[:, :, 0], states.omega[:, :, 0]
+    inertia = np.asarray(scene.bodies[0].inertia)
+    energy = 0.5 * (np.sum(velocity**2, axis=2) + np.einsum("bti,ij,btj->bt", omega, inertia, omega))
+    assert np.all(energy <= energy[:, :1] * (1 + 1e-3))
+    assert np.all(velocity[:, -1, 2] > 0.3)
+    # What is said of the forces is what acted.
+    np.testing.assert_allclose(0.002 * forces, np.diff(velocity, axis=1), atol=1e-8)
+
+
 @pytest.mark.parametrize(("size", "mass", "h"), [(0.05, 0.05, 1 / 60), (0.1, 1.0, 0.01), (1.0, 50.0, 1 / 60)])
 def test_rest_is_quiet(size, mass, h):
     scene = on_floor(dano.Body("body", dano.Box((size / 2,) * 3), mass=mass), h=h, sliding_friction=0.5)

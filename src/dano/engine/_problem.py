@@ -90,6 +90,15 @@ class Problem(eqx.Module):
         assert self.points is not None and self.material is not None
         return Material(*jnp.take(self.material, self.points.contact, axis=1))
 
+    def rebounding(self, share: Float[Array, ""]) -> "Problem":
+        """The same with a share of the restitution in impacts that end within the step."""
+        if self.material is None:
+            return self
+        restitution, instant = (Material._fields.index(name) for name in ("restitution", "instant"))
+        part = jnp.where(self.material[instant] > 0, share, 1)
+        material = self.material.at[restitution].multiply(part)
+        return dataclasses.replace(self, material=material)
+
 
 class Pairs(NamedTuple):
     """Static structure.

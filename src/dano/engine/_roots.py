@@ -12,6 +12,7 @@ from dano.engine._balance import (
     jacobian_in_bodies,
     momentum_jacobian,
     momentum_residual,
+    own_momenta,
     point_momenta,
     to_body,
     to_velocity,
@@ -32,6 +33,13 @@ from dano.maths import matmul, matvec
 
 # How many times the rounding of a pose a step's equations may miss, where the tolerance is its power 3/4.
 _POSES = 8.0
+# Shares of the restitution that a step with impacts tries, until contact adds no energy. Newton's restitution
+# may add some where friction reverses the slip (Kane and Levinson 1985, Dynamics: Theory and Applications).
+# Without rebound contact only dissipates.
+SHARES = tuple(1 - k / 10 for k in range(11))
+# Energy that contact may add, over what it moves between coordinates: impacts reach their goals to 1e-3
+# (see `dano.contact`).
+_ADDS = 1e-3
 
 
 def solve(problem: Problem, found: Found | None, start: Array, pairs: Pairs, options: SolverOptions):
@@ -47,29 +55,27 @@ def solve(problem: Problem, found: Found | None, start: Array, pairs: Pairs, opt
     """
 
     def find_root(problem, found, start, derivatives: bool):
-        find = _root_of_bodies if problem.tree is None else _root_of_trees
-        if is_native(problem):
-            return native_root(problem, found, start, pairs, options, derivatives=derivatives)
-        if problem.points is None:
-            return find(problem, found, start, pairs, options)
-        return one_at_a_time(
-            lambda problem, found, start: find(problem, found, start, pairs, options), problem, found, start
-        )
+        """Velocities, Jacobian and report, and the share of the restitution that adds no energy."""
 
-    def residual(velocities, problem):
-        if problem.tree is None:
-            return whole_residual(velocities, problem, pairs)
-        return _tree_residual(velocities, problem, pairs)
+        def find(problem, found, start):
+            if is_native(problem):
+                return native_root(problem, found, start, pairs, options, derivatives=derivatives)
+            find = _root_of_bodies if problem.tree is None else _root_of_trees
+            return find(problem, found, start, pairs, options)
+
+        if problem.points is None:
+            return *find(problem, found, start), jnp.ones((), start.dtype)
+        return one_at_a_time(lambda *given: _passive(find, *given), problem, found, start)
 
     @eqx.filter_custom_jvp
     def root(problem, found, start):
-        velocities, _, report = find_root(problem, found, start, derivatives=False)
+        velocities, _, report, _ = find_root(problem, found, start, derivatives=False)
         return velocities, report
 
     @root.def_jvp
     def _(primals, tangents):
         problem, found, start = primals
-        velocities, jacobian, report = find_root(problem, found, start, derivatives=True)
+        velocities, jacobian, report, share = find_root(problem, found, start, derivatives=True)
         # The inverse, not a solve: the tangent must be linear in `change` for reverse mode to transpose it.
         inverse = solve_small(jacobian, jnp.eye(jacobian.shape[0], dtype=jacobian.dtype))
         velocities, inverse = (checkpoint_name(value, KEPT) for value in (velocities, inverse))
@@ -77,10 +83,58 @@ def solve(problem: Problem, found: Found | None, start: Array, pairs: Pairs, opt
         d_report = jax.tree.map(lambda _: None, report)
         if not jax.tree.leaves(d_problem):
             return (velocities, report), (jnp.zeros_like(velocities), d_report)
-        _, change = by_autodiff(lambda p: residual(velocities, p), (problem,), (d_problem,))
+        _, change = by_autodiff(
+            lambda p: step_residual(velocities, p.rebounding(share), pairs), (problem,), (d_problem,)
+        )
         return (velocities, report), (-matvec(inverse, change).reshape(velocities.shape), d_report)
 
     return root(problem, found, start)
+
+
+def _passive(find, problem: Problem, found: Found, start: Array):
+    """What `find` returns, and the largest share of the restitution with which contact adds no energy."""
+    shares = jnp.asarray(SHARES, start.dtype)
+    hits = jnp.any(found.stiffness > 0)
+
+    def attempt(k):
+        solution = find(problem.rebounding(shares[k]), found, start)
+        gains = hits & _adds_energy(solution[0], problem, start)
+        return k + 1, gains & (k + 1 < len(SHARES)), solution
+
+    # The first attempt runs in the loop, too, so that it is compiled once.
+    zero = jnp.asarray(0)
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(attempt, zero)[2])
+    begin = zero, jnp.asarray(True), nothing
+    count, _, solution = jax.lax.while_loop(lambda carry: carry[1], lambda carry: attempt(carry[0]), begin)
+    return *solution, shares[count - 1]
+
+
+def step_residual(velocities: Array, problem: Problem, pairs: Pairs) -> Array:
+    """What the equations of a step miss at velocities like those of `solve` [m/s, rad/s]."""
+    if problem.tree is None:
+        return whole_residual(velocities, problem, pairs)
+    return _tree_residual(velocities, problem, pairs)
+
+
+def as_solved(problem: Problem, velocities: Array, pairs: Pairs) -> Problem:
+    """The step with the share of the restitution that its solution fits best: see `SHARES`."""
+    if problem.points is None:
+        return problem
+    shares = jnp.asarray(SHARES, velocities.dtype)
+    missed = jax.lax.map(
+        lambda share: jnp.sum(jnp.abs(step_residual(velocities, problem.rebounding(share), pairs))), shares
+    )
+    return problem.rebounding(shares[jnp.argmin(missed)])
+
+
+def _adds_energy(velocities: Array, problem: Problem, start: Array) -> Array:
+    """Whether contact adds kinetic energy: its impulses times the means of velocities before and after."""
+    if problem.tree is None:
+        impulses, _ = own_momenta(velocities, problem)
+    else:
+        impulses, _ = _tree_momenta(problem, problem.tree, velocities)
+    work = 0.5 * impulses * (start + velocities)
+    return jnp.sum(work) > _ADDS * jnp.sum(jnp.abs(work))
 
 
 def _root_of_bodies(

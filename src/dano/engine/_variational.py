@@ -31,7 +31,7 @@ from dano.engine._problem import (
     structure_of,
 )
 from dano.engine._rigid import turned
-from dano.engine._roots import solve
+from dano.engine._roots import as_solved, solve
 from dano.engine._trees import advance_tree, generalised, turns_too_far
 from dano.maths import quat_to_matrix, safe_normalize
 from dano.scene import Control, Scene, State
@@ -86,9 +86,12 @@ def wrenches(
     pairs = structure_of(scene)
     problem, _ = build_problem(scene, prepared, state, None, pairs)
     if problem.tree is None:
-        world = to_world(problem, _unknowns(scene, following, pairs))
+        solution = _unknowns(scene, following, pairs)
+        world = to_world(problem, solution)
     else:
-        world = problem.tree.twists(generalised(scene, following, state.orientation))
+        solution = generalised(scene, following, state.orientation)
+        world = problem.tree.twists(solution)
+    problem = as_solved(problem, solution, pairs)
     of_patches = contact_wrenches(to_body(problem, world), problem, pairs, Softening())
     found = [(wrench, patch.point) for (wrench, _), patch in zip(of_patches, problem.patches, strict=True)]
     wrench, point = _in_order(scene, found, _point_wrenches(scene, problem, world, state, pairs))
