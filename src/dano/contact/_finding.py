@@ -29,6 +29,7 @@ from dano.contact._geometry import (
     block_clearance,
     FASTEST,
     FIXED,
+    FOUND,
     FROM_Z,
     Geometry,
     Kind,
@@ -36,9 +37,10 @@ from dano.contact._geometry import (
     meeting,
     Mixture,
     near_pairs,
-    OUTSIDE,
     place,
     POLE,
+    PULL,
+    SEARCHES,
     SHARES,
     Side,
     unit,
@@ -106,7 +108,18 @@ def find(
     room = -(-(capacity + _CHUNKS) // ROUND) * ROUND
     if geometry.tables is not None:
         hits = jnp.stack([impacts.instant.astype(dtype), impacts.speed.astype(dtype)], axis=1)
-        constants = [_IMPACT, SHARES, ADVANCES, *POLE, *FROM_Z.ravel(), _TURNED, FASTEST, OUTSIDE]
+        constants = [
+            _IMPACT,
+            SHARES,
+            ADVANCES,
+            *POLE,
+            *FROM_Z.ravel(),
+            _TURNED,
+            FASTEST,
+            PULL,
+            SEARCHES,
+            FOUND,
+        ]
         settings = jnp.append(h.astype(dtype), jnp.asarray(constants, dtype))
         return find_natively(
             geometry.tables, geometry.blocks, geometry.probes, links, hits, settings, capacity, room

@@ -24,9 +24,10 @@ FIXED, AXIS, BALL = 0, 1, 2
 """How the samples of a surface turn with its body: with it; about its z axis they keep facing the other body;
 or they keep facing it altogether."""
 TURNING = {"fixed": FIXED, "axis": AXIS, "ball": BALL}
-OUTSIDE = 8.0
-"""A ball's lowest point, d deep in a solid, is at most so many d beyond an edge that its centre faces; unless
-the centre faces it within 7° of one of the edge's sides."""
+PULL, SEARCHES, FOUND = 0.7, 12, 1e-6
+"""Search for where a growing ellipsoid first touches: share of the largest step that converges, steps,
+and how close two of them end the search, over the shortest semi-axis. For semi-axes 1 : 3 the error falls to
+2 % in 12 steps."""
 
 # Samples count as near within this share of the smaller body's size, besides the way they go.
 _MARGIN = 0.001
@@ -409,19 +410,44 @@ def _aligned(geometry: Geometry, kind: Kind | Mixture, side: Side, turn, origin)
         distance, gradient = kind.sdf_jet(side, point[:, None], 1)
         return distance[0], _direction(-matvec(turn.T, gradient[:, 0]))
 
-    apart, toward = facing(origin)
+    ball = geometry.turning[i] == BALL
+    toward = jnp.zeros_like(origin)
     if BALL in kind.turns:
-        # Again from where it comes closest, because the solid may be small or curved. Where that point lies
-        # in the solid, from one halfway out: inside, beside an edge, the nearest face is not what presses.
-        ball = geometry.turning[i] == BALL
-        lowest = jnp.where(ball, geometry.scale[i] * _direction(geometry.scale[i] * toward), 0)
-        sunk, again = facing(origin + matvec(turn, lowest))
-        apart = jnp.maximum(apart, 0)
-        beyond = jnp.minimum(jnp.sqrt(jnp.sum(lowest * lowest)) - apart, -OUTSIDE * sunk)
-        share = apart / (apart + 2 * jnp.where(beyond > 0, beyond, 1))
-        _, outside = facing(origin + matvec(turn, share * lowest))
-        toward = jnp.where(ball, jnp.where(beyond > 0, outside, again), toward)
+        toward = _first_touch(lambda point: facing(origin + matvec(turn, point)), geometry.scale[i])
+    if AXIS in kind.turns or FIXED in kind.turns:
+        toward = jnp.where(ball, toward, facing(origin)[1])
     return *_turned(geometry, kind, side, turn, toward), toward
+
+
+def _first_touch(facing, scale: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Direction to a solid from where an ellipsoid that grows from its centre touches it first.
+
+    That is the point x of the solid with the least |S⁻¹ x|, S the semi-axes, found by projected gradients
+    with momentum (Nesterov 2004, Introductory Lectures on Convex Optimization, section 2.2.4). An ellipsoid
+    that has sunk in beside an edge is pressed by the edge; the solid's nearest side is another place.
+
+    Args:
+        facing: From a point in the axes of the ellipsoid to its distance and the direction to the solid.
+        scale: S [m].
+    """
+    least = jnp.min(scale)
+    shrink = 1 - PULL * (least / scale) ** 2
+    root = PULL**0.5 * least / jnp.max(scale)
+    momentum = (1 - root) / (1 + root)
+
+    def closer(k, carry):
+        point, nearest, toward, done = carry
+        start = shrink * point
+        apart, found = facing(start)
+        touched = start + jnp.maximum(apart, 0) * found
+        way = touched - nearest
+        following = touched + jnp.where(k > 0, momentum, 0) * way
+        close = jnp.sum(way * way) < (FOUND * least) ** 2
+        new = following, touched, found, done | close
+        return jax.tree.map(lambda old, new: jnp.where(done, old, new), carry, new)
+
+    zero = jnp.zeros_like(scale)
+    return jax.lax.fori_loop(0, SEARCHES, closer, (zero, zero, zero, jnp.asarray(False)))[2]
 
 
 def _turned(geometry: Geometry, kind: Kind | Mixture, side: Side, turn, toward):

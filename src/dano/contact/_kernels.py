@@ -159,7 +159,7 @@ def find_natively(
     probes: Float[Array, "3 k"],
     links,
     impacts: Float[Array, "contacts 2"],
-    settings: Float[Array, "19"],
+    settings: Float[Array, "21"],
     capacity: int,
     room: int,
 ) -> tuple[Points, Found]:

@@ -40,6 +40,8 @@ SHARES = tuple(1 - k / 10 for k in range(11))
 # Energy that contact may add, over what it moves between coordinates: impacts reach their goals to 1e-3
 # (see `dano.contact`).
 _ADDS = 1e-3
+# How often a step's solve may begin again.
+_RESTARTS = 2
 
 
 def solve(problem: Problem, found: Found | None, start: Array, pairs: Pairs, options: SolverOptions):
@@ -96,16 +98,22 @@ def _passive(find, problem: Problem, found: Found, start: Array):
     shares = jnp.asarray(SHARES, start.dtype)
     hits = jnp.any(found.stiffness > 0)
 
-    def attempt(k):
-        solution = find(problem.rebounding(shares[k]), found, start)
-        gains = hits & _adds_energy(solution[0], problem, start)
-        return k + 1, gains & (k + 1 < len(SHARES)), solution
+    def attempt(k, restarts, begin):
+        solution = find(problem.rebounding(shares[k]), found, begin)
+        velocities, _, report = solution
+        # A solve that cycles returns its best velocities; from there, with duals that fit them, most converge.
+        failed = ~report.converged & (restarts < _RESTARTS)
+        gains = hits & (k + 1 < len(SHARES)) & _adds_energy(velocities, problem, start)
+        following = jnp.where(failed, k, k + 1), jnp.where(failed, restarts + 1, restarts)
+        return *following, jnp.where(failed, velocities, start), failed | gains, solution
 
     # The first attempt runs in the loop, too, so that it is compiled once.
     zero = jnp.asarray(0)
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(attempt, zero)[2])
-    begin = zero, jnp.asarray(True), nothing
-    count, _, solution = jax.lax.while_loop(lambda carry: carry[1], lambda carry: attempt(carry[0]), begin)
+    nothing = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(attempt, zero, zero, start)[4]
+    )
+    begin = zero, zero, start, jnp.asarray(True), nothing
+    count, *_, solution = jax.lax.while_loop(lambda carry: carry[3], lambda carry: attempt(*carry[:3]), begin)
     return *solution, shares[count - 1]
 
 

@@ -33,8 +33,9 @@ _AXIS, _BALL = 1, 2
 _SHARE, _FOLLOWS, _SINK, _MARGIN = range(4)
 _FIRST, _SECOND, _SOLID, _CONTACT, _GROUP, _PLACE = range(6)
 # Settings: h, what `dano.contact` calls IMPACT, SHARES and ADVANCES, its pole, its rotation from z, and what
-# it calls TURNED, FASTEST and OUTSIDE.
-_H, _IMPACT, _SHARES, _ADVANCES, _POLE, _FROM_Z, _TURNED, _FASTEST, _OUTSIDE = 0, 1, 2, 3, 4, 7, 16, 17, 18
+# it calls TURNED, FASTEST, PULL, SEARCHES and FOUND.
+_H, _IMPACT, _SHARES, _ADVANCES, _POLE, _FROM_Z, _TURNED, _FASTEST = 0, 1, 2, 3, 4, 7, 16, 17
+_PULL, _SEARCHES, _FOUND = 18, 19, 20
 # A pair at a moment, see `dano.contact.Placed`: samples to solid frame and origin, vector areas, solid axes
 # to world, centre of mass, velocity, spin, lowest, axis, stretch, samples to arms and their offset,
 # direction to the solid.
@@ -218,24 +219,31 @@ def _place_arms(a, b, turning, side, share, settings, out, scratch):
 def _face_solid(a, turning, settings, solid, whole, atlas, out, scratch):
     """Direction from where bodies touch to the solid in the axes of the samples' body, to scratch[30:33]."""
     x, y, z = out[_ORIGIN], out[_ORIGIN + 1], out[_ORIGIN + 2]
-    apart = max(_face(out, solid, whole, atlas, x, y, z, scratch), 0.0)
     if turning == _AXIS:
+        _face(out, solid, whole, atlas, x, y, z, scratch)
         return
-    # Again from where it comes closest, or from above it: see `dano.contact`, `_aligned`.
+    # See `dano.contact`, `_first_touch`.
     p, q, r = a[_SCALE], a[_SCALE + 1], a[_SCALE + 2]
-    scratch[30] *= p
-    scratch[31] *= q
-    scratch[32] *= r
-    _direct(scratch, 30)
-    u, v, w = p * scratch[30], q * scratch[31], r * scratch[32]
-    lowest = math.sqrt(u * u + v * v + w * w)
-    _apply(out, _POINTS, u, v, w, scratch, 33)
-    u, v, w = scratch[33], scratch[34], scratch[35]
-    sunk = _face(out, solid, whole, atlas, x + u, y + v, z + w, scratch)
-    beyond = min(lowest - apart, -settings[_OUTSIDE] * sunk)
-    if beyond > 0.0:
-        share = apart / (apart + 2.0 * beyond)
-        _face(out, solid, whole, atlas, x + share * u, y + share * v, z + share * w, scratch)
+    least, most = min(p, min(q, r)), max(p, max(q, r))
+    root = math.sqrt(settings[_PULL]) * least / most
+    momentum, enough = (1.0 - root) / (1.0 + root), (settings[_FOUND] * least) ** 2
+    px = py = pz = nx = ny = nz = 0.0
+    k = 0
+    while k < settings[_SEARCHES]:
+        u = px - settings[_PULL] * (least / p) ** 2 * px
+        v = py - settings[_PULL] * (least / q) ** 2 * py
+        w = pz - settings[_PULL] * (least / r) ** 2 * pz
+        _apply(out, _POINTS, u, v, w, scratch, 33)
+        apart = _face(out, solid, whole, atlas, x + scratch[33], y + scratch[34], z + scratch[35], scratch)
+        apart = max(apart, 0.0)
+        u, v, w = u + apart * scratch[30], v + apart * scratch[31], w + apart * scratch[32]
+        dx, dy, dz = u - nx, v - ny, w - nz
+        share = momentum if k > 0 else 0.0
+        px, py, pz = u + share * dx, v + share * dy, w + share * dz
+        nx, ny, nz = u, v, w
+        if dx * dx + dy * dy + dz * dz < enough:
+            return
+        k += 1
 
 
 @kernel
