@@ -127,18 +127,29 @@ def _support(scene: Scene, limits: list[Bound]) -> list[Finding]:
 
 def _spins(scene: Scene, limits: list[Bound]) -> list[Finding]:
     h = float(scene.timestep)
-    found = []
-    for body, limit in zip(scene.bodies, limits, strict=True):
-        if limit.spin * h > 2 * RESOLVED:
-            found.append(
-                Finding(
-                    "spin",
-                    f"{body.name!r} turns by {math.degrees(limit.spin * h):.0f}° in a step, more than 60°:"
-                    " its precession is not resolved; a timestep of"
-                    f" {2 * RESOLVED / limit.spin:.2g} s would do",
-                )
-            )
-    return found
+    pairs = zip(scene.bodies, limits, strict=True)
+    return [fast_spin(body.name, "turns", x.spin, h) for body, x in pairs if too_fast(x.spin, h)]
+
+
+def too_fast(spin: float, h: float) -> bool:
+    """Whether a body of this spin [rad/s] turns by more in a step than is resolved (60°)."""
+    return spin * h > 2 * RESOLVED
+
+
+def fast_spin(name: str, verb: str, spin: float, h: float) -> Finding:
+    """What is said of a body that turns too far in a step.
+
+    Args:
+        name: Of the body.
+        verb: What it does: "turns", or "comes to turn".
+        spin: [rad/s].
+        h: Timestep [s].
+    """
+    return Finding(
+        "spin",
+        f"{name!r} {verb} by {math.degrees(spin * h):.0f}° in a step, more than 60°: its precession is not"
+        f" resolved; a timestep of {2 * RESOLVED / spin:.2g} s would do",
+    )
 
 
 def _pair(scene: Scene, state: State, contact: Contact, limits: list[Bound]) -> list[Finding]:

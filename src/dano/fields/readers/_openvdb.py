@@ -21,6 +21,12 @@ _ZIP, _MASKED, _BLOSC = 1, 2, 4
 
 
 def read_openvdb(data: bytes) -> Rows:
+    """The grids of an OpenVDB file.
+
+    Raises:
+        ValueError: If the bytes are none, are damaged, or are of a version that is not read.
+        EOFError: If the file ends too early.
+    """
     stream = Stream(data)
     magic, version = stream.unpack("qI")
     if magic != _MAGIC:
