@@ -15,7 +15,9 @@ _MARK = "dano:"
 _LOOK_GROUP = 2
 """MuJoCo's custom: what is only seen."""
 _LOOK_NODES = 48
+"""Along the longest side of the mesh that is drawn (chosen: fine enough to be looked at)."""
 _PLAIN = (0.85, 0.73, 0.61, 1.0)
+"""Colour of objects without a look (chosen by eye)."""
 
 
 def library() -> Any:

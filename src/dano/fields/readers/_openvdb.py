@@ -9,6 +9,7 @@ import numpy as np
 from dano.fields.readers._sparse import Block, corner, Rows, SparseGrid, Stream, unblosc
 from dano.memory import decompressed
 
+# The first bytes, map types and compression flags of the format, as in openvdb/io and openvdb/math/Maps.h.
 _MAGIC = 0x56444220
 _MAPS = {
     # What precedes the scale: doubles before it, doubles in all.
