@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dano.archive import LOOK, OBJECT, read_archive, write_archive
 from dano.fields import AbstractField, AbstractShape, GridField, SignedDistanceGrid
 from dano.maths import checked_array, checked_count, checked_key, floating, is_traced, Numbers
+from dano.memory import check_nodes
 from dano.notebook import card, cloud, numbers
 from dano.objects._interior import examine, Interior, sealed
 from dano.objects._mass import checked_density, Density, integrate, integrated, MassProperties, Progress
@@ -31,6 +32,13 @@ from dano.objects._surface import draw_surface, equal_areas, SurfaceSamples
 
 MassModel = Literal["auto", "density", "solid"]
 FORMAT, VERSION = OBJECT
+
+_MOST_SAMPLES = 200_000
+"""As many contact samples take two minutes and 3 GB; a hundredth of them do for most purposes."""
+
+_BYTES_PER_NODE = 150
+"""Measured: what building an object takes at its peak, over the nodes of its lattice."""
+
 
 _INTERIOR = tuple(field.name for field in dataclasses.fields(Interior))
 
@@ -118,12 +126,15 @@ class NeuralObject(eqx.Module):
 
         Raises:
             ValueError: If an argument is out of range, the field is empty, has a negative or non-finite
-                density or unbounded support, or no point lies in `density_range`.
+                density or unbounded support, no point lies in `density_range`, there are more than 200,000
+                samples, or the resolution needs more than half of the memory.
         """
         if mass_model not in get_args(MassModel):
             raise ValueError(f"mass_model must be one of {get_args(MassModel)}, got {mass_model!r}")
         say = progress or (lambda description, share: None)
         n_samples = checked_count("n_samples", n_samples)
+        if n_samples > _MOST_SAMPLES:
+            raise ValueError(f"n_samples must be at most {_MOST_SAMPLES}, got {n_samples}")
         key = checked_key(key)
         sampling_key, mass_key = jax.random.split(key)
         original = field
@@ -359,6 +370,8 @@ def _closed(field: AbstractField, resolution: int) -> tuple[AbstractField, Densi
 
     Contact, too, is with the solid whose pores are closed.
     """
+    resolution = checked_count("resolution", resolution, least=4)
+    check_nodes(np.ptp(np.asarray(field.bounds), axis=0), resolution, _BYTES_PER_NODE)
     density = checked_density(field)
     lattice = Lattice.create(density, field.bounds, resolution)
     interior, inside = examine(lattice)
