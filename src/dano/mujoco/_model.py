@@ -79,8 +79,8 @@ def carry_compiled(mujoco: Any, model: Any, body: int, name: str, thing: Thing) 
         )
     if model.body_simple[body]:
         raise ValueError(
-            f"body {name!r} of a compiled model must have a mass that is not about its origin and axes: "
-            "MuJoCo counts on that symmetry once it is compiled; attach to its MjSpec instead"
+            f"body {name!r} of a compiled model has its mass centred at its origin, along its axes: "
+            "MuJoCo simplifies such bodies when it compiles, so attach to its MjSpec instead"
         )
     model.geom_contype[first : first + count] = 0
     model.geom_conaffinity[first : first + count] = 0

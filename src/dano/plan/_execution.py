@@ -182,7 +182,7 @@ def _check(
     if substeps < 1 or (every is not None and every < 1):
         raise ValueError(f"substeps and every must be ≥ 1, got {substeps} and {every}")
     if every is not None and scene is None:
-        raise ValueError("scene must be given with every: new plans need one to believe in")
+        raise ValueError("scene must be given with every: new plans are made in it")
     if len(plan.values) != task.n_steps:
         raise ValueError(f"plan must have the task's {task.n_steps} steps, got {len(plan.values)}")
     planned = float(plan.trajectory.times[1] - plan.trajectory.times[0])

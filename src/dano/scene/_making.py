@@ -88,7 +88,7 @@ def check_materials(
     for body in bodies:
         if body.material is not None:
             raise ValueError(
-                f"material of body {body.name!r} is read by pairs that contacts does not name: "
+                f"material of body {body.name!r} is only used between bodies that no contact names: "
                 "give others=ContactParams(…), too"
             )
 

@@ -148,7 +148,7 @@ def fast_spin(name: str, verb: str, spin: float, h: float) -> Finding:
     return Finding(
         "spin",
         f"{name!r} {verb} by {math.degrees(spin * h):.0f}° in a step, more than 60°: its precession is not"
-        f" resolved; a timestep of {2 * RESOLVED / spin:.2g} s would do",
+        f" resolved; use a timestep of {2 * RESOLVED / spin:.2g} s",
     )
 
 
@@ -169,7 +169,7 @@ def _impact(scene: Scene, contact: Contact, speed: float) -> list[Finding]:
                 "impacts",
                 f"{pair} meet at up to {speed:.2g} m/s and go {1e3 * speed * h:.2g} mm in a step, more"
                 f" than the edge ({1e3 * edge:.2g} mm): how hard they push depends on where in a step they"
-                f' meet; a timestep of {edge / speed:.1g} s, a wider edge or law = "distributed" would do',
+                f' meet; use a timestep of {edge / speed:.1g} s, a wider edge or law = "distributed"',
             )
         ]
     if not isinstance(law, DistributedLaw):
@@ -182,8 +182,8 @@ def _impact(scene: Scene, contact: Contact, speed: float) -> list[Finding]:
             Finding(
                 "impacts",
                 f"an impact of {pair} lasts {period:.2g} s, {period / h:.2g} steps, and a spring"
-                f" (compliant) needs {_STEPS_AN_IMPACT}; a timestep of"
-                f" {period / _STEPS_AN_IMPACT:.1g} s would do",
+                f" (compliant) needs {_STEPS_AN_IMPACT}; use a timestep of"
+                f" {period / _STEPS_AN_IMPACT:.1g} s",
             )
         ]
     slow = float(params.restitution_velocity) + float(np.linalg.norm(np.asarray(scene.gravity))) * h
@@ -193,7 +193,7 @@ def _impact(scene: Scene, contact: Contact, speed: float) -> list[Finding]:
         Finding(
             "impacts",
             f"{pair} meet at up to {speed:.2g} m/s and bounce by restitution only from {slow:.2g} m/s on:"
-            " they will bounce less; a smaller timestep or restitution_velocity would do",
+            " they will bounce less; use a smaller timestep or restitution_velocity",
         )
     ]
 
@@ -230,8 +230,8 @@ def _wall(scene: Scene, contact: Contact, limits: list[Bound]) -> list[Finding]:
         Finding(
             "walls",
             f"{contact.a!r} and {contact.b!r} come up to {1e3 * way:.3g} mm closer in a step, and {thin!r} is"
-            f" {2e3 * depths[thin]:.2g} mm thick: one may pass through the other; a timestep of"
-            f" {h * most / way:.1g} s would do",
+            f" {2e3 * depths[thin]:.2g} mm thick: one may pass through the other; use a timestep of"
+            f" {h * most / way:.1g} s",
         )
     ]
 
@@ -277,7 +277,7 @@ def _samples(scene: Scene) -> list[Finding]:
                 Finding(
                     "samples",
                     f"{body.name!r} has {len(areas)} surface samples, {1e3 * spacing:.2g} mm apart: it will"
-                    f" lie on single ones; {enough} would do, {10 * enough} are better",
+                    f" lie on single ones; use at least {enough}, better {10 * enough}",
                 )
             )
     return found
