@@ -120,7 +120,7 @@ def checked_inertia(name: str, value: Numbers) -> Float[Array, "3 3"]:
         # That of a flat plate is the sum, to rounding.
         if high > (1 + _TRIANGLE) * (low + middle):
             raise ValueError(
-                f"{name} must be possible for a body: no principal moment may exceed the sum of the other two,"
+                f"{name} must be possible: no principal moment may exceed the sum of the other two,"
                 f" got {[float(f'{moment:.6g}') for moment in (low, middle, high)]} kg m²"
             )
     return inertia
