@@ -125,9 +125,9 @@ class NeuralObject(eqx.Module):
             The object; its frame is the field's.
 
         Raises:
-            ValueError: If an argument is out of range, the field is empty, has a negative or non-finite
-                density or unbounded support, no point lies in `density_range`, there are more than 200,000
-                samples, or the resolution needs more than half of the memory.
+            ValueError: If an argument is out of range, the field is empty, unbounded, or has negative or
+                non-finite densities, or no point lies in `density_range`. At most 200,000 samples, and a
+                resolution that fits into half of the memory, are allowed.
         """
         if mass_model not in get_args(MassModel):
             raise ValueError(f"mass_model must be one of {get_args(MassModel)}, got {mass_model!r}")

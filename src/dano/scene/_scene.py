@@ -80,9 +80,9 @@ class Scene(eqx.Module):
             gravity: [m/s², W].
 
         Raises:
-            ValueError: If there is no body, two have one name, a contact names an unknown body, joins two
-                fixed ones or a pair twice, a pair cannot overlap, joints make no trees, a body has a material
-                that nothing reads, or a number is out of range.
+            ValueError: If bodies are missing or share a name, a contact names an unknown body, two fixed ones
+                or a pair twice, a pair cannot overlap, joints make no trees, no pair uses a material, or a
+                number is out of range.
         """
         bodies = checked_parts("bodies", bodies, Body)
         contacts = checked_parts("contacts", contacts, Contact)

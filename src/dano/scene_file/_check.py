@@ -102,8 +102,8 @@ def check_scene(
 ) -> SceneCheck:
     """Say what a scene asks for, what will not be resolved, and what it costs.
 
-    Impacts, spins, thin walls, mass ratios and samples are judged from the initial state and from the speeds
-    that falls can give, then from a run of the scene's first steps.
+    Impacts, spins, thin walls, mass ratios and samples are judged from the initial state and the speeds that
+    a fall can reach. Then the first steps of the scene are run.
 
     Args:
         loaded: The scene.
