@@ -120,7 +120,7 @@ def _support(scene: Scene, limits: list[Bound]) -> list[Finding]:
         if name not in touched:
             found.append(Finding("support", f"{name!r} touches nothing: no contact names it"))
         elif limits[i].falls:
-            text = f"nothing fixed that {name!r} may touch is below it: it may fall for ever"
+            text = f"nothing fixed that {name!r} may touch is below it: it may fall without end"
             found.append(Finding("support", text))
     return found
 
