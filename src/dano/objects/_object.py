@@ -132,9 +132,7 @@ class NeuralObject(eqx.Module):
         if mass_model not in get_args(MassModel):
             raise ValueError(f"mass_model must be one of {get_args(MassModel)}, got {mass_model!r}")
         say = progress or (lambda description, share: None)
-        n_samples = checked_count("n_samples", n_samples)
-        if n_samples > _MOST_SAMPLES:
-            raise ValueError(f"n_samples must be at most {_MOST_SAMPLES}, got {n_samples}")
+        n_samples = _checked_samples(n_samples)
         key = checked_key(key)
         sampling_key, mass_key = jax.random.split(key)
         original = field
@@ -363,6 +361,13 @@ def field_size(
     _, density, lattice, interior = _closed(field, resolution)
     low = float(interior.level) if density_range is None else density_range[0]
     return float(Region.create(lattice, low, floaters=floaters).extents(density).max())
+
+
+def _checked_samples(n: int) -> int:
+    n = checked_count("n_samples", n)
+    if n > _MOST_SAMPLES:
+        raise ValueError(f"n_samples must be at most {_MOST_SAMPLES}, got {n}")
+    return n
 
 
 def _closed(field: AbstractField, resolution: int) -> tuple[AbstractField, Density, Lattice, Interior]:
