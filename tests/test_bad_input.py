@@ -90,6 +90,11 @@ CASES = {
         lambda: built(dano.Box((0.1, 0.1, 0.001)), resolution=24),
         "it is 0.003 m thin: try resolution=268, got 24",
     ),
+    "more samples than memory": (
+        lambda: built(dano.Sphere(0.1), n_samples=10**8),
+        "n_samples must be at most 200000, got 100000000",
+    ),
+    "finer than memory": (lambda: built(dano.Sphere(0.1), resolution=100_000), "resolution must be at most"),
     "range reversed": (lambda: built(grid(), density_range=(2.0, 1.0)), "0 ≤ low < high, got (2.0, 1.0)"),
     "unbounded field": (lambda: built(dano.HalfSpace()), "finite bounds"),
     "body without mass": (lambda: dano.Body("x", dano.Sphere(0.1)), "mass of body 'x' must be given"),

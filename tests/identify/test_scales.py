@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import dano
-from dano.identify._identify import _missed, Errors
+from dano.identify import Errors
+from dano.identify._identify import _missed
 from dano.identify._scales import check_scales
 from dano.identify._uncertainty import _width
 

@@ -120,6 +120,17 @@ def test_a_shape_becomes_an_object_by_baking():
     np.testing.assert_allclose(corners, [0.1, 0.07, 0.05], atol=2e-3)
 
 
+@pytest.mark.parametrize("half", [0.0015, 0.0005])
+def test_thin_plates_are_sampled_on_both_sides(half):
+    """A plate a thousandth as thick as it is wide has flat cells, and samples wherever it has an edge."""
+    plate = dano.Box((0.5, 0.5, half), edge=0.0004)
+    points = np.asarray(dano.objects.draw_contact_samples(plate, 400).points)
+    assert np.all(np.abs(points[:, 2]) < half + 0.0002)
+    for side in (points[:, 2] > 0.5 * half, points[:, 2] < -0.5 * half):
+        assert np.mean(side) > 0.25
+        assert np.all(np.ptp(points[side][:, :2], axis=0) > 0.9)
+
+
 def test_same_key_same_object(messy_ball):
     build = lambda seed: dano.NeuralObject.from_field(  # noqa: E731
         messy_ball, n_samples=200, resolution=32, key=jax.random.key(seed)

@@ -10,6 +10,7 @@ from dano.report import verdict, write_comparison_report
 
 
 def compare(arguments: Compare) -> None:
+    """See `dano compare --help`."""
     inputs = [file for file in (arguments.object, arguments.field, arguments.truth) if file is not None]
     check_output(arguments.output, *inputs, suffix=".html")
     truth = None

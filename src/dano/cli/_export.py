@@ -11,6 +11,7 @@ from dano.vision import LearnedField
 
 
 def export(arguments: Export) -> None:
+    """See `dano export --help`."""
     check_folder(arguments.output)
     given = {"sliding_friction": arguments.friction, "restitution": arguments.restitution}
     parameters = ContactParams(**{key: value for key, value in given.items() if value is not None})

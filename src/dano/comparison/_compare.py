@@ -159,9 +159,9 @@ def compare(
 ) -> Comparison:
     """Measure the mesh route against the neural object itself.
 
-    Level surfaces of the density by marching cubes, as they are and cleaned (largest part, cavities
-    filled), go as convex hulls into MuJoCo. The cleaned surface of the best level, the one with the volume of
-    the reference, goes also as hull into PyBullet, as convex pieces (CoACD) into both, and as MuJoCo's signed
+    Level surfaces of the density by marching cubes, as they are and cleaned (largest part, cavities filled),
+    go as convex hulls into MuJoCo. The best level is the one with the volume of the reference. Its cleaned
+    surface also goes as hull into PyBullet, as convex pieces (CoACD) into both, and as MuJoCo's signed
     distance of a mesh. Each is dropped on a plane from the same random orientations, and probed with small
     spheres. Every mesh has the mass of the object, spread evenly.
 

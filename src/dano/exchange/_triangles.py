@@ -175,8 +175,8 @@ def solid_triangles(solid: AbstractShape, resolution: int) -> tuple[Triangles, F
     distances = signed_distances(solid, nodes.reshape(-1, 3))[0].reshape(shape)
     if not np.any(distances < 0):
         raise ValueError(
-            f"resolution must be such that some nodes lie inside the object, of {resolution} along its"
-            f" longest axis ({spacing:.3g} m apart) none does"
+            f"resolution must be so large that some nodes lie inside the object, got {resolution} along its"
+            f" longest axis ({spacing:.3g} m apart), all outside"
         )
     mesh = level_triangles(-distances, origin, np.full(3, spacing), 0.0)
     points = mesh.vertices

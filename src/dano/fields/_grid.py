@@ -31,9 +31,9 @@ class GridField(AbstractField):
 
     φ(x) = Σ c[i, j, k] β((x − origin)/spacing − (i, j, k)), β the B-spline of degree 1 ("linear"), 2
     ("quadratic", with continuous normals) or 3 ("cubic", with continuous curvature). The values *are* the
-    coefficients c, so that φ ≥ 0 and ∫φ dx = Σ c · (cell volume) hold exactly, at the price that quadratic
-    and cubic splines smooth the values a little; `GridField.interpolating` passes through them instead.
-    Beyond its outermost nodes the density falls to zero over 1, 1.5 or 2 cells and is zero from there on.
+    coefficients c, so φ ≥ 0 and ∫φ dx = Σ c · (cell volume) hold exactly. Quadratic and cubic splines
+    therefore smooth the values a little. `GridField.interpolating` passes through them instead. Beyond its
+    outermost nodes the density falls to zero over 1, 1.5 or 2 cells and is zero from there on.
 
     Attributes:
         coefficients: The values with a border of zeros that makes queries fast; read `values` instead.

@@ -103,7 +103,7 @@ def mesh_field(
         distances = found
     if distances is None or not distances.min() < 0:
         raise ValueError(
-            f"{name}: resolution must be such that some nodes lie inside, of {chosen} none does:"
+            f"{name}: resolution must be so large that some nodes lie inside, got {chosen}, all outside:"
             f" {thin or 'the mesh is too thin'}"
         )
     if thin:

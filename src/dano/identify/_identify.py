@@ -4,11 +4,10 @@ import dataclasses
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from dano.engine import AbstractEngine, Policy, VariationalEngine
 from dano.identify._joint_log import joint_table
@@ -16,155 +15,16 @@ from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Parameter, space_of, values_at, with_values
 from dano.identify._problem import Problem
 from dano.identify._residuals import Linearized
+from dano.identify._result import Errors, Identification, Minimum
 from dano.identify._scales import check_scales
 from dano.identify._settings import deviations, estimated, Noise, Search, Setup, Windowing
-from dano.identify._uncertainty import quantile, uncertainty
+from dano.identify._uncertainty import uncertainty
 from dano.identify._windows import Plan
 from dano.maths import quat_conjugate, quat_log, quat_multiply
-from dano.notebook import card, curves, numbers
 from dano.scene import Control, Scene, State, Trajectory
 from dano.solvers import Solution, Stop
 
 Observed = Motion | Trajectory
-
-
-class Errors(NamedTuple):
-    """How far the fitted motion is from the observed one, over all frames that count.
-
-    Attributes:
-        mean_position: [m]; NaN if positions were not observed.
-        final_position: Mean over motions of the last frame's [m].
-        mean_rotation: [rad].
-        final_rotation: Mean over motions of the last frame's [rad].
-        rms: Of all residuals, in standard deviations of the noise [1].
-    """
-
-    mean_position: float
-    final_position: float
-    mean_rotation: float
-    final_rotation: float
-    rms: float
-
-
-class Minimum(NamedTuple):
-    """Where one of several starts ended: values by name, loss, and why there."""
-
-    values: dict[str, Any]
-    loss: float
-    stop: Stop
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Identification:
-    """Identified parameters.
-
-    Attributes:
-        values: By name of the parameter.
-        standard_errors: By name; ∞ where the data say nothing, NaN for a value on a bound.
-        covariance: Of the coordinates `labels`, shape (p, p).
-        labels: Names of the coordinates: those of the parameters, with indices for arrays.
-        stop: Why the search ended.
-        loss_history: Half the sum of squared residuals, in standard deviations, at the start and after each
-            step.
-        messages: Sentences about parameters on a bound or not determined, and about failed steps.
-        errors: Of the fit.
-        held_out_errors: Of the motions held out, or None.
-        minima: Where each start ended, best first.
-        scene: The scene with the values.
-        controls: The controls with the values, as they were given.
-        initial: Quantities that were estimated of the state in which each window begins.
-        initial_states: State in which each window begins.
-        motions: What was observed.
-        fitted: What the simulation says at the frames of each motion, with the values found.
-        guessed: The same at the start of the search.
-        freedom: Observed numbers less estimated ones.
-        evaluations: How often all windows were simulated, with derivatives.
-        seconds: Time it took [s], compilation included.
-    """
-
-    values: dict[str, Any]
-    standard_errors: dict[str, Any]
-    covariance: np.ndarray
-    labels: tuple[str, ...]
-    stop: Stop
-    loss_history: np.ndarray
-    messages: tuple[str, ...]
-    errors: Errors
-    held_out_errors: Errors | None
-    minima: tuple[Minimum, ...]
-    scene: Scene
-    controls: Any
-    initial: tuple[str, ...]
-    initial_states: State
-    motions: tuple[Motion, ...]
-    fitted: tuple[Motion, ...]
-    guessed: tuple[Motion, ...]
-    freedom: int
-    evaluations: int
-    seconds: float
-
-    def _repr_html_(self) -> str:
-        """What notebooks show: values with errors beside the loss."""
-        rows = [
-            (name, f"{numbers(np.ravel(value))} ± {numbers(np.ravel(self.standard_errors[name]))}")
-            for name, value in self.values.items()
-        ]
-        rows += [("stopped", str(self.stop)), *(("", message) for message in self.messages)]
-        loss = np.log10(np.maximum(np.asarray(self.loss_history, np.float64), 1e-300))
-        steps = np.arange(len(loss), dtype=np.float64)
-        return card("Identification", rows, curves(steps, {"loss": loss}, "log₁₀ of the loss"))
-
-    @property
-    def converged(self) -> bool:
-        """Whether the search ended in a minimum."""
-        return self.stop.converged
-
-    def interval(self, name: str, level: float = 0.95) -> tuple[Any, Any]:
-        """Lower and upper end of the interval that holds a parameter at this rate.
-
-        Raises:
-            ValueError: If there is no such parameter or the level is not between 0 and 1.
-        """
-        if name not in self.values:
-            raise ValueError(f"name must be one of {list(self.values)}, got {name!r}")
-        if not 0 < level < 1:
-            raise ValueError(f"level must lie between 0 and 1, got {level}")
-        half = quantile(level, self.freedom) * np.asarray(self.standard_errors[name])
-        low, high = self.values[name] - half, self.values[name] + half
-        return (float(low), float(high)) if np.ndim(half) == 0 else (low, high)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Numbers and words, as JSON takes them; what is not finite is None."""
-        return {
-            "values": _plain(self.values),
-            "standard_errors": _plain(self.standard_errors),
-            "intervals_95": {name: _plain(list(self.interval(name))) for name in self.values},
-            "stop": self.stop.value,
-            "converged": self.converged,
-            "messages": list(self.messages),
-            "errors": _plain(self.errors._asdict()),
-            "held_out_errors": None
-            if self.held_out_errors is None
-            else _plain(self.held_out_errors._asdict()),
-            "loss_history": _plain(self.loss_history),
-            "labels": list(self.labels),
-            "covariance": _plain(self.covariance),
-            "minima": [
-                {"values": _plain(m.values), "loss": m.loss, "stop": m.stop.value} for m in self.minima
-            ],
-            "freedom": self.freedom,
-            "evaluations": self.evaluations,
-            "seconds": self.seconds,
-        }
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray, Array)) and np.ndim(value) > 0:
-        return [_plain(item) for item in value]
-    number = float(np.asarray(value))
-    return number if np.isfinite(number) else None
 
 
 def identify(
@@ -193,73 +53,47 @@ def identify(
     """Find the parameters of a scene with which it moves as observed.
 
     Minimises ½ Σ ‖(x̂ − x)/σ‖² over frames, bodies and quantities (Sec. V-A of the paper, with W = 1/σ²) by
-    Levenberg–Marquardt within the bounds, differentiating the simulation.
-
-    The arguments come in groups: what moved (`scene` to `initial`), the noise of observations (`noise`,
-    `huber`), windows (`window`, `continuity`, `after`), the search (`starts` to `batch`).
+    Levenberg–Marquardt within the bounds; docs/identify.md says when to choose what.
 
     Args:
         scene: The scene, with values for whatever is not a parameter.
-        observed: One motion or several: simulated trajectories or `Motion`s, of any bodies, in any frames,
-            with any gaps; frames need not lie on steps. Each begins at its own first complete frame.
+        observed: One motion or several, of any bodies. Each begins at its own first complete frame.
         parameters: What is unknown.
         held_out: Motions that are not fitted, to measure the error on.
-        state: What a motion does not say of its beginning, e.g. where an unobserved or a fixed body is (by
-            default fixed ones are at the origin); one for all motions or one for each.
-        controls: Forces and torques [N, N m]: those of each step of each motion, or a policy as in `simulate`
-            (whose time runs from the first frame of the motion).
-        initial: What to estimate of the state in which each window begins: nothing ("given": it is as
-            observed), velocities and spins ("velocities"), all ("states": right for noisy poses, and needed
-            for honest standard errors then), or a list of quantities, e.g. ["velocity"]. Default: "given" if
-            velocities and spins are observed, "velocities" if not.
-        noise: Standard deviations by quantity: position [m], orientation [rad], velocity [m/s], omega
-            [rad/s]. What is left out does not count. Default: positions and orientations, which weigh as if
-            seen at the bodies' surface. Poses with a covariance (`Motion.covariance`) weigh by that instead;
-            this then only says which quantities count.
-        huber: Length of a residual, in those standard deviations, from which it counts linearly instead of
-            squared, e.g. 2: outliers then pull less.
-        window: Frames of the windows that motions are cut into, each simulated from its own initial state
-            (multiple shooting); default: no cuts. For long and for chaotic motions.
-        continuity: Allowed gap between the end of a window and the beginning of the next, as multiple of
-            `noise`; default: any gap. Needs `initial="states"`. A falling sequence is searched with one value
-            after the other, each from where the last one ended: loose windows converge from far-off
-            parameters, tight ones use all of the motion.
-        after: An earlier fit of the same motions in the same windows, from which this one goes on: from its
-            values, by name, and from the initial states that it estimated. To fit at a coarse timestep first,
-            or with fewer unknowns.
-        starts: Points to start from: the scene's values, and others in the bounds, the best of many by their
-            loss. For losses with several minima.
+        state: Of bodies that a motion does not hold; one for all motions or one for each.
+        controls: Forces and torques [N, N m] of each step of each motion, or a policy as in `simulate`.
+        initial: What to estimate of the state in which each window begins: "given" (nothing), "velocities"
+            (with spins), "states" (all), or a list of quantities. Default: what the motion does not hold.
+        noise: Standard deviations of the quantities that count: position [m], orientation [rad], velocity
+            [m/s], omega [rad/s], q [rad or m]. Default: poses. A covariance of the motion goes before.
+        huber: Length of a residual, in standard deviations, from which it counts linearly.
+        window: Frames of the windows that motions are cut into (multiple shooting); default: no cuts.
+        continuity: Allowed gap between windows, as multiple of `noise`, or a falling sequence of it, searched
+            with one after the other. Needs `initial="states"`. Default: any gap.
+        after: An earlier fit of the same windows; this one goes on from its values and initial states.
+        starts: Points to start from: the scene's values, and others in the bounds.
         seed: Of everything random.
-        jacobian: Forward mode costs one rollout per unknown, reverse mode several per observed number.
+        jacobian: "forward" costs one rollout per unknown, "reverse" several per observed number, or "auto".
         max_iterations: Steps of each search.
         tolerance: Stop when the predicted move of the parameters is below this, in standard errors.
-        batch: Windows that a device simulates at once; default one on a CPU, many on a GPU. All devices of
-            this process, and all processes of `jax.distributed`, take a share of the windows.
+        batch: Windows that a device simulates at once; default one on a CPU, many on a GPU.
         engine: Default `VariationalEngine()`.
-        progress: Called with a description and the share done. Ctrl-C during the search returns the best
-            so far.
+        progress: Called with a description and the share done. Ctrl-C returns the best so far.
 
     Returns:
-        Values, standard errors, what is not determined, and the fitted motion. Steps that did not converge
-        are said in `messages` and raise a RuntimeWarning, as does what the data leave open. Motions that
-        can hardly be in metres and seconds raise a UserWarning before the search.
+        Values, standard errors, what is not determined, and the fitted motion. What failed or is left open
+        is said in `messages` and raises a RuntimeWarning; odd units of motions raise a UserWarning.
 
     Raises:
-        ValueError: If motions, parameters and scene do not fit each other, an option is out of range,
-            there are fewer observed numbers than unknowns, a body moves faster than sound, or a window has
-            more than 20,000 steps.
+        ValueError: If motions, parameters and scene do not fit each other or make too much work, or an
+            option is out of range.
     """
-    began = time.perf_counter()
     motions = _motions("observed", observed)
     if not motions:
         raise ValueError("observed must hold at least one motion, got none")
-    if after is not None:
-        parameters = [
-            dataclasses.replace(each, start=after.values.get(each.name, each.start)) for each in parameters
-        ]
     chosen = estimated(initial, motions)
     setup = Setup(
-        space_of(scene, controls, parameters),
+        space_of(scene, controls, _started(parameters, after)),
         scene,
         controls,
         chosen,
@@ -269,22 +103,49 @@ def identify(
         engine or VariationalEngine(),
     )
     check_scales(scene, motions, window)
+    found = _fitted(setup, motions, _motions("held_out", held_out), state, after, progress)
+    for message in found.messages:
+        warnings.warn(message, RuntimeWarning, stacklevel=2)
+    return found
+
+
+def _fitted(
+    setup: Setup,
+    motions: tuple[Motion, ...],
+    held: tuple[Motion, ...],
+    state: State | Sequence[State | None] | None,
+    after: Identification | None,
+    progress: Callable[[str, float], None] | None,
+) -> Identification:
+    """Searches from all starts, and measures the error on what is held out."""
+    began = time.perf_counter()
+    tell = progress or (lambda description, share: None)
     problem = Problem(setup, motions, state)
     if after is not None:
         problem.begin_near(after.initial_states, after.initial)
-    tell = progress or (lambda description, share: None)
     tell("compiling", 0.0)
     solutions = _searched(problem, setup.search, tell)
-    held_errors = None
-    if held := _motions("held_out", held_out):
-        other = Problem(setup, held, state)
-        fixed = other.search(solutions[0].x, max_iterations, tolerance, None, free=False)
-        held_errors = _errors(other.plan, held, other.simulate(fixed.x, fixed.blocks))
+    held_errors = _held_out(setup, held, state, solutions[0])
     found = _identification(setup, problem, motions, solutions, held_errors, began)
-    for message in found.messages:
-        warnings.warn(message, RuntimeWarning, stacklevel=2)
     tell("done", 1.0)
     return found
+
+
+def _started(parameters: Sequence[Parameter], after: Identification | None) -> list[Parameter]:
+    """The parameters, with the values of an earlier fit as starts."""
+    values = {} if after is None else after.values
+    return [dataclasses.replace(each, start=values.get(each.name, each.start)) for each in parameters]
+
+
+def _held_out(
+    setup: Setup, held: tuple[Motion, ...], state: State | Sequence[State | None] | None, best: Solution
+) -> Errors | None:
+    """Errors of motions that were not fitted, with their own initial states; None without motions."""
+    if not held:
+        return None
+    problem, search = Problem(setup, held, state), setup.search
+    fixed = problem.search(best.x, search.max_iterations, search.tolerance, None, free=False)
+    return _errors(problem.plan, held, problem.simulate(fixed.x, fixed.blocks))
 
 
 def _searched(problem: Problem, search: Search, tell: Callable[[str, float], None]) -> list[Solution]:

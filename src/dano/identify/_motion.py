@@ -87,10 +87,9 @@ class Motion:
             q: Joint coordinates of each body, see the attribute; `motion_of_joints` makes them.
 
         Raises:
-            ValueError: If there are fewer than two frames, times do not increase, a shape is wrong, nothing
-                was observed, an entry is infinite, a quaternion is not of unit length, or orientations
-                contradict the angular velocities (as they do in another order than wxyz), or a covariance is
-                not symmetric and positive definite.
+            ValueError: If there are fewer than two frames, times do not increase, nothing was observed, or an
+                array has a wrong shape or impossible values. Orientations that contradict the angular
+                velocities are refused, too: quaternions in another order than wxyz do.
         """
         names = (names,) if isinstance(names, str) else tuple(names)
         if not names or len(set(names)) < len(names) or not all(names):

@@ -230,7 +230,7 @@ def _inertia_box(what: str, p: Parameter, shape: tuple[int, ...], value: np.ndar
     if shape != (3, 3) or value.shape != (3, 3):
         raise ValueError(f"{what} must be a (3, 3) inertia tensor, got shape {shape}, start {value.shape}")
     if np.any(np.isfinite(np.asarray(p.lower))) or np.any(np.isfinite(np.asarray(p.upper))):
-        raise ValueError(f"{what} is an inertia tensor: its form bounds it, leave lower and upper out")
+        raise ValueError(f"{what} is an inertia tensor, which takes no bounds: leave lower and upper out")
     try:
         start = _log_cholesky(value)
     except np.linalg.LinAlgError as error:

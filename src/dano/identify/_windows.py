@@ -199,7 +199,7 @@ def _weighed(
             weights[key] = jnp.asarray(counts / noise[key], dtype)
     if not weights:
         raise ValueError(
-            f"observed must hold frames after the first of one of {list(noise)}, got none that count"
+            f"observed must hold, after the first frame, values of some of {list(noise)}, got none"
         )
     joints = observed.pop("q", None)
     return State(**observed), joints, weights

@@ -5,9 +5,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-_LEAST_FRICTION = 1e-5
-"""MuJoCo's own (mjMINMU)."""
+LEAST_FRICTION = 1e-5
+"""MuJoCo's mjMINMU."""
 _LEAST_WEIGHT = 1e-15
+"""MuJoCo's mjMINVAL."""
 
 
 class Settings(NamedTuple):
@@ -60,7 +61,7 @@ def mixed(model: Any, a: int, b: int, overridden: bool) -> Settings:
     else:
         solref = share * references[0] + (1 - share) * references[1]
     solimp = share * model.geom_solimp[a] + (1 - share) * model.geom_solimp[b]
-    five = np.maximum(friction[[0, 0, 1, 2, 2]], _LEAST_FRICTION)
+    five = np.maximum(friction[[0, 0, 1, 2, 2]], LEAST_FRICTION)
     if overridden:
         option = model.opt
         return Settings(dim, option.o_friction, option.o_solref, option.o_solimp, float(option.o_margin), gap)

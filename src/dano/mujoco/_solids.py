@@ -16,6 +16,7 @@ Vectors = Float[np.ndarray, "n 3"]
 _NEWTON_PASSES = 12
 """For the closest point of an ellipsoid: from below the root, Newton's method on a convex function."""
 _TINY = 1e-12
+"""Lengths are divided by at least this: far below any geom [m], far above rounding."""
 
 
 class Solid(NamedTuple):

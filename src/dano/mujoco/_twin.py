@@ -10,13 +10,12 @@ from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSp
 from dano.maths import quat_multiply, quat_to_matrix
 from dano.mujoco._bridge import Bridge
 from dano.mujoco._model import library
-from dano.mujoco._settings import Settings
+from dano.mujoco._settings import LEAST_FRICTION, Settings
 from dano.scene import Body, Scene
 
 _SOLREF = np.array([0.02, 1.0])
 _SOLIMP = np.array([0.9, 0.95, 0.001, 0.5, 2.0])
-"""MuJoCo's defaults."""
-_LEAST_FRICTION = 1e-5
+"""MuJoCo's defaults, as is `_SOLREF`."""
 
 
 class Motion(NamedTuple):
@@ -109,8 +108,8 @@ class Twin:
         found = self._pair_of.get((int(model.geom_bodyid[a]), int(model.geom_bodyid[b])))
         if found is None:
             return None
-        friction = max(float(self._friction[found[0]]), _LEAST_FRICTION)
-        five = np.array([friction, friction, _LEAST_FRICTION, _LEAST_FRICTION, _LEAST_FRICTION])
+        friction = max(float(self._friction[found[0]]), LEAST_FRICTION)
+        five = np.array([friction, friction, LEAST_FRICTION, LEAST_FRICTION, LEAST_FRICTION])
         return Settings(3, five, _SOLREF, _SOLIMP)
 
     def _load(self, motion: Motion, constants: Constants) -> None:
@@ -120,7 +119,7 @@ class Twin:
         model.opt.timestep, model.opt.gravity[:] = float(constants.timestep), constants.gravity
         self._friction = constants.friction
         for k, pair in self._explicit:
-            model.pair_friction[pair, :2] = max(float(constants.friction[k]), _LEAST_FRICTION)
+            model.pair_friction[pair, :2] = max(float(constants.friction[k]), LEAST_FRICTION)
         free = self._free
         rows = 1 + np.flatnonzero(~free)
         model.body_pos[rows], model.body_quat[rows] = motion.position[~free], motion.orientation[~free]

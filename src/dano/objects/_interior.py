@@ -110,15 +110,16 @@ class Interior(eqx.Module):
 def examine(lattice: Lattice) -> tuple[Interior, Bool[np.ndarray, "nx ny nz"]]:
     """Find the solid that a density stands for, and what its inside looks like.
 
-    The level of the surface is half the plateau density, the natural one of an occupancy and the middle of
-    the wall of anything else, unless the part above it is no watertight solid. It is not if
+    The level of the surface is half the plateau density. For an occupancy this is the natural level, for
+    other fields the middle of the wall. Another level is taken if the part above it is no watertight solid.
+    It is not if
 
     - closing its pores by one more cell enlarges it by more than 6 %, or
     - a lower level finds a hollow of more than 5 % of its volume, bordered by its dense part, that it does
       not enclose: then the hollow is connected with the outside through pores.
 
-    In that case pores of up to four cells are closed, and then lower levels are tried. Higher levels never
-    are: they cost volume and raise no alarm, since a porous solid still covers its silhouettes.
+    In that case pores of up to four cells are closed, and then lower levels are tried. Higher levels are not
+    tried: they lose volume, and no check would show it, since a porous solid still covers its silhouettes.
 
     If none of these is watertight, the first level is taken as it is, and `gap` is NaN.
 

@@ -120,7 +120,7 @@ def checked_inertia(name: str, value: Numbers) -> Float[Array, "3 3"]:
         # That of a flat plate is the sum, to rounding.
         if high > (1 + _TRIANGLE) * (low + middle):
             raise ValueError(
-                f"{name} must be that of some body: no principal moment may exceed the sum of the other two,"
+                f"{name} must be possible: no principal moment may exceed the sum of the other two,"
                 f" got {[float(f'{moment:.6g}') for moment in (low, middle, high)]} kg m²"
             )
     return inertia
@@ -193,11 +193,14 @@ def _compiled_jet(jet, points):
     return jet(points, 1)
 
 
-def cells(bounds: Float[Array, "2 3"], resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Number of cells (3,) and their sides [m] (3,) of a grid of `resolution` cells on the longest axis."""
+def cells(bounds: Float[Array, "2 3"], resolution: int, least: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Number of cells (3,) and their sides [m] (3,) of a grid of `resolution` cells on the longest axis.
+
+    The cells are cubes, but for axes that have the least number of them.
+    """
     resolution = checked_count("resolution", resolution, least=4)
     extent = np.asarray(bounds[1] - bounds[0], dtype=np.float64)
-    count = np.maximum(np.ceil(extent / extent.max() * resolution - 1e-9).astype(int), 1)
+    count = np.maximum(np.ceil(extent / extent.max() * resolution - 1e-9).astype(int), least)
     return count, extent / count
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dano.archive import LOOK, OBJECT, read_archive, write_archive
 from dano.fields import AbstractField, AbstractShape, GridField, SignedDistanceGrid
 from dano.maths import checked_array, checked_count, checked_key, floating, is_traced, Numbers
+from dano.memory import check_nodes
 from dano.notebook import card, cloud, numbers
 from dano.objects._interior import examine, Interior, sealed
 from dano.objects._mass import checked_density, Density, integrate, integrated, MassProperties, Progress
@@ -31,6 +32,13 @@ from dano.objects._surface import draw_surface, equal_areas, SurfaceSamples
 
 MassModel = Literal["auto", "density", "solid"]
 FORMAT, VERSION = OBJECT
+
+_MOST_SAMPLES = 200_000
+"""As many contact samples take two minutes and 3 GB; a hundredth of them do for most purposes."""
+
+_BYTES_PER_NODE = 150
+"""Measured: what building an object takes at its peak, over the nodes of its lattice."""
+
 
 _INTERIOR = tuple(field.name for field in dataclasses.fields(Interior))
 
@@ -117,13 +125,14 @@ class NeuralObject(eqx.Module):
             The object; its frame is the field's.
 
         Raises:
-            ValueError: If an argument is out of range, the field is empty, has a negative or non-finite
-                density or unbounded support, or no point lies in `density_range`.
+            ValueError: If an argument is out of range, the field is empty, unbounded, or has negative or
+                non-finite densities, or no point lies in `density_range`. At most 200,000 samples, and a
+                resolution that fits into half of the memory, are allowed.
         """
         if mass_model not in get_args(MassModel):
             raise ValueError(f"mass_model must be one of {get_args(MassModel)}, got {mass_model!r}")
         say = progress or (lambda description, share: None)
-        n_samples = checked_count("n_samples", n_samples)
+        n_samples = _checked_samples(n_samples)
         key = checked_key(key)
         sampling_key, mass_key = jax.random.split(key)
         original = field
@@ -354,11 +363,20 @@ def field_size(
     return float(Region.create(lattice, low, floaters=floaters).extents(density).max())
 
 
+def _checked_samples(n: int) -> int:
+    n = checked_count("n_samples", n)
+    if n > _MOST_SAMPLES:
+        raise ValueError(f"n_samples must be at most {_MOST_SAMPLES}, got {n}")
+    return n
+
+
 def _closed(field: AbstractField, resolution: int) -> tuple[AbstractField, Density, Lattice, Interior]:
     """A field whose surface has no pores, its density, the lattice it is sampled on, and its inside.
 
     Contact, too, is with the solid whose pores are closed.
     """
+    resolution = checked_count("resolution", resolution, least=4)
+    check_nodes(np.ptp(np.asarray(field.bounds), axis=0), resolution, _BYTES_PER_NODE)
     density = checked_density(field)
     lattice = Lattice.create(density, field.bounds, resolution)
     interior, inside = examine(lattice)

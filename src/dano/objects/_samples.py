@@ -18,6 +18,8 @@ CANDIDATES = 4
 DRAWS = 400
 # Cells across the thinnest side of a field's bounds with which its inside is found wherever the lattice lies.
 _CELLS_ACROSS = 4
+# Along the longest side of a shape, half of what objects have by default: only its edge is looked for.
+_SHAPE_CELLS = 48
 # Of a cell, to find where the density crosses a level: to a thousandth of it.
 _HALVINGS = 10
 
@@ -50,13 +52,21 @@ class Lattice(eqx.Module):
     side: np.ndarray
 
     @classmethod
-    def create(cls, density: Density, bounds: Float[Array, "2 3"], resolution: int) -> "Lattice":
+    def create(
+        cls, density: Density, bounds: Float[Array, "2 3"], resolution: int, *, least: int = 1
+    ) -> "Lattice":
         """Evaluate a density on a lattice over its bounds.
+
+        Args:
+            density: A function of one point.
+            bounds: [m, F].
+            resolution: Cells along the longest axis.
+            least: Cells along each axis; with more than one the cells of thin fields are flat.
 
         Raises:
             ValueError: If it is negative, not finite, or zero everywhere.
         """
-        count, side = cells(bounds, resolution)
+        count, side = cells(bounds, resolution, least)
         origin = np.asarray(bounds[0], dtype=np.float64)
         corners = np.stack(np.meshgrid(*(np.arange(n + 1) for n in count), indexing="ij"), axis=-1).reshape(
             -1, 3
@@ -266,7 +276,7 @@ def draw_contact_samples(shape: AbstractShape, n: int, key: PRNGKeyArray | None 
         ValueError: If the shape is unbounded.
     """
     density = checked_density(shape)
-    lattice = Lattice.create(density, shape.bounds, 48)
+    lattice = Lattice.create(density, shape.bounds, _SHAPE_CELLS, least=_CELLS_ACROSS)
     low, high = surface_range(lattice.values)
     region = Region.create(lattice, low, floaters=True)
     return contact_samples(shape, density, lattice, region, low, high, n, checked_key(key))

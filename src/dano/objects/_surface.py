@@ -85,10 +85,11 @@ def draw_surface(
 
     The areas are those of the surface *inflated* by `skin`: an edge carries length · angle · skin and a
     corner (solid angle) · skin², though neither has an area of its own, however many samples there are.
-    Precisely, the area at height s above the surface belongs to the closest point of the surface, and the
-    areas are the mean over 0 < s < 2 skin under the bell (1 − cos(π s/skin))/(2 skin), whose mean is skin and
-    whose smooth ends make sums over drawn points accurate. Steiner's formula for a box of sides a, b, c then
-    gives 2(ab + bc + ca) + 2π skin (a + b + c) + 1.13 · 4π skin²; concave edges carry less instead of more.
+    Precisely, the area at height s above the surface belongs to the closest point of the surface. The areas
+    are the mean over 0 < s < 2 skin, weighted by (1 − cos(π s/skin))/(2 skin). The mean of this weight is
+    skin, and its smooth ends make sums over drawn points accurate. Steiner's formula for a box of sides a, b,
+    c then gives 2(ab + bc + ca) + 2π skin (a + b + c) + 1.13 · 4π skin²; concave edges carry less instead of
+    more.
 
     Corners are chosen first, then edges, then faces, each time the point farthest from all chosen before.
     The two sides of a wall thinner than the distance between samples are covered separately.

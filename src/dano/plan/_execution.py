@@ -69,8 +69,8 @@ def follow(
     """Carry a plan out in a scene that may differ from the planned one.
 
     Controls are held over a step of the plan: u_t + K_t (x ⊟ x_t) within their bounds, or u_t without
-    feedback. With `every`, the task is planned again after so many steps for those that are left, from where
-    the bodies are then and with the plan so far as first guess: model-predictive control.
+    feedback. With `every`, the rest of the task is planned again after so many steps. The new plan begins at
+    the current state, with the old plan as first guess: model-predictive control.
 
     Args:
         plant: What really happens: the same bodies, other numbers; its timestep is that of the plan divided
@@ -182,7 +182,7 @@ def _check(
     if substeps < 1 or (every is not None and every < 1):
         raise ValueError(f"substeps and every must be ≥ 1, got {substeps} and {every}")
     if every is not None and scene is None:
-        raise ValueError("scene must be given with every: new plans need one to believe in")
+        raise ValueError("scene must be given with every: new plans are made in it")
     if len(plan.values) != task.n_steps:
         raise ValueError(f"plan must have the task's {task.n_steps} steps, got {len(plan.values)}")
     planned = float(plan.trajectory.times[1] - plan.trajectory.times[0])

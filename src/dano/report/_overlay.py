@@ -6,6 +6,7 @@ from jaxtyping import UInt8
 from dano.report._stage import Touches
 from dano.vision import AbstractCamera, Camera
 
+# Colours, chosen by eye.
 _DOT = (24, 26, 30)
 _ARROW = (214, 40, 57)
 # Drawn this many times larger and then reduced: Pillow's lines are not smooth.

@@ -16,7 +16,7 @@ from dano.report._video import encoder, moments_of, require, side_by_side, write
 from dano.scene import Scene
 from dano.vision import Camera, Item, LearnedField, render
 
-# How much of a ghost is seen.
+# How much of a ghost is seen, and pictures in a strip (chosen by eye).
 _GHOST = 0.4
 _MOMENTS = 6
 

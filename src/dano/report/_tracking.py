@@ -21,7 +21,10 @@ _WIDTH = 460
 """Of a picture in the page [CSS pixels]."""
 
 _LINE = np.array([255, 64, 32])
+"""Colour of silhouettes (chosen: rare in photographs)."""
+
 _FINE = 2
+"""Silhouettes are drawn so many times finer than pixels."""
 
 
 def draw_tracked(film: Film, tracked: Tracked, index: int) -> UInt8[np.ndarray, "height width 3"]:

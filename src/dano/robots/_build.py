@@ -42,7 +42,7 @@ def load_urdf(
     Raises:
         ImportError: If a mesh needs packages that are missing.
         ValueError: If the file is missing or broken, its joints make no tree, a link that a joint moves has
-            no mass or an inertia that no body has, or a mesh is missing.
+            no mass or an impossible inertia, or a mesh is missing.
     """
     return build_robot(read_urdf(checked_input(path)), base=base, prefix=prefix, collision=collision)
 

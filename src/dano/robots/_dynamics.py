@@ -32,8 +32,8 @@ def bias_forces(scene: Scene, state: State) -> Float[Array, " k"]:
         ValueError: If the state does not fit the scene.
     """
     still = jnp.zeros(scene.layout.n_velocities, scene.timestep.dtype)
-    force, torque, rows = _needed(scene, state, still)
-    return _pulled(scene.frames(state).jacobian[rows], force, torque)
+    force, torque, jacobian, rows = _needed(scene, state, still)
+    return _pulled(jacobian[rows], force, torque)
 
 
 def gravity_forces(scene: Scene, state: State) -> Float[Array, " k"]:
@@ -91,7 +91,7 @@ def joint_reactions(
         raise ValueError(f"wrenches must have shape ({layout.bodies}, 6), got {given.shape}")
     scene.check_state(state)
     assert state.q is not None
-    force, torque, rows = _needed(scene, state, _checked_acceleration(scene, acceleration))
+    force, torque, _, rows = _needed(scene, state, _checked_acceleration(scene, acceleration))
     poses = place_links(scene.chains, state.position, state.orientation, state.q)
     turned = quat_rotate(poses.orientation[rows], torque)
     lacking = (-given).at[rows].add(jnp.concatenate([force, turned], axis=1))
@@ -143,22 +143,22 @@ def _checked_acceleration(scene: Scene, acceleration: Numbers) -> Float[Array, "
 
 
 def _needed(scene: Scene, state: State, acceleration: Float[Array, " k"]):
-    """Force [N, W] and torque [N m, B] that each body needs beside gravity, and which bodies they are."""
+    """Force [N, W] and torque [N m, B] that bodies need beside gravity, the Jacobian, and which bodies."""
     scene.check_state(state)
     mass, inertia, rows = _masses(scene)
     speeds = generalised_velocities(scene, state)
 
-    def twists(share: Float[Array, ""]) -> tuple[Array, Array]:
+    def twists(share: Float[Array, ""]) -> tuple[tuple[Array, Array], Array]:
         frames = scene.frames(drifted(scene, state, share))
         moved = frames.jacobian @ (speeds + share * acceleration)
-        return moved[:, :3], moved[:, 3:]
+        return (moved[:, :3], moved[:, 3:]), frames.jacobian
 
     zero, one = jnp.zeros((), scene.timestep.dtype), jnp.ones((), scene.timestep.dtype)
-    (_, omega), (gained, turning) = jax.jvp(twists, (zero,), (one,))
+    (_, omega), (gained, turning), jacobian = jax.jvp(twists, (zero,), (one,), has_aux=True)
     force = mass[:, None] * (gained[rows] - scene.gravity[None])
     spin = jnp.einsum("mab,mb->ma", inertia, omega[rows])
     torque = jnp.einsum("mab,mb->ma", inertia, turning[rows]) + jnp.cross(omega[rows], spin)
-    return force, torque, rows
+    return force, torque, jacobian, rows
 
 
 def _pulled(jacobian: Float[Array, "m 6 k"], force: Array, torque: Array) -> Float[Array, " k"]:

@@ -65,7 +65,7 @@ def _shape(solid: Solid, where: str) -> AbstractShape:
     if not solid.path.is_file():
         raise ValueError(
             f"{where}: mesh must be a file, got {solid.path}, which does not exist; "
-            "collision=False reads the robot without what it touches with"
+            "collision=False reads the robot without collision geometry"
         )
     sizes = np.abs(numbers)
     if np.ptp(sizes) > 1e-9 * sizes.max() or min(numbers) <= 0:

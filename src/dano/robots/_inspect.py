@@ -70,7 +70,7 @@ def _of_link(link: Link) -> list[str]:
         doubts.append(f"{where}: inertia is not positive, principal moments {_numbers(moments)} kg m²")
     elif link.mass > 0 and moments[2] > (1 + _ROUNDED) * (moments[0] + moments[1]):
         doubts.append(
-            f"{where}: inertia is that of no body, principal moments {_numbers(moments)} kg m²: "
+            f"{where}: inertia is impossible, principal moments {_numbers(moments)} kg m²: "
             "the largest exceeds the sum of the others"
         )
     for role, solids in (("collision", link.solids), ("visual", link.visuals)):

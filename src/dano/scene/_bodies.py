@@ -111,24 +111,14 @@ class Body(eqx.Module):
             self.density_scale = 1 / jnp.mean(geometry.samples.density)
             if geometry.grid is not None:
                 self.support = Support.create(geometry.grid)
-            properties = geometry.mass
         elif isinstance(geometry, AbstractShape):
             self.shape = geometry
-            if mass is not None and inertia is not None and com is not None:
-                properties = MassProperties(mass, com, inertia)
-            else:
-                properties = None if mass is None else _homogeneous(name, geometry, float(np.asarray(mass)))
         else:
             raise ValueError(
                 f"geometry of body {name!r} must be a NeuralObject or a shape, "
                 f"got {type(geometry).__name__}; a field becomes an object by NeuralObject.from_field"
             )
-        if properties is None:
-            if not self.fixed:
-                raise ValueError(
-                    f"mass of body {name!r} must be given: a shape that moves has none of its own"
-                )
-            properties = MassProperties(1.0, (0.0, 0.0, 0.0), np.eye(3))
+        properties = _properties(name, geometry, (mass, com, inertia), self.fixed)
         share = 1.0
         if mass is not None:
             mass = checked_array(f"mass of body {name!r}", mass, ())
@@ -267,6 +257,29 @@ def _directions(n: int) -> np.ndarray:
     z, angle = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
     radius = np.sqrt(1 - z * z)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+
+
+def _properties(
+    name: str,
+    geometry: NeuralObject | AbstractShape,
+    given: tuple[Numbers | None, Numbers | None, Numbers | None],
+    fixed: bool,
+) -> MassProperties:
+    """Mass, centre of mass and inertia of a neural object, or of a shape from those of them that are given.
+
+    Raises:
+        ValueError: If the mass of a shape that moves is missing.
+    """
+    if isinstance(geometry, NeuralObject):
+        return geometry.mass
+    mass, com, inertia = given
+    if mass is not None and com is not None and inertia is not None:
+        return MassProperties(mass, com, inertia)
+    if mass is not None:
+        return _homogeneous(name, geometry, float(np.asarray(mass)))
+    if not fixed:
+        raise ValueError(f"mass of body {name!r} must be given: a shape that moves has none of its own")
+    return MassProperties(1.0, (0.0, 0.0, 0.0), np.eye(3))
 
 
 def _homogeneous(name: str, shape: AbstractShape, mass: float) -> MassProperties:

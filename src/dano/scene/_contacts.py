@@ -29,6 +29,7 @@ from dano.scene._states import State
 # Edge width of a primitive relative to the size of what touches it: 0.5 % made gradients and rest
 # right, 0.1 % did not.
 EDGE_SHARE = 0.005
+# Samples of a shape that an object touches by the centroid law (convention; neural objects choose theirs).
 SHAPE_SAMPLES = 2000
 
 

@@ -150,7 +150,7 @@ def place_links(
     layout = chains.layout
     turns = np.array([kind == "hinge" for kind in chains.kinds], bool)
     moves = np.array([kind == "slide" for kind in chains.kinds], bool)
-    # A weld reads some coordinate and counts it nought times.
+    # A weld reads some coordinate and counts it zero times.
     value = q[np.maximum(layout.coordinates, 0)] if layout.n_joints else jnp.zeros(len(turns), q.dtype)
     if any(layout.follows):
         value = chains.ratio * value + chains.shift

@@ -1,7 +1,6 @@
 """Scenes: bodies, the contacts between them, a timestep and gravity."""
 
 import dataclasses
-import warnings
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -9,24 +8,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.contact import checked_parameter, CHUNK, ContactParams
+from dano.contact import checked_parameter, ContactParams
 from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
-from dano.names import did_you_mean
 from dano.notebook import card, cloud
 from dano.objects import checked_inertia
 from dano.scene._bodies import Body, checked_parts
 from dano.scene._contacts import Contact, prepared
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
 from dano.scene._joints import Joint, Layout, layout_of
+from dano.scene._making import (
+    check_contacts,
+    check_materials,
+    check_names,
+    room_for,
+    structure,
+    twins_of,
+    warn_of_long_steps,
+)
 from dano.scene._motors import Motor
 from dano.scene._others import Others, others_of
 from dano.scene._states import check_precision, Control, JOINT_QUANTITIES, State, STATE_SIZES
-
-# Share of the smallest body's size by which gravity may move it in a step before a warning says so, and the
-# share that the warning asks for.
-LONGEST_FALL, SHORT_FALL = 0.5, 0.05
-# Room for what a body touches besides the floor that it lies on, and for chunks that are not full.
-CHUNKS_A_BODY = 24
 
 
 class Scene(eqx.Module):
@@ -79,52 +80,31 @@ class Scene(eqx.Module):
             gravity: [m/s², W].
 
         Raises:
-            ValueError: If there is no body, two have one name, a contact names an unknown body, joins two
-                fixed ones or a pair twice, a pair cannot overlap, joints make no trees, a body has a material
-                that nothing reads, or a number is out of range.
+            ValueError: If bodies are missing or share a name, a contact names an unknown body, two fixed ones
+                or a pair twice, a pair cannot overlap, joints make no trees, no pair uses a material, or a
+                number is out of range.
         """
         bodies = checked_parts("bodies", bodies, Body)
         contacts = checked_parts("contacts", contacts, Contact)
         joints = checked_parts("joints", joints, Joint)
-        names = [body.name for body in bodies]
-        if not bodies:
-            raise ValueError("bodies must hold at least one body, got none")
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"bodies must have different names, got {name!r} {names.count(name)} times")
-        layout = layout_of(*_structure(bodies, joints))
+        check_names(bodies)
         timestep = checked_array("timestep", timestep, ())
         if not is_traced(timestep) and not float(timestep) > 0:
             raise ValueError(f"timestep must be > 0 s, got {float(timestep)}")
-        seen: set[frozenset[str]] = set()
-        for contact in contacts:
-            for name in (contact.a, contact.b):
-                if name not in names:
-                    raise ValueError(
-                        f"contact must name bodies of the scene {names}, got {name!r}"
-                        + did_you_mean(name, names)
-                    )
-            if frozenset((contact.a, contact.b)) in seen:
-                raise ValueError(
-                    f"contacts must join each pair once, got ({contact.a!r}, {contact.b!r}) twice"
-                )
-            seen.add(frozenset((contact.a, contact.b)))
-            _check_apart(layout, names, contact)
+        check_contacts(bodies, joints, contacts)
         gravity = checked_array("gravity", gravity, (3,))
         # Before the bodies are prepared, which makes new ones.
-        objects = [body.object for body in bodies]
-        twins = tuple(
-            i if o is None else next(j for j, p in enumerate(objects) if p is o)
-            for i, o in enumerate(objects)
-        )
+        twins = twins_of(bodies)
         bodies, contacts = prepared(bodies, contacts, gravity)
         rest = None
         if others is not None:
             bodies, rest = others_of(bodies, contacts, joints, apart, others, gravity)
-        _check_materials(bodies, others, apart)
+        check_materials(bodies, others, apart)
         if contacts or rest is not None:
-            _warn_of_long_steps(bodies, timestep, gravity)
-        return cls(bodies, contacts, timestep, gravity, twins, joints, rest, _room(bodies, timestep, gravity))
+            warn_of_long_steps(bodies, timestep, gravity)
+        return cls(
+            bodies, contacts, timestep, gravity, twins, joints, rest, room_for(bodies, timestep, gravity)
+        )
 
     def _repr_html_(self) -> str:
         """What notebooks show: bodies with mass and size, and what may touch."""
@@ -146,7 +126,7 @@ class Scene(eqx.Module):
     @property
     def layout(self) -> Layout:
         """Which numbers say how the bodies stand and move."""
-        return layout_of(*_structure(self.bodies, self.joints))
+        return layout_of(*structure(self.bodies, self.joints))
 
     @property
     def chains(self) -> Chains:
@@ -449,87 +429,12 @@ class Scene(eqx.Module):
         return Control(jnp.stack(rows["force"]), jnp.stack(rows["torque"]), **of_joints)
 
 
-def _structure(bodies: Sequence[Body], joints: Sequence[Joint]):
-    """Arguments of `layout_of`."""
-    return (
-        tuple(body.name for body in bodies),
-        tuple(body.fixed for body in bodies),
-        tuple((joint.parent, joint.child, joint.kind, joint.mimics) for joint in joints),
-    )
-
-
-def _check_materials(
-    bodies: Sequence[Body], others: ContactParams | None, apart: Sequence[tuple[str, str]]
-) -> None:
-    """Check that nothing is given that only `others` reads.
-
-    Raises:
-        ValueError: If there is.
-    """
-    if others is not None:
-        return
-    if apart:
-        raise ValueError(f"apart must be empty without others, got {list(apart)}")
-    for body in bodies:
-        if body.material is not None:
-            raise ValueError(
-                f"material of body {body.name!r} is read by pairs that contacts does not name: "
-                "give others=ContactParams(…), too"
-            )
-
-
-def _warn_of_long_steps(
-    bodies: Sequence[Body], timestep: Float[Array, ""], gravity: Float[Array, "3"]
-) -> None:
-    """Warn if gravity alone moves the smallest body by a good part of its size in a step."""
-    if is_traced(timestep, gravity, [body.extent for body in bodies]):
-        return
-    sizes = [(body.size, body.name) for body in bodies if not body.fixed]
-    h, strength = float(timestep), float(np.linalg.norm(np.asarray(gravity)))
-    if not sizes or h * h * strength <= LONGEST_FALL * min(sizes)[0]:
-        return
-    size, name = min(sizes)
-    warnings.warn(
-        f"timestep {h:.3g} s is long: gravity moves bodies by {h * h * strength:.3g} m in a step, and "
-        f"{name!r} is {size:.3g} m large; take at most {(SHORT_FALL * size / strength) ** 0.5:.2g} s",
-        RuntimeWarning,
-        stacklevel=3,
-    )
-
-
-def _room(bodies: Sequence[Body], timestep: Float[Array, ""], gravity: Float[Array, "3"]) -> int | None:
-    """Chunks of point contacts for bodies that lie as flat as they can; None where something is traced."""
-    pressing = [body for body in bodies if not body.fixed and body.surface is not None]
-    if is_traced([body.surface for body in pressing], [body.scale for body in pressing], timestep, gravity):
-        return None
-    margin = 2 * float(timestep) ** 2 * float(np.linalg.norm(np.asarray(gravity)))
-    n_moving = sum(not body.fixed for body in bodies)
-    flat = [-(-body.most_touching(margin) // CHUNK) for body in pressing if body.object is not None]
-    return CHUNKS_A_BODY * n_moving + sum(flat)
-
-
 def _state_keys(layout: Layout, body: int) -> list[str]:
     """What the state of a body is given by."""
     joint = layout.joint_of(body)
     if joint is None:
         return list(STATE_SIZES)
     return list(JOINT_QUANTITIES) if layout.width(joint) else []
-
-
-def _check_apart(layout: Layout, names: list[str], contact: Contact) -> None:
-    """Check that joints let the bodies of a contact move against each other.
-
-    Raises:
-        ValueError: If they are welded together.
-    """
-    a, b = names.index(contact.a), names.index(contact.b)
-    same_root = layout.roots[a] == layout.roots[b]
-    hang = {a, b} <= {*layout.children, *layout.free}
-    if layout.children and same_root and hang and layout.moved_by[a] == layout.moved_by[b]:
-        raise ValueError(
-            f"contact must join bodies that can move against each other, got {contact.a!r} and "
-            f"{contact.b!r}, which are welded together"
-        )
 
 
 def _as_leaf(value: Array, like: Array) -> Array:

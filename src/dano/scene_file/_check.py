@@ -9,8 +9,8 @@ import numpy as np
 from dano.contact import AbstractContactLaw, CentroidLaw, CHUNK, ContactParams, DistributedLaw
 from dano.engine import contact_patches
 from dano.progress import Progress
-from dano.scene import Body, RESOLVED, Scene, State
-from dano.scene_file._forecast import bounds, Finding, forecast, starts
+from dano.scene import Body, Scene, State
+from dano.scene_file._forecast import bounds, fast_spin, Finding, forecast, starts, too_fast
 from dano.scene_file._pieces import run_piece
 from dano.scene_file._reading import SceneFile
 
@@ -102,8 +102,8 @@ def check_scene(
 ) -> SceneCheck:
     """Say what a scene asks for, what will not be resolved, and what it costs.
 
-    Impacts, spins, thin walls, mass ratios and samples are judged from the initial state and from the speeds
-    that falls can give, then from a run of the scene's first steps.
+    Impacts, spins, thin walls, mass ratios and samples are judged from the initial state and the speeds that
+    a fall can reach. Then the first steps of the scene are run.
 
     Args:
         loaded: The scene.
@@ -212,12 +212,6 @@ def _fast_spins(scene: Scene, pieces: list[State]) -> list[Finding]:
     found = []
     for i, body in enumerate(scene.bodies):
         most = float(spins[:, i].max())
-        if not body.fixed and most * h > 2 * RESOLVED >= float(spins[0, i]) * h:
-            found.append(
-                Finding(
-                    "spin",
-                    f"{body.name!r} comes to turn by {math.degrees(most * h):.0f}° in a step, more than 60°;"
-                    f" a timestep of {2 * RESOLVED / most:.2g} s would do",
-                )
-            )
+        if not body.fixed and too_fast(most, h) and not too_fast(float(spins[0, i]), h):
+            found.append(fast_spin(body.name, "comes to turn", most, h))
     return found

@@ -120,25 +120,36 @@ def _support(scene: Scene, limits: list[Bound]) -> list[Finding]:
         if name not in touched:
             found.append(Finding("support", f"{name!r} touches nothing: no contact names it"))
         elif limits[i].falls:
-            text = f"nothing fixed that {name!r} may touch is below it: it may fall for ever"
+            text = f"nothing fixed that {name!r} may touch is below it: it may fall without end"
             found.append(Finding("support", text))
     return found
 
 
 def _spins(scene: Scene, limits: list[Bound]) -> list[Finding]:
     h = float(scene.timestep)
-    found = []
-    for body, limit in zip(scene.bodies, limits, strict=True):
-        if limit.spin * h > 2 * RESOLVED:
-            found.append(
-                Finding(
-                    "spin",
-                    f"{body.name!r} turns by {math.degrees(limit.spin * h):.0f}° in a step, more than 60°:"
-                    " its precession is not resolved; a timestep of"
-                    f" {2 * RESOLVED / limit.spin:.2g} s would do",
-                )
-            )
-    return found
+    pairs = zip(scene.bodies, limits, strict=True)
+    return [fast_spin(body.name, "turns", x.spin, h) for body, x in pairs if too_fast(x.spin, h)]
+
+
+def too_fast(spin: float, h: float) -> bool:
+    """Whether a body of this spin [rad/s] turns by more in a step than is resolved (60°)."""
+    return spin * h > 2 * RESOLVED
+
+
+def fast_spin(name: str, verb: str, spin: float, h: float) -> Finding:
+    """What is said of a body that turns too far in a step.
+
+    Args:
+        name: Of the body.
+        verb: What it does: "turns", or "comes to turn".
+        spin: [rad/s].
+        h: Timestep [s].
+    """
+    return Finding(
+        "spin",
+        f"{name!r} {verb} by {math.degrees(spin * h):.0f}° in a step, more than 60°: its precession is not"
+        f" resolved; use a timestep of {2 * RESOLVED / spin:.2g} s",
+    )
 
 
 def _pair(scene: Scene, state: State, contact: Contact, limits: list[Bound]) -> list[Finding]:
@@ -158,7 +169,7 @@ def _impact(scene: Scene, contact: Contact, speed: float) -> list[Finding]:
                 "impacts",
                 f"{pair} meet at up to {speed:.2g} m/s and go {1e3 * speed * h:.2g} mm in a step, more"
                 f" than the edge ({1e3 * edge:.2g} mm): how hard they push depends on where in a step they"
-                f' meet; a timestep of {edge / speed:.1g} s, a wider edge or law = "distributed" would do',
+                f' meet; use a timestep of {edge / speed:.1g} s, a wider edge or law = "distributed"',
             )
         ]
     if not isinstance(law, DistributedLaw):
@@ -171,8 +182,8 @@ def _impact(scene: Scene, contact: Contact, speed: float) -> list[Finding]:
             Finding(
                 "impacts",
                 f"an impact of {pair} lasts {period:.2g} s, {period / h:.2g} steps, and a spring"
-                f" (compliant) needs {_STEPS_AN_IMPACT}; a timestep of"
-                f" {period / _STEPS_AN_IMPACT:.1g} s would do",
+                f" (compliant) needs {_STEPS_AN_IMPACT}; use a timestep of"
+                f" {period / _STEPS_AN_IMPACT:.1g} s",
             )
         ]
     slow = float(params.restitution_velocity) + float(np.linalg.norm(np.asarray(scene.gravity))) * h
@@ -182,7 +193,7 @@ def _impact(scene: Scene, contact: Contact, speed: float) -> list[Finding]:
         Finding(
             "impacts",
             f"{pair} meet at up to {speed:.2g} m/s and bounce by restitution only from {slow:.2g} m/s on:"
-            " they will bounce less; a smaller timestep or restitution_velocity would do",
+            " they will bounce less; use a smaller timestep or restitution_velocity",
         )
     ]
 
@@ -219,8 +230,8 @@ def _wall(scene: Scene, contact: Contact, limits: list[Bound]) -> list[Finding]:
         Finding(
             "walls",
             f"{contact.a!r} and {contact.b!r} come up to {1e3 * way:.3g} mm closer in a step, and {thin!r} is"
-            f" {2e3 * depths[thin]:.2g} mm thick: one may pass through the other; a timestep of"
-            f" {h * most / way:.1g} s would do",
+            f" {2e3 * depths[thin]:.2g} mm thick: one may pass through the other; use a timestep of"
+            f" {h * most / way:.1g} s",
         )
     ]
 
@@ -266,7 +277,7 @@ def _samples(scene: Scene) -> list[Finding]:
                 Finding(
                     "samples",
                     f"{body.name!r} has {len(areas)} surface samples, {1e3 * spacing:.2g} mm apart: it will"
-                    f" lie on single ones; {enough} would do, {10 * enough} are better",
+                    f" lie on single ones; use at least {enough}, better {10 * enough}",
                 )
             )
     return found

@@ -14,7 +14,6 @@ import numpy as np
 
 from dano.building import BuildOptions
 from dano.fields import AbstractField, AbstractShape, load_field, scaled
-from dano.memory import check_nodes
 from dano.names import did_you_mean
 from dano.objects import field_size, NeuralObject
 from dano.scene_file._doubts import border_doubts, mass_doubt, size_doubts
@@ -26,12 +25,6 @@ Progress = Callable[[str, float], None]
 
 ASSETS = {"bunny": 1.0, "soap": 0.15, "trained_bunny": 1.0, "trained_soap": 0.15}
 """Shipped objects and their masses [kg]."""
-
-MOST_SAMPLES = 200_000
-"""As many contact samples take two minutes and 3 GB; a hundredth of them do for most purposes."""
-
-_BYTES_PER_NODE = 150
-"""Measured: what building an object takes at its peak, over the nodes of its lattice."""
 
 _TRAINED = "trained_"
 
@@ -68,9 +61,6 @@ def build_object(
             f"give either {dashes}mass or {dashes}mass{'-' if dashes else '_'}scale,"
             f" got {chosen.mass} and {chosen.mass_scale}"
         )
-    if chosen.samples > MOST_SAMPLES:
-        raise ValueError(f"samples must be at most {MOST_SAMPLES}, got {chosen.samples}")
-    check_nodes(np.ptp(np.asarray(field.bounds), axis=0), chosen.resolution, _BYTES_PER_NODE)
     common: dict[str, Any] = {
         "density_range": chosen.density_range,
         # Parts of a shape are meant, those of a radiance field are seldom.

@@ -64,6 +64,11 @@ class Schedule(eqx.Module):
 
 
 def read_schedule(top: Table, scene: Scene) -> Schedule | None:
+    """The rows of [[controls]] as a policy; None if there are none.
+
+    Raises:
+        ValueError: If a row names an unknown body, or has a wrong or missing key.
+    """
     rows = [
         Table(f"{top.where}: [[controls]] {i + 1}", row, _CONTROL)
         for i, row in enumerate(top.tables("controls"))

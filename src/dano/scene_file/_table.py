@@ -22,6 +22,11 @@ class Table:
             self.only(valid)
 
     def only(self, valid: Sequence[str]) -> None:
+        """Check that there are no other keys.
+
+        Raises:
+            ValueError: If there is one; it names the valid ones.
+        """
         for key in self.data:
             if key not in valid:
                 raise ValueError(
@@ -33,33 +38,59 @@ class Table:
         return key in self.data
 
     def wrong(self, key: str, expected: str) -> ValueError:
+        """The error that says what was expected of a key and what stands there."""
         return ValueError(f"{self.where}: {key} must be {expected}, got {self.data.get(key)!r}")
 
     def number(self, key: str, default: float | None = None) -> float:
+        """A finite number; without a default the key must be there.
+
+        Raises:
+            ValueError: If it is something else.
+        """
         value = self.data.get(key, default)
         if not is_number(value):
             raise self.wrong(key, "a finite number")
         return float(cast(float, value))
 
     def integer(self, key: str, default: int) -> int:
+        """A whole number.
+
+        Raises:
+            ValueError: If it is something else.
+        """
         value = self.data.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int):
             raise self.wrong(key, "a whole number")
         return value
 
     def boolean(self, key: str, default: bool) -> bool:
+        """True or false.
+
+        Raises:
+            ValueError: If it is something else.
+        """
         value = self.data.get(key, default)
         if not isinstance(value, bool):
             raise self.wrong(key, "true or false")
         return value
 
     def vector(self, key: str, n: int, default: tuple[float, ...] | None = None) -> tuple[float, ...]:
+        """A list of n finite numbers; without a default the key must be there.
+
+        Raises:
+            ValueError: If it is something else.
+        """
         value = self.data.get(key, default)
         if not isinstance(value, (list, tuple)) or len(value) != n or not all(map(is_number, value)):
             raise self.wrong(key, f"a list of {n} finite numbers")
         return tuple(float(x) for x in value)
 
     def word(self, key: str, choices: Sequence[str] | None = None, default: str | None = None) -> str:
+        """A string that is not empty, one of the choices if there are any.
+
+        Raises:
+            ValueError: If it is something else.
+        """
         value = self.data.get(key, default)
         if choices is not None and value not in choices:
             wrong = self.wrong(key, "one of " + ", ".join(map(repr, choices)))
@@ -69,12 +100,22 @@ class Table:
         return value
 
     def table(self, key: str, valid: Sequence[str]) -> "Table":
+        """A table within this one, empty if the key is missing, with no other keys than the valid ones.
+
+        Raises:
+            ValueError: If it is something else.
+        """
         value = self.data.get(key, {})
         if not isinstance(value, dict):
             raise self.wrong(key, "a table")
         return Table(f"{self.where}: {key}", value, valid)
 
     def tables(self, key: str) -> list[dict[str, Any]]:
+        """The rows that are written as [[key]], none if the key is missing.
+
+        Raises:
+            ValueError: If it is something else.
+        """
         value = self.data.get(key, [])
         if not isinstance(value, list) or not all(isinstance(row, dict) for row in value):
             raise self.wrong(key, f"written as [[{key}]] tables")
@@ -82,6 +123,7 @@ class Table:
 
 
 def is_number(value: object) -> bool:
+    """Whether a value of a TOML file is a finite number; true and false are none."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 

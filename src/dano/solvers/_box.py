@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+# Limits that end a search of which rounding is left: projected Newton steps, halvings of one (to 1/4096).
 _MOST_STEPS = 25
 _HALVINGS = 12
 # Of the gradient's entries, by the size of its terms: smaller is rounding.

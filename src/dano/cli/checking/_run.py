@@ -76,7 +76,7 @@ def _print(found: scene_file.SceneCheck) -> None:
     put()
     cost, (mean, slowest) = found.cost, found.total_seconds
     if cost.room is not None:
-        put(f"points      room for {cost.room} point contacts in a step; more are made room for as needed")
+        put(f"points      room for {cost.room} point contacts in a step; room for more is made when needed")
     put(f"compile     {cost.compile_seconds:.1f} s; less when this scene was compiled before")
     put(
         f"a step      {1e6 * cost.step_seconds:.0f} µs, {1e6 * cost.slowest_seconds:.0f} µs in the slowest"

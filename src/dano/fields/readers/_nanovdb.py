@@ -15,6 +15,12 @@ _NANO_CLASSES = {1: "level set", 2: "fog volume"}
 
 
 def read_nanovdb(data: bytes) -> Rows:
+    """The grids of a NanoVDB file.
+
+    Raises:
+        ValueError: If the bytes are none, are damaged, or are of a version that is not read.
+        EOFError: If the file ends too early.
+    """
     rows = []
     for name, kind, buffer in _buffers(data):
         readable = kind in (1, 2)

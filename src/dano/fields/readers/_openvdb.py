@@ -9,6 +9,7 @@ import numpy as np
 from dano.fields.readers._sparse import Block, corner, Rows, SparseGrid, Stream, unblosc
 from dano.memory import decompressed
 
+# The first bytes, map types and compression flags of the format, as in openvdb/io and openvdb/math/Maps.h.
 _MAGIC = 0x56444220
 _MAPS = {
     # What precedes the scale: doubles before it, doubles in all.
@@ -21,6 +22,12 @@ _ZIP, _MASKED, _BLOSC = 1, 2, 4
 
 
 def read_openvdb(data: bytes) -> Rows:
+    """The grids of an OpenVDB file.
+
+    Raises:
+        ValueError: If the bytes are none, are damaged, or are of a version that is not read.
+        EOFError: If the file ends too early.
+    """
     stream = Stream(data)
     magic, version = stream.unpack("qI")
     if magic != _MAGIC:

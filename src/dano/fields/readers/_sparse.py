@@ -53,21 +53,30 @@ class Stream:
         self.data, self.at = data, 0
 
     def take(self, count: int) -> bytes:
+        """The next bytes.
+
+        Raises:
+            EOFError: If there are fewer.
+        """
         if count < 0 or self.at + count > len(self.data):
             raise EOFError
         self.at += count
         return self.data[self.at - count : self.at]
 
     def unpack(self, form: str) -> tuple:
+        """The next values, in the format of `struct` without its byte order."""
         return struct.unpack("<" + form, self.take(struct.calcsize("<" + form)))
 
     def text(self) -> str:
+        """A string behind its length in bytes (uint32), UTF-8."""
         return self.take(self.unpack("I")[0]).decode()
 
     def mask(self, bits: int) -> np.ndarray:
+        """So many bits, the lowest of each byte first, as booleans of shape (bits,)."""
         return np.unpackbits(np.frombuffer(self.take(bits // 8), np.uint8), bitorder="little").astype(bool)
 
     def metadata(self) -> dict[str, bytes]:
+        """OpenVDB's metadata: names and raw values, whose types are passed over."""
         entries = {}
         for _ in range(self.unpack("I")[0]):
             name, _, size = self.text(), self.text(), self.unpack("I")[0]
@@ -82,6 +91,12 @@ def corner(origin: tuple[int, int, int], n: int, side: int, size: int) -> tuple[
 
 
 def unblosc(data: bytes) -> bytes:
+    """What Blosc compressed.
+
+    Raises:
+        ValueError: If the bytes are damaged.
+        ImportError: If blosc is not installed (extra `import`).
+    """
     blosc = optional("blosc", "reading this VDB file needs blosc", "import")
     try:
         return blosc.decompress(data)

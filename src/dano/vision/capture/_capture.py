@@ -106,7 +106,7 @@ class Capture(eqx.Module):
         self.source = str(source)
         if not any(view.split == "train" for view in self.views):
             raise ValueError(
-                f"a capture must have views to train on, got {len(self.views)} views, none of them"
+                f"a capture must have views to train on, got {len(self.views)} views, none for training"
             )
 
     def split(self, name: str) -> tuple[View, ...]:

@@ -369,9 +369,9 @@ def shared_weights(
 ) -> tuple[list[Float[Array, "rays _"]], Float[Array, " rays"]]:
     """Share of a pixel seen of every section of every object, and what gets through all of them.
 
-    The union of all edges cuts every section into pieces; within a section extinction is taken to be
-    uniform, so that a piece has its share of the section's optical depth −log(1 − α), and of what a piece of
-    ray scatters, each object has its share of the sum.
+    The union of all edges cuts every section into pieces. Extinction is taken to be uniform within a section,
+    so a piece has its share of the section's optical depth −log(1 − α). The light that a piece of ray
+    scatters is shared among the objects in proportion to these depths.
 
     Args:
         edges: Ascending distances [m] of each object's sections.

@@ -149,8 +149,8 @@ def march_to_lamp(
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Int[Array, " n"]]:
     """Some steps from points towards a lamp of some width.
 
-    The lamp's disc, at distance t of radius spread · t, is covered up to the height s of the ray above the
-    shape, so the least s / (spread · t), between −1 (dark) and 1 (clear), says how much of it is seen.
+    At distance t the disc of the lamp has the radius spread · t, and the ray is at the height s above the
+    shape. The least s / (spread · t), between −1 (dark) and 1 (clear), says how much of the disc is seen.
 
     Args:
         placed: What stands in the way.

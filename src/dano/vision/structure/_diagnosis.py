@@ -15,7 +15,11 @@ BLURRED = 0.55
 """Measure of blur from which on pictures rarely match."""
 
 _FEW_POINTS = 60
+"""Features of the median picture below which captures are said to show too little to find."""
+
 _FEW_COMMON = 60
+"""The same for what the median picture has in common with its best neighbour."""
+
 _PLAIN = 4.0
 """Standard deviation of grey levels in a picture that shows nothing."""
 
@@ -26,6 +30,7 @@ _TURNED, _TURNED_SHARE = 1.5, 0.08
 """What a rotation may leave of the motion between two pictures to explain it: pixels, and share."""
 
 _CHECKED_PAIRS = 60
+"""Pairs of pictures whose motion is looked at: enough for a median (convention)."""
 
 
 def motion_fault(photographs: Sequence[Photograph], matches: Matches, options: PoseOptions) -> str | None:

@@ -19,9 +19,11 @@ from dano.vision.structure._triangulation import triangulate
 _STANDING = math.radians(45)
 """Angle between a marker's or a plane's normal and the cameras' up beyond which it does not lie but stand."""
 
-_PLANE_TRIALS = 500
 _PLANE_SHARE = 0.25
 """Share of the points that a table must hold."""
+
+_PLANE_TRIALS = 500
+"""Triples drawn: all miss a table of that share with probability (1 − 1/64)⁵⁰⁰ = 4e-4."""
 
 _SECTORS = 8
 """Parts around the middle of a plane that are left out in turn to see how exact it is."""

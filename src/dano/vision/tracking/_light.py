@@ -18,6 +18,7 @@ _FLAT = 0.02
 """Weight of the wish for little light, by which lamps that no pixel can tell apart share theirs."""
 
 _MOST_PIXELS = 700
+"""Of a frame that lamps are fitted to: forty times the directions (convention)."""
 
 
 def unlit() -> tuple[Light, ...]:

@@ -14,9 +14,9 @@ def roughness(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """How far values near the zero level are from a smooth signed distance.
 
-    Slopes are those to both neighbours along each axis, their squares averaged: in the middle of a thin wall,
-    where a signed distance turns round, they are 1 or little less, whereas central differences would vanish
-    there, and to want them to be 1 would fill narrow cavities and thicken walls. For the same reason bending
+    Slopes are those to both neighbours along each axis, their squares averaged. In the middle of a thin wall,
+    where a signed distance turns round, they are 1 or little less. Central differences vanish there: a
+    penalty that wants them to be 1 would fill narrow cavities and thicken walls. For the same reason bending
     counts next to the surface only.
 
     Args:

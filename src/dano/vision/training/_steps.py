@@ -103,10 +103,10 @@ def make_step(options: TrainOptions, *, lit: bool) -> Callable[..., tuple[Learne
         lit: Whether the light of the photographs is known.
 
     Returns:
-        A function of what is learned, state of the optimiser, rays, sharpness [1/m], factor of all rates,
-        share of the view's direction in colours (see `Appearance`), share of the derivative of distances that
-        is spread over neighbours, and key, which returns the first two anew and the mean error of colours and
-        masks.
+        A function that returns the new model, the new state of the optimiser, and the mean error of colours
+        and masks. It takes the model, the state of the optimiser, rays, sharpness [1/m], a factor of all
+        rates, the share of the view's direction in colours (see `Appearance`), the share of the derivative of
+        distances that is spread over neighbours, and a key.
     """
     # What steps do not read is set to one value: trainings that differ only there share the compiled step.
     read = dataclasses.replace(options, **{name: getattr(_DEFAULT, name) for name in _OF_THE_LOOP})

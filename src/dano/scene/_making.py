@@ -1,0 +1,139 @@
+"""What is checked when a scene is made, and what its steps have room for."""
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.contact import CHUNK, ContactParams
+from dano.maths import is_traced
+from dano.names import did_you_mean
+from dano.scene._bodies import Body
+from dano.scene._contacts import Contact
+from dano.scene._joints import Joint, Layout, layout_of
+
+# Share of the smallest body's size by which gravity may move it in a step before a warning says so, and the
+# share that the warning asks for.
+LONGEST_FALL, SHORT_FALL = 0.5, 0.05
+# Room for what a body touches besides the floor that it lies on, and for chunks that are not full.
+CHUNKS_A_BODY = 24
+
+
+def check_names(bodies: Sequence[Body]) -> None:
+    """Check that there are bodies, with different names.
+
+    Raises:
+        ValueError: If not.
+    """
+    if not bodies:
+        raise ValueError("bodies must hold at least one body, got none")
+    names = [body.name for body in bodies]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"bodies must have different names, got {name!r} {names.count(name)} times")
+
+
+def check_contacts(bodies: Sequence[Body], joints: Sequence[Joint], contacts: Sequence[Contact]) -> None:
+    """Check that contacts name bodies of the scene, each pair once, that can move against each other.
+
+    Raises:
+        ValueError: If not, or if the joints make no trees.
+    """
+    names = [body.name for body in bodies]
+    layout = layout_of(*structure(bodies, joints))
+    seen: set[frozenset[str]] = set()
+    for contact in contacts:
+        for name in (contact.a, contact.b):
+            if name not in names:
+                raise ValueError(
+                    f"contact must name bodies of the scene {names}, got {name!r}" + did_you_mean(name, names)
+                )
+        pair = frozenset((contact.a, contact.b))
+        if pair in seen:
+            raise ValueError(f"contacts must join each pair once, got ({contact.a!r}, {contact.b!r}) twice")
+        seen.add(pair)
+        _check_apart(layout, names, contact)
+
+
+def twins_of(bodies: Sequence[Body]) -> tuple[int, ...]:
+    """For each body the first that is made of the same object, see `Scene.twins`."""
+    objects = [body.object for body in bodies]
+    return tuple(
+        i if o is None else next(j for j, p in enumerate(objects) if p is o) for i, o in enumerate(objects)
+    )
+
+
+def structure(bodies: Sequence[Body], joints: Sequence[Joint]):
+    """Arguments of `layout_of`."""
+    return (
+        tuple(body.name for body in bodies),
+        tuple(body.fixed for body in bodies),
+        tuple((joint.parent, joint.child, joint.kind, joint.mimics) for joint in joints),
+    )
+
+
+def check_materials(
+    bodies: Sequence[Body], others: ContactParams | None, apart: Sequence[tuple[str, str]]
+) -> None:
+    """Check that nothing is given that only `others` reads.
+
+    Raises:
+        ValueError: If there is.
+    """
+    if others is not None:
+        return
+    if apart:
+        raise ValueError(f"apart must be empty without others, got {list(apart)}")
+    for body in bodies:
+        if body.material is not None:
+            raise ValueError(
+                f"material of body {body.name!r} is only used between bodies that no contact names: "
+                "give others=ContactParams(…), too"
+            )
+
+
+def warn_of_long_steps(
+    bodies: Sequence[Body], timestep: Float[Array, ""], gravity: Float[Array, "3"]
+) -> None:
+    """Warn if gravity alone moves the smallest body by a good part of its size in a step."""
+    if is_traced(timestep, gravity, [body.extent for body in bodies]):
+        return
+    sizes = [(body.size, body.name) for body in bodies if not body.fixed]
+    h, strength = float(timestep), float(np.linalg.norm(np.asarray(gravity)))
+    if not sizes or h * h * strength <= LONGEST_FALL * min(sizes)[0]:
+        return
+    size, name = min(sizes)
+    warnings.warn(
+        f"timestep {h:.3g} s is long: gravity moves bodies by {h * h * strength:.3g} m in a step, and "
+        f"{name!r} is {size:.3g} m large; take at most {(SHORT_FALL * size / strength) ** 0.5:.2g} s",
+        RuntimeWarning,
+        stacklevel=3,
+    )
+
+
+def room_for(bodies: Sequence[Body], timestep: Float[Array, ""], gravity: Float[Array, "3"]) -> int | None:
+    """Chunks of point contacts for bodies that lie as flat as they can; None where something is traced."""
+    pressing = [body for body in bodies if not body.fixed and body.surface is not None]
+    if is_traced([body.surface for body in pressing], [body.scale for body in pressing], timestep, gravity):
+        return None
+    margin = 2 * float(timestep) ** 2 * float(np.linalg.norm(np.asarray(gravity)))
+    n_moving = sum(not body.fixed for body in bodies)
+    flat = [-(-body.most_touching(margin) // CHUNK) for body in pressing if body.object is not None]
+    return CHUNKS_A_BODY * n_moving + sum(flat)
+
+
+def _check_apart(layout: Layout, names: list[str], contact: Contact) -> None:
+    """Check that joints let the bodies of a contact move against each other.
+
+    Raises:
+        ValueError: If they are welded together.
+    """
+    a, b = names.index(contact.a), names.index(contact.b)
+    same_root = layout.roots[a] == layout.roots[b]
+    hang = {a, b} <= {*layout.children, *layout.free}
+    if layout.children and same_root and hang and layout.moved_by[a] == layout.moved_by[b]:
+        raise ValueError(
+            f"contact must join bodies that can move against each other, got {contact.a!r} and "
+            f"{contact.b!r}, which are welded together"
+        )
