@@ -101,7 +101,7 @@ def _passive(find, problem: Problem, found: Found, start: Array):
     def attempt(k, restarts, begin):
         solution = find(problem.rebounding(shares[k]), found, begin)
         velocities, _, report = solution
-        # A solve that cycles returns its best velocities; from there, with duals that fit them, most converge.
+        # A solve that cycles returns its best velocities: from there, with fitting duals, most converge.
         failed = ~report.converged & (restarts < _RESTARTS)
         gains = hits & (k + 1 < len(SHARES)) & _adds_energy(velocities, problem, start)
         following = jnp.where(failed, k, k + 1), jnp.where(failed, restarts + 1, restarts)
