@@ -16,7 +16,7 @@ class SolverOptions(NamedTuple):
     """When a step's Newton solve stops: see `VariationalEngine`."""
 
     tolerance: float | None = None
-    max_iterations: int = 300
+    max_iterations: int = 500
 
 
 class Report(NamedTuple):

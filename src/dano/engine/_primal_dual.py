@@ -27,14 +27,17 @@ from dano.engine._newton import ENOUGH, GIVE_UP, Report, Search, solve_small, So
 from dano.engine._rigid import FADE
 from dano.scene import RESOLVED
 
-# Softness of stiction, in multiples of the stiction velocity, share of a step that is taken, and passes, of
-# the levels of a solve. The first is friction as it is.
+# Softness of stiction, in multiples of the stiction velocity, share of a step that is taken, whether a line
+# search runs, passes, and whether friction bounds are held, of the levels of a solve. The first is friction as
+# it is.
 TIERS = (
-    (1.0, 1.0, False, 100),
-    (1.0, 1.0, True, 30),
-    *((float(x), 1.0, True, 8) for x in np.geomspace(1e5, 10, 5)),
-    (1.0, 1.0, True, 30),
-    (1.0, 0.4, False, 100),
+    (1.0, 1.0, False, 100, False),
+    (1.0, 1.0, True, 30, False),
+    *((float(x), 1.0, True, 8, False) for x in np.geomspace(1e5, 10, 5)),
+    (1.0, 1.0, True, 30, False),
+    (100.0, 1.0, True, 150, True),
+    (1.0, 1.0, True, 30, False),
+    (1.0, 0.4, False, 100, False),
 )
 # In the first level steps are whole for so many passes, then shares that grow and shrink by these factors and
 # are no less than the last: on recorded piles of 8 to 64 bodies half the passes of fixed shares, or as many.
@@ -43,7 +46,12 @@ _WHOLE, _GROWS, _SHRINKS, _LEAST = 4, 1.1, 0.8, 0.2
 _FIT = 0.375
 # Residual to which soft levels are solved, per stiction velocity of theirs [m/s].
 _SOFT_TOLERANCE = 1e-3
-RULES = (_WHOLE, _GROWS, _SHRINKS, _LEAST, _FIT, _SOFT_TOLERANCE, ENOUGH, GIVE_UP, RESOLVED, FADE)
+# Share of the held friction bounds that is renewed at once, and change that ends it, over all pressure.
+_MIX, _RENEWED = 0.5, 1e-6
+RULES = (
+    *(_WHOLE, _GROWS, _SHRINKS, _LEAST, _FIT, _SOFT_TOLERANCE, ENOUGH, GIVE_UP, RESOLVED, FADE),
+    *(_MIX, _RENEWED),
+)
 """Constants of the loop, in the order in which `dano.native` reads them."""
 
 

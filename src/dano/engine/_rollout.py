@@ -77,7 +77,7 @@ class VariationalEngine(AbstractEngine):
     """
 
     tolerance: float | None = eqx.field(static=True, default=None)
-    max_iterations: int = eqx.field(static=True, default=300)
+    max_iterations: int = eqx.field(static=True, default=500)
     capacity: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):

@@ -16,7 +16,9 @@ FOUND_FRICTION, SLACK, TURN, ALONG, LEAN = 29, 32, 35, 38, 41
 GOING, SLOPE, MISS, GRIP, PRESSURE, FALL, SHIFT = 44, 45, 46, 47, 48, 49, 50
 # Then what is added to the slip, see `dano.contact.Points`.
 DRIFT = 51
-COLUMNS = 54
+# Then the largest friction that a level of a solve holds, see `dano.engine._primal_dual`.
+HELD = 54
+COLUMNS = 55
 
 
 @kernel
@@ -98,8 +100,19 @@ def bound(row, p):
 
 
 @kernel
-def linearize(row, rate, slip_x, slip_y, slip_z, length, softness):
+def linearize(row, rate, slip_x, slip_y, slip_z, length, softness, holds, mix):
     """One linearisation of the law, see `dano.contact.linearized`; duals are taken at a share of the step.
+
+    Args:
+        row: Of the table.
+        rate: Separating speed [m/s].
+        slip_x: Slip [m/s, W].
+        slip_y: …
+        slip_z: …
+        length: Share of the step.
+        softness: Multiplies the stiction velocity.
+        holds: Whether the largest friction is the one that is held.
+        mix: Share of that which is renewed first, from the pressure as it is.
 
     Returns:
         Whether the point presses, now or by the friction that its duals hold.
@@ -108,13 +121,15 @@ def linearize(row, rate, slip_x, slip_y, slip_z, length, softness):
         row[FOUND_FRICTION + k] = row[DUALS + k] + length * row[CHANGES + k]
     row[GOING] = row[DUALS + 3] + length * row[CHANGES + 3]
     find_pressure(row, rate, softness)
-    p = row[PRESSURE]
-    if p == 0.0:
+    limit, marginal = bound(row, row[PRESSURE])
+    if holds:
+        row[HELD] += mix * (limit - row[HELD])
+        limit, marginal = row[HELD], 0.0
+    if limit == 0.0 and row[PRESSURE] == 0.0:
         for k in range(FOUND_FRICTION, GOING):
             row[k] = 0.0
         row[GRIP] = 0.0
         return False
-    limit, marginal = bound(row, p)
     stiction = row[STICTION] * softness
     speed = math.sqrt(slip_x * slip_x + slip_y * slip_y + slip_z * slip_z)
     slow = max(speed, stiction)

@@ -34,6 +34,7 @@ from dano.native._law import (
     follow,
     FOUND_FRICTION,
     GRIP,
+    HELD,
     LEAN,
     linearize,
     MOMENT,
@@ -54,6 +55,10 @@ _DEPTH_ROW, _RATE_ROW, _AREA_ROW, _DRIFT_ROW = 9, 10, 11, 12
 _H, _RELATIVE, _SIZE, _EPSILON = range(4)
 # Rules: constants that `dano.engine` states, in the order of its `RULES`.
 _WHOLE, _GROWS, _SHRINKS, _LEAST, _FIT, _SOFT_TOLERANCE, _ENOUGH, _GIVE_UP, _RESOLVED, _FADE = range(10)
+_MIX, _RENEWED = 10, 11
+# A line search: work of the residual along the step at the accepted point, share to try, the bracket and the
+# works at its ends; then how much work, and how narrow a bracket, is accepted.
+_BEGUN, _LENGTH, _LOW, _LOW_WORK, _HIGH, _HIGH_WORK, _LIMIT, _NARROW = range(8)
 
 
 @kernel
@@ -310,8 +315,26 @@ def _scatter(slope, wrench, apart, a, b, residual, matrix):
 
 
 @kernel
-def _assemble(bodies, velocities, points, groups, apart, length, softness, h, rules, residual, matrix, used):
-    """Residual and Jacobian as momenta, how far duals are from fitting, and all pressure [N s]."""
+def _assemble(bodies, velocities, points, groups, apart, h, rules, pass_, residual, matrix, used):
+    """Residual and Jacobian as momenta.
+
+    Args:
+        bodies: Table of bodies that move.
+        velocities: V that is tried [W].
+        points: Table of points.
+        groups: Their groups.
+        apart: Vectors between the bodies of groups.
+        h: Timestep [s].
+        rules: Constants.
+        pass_: Share of the step, softness, whether friction bounds are held, and share of them to renew.
+        residual: Written to, as is the matrix.
+        matrix: …
+        used: Which blocks of it are not zero.
+
+    Returns:
+        How far duals are from fitting, all pressure, and how much held friction bounds changed [N s].
+    """
+    length, softness, holds, mix = pass_[0], pass_[1], pass_[2] > 0.0, pass_[3]
     m = bodies.shape[0]
     for i in range(m):
         for j in range(m):
@@ -319,7 +342,7 @@ def _assemble(bodies, velocities, points, groups, apart, length, softness, h, ru
                 _clear(matrix[i, j])
         _add_own(bodies[i], velocities[i], h, rules, residual[i], matrix[i, i])
     slope, wrench, twist, six = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty((6, 6))
-    unfit = push = 0.0
+    unfit = push = renewed = 0.0
     for g in range(groups.shape[0]):
         a, b = groups[g, 2], groups[g, 3]
         _relative(velocities, a, b, apart[g], twist)
@@ -328,7 +351,8 @@ def _assemble(bodies, velocities, points, groups, apart, length, softness, h, ru
             row = points[p]
             rate, x, y, z = _motion(row, twist)
             x, y, z = x + row[DRIFT], y + row[DRIFT + 1], z + row[DRIFT + 2]
-            if linearize(row, rate, x, y, z, length, softness):
+            held = row[HELD]
+            if linearize(row, rate, x, y, z, length, softness, holds, mix):
                 if not presses:
                     _clear(slope)
                     for k in range(6):
@@ -339,9 +363,10 @@ def _assemble(bodies, velocities, points, groups, apart, length, softness, h, ru
                 slack = abs(row[SLACK]) + abs(row[SLACK + 1]) + abs(row[SLACK + 2])
                 unfit += weight * (slack + abs(row[SHIFT]))
                 push += weight * row[PRESSURE]
+            renewed += row[WEIGHT] * abs(row[HELD] - held)
         if presses:
             _scatter(slope, wrench, apart[g], a, b, residual, matrix)
-    return unfit, push
+    return unfit, push, renewed
 
 
 @kernel
@@ -448,15 +473,45 @@ def _spread(matrix, used, whole):
 
 
 @kernel
-def _narrowed(work, length, low, low_work, high, high_work):
+def _scales(bodies, scale):
+    """Factors that turn momenta into velocities, shape (m, 6): 1/m, and 3/tr J."""
+    for i in range(bodies.shape[0]):
+        trace = bodies[i, _INERTIA] + bodies[i, _INERTIA + 4] + bodies[i, _INERTIA + 8]
+        for k in range(6):
+            scale[i, k] = 1.0 / bodies[i, _MASS] if k < 3 else 3.0 / trace
+
+
+@kernel
+def _accepts(work, search):
+    """Whether a share of the step is good enough, see `Search.accepts` of `dano.engine`."""
+    bracketed = search[_HIGH] > 0.0
+    limit = search[_LIMIT]
+    misses = work > limit or (bracketed and work < -limit) or math.isnan(work)
+    narrow = bracketed and search[_HIGH] - search[_LOW] < search[_NARROW]
+    return not misses or narrow or search[_BEGUN] >= 0.0
+
+
+@kernel
+def _begin_search(begun, rules, search):
+    search[_BEGUN], search[_LENGTH] = begun, 1.0
+    search[_LOW], search[_LOW_WORK], search[_HIGH], search[_HIGH_WORK] = 0.0, begun, 0.0, 0.0
+    search[_LIMIT], search[_NARROW] = rules[_ENOUGH] * abs(begun), rules[_GIVE_UP]
+
+
+@kernel
+def _narrow(work, search):
     """Bracket and next share of a line search after a miss, see `Search.narrowed` of `dano.engine`."""
-    far = not work < 0.0
-    new_low, new_high = (low, length) if far else (length, high)
-    new_low_work = 0.5 * low_work if far else work
-    new_high_work = work if far else high_work if high == 0.0 else 0.5 * high_work
-    portion = -new_low_work / (new_high_work - new_low_work)
+    length, high = search[_LENGTH], search[_HIGH]
+    if not work < 0.0:
+        search[_LOW_WORK] *= 0.5
+        search[_HIGH], search[_HIGH_WORK] = length, work
+    else:
+        search[_LOW], search[_LOW_WORK] = length, work
+        if high != 0.0:
+            search[_HIGH_WORK] *= 0.5
+    portion = -search[_LOW_WORK] / (search[_HIGH_WORK] - search[_LOW_WORK])
     portion = min(max(portion, 0.1), 0.9) if not math.isnan(portion) else 0.1
-    return new_low, new_low_work, new_high, new_high_work, new_low + portion * (new_high - new_low)
+    search[_LENGTH] = search[_LOW] + portion * (search[_HIGH] - search[_LOW])
 
 
 @kernel
@@ -470,7 +525,7 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
         apart: Vectors between the bodies of groups.
         start: Velocities to start from [W], shape (m, 6); they become the solution.
         settings: h, tolerance over (1 + size), size and rounding.
-        tiers: Softness, share of a step, whether a line search runs, and passes of each level, shape (t, 4).
+        tiers: Rows of `TIERS`.
         rules: Constants.
         max_iterations: Passes.
         whole: The Jacobian there, shape (6 m, 6 m), written to; or of size 0.
@@ -478,74 +533,63 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
     Returns:
         Residual, passes, whether it converged.
     """
-    m = bodies.shape[0]
-    h, epsilon = settings[_H], settings[_EPSILON]
+    m, h, epsilon = bodies.shape[0], settings[_H], settings[_EPSILON]
     used = _pattern(groups, m)
     order, count, later = elimination(used)
     matrix, spare = np.empty((m, m, 6, 6)), np.empty((m, m, 6, 6))
-    residual, step, best = np.empty((m, 6)), np.empty((m, 6)), np.empty((m, 6))
+    residual, step, best = np.empty((m, 6)), np.zeros((m, 6)), np.empty((m, 6))
     accepted, tried, scale = np.empty((m, 6)), np.empty((m, 6)), np.empty((m, 6))
+    search, pass_ = np.zeros(8), np.zeros(4)
     _copy(start, accepted)
     _copy(start, best)
-    for i in range(m):
-        for k in range(6):
-            step[i, k] = 0.0
-        trace = bodies[i, _INERTIA] + bodies[i, _INERTIA + 4] + bodies[i, _INERTIA + 8]
-        for k in range(6):
-            scale[i, k] = 1.0 / bodies[i, _MASS] if k < 3 else 3.0 / trace
+    _scales(bodies, scale)
     _fit_all(points, groups, apart, start)
-    fit = epsilon ** rules[_FIT]
-    level, budget, iteration = 0, tiers[0, 3], 0
-    share, solved = 1.0, False
-    before, best_error = np.inf, np.inf
-    # The line search: work at the accepted point, share to try, the bracket and the works at its ends.
-    begun, length, low, low_work, high, high_work = 0.0, 1.0, 0.0, 0.0, 0.0, 0.0
+    _begin_search(0.0, rules, search)
+    level, budget, iteration, mix = 0, tiers[0, 3], 0, 0.0
+    share, solved, before, best_error = 1.0, False, np.inf, np.inf
     while not solved and iteration < max_iterations and level < tiers.shape[0]:
-        softness, searches = tiers[level, 0], tiers[level, 2] > 0.0
+        softness, searches, holds = tiers[level, 0], tiers[level, 2] > 0.0, tiers[level, 4] > 0.0
+        pass_[0], pass_[1], pass_[2], pass_[3] = search[_LENGTH], softness, tiers[level, 4], mix
         for i in range(m):
             for k in range(6):
-                tried[i, k] = accepted[i, k] + length * step[i, k]
-        unfit, push = _assemble(
-            bodies, tried, points, groups, apart, length, softness, h, rules, residual, matrix, used
+                tried[i, k] = accepted[i, k] + search[_LENGTH] * step[i, k]
+        unfit, push, renewed = _assemble(
+            bodies, tried, points, groups, apart, h, rules, pass_, residual, matrix, used
         )
         work, error, rounding = _measure(matrix, residual, step, tried, scale, used)
-        limit = rules[_ENOUGH] * abs(begun)
-        bracketed = high > 0.0
-        misses = work > limit or (bracketed and work < -limit) or math.isnan(work)
-        narrow = bracketed and high - low < rules[_GIVE_UP]
-        accept = not misses or narrow or begun >= 0.0 or not searches
         tolerance = max(settings[_RELATIVE] * (1.0 + settings[_SIZE]), 16.0 * epsilon * rounding)
         hard = softness == 1.0
         enough = tolerance if hard else max(tolerance, rules[_SOFT_TOLERANCE] * 1e-7 * softness)
         small = error <= enough
-        accept = accept or small
-        solved = small and hard and (unfit <= fit * push or before <= enough)
+        accept = small or not searches or _accepts(work, search)
+        solved = small and hard and (unfit <= epsilon ** rules[_FIT] * push or before <= enough)
         if hard and error < best_error:
             best_error = error
             _copy(tried, best)
-        adapted = share * (rules[_GROWS] if error < before else rules[_SHRINKS])
-        adapted = min(max(adapted, rules[_LEAST]), 1.0)
+        share = min(max(share * (rules[_GROWS] if error < before else rules[_SHRINKS]), rules[_LEAST]), 1.0)
         if level > 0 or iteration < rules[_WHOLE]:
-            adapted = 1.0
+            share = 1.0
         fell = error < 0.5 * before
-        harder = accept and ((small and not hard) or (not small and budget <= 0))
-        if accept:
-            _copy(tried, accepted)
-            if not solved:
-                part = 1.0 if fell else tiers[level, 1] * adapted
-                _find_step(matrix, spare, residual, step, used, part, order, count, later)
-                begun = _work(step, residual)
-                _follow_all(points, groups, apart, step)
-            length, low, low_work, high, high_work = 1.0, 0.0, begun, 0.0, 0.0
-            before = error
-        else:
-            low, low_work, high, high_work, length = _narrowed(work, length, low, low_work, high, high_work)
+        spent = budget <= 0
+        settled = not holds or spent or (0.0 < mix < 1.0 and renewed <= rules[_RENEWED] * push)
+        harder = accept and ((small and not hard and settled) or (not small and spent))
+        budget -= 1
         if harder:
             level += 1
             budget = tiers[min(level, tiers.shape[0] - 1), 3]
+        begins = harder and level < tiers.shape[0] and tiers[level, 4] > 0.0
+        mix = 1.0 if begins else rules[_MIX] if accept and small and holds else 0.0
+        if not accept:
+            _narrow(work, search)
         else:
-            budget -= 1
-        share = adapted
+            _copy(tried, accepted)
+            if not solved:
+                part = 1.0 if fell else tiers[level if not harder else level - 1, 1] * share
+                _find_step(matrix, spare, residual, step, used, part, order, count, later)
+                _follow_all(points, groups, apart, step)
+                # The next pass is no longer of the same function where bounds are renewed: it is accepted.
+                _begin_search(0.0 if mix > 0.0 else _work(step, residual), rules, search)
+            before = error
         iteration += 1
     _copy(accepted if solved else best, start)
     if whole.size > 0:
