@@ -190,6 +190,7 @@ def test_door_hits_a_ball(swung):
     np.testing.assert_allclose(given, 2.0 * velocity[-1, 1], rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_push():
     """A door that a torque turns pushes a ball: end of the ball by torque and by the hinge's place."""
     scene, _ = door_scene(timestep=5e-3, restitution=0.0)

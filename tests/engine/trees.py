@@ -7,7 +7,7 @@ import dano
 
 
 def value_and_forward(function):
-    """A function's value and its derivative in forward mode as one program, which compiles in half the time."""
+    """A function's value and its derivative in forward mode as one program, compiled in half the time."""
 
     def twice(at):
         value = function(at)

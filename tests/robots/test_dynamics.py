@@ -176,11 +176,16 @@ def test_inverse_kinematics():
         dano.Target("tool")
 
 
-def test_gravity_compensation_holds_the_arm():
-    """Held by the torques of its own weight the arm stays where it is, without friction."""
+def free_arm():
+    """The small arm without friction and limits, whose programs are short."""
     robot = dano.load_urdf(ARM, collision=False)
     joints = [dataclasses.replace(joint, friction=None, limits=None) for joint in robot.joints]
-    scene = dano.Scene.create(robot.bodies, joints=joints, timestep=2e-3)
+    return robot, dano.Scene.create(robot.bodies, joints=joints, timestep=2e-3)
+
+
+def test_gravity_compensation_holds_the_arm():
+    """Held by the torques of its own weight the arm stays where it is, without friction."""
+    robot, scene = free_arm()
     state = robot.state(scene, dict(turn=0.3, lift=0.7, bend=0.5))
 
     def held(state, time):
@@ -241,13 +246,11 @@ def _joint_of(scene, robot, name):
 
 def test_float32():
     """Mass matrix and a step in single precision."""
-    robot = dano.load_urdf(ARM, collision=False)
-    scene = robot.scene(timestep=1e-3)
+    robot, scene = free_arm()
     state = robot.state(scene, dict(turn=0.3, lift=0.7, bend=0.5), dict(turn=0.5, lift=-1.0, bend=2.0))
+    mass_matrix = jax.jit(dano.mass_matrix)
     single = jax.tree.map(lambda x: x.astype("float32"), (scene, state))
-    np.testing.assert_allclose(
-        dano.mass_matrix(*single), dano.mass_matrix(scene, state), rtol=1e-4, atol=1e-5
-    )
+    np.testing.assert_allclose(mass_matrix(*single), mass_matrix(scene, state), rtol=1e-4, atol=1e-5)
     after = dano.step(*single)
     assert coordinates(after)[0].dtype == np.float32
     exact = coordinates(dano.step(scene, state))[1]
