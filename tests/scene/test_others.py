@@ -80,6 +80,20 @@ def test_what_a_joint_joins_does_not_touch():
     assert scene.pairs == (("cube", "floor"), ("ball", "floor"))
 
 
+def test_derivative_of_a_mean_by_a_material():
+    """√(μ_a μ_b) changes by half as much as μ_a where both are equal, and not with a third body's."""
+    scene = dano.Scene.create(bodies(), others=PARAMS)
+
+    def frictions(friction):
+        others = scene.replace_material("cube", sliding_friction=friction).others
+        assert others is not None
+        return others.pair_params.sliding_friction
+
+    slopes = dict(zip(scene.pairs, np.asarray(jax.jacfwd(frictions)(0.3)), strict=True))
+    assert slopes == pytest.approx({("cube", "ball"): 0.5, ("cube", "floor"): 0.5, ("ball", "floor"): 0.0})
+
+
+@pytest.mark.slow
 def test_derivative_by_a_material():
     scene = dano.Scene.create(bodies(), others=PARAMS, apart=[("cube", "ball")], timestep=0.005)
     state = sliding(scene)
