@@ -144,6 +144,7 @@ def lumpy_pair():
     return scene, scene.initial_state(a=approaching)
 
 
+@pytest.mark.slow
 def test_neural_pair_gradients():
     """Through a neural–neural hit, with respect to either body's pose: forward = reverse = differences."""
     scene, start = lumpy_pair()
