@@ -16,13 +16,17 @@ PROGRAMS = {
     for page in [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
     if (program := "\n".join(grab_code_blocks(page.read_text(encoding="utf-8"), lang="python")))
 }
+# Pages whose programs take a minute each to compile; what they show has tests of its own beside it.
+LONG = ("docs/identify.md", "docs/learn.md", "docs/robots.md")
 # Of the command line, the commands are what is public.
 PACKAGES = [p for p in sorted((REPOSITORY / "src" / "dano").glob("*/__init__.py")) if p.parent.name != "cli"]
 WIDEST = 90
 """Columns of a code block that fit the pages without scrolling, on a screen of 1280 pixels."""
 
 
-@pytest.mark.parametrize("page", PROGRAMS)
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=pytest.mark.slow if page in LONG else ()) for page in PROGRAMS]
+)
 def test_python_blocks_run(page: str, tmp_path: Path):
     # One process a page, its blocks joined: a page may change JAX's configuration, as its reader would.
     command = [sys.executable, "-c", PROGRAMS[page]]

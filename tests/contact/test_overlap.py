@@ -178,7 +178,14 @@ def apart_cases(pair):
 
 
 @pytest.mark.parametrize(
-    "kind", ["half-space", "sphere", "rounded box", "grid, culled", "grid, every sample"]
+    "kind",
+    [
+        "half-space",
+        pytest.param("sphere", marks=pytest.mark.slow),
+        pytest.param("rounded box", marks=pytest.mark.slow),
+        "grid, culled",
+        pytest.param("grid, every sample", marks=pytest.mark.slow),
+    ],
 )
 def test_derivatives_with_respect_to_both_poses(pair, kind):
     """Forward = reverse = central differences for ψ, χ and n, moving either body."""
@@ -274,7 +281,14 @@ def test_derivative_with_respect_to_grid_and_samples(pair, kind):
 
 
 @pytest.mark.parametrize(
-    "kind", ["half-space", "sphere", "rounded box", "grid, culled", "grid, every sample"]
+    "kind",
+    [
+        "half-space",
+        pytest.param("sphere", marks=pytest.mark.slow),
+        pytest.param("rounded box", marks=pytest.mark.slow),
+        "grid, culled",
+        pytest.param("grid, every sample", marks=pytest.mark.slow),
+    ],
 )
 def test_nothing_when_apart(pair, kind):
     """Far apart: zero patch, and derivatives that are zero rather than NaN."""

@@ -57,7 +57,13 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+# Each pair of shapes is a program of its own; the others take a minute together.
+QUICK = ("ball on box", "box deep in box")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in CASES]
+)
 def test_points_are_found_again_with_derivatives(name):
     """`points_of` repeats `find`; its derivatives by the pose and the motion are those of differences."""
     shape, other, height = CASES[name]

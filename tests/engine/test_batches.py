@@ -122,6 +122,7 @@ def test_two_devices(runs: dano.Rollouts, two_devices):
     same(found, arrays(runs))
 
 
+@pytest.mark.slow
 def test_identification_on_two_devices(two_devices):
     found, expected = two_devices[0], fit()
     assert expected.values["mu"] == pytest.approx(0.2, rel=1e-6)
@@ -129,6 +130,7 @@ def test_identification_on_two_devices(two_devices):
     assert float(found["error"]) == pytest.approx(expected.standard_errors["mu"], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_two_processes(runs: dano.Rollouts, tmp_path: Path):
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))

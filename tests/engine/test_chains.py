@@ -66,6 +66,7 @@ def test_double_pendulum_against_its_equations():
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.05)
 
 
+@pytest.mark.slow
 def test_energy_of_the_panda_swinging_freely():
     """Over 2 s the energy swings by less than 0.5 % of what the potential does, and has no trend."""
     robot = dano.load_urdf(panda(), collision=False)

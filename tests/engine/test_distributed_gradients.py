@@ -134,11 +134,11 @@ STARTS = {
     ("name", "hysteresis"),
     [
         ("slide", 0.3),
-        ("touch-down", 0.0),
-        ("touch-down", 0.3),
-        ("tumble", 0.0),
-        ("tumble", 0.3),
-        ("push", 0.3),
+        pytest.param("touch-down", 0.3, marks=pytest.mark.slow),
+        pytest.param("touch-down", 0.0, marks=pytest.mark.slow),
+        pytest.param("tumble", 0.0, marks=pytest.mark.slow),
+        pytest.param("tumble", 0.3, marks=pytest.mark.slow),
+        pytest.param("push", 0.3, marks=pytest.mark.slow),
     ],
 )
 def test_rollouts_on_a_floor(playground, name, hysteresis):
@@ -155,6 +155,7 @@ def test_rollouts_on_a_floor(playground, name, hysteresis):
     check_rollout(case, 50, irrelevant=irrelevant, **finer)
 
 
+@pytest.mark.slow
 def test_rollout_of_the_sticking_centroid_law():
     # An edge that many of its few samples are in at once.
     scene = on_floor(dano.CentroidLaw(stiction_velocity=1e-7), edge=0.02)

@@ -82,7 +82,16 @@ def hit():
     return scene, scene.initial_state(box=coming), 40
 
 
-@pytest.mark.parametrize("case", [slide, bounce, tumble, hit], ids=lambda case: case.__name__)
+@pytest.mark.parametrize(
+    "case",
+    [
+        slide,
+        pytest.param(hit, marks=pytest.mark.slow),
+        pytest.param(bounce, marks=pytest.mark.slow),
+        pytest.param(tumble, marks=pytest.mark.slow),
+    ],
+    ids=lambda case: case.__name__,
+)
 def test_rollout_gradients(case):
     scene, start, n_steps = case()
 
@@ -135,6 +144,7 @@ def lumpy_pair():
     return scene, scene.initial_state(a=approaching)
 
 
+@pytest.mark.slow
 def test_neural_pair_gradients():
     """Through a neural–neural hit, with respect to either body's pose: forward = reverse = differences."""
     scene, start = lumpy_pair()

@@ -238,8 +238,8 @@ def test_steps_that_are_too_long_for_a_body_are_said():
 
 
 def test_checkpointed_rollout_is_the_same():
-    scene = on_floor(dano.Body("box", point_cloud_box()))
-    start = scene.initial_state(box=dict(position=(0, 0, 0.1), velocity=(1, 0, 0)))
+    scene = on_floor(dano.Body("ball", dano.Sphere(0.05), mass=1.0))
+    start = scene.initial_state(ball=dict(position=(0, 0, 0.06), velocity=(1, 0, 0)))
 
     def distance(v, **options):
         moving = dano.State(start.position, start.orientation, start.velocity.at[0, 0].set(v), start.omega)

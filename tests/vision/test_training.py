@@ -146,6 +146,7 @@ def test_a_full_disk_does_not_end_training(photos: Capture, tmp_path: Path, monk
         )
 
 
+@pytest.mark.slow
 def test_a_third_of_the_views_still_gives_the_solid(photos: Capture):
     few = train(photos.thinned(8), QUICK)
     assert few.scores["test"].psnr > 26
@@ -155,6 +156,7 @@ def test_a_third_of_the_views_still_gives_the_solid(photos: Capture):
     assert np.sum(inside & true) / np.sum(inside | true) > 0.92
 
 
+@pytest.mark.slow
 def test_a_lens_that_is_off_centre_is_corrected_for_held_out_views_too(photos: Capture):
     def off(view: View) -> View:
         c = view.camera
