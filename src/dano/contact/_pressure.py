@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from dano.contact._points import dot, Motion, Points
 from dano.maths import column_norm
@@ -224,6 +224,7 @@ class Linear(NamedTuple):
         turn: l [Pa s/m], zero where points stick.
         along: û, unit slip, zero where points stick.
         lean: b′ f c [Pa s/m].
+        held: Largest friction that is held [Pa].
     """
 
     pressure: Pressure
@@ -233,14 +234,35 @@ class Linear(NamedTuple):
     turn: Float[Array, "3 c p"]
     along: Float[Array, "3 c p"]
     lean: Float[Array, "3 c p"]
+    held: Float[Array, "c p"]
 
 
-def linearized(fixed: Constants, motion: Motion, duals: Duals, softness) -> Linear:
-    """One linearisation of the law with its duals; `softness` multiplies the stiction velocity."""
+def linearized(
+    fixed: Constants,
+    motion: Motion,
+    duals: Duals,
+    softness,
+    holds: Bool[Array, ""],
+    mix: Float[Array, ""],
+    held: Float[Array, "c p"],
+) -> Linear:
+    """One linearisation of the law with its duals.
+
+    Args:
+        fixed: From `constants`.
+        motion: Of the points.
+        duals: The duals.
+        softness: Multiplies the stiction velocity.
+        holds: Whether the largest friction is the one that is held, whatever the pressure.
+        mix: Share of that one which is renewed first, from the pressure as it is.
+        held: That one [Pa].
+    """
     slip = motion.slip
     speed = column_norm(slip)
     p = pressure(fixed, motion.rate, duals.going, softness)
     limit, marginal = bound(fixed, p.value)
+    held = held + jnp.where(holds, mix, 0) * (limit - held)
+    limit, marginal = jnp.where(holds, held, limit), jnp.where(holds, 0, marginal)
     stiction = fixed.stiction * softness
     slow = jnp.maximum(speed, stiction)
     size = column_norm(duals.friction)
@@ -255,6 +277,7 @@ def linearized(fixed: Constants, motion: Motion, duals: Duals, softness) -> Line
         turn=jnp.where(slides[None], friction / slow[None], 0),
         along=jnp.where(slides[None], gain, 0),
         lean=(marginal * p.fall)[None] * gain,
+        held=held,
     )
 
 

@@ -33,9 +33,11 @@ from dano.contact import (
 _FEW, _MANY, _SHORT = 4, 16, 64
 # Rows of `Table.numbers` before those of the constants.
 _GEOMETRY = 13
-# Rows of a memory: the duals, their change by the whole step, and the law at the point tried last.
+# Rows of a memory: the duals, their change by the whole step, the law at the point tried last, and the held
+# friction bound.
 _DUALS, _LAW = 4, 19
-_MEMORY = 2 * _DUALS + _LAW
+_HELD = 2 * _DUALS + _LAW
+_MEMORY = _HELD + 1
 
 
 class Table(NamedTuple):
@@ -66,19 +68,36 @@ class Table(NamedTuple):
         return -(-self.n_chunks // self.width)
 
 
+class Trial(NamedTuple):
+    """What a pass tries.
+
+    Attributes:
+        length: Share of the step that is taken.
+        softness: Multiplies the stiction velocity.
+        holds: Whether the largest friction of each point is held, whatever the pressure.
+        mix: Share of the held one that is renewed first, from the pressure as it is.
+    """
+
+    length: Float[Array, ""]
+    softness: Float[Array, ""]
+    holds: Bool[Array, ""]
+    mix: Float[Array, ""]
+
+
 class Sums(NamedTuple):
     """What a pass over the points finds.
 
     Attributes:
         blocks: Minus the derivative of the residual and minus the residual, which is the sum over the second
             axis of the last column, shape (m + 1, m + 1, 6, 7).
-        unfit: How far duals are from fitting the velocities, and all pressure [N s].
+        unfit: How far duals are from fitting the velocities, all pressure, and how much held friction bounds
+            changed [N s].
         memory: For the next pass.
     """
 
     blocks: Float[Array, "b b 6 7"]
-    unfit: Float[Array, "2"]
-    memory: Float[Array, "27 c p"]
+    unfit: Float[Array, "3"]
+    memory: Float[Array, "28 c p"]
 
 
 def tabulate(
@@ -109,7 +128,7 @@ def tabulate(
     )
 
 
-def first_memory(table: Table, velocities: Float[Array, "m 6"]) -> Float[Array, "27 c p"]:
+def first_memory(table: Table, velocities: Float[Array, "m 6"]) -> Float[Array, "28 c p"]:
     """A memory of duals that fit given velocities."""
 
     def body(k, memory):
@@ -119,18 +138,18 @@ def first_memory(table: Table, velocities: Float[Array, "m 6"]) -> Float[Array, 
         rows = jnp.concatenate([duals.friction, duals.going[None]])
         return jax.lax.dynamic_update_slice(memory, rows, (0, k * table.width, 0))
 
+    # Held bounds are renewed before they are used.
     empty = jnp.zeros((_MEMORY, *table.numbers.shape[1:]), velocities.dtype)
     return jax.lax.fori_loop(0, table.n_batches, body, empty)
 
 
 def assemble(
     table: Table,
-    memory: Float[Array, "27 c p"],
+    memory: Float[Array, "28 c p"],
     fresh: Bool[Array, ""],
     velocities: Float[Array, "m 6"],
     step: Float[Array, "m 6"],
-    length: Float[Array, ""],
-    softness: Float[Array, ""],
+    trial: Trial,
     start: Float[Array, "b b 6 7"],
 ) -> Sums:
     """The sums at the velocities that a solver tries.
@@ -141,8 +160,7 @@ def assemble(
         fresh: Whether the point tried last was accepted, so that the step leads on from there.
         velocities: V that is tried [m/s; rad/s, W].
         step: Whole step from the accepted point to it.
-        length: Share of the step that was taken.
-        softness: Multiplies the stiction velocity.
+        trial: What is tried.
         start: Sums without the points.
     """
 
@@ -154,22 +172,26 @@ def assemble(
         motion, change = jax.lax.optimization_barrier(
             _motions(numbers, between, *_ends(velocities, step, first, second))
         )
-        stored = jnp.where(fresh, _followed(before[2 * _DUALS :], change), before[: 2 * _DUALS])
-        rows = stored[:_DUALS] + length * stored[_DUALS:]
-        duals = Duals(rows[:3], rows[3])
-        linear = jax.lax.optimization_barrier(linearized(_constants(numbers), motion, duals, softness))
+        stored = jnp.where(fresh, _followed(before[2 * _DUALS : _HELD], change), before[: 2 * _DUALS])
+        rows = stored[:_DUALS] + trial.length * stored[_DUALS:]
+        duals, fixed = Duals(rows[:3], rows[3]), _constants(numbers)
+        linear = jax.lax.optimization_barrier(
+            linearized(fixed, motion, duals, trial.softness, trial.holds, trial.mix, before[_HELD])
+        )
         arm, normal, moment, weight = numbers[:3], numbers[3:6], numbers[6:9], numbers[9]
         push = weight * linear.pressure.value
         wrench = sum_wrenches(arm, normal, moment, push, weight[None] * (linear.friction + linear.slack))
         slope = _slopes(arm, normal, moment, linear, weight)
         missed = jnp.sum(jnp.abs(linear.slack), axis=0) + jnp.abs(linear.pressure.shift)
+        renewed = jnp.abs(linear.held - before[_HELD])
+        after = jnp.concatenate([stored, _packed(linear, duals), linear.held[None]])
         return Sums(
             _added(sums.blocks, jnp.concatenate([slope, wrench[:, :, None]], axis=2), between, first, second),
-            sums.unfit + jnp.stack([jnp.sum(weight * missed), jnp.sum(push)]),
-            jax.lax.dynamic_update_slice(sums.memory, jnp.concatenate([stored, _packed(linear, duals)]), at),
+            sums.unfit + jnp.stack([jnp.sum(weight * missed), jnp.sum(push), jnp.sum(weight * renewed)]),
+            jax.lax.dynamic_update_slice(sums.memory, after, at),
         )
 
-    initial = Sums(start, jnp.zeros(2, velocities.dtype), memory)
+    initial = Sums(start, jnp.zeros(3, velocities.dtype), memory)
     return jax.lax.fori_loop(0, table.n_batches, body, initial)
 
 
@@ -227,7 +249,7 @@ def _followed(rows: Float[Array, "19 c p"], change: Motion) -> Float[Array, "8 c
     friction, slack, turn, along, lean = (rows[k : k + 3] for k in range(0, 15, 3))
     going, slope, miss, grip = rows[15:]
     none = jnp.zeros_like(miss)
-    linear = Linear(Pressure(none, none, slope, miss, none), friction, slack, grip, turn, along, lean)
+    linear = Linear(Pressure(none, none, slope, miss, none), friction, slack, grip, turn, along, lean, none)
     new = updated(linear, Duals(friction, going), change)
     changes = jnp.concatenate([new.friction - friction, (new.going - going)[None]])
     return jnp.concatenate([friction, going[None], changes])

@@ -11,7 +11,10 @@ law, too: sums of forces may balance before those of single points do.
 
 Full steps can cycle. A solve that has not converged within a few passes takes shares of steps, smaller after
 each step that made the residual larger; then it goes on with a line search, then from softer friction in
-levels (`TIERS`). What does not converge ends where its residual was smallest.
+levels (`TIERS`). Where that cycles, too, friction mostly presses a point in, which raises its friction. Then
+the bounds b are held: the equations are those of a convex function, and a line search finds their root. The
+bounds are renewed by halves until they fit, and the solve goes on with the law as it is. What does not
+converge ends where its residual was smallest.
 """
 
 from collections.abc import Callable
@@ -22,14 +25,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.engine._assembly import assemble, first_memory, Table
+from dano.engine._assembly import assemble, first_memory, Table, Trial
 from dano.engine._newton import ENOUGH, GIVE_UP, Report, Search, solve_small, SolverOptions
 from dano.engine._rigid import FADE
 from dano.scene import RESOLVED
 
-# Softness of stiction, in multiples of the stiction velocity, share of a step that is taken, whether a line
-# search runs, passes, and whether friction bounds are held, of the levels of a solve. The first is friction as
-# it is.
+# The levels of a solve: softness of stiction, in multiples of the stiction velocity; share of a step that is
+# taken; whether a line search runs; passes; whether friction bounds are held. The first is friction as it is.
 TIERS = (
     (1.0, 1.0, False, 100, False),
     (1.0, 1.0, True, 30, False),
@@ -84,11 +86,12 @@ class _Iterate(NamedTuple):
         level: Row of `TIERS`.
         budget: Passes left in it.
         share: Of a step that is taken in the first level.
+        mix: Share of held friction bounds that the next pass renews.
         best: Velocities where the residual was smallest, with friction as it is; then that residual.
     """
 
     velocities: Float[Array, " k"]
-    memory: Float[Array, "27 c p"]
+    memory: Float[Array, "28 c p"]
     fresh: Bool[Array, ""]
     search: Search
     jacobian: Float[Array, "k k"]
@@ -98,6 +101,7 @@ class _Iterate(NamedTuple):
     level: Int[Array, ""]
     budget: Int[Array, ""]
     share: Float[Array, ""]
+    mix: Float[Array, ""]
     best: Float[Array, " l"]
 
 
@@ -124,27 +128,104 @@ def primal_dual(
     Returns:
         The velocities, the Jacobian there, and the report.
     """
-    n = start.shape[0] if spread is None else spread[1].shape[0]
-    m = n // 6
     epsilon = float(jnp.finfo(start.dtype).eps)
     relative = epsilon**0.75 if options.tolerance is None else options.tolerance
-    softnesses, shares = (jnp.asarray([tier[k] for tier in TIERS], start.dtype) for k in (0, 1))
-    searches = jnp.asarray([tier[2] for tier in TIERS])
-    budgets = jnp.asarray([tier[3] for tier in TIERS])
+    look = _looking(balance, table, scale, spread)
+    levels = [jnp.asarray(column, start.dtype) for column in zip(*TIERS, strict=True)]
+
+    def level_of(number):
+        softness, share, searches, budget, holds = (x[jnp.minimum(number, len(TIERS) - 1)] for x in levels)
+        return softness, share, searches > 0, budget.astype(int), holds > 0
+
+    def unfinished(it: _Iterate):
+        return ~it.solved & (it.iteration < options.max_iterations) & (it.level < len(TIERS))
+
+    def advance(it: _Iterate):
+        softness, share, searches, _, holds = level_of(it.level)
+        velocities, seen = look(it, softness, holds)
+        error = jnp.max(jnp.abs(scale * seen.residual))
+        tolerance = jnp.maximum(relative * (1 + size), 16 * epsilon * seen.size)
+        hard, spent = softness == 1, it.budget <= 0
+        enough = jnp.where(hard, tolerance, jnp.maximum(tolerance, _SOFT_TOLERANCE * 1e-7 * softness))
+        small = error <= enough
+        accept = it.search.accepts(seen.work) | ~searches | small
+        unfit, push, renewed = seen.unfit
+        # Where rounding keeps duals from fitting, a second small residual has to do.
+        solved = small & hard & ((unfit <= epsilon**_FIT * push) | (it.residual <= enough))
+        best = jnp.where(hard & (error < it.best[-1]), jnp.append(velocities, error), it.best)
+        adapted = jnp.clip(it.share * jnp.where(error < it.residual, _GROWS, _SHRINKS), _LEAST, 1)
+        adapted = jnp.where((it.level > 0) | (it.iteration < _WHOLE), 1, adapted)
+        settled = ~holds | spent | ((it.mix > 0) & (it.mix < 1) & (renewed <= _RENEWED * push))
+        harder = accept & ((small & ~hard & settled) | (~small & spent))
+        next_level = jnp.where(harder, it.level + 1, it.level)
+        *_, budget, begins = level_of(next_level)
+        mix = jnp.where(accept & small & holds, _MIX, 0)
+        mix = jnp.where(harder & begins & (next_level < len(TIERS)), 1.0, mix).astype(start.dtype)
+        # Once the residual falls as it should, there is nothing to be damped.
+        part = jnp.where(error < 0.5 * it.residual, 1, share * adapted)
+        step = part * solve_small(seen.jacobian, -(scale * seen.residual)[:, None])[:, 0]
+        # The next pass is no longer of the same function where bounds are renewed: it is accepted.
+        search = Search.start(step, jnp.where(mix > 0, 0, jnp.sum(step * seen.residual)))
+        pick = lambda new, old: jnp.where(accept, new, old)  # noqa: E731
+        return _Iterate(
+            pick(velocities, it.velocities),
+            seen.memory,
+            accept,
+            jax.tree.map(pick, search, it.search.narrowed(seen.work)),
+            seen.jacobian / scale[:, None],
+            pick(error, it.residual),
+            solved,
+            it.iteration + 1,
+            next_level,
+            jnp.where(harder, budget, it.budget - 1),
+            adapted,
+            mix,
+            best,
+        )
+
+    last = jax.lax.while_loop(unfinished, advance, _initial(table, start, spread))
+    velocities = jnp.where(last.solved, last.velocities, last.best[:-1])
+    residual = jnp.where(last.solved, last.residual, last.best[-1])
+    return velocities, last.jacobian, Report(residual, last.iteration, last.solved)
+
+
+class _Seen(NamedTuple):
+    """What a pass finds at the velocities that it tries.
+
+    Attributes:
+        residual: As momenta.
+        jacobian: Its derivative, times `scale`.
+        work: Of the residual along the step.
+        size: Largest sum of the terms of a row of the Jacobian [m/s].
+        unfit: See `Sums`, as is the memory.
+    """
+
+    residual: Float[Array, " k"]
+    jacobian: Float[Array, "k k"]
+    work: Float[Array, ""]
+    size: Float[Array, ""]
+    unfit: Float[Array, "3"]
+    memory: Float[Array, "28 c p"]
+
+
+def _looking(balance, table: Table, scale: Float[Array, " k"], spread):
+    """The function that evaluates what an iterate tries."""
+    n = scale.shape[0] if spread is None else spread[1].shape[0]
+    m = n // 6
 
     def turns(v):
         """Twists of bodies, or changes of them, in proportion to (generalised) velocities."""
         return (v if spread is None else spread[0] @ v).reshape(m, 6)
 
-    def twists(v):
-        return turns(v) if spread is None else turns(v) + spread[1].reshape(m, 6)
-
-    def evaluate(v, it: _Iterate, softness):
-        """Residual and Jacobian as momenta, whether the duals fit, and the memory."""
-        free = balance(v)
+    def look(it: _Iterate, softness, holds):
         step, length = it.search.direction, it.search.length
+        velocities = it.velocities + length * step
+        free, twists = balance(velocities), turns(velocities)
+        if spread is not None:
+            twists = twists + spread[1].reshape(m, 6)
+        trial = Trial(length, softness, holds, it.mix)
         begin = _without_points(free, m)
-        sums = assemble(table, it.memory, it.fresh, twists(v), turns(step), length, softness, begin)
+        sums = assemble(table, it.memory, it.fresh, twists, turns(step), trial, begin)
         residual = -jnp.sum(sums.blocks[:m, :, :, 6], axis=1).ravel()
         jacobian = -sums.blocks[:m, :m, :, :6].transpose(0, 2, 1, 3).reshape(n, n)
         if spread is not None:
@@ -152,59 +233,18 @@ def primal_dual(
             jacobian = spread[0].T @ jacobian @ spread[0]
         if free.coupled is not None:
             jacobian = jacobian + free.coupled.reshape(jacobian.shape)
-        fits = sums.unfit[0] <= epsilon**_FIT * sums.unfit[1]
-        return residual, jacobian, fits, sums.memory
-
-    def unfinished(it: _Iterate):
-        return ~it.solved & (it.iteration < options.max_iterations) & (it.level < len(TIERS))
-
-    def advance(it: _Iterate):
-        level = jnp.minimum(it.level, len(TIERS) - 1)
-        softness, share = softnesses[level], shares[level]
-        velocities = it.velocities + it.search.length * it.search.direction
-        residual, jacobian, fits, memory = evaluate(velocities, it, softness)
-        work = jnp.sum(it.search.direction * residual)
-        accept = it.search.accepts(work) | ~searches[level]
-        error = jnp.max(jnp.abs(scale * residual))
         scaled = scale[:, None] * jacobian
-        rounding = 16 * epsilon * jnp.max(jnp.sum(jnp.abs(scaled * velocities[None]), axis=1))
-        tolerance = jnp.maximum(relative * (1 + size), rounding)
-        hard = softness == 1
-        enough = jnp.where(hard, tolerance, jnp.maximum(tolerance, _SOFT_TOLERANCE * 1e-7 * softness))
-        small = error <= enough
-        accept = accept | small
-        # Where rounding keeps duals from fitting, a second small residual has to do.
-        solved = small & hard & (fits | (it.residual <= enough))
-        best = jnp.append(velocities, error)
-        best = jnp.where(hard & (error < it.best[-1]), best, it.best)
-        adapted = jnp.clip(it.share * jnp.where(error < it.residual, _GROWS, _SHRINKS), _LEAST, 1)
-        adapted = jnp.where((level > 0) | (it.iteration < _WHOLE), 1, adapted)
-        # Once the residual falls as it should, there is nothing to be damped.
-        fell = error < 0.5 * it.residual
-        step = jnp.where(fell, 1, share * adapted) * solve_small(scaled, -(scale * residual)[:, None])[:, 0]
-        step = jnp.where(accept, step, it.search.direction)
-        pick = lambda new, old: jnp.where(accept, new, old)  # noqa: E731
-        search = Search.start(step, jnp.sum(step * residual))
-        harder = accept & ((small & ~hard) | (~small & (it.budget <= 0)))
-        next_level = jnp.where(harder, it.level + 1, it.level)
-        return _Iterate(
-            pick(velocities, it.velocities),
-            memory,
-            accept,
-            jax.tree.map(pick, search, it.search.narrowed(work)),
-            jacobian,
-            pick(error, it.residual),
-            solved,
-            it.iteration + 1,
-            next_level,
-            jnp.where(harder, budgets[jnp.minimum(next_level, len(TIERS) - 1)], it.budget - 1),
-            adapted,
-            best,
-        )
+        size = jnp.max(jnp.sum(jnp.abs(scaled * velocities[None]), axis=1))
+        return velocities, _Seen(residual, scaled, jnp.sum(step * residual), size, sums.unfit, sums.memory)
 
-    initial = _Iterate(
+    return look
+
+
+def _initial(table: Table, start: Float[Array, " k"], spread) -> _Iterate:
+    twists = start if spread is None else spread[0] @ start + spread[1]
+    return _Iterate(
         start,
-        first_memory(table, twists(start)),
+        first_memory(table, twists.reshape(-1, 6)),
         jnp.asarray(False),
         Search.start(jnp.zeros_like(start), jnp.zeros((), start.dtype)),
         jnp.eye(start.shape[0], dtype=start.dtype),
@@ -212,14 +252,11 @@ def primal_dual(
         jnp.asarray(False),
         jnp.asarray(0),
         jnp.asarray(0),
-        budgets[0],
+        jnp.asarray(TIERS[0][3]),
         jnp.ones((), start.dtype),
+        jnp.zeros((), start.dtype),
         jnp.append(start, jnp.inf),
     )
-    last = jax.lax.while_loop(unfinished, advance, initial)
-    velocities = jnp.where(last.solved, last.velocities, last.best[:-1])
-    residual = jnp.where(last.solved, last.residual, last.best[-1])
-    return velocities, last.jacobian, Report(residual, last.iteration, last.solved)
 
 
 def _without_points(free: Balance, m: int) -> Float[Array, "b b 6 7"]:

@@ -162,7 +162,8 @@ def follow(row, rate, slip_x, slip_y, slip_z):
 
 @kernel
 def fit_duals(row, rate, slip_x, slip_y, slip_z):
-    """Duals that fit given velocities."""
+    """Duals that fit given velocities; held bounds are renewed before they are used."""
+    row[HELD] = 0.0
     row[GOING] = rate / max(abs(rate), row[STICTION])
     find_pressure(row, rate, 1.0)
     friction, _ = bound(row, row[PRESSURE])
