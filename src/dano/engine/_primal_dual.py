@@ -131,17 +131,12 @@ def primal_dual(
     epsilon = float(jnp.finfo(start.dtype).eps)
     relative = epsilon**0.75 if options.tolerance is None else options.tolerance
     look = _looking(balance, table, scale, spread)
-    levels = [jnp.asarray(column, start.dtype) for column in zip(*TIERS, strict=True)]
-
-    def level_of(number):
-        softness, share, searches, budget, holds = (x[jnp.minimum(number, len(TIERS) - 1)] for x in levels)
-        return softness, share, searches > 0, budget.astype(int), holds > 0
 
     def unfinished(it: _Iterate):
         return ~it.solved & (it.iteration < options.max_iterations) & (it.level < len(TIERS))
 
     def advance(it: _Iterate):
-        softness, share, searches, _, holds = level_of(it.level)
+        softness, share, searches, _, holds = _level(it.level, start.dtype)
         velocities, seen = look(it, softness, holds)
         error = jnp.max(jnp.abs(scale * seen.residual))
         tolerance = jnp.maximum(relative * (1 + size), 16 * epsilon * seen.size)
@@ -158,7 +153,7 @@ def primal_dual(
         settled = ~holds | spent | ((it.mix > 0) & (it.mix < 1) & (renewed <= _RENEWED * push))
         harder = accept & ((small & ~hard & settled) | (~small & spent))
         next_level = jnp.where(harder, it.level + 1, it.level)
-        *_, budget, begins = level_of(next_level)
+        *_, budget, begins = _level(next_level, start.dtype)
         mix = jnp.where(accept & small & holds, _MIX, 0)
         mix = jnp.where(harder & begins & (next_level < len(TIERS)), 1.0, mix).astype(start.dtype)
         # Once the residual falls as it should, there is nothing to be damped.
@@ -187,6 +182,13 @@ def primal_dual(
     velocities = jnp.where(last.solved, last.velocities, last.best[:-1])
     residual = jnp.where(last.solved, last.residual, last.best[-1])
     return velocities, last.jacobian, Report(residual, last.iteration, last.solved)
+
+
+def _level(number: Int[Array, ""], dtype):
+    """A row of `TIERS`, the last one beyond it."""
+    columns = [jnp.asarray(column, dtype) for column in zip(*TIERS, strict=True)]
+    softness, share, searches, budget, holds = (x[jnp.minimum(number, len(TIERS) - 1)] for x in columns)
+    return softness, share, searches > 0, budget.astype(int), holds > 0
 
 
 class _Seen(NamedTuple):

@@ -475,30 +475,26 @@ def _find_drift(placed, x, y, z, rx, ry, rz, nx, ny, nz, found, scratch):
 
 
 @kernel
-def _list_block(
-    turning,
-    solid,
-    whole,
-    atlas,
-    placed,
-    blocks,
-    n,
-    side,
-    share,
-    settings,
-    turned,
-    lists,
-    used,
-    filled,
-    sums,
-    scratch,
-):
+def _list_block(turning, target, placed, blocks, n, how, lists, used, filled, sums, scratch):
     """List the samples of a block that may press; returns the full chunks and the places of the next one.
 
     Added to `sums`, over samples that sink in: area; then load, and rate, arm and normal weighted by it; then
     the load of those that lie in the solid and face the other way.
+
+    Args:
+        turning: How samples turn with their body.
+        target: The solid, its whole numbers, and spline coefficients.
+        placed: From `_place`.
+        blocks: Points and vector areas of samples.
+        n: Which block.
+        how: Row of the table of pairs, share of the step, settings, whether to list what faces the other way.
+        lists: Numbers of points, and their samples, written to.
+        used: Full chunks before.
+        filled: Places of the next one.
+        sums: See above.
+        scratch: Room.
     """
-    numbers, samples = lists
+    (solid, whole, atlas), (side, share, settings, turned), (numbers, samples) = target, how, lists
     h, room, width = settings[_H], numbers.shape[1], numbers.shape[2]
     found = scratch[80:95]
     # Where geometry is taken early, what is about to touch has sunk in by no more than this, or nearly does.
@@ -543,25 +539,9 @@ def _list_block(
 
 
 @kernel
-def _list_pair(
-    count,
-    side,
-    share,
-    reach,
-    turned,
-    settings,
-    solid,
-    whole,
-    atlas,
-    placed,
-    surfaces,
-    lists,
-    used,
-    sums,
-    scratch,
-):
+def _list_pair(count, target, placed, reach, surfaces, how, lists, used, sums, scratch):
     """List the samples of a body that may press, see `_list_block`; returns the chunks in use."""
-    blocks, balls, runs = surfaces
+    (blocks, balls, runs), (solid, whole, atlas) = surfaces, target
     lane, beyond = 0, count[_START]
     for n in range(count[_START], count[_START] + count[_BLOCKS]):
         if n < beyond:
@@ -576,22 +556,7 @@ def _list_pair(
         if d - balls[n, 3] * placed[_STRETCH] > reach:
             continue
         used, lane = _list_block(
-            count[_TURNING],
-            solid,
-            whole,
-            atlas,
-            placed,
-            blocks,
-            n,
-            side,
-            share,
-            settings,
-            turned,
-            lists,
-            used,
-            lane,
-            sums,
-            scratch,
+            count[_TURNING], target, placed, blocks, n, how, lists, used, lane, sums, scratch
         )
     return used + 1 if lane > 0 else used
 
@@ -617,6 +582,15 @@ def _impact(a, b, sums, hit_speed, instant, settings):
     h = settings[_H]
     stiffness = settings[_IMPACT] / (h * h * (mobility * area))
     return 2.0 ** np.rint(math.log2(stiffness))
+
+
+@kernel
+def _label(name, share, stiffness, first, end, of_chunk, labels):
+    """What the chunks of a pair have in common."""
+    for c in range(first, end):
+        of_chunk[0, c], of_chunk[1, c] = share, stiffness
+        labels[0, c], labels[1, c], labels[2, c] = name[_FIRST], name[_SECOND], name[_CONTACT]
+        labels[3, c], labels[4, c] = name[_GROUP], name[_PLACE]
 
 
 @kernel
@@ -658,7 +632,7 @@ def _find(
     """
     numbers, of_chunk = points
     labels, samples = where
-    room = numbers.shape[1]
+    surfaces, points_of, room = (blocks, balls, runs), (numbers, samples), numbers.shape[1]
     left = np.empty(max(1, counts[:, _PROBES].max()), np.int64)
     placed, scratch, sums = np.empty(_PLACED), np.empty(100), np.empty(10)
     used = 0
@@ -683,29 +657,13 @@ def _find(
             # What faces the other way presses where its load is the larger one.
             if turned and not sums[9] > sums[1]:
                 continue
+            how = side, share, settings, turned
             used = _list_pair(
-                count,
-                side,
-                share,
-                reach,
-                turned,
-                settings,
-                solid,
-                whole,
-                atlas,
-                placed,
-                (blocks, balls, runs),
-                (numbers, samples),
-                used,
-                sums,
-                scratch,
+                count, (solid, whole, atlas), placed, reach, surfaces, how, points_of, used, sums, scratch
             )
         contact = name[_CONTACT]
         stiffness = _impact(a, b, sums, impacts[contact, 1], impacts[contact, 0], settings)
-        for c in range(first, min(used, room)):
-            of_chunk[0, c], of_chunk[1, c] = share, stiffness
-            labels[0, c], labels[1, c], labels[2, c] = name[_FIRST], name[_SECOND], contact
-            labels[3, c], labels[4, c] = name[_GROUP], name[_PLACE]
+        _label(name, share, stiffness, first, min(used, room), of_chunk, labels)
     return used
 
 
