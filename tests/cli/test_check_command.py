@@ -92,7 +92,7 @@ def test_a_compliant_impact_needs_as_many_steps_as_it_lasts():
     assert lasts < 20 * h
 
 
-def test_walls_of_either_law_are_foretold_where_balls_pass_through():
+def test_walls_of_either_law_are_foretold_where_balls_may_pass_through():
     def wall(half: float, speed: float, law) -> tuple[bool, bool]:
         bodies = [
             dano.Body("ball", dano.Sphere(0.03), mass=0.2),
@@ -110,7 +110,8 @@ def test_walls_of_either_law_are_foretold_where_balls_pass_through():
     assert wall(0.01, 2.0, centroid) == (False, False)
     assert wall(0.01, 20.0, centroid) == (True, True)
     assert wall(0.01, 20.0, distributed) == (False, False)
-    assert wall(0.0001, 160.0, distributed) == (True, True)
+    # Foretold is what a step cannot be sure to resolve; this wall holds all the same.
+    assert wall(0.0001, 160.0, distributed) == (True, False)
 
 
 def test_masses_and_lost_bodies():

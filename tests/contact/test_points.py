@@ -166,7 +166,7 @@ def test_linearised_law_is_the_derivative_of_the_law(instant):
     motion, one = Motion(rate, slip), jnp.ones(())
     fixed = constants(material, points)
     duals = first_duals(fixed, motion, one)
-    linear = linearized(fixed, motion, duals, one)
+    linear = linearized(fixed, motion, duals, one, jnp.asarray(False), 0 * one, jnp.zeros(shape))
     pressure, friction = traction(material, points, motion)
     np.testing.assert_allclose(linear.pressure.value, pressure, rtol=1e-12)
     np.testing.assert_allclose(linear.friction, friction, rtol=1e-9, atol=1e-9)

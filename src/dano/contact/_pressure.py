@@ -241,7 +241,7 @@ def linearized(
     fixed: Constants,
     motion: Motion,
     duals: Duals,
-    softness,
+    softness: Float[Array, ""],
     holds: Bool[Array, ""],
     mix: Float[Array, ""],
     held: Float[Array, "c p"],

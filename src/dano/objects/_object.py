@@ -376,8 +376,8 @@ def _closed(field: AbstractField, resolution: int) -> tuple[AbstractField, Densi
     Contact, too, is with the solid whose pores are closed.
     """
     resolution = checked_count("resolution", resolution, least=4)
-    check_nodes(np.ptp(np.asarray(field.bounds), axis=0), resolution, _BYTES_PER_NODE)
     density = checked_density(field)
+    check_nodes(np.ptp(np.asarray(field.bounds), axis=0), resolution, _BYTES_PER_NODE)
     lattice = Lattice.create(density, field.bounds, resolution)
     interior, inside = examine(lattice)
     if float(interior.gap) > 0:
