@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 import dano
-from dano.objects import field_size
+from dano.objects import draw_contact_samples, field_size
 
 N = 48
 AXIS = np.linspace(-0.6, 0.6, N)
@@ -124,7 +124,7 @@ def test_a_shape_becomes_an_object_by_baking():
 def test_thin_plates_are_sampled_on_both_sides(half):
     """A plate a thousandth as thick as it is wide has flat cells, and samples wherever it has an edge."""
     plate = dano.Box((0.5, 0.5, half), edge=0.0004)
-    points = np.asarray(dano.objects.draw_contact_samples(plate, 400).points)
+    points = np.asarray(draw_contact_samples(plate, 400).points)
     assert np.all(np.abs(points[:, 2]) < half + 0.0002)
     for side in (points[:, 2] > 0.5 * half, points[:, 2] < -0.5 * half):
         assert np.mean(side) > 0.25
