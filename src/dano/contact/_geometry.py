@@ -414,7 +414,7 @@ def _aligned(geometry: Geometry, kind: Kind | Mixture, side: Side, turn, origin)
     toward = jnp.zeros_like(origin)
     if BALL in kind.turns:
         toward = _first_touch(lambda point: facing(origin + matvec(turn, point)), geometry.scale[i])
-    if AXIS in kind.turns or FIXED in kind.turns:
+    if AXIS in kind.turns:
         toward = jnp.where(ball, toward, facing(origin)[1])
     return *_turned(geometry, kind, side, turn, toward), toward
 

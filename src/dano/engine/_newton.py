@@ -66,6 +66,7 @@ class _Schedule(NamedTuple):
 
     @classmethod
     def create(cls, tiers, budgets, dtype) -> "_Schedule":
+        """The levels of tiers like `_TIERS`, and how many passes each of their levels has."""
         scale = np.concatenate([scales for _, scales in tiers])
         lengths = [len(scales) for _, scales in tiers]
         ends = np.cumsum(lengths)
@@ -101,6 +102,7 @@ class Search(NamedTuple):
 
     @classmethod
     def start(cls, direction, work) -> "Search":
+        """The search along a step on which the residual does this work at its beginning."""
         zero, one = jnp.zeros_like(work), jnp.ones_like(work)
         return cls(direction, jnp.stack([work, one, zero, work, zero, zero]))
 

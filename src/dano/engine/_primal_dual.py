@@ -79,7 +79,7 @@ class _Iterate(NamedTuple):
         memory: What the sums over points keep: see `assemble`.
         fresh: Whether the point tried last was accepted.
         search: The step from the accepted point, and how much of it is tried next.
-        jacobian: ∂R/∂V at the point before, shape (k, k).
+        jacobian: Derivative of the momenta at the point before, times the scale, shape (k, k).
         residual: Largest residual over mass or inertia at the accepted point.
         solved: Whether that was small enough.
         iteration: Passes.
@@ -167,7 +167,7 @@ def primal_dual(
             seen.memory,
             accept,
             jax.tree.map(pick, search, it.search.narrowed(seen.work)),
-            seen.jacobian / scale[:, None],
+            seen.jacobian,
             pick(error, it.residual),
             solved,
             it.iteration + 1,
@@ -181,7 +181,7 @@ def primal_dual(
     last = jax.lax.while_loop(unfinished, advance, _initial(table, start, spread))
     velocities = jnp.where(last.solved, last.velocities, last.best[:-1])
     residual = jnp.where(last.solved, last.residual, last.best[-1])
-    return velocities, last.jacobian, Report(residual, last.iteration, last.solved)
+    return velocities, last.jacobian / scale[:, None], Report(residual, last.iteration, last.solved)
 
 
 def _level(number: Int[Array, ""], dtype):

@@ -129,10 +129,14 @@ def as_solved(problem: Problem, velocities: Array, pairs: Pairs) -> Problem:
     if problem.points is None:
         return problem
     shares = jnp.asarray(SHARES, velocities.dtype)
-    missed = jax.lax.map(
-        lambda share: jnp.sum(jnp.abs(step_residual(velocities, problem.rebounding(share), pairs))), shares
-    )
-    return problem.rebounding(shares[jnp.argmin(missed)])
+
+    def missed(share):
+        return jnp.sum(jnp.abs(step_residual(velocities, problem.rebounding(share), pairs)))
+
+    # Only in impacts that end within the step the share counts.
+    hits = jnp.any(problem.points.stiffness > 0)
+    share = jax.lax.cond(hits, lambda: shares[jnp.argmin(jax.lax.map(missed, shares))], lambda: shares[0])
+    return problem.rebounding(share)
 
 
 def _adds_energy(velocities: Array, problem: Problem, start: Array) -> Array:

@@ -57,8 +57,8 @@ _H, _RELATIVE, _SIZE, _EPSILON = range(4)
 _WHOLE, _GROWS, _SHRINKS, _LEAST, _FIT, _SOFT_TOLERANCE, _ENOUGH, _GIVE_UP, _RESOLVED, _FADE = range(10)
 _MIX, _RENEWED = 10, 11
 # A line search: work of the residual along the step at the accepted point, share to try, the bracket and the
-# works at its ends; then how much work, and how narrow a bracket, is accepted.
-_BEGUN, _LENGTH, _LOW, _LOW_WORK, _HIGH, _HIGH_WORK, _LIMIT, _NARROW = range(8)
+# works at its ends.
+_BEGUN, _LENGTH, _LOW, _LOW_WORK, _HIGH, _HIGH_WORK = range(6)
 
 
 @kernel
@@ -482,20 +482,19 @@ def _scales(bodies, scale):
 
 
 @kernel
-def _accepts(work, search):
+def _accepts(work, rules, search):
     """Whether a share of the step is good enough, see `Search.accepts` of `dano.engine`."""
     bracketed = search[_HIGH] > 0.0
-    limit = search[_LIMIT]
+    limit = rules[_ENOUGH] * abs(search[_BEGUN])
     misses = work > limit or (bracketed and work < -limit) or math.isnan(work)
-    narrow = bracketed and search[_HIGH] - search[_LOW] < search[_NARROW]
+    narrow = bracketed and search[_HIGH] - search[_LOW] < rules[_GIVE_UP]
     return not misses or narrow or search[_BEGUN] >= 0.0
 
 
 @kernel
-def _begin_search(begun, rules, search):
+def _begin_search(begun, search):
     search[_BEGUN], search[_LENGTH] = begun, 1.0
     search[_LOW], search[_LOW_WORK], search[_HIGH], search[_HIGH_WORK] = 0.0, begun, 0.0, 0.0
-    search[_LIMIT], search[_NARROW] = rules[_ENOUGH] * abs(begun), rules[_GIVE_UP]
 
 
 @kernel
@@ -539,12 +538,12 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
     matrix, spare = np.empty((m, m, 6, 6)), np.empty((m, m, 6, 6))
     residual, step, best = np.empty((m, 6)), np.zeros((m, 6)), np.empty((m, 6))
     accepted, tried, scale = np.empty((m, 6)), np.empty((m, 6)), np.empty((m, 6))
-    search, pass_ = np.zeros(8), np.zeros(4)
+    search, pass_ = np.zeros(6), np.zeros(4)
     _copy(start, accepted)
     _copy(start, best)
     _scales(bodies, scale)
     _fit_all(points, groups, apart, start)
-    _begin_search(0.0, rules, search)
+    _begin_search(0.0, search)
     level, budget, iteration, mix = 0, tiers[0, 3], 0, 0.0
     share, solved, before, best_error = 1.0, False, np.inf, np.inf
     while not solved and iteration < max_iterations and level < tiers.shape[0]:
@@ -561,7 +560,7 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
         hard = softness == 1.0
         enough = tolerance if hard else max(tolerance, rules[_SOFT_TOLERANCE] * 1e-7 * softness)
         small = error <= enough
-        accept = small or not searches or _accepts(work, search)
+        accept = small or not searches or _accepts(work, rules, search)
         solved = small and hard and (unfit <= epsilon ** rules[_FIT] * push or before <= enough)
         if hard and error < best_error:
             best_error = error
@@ -569,7 +568,7 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
         share = min(max(share * (rules[_GROWS] if error < before else rules[_SHRINKS]), rules[_LEAST]), 1.0)
         if level > 0 or iteration < rules[_WHOLE]:
             share = 1.0
-        fell = error < 0.5 * before
+        part = 1.0 if error < 0.5 * before else tiers[level, 1] * share
         spent = budget <= 0
         settled = not holds or spent or (0.0 < mix < 1.0 and renewed <= rules[_RENEWED] * push)
         harder = accept and ((small and not hard and settled) or (not small and spent))
@@ -584,11 +583,10 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
         else:
             _copy(tried, accepted)
             if not solved:
-                part = 1.0 if fell else tiers[level if not harder else level - 1, 1] * share
                 _find_step(matrix, spare, residual, step, used, part, order, count, later)
                 _follow_all(points, groups, apart, step)
                 # The next pass is no longer of the same function where bounds are renewed: it is accepted.
-                _begin_search(0.0 if mix > 0.0 else _work(step, residual), rules, search)
+                _begin_search(0.0 if mix > 0.0 else _work(step, residual), search)
             before = error
         iteration += 1
     _copy(accepted if solved else best, start)
