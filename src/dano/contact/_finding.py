@@ -22,30 +22,23 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dano.contact._colliders import BLOCK
-from dano.contact._geometry import (
+from dano.contact._geometry import AXIS, BALL, FIXED, Geometry, Kind, Links, Mixture, Side
+from dano.contact._kernels import find_natively
+from dano.contact._placing import (
     ADVANCES,
-    AXIS,
-    BALL,
     block_clearance,
     FASTEST,
-    FIXED,
     FOUND,
     FROM_Z,
-    Geometry,
-    Kind,
-    Links,
     meeting,
-    Mixture,
     near_pairs,
     place,
     POLE,
     PULL,
     SEARCHES,
     SHARES,
-    Side,
     unit,
 )
-from dano.contact._kernels import find_natively
 from dano.contact._points import CHUNK, cross, dot, Found, Points, ROUND
 from dano.maths import matmul, matvec
 
