@@ -1,15 +1,17 @@
-"""Few, well placed surface samples of primitives: corners, edges, Gauss points of faces; directions of balls.
+"""Few, well placed surface samples of primitives: corners, edges, points of faces; directions of balls.
 
 Edges and corners have the areas of the surface inflated by a skin, as `draw_surface` has them, thicker: an
-edge length · angle · skin, a corner (solid angle) · 1.13 skin²; a face has the rest of its own. Forces and
-moments of a pressure that is linear over a whole face come out exactly, and so does the weight of a body on
-an edge or a corner. Where a face is pressed in part, the moment is off by up to half the distance of its
-points, as long as neither edge nor corner is pressed.
+edge length · angle · skin, a corner (solid angle) · 1.13 skin²; a face has the rest of its own. Points inside
+a face are drawn in so far that its second moments stay those of the face. Forces and moments of a pressure
+that is linear over a whole face come out exactly, and so does the weight of a body on an edge or a corner.
+Where a face is pressed in part, the moment is off by up to half the distance of its points, as long as
+neither edge nor corner is pressed.
 """
 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import roots_jacobi
 
 from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, Sphere
 from dano.objects._surface import draw_surface
@@ -21,8 +23,15 @@ SKIN = 0.005
 _THIN = 0.1
 # Mean of s² over the skin, in units of skin²: see `draw_surface`.
 _CORNER = 1.13
-# Gauss points along a side of a face, and points along an edge between its corners.
-_FACE, _EDGE = 4, 5
+# Points along a side of a face over its half length: of equal weight, with the mean square of the side. The
+# mean distance of a face's points from its middle, which the moment of sliding friction goes with, is 0.2 %
+# off for all ratios of its sides up to 10; with four Gauss points it is 0.9 to 3.7 % off.
+_INNER = 0.2186
+_FACE = np.array([-1.0, -1.0, 1.0, 1.0]) * np.sqrt(
+    [2 / 3 - _INNER**2, _INNER**2, _INNER**2, 2 / 3 - _INNER**2]
+)
+# Points along an edge between its corners.
+_EDGE = 5
 # Rings of directions on a ball around where it touches, and directions a ring.
 _RINGS, _SPOKES = 15, 8
 # Rows of samples around a cylinder's axis are one less, so that one lies where it touches; rings on its ends.
@@ -68,17 +77,24 @@ def _box(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     corner_area = np.pi / 4 * _CORNER * skin**2
     signs = np.array([-1.0, 1.0])
     points, vectors = [], []
-    nodes, weights = np.polynomial.legendre.leggauss(_FACE)
     along = (2 * np.arange(_EDGE) + 1) / _EDGE - 1
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
         # What edges and corners carry of a flat face is taken off its inside.
         inside = 1 - (skin * (half[u] + half[v]) + corner_area) / (half[u] * half[v])
+        drawn_in = np.ones(3)
+        for i, other in ((u, v), (v, u)):
+            # Second moments over half², over the area of the face.
+            of_edges = (skin * (half[other] + half[i] * np.mean(along**2)) + corner_area) / (
+                half[u] * half[v]
+            )
+            drawn_in[i] = np.sqrt((1 / 3 - of_edges) * 3 / inside)
         for sign in signs:
-            for a, wa in zip(nodes, weights, strict=True):
-                for b, wb in zip(nodes, weights, strict=True):
-                    points.append(_at(axis, u, v, sign, a, b) * half)
-                    vectors.append(_at(axis, u, v, inside * sign * wa * wb * half[u] * half[v], 0.0, 0.0))
+            share = inside * sign * 4 * half[u] * half[v] / len(_FACE) ** 2
+            for a in _FACE:
+                for b in _FACE:
+                    points.append(_at(axis, u, v, sign, a, b) * drawn_in * half)
+                    vectors.append(_at(axis, u, v, share, 0.0, 0.0))
         for su in signs:
             for sv in signs:
                 for t in along:
@@ -119,26 +135,27 @@ def _around() -> tuple[np.ndarray, np.ndarray]:
 def _side(radius: float, half_length: float, carried: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The curved side of a cylinder, with the area of one of half length `carried`."""
     out, shares = _around()
-    nodes, weights = np.polynomial.legendre.leggauss(_FACE)
-    points = [radius * out + half_length * z * _UP for z in nodes]
-    return points, [(radius * shares * w * carried)[:, None] * out for w in weights]
+    points = [radius * out + half_length * z * _UP for z in _FACE]
+    return points, [(radius * shares * 2 * carried / len(_FACE))[:, None] * out for _ in _FACE]
 
 
 def _cylinder(radius: float, half_length: float, size: float) -> tuple[np.ndarray, np.ndarray]:
     skin = min(SKIN * size, _THIN * min(radius, half_length))
     out, shares = _around()
     points, vectors = _side(radius, half_length, half_length - skin)
+    # Gauss points of a disc: means of 1, r … r⁵ over it are exact, so the moment of sliding friction is, too.
+    nodes, weights = roots_jacobi(_END_RINGS, 0, 1)
+    rings, weights = (1 + nodes) / 2, weights / weights.sum()
     for sign in (-1, 1):
         # A rim carries both normals of its quarter circle.
         points.append(radius * out + sign * half_length * _UP)
         vectors.append((radius * shares * skin)[:, None] * (out + sign * _UP))
-        inner = np.linspace(0, 1, _END_RINGS + 1)
-        for low, high in zip(inner[:-1], inner[1:], strict=True):
-            # At the radius whose moment is the ring's.
-            middle = np.sqrt((low**2 + high**2) / 2)
-            points.append(radius * middle * out + sign * half_length * _UP)
-            inside = 1 - 2 * skin / radius
-            vectors.append((inside * shares * radius**2 * (high**2 - low**2) / 2)[:, None] * sign * _UP)
+        # What the rim carries is taken off the inside: area, and second moment over radius².
+        inside = 1 - 2 * skin / radius
+        drawn_in = np.sqrt((1 / 2 - 2 * skin / radius) * 2 / inside)
+        for ring, weight in zip(rings, weights, strict=True):
+            points.append(radius * drawn_in * ring * out + sign * half_length * _UP)
+            vectors.append((inside * shares * radius**2 / 2 * weight)[:, None] * sign * _UP)
     return np.concatenate(points), np.concatenate(vectors)
 
 
