@@ -38,6 +38,7 @@ from dano.contact._points import (
     Found as Found,
     Motion as Motion,
     motion_at as motion_at,
+    over_chunks as over_chunks,
     point_motion as point_motion,
     Points as Points,
 )

@@ -39,7 +39,7 @@ from dano.contact._placing import (
     SHARES,
     unit,
 )
-from dano.contact._points import CHUNK, cross, dot, Found, Points, ROUND
+from dano.contact._points import CHUNK, cross, dot, Found, over_chunks, Points, ROUND
 from dano.maths import matmul, matvec
 
 # Blocks whose samples are looked at together.
@@ -309,11 +309,23 @@ def _impact_stiffness(links: Links, side: Side, placed, sums, impacts: Impacts, 
 
 def points_of(geometry: Geometry, links: Links, where: Found, h: Float[Array, ""]) -> Points:
     """The points of `find` again, as a function that can be differentiated."""
-    dtype = links.position.dtype
-    rows = jnp.zeros((15, *where.sample.shape), dtype)
+
+    def again(chunks):
+        return jnp.moveaxis(_rows_of(geometry, links, h, *chunks), 1, 0)
+
+    chunks = where.group, where.side, where.share, where.sample, where.filled
+    rows = jnp.moveaxis(over_chunks(again, chunks, where.count), 0, 1)
+    return _assembled(geometry, links, where, rows)
+
+
+def _rows_of(
+    geometry: Geometry, links: Links, h, group, side, share, sample, filled
+) -> Float[Array, "15 c p"]:
+    """See `_rows`: of some chunks, see `Found`."""
+    rows = jnp.zeros((15, *sample.shape), links.position.dtype)
     for number, kind in enumerate(geometry.kinds):
-        mine = where.group == number
-        index = jnp.where(mine, where.side, 0)
+        mine = group == number
+        index = jnp.where(mine, side, 0)
 
         def chunk(index, share, sample, kind=kind):
             side = Side(*(x[index] for x in kind.sides))
@@ -323,10 +335,10 @@ def points_of(geometry: Geometry, links: Links, where: Found, h: Float[Array, ""
 
         # Chunks of other kinds read a sample of this kind's, so that they divide by nothing that is zero.
         own = geometry.start[kind.sides.first[0]] * BLOCK
-        sample = jnp.where(mine[:, None] & where.filled, where.sample, own)
-        of_kind = jax.vmap(chunk, out_axes=1)(index, where.share, sample)
-        rows = jnp.where((mine[:, None] & where.filled)[None], of_kind, rows)
-    return _assembled(geometry, links, where, rows)
+        read = jnp.where(mine[:, None] & filled, sample, own)
+        of_kind = jax.vmap(chunk, out_axes=1)(index, share, read)
+        rows = jnp.where((mine[:, None] & filled)[None], of_kind, rows)
+    return rows
 
 
 def _names(side: Side):

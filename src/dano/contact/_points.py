@@ -4,9 +4,11 @@ Finding contact knows shapes and no forces; a law knows forces and no shapes. Be
 chunks of at most `CHUNK` points that lie on one body (first), press on another (second), and share a contact.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -14,6 +16,8 @@ CHUNK = 16
 """Points of a chunk. A chunk belongs to one pair of bodies, so sums over pairs are sums over chunks."""
 ROUND = 16
 """A list has room for a multiple of so many chunks."""
+# Chunks of which derivatives are taken at once.
+_TOGETHER = 4
 
 
 class Points(eqx.Module):
@@ -116,6 +120,30 @@ class Found(eqx.Module):
     stiffness: Float[Array, " c"]
     count: Int[Array, ""]
     overflow: Bool[Array, ""]
+
+
+def over_chunks(function: Callable[[Any], Any], chunks: Any, count: Int[Array, ""]) -> Any:
+    """What a function gives for the chunks in use, zeros for others, as it can be differentiated quickly.
+
+    A list has room for many more chunks than are in use. Machine code skips the others; so does this.
+
+    Args:
+        function: Of a few chunks; arrays with the chunks along the first axis, as are its results.
+        chunks: All chunks, `ROUND` times a whole number.
+        count: How many are in use.
+    """
+    blocks = jax.tree.map(lambda x: x.reshape(-1, _TOGETHER, *x.shape[1:]), chunks)
+    n = jax.tree.leaves(blocks)[0].shape[0]
+
+    # Reverse mode computes a block again: what it would keep of each costs more to store.
+    @jax.checkpoint
+    def visit(_, inputs):
+        start, block = inputs
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function, block))
+        return None, jax.lax.cond(start < count, function, lambda _: nothing, block)
+
+    _, results = jax.lax.scan(visit, None, (_TOGETHER * jnp.arange(n), blocks))
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), results)
 
 
 class Motion(NamedTuple):

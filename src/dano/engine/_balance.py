@@ -7,7 +7,10 @@ from jaxtyping import Array, Float
 
 from dano.contact import (
     cross,
+    Material,
+    over_chunks,
     point_motion,
+    Points,
     Softening,
     traction,
 )
@@ -156,18 +159,22 @@ def chunk_wrenches(problem: Problem, world: Float[Array, "m 6"], pairs: Pairs):
 
     Velocities of the bodies that move are in W.
     """
-    points = problem.points
-    assert points is not None
+    points, material, count = problem.points, problem.material, problem.count
+    assert points is not None and material is not None and count is not None
     bodies = jnp.concatenate([world, jnp.zeros((1, 6), world.dtype)])[np.array(pairs.rows)]
-    pressure, friction = traction(
-        problem.chunk_material, points, point_motion(bodies[:, :3], bodies[:, 3:], points)
-    )
-    wrench = sum_wrenches(
-        points.arm, points.normal, points.moment, points.area * pressure, points.area[None] * friction
-    )
-    force = wrench[:, :3].T
-    moment = wrench[:, 3:].T + cross(points.between, force)
-    return wrench, -jnp.concatenate([force, moment]).T
+
+    def press(chunks):
+        rows, stiffness, between, *names = chunks
+        few = Points(jnp.moveaxis(rows, 0, 1), stiffness, between.T, *names)
+        motion = point_motion(bodies[:, :3], bodies[:, 3:], few)
+        pressure, friction = traction(Material(*jnp.take(material, few.contact, axis=1)), few, motion)
+        wrench = sum_wrenches(few.arm, few.normal, few.moment, few.area * pressure, few.area[None] * friction)
+        force = wrench[:, :3].T
+        moment = wrench[:, 3:].T + cross(few.between, force)
+        return wrench, -jnp.concatenate([force, moment]).T
+
+    rows, names = jnp.moveaxis(points.rows, 1, 0), (points.first, points.second, points.contact)
+    return over_chunks(press, (rows, points.stiffness, points.between.T, *names), count)
 
 
 def point_momenta(problem: Problem, world: Float[Array, "m 6"], pairs: Pairs) -> Float[Array, "m 6"]:

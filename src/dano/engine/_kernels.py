@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dano.contact import Found
 from dano.engine._balance import jacobian_in_bodies, to_body, to_velocity, to_world
 from dano.engine._newton import Report, SolverOptions
 from dano.engine._primal_dual import RULES, TIERS
@@ -19,7 +18,6 @@ def is_native(problem: Problem) -> bool:
 
 def native_root(
     problem: Problem,
-    found: Found | None,
     start: Float[Array, "m 6"],
     pairs: Pairs,
     options: SolverOptions,
@@ -29,8 +27,8 @@ def native_root(
     """Velocities, the Jacobian of R with spins in B (zeros unless asked for), and the report."""
     from dano.native import solver_name  # compiles or loads the kernel, so only where it is used
 
-    points, material = problem.points, problem.material
-    assert points is not None and material is not None and found is not None
+    points, material, count = problem.points, problem.material, problem.count
+    assert points is not None and material is not None and count is not None
     m, dtype = start.shape[0], start.dtype
     bodies = [
         problem.mass[:, None],
@@ -63,7 +61,7 @@ def native_root(
         jnp.asarray([RULES], dtype),
         jnp.stack([points.first, points.second, points.contact]).astype(jnp.int32),
         body_rows,
-        jnp.stack([found.count.astype(jnp.int32), jnp.asarray(options.max_iterations, jnp.int32)]),
+        jnp.stack([count.astype(jnp.int32), jnp.asarray(options.max_iterations, jnp.int32)]),
     )
     residual, passes, solved = report
     whole = jacobian_in_bodies(problem, jacobian) if derivatives else jnp.zeros((6 * m, 6 * m), dtype)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from dano.contact import (
     AbstractPatchLaw,
@@ -67,6 +67,7 @@ class Problem(eqx.Module):
         params: Parameters of each of these contacts.
         laws: Law of each of them.
         points: Point contacts, or None if no contact has a point law.
+        count: Chunks of points in use.
         material: Of the contacts, the fields of `Material` one below the other.
         tree: What joints allow, or None if there are none: then all bodies that move are free.
     """
@@ -81,6 +82,7 @@ class Problem(eqx.Module):
     params: tuple[ContactParams, ...]
     laws: tuple[AbstractPatchLaw, ...]
     points: Points | None
+    count: Int[Array, ""] | None
     material: Float[Array, "13 k"] | None
     tree: Tree | None
 
@@ -207,6 +209,7 @@ def build_problem(
         tuple(contact.params for contact in contacts),
         laws,
         points,
+        None if found is None else found.count,
         prepared.material,
         tree,
     )
@@ -285,7 +288,7 @@ def _(primals, tangents):
     def again(geometry, links, h):
         return eqx.filter(points_of(geometry, links, found, h), eqx.is_inexact_array)
 
-    return by_autodiff(again, (geometry, links, h), tangents[:3])
+    return numbers, by_autodiff(again, (geometry, links, h), tangents[:3])[1]
 
 
 def links_of(scene: Scene, state: State, h) -> Links:

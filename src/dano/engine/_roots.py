@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from dano.contact import by_autodiff, Found, KEPT, Softening
+from dano.contact import by_autodiff, KEPT, Softening
 from dano.engine._assembly import Table, tabulate
 from dano.engine._balance import (
     jacobian_in_bodies,
@@ -44,43 +44,42 @@ _ADDS = 1e-3
 _RESTARTS = 2
 
 
-def solve(problem: Problem, found: Found | None, start: Array, pairs: Pairs, options: SolverOptions):
+def solve(problem: Problem, start: Array, pairs: Pairs, options: SolverOptions):
     """Velocities at the end of a step, and the report.
 
     Args:
         problem: The step.
-        found: Where its points were found.
         start: Velocities to start from: of free bodies, shape (m, 6), spins in B; with joints generalised
             ones, shape (k,), spins in W.
         pairs: Static structure.
         options: When to stop.
     """
 
-    def find_root(problem, found, start, derivatives: bool):
+    def find_root(problem, start, derivatives: bool):
         """Velocities, Jacobian and report, and the share of the restitution that adds no energy."""
 
-        def find(problem, found, start):
+        def find(problem, start):
             if is_native(problem):
-                return native_root(problem, found, start, pairs, options, derivatives=derivatives)
+                return native_root(problem, start, pairs, options, derivatives=derivatives)
             find = _root_of_bodies if problem.tree is None else _root_of_trees
-            return find(problem, found, start, pairs, options)
+            return find(problem, start, pairs, options)
 
         if problem.points is None:
-            return *find(problem, found, start), jnp.ones((), start.dtype)
-        return one_at_a_time(lambda *given: _passive(find, *given), problem, found, start)
+            return *find(problem, start), jnp.ones((), start.dtype)
+        return one_at_a_time(lambda *given: _passive(find, *given), problem, start)
 
     @eqx.filter_custom_jvp
-    def root(problem, found, start):
-        velocities, _, report, _ = find_root(problem, found, start, derivatives=False)
+    def root(problem, start):
+        velocities, _, report, _ = find_root(problem, start, derivatives=False)
         return velocities, report
 
     @root.def_jvp
     def _(primals, tangents):
-        problem, found, start = primals
-        velocities, jacobian, report, share = find_root(problem, found, start, derivatives=True)
+        problem, start = primals
+        velocities, jacobian, report, share = find_root(problem, start, derivatives=True)
         # The inverse, not a solve: the tangent must be linear in `change` for reverse mode to transpose it.
         inverse = solve_small(jacobian, jnp.eye(jacobian.shape[0], dtype=jacobian.dtype))
-        velocities, inverse = (checkpoint_name(value, KEPT) for value in (velocities, inverse))
+        velocities, inverse, share = (checkpoint_name(x, KEPT) for x in (velocities, inverse, share))
         d_problem = tangents[0]
         d_report = jax.tree.map(lambda _: None, report)
         if not jax.tree.leaves(d_problem):
@@ -90,16 +89,17 @@ def solve(problem: Problem, found: Found | None, start: Array, pairs: Pairs, opt
         )
         return (velocities, report), (-matvec(inverse, change).reshape(velocities.shape), d_report)
 
-    return root(problem, found, start)
+    return root(problem, start)
 
 
-def _passive(find, problem: Problem, found: Found, start: Array):
+def _passive(find, problem: Problem, start: Array):
     """What `find` returns, and the largest share of the restitution with which contact adds no energy."""
     shares = jnp.asarray(SHARES, start.dtype)
-    hits = jnp.any(found.stiffness > 0)
+    assert problem.points is not None
+    hits = jnp.any(problem.points.stiffness > 0)
 
     def attempt(k, restarts, begin):
-        solution = find(problem.rebounding(shares[k]), found, begin)
+        solution = find(problem.rebounding(shares[k]), begin)
         velocities, _, report = solution
         # A solve that cycles returns its best velocities: from there, with fitting duals, most converge.
         failed = ~report.converged & (restarts < _RESTARTS)
@@ -149,9 +149,7 @@ def _adds_energy(velocities: Array, problem: Problem, start: Array) -> Array:
     return jnp.sum(work) > _ADDS * jnp.sum(jnp.abs(work))
 
 
-def _root_of_bodies(
-    problem: Problem, found, start: Float[Array, "m 6"], pairs: Pairs, options: SolverOptions
-):
+def _root_of_bodies(problem: Problem, start: Float[Array, "m 6"], pairs: Pairs, options: SolverOptions):
     """Velocities of free bodies, the Jacobian of R with spins in B, and the report."""
     m, scale = start.shape[0], to_velocity(problem)
     size = jnp.max(jnp.abs(scale * problem.impulse.ravel()))
@@ -176,12 +174,12 @@ def _root_of_bodies(
 
     world = to_world(problem, start)
     velocities, jacobian, report = primal_dual(
-        balance, _table(problem, found, pairs), world.ravel(), scale, size, options
+        balance, _table(problem, pairs), world.ravel(), scale, size, options
     )
     return to_body(problem, velocities.reshape(m, 6)), jacobian_in_bodies(problem, jacobian), report
 
 
-def _root_of_trees(problem: Problem, found, start: Float[Array, " k"], pairs: Pairs, options: SolverOptions):
+def _root_of_trees(problem: Problem, start: Float[Array, " k"], pairs: Pairs, options: SolverOptions):
     """Generalised velocities, the Jacobian of their residual, and the report."""
     tree = problem.tree
     assert tree is not None
@@ -225,7 +223,7 @@ def _root_of_trees(problem: Problem, found, start: Float[Array, " k"], pairs: Pa
 
         solution, jacobian, report = primal_dual(
             without_points,
-            _table(problem, found, pairs),
+            _table(problem, pairs),
             start,
             scale,
             size,
@@ -275,8 +273,8 @@ def _world_inertia(problem: Problem) -> Float[Array, "m 3 3"]:
     return jax.vmap(lambda r, j: matmul(matmul(r, j), r.T))(problem.rotation, problem.inertia)
 
 
-def _table(problem: Problem, found: Found | None, pairs: Pairs) -> Table:
-    assert problem.points is not None and found is not None
+def _table(problem: Problem, pairs: Pairs) -> Table:
+    assert problem.points is not None and problem.count is not None
     return tabulate(
-        problem.points, problem.chunk_material, found.count, jnp.asarray(pairs.rows), problem.timestep
+        problem.points, problem.chunk_material, problem.count, jnp.asarray(pairs.rows), problem.timestep
     )

@@ -47,7 +47,7 @@ def step(
     problem, found = build_problem(scene, prepared, state, control, pairs)
     h, tree = scene.timestep, problem.tree
     start = _unknowns(scene, state, pairs)
-    solution, report = solve(problem, found, start, pairs, options)
+    solution, report = solve(problem, start, pairs, options)
     if tree is None:
         following = _advance(state, solution, h, pairs)
     else:
