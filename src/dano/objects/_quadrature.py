@@ -23,10 +23,10 @@ SKIN = 0.005
 _THIN = 0.1
 # Mean of s² over the skin, in units of skin²: see `draw_surface`.
 _CORNER = 1.13
-# Points along a side of a face over its half length, and their weights: exact for polynomials to third degree,
-# so for a pressure that is linear. Gauss points are exact to seventh, but the mean distance of a face's points
-# from its middle, which the moment of sliding friction goes with, is 0.9 to 3.7 % off with them; with these it
-# is 0.6 % off at most, for all ratios of the sides up to 10.
+# Points along a side of a face over its half length, and their weights: exact for polynomials to third
+# degree, so for a pressure that is linear. Gauss points are exact to seventh, but the mean distance of a
+# face's points from its middle, which the moment of sliding friction goes with, is 0.9 to 3.7 % off with
+# them. With these it is 0.6 % off at most, for all ratios of the sides up to 10.
 _INNER, _INNER_WEIGHT = 0.2767, 0.3
 _OUTER = np.sqrt((1 / 6 - _INNER_WEIGHT * _INNER**2) / (0.5 - _INNER_WEIGHT))
 _FACE = np.array([-_OUTER, -_INNER, _INNER, _OUTER])
