@@ -101,10 +101,10 @@ HEADLINES = (
     ),
     Headline(
         "a step of eight boxes that fall, default law",
-        Cell("{:.0f} µs", "speed-bodies-cpu", (("8 boxes dropped, 100 steps of 5 ms, per step", "8 boxes"),)),
+        Cell("{:.0f} µs", "speed-cpu", (("8 boxes dropped, 100 steps of 5 ms, per step", "8 boxes"),)),
         Cell(
             "MuJoCo: {:.0f} µs",
-            "speed-bodies-cpu",
+            "speed-cpu",
             (("8 boxes dropped, 100 steps of 5 ms, per step", "MuJoCo: 8 boxes"),),
         ),
     ),

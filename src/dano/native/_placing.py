@@ -194,8 +194,9 @@ def place_arms(a, b, turning, side, share, settings, out, scratch):
         out[AXIS_AT + k] = out[ARMS + 3 * k + 2]
     _apply_transposed(out, ARMS, out[FACING], out[FACING + 1], out[FACING + 2], scratch, 30)
     _align(a, turning, settings, scratch[30], scratch[31], scratch[32], out, ARMS, -1, scratch)
+    slower = max(1.0, norm(a, SPIN) * h)
     for k in range(3):
-        out[LOWEST + k] = out[ARM_ORIGIN + k] - out[ARMS + 3 * k + 2]
+        out[LOWEST + k] = (out[ARM_ORIGIN + k] - out[ARMS + 3 * k + 2]) / slower
 
 
 @kernel
