@@ -42,8 +42,8 @@ class Placed(NamedTuple):
         between: From the second body's centre of mass to the first's at the start [m, W].
         arms: Sample coordinates → arms from the first body's centre of mass, shape (3, 4). Those of samples
             that keep facing the solid are those of the start of the step.
-        lowest: The arm of a ball's or an ellipsoid's densest samples [m]; shorter by the turn where that is above
-            1 rad a step, because the lowest point then rises and sinks by less than the arm says.
+        lowest: The arm of a ball's or an ellipsoid's densest samples [m]; shorter by the turn where that is
+            above 1 rad a step, because the lowest point then rises and sinks by less than the arm says.
         axis: The first body's z axis, then.
         stretch: Largest factor by which `points` enlarges.
     """
