@@ -185,10 +185,10 @@ def test_solves_steps_alike(heap, held, monkeypatch):
 
     @jax.jit
     def both(state):
-        problem, found = build_problem(scene, prepared, state, None, pairs)
+        problem, _ = build_problem(scene, prepared, state, None, pairs)
         start = jnp.concatenate([state.velocity, state.omega], axis=1)[: len(pairs.moving)]
-        native = native_root(problem, found, start, pairs, options, derivatives=True)
-        return native, _root_of_bodies(problem, found, start, pairs, options)
+        native = native_root(problem, start, pairs, options, derivatives=True)
+        return native, _root_of_bodies(problem, start, pairs, options)
 
     for state in states:
         (velocities, jacobian, report), (expected, slopes, slow) = both(state)

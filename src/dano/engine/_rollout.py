@@ -386,7 +386,7 @@ def _say(scene: Scene, following: State, report: Report) -> None:
         warnings.warn(
             f"{names} turns by more than 60° in a step, first in step {np.flatnonzero(fast.any(axis=1))[0]}: "
             "the spin is kept, precession is not resolved; "
-            f"a timestep of {2 * RESOLVED / spins.max():.2g} s would do",
+            f"use a timestep of {2 * RESOLVED / spins.max():.2g} s or less",
             RuntimeWarning,
             stacklevel=3,
         )
