@@ -193,7 +193,8 @@ def test_solves_steps_alike(heap, held, monkeypatch):
     for state in states:
         (velocities, jacobian, report), (expected, slopes, slow) = both(state)
         assert bool(report.converged) and bool(slow.converged)
-        np.testing.assert_allclose(velocities, expected, atol=1e-8)
+        # Both miss their equations by 1e-11 m/s; where a heap gives way, velocities differ by more.
+        np.testing.assert_allclose(velocities, expected, atol=1e-7)
         np.testing.assert_allclose(jacobian, slopes, rtol=1e-5, atol=1e-6 * float(jnp.abs(slopes).max()))
         if not held:
             assert abs(int(report.iterations) - int(slow.iterations)) <= 2

@@ -11,7 +11,6 @@ neither edge nor corner is pressed.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import roots_jacobi
 
 from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, Sphere
 from dano.objects._surface import draw_surface
@@ -141,6 +140,8 @@ def _side(radius: float, half_length: float, carried: float) -> tuple[list[np.nd
 
 
 def _cylinder(radius: float, half_length: float, size: float) -> tuple[np.ndarray, np.ndarray]:
+    from scipy.special import roots_jacobi
+
     skin = min(SKIN * size, _THIN * min(radius, half_length))
     out, shares = _around()
     points, vectors = _side(radius, half_length, half_length - skin)
