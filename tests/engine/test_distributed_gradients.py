@@ -179,4 +179,5 @@ def test_two_neural_objects_meet():
         [dano.Body("a", lump), dano.Body("b", lump)], [contact], gravity=(0.0, 0.0, 0.0)
     )
     coming = {"position": (0.3, 0.02, 0.01), "velocity": (-1, 0, 0), "orientation": (1, 0.2, 0.1, 0.3)}
-    check_rollout(Case(scene, scene.initial_state(a=coming)), 25)
+    # They touch in an impact only, which ends within its step whatever the stiffness.
+    check_rollout(Case(scene, scene.initial_state(a=coming)), 25, irrelevant=("stiffness",))
