@@ -269,6 +269,14 @@ WRONG_TYPES = {
     "dano.NeuralObject.from_field(sphere, n_samples=300.0)": "n_samples must be a whole number, got 300.0",
     "dano.NeuralObject.from_field(sphere, resolution=16.5)": "resolution must be a whole number, got 16.5",
     "dano.simulate(falling, falling.initial_state(), 2.5)": "n_steps must be a whole number, got 2.5",
+    "dano.simulate(falling, falling.initial_state(), 9, checkpoint_every=2.5)": (
+        "checkpoint_every must be a whole number, got 2.5"
+    ),
+    "dano.simulate(falling, None, 3)": "state must be a dano.State, got NoneType",
+    'dano.simulate("scene.toml", None, 3)': "scene must be a dano.Scene, got str",
+    "dano.step(falling, np.zeros(3))": "state must be a dano.State, got ndarray",
+    "dano.linearize(ball, falling.initial_state())": "scene must be a dano.Scene, got Body",
+    "dano.contact_history(falling, [1])": "state must be a dano.State, got list",
 }
 """What users write who have not read the signature, and what they are told."""
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from dano.contact import Patch
 from dano.engine._compiling import compiled
-from dano.engine._rollout import AbstractEngine, VariationalEngine
+from dano.engine._rollout import AbstractEngine, check_state, VariationalEngine
 from dano.scene import Scene, State
 
 
@@ -76,7 +76,7 @@ def contact_patches(
     Raises:
         ValueError: If the states do not fit the scene.
     """
-    scene.check_state(states)
+    check_state(scene, states)
     if not scene.pairs:
         return ()
     found = _jitted_patches(engine or VariationalEngine(), scene, states)
@@ -84,7 +84,7 @@ def contact_patches(
 
 
 def _checked_steps(engine: AbstractEngine | None, scene: Scene, states: State):
-    scene.check_state(states)
+    check_state(scene, states)
     if not scene.pairs:
         raise ValueError("scene must have at least one contact, got none")
     return _jitted_steps(engine or VariationalEngine(), scene, states)

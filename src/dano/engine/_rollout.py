@@ -117,6 +117,17 @@ class VariationalEngine(AbstractEngine):
         return _variational.wrenches(scene, prepared, before, after, about)
 
 
+def check_state(scene: Scene, state: State) -> None:
+    """`Scene.check_state`, after the scene itself.
+
+    Raises:
+        ValueError: If the scene is none, or the state does not fit it.
+    """
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene must be a dano.Scene, got {type(scene).__name__}")
+    scene.check_state(state)
+
+
 def step(
     scene: Scene, state: State, control: Control | None = None, *, engine: AbstractEngine | None = None
 ) -> State:
@@ -135,7 +146,7 @@ def step(
     Raises:
         ValueError: If the state or control does not fit the scene.
     """
-    scene.check_state(state)
+    check_state(scene, state)
     _check_control(scene, control, ())
     following, report = _with_room(engine, scene, lambda engine: _jitted_step(engine, scene, state, control))
     _say(scene, following, report)
@@ -175,16 +186,16 @@ def simulate(
         ValueError: If the state or controls do not fit the scene, or `n_steps` is missing, < 1 or contradicts
             them.
     """
-    scene.check_state(state)
+    check_state(scene, state)
     if controls is not None and not callable(controls):
         rows = int(controls.force.shape[0]) if controls.force.ndim == 3 else -1
         if n_steps is None:
             n_steps = rows
         _check_control(scene, controls, (n_steps,))
     n_steps = checked_count("n_steps", n_steps)
-    if checkpoint_every is not None and checkpoint_every < 1:
-        raise ValueError(f"checkpoint_every must be ≥ 1, got {checkpoint_every}")
-    if checkpoint_every is None and n_steps > CHECKPOINT_FROM:
+    if checkpoint_every is not None:
+        checkpoint_every = checked_count("checkpoint_every", checkpoint_every)
+    elif n_steps > CHECKPOINT_FROM:
         checkpoint_every = math.isqrt(n_steps)
     states, report = _with_room(
         engine,
@@ -213,7 +224,7 @@ def linearize(
     Raises:
         ValueError: If the state or control does not fit the scene.
     """
-    scene.check_state(state)
+    check_state(scene, state)
     _check_control(scene, control, ())
     return _jitted_linearize(engine or VariationalEngine(), scene, state, control)
 

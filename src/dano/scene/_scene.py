@@ -369,9 +369,11 @@ class Scene(eqx.Module):
         """Check a concrete state against the scene; traced values pass.
 
         Raises:
-            ValueError: If a shape or dtype is wrong, a number is not finite, or a quaternion is not of unit
-                length.
+            ValueError: If it is no state, a shape or dtype is wrong, a number is not finite, or a quaternion
+                is not of unit length.
         """
+        if not isinstance(state, State):
+            raise ValueError(f"state must be a dano.State, got {type(state).__name__}")
         check_precision(state, self.timestep.dtype)
         for key, size in STATE_SIZES.items():
             value = getattr(state, key)
