@@ -193,8 +193,9 @@ def test_solves_steps_alike(heap, held, monkeypatch):
     for state in states:
         (velocities, jacobian, report), (expected, slopes, slow) = both(state)
         assert bool(report.converged) and bool(slow.converged)
-        # Both miss their equations by 1e-11 m/s; where a heap gives way, velocities differ by more.
-        np.testing.assert_allclose(velocities, expected, atol=1e-7)
+        # Where an impact is so stiff that rounding of its terms leaves a residual, velocities differ by more.
+        rounded = max(float(report.residual), float(slow.residual)) > 1e-8
+        np.testing.assert_allclose(velocities, expected, atol=1e-7 if rounded else 1e-8)
         np.testing.assert_allclose(jacobian, slopes, rtol=1e-5, atol=1e-6 * float(jnp.abs(slopes).max()))
         if not held:
             assert abs(int(report.iterations) - int(slow.iterations)) <= 2

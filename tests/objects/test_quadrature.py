@@ -9,7 +9,7 @@ from dano.objects import surface_quadrature
 
 
 def _lower_face(shape):
-    """Areas [m²] and points [m] that press down on a floor, and the height of the face."""
+    """Areas [m²] and points [m] of a face that lies on a floor."""
     samples = surface_quadrature(shape)
     down = samples.vectors[:, 2] < 0
     flat = down & np.isclose(samples.points[:, 2], samples.points[:, 2].min())

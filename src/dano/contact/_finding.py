@@ -309,20 +309,17 @@ def _impact_stiffness(links: Links, side: Side, placed, sums, impacts: Impacts, 
 
 def points_of(geometry: Geometry, links: Links, where: Found, h: Float[Array, ""]) -> Points:
     """The points of `find` again, as a function that can be differentiated."""
-
-    def again(chunks):
-        return jnp.moveaxis(_rows_of(geometry, links, h, *chunks), 1, 0)
-
     chunks = where.group, where.side, where.share, where.sample, where.filled
-    rows = jnp.moveaxis(over_chunks(again, chunks, where.count), 0, 1)
-    return _assembled(geometry, links, where, rows)
+    rows = over_chunks(lambda few: _rows_of(geometry, links, h, *few), chunks, where.count)
+    return _assembled(geometry, links, where, jnp.moveaxis(rows, 1, 0))
 
 
 def _rows_of(
     geometry: Geometry, links: Links, h, group, side, share, sample, filled
-) -> Float[Array, "15 c p"]:
-    """See `_rows`: of some chunks, see `Found`."""
-    rows = jnp.zeros((15, *sample.shape), links.position.dtype)
+) -> Float[Array, "c 15 p"]:
+    """What `_rows` gives for each of some chunks, see `Found`."""
+    chunks, points = sample.shape
+    rows = jnp.zeros((chunks, 15, points), links.position.dtype)
     for number, kind in enumerate(geometry.kinds):
         mine = group == number
         index = jnp.where(mine, side, 0)
@@ -336,8 +333,8 @@ def _rows_of(
         # Chunks of other kinds read a sample of this kind's, so that they divide by nothing that is zero.
         own = geometry.start[kind.sides.first[0]] * BLOCK
         read = jnp.where(mine[:, None] & filled, sample, own)
-        of_kind = jax.vmap(chunk, out_axes=1)(index, share, read)
-        rows = jnp.where((mine[:, None] & filled)[None], of_kind, rows)
+        of_kind = jax.vmap(chunk)(index, share, read)
+        rows = jnp.where((mine[:, None] & filled)[:, None], of_kind, rows)
     return rows
 
 

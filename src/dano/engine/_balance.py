@@ -7,7 +7,6 @@ from jaxtyping import Array, Float
 
 from dano.contact import (
     cross,
-    Material,
     over_chunks,
     point_motion,
     Points,
@@ -159,15 +158,15 @@ def chunk_wrenches(problem: Problem, world: Float[Array, "m 6"], pairs: Pairs):
 
     Velocities of the bodies that move are in W.
     """
-    points, material, count = problem.points, problem.material, problem.count
-    assert points is not None and material is not None and count is not None
+    points, count = problem.points, problem.count
+    assert points is not None and count is not None
     bodies = jnp.concatenate([world, jnp.zeros((1, 6), world.dtype)])[np.array(pairs.rows)]
 
     def press(chunks):
         rows, stiffness, between, *names = chunks
         few = Points(jnp.moveaxis(rows, 0, 1), stiffness, between.T, *names)
         motion = point_motion(bodies[:, :3], bodies[:, 3:], few)
-        pressure, friction = traction(Material(*jnp.take(material, few.contact, axis=1)), few, motion)
+        pressure, friction = traction(problem.material_of(few.contact), few, motion)
         wrench = sum_wrenches(few.arm, few.normal, few.moment, few.area * pressure, few.area[None] * friction)
         force = wrench[:, :3].T
         moment = wrench[:, 3:].T + cross(few.between, force)

@@ -86,11 +86,10 @@ class Problem(eqx.Module):
     material: Float[Array, "13 k"] | None
     tree: Tree | None
 
-    @property
-    def chunk_material(self) -> Material:
-        """Of the chunks of points."""
-        assert self.points is not None and self.material is not None
-        return Material(*jnp.take(self.material, self.points.contact, axis=1))
+    def material_of(self, contact: Int[Array, " c"]) -> Material:
+        """Of chunks of points, by their contacts."""
+        assert self.material is not None
+        return Material(*jnp.take(self.material, contact, axis=1))
 
     def rebounding(self, share: Float[Array, ""]) -> "Problem":
         """The same with a share of the restitution in impacts that end within the step."""

@@ -275,6 +275,5 @@ def _world_inertia(problem: Problem) -> Float[Array, "m 3 3"]:
 
 def _table(problem: Problem, pairs: Pairs) -> Table:
     assert problem.points is not None and problem.count is not None
-    return tabulate(
-        problem.points, problem.chunk_material, problem.count, jnp.asarray(pairs.rows), problem.timestep
-    )
+    material, rows = problem.material_of(problem.points.contact), jnp.asarray(pairs.rows)
+    return tabulate(problem.points, material, problem.count, rows, problem.timestep)

@@ -354,6 +354,7 @@ def _clear(block):
 
 @kernel
 def pattern(groups, m):
+    """Which bodies share a block of the Jacobian, shape (m, m): each with itself and what it touches."""
     coupled = np.empty((m, m), np.bool_)
     for i in range(m):
         for j in range(m):

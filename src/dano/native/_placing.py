@@ -40,6 +40,7 @@ def _matrix(q, at, out, to):
 
 @kernel
 def apply(a, at, x, y, z, out, to):
+    """A 3 × 3 matrix a[at:], row by row, times a vector, into out[to:]."""
     for k in range(3):
         row = at + 3 * k
         out[to + k] = a[row] * x + a[row + 1] * y + a[row + 2] * z
@@ -80,6 +81,7 @@ def _moved(body, share, h, out):
 
 @kernel
 def norm(a, at):
+    """Length of the vector a[at:]."""
     return math.sqrt(a[at] * a[at] + a[at + 1] * a[at + 1] + a[at + 2] * a[at + 2])
 
 

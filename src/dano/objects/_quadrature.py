@@ -81,16 +81,15 @@ def _box(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
         # What edges and corners carry of a flat face is taken off its inside.
-        inside = 1 - (skin * (half[u] + half[v]) + corner_area) / (half[u] * half[v])
+        face = half[u] * half[v]
+        inside = 1 - (skin * (half[u] + half[v]) + corner_area) / face
         drawn_in = np.ones(3)
         for i, other in ((u, v), (v, u)):
             # Second moments over half², over the area of the face.
-            of_edges = (skin * (half[other] + half[i] * np.mean(along**2)) + corner_area) / (
-                half[u] * half[v]
-            )
-            drawn_in[i] = np.sqrt((1 / 3 - of_edges) * 3 / inside)
+            of_edges = (skin * (half[other] + half[i] * np.mean(along**2)) + corner_area) / face
+            drawn_in[i] = np.sqrt((1 - 3 * of_edges) / inside)
         for sign in signs:
-            area = inside * sign * 4 * half[u] * half[v]
+            area = inside * sign * 4 * face
             for a, wa in zip(_FACE, _WEIGHTS, strict=True):
                 for b, wb in zip(_FACE, _WEIGHTS, strict=True):
                     points.append(_at(axis, u, v, sign, a, b) * drawn_in * half)
@@ -154,7 +153,7 @@ def _cylinder(radius: float, half_length: float, size: float) -> tuple[np.ndarra
         vectors.append((radius * shares * skin)[:, None] * (out + sign * _UP))
         # What the rim carries is taken off the inside: area, and second moment over radius².
         inside = 1 - 2 * skin / radius
-        drawn_in = np.sqrt((1 / 2 - 2 * skin / radius) * 2 / inside)
+        drawn_in = np.sqrt((1 - 4 * skin / radius) / inside)
         for ring, weight in zip(rings, weights, strict=True):
             points.append(radius * drawn_in * ring * out + sign * half_length * _UP)
             vectors.append((inside * shares * radius**2 / 2 * weight)[:, None] * sign * _UP)
