@@ -1,6 +1,7 @@
 """Every example runs, and its numbers obey physics."""
 
 import runpy
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -98,3 +99,15 @@ def test_mujoco_push():
     assert answer["pushed"] > 0.03
     assert answer["hand_contacts"] > 0
     assert answer["joint_error"] < 0.1
+
+
+def test_mujoco_panda():
+    pytest.importorskip("mujoco")
+    if find_spec("frax") is None:
+        pytest.skip("the package frax, which ships the Panda, is not installed: pip install frax")
+    answer = run("10_mujoco_panda")
+    # The hand goes 20 cm, the first 7 of them before it meets the bunny, and pushes it straight ahead.
+    assert answer["pushed"] == pytest.approx(0.13, abs=0.03)
+    assert abs(answer["aside"]) < 0.02
+    assert answer["hand_contacts"] > 3
+    assert answer["joint_error"] < 0.02

@@ -267,6 +267,21 @@ def test_bad_input_is_named():
         Bridge(model).attach("toy", thing("bunny"))
 
 
+def test_robot_files_keep_what_stands_for_an_object():
+    """MuJoCo discards what is only seen when it compiles them."""
+    link = "<inertial><mass value='1'/><inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/></inertial>"
+    spec = mujoco.MjSpec.from_string(f"<robot name='r'><link name='base'>{link}</link></robot>")
+    spec.worldbody.add_geom(**SUPPORTS["plane"](spec))
+    spec.worldbody.add_body(name="toy", pos=[0, 0, 0.05]).add_freejoint()
+    bridge = Bridge(spec)
+    bridge.attach("toy", thing("ball"), look=False)
+    model = bridge.compile()
+    data = mujoco.MjData(model)
+    with bridge:
+        mujoco.mj_step(model, data, 100)
+    assert data.ncon > 0
+
+
 def test_what_cannot_work_is_said_in_the_first_step():
     bridge, model, data = compiled("plane", "ball")
     with bridge:

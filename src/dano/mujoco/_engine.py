@@ -4,6 +4,7 @@ MuJoCo has no derivatives of its own: those of a step are central differences of
 controls, masses, inertias, frictions, gravity and the timestep.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +15,8 @@ from jaxtyping import Array, Float
 
 from dano.contact import Patch
 from dano.engine import AbstractEngine, Report, VariationalEngine
+from dano.mujoco._model import library
+from dano.mujoco._spec import TOUCHES
 from dano.mujoco._twin import Constants, Motion, Twin
 from dano.scene import Control, Scene, State
 
@@ -27,62 +30,115 @@ class _Place(NamedTuple):
 
 
 class MuJoCoEngine(AbstractEngine):
-    """Steps a scene in MuJoCo: same bodies and pairs, MuJoCo's contact.
+    """Steps a scene in MuJoCo: same bodies, joints, motors and pairs, MuJoCo's contact.
 
     At its defaults but for elliptic friction cones with impratio 10, which hold bodies on slopes, and the
     integrator "implicit", with which bodies that tumble gain no energy.
 
-    Neural objects touch by their samples, as through `Bridge`. Of a contact's parameters the sliding friction
-    counts; MuJoCo has no coefficient of restitution, and its stiffness is its own. Shapes, samples, centres
-    of mass are those of the scene that the engine was made for, other numbers those of the scene that is
-    stepped.
+    Neural objects touch by their samples, as through `Bridge`, or as meshes of their solids. Of a contact's
+    parameters the sliding friction and the restitution count; the stiffness is MuJoCo's own. Springs of
+    contacts are damped so that they rebound as the restitution says, but all rebound by 0.13 or more: that is
+    what MuJoCo's default does.
+
+    Joints, and what acts on them, are MuJoCo's: limits give way a little, friction holds by MuJoCo's solver,
+    springs and position motors pull by where joints are at the start of a step. So a motor whose stiffness
+    exceeds four times what it moves per h² is unstable.
+
+    Shapes, samples, centres of mass and the places of joints are those of the scene that the engine was made
+    for, other numbers those of the scene that is stepped.
 
     A step calls MuJoCo on the host, one rollout after the other also under `jax.vmap`. Derivatives are
-    central differences of MuJoCo's step, forward and reverse; with respect to shapes, samples and centres of
-    mass they are zero. MuJoCo's contact forces jump where a point begins to touch, and differences across a
-    jump are large: what they say of a rollout with impacts is of little use.
+    central differences of MuJoCo's step, forward and reverse; with respect to shapes, samples, centres of
+    mass and places of joints they are zero. MuJoCo's contact forces jump where a point begins to touch, and
+    differences across a jump are large: what they say of a rollout with impacts is of little use.
 
     Attributes:
         names: Bodies of the scene (static).
+        objects: As what neural objects touch: "samples", "hull" or "distance" (static).
         difference: Step of the differences in SI units, of masses, inertias, timesteps a share (static).
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
+    objects: str = eqx.field(static=True)
     difference: float = eqx.field(static=True)
     _twin: Twin = eqx.field(static=True)
 
-    def __init__(self, scene: Scene, *, difference: float = 1e-6):
+    def __init__(self, scene: Scene, *, objects: str = "samples", difference: float = 1e-6):
         """Build the model of a scene.
 
         Args:
             scene: The scene.
+            objects: As what neural objects touch: by their "samples"; or a mesh of their solid, which MuJoCo
+                takes as its convex "hull", or between two of them by its signed "distance" (from 4.0).
             difference: See the class.
 
         Raises:
             ImportError: If mujoco is missing.
-            ValueError: If the scene has joints, nothing that moves, or a shape that is no geom of MuJoCo's,
-                or the difference is not positive.
+            ValueError: If nothing in the scene moves, a shape is no geom of MuJoCo's, an object has no solid
+                for a mesh, or an option is out of range.
         """
+        if objects not in TOUCHES:
+            raise ValueError(f"objects must be one of {', '.join(TOUCHES)}, got {objects!r}")
         if not difference > 0:
             raise ValueError(f"difference must be > 0, got {difference}")
         if not any(not body.fixed for body in scene.bodies):
             raise ValueError("scene must have a body that moves, got only fixed ones")
         self.names, self.difference = scene.names, float(difference)
-        self._twin = Twin(scene)
+        self.objects = objects
+        self._twin = Twin(scene, objects)
 
     @property
     def model(self) -> Any:
         """The `mujoco.MjModel`."""
         return self._twin.model
 
+    @property
+    def bridge(self) -> Any:
+        """What MuJoCo's own loop runs in: `with engine.bridge: mujoco.mj_step(engine.model, data)`."""
+        return self._twin.bridge
+
+    def data(self, scene: Scene, state: State, control: Control | None = None) -> Any:
+        """A new `mujoco.MjData` at a state, for MuJoCo's own loop, viewer or renderer.
+
+        The model gets the numbers of the scene, too.
+
+        Raises:
+            ValueError: If the state does not fit the scene, or the scene the engine.
+        """
+        self._check(scene)
+        scene.check_state(state)
+        data = library().MjData(self.model)
+        self._twin.load(
+            data, Motion(*_doubles(_motion(state))), Constants(*_doubles(_constants(scene, control)))
+        )
+        return data
+
+    def state(self, scene: Scene, data: Any) -> State:
+        """The state that an `mujoco.MjData` of this engine's model is in.
+
+        Raises:
+            ValueError: If the scene is not the engine's.
+        """
+        self._check(scene)
+        empty = scene.initial_state()
+        found = self._twin.read(data, Motion(*_doubles(_motion(empty))))
+        dtype = scene.timestep.dtype
+        return _filled(scene, State(*(jnp.asarray(x, dtype) for x in found)))
+
+    def _check(self, scene: Scene) -> None:
+        if scene.names != self.names:
+            raise ValueError(f"scene must have the bodies {list(self.names)}, got {list(scene.names)}")
+        joints = tuple((joint.parent, joint.child, joint.kind) for joint in scene.joints)
+        if joints != self._twin.joints:
+            raise ValueError(f"scene must have the joints {list(self._twin.joints)}, got {list(joints)}")
+
     def prepare(self, scene: Scene) -> Any:
         """See `AbstractEngine.prepare`.
 
         Raises:
-            ValueError: If the scene has other bodies than the one that the engine was made for.
+            ValueError: If the scene has other bodies or joints than the one that the engine was made for.
         """
-        if scene.names != self.names:
-            raise ValueError(f"scene must have the bodies {list(self.names)}, got {list(scene.names)}")
+        self._check(scene)
         return VariationalEngine().prepare(scene)
 
     def step(
@@ -95,11 +151,12 @@ class MuJoCoEngine(AbstractEngine):
         place = _Place(shapes, _used(scene, shapes), self.difference)
         flat = jnp.concatenate([x.astype(dtype).ravel() for x in numbers])
         out = _advance(self._twin, place, flat)
-        n = len(scene.bodies)
-        parts = jnp.split(out, [3 * n, 7 * n, 10 * n, 13 * n])
-        after = State(*(part.reshape(n, -1) for part in parts[:4]))
+        ends = np.cumsum([int(np.prod(shape)) for shape in shapes[: len(Motion._fields)]])
+        *parts, passes = jnp.split(out, ends)
+        rows = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=False)]
+        after = _filled(scene, State(*rows))
         bad = ~jnp.all(jnp.isfinite(out))
-        passes = jax.lax.stop_gradient(parts[4][0]).astype(int)
+        passes = jax.lax.stop_gradient(passes[0]).astype(int)
         return after, Report(jnp.where(bad, jnp.inf, 0).astype(dtype), passes, ~bad)
 
     def touch(self, scene: Scene, prepared: Any, state: State) -> Patch:
@@ -126,37 +183,81 @@ class MuJoCoEngine(AbstractEngine):
         return jax.pure_callback(host, result, *arguments, vmap_method="sequential")
 
 
+def _filled(scene: Scene, state: State) -> State:
+    """With rows of bodies on joints as the joints say; without q and v if there are none."""
+    return scene.filled(state) if scene.joints else dataclasses.replace(state, q=None, v=None)
+
+
 def _motion(state: State) -> tuple[Array, ...]:
     """The numbers of `Motion`."""
-    return state.position, state.orientation, state.velocity, state.omega
+    none = jnp.zeros(0, state.position.dtype)
+    joints = (none, none) if state.q is None or state.v is None else (state.q, state.v)
+    return state.position, state.orientation, state.velocity, state.omega, *joints
 
 
 def _constants(scene: Scene, control: Control | None) -> tuple[Array, ...]:
     """The numbers of `Constants`."""
-    zero = jnp.zeros((len(scene.bodies), 3), scene.timestep.dtype)
-    frictions = [contact.params.sliding_friction[None] for contact in scene.contacts]
-    if scene.others is not None:
-        frictions.append(scene.others.pair_params.sliding_friction)
-    friction = jnp.concatenate(frictions) if frictions else jnp.zeros(0, zero.dtype)
+    dtype, laws, k = scene.timestep.dtype, scene.chains.laws, scene.layout.n_joints
+    still, idle = jnp.zeros((len(scene.bodies), 3), dtype), jnp.zeros(k, dtype)
+
+    def given(value: Array | None, default: Array) -> Array:
+        return default if value is None else value
+
+    pushed = (still, still, None, None)
+    if control is not None:
+        pushed = control.force, control.torque, control.effort, control.command
     return (
-        zero if control is None else control.force,
-        zero if control is None else control.torque,
+        pushed[0],
+        pushed[1],
+        given(pushed[2], idle),
+        given(pushed[3], idle),
         jnp.stack([body.mass * body.mass_scale for body in scene.bodies]),
         jnp.stack([body.inertia * body.mass_scale for body in scene.bodies]),
-        friction,
+        _of_pairs(scene, "sliding_friction"),
+        _of_pairs(scene, "restitution"),
         scene.gravity,
         scene.timestep,
+        laws.damping,
+        given(laws.armature, idle),
+        given(laws.stiffness, idle),
+        laws.rest,
+        given(laws.friction, idle),
+        given(laws.limits, jnp.broadcast_to(jnp.asarray([-jnp.inf, jnp.inf], dtype), (k, 2))),
+        given(laws.motor, jnp.zeros((k, 5), dtype)),
     )
 
 
+def _of_pairs(scene: Scene, name: str) -> Float[Array, " p"]:
+    """A parameter of all pairs; zero where a law does not read it."""
+    dtype = scene.timestep.dtype
+    own = [getattr(contact.params, name) for contact in scene.contacts]
+    values = [jnp.zeros(1, dtype) if value is None else value[None] for value in own]
+    if scene.others is not None:
+        values.append(getattr(scene.others.pair_params, name))
+    return jnp.concatenate(values) if values else jnp.zeros(0, dtype)
+
+
 def _used(scene: Scene, shapes: tuple[tuple[int, ...], ...]) -> tuple[int, ...]:
-    """Numbers on which a step depends: of fixed bodies only where they are."""
+    """Numbers on which a step depends: of fixed bodies only where they are, of those on joints nothing."""
+    layout, laws = scene.layout, scene.chains.laws
     fixed = np.array([body.fixed for body in scene.bodies])
+    hangs = np.isin(np.arange(len(fixed)), layout.children)
+    owners = [scene.joints[j] for j in layout.with_coordinates]
+    no_motor = np.array([joint.motor is None for joint in owners], bool)
+    unused = {
+        **dict.fromkeys(("position", "orientation"), hangs),
+        **dict.fromkeys(("velocity", "omega"), fixed | hangs),
+        **dict.fromkeys(("force", "torque", "mass", "inertia"), fixed),
+        **dict.fromkeys(("command", "motor"), no_motor),
+        "limits": np.array([joint.limits is None for joint in owners], bool),
+        "armature": laws.armature is None,
+        **dict.fromkeys(("stiffness", "rest"), laws.stiffness is None),
+        "stiction": laws.friction is None,
+    }
     used = []
     for name, shape in zip((*Motion._fields, *Constants._fields), shapes, strict=True):
         mask = np.ones(shape, bool)
-        if name in ("velocity", "omega", "force", "torque", "mass", "inertia"):
-            mask[fixed] = False
+        mask[unused.get(name, False)] = False
         used.append(mask.ravel())
     return tuple(np.flatnonzero(np.concatenate(used)).tolist())
 
@@ -185,7 +286,7 @@ def _(primals, tangents):
 
 
 def _size_out(place: _Place) -> int:
-    return 13 * place.shapes[0][0] + 1
+    return sum(int(np.prod(shape)) for shape in place.shapes[: len(Motion._fields)]) + 1
 
 
 def _stepped(twin: Twin, place: _Place, flat: Any) -> Float[np.ndarray, " m"]:

@@ -48,6 +48,8 @@ def carry(mujoco: Any, spec: Any, name: str, thing: Thing, look: NeuralObject | 
     body.inertia = [0, 0, 0]
     body.fullinertia = thing.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     body.explicitinertial = True
+    # Robot files ask for it; the geom that stands for the object would go.
+    spec.compiler.discardvisual = False
     spec.add_text(name=f"{_MARK}{name}", data="neural object")
     seen = {"contype": 0, "conaffinity": 0, "group": _LOOK_GROUP, "mass": 0.0, "rgba": _PLAIN}
     if mesh is not None:

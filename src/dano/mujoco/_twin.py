@@ -1,30 +1,36 @@
-"""A scene as a MuJoCo model, on the host: same bodies, same pairs, MuJoCo's contact."""
+"""A scene as a MuJoCo model, on the host: same bodies, joints, motors and pairs, MuJoCo's contact."""
 
+import contextlib
 import threading
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSpace, PosedShape, Sphere
-from dano.maths import quat_multiply, quat_to_matrix
+from dano.maths import quat_exp, quat_log
 from dano.mujoco._bridge import Bridge
 from dano.mujoco._model import library
+from dano.mujoco._rebound import spring_of
 from dano.mujoco._settings import LEAST_FRICTION, Settings
-from dano.scene import Body, Scene
+from dano.mujoco._spec import add_mesh, AS_SAMPLES, joint_names, motor_name, spec_of, weigh_later
+from dano.scene import Scene
 
-_SOLREF = np.array([0.02, 1.0])
-_SOLIMP = np.array([0.9, 0.95, 0.001, 0.5, 2.0])
-"""MuJoCo's defaults, as is `_SOLREF`."""
+_ENDLESS = 1e9
+"""What MuJoCo is told for infinite limits, in SI units: it wants finite ones."""
 
 
 class Motion(NamedTuple):
-    """States as MuJoCo takes them: arrays over the bodies of a scene, see `dano.State`."""
+    """States as MuJoCo takes them: arrays over the bodies and joints of a scene, see `dano.State`.
+
+    Rows of bodies that hang on joints do not count.
+    """
 
     position: Float[np.ndarray, "n 3"]
     orientation: Float[np.ndarray, "n 4"]
     velocity: Float[np.ndarray, "n 3"]
     omega: Float[np.ndarray, "n 3"]
+    q: Float[np.ndarray, " k"]
+    v: Float[np.ndarray, " k"]
 
 
 class Constants(NamedTuple):
@@ -33,76 +39,134 @@ class Constants(NamedTuple):
     Attributes:
         force: On the bodies, at their centres of mass [N, W], shape (n, 3).
         torque: [N m, W], shape (n, 3).
+        effort: On the joint coordinates [N m or N], shape (k,).
+        command: Of motors, shape (k,).
         mass: [kg], shape (n,).
         inertia: [kg m², B], shape (n, 3, 3).
         friction: Sliding friction of each pair of the scene, shape (p,).
+        restitution: Coefficient of restitution of each pair, shape (p,).
         gravity: [m/s²], shape (3,).
         timestep: [s], shape ().
+        damping: Of the joint coordinates, as all that follows; see `JointLaws`. Shape (k,).
+        armature: Shape (k,).
+        stiffness: Shape (k,).
+        rest: Shape (k,).
+        stiction: Friction of the joints, shape (k,).
+        limits: Shape (k, 2).
+        motor: Shape (k, 5).
     """
 
     force: Float[np.ndarray, "n 3"]
     torque: Float[np.ndarray, "n 3"]
+    effort: Float[np.ndarray, " k"]
+    command: Float[np.ndarray, " k"]
     mass: Float[np.ndarray, " n"]
     inertia: Float[np.ndarray, "n 3 3"]
     friction: Float[np.ndarray, " p"]
+    restitution: Float[np.ndarray, " p"]
     gravity: Float[np.ndarray, "3"]
     timestep: Float[np.ndarray, ""]
+    damping: Float[np.ndarray, " k"]
+    armature: Float[np.ndarray, " k"]
+    stiffness: Float[np.ndarray, " k"]
+    rest: Float[np.ndarray, " k"]
+    stiction: Float[np.ndarray, " k"]
+    limits: Float[np.ndarray, "k 2"]
+    motor: Float[np.ndarray, "k 5"]
+
+
+class _Single(NamedTuple):
+    """A joint of MuJoCo's with one coordinate.
+
+    Attributes:
+        joint: Its index.
+        place: Coordinate of ours.
+        ratio: 1, but of one that mimics another, see `dano.Joint`.
+        shift: 0, the same.
+        leads: Whether the coordinate is its own.
+    """
+
+    joint: int
+    place: int
+    ratio: float
+    shift: float
+    leads: bool
+
+
+class _Places(NamedTuple):
+    """Where things of a scene stand in MuJoCo's arrays. Joints are MuJoCo's, in the order of ours.
+
+    Attributes:
+        bodies: Index of each body.
+        fixed: Rows of the bodies that never move.
+        moving: Of the others.
+        free: Of those that hang on no joint.
+        free_q: Their seven places in qpos.
+        free_v: Their six places in qvel.
+        singles: Hinges and slides, those of planar joints among them.
+        balls: Joint and first coordinate of balls.
+        dofs: Place in qvel of each coordinate of ours.
+        motors: Actuator and coordinate of each motor.
+    """
+
+    bodies: Int[np.ndarray, " n"]
+    fixed: Int[np.ndarray, " f"]
+    moving: Int[np.ndarray, " m"]
+    free: Int[np.ndarray, " r"]
+    free_q: Int[np.ndarray, "r 7"]
+    free_v: Int[np.ndarray, "r 6"]
+    singles: list[_Single]
+    balls: list[tuple[int, int]]
+    dofs: Int[np.ndarray, " k"]
+    motors: list[tuple[int, int]]
 
 
 class Twin:
-    """The model of a scene. Its body frames are ours: axes of the field frame at the centre of mass."""
+    """The model of a scene, and data to step it with."""
 
-    def __init__(self, scene: Scene):
+    def __init__(self, scene: Scene, touch: str = AS_SAMPLES):
         """Build it.
+
+        Args:
+            scene: The scene.
+            touch: As what neural objects touch, see `TOUCHES`.
 
         Raises:
             ImportError: If mujoco is missing.
-            ValueError: If the scene has joints, or a shape that is no geom of MuJoCo's.
+            ValueError: If a shape is no geom of MuJoCo's, or an object has no solid to make a mesh of.
         """
-        if scene.joints:
-            raise ValueError(f"scene must have no joints for MuJoCoEngine, got {len(scene.joints)}")
         self._mujoco = mujoco = library()
         self._lock = threading.Lock()
-        self._spec = spec = mujoco.MjSpec()
-        # With the default integrator bodies that tumble gain energy without limit.
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT
-        spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0
-        spec.option.timestep = float(scene.timestep)
-        self._free = np.array([not body.fixed for body in scene.bodies])
-        for body in scene.bodies:
-            _add_body(mujoco, spec, body)
-        objects = {body.name for body in scene.bodies if body.object is not None}
-        self._bridge = Bridge(spec, choose=self._settings)
-        for body in scene.bodies:
-            if body.object is not None:
+        spec = spec_of(mujoco, scene)
+        objects = {body.name: body for body in scene.bodies if body.object is not None}
+        sampled = set(objects) if touch == AS_SAMPLES else set()
+        self._attached = Bridge(spec, choose=self._settings)
+        for name, body in objects.items():
+            assert body.object is not None
+            if name in sampled:
                 middle = np.asarray(body.com + body.com_offset, np.float64)
-                self._bridge.attach(body.name, body.object, position=-middle, look=False)
-        for body in spec.bodies[1:]:
-            # The true ones are written before each step. These are such that MuJoCo counts on no symmetry.
-            body.mass, body.ipos, body.explicitinertial = 1.0, np.zeros(3), True
-            body.fullinertia = [2, 3, 4, 0.1, 0.2, 0.3]
-        for a, b in scene.pairs:
-            if not objects & {a, b}:
-                spec.add_pair(name=f"{a}|{b}", geomname1=a, geomname2=b, condim=3)
-        self.model = model = self._bridge.compile() if objects else spec.compile()
+                self._attached.attach(name, body.object, position=-middle, look=False)
+            else:
+                add_mesh(mujoco, spec, body, body.object, touch)
+        weigh_later(spec)
+        explicit = [(k, a, b) for k, (a, b) in enumerate(scene.pairs) if not sampled & {a, b}]
+        for k, a, b in explicit:
+            spec.add_pair(name=f"pair {k}", geomname1=a, geomname2=b, condim=3)
+        self.model = model = self._attached.compile() if sampled else spec.compile()
         self._data = mujoco.MjData(model)
-        self._neural = bool(objects)
-        self._pair_of = self._pairs(scene)
-        self._explicit = [
-            (k, mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_PAIR, f"{a}|{b}"))
-            for k, (a, b) in enumerate(scene.pairs)
-            if not objects & {a, b}
-        ]
+        self.bridge = self._attached if sampled else contextlib.nullcontext()
+        self.joints = tuple((joint.parent, joint.child, joint.kind) for joint in scene.joints)
+        self.places = places = _places(mujoco, model, scene)
+        self._pair_of: dict[tuple[int, int], tuple[int, float]] = {}
+        for k, pair in enumerate(scene.pairs):
+            a, b = (int(places.bodies[scene.index(name)]) for name in pair)
+            self._pair_of[b, a], self._pair_of[a, b] = (k, 1.0), (k, -1.0)
+        kind = mujoco.mjtObj.mjOBJ_PAIR
+        self._explicit = [(k, mujoco.mj_name2id(model, kind, f"pair {k}")) for k, _, _ in explicit]
         self._friction = np.zeros(len(scene.pairs))
-        self._weights: tuple[Any, Any] | None = None
-
-    def _pairs(self, scene: Scene) -> dict[tuple[int, int], tuple[int, float]]:
-        """Pair of two bodies of the model, and 1 if the first one of the pair comes second, else −1."""
-        found = {}
-        for k, names in enumerate(scene.pairs):
-            a, b = (scene.index(name) + 1 for name in names)
-            found[b, a], found[a, b] = (k, 1.0), (k, -1.0)
-        return found
+        self._springs: list[tuple[np.ndarray, np.ndarray]] = []
+        self._sprung: tuple[Any, ...] | None = None
+        self._weights: tuple[Any, ...] | None = None
 
     def _settings(self, model: Any, a: int, b: int) -> Settings | None:
         found = self._pair_of.get((int(model.geom_bodyid[a]), int(model.geom_bodyid[b])))
@@ -110,61 +174,125 @@ class Twin:
             return None
         friction = max(float(self._friction[found[0]]), LEAST_FRICTION)
         five = np.array([friction, friction, LEAST_FRICTION, LEAST_FRICTION, LEAST_FRICTION])
-        return Settings(3, five, _SOLREF, _SOLIMP)
+        return Settings(3, five, *self._springs[found[0]])
 
-    def _load(self, motion: Motion, constants: Constants) -> None:
-        """Write a state and its constants into the model and its data."""
-        model, data = self.model, self._data
+    def load(self, data: Any, motion: Motion, constants: Constants) -> None:
+        """Write a state and its constants into the model and some data."""
+        model, places = self.model, self.places
         self._mujoco.mj_resetData(model, data)
         model.opt.timestep, model.opt.gravity[:] = float(constants.timestep), constants.gravity
-        self._friction = constants.friction
+        self._load_contacts(constants)
+        self._load_joints(constants)
+        self._weigh(constants)
+        rows = places.bodies[places.fixed]
+        model.body_pos[rows] = motion.position[places.fixed]
+        model.body_quat[rows] = motion.orientation[places.fixed]
+        free = places.free
+        data.qpos[places.free_q] = np.concatenate([motion.position[free], motion.orientation[free]], axis=1)
+        data.qvel[places.free_v] = np.concatenate([motion.velocity[free], motion.omega[free]], axis=1)
+        for joint, place, ratio, shift, _ in places.singles:
+            data.qpos[model.jnt_qposadr[joint]] = ratio * motion.q[place] + shift
+            data.qvel[model.jnt_dofadr[joint]] = ratio * motion.v[place]
+        for joint, place in places.balls:
+            first = model.jnt_qposadr[joint]
+            data.qpos[first : first + 4] = quat_exp(motion.q[place : place + 3])
+        data.qvel[places.dofs] = motion.v
+        data.xfrc_applied[places.bodies] = np.concatenate([constants.force, constants.torque], axis=1)
+        data.qfrc_applied[places.dofs] = constants.effort
+        for actuator, place in places.motors:
+            data.ctrl[actuator] = constants.command[place]
+
+    def _load_contacts(self, constants: Constants) -> None:
+        model, self._friction = self.model, constants.friction
+        sprung = (constants.restitution, constants.timestep)
+        changed = self._sprung is None or not all(map(np.array_equal, self._sprung, sprung))
+        if changed:
+            self._sprung = tuple(np.array(x) for x in sprung)
+            self._springs = [spring_of(float(e), float(constants.timestep)) for e in constants.restitution]
         for k, pair in self._explicit:
             model.pair_friction[pair, :2] = max(float(constants.friction[k]), LEAST_FRICTION)
-        free = self._free
-        rows = 1 + np.flatnonzero(~free)
-        model.body_pos[rows], model.body_quat[rows] = motion.position[~free], motion.orientation[~free]
-        self._weigh(constants.mass, constants.inertia)
-        data.qpos[:] = np.concatenate([motion.position[free], motion.orientation[free]], axis=1).ravel()
-        data.qvel[:] = np.concatenate([motion.velocity[free], motion.omega[free]], axis=1).ravel()
-        data.xfrc_applied[1:] = np.concatenate([constants.force, constants.torque], axis=1)
+            model.pair_solref[pair], model.pair_solimp[pair] = self._springs[k]
 
-    def _weigh(self, mass: Float[np.ndarray, " n"], inertia: Float[np.ndarray, "n 3 3"]) -> None:
-        if self._weights is not None and all(map(np.array_equal, self._weights, (mass, inertia))):
+    def _load_joints(self, constants: Constants) -> None:
+        model, places = self.model, self.places
+        if not places.dofs.size:
             return
-        self._weights = mass.copy(), inertia.copy()
-        model = self.model
-        for i in np.flatnonzero(self._free):
-            moments, axes = np.linalg.eigh(inertia[i])
+        model.dof_damping[places.dofs] = constants.damping
+        model.dof_frictionloss[places.dofs] = constants.stiction
+        for joint, place, *_, leads in places.singles:
+            if leads:
+                model.jnt_stiffness[joint] = constants.stiffness[place]
+                model.jnt_range[joint] = np.clip(constants.limits[place], -_ENDLESS, _ENDLESS)
+                model.qpos_spring[model.jnt_qposadr[joint]] = constants.rest[place]
+        for joint, place in places.balls:
+            first = model.jnt_qposadr[joint]
+            model.jnt_stiffness[joint] = constants.stiffness[place]
+            model.qpos_spring[first : first + 4] = quat_exp(constants.rest[place : place + 3])
+        for actuator, place in places.motors:
+            gear, stiffness, damping, least, most = constants.motor[place]
+            model.actuator_gear[actuator, 0] = gear
+            gain = stiffness or damping or 1.0
+            bias = damping if stiffness or damping else 0.0
+            model.actuator_gainprm[actuator, 0] = gain
+            model.actuator_biasprm[actuator, :3] = 0.0, -stiffness, -bias
+            model.actuator_forcerange[actuator] = np.clip([least, most], -_ENDLESS, _ENDLESS)
+        # As hard as the timestep allows.
+        model.eq_solref[:, 0] = 2 * float(constants.timestep)
+
+    def _weigh(self, constants: Constants) -> None:
+        weights = constants.mass, constants.inertia, constants.armature
+        if self._weights is not None and all(map(np.array_equal, self._weights, weights)):
+            return
+        self._weights = tuple(x.copy() for x in weights)
+        model, places = self.model, self.places
+        for i in places.moving:
+            moments, axes = np.linalg.eigh(constants.inertia[i])
             axes = axes * np.sign(np.linalg.det(axes))
-            self._mujoco.mju_mat2Quat(model.body_iquat[i + 1], axes.ravel())
-            model.body_mass[i + 1], model.body_inertia[i + 1] = mass[i], moments
+            row = places.bodies[i]
+            self._mujoco.mju_mat2Quat(model.body_iquat[row], axes.ravel())
+            model.body_mass[row], model.body_inertia[row] = constants.mass[i], moments
+        model.dof_armature[places.dofs] = constants.armature
         self._mujoco.mj_setConst(model, self._mujoco.MjData(model))
 
     def step(self, motion: Motion, constants: Constants) -> tuple[Motion, int]:
         """The state a timestep later, and passes of MuJoCo's solver."""
         with self._lock:
-            self._load(motion, constants)
-            self._run(self._mujoco.mj_step)
-            data, free = self._data, self._free
-            qpos, qvel = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
-            after = Motion(*(x.copy() for x in motion))
-            after.position[free], after.orientation[free] = qpos[:, :3], qpos[:, 3:]
-            after.velocity[free], after.omega[free] = qvel[:, :3], qvel[:, 3:]
-            return after, int(data.solver_niter[0])
+            self.load(self._data, motion, constants)
+            with self.bridge:
+                self._mujoco.mj_step(self.model, self._data)
+            return self.read(self._data, motion), int(self._data.solver_niter[0])
+
+    def read(self, data: Any, before: Motion) -> Motion:
+        """The state that data is in; rows of bodies that do not move freely are those of `before`."""
+        model, places, free = self.model, self.places, self.places.free
+        after = Motion(*(np.array(x) for x in before))
+        qpos, qvel = data.qpos[places.free_q], data.qvel[places.free_v]
+        after.position[free], after.orientation[free] = qpos[:, :3], qpos[:, 3:]
+        after.velocity[free], after.omega[free] = qvel[:, :3], qvel[:, 3:]
+        for joint, place, *_, leads in places.singles:
+            if leads:
+                after.q[place] = data.qpos[model.jnt_qposadr[joint]]
+        for joint, place in places.balls:
+            first = model.jnt_qposadr[joint]
+            after.q[place : place + 3] = quat_log(data.qpos[first : first + 4])
+        after.v[:] = data.qvel[places.dofs]
+        return after
 
     def wrenches(
         self, before: Motion, after: Motion, constants: Constants, about: Float[np.ndarray, "p 3"]
     ) -> Float[np.ndarray, "p 6"]:
         """Forces, and torques about points, on the first body of each pair in a step, by inverse dynamics."""
-        mujoco, free = self._mujoco, self._free
+        mujoco, data, discrete = self._mujoco, self._data, int(self._mujoco.mjtEnableBit.mjENBL_INVDISCRETE)
         with self._lock:
-            self._load(before, constants)
-            change = [after.velocity - before.velocity, after.omega - before.omega]
-            acceleration = np.concatenate([x[free] for x in change], axis=1) / float(constants.timestep)
-            self._data.qacc[:] = acceleration.ravel()
-            self.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_INVDISCRETE)
-            self._run(mujoco.mj_inverse)
-            self.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_INVDISCRETE)
+            # Where the step led, for its velocities.
+            self.load(data, after, constants)
+            faster = data.qvel.copy()
+            self.load(data, before, constants)
+            data.qacc[:] = (faster - data.qvel) / float(constants.timestep)
+            self.model.opt.enableflags |= discrete
+            with self.bridge:
+                mujoco.mj_inverse(self.model, data)
+            self.model.opt.enableflags &= ~discrete
             return self._summed(about)
 
     def _summed(self, about: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 6"]:
@@ -181,53 +309,31 @@ class Twin:
             total[k, 3:] += torque + np.cross(contact.pos - about[k], force)
         return total
 
-    def _run(self, function: Any) -> None:
-        if self._neural:
-            with self._bridge:
-                function(self.model, self._data)
-        else:
-            function(self.model, self._data)
 
-
-def _add_body(mujoco: Any, spec: Any, body: Body) -> None:
-    added = spec.worldbody.add_body(name=body.name)
-    if not body.fixed:
-        added.add_freejoint()
-    if body.shape is None:
-        return
-    kind, size, place, turn = _geom(mujoco, body.shape, body.name)
-    place = place - np.asarray(body.com + body.com_offset, np.float64)
-    added.add_geom(name=body.name, type=kind, size=size, pos=place, quat=turn, contype=0, conaffinity=0)
-
-
-def _geom(mujoco: Any, shape: AbstractShape, name: str):
-    """MuJoCo's type, size, place and turn of a shape.
-
-    Raises:
-        ValueError: If MuJoCo has no such geom.
-    """
-    types, still, upright = mujoco.mjtGeom, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
-    if isinstance(shape, PosedShape):
-        kind, size, place, turn = _geom(mujoco, shape.shape, name)
-        pose = shape.pose
-        rotation, shift = np.asarray(quat_to_matrix(pose.orientation)), np.asarray(pose.position)
-        return kind, size, rotation @ place + shift, np.asarray(quat_multiply(pose.orientation, turn))
-    if isinstance(shape, HalfSpace):
-        normal = np.asarray(shape.normal_direction, np.float64)
-        turn = np.zeros(4)
-        mujoco.mju_quatZ2Vec(turn, normal)
-        return types.mjGEOM_PLANE, [1, 1, 1], float(shape.offset) * normal, turn
-    if isinstance(shape, Sphere):
-        return types.mjGEOM_SPHERE, [float(shape.radius), 0, 0], still, upright
-    if isinstance(shape, Box) and float(shape.rounding) == 0:
-        return types.mjGEOM_BOX, np.asarray(shape.half_extents).tolist(), still, upright
-    if isinstance(shape, Capsule):
-        return types.mjGEOM_CAPSULE, [float(shape.radius), float(shape.half_length), 0], still, upright
-    if isinstance(shape, Cylinder):
-        return types.mjGEOM_CYLINDER, [float(shape.radius), float(shape.half_length), 0], still, upright
-    if isinstance(shape, Ellipsoid):
-        return types.mjGEOM_ELLIPSOID, np.asarray(shape.semi_axes).tolist(), still, upright
-    raise ValueError(
-        f"shape of body {name!r} must be a half-space, sphere, box without rounding, capsule, cylinder, "
-        f"ellipsoid, or one of these posed, for MuJoCoEngine, got {type(shape).__name__}"
-    )
+def _places(mujoco: Any, model: Any, scene: Scene) -> _Places:
+    layout, kinds = scene.layout, mujoco.mjtObj
+    fixed = np.array([body.fixed for body in scene.bodies])
+    bodies = np.array([mujoco.mj_name2id(model, kinds.mjOBJ_BODY, name) for name in scene.names])
+    free = np.array(layout.free, int)
+    first = np.array([model.body_jntadr[bodies[i]] for i in free], int)
+    free_q = model.jnt_qposadr[first][:, None] + np.arange(7)
+    free_v = model.jnt_dofadr[first][:, None] + np.arange(6)
+    singles, balls, motors = [], [], []
+    dofs = np.zeros(layout.n_joints, int)
+    for j, joint in enumerate(scene.joints):
+        own = [mujoco.mj_name2id(model, kinds.mjOBJ_JOINT, name) for name in joint_names(joint)]
+        place = layout.coordinates[j]
+        if joint.kind == "ball":
+            balls.append((own[0], place))
+            dofs[place : place + 3] = model.jnt_dofadr[own[0]] + np.arange(3)
+            continue
+        for part, index in enumerate(own):
+            tied = (float(joint.ratio), float(joint.shift)) if joint.mimics else (1.0, 0.0)
+            singles.append(_Single(index, place + part, *tied, not joint.mimics))
+            if not joint.mimics:
+                dofs[place + part] = model.jnt_dofadr[index]
+        if joint.motor is not None:
+            actuator = mujoco.mj_name2id(model, kinds.mjOBJ_ACTUATOR, motor_name(joint))
+            motors.append((actuator, place))
+    rows = np.flatnonzero(fixed), np.flatnonzero(~fixed), free
+    return _Places(bodies, *rows, free_q, free_v, singles, balls, dofs, motors)

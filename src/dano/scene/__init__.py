@@ -13,6 +13,7 @@ from dano.scene._frames import (
     joints_of as joints_of,
     link_jacobian as link_jacobian,
     place_links as place_links,
+    plane_axes as plane_axes,
     Poses as Poses,
     RESOLVED as RESOLVED,
     step_twists as step_twists,

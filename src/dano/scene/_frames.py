@@ -163,7 +163,7 @@ def place_links(
     if planes.size:
         own = q[triples(first)]
         turn = turn.at[planes].set(own[:, 2:] * chains.axis[planes])
-        path = path.at[planes].set(jnp.einsum("ma,mab->mb", own[:, :2], _plane_axes(chains, planes)))
+        path = path.at[planes].set(jnp.einsum("ma,mab->mb", own[:, :2], plane_axes(chains.axis[planes])))
     # The world is the last row.
     origin = jnp.concatenate([position - quat_rotate(orientation, chains.com), jnp.zeros((1, 3), q.dtype)])
     turned = jnp.concatenate([orientation, jnp.array([[1.0, 0.0, 0.0, 0.0]], q.dtype)])
@@ -246,14 +246,13 @@ def _directions(chains: Chains, poses: Poses) -> Float[Array, "d 3"]:
         rest = chains.orientation[j]
         if parent < layout.bodies:
             rest = quat_multiply(poses.orientation[parent], rest)
-        axes = quat_rotate(rest[None], _plane_axes(chains, np.array([j]))[0])
+        axes = quat_rotate(rest[None], plane_axes(chains.axis[np.array([j])])[0])
         directions = directions.at[np.array([index[j, part] for part in range(2)])].set(axes)
     return directions
 
 
-def _plane_axes(chains: Chains, rows: np.ndarray) -> Float[Array, "m 2 3"]:
-    """`plane_axes` of planar joints, which may be traced."""
-    axis = chains.axis[rows]
+def plane_axes(axis: Float[Array, "m 3"]) -> Float[Array, "m 2 3"]:
+    """The two directions along which the lengths of planar joints are measured, from their axes."""
     eye = jnp.eye(3, dtype=axis.dtype)
     start = jnp.where((jnp.abs(axis[:, 0]) < 0.99)[:, None], eye[:1], eye[1:2])
     first = start - jnp.sum(axis * start, axis=1, keepdims=True) * axis
@@ -365,7 +364,7 @@ def joint_values(chains: Chains, state: State) -> tuple[Float[Array, " k"], Floa
         v = v.at[triples(first)].set(own)
     planes, first = joints_of(layout, "planar")
     if first.size:
-        axes = quat_rotate(rest[first][:, None], _plane_axes(chains, planes))
+        axes = quat_rotate(rest[first][:, None], plane_axes(chains.axis[planes]))
         places = triples(first)[:, :2]
         q = q.at[places].set(jnp.einsum("mab,mb->ma", axes, way[first]))
         v = v.at[places].set(jnp.einsum("mab,mb->ma", axes, moving[first]))
