@@ -151,6 +151,86 @@ def test_mjcf(tmp_path):
         dano.load_mjcf(path)
 
 
+FOUR_BAR = """<mujoco><compiler angle="radian"/><worldbody>
+    <body name="crank"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.01"/>
+    <body name="coupler" pos="0.2 0 0"><joint axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.01"/>{sites[0]}</body></body>
+    <body name="rocker" pos="0.45 0 0"><joint axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 -0.25 0 0" size="0.01"/>{sites[1]}</body>
+    </worldbody><equality>{tie}</equality></mujoco>"""
+SITES = ('<site name="a" pos="0.4 0 0"/>', '<site name="b" pos="-0.25 0 0" quat="0.5 0.5 0.5 0.5"/>')
+TIES = {
+    # The bars lie on one line: the rocker's end is 0.2 m from the origin, where the coupler begins.
+    "connect": ("", ""),
+    "connect of sites": SITES,
+    "weld of sites": SITES,
+}
+
+
+@pytest.mark.parametrize("kind", TIES)
+def test_loops_of_mjcf(kind, tmp_path):
+    """What MuJoCo holds together is held; what is written again is read as the same."""
+    mujoco = pytest.importorskip("mujoco")
+    tie = {
+        "connect": '<connect body1="coupler" body2="rocker" anchor="0 0.1 0"/>',
+        "connect of sites": '<connect site1="a" site2="b"/>',
+        "weld of sites": '<weld site1="a" site2="b"/>',
+    }[kind]
+    path = tmp_path / "four.xml"
+    path.write_text(FOUR_BAR.format(sites=TIES[kind], tie=tie))
+    robot = dano.load_mjcf(path)
+    dano.export_robot(robot, tmp_path / "again.xml")
+    for again in (robot, dano.load_mjcf(tmp_path / "again.xml")):
+        scene = again.scene()
+        state = scene.initial_state(crank=dict(q=0.3), coupler=dict(q=-0.4), rocker=dict(q=0.2))
+        assert scene.closing is not None
+        gaps = np.asarray(scene.closing.gaps(state.position, state.orientation))
+        model = mujoco.MjModel.from_xml_path(str(path))
+        data = mujoco.MjData(model)
+        data.qpos[:] = state.q
+        mujoco.mj_forward(model, data)
+        theirs = data.efc_pos[: gaps.size]
+        # MuJoCo's gap is that of the first against the second; its turn is half of that in other axes.
+        np.testing.assert_allclose(-gaps[:3], theirs[:3], atol=1e-9)
+        np.testing.assert_allclose(np.linalg.norm(gaps[3:]), 2 * np.linalg.norm(theirs[3:]), atol=1e-9)
+    assert any("loop: coupler and rocker" in line for line in robot_tree(robot.description))
+    with pytest.raises(ValueError, match="URDF has no loops, got one of 'coupler' and 'rocker'"):
+        dano.export_robot(robot, tmp_path / "again.urdf")
+
+
+def test_loops_in_scene_files(tmp_path):
+    """`[[loops]]` close from the coordinates that are given; the others follow."""
+    rod = """
+    [[bodies]]
+    name = "{0}"
+    shape = "box"
+    half_extents = [{1}, 0.01, 0.01]
+    mass = 0.5
+    {3}
+    [[joints]]
+    child = "{0}"
+    axis = [0.0, 1.0, 0.0]
+    anchor = [-{1}, 0.0, 0.0]
+    position = [{2}, 0.0, 0.0]
+    """
+    text = (
+        "n_steps = 2\n"
+        + rod.format("crank", 0.1, 0.1, "q = -0.9")
+        + rod.format("rocker", 0.2, 0.65, "")
+        + rod.format("coupler", 0.25, 0.35, "")
+        + 'parent = "crank"\n[[loops]]\nfirst = "coupler"\nsecond = "rocker"\n'
+        + "position = [0.25, 0.0, 0.0]\nanchor = [0.2, 0.0, 0.0]\n"
+    )
+    file = parse_scene(text, tmp_path / "scene.toml")
+    assert file.scene.closing is not None
+    np.testing.assert_allclose(coordinates(file.state)[0][0], -0.9)
+    np.testing.assert_allclose(
+        file.scene.closing.gaps(file.state.position, file.state.orientation), 0, atol=1e-11
+    )
+    with pytest.raises(ValueError, match=r"\[\[loops\]\] 1.*unknown key 'frst'.*did you mean 'first'"):
+        parse_scene(text.replace("first =", "frst ="), tmp_path / "scene.toml")
+
+
 def test_meshes_are_kept_by_their_content(tmp_path, monkeypatch):
     """A mesh becomes a signed distance once, and is read from the cache afterwards."""
     trimesh = pytest.importorskip("trimesh")

@@ -25,6 +25,8 @@ Policy = Callable[[State, Float[Array, ""]], Control]
 
 # From here on reverse mode recomputes segments instead of keeping every step's residuals.
 CHECKPOINT_FROM = 2000
+# Gap in a loop with which a state may start [m, rad]; in single precision a hundred times more.
+_OPEN = 1e-6
 
 
 class AbstractEngine(eqx.Module):
@@ -118,14 +120,27 @@ class VariationalEngine(AbstractEngine):
 
 
 def check_state(scene: Scene, state: State) -> None:
-    """`Scene.check_state`, after the scene itself.
+    """`Scene.check_state`, after the scene itself; and whether loops are closed.
 
     Raises:
-        ValueError: If the scene is none, or the state does not fit it.
+        ValueError: If the scene is none, the state does not fit it, or loops are open.
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"scene must be a dano.Scene, got {type(scene).__name__}")
     scene.check_state(state)
+    if scene.loops and state.position.ndim == 2 and not is_traced(state, scene):
+        gap = float(_jitted_gap(scene, state))
+        if gap > (_OPEN if state.position.dtype == jnp.float64 else 100 * _OPEN):
+            raise ValueError(
+                f"state must close the loops of the scene, got a gap of {gap:.3g} m or rad:"
+                " dano.close_loops(scene, state) closes them"
+            )
+
+
+@compiled
+def _jitted_gap(scene, state):
+    frames = scene.frames(state)
+    return jnp.max(jnp.abs(scene.closing.gaps(frames.position, frames.orientation)))
 
 
 def step(

@@ -27,8 +27,8 @@ from dano.engine._newton import newton, solve_small, SolverOptions
 from dano.engine._primal_dual import Balance, primal_dual
 from dano.engine._problem import Pairs, Problem
 from dano.engine._sequential import one_at_a_time
-from dano.engine._trees import mass_matrix, rough_of, Tree, tree_balance
-from dano.engine.joints import Rough
+from dano.engine._trees import closure_of, loop_gaps, mass_matrix, rough_of, Tree, tree_balance
+from dano.engine.joints import Closure, Rough
 from dano.maths import matmul, matvec
 
 # How many times the rounding of a pose a step's equations may miss, where the tolerance is its power 3/4.
@@ -89,7 +89,10 @@ def solve(problem: Problem, start: Array, pairs: Pairs, options: SolverOptions):
         )
         return (velocities, report), (-matvec(inverse, change).reshape(velocities.shape), d_report)
 
-    return root(problem, start)
+    if not _closes(problem):
+        return root(problem, start)
+    velocities, report = root(problem, jnp.concatenate([start, _no_forces(problem)]))
+    return velocities[: start.shape[0]], report
 
 
 def _passive(find, problem: Problem, start: Array):
@@ -129,6 +132,8 @@ def as_solved(problem: Problem, velocities: Array, pairs: Pairs) -> Problem:
     if problem.points is None:
         return problem
     shares = jnp.asarray(SHARES, velocities.dtype)
+    if _closes(problem):
+        velocities = _with_forces(velocities, problem, pairs)
 
     def missed(share):
         return jnp.sum(jnp.abs(step_residual(velocities, problem.rebounding(share), pairs)))
@@ -144,7 +149,11 @@ def _adds_energy(velocities: Array, problem: Problem, start: Array) -> Array:
     if problem.tree is None:
         impulses, _ = own_momenta(velocities, problem)
     else:
-        impulses, _ = _tree_momenta(problem, problem.tree, velocities)
+        k = problem.tree.jacobian.shape[2]
+        impulses, _ = _tree_momenta(problem, problem.tree, velocities[:k])
+        if _closes(problem):
+            impulses = impulses - _closure(problem, problem.tree).pulled(velocities[k:])
+        start, velocities = start[:k], velocities[:k]
     work = 0.5 * impulses * (start + velocities)
     return jnp.sum(work) > _ADDS * jnp.sum(jnp.abs(work))
 
@@ -183,7 +192,7 @@ def _root_of_trees(problem: Problem, start: Float[Array, " k"], pairs: Pairs, op
     """Generalised velocities, the Jacobian of their residual, and the report."""
     tree = problem.tree
     assert tree is not None
-    m, k, velocity_scale = len(pairs.moving), start.shape[0], _tree_scale(problem, tree)
+    m, k, velocity_scale = len(pairs.moving), tree.jacobian.shape[2], _tree_scale(problem, tree)
     size = jnp.max(
         jnp.abs(velocity_scale * tree.pulled(jax.vmap(matvec)(to_world_matrices(problem), problem.impulse)))
     )
@@ -192,11 +201,13 @@ def _root_of_trees(problem: Problem, start: Float[Array, " k"], pairs: Pairs, op
     epsilon, reach = float(jnp.finfo(start.dtype).eps), 1 + jnp.max(jnp.abs(tree.position))
     size = size + _POSES * epsilon**0.25 * reach / problem.timestep
     rough = _rough(problem, tree)
-    spread, scale = tree.jacobian.reshape(6 * m, -1), velocity_scale
-    if rough is not None:
-        start = rough.started(start)
-        spread = jnp.pad(spread, ((0, 0), (0, rough.rows.size)))
-        scale = jnp.concatenate([scale, jnp.broadcast_to(1 / problem.timestep, rough.rows.shape)])
+    closure = _closure(problem, tree) if _closes(problem) else None
+    forces = start[k:]
+    start = start[:k] if rough is None else rough.started(start[:k])
+    n = start.shape[0]
+    start = jnp.concatenate([start, forces])
+    spread = jnp.pad(tree.jacobian.reshape(6 * m, -1), ((0, 0), (0, start.shape[0] - k)))
+    scale = jnp.concatenate([velocity_scale, jnp.broadcast_to(1 / problem.timestep, (start.shape[0] - k,))])
 
     def balance(unknowns, softening):
         y = unknowns[:k]
@@ -205,7 +216,12 @@ def _root_of_trees(problem: Problem, start: Float[Array, " k"], pairs: Pairs, op
             momenta, slopes = world_patches(problem, tree.twists(y), pairs, softening)
             pulled = jnp.einsum("iak,iajb,jbl->kl", tree.jacobian, slopes, tree.jacobian)
             residual, jacobian = residual - tree.pulled(momenta), jacobian + pulled
-        return (residual, jacobian) if rough is None else rough.extended(unknowns, residual, jacobian)
+        if rough is not None:
+            residual, jacobian = rough.extended(unknowns[:n], residual, jacobian)
+        if closure is not None:
+            gaps = loop_gaps(tree, y, problem.timestep)
+            residual, jacobian = closure.extended(unknowns, residual, jacobian, gaps)
+        return residual, jacobian
 
     def evaluate(unknowns, softening):
         residual, jacobian = balance(unknowns, softening)
@@ -231,8 +247,12 @@ def _root_of_trees(problem: Problem, start: Float[Array, " k"], pairs: Pairs, op
             spread=(spread, tree.offset.ravel()),
         )
     if rough is not None:
-        solution, jacobian = rough.finished(solution, jacobian)
-    return solution, velocity_scale[:, None] * jacobian, report
+        own, block = rough.finished(solution[:n], jacobian[:n, :n])
+        across, down, last = jacobian[:k, n:], jacobian[n:, :k], jacobian[n:, n:]
+        jacobian = jnp.block([[block, across], [down, last]]) if closure is not None else block
+        solution = jnp.concatenate([own, solution[n:]])
+    scale = jnp.concatenate([velocity_scale, scale[n:]])
+    return solution, scale[:, None] * jacobian, report
 
 
 def _rough(problem: Problem, tree: Tree) -> Rough | None:
@@ -243,10 +263,39 @@ def _rough(problem: Problem, tree: Tree) -> Rough | None:
     return rough_of(tree, jnp.linalg.inv(mass), problem.timestep)
 
 
-def _tree_residual(y: Float[Array, " k"], problem: Problem, pairs: Pairs) -> Float[Array, " k"]:
-    """What the equations of a step with joints miss, in velocities, with the laws as they are."""
+def _closes(problem: Problem) -> bool:
+    """Whether a step has loops."""
+    return problem.tree is not None and problem.tree.loops is not None
+
+
+def _closure(problem: Problem, tree: Tree) -> Closure:
+    mass = mass_matrix(tree, problem.mass, _world_inertia(problem))
+    return closure_of(tree, jnp.linalg.inv(mass), problem.timestep)
+
+
+def _no_forces(problem: Problem) -> Float[Array, " c"]:
+    """Forces in loops to start from."""
+    assert problem.tree is not None and problem.tree.loops is not None
+    return jnp.zeros(problem.tree.loops.size, problem.timestep.dtype)
+
+
+def _with_forces(y: Float[Array, " k"], problem: Problem, pairs: Pairs) -> Array:
+    """Generalised velocities with the forces in loops that fit them best."""
     tree = problem.tree
     assert tree is not None
+    missing = _tree_residual(jnp.concatenate([y, _no_forces(problem)]), problem, pairs)[: y.shape[0]]
+    forces = _closure(problem, tree).multipliers(missing / _tree_scale(problem, tree))
+    return jnp.concatenate([y, forces])
+
+
+def _tree_residual(unknowns: Array, problem: Problem, pairs: Pairs) -> Array:
+    """What the equations of a step with joints miss, in velocities, with the laws as they are.
+
+    Unknowns are generalised velocities, and forces in loops if there are some.
+    """
+    tree = problem.tree
+    assert tree is not None
+    y = unknowns[: tree.jacobian.shape[2]]
     residual, _ = _tree_momenta(problem, tree, y)
     given = jnp.zeros_like(tree.offset)
     if problem.patches:
@@ -257,7 +306,12 @@ def _tree_residual(y: Float[Array, " k"], problem: Problem, pairs: Pairs) -> Flo
     rough = _rough(problem, tree)
     if rough is not None:
         missing = missing.at[rough.rows].add(problem.timestep * rough.ramps(y[rough.rows]))
-    return _tree_scale(problem, tree) * missing
+    if not _closes(problem):
+        return _tree_scale(problem, tree) * missing
+    closure = _closure(problem, tree)
+    missing = missing - closure.pulled(unknowns[y.shape[0] :])
+    gaps, _ = loop_gaps(tree, y, problem.timestep)
+    return jnp.concatenate([_tree_scale(problem, tree) * missing, gaps / problem.timestep])
 
 
 def _tree_momenta(problem: Problem, tree: Tree, y: Float[Array, " k"]):

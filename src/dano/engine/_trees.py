@@ -23,13 +23,14 @@ from jaxtyping import Array, Float
 
 from dano.engine._newton import inverse3
 from dano.engine._rigid import turn_slopes, turned
-from dano.engine.joints import JointForces, Rough
+from dano.engine.joints import Closure, JointForces, Rough
 from dano.maths import matmul, matvec, quat_exp, quat_log, quat_to_matrix, safe_norm
 from dano.scene import (
     Chains,
     Control,
     joints_of,
     link_jacobian,
+    Loops,
     place_links,
     Poses,
     Scene,
@@ -53,6 +54,7 @@ class Tree(eqx.Module):
         forces: What acts on them.
         jacobian: J at the start: twists [W] of the bodies that move per velocity, shape (m, 6, k).
         offset: c: what they move by besides J y, shape (m, 6).
+        loops: What closes chains; None if nothing does.
     """
 
     chains: Chains
@@ -62,6 +64,7 @@ class Tree(eqx.Module):
     forces: JointForces
     jacobian: Float[Array, "m 6 k"]
     offset: Float[Array, "m 6"]
+    loops: Loops | None = None
 
     def twists(self, y: Float[Array, " k"]) -> Float[Array, "m 6"]:
         """How bodies move as contact sees it [m/s; rad/s, W]."""
@@ -90,6 +93,7 @@ def build_tree(scene: Scene, state: State, control: Control | None) -> tuple[Tre
         JointForces(chains.laws, state.q, state.v, effort, command, h),
         jacobian,
         jnp.zeros(jacobian.shape[:2], h.dtype),
+        scene.closing,
     )
     y = generalised(scene, state, state.orientation)
     ahead = _ahead(tree, y, h)
@@ -140,6 +144,29 @@ def rough_of(tree: Tree, inverse_mass: Float[Array, "k k"], h: Float[Array, ""])
     rows = 6 * len(tree.chains.layout.free) + np.array(tree.chains.laws.rough, int)
     weight = jax.lax.stop_gradient(1 / inverse_mass[rows, rows])
     return Rough(tree.forces.ramps(weight), rows, weight / h, h)
+
+
+def closure_of(tree: Tree, inverse_mass: Float[Array, "k k"], h: Float[Array, ""]) -> Closure:
+    """What closes the loops of a step; arguments are those of `rough_of`."""
+    slopes = _loop_slopes(tree, tree.position, tree.orientation, tree.jacobian)
+    return Closure.create(slopes, jax.lax.stop_gradient(inverse_mass), h)
+
+
+def loop_gaps(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]):
+    """Gaps of the loops after a step with generalised velocities y, and their derivative by y."""
+    ahead = _ahead(tree, y, h)
+    assert tree.loops is not None
+    gaps = tree.loops.gaps(ahead.position, ahead.orientation)
+    _, ends = _end_slopes(tree, ahead, y, h)
+    return gaps, _loop_slopes(tree, ahead.position, ahead.orientation, ends)
+
+
+def _loop_slopes(tree: Tree, position: Array, orientation: Array, moved: Float[Array, "m 6 k"]):
+    """Derivative of the gaps by numbers that move the bodies that are not fixed."""
+    layout = tree.chains.layout
+    assert tree.loops is not None
+    whole = jnp.zeros((layout.bodies, *moved.shape[1:]), moved.dtype)
+    return tree.loops.slopes(position, orientation, whole.at[np.array(layout.moving)].set(moved))
 
 
 def mass_matrix(tree: Tree, mass: Float[Array, " m"], inertia: Float[Array, "m 3 3"]) -> Float[Array, "k k"]:
@@ -238,10 +265,16 @@ def _world_twists(
 def _twist_slopes(
     tree: Tree, ahead: Poses, y: Float[Array, " k"], h: Float[Array, ""]
 ) -> Float[Array, "m 6 k"]:
-    """Derivative of `_world_twists` by y.
+    """Derivative of `_world_twists` by y."""
+    turns, slopes = _end_slopes(tree, ahead, y, h)
+    return jnp.concatenate([slopes[:, :3] / h, jnp.einsum("mab,mbk->mak", turns, slopes[:, 3:])], axis=1)
 
-    Turning the end of a step by a small angle a [W] changes the spin by R A(ω) Rᵀ a with A of `turn_slopes`,
-    where R is the orientation at the start.
+
+def _end_slopes(tree: Tree, ahead: Poses, y: Float[Array, " k"], h: Float[Array, ""]):
+    """By how much y moves and turns bodies at the end of a step, and what turning does to their spins.
+
+    Turning the end by a small angle a [W] changes the spin by R A(ω) Rᵀ a with A of `turn_slopes`, where R is
+    the orientation at the start. Shapes (m, 3, 3) of that, and (m, 6, k).
     """
     layout = tree.chains.layout
     moving, free = np.array(layout.moving), np.array(layout.free, int)
@@ -261,8 +294,7 @@ def _twist_slopes(
         mine = slopes[:, :, 6 * place : 6 * place + 6]
         inverse = inverse3(turns[layout.moving.index(int(body))])
         columns = [mine[:, :, :3] * h, jnp.einsum("mab,bc->mac", mine[:, :, 3:], inverse), *columns]
-    slopes = jnp.concatenate(columns, axis=2)
-    return jnp.concatenate([slopes[:, :3] / h, jnp.einsum("mab,mbk->mak", turns, slopes[:, 3:])], axis=1)
+    return turns, jnp.concatenate(columns, axis=2)
 
 
 def _with_balls(tree: Tree, slopes: Float[Array, "m 6 j"], v: Float[Array, " j"], h: Float[Array, ""]):

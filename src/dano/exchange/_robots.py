@@ -121,6 +121,11 @@ def _urdf(description: Description, target: Path) -> ET.Element:
         warnings.warn(
             f"URDF has no armature and no springs: those of {', '.join(lost)} are left out", stacklevel=3
         )
+    if description.ties:
+        first = description.ties[0]
+        raise ValueError(
+            f"{target}: URDF has no loops, got one of {first.first!r} and {first.second!r}: write an .xml"
+        )
     for joint in description.joints:
         _urdf_joint(root, joint, target)
     return root
@@ -212,6 +217,15 @@ def _mjcf(description: Description, target: Path) -> ET.Element:
 
     for link in description.links:
         row_of(link.name)
+    for i, tie in enumerate(description.ties):
+        # Sites say where both points are; an anchor would mean those of the joints' zero.
+        turns = {tie.first: tie.orientation, tie.second: (1.0, 0.0, 0.0, 0.0)}
+        ends = {"site1": (tie.first, tie.position), "site2": (tie.second, tie.anchor)}
+        names = {key: f"loop {i} of {link}" for key, (link, _) in ends.items()}
+        for key, (link, point) in ends.items():
+            place = {"pos": words(np.array(point)), "quat": words(np.array(turns[link]))}
+            ET.SubElement(rows[link], "site", {"name": names[key], **place})
+        ET.SubElement(equal, "connect" if tie.kind == "point" else "weld", names)
     return root
 
 

@@ -12,6 +12,7 @@ from dano.robots._description import (
     Link as Link,
     Placed as Placed,
     Solid as Solid,
+    Tie as Tie,
 )
 from dano.robots._dynamics import (
     bias_forces as bias_forces,
@@ -29,5 +30,6 @@ from dano.robots._inverse import (
     InverseKinematics as InverseKinematics,
     Target as Target,
 )
+from dano.robots._loops import close_loops as close_loops, loop_gaps as loop_gaps
 from dano.robots._operational import operational_space_torque as operational_space_torque
 from dano.robots._robot import Robot as Robot

@@ -8,13 +8,13 @@ import numpy as np
 
 from dano.archive import checked_input
 from dano.fields import Sphere
-from dano.maths import Pose, quat_multiply, quat_rotate
-from dano.robots._description import Connection, Description, Link, Placed
+from dano.maths import Pose, quat_conjugate, quat_multiply, quat_rotate
+from dano.robots._description import Connection, Description, Link, Placed, Tie
 from dano.robots._geometry import shape_of
 from dano.robots._mjcf import read_mjcf
 from dano.robots._robot import Robot
 from dano.robots._urdf import read_urdf, rotation_of
-from dano.scene import Body, Joint
+from dano.scene import Body, Joint, Loop
 
 FLOATING = "floating"
 # Radius of what stands for a link without a shape, in pictures only [m].
@@ -56,7 +56,8 @@ def load_mjcf(
 ) -> Robot:
     """A robot from a file of MuJoCo, read by MuJoCo's own compiler; arguments are those of `load_urdf`.
 
-    What dano has no counterpart of is an error: bodies with two joints, tendons.
+    `connect` and `weld` close loops. What dano has no counterpart of is an error: bodies with two joints,
+    tendons.
 
     Raises:
         ImportError: If mujoco is missing.
@@ -129,6 +130,7 @@ def build_robot(
         efforts,
         tuple(touching),
         description,
+        tuple(_loop(tie, frames) for tie in description.ties),
     )
 
 
@@ -247,6 +249,18 @@ def _joint(
         mimics=mimics,
         **options,
     )
+
+
+def _loop(tie: Tie, frames: dict[str, tuple[str | None, np.ndarray, np.ndarray]]) -> Loop:
+    """A loop between bodies: places of links in their bodies are part of its own."""
+    (first, *place), (second, *other) = frames[tie.first], frames[tie.second]
+    points = [_moved((p, q), Placed(x)) for (p, q), x in ((place, tie.position), (other, tie.anchor))]
+    turn = quat_multiply(quat_multiply(place[1], np.array(tie.orientation)), quat_conjugate(other[1]))
+    if second is None:
+        first, second, points, turn = second, first, points[::-1], quat_conjugate(turn)
+    if second is None:
+        raise ValueError(f"loop must join links that move, got {tie.first!r} and {tie.second!r}")
+    return Loop(first, second, tie.kind, position=points[0][0], anchor=points[1][0], orientation=turn)
 
 
 def _leader(description: Description, joint: Connection) -> tuple[str, float, float] | None:

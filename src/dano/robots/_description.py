@@ -95,6 +95,27 @@ class Connection:
 
 
 @dataclass(frozen=True)
+class Tie:
+    """What closes a loop of a robot: see `dano.Loop`, with links for bodies.
+
+    Attributes:
+        kind: "point" or "weld".
+        first: A link.
+        second: Another.
+        position: A point of the first [m, frame of the link].
+        anchor: The point of the second that stays there.
+        orientation: Of a weld: of the second link's frame in the first's, wxyz.
+    """
+
+    kind: str
+    first: str
+    second: str
+    position: tuple[float, ...]
+    anchor: tuple[float, ...]
+    orientation: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
 class Description:
     """A robot's file.
 
@@ -103,12 +124,14 @@ class Description:
         source: The file.
         links: All links.
         joints: All joints.
+        ties: What closes loops.
     """
 
     name: str
     source: Path
     links: tuple[Link, ...]
     joints: tuple[Connection, ...]
+    ties: tuple[Tie, ...] = ()
 
     def link(self, name: str) -> Link:
         """A link by name."""
@@ -149,6 +172,9 @@ class Description:
             raise ValueError(
                 f"{where}: a robot must have one root link, got {len(roots)}: {', '.join(roots)}"
             )
+        for link in [link for tie in self.ties for link in (tie.first, tie.second)]:
+            if link not in names:
+                raise ValueError(f"{where}: a loop must join links, got {link!r}{did_you_mean(link, names)}")
         self._check_mimics(where, joints)
         return self
 

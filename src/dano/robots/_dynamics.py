@@ -1,7 +1,7 @@
 """Mass, bias and gravity of trees in their own coordinates, and torques that follow from them.
 
 With generalised velocities v (see `Frames`): M(q) v̇ + b(q, v) = τ, where b holds Coriolis, centrifugal and
-gravity terms. Springs, friction, damping, limits and motors of joints are no part of b.
+gravity terms. Springs, friction, damping, limits, motors and loops of joints are no part of b.
 """
 
 import dataclasses
@@ -86,6 +86,11 @@ def joint_reactions(
     layout, dtype = scene.layout, scene.timestep.dtype
     if not scene.joints:
         raise ValueError("scene must have joints, got none")
+    if scene.loops:
+        raise ValueError(
+            f"scene must have no loops, got {len(scene.loops)}: what their joints carry does not follow from"
+            " the motion"
+        )
     given = jnp.zeros((layout.bodies, 6), dtype) if wrenches is None else jnp.asarray(wrenches, dtype)
     if given.shape != (layout.bodies, 6):
         raise ValueError(f"wrenches must have shape ({layout.bodies}, 6), got {given.shape}")

@@ -47,7 +47,7 @@ def robot_tree(description: Description) -> list[str]:
     for link in description.links:
         if link.name not in hangs:
             draw(link.name, "", None, True)
-    return lines
+    return lines + [f"loop: {tie.first} and {tie.second}, {tie.kind}" for tie in description.ties]
 
 
 def _described(joint: Connection) -> str:

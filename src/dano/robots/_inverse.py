@@ -12,9 +12,13 @@ from jaxtyping import Array, Float
 
 from dano.maths import checked_array, checked_quaternion, Numbers, quat_conjugate, quat_log, quat_multiply
 from dano.names import did_you_mean
+from dano.robots._loops import close_loops, loop_gaps
 from dano.robots._robot import Robot
 from dano.scene import Scene, State
 from dano.solvers import bounded_least_squares, NormalEquations
+
+# What a gap in a loop counts for, beside a target's distance.
+_LOOPS = 100.0
 
 
 class Target(eqx.Module):
@@ -94,6 +98,7 @@ def inverse_kinematics(
 
     Minimises Σ (weight · distance)² + (weight · length · angle)² by bounded least squares. What the targets
     leave free goes to the posture. It finds the minimum next to where it starts, and says what it missed.
+    Loops stay closed.
 
     Args:
         robot: The robot.
@@ -136,6 +141,7 @@ def inverse_kinematics(
         linearize, start, lower=lower, upper=upper, max_iterations=max_iterations, tolerance=1e-12
     )
     found = scene.filled(dataclasses.replace(resting, q=jnp.asarray(solution.x, dtype)))
+    found = close_loops(scene, found) if scene.loops else found
     errors = np.array([_errors(robot, scene, found, target) for target in targets])
     tight = np.flatnonzero((solution.x <= lower) | (solution.x >= upper))
     met = bool(np.nanmax(errors[:, 0], initial=0) <= 1e-4 and np.nanmax(errors[:, 1], initial=0) <= 1e-3)
@@ -162,13 +168,9 @@ def _linearized(place, scene: Scene, state: State, targets: tuple[Target, ...], 
 @eqx.filter_jit
 def _missed(place, scene: Scene, state: State, targets: tuple[Target, ...], q):
     def of(q):
-        return jnp.concatenate(
-            [
-                part
-                for target in targets
-                for part in _parts(place, scene, dataclasses.replace(state, q=q), target)
-            ]
-        )
+        at = dataclasses.replace(state, q=q)
+        parts = [part for target in targets for part in _parts(place, scene, at, target)]
+        return jnp.concatenate([*parts, *([_LOOPS * loop_gaps(scene, at)] if scene.loops else [])])
 
     return of(q), jax.jacfwd(of)(q)
 

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from dano.robots._description import Connection, Description, Link, Placed, Solid
+from dano.maths import quat_conjugate, quat_multiply
+from dano.robots._description import Connection, Description, Link, Placed, Solid, Tie
 
 _WORLD = "world"
 
@@ -35,7 +36,7 @@ def read_mjcf(path: Path) -> Description:
     reader = _Reader(path, model, mujoco)
     links = (Link(_WORLD), *(reader.link(i) for i in range(1, model.nbody)))
     joints = tuple(reader.joint(i) for i in range(1, model.nbody))
-    return Description(path.stem, path, links, joints).checked()
+    return Description(path.stem, path, links, joints, tuple(reader.ties())).checked()
 
 
 class _Reader:
@@ -117,6 +118,31 @@ class _Reader:
             rest=float(model.qpos_spring[model.jnt_qposadr[j]]) if single else 0.0,
             mimics=self.leader(j),
         )
+
+    def ties(self) -> list[Tie]:
+        """What `connect` and `weld` hold together."""
+        model, types = self.model, self.mujoco.mjtEq
+        kinds = {int(types.mjEQ_CONNECT): "point", int(types.mjEQ_WELD): "weld"}
+        found = []
+        for e in range(model.neq):
+            kind = kinds.get(int(model.eq_type[e]))
+            if kind is None or not model.eq_active0[e]:
+                continue
+            ends = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+            data = model.eq_data[e]
+            if int(model.eq_objtype[e]) == int(self.mujoco.mjtObj.mjOBJ_SITE):
+                place = [model.site_pos[s] for s in ends]
+                turn = quat_multiply(model.site_quat[ends[0]], quat_conjugate(model.site_quat[ends[1]]))
+                ends = tuple(int(model.site_bodyid[s]) for s in ends)
+            elif kind == "point":
+                place, turn = [data[:3], data[3:6]], np.eye(4)[0]
+            else:
+                place, turn = [data[3:6], data[:3]], data[6:10]
+            turn = np.asarray(turn, float) if kind == "weld" else np.eye(4)[0]
+            position, anchor, turned = (tuple(map(float, x)) for x in (*place, turn))
+            first, second = (self.name(i) for i in ends)
+            found.append(Tie(kind, first, second, position, anchor, turned))
+        return found
 
     def leader(self, j: int) -> tuple[str, float, float] | None:
         """What an equality of joints says that a joint follows, if it is linear."""

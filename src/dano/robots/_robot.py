@@ -12,7 +12,7 @@ from dano.contact import ContactParams
 from dano.maths import Numbers, quat_multiply, quat_rotate
 from dano.names import did_you_mean
 from dano.robots._description import Description
-from dano.scene import Body, Contact, Joint, Scene, State
+from dano.scene import Body, Contact, Joint, Loop, Scene, State
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class Robot:
         efforts: Largest torque or force of each joint with coordinates [N m or N], by its name in the file.
         touching: Bodies that have a shape of their own to touch with.
         description: What the file says.
+        loops: What closes chains of its joints.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Robot:
     efforts: dict[str, float]
     touching: tuple[str, ...]
     description: Description
+    loops: tuple[Loop, ...] = ()
 
     def scene(
         self,
@@ -48,21 +50,27 @@ class Robot:
         bodies: Sequence[Body] = (),
         contacts: Sequence[Contact] = (),
         joints: Sequence[Joint] = (),
+        loops: Sequence[Loop] = (),
         **options: Any,
     ) -> Scene:
-        """A scene of the robot, and of other bodies, contacts and joints after its own.
+        """A scene of the robot, and of other bodies, contacts, joints and loops after its own.
 
         Args:
             bodies: Other bodies.
             contacts: Contacts; `contacts_with` lists those of the robot.
             joints: Other joints.
+            loops: Other loops.
             **options: Of `Scene.create`, such as `timestep` and `gravity`.
 
         Raises:
             ValueError: As `Scene.create`.
         """
         return Scene.create(
-            [*self.bodies, *bodies], list(contacts), joints=[*self.joints, *joints], **options
+            [*self.bodies, *bodies],
+            list(contacts),
+            joints=[*self.joints, *joints],
+            loops=[*self.loops, *loops],
+            **options,
         )
 
     def contacts_with(self, *others: str, params: ContactParams | None = None) -> list[Contact]:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
 from dano.names import did_you_mean
+from dano.scene._loops import Loop
 from dano.scene._motors import checked_limits, Motor
 
 JOINT_KINDS = ("hinge", "slide", "weld", "ball", "planar")
@@ -213,11 +214,11 @@ class Layout(NamedTuple):
         return self.children.index(body) if body in self.children else None
 
 
-def joined(joints: Sequence[Joint]) -> Callable[[str, str], bool]:
+def joined(joints: Sequence[Joint | Loop]) -> Callable[[str, str], bool]:
     """Whether two bodies are parts of one rigid body, or neighbours: they overlap where a joint is.
 
     Args:
-        joints: The joints of a scene.
+        joints: The joints of a scene, and its loops.
     """
     link: dict[str | None, str | None] = {}
 
@@ -227,9 +228,10 @@ def joined(joints: Sequence[Joint]) -> Callable[[str, str], bool]:
         return name
 
     for joint in joints:
-        if joint.kind == "weld":
+        if isinstance(joint, Joint) and joint.kind == "weld":
             link[link_of(joint.child)] = link_of(joint.parent)
-    neighbours = {frozenset((link_of(j.parent), link_of(j.child))) for j in joints if j.kind != "weld"}
+    ends = [(x.parent, x.child) if isinstance(x, Joint) else (x.first, x.second) for x in joints]
+    neighbours = {frozenset((link_of(a), link_of(b))) for a, b in ends if link_of(a) != link_of(b)}
 
     def check(a: str, b: str) -> bool:
         ends = frozenset((link_of(a), link_of(b)))

@@ -14,6 +14,7 @@ from dano.contact import combined, ContactParams, DistributedLaw, Setting
 from dano.scene._bodies import Body
 from dano.scene._contacts import check_objects, checked_support, Contact, heaviest, with_surface
 from dano.scene._joints import joined, Joint
+from dano.scene._loops import Loop
 
 
 class Others(eqx.Module):
@@ -46,7 +47,7 @@ class Others(eqx.Module):
 def others_of(
     bodies: Sequence[Body],
     contacts: Sequence[Contact],
-    joints: Sequence[Joint],
+    joints: Sequence[Joint | Loop],
     apart: Sequence[tuple[str, str]],
     params: ContactParams,
     gravity: Float[Array, "3"],
@@ -56,7 +57,7 @@ def others_of(
     Args:
         bodies: All bodies of a scene.
         contacts: Pairs that are named.
-        joints: What joins needs not touch.
+        joints: And loops: what joins needs not touch.
         apart: Names of further pairs that do not touch.
         params: What bodies without a material of their own are made of.
         gravity: [m/s², W].

@@ -16,6 +16,7 @@ from dano.scene._bodies import Body, checked_parts
 from dano.scene._contacts import Contact, prepared
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
 from dano.scene._joints import Joint, Layout, layout_of
+from dano.scene._loops import check_loops, Loop, Loops, loops_of
 from dano.scene._making import (
     check_contacts,
     check_materials,
@@ -43,6 +44,7 @@ class Scene(eqx.Module):
         joints: What hangs on what.
         others: Pairs of bodies that no contact names; None if they do not touch.
         room: Chunks of point contacts that a step has room for (static); None leaves it to the engine.
+        loops: What closes chains of joints.
     """
 
     bodies: tuple[Body, ...]
@@ -53,6 +55,7 @@ class Scene(eqx.Module):
     joints: tuple[Joint, ...] = ()
     others: Others | None = None
     room: int | None = eqx.field(static=True, default=None)
+    loops: tuple[Loop, ...] = ()
 
     @classmethod
     def create(
@@ -61,6 +64,7 @@ class Scene(eqx.Module):
         contacts: Sequence[Contact] = (),
         *,
         joints: Sequence[Joint] = (),
+        loops: Sequence[Loop] = (),
         others: ContactParams | None = None,
         apart: Sequence[tuple[str, str]] = (),
         timestep: Numbers = 0.01,
@@ -72,39 +76,42 @@ class Scene(eqx.Module):
             bodies: The bodies, in the order that states index.
             contacts: Which pairs may touch, and how.
             joints: What hangs on what, in the order of the coordinates q.
+            loops: What closes chains of joints.
             others: Lets all other pairs touch, too, by `DistributedLaw`: parameters of bodies that have no
                 `Body.material` of their own. Those of a pair follow from its two bodies, see
-                `Others.pair_params`. What a joint joins does not touch.
+                `Others.pair_params`. What a joint or a loop joins does not touch.
             apart: Names of pairs that do not touch although `others` is given.
             timestep: h [s].
             gravity: [m/s², W].
 
         Raises:
             ValueError: If bodies are missing or share a name, a contact names an unknown body, two fixed ones
-                or a pair twice, a pair cannot overlap, joints make no trees, no pair uses a material, or a
-                number is out of range.
+                or a pair twice, a pair cannot overlap, joints make no trees, a loop closes no chain, no
+                pair uses a material, or a number is out of range.
         """
         bodies = checked_parts("bodies", bodies, Body)
         contacts = checked_parts("contacts", contacts, Contact)
         joints = checked_parts("joints", joints, Joint)
+        loops = checked_parts("loops", loops, Loop)
         check_names(bodies)
         timestep = checked_array("timestep", timestep, ())
         if not is_traced(timestep) and not float(timestep) > 0:
             raise ValueError(f"timestep must be > 0 s, got {float(timestep)}")
         check_contacts(bodies, joints, contacts)
+        children = layout_of(*structure(bodies, joints)).children
+        check_loops([body.name for body in bodies], children, loops)
         gravity = checked_array("gravity", gravity, (3,))
         # Before the bodies are prepared, which makes new ones.
         twins = twins_of(bodies)
         bodies, contacts = prepared(bodies, contacts, gravity)
         rest = None
         if others is not None:
-            bodies, rest = others_of(bodies, contacts, joints, apart, others, gravity)
+            bodies, rest = others_of(bodies, contacts, (*joints, *loops), apart, others, gravity)
         check_materials(bodies, others, apart)
         if contacts or rest is not None:
             warn_of_long_steps(bodies, timestep, gravity)
-        return cls(
-            bodies, contacts, timestep, gravity, twins, joints, rest, room_for(bodies, timestep, gravity)
-        )
+        room = room_for(bodies, timestep, gravity)
+        return cls(bodies, contacts, timestep, gravity, twins, joints, rest, room, loops)
 
     def _repr_html_(self) -> str:
         """What notebooks show: bodies with mass and size, and what may touch."""
@@ -133,6 +140,12 @@ class Scene(eqx.Module):
         """The trees that bodies and joints make, as arrays."""
         com = jnp.stack([body.com + body.com_offset for body in self.bodies])
         return chains_of(self.layout, self.joints, com.astype(self.timestep.dtype))
+
+    @property
+    def closing(self) -> Loops | None:
+        """The loops as arrays; None if there are none."""
+        com = jnp.stack([body.com + body.com_offset for body in self.bodies])
+        return loops_of(self.names, self.loops, com.astype(self.timestep.dtype))
 
     @property
     def driven(self) -> bool:

@@ -19,8 +19,19 @@ from dano.maths import Pose
 from dano.memory import memory_limit
 from dano.names import did_you_mean
 from dano.objects import MassModel, NeuralObject
-from dano.robots import Robot
-from dano.scene import Body, Contact, joined, Joint, JOINT_KINDS, JOINT_QUANTITIES, Scene, State
+from dano.robots import close_loops, Robot
+from dano.scene import (
+    Body,
+    Contact,
+    joined,
+    Joint,
+    JOINT_KINDS,
+    JOINT_QUANTITIES,
+    Loop,
+    LOOP_KINDS,
+    Scene,
+    State,
+)
 from dano.scene_file._objects import asset_look, build_asset, build_object, Progress
 from dano.scene_file._robots import read_robots, robot_files
 from dano.scene_file._schedule import read_schedule, Schedule
@@ -44,6 +55,7 @@ _STATE = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 _GEOMETRY = ("object", "field", "asset", "shape")
 _BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE, *JOINT_QUANTITIES)
 _JOINT = {"axis": 3, "anchor": 3, "position": 3, "orientation": 4}
+_LOOP = {"position": 3, "anchor": 3, "orientation": 4}
 _JOINT_NUMBERS = ("damping", "friction", "armature", "stiffness", "rest", "ratio", "shift")
 # The mass of a body is a key of the body.
 _BUILD = tuple(field.name for field in dataclasses.fields(BuildOptions) if field.name != "mass")
@@ -87,6 +99,7 @@ _TOP = (
     "n_steps",
     "bodies",
     "joints",
+    "loops",
     "robots",
     "contacts",
     "default_contact",
@@ -224,14 +237,19 @@ def parse_scene(
     bodies += [body for robot, _ in robots for body in robot.bodies]
     joints = [joint for robot, _ in robots for joint in robot.joints]
     joints += _joints(top, [body.name for body in bodies])
-    contacts = _contacts(top, bodies, joints, default_law, [robot for robot, _ in robots])
+    loops = [loop for robot, _ in robots for loop in robot.loops]
+    loops += _loops(top, [body.name for body in bodies])
+    contacts = _contacts(top, bodies, [*joints, *loops], default_law, [robot for robot, _ in robots])
     with located(str(path)):
-        scene = Scene.create(bodies, contacts, joints=joints, timestep=h, gravity=gravity)
+        scene = Scene.create(bodies, contacts, joints=joints, loops=loops, timestep=h, gravity=gravity)
         given = (*_STATE, *JOINT_QUANTITIES)
         start = {row["name"]: {key: row[key] for key in given if key in row} for row in tables}
         for robot, q in robots:
             start |= robot.start(q)
         state = scene.initial_state(**start)
+        if loops:
+            # Coordinates that the file gives stay as they are.
+            state = close_loops(scene, state, [name for name, given in start.items() if "q" in given])
     objects = {
         row["name"]: row["asset"] if "asset" in row else path.parent / Path(row["object"]).expanduser()
         for row in tables
@@ -359,8 +377,25 @@ def _joints(top: Table, names: Sequence[str]) -> list[Joint]:
     return joints
 
 
+def _loops(top: Table, names: Sequence[str]) -> list[Loop]:
+    loops = []
+    for i, row in enumerate(top.tables("loops")):
+        table = Table(f"{top.where}: [[loops]] {i + 1}", row, ("first", "second", "kind", *_LOOP))
+        second = table.word("second", names)
+        first = table.word("first", names) if "first" in table else None
+        with located(table.where):
+            kind = table.word("kind", LOOP_KINDS, "point")
+            given: dict[str, Any] = {key: table.vector(key, n) for key, n in _LOOP.items() if key in table}
+            loops.append(Loop(first, second, kind, **given))
+    return loops
+
+
 def _contacts(
-    top: Table, bodies: Sequence[Body], joints: Sequence[Joint], default_law: str, robots: Sequence[Robot]
+    top: Table,
+    bodies: Sequence[Body],
+    joints: Sequence[Joint | Loop],
+    default_law: str,
+    robots: Sequence[Robot],
 ) -> list[Contact]:
     default = top.table("default_contact", _CONTACT)
     default.where = f"{top.where}: [default_contact]"
