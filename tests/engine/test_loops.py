@@ -10,6 +10,7 @@ from engine.trees import coordinates, value_and_forward
 from scipy.integrate import solve_ivp
 
 import dano
+from dano.mujoco import MuJoCoEngine
 
 CRANK, COUPLER, ROCKER, GROUND, G = 0.2, 0.5, 0.4, 0.45, 9.81
 MASSES = (0.5, 0.8, 0.6)
@@ -266,5 +267,8 @@ def test_open_loops_and_wrong_ones_are_said():
         dano.Loop("a", "b", "pin")
     with pytest.raises(ValueError, match="loop must join two different bodies, got 'a' twice"):
         dano.Loop("a", "a")
+    with pytest.raises(ValueError, match="scene must have no loops for MuJoCoEngine, got 1"):
+        pytest.importorskip("mujoco")
+        MuJoCoEngine(scene)
     with pytest.raises(ValueError, match="scene must have no loops, got 1"):
         dano.joint_reactions(scene, on_its_way(scene, 0.9), np.zeros(3))

@@ -74,8 +74,8 @@ class MuJoCoEngine(AbstractEngine):
 
         Raises:
             ImportError: If mujoco is missing.
-            ValueError: If nothing in the scene moves, a shape is no geom of MuJoCo's, an object has no solid
-                for a mesh, or an option is out of range.
+            ValueError: If nothing in the scene moves, it has loops, a shape is no geom of MuJoCo's, an object
+                has no solid for a mesh, or an option is out of range.
         """
         if objects not in TOUCHES:
             raise ValueError(f"objects must be one of {', '.join(TOUCHES)}, got {objects!r}")
@@ -83,6 +83,8 @@ class MuJoCoEngine(AbstractEngine):
             raise ValueError(f"difference must be > 0, got {difference}")
         if not any(not body.fixed for body in scene.bodies):
             raise ValueError("scene must have a body that moves, got only fixed ones")
+        if scene.loops:
+            raise ValueError(f"scene must have no loops for MuJoCoEngine, got {len(scene.loops)}")
         self.names, self.difference = scene.names, float(difference)
         self.objects = objects
         self._twin = Twin(scene, objects)
