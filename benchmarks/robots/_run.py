@@ -4,6 +4,7 @@ import dataclasses
 import importlib.util
 import time
 import xml.etree.ElementTree as ET
+from importlib.resources import files
 from pathlib import Path
 
 import jax
@@ -22,6 +23,7 @@ from benchmarks._measure import (
     time_in_turn,
     warm_up,
 )
+from benchmarks.robots import _chains, _identify
 from dano.robots import Robot
 
 STEPS = 1000
@@ -29,6 +31,9 @@ TIMESTEP = 1e-3
 START = np.array([0.1, 0.4, -0.3, -1.5, 0.2, 1.6, 0.5])
 SPEED = "One step of 1 ms, without contact"
 SWING = "Free swing without friction"
+KEPT = "What chains keep"
+SHARED = 1.5  # load average from which on other programs ran, too
+FOUND = "Found from logs"
 
 
 def run() -> None:
@@ -42,7 +47,12 @@ def run() -> None:
         robot = dano.load_urdf(path, collision=False)
         rows = _speed_rows(robot, path, 3 if arguments.quick else 15)
         rows += _swing_rows(robot, path, 2.0 if arguments.quick else 60.0)
-    report("robots", rows, {"steps": STEPS, "timestep": TIMESTEP}, load, arguments.json)
+        rows += _chains.rows(KEPT, 200 if arguments.quick else 10_000)
+        arm = Path(str(files("dano") / "assets" / "arm.urdf"))
+        rows += _identify.rows(FOUND, path, arm, 1 if arguments.quick else 8)
+    # Other programs slow down what is timed, most of all what reads much memory.
+    settings = {"steps": STEPS, "timestep": TIMESTEP, "shared": load_average() > SHARED}
+    report("robots", rows, settings, load, arguments.json)
 
 
 def _panda() -> Path | None:
