@@ -2,6 +2,7 @@
 
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -75,6 +76,43 @@ def test_a_task_file_says_what_the_task_is(folder):
     assert given.task.goals[0].axes == "xy" and given.task.limits[0].name == "limit of velocity of puck"
 
 
+MOTOR = """
+timestep = 0.1
+n_steps = 3
+gravity = [0.0, 0.0, 0.0]
+[[bodies]]
+name = "jaw"
+shape = "box"
+half_extents = [0.1, 0.1, 0.1]
+mass = 1.0
+[[joints]]
+child = "jaw"
+kind = "slide"
+axis = [1.0, 0.0, 0.0]
+motor = { kind = "position", stiffness = 400.0, damping = 40.0, limits = [-50.0, 50.0] }
+"""
+
+
+def test_commands_of_motors_are_controls_of_a_task(tmp_path):
+    """A motor in a scene file, and first guesses with straight lines between moments."""
+    (tmp_path / "scene.toml").write_text(MOTOR)
+    (tmp_path / "task.toml").write_text(
+        'n_steps = 5\n[[actuators]]\nbody = "jaw"\nkind = "command"\nlower = -1.0\nupper = 1.0\n'
+        'start = [[0.0, 0.0], [0.1, 0.0], [0.3, 0.4]]\n[[goals]]\nbody = "jaw"\nq = 0.4\n'
+    )
+    scene = load_scene(tmp_path / "scene.toml").scene
+    given = load_task(tmp_path / "task.toml", scene)
+    np.testing.assert_allclose(given.controls[:, 0], [0, 0, 0.2, 0.4, 0.4], atol=1e-12)
+    controls = given.task.controls(scene, jnp.asarray(given.controls))
+    np.testing.assert_allclose(controls.command, given.controls)
+    with pytest.raises(ValueError, match=r"\[\[joints\]\] 1 .*unknown key 'stifness'"):
+        (tmp_path / "wrong.toml").write_text(MOTOR.replace("stiffness", "stifness"))
+        load_scene(tmp_path / "wrong.toml")
+    with pytest.raises(ValueError, match="command of 'jaw' must be that of a joint with a motor"):
+        (tmp_path / "plain.toml").write_text(MOTOR[: MOTOR.index("motor =")])
+        load_task(tmp_path / "task.toml", load_scene(tmp_path / "plain.toml").scene)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -85,7 +123,9 @@ def test_a_task_file_says_what_the_task_is(folder):
         ("limit = 20.0", "limt = 20.0", "unknown key 'limt'; .*; did you mean 'limit'"),
         ("limit = 20.0", "lower = 3.0\nupper = 2.0", "no control lies between them"),
         ("limit = 20.0", "limit = 'much'", "limit must be a number or a list of numbers, got 'much'"),
-        ("start = [1.0, 0.0]", "start = [1.0]", "start must be a number or a list of 2"),
+        ("start = [1.0, 0.0]", "start = [1.0]", "start must be a number, a list of 2, or rows of a time"),
+        ("start = [1.0, 0.0]", "start = [[0.0, 1.0]]", "start must be rows of a growing time and 2 numbers"),
+        ("start = [1.0, 0.0]", "start = [[1, 0, 0], [0, 0, 0]]", "rows of a growing time and 2 numbers"),
         ("limit = 20.0", 'kind = "forc"\nlimit = 1.0', "kind must be one of .*; did you mean 'force'"),
         ("position = [0.3, 0.1, 0.0]", "", "needs exactly one of position, orientation"),
         ("position = [0.3, 0.1, 0.0]", "positoin = [0, 0, 0]", "did you mean 'position'"),

@@ -214,7 +214,10 @@ def test_softened_contact_has_that_share_of_the_stiffness(pushing):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: dano.Actuator("a", "push", limit=1.0), "must be one of force, torque, effort, got 'push'"),
+        (
+            lambda: dano.Actuator("a", "push", limit=1.0),
+            "must be one of force, torque, effort, command, got 'push'",
+        ),
         (lambda: dano.Actuator("a"), "bounds of the force of 'a' must be given"),
         (
             lambda: dano.Actuator("a", lower=2.0, upper=1.0),

@@ -144,8 +144,13 @@ def load_controls(path: str | os.PathLike[str]) -> Control:
     """
     data = read_archive(path, "dano-plan", 1)
     try:
-        effort = jnp.asarray(data["control_effort"]) if "control_effort" in data else None
-        return Control(jnp.asarray(data["control_force"]), jnp.asarray(data["control_torque"]), effort)
+        force, torque = (jnp.asarray(data[f"control_{name}"]) for name in ("force", "torque"))
+        joints = {
+            name: jnp.asarray(data[key])
+            for name in ("effort", "command")
+            if (key := f"control_{name}") in data
+        }
+        return Control(force, torque, **joints)
     except KeyError as error:
         raise ValueError(f"{path} is not a valid plan: it lacks {error}") from error
 

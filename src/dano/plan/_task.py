@@ -20,7 +20,7 @@ from dano.maths import (
 from dano.names import did_you_mean
 from dano.scene import Control, Scene, State
 
-KINDS = {"force": 3, "torque": 3, "effort": 1}
+KINDS = {"force": 3, "torque": 3, "effort": 1, "command": 1}
 """What an actuator can be, and how many numbers it has."""
 QUANTITIES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3, "q": 1, "v": 1}
 """What a goal or a limit can be about, and how many numbers that takes."""
@@ -28,11 +28,12 @@ _AXES = "xyz"
 
 
 class Actuator(eqx.Module):
-    """A force, a torque or a joint's effort that the plan may choose.
+    """A force, a torque, a joint's effort or its motor's command that the plan may choose.
 
     Attributes:
-        body: Name of the body; for an effort the one that hangs on the joint.
-        kind: "force" at the centre of mass [N, W], "torque" [N m, W], or "effort" of a joint [N m or N].
+        body: Name of the body; for an effort or a command the one that hangs on the joint.
+        kind: "force" at the centre of mass [N, W], "torque" [N m, W], "effort" of a joint [N m or N], or
+            "command" of its motor, see `dano.Motor`.
         axes: Which components of a force or a torque it has, e.g. "xy" (static).
         lower: Least values, shape (number of axes,).
         upper: Largest values.
@@ -61,11 +62,11 @@ class Actuator(eqx.Module):
 
         Args:
             body: Name of the body.
-            kind: "force", "torque" or "effort".
+            kind: "force", "torque", "effort" or "command".
             limit: Bound of the magnitude of every component; instead of `lower` and `upper`.
             lower: Least value, one number or one per axis.
             upper: Largest value.
-            axes: Components in use, letters of "xyz"; unused for an effort.
+            axes: Components in use, letters of "xyz"; unused for an effort or a command.
             cost: Price of its squares.
 
         Raises:
@@ -77,7 +78,7 @@ class Actuator(eqx.Module):
                 f"kind of the actuator of {body!r} must be one of {', '.join(KINDS)}, got {kind!r}"
             )
         self.body, self.kind = body, kind
-        self.axes = "" if kind == "effort" else _checked_axes(axes, f"the {kind} of {body!r}")
+        self.axes = "" if KINDS[kind] == 1 else _checked_axes(axes, f"the {kind} of {body!r}")
         what = f"of the {kind} of {body!r}"
         if limit is not None:
             if lower is not None or upper is not None:
@@ -303,9 +304,13 @@ class Task(eqx.Module):
                 )
             i = scene.index(part.body)
             joint = layout.joint_of(i)
-            if kind in ("effort", "q", "v") and (joint is None or layout.width(joint) != 1):
+            if kind in ("effort", "command", "q", "v") and (joint is None or layout.width(joint) != 1):
                 raise ValueError(
                     f"{kind} of {part.body!r} must be that of a joint with one coordinate, got a body without"
+                )
+            if kind == "command" and joint is not None and scene.joints[joint].motor is None:
+                raise ValueError(
+                    f"command of {part.body!r} must be that of a joint with a motor, it has none"
                 )
             if isinstance(part, Actuator) and i not in layout.moving:
                 raise ValueError(f"actuator must drive a body that moves, got the fixed {part.body!r}")
@@ -324,20 +329,23 @@ class Task(eqx.Module):
         n = len(scene.bodies)
         force, torque = jnp.zeros((n, 3), u.dtype), jnp.zeros((n, 3), u.dtype)
         layout = scene.layout
-        effort = jnp.zeros(layout.n_joints, u.dtype) if layout.n_joints else None
+        given = {"effort": jnp.zeros(layout.n_joints, u.dtype)} if layout.n_joints else {}
+        if scene.driven:
+            given["command"] = jnp.zeros(layout.n_joints, u.dtype)
         at = 0
         for actuator in self.actuators:
             values, i = u[at : at + actuator.size], scene.index(actuator.body)
             at += actuator.size
-            if actuator.kind == "effort":
+            if KINDS[actuator.kind] == 1:
                 joint = layout.joint_of(i)
-                assert effort is not None and joint is not None
-                effort = effort.at[layout.coordinates[joint]].add(values[0])
+                assert joint is not None
+                place = layout.coordinates[joint]
+                given[actuator.kind] = given[actuator.kind].at[place].add(values[0])
             elif actuator.kind == "force":
                 force = force.at[i, actuator.places()].add(values)
             else:
                 torque = torque.at[i, actuator.places()].add(values)
-        return Control(force, torque, effort)
+        return Control(force, torque, **given)
 
     def controls(self, scene: Scene, u: Float[Array, "T m"]) -> Control:
         """`control` of every step."""

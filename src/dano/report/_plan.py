@@ -135,7 +135,7 @@ def draw_controls(task: Task, plan: Plan, path: str | os.PathLike[str]) -> None:
     figure = Figure(figsize=(8, 2.2 * (len(task.actuators) + 1)), layout="constrained")
     axes = figure.subplots(len(task.actuators) + 1, 1, sharex=True)
     at = 0
-    units = {"force": "N", "torque": "N m", "effort": "N or N m"}
+    units = {"force": "N", "torque": "N m", "effort": "N or N m", "command": "of its motor"}
     for axis, actuator in zip(axes, task.actuators, strict=False):
         for j in range(actuator.size):
             label = actuator.axes[j] if actuator.axes else None

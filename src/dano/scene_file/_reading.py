@@ -29,6 +29,8 @@ from dano.scene import (
     JOINT_QUANTITIES,
     Loop,
     LOOP_KINDS,
+    Motor,
+    MOTOR_KINDS,
     Scene,
     State,
 )
@@ -55,6 +57,7 @@ _STATE = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 _GEOMETRY = ("object", "field", "asset", "shape")
 _BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE, *JOINT_QUANTITIES)
 _JOINT = {"axis": 3, "anchor": 3, "position": 3, "orientation": 4}
+_MOTOR_NUMBERS = ("stiffness", "damping", "gear")
 _LOOP = {"position": 3, "anchor": 3, "orientation": 4}
 _JOINT_NUMBERS = ("damping", "friction", "armature", "stiffness", "rest", "ratio", "shift")
 # The mass of a body is a key of the body.
@@ -360,7 +363,7 @@ def _joints(top: Table, names: Sequence[str]) -> list[Joint]:
         table = Table(
             f"{top.where}: [[joints]] {i + 1}",
             row,
-            ("parent", "child", "kind", *_JOINT, "limits", *_JOINT_NUMBERS, "mimics"),
+            ("parent", "child", "kind", *_JOINT, "limits", *_JOINT_NUMBERS, "mimics", "motor"),
         )
         child = table.word("child", names)
         table.where += f" ({child!r})"
@@ -373,8 +376,17 @@ def _joints(top: Table, names: Sequence[str]) -> list[Joint]:
                 options["limits"] = table.vector("limits", 2)
             if "mimics" in table:
                 options["mimics"] = table.word("mimics", names)
+            if "motor" in table:
+                options["motor"] = _motor(table.table("motor", ("kind", *_MOTOR_NUMBERS, "limits")))
             joints.append(Joint(parent, child, kind, **options))
     return joints
+
+
+def _motor(table: Table) -> Motor:
+    given: dict[str, Any] = {key: table.number(key) for key in _MOTOR_NUMBERS if key in table}
+    if "limits" in table:
+        given["limits"] = table.vector("limits", 2)
+    return Motor(table.word("kind", MOTOR_KINDS, "effort"), **given)
 
 
 def _loops(top: Table, names: Sequence[str]) -> list[Loop]:

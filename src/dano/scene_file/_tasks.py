@@ -88,14 +88,15 @@ def load_task(path: str | os.PathLike[str], scene: Scene) -> TaskFile:
         raise ValueError(f"{source} must be a TOML task file: {error}") from error
     top = Table(str(source), data, _TOP)
     n_steps = _steps(top, float(scene.timestep))
-    read = [_actuator(table, scene) for table in _rows(top, "actuators", _ACTUATOR)]
+    times = float(scene.timestep) * np.arange(n_steps)
+    read = [_actuator(table, scene, times) for table in _rows(top, "actuators", _ACTUATOR)]
     goals = [_goal(table, scene) for table in _rows(top, "goals", _GOAL)]
     limits = [_limit(table, scene) for table in _rows(top, "limits", _LIMIT)]
     with located(str(source)):
         task = Task(n_steps, [actuator for actuator, _ in read], goals, limits)
         task.check(scene)
-    start = np.concatenate([first for _, first in read])
-    return TaskFile(task, np.tile(start, (n_steps, 1)), _search(top), source, text)
+    start = np.concatenate([first for _, first in read], axis=1)
+    return TaskFile(task, start, _search(top), source, text)
 
 
 def _rows(top: Table, name: str, valid: Sequence[str]) -> list[Table]:
@@ -137,20 +138,35 @@ def _numbers(table: Table, key: str) -> Any:
     return tuple(float(x) for x in value) if isinstance(value, list) else float(value)
 
 
-def _actuator(table: Table, scene: Scene) -> tuple[Actuator, np.ndarray]:
+def _actuator(table: Table, scene: Scene, times: np.ndarray) -> tuple[Actuator, np.ndarray]:
+    """An actuator, and the first guess of its controls at all times [s]."""
     body = _body(table, scene)
     kind = table.word("kind", list(KINDS), "force")
-    if kind == "effort" and "axes" in table:
-        raise ValueError(f"{table.where}: an effort has no axes")
+    if KINDS[kind] == 1 and "axes" in table:
+        raise ValueError(f"{table.where}: {'an' if kind == 'effort' else 'a'} {kind} has no axes")
     options = {key: _numbers(table, key) for key in ("limit", "lower", "upper") if key in table}
     with located(table.where):
         actuator = Actuator(
             body, kind, axes=table.word("axes", None, "xyz"), cost=table.number("cost", 1e-4), **options
         )
-        start = np.asarray(_numbers(table, "start") if "start" in table else 0.0)
-        if start.shape not in ((), (actuator.size,)):
-            raise table.wrong("start", f"a number or a list of {actuator.size}")
-        return actuator, np.broadcast_to(start, (actuator.size,))
+        return actuator, _start(table, actuator.size, times)
+
+
+def _start(table: Table, size: int, times: np.ndarray) -> np.ndarray:
+    """First controls: as they are, or straight lines between rows of a time [s] and the controls."""
+    given = table.data.get("start", 0.0)
+    if isinstance(given, list) and given and isinstance(given[0], list):
+        good = all(
+            len(row) == 1 + size and all(map(is_number, row)) for row in given if isinstance(row, list)
+        )
+        rows = np.array(given, float) if good and all(isinstance(row, list) for row in given) else None
+        if rows is None or np.any(np.diff(rows[:, 0]) <= 0):
+            raise table.wrong("start", f"rows of a growing time and {size} numbers")
+        return np.stack([np.interp(times, rows[:, 0], column) for column in rows[:, 1:].T], axis=1)
+    start = np.asarray(_numbers(table, "start") if "start" in table else 0.0)
+    if start.shape not in ((), (size,)):
+        raise table.wrong("start", f"a number, a list of {size}, or rows of a time and {size} numbers")
+    return np.broadcast_to(start, (times.size, size))
 
 
 def _goal(table: Table, scene: Scene) -> Goal:
