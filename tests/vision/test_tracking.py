@@ -12,9 +12,10 @@ from dano.identify import load_motion
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate, quat_to_matrix
 from dano.scene_file import asset_look
 from dano.vision import Film, Light, PosedCamera, track, TrackOptions
+from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._refine import Refined
 from dano.vision.tracking._segments import like_object, overlap, Place, unlike_place
-from dano.vision.tracking._subject import Placement, Subject
+from dano.vision.tracking._subject import Subject
 from dano.vision.tracking._sureness import covariance_of, unobservable
 
 SIZE = (96, 72)
@@ -86,13 +87,14 @@ def test_slopes_are_differences_of_what_is_seen(bunny, camera):
     y, x = np.mgrid[16:56:2, 30:66:2]
     pixels = np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
     lamps = (Light(LIGHT), Light((1, 0, 0.5), intensity=0.3), Light((-1, 0, 0.2), intensity=0.2))
-    rays = camera.position, camera.directions(pixels), camera.pixel_angle
-    seen = subject.see(place, lamps, *rays, slopes=True)
+    seen = subject.picture(place, lamps, camera, pixels, slopes=True)
     for k in range(6):
         # A step of half a pixel: what the eye could see.
         step = np.zeros(6)
         step[k] = 0.012
-        high, low = (subject.see(place.moved(s * step, subject.radius), lamps, *rays) for s in (1, -1))
+        high, low = (
+            subject.picture(place.moved(s * step, subject.radius), lamps, camera, pixels) for s in (1, -1)
+        )
         # Colours jump where one part of the object hides another, which no derivative tells.
         for slope, values, least in (
             (seen.opacity_slope[:, k], (high.opacity - low.opacity) / 0.024, 0.85),

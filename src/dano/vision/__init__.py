@@ -56,6 +56,7 @@ from dano.vision.structure import (
     Up as Up,
 )
 from dano.vision.tracking import (
+    adjust_poses as adjust_poses,
     Film as Film,
     Overlay as Overlay,
     read_film as read_film,

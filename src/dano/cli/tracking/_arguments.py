@@ -32,6 +32,8 @@ class Track:
         occluders: Folder with a mask for each frame, bright where something hides the object.
         rate: Frames a second; default: the times in the video.
         slow_motion: How many times slower the video plays than it was filmed.
+        shutter: How long a frame is exposed [s], if what moves is blurred.
+        readout: How much later the last row of a frame is exposed than the first (rolling shutter) [s].
         every: Take every so many-th frame.
         body: Name of the body in the motion; default: the object's.
         start: Rough pose in the first frame: x y z [m] and qw qx qy qz; default: searched.
@@ -57,6 +59,8 @@ class Track:
     occluders: Path | None = None
     rate: float | None = None
     slow_motion: float = 1.0
+    shutter: float = 0.0
+    readout: float = 0.0
     every: int = 1
     body: str | None = None
     start: tuple[float, float, float, float, float, float, float] | None = None

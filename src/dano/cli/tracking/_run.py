@@ -33,7 +33,14 @@ def track(command: Track) -> None:
     check_distinct(output=command.output, report=command.report)
     _check_camera(command)
     field = _field(command.object)
-    options = TrackOptions(masks=command.mask_source, loss=command.loss, rays=command.rays, seed=command.seed)
+    options = TrackOptions(
+        masks=command.mask_source,
+        loss=command.loss,
+        rays=command.rays,
+        shutter=command.shutter,
+        readout=command.readout,
+        seed=command.seed,
+    )
     progress = Progress()
     film = read_film(
         command.video,

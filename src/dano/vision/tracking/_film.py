@@ -48,6 +48,22 @@ class Film(NamedTuple):
         """Width and height [pixels]."""
         return self.images[0].shape[1], self.images[0].shape[0]
 
+    def check_size(self, camera: PosedCamera) -> None:
+        """Refuse a camera of another size than the film.
+
+        Raises:
+            ValueError: If it is.
+        """
+        width, height = self.size
+        near = (camera.width // self.shrunk, camera.height // self.shrunk)
+        if (width, height) == near:
+            return
+        turned = ", as if the film were turned: photographs for poses must be held like the film"
+        raise ValueError(
+            f"camera must be of the size of the film, {width * self.shrunk} × {height * self.shrunk} pixels,"
+            f" got {camera.width} × {camera.height}" + (turned if (height, width) == near else "")
+        )
+
     def camera(self, original: PosedCamera) -> PosedCamera:
         """The camera of the averaged frames, from that of the original ones."""
         k = self.shrunk

@@ -6,7 +6,8 @@ from scipy.optimize import nnls
 
 from dano.vision.capture import AbstractCamera, Light
 from dano.vision.drawing import GAMMA
-from dano.vision.tracking._subject import Placement, Subject
+from dano.vision.tracking._placement import Placement
+from dano.vision.tracking._subject import Subject
 
 LAMPS = 3
 """Lamps that a film is lit by: a sun, a sky, and what a table throws back."""

@@ -8,9 +8,13 @@ from jaxtyping import Float
 from dano.vision.capture import background_mask, Light, PosedCamera, View
 from dano.vision.tracking._film import Film, read_picture
 from dano.vision.tracking._options import TrackOptions
+from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._refine import silhouette, Target, window_of
 from dano.vision.tracking._segments import like_object, Palette, Place, unlike_place
-from dano.vision.tracking._subject import Placement, Subject
+from dano.vision.tracking._subject import Subject
+
+BLIND = 0.5
+"""Share of the silhouette that must not be hidden."""
 
 
 class Masking:

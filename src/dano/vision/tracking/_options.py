@@ -25,6 +25,10 @@ class TrackOptions:
         rays: Pixels of a frame that the finest refinement takes.
         lost: Overlap of mask and silhouette, as intersection over union, below which the object is lost.
         search_every: After how many frames a lost object is looked for again in all orientations.
+        shutter: How long a frame is exposed [s], by which what moves is blurred; 0 takes it to be sharp. The
+            time of a frame is the middle of its exposure.
+        readout: How much later the last row of a frame is exposed than the first (rolling shutter) [s]; the
+            time of a frame is that of its middle row.
         seed: Of all random numbers.
     """
 
@@ -36,6 +40,8 @@ class TrackOptions:
     rays: int = 2048
     lost: float = 0.75
     search_every: int = 3
+    shutter: float = 0.0
+    readout: float = 0.0
     seed: int = 0
 
     def __post_init__(self):
@@ -47,5 +53,8 @@ class TrackOptions:
         for name, low in least.items():
             if getattr(self, name) < low:
                 raise ValueError(f"{name} must be ≥ {low}, got {getattr(self, name)}")
+        for name in ("shutter", "readout"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"{name} must be ≥ 0 and < 1 s, got {getattr(self, name)}")
         if not 0 < self.lost < 1:
             raise ValueError(f"lost must lie between 0 and 1, got {self.lost}")

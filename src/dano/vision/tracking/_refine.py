@@ -5,6 +5,7 @@ deviation and weighted robustly; derivatives are the renderer's. Levenberg's dam
 went too far.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +13,9 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from dano.vision.capture import Light, PosedCamera
+from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._segments import overlap
-from dano.vision.tracking._subject import Placement, Seen, Subject
+from dano.vision.tracking._subject import Seen, Subject
 
 _MASK_NOISE = 0.12
 """Standard deviation of a mask at the edge, least."""
@@ -147,7 +149,7 @@ def aligned(subject: Subject, target: Target, place: Placement, lamps: tuple[Lig
     depth = float((subject.middle(place) - target.camera.position) @ target.camera.axes[2])
     right, up, _ = target.camera.axes
     shift = (given - here) * depth / target.camera.focal
-    return Placement(place.position + shift[0] * right - shift[1] * up, place.orientation)
+    return dataclasses.replace(place, position=place.position + shift[0] * right - shift[1] * up)
 
 
 def refine(
@@ -226,10 +228,7 @@ def _chosen(opacity, target: Target, window, rays: int, random: np.random.Genera
 def _rows(subject: Subject, target: Target, place: Placement, lamps, index: np.ndarray, loss: str) -> _Rows:
     y, x = index.T
     pixels = np.stack([x, y], axis=1) + 0.5
-    camera = target.camera
-    seen = subject.see(
-        place, lamps, camera.position, camera.directions(pixels), camera.pixel_angle, slopes=True
-    )
+    seen = subject.picture(place, lamps, target.camera, pixels, slopes=True)
     if loss == "paper":
         return _paper_rows(target, seen, index)
     sigma = _MASK_NOISE

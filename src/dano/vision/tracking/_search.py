@@ -15,8 +15,9 @@ from dano.maths import quat_conjugate, quat_from_matrix, quat_log, quat_multiply
 from dano.vision.capture import Light
 from dano.vision.tracking._light import LAMPS, LightFit
 from dano.vision.tracking._options import TrackOptions
+from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._refine import pixels_of, refine, Refined, silhouette, Target
-from dano.vision.tracking._subject import CHUNK, Placement, Subject
+from dano.vision.tracking._subject import CHUNK, Subject
 
 _SIDE = 32
 """Pixels a side of rendered views: a chunk of rays."""
@@ -205,7 +206,9 @@ def _view(subject: Subject, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, f
     places = (-axes[1] - 0.3 * axes[2], axes[0] - 0.5 * axes[2], -axes[0] - 0.5 * axes[2])
     lamps = tuple(Light(place, intensity=0.4) for place in places)
     here = Placement(np.zeros(3), np.array([1.0, 0, 0, 0]))
-    seen = subject.see(here, lamps, subject.centre - away * axes[2], directions, width)
+    seen = subject.see(
+        here, lamps, np.broadcast_to(subject.centre - away * axes[2], directions.shape), directions, width
+    )
     colour = seen.colour / np.maximum(seen.opacity, 0.3)[:, None]
     return seen.opacity.reshape(_SIDE, _SIDE), colour.reshape(_SIDE, _SIDE, 3), width
 

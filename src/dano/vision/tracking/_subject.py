@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.maths import quat_exp, quat_multiply, quat_to_matrix
+from dano.maths import quat_exp, quat_multiply, quat_rotate, quat_to_matrix
 from dano.vision.capture import AbstractCamera, Light
 from dano.vision.drawing import Part, through
 from dano.vision.radiance import LearnedField, Sampling, SurfaceModel
+from dano.vision.tracking._placement import Drift, Placement
 
 CHUNK = 512
 """Rays at once: one size, one compilation."""
@@ -21,23 +22,6 @@ SAMPLING = Sampling(48, 12, 2)
 
 _STEEPEST = 4.0
 """Sharpness of a silhouette times the width of a pixel: its edge is as soft as a pixel's average makes it."""
-
-
-class Placement(NamedTuple):
-    """Where the object's field frame is.
-
-    Attributes:
-        position: Of its origin [m, W], shape (3,).
-        orientation: Unit quaternion wxyz, F → W, shape (4,).
-    """
-
-    position: Float[np.ndarray, "3"]
-    orientation: Float[np.ndarray, "4"]
-
-    def moved(self, change: Float[np.ndarray, "6"], radius: float) -> "Placement":
-        """Shifted by `change[:3]` radii [W], then turned by the rotation vector `change[3:]` [rad, F]."""
-        turned = quat_multiply(self.orientation, quat_exp(np.asarray(change[3:], np.float64)))
-        return Placement(self.position + radius * change[:3], turned / np.linalg.norm(turned))
 
 
 class Seen(NamedTuple):
@@ -87,31 +71,29 @@ class Subject:
         self,
         place: Placement,
         lamps: tuple[Light, ...],
-        origin: Float[np.ndarray, "3"],
+        origins: Float[np.ndarray, "n 3"],
         directions: Float[np.ndarray, "n 3"],
         pixel: float,
         *,
         slopes: bool = False,
     ) -> Seen:
-        """What rays from one point see.
+        """What rays see of the object at rest.
 
         Args:
             place: Where the object is.
             lamps: Light that it is under.
-            origin: Of the rays [m, W].
+            origins: Of the rays [m, W].
             directions: Unit vectors [W].
             pixel: Angle between neighbouring rays [rad].
             slopes: Whether derivatives are wanted.
         """
-        away = max(float(np.linalg.norm(self.middle(place) - origin)), self.radius)
+        away = max(float(np.linalg.norm(self.middle(place) - origins[0])), self.radius)
         sharpness = np.float32(min(self._drawn, _STEEPEST / (pixel * away)))
         n = len(directions)
         rows = [np.zeros((0,)), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3, 6))]
         parts = [rows]
         for start in range(0, n, CHUNK):
-            some = directions[start : start + CHUNK].astype(np.float32)
-            # Rays that only fill the chunk look away from the object.
-            filled = np.concatenate([some, np.tile(-some[:1], (CHUNK - len(some), 1))])
+            rays = slice(start, min(start + CHUNK, n))
             looking = _Looking(
                 self._model,
                 jnp.asarray(place.position, jnp.float32),
@@ -119,22 +101,67 @@ class Subject:
                 jnp.asarray(self.radius, jnp.float32),
                 sharpness,
                 lamps,
-                jnp.asarray(origin, jnp.float32),
-                jnp.asarray(filled),
+                _filled(origins[rays], origins[0]),
+                # Rays that only fill the chunk look away from the object.
+                _filled(directions[rays], -directions[0]),
             )
             found = _linearized(looking) if slopes else _seen(looking)
-            parts.append([np.asarray(x, np.float64)[: len(some)] for x in found] + rows[len(found) :])
+            parts.append(
+                [np.asarray(x, np.float64)[: len(origins[rays])] for x in found] + rows[len(found) :]
+            )
         return Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def picture(
-        self, place: Placement, lamps: tuple[Light, ...], camera: AbstractCamera, pixels: np.ndarray
+        self,
+        place: Placement,
+        lamps: tuple[Light, ...],
+        camera: AbstractCamera,
+        pixels: Float[np.ndarray, "n 2"],
+        *,
+        slopes: bool = False,
     ) -> Seen:
-        """What a camera sees at image coordinates [pixels]."""
-        return self.see(place, lamps, camera.position, camera.directions(pixels), camera.pixel_angle)
+        """What a camera sees at image coordinates [pixels], in the mean of its exposure.
+
+        Colours are averaged as sRGB: where an object is opaque they differ little within the blur.
+        """
+        directions, pixel = camera.directions(pixels), camera.pixel_angle
+        origins = np.broadcast_to(camera.position, directions.shape)
+        drift = place.drift
+        if drift is None:
+            return self.see(place, lamps, origins, directions, pixel, slopes=slopes)
+        away = max(float(np.linalg.norm(self.middle(place) - camera.position)), self.radius)
+        way = np.linalg.norm(drift.velocity) + self.radius * np.linalg.norm(drift.spin)
+        moments = drift.moments(pixels[:, 1] / camera.height, float(way) / (pixel * away))
+        exposures = [
+            self.see(
+                place, lamps, *self._meanwhile(place, drift, late, origins, directions), pixel, slopes=slopes
+            )
+            for late in moments.T
+        ]
+        return Seen(*(np.mean(column, axis=0) for column in zip(*exposures, strict=True)))
+
+    def _meanwhile(
+        self,
+        place: Placement,
+        drift: Drift,
+        late: Float[np.ndarray, " n"],
+        origins: np.ndarray,
+        directions: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rays that see of the object at its pose what given rays see of it some time later."""
+        middle = self.middle(place)
+        back = quat_exp(-late[:, None] * drift.spin)
+        here = middle + quat_rotate(back, origins - middle - late[:, None] * drift.velocity)
+        return here, quat_rotate(back, directions)
+
+
+def _filled(rows: Float[np.ndarray, "n 3"], last: Float[np.ndarray, "3"]) -> Array:
+    """Rows of a chunk, with others put in where it has fewer."""
+    return jnp.asarray(np.concatenate([rows, np.tile(last, (CHUNK - len(rows), 1))]), jnp.float32)
 
 
 class _Looking(NamedTuple):
-    """A model somewhere, and rays from one point."""
+    """A model somewhere, and rays."""
 
     model: SurfaceModel
     position: Array
@@ -142,7 +169,7 @@ class _Looking(NamedTuple):
     radius: Array
     sharpness: np.float32
     lamps: tuple[Light, ...]
-    origin: Array
+    origins: Array
     directions: Array
 
     def moved(self, change: Array) -> tuple[Array, Array]:
@@ -150,10 +177,9 @@ class _Looking(NamedTuple):
         turned = quat_multiply(self.orientation, quat_exp(change[3:]))
         place = self.position + self.radius * change[:3]
         part = Part(self.model, quat_to_matrix(turned), place, jnp.asarray(self.sharpness))
-        origins = jnp.broadcast_to(self.origin, self.directions.shape)
         limit = jnp.full(len(self.directions), jnp.inf, jnp.float32)
         colour, _, (opacity,), _ = through(
-            (part,), (self.lamps,), origins, self.directions, limit, 0.0, SAMPLING
+            (part,), (self.lamps,), self.origins, self.directions, limit, 0.0, SAMPLING
         )
         return opacity, colour
 

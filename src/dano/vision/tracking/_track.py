@@ -1,24 +1,25 @@
 """The verb: the pose of a known object in every frame of a film."""
 
+import dataclasses
 import time
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply
 from dano.progress import Progress
-from dano.vision.capture import Light, PosedCamera
+from dano.vision.capture import PosedCamera
 from dano.vision.radiance import LearnedField
 from dano.vision.tracking._film import Film
 from dano.vision.tracking._light import LightFit
-from dano.vision.tracking._masking import Masking
+from dano.vision.tracking._masking import BLIND, Masking
 from dano.vision.tracking._options import TrackOptions
+from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.tracking._refine import aligned, refine, Refined, Target, window_of
+from dano.vision.tracking._result import HIDDEN, LOST, OUTSIDE, TRACKED, Tracked, tracked
 from dano.vision.tracking._search import half_turns, learn_light, score, search, Start, unlikeness
-from dano.vision.tracking._subject import CHUNK, Placement, Subject
-from dano.vision.tracking._sureness import covariance_of, unobservable
+from dano.vision.tracking._subject import CHUNK, Subject
 
 _COARSE = 24
 """Size of the object [pixels] at the coarsest level of the pyramid."""
@@ -35,71 +36,11 @@ _ALIKE = 0.02
 _OTHER = np.radians(12)
 """Angle from which a start is another one."""
 
-_CLEAR = 1.05
-"""Ratio of how starts fit up to which a message says so."""
-
-_BLIND = 0.5
-"""Share of the silhouette that must not be hidden."""
-
 _WORSE = 0.03
 """By how much less than usually a silhouette must overlap for other poses to be tried."""
 
 _ASIDE = np.radians(15)
 """By how much these are turned."""
-
-TRACKED, LOST, OUTSIDE, HIDDEN = "tracked", "lost", "outside", "hidden"
-"""What became of a frame."""
-
-
-class Overlay(NamedTuple):
-    """A silhouette in a frame.
-
-    Attributes:
-        window: Rows and columns of the frame.
-        opacity: Rendered there.
-    """
-
-    window: tuple[slice, slice]
-    opacity: Float[np.ndarray, "_ _"]
-
-
-class Tracked(NamedTuple):
-    """Poses of an object in the frames of a film. What was not seen is NaN.
-
-    Attributes:
-        times: Of the frames [s], shape (T,).
-        position: Of the origin of the object's frame [m, W], shape (T, 3).
-        orientation: Unit quaternions wxyz, object → world, shape (T, 4).
-        covariance: Of each pose: of the position [m, W], then of the rotation vector [rad, object's frame],
-            shape (T, 6, 6).
-        status: Of each frame: "tracked", "lost", "outside" the picture, or "hidden".
-        quality: Overlap of each mask with the silhouette, as intersection over union, shape (T,).
-        colour_error: Usual difference of colours of each frame, in sRGB, shape (T,).
-        lamps: Light that the film is under.
-        ambiguity: How well the next-best orientation explains the first frame: its difference of colours over
-            that of the best; ∞ if none has a silhouette that fits as well. Near 1 the start may be another.
-        overlays: Silhouettes at these poses, None where there is none.
-        messages: What a user should know, in sentences.
-        seconds: Time a frame took [s], the search at the start not included.
-    """
-
-    times: Float[np.ndarray, " T"]
-    position: Float[np.ndarray, "T 3"]
-    orientation: Float[np.ndarray, "T 4"]
-    covariance: Float[np.ndarray, "T 6 6"]
-    status: tuple[str, ...]
-    quality: Float[np.ndarray, " T"]
-    colour_error: Float[np.ndarray, " T"]
-    lamps: tuple[Light, ...]
-    ambiguity: float
-    overlays: tuple[Overlay | None, ...]
-    messages: tuple[str, ...]
-    seconds: float
-
-    @property
-    def n_tracked(self) -> int:
-        """Frames with a pose."""
-        return sum(status == TRACKED for status in self.status)
 
 
 def track(
@@ -131,7 +72,7 @@ def track(
             frame.
     """
     chosen = options or TrackOptions()
-    _check_size(film, camera)
+    film.check_size(camera)
     walk = _Walk(film, field, camera, chosen, background)
     first = None if start is None else Placement(*(np.asarray(x, np.float64) for x in start))
     if first is not None:
@@ -141,18 +82,6 @@ def track(
         tell(f"tracking, frame {film.names[i]}", i / len(film.times))
         walk.step(i)
     return walk.result()
-
-
-def _check_size(film: Film, camera: PosedCamera) -> None:
-    width, height = film.size
-    near = (camera.width // film.shrunk, camera.height // film.shrunk)
-    if (width, height) == near:
-        return
-    turned = ", as if the film were turned: photographs for poses must be held like the film"
-    raise ValueError(
-        f"camera must be of the size of the film, {width * film.shrunk} × {height * film.shrunk} pixels, got"
-        f" {camera.width} × {camera.height}" + (turned if (height, width) == near else "")
-    )
 
 
 class _Walk:
@@ -191,6 +120,8 @@ class _Walk:
             if found is None and status == LOST and self._missed == 0:
                 found, searched = self._searched(i), True
         if found is not None:
+            found = self._exposed(i, found)
+        if found is not None:
             status = TRACKED
             self._missed = 0
             count = self._status.count(TRACKED)
@@ -221,7 +152,25 @@ class _Walk:
         return Placement(
             last.position + share * (last.position - earlier.position),
             quat_multiply(last.orientation, quat_exp(share * turn)),
+            last.drift,
         )
+
+    def _exposed(self, i: int, found: Refined) -> Refined:
+        """The pose once more, with how the object moves while the frame is exposed."""
+        options = self._options
+        seen = [j for j in range(i) if self._found[j] is not None]
+        if not (options.shutter or options.readout) or not seen:
+            return found
+        last = self._place(seen[-1])
+        duration = self._film.times[i] - self._film.times[seen[-1]]
+        drift = Drift.between(
+            last, found.place, duration, self._subject.middle, options.shutter, options.readout
+        )
+        if last.drift is None:
+            # The first frame was taken for one of an object at rest.
+            begun = self._fine(seen[-1], dataclasses.replace(last, drift=drift), self._light)
+            self._found[seen[-1]] = begun or self._found[seen[-1]]
+        return self._fine(i, dataclasses.replace(found.place, drift=drift), self._light) or found
 
     def _place(self, i: int) -> Placement:
         found = self._found[i]
@@ -287,7 +236,7 @@ class _Walk:
             0 <= middle[0] <= self._camera.width and 0 <= middle[1] <= self._camera.height
         ):
             return None, OUTSIDE
-        if self._masking.hidden(i, window) > 1 - _BLIND:
+        if self._masking.hidden(i, window) > 1 - BLIND:
             return None, HIDDEN
         found = self._refined(i, before, self._light)
         if found is None or found.overlap < self._options.lost:
@@ -372,49 +321,14 @@ class _Walk:
                 f"video: the object was found in none of {len(self._found)} frames: it must be in the"
                 " picture, of the size that camera and object say, and masks must show it (see docs/track.md)"
             )
-        n = len(self._found)
-        position, orientation = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
-        covariance = np.full((n, 6, 6), np.nan)
-        quality, colour = np.full(n, np.nan), np.full(n, np.nan)
-        overlays: list[Overlay | None] = [None] * n
-        for i, found in enumerate(self._found):
-            if found is not None:
-                position[i], orientation[i] = found.place
-                covariance[i] = covariance_of(found, self._subject, self._camera.position)
-                quality[i], colour[i] = found.overlap, found.colour_error
-                overlays[i] = Overlay(found.window, found.silhouette)
-        known = [found for found in self._found if found is not None]
-        return Tracked(
-            self._film.times,
-            position,
-            orientation,
-            covariance,
-            tuple(self._status),
-            quality,
-            colour,
+        return tracked(
+            self._film,
+            self._subject,
+            self._camera.position,
+            self._found,
+            self._status,
             self._light.lamps,
-            self._ambiguity,
-            tuple(overlays),
-            tuple(self._messages(known)),
-            float(np.mean(self._seconds)) if self._seconds else 0.0,
+            notes=self._masking.notes,
+            ambiguity=self._ambiguity,
+            seconds=self._seconds,
         )
-
-    def _messages(self, known: list[Refined]) -> list[str]:
-        """What a user should know."""
-        texts = [*self._film.notes, *self._masking.notes, *unobservable(known, self._subject)]
-        for status, words in (
-            (LOST, "the object was lost (its mask does not fit the silhouette)"),
-            (OUTSIDE, "the object was out of the picture"),
-            (HIDDEN, "the object was hidden by more than half"),
-        ):
-            names = [n for n, s in zip(self._film.names, self._status, strict=True) if s == status]
-            if names:
-                texts.append(
-                    f"{words} in {len(names)} frames: {', '.join(names[:6])}{' …' * (len(names) > 6)}"
-                )
-        if self._ambiguity < _CLEAR:
-            texts.append(
-                "another orientation explains the first frame nearly as well: the object may be turned by a"
-                " symmetry of its shape; give start if it is"
-            )
-        return texts

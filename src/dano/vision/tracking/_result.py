@@ -1,0 +1,143 @@
+"""What tracking finds: poses of an object in the frames of a film, and how sure they are."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dano.vision.capture import Light
+from dano.vision.tracking._film import Film
+from dano.vision.tracking._refine import Refined
+from dano.vision.tracking._subject import Subject
+from dano.vision.tracking._sureness import covariance_of, unobservable
+
+_CLEAR = 1.05
+"""Ratio of how starts fit up to which a message says so."""
+
+TRACKED, LOST, OUTSIDE, HIDDEN = "tracked", "lost", "outside", "hidden"
+"""What became of a frame."""
+
+
+class Overlay(NamedTuple):
+    """A silhouette in a frame.
+
+    Attributes:
+        window: Rows and columns of the frame.
+        opacity: Rendered there.
+    """
+
+    window: tuple[slice, slice]
+    opacity: Float[np.ndarray, "_ _"]
+
+
+class Tracked(NamedTuple):
+    """Poses of an object in the frames of a film. What was not seen is NaN.
+
+    Attributes:
+        times: Of the frames [s], shape (T,).
+        position: Of the origin of the object's frame [m, W], shape (T, 3).
+        orientation: Unit quaternions wxyz, object → world, shape (T, 4).
+        covariance: Of each pose: of the position [m, W], then of the rotation vector [rad, object's frame],
+            shape (T, 6, 6).
+        status: Of each frame: "tracked", "lost", "outside" the picture, or "hidden".
+        quality: Overlap of each mask with the silhouette, as intersection over union, shape (T,).
+        colour_error: Usual difference of colours of each frame, in sRGB, shape (T,).
+        lamps: Light that the film is under.
+        ambiguity: How well the next-best orientation explains the first frame: its difference of colours over
+            that of the best; ∞ if none has a silhouette that fits as well. Near 1 the start may be another.
+        overlays: Silhouettes at these poses, None where there is none.
+        messages: What a user should know, in sentences.
+        seconds: Time a frame took [s], the search at the start not included.
+    """
+
+    times: Float[np.ndarray, " T"]
+    position: Float[np.ndarray, "T 3"]
+    orientation: Float[np.ndarray, "T 4"]
+    covariance: Float[np.ndarray, "T 6 6"]
+    status: tuple[str, ...]
+    quality: Float[np.ndarray, " T"]
+    colour_error: Float[np.ndarray, " T"]
+    lamps: tuple[Light, ...]
+    ambiguity: float
+    overlays: tuple[Overlay | None, ...]
+    messages: tuple[str, ...]
+    seconds: float
+
+    @property
+    def n_tracked(self) -> int:
+        """Frames with a pose."""
+        return sum(status == TRACKED for status in self.status)
+
+
+def tracked(
+    film: Film,
+    subject: Subject,
+    eye: Float[np.ndarray, "3"],
+    found: Sequence[Refined | None],
+    status: Sequence[str],
+    lamps: tuple[Light, ...],
+    *,
+    notes: Sequence[str] = (),
+    ambiguity: float = np.inf,
+    seconds: Sequence[float] = (),
+) -> Tracked:
+    """Poses of a film put together.
+
+    Args:
+        film: The frames.
+        subject: The object.
+        eye: Where the camera is [m, W].
+        found: What was found in each frame.
+        status: What became of each frame.
+        lamps: Light.
+        notes: Sentences about masks.
+        ambiguity: As in `Tracked`.
+        seconds: Time of each frame [s].
+    """
+    n = len(found)
+    position, orientation = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
+    covariance = np.full((n, 6, 6), np.nan)
+    quality, colour = np.full(n, np.nan), np.full(n, np.nan)
+    overlays: list[Overlay | None] = [None] * n
+    for i, one in enumerate(found):
+        if one is not None:
+            position[i], orientation[i] = one.place.position, one.place.orientation
+            covariance[i] = covariance_of(one, subject, eye)
+            quality[i], colour[i] = one.overlap, one.colour_error
+            overlays[i] = Overlay(one.window, one.silhouette)
+    known = [one for one in found if one is not None]
+    texts = [*film.notes, *notes, *unobservable(known, subject), *_messages(film, status, ambiguity)]
+    return Tracked(
+        film.times,
+        position,
+        orientation,
+        covariance,
+        tuple(status),
+        quality,
+        colour,
+        lamps,
+        ambiguity,
+        tuple(overlays),
+        tuple(texts),
+        float(np.mean(seconds)) if len(seconds) else 0.0,
+    )
+
+
+def _messages(film: Film, status: Sequence[str], ambiguity: float) -> list[str]:
+    """What a user should know of frames without a pose, and of the start."""
+    texts = []
+    for kind, words in (
+        (LOST, "the object was lost (its mask does not fit the silhouette)"),
+        (OUTSIDE, "the object was out of the picture"),
+        (HIDDEN, "the object was hidden by more than half"),
+    ):
+        names = [n for n, s in zip(film.names, status, strict=True) if s == kind]
+        if names:
+            texts.append(f"{words} in {len(names)} frames: {', '.join(names[:6])}{' …' * (len(names) > 6)}")
+    if ambiguity < _CLEAR:
+        texts.append(
+            "another orientation explains the first frame nearly as well: the object may be turned by a"
+            " symmetry of its shape; give start if it is"
+        )
+    return texts
