@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from scipy import ndimage
 
 from dano.vision.capture import background_mask, Light, PosedCamera, View
 from dano.vision.tracking._film import Film, read_picture
@@ -40,16 +41,15 @@ class Masking:
             raise ValueError(
                 "masks: there are none (a folder of masks, or frames with alpha), though masks='given'"
             )
-        if self.source in ("static", "object"):
+        if background is not None:
             width, height = film.size
-            if background is not None:
-                self._place = Place(read_picture(background, (height, width), film.shrunk), film.images)
-            else:
-                self._place = Place.of_film(film.images)
-                self.notes.append(
-                    "masks: what is behind the object is taken from the median of all frames; a picture of"
-                    " the place without it (background) is better"
-                )
+            self._place = Place(read_picture(background, (height, width), film.shrunk), film.images)
+        elif self.source in ("static", "object"):
+            self._place = Place.of_film(film.images)
+            self.notes.append(
+                "masks: what is behind the object is taken from the median of all frames; a picture of"
+                " the place without it (background) is better"
+            )
 
     def _is_plain(self) -> bool:
         try:
@@ -120,7 +120,10 @@ class Masking:
             blur: By how much the pose may be off [pixels].
         """
         if self.source != "object":
-            return self.alone(i, camera)
+            target = self.alone(i, camera)
+            if target is None or self._place is None:
+                return target
+            return target._replace(behind=self._place.seen_in(target.image, target.mask < 0.05))
         window = window_of(subject, place, camera, 1.5)
         if window is None:
             return None
@@ -128,7 +131,12 @@ class Masking:
         image = self._image(i)
         mask = np.zeros(image.shape[:2], np.float32)
         mask[window] = like_object(image[window], expected, blur, self._palette, self._place, window)
-        return Target(camera, image.astype(np.float64), mask, self._seen(i))
+        behind = None
+        if self._place is not None:
+            free = np.ones(mask.shape, bool)
+            free[window] = ~ndimage.binary_dilation(expected > 0.02, iterations=int(np.ceil(blur)))
+            behind = self._place.seen_in(image, free & (mask < 0.05))
+        return Target(camera, image.astype(np.float64), mask, self._seen(i), behind)
 
     def learn(self, target: Target, window: tuple[slice, slice], shape: np.ndarray) -> None:
         """Take the object's colours in a frame into account, where it surely is."""

@@ -23,6 +23,9 @@ _MASK_NOISE = 0.12
 _COLOUR_NOISE = 0.025
 """Standard deviation of a colour, in sRGB, least: a learned look is not better."""
 
+_SHADE_DOUBT = 0.3
+"""Standard deviation of how bright a place is that the object's shadow may reach, as a share."""
+
 _OUTLIER = 3.0
 """Standard deviations from which residuals lose weight (Geman and McClure)."""
 
@@ -47,12 +50,14 @@ class Target(NamedTuple):
         image: sRGB in [0, 1].
         mask: Where the object is, 0 to 1.
         seen: Where nothing else stands in front of it.
+        behind: What would be seen there without the object, in this frame's light; None if it is not known.
     """
 
     camera: PosedCamera
     image: Float[np.ndarray, "height width 3"]
     mask: Float[np.ndarray, "height width"]
     seen: Bool[np.ndarray, "height width"]
+    behind: Float[np.ndarray, "height width 3"] | None = None
 
     def reduced(self, factor: int) -> "Target":
         """The same with so many pixels a side averaged into one."""
@@ -67,7 +72,8 @@ class Target(NamedTuple):
         camera = self.camera.replaced(
             focal=self.camera.focal / factor, centre=self.camera.centre / factor, width=w, height=h
         )
-        return Target(camera, mean(self.image), mean(self.mask), mean(self.seen.astype(float)) > 0.99)
+        behind = None if self.behind is None else mean(self.behind)
+        return Target(camera, mean(self.image), mean(self.mask), mean(self.seen.astype(float)) > 0.99, behind)
 
 
 class Refined(NamedTuple):
@@ -129,9 +135,14 @@ def silhouette(
     subject: Subject, place: Placement, lamps: tuple[Light, ...], camera: PosedCamera, window
 ) -> tuple[np.ndarray, np.ndarray]:
     """Opacity and colour over black of the pixels of a window."""
-    seen = subject.picture(place, lamps, camera, pixels_of(window))
+    pixels = pixels_of(window)
+    near = subject.reached(place, camera, pixels)
+    opacity, colour = np.zeros(len(pixels)), np.zeros((len(pixels), 3))
+    if near.any():
+        seen = subject.picture(place, lamps, camera, pixels[near])
+        opacity[near], colour[near] = seen.opacity, seen.colour
     shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
-    return seen.opacity.reshape(shape), seen.colour.reshape(*shape, 3)
+    return opacity.reshape(shape), colour.reshape(*shape, 3)
 
 
 def aligned(subject: Subject, target: Target, place: Placement, lamps: tuple[Light, ...]) -> Placement:
@@ -231,6 +242,8 @@ def _rows(subject: Subject, target: Target, place: Placement, lamps, index: np.n
     seen = subject.picture(place, lamps, target.camera, pixels, slopes=True)
     if loss == "paper":
         return _paper_rows(target, seen, index)
+    if loss == "photometric" and target.behind is not None:
+        return _composed_rows(target, seen, index)
     sigma = _MASK_NOISE
     residual = ((seen.opacity - target.mask[y, x]) / sigma)[:, None]
     slope = (seen.opacity_slope / sigma)[:, None]
@@ -238,22 +251,67 @@ def _rows(subject: Subject, target: Target, place: Placement, lamps, index: np.n
     total, weights, error = float(cost.mean()), weight[:, None], float("nan")
     if loss == "photometric":
         inside = (seen.opacity > 0.9) & (target.mask[y, x] > 0.5)
-        away = seen.colour / np.maximum(seen.opacity, 0.5)[:, None] - target.image[y, x]
-        lengths = np.sqrt(np.mean(away**2, axis=1))
-        error = float(np.median(lengths[inside])) if inside.any() else float("nan")
-        noise = max(1.2 * error, _COLOUR_NOISE) if inside.any() else 1.0
-        rows = np.where(inside[:, None], away / noise, 0)
         ratio = seen.colour / np.maximum(seen.opacity, 0.5)[:, None]
         change = seen.colour_slope - ratio[..., None] * seen.opacity_slope[:, None]
-        light, cost = _robust(np.where(inside, lengths / noise, 0))
-        # Costs of different noise can be compared only with what the noise itself costs.
-        total += float(np.mean(np.where(inside, cost + np.log(noise / _COLOUR_NOISE), 0)))
-        residual = np.concatenate([residual, rows / np.sqrt(3)], axis=1)
-        slope = np.concatenate(
-            [slope, np.where(inside[:, None, None], change / noise / np.sqrt(3), 0)], axis=1
-        )
-        weights = np.concatenate([weights, np.repeat(light[:, None], 3, axis=1)], axis=1)
+        light = _colour_rows(ratio - target.image[y, x], change, inside, inside)
+        total, error = total + light.cost, light.colour_error
+        residual = np.concatenate([residual, light.residual], axis=1)
+        slope = np.concatenate([slope, light.slope], axis=1)
+        weights = np.concatenate([weights, light.weight], axis=1)
     return _Rows(residual, slope, weights, total, error)
+
+
+def _composed_rows(target: Target, seen: Seen, index: np.ndarray) -> _Rows:
+    """Object over what is known to be behind it, less the frame: no mask stands between."""
+    y, x = index.T
+    assert target.behind is not None
+    behind, alpha = target.behind[y, x], np.clip(seen.opacity, 0, 1)[:, None]
+    # As the look was learned: colours of sRGB are mixed, not light.
+    away = seen.colour + (1 - alpha) * behind - target.image[y, x]
+    change = seen.colour_slope - behind[..., None] * seen.opacity_slope[:, None]
+    inside = (seen.opacity > 0.9) & (target.mask[y, x] > 0.5)
+    # How bright the place is, in the object's shadow above all, is known roughly.
+    doubt = _SHADE_DOUBT * (1 - alpha) * behind
+    return _colour_rows(away, change, inside, np.ones(len(index), bool), doubt)
+
+
+def _colour_rows(
+    away: np.ndarray,
+    change: np.ndarray,
+    inside: np.ndarray,
+    counted: np.ndarray,
+    doubt: np.ndarray | None = None,
+) -> _Rows:
+    """Rows of differences of colours over their noise, which pixels inside the object tell.
+
+    Args:
+        away: Differences in sRGB (n, 3).
+        change: Their derivatives (n, 3, 6).
+        inside: Pixels that show the object and nothing else.
+        counted: Pixels that count.
+        doubt: Differences (n, 3) that are expected with variance one beside the noise, e.g. of brightness.
+    """
+    lengths = np.sqrt(np.mean(away**2, axis=1))
+    error = float(np.median(lengths[inside])) if inside.any() else float("nan")
+    noise = max(1.2 * error, _COLOUR_NOISE) if inside.any() else 1.0
+    if doubt is not None:
+        # (σ² I + d dᵀ)^(−1/2) σ: what lies along d counts less.
+        square = np.sum(doubt**2, axis=1)
+        less = (1 - 1 / np.sqrt(1 + square / noise**2)) / np.maximum(square, 1e-12)
+        away = away - (less * np.sum(doubt * away, axis=1))[:, None] * doubt
+        change = change - (less[:, None] * np.einsum("nc,nck->nk", doubt, change))[:, None] * doubt[..., None]
+        lengths = np.sqrt(np.mean(away**2, axis=1))
+    weight, cost = _robust(np.where(counted, lengths / noise, 0))
+    # Costs of different noise can be compared only with what the noise itself costs.
+    total = float(np.mean(np.where(counted, cost + np.log(noise / _COLOUR_NOISE), 0)))
+    scale = noise * np.sqrt(3)
+    return _Rows(
+        np.where(counted[:, None], away / scale, 0),
+        np.where(counted[:, None, None], change / scale, 0),
+        np.repeat(weight[:, None], 3, axis=1),
+        total,
+        error,
+    )
 
 
 def _robust(lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -24,6 +24,15 @@ _STILL = 0.05
 _LEAST_AREA = 24
 """Pixels below which a mask says nothing."""
 
+_SHADE_BLUR = 3.0
+"""Standard deviation of the blur over which a place is taken to be equally bright [pixels]."""
+
+_SHADE_PRIOR = 1e-3
+"""Brightness by which the shade falls back to one where nothing of the place is seen."""
+
+_SHADE_RANGE = (0.15, 1.5)
+"""Least and largest shade."""
+
 
 class Place:
     """What is seen where the object is not.
@@ -65,6 +74,21 @@ class Place:
             square = np.sum((image - shade * colours) ** 2, axis=2) / (2 * (1.5 * self.noise) ** 2)
             best = np.maximum(best, -square + (0 if shade == 1.0 else np.log(_SHADOW_PRIOR)))
         return best - 1.5 * np.log(2 * np.pi) - 3 * np.log(1.5 * self.noise)
+
+    def seen_in(
+        self, image: Float[np.ndarray, "height width 3"], free: Bool[np.ndarray, "height width"]
+    ) -> Float[np.ndarray, "height width 3"]:
+        """The place as a frame shows it: in its shadows and exposure, carried on to where it is hidden.
+
+        Args:
+            image: The frame.
+            free: Where it surely shows the place.
+        """
+        weight = free.astype(np.float64)
+        sums = [ndimage.gaussian_filter(weight * x.mean(axis=2), _SHADE_BLUR) for x in (image, self.colours)]
+        # Far from everything that is free the place is as bright as in the picture of it.
+        shade = (sums[0] + _SHADE_PRIOR) / (sums[1] + _SHADE_PRIOR)
+        return np.clip(shade, *_SHADE_RANGE)[..., None] * self.colours
 
 
 class Palette:

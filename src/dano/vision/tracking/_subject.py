@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from dano.maths import quat_exp, quat_multiply, quat_rotate, quat_to_matrix
 from dano.vision.capture import AbstractCamera, Light
@@ -19,6 +19,12 @@ CHUNK = 512
 
 SAMPLING = Sampling(48, 12, 2)
 """Coarser than for pictures to look at: a pixel of a film has noise of its own."""
+
+_SOFT = 3.0
+"""Pixels by which the edge of a silhouette lies outside the box, at most."""
+
+_LOOSE = 0.02
+"""Share of its size by which the object's density reaches out of the box of its surface."""
 
 _STEEPEST = 4.0
 """Sharpness of a silhouette times the width of a pixel: its edge is as soft as a pixel's average makes it."""
@@ -51,7 +57,7 @@ class Subject:
     """
 
     def __init__(self, field: LearnedField):
-        lower, upper = np.asarray(field.solid.solid_bounds, np.float64)
+        lower, upper = self._box = np.asarray(field.solid.solid_bounds, np.float64)
         self.centre = 0.5 * (lower + upper)
         self.radius = 0.5 * float(np.linalg.norm(upper - lower))
         self.size = float((upper - lower).max())
@@ -66,6 +72,25 @@ class Subject:
     def around(self, middle: Float[np.ndarray, "3"], orientation: Float[np.ndarray, "4"]) -> Placement:
         """The placement with an orientation whose ball lies around a point [m, W]."""
         return Placement(middle - quat_to_matrix(orientation) @ self.centre, orientation)
+
+    def reached(
+        self, place: Placement, camera: AbstractCamera, pixels: Float[np.ndarray, "n 2"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Which pixels may show the object: their rays pass the box around it, or by less than its edge."""
+        away = max(float(np.linalg.norm(self.middle(place) - camera.position)), self.radius)
+        margin = _SOFT * camera.pixel_angle * away + _LOOSE * self.size
+        drift = place.drift
+        if drift is not None:
+            way = np.linalg.norm(drift.velocity) + self.radius * np.linalg.norm(drift.spin)
+            margin += 0.5 * (drift.shutter + drift.readout) * float(way)
+        turn = quat_to_matrix(place.orientation)
+        directions = camera.directions(pixels) @ turn
+        origin = (camera.position - place.position) @ turn
+        # Distances at which rays cross the three pairs of planes of the box; parallel ones by rounding.
+        safe = np.where(np.abs(directions) < 1e-12, 1e-12, directions)
+        first, last = (self._box[0] - margin - origin) / safe, (self._box[1] + margin - origin) / safe
+        enter, leave = np.minimum(first, last).max(axis=1), np.maximum(first, last).min(axis=1)
+        return (leave > enter) & (leave > 0)
 
     def see(
         self,

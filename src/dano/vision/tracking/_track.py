@@ -125,7 +125,7 @@ class _Walk:
             status = TRACKED
             self._missed = 0
             count = self._status.count(TRACKED)
-            if searched or count % _LIGHT_EVERY == 0:
+            if searched or count < _LIGHT_EVERY or count % _LIGHT_EVERY == 0:
                 known = self._light.known
                 self._learn(i, found)
                 if self._light.known and not known:
@@ -135,6 +135,14 @@ class _Walk:
             self._missed += 1
         self._found.append(found)
         self._status.append(status)
+        if found is not None and self._status.count(TRACKED) == _LIGHT_EVERY:
+            self._settle()
+
+    def _settle(self) -> None:
+        """Refine the first frames again, under the light that several frames tell."""
+        for j, found in enumerate(self._found):
+            if found is not None:
+                self._found[j] = self._fine(j, found.place, self._light) or found
 
     def _expected(self, i: int) -> Placement | None:
         """The pose at constant velocity; None if there is nothing to go by."""

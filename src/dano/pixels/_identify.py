@@ -1,0 +1,140 @@
+"""Parameters of a scene from the pixels of a film, through the simulation."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dano.identify import Identification, identify, Motion, Parameter
+from dano.maths import checked_count
+from dano.progress import Progress
+from dano.scene import Scene
+from dano.vision import adjust_poses, Film, LearnedField, Light, PosedCamera, Tracked, TrackOptions
+
+_SETTLED = 0.1
+"""Move of a parameter, in its standard errors, below which the search ends."""
+
+_LIGHT_PASSES = 2
+"""Passes in which the light is fitted: after that poses are right, and it would only follow the noise."""
+
+
+class FilmFit(NamedTuple):
+    """Parameters from a film.
+
+    Attributes:
+        fit: Values with error bars, and the motion that they give.
+        poses: The same from the poses alone, which the search began with.
+        tracked: What the film shows at the motion found: quality and status of frames, light, silhouettes.
+        history: Values of the parameters after each pass, the first of them from the poses alone.
+        settled: Whether the last pass moved no value by more than a tenth of its standard error.
+    """
+
+    fit: Identification
+    poses: Identification
+    tracked: Tracked
+    history: tuple[Mapping[str, Any], ...]
+    settled: bool
+
+    @property
+    def lamps(self) -> tuple[Light, ...]:
+        """Light that the film is under."""
+        return self.tracked.lamps
+
+
+def identify_in_film(
+    scene: Scene,
+    film: Film,
+    look: LearnedField,
+    camera: PosedCamera,
+    motion: Motion,
+    parameters: Sequence[Parameter],
+    *,
+    options: TrackOptions | None = None,
+    background: str | Path | None = None,
+    passes: int = 6,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> FilmFit:
+    """Find the parameters of a scene with which its rollout, rendered, looks like a film.
+
+    Begins with the parameters that poses of the body give (`identify`). Then the film is rendered at the
+    simulated poses, and residuals of silhouettes and colours, weighted robustly, are linearised there: a step
+    of Gauss–Newton on pixels, through renderer and simulation, in parameters and initial state. The light is
+    fitted in between. Frames in which tracking fails count as far as their pixels say something about the
+    simulated motion. Memory is that of one frame beside the rollout.
+
+    Args:
+        scene: The scene, with values for whatever is not a parameter.
+        film: The frames.
+        look: How the body looks.
+        camera: Which took the film.
+        motion: Poses of that one body, as `Motion.from_tracked` gives them, at the film's times.
+        parameters: What is unknown.
+        options: How pixels are compared, as for `track`.
+        background: Picture of the place without the object.
+        passes: Steps on pixels at most.
+        progress: Told how far it is.
+        **settings: More arguments of `identify`, such as `initial` or `controls`.
+
+    Raises:
+        ValueError: If the motion is not of one body at the film's times, or as `identify` and `track` say.
+    """
+    _check(film, motion, settings)
+    passes = checked_count("passes", passes)
+    body = motion.names[0]
+    before = identify(scene, motion, parameters, progress=progress, **settings)
+    fit, history, settled, lamps = before, [before.values], False, None
+    found = None
+    for k in range(passes):
+        seen = fit.fitted[0]
+        found = adjust_poses(
+            film,
+            look,
+            camera,
+            seen.position[:, 0],
+            seen.orientation[:, 0],
+            options,
+            background=background,
+            lamps=lamps,
+            progress=progress,
+        )
+        lamps = found.lamps if k + 1 >= _LIGHT_PASSES else None
+        pulled = Motion.from_tracked(found, body)
+        last = fit
+        fit = identify(scene, pulled, parameters, after=fit, progress=progress, **settings)
+        history.append(fit.values)
+        if settled := _moved(last, fit) < _SETTLED and k + 1 >= _LIGHT_PASSES:
+            break
+    assert found is not None
+    return FilmFit(fit, before, found, tuple(history), settled)
+
+
+def _moved(before: Identification, after: Identification) -> float:
+    """Largest move of a value, in its standard errors."""
+    moves = [
+        np.abs(np.asarray(after.values[name]) - np.asarray(before.values[name]))
+        / np.maximum(np.asarray(after.standard_errors[name]), 1e-12)
+        for name in after.values
+    ]
+    return max((float(np.max(move)) for move in moves), default=0.0)
+
+
+def _check(film: Film, motion: Motion, settings: Mapping[str, Any]) -> None:
+    if not isinstance(motion, Motion) or len(motion.names) != 1:
+        raise ValueError(
+            f"motion must be of the one body that the film shows, got {getattr(motion, 'names', motion)!r}"
+        )
+    if motion.point != "origin":
+        raise ValueError(
+            "motion must hold positions of the origin of the body's field frame (point='origin'), as tracking"
+            f" gives them, got point={motion.point!r}"
+        )
+    if len(motion.times) != len(film.times) or not np.allclose(motion.times, film.times, atol=1e-4):
+        raise ValueError(
+            f"motion must have a pose for each of the film's {len(film.times)} frames at their times, got"
+            f" {len(motion.times)} from {motion.times[0]:.4g} to {motion.times[-1]:.4g} s (film: 0 to"
+            f" {film.times[-1]:.4g} s)"
+        )
+    if wrong := {"progress", "after", "state"} & set(settings):
+        raise ValueError(f"settings must not hold {', '.join(sorted(wrong))}")
