@@ -10,8 +10,9 @@ import pytest
 from vision.models import learned
 
 import dano
-from dano.pixels import film
-from dano.vision import Camera, LearnedField, Light
+from dano.identify import Motion
+from dano.pixels import film, identify_in_film
+from dano.vision import Camera, Film, LearnedField, Light, PosedCamera, TrackOptions
 
 STEPS, EVERY = 12, 6
 
@@ -85,6 +86,64 @@ def test_forward_is_reverse(pictures):
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(STEPS // EVERY + 1, 24 * 16, 3)))
     loss = lambda numbers: jnp.sum(weights * pictures(numbers))  # noqa: E731
     np.testing.assert_allclose(jax.jacfwd(loss)(POINT), jax.grad(loss)(POINT), rtol=2e-3, atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def watched(scene, look):
+    """A film of the ball, sliding with a friction of 0.3, and the camera that took it."""
+    true = scene.replace_contact("ball", "floor", sliding_friction=0.3)
+    state = scene.initial_state(ball={"position": (-0.2, 0, 0.3), "velocity": (2.0, 0, 0)})
+    pose = np.array([[1.0, 0, 0, 0.05], [0, 0, -1.0, -1.9], [0, 1.0, 0, 0.35]])
+    camera = PosedCamera(pose, focal=64.0, width=56, height=40)
+    back = (0.1, 0.2, 0.4)
+    lamps = (Light((0.3, -0.6, 0.8)),)
+    seen = film(true, state, 12, {"ball": look}, camera, lamps, every=3, background=back)
+    images = np.asarray(seen.colour)
+    images = np.rint(255 * np.clip(images, 0, 1)).astype(np.uint8).reshape(-1, 40, 56, 3)
+    masks = list(np.asarray(seen.opacity, np.float32).reshape(-1, 40, 56))
+    n = len(images)
+    taken = Film(tuple(map(str, range(n))), np.asarray(seen.times), list(images), masks, [None] * n, 1, ())
+    motion = Motion.from_trajectory(dano.simulate(true, state, 12), bodies=["ball"], every=3)
+    return taken, camera, motion
+
+
+@pytest.mark.slow
+def test_friction_is_found_from_pixels(scene, look, watched):
+    taken, camera, motion = watched
+    random = np.random.default_rng(1)
+    # Poses that are wrong by 5 % of the ball's radius tell friction badly; the pixels tell it well.
+    rough = Motion.create(
+        motion.times,
+        "ball",
+        position=motion.position[:, 0] + 0.015 * random.normal(size=(len(motion.times), 3)) * [1, 0, 0],
+        orientation=motion.orientation[:, 0],
+        covariance=np.tile(np.diag([0.015**2] * 3 + [0.05**2] * 3), (len(motion.times), 1, 1)),
+        point="origin",
+    )
+    friction = dano.Parameter("mu", lambda s: s.contact("ball", "floor").sliding_friction, 0.05, 1.0)
+    found = identify_in_film(
+        scene,
+        taken,
+        look,
+        camera,
+        rough,
+        [friction],
+        options=TrackOptions(masks="given", rays=1500),
+        initial="velocities",
+    )
+    before, after = (float(fit.values["mu"]) for fit in (found.poses, found.fit))
+    assert abs(after / 0.3 - 1) < 0.02
+    assert abs(after - 0.3) < 0.5 * abs(before - 0.3)
+    assert len(found.history) >= 3
+
+
+def test_motions_that_do_not_belong_to_a_film_are_refused(scene, look, watched):
+    taken, camera, motion = watched
+    with pytest.raises(ValueError, match="point='origin'"):
+        identify_in_film(scene, taken, look, camera, motion, [])
+    short = dataclasses.replace(motion, point="origin").part(0, 3)
+    with pytest.raises(ValueError, match="for each of the film's 5 frames"):
+        identify_in_film(scene, taken, look, camera, short, [])
 
 
 def test_what_is_wrong_is_said(scene, look):

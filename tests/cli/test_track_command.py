@@ -30,3 +30,24 @@ def test_objects_without_a_look_are_refused(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit):
         main(["track", "film.mp4", "bunny", "-o", "m.npz", "--camera", "c.json"])
     assert "must have a learned look" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        (["--video", "film.mp4"], "video needs --look"),
+        (["--look", "trained_soap"], "give --video, too"),
+        (
+            ["--video", "film.mp4", "--look", "trained_soap"],
+            "give either --camera FILE, or --focal with --eye",
+        ),
+        (["--video", "film.mp4", "--look", "bunny", "--camera", "c.json"], "look must have a learned look"),
+        (["b.npz", "--video", "film.mp4", "--look", "trained_soap"], "that of the one motion, got 2 motions"),
+    ],
+)
+def test_films_to_identify_from_need_a_look_and_a_camera(tmp_path, monkeypatch, capsys, options, match):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        main(["identify", "scene.toml", "a.npz", *options, "-p", "soap.mass:0:1"])
+    assert stop.value.code == 2
+    assert match in capsys.readouterr().err

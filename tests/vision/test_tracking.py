@@ -1,5 +1,6 @@
 """Tracking a learned object in films that are drawn of it, by another path than the tracker's own."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -11,8 +12,8 @@ from dano.cli import main
 from dano.identify import load_motion
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate, quat_to_matrix
 from dano.scene_file import asset_look
-from dano.vision import Film, Light, PosedCamera, track, TrackOptions
-from dano.vision.tracking._placement import Placement
+from dano.vision import adjust_poses, Film, Light, PosedCamera, track, TrackOptions
+from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.tracking._refine import Refined
 from dano.vision.tracking._segments import like_object, overlap, Place, unlike_place
 from dano.vision.tracking._subject import Subject
@@ -103,6 +104,79 @@ def test_slopes_are_differences_of_what_is_seen(bunny, camera):
             cosine = np.sum(slope * values) / np.linalg.norm(slope) / np.linalg.norm(values)
             assert cosine > least
             assert np.linalg.norm(slope) == pytest.approx(np.linalg.norm(values), rel=0.4)
+
+
+def test_exposures_are_those_of_a_moving_object(bunny, camera):
+    subject = Subject(bunny)
+    position, orientation = path(1)
+    velocity, spin = np.array([0.5, 0.1, -0.2]), np.array([0.0, 1.5, 2.0])
+    still = Placement(position[0], orientation[0])
+    y, x = np.mgrid[12:60:3, 26:74:3]
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
+    lamps = (Light(LIGHT), Light((1, 0, 0.5), intensity=0.3), Light((-1, 0, 0.2), intensity=0.2))
+
+    def later(time, rows):
+        """The object itself moved, not the rays."""
+        turned = quat_multiply(quat_exp(time * spin), still.orientation)
+        place = subject.around(subject.middle(still) + time * velocity, turned)
+        return subject.picture(place, lamps, camera, pixels[rows])
+
+    everything = np.arange(len(pixels))
+    blurred = dataclasses.replace(still, drift=Drift(velocity, spin, 0.02, 0.0))
+    seen = subject.picture(blurred, lamps, camera, pixels)
+    speed = (np.linalg.norm(velocity) + subject.radius * np.linalg.norm(spin)) / (
+        camera.pixel_angle * np.linalg.norm(subject.middle(still) - camera.position)
+    )
+    moments = blurred.drift.moments(pixels[:, 1] / camera.height, speed)
+    assert moments.shape[1] == 4
+    mean = np.mean([later(t, everything).opacity for t in moments[0]], axis=0)
+    np.testing.assert_allclose(seen.opacity, mean, atol=5e-3)
+    sharp = subject.picture(still, lamps, camera, pixels)
+    assert np.abs(sharp.opacity - mean).max() > 0.2
+
+    rolling = dataclasses.replace(still, drift=Drift(velocity, spin, 0.0, 0.03))
+    seen = subject.picture(rolling, lamps, camera, pixels)
+    for row in np.unique(pixels[:, 1])[::5]:
+        rows = np.flatnonzero(pixels[:, 1] == row)
+        late = (row / camera.height - 0.5) * 0.03
+        np.testing.assert_allclose(seen.opacity[rows], later(late, rows).opacity, atol=5e-3)
+
+
+def test_pixels_pull_wrong_poses_towards_the_true_ones(bunny, camera, filmed):
+    position, orientation, frames, masks = filmed
+    film = film_of(frames, masks)
+    off = position + np.array([0.004, 0.0, -0.003])
+    turned = quat_multiply(orientation, quat_exp(np.tile([0.0, 0.04, 0.0], (4, 1))))
+    off[3] = [5.0, 0.0, 0.0]
+    found = adjust_poses(film, bunny, camera, off, turned, ROUGH)
+    assert found.status == ("tracked", "tracked", "tracked", "outside")
+    rows = slice(0, 3)
+    shift, turn = errors(found, position, orientation, rows)
+    assert shift.max() < 0.5 * 0.005 / 0.12
+    assert turn.max() < 0.5 * 0.04
+    assert np.isnan(found.position[3]).all()
+    assert np.all(np.linalg.eigvalsh(found.covariance[rows]) > 0)
+    with pytest.raises(ValueError, match=r"position must have shape \(4, 3\), got \(3, 3\)"):
+        adjust_poses(film, bunny, camera, off[:3], turned, ROUGH)
+    with pytest.raises(ValueError, match="no frame of 4 shows the object"):
+        adjust_poses(film, bunny, camera, off + 9.0, turned, ROUGH)
+
+
+def test_a_place_is_seen_in_the_frame_s_shadow_and_exposure():
+    random = np.random.default_rng(3)
+    colours = random.uniform(0.2, 0.8, (40, 50, 3)).astype(np.float32)
+    place = Place(colours, [np.rint(255 * colours).astype(np.uint8)])
+    shade = np.where(np.arange(50) < 25, 0.5, 0.9)[None, :, None]
+    image = shade * colours
+    free = np.ones((40, 50), bool)
+    free[15:25, 20:30] = False
+    image[~free] = 0.1
+    seen = place.seen_in(image, free)
+    np.testing.assert_allclose(seen[:, :15], 0.5 * colours[:, :15], rtol=0.02)
+    np.testing.assert_allclose(seen[:, 40:], 0.9 * colours[:, 40:], rtol=0.02)
+    inside = seen[~free] / colours[~free]
+    assert inside.min() > 0.45
+    assert inside.max() < 0.95
 
 
 def test_a_film_is_tracked_and_its_end_lies_outside(bunny, camera, filmed):

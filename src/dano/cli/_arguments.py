@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import arg, Positional
+from tyro.conf import arg, OmitArgPrefixes, Positional
 
 from dano.building import BuildOptions
 
@@ -285,6 +285,51 @@ class Simulate:
 
 
 @dataclass(frozen=True)
+class Filming:
+    """How the film was taken, and what tells the object from the rest.
+
+    Attributes:
+        camera: Intrinsics and pose of the camera: a .json file as of `dano poses`, with one frame.
+        focal: Focal length, or two, across and down [pixels], instead of --camera.
+        centre: Principal point [pixels]; default: the middle.
+        distortion: k1 k2 p1 p2 of OpenCV's model.
+        eye: Where the camera is [m], z up, instead of --camera.
+        look_at: Where it looks [m].
+        masks: Folder with a mask for each frame, bright where the object is.
+        mask_source: Where masks come from: given, static (unlike the place without the object), plain (unlike
+            a background of one colour), object (like the object where it is expected); auto: given ones, else
+            plain, else object.
+        background: Picture of the place without the object.
+        occluders: Folder with a mask for each frame, bright where something hides the object.
+        slow_motion: How many times slower the video plays than it was filmed.
+        shutter: How long a frame is exposed [s], if what moves is blurred.
+        readout: How much later the last row of a frame is exposed than the first (rolling shutter) [s].
+        every: Take every so many-th frame.
+        loss: What is minimised: photometric, silhouette, or the paper's two terms.
+        rays: Most pixels of a frame.
+        seed: Seed of all random numbers.
+    """
+
+    camera: Path | None = None
+    focal: tuple[float, ...] = ()
+    centre: tuple[float, float] | None = None
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    eye: tuple[float, float, float] | None = None
+    look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    masks: Path | None = None
+    mask_source: Literal["auto", "given", "static", "plain", "object"] = "auto"
+    background: Path | None = None
+    occluders: Path | None = None
+    slow_motion: float = 1.0
+    shutter: float = 0.0
+    readout: float = 0.0
+    every: int = 1
+    loss: Literal["photometric", "silhouette", "paper"] = "photometric"
+    rays: int = 2048
+    seed: int = 0
+
+
+@dataclass(frozen=True)
 class Identify:
     """Find the parameters of a scene from observed motions of its bodies, with error bars.
 
@@ -311,6 +356,10 @@ class Identify:
         point: What positions refer to: centre of mass (com) or origin of the field's frame (origin).
         rate: Frames per second, for files without times.
         timestep: Timestep of the simulation [s]; default: the scene's.
+        video: The film that the one motion was tracked in: its pixels are fitted through the simulation.
+            Needs --look and --camera.
+        look: What the body in the film looks like: what `dano train` wrote, or trained_bunny or trained_soap.
+        filming: How the film was taken.
         json: Print one JSON object instead of text.
     """
 
@@ -332,6 +381,9 @@ class Identify:
     point: Literal["com", "origin"] | None = None
     rate: float | None = None
     timestep: float | None = None
+    video: Path | None = None
+    look: str | None = None
+    filming: OmitArgPrefixes[Filming] = Filming()
     json: bool = False
 
     def __call__(self) -> None:
@@ -478,11 +530,12 @@ class Demo:
 
     Attributes:
         name: drop: a bunny, a bar of soap and a ball fall. collision: a ball hits two bunnies. all: both.
+            soap: from photographs and a film of a bar of soap to its friction, in some minutes.
         output: Folder for everything that is written.
         json: Print one JSON object instead of text.
     """
 
-    name: Positional[Literal["all", "drop", "collision"]] = "drop"
+    name: Positional[Literal["all", "drop", "collision", "soap"]] = "drop"
     output: Output = Path("dano-demo")
     json: bool = False
 

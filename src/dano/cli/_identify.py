@@ -2,8 +2,9 @@
 
 import json
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from dano.identify import Identification, identify as fit_parameters, load_motio
 from dano.names import did_you_mean
 from dano.scene import Scene
 from dano.solvers import Stop
+
+if TYPE_CHECKING:
+    from dano.pixels import FilmFit
 
 _OF_BODIES = ("mass_scale", "com_offset", "inertia", "mass", "com")
 
@@ -33,6 +37,7 @@ def identify(command: Identify) -> None:
         raise ImportError(missing)
     if not command.motions:
         raise ValueError("motions must name at least one file, got none")
+    filming = _film_of(command)
     # An interrupted search returns its best so far.
     progress = Progress(stops=False)
     loaded = scene_file.load_scene(scene, timestep=command.timestep, progress=progress)
@@ -46,23 +51,27 @@ def identify(command: Identify) -> None:
     with warnings.catch_warnings():
         # They are in the result, and said at the end.
         warnings.simplefilter("ignore", RuntimeWarning)
-        fit = fit_parameters(
-            loaded.scene,
-            found,
-            chosen,
-            state=loaded.state,
-            controls=loaded.controls,
-            noise=given or None,
-            held_out=others,
-            progress=progress,
-            initial=command.initial,
-            huber=command.huber,
-            window=command.window,
-            continuity=command.continuity,
-            starts=command.starts,
-        )
+        settings: dict[str, Any] = {
+            "state": loaded.state,
+            "controls": loaded.controls,
+            "noise": given or None,
+            "held_out": others,
+            "initial": command.initial,
+            "huber": command.huber,
+            "window": command.window,
+            "continuity": command.continuity,
+            "starts": command.starts,
+        }
+        seen = None
+        if filming is None:
+            fit = fit_parameters(loaded.scene, found, chosen, progress=progress, **settings)
+        else:
+            seen = filming(loaded.scene, found[0], chosen, progress, settings)
+            fit = seen.fit
     progress.close()
     result = {"scene": str(scene), "motions": [str(path) for path in command.motions], **fit.to_dict()}
+    if seen is not None:
+        result["film"] = _of_film(command, seen)
     if output is not None:
         with replacing(output) as file:
             file.write((json.dumps(result, indent=2, ensure_ascii=False) + "\n").encode())
@@ -77,6 +86,8 @@ def identify(command: Identify) -> None:
         put_json(result)
     else:
         _print(fit)
+        if seen is not None:
+            _print_film(seen)
         for label, file in (("result", output), ("report", None if stopped else report)):
             if file is not None:
                 put(f"{label:<10}  {file}")
@@ -84,6 +95,75 @@ def identify(command: Identify) -> None:
         raise KeyboardInterrupt("the values are the best so far")
     for message in fit.messages:
         say(f"warning: {message}")
+
+
+def _film_of(command: Identify) -> "Callable[..., FilmFit] | None":
+    """What fits the pixels of the film that the command names; None if it names none.
+
+    Raises:
+        ValueError: If the film lacks something, or is of several motions.
+    """
+    if command.video is None:
+        if command.look is not None:
+            raise ValueError("look says how the body in a film looks: give --video, too")
+        return None
+    if command.look is None:
+        raise ValueError("video needs --look: what `dano train` wrote of the body in it")
+    if len(command.motions) != 1:
+        raise ValueError(f"video must be that of the one motion, got {len(command.motions)} motions")
+    # Here, because most fits are of poses.
+    from dano.cli.tracking import _filming
+    from dano.pixels import identify_in_film
+
+    _filming.check_camera(command.filming)
+    look, video = _filming.look_of(command.look, "look"), command.video
+
+    def fit(scene: Scene, motion: Motion, chosen: list[Parameter], progress: Progress, settings) -> "FilmFit":
+        film = _filming.filmed(command.filming, video, command.rate, progress)
+        return identify_in_film(
+            scene,
+            film,
+            look,
+            _filming.camera_of(command.filming, film),
+            motion,
+            chosen,
+            options=_filming.options_of(command.filming),
+            background=command.filming.background,
+            progress=progress,
+            **settings,
+        )
+
+    return fit
+
+
+def _of_film(command: Identify, seen: "FilmFit") -> dict[str, Any]:
+    """What pixels said, beside the poses."""
+    return {
+        "file": str(command.video),
+        "from_poses": {name: np.asarray(value).tolist() for name, value in seen.poses.values.items()},
+        "from_poses_standard_errors": {
+            name: np.asarray(value).tolist() for name, value in seen.poses.standard_errors.items()
+        },
+        "passes": len(seen.history) - 1,
+        "settled": seen.settled,
+        "frames": len(seen.tracked.status),
+        "frames_used": seen.tracked.n_tracked,
+        "colour_error": float(np.nanmedian(seen.tracked.colour_error)),
+        "lamps": [
+            {"towards": np.asarray(lamp.place).tolist(), "power": np.asarray(lamp.colour).tolist()}
+            for lamp in seen.lamps
+        ],
+    }
+
+
+def _print_film(seen: "FilmFit") -> None:
+    put(
+        f"film        pixels of {seen.tracked.n_tracked} of {len(seen.tracked.status)} frames,"
+        f" {len(seen.history) - 1} passes{'' if seen.settled else ', not settled'}; from the poses alone:"
+    )
+    for name, value in seen.poses.values.items():
+        if np.ndim(value) == 0:
+            put(f"{name:<32.32} {value:12.6g} {seen.poses.standard_errors[name]:15.3g}")
 
 
 def _parameter(text: str, scene: Scene) -> Parameter:

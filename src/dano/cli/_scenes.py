@@ -71,6 +71,12 @@ def demo(command: Demo) -> None:
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"output path must be a folder, got the file {folder}")
     folder.mkdir(parents=True, exist_ok=True)
+    if command.name == "soap":
+        # Here, because no other demo trains or tracks.
+        from dano.cli.tracking._soap import demo_soap
+
+        demo_soap(folder, as_json=command.json)
+        return
     missing = missing_for_pictures(video=True)
     if missing:
         say(f"warning: numbers only, {missing}")

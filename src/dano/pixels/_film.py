@@ -83,27 +83,65 @@ def film(
     _check(scene, looks, lights)
     every = checked_count("every", every)
     trajectory = simulate(scene, state, n_steps, controls=controls, engine=engine)
-    if pixels is None:
-        y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-        pixels = np.stack([x.ravel(), y.ravel()], axis=1)
-    view = _View(
-        [jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), look.model) for look in looks.values()],
-        [float(look.drawn_sharpness) for look in looks.values()],
-        camera,
-        camera.directions(np.asarray(pixels, np.float64)).astype(np.float32),
-        _backdrop(background, len(pixels)),
-        tuple(lights),
-        sampling,
-    )
     at = np.arange(0, n_steps + 1, every)
     rows = np.array([scene.index(name) for name in looks])
     orientation = quat_normalize(trajectory.states.orientation[at][:, rows])
     arms = jnp.stack([scene.bodies[i].com + scene.bodies[i].com_offset for i in rows])
     arms = jnp.broadcast_to(arms.astype(orientation.dtype), (*orientation.shape[:2], 3))
     position = trajectory.states.position[at][:, rows] - quat_rotate(orientation, arms)
-    drawn = jax.checkpoint(lambda pose: _drawn(view, *pose))
-    colour, opacity = jax.lax.map(drawn, (position.astype(jnp.float32), orientation.astype(jnp.float32)))
+    colour, opacity = draw_frames(
+        list(looks.values()),
+        position,
+        orientation,
+        camera,
+        lights,
+        pixels=pixels,
+        background=background,
+        sampling=sampling,
+    )
     return Frames(colour, opacity, trajectory.times[at])
+
+
+def draw_frames(
+    looks: Sequence[LearnedField],
+    position: Float[Array, "frames n 3"],
+    orientation: Float[Array, "frames n 4"],
+    camera: AbstractCamera,
+    lights: Sequence[Light],
+    *,
+    pixels: Float[np.ndarray, "m 2"] | None = None,
+    background: Numbers = (0.0, 0.0, 0.0),
+    sampling: Sampling = FILM_SAMPLING,
+) -> tuple[Float[Array, "frames m 3"], Float[Array, "frames m"]]:
+    """Colour and opacity of the pixels of objects at given poses, differentiable in poses and lights.
+
+    Args:
+        looks: What the n objects look like.
+        position: Of the origins of their frames [m, W].
+        orientation: Unit quaternions wxyz, object → world.
+        camera: From where.
+        lights: Lamps, fixed in the world.
+        pixels: Image coordinates of the pixels wanted; default: all, row by row.
+        background: sRGB behind the objects, of one colour (3,) or of every pixel (m, 3).
+        sampling: How finely rays are sampled.
+
+    Raises:
+        ValueError: If the background has another shape.
+    """
+    if pixels is None:
+        y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+        pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    view = _View(
+        [jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), look.model) for look in looks],
+        [float(look.drawn_sharpness) for look in looks],
+        camera,
+        camera.directions(np.asarray(pixels, np.float64)).astype(np.float32),
+        _backdrop(background, len(pixels)),
+        tuple(lights),
+        sampling,
+    )
+    drawn = jax.checkpoint(lambda pose: _drawn(view, *pose))
+    return jax.lax.map(drawn, (jnp.asarray(position, jnp.float32), jnp.asarray(orientation, jnp.float32)))
 
 
 class _View(NamedTuple):

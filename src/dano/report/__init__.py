@@ -11,6 +11,7 @@ from dano.report._plan import draw_controls as draw_controls, film_plan as film_
 from dano.report._resample import frame_count as frame_count
 from dano.report._tracking import (
     draw_tracked as draw_tracked,
+    write_film_report as write_film_report,
     write_tracking_report as write_tracking_report,
 )
 from dano.report._training import (

@@ -54,7 +54,7 @@ def write_identification_report(
         path,
         title,
         [
-            _values(fit),
+            values_table(fit),
             outcome,
             warnings(fit.messages),
             "<h2>How far off</h2>",
@@ -67,7 +67,8 @@ def write_identification_report(
     )
 
 
-def _values(fit: Identification) -> str:
+def values_table(fit: Identification) -> str:
+    """Values of parameters with errors and intervals."""
     rows = []
     for name, value in fit.values.items():
         low, high = fit.interval(name)

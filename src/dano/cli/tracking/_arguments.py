@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
 
-from dano.cli._arguments import Output, UNNAMED
+from dano.cli._arguments import Filming, Output, UNNAMED
 
 
 @dataclass(frozen=True)
@@ -18,28 +17,10 @@ class Track:
         object: What `dano train` wrote (.dano or .field.npz), or trained_bunny or trained_soap.
         output: Where to write the motion (.npz), for `dano identify`.
         report: Where to write a page with the silhouettes over the frames (.html).
-        camera: Intrinsics and pose of the camera: a .json file as of `dano poses`, with one frame.
-        focal: Focal length, or two, across and down [pixels], instead of --camera.
-        centre: Principal point [pixels]; default: the middle.
-        distortion: k1 k2 p1 p2 of OpenCV's model.
-        eye: Where the camera is [m], z up, instead of --camera.
-        look_at: Where it looks [m].
-        masks: Folder with a mask for each frame, bright where the object is.
-        mask_source: Where masks come from: given, static (unlike the place without the object), plain (unlike
-            a background of one colour), object (like the object where it is expected); auto: given ones, else
-            plain, else object.
-        background: Picture of the place without the object.
-        occluders: Folder with a mask for each frame, bright where something hides the object.
         rate: Frames a second; default: the times in the video.
-        slow_motion: How many times slower the video plays than it was filmed.
-        shutter: How long a frame is exposed [s], if what moves is blurred.
-        readout: How much later the last row of a frame is exposed than the first (rolling shutter) [s].
-        every: Take every so many-th frame.
         body: Name of the body in the motion; default: the object's.
         start: Rough pose in the first frame: x y z [m] and qw qx qy qz; default: searched.
-        loss: What is minimised: photometric, silhouette, or the paper's two terms.
-        rays: Most pixels of a frame.
-        seed: Seed of all random numbers.
+        filming: How the film was taken.
         json: Print one JSON object instead of text.
     """
 
@@ -47,26 +28,10 @@ class Track:
     object: Positional[str]
     output: Output = UNNAMED
     report: Path | None = None
-    camera: Path | None = None
-    focal: tuple[float, ...] = ()
-    centre: tuple[float, float] | None = None
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    eye: tuple[float, float, float] | None = None
-    look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    masks: Path | None = None
-    mask_source: Literal["auto", "given", "static", "plain", "object"] = "auto"
-    background: Path | None = None
-    occluders: Path | None = None
     rate: float | None = None
-    slow_motion: float = 1.0
-    shutter: float = 0.0
-    readout: float = 0.0
-    every: int = 1
     body: str | None = None
     start: tuple[float, float, float, float, float, float, float] | None = None
-    loss: Literal["photometric", "silhouette", "paper"] = "photometric"
-    rays: int = 2048
-    seed: int = 0
+    filming: OmitArgPrefixes[Filming] = Filming()
     json: bool = False
 
     def __call__(self) -> None:

@@ -8,19 +8,9 @@ import numpy as np
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
 from dano.cli.tracking._arguments import Track
+from dano.cli.tracking._filming import camera_of, check_camera, filmed, look_of, options_of
 from dano.identify import Motion, save_motion
-from dano.scene_file import asset_look
-from dano.vision import (
-    Camera,
-    Film,
-    LearnedField,
-    load_camera,
-    PosedCamera,
-    read_film,
-    track as find_poses,
-    Tracked,
-    TrackOptions,
-)
+from dano.vision import track as find_poses, Tracked
 
 
 def track(command: Track) -> None:
@@ -31,35 +21,19 @@ def track(command: Track) -> None:
         if missing := missing_for_pictures(video=False):
             raise ImportError(missing)
     check_distinct(output=command.output, report=command.report)
-    _check_camera(command)
-    field = _field(command.object)
-    options = TrackOptions(
-        masks=command.mask_source,
-        loss=command.loss,
-        rays=command.rays,
-        shutter=command.shutter,
-        readout=command.readout,
-        seed=command.seed,
-    )
+    check_camera(command.filming)
+    field, options = look_of(command.object, "object"), options_of(command.filming)
     progress = Progress()
-    film = read_film(
-        command.video,
-        rate=command.rate,
-        slow_motion=command.slow_motion,
-        every=command.every,
-        masks=command.masks,
-        occluders=command.occluders,
-        progress=progress,
-    )
+    film = filmed(command.filming, command.video, command.rate, progress)
     start = None
     if command.start is not None:
         start = np.array(command.start[:3]), np.array(command.start[3:]) / np.linalg.norm(command.start[3:])
     found = find_poses(
         film,
         field,
-        _camera(command, film),
+        camera_of(command.filming, film),
         options,
-        background=command.background,
+        background=command.filming.background,
         start=start,
         progress=progress,
     )
@@ -75,54 +49,6 @@ def track(command: Track) -> None:
         put_json(numbers)
         return
     _print(numbers, command)
-
-
-def _check_camera(command: Track) -> None:
-    if (command.camera is None) == (command.eye is None or not command.focal):
-        raise ValueError(
-            "camera: give either --camera FILE, or --focal with --eye (and --look-at), to say from where the"
-            " film was taken"
-        )
-
-
-def _camera(command: Track, film: Film) -> PosedCamera:
-    width, height = (n * film.shrunk for n in film.size)
-    if command.camera is not None:
-        return load_camera(command.camera, width, height)
-    assert command.eye is not None
-    axes = Camera(command.eye, command.look_at, width=width, height=height).axes
-    pose = np.concatenate([axes.T * np.array([1.0, 1.0, -1.0]), np.array(command.eye)[:, None]], axis=1)
-    k1, k2, p1, p2 = command.distortion
-    if len(command.focal) > 2:
-        raise ValueError(f"focal must be one number or two [pixels], got {len(command.focal)}")
-    focal = command.focal[0] if len(command.focal) == 1 else command.focal
-    return PosedCamera(
-        pose,
-        focal=focal,
-        width=width,
-        height=height,
-        centre=command.centre,
-        distortion=(k1, k2, 0.0, p1, p2),
-    )
-
-
-def _field(name: str) -> LearnedField:
-    """A learned object: from a file, or one that is shipped."""
-    path = Path(name)
-    if not path.suffix:
-        look = asset_look(name)
-        if look is not None:
-            return look
-    elif path.suffix.lower() == ".dano":
-        look = LearnedField.of_object(path)
-        if look is not None:
-            return look
-    else:
-        return LearnedField.load(path)
-    raise ValueError(
-        f"object must have a learned look (a .dano or .field.npz file of `dano train`, or trained_bunny,"
-        f" trained_soap), got {name}, which has none"
-    )
 
 
 def _numbers(command: Track, found: Tracked) -> dict[str, Any]:

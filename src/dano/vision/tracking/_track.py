@@ -193,7 +193,8 @@ class _Walk:
         if target is None:
             return None
         starts = search(self._subject, target, self._options, self._random)
-        finished = [self._finished(i, start.refined.place, start.light) for start in starts[:3]]
+        # At low resolution a wrong pose may look as good as the right one, so all are finished.
+        finished = [self._finished(i, start.refined.place, start.light) for start in starts]
         finer = sorted((s for s in finished if s is not None), key=lambda s: s.score)
         if not finer or finer[0].refined.overlap < _FOUND:
             return None
@@ -235,6 +236,9 @@ class _Walk:
         target = self._masking.near(i, self._subject, found.place, light.lamps, self._camera, 2.0)
         if target is not None and self._options.loss == "photometric":
             learn_light(self._subject, target, found.place, found.window, found.silhouette, own)
+            if own.known and not light.known:
+                # Without light colours did not count, and costs could not be compared.
+                found = self._fine(i, found.place, own) or found
         return Start(found, own if own.known else light, score(found))
 
     def _followed(self, i: int, before: Placement) -> tuple[Refined | None, str]:

@@ -1,0 +1,97 @@
+"""A film, its camera and the object in it, as commands name them."""
+
+from pathlib import Path
+
+import numpy as np
+
+from dano.cli._arguments import Filming
+from dano.progress import Progress
+from dano.scene_file import asset_look
+from dano.vision import Camera, Film, LearnedField, load_camera, PosedCamera, read_film, TrackOptions
+
+
+def check_camera(filming: Filming) -> None:
+    """Refuse no camera, and two.
+
+    Raises:
+        ValueError: If it is not said from where the film was taken, or twice.
+    """
+    if (filming.camera is None) == (filming.eye is None or not filming.focal):
+        raise ValueError(
+            "camera: give either --camera FILE, or --focal with --eye (and --look-at), to say from where the"
+            " film was taken"
+        )
+
+
+def filmed(filming: Filming, video: Path, rate: float | None, progress: Progress) -> Film:
+    """The frames of a video or a folder."""
+    return read_film(
+        video,
+        rate=rate,
+        slow_motion=filming.slow_motion,
+        every=filming.every,
+        masks=filming.masks,
+        occluders=filming.occluders,
+        progress=progress,
+    )
+
+
+def options_of(filming: Filming) -> TrackOptions:
+    """How frames are compared with the object."""
+    return TrackOptions(
+        masks=filming.mask_source,
+        loss=filming.loss,
+        rays=filming.rays,
+        shutter=filming.shutter,
+        readout=filming.readout,
+        seed=filming.seed,
+    )
+
+
+def camera_of(filming: Filming, film: Film) -> PosedCamera:
+    """The camera that took a film.
+
+    Raises:
+        ValueError: If the focal length is more than two numbers, or the file is none of a camera.
+    """
+    width, height = (n * film.shrunk for n in film.size)
+    if filming.camera is not None:
+        return load_camera(filming.camera, width, height)
+    assert filming.eye is not None
+    axes = Camera(filming.eye, filming.look_at, width=width, height=height).axes
+    pose = np.concatenate([axes.T * np.array([1.0, 1.0, -1.0]), np.array(filming.eye)[:, None]], axis=1)
+    k1, k2, p1, p2 = filming.distortion
+    if len(filming.focal) > 2:
+        raise ValueError(f"focal must be one number or two [pixels], got {len(filming.focal)}")
+    focal = filming.focal[0] if len(filming.focal) == 1 else filming.focal
+    return PosedCamera(
+        pose,
+        focal=focal,
+        width=width,
+        height=height,
+        centre=filming.centre,
+        distortion=(k1, k2, 0.0, p1, p2),
+    )
+
+
+def look_of(name: str, argument: str) -> LearnedField:
+    """A learned object: from a file, or one that is shipped.
+
+    Raises:
+        ValueError: If it has no learned look; the message names the argument.
+    """
+    path = Path(name)
+    if not path.suffix:
+        look = asset_look(name)
+        if look is not None:
+            return look
+    elif path.suffix.lower() == ".dano":
+        look = LearnedField.of_object(path)
+        if look is not None:
+            return look
+    else:
+        return LearnedField.load(path)
+    raise ValueError(
+        f"{argument} must have a learned look (a .dano or .field.npz file of `dano train`, or trained_bunny,"
+        f" trained_soap), got {name}, which has none"
+    )

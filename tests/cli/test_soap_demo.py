@@ -1,0 +1,37 @@
+"""`dano demo soap`: what it starts from, and that stages are not done twice."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dano.cli import main
+from dano.cli.tracking import _soap
+from dano.vision import load_camera, load_capture, read_film
+
+
+def test_the_case_holds_photographs_a_film_and_the_truth(tmp_path):
+    _soap.unpack(tmp_path)
+    assert len(load_capture(tmp_path / "photographs").split("train")) == 64
+    film = read_film(tmp_path / "film.mp4")
+    truth = json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))
+    assert len(film.times) == len(truth["position"]) == 24
+    camera = load_camera(tmp_path / "camera.json", *film.size)
+    # The soap is in the picture all the time.
+    assert all(0 < x < 400 and 0 < y < 300 for x, y, _ in camera.project(np.array(truth["position"])))
+
+
+@pytest.mark.slow
+def test_friction_from_photographs_and_a_film(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(_soap, "TRAINING", {"resolution": 48, "iterations": 200, "batch": 2048})
+    main(["demo", "soap", "--output", str(tmp_path), "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert found["friction"] == pytest.approx(found["truth"], rel=0.05)
+    assert found["frames_used"] == found["frames"] == 24
+    page = (tmp_path / "soap_story.html").read_text(encoding="utf-8")
+    assert "<video" in page
+    (tmp_path / "soap_friction.json").unlink()
+    made = (tmp_path / "soap.dano").stat().st_mtime_ns
+    main(["demo", "soap", "--output", str(tmp_path)])
+    assert (tmp_path / "soap.dano").stat().st_mtime_ns == made
+    assert "soap.dano is there" in capsys.readouterr().out
