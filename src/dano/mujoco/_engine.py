@@ -5,6 +5,7 @@ controls, masses, inertias, frictions, gravity and the timestep.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,6 +19,7 @@ from dano.engine import AbstractEngine, Report, VariationalEngine
 from dano.mujoco._model import library
 from dano.mujoco._spec import TOUCHES
 from dano.mujoco._twin import Constants, Motion, Twin
+from dano.names import did_you_mean
 from dano.scene import Control, Scene, State
 
 
@@ -33,7 +35,7 @@ class MuJoCoEngine(AbstractEngine):
     """Steps a scene in MuJoCo: same bodies, joints, motors and pairs, MuJoCo's contact.
 
     At its defaults but for elliptic friction cones with impratio 10, which hold bodies on slopes, and the
-    integrator "implicit", with which bodies that tumble gain no energy.
+    integrator "implicit", with which bodies that tumble gain no energy. Options may say otherwise.
 
     Neural objects touch by their samples, as through `Bridge`, or as meshes of their solids. Of a contact's
     parameters the sliding friction and the restitution count; the stiffness is MuJoCo's own. Springs of
@@ -63,13 +65,22 @@ class MuJoCoEngine(AbstractEngine):
     difference: float = eqx.field(static=True)
     _twin: Twin = eqx.field(static=True)
 
-    def __init__(self, scene: Scene, *, objects: str = "samples", difference: float = 1e-6):
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        objects: str = "samples",
+        options: Mapping[str, Any] | None = None,
+        difference: float = 1e-6,
+    ):
         """Build the model of a scene.
 
         Args:
             scene: The scene.
             objects: As what neural objects touch: by their "samples"; or a mesh of their solid, which MuJoCo
                 takes as its convex "hull", or between two of them by its signed "distance" (from 4.0).
+            options: Of MuJoCo's `mjOption` by their names, such as `impratio` or `iterations`; gravity and
+                timestep are the scene's.
             difference: See the class.
 
         Raises:
@@ -87,7 +98,7 @@ class MuJoCoEngine(AbstractEngine):
             raise ValueError(f"scene must have no loops for MuJoCoEngine, got {len(scene.loops)}")
         self.names, self.difference = scene.names, float(difference)
         self.objects = objects
-        self._twin = Twin(scene, objects)
+        self._twin = Twin(scene, objects, _checked_options(options or {}))
 
     @property
     def model(self) -> Any:
@@ -183,6 +194,17 @@ class MuJoCoEngine(AbstractEngine):
 
         arguments = _motion(before), _motion(after), constants, about
         return jax.pure_callback(host, result, *arguments, vmap_method="sequential")
+
+
+def _checked_options(options: Mapping[str, Any]) -> Mapping[str, Any]:
+    library_options = library().MjOption()
+    valid = [x for x in dir(library_options) if not x.startswith("_") and x not in ("gravity", "timestep")]
+    for name in options:
+        if name not in valid:
+            raise ValueError(
+                f"options must be of {', '.join(valid)}, got {name!r}{did_you_mean(name, valid)}"
+            )
+    return options
 
 
 def _filled(scene: Scene, state: State) -> State:

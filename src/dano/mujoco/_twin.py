@@ -2,6 +2,8 @@
 
 import contextlib
 import threading
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -124,12 +126,15 @@ class _Places(NamedTuple):
 class Twin:
     """The model of a scene, and data to step it with."""
 
-    def __init__(self, scene: Scene, touch: str = AS_SAMPLES):
+    def __init__(
+        self, scene: Scene, touch: str = AS_SAMPLES, options: Mapping[str, Any] = MappingProxyType({})
+    ):
         """Build it.
 
         Args:
             scene: The scene.
             touch: As what neural objects touch, see `TOUCHES`.
+            options: Of MuJoCo's `mjOption`.
 
         Raises:
             ImportError: If mujoco is missing.
@@ -138,6 +143,8 @@ class Twin:
         self._mujoco = mujoco = library()
         self._lock = threading.Lock()
         spec = spec_of(mujoco, scene)
+        for name, value in options.items():
+            setattr(spec.option, name, value)
         objects = {body.name: body for body in scene.bodies if body.object is not None}
         sampled = set(objects) if touch == AS_SAMPLES else set()
         self._attached = Bridge(spec, choose=self._settings)
