@@ -24,6 +24,11 @@ def hollow(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 1 - np.exp(-4 * (x**2 + y**2))
 
 
+def with_article(support: str) -> str:
+    """A support in a sentence."""
+    return f"{'an' if support[0] in 'aeiou' else 'a'} {support}"
+
+
 def agreement_row(name: str, support: str, model, bridge) -> Row:
     """From rest in MuJoCo, both engines let the object slide.
 
@@ -68,7 +73,7 @@ def agreement_row(name: str, support: str, model, bridge) -> Row:
     group = f"Beside our engine, over {WATCH:g} s"
     return Row(
         group,
-        f"{name} slides on a {support}, apart",
+        f"{name} slides on {with_article(support)}, apart",
         100 * apart.max() / obj.size,
         "% of size",
         MOST,

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from benchmarks._measure import load_average, parse_arguments, report, Row
-from benchmarks.bridge._agreement import agreement_row, HOLLOW, hollow, HOLLOW_NODES
+from benchmarks.bridge._agreement import agreement_row, HOLLOW, hollow, HOLLOW_NODES, with_article
 from dano.exchange import solid_triangles
 from dano.mujoco import Bridge
 from dano.scene_file import build_asset
@@ -63,16 +63,16 @@ def run() -> None:
 
 
 def _rest_rows(name: str, support: str, timestep: float) -> list[Row]:
-    group = f"{name} on a {support}, {1000 * timestep:g} ms"
+    group = f"{name} on {with_article(support)}, {1000 * timestep:g} ms"
     ours, theirs = (_rest(name, support, timestep, own) for own in (False, True))
     budget = 1e6 * timestep
     return [
         Row(group, "largest speed at rest", ours.speed, "m/s", MOST_CREEP, note=f"{ours.contacts} contacts"),
-        Row(group, "the same, MuJoCo's hull", theirs.speed, "m/s", note=f"{theirs.contacts} contacts"),
+        Row(group, "speed of MuJoCo's hull", theirs.speed, "m/s", note=f"{theirs.contacts} contacts"),
         Row(group, "creep", ours.creep, "m/s", max(theirs.creep, 1e-9), note=f"{ours.warnings} warnings"),
-        Row(group, "the same, MuJoCo's hull", theirs.creep, "m/s"),
+        Row(group, "creep of MuJoCo's hull", theirs.creep, "m/s"),
         Row(group, "time of a step", ours.microseconds, "µs", budget, note="target: real time"),
-        Row(group, "the same, MuJoCo's hull", theirs.microseconds, "µs"),
+        Row(group, "time of MuJoCo's hull", theirs.microseconds, "µs"),
     ]
 
 

@@ -28,8 +28,14 @@ class Own:
 
     name = "dano"
 
-    def __init__(self, thing: NeuralObject, timestep: float):
-        """Make a scene; `timestep` [s]."""
+    def __init__(self, thing: NeuralObject, timestep: float, stiffer: float = 1.0):
+        """Make a scene.
+
+        Args:
+            thing: The object.
+            timestep: [s].
+            stiffer: What the default stiffness of its contact is multiplied with.
+        """
         self._thing = thing
         # Room for every sample, should all of them touch.
         self._engine = VariationalEngine(
@@ -41,6 +47,8 @@ class Own:
             timestep=timestep,
             gravity=(0.0, 0.0, -GRAVITY),
         )
+        stiffness = self._scene.contact("object", "floor").stiffness
+        self._scene = self._scene.replace_contact("object", "floor", stiffness=stiffer * stiffness)
 
     def drop(self, start: Start, n_steps: int) -> Path:
         """Let the body fall on the plane z = 0."""

@@ -2,6 +2,7 @@
 
 from dano.report._capture import draw_capture as draw_capture
 from dano.report._comparison import (
+    draw_rest as draw_rest,
     verdict as verdict,
     write_comparison_report as write_comparison_report,
 )
