@@ -32,7 +32,7 @@ class _Place(NamedTuple):
 
 
 class MuJoCoEngine(AbstractEngine):
-    """Steps a scene in MuJoCo: same bodies, joints, motors and pairs, MuJoCo's contact.
+    """Steps a scene in MuJoCo: same bodies, joints, loops, motors and pairs, MuJoCo's contact.
 
     At its defaults but for elliptic friction cones with impratio 10, which hold bodies on slopes, and the
     integrator "implicit", with which bodies that tumble gain no energy. Options may say otherwise.
@@ -42,9 +42,9 @@ class MuJoCoEngine(AbstractEngine):
     contacts are damped so that they rebound as the restitution says, but all rebound by 0.13 or more: that is
     what MuJoCo's default does.
 
-    Joints, and what acts on them, are MuJoCo's: limits give way a little, friction holds by MuJoCo's solver,
-    springs and position motors pull by where joints are at the start of a step. So a motor whose stiffness
-    exceeds four times what it moves per h² is unstable.
+    Joints, and what acts on them, are MuJoCo's: loops and limits give way a little, friction holds by
+    MuJoCo's solver, springs and position motors pull by where joints are at the start of a step. So a motor
+    whose stiffness exceeds four times what it moves per h² is unstable.
 
     Shapes, samples, centres of mass and the places of joints are those of the scene that the engine was made
     for, other numbers those of the scene that is stepped.
@@ -85,8 +85,8 @@ class MuJoCoEngine(AbstractEngine):
 
         Raises:
             ImportError: If mujoco is missing.
-            ValueError: If nothing in the scene moves, it has loops, a shape is no geom of MuJoCo's, an object
-                has no solid for a mesh, or an option is out of range.
+            ValueError: If nothing in the scene moves, a shape is no geom of MuJoCo's, an object has no solid
+                for a mesh, or an option is out of range.
         """
         if objects not in TOUCHES:
             raise ValueError(f"objects must be one of {', '.join(TOUCHES)}, got {objects!r}")
@@ -94,8 +94,6 @@ class MuJoCoEngine(AbstractEngine):
             raise ValueError(f"difference must be > 0, got {difference}")
         if not any(not body.fixed for body in scene.bodies):
             raise ValueError("scene must have a body that moves, got only fixed ones")
-        if scene.loops:
-            raise ValueError(f"scene must have no loops for MuJoCoEngine, got {len(scene.loops)}")
         self.names, self.difference = scene.names, float(difference)
         self.objects = objects
         self._twin = Twin(scene, objects, _checked_options(options or {}))
@@ -142,8 +140,11 @@ class MuJoCoEngine(AbstractEngine):
         if scene.names != self.names:
             raise ValueError(f"scene must have the bodies {list(self.names)}, got {list(scene.names)}")
         joints = tuple((joint.parent, joint.child, joint.kind) for joint in scene.joints)
+        joints += tuple((loop.first, loop.second, loop.kind) for loop in scene.loops)
         if joints != self._twin.joints:
-            raise ValueError(f"scene must have the joints {list(self._twin.joints)}, got {list(joints)}")
+            raise ValueError(
+                f"scene must have the joints and loops {list(self._twin.joints)}, got {list(joints)}"
+            )
 
     def prepare(self, scene: Scene) -> Any:
         """See `AbstractEngine.prepare`.

@@ -162,7 +162,10 @@ class Twin:
         self.model = model = self._attached.compile() if sampled else spec.compile()
         self._data = mujoco.MjData(model)
         self.bridge = self._attached if sampled else contextlib.nullcontext()
-        self.joints = tuple((joint.parent, joint.child, joint.kind) for joint in scene.joints)
+        self.joints = (
+            *((joint.parent, joint.child, joint.kind) for joint in scene.joints),
+            *((loop.first, loop.second, loop.kind) for loop in scene.loops),
+        )
         self.places = places = _places(mujoco, model, scene)
         self._pair_of: dict[tuple[int, int], tuple[int, float]] = {}
         for k, pair in enumerate(scene.pairs):
@@ -222,6 +225,8 @@ class Twin:
 
     def _load_joints(self, constants: Constants) -> None:
         model, places = self.model, self.places
+        # What ties joints and closes loops is as hard as the timestep allows.
+        model.eq_solref[:, 0] = 2 * float(constants.timestep)
         if not places.dofs.size:
             return
         model.dof_damping[places.dofs] = constants.damping
@@ -243,8 +248,6 @@ class Twin:
             model.actuator_gainprm[actuator, 0] = gain
             model.actuator_biasprm[actuator, :3] = 0.0, -stiffness, -bias
             model.actuator_forcerange[actuator] = np.clip([least, most], -_ENDLESS, _ENDLESS)
-        # As hard as the timestep allows.
-        model.eq_solref[:, 0] = 2 * float(constants.timestep)
 
     def _weigh(self, constants: Constants) -> None:
         weights = constants.mass, constants.inertia, constants.armature
