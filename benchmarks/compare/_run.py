@@ -172,6 +172,6 @@ def _panels(found: Comparison) -> list[Panel]:
         seen.add((row.route, row.level))
         title = {"neural object": "object", "hull of the surface as it is": "mesh"}.get(row.route, row.route)
         title = title.replace("best surface: ", "").replace("CoACD", f"{row.pieces} pieces")
-        level = "" if math.isnan(row.level) else f", φ = {row.level:.3g}"
+        level = "" if math.isnan(row.level) else f", density {row.level:.3g}"
         shown.append(Panel(draw_rest(stand, found.size), title + level, verdict(row)))
     return shown

@@ -79,13 +79,10 @@ def comparison(thing):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_box_compared_with_itself(comparison):
-    soft, stiff, *meshes = comparison.rows
-    assert (soft.route, stiff.route) == ("neural object", "neural object, 10 times as stiff")
-    for own in (soft, stiff):
-        assert own.engine == "dano"
-        assert own.tilt < 1 and abs(own.gap) < 0.01 and own.phantom == 0 and own.motion_error < 0.2
-        assert abs(own.volume_error) < 0.02
-    assert abs(stiff.gap) < 0.5 * abs(soft.gap)
+    own, *meshes = comparison.rows
+    assert (own.route, own.engine) == ("neural object", "dano")
+    assert own.tilt < 1 and abs(own.gap) < 0.01 and own.phantom == 0 and own.motion_error < 0.2
+    assert abs(own.volume_error) < 0.02
     assert [row.level for row in meshes[:4]] == [0.5, 0.5, 0.9, 0.9]
     for row in meshes:
         # Its hull is the box: nothing to be wrong about but the cells of the grid.

@@ -34,8 +34,6 @@ _COUNTS = 0.01
 _N_PROBES, _PROBE = 400, 0.04
 """Balls that feel for the surface, and their radius as a share of the size. 400 tell a share to 5 %
 (binomial, 95 %)."""
-_STIFFER = 10.0
-"""Than the default contact, by which a body sinks in by up to 1 % of its size: what of a tilt is softness."""
 _RESOLUTION = 96
 """Nodes along the longest axis of the grid that meshes are made of: as `dano build`."""
 
@@ -113,7 +111,7 @@ class Comparison(NamedTuple):
     """What `compare` found.
 
     Attributes:
-        rows: The object itself first, with its default contact and with a stiffer one.
+        rows: The object itself first.
         scenery: What to draw of them, in the same order; without those that could not be simulated.
         reference: What errors are measured against: "the truth" or "the neural object".
         size: Of the reference [m].
@@ -202,10 +200,9 @@ def compare(
     missing = _missing(decomposed)
     say("the object itself", 0.02)
     rows, scenery = [], []
-    for route, stiffer in (("neural object", 1.0), (f"neural object, {_STIFFER:g} times as stiff", _STIFFER)):
-        begin = time.perf_counter()
-        own = Own(thing, TIMESTEP, stiffer)
-        _measured(bench, own, _own_row(bench, route), [], _surface(thing), rows, scenery, begin)
+    begin = time.perf_counter()
+    own = Own(thing, TIMESTEP)
+    _measured(bench, own, _own_row(bench), [], _surface(thing), rows, scenery, begin)
     jobs = [(level, cleaned) for level in chosen for cleaned in (False, True)]
     for i, (level, cleaned) in enumerate(jobs):
         say(f"surface at {level:.3g}", 0.1 + 0.4 * i / len(jobs))
@@ -323,13 +320,13 @@ def _errors(bench: _Bench, moments: Moments, com: np.ndarray, inertia: np.ndarra
     }
 
 
-def _own_row(bench: _Bench, route: str) -> Row:
+def _own_row(bench: _Bench) -> Row:
     surface = _surface(bench.thing)
     mass = bench.thing.mass
     errors = _errors(bench, enclosed(surface), np.asarray(mass.com), np.asarray(mass.inertia))
     if bench.truth is None:
         errors = {}  # It is the reference.
-    return Row(route, "dano")._replace(**errors)
+    return Row("neural object", "dano")._replace(**errors)
 
 
 def _mesh_row(

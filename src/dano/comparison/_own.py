@@ -28,14 +28,8 @@ class Own:
 
     name = "dano"
 
-    def __init__(self, thing: NeuralObject, timestep: float, stiffer: float = 1.0):
-        """Make a scene.
-
-        Args:
-            thing: The object.
-            timestep: [s].
-            stiffer: What the default stiffness of its contact is multiplied with.
-        """
+    def __init__(self, thing: NeuralObject, timestep: float):
+        """Make a scene; `timestep` [s]."""
         self._thing = thing
         # Room for every sample, should all of them touch.
         self._engine = VariationalEngine(
@@ -47,8 +41,6 @@ class Own:
             timestep=timestep,
             gravity=(0.0, 0.0, -GRAVITY),
         )
-        stiffness = self._scene.contact("object", "floor").stiffness
-        self._scene = self._scene.replace_contact("object", "floor", stiffness=stiffer * stiffness)
 
     def drop(self, start: Start, n_steps: int) -> Path:
         """Let the body fall on the plane z = 0."""
