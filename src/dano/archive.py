@@ -15,6 +15,7 @@ from typing import BinaryIO, cast, IO
 
 import numpy as np
 
+from dano.checks import checked_path
 from dano.memory import in_bytes, memory_limit
 
 OBJECT = "dano-object", 2
@@ -88,7 +89,7 @@ def checked_output(path: str | os.PathLike[str]) -> Path:
     Raises:
         ValueError: If it is a directory, a disk or a socket, or its parent does not exist.
     """
-    target = Path(path)
+    target = checked_path("output path", path)
     if target.is_dir():
         raise ValueError(f"output path must be a file, got the directory {target}")
     # A link to nothing is made a file where it leads to.
@@ -110,7 +111,7 @@ def checked_input(path: str | os.PathLike[str]) -> Path:
     Raises:
         ValueError: If it is missing or a directory.
     """
-    source = Path(path)
+    source = checked_path("input path", path)
     if not source.exists():
         raise ValueError(f"input path must be an existing file, got {source}")
     if not source.is_file():

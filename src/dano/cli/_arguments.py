@@ -265,6 +265,7 @@ class Simulate:
         steps: Number of steps; default: the scene's.
         timestep: Timestep [s]; default: the scene's.
         slow_motion: Video seconds per simulated second.
+        resume: Go on with a run that was interrupted or killed; the result is the same to the last bit.
         json: Print one JSON object instead of text.
     """
 
@@ -275,6 +276,7 @@ class Simulate:
     steps: int | None = None
     timestep: float | None = None
     slow_motion: float = 1.0
+    resume: bool = False
     json: bool = False
 
     def __call__(self) -> None:

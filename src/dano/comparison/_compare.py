@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from dano.checks import checked_count, checked_items, checked_kind, checked_optional
 from dano.comparison._bodies import GRAVITY, Path, Probes, Rigid, rotation_of, Solid, Start, together
 from dano.comparison._mujoco import MuJoCo
 from dano.comparison._own import Own
@@ -186,10 +187,13 @@ def compare(
         ImportError: If mujoco or libigl is missing.
         ValueError: If the object has no grid or no solid, or an option is out of range.
     """
+    checked_kind("thing", thing, NeuralObject)
+    checked_optional("field", field, AbstractField)
+    checked_optional("truth", truth, AbstractShape)
+    checked_count("seed", seed, least=0)
     if thing.grid is None or thing.solid is None:
         raise ValueError("object must have a density grid to be meshed, got one made of samples alone")
-    if not 1 <= drops <= 100:
-        raise ValueError(f"drops must lie between 1 and 100, got {drops}")
+    checked_count("drops", drops, most=100)
     grid = _grid(thing.grid if field is None else field)
     top = float(grid.values.max())
     chosen = _checked_levels(thing, levels, top)
@@ -256,8 +260,9 @@ def _checked_levels(thing: NeuralObject, levels: Sequence[float] | None, top: fl
         if thing.interior is not None:
             dense = max(float(thing.interior.wall), 2 * float(thing.interior.level))
         return [share * min(dense, 0.95 * top) for share in SHARES]
+    levels = checked_items("levels", levels, float, int)
     for level in levels:
-        if not (math.isfinite(level) and 0 < level < top):
+        if not 0 < level < top:
             raise ValueError(f"levels must lie between 0 and the largest density {top:.4g}, got {level}")
     if len(levels) == 0:
         raise ValueError("levels must name at least one density, got none")

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_choice, checked_kind, checked_number
 from dano.contact import Patch
 from dano.engine import AbstractEngine, Report, VariationalEngine
 from dano.mujoco._model import library
@@ -88,10 +89,9 @@ class MuJoCoEngine(AbstractEngine):
             ValueError: If nothing in the scene moves, a shape is no geom of MuJoCo's, an object has no solid
                 for a mesh, or an option is out of range.
         """
-        if objects not in TOUCHES:
-            raise ValueError(f"objects must be one of {', '.join(TOUCHES)}, got {objects!r}")
-        if not difference > 0:
-            raise ValueError(f"difference must be > 0, got {difference}")
+        checked_kind("scene", scene, Scene)
+        difference = checked_number("difference", difference, above=0)
+        checked_choice("objects", objects, list(TOUCHES))
         if not any(not body.fixed for body in scene.bodies):
             raise ValueError("scene must have a body that moves, got only fixed ones")
         self.names, self.difference = scene.names, float(difference)

@@ -6,6 +6,7 @@ exp(−cost/temperature) (MPPI; Williams et al. 2017). Constraints are priced: t
 J + ½ p Σ violation², with a price p that grows from pass to pass.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,10 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_count, checked_number
 from dano.solvers import TrajectoryProblem
 
 
-class SamplingOptions(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class SamplingOptions:
     """How to sample.
 
     Attributes:
@@ -45,6 +48,20 @@ class SamplingOptions(NamedTuple):
     price: float = 10.0
     last_price: float = 1e3
     max_seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check all numbers.
+
+        Raises:
+            ValueError: If one is out of range.
+        """
+        for name in ("passes", "samples", "knots"):
+            checked_count(name, getattr(self, name))
+        checked_number("best", self.best, above=0, most=1)
+        for name in ("deviation", "least", "temperature", "price", "last_price"):
+            checked_number(name, getattr(self, name), above=0)
+        if self.max_seconds is not None:
+            checked_number("max_seconds", self.max_seconds, above=0)
 
 
 class Sampled(NamedTuple):

@@ -7,10 +7,29 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from dano.checks import checked_kind
 from dano.engine import contact_history
 from dano.maths import Pose, quat_to_matrix
 from dano.scene import Body, Scene, Trajectory
 from dano.vision import Camera, Item, LearnedField, PALETTE
+
+
+def check_run(scene: Scene, trajectory: Trajectory) -> None:
+    """Check that a trajectory is one of a scene, with at least one step, and finite.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    checked_kind("scene", scene, Scene)
+    checked_kind("trajectory", trajectory, Trajectory)
+    if tuple(trajectory.names) != tuple(scene.names):
+        raise ValueError(
+            f"trajectory must be of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
+        )
+    if len(trajectory.times) < 2:
+        raise ValueError(f"trajectory must have at least one step, got {len(trajectory.times)} states")
+    if not np.all(np.isfinite(np.asarray(trajectory.states.position))):
+        raise ValueError("trajectory must be finite, got positions that are NaN or infinite")
 
 
 class Stage(NamedTuple):
@@ -50,9 +69,12 @@ def stage(
     Raises:
         ValueError: If a colour is none, a colour or look names no body, or nothing can be drawn.
     """
-    colours, looks = {} if colours is None else colours, {} if looks is None else looks
+    colours = {} if colours is None else checked_kind("colours", colours, Mapping)
+    looks = {} if looks is None else checked_kind("looks", looks, Mapping)
     for name in (*colours, *looks):
         scene.index(name)
+    for name, look in looks.items():
+        checked_kind(f"looks of {name!r}", look, LearnedField)
     items, rows, offsets, used = [], [], [], 0
     for row, body in enumerate(scene.bodies):
         if body.field is None:

@@ -10,14 +10,17 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dano.archive import checked_output, replacing
+from dano.checks import checked_function, checked_items, checked_kind, checked_path
 from dano.extras import optional
 from dano.progress import Progress
 from dano.report._overlay import draw_clock, draw_touches
 from dano.report._resample import frame_times, poses_at
-from dano.report._stage import camera_for, stage, touches
+from dano.report._stage import camera_for, check_run, stage, touches
 from dano.scene import Scene, Trajectory
 from dano.vision import Camera, LearnedField, render
 
+MOST_PIXELS = 8192
+"""Longest side of a film: what common decoders of H.264 can show."""
 _STRIP_MOMENTS = 6
 """Moments in a picture strip: two rows of three (convention)."""
 
@@ -63,9 +66,12 @@ def render_trajectory(
             is a directory, lies in none, or has another ending.
         ImportError: If av or pillow is missing.
     """
-    outputs = _checked(
-        scene, trajectory, path, strip, size if camera is None else (camera.width, camera.height)
-    )
+    if camera is not None:
+        checked_kind("camera", camera, Camera)
+        size = camera.width, camera.height
+    outputs = _checked(scene, trajectory, path, strip, size)
+    if progress is not None:
+        checked_function("progress", progress)
     times = frame_times(trajectory, fps, slow_motion)
     drawn = stage(scene, colours, looks)
     camera = camera_for(scene, drawn, trajectory, *size) if camera is None else camera
@@ -106,21 +112,16 @@ def _checked(scene, trajectory, path, strip, size) -> tuple[Path | None, Path | 
     """Output paths, after checks that need no work."""
     if path is None and strip is None:
         raise ValueError("path or strip must be given, got None for both")
-    if tuple(trajectory.names) != tuple(scene.names):
+    check_run(scene, trajectory)
+    size = checked_items("size", size, int)
+    if len(size) != 2 or not all(16 <= n <= MOST_PIXELS and n % 2 == 0 for n in size):
         raise ValueError(
-            f"trajectory must be of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
-        )
-    if len(trajectory.times) < 2:
-        raise ValueError(f"trajectory must have at least one step, got {len(trajectory.times)} states")
-    if not np.all(np.isfinite(np.asarray(trajectory.states.position))):
-        raise ValueError("trajectory must be finite, got positions that are NaN or infinite")
-    if min(size) < 16 or any(n != int(n) or n % 2 for n in size):
-        raise ValueError(
-            f"size must be two even numbers of at least 16 pixels (video codecs need them even), got {size}"
+            f"size must be two even numbers from 16 to {MOST_PIXELS} pixels (video codecs need them even),"
+            f" got {list(size)}"
         )
     checked = []
     for name, output, suffix in (("path", path, ".mp4"), ("strip", strip, ".png")):
-        if output is not None and Path(output).suffix.lower() != suffix:
+        if output is not None and checked_path(name, output).suffix.lower() != suffix:
             raise ValueError(f"{name} must end in {suffix}, got {output}")
         checked.append(None if output is None else checked_output(output))
     if path is not None:

@@ -9,11 +9,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from dano.checks import checked_count
 from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, PosedShape, Sphere
 from dano.maths import Pose, quat_to_matrix
 from dano.report._object import normal_colours
 from dano.report._resample import poses_at
-from dano.report._stage import Touches, touches
+from dano.report._stage import check_run, Touches, touches
 from dano.report._video import require
 from dano.scene import Body, Scene, Trajectory
 from dano.vision import checked_colour, Item, PALETTE, placement
@@ -167,12 +168,8 @@ def view(
         ValueError: If the trajectory is not one of this scene or the port is none.
         ImportError: If viser is missing.
     """
-    if tuple(trajectory.names) != tuple(scene.names):
-        raise ValueError(
-            f"trajectory must be of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
-        )
-    if not 0 < int(port) < 65536:
-        raise ValueError(f"port must lie in 1 … 65535, got {port}")
+    check_run(scene, trajectory)
+    checked_count("port", port, most=65535)
     viser = require("viser")
     viewer = Viewer(
         viser.ViserServer(host=host, port=int(port), label="dano", verbose=False), scene, trajectory
