@@ -240,6 +240,8 @@ def _run(loaded: scene_file.SceneFile, command: Simulate, clock: running.Clock) 
             video,
             strip=strip,
             slow_motion=command.slow_motion,
+            camera=command.camera,
+            size=command.size,
             looks=loaded.looks(),
             progress=progress,
         )

@@ -6,6 +6,7 @@ from dano.report._comparison import (
     verdict as verdict,
     write_comparison_report as write_comparison_report,
 )
+from dano.report._framing import CAMERAS as CAMERAS
 from dano.report._identification import write_identification_report as write_identification_report
 from dano.report._object import draw_object as draw_object
 from dano.report._plan import draw_controls as draw_controls, film_plan as film_plan

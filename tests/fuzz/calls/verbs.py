@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 import dano
+from dano import robots
 from dano.plan import load_controls
 from tests.fuzz import kinds
 from tests.fuzz.calls.call import Call
@@ -55,7 +56,7 @@ def _robots(w: World) -> Iterator[Call]:
         {"scene": instance(), "effort": array(k)},
     )
     loops = {"scene": instance(), "state": {**instance(), "without loops": w.arm_state}}
-    for name, verb in (("loop_gaps", dano.loop_gaps), ("close_loops", dano.close_loops)):
+    for name, verb in (("robots.loop_gaps", robots.loop_gaps), ("close_loops", dano.close_loops)):
         yield Call(name, verb, robot, loops, {"state": ""})
     link = {**NAME, "unknown": "tail"}
     yield Call(
