@@ -1,5 +1,6 @@
 """Arguments as they are given, checked before any work starts; arrays are checked in `dano.maths`."""
 
+import contextlib
 import math
 import operator
 import os
@@ -74,6 +75,7 @@ def checked_number(
     least: int | float = -math.inf,
     above: int | float = -math.inf,
     most: int | float = math.inf,
+    unit: str = "",
 ) -> float:
     """`value` as a finite number.
 
@@ -83,25 +85,27 @@ def checked_number(
         least: Smallest valid number.
         above: Numbers must be larger than this.
         most: Largest valid number.
+        unit: Of the number, for the error.
 
     Raises:
         ValueError: If it is no number, not finite, or out of range.
     """
-    bounds = (
-        f"≥ {least:g}" * (least > -math.inf),
-        f"> {above:g}" * (above > -math.inf),
-        f"≤ {most:g}" * (most < math.inf),
+    number = None
+    if value is not None and not isinstance(value, (str, bytes, complex)):
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
+            number = float(value)  # pyright: ignore[reportArgumentType]
+    if number is not None and math.isfinite(number) and least <= number <= most and number > above:
+        return number
+    if least > -math.inf and most < math.inf:
+        valid = f"lie in [{least:g}, {most:g}]"
+    elif above > -math.inf and most < math.inf:
+        valid = f"be > {above:g} and ≤ {most:g}"
+    else:
+        bound = f" and > {above:g}" if above > -math.inf else f" and ≥ {least:g}" if least > -math.inf else ""
+        valid = f"be finite{bound}"
+    raise ValueError(
+        f"{name} must {valid}{unit and f' {unit}'}, got {shown(value) if number is None else number}"
     )
-    must = " and ".join(["finite", *filter(None, bounds)])
-    if value is None or isinstance(value, (str, bytes, complex)):
-        raise ValueError(f"{name} must be a number, {must}, got {shown(value)}")
-    try:
-        number = float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name} must be a number, {must}, got {shown(value)}") from None
-    if not (math.isfinite(number) and least <= number <= most and number > above):
-        raise ValueError(f"{name} must be {must}, got {number}")
-    return number
 
 
 def checked_count(name: str, value: object, least: int = 1, most: int | None = None) -> int:
@@ -127,8 +131,9 @@ def checked_choice(name: str, value: object, choices: Sequence[str]) -> str:
         ValueError: If it is another; says which is nearly meant.
     """
     if not isinstance(value, str) or value not in choices:
-        valid = ", ".join(repr(choice) for choice in choices)
-        raise ValueError(f"{name} must be one of {valid}, got {shown(value)}{did_you_mean(value, choices)}")
+        raise ValueError(
+            f"{name} must be one of {', '.join(choices)}, got {shown(value)}{did_you_mean(value, choices)}"
+        )
     return value
 
 

@@ -105,7 +105,7 @@ def test_bad_input_is_named(scene, engine):
     hung, loose = (dano.Scene.create(bodies=[panel], joints=joints) for joints in ([hinge], []))
     with pytest.raises(ValueError, match=r"scene must have the joints \[\], got .*'door', 'hinge'"):
         dano.step(hung, hung.initial_state(), engine=MuJoCoEngine(loose))
-    with pytest.raises(ValueError, match="difference must be > 0"):
+    with pytest.raises(ValueError, match="difference must be finite and > 0"):
         MuJoCoEngine(scene, difference=0.0)
     with pytest.raises(ValueError, match=r"scene must have the bodies \['bunny', 'floor'\]"):
         dano.step(free, free.initial_state(door=dict(position=(0, 0, 0))), engine=engine)

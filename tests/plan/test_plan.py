@@ -232,8 +232,8 @@ def test_softened_contact_has_that_share_of_the_stiffness(pushing):
         (lambda: dano.Goal("a", positon=(0, 0, 0)), "did you mean 'position'"),
         (lambda: dano.Goal("a", q=0.0, within=0.0), "within of the goal of 'a' must be > 0, got 0.0"),
         (lambda: dano.Limit("a", "velocity", lower=1.0, upper=0.0), "must be ≤ upper, got 1.0 and 0.0"),
-        (lambda: dano.Limit("a", "orientation"), "must be about one of position, velocity"),
-        (lambda: dano.Task(0, [], []), "n_steps must be a whole number ≥ 1, got 0"),
+        (lambda: dano.Limit("a", "orientation"), "must be one of position, velocity"),
+        (lambda: dano.Task(0, [], []), "n_steps must be ≥ 1, got 0"),
         (lambda: dano.Task(5, [], []), "at least one actuator and one goal"),
         (
             lambda: dano.Task(5, [dano.Actuator("a", limit=1.0)] * 2, [dano.Goal("a", q=0.0)]),

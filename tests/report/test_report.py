@@ -140,7 +140,7 @@ def test_moving_bodies_fill_a_third_of_the_height_and_stay_in_view(run: Run):
     position = 10 * np.asarray(trajectory.states.position)
     orientation = np.asarray(trajectory.states.orientation)
     moving, _ = _framing._corners(scene, drawn, position, orientation)
-    fills = {}
+    fills, cameras = {}, []
     for how in CAMERAS:
         cameras = _framing.cameras_for(scene, drawn, position, orientation, 0.01, (640, 400), how)
         assert len(cameras) == n

@@ -125,7 +125,7 @@ def test_joints_that_make_no_tree_are_errors(joints, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (dict(kind="screw"), "'slide', 'weld', 'ball', 'planar', got 'screw'"),
+        (dict(kind="screw"), "hinge, slide, weld, ball, planar, got 'screw'"),
         (dict(axis=(0, 0, 0)), "axis of the joint of 'b' must not be zero"),
         (dict(axis=(0, 0)), "axis of the joint of 'b'"),
         (dict(orientation=(0, 0, 0, 0)), "orientation of the joint of 'b'"),

@@ -130,11 +130,8 @@ def export_object(
     formats = _checked_formats(to)
     name = _checked_name(_default_name(target) if name is None else name)
     contact = checked_optional("contact", contact, ContactParams) or ContactParams()
-    if look is not None:
-        # Here, not above: without photographs nobody needs it.
-        from dano.vision import LearnedField
-
-        checked_kind("look", look, LearnedField)
+    if look is not None and not hasattr(look, "model"):
+        raise ValueError(f"look must be a dano.vision.LearnedField, got {type(look).__name__}")
     if progress is not None:
         checked_function("progress", progress)
     how = chosen_collision(collision)

@@ -5,10 +5,10 @@ from typing import Any
 
 import jax
 
+from dano.checks import checked_count
 from dano.engine import AbstractEngine, VariationalEngine
 from dano.extras import optional
 from dano.gym._rules import Rules, Start
-from dano.maths import checked_count
 from dano.plan import Task
 from dano.scene import Scene, State
 

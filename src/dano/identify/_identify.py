@@ -230,16 +230,14 @@ def _motions(name: str, observed: Observed | Sequence[Any]) -> tuple[Motion, ...
 
 def _check_states(scene: Scene, state: State | Sequence[State | None] | None) -> None:
     """Check the initial states that were given."""
-    several = isinstance(state, Sequence) and not isinstance(state, str)
-    for one in state if several else [state]:
+    for one in _listed(state):
         if one is not None:
             scene.check_state(one)
 
 
 def _check_controls(controls: Any) -> None:
     """Check what drives the motions; shapes are checked when it is cut to them."""
-    several = isinstance(controls, Sequence) and not isinstance(controls, str)
-    for one in controls if several else [controls]:
+    for one in _listed(controls):
         if one is not None and not callable(one):
             checked_kind("controls", one, Control)
 
@@ -313,3 +311,8 @@ def _as_motions(plan: Plan, motions: Sequence[Motion], found: Linearized, scene:
                 arrays[key][rows] = predicted[key][w, : len(rows)][:, bodies]
         result.append(dataclasses.replace(motion, **arrays, covariance=None, q=q))
     return tuple(result)
+
+
+def _listed(value: Any) -> Sequence[Any]:
+    """What is given for each motion, or one for all, as a list."""
+    return value if isinstance(value, Sequence) and not isinstance(value, str) else [value]

@@ -265,7 +265,7 @@ def check_scale(mass_scale: float, mass: float | None) -> None:
     """Raise a ValueError unless the given mass or mass scale is positive and finite."""
     checked_number("mass_scale", mass_scale, above=0)
     if mass is not None:
-        checked_number("mass", mass, above=0)
+        checked_number("mass", mass, above=0, unit="kg")
 
 
 def _moments(density: np.ndarray, x: np.ndarray) -> np.ndarray:

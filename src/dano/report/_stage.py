@@ -62,15 +62,15 @@ class Stage(NamedTuple):
 
 
 def stage(
-    scene: Scene, colours: dict[str, str] | None = None, looks: Mapping[str, LearnedField] | None = None
+    scene: Scene, colours: Mapping[str, str] | None = None, looks: Mapping[str, LearnedField] | None = None
 ) -> Stage:
     """Make the bodies of a scene ready for drawing; bodies without a field or shape are left out.
 
     Raises:
         ValueError: If a colour is none, a colour or look names no body, or nothing can be drawn.
     """
-    colours = {} if colours is None else checked_kind("colours", colours, Mapping)
-    looks = {} if looks is None else checked_kind("looks", looks, Mapping)
+    colours = checked_kind("colours", {} if colours is None else colours, Mapping)
+    looks = checked_kind("looks", {} if looks is None else looks, Mapping)
     for name in (*colours, *looks):
         scene.index(name)
     for name, look in looks.items():

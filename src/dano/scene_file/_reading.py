@@ -219,7 +219,11 @@ def parse_scene(
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path} must be a TOML scene file: {error}") from error
     top = Table(str(path), data, _TOP)
-    h = top.number("timestep", 0.01) if timestep is None else checked_number("timestep", timestep, above=0)
+    h = (
+        top.number("timestep", 0.01)
+        if timestep is None
+        else checked_number("timestep", timestep, above=0, unit="s")
+    )
     if not (math.isfinite(h) and h > 0):
         raise ValueError(f"{path}: timestep must be finite and > 0 s, got {h}")
     steps = _steps(top, h) if n_steps is None else n_steps

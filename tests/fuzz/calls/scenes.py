@@ -1,8 +1,10 @@
 """Contacts, bodies, scenes, states, simulations."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import dano
@@ -59,7 +61,7 @@ def _contact(w: World) -> Iterator[Call]:
     yield Call(
         "overlap",
         dano.overlap,
-        {"a": w.ball.collider(np.zeros(3), np.eye(3)), "b": collider},
+        {"a": w.ball.collider(jnp.zeros(3), jnp.eye(3)), "b": collider},
         {"a": instance(), "b": instance()},
     )
 
@@ -214,7 +216,7 @@ def _scenes(w: World) -> Iterator[Call]:
 
 
 def _states(w: World) -> Iterator[Call]:
-    def ball(**given: object) -> dano.State:
+    def ball(**given: Any) -> dano.State:
         return w.scene.initial_state(ball=given)
 
     vectors = {name: array(3) for name in ("position", "velocity", "omega")}
@@ -231,12 +233,12 @@ def _states(w: World) -> Iterator[Call]:
         {"wall": {"unknown": {}}, "ball": {"number": 3, "text": "up", "list": [1, 2, 3], "nothing": None}},
     )
 
-    def door(**given: object) -> dano.State:
+    def door(**given: Any) -> dano.State:
         return w.door.initial_state(ball=given)
 
     yield Call("Scene.initial_state (joints)", door, {}, {"q": NUMBER, "v": NUMBER})
 
-    def push(**given: object) -> dano.Control:
+    def push(**given: Any) -> dano.Control:
         return w.scene.control(ball=given)
 
     yield Call("Scene.control", push, {}, {"force": array(3), "torque": array(3), "speed": {"unknown": 1.0}})
@@ -259,7 +261,7 @@ def _rollouts(w: World) -> Iterator[Call]:
         "number": 3,
         "text": "push",
         "array": np.zeros((2, 3)),
-        "of another scene": dano.Control(np.zeros((3, 3)), np.zeros((3, 3))),
+        "of another scene": dano.Control(jnp.zeros((3, 3)), jnp.zeros((3, 3))),
     }
     good = {"scene": w.scene, "state": w.state}
     yield Call("step", dano.step, good, {**both, "control": control, **engine})
