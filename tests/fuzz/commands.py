@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from dano.cli import main
 from tests.fuzz.judging import LIMIT, limited, LONGEST, Outcome, TookTooLongError
@@ -35,6 +36,7 @@ class Command:
 POSITIVE = ("0", "-1", "nan", "inf", "many", "1e400")
 COUNT = ("0", "-1", "2.5", "nan", "many")
 LENGTHS = ("-1", "nan", "inf", "many")
+CAMERA = ("--focal", "100", "--eye", "0", "-1", "1")
 COMMANDS = (
     Command(
         ("build", "field.npz", "-o", "new.dano"),
@@ -138,9 +140,10 @@ COMMANDS = (
         },
         ("--features-on", "--up", "--lens", "--marker-family"),
     ),
+    Command(("track", "film.mp4", "trained_soap", "-o", "new.npz", *CAMERA), ("film.mp4",)),
     Command(
-        ("track", "film.mp4", "thing.dano", "-o", "new.npz", "--focal", "100", "--eye", "0", "-1", "1"),
-        ("film.mp4", "thing.dano"),
+        ("track", "frames", "trained_soap", "-o", "new.npz", *CAMERA, "--rate", "30"),
+        ("frames",),
         {"-o": ".npz", "--report": ".html"},
         {
             "--focal": POSITIVE,
@@ -173,6 +176,9 @@ def _hostile(world: World) -> dict[str, bytes]:
     (world.folder / "task.toml").write_text("[[goals]]\nbody = 'wall'\n", encoding="utf-8")
     (world.folder / "film.mp4").write_bytes(b"no film")
     (world.folder / "photos").mkdir()
+    (world.folder / "frames").mkdir()
+    for i in range(6):
+        Image.new("RGB", (64, 48), (200, 200, 10 * i)).save(world.folder / "frames" / f"{i}.png")
     pickled, lying = io.BytesIO(), io.BytesIO()
     np.savez(pickled, format=np.array({"a": 1}, dtype=object))
     np.savez(lying, values=np.zeros(3))

@@ -139,7 +139,7 @@ def test_moving_bodies_fill_a_third_of_the_height_and_stay_in_view(run: Run):
     # Ten times as far: a camera that stands still would show specks.
     position = 10 * np.asarray(trajectory.states.position)
     orientation = np.asarray(trajectory.states.orientation)
-    moving, _ = _framing._corners(scene, drawn, position, orientation)
+    moving, _ = _framing._points(scene, drawn, position, orientation)
     fills, cameras = {}, []
     for how in CAMERAS:
         cameras = _framing.cameras_for(scene, drawn, position, orientation, 0.01, (640, 400), how)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.checks import checked_kind
+from dano.checks import checked_kind, shown
 from dano.identify._motion import JOINT_NUMBERS, Motion
 from dano.maths import checked_floating, checked_numbers, Numbers, quat_rotate
 from dano.scene import Layout, Scene, State
@@ -62,8 +62,8 @@ def motion_of_joints(scene: Scene, times: Numbers, q: Numbers, *, state: State |
     stamps, rows = checked_numbers("times", times), checked_floating("q", q).astype(scene.timestep.dtype)
     if not k:
         raise ValueError("scene must have joints with coordinates, got none")
-    if stamps.ndim != 1:
-        raise ValueError(f"times must be a vector, got shape {stamps.shape}")
+    if stamps.ndim != 1 or not np.all(np.diff(stamps) > 0):
+        raise ValueError(f"times must be a vector of increasing numbers [s], got {shown(times)}")
     if rows.shape != (len(stamps), k):
         raise ValueError(f"q must have shape ({len(stamps)}, {k}) as times have it, got {rows.shape}")
     if not np.all(np.isfinite(np.asarray(rows))):

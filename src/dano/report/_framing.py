@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from dano.fields import AbstractShape, Ellipsoid, Sphere
 from dano.maths import quat_to_matrix
 from dano.report._stage import Stage
-from dano.scene import Scene, Trajectory
+from dano.scene import Body, Scene, Trajectory
 from dano.vision import Camera
 
 CAMERAS = ("auto", "fixed", "follow")
@@ -15,9 +16,11 @@ CAMERAS = ("auto", "fixed", "follow")
 LEAST = 1 / 3
 """Share of a picture's height that moving bodies fill, together, wherever a camera can do that."""
 # Seen a little from above; margin around what is framed.
-_DOWN, _MARGIN = -0.36, 0.1
+_DOWN, _MARGIN = -0.36, 0.08
+# Points that stand for a round body or an object.
+_POINTS = 100
 # Seconds before and after a frame that a following camera keeps in view, too: the longer, the calmer.
-_CALM = (0.5, 0.35, 0.25, 0.17, 0.12, 0.08, 0.05, 0.03, 0.0)
+_CALM = (0.5, 0.35, 0.25, 0.17, 0.12, 0.08, 0.05, 0.03)
 
 
 def camera_for(scene: Scene, drawn: Stage, trajectory: Trajectory, width: int, height: int) -> Camera:
@@ -25,7 +28,7 @@ def camera_for(scene: Scene, drawn: Stage, trajectory: Trajectory, width: int, h
     position = np.asarray(trajectory.states.position, dtype=np.float64)
     orientation = np.asarray(trajectory.states.orientation, dtype=np.float64)
     steps = np.unique(np.linspace(0, len(position) - 1, 60).astype(int))
-    moving, still = _corners(scene, drawn, position[steps], orientation[steps])
+    moving, still = _points(scene, drawn, position[steps], orientation[steps])
     return _fixed(moving, still, _direction(scene, drawn, position[steps], moving, still), width, height)
 
 
@@ -50,19 +53,21 @@ def cameras_for(
         how: One of `CAMERAS`. A following camera keeps its direction and shifts; "auto" follows if bodies
             would otherwise fill less than a third of the height.
     """
-    moving, still = _corners(scene, drawn, position, orientation)
+    moving, still = _points(scene, drawn, position, orientation)
     direction = _direction(scene, drawn, position, moving, still)
     fixed = _fixed(moving, still, direction, *size)
     if how == "fixed" or not moving.shape[1]:
         return [fixed] * len(position)
     if how == "auto" and _least_fill([fixed] * len(moving), moving) >= LEAST:
         return [fixed] * len(position)
-    cameras = [fixed] * len(position)
+    nearest = _following(moving, direction, 0, size)
+    # Bodies far apart cannot fill it: then nearly what can be had.
+    wanted = min(LEAST, 0.9 * _least_fill(nearest, moving))
     for calm in _CALM:
         cameras = _following(moving, direction, round(calm / step), size)
-        if _least_fill(cameras, moving) >= LEAST:
-            break
-    return cameras
+        if _least_fill(cameras, moving) >= wanted:
+            return cameras
+    return nearest
 
 
 def _following(
@@ -106,23 +111,37 @@ def _least_fill(cameras: Sequence[Camera], moving: Float[np.ndarray, "frames n 3
     return float(min(heights))
 
 
-def _corners(
+def _points(
     scene: Scene, drawn: Stage, position: np.ndarray, orientation: np.ndarray
 ) -> tuple[Float[np.ndarray, "frames n 3"], Float[np.ndarray, "m 3"]]:
-    """Corners of boxes around bounded bodies [m, W]: of those that move in each frame, and of fixed ones."""
+    """Points on bounded bodies [m, W]: on those that move in each frame, and on fixed ones."""
     moving, still = [np.zeros((len(position), 0, 3))], [np.zeros((0, 3))]
     for item, row, com in zip(drawn.items, drawn.rows, drawn.offsets, strict=True):
         if item.shape is None or item.plane is not None:
             continue
-        lower, upper = np.asarray(item.shape.bounds, dtype=np.float64)
-        corners = np.where(np.array(list(np.ndindex(2, 2, 2))) == 1, upper, lower) - com
+        outline = _outline(scene.bodies[row], item.shape) - com
         turns = quat_to_matrix(orientation[:, row])
-        placed = position[:, None, row] + np.einsum("tij,nj->tni", turns, corners)
+        placed = position[:, None, row] + np.einsum("tij,nj->tni", turns, outline)
         if scene.bodies[row].fixed:
             still.append(placed[0])
         else:
             moving.append(placed)
     return np.concatenate(moving, axis=1), np.concatenate(still)
+
+
+def _outline(body: Body, shape: AbstractShape) -> Float[np.ndarray, "n 3"]:
+    """Points on a body [m, F] between which it lies, or nearly."""
+    if body.object is not None:
+        points = np.asarray(body.object.surface.points, dtype=np.float64)
+        return points[:: max(1, len(points) // _POINTS)]
+    lower, upper = np.asarray(shape.bounds, dtype=np.float64)
+    corners = np.array(list(np.ndindex(2, 2, 2))) * 2.0 - 1
+    if isinstance(shape, (Sphere, Ellipsoid)):
+        k = np.arange(_POINTS) + 0.5
+        z, angle = 1 - 2 * k / _POINTS, np.pi * (1 + np.sqrt(5)) * k
+        round_off = np.sqrt(1 - z * z)
+        corners = np.stack([round_off * np.cos(angle), round_off * np.sin(angle), z], axis=1)
+    return 0.5 * (lower + upper) + 0.5 * (upper - lower) * corners
 
 
 def _direction(scene: Scene, drawn: Stage, position: np.ndarray, moving, still) -> np.ndarray:
