@@ -22,13 +22,14 @@ if limit >= 0:
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 sys.argv[0] = "dano"
-from dano.cli import main
+from dano_start import main
+print("started", file=sys.stderr, flush=True)
 main()
 """
 WAIT = 240
 """Seconds after which a command counts as hanging."""
-MOMENTS = (0.3, 1.0, 2.0, 4.0, 7.0, 11.0)
-"""Seconds after which a command is stopped: while it starts, reads, compiles, simulates, writes."""
+MOMENTS = (0.2, 1.0, 2.0, 4.0, 7.0, 11.0)
+"""Seconds after its start at which a command is stopped: it starts, reads, compiles, simulates, writes."""
 
 
 def tried_processes(world: World) -> Iterator[Outcome]:
@@ -49,7 +50,7 @@ def tried_processes(world: World) -> Iterator[Outcome]:
 def _start(folder: Path, *words: str, limit: int | None = None) -> subprocess.Popen[str]:
     """A command in a process of its own; `limit`: largest file that it may write [bytes]."""
 
-    return subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, str(-1 if limit is None else limit), *words],
         cwd=folder,
         env={**os.environ, "DANO_CACHE_DIR": "off", "PYTHONPATH": os.pathsep.join(sys.path)},
@@ -57,6 +58,9 @@ def _start(folder: Path, *words: str, limit: int | None = None) -> subprocess.Po
         stderr=subprocess.PIPE,
         text=True,
     )
+    assert process.stderr is not None
+    assert process.stderr.readline() == "started\n"
+    return process
 
 
 def _left(folder: Path) -> list[str]:
@@ -87,9 +91,7 @@ def _stopped(folder: Path, number: signal.Signals, moment: float) -> Outcome:
     process.send_signal(number)
 
     def wrong(code: int, out: str, err: str) -> str:
-        # Before dano is imported nobody listens: the system's own end, without a word.
-        early = code == -number or (code == 1 and moment < 3)
-        if code not in (0, 130) and not early:
+        if code not in (0, 130):
             return f"ended with code {code}"
         if left := _left(folder):
             return f"left {left}"

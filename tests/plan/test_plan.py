@@ -256,7 +256,7 @@ def test_a_task_of_another_scene_is_said(puck):
         dano.plan(puck, state, jointless)
     with pytest.raises(ValueError, match="method must be one of ilqr, cem, mppi, got 'pso'"):
         dano.plan(puck, state, drive(position=(0, 0, 0)), method="pso")
-    with pytest.raises(ValueError, match="controls must be finite numbers of shape"):
+    with pytest.raises(ValueError, match="controls must have shape"):
         dano.plan(puck, state, drive(position=(0, 0, 0)), controls=np.zeros((3, 1)))
     with pytest.raises(ValueError, match="softening must hold factors between 0 and 1, got 2"):
         dano.plan(puck, state, drive(position=(0, 0, 0)), softening=[2.0])
