@@ -77,9 +77,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         os.umask(mask)
         os.chmod(name, 0o666 & ~mask)
         os.replace(name, target)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(name)
+        if isinstance(error, OSError) and error.strerror and error.filename in (None, name):
+            # A full disk names no file.
+            raise OSError(f"{target} cannot be written: {error.strerror}") from error
         raise
 
 
@@ -87,7 +90,7 @@ def checked_output(path: str | os.PathLike[str]) -> Path:
     """`path` if it can be written: a file, new or not, a character device, or a pipe.
 
     Raises:
-        ValueError: If it is a directory, a disk or a socket, or its parent does not exist.
+        ValueError: If it is a directory, a disk or a socket, or its parent does not exist or takes no files.
     """
     target = checked_path("output path", path)
     if target.is_dir():
@@ -102,6 +105,14 @@ def checked_output(path: str | os.PathLike[str]) -> Path:
     elif not (target.is_file() or target.is_char_device() or target.is_fifo()):
         kind = "disk" if target.is_block_device() else "socket"
         raise ValueError(f"output path must be a file, a character device or a pipe, got the {kind} {target}")
+    if not target.exists() or target.is_file():
+        try:
+            # It has no name, and is gone at once.
+            tempfile.TemporaryFile(dir=target.resolve().parent).close()
+        except OSError as error:
+            raise ValueError(
+                f"output path must be in a folder that can be written, got {target}: {error.strerror}"
+            ) from error
     return target
 
 

@@ -11,6 +11,7 @@ import jax
 
 from tests.fuzz.calls import calls
 from tests.fuzz.commands import tried_commands
+from tests.fuzz.drawn import tried_drawn
 from tests.fuzz.files import tried_files
 from tests.fuzz.judging import judge, Outcome, VERDICTS
 from tests.fuzz.processes import tried_processes
@@ -29,6 +30,7 @@ def tried_calls(world: World) -> Iterator[Outcome]:
 
 PARTS: dict[str, Callable[[World], Iterator[Outcome]]] = {
     "calls": tried_calls,
+    "drawn": tried_drawn,
     "files": tried_files,
     "commands": tried_commands,
     "processes": tried_processes,

@@ -1,6 +1,6 @@
 """Kinds of arguments, and for each the values that it must refuse."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -88,7 +88,7 @@ def target(folder: Path, suffix: str) -> Bad:
     return {"folder": taken, "no folder": folder / "nowhere" / f"a{suffix}", "number": 3, "thing": Thing()}
 
 
-SHAPELESS: Callable[..., st.SearchStrategy] = lambda: st.one_of(  # noqa: E731
+SHAPELESS: st.SearchStrategy[object] = st.one_of(
     st.none(),
     st.booleans(),
     st.text(max_size=8),

@@ -68,6 +68,12 @@ def _left(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.rglob("*.part"))
 
 
+def _one_line(err: str, says: str) -> bool:
+    """Whether an error is one line that names what it is about; lines of progress are none."""
+    lines = [line for line in err.splitlines() if not line.endswith(" %") and " s left" not in line]
+    return len(lines) == 1 and lines[0].startswith("dano: error: ") and says in lines[0]
+
+
 def _ended(case: str, process: subprocess.Popen[str], good: Callable[[int, str, str], str]) -> Outcome:
     """Wait for a command; `good` says what is wrong with code, stdout and stderr, nothing if all is well."""
     try:
@@ -132,7 +138,7 @@ def _full_disk(world: World, size: int) -> Outcome:
     process = _start(world.folder, "build", "field.npz", "-o", output.name, "--mass", "1", limit=size)
 
     def wrong(code: int, out: str, err: str) -> str:
-        if code != 2 or err.count("\n") != 1 or not err.startswith("dano: error: "):
+        if code != 2 or not _one_line(err, output.name):
             return f"ended with code {code}"
         if output.read_bytes() != PRECIOUS:
             return "the old file is gone"
@@ -146,9 +152,8 @@ def _read_only(world: World) -> Iterator[Outcome]:
     for place in ("/proc/dano.npz", "/sys/dano.npz", "/dev/full"):
         process = _start(world.folder, "build", "field.npz", "-o", place, "--mass", "1", "--samples", "50")
 
-        def wrong(code: int, out: str, err: str) -> str:
-            one_line = err.count("\n") == 1 and err.startswith("dano: error: ")
-            return "" if code == 2 and one_line else f"ended with code {code}"
+        def wrong(code: int, out: str, err: str, place: str = place) -> str:
+            return "" if code == 2 and _one_line(err, place) else f"ended with code {code}"
 
         yield _ended(f"build -o {place}", process, wrong)
 

@@ -85,7 +85,7 @@ class Actuator(eqx.Module):
                 raise ValueError(f"limit {what} must stand alone, got lower or upper besides it")
             upper = checked_numbers(f"limit {what}", limit)
             lower = -upper
-            if upper.size > max(1, len(self.axes)) or not np.all(np.isfinite(upper) & (upper > 0)):
+            if not 1 <= upper.size <= max(1, len(self.axes)) or not np.all(np.isfinite(upper) & (upper > 0)):
                 raise ValueError(
                     f"limit {what} must be finite and > 0, one number or one per axis, got {shown(limit)}"
                 )
