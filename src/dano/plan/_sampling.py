@@ -1,9 +1,9 @@
 """Planning by sampling: the cross-entropy method and path integrals, on rollouts of the same problem.
 
-Both draw control sequences w ~ N(mean, deviation²) at a few knots with straight lines between them, roll all
-of them out, and move the mean: to that of the best (CEM; Rubinstein 1999), or to the average with weights
-exp(−cost/temperature) (MPPI; Williams et al. 2017). Constraints are priced: the cost is
-J + ½ p Σ violation², with a price p that grows from pass to pass.
+Both draw what is added to the first controls, N(mean, deviation²) at a few knots with straight lines between
+them, roll all sequences out, and move the mean, which begins at zero: to that of the best (CEM; Rubinstein
+1999), or to the average with weights exp(−cost/temperature) (MPPI; Williams et al. 2017). Constraints are
+priced: the cost is J + ½ p Σ violation², with a price p that grows from pass to pass.
 """
 
 import dataclasses
@@ -29,7 +29,8 @@ class SamplingOptions:
         passes: How often to draw.
         samples: Sequences in a pass.
         best: Share of them that CEM keeps.
-        knots: Moments at which controls are drawn.
+        knots: Moments at which numbers are drawn, with straight lines between them; with one, controls are
+            the first ones moved by as much at all times.
         deviation: First standard deviation, as a share of the bounds.
         least: Deviation that is always left.
         temperature: Of MPPI, as a share of the spread of costs.
@@ -98,7 +99,7 @@ def sampled(
     Args:
         problem: The problem.
         start: x_0.
-        controls: First mean.
+        controls: What the search adds to.
         method: "cem" or "mppi".
         options: See `SamplingOptions`.
         key: Of the random numbers.
@@ -110,7 +111,7 @@ def sampled(
     lift = _lines(n_steps, min(options.knots, n_steps))
     assert problem.lower is not None and problem.upper is not None
     least, most = problem.lower, problem.upper
-    mean = jnp.asarray(np.linalg.lstsq(lift, np.asarray(controls), rcond=None)[0])
+    mean = jnp.zeros((lift.shape[1], m), controls.dtype)
     spread = jnp.full_like(mean, options.deviation)
     prices = np.geomspace(options.price, options.last_price, options.passes)
     jit: Any = eqx.filter_jit
@@ -123,7 +124,7 @@ def sampled(
                 draw, (options.samples, *mean.shape), mean.dtype
             )
             knots = knots.at[0].set(mean)
-            sequences = jnp.einsum("tk,skm->stm", jnp.asarray(lift), knots)
+            sequences = controls[None] + jnp.einsum("tk,skm->stm", jnp.asarray(lift), knots)
             sequences = jnp.clip(sequences, *(jnp.broadcast_to(b, sequences.shape) for b in (least, most)))
             sequences = sequences.at[1].set(best)
             cost, violation = (np.asarray(x) for x in rate(problem, start, sequences))

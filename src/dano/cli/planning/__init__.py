@@ -56,7 +56,7 @@ def _found(loaded, given, command: Plan, progress: Progress) -> Planned:
     if search.max_iterations is not None:
         options = options._replace(max_iterations=search.max_iterations)
     sampling = SamplingOptions(max_seconds=search.max_seconds)
-    counts = {name: getattr(search, name) for name in ("passes", "samples")}
+    counts = {name: getattr(search, name) for name in ("passes", "samples", "knots", "deviation")}
     sampling = dataclasses.replace(sampling, **{name: n for name, n in counts.items() if n is not None})
     most = options.max_iterations * options.max_updates
 
