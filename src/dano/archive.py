@@ -64,8 +64,11 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         with tempfile.TemporaryFile() as whole:
             yield whole
             whole.seek(0)
-            with open(target, "wb") as stream:
-                shutil.copyfileobj(whole, stream)
+            try:
+                with open(target, "wb") as stream:
+                    shutil.copyfileobj(whole, stream)
+            except OSError as error:
+                raise OSError(f"{target} cannot be written: {error.strerror}") from error
         return
     target = target.resolve()
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
