@@ -288,7 +288,7 @@ def test_open_loops_and_wrong_ones_are_said():
         dano.Scene.create(scene.bodies, joints=scene.joints, loops=[dano.Loop("crnk", "rocker")])
     with pytest.raises(ValueError, match="loop must close a chain of joints, got 'crank' and 'rocker'"):
         dano.Scene.create(scene.bodies, loops=[dano.Loop("crank", "rocker")])
-    with pytest.raises(ValueError, match="kind of a loop must be one of point, weld, got 'pin'"):
+    with pytest.raises(ValueError, match="kind must be one of point, weld, got 'pin'"):
         dano.Loop("a", "b", "pin")
     with pytest.raises(ValueError, match="loop must join two different bodies, got 'a' twice"):
         dano.Loop("a", "a")
