@@ -389,8 +389,8 @@ def checked_floating(name: str, value: Numbers) -> Array:
         ValueError: If it holds something else than real numbers, or its rows differ in length.
     """
     try:
-        # NumPy would drop an imaginary part with a warning.
-        real = not np.iscomplexobj(value)
+        # NumPy would drop an imaginary part with a warning, and reads no tracers, alone or in a tuple.
+        real = is_traced(value) or not np.iscomplexobj(value)
         array = floating(value) if real else None
     except (TypeError, ValueError, OverflowError):
         array = None
