@@ -104,6 +104,7 @@ def test_commands_of_motors_are_controls_of_a_task(tmp_path):
     given = load_task(tmp_path / "task.toml", scene)
     np.testing.assert_allclose(given.controls[:, 0], [0, 0, 0.2, 0.4, 0.4], atol=1e-12)
     controls = given.task.controls(scene, jnp.asarray(given.controls))
+    assert controls.command is not None
     np.testing.assert_allclose(controls.command, given.controls)
     with pytest.raises(ValueError, match=r"\[\[joints\]\] 1 .*unknown key 'stifness'"):
         (tmp_path / "wrong.toml").write_text(MOTOR.replace("stiffness", "stifness"))
