@@ -6,6 +6,7 @@ import signal
 import numpy as np
 import pytest
 
+from dano.cli import _console
 from dano.cli.running import _checkpoint, _rollout, Clock
 
 
@@ -71,6 +72,16 @@ def test_a_run_that_was_killed_has_left_its_pieces(run, scene, tmp_path, monkeyp
     assert answer.code == 2 and "run.checkpoint.npz must be of this scene" in answer.err
     assert run("simulate", scene, "-o", tmp_path / "run.npz", "--resume").code == 0
     assert not kept.exists()
+
+
+def test_progress_is_told_in_files_too(monkeypatch, capsys):
+    monkeypatch.setattr(_console, "QUIET", 10.0)
+    now = iter([0.0, 1.0, 11.0, 12.0, 31.0])
+    monkeypatch.setattr(_console.time, "monotonic", lambda: next(now))
+    progress = _console.Progress()
+    for share in (0.0, 0.25, 0.3, 0.75):
+        progress("simulating", share)
+    assert capsys.readouterr().err == ("dano: simulating 25 %, 30 s left\ndano: simulating 75 %, 10 s left\n")
 
 
 def test_the_parts_of_the_time_add_up(run, scene, tmp_path):
