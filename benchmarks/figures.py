@@ -10,9 +10,9 @@ with the groups of rows to show, all without any. Two other forms:
     <!-- figures: cases FILE.json FILE.json | NAME | NAME … -->
     <!-- figures: headlines -->
 
-The first has a row for each group of its files and a column for each name. The second has the rows that
-`benchmarks/_headlines.py` lists. `python -m benchmarks.figures` rewrites all tables; with `--check` it
-changes nothing and fails where one is out of date.
+The first has a row for each group of its files that has such names, and a column for each name. The
+second has the rows that `benchmarks/_headlines.py` lists. `python -m benchmarks.figures` rewrites all
+tables; with `--check` it changes nothing and fails where one is out of date.
 """
 
 import argparse
@@ -59,11 +59,17 @@ def _cases(what: str) -> str:
         for group in dict.fromkeys(row["group"] for row in rows):
             found = {row["name"]: stored_row(row) for row in rows if row["group"] == group}
             missing = [name for name in names if name not in found]
+            if len(missing) == len(names):
+                continue  # A group of other things.
             if missing:
                 raise ValueError(f"{file} must have rows {names} for {group!r}, {missing[0]!r} is not there")
-            cells = [f"{found[name].value:.3g} {found[name].unit}".strip() for name in names]
+            cells = [_measured(found[name]) for name in names]
             lines.append(f"| {group} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n\n"
+
+
+def _measured(row: Row) -> str:
+    return "–" if row.value is None else f"{row.value:.3g} {row.unit}".strip()
 
 
 def _headlines() -> str:

@@ -9,6 +9,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from dano.maths import (
+    checked_array,
     column_norm,
     Pose,
     quat_conjugate,
@@ -197,3 +198,14 @@ def test_norms_differentiate_at_zero():
 def test_skew_is_the_cross_product():
     a, b = jnp.asarray(VECTORS[0]), jnp.asarray(VECTORS[1])
     np.testing.assert_allclose(skew(a) @ b, np.cross(a, b), atol=1e-15)
+
+
+def test_arguments_may_hold_traced_numbers():
+    """A user's velocity=(v, 0, 0) under jax.grad."""
+
+    def size(v):
+        return jnp.sum(checked_array("velocity", (v, 0, 2), (3,)) ** 2)
+
+    assert float(jax.grad(size)(3.0)) == 6.0
+    with pytest.raises(ValueError, match="velocity must be a number or an array of real numbers"):
+        checked_array("velocity", (1j, 0, 2), (3,))

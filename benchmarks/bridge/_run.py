@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from benchmarks._measure import load_average, parse_arguments, report, Row
+from benchmarks.bridge._agreement import agreement_row, HOLLOW, hollow, HOLLOW_NODES, with_article
 from dano.exchange import solid_triangles
 from dano.mujoco import Bridge
 from dano.scene_file import build_asset
@@ -43,8 +44,13 @@ def run() -> None:
     for name in ("trained_bunny", "trained_soap"):
         for support in supports:
             rows += _rest_rows(name, support, TIMESTEP)
-    for timestep in () if arguments.quick else (0.001, 0.005, 0.01):
-        rows += _rest_rows("trained_bunny", "plane", timestep)
+    for name in () if arguments.quick else ("trained_bunny", "trained_soap"):
+        for timestep in (0.001, 0.005, 0.01):
+            rows += _rest_rows(name, "plane", timestep)
+    for name in ("trained_bunny", "trained_soap"):
+        rows += [
+            agreement_row(name, support, *_model(name, support, TIMESTEP, False)) for support in supports
+        ]
     rows.append(_memory_row(10.0 if arguments.quick else LONG_RUN))
     settings = {
         "date": datetime.datetime.now().isoformat(timespec="minutes"),
@@ -57,16 +63,16 @@ def run() -> None:
 
 
 def _rest_rows(name: str, support: str, timestep: float) -> list[Row]:
-    group = f"{name} on a {support}, {1000 * timestep:g} ms"
+    group = f"{name} on {with_article(support)}, {1000 * timestep:g} ms"
     ours, theirs = (_rest(name, support, timestep, own) for own in (False, True))
     budget = 1e6 * timestep
     return [
         Row(group, "largest speed at rest", ours.speed, "m/s", MOST_CREEP, note=f"{ours.contacts} contacts"),
-        Row(group, "the same, MuJoCo's hull", theirs.speed, "m/s", note=f"{theirs.contacts} contacts"),
+        Row(group, "speed of MuJoCo's hull", theirs.speed, "m/s", note=f"{theirs.contacts} contacts"),
         Row(group, "creep", ours.creep, "m/s", max(theirs.creep, 1e-9), note=f"{ours.warnings} warnings"),
-        Row(group, "the same, MuJoCo's hull", theirs.creep, "m/s"),
+        Row(group, "creep of MuJoCo's hull", theirs.creep, "m/s"),
         Row(group, "time of a step", ours.microseconds, "µs", budget, note="target: real time"),
-        Row(group, "the same, MuJoCo's hull", theirs.microseconds, "µs"),
+        Row(group, "time of MuJoCo's hull", theirs.microseconds, "µs"),
     ]
 
 
@@ -130,9 +136,12 @@ def _support(spec, support: str) -> dict:
             corners = np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.2, 0.2) for z in (-0.2, 0.0)])
             spec.add_mesh(name="block", uservert=corners.ravel().tolist())
             return {"type": TYPES.mjGEOM_MESH, "meshname": "block"}
-    x = np.linspace(-1, 1, 41)
-    heights = 1 - np.exp(-4 * (x[None] ** 2 + x[:, None] ** 2))
-    spec.add_hfield(name="hollow", nrow=41, ncol=41, size=[0.3, 0.3, 0.05, 0.05], userdata=heights.ravel())
+    x = np.linspace(-1, 1, HOLLOW_NODES)
+    heights = hollow(x[None], x[:, None]).ravel()
+    half, top = HOLLOW
+    spec.add_hfield(
+        name="hollow", nrow=len(x), ncol=len(x), size=[half, half, top, top], userdata=heights.tolist()
+    )
     return {"type": TYPES.mjGEOM_HFIELD, "hfieldname": "hollow"}
 
 

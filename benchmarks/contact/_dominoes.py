@@ -8,11 +8,13 @@ degree of freedom, integrated here. The scene has the same: friction 2 below the
 """
 
 import importlib.util
+from typing import Any
 
 import numpy as np
 
 import dano
 from benchmarks._measure import Row, skipped
+from benchmarks.contact._mujoco import domino_directions
 from benchmarks.contact._scenes import GRAVITY, play
 
 GROUP = "Twenty dominoes: speed of the wave"
@@ -140,7 +142,7 @@ def _passing(times: np.ndarray, upward: np.ndarray) -> np.ndarray:
     return found
 
 
-def _dano_times(n: int, timestep: float) -> tuple[np.ndarray, str]:
+def _scene(n: int, timestep: float) -> dano.Scene:
     shape = dano.Box((0.5 * THICKNESS, 0.5 * WIDTH, 0.5 * HEIGHT))
     bodies = [dano.Body(f"d{i}", shape, mass=MASS) for i in range(n)]
     bodies.append(dano.Body("floor", dano.HalfSpace(), fixed=True))
@@ -149,39 +151,19 @@ def _dano_times(n: int, timestep: float) -> tuple[np.ndarray, str]:
     law = dano.DistributedLaw()
     contacts = [dano.Contact(f"d{i}", "floor", rough, law=law) for i in range(n)]
     contacts += [dano.Contact(f"d{i}", f"d{i + 1}", smooth, law=law) for i in range(n - 1)]
-    scene = dano.Scene.create(bodies, contacts, timestep=timestep)
-    places = {f"d{i}": {"position": p, "orientation": q} for i, (p, q) in enumerate(_starts(n))}
-    motion = play(scene, SECONDS, **places)
+    return dano.Scene.create(bodies, contacts, timestep=timestep)
+
+
+def _places(n: int) -> dict[str, dict[str, Any]]:
+    return {f"d{i}": {"position": p, "orientation": q} for i, (p, q) in enumerate(_starts(n))}
+
+
+def _dano_times(n: int, timestep: float) -> tuple[np.ndarray, str]:
+    motion = play(_scene(n, timestep), SECONDS, **_places(n))
     return _passing(motion.times, motion.rotation[:, :n, 2, 2]), motion.said
 
 
 def _mujoco_times(n: int) -> np.ndarray:
-    import mujoco
-
-    bodies = "".join(
-        f'<body name="d{i}" pos="{_words(p)}" quat="{_words(q)}"><freejoint/>'
-        f'<geom name="g{i}" type="box" size="{0.5 * THICKNESS} {0.5 * WIDTH} {0.5 * HEIGHT}" mass="{MASS}" '
-        'contype="0" conaffinity="0"/></body>'
-        for i, (p, q) in enumerate(_starts(n))
-    )
-    stiff = f'condim="3" solref="{MUJOCO_SOLREF} 1"'
-    rough = f'friction="{FOOT_FRICTION} {FOOT_FRICTION} 0 0 0"'
-    pairs = "".join(f'<pair geom1="g{i}" geom2="floor" {stiff} {rough}/>' for i in range(n))
-    pairs += "".join(
-        f'<pair geom1="g{i}" geom2="g{i + 1}" condim="1" solref="{MUJOCO_SOLREF} 1"/>' for i in range(n - 1)
-    )
-    model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><option timestep="{MUJOCO_TIMESTEP}" gravity="0 0 {-GRAVITY}" cone="elliptic"/><worldbody>'
-        f'<geom name="floor" type="plane" size="5 5 1" contype="0" conaffinity="0"/>{bodies}</worldbody>'
-        f"<contact>{pairs}</contact></mujoco>"
-    )
-    data = mujoco.MjData(model)
-    upward = []
-    for _ in range(round(SECONDS / MUJOCO_TIMESTEP)):
-        mujoco.mj_step(model, data)
-        upward.append(data.xmat[1:, 8].copy())
-    return _passing(MUJOCO_TIMESTEP * np.arange(1, len(upward) + 1), np.array(upward))
-
-
-def _words(numbers) -> str:
-    return " ".join(f"{x:.9g}" for x in numbers)
+    scene = _scene(n, MUJOCO_TIMESTEP)
+    upward = domino_directions(scene, _places(n), MUJOCO_SOLREF, SECONDS)
+    return _passing(MUJOCO_TIMESTEP * np.arange(1, len(upward) + 1), upward)

@@ -4,35 +4,16 @@ It has no coefficient of restitution, so that part has no counterpart.
 """
 
 import importlib.util
+import warnings
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
+import dano
 from benchmarks._measure import Row, skipped
-from benchmarks.contact._scenes import GRAVITY
-
-
-class Geom(NamedTuple):
-    """A body of one geom.
-
-    Attributes:
-        kind: MuJoCo's type.
-        size: Half lengths [m].
-        mass: [kg].
-        position: [m, W].
-        orientation: wxyz, body → world.
-        velocity: [m/s, W].
-        omega: [rad/s, B].
-    """
-
-    kind: str
-    size: Sequence[float]
-    mass: float
-    position: Sequence[float]
-    orientation: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
-    velocity: Sequence[float] = (0.0, 0.0, 0.0)
-    omega: Sequence[float] = (0.0, 0.0, 0.0)
+from benchmarks._mujoco import at_defaults, World
+from benchmarks.contact._scenes import Geometry, GRAVITY
 
 
 def installed() -> bool:
@@ -45,37 +26,24 @@ def missing(group: str) -> list[Row]:
     return [skipped(group, "MuJoCo", "not installed: pip install 'dano[mujoco]'")]
 
 
-def play(
-    bodies: Sequence[Geom],
+def world_of(
+    geometries: Sequence[Geometry],
     timestep: float,
-    seconds: float,
     *,
+    mass: float = 1.0,
     friction: float = 0.2,
-    fixed: str = '<geom type="plane" size="50 50 1" friction="0"/>',
-    gravity: Sequence[float] = (0.0, 0.0, -GRAVITY),
-) -> np.ndarray:
-    """Positions over time [m, W], shape (t, n, 3), above a plane unless something else is fixed.
-
-    The larger friction coefficient of a pair counts.
-    """
-    import mujoco
-
-    words = "".join(
-        f'<body pos="{_words(b.position)}" quat="{_words(b.orientation)}"><freejoint/>'
-        f'<geom type="{b.kind}" size="{_words(b.size)}" mass="{b.mass}" friction="{friction}"/></body>'
-        for b in bodies
-    )
-    model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><option timestep="{timestep}" gravity="{_words(gravity)}"/>'
-        f"<worldbody>{fixed}{words}</worldbody></mujoco>"
-    )
-    data = mujoco.MjData(model)
-    data.qvel[:] = np.concatenate([[*b.velocity, *b.omega] for b in bodies])
-    places = [data.qpos.copy()]
-    for _ in range(round(seconds / timestep)):
-        mujoco.mj_step(model, data)
-        places.append(data.qpos.copy())
-    return np.array(places).reshape(len(places), -1, 7)[:, :, :3]
+    fixed: dano.AbstractShape | None = None,
+    gravity: tuple[float, float, float] = (0.0, 0.0, -GRAVITY),
+) -> World:
+    """Bodies b0, b1, … above a plane unless something else is fixed; all of them may touch."""
+    bodies = [dano.Body(f"b{i}", shape, mass=mass) for i, shape in enumerate(geometries)]
+    bodies.append(dano.Body("fixed", dano.HalfSpace() if fixed is None else fixed, fixed=True))
+    material = dano.ContactParams(sliding_friction=friction)
+    with warnings.catch_warnings():
+        # That these steps are long for dano's contact is not MuJoCo's business.
+        warnings.simplefilter("ignore")
+        scene = dano.Scene.create(bodies, others=material, timestep=timestep, gravity=gravity)
+    return World(scene, options=at_defaults())
 
 
 def rolling_rows(group: str, rates: Sequence[float], steps: Sequence[float]) -> list[Row]:
@@ -83,18 +51,12 @@ def rolling_rows(group: str, rates: Sequence[float], steps: Sequence[float]) -> 
     if not installed():
         return missing(group)
     found, radius = [], 0.03
+    worlds = {h: world_of([dano.Sphere(radius)], h, friction=0.5) for h in steps}
     for rate in rates:
         kept = {}
-        for h in steps:
-            start = Geom(
-                "sphere",
-                [radius],
-                1.0,
-                (0, 0, radius),
-                velocity=(rate * radius, 0, 0),
-                omega=(0, rate, 0),
-            )
-            x = play([start], h, 1.0, friction=0.5)[:, 0, 0]
+        start = {"position": (0, 0, radius), "velocity": (rate * radius, 0, 0), "omega": (0, rate, 0)}
+        for h, world in worlds.items():
+            x = world.play(1.0, b0=start)[:, 0, 0]
             first = int(0.9 * len(x))
             kept[h] = (x[-1] - x[first]) / ((len(x) - 1 - first) * h) / (rate * radius)
         note = "kept: " + ", ".join(f"{1000 * h:g} ms {share:.3f}" for h, share in kept.items())
@@ -110,11 +72,12 @@ def impact_rows(group: str, speeds: Sequence[float], steps: Sequence[float]) -> 
     if not installed():
         return missing(group)
     found, radius = [], 0.05
+    worlds = {h: world_of([dano.Sphere(radius)], h) for h in steps}
     for speed in speeds:
         depths = []
-        for h in steps:
-            start = Geom("sphere", [radius], 1.0, (0, 0, radius + 1.3 * h * speed), velocity=(0, 0, -speed))
-            z = play([start], h, max(0.1, 50 * h))[:, 0, 2]
+        for h, world in worlds.items():
+            start = {"position": (0, 0, radius + 1.3 * h * speed), "velocity": (0, 0, -speed)}
+            z = world.play(max(0.1, 50 * h), b0=start)[:, 0, 2]
             depths.append(100 * (radius - z.min()) / (2 * radius))
         note = ", ".join(f"{1000 * h:g} ms {depth:.2g}" for h, depth in zip(steps, depths, strict=True))
         found.append(Row(group, f"MuJoCo: ball at {speed:g} m/s", max(depths), "% of size", note=note))
@@ -126,12 +89,13 @@ def wall_row(group: str, timestep: float, phases: int) -> Row:
     speed, radius, half = 10.0, 0.02, 0.001
     if not installed():
         return missing(group)[0]
-    wall = f'<geom type="box" size="{half} 0.5 0.5" friction="0"/>'
+    wall = dano.Box((half, 0.5, 0.5))
+    world = world_of([dano.Sphere(radius)], timestep, mass=0.03, fixed=wall, gravity=(0.0, 0.0, 0.0))
     through = 0
     for phase in np.arange(phases) / phases:
         x = -(half + radius + (1 + phase) * speed * timestep)
-        start = Geom("sphere", [radius], 0.03, (x, 0.013, 0.007), velocity=(speed, 0, 0))
-        through += bool(play([start], timestep, 0.3, fixed=wall, gravity=(0, 0, 0))[-1, 0, 0] > 0)
+        start = {"position": (x, 0.013, 0.007), "velocity": (speed, 0, 0)}
+        through += bool(world.play(0.3, b0=start)[-1, 0, 0] > 0)
     name = f"MuJoCo: balls that get through, {1000 * timestep:g} ms"
     return Row(group, name, float(through), "", note=f"of {phases} throws")
 
@@ -140,9 +104,9 @@ def creep_row(group: str, friction: float, angle: float, timestep: float) -> Row
     """Speed of a box on a slope [m/s]."""
     if not installed():
         return missing(group)[0]
-    gravity = (GRAVITY * np.sin(angle), 0.0, -GRAVITY * np.cos(angle))
-    box = Geom("box", (0.05, 0.04, 0.03), 1.0, (0, 0, 0.03))
-    places = play([box], timestep, 4.0, friction=friction, gravity=gravity)[:, 0]
+    gravity = (GRAVITY * float(np.sin(angle)), 0.0, -GRAVITY * float(np.cos(angle)))
+    world = world_of([dano.Box((0.05, 0.04, 0.03))], timestep, friction=friction, gravity=gravity)
+    places = world.play(4.0, b0={"position": (0, 0, 0.03)})[:, 0, :3]
     first = round(3.0 / timestep)
     speed = np.linalg.norm(places[-1] - places[first]) / ((len(places) - 1 - first) * timestep)
     return Row(group, f"MuJoCo: box, {1000 * timestep:.3g} ms", float(speed), "m/s")
@@ -152,12 +116,34 @@ def stack_row(group: str, places: Sequence[Sequence[float]], half: float, second
     """Way of the box in a stack that moved most [mm]."""
     if not installed():
         return missing(group)[0]
-    boxes = [Geom("box", [half] * 3, 1.0, place) for place in places]
-    moved = play(boxes, 0.005, seconds, friction=0.5)
+    world = world_of([dano.Box((half,) * 3)] * len(places), 0.005, friction=0.5)
+    starts = {f"b{i}": {"position": place} for i, place in enumerate(places)}
+    moved = world.play(seconds, **starts)[:, :, :3]
     way = 1000 * np.linalg.norm(moved[-1] - moved[0], axis=1).max()
-    name = f"MuJoCo: {len(boxes)} boxes, {seconds:g} s: way of the box that moved most"
+    name = f"MuJoCo: {len(places)} boxes, {seconds:g} s: way of the box that moved most"
     return Row(group, name, float(way), "mm")
 
 
-def _words(numbers) -> str:
-    return " ".join(f"{x:.9g}" for x in numbers)
+def domino_directions(
+    scene: dano.Scene, starts: dict[str, dict[str, Any]], solref: float, seconds: float
+) -> np.ndarray:
+    """Z components of the bodies' own z axes after each step, shape (t, n): stiff contacts, elliptic cones.
+
+    Args:
+        scene: Bodies, the fixed ones last.
+        starts: Their states.
+        solref: Time constant of contacts [s].
+        seconds: To play.
+    """
+    import mujoco
+
+    world = World(scene, options=at_defaults(cone=mujoco.mjtCone.mjCONE_ELLIPTIC))
+    model, data = world.engine.model, world.data(**starts)
+    model.pair_solref[:] = solref, 1.0
+    # Without friction there is one direction of force, not three.
+    model.pair_dim[model.pair_friction[:, 0] < 1e-4] = 1
+    n, upward = len(starts), []
+    for _ in range(round(seconds / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+        upward.append(data.xmat[1 : n + 1, 8].copy())
+    return np.array(upward)

@@ -26,9 +26,9 @@ def _floating(group: str, n_steps: int) -> list[Row]:
         for i, axis in enumerate(axes)
     ]
     scene = dano.Scene.create(bodies, joints=joints, timestep=1e-3, gravity=(0, 0, 0))
-    speeds = {f"link {i + 1}": dict(q=0.2, v=(-1) ** i * 1.5) for i in range(LINKS)}
-    start = scene.initial_state(**{"link 0": dict(velocity=(0.2, 0, 0.1), omega=(1, 0.5, -1))}, **speeds)
-    states, h = dano.simulate(scene, start, n_steps).states, float(scene.timestep)
+    given: dict[str, dict] = {f"link {i + 1}": dict(q=0.2, v=(-1) ** i * 1.5) for i in range(LINKS)}
+    given["link 0"] = dict(velocity=(0.2, 0, 0.1), omega=(1, 0.5, -1))
+    states, h = dano.simulate(scene, scene.initial_state(**given), n_steps).states, float(scene.timestep)
     mass = np.array([float(body.mass) for body in scene.bodies])[:, None]
     inertia = jnp.stack([body.inertia for body in scene.bodies])
     linear = mass * np.asarray(states.velocity)

@@ -101,8 +101,3 @@ def inertias(structure: Structure, scene: dano.Scene) -> np.ndarray:
     """Tensors about the centres of mass of the bodies that move [kg m², B], shape (n, 3, 3)."""
     bodies = scene.bodies[: len(structure.pieces)]
     return np.array([np.asarray(body.inertia * body.mass_scale) for body in bodies])
-
-
-def centres(structure: Structure, scene: dano.Scene) -> np.ndarray:
-    """Centres of mass in the frames of the shapes [m, F], shape (n, 3)."""
-    return np.array([np.asarray(body.com) for body in scene.bodies[: len(structure.pieces)]])

@@ -2,22 +2,21 @@
 
 That is "implicit", for with the default one bodies that tumble fast in free flight gain energy without limit.
 
-Shapes are MuJoCo's own, without rounding; the bunny is the mesh that it was made from (its convex hull, as
-MuJoCo takes meshes), the soap a box of the same extents. Masses and inertias are dano's. MuJoCo takes the
-larger friction coefficient of a pair, as the drawn scenes do; it has no coefficient of restitution.
+Shapes are MuJoCo's own, without rounding; of objects it has the hulls, as it takes meshes. Its contact is the
+default one, whatever the restitution.
 """
 
 import time
 from dataclasses import dataclass
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
-from benchmarks._measure import REPOSITORY
-from benchmarks.robust._draw import Material, Piece, Start, Structure
+import dano
+from benchmarks._mujoco import at_defaults, World
+from benchmarks.robust._draw import Start, Structure
 from benchmarks.robust._judge import Motion
-
-BUNNY_SIZE = 0.12  # [m], as assets/make_objects.py makes it
-SOAP_HALF_EXTENTS = (0.045, 0.03, 0.015)  # [m], as assets/solids.py has it
 
 
 @dataclass(frozen=True)
@@ -29,75 +28,52 @@ class Played:
     seconds: float
 
 
-def model_of(structure: Structure, material: Material, inertia: np.ndarray, com: np.ndarray):
-    """The scene as a compiled model.
-
-    Args:
-        structure: Its shapes.
-        material: Masses, friction, timestep.
-        inertia: About the centres of mass [kg m², B], shape (n, 3, 3).
-        com: Centres of mass in the frames of the shapes [m], shape (n, 3).
-    """
-    import mujoco
-
-    bodies = "".join(
-        f'<body name="{piece.name}"><freejoint/>'
-        f'<inertial pos="0 0 0" mass="{material.masses[i]}" fullinertia="{_six(inertia[i])}"/>'
-        f'<geom {_geom(piece)} pos="{_words(-com[i])}" friction="{material.frictions[i]}"/></body>'
-        for i, piece in enumerate(structure.pieces)
-    )
-    walls = "".join(
-        f'<geom type="box" size="{_words(wall.half_extents)}" pos="{_words(wall.centre)}" friction="0"/>'
-        for wall in structure.walls
-    )
-    scale = _words([BUNNY_SIZE] * 3)
-    xml = (
-        f'<mujoco><option timestep="{material.timestep}" integrator="implicit"/>'
-        '<compiler balanceinertia="true"/>'
-        f'<asset><mesh name="bunny" file="bunny.obj" scale="{scale}"/></asset>'
-        f'<worldbody><geom type="plane" size="50 50 1" friction="0"/>{walls}{bodies}</worldbody></mujoco>'
-    )
-    return mujoco.MjModel.from_xml_string(xml, {"bunny.obj": (REPOSITORY / "assets/bunny.obj").read_bytes()})
-
-
-def play(model, start: Start, inertia: np.ndarray, n_steps: int) -> Played:
-    """Simulate and keep all states."""
+def world_of(structure: Structure, scene: dano.Scene) -> World:
+    """The shapes of a scene, compiled."""
     import mujoco
 
     # They are counted below; MuJoCo would also write each to the terminal and to a file.
     mujoco.set_mju_user_warning(lambda _: None)
-    data = mujoco.MjData(model)
-    n = len(start.position)
-    data.qpos[:] = np.concatenate([start.position, start.orientation], axis=1).ravel()
-    data.qvel[:] = np.concatenate([start.velocity, start.omega], axis=1).ravel()
-    places, speeds = [data.qpos.copy()], [data.qvel.copy()]
+    options = at_defaults(integrator=mujoco.mjtIntegrator.mjINT_IMPLICIT)
+    return World(_plain(structure, scene), objects="hull", options=options)
+
+
+def _plain(structure: Structure, scene: dano.Scene) -> dano.Scene:
+    """The scene with sharp boxes and without restitution."""
+    rounded = [i for i, piece in enumerate(structure.pieces) if piece.kind == "rounded box"]
+
+    def changed(scene):
+        return [scene.bodies[i].shape.rounding for i in rounded] + [
+            contact.params.restitution for contact in scene.contacts
+        ]
+
+    return eqx.tree_at(changed, scene, [jnp.zeros_like(x) for x in changed(scene)])
+
+
+def play(
+    world: World, structure: Structure, scene: dano.Scene, start: Start, inertia: np.ndarray, n_steps: int
+) -> Played:
+    """Simulate a scene with the world's shapes and keep all states."""
+    import mujoco
+
+    model, n = world.engine.model, len(structure.pieces)
+    world.scene = _plain(structure, scene)
+    names = ("position", "orientation", "velocity", "omega")
+    places = {
+        piece.name: {name: getattr(start, name)[i] for name in names}
+        for i, piece in enumerate(structure.pieces)
+    }
+    data = world.data(
+        **places, **{wall.name: {"position": np.array(wall.centre)} for wall in structure.walls}
+    )
+    poses, speeds = [data.qpos.copy()], [data.qvel.copy()]
     seconds = 0.0
     for _ in range(n_steps):
         before = time.process_time()
         mujoco.mj_step(model, data)
         seconds += time.process_time() - before
-        places.append(data.qpos.copy())
+        poses.append(data.qpos.copy())
         speeds.append(data.qvel.copy())
-    pose, twist = np.array(places).reshape(-1, n, 7), np.array(speeds).reshape(-1, n, 6)
+    pose, twist = np.array(poses).reshape(-1, n, 7), np.array(speeds).reshape(-1, n, 6)
     motion = Motion(pose[..., :3], pose[..., 3:], twist[..., :3], twist[..., 3:], inertia)
     return Played(motion, int(sum(warning.number for warning in data.warning)), seconds)
-
-
-def _geom(piece: Piece) -> str:
-    lengths = _words(piece.lengths)
-    match piece.kind:
-        case "box" | "plate" | "rounded box":
-            return f'type="box" size="{lengths}"'
-        case "sphere" | "capsule" | "cylinder" | "ellipsoid":
-            return f'type="{piece.kind}" size="{lengths}"'
-        case "bunny" | "trained_bunny":
-            return 'type="mesh" mesh="bunny"'
-    return f'type="box" size="{_words(SOAP_HALF_EXTENTS)}"'
-
-
-def _six(I: np.ndarray) -> str:
-    return _words([I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]])
-
-
-def _words(numbers) -> str:
-    return " ".join(f"{x:.9g}" for x in numbers)

@@ -136,16 +136,13 @@ def _play_structure(structure: Structure, steps: int, mine: Tally, theirs: Tally
     """Play scenes of one set of shapes until so many steps are done."""
     began = time.monotonic()
     prepared = _dano.template(structure)
+    world = None if theirs is None else _mujoco.world_of(structure, prepared)
     probes, walls = _probes(structure)
     done = material_number = 0
     while done < steps:
         material = draw_material(structure, material_number)
         scene = _dano.scene_of(structure, material, prepared)
         inertia = _dano.inertias(structure, scene)
-        model = None
-        if theirs is not None:
-            com = _dano.centres(structure, scene)
-            model = _mujoco.model_of(structure, material, inertia, com)
         for number in range(STARTS):
             start = draw_start(structure, material_number, number)
             name = f"{structure.seed}/{structure.number}/{material_number}/{number}"
@@ -157,8 +154,8 @@ def _play_structure(structure: Structure, steps: int, mine: Tally, theirs: Tally
             else:
                 mine.seconds += played.seconds
                 mine.timed += ROLLOUT
-            if theirs is not None:
-                other = _mujoco.play(model, start, inertia, ROLLOUT)
+            if theirs is not None and world is not None:
+                other = _mujoco.play(world, structure, scene, start, inertia, ROLLOUT)
                 theirs.add(name, judge(structure, material, other.motion, [], walls), ROLLOUT, other.warnings)
                 theirs.seconds += other.seconds
                 theirs.timed += ROLLOUT
@@ -279,7 +276,7 @@ def _replay(name: str, largest: int, *, mujoco: bool) -> None:
     print(f"  deepest at rest {depths[0]}, at impact {depths[1]} of the size")
     print(f"  {len(failed)} steps not converged{f', first {failed[0]}' if failed else ''}")
     if mujoco:
-        inertia, com = _dano.inertias(structure, scene), _dano.centres(structure, scene)
-        other = _mujoco.play(_mujoco.model_of(structure, material, inertia, com), start, inertia, ROLLOUT)
+        world, inertia = _mujoco.world_of(structure, scene), _dano.inertias(structure, scene)
+        other = _mujoco.play(world, structure, scene, start, inertia, ROLLOUT)
         found = judge(structure, material, other.motion, [], walls)
         print(f"MuJoCo: {describe(found) or 'no failure'}, {other.warnings} warnings")

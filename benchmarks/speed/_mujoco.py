@@ -2,6 +2,9 @@
 
 The hull is what MuJoCo makes of a mesh unless asked otherwise. With `type="sdf"` two meshes collide by their
 signed distances, at MuJoCo's default options; a plane still meets the hull.
+
+The models are written as a user of MuJoCo writes them: `MuJoCoEngine` lists the pairs of a scene one by one,
+past MuJoCo's broad phase, and takes its state from dano before each step. That is not what a step costs.
 """
 
 from collections.abc import Callable, Sequence

@@ -15,6 +15,7 @@ from typing import BinaryIO, cast, IO
 
 import numpy as np
 
+from dano.checks import checked_path
 from dano.memory import in_bytes, memory_limit
 
 OBJECT = "dano-object", 2
@@ -63,8 +64,11 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         with tempfile.TemporaryFile() as whole:
             yield whole
             whole.seek(0)
-            with open(target, "wb") as stream:
-                shutil.copyfileobj(whole, stream)
+            try:
+                with open(target, "wb") as stream:
+                    shutil.copyfileobj(whole, stream)
+            except OSError as error:
+                raise OSError(f"{target} cannot be written: {error.strerror}") from error
         return
     target = target.resolve()
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
@@ -76,9 +80,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         os.umask(mask)
         os.chmod(name, 0o666 & ~mask)
         os.replace(name, target)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(name)
+        if isinstance(error, OSError) and error.strerror and error.filename in (None, name):
+            # A full disk names no file.
+            raise OSError(f"{target} cannot be written: {error.strerror}") from error
         raise
 
 
@@ -86,9 +93,9 @@ def checked_output(path: str | os.PathLike[str]) -> Path:
     """`path` if it can be written: a file, new or not, a character device, or a pipe.
 
     Raises:
-        ValueError: If it is a directory, a disk or a socket, or its parent does not exist.
+        ValueError: If it is a directory, a disk or a socket, or its parent does not exist or takes no files.
     """
-    target = Path(path)
+    target = checked_path("output path", path)
     if target.is_dir():
         raise ValueError(f"output path must be a file, got the directory {target}")
     # A link to nothing is made a file where it leads to.
@@ -101,6 +108,14 @@ def checked_output(path: str | os.PathLike[str]) -> Path:
     elif not (target.is_file() or target.is_char_device() or target.is_fifo()):
         kind = "disk" if target.is_block_device() else "socket"
         raise ValueError(f"output path must be a file, a character device or a pipe, got the {kind} {target}")
+    if not target.exists() or target.is_file():
+        try:
+            # It has no name, and is gone at once.
+            tempfile.TemporaryFile(dir=target.resolve().parent).close()
+        except OSError as error:
+            raise ValueError(
+                f"output path must be in a folder that can be written, got {target}: {error.strerror}"
+            ) from error
     return target
 
 
@@ -110,7 +125,7 @@ def checked_input(path: str | os.PathLike[str]) -> Path:
     Raises:
         ValueError: If it is missing or a directory.
     """
-    source = Path(path)
+    source = checked_path("input path", path)
     if not source.exists():
         raise ValueError(f"input path must be an existing file, got {source}")
     if not source.is_file():

@@ -1,12 +1,12 @@
 """From photographs to a neural object: read, mask, train, integrate."""
 
-import math
 import os
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from dano.checks import checked_count, checked_number, checked_optional, checked_path
 from dano.fields import bake, GridField
 from dano.objects import NeuralObject
 from dano.progress import Progress
@@ -84,9 +84,12 @@ def train_object(
         KeyboardInterrupt: When interrupted, after the state has been saved to `checkpoint`.
     """
     for name, value in (("mass", mass), ("mass_density", mass_density)):
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be positive and finite, got {value}")
-    options = TrainOptions() if options is None else options
+        if name == "mass_density" or value is not None:
+            checked_number(name, value, above=0)
+    checked_count("downscale", downscale)
+    options = checked_optional("options", options, TrainOptions) or TrainOptions()
+    if not isinstance(photographs, Capture):
+        photographs = checked_path("photographs", photographs)
     say = progress or _silent
     capture, given = _masked(photographs, downscale, network, say)
     if views is not None:

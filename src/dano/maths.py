@@ -6,7 +6,6 @@ quaternions compute NumPy arrays with NumPy, on the host and in their own dtype,
 """
 
 import functools
-import operator
 from collections.abc import Sequence
 from types import ModuleType
 from typing import Any, TypeVar
@@ -17,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+
+from dano.checks import shown
 
 Numbers = ArrayLike | Sequence[Any]
 """What constructors take for an array: an array, a number, or (nested) lists and tuples of numbers."""
@@ -298,18 +299,51 @@ def is_traced(*values: object) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
-def checked_array(name: str, value: Numbers, shape: tuple[int, ...]) -> Array:
+def checked_array(
+    name: str,
+    value: Numbers,
+    shape: tuple[int, ...],
+    *,
+    least: int | float | None = None,
+    above: int | float | None = None,
+) -> Array:
     """`value` as a floating array of `shape`; NumPy rules for the dtype, finite unless traced.
 
+    Args:
+        name: Of the argument.
+        value: What was given.
+        shape: What it must have.
+        least: What no entry may be below; default: none.
+        above: What every entry must exceed.
+
     Raises:
-        ValueError: If the shape differs or an entry is not finite.
+        ValueError: If the shape differs, or an entry is no number, not finite or out of range.
     """
-    array = floating(value)
+    array = checked_floating(name, value)
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
-    if not is_traced(array) and not np.all(np.isfinite(np.asarray(array))):
-        raise ValueError(f"{name} must be finite, got {np.asarray(array).tolist()}")
+    if is_traced(array):
+        return array
+    host = np.asarray(array)
+    if not np.all(np.isfinite(host)):
+        raise ValueError(f"{name} must be finite, got {shown(host.tolist())}")
+    if least is not None and not np.all(host >= least):
+        raise ValueError(f"{name} must be ≥ {least:g}, got {shown(host.tolist())}")
+    if above is not None and not np.all(host > above):
+        raise ValueError(f"{name} must be > {above:g}, got {shown(host.tolist())}")
     return array
+
+
+def checked_points(name: str, value: Numbers) -> Float[Array, "n 3"]:
+    """`value` as at least one point, shape (n, 3).
+
+    Raises:
+        ValueError: If the shape is another, or a number is not finite.
+    """
+    array = checked_floating(name, value)
+    if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
+        raise ValueError(f"{name} must have shape (n, 3) with n ≥ 1, got {array.shape}")
+    return checked_array(name, array, array.shape)
 
 
 def checked_quaternion(name: str, value: Numbers) -> Array:
@@ -334,19 +368,35 @@ def floating(value: Numbers) -> Array:
     return jnp.asarray(value, dtype=jnp.result_type(float))
 
 
-def checked_count(name: str, value: object, least: int = 1) -> int:
-    """`value` as a whole number.
+def checked_numbers(name: str, value: Numbers) -> np.ndarray:
+    """`value` as a floating array on the host, with NaN and infinities left in it.
 
     Raises:
-        ValueError: If it is none, such as 300.0, or smaller than `least`.
+        ValueError: If it holds something else than real numbers, or its rows differ in length.
     """
     try:
-        count = operator.index(value)  # pyright: ignore[reportArgumentType]
-    except TypeError:
-        raise ValueError(f"{name} must be a whole number, got {value!r}") from None
-    if count < least:
-        raise ValueError(f"{name} must be ≥ {least}, got {count}")
-    return count
+        if value is not None and not np.iscomplexobj(value):
+            return np.array(value, float)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise ValueError(f"{name} must be a number or an array of real numbers, got {shown(value)}")
+
+
+def checked_floating(name: str, value: Numbers) -> Array:
+    """`floating` of what a user gave.
+
+    Raises:
+        ValueError: If it holds something else than real numbers, or its rows differ in length.
+    """
+    try:
+        # NumPy would drop an imaginary part with a warning, and reads no tracers, alone or in a tuple.
+        real = is_traced(value) or not np.iscomplexobj(value)
+        array = floating(value) if real else None
+    except (TypeError, ValueError, OverflowError):
+        array = None
+    if array is None:
+        raise ValueError(f"{name} must be a number or an array of real numbers, got {shown(value)}")
+    return array
 
 
 def checked_key(key: PRNGKeyArray | None) -> PRNGKeyArray:
@@ -362,5 +412,5 @@ def checked_key(key: PRNGKeyArray | None) -> PRNGKeyArray:
     # What `jax.random.PRNGKey` makes.
     old = dtype == np.uint32 and shape == (2,)
     if not (typed or old):
-        raise ValueError(f"key must be one random key such as jax.random.key(0), got {key!r}")
+        raise ValueError(f"key must be one random key such as jax.random.key(0), got {shown(key)}")
     return key

@@ -1,5 +1,6 @@
 """A small object, made once by `dano build`, and the command line as a function."""
 
+import math
 import signal
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,6 +28,12 @@ def ellipsoid_values() -> np.ndarray:
     x = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in (18, 16, 14)), indexing="ij"), axis=-1)
     radius = np.linalg.norm(x / np.array([6.0, 5.0, 4.0]), axis=-1)
     return 100 * np.clip(0.5 - 2.5 * (radius - 1), 0, 1)
+
+
+@pytest.fixture(autouse=True)
+def no_progress(monkeypatch):
+    """Lines of progress come every ten seconds: on a slow machine between those that tests look at."""
+    monkeypatch.setattr("dano.cli._console.QUIET", math.inf)
 
 
 @pytest.fixture

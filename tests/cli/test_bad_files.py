@@ -138,7 +138,7 @@ def test_bad_outputs(run, egg, field, scene, tmp_path):
         (("--steps", "0"), "n_steps must be ≥ 1, got 0"),
         (("--timestep", "0"), "timestep must be finite and > 0 s, got 0.0"),
         (("--timestep", "nan"), "timestep must be finite and > 0 s, got nan"),
-        (("--slow-motion", "0"), "slow_motion must be > 0, got 0.0"),
+        (("--slow-motion", "0"), "slow_motion must be finite and > 0, got 0.0"),
         (("--slow-motion", "1e9", "--video", "RUN.mp4"), "slow_motion must be at most 4.17e+03, so that"),
         (("--steps", "100000000000"), "steps of 2 bodies, got 1e+11 of 0.002 s"),
     ],

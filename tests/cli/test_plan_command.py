@@ -104,6 +104,7 @@ def test_commands_of_motors_are_controls_of_a_task(tmp_path):
     given = load_task(tmp_path / "task.toml", scene)
     np.testing.assert_allclose(given.controls[:, 0], [0, 0, 0.2, 0.4, 0.4], atol=1e-12)
     controls = given.task.controls(scene, jnp.asarray(given.controls))
+    assert controls.command is not None
     np.testing.assert_allclose(controls.command, given.controls)
     with pytest.raises(ValueError, match=r"\[\[joints\]\] 1 .*unknown key 'stifness'"):
         (tmp_path / "wrong.toml").write_text(MOTOR.replace("stiffness", "stifness"))
@@ -130,7 +131,7 @@ def test_commands_of_motors_are_controls_of_a_task(tmp_path):
         ("position = [0.3, 0.1, 0.0]", "", "needs exactly one of position, orientation"),
         ("position = [0.3, 0.1, 0.0]", "positoin = [0, 0, 0]", "did you mean 'position'"),
         ("within = 1e-4", "within = 0.0", "within of the goal of 'puck' must be > 0"),
-        ('quantity = "velocity"', 'quantity = "speed"', "must be about one of position, velocity"),
+        ('quantity = "velocity"', 'quantity = "speed"', "must be one of position, velocity"),
         ("max_seconds = 600.0", "max_seconds = 0.0", "max_seconds must be > 0 s, got 0.0"),
         ("max_seconds = 600.0", 'method = "lqr"', "method must be one of .*; did you mean 'ilqr'"),
         ("max_seconds = 600.0", "softening = [2.0]", "softening must be factors between 0 and 1"),

@@ -230,7 +230,7 @@ def test_angles_give_the_rotation_back(seed):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"to": "stl"}, "to must be of .*got 'stl'"),
+        ({"to": "stl"}, "to must be one of .*got 'stl'"),
         ({"to": ["mjcf", "udrf"]}, "got 'udrf'; did you mean 'urdf'"),
         ({"to": []}, "at least one"),
         ({"name": "a b"}, "name must be a letter.*got 'a b'"),

@@ -60,7 +60,7 @@ def test_bad_bakes():
         bake(HalfSpace())
     with pytest.raises(ValueError, match="resolution must lie between 4 and 1024"):
         bake(Sphere(0.1), 2)
-    with pytest.raises(ValueError, match="batch_size must be at least 1"):
+    with pytest.raises(ValueError, match="batch_size must be ≥ 1"):
         bake(Sphere(0.1), batch_size=0)
     with pytest.raises(ValueError, match="interpolation must be one of"):
         bake(Sphere(0.1), interpolation="septic")

@@ -154,5 +154,5 @@ def test_bad_bounds(bounds, message):
 
 
 def test_bad_step():
-    with pytest.raises(ValueError, match="step must be positive"):
+    with pytest.raises(ValueError, match="step must be finite and > 0"):
         CallableField(Counted(), BOUNDS, step=0.0)

@@ -160,7 +160,7 @@ def test_meshes_that_enclose_nothing_are_refused(trimesh, tmp_path):
         mesh_field(tmp_path / "none.obj")
     with pytest.raises(ValueError, match="resolution must lie between 8 and 512"):
         mesh_field(box, 4)
-    with pytest.raises(ValueError, match="scale must be positive"):
+    with pytest.raises(ValueError, match="scale must be finite and > 0"):
         mesh_field(box, scale=0.0)
 
 

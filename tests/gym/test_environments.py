@@ -62,6 +62,8 @@ def test_rewards_are_costs_and_what_the_errors_fall_by(pushed):
     seen, _ = env.reset(seed=0)
     np.testing.assert_allclose(seen[[0, 13, 15, 17]], [0, 0.3, -1, 1])
     share, total, x, v, cost = -0.25, 0.0, 0.0, 0.0, 0.0
+    terminated = truncated = False
+    info: dict = {}
     for _ in range(N_STEPS):
         cost += H * (0.5 * PRICE * (share * LIMIT) ** 2 + 0.5 * 0.5 * (x - 1) ** 2)
         v += H * share * LIMIT / MASS
@@ -95,7 +97,8 @@ def test_many_episodes_are_single_ones(pushed):
     alone = [make_env(scene, state, task) for _ in range(3)]
     for env, at in zip(alone, begun, strict=True):
         env.reset(options={"state": at})
-    random = np.random.default_rng(0)
+    random, truncated = np.random.default_rng(0), np.zeros(3, bool)
+    actions = np.zeros((3, 3), np.float32)
     for _ in range(N_STEPS):
         actions = random.uniform(-1, 1, (3, 3)).astype(np.float32)
         seen, rewards, terminated, truncated, _ = many.step(actions)
@@ -120,4 +123,4 @@ def test_wrong_options_are_said(pushed, options, message):
     with pytest.raises(ValueError, match=message):
         make_env(*pushed, **options)
     with pytest.raises(ValueError, match="n_envs must be"):
-        make_vector_env(*pushed, 0)
+        make_vector_env(*pushed, n_envs=0)

@@ -124,7 +124,7 @@ def test_conventions_that_contradict_the_spin_are_found(change, match):
         ({"position": np.full((20, 3), np.inf)}, "frame 0 is infinite"),
         ({"orientation": np.full((20, 4), 1.0)}, "of length 2"),
         ({"names": ("a", "a")}, "different non-empty names"),
-        ({"point": "middle"}, "'com' or 'origin'"),
+        ({"point": "middle"}, "com, origin"),
         ({"lag": -1.0}, "lag must be finite"),
         ({"covariance": np.zeros((20, 3, 3))}, r"covariance must have shape \(20, 1, 6, 6\)"),
         ({"covariance": np.tile(-np.eye(6), (20, 1, 1))}, "positive definite.*frame 0"),

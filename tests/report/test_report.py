@@ -9,9 +9,10 @@ import pytest
 from vision.models import learned
 
 import dano
-from dano.report import draw_object, render_trajectory, view
+from dano.report import _framing, CAMERAS, draw_object, render_trajectory, view
 from dano.report._object import with_error
 from dano.report._resample import frame_times, poses_at
+from dano.report._stage import stage
 from dano.scene_file import drop_scene, parse_scene
 from dano.vision import LearnedField
 
@@ -106,7 +107,14 @@ def test_a_film_shows_what_an_object_has_learned_to_look_like(cube, tmp_path):
 def test_video_has_every_frame_and_moves(run: Run, tmp_path):
     path, strip, told = tmp_path / "run.mp4", tmp_path / "run.png", []
     render_trajectory(
-        *run, path, fps=20, size=SIZE, slow_motion=1.5, strip=strip, progress=lambda *x: told.append(x)
+        *run,
+        path,
+        fps=20,
+        size=SIZE,
+        slow_motion=1.5,
+        camera="fixed",
+        strip=strip,
+        progress=lambda *x: told.append(x),
     )
     with av.open(path) as container:
         stream = container.streams.video[0]
@@ -122,6 +130,30 @@ def test_video_has_every_frame_and_moves(run: Run, tmp_path):
     with Image.open(strip) as sheet:
         assert sheet.width >= 3 * SIZE[0] and sheet.height >= 2 * SIZE[1]
     assert sorted(tmp_path.iterdir()) == [path, strip]
+
+
+def test_moving_bodies_fill_a_third_of_the_height_and_stay_in_view(run: Run):
+    scene, trajectory = run
+    drawn = stage(scene)
+    n = len(trajectory.times)
+    # Ten times as far: a camera that stands still would show specks.
+    position = 10 * np.asarray(trajectory.states.position)
+    orientation = np.asarray(trajectory.states.orientation)
+    moving, _ = _framing._points(scene, drawn, position, orientation)
+    fills, cameras = {}, []
+    for how in CAMERAS:
+        cameras = _framing.cameras_for(scene, drawn, position, orientation, 0.01, (640, 400), how)
+        assert len(cameras) == n
+        fills[how] = _framing._least_fill(cameras, moving)
+        for camera, points in zip(cameras, moving, strict=True):
+            x, y = camera.project(points)[:, :2].T
+            assert 0 < x.min() and x.max() < 640 and 0 < y.min() and y.max() < 400
+    assert fills["fixed"] < 0.2
+    assert fills["follow"] == fills["auto"] >= 1 / 3
+    # Calm: from frame to frame the camera shifts by less than what it follows.
+    places = np.array([camera.position for camera in cameras])
+    shifts, steps = (np.linalg.norm(np.diff(x, axis=0), axis=-1).max() for x in (places, position[:, :1]))
+    assert shifts <= 1.5 * steps
 
 
 def test_a_motion_shorter_than_a_frame_is_one_picture(run: Run, tmp_path):
@@ -153,8 +185,8 @@ def test_an_interrupted_video_leaves_what_was_there(run: Run, tmp_path):
         ("missing/run.mp4", {}, "existing directory"),
         ("run.avi", {}, "must end in .mp4"),
         ("run.mp4", {"size": (95, 64)}, "even"),
-        ("run.mp4", {"fps": 0}, "fps must be positive"),
-        ("run.mp4", {"slow_motion": -1.0}, "slow_motion must be positive"),
+        ("run.mp4", {"fps": 0}, "fps must be finite and > 0"),
+        ("run.mp4", {"slow_motion": -1.0}, "slow_motion must be finite and > 0"),
         ("run.mp4", {"colours": {"cat": "#000000"}}, "body must be one of"),
         (None, {}, "path or strip"),
     ],

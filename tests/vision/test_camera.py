@@ -49,7 +49,7 @@ def test_framing_keeps_balls_in_view_and_is_as_near_as_it_can_be():
         ({"position": (0, 0, 0)}, "look_at must differ"),
         ({"position": (1, 0)}, "position must have shape"),
         ({"position": (1, 0, 0), "vertical_fov": 4.0}, "vertical_fov must lie"),
-        ({"position": (1, 0, 0), "width": 0}, "width and height"),
+        ({"position": (1, 0, 0), "width": 0}, "width must be ≥ 1"),
     ],
 )
 def test_bad_cameras_are_refused(options, message):

@@ -44,7 +44,7 @@ def test_distortion_follows_the_formula_and_is_undone():
         (np.diag([1.0, 1.0, -1.0, 1.0]), {}, "a reflection"),
         (np.eye(3), {}, r"shape \(4, 4\) or \(3, 4\)"),
         (np.eye(4), {"focal": -1.0}, "focal must be positive"),
-        (np.eye(4), {"width": 0}, "width and height"),
+        (np.eye(4), {"width": 0}, "width must be ≥ 1"),
         (np.eye(4), {"distortion": (-9.0, 0, 0, 0, 0)}, "distortion must be invertible"),
     ],
 )

@@ -175,7 +175,7 @@ def test_learned_media_dim_what_is_behind_them_and_shadow_the_floor():
         (lambda: Item(Sphere(0.1), colour="red"), "colour must be"),
         (lambda: Item(Sphere(0.1), colour=(2, 0, 0)), "colour must have"),
         (lambda: Item(Sphere(0.1), level=1.0, density_scale=1.0), "excludes"),
-        (lambda: Item(Sphere(0.1), level=-1.0), "level must be positive"),
+        (lambda: Item(Sphere(0.1), level=-1.0), "level must be finite and > 0"),
         (lambda: Item(HalfSpace(), density_scale=1.0), "finite bounds"),
         (lambda: render([], Camera((1, 0, 0)), light=(0, 0, 0)), "light must be"),
     ],

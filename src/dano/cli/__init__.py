@@ -1,9 +1,11 @@
 """The command line: `dano train | data | import | build | inspect | simulate | …`, see `dano --help`."""
 
 import contextlib
+import os
 import sys
 import warnings
 from collections.abc import Sequence
+from typing import NoReturn
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -27,17 +29,29 @@ def main(argv: Sequence[str] | None = None) -> None:
         except KeyboardInterrupt as stop:
             end_line()
             say("; ".join(["interrupted", *map(str, stop.args)]))
-            raise SystemExit(130) from None
+            _leave(130, at_once=argv is None)
         except Exception as error:
             end_line()
             if interrupted():
                 # Whatever went wrong then is a consequence.
                 say("interrupted")
-                raise SystemExit(130) from error
+                _leave(130, at_once=argv is None)
             if not isinstance(error, (ValueError, ImportError, OSError, MemoryError)):
                 raise
             say("error: " + (" ".join(str(error).split()) or "out of memory"))
             raise SystemExit(2) from error
+
+
+def _leave(code: int, *, at_once: bool) -> NoReturn:
+    """End with a code; `at_once`: without Python's clearing up.
+
+    XLA may still be compiling in threads of its own, which that would crash.
+    """
+    if not at_once:
+        raise SystemExit(code)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def _run(argv: list[str], keep: bool) -> None:

@@ -264,7 +264,11 @@ class Simulate:
         strip: Where to write a picture of several moments side by side (.png).
         steps: Number of steps; default: the scene's.
         timestep: Timestep [s]; default: the scene's.
+        camera: fixed: sees all bodies all the time; follow: shifts with those that move; auto: follows if
+            bodies would otherwise fill less than a third of the height.
+        size: Width and height of pictures [pixels], even numbers.
         slow_motion: Video seconds per simulated second.
+        resume: Go on with a run that was interrupted or killed; the result is the same to the last bit.
         json: Print one JSON object instead of text.
     """
 
@@ -274,7 +278,10 @@ class Simulate:
     strip: Path | None = None
     steps: int | None = None
     timestep: float | None = None
+    camera: Literal["auto", "fixed", "follow"] = "auto"
+    size: tuple[int, int] = (640, 400)
     slow_motion: float = 1.0
+    resume: bool = False
     json: bool = False
 
     def __call__(self) -> None:

@@ -1,6 +1,7 @@
 """`dano compare`."""
 
 from dano import comparison
+from dano.checks import checked_number
 from dano.cli._arguments import Compare
 from dano.cli._console import Progress, put, put_json
 from dano.cli._outputs import check_output
@@ -14,6 +15,7 @@ def compare(arguments: Compare) -> None:
     inputs = [file for file in (arguments.object, arguments.field, arguments.truth) if file is not None]
     check_output(arguments.output, *inputs, suffix=".html")
     truth = None
+    checked_number("truth_scale", arguments.truth_scale, above=0)
     if arguments.truth is not None:
         truth = load_field(arguments.truth, scale=arguments.truth_scale)
         if not isinstance(truth, AbstractShape):

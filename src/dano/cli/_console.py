@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,17 +11,22 @@ from dano.cli._interrupt import interrupted
 
 BAR = 24
 """Characters of a progress bar (convention)."""
+QUIET = 10.0
+"""Seconds between two lines of progress where stderr is no terminal (convention)."""
 
 
 class Progress:
-    """A line on stderr that says what is being done and how far it is; silent if stderr is no terminal.
+    """A line on stderr that says what is being done, how far it is, and how long it still takes.
 
-    An interrupt that was lost is raised again here, unless what runs returns its best so far instead.
+    Where stderr is no terminal, such as a file, it says so in a line every ten seconds. An interrupt
+    that was lost is raised again here, unless what runs returns its best so far instead.
     """
 
     def __init__(self, *, stops: bool = True) -> None:
         self._shown = sys.stderr.isatty()
         self._stops = stops
+        self._what = ""
+        self._began = self._told = time.monotonic()
 
     def __call__(self, description: str, share: float) -> None:
         """Show a description and the share done, between 0 and 1.
@@ -30,17 +36,32 @@ class Progress:
         """
         if self._stops and interrupted():
             raise KeyboardInterrupt
-        if not self._shown:
-            return
-        done = round(BAR * min(max(share, 0.0), 1.0))
-        bar = "█" * done + "·" * (BAR - done)
-        sys.stderr.write(f"\r\x1b[2K{description:<28.28} {bar} {100 * share:3.0f} %")
-        sys.stderr.flush()
+        now, share = time.monotonic(), min(max(share, 0.0), 1.0)
+        # What stands behind a comma changes from call to call.
+        if (what := description.partition(",")[0]) != self._what:
+            self._what, self._began = what, now
+        left = _time_left(now - self._began, share)
+        if self._shown:
+            done = round(BAR * share)
+            bar = "█" * done + "·" * (BAR - done)
+            sys.stderr.write(f"\r\x1b[2K{description:<28.28} {bar} {100 * share:3.0f} %{left}")
+            sys.stderr.flush()
+        elif now - self._told >= QUIET:
+            self._told = now
+            say(f"{description} {100 * share:.0f} %{left}")
 
     def close(self) -> None:
         """Clear the line."""
         if self._shown:
             end_line()
+
+
+def _time_left(passed: float, share: float) -> str:
+    """How long work takes that has taken some seconds for a share of it; nothing where that is not known."""
+    if passed < 1 or not 0.02 <= share < 1:
+        return ""
+    left = passed * (1 - share) / share
+    return f", {left:.0f} s left" if left < 100 else f", {left / 60:.0f} min left"
 
 
 def end_line() -> None:

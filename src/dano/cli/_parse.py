@@ -1,6 +1,10 @@
 """From the words on the command line to the command that they ask for."""
 
+import contextlib
+import dataclasses
 import inspect
+import io
+import re
 import textwrap
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -69,10 +73,10 @@ _COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
 def parse(argv: Sequence[str]) -> Callable[[], None]:
     """The command that the arguments ask for, ready to be called.
 
-    Exits with code 0 after printing help, with 2 if the arguments are wrong.
+    Exits with code 0 after printing help.
 
     Raises:
-        ValueError: If there is no such command.
+        ValueError: If there is no such command, or its arguments are wrong.
     """
     words = list(argv) or ["--help"]
     if words == ["--version"]:
@@ -91,14 +95,36 @@ def parse(argv: Sequence[str]) -> Callable[[], None]:
             f"command must be one of {', '.join(_COMMANDS)}, got {words[0]!r}"
             + did_you_mean(words[0], _COMMANDS)
         )
-    row = _COMMANDS[words[0]]
-    return tyro.cli(
-        row.kind,
-        prog=f"dano {words[0]}",
-        description=f"{_about(row.kind)}\n\nExample: {row.example}",
-        args=words[1:],
-        config=(FlagCreatePairsOff,),
-    )
+    row, said = _COMMANDS[words[0]], io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                row.kind,
+                prog=f"dano {words[0]}",
+                description=f"{_about(row.kind)}\n\nExample: {row.example}",
+                args=words[1:],
+                config=(FlagCreatePairsOff,),
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+    text = _unboxed(said.getvalue())
+    unknown = re.match(r"Unrecognized options: (--[\w-]+)", text)
+    options = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(row.kind)]
+    hint = did_you_mean(unknown[1], options) if unknown else ""
+    raise ValueError(f"{text}{hint}; see dano {words[0]} --help")
+
+
+def _unboxed(box: str) -> str:
+    """What an error box of tyro says, without its frame and the help below it."""
+    lines = [line.strip().strip("│").strip() for line in box.splitlines()]
+    words: list[str] = []
+    # The title is part of the frame, or where only ASCII can be written, a line with a rule below it.
+    for line in lines[1:] if box.startswith("╭") else lines[2:]:
+        if line and set(line) <= set("─-"):
+            break
+        words += line.split()
+    return " ".join(words).split(" Got errors:")[0].rstrip(".")
 
 
 def _about(kind: type) -> str:

@@ -11,7 +11,8 @@ from typing import Any
 
 from dano import scene_file
 from dano.archive import replacing
-from dano.cli import _rollout
+from dano.checks import checked_number
+from dano.cli import running
 from dano.cli._arguments import Demo, Simulate, View
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
@@ -31,9 +32,10 @@ def simulate(command: Simulate) -> None:
             check_output(picture, scene, suffix=suffix)
             if missing := missing_for_pictures(video=suffix == ".mp4"):
                 raise ImportError(missing)
-    if not command.slow_motion > 0:
-        raise ValueError(f"slow_motion must be > 0, got {command.slow_motion}")
+    checked_number("slow_motion", command.slow_motion, above=0)
     check_distinct(output=output, video=video, strip=strip)
+    clock = running.Clock(since_start=running.is_program())
+    clock("reading the scene")
     loaded = load(scene, command.steps, command.timestep)
     for path in (output, video, strip):
         if path is not None:
@@ -42,15 +44,16 @@ def simulate(command: Simulate) -> None:
         from dano.report import frame_count
 
         frame_count(loaded.n_steps * float(loaded.scene.timestep), command.slow_motion)
-    report = _run(loaded, command)
+    report = _run(loaded, command, clock)
     if command.json:
-        put_json({"scene": str(scene), **report})
+        put_json({"scene": str(scene), **report, "seconds": clock.parts()})
     else:
-        _rollout.print_rollout(report)
+        running.print_rollout(report)
         put()
+        put(clock.told())
         _print_files(report)
         put(f"`dano view {output}` shows it in the browser")
-    _rollout.warn_unconverged(report)
+    running.warn_unconverged(report)
 
 
 def view(command: View) -> None:
@@ -89,9 +92,9 @@ def demo(command: Demo) -> None:
             if not command.json:
                 put()
                 put(f"== {scene} ==")
-                _rollout.print_rollout(reports[scene])
+                running.print_rollout(reports[scene])
                 put()
-            _rollout.warn_unconverged(reports[scene])
+            running.warn_unconverged(reports[scene])
         tell("drawing films")
         artist.finish()
     for scene, report in reports.items():
@@ -136,7 +139,7 @@ def _demo_scene(name: str, folder: Path, artist: "_Artist", tell: Callable[[str]
             artist.draw(made, folder / f"{asset}.png")
     loaded = load(path, None, None)
     tell(f"{name}: compiling and simulating {loaded.n_steps} steps")
-    rollout, report = _simulated(loaded, path.with_suffix(".npz"))
+    rollout, report = _simulated(loaded, path.with_suffix(".npz"), running.Clock())
     tell(f"{name}: simulated, {path.with_suffix('.npz')} written")
     report = {"scene": str(path), "objects": objects, **report}
     report.update(artist.film(loaded, rollout, path.with_suffix(".mp4"), path.with_suffix(".png")))
@@ -170,7 +173,7 @@ class _Artist:
             self._order(self._thread.submit(draw_object, made, path, title=path.stem), path)
 
     def film(
-        self, loaded: scene_file.SceneFile, rollout: _rollout.Rollout, video: Path, strip: Path
+        self, loaded: scene_file.SceneFile, rollout: running.Rollout, video: Path, strip: Path
     ) -> dict[str, str]:
         """Order the film of a run; the paths of what will be there, for the report."""
         if not self._draws:
@@ -227,10 +230,12 @@ def load(path: Path, steps: int | None, timestep: float | None) -> scene_file.Sc
     return loaded
 
 
-def _run(loaded: scene_file.SceneFile, command: Simulate) -> dict[str, Any]:
+def _run(loaded: scene_file.SceneFile, command: Simulate, clock: running.Clock) -> dict[str, Any]:
     """Simulate, save and draw; what came out in numbers."""
     video, strip = command.video, command.strip
-    rollout, report = _simulated(loaded, command.output)
+    kept = running.Checkpoint(command.output, loaded)
+    rollout, report = _simulated(loaded, command.output, clock, kept, resume=command.resume)
+    clock("drawing")
     if video is not None or strip is not None:
         from dano.report import render_trajectory
 
@@ -241,6 +246,8 @@ def _run(loaded: scene_file.SceneFile, command: Simulate) -> dict[str, Any]:
             video,
             strip=strip,
             slow_motion=command.slow_motion,
+            camera=command.camera,
+            size=command.size,
             looks=loaded.looks(),
             progress=progress,
         )
@@ -251,13 +258,24 @@ def _run(loaded: scene_file.SceneFile, command: Simulate) -> dict[str, Any]:
     return report
 
 
-def _simulated(loaded: scene_file.SceneFile, output: Path) -> tuple[_rollout.Rollout, dict[str, Any]]:
+def _simulated(
+    loaded: scene_file.SceneFile,
+    output: Path,
+    clock: running.Clock,
+    kept: running.Checkpoint | None = None,
+    *,
+    resume: bool = False,
+) -> tuple[running.Rollout, dict[str, Any]]:
     """Simulate and save; the rollout, and what came out in numbers."""
     progress = Progress()
-    rollout = _rollout.roll_out(loaded, progress)
+    rollout = running.roll_out(loaded, progress, clock, kept, resume=resume)
+    clock("writing")
     scene_file.save_run(output, rollout.trajectory, loaded)
+    if kept is not None:
+        kept.remove()
+    clock("contact forces")
     progress("contact forces", 0.0)
-    report = {**_rollout.describe(rollout, loaded.scene), "run": str(output)}
+    report = {**running.describe(rollout, loaded.scene), "run": str(output)}
     progress.close()
     return rollout, report
 

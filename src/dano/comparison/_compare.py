@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from dano.checks import checked_count, checked_items, checked_kind, checked_optional
 from dano.comparison._bodies import GRAVITY, Path, Probes, Rigid, rotation_of, Solid, Start, together
 from dano.comparison._mujoco import MuJoCo
 from dano.comparison._own import Own
@@ -53,7 +54,8 @@ class Row(NamedTuple):
         volume_error: Relative.
         com_error: Distance over the size.
         inertia_error: Largest difference of a principal moment, relative.
-        tilt: Largest angle between a rest and the nearest stable pose of the reference [°].
+        tilt: Largest angle between a rest and the nearest stable pose of the reference [°]; of the object as
+            reference, of its mesh or of its samples.
         gap: Of all rests, the height of the reference's lowest point over the floor that is largest in size,
             over the size of the reference; negative: below the floor.
         phantom: Share of clear probes that touch.
@@ -185,10 +187,13 @@ def compare(
         ImportError: If mujoco or libigl is missing.
         ValueError: If the object has no grid or no solid, or an option is out of range.
     """
+    checked_kind("thing", thing, NeuralObject)
+    checked_optional("field", field, AbstractField)
+    checked_optional("truth", truth, AbstractShape)
+    checked_count("seed", seed, least=0)
     if thing.grid is None or thing.solid is None:
         raise ValueError("object must have a density grid to be meshed, got one made of samples alone")
-    if not 1 <= drops <= 100:
-        raise ValueError(f"drops must lie between 1 and 100, got {drops}")
+    checked_count("drops", drops, most=100)
     grid = _grid(thing.grid if field is None else field)
     top = float(grid.values.max())
     chosen = _checked_levels(thing, levels, top)
@@ -255,8 +260,9 @@ def _checked_levels(thing: NeuralObject, levels: Sequence[float] | None, top: fl
         if thing.interior is not None:
             dense = max(float(thing.interior.wall), 2 * float(thing.interior.level))
         return [share * min(dense, 0.95 * top) for share in SHARES]
+    levels = checked_items("levels", levels, float, int)
     for level in levels:
-        if not (math.isfinite(level) and 0 < level < top):
+        if not 0 < level < top:
             raise ValueError(f"levels must lie between 0 and the largest density {top:.4g}, got {level}")
     if len(levels) == 0:
         raise ValueError("levels must name at least one density, got none")
@@ -290,6 +296,10 @@ def _bench(thing: NeuralObject, truth: AbstractShape | None, drops: int, seed: i
     probes = Probes(centres, radius, clearance)
     n_steps = round(_SETTLED * math.sqrt(size / GRAVITY) / TIMESTEP)
     stable = stable_directions(hull, com)
+    if true is None:
+        # The object touches by samples. Where its surface is ragged their hull stands on other points.
+        samples = convex_hull(np.asarray(thing.surface.points, np.float64))
+        stable = np.concatenate([stable, stable_directions(samples, com)])
     return _Bench(thing, solid, stable, starts, n_steps, probes, true, {})
 
 

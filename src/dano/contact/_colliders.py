@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float
 
+from dano.checks import checked_optional
 from dano.fields import AbstractField, GridField
-from dano.maths import floating, Numbers, Pose, safe_norm
+from dano.maths import checked_array, floating, Numbers, Pose, safe_norm
 
 # Samples per block. Fewer make the culling finer, more make each pass over a block fatter.
 BLOCK = 16
@@ -167,10 +168,18 @@ class Collider(eqx.Module):
         rotation: Array | None = None,
         origin: Array | None = None,
     ):
-        """Build a collider; give either `pose` or both `rotation` and `origin` (default: identity)."""
-        pose = Pose() if pose is None else pose
+        """Build a collider; give either `pose` or both `rotation` and `origin` (default: identity).
+
+        Raises:
+            ValueError: If an argument is of another kind, or a number is negative or not finite.
+        """
+        checked_optional("field", field, AbstractField)
+        checked_optional("samples", samples, SampleSet)
+        checked_optional("support", support, Support)
+        pose = checked_optional("pose", pose, Pose) or Pose()
         self.samples, self.field, self.support = samples, field, support
-        self.density_scale, self.mass = floating(density_scale), floating(mass)
+        self.density_scale = checked_array("density_scale", density_scale, (), least=0.0)
+        self.mass = checked_array("mass", mass, (), least=0.0)
         self.rotation = pose.matrix if rotation is None else rotation
         self.origin = pose.position if origin is None else origin
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from dano.contact._colliders import Collider
 from dano.contact._overlap import overlap, Patch
-from dano.maths import floating, is_traced, Numbers
+from dano.maths import checked_floating, is_traced, Numbers
 
 # A scalar, or None until a scene fills it in; written so that type checkers let users read it from a scene.
 Filled = Float[Array, ""] | Any
@@ -227,7 +227,7 @@ def non_negative(name: str, value: Numbers) -> Float[Array, ""]:
     Raises:
         ValueError: If it is not.
     """
-    array = floating(value)
+    array = checked_floating(name, value)
     if array.shape != ():
         raise ValueError(f"{name} must be a scalar, got shape {array.shape}")
     if not is_traced(array) and not (np.isfinite(array) and array >= 0):

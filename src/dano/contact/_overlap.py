@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from dano.checks import checked_kind
 from dano.contact._colliders import BLOCK, Collider, SampleSet, Support, SYMMETRIC
 from dano.contact._derivatives import by_autodiff, keep
 from dano.fields import AbstractField, AbstractShape, GridField, HalfSpace, PosedField, PosedShape, Sphere
@@ -84,6 +85,8 @@ def overlap(a: Collider, b: Collider) -> Patch:
     Raises:
         ValueError: If no side has samples to test against a field of the other.
     """
+    checked_kind("a", a, Collider)
+    checked_kind("b", b, Collider)
     if isinstance(a.field, Sphere) and isinstance(b.field, HalfSpace):
         return _cap(a, b)
     if isinstance(a.field, HalfSpace) and isinstance(b.field, Sphere):

@@ -10,6 +10,7 @@ from dano.engine._history import (
 from dano.engine._newton import Report as Report
 from dano.engine._rollout import (
     AbstractEngine as AbstractEngine,
+    checked_engine as checked_engine,
     difference as difference,
     linearize as linearize,
     Policy as Policy,

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from dano.contact import Patch
 from dano.engine._compiling import compiled
-from dano.engine._rollout import AbstractEngine, check_state, VariationalEngine
+from dano.engine._rollout import AbstractEngine, check_state, checked_engine
 from dano.scene import Scene, State
 
 
@@ -79,7 +79,9 @@ def contact_patches(
     check_state(scene, states)
     if not scene.pairs:
         return ()
-    found = _jitted_patches(engine or VariationalEngine(), scene, states)
+    engine = checked_engine(engine)
+    _check_leading(states)
+    found = _jitted_patches(engine, scene, states)
     return tuple(jax.tree.map(lambda x, k=k: x[:, k], found) for k in range(len(scene.pairs)))
 
 
@@ -87,7 +89,16 @@ def _checked_steps(engine: AbstractEngine | None, scene: Scene, states: State):
     check_state(scene, states)
     if not scene.pairs:
         raise ValueError("scene must have at least one contact, got none")
-    return _jitted_steps(engine or VariationalEngine(), scene, states)
+    engine = checked_engine(engine)
+    _check_leading(states)
+    return _jitted_steps(engine, scene, states)
+
+
+def _check_leading(states: State) -> None:
+    if states.position.ndim != 3:
+        raise ValueError(
+            f"states must be consecutive states, with shape (n, n_bodies, 3), got {states.position.shape}"
+        )
 
 
 @compiled

@@ -13,12 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_count, checked_kind, checked_number
 from dano.contact import KEPT, Patch
 from dano.engine import _problem, _variational
 from dano.engine._compiling import compiled
 from dano.engine._newton import Report, SolverOptions
 from dano.engine._rigid import too_fast
-from dano.maths import checked_count, is_traced, quat_conjugate, quat_exp, quat_multiply
+from dano.maths import is_traced, quat_conjugate, quat_exp, quat_multiply
 from dano.scene import Control, RESOLVED, Scene, State, Trajectory
 
 Policy = Callable[[State, Float[Array, ""]], Control]
@@ -84,12 +85,11 @@ class VariationalEngine(AbstractEngine):
 
     def __check_init__(self):
         """Raise a ValueError unless both options are positive."""
-        if self.tolerance is not None and not self.tolerance > 0:
-            raise ValueError(f"tolerance must be > 0, got {self.tolerance}")
-        if self.max_iterations < 1:
-            raise ValueError(f"max_iterations must be ≥ 1, got {self.max_iterations}")
-        if self.capacity is not None and self.capacity < 1:
-            raise ValueError(f"capacity must be ≥ 1, got {self.capacity}")
+        if self.tolerance is not None:
+            checked_number("tolerance", self.tolerance, above=0)
+        checked_count("max_iterations", self.max_iterations)
+        if self.capacity is not None:
+            checked_count("capacity", self.capacity)
 
     def prepare(self, scene: Scene) -> _problem.Prepared:
         """See `AbstractEngine.prepare`."""
@@ -125,8 +125,7 @@ def check_state(scene: Scene, state: State) -> None:
     Raises:
         ValueError: If the scene is none, the state does not fit it, or loops are open.
     """
-    if not isinstance(scene, Scene):
-        raise ValueError(f"scene must be a dano.Scene, got {type(scene).__name__}")
+    checked_kind("scene", scene, Scene)
     scene.check_state(state)
     if scene.loops and state.position.ndim == 2 and not is_traced(state, scene):
         gap = float(_jitted_gap(scene, state))
@@ -141,6 +140,15 @@ def check_state(scene: Scene, state: State) -> None:
 def _jitted_gap(scene, state):
     frames = scene.frames(state)
     return jnp.max(jnp.abs(scene.closing.gaps(frames.position, frames.orientation)))
+
+
+def checked_engine(engine: AbstractEngine | None) -> AbstractEngine:
+    """An engine; None stands for `VariationalEngine()`.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    return VariationalEngine() if engine is None else checked_kind("engine", engine, AbstractEngine)
 
 
 def step(
@@ -203,6 +211,7 @@ def simulate(
     """
     check_state(scene, state)
     if controls is not None and not callable(controls):
+        checked_kind("controls", controls, Control)
         rows = int(controls.force.shape[0]) if controls.force.ndim == 3 else -1
         if n_steps is None:
             n_steps = rows
@@ -241,7 +250,7 @@ def linearize(
     """
     check_state(scene, state)
     _check_control(scene, control, ())
-    return _jitted_linearize(engine or VariationalEngine(), scene, state, control)
+    return _jitted_linearize(checked_engine(engine), scene, state, control)
 
 
 @compiled
@@ -350,7 +359,7 @@ def _with_room(
     engine: AbstractEngine | None, scene: Scene, run: Callable[[AbstractEngine], tuple[State, Report]]
 ) -> tuple[State, Report]:
     """Run, and run again with room for more contacts as long as there were more, if the engine may choose."""
-    current = chosen = engine or VariationalEngine()
+    current = chosen = checked_engine(engine)
     factor = 1
     while True:
         states, report = run(current)
@@ -367,6 +376,7 @@ def _with_room(
 def _check_control(scene: Scene, control: Control | None, leading: tuple[int, ...]) -> None:
     if control is None:
         return
+    checked_kind("control", control, Control)
     expected = (*leading, len(scene.bodies), 3)
     for name in ("force", "torque"):
         value = getattr(control, name)

@@ -1,7 +1,6 @@
 """The verb: an object as a folder that other simulators load."""
 
 import json
-import math
 import os
 import re
 import shutil
@@ -12,6 +11,16 @@ from typing import Any, get_args, Literal, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
+from dano.checks import (
+    checked_choice,
+    checked_count,
+    checked_function,
+    checked_items,
+    checked_kind,
+    checked_number,
+    checked_optional,
+    checked_path,
+)
 from dano.contact import ContactParams
 from dano.exchange import _mjcf, _urdf, _usd
 from dano.exchange._contents import Contents, MESHES, VISUAL
@@ -20,7 +29,6 @@ from dano.exchange._pieces import chosen_collision, convex_hull, decomposition
 from dano.exchange._triangles import solid_triangles, Triangles
 from dano.exchange._wavefront import write_image, write_material, write_obj
 from dano.memory import check_nodes
-from dano.names import did_you_mean
 from dano.objects import NeuralObject
 
 if TYPE_CHECKING:
@@ -117,10 +125,15 @@ def export_object(
             wrote.
         ImportError: If libigl is missing, pillow for colours, coacd for "coacd", usd-core for "usd".
     """
-    target = Path(folder)
+    checked_kind("obj", obj, NeuralObject)
+    target = checked_path("folder", folder)
     formats = _checked_formats(to)
     name = _checked_name(_default_name(target) if name is None else name)
-    contact = ContactParams() if contact is None else contact
+    contact = checked_optional("contact", contact, ContactParams) or ContactParams()
+    if look is not None and not hasattr(look, "model"):
+        raise ValueError(f"look must be a dano.vision.LearnedField, got {type(look).__name__}")
+    if progress is not None:
+        checked_function("progress", progress)
     how = chosen_collision(collision)
     _check_numbers(concavity, max_pieces, resolution, texture_size)
     check_folder(target)
@@ -166,12 +179,9 @@ def _surfaces(obj: NeuralObject, resolution: int) -> tuple[Triangles, np.ndarray
 
 
 def _checked_formats(to: str | Sequence[str]) -> list[str]:
-    formats = [to] if isinstance(to, str) else list(to)
+    formats = [to] if isinstance(to, str) else list(checked_items("to", to, str))
     for form in formats:
-        if form not in get_args(Format):
-            raise ValueError(
-                f"to must be of {list(get_args(Format))}, got {form!r}{did_you_mean(form, get_args(Format))}"
-            )
+        checked_choice("to", form, get_args(Format))
     if not formats:
         raise ValueError(f"to must name at least one of {list(get_args(Format))}, got none")
     return list(dict.fromkeys(formats))
@@ -183,7 +193,7 @@ def _default_name(folder: Path) -> str:
 
 
 def _checked_name(name: str) -> str:
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ValueError(f"name must be a letter, then letters, digits and underscores, got {name!r}")
     if name in ("scene", MESHES):
         raise ValueError(f"name must not be {name!r}, which other files of the folder are called")
@@ -191,14 +201,11 @@ def _checked_name(name: str) -> str:
 
 
 def _check_numbers(concavity: float, max_pieces: int | None, resolution: int, texture_size: int) -> None:
-    if not (math.isfinite(concavity) and 0.01 <= concavity <= 1):
-        raise ValueError(f"concavity must lie in [0.01, 1], got {concavity}")
-    if max_pieces is not None and max_pieces < 1:
-        raise ValueError(f"max_pieces must be ≥ 1, got {max_pieces}")
-    if not 8 <= resolution <= 512:
-        raise ValueError(f"resolution must lie between 8 and 512 nodes, got {resolution}")
-    if not 64 <= texture_size <= 8192:
-        raise ValueError(f"texture_size must lie between 64 and 8192 texels, got {texture_size}")
+    checked_number("concavity", concavity, least=0.01, most=1)
+    if max_pieces is not None:
+        checked_count("max_pieces", max_pieces)
+    checked_count("resolution", resolution, least=8, most=512)
+    checked_count("texture_size", texture_size, least=64, most=8192)
 
 
 def check_folder(folder: Path) -> None:

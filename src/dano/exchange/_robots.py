@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dano.archive import checked_output, replacing
+from dano.checks import checked_kind, checked_optional
 from dano.exchange._contents import words
 from dano.exchange._urdf import roll_pitch_yaw
 from dano.maths import quat_to_matrix
@@ -42,6 +43,8 @@ def export_robot(robot: Robot, path: str | os.PathLike[str], *, scene: Scene | N
         ValueError: If the suffix is another, the parent folder does not exist, the scene lacks a body of the
             robot, or the format has no such joint.
     """
+    checked_kind("robot", robot, Robot)
+    checked_optional("scene", scene, Scene)
     target = checked_output(path)
     writers: dict[str, Callable[[Description, Path], ET.Element]] = {".urdf": _urdf, ".xml": _mjcf}
     if target.suffix.lower() not in writers:

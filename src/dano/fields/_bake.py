@@ -9,9 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from dano.checks import checked_count, checked_function, checked_kind
 from dano.fields._base import AbstractField
 from dano.fields._grid import GridField
 from dano.fields._spline import degree_of
+from dano.maths import checked_key
 from dano.memory import check_nodes
 from dano.progress import Progress
 
@@ -79,12 +81,12 @@ def bake(
             or the field is zero or not finite at the nodes.
     """
     degree_of(interpolation)
-    if not isinstance(field, AbstractField):
-        raise ValueError(f"field must be a dano field (an AbstractField), got {type(field).__name__}")
-    if not 4 <= resolution <= 1024:
-        raise ValueError(f"resolution must lie between 4 and 1024 nodes, got {resolution}")
-    if batch_size < 1:
-        raise ValueError(f"batch_size must be at least 1 point, got {batch_size}")
+    checked_kind("field", field, AbstractField)
+    resolution = checked_count("resolution", resolution, least=4, most=1024)
+    batch_size = checked_count("batch_size", batch_size)
+    key = checked_key(key)
+    if progress is not None:
+        checked_function("progress", progress)
     lower, upper = np.asarray(field.bounds, dtype=np.float64)
     if not np.all(np.isfinite([lower, upper])):
         raise ValueError(

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from dano.checks import checked_number
 from dano.fields._base import AbstractField, check_order, Jet, vmapped_jet
-from dano.maths import floating, is_traced, Numbers
+from dano.maths import checked_floating, is_traced, Numbers
 
 Framework = Literal["jax", "numpy", "torch"]
 
@@ -73,9 +74,8 @@ class CallableField(AbstractField):
         if framework not in (None, "jax", "numpy", "torch"):
             raise ValueError(f"framework must be 'jax', 'numpy', 'torch' or None, got {framework!r}")
         extent = _finite_box(self.box)
-        self.step = 1e-4 * float(np.max(extent[1] - extent[0])) if step is None else float(step)
-        if not (np.isfinite(self.step) and self.step > 0):
-            raise ValueError(f"step must be positive [m], got {step}")
+        usual = 1e-4 * float(np.max(extent[1] - extent[0]))
+        self.step = usual if step is None else checked_number("step", step, above=0)
         self.framework = _probe(function, framework, extent)
         is_module = self.framework == "jax" and isinstance(function, eqx.Module)
         self.module = function if is_module else None
@@ -134,21 +134,21 @@ class CallableField(AbstractField):
         return jnp.where(inside, jnp.where(value < 0, 0, value), 0)
 
 
-def checked_bounds(bounds: Numbers) -> Float[Array, "2 3"]:
+def checked_bounds(bounds: Numbers, name: str = "bounds") -> Float[Array, "2 3"]:
     """`bounds` as a floating array; entries may be infinite.
 
     Raises:
         ValueError: If the shape is not (2, 3), an entry is NaN, or a lower bound is not below its upper
             bound.
     """
-    array = floating(bounds)
+    array = checked_floating(name, bounds)
     if array.shape != (2, 3):
-        raise ValueError(f"bounds must have shape (2, 3), lower and upper corner [m], got {array.shape}")
+        raise ValueError(f"{name} must have shape (2, 3), lower and upper corner [m], got {array.shape}")
     if not is_traced(array):
         host = np.asarray(array)
         if not np.all(host[0] < host[1]):
             raise ValueError(
-                f"bounds must have every lower corner below its upper corner, got {host.tolist()}"
+                f"{name} must have every lower corner below its upper corner, got {host.tolist()}"
             )
     return array
 

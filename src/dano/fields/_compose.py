@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from dano.checks import checked_kind
 from dano.fields._base import AbstractField, check_order, Jet
 from dano.fields._grid import GridField
 from dano.fields._shapes import AbstractShape, checked_edge, scaled_moments, SolidMoments
 from dano.fields._signed_distance import SignedDistanceGrid
-from dano.maths import checked_array, is_traced, Pose
+from dano.maths import checked_array, Pose
 
 
 @overload
@@ -28,10 +29,8 @@ def posed(field: AbstractField, pose: Pose) -> "PosedShape | PosedField":
     Raises:
         ValueError: If `field` is not a field or `pose` is not a `Pose`.
     """
-    if not isinstance(field, AbstractField):
-        raise ValueError(f"field must be a dano field (an AbstractField), got {type(field).__name__}")
-    if not isinstance(pose, Pose):
-        raise ValueError(f"pose must be a dano.maths.Pose, got {type(pose).__name__}")
+    checked_kind("field", field, AbstractField)
+    checked_kind("pose", pose, Pose)
     return (
         PosedShape(shape=field, pose=pose)
         if isinstance(field, AbstractShape)
@@ -59,11 +58,8 @@ def scaled(field: AbstractField, factor: ArrayLike) -> AbstractField:
     Raises:
         ValueError: If `field` is not a field or `factor` is not finite and positive.
     """
-    if not isinstance(field, AbstractField):
-        raise ValueError(f"field must be a dano field (an AbstractField), got {type(field).__name__}")
-    factor = checked_array("factor", factor, ())
-    if not is_traced(factor) and not float(factor) > 0:
-        raise ValueError(f"factor must be > 0, got {float(factor)}")
+    checked_kind("field", field, AbstractField)
+    factor = checked_array("factor", factor, (), above=0.0)
     if isinstance(field, GridField):
         return GridField(field.values, field.origin * factor, field.spacing * factor, field.interpolation)
     if isinstance(field, SignedDistanceGrid):
@@ -95,10 +91,7 @@ def union(*fields: AbstractField, edge: ArrayLike | None = None) -> "UnionShape 
     if not fields:
         raise ValueError("fields must hold at least one field, got none")
     for index, field in enumerate(fields):
-        if not isinstance(field, AbstractField):
-            raise ValueError(
-                f"fields[{index}] must be a dano field (an AbstractField), got {type(field).__name__}"
-            )
+        checked_kind(f"fields[{index}]", field, AbstractField)
     shapes = tuple(field for field in fields if isinstance(field, AbstractShape))
     if len(shapes) < len(fields):
         if edge is not None:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from dano.fields._base import AbstractField, check_order, Jet
 from dano.fields._spline import border, degree_of, multi_indices, nonnegative_coefficients, spline_jet
-from dano.maths import checked_array, floating, is_traced, Numbers
+from dano.maths import checked_array, checked_floating, is_traced, Numbers
 
 
 class DensityMoments(NamedTuple):
@@ -189,7 +189,7 @@ def checked_values(values: Numbers, name: str = "values") -> Array:
         ValueError: If the shape is not (nx, ny, nz) with two nodes an axis, a value is negative or not
             finite, or all are zero.
     """
-    array = floating(values)
+    array = checked_floating(name, values)
     if array.ndim != 3 or min(array.shape) < 2:
         raise ValueError(
             f"{name} must have shape (nx, ny, nz) with at least 2 nodes an axis, got {array.shape}"
@@ -219,7 +219,7 @@ def checked_spacing(spacing: Numbers) -> Float[Array, "3"]:
     Raises:
         ValueError: If it is neither a number nor of shape (3,), or not finite and positive.
     """
-    array = floating(spacing)
+    array = checked_floating("spacing", spacing)
     if array.shape not in ((), (3,)):
         raise ValueError(f"spacing must be a number or have shape (3,), got shape {array.shape}")
     if not is_traced(array) and not (

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 import jax.numpy as jnp
 import numpy as np
 
+from dano.checks import checked_count, checked_number, shown
 from dano.extras import optional
 from dano.fields._redistance import spread_distances
 from dano.fields._shapes import SolidMoments
@@ -81,10 +82,9 @@ def mesh_field(
             are too thin for any node to lie inside, or an option is out of range.
     """
     degree_of(interpolation)
-    if resolution is not None and not 8 <= resolution <= 512:
-        raise ValueError(f"resolution must lie between 8 and 512 nodes, got {resolution}")
-    if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"scale must be positive, got {scale}")
+    if resolution is not None:
+        resolution = checked_count("resolution", resolution, least=8, most=512)
+    scale = checked_number("scale", scale, above=0)
     name = str(mesh) if isinstance(mesh, (str, Path)) else "mesh"
     solid = _parts(_load_solid(mesh, scale))
     lower, upper = solid.whole.bounds
@@ -245,7 +245,7 @@ def _load_solid(mesh: "str | Path | trimesh.Trimesh", scale: float) -> "trimesh.
     if isinstance(mesh, trimesh.Scene):
         mesh = mesh.to_mesh()
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise ValueError(f"{name}: expected a triangle mesh with faces, got {type(mesh).__name__}")
+        raise ValueError(f"{name} must be a triangle mesh with faces, or its file, got {shown(mesh)}")
     solid = trimesh.Trimesh(np.asarray(mesh.vertices) * scale, np.asarray(mesh.faces), process=True)
     # Texture and normal seams duplicate vertices, which tears a closed surface apart.
     solid.merge_vertices(merge_tex=True, merge_norm=True)

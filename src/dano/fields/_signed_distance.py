@@ -10,7 +10,7 @@ from dano.fields._grid import checked_spacing, scaled_jet
 from dano.fields._redistance import spread_distances
 from dano.fields._shapes import AbstractShape, checked_edge, scaled_moments, SolidMoments
 from dano.fields._spline import border, degree_of, interpolating_coefficients, spline_jet
-from dano.maths import checked_array, column_norm, floating, is_traced, Numbers
+from dano.maths import checked_array, checked_floating, column_norm, is_traced, Numbers
 
 _EXTENSION = 16
 """Nodes added by odd reflection, which continues a slope, to keep the spline filter's ends away."""
@@ -180,7 +180,7 @@ def extended_distances(distances: np.ndarray, spacing: np.ndarray, width: float)
 def _checked_distances(distances: Numbers) -> np.ndarray:
     if is_traced(distances):
         raise ValueError("distances must be concrete: spline coefficients are found on the host")
-    host = np.asarray(floating(distances))
+    host = np.asarray(checked_floating("distances", distances))
     if host.ndim != 3 or min(host.shape) < 3:
         raise ValueError(
             f"distances must have shape (nx, ny, nz) with at least 3 nodes an axis, got {host.shape}"

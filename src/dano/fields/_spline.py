@@ -21,6 +21,8 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
+from dano.checks import checked_choice
+
 DEGREES = {"linear": 1, "quadratic": 2, "cubic": 3}
 """Degree of the spline of each kind of interpolation."""
 
@@ -43,9 +45,7 @@ def degree_of(interpolation: str) -> int:
     Raises:
         ValueError: If the name is not known.
     """
-    if interpolation not in DEGREES:
-        raise ValueError(f"interpolation must be one of {sorted(DEGREES)}, got {interpolation!r}")
-    return DEGREES[interpolation]
+    return DEGREES[checked_choice("interpolation", interpolation, list(DEGREES))]
 
 
 def multi_indices(order: int) -> list[tuple[int, int, int]]:

@@ -1,14 +1,13 @@
 """Environments from scenes and tasks."""
 
-import math
 from typing import Any
 
 import jax
 
+from dano.checks import checked_count, checked_function, checked_kind, checked_number, checked_optional
 from dano.engine import AbstractEngine, VariationalEngine
 from dano.extras import optional
 from dano.gym._rules import Rules, Start
-from dano.maths import checked_count
 from dano.plan import Task
 from dano.scene import Scene, State
 
@@ -49,7 +48,7 @@ def make_env(
     optional("gymnasium", _NEED, "gym")
     from dano.gym._environments import SceneEnv
 
-    return SceneEnv(_checked(scene, state, task, repeat, shaping, engine), state, start)
+    return SceneEnv(_checked(scene, state, task, start, repeat, shaping, engine), state, start)
 
 
 def make_vector_env(
@@ -85,17 +84,26 @@ def make_vector_env(
     from dano.gym._environments import SceneVectorEnv
 
     n_envs = checked_count("n_envs", n_envs)
-    return SceneVectorEnv(_checked(scene, state, task, repeat, shaping, engine), state, n_envs, start)
+    return SceneVectorEnv(_checked(scene, state, task, start, repeat, shaping, engine), state, n_envs, start)
 
 
 def _checked(
-    scene: Scene, state: State, task: Task, repeat: int, shaping: float, engine: AbstractEngine | None
+    scene: Scene,
+    state: State,
+    task: Task,
+    start: Start | None,
+    repeat: int,
+    shaping: float,
+    engine: AbstractEngine | None,
 ) -> Rules:
-    scene.check_state(state)
+    checked_kind("scene", scene, Scene).check_state(state)
+    checked_kind("task", task, Task)
+    checked_optional("engine", engine, AbstractEngine)
+    if start is not None:
+        checked_function("start", start)
     if jax.tree.leaves(state)[0].ndim != 2:
         raise ValueError(f"state must be one state, got leaves of shape {jax.tree.leaves(state)[0].shape}")
     task.check(scene)
     repeat = checked_count("repeat", repeat)
-    if not (math.isfinite(shaping) and shaping >= 0):
-        raise ValueError(f"shaping must be finite and ≥ 0, got {shaping}")
-    return Rules(scene, task, engine or VariationalEngine(), repeat, float(shaping))
+    shaping = checked_number("shaping", shaping, least=0)
+    return Rules(scene, task, engine or VariationalEngine(), repeat, shaping)

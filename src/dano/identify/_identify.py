@@ -9,7 +9,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from dano.engine import AbstractEngine, Policy, VariationalEngine
+from dano.checks import checked_function, checked_items, checked_kind
+from dano.engine import AbstractEngine, checked_engine, Policy
 from dano.identify._joint_log import joint_table
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Parameter, space_of, values_at, with_values
@@ -88,7 +89,13 @@ def identify(
         ValueError: If motions, parameters and scene do not fit each other or make too much work, or an
             option is out of range.
     """
+    checked_kind("scene", scene, Scene)
+    parameters = checked_items("parameters", parameters, Parameter)
     motions = _motions("observed", observed)
+    _check_states(scene, state)
+    _check_controls(controls)
+    if progress is not None:
+        checked_function("progress", progress)
     if not motions:
         raise ValueError("observed must hold at least one motion, got none")
     chosen = estimated(initial, motions)
@@ -100,7 +107,7 @@ def identify(
         Noise(deviations(scene, motions, noise), huber),
         Windowing.create(window, continuity, chosen),
         Search(starts, seed, jacobian, max_iterations, tolerance, batch),
-        engine or VariationalEngine(),
+        checked_engine(engine),
     )
     check_scales(scene, motions, window)
     found = _fitted(setup, motions, _motions("held_out", held_out), state, after, progress)
@@ -216,13 +223,23 @@ def _identification(
 
 
 def _motions(name: str, observed: Observed | Sequence[Any]) -> tuple[Motion, ...]:
-    items = [observed] if isinstance(observed, (Motion, Trajectory)) else list(observed)
-    found = []
-    for item in items:
-        if not isinstance(item, (Motion, Trajectory)):
-            raise ValueError(f"{name} must hold Motions or Trajectories, got {type(item).__name__}")
-        found.append(item if isinstance(item, Motion) else Motion.from_trajectory(item))
-    return tuple(found)
+    one = isinstance(observed, (Motion, Trajectory))
+    items = checked_items(name, [observed] if one else observed, Motion, Trajectory)
+    return tuple(item if isinstance(item, Motion) else Motion.from_trajectory(item) for item in items)
+
+
+def _check_states(scene: Scene, state: State | Sequence[State | None] | None) -> None:
+    """Check the initial states that were given."""
+    for one in _listed(state):
+        if one is not None:
+            scene.check_state(one)
+
+
+def _check_controls(controls: Any) -> None:
+    """Check what drives the motions; shapes are checked when it is cut to them."""
+    for one in _listed(controls):
+        if one is not None and not callable(one):
+            checked_kind("controls", one, Control)
 
 
 def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:
@@ -294,3 +311,8 @@ def _as_motions(plan: Plan, motions: Sequence[Motion], found: Linearized, scene:
                 arrays[key][rows] = predicted[key][w, : len(rows)][:, bodies]
         result.append(dataclasses.replace(motion, **arrays, covariance=None, q=q))
     return tuple(result)
+
+
+def _listed(value: Any) -> Sequence[Any]:
+    """What is given for each motion, or one for all, as a list."""
+    return value if isinstance(value, Sequence) and not isinstance(value, str) else [value]

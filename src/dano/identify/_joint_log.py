@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_kind, shown
 from dano.identify._motion import JOINT_NUMBERS, Motion
-from dano.maths import Numbers, quat_rotate
+from dano.maths import checked_floating, checked_numbers, Numbers, quat_rotate
 from dano.scene import Layout, Scene, State
 
 
@@ -53,12 +54,20 @@ def motion_of_joints(scene: Scene, times: Numbers, q: Numbers, *, state: State |
     Raises:
         ValueError: If shapes do not fit, or the scene has no joints with coordinates.
     """
+    checked_kind("scene", scene, Scene)
+    if state is not None:
+        checked_kind("state", state, State)
+        scene.check_state(state)
     k = scene.layout.n_joints
-    rows = jnp.asarray(np.asarray(q), scene.timestep.dtype)
+    stamps, rows = checked_numbers("times", times), checked_floating("q", q).astype(scene.timestep.dtype)
     if not k:
         raise ValueError("scene must have joints with coordinates, got none")
-    if rows.ndim != 2 or rows.shape[1] != k or np.shape(times) != rows.shape[:1]:
-        raise ValueError(f"q must have shape ({np.size(times)}, {k}), got {rows.shape}")
+    if stamps.ndim != 1 or not np.all(np.diff(stamps) > 0):
+        raise ValueError(f"times must be a vector of increasing numbers [s], got {shown(times)}")
+    if rows.shape != (len(stamps), k):
+        raise ValueError(f"q must have shape ({len(stamps)}, {k}) as times have it, got {rows.shape}")
+    if not np.all(np.isfinite(np.asarray(rows))):
+        raise ValueError("q must be finite")
     base = scene.initial_state() if state is None else state
 
     def placed(row):
@@ -69,7 +78,7 @@ def motion_of_joints(scene: Scene, times: Numbers, q: Numbers, *, state: State |
     hanging = list(scene.layout.children)
     origin = frames.position - quat_rotate(frames.orientation, com[None])
     return Motion.create(
-        np.asarray(times),
+        stamps,
         [scene.names[i] for i in hanging],
         position=np.asarray(origin)[:, hanging],
         orientation=np.asarray(frames.orientation)[:, hanging],

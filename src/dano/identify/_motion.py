@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dano.maths import Numbers, quat_conjugate, quat_log, quat_multiply, quat_rotate
+from dano.checks import checked_choice, checked_count, checked_items, checked_kind, checked_number
+from dano.maths import checked_numbers, Numbers, quat_conjugate, quat_log, quat_multiply, quat_rotate
 from dano.scene import Trajectory
 
 if TYPE_CHECKING:
@@ -91,26 +92,24 @@ class Motion:
                 array has a wrong shape or impossible values. Orientations that contradict the angular
                 velocities are refused, too: quaternions in another order than wxyz do.
         """
-        names = (names,) if isinstance(names, str) else tuple(names)
+        names = (names,) if isinstance(names, str) else checked_items("names", names, str)
         if not names or len(set(names)) < len(names) or not all(names):
             raise ValueError(f"names must be different non-empty names of bodies, got {list(names)}")
-        stamps = np.asarray(times, dtype=float)
+        stamps = checked_numbers("times", times)
         if stamps.ndim != 1 or len(stamps) < 2:
             raise ValueError(f"times must be a vector of at least two frames, got shape {stamps.shape}")
         if not np.all(np.isfinite(stamps)) or not np.all(np.diff(stamps) > 0):
             bad = int(np.flatnonzero(~(np.diff(stamps) > 0))[0]) + 1
             raise ValueError(f"times must be finite and increase, got {stamps[bad]} s at frame {bad}")
-        if point not in ("com", "origin"):
-            raise ValueError(f"point must be 'com' or 'origin', got {point!r}")
-        if not (np.isfinite(lag) and lag >= 0):
-            raise ValueError(f"lag must be finite and ≥ 0 s, got {lag}")
+        checked_choice("point", point, ("com", "origin"))
+        lag = checked_number("lag", lag, least=0)
         given = {"position": position, "orientation": orientation, "velocity": velocity, "omega": omega}
         arrays = {name: _frames(name, value, len(stamps), len(names)) for name, value in given.items()}
         for row, name in enumerate(names):
             if not any(np.isfinite(arrays[key][:, row]).all(axis=-1).any() for key in QUANTITIES):
                 raise ValueError(f"motion of {name!r} must hold at least one observed frame, got none")
         arrays["orientation"] = _unit_quaternions(arrays["orientation"])
-        motion = cls(stamps, **arrays, names=names, point=point, lag=float(lag))
+        motion = cls(stamps, **arrays, names=names, point=point, lag=lag)
         if covariance is not None:
             matrices = _covariances(covariance, len(stamps), len(names))
             motion = dataclasses.replace(motion, covariance=matrices)
@@ -128,12 +127,12 @@ class Motion:
         Raises:
             ValueError: If a body is unknown or `every` < 1.
         """
-        chosen = trajectory.names if bodies is None else tuple(bodies)
+        checked_kind("trajectory", trajectory, Trajectory)
+        chosen = trajectory.names if bodies is None else checked_items("bodies", bodies, str)
         for name in chosen:
             if name not in trajectory.names:
                 raise ValueError(f"bodies must be among {list(trajectory.names)}, got {name!r}")
-        if every < 1:
-            raise ValueError(f"every must be ≥ 1, got {every}")
+        every = checked_count("every", every)
         rows = [trajectory.names.index(name) for name in chosen]
         times = np.asarray(trajectory.times)
         states = trajectory.states
@@ -198,7 +197,7 @@ def _frames(name: str, value: Numbers | None, n_frames: int, n_bodies: int) -> n
     shape = (n_frames, n_bodies, size)
     if value is None:
         return np.full(shape, np.nan)
-    array = np.array(value, dtype=float)
+    array = checked_numbers(name, value)
     if array.ndim == 2 and n_bodies == 1:
         array = array[:, None]
     if array.shape != shape:
@@ -213,7 +212,7 @@ def _frames(name: str, value: Numbers | None, n_frames: int, n_bodies: int) -> n
 
 def _covariances(value: Numbers, n_frames: int, n_bodies: int) -> np.ndarray:
     shape = (n_frames, n_bodies, 6, 6)
-    array = np.array(value, dtype=float)
+    array = checked_numbers("covariance", value)
     if array.ndim == 3 and n_bodies == 1:
         array = array[:, None]
     if array.shape != shape:

@@ -18,6 +18,7 @@ from dano.archive import (
     TRAJECTORY,
     write_archive,
 )
+from dano.checks import checked_choice, checked_items, checked_kind, checked_number
 from dano.identify._motion import Motion, QUANTITIES
 
 _SYNONYMS = {
@@ -62,15 +63,18 @@ def load_motion(
         ValueError: If the file is missing, broken or lacks something, or see `Motion.create`.
     """
     source = checked_input(path)
-    if order not in ("wxyz", "xyzw"):
-        raise ValueError(f"order must be 'wxyz' or 'xyzw', got {order!r}")
-    if rate is not None and not (np.isfinite(rate) and rate > 0):
-        raise ValueError(f"rate must be > 0 frames a second, got {rate}")
+    checked_choice("order", order, ("wxyz", "xyzw"))
+    if point is not None:
+        checked_choice("point", point, ("com", "origin"))
+    if rate is not None:
+        rate = checked_number("rate", rate, above=0)
+    if names is not None:
+        names = (names,) if isinstance(names, str) else checked_items("names", names, str)
     suffix = source.suffix.lower()
     if suffix not in (".npz", ".csv"):
         raise ValueError(f"motion must be an .npz or .csv file, got {source}")
     arrays, found = _read_npz(source) if suffix == ".npz" else _read_csv(source)
-    chosen = (names,) if isinstance(names, str) else tuple(names or found or ())
+    chosen = tuple(names or found or ())
     if not chosen:
         raise ValueError(f"{source} does not name its bodies: give names")
     if found and names is not None and set(chosen) <= set(found):
@@ -112,6 +116,7 @@ def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
     Raises:
         ValueError: If the suffix is another, `path` is a directory or its parent does not exist.
     """
+    checked_kind("motion", motion, Motion)
     target = checked_output(path)
     if target.suffix.lower() == ".npz":
         arrays = {key: getattr(motion, key) for key in ("times", *QUANTITIES)}

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.maths import Numbers
+from dano.checks import checked_choice, checked_function, checked_text
+from dano.maths import checked_numbers, Numbers
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -42,6 +43,34 @@ class Parameter:
     coordinates: str | None = None
     of: str = "scene"
     apply: Callable[[Any, Array], Any] | None = None
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without a scene.
+
+        Raises:
+            ValueError: If the name is empty, both or none of `where` and `apply` are given, a number is none,
+                bounds cross, or a word is unknown.
+        """
+        what = f"of parameter {checked_text('name', self.name)!r}"
+        if (self.where is None) == (self.apply is None):
+            which = "none" if self.where is None else "both"
+            raise ValueError(f"parameter {self.name!r} must have either where or apply, got {which}")
+        checked_function("where", self.where if self.where is not None else self.apply)
+        checked_choice("of", self.of, ("scene", "controls"))
+        if self.coordinates is not None:
+            checked_choice("coordinates", self.coordinates, ("value", "log", "inertia"))
+        for name in ("lower", "upper", "start"):
+            value = getattr(self, name)
+            if value is not None and np.any(np.isnan(checked_numbers(f"{name} {what}", value))):
+                raise ValueError(f"{name} {what} must not be NaN")
+        lower, upper = (checked_numbers(name, getattr(self, name)) for name in ("lower", "upper"))
+        if lower.shape == upper.shape and np.any(lower > upper):
+            raise ValueError(f"lower {what} must be ≤ upper, got {self.lower} and {self.upper}")
+        if self.start is None or self.coordinates == "inertia":
+            return
+        start = checked_numbers("start", self.start)
+        if start.shape == lower.shape == upper.shape and not np.all((lower <= start) & (start <= upper)):
+            raise ValueError(f"start {what} must lie between {self.lower} and {self.upper}, got {self.start}")
 
 
 class Selection(NamedTuple):
@@ -131,22 +160,12 @@ def space_of(scene: Any, controls: Any, parameters: Sequence[Parameter]) -> Spac
 
 
 def _checked(p: Parameter, home: Any) -> tuple[Selection, np.ndarray, np.ndarray, np.ndarray]:
-    if not isinstance(p.name, str) or not p.name:
-        raise ValueError(f"name of a parameter must be a non-empty string, got {p.name!r}")
     what = f"parameter {p.name!r}"
-    if p.of not in ("scene", "controls"):
-        raise ValueError(f"of in {what} must be 'scene' or 'controls', got {p.of!r}")
     if home is None:
         raise ValueError(f"{what} is one of the controls, but no controls are given")
-    if (p.where is None) == (p.apply is None):
-        raise ValueError(
-            f"{what} must have either where or apply, got {'none' if p.where is None else 'both'}"
-        )
     current, put = _derived(p, what, home) if p.where is None else _picked(p, what, home)
     shape = current.shape
     coordinates = p.coordinates or ("inertia" if shape == (3, 3) else "value")
-    if coordinates not in ("value", "log", "inertia"):
-        raise ValueError(f"coordinates of {what} must be 'value', 'log' or 'inertia', got {coordinates!r}")
     selection = Selection(p.name, put, p.of, coordinates, shape)
     value = np.asarray(current if p.start is None else p.start, dtype=float)
     if coordinates == "inertia":

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from dano.checks import checked_choice, checked_count, checked_items, checked_kind, checked_number
 from dano.engine import AbstractEngine
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Space
+from dano.maths import checked_numbers
 from dano.scene import Scene
 
 _MOST_STARTS = 10_000
@@ -32,8 +34,8 @@ class Noise:
     huber: float | None
 
     def __post_init__(self):
-        if self.huber is not None and not self.huber > 0:
-            raise ValueError(f"huber must be > 0, got {self.huber}")
+        if self.huber is not None:
+            checked_number("huber", self.huber, above=0)
 
 
 @dataclass(frozen=True)
@@ -58,9 +60,10 @@ class Windowing:
         Raises:
             ValueError: If they are out of range, or do not fit what is estimated of the initial states.
         """
-        if window is not None and window < 2:
-            raise ValueError(f"window must hold at least 2 frames, got {window}")
-        gaps = () if continuity is None else tuple(np.atleast_1d(np.asarray(continuity, float)).tolist())
+        if window is not None:
+            window = checked_count("window", window, least=2)
+        known = continuity is not None
+        gaps = tuple(np.atleast_1d(checked_numbers("continuity", continuity)).tolist()) if known else ()
         if gaps:
             if not all(gap > 0 for gap in gaps) or any(b >= a for a, b in zip(gaps, gaps[1:], strict=False)):
                 raise ValueError(f"continuity must be > 0, and a sequence of it must fall, got {list(gaps)}")
@@ -93,14 +96,10 @@ class Search:
     batch: int | None
 
     def __post_init__(self):
-        if not 1 <= self.starts <= _MOST_STARTS:
-            raise ValueError(f"starts must be ≥ 1 and ≤ {_MOST_STARTS}, got {self.starts}")
-        if self.jacobian not in ("auto", "forward", "reverse"):
-            raise ValueError(f"jacobian must be 'auto', 'forward' or 'reverse', got {self.jacobian!r}")
-        if not self.tolerance > 0:
-            raise ValueError(f"tolerance must be > 0 standard errors, got {self.tolerance}")
-        if self.max_iterations < 1:
-            raise ValueError(f"max_iterations must be ≥ 1, got {self.max_iterations}")
+        checked_count("starts", self.starts, most=_MOST_STARTS)
+        checked_choice("jacobian", self.jacobian, ("auto", "forward", "reverse"))
+        checked_number("tolerance", self.tolerance, above=0)
+        checked_count("max_iterations", self.max_iterations)
 
 
 @dataclass(frozen=True)
@@ -140,9 +139,8 @@ def estimated(initial: str | Sequence[str] | None, motions: Sequence[Motion]) ->
         first = [np.concatenate([m.velocity, m.omega], axis=-1) for m in motions]
         initial = "given" if all(np.isfinite(v).all() for v in first) else "velocities"
     if isinstance(initial, str):
-        if initial not in _INITIAL:
-            raise ValueError(f"initial must be one of {list(_INITIAL)} or list quantities, got {initial!r}")
-        return _INITIAL[initial]
+        return _INITIAL[checked_choice("initial", initial, list(_INITIAL))]
+    initial = checked_items("initial", initial, str)
     if wrong := [key for key in initial if key not in QUANTITIES]:
         raise ValueError(f"initial must list some of {list(QUANTITIES)}, got {wrong[0]!r}")
     return tuple(key for key in QUANTITIES if key in initial)
@@ -165,11 +163,11 @@ def deviations(
         # A thousandth of the size, seen at half the size from the middle.
         poses = {"position": 1e-3 * float(np.mean(finite)), "orientation": 2e-3}
         return {**poses, "q": 1e-3} if joints else poses
+    checked_kind("noise", noise, Mapping, hint="; such as {'position': 0.001} [m]")
     for key, value in noise.items():
         if key not in _NOISE:
             raise ValueError(f"noise must be given for some of {list(_NOISE)}, got {key!r}")
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"noise of {key} must be finite and > 0, got {value}")
+        checked_number(f"noise of {key}", value, above=0)
     if not noise:
         raise ValueError(f"noise must be given for at least one of {list(_NOISE)}, got none")
     if joints and "q" not in noise:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dano.maths import checked_array, Numbers
-from dano.mujoco._model import carry, carry_compiled, is_marked, library, names_of, without_callback
+from dano.mujoco._model import carry, carry_compiled, concerns, library, names_of, without_callback
 from dano.mujoco._settings import Writer
 from dano.mujoco._table import body_index, Chooser, Table
 from dano.mujoco._things import Thing, thing_of
@@ -116,7 +116,7 @@ class Bridge:
         if spec:
             carry(mujoco, self.target, body, thing, obj if look else None)
         else:
-            carry_compiled(mujoco, self.target, body_index(mujoco, self.target, body), body, thing)
+            carry_compiled(mujoco, self.target, body_index(self.target, body), body, thing)
         self._things[body] = thing
         self._tables.clear()
 
@@ -198,13 +198,8 @@ class Bridge:
         return found[1]
 
     def _looked_up(self, model: Any) -> Table | None:
-        mujoco = self._mujoco
-        kind = mujoco.mjtObj.mjOBJ_BODY
-        ours = (
-            mujoco.mj_name2id(model, kind, name) >= 0 or is_marked(mujoco, model, name)
-            for name in self._things
-        )
-        return self._checked(model) if any(ours) else None
+        ours = any(concerns(model, name) for name in self._things)
+        return self._checked(model) if ours else None
 
     def _checked(self, model: Any) -> Table:
         mujoco = self._mujoco

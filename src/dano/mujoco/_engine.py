@@ -5,6 +5,7 @@ controls, masses, inertias, frictions, gravity and the timestep.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,11 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_choice, checked_kind, checked_number
 from dano.contact import Patch
 from dano.engine import AbstractEngine, Report, VariationalEngine
 from dano.mujoco._model import library
 from dano.mujoco._spec import TOUCHES
 from dano.mujoco._twin import Constants, Motion, Twin
+from dano.names import did_you_mean
 from dano.scene import Control, Scene, State
 
 
@@ -30,19 +33,19 @@ class _Place(NamedTuple):
 
 
 class MuJoCoEngine(AbstractEngine):
-    """Steps a scene in MuJoCo: same bodies, joints, motors and pairs, MuJoCo's contact.
+    """Steps a scene in MuJoCo: same bodies, joints, loops, motors and pairs, MuJoCo's contact.
 
     At its defaults but for elliptic friction cones with impratio 10, which hold bodies on slopes, and the
-    integrator "implicit", with which bodies that tumble gain no energy.
+    integrator "implicit", with which bodies that tumble gain no energy. Options may say otherwise.
 
     Neural objects touch by their samples, as through `Bridge`, or as meshes of their solids. Of a contact's
     parameters the sliding friction and the restitution count; the stiffness is MuJoCo's own. Springs of
     contacts are damped so that they rebound as the restitution says, but all rebound by 0.13 or more: that is
     what MuJoCo's default does.
 
-    Joints, and what acts on them, are MuJoCo's: limits give way a little, friction holds by MuJoCo's solver,
-    springs and position motors pull by where joints are at the start of a step. So a motor whose stiffness
-    exceeds four times what it moves per h² is unstable.
+    Joints, and what acts on them, are MuJoCo's: loops and limits give way a little, friction holds by
+    MuJoCo's solver, springs and position motors pull by where joints are at the start of a step. So a motor
+    whose stiffness exceeds four times what it moves per h² is unstable.
 
     Shapes, samples, centres of mass and the places of joints are those of the scene that the engine was made
     for, other numbers those of the scene that is stepped.
@@ -63,31 +66,37 @@ class MuJoCoEngine(AbstractEngine):
     difference: float = eqx.field(static=True)
     _twin: Twin = eqx.field(static=True)
 
-    def __init__(self, scene: Scene, *, objects: str = "samples", difference: float = 1e-6):
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        objects: str = "samples",
+        options: Mapping[str, Any] | None = None,
+        difference: float = 1e-6,
+    ):
         """Build the model of a scene.
 
         Args:
             scene: The scene.
             objects: As what neural objects touch: by their "samples"; or a mesh of their solid, which MuJoCo
                 takes as its convex "hull", or between two of them by its signed "distance" (from 4.0).
+            options: Of MuJoCo's `mjOption` by their names, such as `impratio` or `iterations`; gravity and
+                timestep are the scene's.
             difference: See the class.
 
         Raises:
             ImportError: If mujoco is missing.
-            ValueError: If nothing in the scene moves, it has loops, a shape is no geom of MuJoCo's, an object
-                has no solid for a mesh, or an option is out of range.
+            ValueError: If nothing in the scene moves, a shape is no geom of MuJoCo's, an object has no solid
+                for a mesh, or an option is out of range.
         """
-        if objects not in TOUCHES:
-            raise ValueError(f"objects must be one of {', '.join(TOUCHES)}, got {objects!r}")
-        if not difference > 0:
-            raise ValueError(f"difference must be > 0, got {difference}")
+        checked_kind("scene", scene, Scene)
+        difference = checked_number("difference", difference, above=0)
+        checked_choice("objects", objects, list(TOUCHES))
         if not any(not body.fixed for body in scene.bodies):
             raise ValueError("scene must have a body that moves, got only fixed ones")
-        if scene.loops:
-            raise ValueError(f"scene must have no loops for MuJoCoEngine, got {len(scene.loops)}")
         self.names, self.difference = scene.names, float(difference)
         self.objects = objects
-        self._twin = Twin(scene, objects)
+        self._twin = Twin(scene, objects, _checked_options(options or {}))
 
     @property
     def model(self) -> Any:
@@ -131,8 +140,11 @@ class MuJoCoEngine(AbstractEngine):
         if scene.names != self.names:
             raise ValueError(f"scene must have the bodies {list(self.names)}, got {list(scene.names)}")
         joints = tuple((joint.parent, joint.child, joint.kind) for joint in scene.joints)
+        joints += tuple((loop.first, loop.second, loop.kind) for loop in scene.loops)
         if joints != self._twin.joints:
-            raise ValueError(f"scene must have the joints {list(self._twin.joints)}, got {list(joints)}")
+            raise ValueError(
+                f"scene must have the joints and loops {list(self._twin.joints)}, got {list(joints)}"
+            )
 
     def prepare(self, scene: Scene) -> Any:
         """See `AbstractEngine.prepare`.
@@ -183,6 +195,17 @@ class MuJoCoEngine(AbstractEngine):
 
         arguments = _motion(before), _motion(after), constants, about
         return jax.pure_callback(host, result, *arguments, vmap_method="sequential")
+
+
+def _checked_options(options: Mapping[str, Any]) -> Mapping[str, Any]:
+    library_options = library().MjOption()
+    valid = [x for x in dir(library_options) if not x.startswith("_") and x not in ("gravity", "timestep")]
+    for name in options:
+        if name not in valid:
+            raise ValueError(
+                f"options must be of {', '.join(valid)}, got {name!r}{did_you_mean(name, valid)}"
+            )
+    return options
 
 
 def _filled(scene: Scene, state: State) -> State:

@@ -97,9 +97,13 @@ def carry_compiled(mujoco: Any, model: Any, body: int, name: str, thing: Thing) 
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def is_marked(mujoco: Any, model: Any, name: str) -> bool:
-    """Whether a model was compiled from a spec whose body of that name has an object."""
-    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, f"{_MARK}{name}") >= 0
+def concerns(model: Any, name: str) -> bool:
+    """Whether a model has a body, or was compiled from a spec whose body of that name has an object."""
+    try:
+        return model.body(name) is not None
+    except KeyError:
+        texts = [model.names[start:].split(b"\0", 1)[0] for start in model.name_textadr]
+        return f"{_MARK}{name}".encode() in texts
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""A scene as an `MjSpec`: bodies in their trees, joints, motors, shapes and pairs that may touch."""
+"""A scene as an `MjSpec`: bodies in their trees, joints, loops, motors and shapes."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -16,7 +16,8 @@ AS_SAMPLES, AS_HULL, AS_DISTANCE = "samples", "hull", "distance"
 TOUCHES = (AS_SAMPLES, AS_HULL, AS_DISTANCE)
 """As what neural objects touch."""
 FOLLOWS = (0.999, 0.999, 0.001, 0.5, 2.0)
-"""Impedance of what ties a joint to the one that it mimics: nearly rigid (MuJoCo's largest is 0.9999)."""
+"""Impedance of what ties a joint to the one that it mimics, and closes loops: nearly rigid (MuJoCo's largest
+is 0.9999)."""
 _MESH_NODES = 40
 """Along the longest side of the mesh of an object (chosen: a hull of some hundred faces)."""
 
@@ -57,6 +58,7 @@ def spec_of(mujoco: Any, scene: Scene) -> Any:
                 conaffinity=0,
             )
     _add_motors(mujoco, spec, scene)
+    _add_loops(mujoco, spec, scene, added)
     return spec
 
 
@@ -171,6 +173,24 @@ def _add_motors(mujoco: Any, spec: Any, scene: Scene) -> None:
                 forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
                 forcerange=[-1.0, 1.0],
             )
+
+
+def _add_loops(mujoco: Any, spec: Any, scene: Scene, added: dict[str | None, Any]) -> None:
+    """Equalities of sites: those of bodies would be closed where the joints are at zero."""
+    kinds = {"point": mujoco.mjtEq.mjEQ_CONNECT, "weld": mujoco.mjtEq.mjEQ_WELD}
+    for k, loop in enumerate(scene.loops):
+        ends = (
+            (loop.first, loop.position, np.asarray(loop.orientation, np.float64)),
+            (loop.second, loop.anchor, np.array([1.0, 0.0, 0.0, 0.0])),
+        )
+        names = (f"loop {k}:0", f"loop {k}:1")
+        for name, (body, place, turn) in zip(names, ends, strict=True):
+            middle = np.zeros(3) if body is None else _middle(scene.body(body))
+            added[body].add_site(name=name, pos=np.asarray(place, np.float64) - middle, quat=turn)
+        tie = spec.add_equality(
+            type=kinds[loop.kind], objtype=mujoco.mjtObj.mjOBJ_SITE, name1=names[0], name2=names[1]
+        )
+        tie.solimp = FOLLOWS
 
 
 def _middle(body: Body) -> Float[np.ndarray, "3"]:

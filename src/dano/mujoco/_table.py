@@ -65,7 +65,7 @@ class Table:
         self._mujoco = mujoco
         self._kinds = mujoco.mjtGeom
         self._choose = choose or self._mixed
-        bodies = {name: body_index(mujoco, model, name) for name in things}
+        bodies = {name: body_index(model, name) for name in things}
         taken = np.isin(model.geom_bodyid, list(bodies.values()))
         self.carriers = [
             Carrier(body, _geom_of(model, body, name), things[name], self._others(model, body, taken))
@@ -160,17 +160,18 @@ class Table:
         return self._solids[geom]
 
 
-def body_index(mujoco: Any, model: Any, name: str) -> int:
+def body_index(model: Any, name: str) -> int:
     """Index of a body of a compiled model.
 
     Raises:
         ValueError: If there is none.
     """
-    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
-    if body < 0:
+    # Not by MuJoCo's functions: before 4.0 an error in a callback that has called one ends the process.
+    try:
+        return model.body(name).id
+    except KeyError:
         names = [model.body(i).name for i in range(model.nbody)]
-        raise ValueError(f"body must be one of {names}, got {name!r}")
-    return body
+        raise ValueError(f"body must be one of {names}, got {name!r}") from None
 
 
 def _geom_of(model: Any, body: int, name: str) -> int:

@@ -2,6 +2,8 @@
 
 import contextlib
 import threading
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -124,12 +126,15 @@ class _Places(NamedTuple):
 class Twin:
     """The model of a scene, and data to step it with."""
 
-    def __init__(self, scene: Scene, touch: str = AS_SAMPLES):
+    def __init__(
+        self, scene: Scene, touch: str = AS_SAMPLES, options: Mapping[str, Any] = MappingProxyType({})
+    ):
         """Build it.
 
         Args:
             scene: The scene.
             touch: As what neural objects touch, see `TOUCHES`.
+            options: Of MuJoCo's `mjOption`.
 
         Raises:
             ImportError: If mujoco is missing.
@@ -138,6 +143,8 @@ class Twin:
         self._mujoco = mujoco = library()
         self._lock = threading.Lock()
         spec = spec_of(mujoco, scene)
+        for name, value in options.items():
+            setattr(spec.option, name, value)
         objects = {body.name: body for body in scene.bodies if body.object is not None}
         sampled = set(objects) if touch == AS_SAMPLES else set()
         self._attached = Bridge(spec, choose=self._settings)
@@ -155,7 +162,10 @@ class Twin:
         self.model = model = self._attached.compile() if sampled else spec.compile()
         self._data = mujoco.MjData(model)
         self.bridge = self._attached if sampled else contextlib.nullcontext()
-        self.joints = tuple((joint.parent, joint.child, joint.kind) for joint in scene.joints)
+        self.joints = (
+            *((joint.parent, joint.child, joint.kind) for joint in scene.joints),
+            *((loop.first, loop.second, loop.kind) for loop in scene.loops),
+        )
         self.places = places = _places(mujoco, model, scene)
         self._pair_of: dict[tuple[int, int], tuple[int, float]] = {}
         for k, pair in enumerate(scene.pairs):
@@ -215,6 +225,8 @@ class Twin:
 
     def _load_joints(self, constants: Constants) -> None:
         model, places = self.model, self.places
+        # What ties joints and closes loops is as hard as the timestep allows.
+        model.eq_solref[:, 0] = 2 * float(constants.timestep)
         if not places.dofs.size:
             return
         model.dof_damping[places.dofs] = constants.damping
@@ -236,8 +248,6 @@ class Twin:
             model.actuator_gainprm[actuator, 0] = gain
             model.actuator_biasprm[actuator, :3] = 0.0, -stiffness, -bias
             model.actuator_forcerange[actuator] = np.clip([least, most], -_ENDLESS, _ENDLESS)
-        # As hard as the timestep allows.
-        model.eq_solref[:, 0] = 2 * float(constants.timestep)
 
     def _weigh(self, constants: Constants) -> None:
         weights = constants.mass, constants.inertia, constants.armature

@@ -13,6 +13,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from dano.checks import checked_kind
 from dano.fields import GridField
 from dano.maths import floating
 from dano.objects._mass import host_jet
@@ -158,6 +159,7 @@ def fill_hollows(grid: GridField) -> tuple[GridField, Interior]:
         The grid whose nodes inside the solid have at least the density of the wall, and what `grid` was like
         (`cavity`: share of the solid that was hollow).
     """
+    checked_kind("grid", grid, GridField)
     origin, spacing = np.asarray(grid.origin, np.float64), np.asarray(grid.spacing, np.float64)
     lattice = Lattice(node_values(grid), origin, spacing)
     interior, inside = examine(lattice)

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from dano.checks import checked_count, checked_number
 from dano.fields import AbstractField, GridField, Jet
-from dano.maths import checked_array, checked_count, is_traced, Numbers
+from dano.maths import checked_array, checked_key, is_traced, Numbers
 
 Density = Callable[[Float[Array, "3"]], Float[Array, ""]]
 Progress = Callable[[str, float], None]
@@ -55,14 +56,12 @@ class MassProperties(eqx.Module):
         Raises:
             ValueError: If the mass is not positive or the inertia is not symmetric and positive definite.
         """
-        self.mass = checked_array("mass", mass, ())
+        self.mass = checked_array("mass", mass, (), above=0.0)
         self.com = checked_array("com", com, (3,))
         self.inertia = checked_inertia("inertia", inertia)
         self.mass_error = checked_array("mass_error", mass_error, ())
         self.com_error = checked_array("com_error", com_error, (3,))
         self.inertia_error = checked_array("inertia_error", inertia_error, (3, 3))
-        if not is_traced(self.mass) and not float(self.mass) > 0:
-            raise ValueError(f"mass must be > 0 kg, got {float(self.mass)}")
 
     @classmethod
     def from_field(
@@ -207,8 +206,9 @@ def cells(bounds: Float[Array, "2 3"], resolution: int, least: int = 1) -> tuple
 def integrated(field: AbstractField, mass_scale, mass, resolution, key, progress) -> MassProperties:
     """See `MassProperties.from_field`."""
     density = checked_density(field)
+    check_scale(mass_scale, mass)
+    resolution, key = checked_count("resolution", resolution), checked_key(key)
     if isinstance(field, GridField):
-        check_scale(mass_scale, mass)
         moments = field.moments()
         total = mass_scale * float(moments.integral) if mass is None else mass
         second = np.asarray(moments.second_moment) * (total / float(moments.integral))
@@ -218,7 +218,6 @@ def integrated(field: AbstractField, mass_scale, mass, resolution, key, progress
 
 def integrate(density, bounds, mass_scale, mass, resolution, key, progress) -> MassProperties:
     """See `MassProperties.from_field`; `density` is a function of one point."""
-    check_scale(mass_scale, mass)
     count, side = cells(bounds, resolution)
     low = np.asarray(bounds[0], dtype=np.float64)
     center = low + 0.5 * count * side
@@ -259,15 +258,14 @@ def integrate(density, bounds, mass_scale, mass, resolution, key, progress) -> M
 
 def host_random(key: PRNGKeyArray | None) -> np.random.Generator:
     """NumPy's generator seeded by a JAX key; `jax.random.key(0)` if there is none."""
-    return np.random.default_rng(np.asarray(jax.random.key_data(jax.random.key(0) if key is None else key)))
+    return np.random.default_rng(np.asarray(jax.random.key_data(checked_key(key))))
 
 
 def check_scale(mass_scale: float, mass: float | None) -> None:
     """Raise a ValueError unless the given mass or mass scale is positive and finite."""
-    if not (mass_scale > 0 and np.isfinite(mass_scale)):
-        raise ValueError(f"mass_scale must be finite and > 0, got {mass_scale}")
-    if mass is not None and not (mass > 0 and np.isfinite(mass)):
-        raise ValueError(f"mass must be finite and > 0 kg, got {mass}")
+    checked_number("mass_scale", mass_scale, above=0)
+    if mass is not None:
+        checked_number("mass", mass, above=0, unit="kg")
 
 
 def _moments(density: np.ndarray, x: np.ndarray) -> np.ndarray:

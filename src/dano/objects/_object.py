@@ -12,12 +12,21 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.archive import LOOK, OBJECT, read_archive, write_archive
+from dano.checks import checked_choice, checked_count, checked_function
 from dano.fields import AbstractField, AbstractShape, GridField, SignedDistanceGrid
-from dano.maths import checked_array, checked_count, checked_key, floating, is_traced, Numbers
+from dano.maths import checked_array, checked_key, checked_points, floating, is_traced, Numbers
 from dano.memory import check_nodes
 from dano.notebook import card, cloud, numbers
 from dano.objects._interior import examine, Interior, sealed
-from dano.objects._mass import checked_density, Density, integrate, integrated, MassProperties, Progress
+from dano.objects._mass import (
+    check_scale,
+    checked_density,
+    Density,
+    integrate,
+    integrated,
+    MassProperties,
+    Progress,
+)
 from dano.objects._samples import (
     baked,
     contact_grid,
@@ -129,8 +138,11 @@ class NeuralObject(eqx.Module):
                 non-finite densities, or no point lies in `density_range`. At most 200,000 samples, and a
                 resolution that fits into half of the memory, are allowed.
         """
-        if mass_model not in get_args(MassModel):
-            raise ValueError(f"mass_model must be one of {get_args(MassModel)}, got {mass_model!r}")
+        checked_choice("mass_model", mass_model, get_args(MassModel))
+        check_scale(mass_scale, mass)
+        density_range = None if density_range is None else _checked_range(density_range)
+        if progress is not None:
+            checked_function("progress", progress)
         say = progress or (lambda description, share: None)
         n_samples = _checked_samples(n_samples)
         key = checked_key(key)
@@ -140,8 +152,6 @@ class NeuralObject(eqx.Module):
         level = float(interior.level)
         model, reason = _weighed(original, interior, mass_model)
         low, high = (level, 1.8 * level) if density_range is None else density_range
-        if not 0 <= low < high:
-            raise ValueError(f"density_range must satisfy 0 ≤ low < high, got ({low}, {high})")
         body = Region.create(lattice, low, floaters=floaters)
         say("samples", 0.0)
         samples = contact_samples(field, density, lattice, body, low, high, n_samples, sampling_key)
@@ -198,10 +208,7 @@ class NeuralObject(eqx.Module):
         Raises:
             ValueError: If a shape or value is out of range.
         """
-        points, density = floating(points), floating(density)
-        if points.ndim != 2 or points.shape[1] != 3 or points.shape[0] == 0:
-            raise ValueError(f"points must have shape (n, 3) with n ≥ 1, got {points.shape}")
-        points = checked_array("points", points, points.shape)
+        points = checked_points("points", points)
         density = checked_array("density", density, (points.shape[0],))
         if not is_traced(density) and (float(density.min()) < 0 or float(density.max()) <= 0):
             raise ValueError(
@@ -358,6 +365,7 @@ def field_size(
         ValueError: If the field is empty, has a negative or non-finite density or unbounded support, or does
             not reach the density range.
     """
+    density_range = None if density_range is None else _checked_range(density_range)
     _, density, lattice, interior = _closed(field, resolution)
     low = float(interior.level) if density_range is None else density_range[0]
     return float(Region.create(lattice, low, floaters=floaters).extents(density).max())
@@ -368,6 +376,13 @@ def _checked_samples(n: int) -> int:
     if n > _MOST_SAMPLES:
         raise ValueError(f"n_samples must be at most {_MOST_SAMPLES}, got {n}")
     return n
+
+
+def _checked_range(density_range: tuple[float, float]) -> tuple[float, float]:
+    low, high = np.asarray(checked_array("density_range", density_range, (2,)), np.float64).tolist()
+    if not 0 <= low < high:
+        raise ValueError(f"density_range must satisfy 0 ≤ low < high, got ({low}, {high})")
+    return low, high
 
 
 def _closed(field: AbstractField, resolution: int) -> tuple[AbstractField, Density, Lattice, Interior]:

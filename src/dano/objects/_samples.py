@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from dano.checks import checked_count, checked_kind
 from dano.fields import AbstractField, AbstractShape, GridField
-from dano.maths import checked_key, floating
+from dano.maths import checked_array, checked_key, checked_points, floating, Numbers
 from dano.objects._mass import cells, checked_density, Density, evaluate, host_random
 from dano.objects._surface import farthest_points
 
@@ -36,6 +37,17 @@ class ContactSamples(eqx.Module):
     points: Float[Array, "n 3"]
     density: Float[Array, " n"]
     normals: Float[Array, "n 3"]
+
+    def __init__(self, points: Numbers, density: Numbers, normals: Numbers):
+        """Contact samples; see the attributes.
+
+        Raises:
+            ValueError: If shapes differ or a number is not finite.
+        """
+        self.points = checked_points("points", points)
+        n = len(self.points)
+        self.density = checked_array("density", density, (n,))
+        self.normals = checked_array("normals", normals, (n, 3))
 
 
 class Lattice(eqx.Module):
@@ -273,8 +285,10 @@ def draw_contact_samples(shape: AbstractShape, n: int, key: PRNGKeyArray | None 
         key: Random key; default `jax.random.key(0)`.
 
     Raises:
-        ValueError: If the shape is unbounded.
+        ValueError: If the shape is none or unbounded, or n is no whole number ≥ 1.
     """
+    checked_kind("shape", shape, AbstractShape)
+    n = checked_count("n", n)
     density = checked_density(shape)
     lattice = Lattice.create(density, shape.bounds, _SHAPE_CELLS, least=_CELLS_ACROSS)
     low, high = surface_range(lattice.values)

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from dano.checks import checked_count, checked_kind, checked_number
 from dano.fields import AbstractShape
-from dano.maths import floating, is_traced
+from dano.maths import checked_array, checked_points, floating, is_traced
 from dano.objects._mass import host_jet, host_random, MassProperties
 
 SKIN = 0.0025
@@ -52,7 +53,15 @@ class SurfaceSamples(eqx.Module):
         areas: Float[Array, " n"],
         vectors: Float[Array, "n 3"] | None = None,
     ):
-        """Vector areas default to those of flat pieces: area · normal."""
+        """Vector areas default to those of flat pieces: area · normal.
+
+        Raises:
+            ValueError: If shapes differ or a number is not finite.
+        """
+        points = checked_points("points", points)
+        n = len(points)
+        normals, areas = checked_array("normals", normals, (n, 3)), checked_array("areas", areas, (n,))
+        vectors = None if vectors is None else checked_array("vectors", vectors, (n, 3))
         self.points, self.normals, self.areas = points, normals, areas
         self.vectors = areas[:, None] * normals if vectors is None else vectors
 
@@ -103,14 +112,12 @@ def draw_surface(
     Raises:
         ValueError: If the shape is unbounded or has no surface, or a number is out of range.
     """
+    checked_kind("shape", shape, AbstractShape)
+    n = checked_count("n", n)
     bounds = np.asarray(shape.bounds, dtype=np.float64)
     if not np.all(np.isfinite(bounds)):
         raise ValueError(f"shape must have finite bounds to be sampled, got {bounds.tolist()}")
-    if n < 1:
-        raise ValueError(f"n must be ≥ 1 sample, got {n}")
-    skin = SKIN * float(shape.size) if skin is None else float(skin)
-    if not (np.isfinite(skin) and skin > 0):
-        raise ValueError(f"skin must be finite and > 0 m, got {skin}")
+    skin = SKIN * float(shape.size) if skin is None else checked_number("skin", skin, above=0)
     shell = _shell(shape, bounds, skin, max(COUNTED * n, FEWEST), host_random(key))
     pitch = math.sqrt(shell.areas.sum() / n)
     chosen = _chosen(shell, n, pitch)

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_count, checked_kind
 from dano.engine import AbstractEngine, Policy, simulate
-from dano.maths import checked_count, Numbers, quat_normalize, quat_rotate, quat_to_matrix
+from dano.maths import Numbers, quat_normalize, quat_rotate, quat_to_matrix
 from dano.scene import Control, Scene, State
 from dano.vision import AbstractCamera, AbstractModel, LearnedField, Light, Part, Sampling, through
 
@@ -80,8 +81,13 @@ def film(
         ValueError: If a look is of no body, there is none, there is no light, `every` is < 1, or the
             background has another shape.
     """
-    _check(scene, looks, lights)
+    checked_kind("scene", scene, Scene)
+    scene.check_state(state)
+    n_steps = checked_count("n_steps", n_steps)
+    checked_kind("camera", camera, AbstractCamera)
+    checked_kind("looks", looks, Mapping)
     every = checked_count("every", every)
+    _check(scene, looks, lights)
     trajectory = simulate(scene, state, n_steps, controls=controls, engine=engine)
     at = np.arange(0, n_steps + 1, every)
     rows = np.array([scene.index(name) for name in looks])

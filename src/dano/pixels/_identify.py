@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dano.checks import checked_count, checked_kind
 from dano.identify import Identification, identify, Motion, Parameter
-from dano.maths import checked_count
 from dano.progress import Progress
 from dano.scene import Scene
 from dano.vision import adjust_poses, Film, LearnedField, Light, PosedCamera, Tracked, TrackOptions
@@ -80,6 +80,10 @@ def identify_in_film(
     Raises:
         ValueError: If the motion is not of one body at the film's times, or as `identify` and `track` say.
     """
+    checked_kind("scene", scene, Scene)
+    checked_kind("film", film, Film)
+    checked_kind("look", look, LearnedField)
+    checked_kind("camera", camera, PosedCamera)
     _check(film, motion, settings)
     passes = checked_count("passes", passes)
     body = motion.names[0]

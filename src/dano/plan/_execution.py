@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.engine import AbstractEngine, compiler_options, VariationalEngine
+from dano.checks import checked_count, checked_kind, checked_optional
+from dano.engine import AbstractEngine, checked_engine, compiler_options
 from dano.plan._plan import goal_errors, GoalError, OPTIONS, Plan
 from dano.plan._problem import Difference, problem_of, Scales
 from dano.plan._task import Task
@@ -88,8 +89,14 @@ def follow(
     Raises:
         ValueError: If timesteps do not fit, or `scene` is missing.
     """
-    began, engine = time.perf_counter(), engine or VariationalEngine()
-    n_steps = task.n_steps
+    began, engine = time.perf_counter(), checked_engine(engine)
+    checked_kind("plant", plant, Scene)
+    checked_count("substeps", substeps)
+    if every is not None:
+        checked_count("every", every)
+    n_steps = checked_kind("task", task, Task).n_steps
+    checked_kind("plan", plan, Plan)
+    checked_optional("options", options, TrajectoryOptions)
     _check(plant, state, task, plan, scene, substeps, every)
     scales, length = Scales.of(task), every or n_steps
     nominal = jax.tree.map(lambda x: x[:-1], plan.trajectory.states)
@@ -179,8 +186,6 @@ def _check(
 ) -> None:
     plant.check_state(state)
     task.check(plant)
-    if substeps < 1 or (every is not None and every < 1):
-        raise ValueError(f"substeps and every must be ≥ 1, got {substeps} and {every}")
     if every is not None and scene is None:
         raise ValueError("scene must be given with every: new plans are made in it")
     if len(plan.values) != task.n_steps:

@@ -1,5 +1,6 @@
 """The verb: a plan for a scene and a task."""
 
+import dataclasses
 import os
 import time
 import warnings
@@ -14,8 +15,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.archive import read_archive, write_archive
-from dano.engine import AbstractEngine, compiler_options, simulate, VariationalEngine
-from dano.maths import floating
+from dano.checks import (
+    checked_choice,
+    checked_count,
+    checked_function,
+    checked_items,
+    checked_kind,
+    checked_optional,
+)
+from dano.engine import AbstractEngine, checked_engine, compiler_options, simulate
+from dano.maths import checked_array
 from dano.plan._problem import problem_of, Scales, VIOLATION
 from dano.plan._sampling import sampled, SamplingOptions
 from dano.plan._softening import softened
@@ -201,10 +210,16 @@ def plan(
         ValueError: If the task does not fit the scene, a method is unknown, or a shape is wrong.
     """
     began = time.perf_counter()
+    checked_kind("scene", scene, Scene)
     scene.check_state(state)
-    task.check(scene)
+    checked_kind("task", task, Task).check(scene)
     _check_search(method, explore, softening)
-    engine, state = engine or VariationalEngine(), scene.filled(state)
+    seed, warm = checked_count("seed", seed, least=0), checked_optional("warm", warm, Plan)
+    options = checked_optional("options", options, TrajectoryOptions)
+    sampling = checked_optional("sampling", sampling, SamplingOptions)
+    if callback is not None:
+        checked_function("callback", callback)
+    engine, state = checked_engine(engine), scene.filled(state)
     scales = Scales.of(task)
     guess = scales.scaled(_first_guess(task, controls, warm))
     problem = problem_of(scene, task, engine)
@@ -212,7 +227,7 @@ def plan(
     search = sampling or SamplingOptions()
     if method != "ilqr" or explore:
         if method == "ilqr":
-            search = search._replace(passes=explore)
+            search = dataclasses.replace(search, passes=explore)
         found = sampled(
             problem,
             state,
@@ -235,11 +250,9 @@ def plan(
 
 
 def _check_search(method: str, explore: int, softening: Sequence[float]) -> None:
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
-    if explore < 0:
-        raise ValueError(f"explore must be ≥ 0, got {explore}")
-    for factor in softening:
+    checked_choice("method", method, METHODS)
+    checked_count("explore", explore, least=0)
+    for factor in checked_items("softening", softening, float, int):
         if not 0 < factor < 1:
             raise ValueError(f"softening must hold factors between 0 and 1, got {factor}")
 
@@ -273,9 +286,7 @@ def _first_guess(task: Task, controls: Any, warm: Plan | None) -> Array:
     shape = (task.n_steps, lower.size)
     if controls is None:
         controls = np.zeros(shape) if warm is None else warm.values
-    if np.shape(controls) != shape or not np.all(np.isfinite(np.asarray(controls))):
-        raise ValueError(f"controls must be finite numbers of shape {shape}, got shape {np.shape(controls)}")
-    return floating(controls)
+    return checked_array("controls", controls, shape)
 
 
 def _what_is_missed(solution: TrajectorySolution) -> str:

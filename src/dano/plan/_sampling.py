@@ -1,11 +1,12 @@
 """Planning by sampling: the cross-entropy method and path integrals, on rollouts of the same problem.
 
-Both draw control sequences w ~ N(mean, deviation²) at a few knots with straight lines between them, roll all
-of them out, and move the mean: to that of the best (CEM; Rubinstein 1999), or to the average with weights
-exp(−cost/temperature) (MPPI; Williams et al. 2017). Constraints are priced: the cost is
-J + ½ p Σ violation², with a price p that grows from pass to pass.
+Both draw what is added to the first controls, N(mean, deviation²) at a few knots with straight lines between
+them, roll all sequences out, and move the mean, which begins at zero: to that of the best (CEM; Rubinstein
+1999), or to the average with weights exp(−cost/temperature) (MPPI; Williams et al. 2017). Constraints are
+priced: the cost is J + ½ p Σ violation², with a price p that grows from pass to pass.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,17 +17,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_count, checked_number
 from dano.solvers import TrajectoryProblem
 
 
-class SamplingOptions(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class SamplingOptions:
     """How to sample.
 
     Attributes:
         passes: How often to draw.
         samples: Sequences in a pass.
         best: Share of them that CEM keeps.
-        knots: Moments at which controls are drawn.
+        knots: Moments at which numbers are drawn, with straight lines between them; with one, controls are
+            the first ones moved by as much at all times.
         deviation: First standard deviation, as a share of the bounds.
         least: Deviation that is always left.
         temperature: Of MPPI, as a share of the spread of costs.
@@ -45,6 +49,20 @@ class SamplingOptions(NamedTuple):
     price: float = 10.0
     last_price: float = 1e3
     max_seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check all numbers.
+
+        Raises:
+            ValueError: If one is out of range.
+        """
+        for name in ("passes", "samples", "knots"):
+            checked_count(name, getattr(self, name))
+        checked_number("best", self.best, above=0, most=1)
+        for name in ("deviation", "least", "temperature", "price", "last_price"):
+            checked_number(name, getattr(self, name), above=0)
+        if self.max_seconds is not None:
+            checked_number("max_seconds", self.max_seconds, above=0)
 
 
 class Sampled(NamedTuple):
@@ -81,7 +99,7 @@ def sampled(
     Args:
         problem: The problem.
         start: x_0.
-        controls: First mean.
+        controls: What the search adds to.
         method: "cem" or "mppi".
         options: See `SamplingOptions`.
         key: Of the random numbers.
@@ -93,7 +111,7 @@ def sampled(
     lift = _lines(n_steps, min(options.knots, n_steps))
     assert problem.lower is not None and problem.upper is not None
     least, most = problem.lower, problem.upper
-    mean = jnp.asarray(np.linalg.lstsq(lift, np.asarray(controls), rcond=None)[0])
+    mean = jnp.zeros((lift.shape[1], m), controls.dtype)
     spread = jnp.full_like(mean, options.deviation)
     prices = np.geomspace(options.price, options.last_price, options.passes)
     jit: Any = eqx.filter_jit
@@ -106,7 +124,7 @@ def sampled(
                 draw, (options.samples, *mean.shape), mean.dtype
             )
             knots = knots.at[0].set(mean)
-            sequences = jnp.einsum("tk,skm->stm", jnp.asarray(lift), knots)
+            sequences = controls[None] + jnp.einsum("tk,skm->stm", jnp.asarray(lift), knots)
             sequences = jnp.clip(sequences, *(jnp.broadcast_to(b, sequences.shape) for b in (least, most)))
             sequences = sequences.at[1].set(best)
             cost, violation = (np.asarray(x) for x in rate(problem, start, sequences))

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 
+from dano.checks import checked_number
 from dano.scene import Scene
 
 _STIFF = ("stiffness", "spring", "damper")
@@ -17,8 +18,7 @@ def softened(scene: Scene, factor: float) -> Scene:
     Raises:
         ValueError: If the factor is not positive.
     """
-    if not factor > 0:
-        raise ValueError(f"factor must be > 0, got {factor}")
+    checked_number("factor", factor, above=0)
 
     def params_of(scene: Scene) -> list:
         every = [contact.params for contact in scene.contacts]

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_choice, checked_count, checked_items, checked_text, shown
 from dano.maths import (
     checked_array,
+    checked_numbers,
     checked_quaternion,
     is_traced,
     Numbers,
@@ -73,17 +75,20 @@ class Actuator(eqx.Module):
             ValueError: If the kind or an axis is unknown, the bounds are missing, not finite or crossed, or
                 the cost is negative.
         """
-        if kind not in KINDS:
-            raise ValueError(
-                f"kind of the actuator of {body!r} must be one of {', '.join(KINDS)}, got {kind!r}"
-            )
+        checked_text("body", body)
+        checked_choice(f"kind of the actuator of {body!r}", kind, list(KINDS))
         self.body, self.kind = body, kind
         self.axes = "" if KINDS[kind] == 1 else _checked_axes(axes, f"the {kind} of {body!r}")
         what = f"of the {kind} of {body!r}"
         if limit is not None:
             if lower is not None or upper is not None:
                 raise ValueError(f"limit {what} must stand alone, got lower or upper besides it")
-            lower, upper = -np.asarray(limit, float), np.asarray(limit, float)
+            upper = checked_numbers(f"limit {what}", limit)
+            lower = -upper
+            if not 1 <= upper.size <= max(1, len(self.axes)) or not np.all(np.isfinite(upper) & (upper > 0)):
+                raise ValueError(
+                    f"limit {what} must be finite and > 0, one number or one per axis, got {shown(limit)}"
+                )
         if lower is None or upper is None:
             raise ValueError(f"bounds {what} must be given: limit, or lower and upper")
         n = max(1, len(self.axes))
@@ -94,9 +99,7 @@ class Actuator(eqx.Module):
                 f"lower {what} must be < upper, got {np.asarray(self.lower).tolist()} and "
                 f"{np.asarray(self.upper).tolist()}: no control lies between them"
             )
-        self.cost = checked_array(f"cost {what}", cost, ())
-        if not is_traced(self.cost) and float(self.cost) < 0:
-            raise ValueError(f"cost {what} must be ≥ 0, got {float(self.cost)}")
+        self.cost = checked_array(f"cost {what}", cost, (), least=0.0)
 
     @property
     def size(self) -> int:
@@ -161,6 +164,7 @@ class Goal(eqx.Module):
             ValueError: If not exactly one quantity is given, it is unknown, a shape is wrong, or a weight is
                 negative or `within` not positive.
         """
+        checked_text("body", body)
         if len(value) != 1:
             raise ValueError(
                 f"goal of {body!r} must have one of {', '.join(QUANTITIES)}, got {list(value) or 'none'}"
@@ -170,13 +174,8 @@ class Goal(eqx.Module):
         self.axes = _AXES if self.quantity in ("q", "v") else _checked_axes(axes, f"the goal of {body!r}")
         self.required = bool(required)
         for name, number in (("running", running), ("final", final), ("within", within)):
-            checked = checked_array(f"{name} of the goal of {body!r}", number, ())
-            least = "> 0" if name == "within" else "≥ 0"
-            if not is_traced(checked) and not (
-                float(checked) > 0 or (name != "within" and float(checked) == 0)
-            ):
-                raise ValueError(f"{name} of the goal of {body!r} must be {least}, got {float(checked)}")
-            setattr(self, name, checked)
+            bound = {"above": 0.0} if name == "within" else {"least": 0.0}
+            setattr(self, name, checked_array(f"{name} of the goal of {body!r}", number, (), **bound))
 
     @property
     def name(self) -> str:
@@ -219,20 +218,20 @@ class Limit(eqx.Module):
         Raises:
             ValueError: If the quantity is unknown, or bounds are NaN or crossed.
         """
+        checked_text("body", body)
         valid = [name for name in QUANTITIES if name != "orientation"]
-        if quantity not in valid:
-            raise ValueError(
-                f"limit of {body!r} must be about one of {', '.join(valid)}, got {quantity!r}"
-                + did_you_mean(quantity, valid)
-            )
+        checked_choice(f"quantity of the limit of {body!r}", quantity, valid)
         self.body, self.quantity = body, quantity
         self.axes = _AXES if QUANTITIES[quantity] == 1 else _checked_axes(axes, f"the limit of {body!r}")
         n = 1 if QUANTITIES[quantity] == 1 else len(self.axes)
-        bounds = [np.asarray(each, float) for each in (lower, upper)]
-        if any(b.shape not in ((), (n,)) or np.any(np.isnan(b)) for b in bounds):
-            raise ValueError(
-                f"bounds of the limit of {body!r} must be one number or {n}, got {lower}, {upper}"
-            )
+        bounds = []
+        for side, given in (("lower", lower), ("upper", upper)):
+            bound = checked_numbers(f"{side} of the limit of {body!r}", given)
+            if bound.shape not in ((), (n,)) or np.any(np.isnan(bound)):
+                raise ValueError(
+                    f"{side} of the limit of {body!r} must be one number or {n}, not NaN, got {shown(given)}"
+                )
+            bounds.append(bound)
         self.lower, self.upper = (jnp.asarray(np.broadcast_to(b, (n,))) for b in bounds)
         if not np.all(self.lower <= self.upper):
             raise ValueError(f"lower of the limit of {body!r} must be ≤ upper, got {lower} and {upper}")
@@ -279,10 +278,9 @@ class Task(eqx.Module):
         Raises:
             ValueError: If there is no step, no actuator or no goal, or two actuators drive the same.
         """
-        if int(n_steps) != n_steps or n_steps < 1:
-            raise ValueError(f"n_steps must be a whole number ≥ 1, got {n_steps}")
-        self.n_steps = int(n_steps)
-        self.actuators, self.goals, self.limits = tuple(actuators), tuple(goals), tuple(limits)
+        self.n_steps = checked_count("n_steps", n_steps)
+        self.actuators = checked_items("actuators", actuators, Actuator)
+        self.goals, self.limits = checked_items("goals", goals, Goal), checked_items("limits", limits, Limit)
         if not self.actuators or not self.goals:
             raise ValueError("task must have at least one actuator and one goal")
         driven = [(a.body, a.kind, axis) for a in self.actuators for axis in a.axes or "q"]
@@ -370,7 +368,11 @@ def _difference(scene: Scene, state: State, body: str, quantity: str, value: Arr
 
 
 def _checked_axes(axes: str, what: str) -> str:
-    if not axes or any(axis not in _AXES or axes.count(axis) > 1 for axis in axes):
+    if (
+        not isinstance(axes, str)
+        or not axes
+        or any(axis not in _AXES or axes.count(axis) > 1 for axis in axes)
+    ):
         raise ValueError(f"axes of {what} must be different letters of 'xyz', got {axes!r}")
     return axes
 
@@ -388,7 +390,7 @@ def _checked_value(quantity: str, value: Numbers, what: str) -> Array:
 
 
 def _spread(name: str, value: Numbers, n: int) -> Array:
-    array = np.asarray(value, float)
+    array = checked_numbers(name, value)
     if array.shape not in ((), (n,)):
         raise ValueError(f"{name} must be one number or {n}, got shape {array.shape}")
     return checked_array(name, np.broadcast_to(array, (n,)), (n,))

@@ -2,9 +2,11 @@
 
 from dano.report._capture import draw_capture as draw_capture
 from dano.report._comparison import (
+    draw_rest as draw_rest,
     verdict as verdict,
     write_comparison_report as write_comparison_report,
 )
+from dano.report._framing import CAMERAS as CAMERAS
 from dano.report._identification import write_identification_report as write_identification_report
 from dano.report._object import draw_object as draw_object
 from dano.report._plan import draw_controls as draw_controls, film_plan as film_plan

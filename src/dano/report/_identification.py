@@ -9,9 +9,10 @@ import numpy as np
 
 from dano.identify import Identification, Motion
 from dano.maths import quat_rotate
+from dano.report._framing import camera_for
 from dano.report._page import png, table, video, warnings, write_page
 from dano.report._resample import frame_times, poses_at
-from dano.report._stage import camera_for, stage
+from dano.report._stage import stage
 from dano.report._video import encoder, require, side_by_side
 from dano.scene import Scene, State, Trajectory
 from dano.vision import render

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from dano.archive import checked_output, replacing
+from dano.checks import checked_kind
 from dano.maths import Pose
 from dano.objects import NeuralObject
 from dano.report._stage import object_level
@@ -37,6 +38,7 @@ def draw_object(obj: NeuralObject, path: str | os.PathLike[str], *, title: str |
         ValueError: If the path does not end in .png, is a directory, or lies in none.
         ImportError: If matplotlib or pillow is missing.
     """
+    checked_kind("obj", obj, NeuralObject)
     target = checked_output(path)
     if target.suffix.lower() != ".png":
         raise ValueError(f"path must end in .png, got {target}")

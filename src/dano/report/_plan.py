@@ -10,8 +10,9 @@ from jaxtyping import UInt8
 from dano.archive import checked_output, replacing
 from dano.plan import Plan, Task
 from dano.progress import Progress
+from dano.report._framing import camera_for
 from dano.report._resample import frame_times, poses_at
-from dano.report._stage import camera_for, Stage, stage
+from dano.report._stage import Stage, stage
 from dano.report._video import encoder, moments_of, require, side_by_side, write_png
 from dano.scene import Scene
 from dano.vision import Camera, Item, LearnedField, render

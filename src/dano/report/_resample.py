@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from dano.checks import checked_number
 from dano.maths import quat_slerp
 from dano.scene import Trajectory
 
@@ -35,14 +36,13 @@ def frame_count(duration: float, slow_motion: int | float, fps: int | float = 30
         ValueError: If a rate is not positive, or there are more than a hundred thousand frames: drawing them
             would take hours.
     """
-    for name, value in (("fps", fps), ("slow_motion", slow_motion)):
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be positive, got {value}")
+    for name, value in (("duration", duration), ("fps", fps), ("slow_motion", slow_motion)):
+        checked_number(name, value, above=0)
     count = duration * fps * slow_motion
     if not count < MOST_FRAMES:
         raise ValueError(
             f"slow_motion must be at most {MOST_FRAMES / (duration * fps):.3g}, so that a video of"
-            f" {duration:.4g} s has at most {MOST_FRAMES} frames, got {slow_motion:g}"
+            f" {duration:.4g} s has at most {MOST_FRAMES} frames, got {slow_motion:g} with fps {fps:g}"
         )
     return int(np.floor(count + 1e-6)) + 1
 

@@ -7,10 +7,29 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from dano.checks import checked_kind
 from dano.engine import contact_history
 from dano.maths import Pose, quat_to_matrix
 from dano.scene import Body, Scene, Trajectory
-from dano.vision import Camera, Item, LearnedField, PALETTE
+from dano.vision import Item, LearnedField, PALETTE
+
+
+def check_run(scene: Scene, trajectory: Trajectory) -> None:
+    """Check that a trajectory is one of a scene, with at least one step, and finite.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    checked_kind("scene", scene, Scene)
+    checked_kind("trajectory", trajectory, Trajectory)
+    if tuple(trajectory.names) != tuple(scene.names):
+        raise ValueError(
+            f"trajectory must be of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
+        )
+    if len(trajectory.times) < 2:
+        raise ValueError(f"trajectory must have at least one step, got {len(trajectory.times)} states")
+    if not np.all(np.isfinite(np.asarray(trajectory.states.position))):
+        raise ValueError("trajectory must be finite, got positions that are NaN or infinite")
 
 
 class Stage(NamedTuple):
@@ -43,16 +62,19 @@ class Stage(NamedTuple):
 
 
 def stage(
-    scene: Scene, colours: dict[str, str] | None = None, looks: Mapping[str, LearnedField] | None = None
+    scene: Scene, colours: Mapping[str, str] | None = None, looks: Mapping[str, LearnedField] | None = None
 ) -> Stage:
     """Make the bodies of a scene ready for drawing; bodies without a field or shape are left out.
 
     Raises:
         ValueError: If a colour is none, a colour or look names no body, or nothing can be drawn.
     """
-    colours, looks = {} if colours is None else colours, {} if looks is None else looks
+    colours = checked_kind("colours", {} if colours is None else colours, Mapping)
+    looks = checked_kind("looks", {} if looks is None else looks, Mapping)
     for name in (*colours, *looks):
         scene.index(name)
+    for name, look in looks.items():
+        checked_kind(f"looks of {name!r}", look, LearnedField)
     items, rows, offsets, used = [], [], [], 0
     for row, body in enumerate(scene.bodies):
         if body.field is None:
@@ -84,47 +106,6 @@ def object_level(density_range: np.ndarray) -> float:
     """Where in a range of densities the eye sees the surface: low in it, for that is where contact begins."""
     low, high = float(density_range[0]), float(density_range[1])
     return low**0.75 * high**0.25 if low > 0 else 0.1 * high
-
-
-def camera_for(scene: Scene, drawn: Stage, trajectory: Trajectory, width: int, height: int) -> Camera:
-    """A camera that sees every bounded body all the time, from across the main direction of motion."""
-    position = np.asarray(trajectory.states.position, dtype=np.float64)
-    orientation = np.asarray(trajectory.states.orientation, dtype=np.float64)
-    steps = np.unique(np.linspace(0, len(position) - 1, 60).astype(int))
-    centres, moving = [], []
-    for item, row, com in zip(drawn.items, drawn.rows, drawn.offsets, strict=True):
-        if item.shape is None or item.plane is not None:
-            continue
-        lower, upper = np.asarray(item.shape.bounds, dtype=np.float64)
-        corners = np.where(np.array(list(np.ndindex(2, 2, 2))) == 1, upper, lower)
-        for step in steps[:1] if scene.bodies[row].fixed else steps:
-            centres.append(position[step, row] + (corners - com) @ quat_to_matrix(orientation[step, row]).T)
-        if not scene.bodies[row].fixed:
-            moving.append(position[steps, row, :2])
-    if not centres:
-        return Camera((3.0, -8.0, 4.0), width=width, height=height)
-    centres = np.concatenate(centres)
-    right = _main_direction(centres, moving)
-    # Seen a little from the side, motion along the screen still shows depth.
-    ahead = np.array([-right[1], right[0]])
-    ahead = 0.94 * ahead + 0.34 * right
-    direction = (*(ahead / np.linalg.norm(ahead)), -0.36)
-    return Camera.framing(centres, np.zeros(len(centres)), direction=direction, width=width, height=height)
-
-
-def _main_direction(centres: np.ndarray, moving: list[np.ndarray]) -> np.ndarray:
-    """Horizontal unit vector that shall run to the right of the picture."""
-    flat = np.concatenate([path - path.mean(axis=0) for path in moving]) if moving else np.zeros((1, 2))
-    if np.abs(flat).max() < 0.2 * np.ptp(centres[:, :2], axis=0).max(initial=0.0):
-        flat = centres[:, :2] - centres[:, :2].mean(axis=0)
-    if np.abs(flat).max() < 1e-9:
-        return np.array([1.0, 0.0])
-    _, _, axes = np.linalg.svd(flat, full_matrices=False)
-    right = axes[0]
-    travel = sum((path[-1] - path[0] for path in moving), np.zeros(2)) @ right
-    if abs(travel) > 1e-6 * np.abs(flat).max():
-        return right if travel > 0 else -right
-    return right if right[0] >= 0 else -right
 
 
 class Touches(NamedTuple):

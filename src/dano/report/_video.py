@@ -10,14 +10,18 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dano.archive import checked_output, replacing
+from dano.checks import checked_choice, checked_function, checked_items, checked_kind, checked_path
 from dano.extras import optional
 from dano.progress import Progress
+from dano.report._framing import CAMERAS, cameras_for
 from dano.report._overlay import draw_clock, draw_touches
 from dano.report._resample import frame_times, poses_at
-from dano.report._stage import camera_for, stage, touches
+from dano.report._stage import check_run, stage, touches
 from dano.scene import Scene, Trajectory
 from dano.vision import Camera, LearnedField, render
 
+MOST_PIXELS = 8192
+"""Longest side of a film: what common decoders of H.264 can show."""
 _STRIP_MOMENTS = 6
 """Moments in a picture strip: two rows of three (convention)."""
 
@@ -33,7 +37,7 @@ def render_trajectory(
     contact_points: bool = True,
     clock: bool = True,
     strip: str | os.PathLike[str] | None = None,
-    camera: Camera | None = None,
+    camera: Camera | str = "auto",
     colours: dict[str, str] | None = None,
     looks: Mapping[str, LearnedField] | None = None,
     progress: Progress | None = None,
@@ -52,7 +56,9 @@ def render_trajectory(
         contact_points: Whether to draw where bodies touch, and the contact force as an arrow.
         clock: Whether to draw the time, and a bar that says how long things are in the middle of the motion.
         strip: A PNG with some moments of the motion, from left to right; None for none.
-        camera: From where; default: chosen such that all bodies stay in view. Replaces `size`.
+        camera: From where: a camera, which replaces `size`; or "fixed", which sees all bodies all the time;
+            "follow", which shifts with those that move; "auto", which follows if bodies would otherwise fill
+            less than a third of the height.
         colours: "#rrggbb" by body name, for those that shall have a certain one.
         looks: What bodies have learned to look like, by name: `LearnedField.of_object`, or
             `SceneFile.looks`. A colour takes precedence.
@@ -63,24 +69,35 @@ def render_trajectory(
             is a directory, lies in none, or has another ending.
         ImportError: If av or pillow is missing.
     """
-    outputs = _checked(
-        scene, trajectory, path, strip, size if camera is None else (camera.width, camera.height)
-    )
+    if isinstance(camera, str):
+        checked_choice("camera", camera, CAMERAS)
+    else:
+        checked_kind("camera", camera, Camera, hint=f", or one of {', '.join(CAMERAS)}")
+        size = camera.width, camera.height
+    outputs = _checked(scene, trajectory, path, strip, size)
+    if progress is not None:
+        checked_function("progress", progress)
     times = frame_times(trajectory, fps, slow_motion)
     drawn = stage(scene, colours, looks)
-    camera = camera_for(scene, drawn, trajectory, *size) if camera is None else camera
     touched = touches(scene, trajectory, times) if contact_points else None
     length = 0.55 * float(np.median([item.radius for item in drawn.items if item.plane is None] or [1.0]))
     position, orientation = poses_at(trajectory, times)
-
+    if isinstance(camera, str):
+        step = 1 / (fps * slow_motion)
+        cameras = cameras_for(scene, drawn, position, orientation, step, size, camera)
+    else:
+        cameras = [camera] * len(times)
     bounded = [row for row, item in zip(drawn.rows, drawn.items, strict=True) if item.plane is None]
-    middle = position[:, bounded or drawn.rows].mean(axis=(0, 1))
-    distance = max(float((middle - camera.position) @ camera.axes[2]), 1e-3)
 
     def picture(frame: int) -> UInt8[np.ndarray, "height width 3"]:
-        image = render(drawn.posed(position[frame], orientation[frame]), camera, floor=False)
-        image = image if touched is None else draw_touches(image, camera, touched, frame, length)
-        return draw_clock(image, camera, float(times[frame]), distance) if clock else image
+        eye = cameras[frame]
+        image = render(drawn.posed(position[frame], orientation[frame]), eye, floor=False)
+        image = image if touched is None else draw_touches(image, eye, touched, frame, length)
+        if not clock:
+            return image
+        middle = position[frame, bounded or drawn.rows].mean(axis=0)
+        distance = max(float((middle - eye.position) @ eye.axes[2]), 1e-3)
+        return draw_clock(image, eye, float(times[frame]), distance)
 
     moments = moments_of(position, _STRIP_MOMENTS)
     frames = range(len(times)) if outputs[0] is not None else moments.tolist()
@@ -89,7 +106,7 @@ def render_trajectory(
         add = None
         if outputs[0] is not None:
             file = stack.enter_context(replacing(outputs[0]))
-            add = stack.enter_context(encoder(file, fps, camera.width, camera.height))
+            add = stack.enter_context(encoder(file, fps, *size))
         for count, frame in enumerate(frames):
             image = picture(frame)
             if add is not None:
@@ -106,21 +123,16 @@ def _checked(scene, trajectory, path, strip, size) -> tuple[Path | None, Path | 
     """Output paths, after checks that need no work."""
     if path is None and strip is None:
         raise ValueError("path or strip must be given, got None for both")
-    if tuple(trajectory.names) != tuple(scene.names):
+    check_run(scene, trajectory)
+    size = checked_items("size", size, int)
+    if len(size) != 2 or not all(16 <= n <= MOST_PIXELS and n % 2 == 0 for n in size):
         raise ValueError(
-            f"trajectory must be of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
-        )
-    if len(trajectory.times) < 2:
-        raise ValueError(f"trajectory must have at least one step, got {len(trajectory.times)} states")
-    if not np.all(np.isfinite(np.asarray(trajectory.states.position))):
-        raise ValueError("trajectory must be finite, got positions that are NaN or infinite")
-    if min(size) < 16 or any(n != int(n) or n % 2 for n in size):
-        raise ValueError(
-            f"size must be two even numbers of at least 16 pixels (video codecs need them even), got {size}"
+            f"size must be two even numbers from 16 to {MOST_PIXELS} pixels (video codecs need them even),"
+            f" got {list(size)}"
         )
     checked = []
     for name, output, suffix in (("path", path, ".mp4"), ("strip", strip, ".png")):
-        if output is not None and Path(output).suffix.lower() != suffix:
+        if output is not None and checked_path(name, output).suffix.lower() != suffix:
             raise ValueError(f"{name} must end in {suffix}, got {output}")
         checked.append(None if output is None else checked_output(output))
     if path is not None:

@@ -9,14 +9,15 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from dano.checks import checked_count
 from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, PosedShape, Sphere
 from dano.maths import Pose, quat_to_matrix
 from dano.report._object import normal_colours
 from dano.report._resample import poses_at
-from dano.report._stage import Touches, touches
+from dano.report._stage import check_run, Touches, touches
 from dano.report._video import require
 from dano.scene import Body, Scene, Trajectory
-from dano.vision import checked_colour, Item, PALETTE, placement
+from dano.vision import Camera, checked_colour, Item, PALETTE, placement
 
 _TICK = 1 / 30
 """Time between frames [s] (convention)."""
@@ -46,6 +47,7 @@ class Viewer:
         self._touched = touches(scene, trajectory, np.asarray(trajectory.times, dtype=np.float64))
         self._handles, self._offsets = [], []
         self._place(scene)
+        self._aim(scene)
         self._controls()
         self._show()
         self._thread = threading.Thread(target=self._play, daemon=True, name="dano viewer")
@@ -66,6 +68,18 @@ class Viewer:
             self._handles.append(_add_body(self._server, name, body, colour))
             self._offsets.append(np.asarray(body.com + body.com_offset, dtype=np.float64))
         self._arrows = None
+
+    def _aim(self, scene: Scene) -> None:
+        """Let the page open on the bodies that move, near enough to see them, over the whole run."""
+        moving = [i for i, body in enumerate(scene.bodies) if not body.fixed and np.isfinite(body.size)]
+        if not moving:
+            return
+        places = np.asarray(self._trajectory.states.position, dtype=np.float64)[:, moving].reshape(-1, 3)
+        radii = np.tile([0.5 * scene.bodies[i].size for i in moving], len(self._trajectory.times))
+        camera = Camera.framing(places, radii, width=3, height=2, margin=0.15)
+        start = self._server.initial_camera
+        start.up, start.fov = (0.0, 0.0, 1.0), camera.vertical_fov
+        start.position, start.look_at = tuple(camera.position), tuple(camera.look_at)
 
     def _controls(self) -> None:
         gui, times = self._server.gui, np.asarray(self._trajectory.times, dtype=np.float64)
@@ -167,12 +181,8 @@ def view(
         ValueError: If the trajectory is not one of this scene or the port is none.
         ImportError: If viser is missing.
     """
-    if tuple(trajectory.names) != tuple(scene.names):
-        raise ValueError(
-            f"trajectory must be of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
-        )
-    if not 0 < int(port) < 65536:
-        raise ValueError(f"port must lie in 1 … 65535, got {port}")
+    check_run(scene, trajectory)
+    checked_count("port", port, most=65535)
     viser = require("viser")
     viewer = Viewer(
         viser.ViserServer(host=host, port=int(port), label="dano", verbose=False), scene, trajectory

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from dano.archive import checked_input
+from dano.checks import shown
 from dano.fields import Sphere
 from dano.maths import Pose, quat_conjugate, quat_multiply, quat_rotate
 from dano.robots._description import Connection, Description, Link, Placed, Tie
@@ -86,8 +87,11 @@ def build_robot(
     collision: bool = True,
 ) -> Robot:
     """Bodies and joints of what a file says; see `load_urdf`."""
-    if isinstance(base, str) and base != FLOATING:
-        raise ValueError(f"base must be a dano.Pose, 'floating' or None, got {base!r}")
+    floats = isinstance(base, str) and base == FLOATING
+    if not (base is None or floats or isinstance(base, Pose)):
+        raise ValueError(f"base must be a dano.Pose, 'floating' or None, got {shown(base)}")
+    if not isinstance(prefix, str):
+        raise ValueError(f"prefix must be a string, got {shown(prefix)}")
     groups = grouped_links(description)
     root = next(iter(groups))
     if description.links and base is None and description.joints:

@@ -11,7 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.maths import Numbers, quat_exp, quat_log, quat_multiply, quat_rotate
+from dano.checks import checked_kind
+from dano.maths import (
+    checked_array,
+    checked_floating,
+    Numbers,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+    quat_rotate,
+)
 from dano.scene import Control, joints_of, place_links, Scene, State, triples
 
 
@@ -31,6 +40,7 @@ def bias_forces(scene: Scene, state: State) -> Float[Array, " k"]:
     Raises:
         ValueError: If the state does not fit the scene.
     """
+    checked_kind("scene", scene, Scene)
     still = jnp.zeros(scene.layout.n_velocities, scene.timestep.dtype)
     force, torque, jacobian, rows = _needed(scene, state, still)
     return _pulled(jacobian[rows], force, torque)
@@ -59,6 +69,8 @@ def computed_torque(scene: Scene, state: State, acceleration: Numbers) -> Float[
     Raises:
         ValueError: If the state does not fit the scene, or the accelerations are not k numbers.
     """
+    checked_kind("scene", scene, Scene)
+    scene.check_state(state)
     wanted = _checked_acceleration(scene, acceleration)
     return mass_matrix(scene, state) @ wanted + bias_forces(scene, state)
 
@@ -83,6 +95,7 @@ def joint_reactions(
     Raises:
         ValueError: If the state does not fit the scene, a shape is wrong, or the scene has no joints.
     """
+    checked_kind("scene", scene, Scene)
     layout, dtype = scene.layout, scene.timestep.dtype
     if not scene.joints:
         raise ValueError("scene must have joints, got none")
@@ -91,9 +104,9 @@ def joint_reactions(
             f"scene must have no loops, got {len(scene.loops)}: what their joints carry does not follow from"
             " the motion"
         )
-    given = jnp.zeros((layout.bodies, 6), dtype) if wrenches is None else jnp.asarray(wrenches, dtype)
-    if given.shape != (layout.bodies, 6):
-        raise ValueError(f"wrenches must have shape ({layout.bodies}, 6), got {given.shape}")
+    shape = (layout.bodies, 6)
+    given = jnp.zeros(shape) if wrenches is None else checked_array("wrenches", wrenches, shape)
+    given = given.astype(dtype)
     scene.check_state(state)
     assert state.q is not None
     force, torque, _, rows = _needed(scene, state, _checked_acceleration(scene, acceleration))
@@ -118,7 +131,18 @@ def joint_control(scene: Scene, effort: Float[Array, " k"]) -> Control:
     Args:
         scene: The scene.
         effort: Of the joints alone, or generalised forces, whose last entries are those of the joints.
+
+    Raises:
+        ValueError: If there are fewer or more efforts, or one is not finite.
     """
+    checked_kind("scene", scene, Scene)
+    effort = checked_floating("effort", effort)
+    sizes = {scene.layout.n_joints, scene.layout.n_velocities}
+    if effort.shape not in {(size,) for size in sizes}:
+        raise ValueError(
+            f"effort must have shape ({' or '.join(map(str, sorted(sizes)))},), got {effort.shape}"
+        )
+    effort = checked_array("effort", effort, effort.shape)
     still = jnp.zeros((len(scene.bodies), 3), scene.timestep.dtype)
     return Control(still, still, effort[effort.shape[0] - scene.layout.n_joints :])
 
@@ -132,6 +156,7 @@ def generalised_velocities(scene: Scene, state: State) -> Float[Array, " k"]:
 
 def _masses(scene: Scene) -> tuple[Float[Array, " m"], Float[Array, "m 3 3"], np.ndarray]:
     """Mass [kg] and inertia [kg m², B] of the bodies that move, and which they are."""
+    checked_kind("scene", scene, Scene)
     rows = np.array(scene.layout.moving, int)
     bodies = [scene.bodies[i] for i in rows]
     dtype = scene.timestep.dtype
@@ -141,10 +166,8 @@ def _masses(scene: Scene) -> tuple[Float[Array, " m"], Float[Array, "m 3 3"], np
 
 
 def _checked_acceleration(scene: Scene, acceleration: Numbers) -> Float[Array, " k"]:
-    wanted = jnp.asarray(acceleration, scene.timestep.dtype)
-    if wanted.shape != (scene.layout.n_velocities,):
-        raise ValueError(f"acceleration must have shape ({scene.layout.n_velocities},), got {wanted.shape}")
-    return wanted
+    wanted = checked_array("acceleration", acceleration, (scene.layout.n_velocities,))
+    return wanted.astype(scene.timestep.dtype)
 
 
 def _needed(scene: Scene, state: State, acceleration: Float[Array, " k"]):

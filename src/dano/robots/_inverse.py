@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_count, checked_items, checked_number, checked_text
 from dano.maths import checked_array, checked_quaternion, Numbers, quat_conjugate, quat_log, quat_multiply
 from dano.names import did_you_mean
 from dano.robots._loops import close_loops, loop_gaps
-from dano.robots._robot import Robot
+from dano.robots._robot import check_arguments, Robot
 from dano.scene import Scene, State
 from dano.solvers import bounded_least_squares, NormalEquations
 
@@ -52,6 +53,7 @@ class Target(eqx.Module):
         Raises:
             ValueError: If neither a position nor an orientation is given, or a number is wrong.
         """
+        checked_text("link", link)
         if position is None and orientation is None:
             raise ValueError(f"target of link {link!r} must have a position or an orientation, got neither")
         self.link = link
@@ -60,8 +62,8 @@ class Target(eqx.Module):
         self.orientation = (
             None if orientation is None else checked_quaternion(f"orientation {what}", orientation)
         )
-        self.weight = checked_array(f"weight {what}", weight, ())
-        self.length = checked_array(f"length {what}", length, ())
+        self.weight = checked_array(f"weight {what}", weight, (), least=0.0)
+        self.length = checked_array(f"length {what}", length, (), above=0.0)
 
 
 class InverseKinematics(NamedTuple):
@@ -112,13 +114,16 @@ def inverse_kinematics(
     Raises:
         ValueError: If there is no target, a link is unknown, or a shape is wrong.
     """
+    check_arguments(robot, scene, state)
+    targets = checked_items("targets", targets, Target)
     if not targets:
         raise ValueError("targets must hold at least one, got none")
+    posture_weight = checked_number("posture_weight", posture_weight, least=0)
+    max_iterations = checked_count("max_iterations", max_iterations)
     for target in targets:
         if target.link not in robot.frames:
             hint = did_you_mean(target.link, robot.frames)
             raise ValueError(f"target must name one of {list(robot.frames)}, got {target.link!r}{hint}")
-    scene.check_state(state)
     if state.q is None or not scene.layout.n_joints:
         raise ValueError("scene must have joints with coordinates to move, got none")
     k = scene.layout.n_joints

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_items, checked_kind
 from dano.names import did_you_mean
 from dano.scene import Scene, State
 
@@ -25,6 +26,7 @@ def loop_gaps(scene: Scene, state: State) -> Float[Array, " c"]:
     Raises:
         ValueError: If the state does not fit the scene, or it has no loops.
     """
+    checked_kind("scene", scene, Scene)
     loops = scene.closing
     if loops is None:
         raise ValueError("scene must have loops, got none")
@@ -48,6 +50,7 @@ def close_loops(scene: Scene, state: State, hold: Sequence[str] = ()) -> State:
             how much.
     """
     gaps = loop_gaps(scene, state)
+    hold = checked_items("hold", hold, str)
     moves = _free_columns(scene, hold)
     limit = _CLOSED if gaps.dtype == jnp.float64 else _FLOAT32
     assert state.q is not None and state.v is not None

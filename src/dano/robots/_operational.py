@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dano.maths import Numbers
+from dano.checks import checked_number
+from dano.maths import checked_array, checked_floating, Numbers
 from dano.robots._dynamics import bias_forces, drifted, generalised_velocities, mass_matrix
-from dano.robots._robot import Robot
+from dano.robots._robot import check_arguments, Robot
 from dano.scene import Scene, State
 
 
@@ -42,15 +43,15 @@ def operational_space_torque(
     Raises:
         ValueError: If the link is unknown, a shape is wrong, or `softness` < 0.
     """
+    check_arguments(robot, scene, state)
     dtype, k = scene.timestep.dtype, scene.layout.n_velocities
-    wanted = jnp.asarray(acceleration, dtype)
+    wanted = checked_floating("acceleration", acceleration)
     if wanted.shape not in ((3,), (6,)):
         raise ValueError(f"acceleration must have shape (3,) or (6,), got {wanted.shape}")
-    free = jnp.zeros(k, dtype) if posture is None else jnp.asarray(posture, dtype)
-    if free.shape != (k,):
-        raise ValueError(f"posture must have shape ({k},), got {free.shape}")
-    if not softness >= 0:
-        raise ValueError(f"softness must be ≥ 0, got {softness}")
+    wanted = checked_array("acceleration", wanted, wanted.shape).astype(dtype)
+    free = jnp.zeros(k) if posture is None else checked_array("posture", posture, (k,))
+    free = free.astype(dtype)
+    checked_number("softness", softness, least=0)
     n, speeds = wanted.shape[0], generalised_velocities(scene, state)
     jacobian = robot.place(scene, state, link)[2][:n]
 

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_items, checked_kind
 from dano.contact import ContactParams
-from dano.maths import Numbers, quat_multiply, quat_rotate
+from dano.maths import checked_array, checked_floating, Numbers, quat_multiply, quat_rotate
 from dano.names import did_you_mean
 from dano.robots._description import Description
 from dano.scene import Body, Contact, Joint, Loop, Scene, State
@@ -65,9 +66,11 @@ class Robot:
         Raises:
             ValueError: As `Scene.create`.
         """
+        bodies, joints = checked_items("bodies", bodies, Body), checked_items("joints", joints, Joint)
+        loops = checked_items("loops", loops, Loop)
         return Scene.create(
             [*self.bodies, *bodies],
-            list(contacts),
+            contacts,
             joints=[*self.joints, *joints],
             loops=[*self.loops, *loops],
             **options,
@@ -88,12 +91,15 @@ class Robot:
             v: Their velocities.
 
         Raises:
-            ValueError: If a joint is unknown.
+            ValueError: If a joint is unknown, or a number is not finite.
         """
         given: dict[str, dict[str, Numbers]] = {}
-        for key, values in (("q", q or {}), ("v", v or {})):
+        for key, values in (("q", q), ("v", v)):
+            values = {} if values is None else checked_kind(key, values, Mapping)
             for name, value in values.items():
-                given.setdefault(self.body_of(name), {})[key] = value
+                body, what = self.body_of(name), f"{key} of joint {name!r}"
+                numbers = checked_floating(what, value)
+                given.setdefault(body, {})[key] = checked_array(what, numbers, numbers.shape)
         first = self.bodies[0]
         if first.fixed and self.base is not None:
             position, orientation = (jnp.asarray(x) for x in self.base)
@@ -113,6 +119,7 @@ class Robot:
         Raises:
             ValueError: If a joint is unknown, or as `Scene.initial_state`.
         """
+        checked_kind("scene", scene, Scene)
         return scene.initial_state(**self.start(q, v), **others)
 
     def body_of(self, joint: str) -> str:
@@ -121,7 +128,7 @@ class Robot:
         Raises:
             ValueError: If there is none with coordinates of its own.
         """
-        if joint not in self.joint_names:
+        if not isinstance(joint, str) or joint not in self.joint_names:
             hint = did_you_mean(joint, self.joint_names)
             raise ValueError(f"joint must be one of {list(self.joint_names)}, got {joint!r}{hint}")
         return self.joint_names[joint]
@@ -143,7 +150,8 @@ class Robot:
         Raises:
             ValueError: If the link is unknown.
         """
-        if link not in self.frames:
+        check_arguments(self, scene, state)
+        if not isinstance(link, str) or link not in self.frames:
             raise ValueError(
                 f"link must be one of {list(self.frames)}, got {link!r}{did_you_mean(link, self.frames)}"
             )
@@ -159,3 +167,14 @@ class Robot:
         velocities = frames.jacobian[i, :3].T + jnp.cross(spins, arm[None])
         jacobian = jnp.concatenate([velocities, spins], axis=1).T
         return frames.position[i] + arm, quat_multiply(q, own[1]), jacobian
+
+
+def check_arguments(robot: Robot, scene: Scene, state: State) -> None:
+    """Check what verbs of robots are called with.
+
+    Raises:
+        ValueError: If one is of another kind, or the state does not fit the scene.
+    """
+    checked_kind("robot", robot, Robot)
+    checked_kind("scene", scene, Scene)
+    scene.check_state(state)

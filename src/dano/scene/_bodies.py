@@ -1,19 +1,15 @@
 """Bodies: geometry, mass properties, and a name."""
 
-from collections.abc import Iterable
-from typing import TypeVar
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_optional, checked_text
 from dano.contact import Collider, ContactParams, Part, SampleSet, Support, SurfaceSet
 from dano.fields import AbstractField, AbstractShape, Ellipsoid, SignedDistanceGrid, Sphere
-from dano.maths import checked_array, floating, is_traced, Numbers
+from dano.maths import checked_array, floating, Numbers
 from dano.objects import checked_inertia, MassProperties, NeuralObject
-
-P = TypeVar("P")
 
 # Orientations over which the support of a body is sampled.
 ORIENTATIONS = 256
@@ -96,11 +92,9 @@ class Body(eqx.Module):
             ValueError: If the name is empty, the geometry is no shape or object, or a mass property is
                 missing or out of range.
         """
-        if not isinstance(name, str) or not name:
-            raise ValueError(f"name must be a non-empty string, got {name!r}")
-        self.name = name
+        self.name = checked_text("name", name)
         self.fixed = bool(fixed)
-        self.material = material
+        self.material = checked_optional(f"material of body {name!r}", material, ContactParams)
         self.samples = self.support = self.surface = self.extent = self.object = self.shape = None
         self.density_scale = floating(1.0)
         if isinstance(geometry, NeuralObject):
@@ -118,12 +112,10 @@ class Body(eqx.Module):
                 f"geometry of body {name!r} must be a NeuralObject or a shape, "
                 f"got {type(geometry).__name__}; a field becomes an object by NeuralObject.from_field"
             )
+        mass = None if mass is None else checked_array(f"mass of body {name!r}", mass, (), above=0.0)
         properties = _properties(name, geometry, (mass, com, inertia), self.fixed)
         share = 1.0
         if mass is not None:
-            mass = checked_array(f"mass of body {name!r}", mass, ())
-            if not is_traced(mass) and not float(mass) > 0:
-                raise ValueError(f"mass of body {name!r} must be > 0 kg, got {float(mass)}")
             share = mass / properties.mass
         self.mass = properties.mass if mass is None else mass
         self.inertia = (
@@ -132,9 +124,7 @@ class Body(eqx.Module):
             else checked_inertia(f"inertia of body {name!r}", inertia)
         )
         self.com = properties.com if com is None else checked_array(f"com of body {name!r}", com, (3,))
-        self.mass_scale = checked_array(f"mass_scale of body {name!r}", mass_scale, ())
-        if not is_traced(self.mass_scale) and not float(self.mass_scale) > 0:
-            raise ValueError(f"mass_scale of body {name!r} must be > 0, got {float(self.mass_scale)}")
+        self.mass_scale = checked_array(f"mass_scale of body {name!r}", mass_scale, (), above=0.0)
         self.com_offset = checked_array(f"com_offset of body {name!r}", com_offset, (3,))
 
     @property
@@ -293,20 +283,3 @@ def _homogeneous(name: str, shape: AbstractShape, mass: float) -> MassProperties
         return MassProperties.from_field(shape, mass=mass)
     second = np.asarray(moments.second_moment) * (mass / float(moments.volume))
     return MassProperties(mass, moments.centroid, np.trace(second) * np.eye(3) - second)
-
-
-def checked_parts(name: str, parts: Iterable[object], kind: type[P]) -> tuple[P, ...]:
-    """What a scene is made of, if all of it is of one kind.
-
-    Raises:
-        ValueError: If something else is among it.
-    """
-    found = []
-    for part in parts:
-        if not isinstance(part, kind):
-            raise ValueError(
-                f"{name} must hold dano.{kind.__name__} objects only,"
-                f" got {part!r} of type {type(part).__name__}"
-            )
-        found.append(part)
-    return tuple(found)

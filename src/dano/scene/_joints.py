@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_choice, checked_optional, checked_text
 from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
 from dano.names import did_you_mean
 from dano.scene._loops import Loop
@@ -95,8 +96,11 @@ class Joint(eqx.Module):
             ValueError: If the kind is unknown, a body hangs on itself, the axis or the orientation is zero, a
                 shape is wrong, a number is out of range, or the kind has no such thing.
         """
-        if kind not in JOINT_KINDS:
-            raise ValueError(f"kind must be one of {', '.join(JOINT_KINDS)}, got {kind!r}")
+        checked_choice("kind", kind, JOINT_KINDS)
+        checked_text("child", child)
+        for name, other in (("parent", parent), ("mimics", mimics)):
+            if other is not None:
+                checked_text(name, other)
         if parent == child:
             raise ValueError(f"joint must join two different bodies, got {child!r} twice")
         self.parent, self.child, self.kind = parent, child, kind
@@ -109,18 +113,16 @@ class Joint(eqx.Module):
         self.anchor = checked_array(f"anchor {what}", anchor, (3,))
         self.position = checked_array(f"position {what}", position, (3,))
         self.orientation = checked_quaternion(f"orientation {what}", orientation)
-        self.damping = _not_negative(f"damping {what}", damping)
+        self.damping = checked_array(f"damping {what}", damping, (), least=0.0)
         self.friction, self.armature, self.stiffness = (
-            None if value is None else _not_negative(f"{name} {what}", value)
+            None if value is None else checked_array(f"{name} {what}", value, (), least=0.0)
             for name, value in (("friction", friction), ("armature", armature), ("stiffness", stiffness))
         )
         self.limits = None if limits is None else checked_limits(f"limits {what}", limits)
         self.rest = checked_array(f"rest {what}", rest, ())
         self.ratio = checked_array(f"ratio {what}", ratio, ())
         self.shift = checked_array(f"shift {what}", shift, ())
-        if motor is not None and not isinstance(motor, Motor):
-            raise ValueError(f"motor {what} must be a dano.Motor, got {type(motor).__name__}")
-        self.mimics, self.motor = mimics, motor
+        self.mimics, self.motor = mimics, checked_optional(f"motor {what}", motor, Motor)
         self._check_kind(what)
 
     def _check_kind(self, what: str) -> None:
@@ -141,13 +143,6 @@ class Joint(eqx.Module):
 
 
 _LAWS = ("limits", "friction", "armature", "stiffness", "motor")
-
-
-def _not_negative(name: str, value: Numbers) -> Float[Array, ""]:
-    array = checked_array(name, value, ())
-    if not is_traced(array) and float(array) < 0:
-        raise ValueError(f"{name} must be ≥ 0, got {float(array)}")
-    return array
 
 
 class Layout(NamedTuple):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_choice, checked_text
 from dano.maths import checked_array, checked_quaternion, Numbers, quat_conjugate, quat_multiply, quat_rotate
 from dano.names import did_you_mean
 
@@ -50,8 +51,10 @@ class Loop(eqx.Module):
         Raises:
             ValueError: If the kind is unknown, both bodies are one, a shape is wrong or a quaternion is zero.
         """
-        if kind not in LOOP_KINDS:
-            raise ValueError(f"kind of a loop must be one of {', '.join(LOOP_KINDS)}, got {kind!r}")
+        checked_choice("kind", kind, LOOP_KINDS)
+        checked_text("second", second)
+        if first is not None:
+            checked_text("first", first)
         if first == second:
             raise ValueError(f"loop must join two different bodies, got {second!r} twice")
         self.first, self.second, self.kind = first, second, kind

@@ -1,11 +1,11 @@
 """What drives joints: commands of a step become torques or forces, within limits and through a gear."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.maths import checked_array, is_traced, Numbers
+from dano.checks import checked_choice
+from dano.maths import checked_array, checked_floating, is_traced, Numbers
 
 MOTOR_KINDS = ("effort", "position", "velocity")
 """What the command of a motor is: a torque or force, a place to go to, or a speed to keep."""
@@ -51,8 +51,7 @@ class Motor(eqx.Module):
             ValueError: If the kind is unknown, a number is out of range, the gear is zero, or what the kind
                 needs is missing.
         """
-        if kind not in MOTOR_KINDS:
-            raise ValueError(f"kind of motor must be one of {', '.join(MOTOR_KINDS)}, got {kind!r}")
+        checked_choice("kind of motor", kind, MOTOR_KINDS)
         self.kind = kind
         self.stiffness = checked_array("stiffness of motor", stiffness, ())
         self.damping = checked_array("damping of motor", damping, ())
@@ -77,7 +76,7 @@ def checked_limits(name: str, value: Numbers) -> Float[Array, "2"]:
     Raises:
         ValueError: If they are not.
     """
-    limits = jnp.asarray(value, jnp.result_type(float)) if not is_traced(value) else jnp.asarray(value)
+    limits = checked_floating(name, value)
     if limits.shape != (2,):
         raise ValueError(f"{name} must be two numbers, got shape {limits.shape}")
     if not is_traced(limits) and not np.less_equal(*np.asarray(limits)):

@@ -2,7 +2,7 @@
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import equinox as eqx
 import jax
@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import shown
 from dano.contact import combined, ContactParams, DistributedLaw, Setting
 from dano.scene._bodies import Body
 from dano.scene._contacts import check_objects, checked_support, Contact, heaviest, with_surface
@@ -71,7 +72,11 @@ def others_of(
         if given is not None:
             law.check(given)
     names = [body.name for body in bodies]
+    if isinstance(apart, str) or not isinstance(apart, Iterable):
+        raise ValueError(f"apart must be pairs of names of bodies, got {shown(apart)}")
     for pair in apart:
+        if isinstance(pair, str) or not isinstance(pair, Sequence) or len(pair) != 2:
+            raise ValueError(f"apart must hold pairs of names of bodies, got {shown(pair)}")
         for name in pair:
             if name not in names:
                 raise ValueError(f"apart must name bodies of the scene {names}, got {name!r}")

@@ -1,18 +1,19 @@
 """Scenes: bodies, the contacts between them, a timestep and gravity."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.checks import checked_items, checked_kind, checked_optional, shown
 from dano.contact import checked_parameter, ContactParams
 from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
 from dano.notebook import card, cloud
 from dano.objects import checked_inertia
-from dano.scene._bodies import Body, checked_parts
+from dano.scene._bodies import Body
 from dano.scene._contacts import Contact, prepared
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
 from dano.scene._joints import Joint, Layout, layout_of
@@ -89,14 +90,13 @@ class Scene(eqx.Module):
                 or a pair twice, a pair cannot overlap, joints make no trees, a loop closes no chain, no
                 pair uses a material, or a number is out of range.
         """
-        bodies = checked_parts("bodies", bodies, Body)
-        contacts = checked_parts("contacts", contacts, Contact)
-        joints = checked_parts("joints", joints, Joint)
-        loops = checked_parts("loops", loops, Loop)
+        bodies = checked_items("bodies", bodies, Body)
+        contacts = checked_items("contacts", contacts, Contact)
+        joints = checked_items("joints", joints, Joint)
+        loops = checked_items("loops", loops, Loop)
+        checked_optional("others", others, ContactParams)
         check_names(bodies)
-        timestep = checked_array("timestep", timestep, ())
-        if not is_traced(timestep) and not float(timestep) > 0:
-            raise ValueError(f"timestep must be > 0 s, got {float(timestep)}")
+        timestep = checked_array("timestep", timestep, (), above=0.0)
         check_contacts(bodies, joints, contacts)
         children = layout_of(*structure(bodies, joints)).children
         check_loops([body.name for body in bodies], children, loops)
@@ -321,7 +321,7 @@ class Scene(eqx.Module):
             "omega": (0.0,) * 3,
         }
         for i, name in enumerate(self.names):
-            given = bodies.get(name, {})
+            given = _given("state", name, bodies)
             valid = _state_keys(layout, i)
             for key in given:
                 if key not in valid:
@@ -341,14 +341,22 @@ class Scene(eqx.Module):
         """The state with the rows of bodies on joints as `q` and `v` say; for one state.
 
         What starts a simulation does this itself: it is for those who change `q` or `v` and look at poses.
+
+        Raises:
+            ValueError: If the state does not fit the scene.
         """
+        self.check_state(state)
         return filled(self.chains, state, self.timestep)
 
     def joint_values(self, state: State) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
         """Coordinates q and velocities v of the joints that poses and velocities of the bodies have.
 
         Angles are between −π and π; what the joints do not allow is left out.
+
+        Raises:
+            ValueError: If the state is none, or not one of this scene's bodies.
         """
+        self._check_bodies(state)
         return joint_values(self.chains, state)
 
     def frames(self, state: State) -> Frames:
@@ -385,17 +393,7 @@ class Scene(eqx.Module):
             ValueError: If it is no state, a shape or dtype is wrong, a number is not finite, or a quaternion
                 is not of unit length.
         """
-        if not isinstance(state, State):
-            raise ValueError(f"state must be a dano.State, got {type(state).__name__}")
-        check_precision(state, self.timestep.dtype)
-        for key, size in STATE_SIZES.items():
-            value = getattr(state, key)
-            if value.shape[-2:] != (len(self.bodies), size):
-                raise ValueError(
-                    f"state.{key} must have shape (…, {len(self.bodies)}, {size}), got {value.shape}"
-                )
-            if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
-                raise ValueError(f"state.{key} must be finite, got {np.asarray(value).tolist()}")
+        self._check_bodies(state)
         for key in JOINT_QUANTITIES:
             value = getattr(state, key)
             if not self.joints and value is None:
@@ -405,11 +403,24 @@ class Scene(eqx.Module):
                 got = None if value is None else value.shape
                 raise ValueError(f"state.{key} must have shape {expected}, got {got}")
             if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
-                raise ValueError(f"state.{key} must be finite, got {np.asarray(value).tolist()}")
+                raise ValueError(f"state.{key} must be finite, got {shown(np.asarray(value).tolist())}")
         if not is_traced(state.orientation):
             norms = np.linalg.norm(np.asarray(state.orientation), axis=-1)
             if np.any(np.abs(norms - 1) > 1e-3):
                 raise ValueError(f"state.orientation must hold unit quaternions, got norms {norms.tolist()}")
+
+    def _check_bodies(self, state: State) -> None:
+        """Check what a state says of bodies."""
+        checked_kind("state", state, State)
+        check_precision(state, self.timestep.dtype)
+        for key, size in STATE_SIZES.items():
+            value = getattr(state, key)
+            if value.shape[-2:] != (len(self.bodies), size):
+                raise ValueError(
+                    f"state.{key} must have shape (…, {len(self.bodies)}, {size}), got {value.shape}"
+                )
+            if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
+                raise ValueError(f"state.{key} must be finite, got {shown(np.asarray(value).tolist())}")
 
     def control(self, /, **bodies: dict[str, Numbers]) -> Control:
         """Control for one step: bodies by keyword, each a dict of `force` [N, W] and `torque` [N m, W].
@@ -425,7 +436,7 @@ class Scene(eqx.Module):
             self.index(name)
         layout = self.layout
         for i, name in enumerate(self.names):
-            given = bodies.get(name, {})
+            given = _given("control", name, bodies)
             joint = layout.joint_of(i)
             driven = joint is not None and layout.width(joint) > 0
             valid = [*rows, *(["effort"] if driven else [])]
@@ -442,6 +453,14 @@ class Scene(eqx.Module):
             keys = ("effort", "command") if self.driven else ("effort",)
             of_joints = self._joint_values(bodies, keys)
         return Control(jnp.stack(rows["force"]), jnp.stack(rows["torque"]), **of_joints)
+
+
+def _given(what: str, name: str, bodies: dict[str, dict[str, Numbers]]) -> dict[str, Numbers]:
+    """What was given of a body, by quantity."""
+    given = bodies.get(name, {})
+    if not isinstance(given, Mapping):
+        raise ValueError(f"{what} of {name!r} must be a dict such as dict(…=…), got {shown(given)}")
+    return dict(given)
 
 
 def _state_keys(layout: Layout, body: int) -> list[str]:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.building import BuildOptions
+from dano.checks import checked_path
 from dano.fields import AbstractField, AbstractShape, load_field, scaled
 from dano.names import did_you_mean
 from dano.objects import field_size, NeuralObject
@@ -101,6 +102,7 @@ def load_object(source: str | os.PathLike[str], *, progress: Progress | None = N
     Raises:
         ValueError: If there is neither such a file nor such a name, or the file is not a neural object.
     """
+    checked_path("source", source)
     if str(source) in ASSETS and not os.path.exists(source):
         return build_asset(str(source), progress=progress)
     if not os.path.exists(source) and not Path(source).suffix:

@@ -13,6 +13,7 @@ from typing import Any, cast, get_args, TYPE_CHECKING
 
 from dano.archive import checked_input
 from dano.building import BuildOptions
+from dano.checks import checked_choice, checked_count, checked_number, shown
 from dano.contact import AbstractContactLaw, CentroidLaw, ContactParams, DistributedLaw
 from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSpace, load_field, posed, Sphere
 from dano.maths import Pose
@@ -208,14 +209,21 @@ def parse_scene(
     Raises:
         ValueError: As `load_scene`.
     """
-    if default_law not in _LAWS:
-        raise ValueError(f"default_law must be one of {', '.join(_LAWS)}, got {default_law!r}")
+    checked_choice("default_law", default_law, list(_LAWS))
+    if not isinstance(text, str):
+        raise ValueError(f"text must be that of a TOML scene file, got {shown(text)}")
+    if n_steps is not None:
+        n_steps = checked_count("n_steps", n_steps)
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path} must be a TOML scene file: {error}") from error
     top = Table(str(path), data, _TOP)
-    h = top.number("timestep", 0.01) if timestep is None else timestep
+    h = (
+        top.number("timestep", 0.01)
+        if timestep is None
+        else checked_number("timestep", timestep, above=0, unit="s")
+    )
     if not (math.isfinite(h) and h > 0):
         raise ValueError(f"{path}: timestep must be finite and > 0 s, got {h}")
     steps = _steps(top, h) if n_steps is None else n_steps

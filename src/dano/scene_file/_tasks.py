@@ -20,7 +20,8 @@ _TOP = ("duration", "n_steps", "actuators", "goals", "limits", "search")
 _ACTUATOR = ("body", "kind", "limit", "lower", "upper", "axes", "cost", "start")
 _GOAL = ("body", *QUANTITIES, "running", "final", "required", "within", "axes")
 _LIMIT = ("body", "quantity", "lower", "upper", "axes")
-_SEARCH = ("method", "explore", "softening", "seed", "max_seconds", "max_iterations", "passes", "samples")
+_SEARCH_COUNTS = ("max_iterations", "passes", "samples", "knots")
+_SEARCH = ("method", "explore", "softening", "seed", "max_seconds", *_SEARCH_COUNTS, "deviation")
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,8 @@ class Search:
         max_iterations: Of an inner minimum; None: the default.
         passes: Of sampling; None: the default.
         samples: In a pass; None: the default.
+        knots: Moments at which they draw; None: the default.
+        deviation: First deviation, as a share of the bounds; None: the default.
     """
 
     method: Method
@@ -46,6 +49,8 @@ class Search:
     max_iterations: int | None
     passes: int | None
     samples: int | None
+    knots: int | None
+    deviation: float | None
 
 
 @dataclass(frozen=True)
@@ -198,7 +203,7 @@ def _limit(table: Table, scene: Scene) -> Limit:
 def _search(top: Table) -> Search:
     table = top.table("search", _SEARCH)
     counts: dict[str, int | None] = {}
-    for key in ("max_iterations", "passes", "samples"):
+    for key in _SEARCH_COUNTS:
         counts[key] = table.integer(key, 1) if key in table else None
         least = 4 if key == "samples" else 1
         if key in table and cast(int, counts[key]) < least:
@@ -213,5 +218,9 @@ def _search(top: Table) -> Search:
     seconds = table.number("max_seconds") if "max_seconds" in table else None
     if seconds is not None and seconds <= 0:
         raise table.wrong("max_seconds", "> 0 s")
+    deviation = table.number("deviation") if "deviation" in table else None
+    if deviation is not None and deviation <= 0:
+        raise table.wrong("deviation", "> 0")
     method = cast(Method, table.word("method", METHODS, "ilqr"))
-    return Search(method, explore, softening, table.integer("seed", 0), seconds, **counts)
+    seed = table.integer("seed", 0)
+    return Search(method, explore, softening, seed, seconds, **counts, deviation=deviation)

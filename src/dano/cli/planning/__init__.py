@@ -1,5 +1,6 @@
 """`dano plan`."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dano import scene_file
+from dano.checks import checked_number
 from dano.cli._arguments import Plan
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
@@ -24,6 +26,7 @@ def plan(command: Plan) -> None:
             if missing := missing_for_pictures(video=name == "video"):
                 raise ImportError(missing)
     check_distinct(output=command.output, **pictures)
+    checked_number("slow_motion", command.slow_motion, above=0)
     # An interrupted search returns its best so far.
     progress = Progress(stops=False)
     loaded = scene_file.load_scene(command.scene, progress=progress)
@@ -53,8 +56,8 @@ def _found(loaded, given, command: Plan, progress: Progress) -> Planned:
     if search.max_iterations is not None:
         options = options._replace(max_iterations=search.max_iterations)
     sampling = SamplingOptions(max_seconds=search.max_seconds)
-    counts = {name: getattr(search, name) for name in ("passes", "samples")}
-    sampling = sampling._replace(**{name: n for name, n in counts.items() if n is not None})
+    counts = {name: getattr(search, name) for name in ("passes", "samples", "knots", "deviation")}
+    sampling = dataclasses.replace(sampling, **{name: n for name, n in counts.items() if n is not None})
     most = options.max_iterations * options.max_updates
 
     def tell(stage: str, iteration: int, cost: float) -> bool:

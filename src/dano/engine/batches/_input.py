@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dano.checks import checked_count
 from dano.engine._rollout import _check_control, AbstractEngine
 from dano.engine.batches._kernel import Inputs, Kept, Program
 from dano.maths import is_traced
@@ -107,13 +108,13 @@ def checked_job(
     examples, by_row = _scenes(scene, parameters)
     _check_states(examples, states)
     n_steps = _checked_steps(examples[0], controls, n_steps)
+    every, first, steps = _kept_steps(keep, n_steps)
     many_controls = isinstance(controls, Control) and controls.force.ndim == 4
     marks = (by_row, parameters is not None, states.position.ndim == 3, many_controls, False)
     inputs = Inputs(scene, parameters, states, controls, engine)
     n_rollouts = _agreed(
         {name: part for name, part, mark in zip(Inputs._fields, inputs, marks, strict=True) if mark}
     )
-    every, first, steps = _kept_steps(keep, n_steps)
     arrays, static = eqx.partition(inputs, _is_array)
     by_rollout = Inputs(
         *(jax.tree.map(lambda _, m=mark: m, part) for part, mark in zip(arrays, marks, strict=True))
@@ -220,9 +221,7 @@ def _checked_steps(scene: Scene, controls: Any, n_steps: int | None) -> int:
             )
         n_steps = controls.force.shape[-3] if n_steps is None else n_steps
         _check_control(scene, controls, (*controls.force.shape[:-3], n_steps))
-    if n_steps is None or n_steps < 1:
-        raise ValueError(f"n_steps must be ≥ 1, got {n_steps}")
-    return n_steps
+    return checked_count("n_steps", n_steps)
 
 
 def _kept_steps(keep: str | int, n_steps: int) -> tuple[int, bool, np.ndarray]:

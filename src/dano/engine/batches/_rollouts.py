@@ -13,7 +13,8 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.engine._rollout import AbstractEngine, Policy, VariationalEngine
+from dano.checks import checked_count, checked_function, checked_path
+from dano.engine._rollout import AbstractEngine, checked_engine, Policy
 from dano.engine.batches._devices import device_mesh, gather, meet, put_rows, put_whole, take_rows
 from dano.engine.batches._input import checked_job, Job
 from dano.engine.batches._kernel import Kept, simulate_rows
@@ -203,9 +204,14 @@ def rollouts(
         ImportError: With `path` and without the extra `batch`.
     """
     mesh = device_mesh(devices)
-    if batch_size is not None and batch_size < 1:
-        raise ValueError(f"batch_size must be ≥ 1, got {batch_size}")
-    job = checked_job(scene, states, n_steps, parameters, controls, engine or VariationalEngine(), keep)
+    for name, size in (("batch_size", batch_size), ("chunk_size", chunk_size)):
+        if size is not None:
+            checked_count(name, size)
+    if path is not None:
+        checked_path("path", path)
+    if progress is not None:
+        checked_function("progress", progress)
+    job = checked_job(scene, states, n_steps, parameters, controls, checked_engine(engine), keep)
     batch, chunk = _sizes(job, mesh, batch_size, chunk_size)
     tell = progress or (lambda description, share: None)
     if path is None:
@@ -230,7 +236,7 @@ def _sizes(job: Job, mesh: Mesh, batch_size: int | None, chunk_size: int | None)
         return batch, batch * max(1, batches)
     if batch_size is None:
         batch = min(batch, chunk_size)
-    if chunk_size < 1 or chunk_size % batch:
+    if chunk_size % batch:
         raise ValueError(f"chunk_size must be a multiple of batch_size = {batch}, got {chunk_size}")
     return batch, chunk_size
 

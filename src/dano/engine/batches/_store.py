@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from dano.archive import checked_output
+from dano.checks import checked_path
 from dano.engine.batches._input import Job
 from dano.engine.batches._kernel import Kept
 from dano.scene import state_arrays
@@ -49,7 +50,7 @@ class RolloutStore:
             ImportError: Without the extra `batch`.
         """
         zarr = _zarr()
-        target = Path(path)
+        target = checked_path("path", path)
         if not target.is_dir():
             raise ValueError(f"path must be a folder that rollouts wrote, got {target}")
         try:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dano.archive import FIELD, write_archive
+from dano.checks import checked_number, checked_path
 from dano.fields._base import AbstractField
 from dano.fields._callable import checked_bounds
 from dano.fields._compose import posed, scaled
@@ -124,18 +125,18 @@ def load_field(
             promises, or an option is not known; the message names the file and what was expected.
         ImportError: If reading it needs a package that is not installed, or a function cannot be imported.
     """
-    if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"scale must be finite and > 0, got {scale}")
+    scale = checked_number("scale", scale, above=0)
     if pose is not None and not isinstance(pose, Pose):
         raise ValueError(f"pose must be a dano.maths.Pose, got {type(pose).__name__}")
-    box = None if crop is None else np.asarray(checked_bounds(crop), np.float64)
+    box = None if crop is None else np.asarray(checked_bounds(crop, "crop"), np.float64)
     field = _read(path, box, options)
     field = scaled(field, scale) if scale != 1 else field
     return field if pose is None else posed(field, pose)
 
 
 def _read(path: str | Path, crop: np.ndarray | None, options: dict[str, Any]) -> AbstractField:
-    if path in SHIPPED and not Path(path).exists():
+    checked_path("path", path)
+    if str(path) in SHIPPED and not Path(path).exists():
         with as_file(files("dano") / "assets" / f"{path}.npz") as shipped:
             return _read(shipped, crop, options)
     if (
@@ -211,7 +212,7 @@ def save_field(field: GridField | SignedDistanceGrid, path: str | Path) -> None:
     Raises:
         ValueError: If `field` is no grid, or `path` does not end in .npz, is a folder, or lies in none.
     """
-    path = Path(path)
+    path = checked_path("path", path)
     if not isinstance(field, (GridField, SignedDistanceGrid)):
         raise ValueError(
             f"field must be a GridField or SignedDistanceGrid to be saved, got {type(field).__name__}:"

@@ -8,7 +8,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.maths import checked_array, is_traced, Numbers
+from dano.checks import checked_count, checked_number
+from dano.maths import checked_array, checked_numbers, is_traced, Numbers
 
 Slopes = TypeVar("Slopes", np.ndarray, Array)
 
@@ -90,14 +91,12 @@ class Camera(AbstractCamera):
             raise ValueError("position and look_at must be concrete: pictures are drawn on the host")
         self.position = np.asarray(checked_array("position", position, (3,)), dtype=np.float64)
         self.look_at = np.asarray(checked_array("look_at", look_at, (3,)), dtype=np.float64)
-        self.vertical_fov = float(vertical_fov)
-        self.width, self.height = int(width), int(height)
+        self.vertical_fov = checked_number("vertical_fov", vertical_fov)
+        self.width, self.height = checked_count("width", width), checked_count("height", height)
         if not np.linalg.norm(self.look_at - self.position) > 0:
             raise ValueError(f"look_at must differ from position, got {self.position.tolist()} twice")
         if not 0 < self.vertical_fov < math.pi:
             raise ValueError(f"vertical_fov must lie in (0, π) rad, got {vertical_fov}")
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"width and height must be ≥ 1 pixel, got {width} × {height}")
 
     @property
     def axes(self) -> Float[np.ndarray, "3 3"]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -225,7 +224,7 @@ class PosedCamera(AbstractCamera):
             ValueError: If the pose is no rotation and translation, a focal length is not positive, the image
                 is empty, or the distortion folds the image over itself.
         """
-        pose = np.asarray(camera_to_world, dtype=np.float64)
+        pose = checked_numbers("camera_to_world", camera_to_world)
         if pose.shape not in ((4, 4), (3, 4)) or not np.all(np.isfinite(pose)):
             raise ValueError(f"camera_to_world must be finite with shape (4, 4) or (3, 4), got {pose.shape}")
         rotation = pose[:3, :3]
@@ -237,8 +236,11 @@ class PosedCamera(AbstractCamera):
         u, _, vt = np.linalg.svd(rotation)
         self.axes = (u @ vt).T * np.array([1.0, 1.0, -1.0])[:, None]
         self.position = pose[:3, 3].copy()
-        self.focal = np.broadcast_to(np.asarray(focal, dtype=np.float64), (2,)).copy()
-        self.width, self.height = int(width), int(height)
+        lengths = checked_numbers("focal", focal)
+        if lengths.shape not in ((), (2,)):
+            raise ValueError(f"focal must be a number or two, one per axis, got shape {lengths.shape}")
+        self.focal = np.broadcast_to(lengths, (2,)).copy()
+        self.width, self.height = checked_count("width", width), checked_count("height", height)
         middle = (0.5 * self.width, 0.5 * self.height)
         self.centre = np.asarray(
             checked_array("centre", middle if centre is None else centre, (2,)), dtype=np.float64
@@ -246,8 +248,6 @@ class PosedCamera(AbstractCamera):
         self.distortion = np.asarray(checked_array("distortion", distortion, (5,)), dtype=np.float64)
         if not (np.all(np.isfinite(self.focal)) and np.all(self.focal > 0)):
             raise ValueError(f"focal must be positive [pixels], got {self.focal.tolist()}")
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"width and height must be ≥ 1 pixel, got {width} × {height}")
         if np.any(self.distortion):
             corners = np.array([[0, 0], [self.width, 0], [0, self.height], [self.width, self.height]])
             slopes = _undistorted((corners - self.centre) / self.focal, self.distortion)

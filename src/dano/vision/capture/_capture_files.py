@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from dano.checks import checked_count, checked_path
 from dano.vision.capture._camera import PosedCamera
 from dano.vision.capture._capture import Capture, SPLITS, View
 from dano.vision.capture._masks import cut_out
@@ -47,11 +48,10 @@ def load_capture(path: str | Path, *, hold_out: int | None = None, downscale: in
             the size that its camera states; the message names the file.
         ImportError: If pillow is missing.
     """
-    path = Path(path)
-    if hold_out is not None and hold_out < 0:
-        raise ValueError(f"hold_out must be ≥ 0, got {hold_out}")
-    if downscale < 1:
-        raise ValueError(f"downscale must be ≥ 1, got {downscale}")
+    path = checked_path("path", path)
+    if hold_out is not None:
+        checked_count("hold_out", hold_out, least=0)
+    checked_count("downscale", downscale)
     if not path.exists():
         raise ValueError(
             f"{path}: no such folder or file; expected a folder with transforms.json or anno.json"
@@ -83,7 +83,7 @@ def load_camera(path: str | Path, width: int, height: int) -> PosedCamera:
         ValueError: If the file is missing or lacks something, holds several frames, or the pictures have
             another shape.
     """
-    source = Path(path)
+    source = checked_path("path", path)
     content = _json(source)
     frames = content.get("frames", [])
     if "transform_matrix" not in content:

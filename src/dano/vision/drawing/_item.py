@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
+from dano.checks import checked_number, checked_optional
 from dano.fields import (
     AbstractField,
     AbstractShape,
@@ -101,9 +102,9 @@ class Item(eqx.Module):
             ("density_scale", density_scale),
             ("sharpness", sharpness),
         ):
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be positive and finite, got {value}")
-        self.pose = Pose() if pose is None else pose
+            if value is not None:
+                checked_number(name, value, above=0)
+        self.pose = checked_optional("pose", pose, Pose) or Pose()
         self.density_scale = 0.0 if density_scale is None else float(density_scale)
         self.shape = self.medium = self.model = None
         self.sharpness = 0.0
@@ -165,7 +166,7 @@ def placement(pose: Pose) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
     return rotation, np.asarray(pose.position, dtype=np.float64)
 
 
-def checked_colour(colour: str | Numbers) -> Float[np.ndarray, "3"]:
+def checked_colour(colour: str | Numbers, name: str = "colour") -> Float[np.ndarray, "3"]:
     """A colour as sRGB in [0, 1].
 
     Raises:
@@ -178,11 +179,11 @@ def checked_colour(colour: str | Numbers) -> Float[np.ndarray, "3"]:
         except ValueError:
             value = None
         if value is None or len(digits) != 6:
-            raise ValueError(f"colour must be '#rrggbb' or three numbers in [0, 1], got {colour!r}")
+            raise ValueError(f"{name} must be '#rrggbb' or three numbers in [0, 1], got {colour!r}")
         return value
-    value = np.asarray(checked_array("colour", colour, (3,)), dtype=np.float64)
+    value = np.asarray(checked_array(name, colour, (3,)), dtype=np.float64)
     if value.min() < 0 or value.max() > 1:
-        raise ValueError(f"colour must have numbers in [0, 1], got {value.tolist()}")
+        raise ValueError(f"{name} must have numbers in [0, 1], got {value.tolist()}")
     return value
 
 

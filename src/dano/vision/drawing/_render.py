@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 from scipy import ndimage
 
+from dano.checks import checked_items, checked_kind
 from dano.maths import checked_array, Numbers
 from dano.vision.capture import AbstractCamera, Camera
 from dano.vision.drawing._composed import part_of, radiance, reached_through, through
@@ -128,11 +129,8 @@ def render(
     Raises:
         ValueError: If an item is not an `Item`, the light is zero, or a colour is none.
     """
-    for i, item in enumerate(items):
-        if not isinstance(item, Item):
-            raise ValueError(
-                f"items[{i}] must be an Item (a field made ready for drawing), got {type(item).__name__}"
-            )
+    items = checked_items("items", items, Item)
+    checked_kind("camera", camera, AbstractCamera)
     view = _View(items, camera, _surroundings(camera, _focus(camera, items), light, background), floor)
     empty = _empty(view, camera)
     colour, touched = _radiance(view, empty.directions, empty.depth, empty.which, empty.colour)
@@ -163,7 +161,7 @@ def _surroundings(
         towards = np.asarray(checked_array("light", light, (3,)), dtype=np.float64)
         if not np.linalg.norm(towards) > 0:
             raise ValueError("light must be a direction other than zero, got (0, 0, 0)")
-    horizon = checked_colour("#eef0f2" if background is None else background)
+    horizon = checked_colour("#eef0f2" if background is None else background, "background")
     distance = float(np.linalg.norm(focus - camera.position))
     return Surroundings.create(towards, horizon, focus, distance, camera.pixel_angle)
 

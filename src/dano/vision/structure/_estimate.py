@@ -1,6 +1,7 @@
 """From pictures to cameras: the whole way."""
 
 import math
+import os
 import shutil
 import tempfile
 from collections.abc import Sequence
@@ -10,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
+from dano.checks import checked_items, checked_optional, checked_path
 from dano.progress import Progress
 from dano.vision.capture import PosedCamera
 from dano.vision.structure._colmap import colmap, opencv, quiet
@@ -120,7 +122,11 @@ def estimate_poses(
         ValueError: If there are too few pictures, or they show no cameras; says why.
         ImportError: If pycolmap, OpenCV or, for a video, av is missing.
     """
-    options = PoseOptions() if options is None else options
+    options = checked_optional("options", options, PoseOptions) or PoseOptions()
+    if isinstance(images, (str, os.PathLike)):
+        images = checked_path("images", images)
+    else:
+        images = checked_items("images", images, Path)
     told = (lambda _what, _share: None) if progress is None else progress
     # What is missing is said before work starts.
     colmap()

@@ -1,7 +1,11 @@
 """What is asked of structure from motion: every choice, with its default."""
 
 import dataclasses
-import math
+
+import numpy as np
+
+from dano.checks import checked_choice, checked_count, checked_kind, checked_number
+from dano.maths import checked_array, checked_numbers
 
 FEATURES_ON = ("auto", "everything", "object", "surroundings")
 UPS = ("auto", "marker", "plane", "cameras", "none")
@@ -37,12 +41,13 @@ class KnownLength:
         Raises:
             ValueError: If the length is not positive, or fewer than two pictures show its ends.
         """
-        if not (math.isfinite(self.length) and self.length > 0):
-            raise ValueError(f"length must be positive [m], got {self.length}")
+        checked_number("length", self.length, above=0)
+        checked_kind("ends", self.ends, dict)
+        for name, places in self.ends.items():
+            checked_array(f"ends in {name!r}", places, (4,))
         if len(self.ends) < 2:
             raise ValueError(f"ends must be given in two pictures at least, got {sorted(self.ends)}")
-        if not self.pixel_error > 0:
-            raise ValueError(f"pixel_error must be positive [pixels], got {self.pixel_error}")
+        checked_number("pixel_error", self.pixel_error, above=0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,26 +101,24 @@ class PoseOptions:
             ("up", UPS),
             ("marker_family", MARKERS),
         ):
-            if getattr(self, name) not in values:
-                raise ValueError(f"{name} must be one of {', '.join(values)}, got {getattr(self, name)!r}")
-        sizes = ("focal", "pixels", self.focals), ("marker_size", "m", (self.marker_size,))
-        for name, unit, values in sizes:
-            for value in values or ():
-                if value is not None and not (math.isfinite(value) and value > 0):
-                    raise ValueError(f"{name} must be positive [{unit}], got {value}")
+            checked_choice(name, getattr(self, name), list(values))
+        if self.focal is not None:
+            lengths = checked_numbers("focal", self.focal)
+            if lengths.shape not in ((), (2,)) or not np.all(np.isfinite(lengths) & (lengths > 0)):
+                raise ValueError(
+                    f"focal must be one number or two, finite and > 0 [pixels], got {self.focal}"
+                )
+        if self.marker_size is not None:
+            checked_number("marker_size", self.marker_size, above=0)
         for name in ("centre", "distortion"):
             if getattr(self, name) is not None and self.focal is None:
                 raise ValueError(f"{name} needs focal: only a lens that is known as a whole is kept as it is")
-        if not 100 <= self.features <= 20000:
-            raise ValueError(f"features must lie between 100 and 20000, got {self.features}")
-        if not FEWEST <= self.frames <= 2000:
-            raise ValueError(f"frames must lie between {FEWEST} and 2000, got {self.frames}")
+        checked_count("features", self.features, least=100, most=20000)
+        checked_count("frames", self.frames, least=FEWEST, most=2000)
         if self.up == "marker" and self.marker_size is None:
             raise ValueError("up='marker' needs marker_size, the side of the printed square [m]")
-        if self.model < 1:
-            raise ValueError(f"model must be ≥ 1, got {self.model}")
-        if self.seed < 0:
-            raise ValueError(f"seed must be ≥ 0, got {self.seed}")
+        checked_count("model", self.model)
+        checked_count("seed", self.seed, least=0)
 
     @property
     def focals(self) -> tuple[float, float] | None:

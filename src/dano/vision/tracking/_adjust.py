@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from dano.checks import checked_kind
 from dano.progress import Progress
 from dano.vision.capture import Light, PosedCamera
 from dano.vision.radiance import LearnedField
@@ -58,6 +59,9 @@ def adjust_poses(
         ValueError: If arrays or camera do not fit the film, there is no mask to be had, or the object is seen
             in no frame.
     """
+    checked_kind("film", film, Film)
+    checked_kind("field", field, LearnedField)
+    checked_kind("camera", camera, PosedCamera)
     chosen, n = options or TrackOptions(), len(film.times)
     film.check_size(camera)
     for name, array, width in (("position", position, 3), ("orientation", orientation, 4)):

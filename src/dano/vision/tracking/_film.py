@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from dano.checks import checked_path
 from dano.progress import Progress
 from dano.vision.capture import PosedCamera
 from dano.vision.structure import picture_files, timed_frames, VIDEOS
@@ -97,7 +98,7 @@ def read_film(
         ValueError: If the film is missing, broken, or too short, or masks do not fit it.
         ImportError: If av (videos) or pillow (pictures) is missing.
     """
-    source = Path(path)
+    source = checked_path("path", path)
     for name, value in (("rate", rate), ("slow_motion", slow_motion)):
         if value is not None and not (np.isfinite(value) and value > 0):
             raise ValueError(f"{name} must be finite and > 0, got {value}")

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from dano.checks import checked_choice, checked_count, checked_number
+
 MASK_SOURCES = ("auto", "given", "static", "plain", "object")
 LOSSES = ("photometric", "silhouette", "paper")
 
@@ -45,16 +47,13 @@ class TrackOptions:
     seed: int = 0
 
     def __post_init__(self):
-        if self.masks not in MASK_SOURCES:
-            raise ValueError(f"masks must be one of {list(MASK_SOURCES)}, got {self.masks!r}")
-        if self.loss not in LOSSES:
-            raise ValueError(f"loss must be one of {list(LOSSES)}, got {self.loss!r}")
+        checked_choice("masks", self.masks, MASK_SOURCES)
+        checked_choice("loss", self.loss, LOSSES)
         least = {"views": 12, "turns": 4, "candidates": 1, "rays": 256, "search_every": 1}
         for name, low in least.items():
-            if getattr(self, name) < low:
-                raise ValueError(f"{name} must be ≥ {low}, got {getattr(self, name)}")
+            checked_count(name, getattr(self, name), least=low)
         for name in ("shutter", "readout"):
-            if not 0 <= getattr(self, name) < 1:
+            if not 0 <= checked_number(name, getattr(self, name)) < 1:
                 raise ValueError(f"{name} must be ≥ 0 and < 1 s, got {getattr(self, name)}")
         if not 0 < self.lost < 1:
             raise ValueError(f"lost must lie between 0 and 1, got {self.lost}")

@@ -2,7 +2,8 @@
 
 import dataclasses
 
-import numpy as np
+from dano.checks import checked_count, checked_number
+from dano.maths import checked_array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +53,7 @@ class TrainOptions:
         Raises:
             ValueError: If one is out of range.
         """
-        ranges: dict[str, tuple[float, float]] = {
+        ranges = {
             "resolution": (16, 384),
             "iterations": (1, 10**6),
             "batch": (16, 2**20),
@@ -60,21 +61,18 @@ class TrainOptions:
             "check_every": (1, 10**6),
         }
         for name, (low, high) in ranges.items():
-            if not low <= getattr(self, name) <= high:
-                raise ValueError(f"{name} must lie between {low} and {high}, got {getattr(self, name)}")
+            checked_count(name, getattr(self, name), least=low, most=high)
         rates = {"rate_distance": self.rate_distance, "rate_network": self.rate_network}
         if self.rate_features is not None:
             rates["rate_features"] = self.rate_features
         for name, rate in rates.items():
-            if not (np.isfinite(rate) and rate > 0):
-                raise ValueError(f"{name} must be positive, got {rate}")
+            checked_number(name, rate, above=0)
         for name in ("mask_weight", "eikonal_weight", "smoothness_weight"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise ValueError(f"{name} must be ≥ 0, got {getattr(self, name)}")
-        if not all(b > 0 for b in self.blur):
-            raise ValueError(f"blur must be positive, got {self.blur}")
-        if self.seconds is not None and not self.seconds > 0:
-            raise ValueError(f"seconds must be positive, got {self.seconds}")
+            checked_number(name, getattr(self, name), least=0)
+        checked_array("blur", self.blur, (2,), above=0)
+        if self.seconds is not None:
+            checked_number("seconds", self.seconds, above=0)
+        checked_count("seed", self.seed, least=0)
 
     def rate_of_features(self, *, lit: bool) -> float:
         """`rate_features`, or the rate for photographs whose light is known (`lit`) or not."""

@@ -1,4 +1,4 @@
-"""Bad input through the Python interface: an error before any work starts, which names what is wrong."""
+"""What is said of bad input through the Python interface; `python -m tests.fuzz` tries much more."""
 
 import json
 import subprocess

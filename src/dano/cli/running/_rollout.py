@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.cli._console import Progress, put, say
+from dano.cli.running._checkpoint import Checkpoint
+from dano.cli.running._clock import Clock
 from dano.engine import contact_history
 from dano.scene import (
     JOINT_QUANTITIES,
@@ -21,8 +23,12 @@ from dano.scene import (
 )
 from dano.scene_file import run_piece, SceneFile
 
-# A rollout is run in so many pieces: progress can be shown, and an interrupt is heard, between two of them.
+# A rollout is run in so many pieces or more: progress can be shown, and an interrupt is heard, between two.
 PIECES = 20
+# Steps of a piece at most: some seconds of work.
+LONGEST = 2000
+# Seconds of work that are kept when a run is interrupted.
+WORTH = 2.0
 
 
 @dataclass(frozen=True)
@@ -34,24 +40,63 @@ class Rollout:
     run_seconds: float
 
 
-def roll_out(loaded: SceneFile, progress: Progress) -> Rollout:
-    """Simulate a scene file."""
-    length = math.ceil(loaded.n_steps / PIECES)
+def roll_out(
+    loaded: SceneFile,
+    progress: Progress,
+    clock: Clock,
+    kept: Checkpoint | None = None,
+    *,
+    resume: bool = False,
+) -> Rollout:
+    """Simulate a scene file.
+
+    Args:
+        loaded: The scene file.
+        progress: Told how far it is; raises when the command is interrupted.
+        clock: Told what takes the time.
+        kept: Where pieces are kept; None to keep nothing.
+        resume: Whether to go on with the pieces that are kept there already.
+
+    Raises:
+        KeyboardInterrupt: When interrupted; says how to go on if pieces were kept.
+    """
+    length = piece_length(loaded.n_steps)
     n_pieces = math.ceil(loaded.n_steps / length)
     h = float(loaded.scene.timestep)
-    progress("compiling the simulation", 0.0)
-    warm_up = run_piece(loaded, loaded.state, 0.0, length)[1]
-    state, pieces, seconds = loaded.state, [], []
-    for i in range(n_pieces):
-        # The last piece may run past the end: all have one length, so that only one program is compiled.
-        piece, took = run_piece(loaded, state, i * length * h, length)
-        state = jax.tree.map(lambda x: x[-1], piece.states)
-        pieces.append(piece)
-        seconds.append(took)
-        progress("simulating", (i + 1) / n_pieces)
+    clock("simulating")
+    pieces = kept.read() if kept is not None and resume else []
+    first, seconds = len(pieces), []
+    try:
+        for i in range(first, n_pieces):
+            progress("simulating" if seconds else "compiling the simulation", i / n_pieces)
+            state = jax.tree.map(lambda x: x[-1], pieces[-1].states) if pieces else loaded.state
+            # The last piece may run past the end: all have one length, so only one program is compiled.
+            piece, took = run_piece(loaded, state, i * length * h, length)
+            pieces.append(piece)
+            seconds.append(took)
+            if kept is not None and i + 1 < n_pieces:
+                kept.keep(pieces)
+        progress("simulating", 1.0)
+    except KeyboardInterrupt:
+        if kept is None or kept.path is None or sum(seconds[1:]) < WORTH:
+            raise
+        kept.keep(pieces, now=True)
+        done = len(pieces) * length
+        raise KeyboardInterrupt(f"{done} of {loaded.n_steps} steps are kept, --resume goes on") from None
     progress.close()
+    if len(seconds) == 1:
+        seconds.append(run_piece(loaded, loaded.state, 0.0, length)[1])
+    # Only the first piece was compiled.
+    usual = sum(seconds[1:]) / max(1, len(seconds) - 1)
+    compiling = max(0.0, seconds[0] - usual) if seconds else 0.0
+    clock.move(compiling, "simulating", "compiling")
     share = loaded.n_steps / (n_pieces * length)
-    return Rollout(_joined(pieces, loaded), max(0.0, warm_up - seconds[0]), share * sum(seconds))
+    return Rollout(_joined(pieces, loaded), compiling, share * n_pieces * usual)
+
+
+def piece_length(n_steps: int) -> int:
+    """Steps of the pieces that a run is cut into."""
+    return min(math.ceil(n_steps / PIECES), LONGEST)
 
 
 def _joined(pieces: list[Trajectory], loaded: SceneFile) -> Trajectory:

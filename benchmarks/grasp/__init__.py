@@ -1,0 +1,1 @@
+"""Two fingers grasp the bunny and lift it: from bad first grasps, how many become good ones."""
