@@ -188,7 +188,7 @@ def render(mi, film: Film, folder: Path, paths: int) -> None:
             time + SHUTTER * (np.arange(BLURRED) + 0.5 - BLURRED / 2) / BLURRED if film.hard else [time]
         )
         (places, turns), _ = film.moved(film, np.maximum(exposures, 0.0))
-        colours, cover = 0.0, 0.0
+        colours, cover = np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))
         for place, turn in zip(places, turns, strict=True):
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = matrix(turn), place

@@ -102,7 +102,7 @@ def watched(scene, look):
     images = np.rint(255 * np.clip(images, 0, 1)).astype(np.uint8).reshape(-1, 40, 56, 3)
     masks = list(np.asarray(seen.opacity, np.float32).reshape(-1, 40, 56))
     n = len(images)
-    taken = Film(tuple(map(str, range(n))), np.asarray(seen.times), list(images), masks, [None] * n, 1, ())
+    taken = Film(tuple(map(str, range(n))), np.asarray(seen.times), [*images], [*masks], [None] * n, 1, ())
     motion = Motion.from_trajectory(dano.simulate(true, state, 12), bodies=["ball"], every=3)
     return taken, camera, motion
 

@@ -1,15 +1,30 @@
-"""Friction of a slide from tracked poses."""
+"""Parameters from tracked poses and from pixels."""
 
 import warnings
+from pathlib import Path
+
+import numpy as np
 
 import dano
 from dano.identify import identify, Motion
+from dano.pixels import FilmFit, identify_in_film
 from dano.scene_file import build_asset
-from dano.vision import Tracked
+from dano.vision import Film, LearnedField, PosedCamera, Tracked, TrackOptions
+
+SLIDES = ("soap_slide", "bunny_slide", "soap_hard", "bunny_hard")
+"""Films of slides on the table alone."""
 
 
-def friction_of(name: str, found: Tracked) -> tuple[float, float]:
-    """Friction and its standard error, from the poses of a film and their covariances."""
+def fit_film(
+    name: str,
+    film: Film,
+    look: LearnedField,
+    camera: PosedCamera,
+    found: Tracked,
+    options: TrackOptions,
+    background: Path | None,
+) -> FilmFit:
+    """Friction of a slide, from poses and from pixels."""
     scene = dano.Scene.create(
         bodies=[
             dano.Body(name, build_asset(f"trained_{name}")),
@@ -18,9 +33,29 @@ def friction_of(name: str, found: Tracked) -> tuple[float, float]:
         contacts=[dano.Contact(name, "table", dano.ContactParams(sliding_friction=0.5))],
         timestep=1 / 120,
     )
-    motion = Motion.from_tracked(found, name)
     friction = dano.Parameter("mu", lambda s: s.contact(name, "table").sliding_friction, 0.02, 1.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        fit = identify(scene, motion, [friction], initial="velocities")
-    return float(fit.values["mu"]), float(fit.standard_errors["mu"])
+        return identify_in_film(
+            scene,
+            film,
+            look,
+            camera,
+            Motion.from_tracked(found, name),
+            [friction],
+            options=options,
+            background=background,
+            initial="states",
+        )
+
+
+def fit_centre_of_mass(name: str, found: Tracked, frames: int) -> np.ndarray:
+    """Centre of mass [m, object's frame] of what flies, from its first frames; the state is unknown, too."""
+    built = build_asset(f"trained_{name}")
+    scene = dano.Scene.create(bodies=[dano.Body(name, built)], timestep=1 / 240)
+    motion = Motion.from_tracked(found, name)
+    away = dano.Parameter("away", lambda s: s.body(name).com_offset, -0.03, 0.03)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        fit = identify(scene, motion.part(0, frames), [away], initial="states")
+    return np.asarray(built.mass.com) + np.asarray(fit.values["away"])

@@ -23,7 +23,8 @@ def test_the_case_holds_photographs_a_film_and_the_truth(tmp_path):
 
 @pytest.mark.slow
 def test_friction_from_photographs_and_a_film(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(_soap, "TRAINING", {"resolution": 48, "iterations": 200, "batch": 2048})
+    monkeypatch.setattr(_soap, "RESOLUTION", 48)
+    monkeypatch.setattr(_soap, "ITERATIONS", 200)
     main(["demo", "soap", "--output", str(tmp_path), "--json"])
     found = json.loads(capsys.readouterr().out)
     assert found["friction"] == pytest.approx(found["truth"], rel=0.05)

@@ -122,12 +122,13 @@ def test_exposures_are_those_of_a_moving_object(bunny, camera):
         return subject.picture(place, lamps, camera, pixels[rows])
 
     everything = np.arange(len(pixels))
-    blurred = dataclasses.replace(still, drift=Drift(velocity, spin, 0.02, 0.0))
+    drift = Drift(velocity, spin, 0.02, 0.0)
+    blurred = dataclasses.replace(still, drift=drift)
     seen = subject.picture(blurred, lamps, camera, pixels)
     speed = (np.linalg.norm(velocity) + subject.radius * np.linalg.norm(spin)) / (
         camera.pixel_angle * np.linalg.norm(subject.middle(still) - camera.position)
     )
-    moments = blurred.drift.moments(pixels[:, 1] / camera.height, speed)
+    moments = drift.moments(pixels[:, 1] / camera.height, speed)
     assert moments.shape[1] == 4
     mean = np.mean([later(t, everything).opacity for t in moments[0]], axis=0)
     np.testing.assert_allclose(seen.opacity, mean, atol=5e-3)

@@ -9,6 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 import dano
@@ -28,7 +29,7 @@ from dano.vision import Film, LearnedField, load_capture, PosedCamera, View
 _CASE = "soap_case.zip"
 """Photographs, film, camera, table and truth, packed by assets/make_soap_case.py."""
 
-TRAINING = {"resolution": 64, "iterations": 500, "batch": 4096}
+RESOLUTION, ITERATIONS = 64, 500
 """Some minutes on two cores; the soap has no detail that more would show."""
 
 _STEP = 1 / 240
@@ -65,7 +66,8 @@ def demo_soap(folder: Path, *, as_json: bool) -> None:
             Train(
                 case / "photographs",
                 made,
-                **TRAINING,
+                resolution=RESOLUTION,
+                iterations=ITERATIONS,
                 mass=0.15,
                 resume=made.with_name("soap.checkpoint.npz").exists(),
             )
@@ -206,8 +208,8 @@ def _simulated(
     motion = found.fit.fitted[0]
     colour, _ = draw_frames(
         [look],
-        motion.position,
-        motion.orientation,
+        jnp.asarray(motion.position),
+        jnp.asarray(motion.orientation),
         camera,
         found.lamps,
         pixels=np.stack([x.ravel(), y.ravel()], axis=1),

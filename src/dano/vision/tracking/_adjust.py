@@ -132,7 +132,7 @@ def _places(
         if (options.shutter or options.readout) and len(rows) > 1:
             first, last = rows[max(k - 1, 0)], rows[min(k + 1, len(rows) - 1)]
             before, after = (Placement(position[j], orientation[j]) for j in (first, last))
-            duration = film.times[last] - film.times[first]
+            duration = float(film.times[last] - film.times[first])
             drift = Drift.between(before, after, duration, subject.middle, options.shutter, options.readout)
             place = Placement(position[i], orientation[i], drift)
         places[i] = place

@@ -74,7 +74,9 @@ def track(
     chosen = options or TrackOptions()
     film.check_size(camera)
     walk = _Walk(film, field, camera, chosen, background)
-    first = None if start is None else Placement(*(np.asarray(x, np.float64) for x in start))
+    first = None
+    if start is not None:
+        first = Placement(np.asarray(start[0], np.float64), np.asarray(start[1], np.float64))
     if first is not None:
         walk.begin(first)
     tell = progress or (lambda text, share: None)
@@ -170,7 +172,7 @@ class _Walk:
         if not (options.shutter or options.readout) or not seen:
             return found
         last = self._place(seen[-1])
-        duration = self._film.times[i] - self._film.times[seen[-1]]
+        duration = float(self._film.times[i] - self._film.times[seen[-1]])
         drift = Drift.between(
             last, found.place, duration, self._subject.middle, options.shutter, options.readout
         )
