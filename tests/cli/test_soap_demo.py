@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from dano.cli import main
-from dano.cli.tracking import _soap
+from dano.cli.tracking import soap
 from dano.vision import load_camera, load_capture, read_film
 
 
 def test_the_case_holds_photographs_a_film_and_the_truth(tmp_path):
-    _soap.unpack(tmp_path)
+    soap.unpack(tmp_path)
     assert len(load_capture(tmp_path / "photographs").split("train")) == 64
     film = read_film(tmp_path / "film.mp4")
     truth = json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))
@@ -23,8 +23,8 @@ def test_the_case_holds_photographs_a_film_and_the_truth(tmp_path):
 
 @pytest.mark.slow
 def test_friction_from_photographs_and_a_film(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(_soap, "RESOLUTION", 48)
-    monkeypatch.setattr(_soap, "ITERATIONS", 200)
+    monkeypatch.setattr(soap, "RESOLUTION", 48)
+    monkeypatch.setattr(soap, "ITERATIONS", 200)
     main(["demo", "soap", "--output", str(tmp_path), "--json"])
     found = json.loads(capsys.readouterr().out)
     assert found["friction"] == pytest.approx(found["truth"], rel=0.05)

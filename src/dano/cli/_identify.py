@@ -37,7 +37,7 @@ def identify(command: Identify) -> None:
         raise ImportError(missing)
     if not command.motions:
         raise ValueError("motions must name at least one file, got none")
-    filming = _film_of(command)
+    fit_pixels = _film_of(command)
     # An interrupted search returns its best so far.
     progress = Progress(stops=False)
     loaded = scene_file.load_scene(scene, timestep=command.timestep, progress=progress)
@@ -63,10 +63,10 @@ def identify(command: Identify) -> None:
             "starts": command.starts,
         }
         seen = None
-        if filming is None:
+        if fit_pixels is None:
             fit = fit_parameters(loaded.scene, found, chosen, progress=progress, **settings)
         else:
-            seen = filming(loaded.scene, found[0], chosen, progress, settings)
+            seen = fit_pixels(loaded.scene, found[0], chosen, progress, settings)
             fit = seen.fit
     progress.close()
     result = {"scene": str(scene), "motions": [str(path) for path in command.motions], **fit.to_dict()}
@@ -112,22 +112,22 @@ def _film_of(command: Identify) -> "Callable[..., FilmFit] | None":
     if len(command.motions) != 1:
         raise ValueError(f"video must be that of the one motion, got {len(command.motions)} motions")
     # Here, because most fits are of poses.
-    from dano.cli.tracking import _filming
+    from dano.cli.tracking import filming
     from dano.pixels import identify_in_film
 
-    _filming.check_camera(command.filming)
-    look, video = _filming.look_of(command.look, "look"), command.video
+    filming.check_camera(command.filming)
+    look, video = filming.look_of(command.look, "look"), command.video
 
     def fit(scene: Scene, motion: Motion, chosen: list[Parameter], progress: Progress, settings) -> "FilmFit":
-        film = _filming.filmed(command.filming, video, command.rate, progress)
+        film = filming.filmed(command.filming, video, command.rate, progress)
         return identify_in_film(
             scene,
             film,
             look,
-            _filming.camera_of(command.filming, film),
+            filming.camera_of(command.filming, film),
             motion,
             chosen,
-            options=_filming.options_of(command.filming),
+            options=filming.options_of(command.filming),
             background=command.filming.background,
             progress=progress,
             **settings,

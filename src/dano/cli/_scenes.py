@@ -76,7 +76,7 @@ def demo(command: Demo) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     if command.name == "soap":
         # Here, because no other demo trains or tracks.
-        from dano.cli.tracking._soap import demo_soap
+        from dano.cli.tracking.soap import demo_soap
 
         demo_soap(folder, as_json=command.json)
         return

@@ -22,6 +22,9 @@ from dano.vision.tracking._subject import Subject
 _LIGHT_FRAMES = 6
 """Frames, spread over the film, that the light is fitted to."""
 
+_STEPS = 3
+"""Of Gauss and Newton: residuals saturate some pixels away from an edge, where one step does not get far."""
+
 _LEAST_OVERLAP = 0.3
 """Overlap of mask and silhouette below which a frame says nothing of a pose near the predicted one."""
 
@@ -38,7 +41,7 @@ def adjust_poses(
     lamps: tuple[Light, ...] | None = None,
     progress: Progress | None = None,
 ) -> Tracked:
-    """Move given poses of an object in a film by one step of Gauss–Newton on its pixels.
+    """Move given poses of an object in a film by a few steps of Gauss–Newton on its pixels.
 
     Each frame is rendered at the pose given for it. The pose that comes out, and its covariance, say in which
     direction pixels pull, and how much. A least squares fit of a model to them is a step of Gauss–Newton on
@@ -112,11 +115,13 @@ def _step(
     options: TrackOptions,
     random: np.random.Generator,
 ) -> Refined | None:
-    """One step of the search from a pose; None if the object is not near it."""
+    """A few steps of the search from a pose; None if the object is not near it."""
     target = masking.near(i, subject, place, lamps, camera, 2.0)
     if target is None:
         return None
-    one = refine(subject, target, place, lamps, loss=options.loss, steps=1, rays=options.rays, random=random)
+    one = refine(
+        subject, target, place, lamps, loss=options.loss, steps=_STEPS, rays=options.rays, random=random
+    )
     return None if one is None or one.overlap < _LEAST_OVERLAP else one
 
 
