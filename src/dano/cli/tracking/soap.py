@@ -35,7 +35,7 @@ RESOLUTION, ITERATIONS = 64, 500
 _STEP = 1 / 240
 """Of the simulation [s]: four for each frame of the film."""
 
-_PHOTOGRAPHS = 9
+_PHOTOGRAPHS = 8
 """Shown in the page."""
 
 
