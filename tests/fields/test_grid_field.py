@@ -230,7 +230,7 @@ BAD = {
     "empty": (0 * VALUES, 0.1, "quadratic", "positive density somewhere"),
     "spacing": (VALUES, 0.0, "quadratic", "spacing must be finite and positive"),
     "spacings": (VALUES, (0.1, 0.1), "quadratic", r"spacing must be a number or have shape \(3,\)"),
-    "interpolation": (VALUES, 0.1, "quintic", "interpolation must be one of .*'quadratic'"),
+    "interpolation": (VALUES, 0.1, "quintic", "interpolation must be one of .*quadratic"),
 }
 
 

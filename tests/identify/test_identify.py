@@ -316,8 +316,10 @@ def test_a_parameter_that_is_no_leaf():
     fit = dano.identify(ball_scene(), motion, [angle])
     assert fit.values["angle"] == pytest.approx(0.1, abs=1e-6)
     assert float(fit.scene.gravity[0]) == pytest.approx(9.81 * np.sin(0.1), abs=1e-5)
-    refuse("either where or apply", parameters=[dataclasses.replace(angle, where=FRICTION.where)])
-    refuse("either where or apply", parameters=[dano.Parameter("nothing")])
+    with pytest.raises(ValueError, match="either where or apply, got both"):
+        dataclasses.replace(angle, where=FRICTION.where)
+    with pytest.raises(ValueError, match="either where or apply"):
+        dano.Parameter("nothing")
     refuse("give its start", parameters=[dataclasses.replace(angle, start=None)])
     refuse("must return the scene", parameters=[dataclasses.replace(angle, apply=lambda s, value: value)])
 
@@ -473,7 +475,8 @@ def refuse(match, observed=None, parameters=(FRICTION,), **options):
     if observed is None:
         observed = sliding_motion()
     with pytest.raises(ValueError, match=match):
-        dano.identify(scene, observed, list(parameters), **options)
+        # What is wrong with a parameter by itself is said when it is made.
+        dano.identify(scene, observed, list(parameters() if callable(parameters) else parameters), **options)
 
 
 def sliding_motion(n=10):
@@ -483,13 +486,13 @@ def sliding_motion(n=10):
 
 
 def changed(**options):
-    return [dataclasses.replace(FRICTION, **options)]
+    return lambda: [dataclasses.replace(FRICTION, **options)]
 
 
 def test_bad_input():
     at = lambda path: changed(where=path)  # noqa: E731
     refuse("at least one motion", observed=[])
-    refuse("Motions or Trajectories", observed=[3])
+    refuse("observed must hold dano.Motion or dano.Trajectory objects", observed=[3])
     refuse("at least one Parameter", parameters=[])
     refuse("different names", parameters=[FRICTION, FRICTION])
     refuse("lower of parameter 'mu' must be ≤ upper", parameters=changed(lower=2.0))
@@ -501,7 +504,7 @@ def test_bad_input():
     refuse("not parts or copies", parameters=at(lambda s: 2 * s.gravity))
     refuse("each leaf once", parameters=at(lambda s: [s.gravity, s.gravity]))
     refuse("no controls are given", parameters=changed(of="controls"))
-    refuse("'value', 'log' or 'inertia'", parameters=changed(coordinates="cubic"))
+    refuse("coordinates must be one of value, log, inertia", parameters=changed(coordinates="cubic"))
     refuse("must be > 0 to have a logarithm", parameters=changed(coordinates="log", start=0.0))
     refuse("noise of position", noise={"position": 0.0})
     refuse("noise must be given for some", noise={"place": 1.0})

@@ -249,12 +249,12 @@ def test_blur_grows_with_blur_in_any_direction_and_not_with_noise():
 @pytest.mark.parametrize(
     ("choice", "message"),
     [
-        ({"focal": -1.0}, "focal must be positive"),
-        ({"focal": (500.0, 0.0)}, "focal must be positive"),
+        ({"focal": -1.0}, "focal must be one number or two, finite and > 0"),
+        ({"focal": (500.0, 0.0)}, "focal must be one number or two, finite and > 0"),
         ({"distortion": (0.1, 0.0, 0.0, 0.0)}, "distortion needs focal"),
         ({"lens": "fisheye"}, "lens must be one of radial"),
         ({"features_on": "table"}, "features_on must be one of auto"),
-        ({"marker_size": 0.0}, "marker_size must be positive"),
+        ({"marker_size": 0.0}, "marker_size must be finite and > 0"),
         ({"marker_family": "DICT_5"}, "marker_family must be one of DICT_APRILTAG_36h11"),
         ({"up": "marker"}, "needs marker_size"),
         ({"frames": 2}, "frames must lie between"),

@@ -229,10 +229,10 @@ def test_training_stops_when_outlines_become_worse_or_nothing_changes():
     [
         ({"resolution": 4}, "resolution must lie"),
         ({"iterations": 0}, "iterations must lie"),
-        ({"rate_distance": 0.0}, "rate_distance must be positive"),
-        ({"rate_features": -0.1}, "rate_features must be positive"),
+        ({"rate_distance": 0.0}, "rate_distance must be finite and > 0"),
+        ({"rate_features": -0.1}, "rate_features must be finite and > 0"),
         ({"mask_weight": -1.0}, "mask_weight must be"),
-        ({"seconds": 0.0}, "seconds must be positive"),
+        ({"seconds": 0.0}, "seconds must be finite and > 0"),
     ],
 )
 def test_bad_options_are_refused(options, message):
