@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -470,7 +471,7 @@ def test_single_precision():
     assert fit.values["mu"] == pytest.approx(0.25, abs=2e-3)
 
 
-def refuse(match, observed=None, parameters=(FRICTION,), **options):
+def refuse(match, observed=None, parameters: Any = (FRICTION,), **options):
     scene = ball_scene()
     if observed is None:
         observed = sliding_motion()
