@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -471,7 +471,10 @@ def test_single_precision():
     assert fit.values["mu"] == pytest.approx(0.25, abs=2e-3)
 
 
-def refuse(match, observed=None, parameters: Any = (FRICTION,), **options):
+Parameters = Sequence[dano.Parameter]
+
+
+def refuse(match, observed=None, parameters: Parameters | Callable[[], Parameters] = (FRICTION,), **options):
     scene = ball_scene()
     if observed is None:
         observed = sliding_motion()
