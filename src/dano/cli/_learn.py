@@ -12,6 +12,7 @@ from dano.archive import replacing
 from dano.cli._arguments import Data, Poses, Train
 from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
+from dano.cli.tracking.filming import focal_of
 from dano.fields import save_field
 from dano.learning import LearnedObject, train_object
 from dano.objects import NeuralObject
@@ -35,7 +36,7 @@ def poses(command: Poses) -> None:
     """See `dano poses --help`."""
     check_output(command.output, command.images, suffix=".json")
     options = PoseOptions(
-        focal=_focal(command.focal),
+        focal=focal_of(command.focal),
         centre=command.centre,
         distortion=command.distortion,
         lens=command.lens,
@@ -65,17 +66,6 @@ def poses(command: Poses) -> None:
     _print_poses(found)
     put()
     put(f"wrote {command.output}: next, `dano data {command.output}` and `dano train {command.output}`")
-
-
-def _focal(numbers: tuple[float, ...]) -> float | tuple[float, float] | None:
-    match numbers:
-        case ():
-            return None
-        case (focal,):
-            return focal
-        case (across, down):
-            return across, down
-    raise ValueError(f"focal must be one number or two [pixels], got {len(numbers)}")
 
 
 def _known_length(command: Poses) -> KnownLength | None:

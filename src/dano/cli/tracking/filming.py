@@ -48,6 +48,22 @@ def options_of(filming: Filming) -> TrackOptions:
     )
 
 
+def focal_of(numbers: tuple[float, ...]) -> float | tuple[float, float] | None:
+    """Focal lengths as options give them: one number, two, or None for none.
+
+    Raises:
+        ValueError: If there are more.
+    """
+    match numbers:
+        case ():
+            return None
+        case (focal,):
+            return focal
+        case (across, down):
+            return across, down
+    raise ValueError(f"focal must be one number or two [pixels], got {len(numbers)}")
+
+
 def camera_of(filming: Filming, film: Film) -> PosedCamera:
     """The camera that took a film.
 
@@ -61,9 +77,8 @@ def camera_of(filming: Filming, film: Film) -> PosedCamera:
     axes = Camera(filming.eye, filming.look_at, width=width, height=height).axes
     pose = np.concatenate([axes.T * np.array([1.0, 1.0, -1.0]), np.array(filming.eye)[:, None]], axis=1)
     k1, k2, p1, p2 = filming.distortion
-    if len(filming.focal) > 2:
-        raise ValueError(f"focal must be one number or two [pixels], got {len(filming.focal)}")
-    focal = filming.focal[0] if len(filming.focal) == 1 else filming.focal
+    focal = focal_of(filming.focal)
+    assert focal is not None
     return PosedCamera(
         pose,
         focal=focal,

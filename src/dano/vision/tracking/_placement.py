@@ -37,6 +37,10 @@ class Drift(NamedTuple):
         spin = quat_rotate(after.orientation, turn / duration)
         return cls((middle(after) - middle(before)) / duration, spin, shutter, readout)
 
+    def speed(self, radius: float) -> float:
+        """Of the fastest point of a ball around the middle, at most [m/s]."""
+        return float(np.linalg.norm(self.velocity) + radius * np.linalg.norm(self.spin))
+
     def moments(self, rows: Float[np.ndarray, " n"], speed: float) -> Float[np.ndarray, "n k"]:
         """Times at which pixels see the object, from the middle of the exposure of the middle row [s].
 

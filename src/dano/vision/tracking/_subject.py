@@ -81,8 +81,7 @@ class Subject:
         margin = _SOFT * camera.pixel_angle * away + _LOOSE * self.size
         drift = place.drift
         if drift is not None:
-            way = np.linalg.norm(drift.velocity) + self.radius * np.linalg.norm(drift.spin)
-            margin += 0.5 * (drift.shutter + drift.readout) * float(way)
+            margin += 0.5 * (drift.shutter + drift.readout) * drift.speed(self.radius)
         turn = quat_to_matrix(place.orientation)
         directions = camera.directions(pixels) @ turn
         origin = (camera.position - place.position) @ turn
@@ -155,8 +154,7 @@ class Subject:
         if drift is None:
             return self.see(place, lamps, origins, directions, pixel, slopes=slopes)
         away = max(float(np.linalg.norm(self.middle(place) - camera.position)), self.radius)
-        way = np.linalg.norm(drift.velocity) + self.radius * np.linalg.norm(drift.spin)
-        moments = drift.moments(pixels[:, 1] / camera.height, float(way) / (pixel * away))
+        moments = drift.moments(pixels[:, 1] / camera.height, drift.speed(self.radius) / (pixel * away))
         exposures = [
             self.see(
                 place, lamps, *self._meanwhile(place, drift, late, origins, directions), pixel, slopes=slopes
