@@ -74,18 +74,20 @@ def demo(command: Demo) -> None:
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"output path must be a folder, got the file {folder}")
     folder.mkdir(parents=True, exist_ok=True)
+    missing = missing_for_pictures(video=True)
+    began = time.monotonic()
+    tell = (lambda _: None) if command.json else _clock(began)
     if command.name == "soap":
+        if missing:
+            raise ImportError(missing)
         # Here, because no other demo trains or tracks.
         from dano.cli.tracking.soap import demo_soap
 
-        demo_soap(folder, as_json=command.json)
+        demo_soap(folder, tell, began, as_json=command.json)
         return
-    missing = missing_for_pictures(video=True)
     if missing:
         say(f"warning: numbers only, {missing}")
-    began = time.monotonic()
     reports: dict[str, dict[str, Any]] = {}
-    tell = (lambda _: None) if command.json else _clock(began)
     with _Artist(draws=missing is None, tell=tell) as artist:
         for scene in SCENES if command.name == "all" else (command.name,):
             reports[scene] = _demo_scene(scene, folder, artist, tell)

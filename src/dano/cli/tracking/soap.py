@@ -1,7 +1,9 @@
 """`dano demo soap`: photographs and a film of one bar of soap, and what follows from them."""
 
+import contextlib
 import io
 import json
+import sys
 import time
 import zipfile
 from collections.abc import Callable
@@ -17,7 +19,6 @@ from dano.archive import replacing
 from dano.cli._arguments import Filming, Train
 from dano.cli._console import Progress, put, put_json
 from dano.cli._learn import train
-from dano.cli._outputs import missing_for_pictures
 from dano.cli.tracking._arguments import Track
 from dano.cli.tracking._run import track
 from dano.cli.tracking.filming import camera_of, filmed, options_of
@@ -39,27 +40,41 @@ _PHOTOGRAPHS = 8
 """Shown in the page."""
 
 
-def demo_soap(folder: Path, *, as_json: bool) -> None:
+def demo_soap(folder: Path, tell: Callable[[str], None], began: float, *, as_json: bool) -> None:
     """Learn a soap from photographs, track it in a film, find its friction, and write a page about it.
 
     Every stage leaves its files; what is there already is not made again.
 
     Args:
         folder: Where files go.
+        tell: Told what is done when.
+        began: When the command began, by `time.monotonic` [s].
         as_json: Whether to print one JSON object instead of text.
-
-    Raises:
-        ImportError: If pictures and films cannot be read or written.
     """
-    if missing := missing_for_pictures(video=True):
-        raise ImportError(missing)
-    began = time.monotonic()
-    say = (lambda text: None) if as_json else _clock(began)
+    page, result = folder / "soap_story.html", folder / "soap_friction.json"
+    # What the stages print is no part of the object.
+    with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
+        _make(folder, page, result, tell)
+    found = json.loads(result.read_text(encoding="utf-8"))
+    if as_json:
+        put_json({"folder": str(folder), "seconds": time.monotonic() - began, **found})
+        return
+    put()
+    put(f"friction    {found['friction']:.4f} ± {found['standard_error']:.4f} from the pixels")
+    alone = f"{found['from_poses']:.4f} ± {found['from_poses_standard_error']:.4f}"
+    put(f"            {alone} from the poses alone")
+    put(f"            {found['truth']:.4f} is what the film was made with")
+    put(f"look at     {page}")
+    put(f"took {time.monotonic() - began:.0f} s; a stage is made again when its file is removed")
+
+
+def _make(folder: Path, page: Path, result: Path, tell: Callable[[str], None]) -> None:
+    """All stages, one after the other."""
     case = folder / "case"
-    _stage(say, case / "truth.json", "unpacking photographs and film", lambda: unpack(case))
+    _stage(tell, case / "truth.json", "unpacking photographs and film", lambda: unpack(case))
     made, motion = folder / "soap.dano", folder / "soap_motion.npz"
     _stage(
-        say,
+        tell,
         made,
         f"dano train {case / 'photographs'} -o {made}",
         lambda: train(
@@ -75,37 +90,21 @@ def demo_soap(folder: Path, *, as_json: bool) -> None:
     )
     filming = Filming(camera=case / "camera.json", background=case / "table.png", mask_source="object")
     command = Track(case / "film.mp4", str(made), motion, folder / "soap_track.html", filming=filming)
-    _stage(say, motion, f"dano track {command.video} {made} --camera … -o {motion}", lambda: track(command))
-    page, result = folder / "soap_story.html", folder / "soap_friction.json"
+    _stage(tell, motion, f"dano track {command.video} {made} --camera … -o {motion}", lambda: track(command))
     _stage(
-        say,
+        tell,
         result,
         "friction and speed from the pixels of the film, through the simulation",
         lambda: _identify(command, case, page, result),
     )
-    found = json.loads(result.read_text(encoding="utf-8"))
-    if as_json:
-        put_json({"folder": str(folder), "seconds": time.monotonic() - began, **found})
-        return
-    put()
-    put(f"friction    {found['friction']:.4f} ± {found['standard_error']:.4f} from the pixels")
-    alone = f"{found['from_poses']:.4f} ± {found['from_poses_standard_error']:.4f}"
-    put(f"            {alone} from the poses alone")
-    put(f"            {found['truth']:.4f} is what the film was made with")
-    put(f"look at     {page}")
-    put(f"took {time.monotonic() - began:.0f} s; a stage is made again when its file is removed")
 
 
-def _clock(began: float) -> Callable[[str], None]:
-    return lambda text: put(f"[{time.monotonic() - began:5.1f} s] {text}")
-
-
-def _stage(say: Callable[[str], None], output: Path, what: str, make: Callable[[], object]) -> None:
+def _stage(tell: Callable[[str], None], output: Path, what: str, make: Callable[[], object]) -> None:
     """Make a file unless it is there."""
     if output.exists():
-        say(f"{output} is there")
+        tell(f"{output} is there")
         return
-    say(what)
+    tell(what)
     make()
 
 
