@@ -40,6 +40,36 @@ def test_slow_motions_in_other_units_are_doubted():
         check_scales(SCENE, [pushed(second=1000)], 2)
 
 
+@pytest.mark.parametrize(
+    ("height", "text"),
+    [(0.05, None), (0.045, None), (0.02, "lie 30 mm inside 'floor'"), (0.09, "lie 40 mm above 'floor'")],
+)
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+def test_bodies_beside_the_plane_that_carries_them_are_said(height, text, tilt):
+    """As after a wrong focal length: the object seems to be nearer or further than it is."""
+    box = dano.Body("box", dano.Box((0.05, 0.05, 0.05)), mass=1.0)
+    floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
+    scene = dano.Scene.create([box, floor], [dano.Contact("box", "floor")], timestep=0.005)
+    turn = dano.maths.quat_exp(np.array([tilt, 0.0, 0.0]))
+    state = scene.initial_state(floor={"position": (0.0, 0.1, 0.2), "orientation": turn})
+    times = np.arange(12) / 30
+    local = np.stack([0.05 * times, 0 * times, height + 0 * times], axis=1)
+    position = np.asarray(dano.maths.quat_rotate(turn, local)) + np.array([0.0, 0.1, 0.2])
+    motion = dano.Motion.create(times, ("box",), position=position, orientation=np.tile(turn, (12, 1)))
+    falling = motion.position - 4.9 * times[:, None, None] ** 2 * np.array([0.0, 0.0, -1.0])
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        check_scales(scene, [motion], None, state)
+        assert [text is not None and text in str(w.message) for w in said] == [True] * (text is not None)
+    with warnings.catch_warnings():
+        # What falls may be anywhere above.
+        warnings.simplefilter("error")
+        thrown = dano.Motion.create(
+            times, ("box",), position=falling + 0.05, orientation=np.tile(turn, (12, 1))
+        )
+        check_scales(scene, [thrown], None, state)
+
+
 def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="position of 'ball' must be in metres .* got a speed of 500 m/s"):
         check_scales(SCENE, [pushed(unit=10000)], None)

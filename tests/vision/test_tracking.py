@@ -13,6 +13,9 @@ from dano.identify import load_motion
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate, quat_to_matrix
 from dano.scene_file import asset_look
 from dano.vision import adjust_poses, Film, Light, PosedCamera, track, TrackOptions
+from dano.vision.drawing import GAMMA
+from dano.vision.tracking._edges import common_offset, edge_offset, moved_edge
+from dano.vision.tracking._light import LightFit
 from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.tracking._refine import Refined
 from dano.vision.tracking._segments import like_object, overlap, Place, unlike_place
@@ -260,6 +263,71 @@ def test_what_is_wrong_is_said(bunny, camera, filmed):
         TrackOptions(masks="magic")
     with pytest.raises(ValueError, match="rays must be ≥ 256, got 3"):
         TrackOptions(rays=3)
+
+
+@pytest.mark.parametrize("change", [-2.0, -1.0, 0.0, 1.0, 2.0])
+def test_the_edge_of_a_mask_is_found_in_the_picture_and_moved_there(change):
+    y, x = np.mgrid[:90, :120]
+    inside = 25.3 - np.hypot(y - 44.2, (x - 61.7) / 1.4)  # pixels, nearly: an ellipse of closed form
+    truth = np.clip(0.5 + inside, 0, 1)
+    rng = np.random.default_rng(0)
+    texture = ndimage.gaussian_filter(rng.normal(size=(2, 90, 120, 3)), (0, 1.5, 1.5, 0))
+    image = truth[..., None] * (0.7 + 0.15 * texture[0]) + (1 - truth[..., None]) * (0.3 + 0.15 * texture[1])
+    mask = np.clip(0.5 + inside + change, 0, 1)
+    seen = np.ones(mask.shape, bool)
+    offset = edge_offset(mask, image, seen)
+    # Sideways a unit of the ellipse is 1.4 pixels.
+    assert offset == pytest.approx(1.2 * change, abs=0.35)
+    assert overlap(moved_edge(mask, -offset), truth) > 0.975
+    # A plain picture shows no edge, and what differs from frame to frame is no common offset.
+    assert np.isnan(edge_offset(mask, np.full_like(image, 0.5), seen))
+    assert np.isnan(edge_offset(np.zeros_like(mask), image, seen))
+    assert common_offset([offset] * 5) == (pytest.approx(offset) if change else 0)
+    assert common_offset([-2.0, 2.0, -1.5, 1.5]) == 0
+    assert common_offset([offset, np.nan, np.nan]) == 0
+
+
+@pytest.mark.parametrize("grown", [-1.5, 1.5])
+def test_masks_of_a_wrong_size_are_moved_and_that_is_said(bunny, camera, filmed, grown):
+    position, orientation, frames, masks = filmed
+    wrong = [np.float32(moved_edge(mask, grown)) for mask in masks]
+    found = track(film_of(frames, wrong), bunny, camera, ROUGH, start=(position[0], orientation[0]))
+    assert any("their edge lies 1." in text and "they were moved" in text for text in found.messages)
+    place, _ = errors(found, position, orientation, slice(None))
+    # A pixel and a half of 40 is 4 % of the distance, or 17 % of the size.
+    assert np.median(place) < 0.03
+
+
+def test_the_sun_is_found_between_the_directions_that_lamps_have(bunny, camera):
+    subject = Subject(bunny)
+    light = LightFit(subject)
+    sun = np.array([-0.35, -0.55, 0.76]) / np.linalg.norm([-0.35, -0.55, 0.76])
+    sky = np.random.default_rng(1).normal(size=(16, 3))
+    sky[:, 2] = np.abs(sky[:, 2])
+    dark = Light((0.0, 0.0, 1.0), intensity=0.0)
+    y, x = np.mgrid[10:62:2, 24:72:2]
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
+    for turn in ((0.2, -0.1, 0.8), (0.5, 0.4, -1.2), (-0.3, 0.2, 2.4)):
+        place = subject.around(np.zeros(3), quat_exp(np.array(turn)))
+        # Sunlight and that of a cloudy sky add up, in linear light.
+        shares = [(sun, 0.8), *((towards, 0.3 / len(sky)) for towards in sky)]
+        pictures = [
+            subject.picture(place, (Light(towards), dark, dark), camera, pixels) for towards, _ in shares
+        ]
+        inside = pictures[0].opacity > 0.95
+        linear = sum(
+            share * seen.colour[inside] ** GAMMA for (_, share), seen in zip(shares, pictures, strict=True)
+        )
+        light.add(place, camera, pixels[inside], linear ** (1 / GAMMA))
+
+    def off():
+        strongest = max(light.lamps, key=lambda lamp: float(np.sum(lamp.colour)))
+        return np.degrees(np.arccos(np.clip(np.asarray(strongest.place) @ sun, -1, 1)))
+
+    before = off()
+    light.find_sun()
+    assert before > 8
+    assert off() < 5
 
 
 def ramp():

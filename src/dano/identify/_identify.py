@@ -109,7 +109,7 @@ def identify(
         Search(starts, seed, jacobian, max_iterations, tolerance, batch),
         checked_engine(engine),
     )
-    check_scales(scene, motions, window)
+    check_scales(scene, motions, window, state if isinstance(state, State) else None)
     found = _fitted(setup, motions, _motions("held_out", held_out), state, after, progress)
     for message in found.messages:
         warnings.warn(message, RuntimeWarning, stacklevel=2)

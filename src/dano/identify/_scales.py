@@ -5,8 +5,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dano.fields import HalfSpace
 from dano.identify._motion import Motion
-from dano.scene import Scene
+from dano.maths import quat_rotate, quat_to_matrix
+from dano.scene import Scene, State
 
 _FASTEST = 340.0
 """Speed [m/s] that bodies stay below which fall, slide and are thrown: that of sound."""
@@ -21,8 +23,17 @@ _SLOW_CAMERA = 1.0
 """Seconds between frames from which the unit of times is doubted, if there are several."""
 
 
-def check_scales(scene: Scene, motions: Sequence[Motion], window: int | None) -> None:
-    """Compare motions with the sizes of the bodies, with speeds that bodies have, and with the timestep.
+_BESIDE = 0.1
+"""Share of a body's size by which it may seem to be above or below a plane that it touches."""
+
+_STEADY = 0.15
+"""Seconds at one height from which a body does not fall: free fall is 11 cm by then."""
+
+
+def check_scales(
+    scene: Scene, motions: Sequence[Motion], window: int | None, state: State | None = None
+) -> None:
+    """Compare motions with bodies' sizes, usual speeds, planes that carry bodies, and the timestep.
 
     What is odd, but possible, raises a UserWarning.
 
@@ -30,6 +41,7 @@ def check_scales(scene: Scene, motions: Sequence[Motion], window: int | None) ->
         scene: The scene.
         motions: What was observed.
         window: Frames of the windows that motions are cut into; None for whole motions.
+        state: Where planes are; default: as they were made.
 
     Raises:
         ValueError: If a body moves faster than sound, or a window has more steps than anybody waits for.
@@ -40,6 +52,7 @@ def check_scales(scene: Scene, motions: Sequence[Motion], window: int | None) ->
         for row, name in enumerate(motion.names):
             if name in scene.names:
                 _check_positions(name, motion.times, motion.position[:, row], scene.body(name).size, h)
+                _check_planes(scene, state, motion, row)
 
 
 def _check_times(times: np.ndarray, h: float, window: int | None) -> None:
@@ -80,3 +93,54 @@ def _check_positions(name: str, times: np.ndarray, places: np.ndarray, size: flo
             " 1000",
             stacklevel=4,
         )
+
+
+def _check_planes(scene: Scene, state: State | None, motion: Motion, row: int) -> None:
+    """Whether a body that planes may carry seems to lie in them, or to float."""
+    name = motion.names[row]
+    body = scene.body(name)
+    if motion.orientation is None or body.surface is None or body.surface.turning != "fixed":
+        return
+    poses = np.concatenate([motion.position[:, row], motion.orientation[:, row]], axis=1)
+    known = np.isfinite(poses).all(axis=1)
+    if known.sum() < 2:
+        return
+    planes = {a if b == name else b for a, b in scene.pairs if name in (a, b)}
+    for other in sorted(planes):
+        plane = scene.body(other)
+        if not plane.fixed or not isinstance(plane.shape, HalfSpace):
+            continue
+        normal, offset = np.asarray(plane.shape.normal_direction), float(plane.shape.offset)
+        if state is not None:
+            i = scene.index(other)
+            normal = np.asarray(quat_rotate(state.orientation[i], normal))
+            offset += float(
+                normal @ np.asarray(state.position[i] - quat_rotate(state.orientation[i], plane.com))
+            )
+        gaps = _gaps(body, motion, row, known, normal, offset)
+        text = _beside(gaps, motion.times[known], body.size)
+        if text:
+            warnings.warn(
+                f"{name!r} seems to lie {1e3 * abs(np.median(gaps)):.3g} mm {text} {other!r}: focal length,"
+                " place of the camera or scale of the film do not fit the scene, or the scene's plane lies"
+                " elsewhere",
+                stacklevel=5,
+            )
+
+
+def _gaps(body, motion: Motion, row: int, known, normal: np.ndarray, offset: float) -> np.ndarray:
+    """Distance of a body's lowest point from a plane in each known frame [m]."""
+    points = np.asarray(body.surface.points[:3])
+    turned = np.asarray(quat_to_matrix(motion.orientation[known, row]))
+    arm = np.zeros(3) if motion.point == "origin" else np.asarray(body.com + body.com_offset)
+    lowest = (np.einsum("tij,i->tj", turned, normal) @ (points - arm[:, None])).min(axis=1)
+    return motion.position[known, row] @ normal - offset + lowest
+
+
+def _beside(gaps: np.ndarray, times: np.ndarray, size: float) -> str:
+    """In words, on which side of a plane a body lies that should lie on it; nothing if it is right."""
+    middle = float(np.median(gaps))
+    if middle < -_BESIDE * size:
+        return "inside"
+    steady = np.ptp(gaps) < 0.5 * middle and times[-1] - times[0] > _STEADY
+    return "above" if middle > _BESIDE * size and steady else ""

@@ -162,3 +162,4 @@ def _learn_light(
             shape, _ = silhouette(subject, place, light.lamps, camera, window)
             learn_light(subject, target, place, window, shape, light)
             masking.learn(target, window, shape)
+    light.find_sun()

@@ -2,7 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import nnls
+from scipy.optimize import minimize, nnls
 
 from dano.vision.capture import AbstractCamera, Light
 from dano.vision.drawing import GAMMA
@@ -14,6 +14,18 @@ LAMPS = 3
 
 _DIRECTIONS = 16
 """Directions that lamps may come from, evenly spread."""
+
+_OTHER = np.cos(np.radians(40))
+"""Cosine of the angle around the sun in which no other lamp is looked for: it would only share the sun's power."""
+
+_TURN = 0.2
+"""First turn of the search for the sun [rad]: half the distance of neighbouring directions."""
+
+_TRIES = 30
+"""Directions that this search tries: two angles to a degree."""
+
+_FAR_OFF = 0.1
+"""Difference of colours [sRGB] from which a pixel says nothing of the sun, e.g. in a shadow of something else."""
 
 _FLAT = 0.02
 """Weight of the wish for little light, by which lamps that no pixel can tell apart share theirs."""
@@ -43,6 +55,8 @@ class LightFit:
         self._keep = keep
         self._rows: list[np.ndarray] = []
         self._seen: list[np.ndarray] = []
+        self._views: list[tuple[Placement, AbstractCamera, np.ndarray]] = []
+        self._sun: np.ndarray | None = None
         turn = np.pi * (3 - np.sqrt(5)) * np.arange(_DIRECTIONS)
         z = 1 - 2 * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
         flat = np.sqrt(1 - z**2)
@@ -66,23 +80,70 @@ class LightFit:
         if len(pixels) < 3 * _DIRECTIONS:
             return
         some = np.linspace(0, len(pixels) - 1, min(len(pixels), _MOST_PIXELS)).astype(int)
-        columns = []
-        for towards in self._places if self._subject.lit else self._places[:1]:
-            dark = Light((0.0, 0.0, 1.0), intensity=0.0)
-            seen = self._subject.picture(place, (Light(towards), *[dark] * (LAMPS - 1)), camera, pixels[some])
-            columns.append(np.maximum(seen.colour / np.maximum(seen.opacity, 0.5)[:, None], 0) ** GAMMA)
-        self._rows = [*self._rows, np.stack(columns, axis=-1)][-self._keep :]
+        view = (place, camera, pixels[some])
+        places = self._places if self._subject.lit else self._places[:1]
+        rows = np.stack([self._column(view, towards) for towards in places], axis=-1)
+        self._views = [*self._views, view][-self._keep :]
+        self._rows = [*self._rows, rows][-self._keep :]
         self._seen = [*self._seen, colours[some] ** GAMMA][-self._keep :]
         self.lamps = self._fitted()
         self.known = True
 
-    def _fitted(self) -> tuple[Light, ...]:
+    def find_sun(self) -> None:
+        """Turn the strongest lamp, with a sky and a ground beside it, to where colours fit best."""
+        if not self.known or not self._subject.lit:
+            return
+        strongest = max(self.lamps, key=lambda lamp: float(np.sum(lamp.colour)))
+        towards = np.asarray(strongest.place if self._sun is None else self._sun, np.float64)
+        side = np.cross(towards, np.eye(3)[np.argmin(np.abs(towards))])
+        side /= np.linalg.norm(side)
+        across = np.stack([side, np.cross(towards, side)])
         rows, seen = np.concatenate(self._rows), np.concatenate(self._seen)
+        above = self._places[:, 2] > 0
+        around = np.stack([rows[..., above].mean(axis=-1), rows[..., ~above].mean(axis=-1)], axis=-1)
+
+        def turned(angles: np.ndarray) -> np.ndarray:
+            place = towards + angles @ across
+            return place / np.linalg.norm(place)
+
+        def unlike(angles: np.ndarray) -> float:
+            column = np.concatenate([self._column(view, turned(angles)) for view in self._views])
+            total = 0.0
+            for c in range(3):
+                mixed = np.concatenate([column[:, c, None], around[:, c]], axis=1)
+                found = mixed @ _powers(mixed, seen[:, c])
+                away = np.maximum(found, 0) ** (1 / GAMMA) - seen[:, c] ** (1 / GAMMA)
+                total += float(np.mean(np.minimum(away**2, _FAR_OFF**2)))
+            return total
+
+        corners = _TURN * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        best = minimize(
+            unlike, np.zeros(2), method="Nelder-Mead", options={"maxfev": _TRIES, "initial_simplex": corners}
+        )
+        self._sun = turned(best.x)
+        self.lamps = self._fitted()
+
+    def _column(self, view: tuple[Placement, AbstractCamera, np.ndarray], towards: np.ndarray) -> np.ndarray:
+        """Light that pixels of a frame get from a lamp of power one (n, 3)."""
+        place, camera, pixels = view
+        dark = Light((0.0, 0.0, 1.0), intensity=0.0)
+        seen = self._subject.picture(place, (Light(towards), *[dark] * (LAMPS - 1)), camera, pixels)
+        return np.maximum(seen.colour / np.maximum(seen.opacity, 0.5)[:, None], 0) ** GAMMA
+
+    def _fitted(self) -> tuple[Light, ...]:
+        rows, seen, places = np.concatenate(self._rows), np.concatenate(self._seen), self._places
+        first = []
+        if self._sun is not None:
+            sun = np.concatenate([self._column(view, self._sun) for view in self._views])
+            others = places @ self._sun < _OTHER
+            rows = np.concatenate([sun[..., None], rows[..., others]], axis=-1)
+            places, first = np.concatenate([self._sun[None], places[others]]), [0]
         powers = np.stack([_powers(rows[:, c], seen[:, c]) for c in range(3)], axis=1)
-        chosen = np.argsort(-powers.sum(axis=1))[:LAMPS]
+        order = np.argsort(-powers.sum(axis=1))
+        chosen = [*first, *order[~np.isin(order, first)]][:LAMPS]
         powers = np.stack([_powers(rows[:, c][:, chosen], seen[:, c]) for c in range(3)], axis=1)
         dark = [Light((0.0, 0.0, 1.0), intensity=0.0)] * (LAMPS - len(chosen))
-        return (*(Light(self._places[i], colour=p) for i, p in zip(chosen, powers, strict=True)), *dark)
+        return (*(Light(places[i], colour=p) for i, p in zip(chosen, powers, strict=True)), *dark)
 
 
 def _powers(rows: np.ndarray, seen: np.ndarray) -> np.ndarray:

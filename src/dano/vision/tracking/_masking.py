@@ -7,12 +7,16 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from dano.vision.capture import background_mask, Light, PosedCamera, View
+from dano.vision.tracking._edges import common_offset, edge_offset, moved_edge
 from dano.vision.tracking._film import Film, read_picture
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._refine import silhouette, Target, window_of
 from dano.vision.tracking._segments import like_object, Palette, Place, unlike_place
 from dano.vision.tracking._subject import Subject
+
+_EDGE_FRAMES = 8
+"""Frames, spread over a film, in which edges of given masks are measured."""
 
 BLIND = 0.5
 """Share of the silhouette that must not be hidden."""
@@ -41,6 +45,7 @@ class Masking:
             raise ValueError(
                 "masks: there are none (a folder of masks, or frames with alpha), though masks='given'"
             )
+        self._too_large = self._offset() if self.source == "given" else 0.0
         if background is not None:
             width, height = film.size
             self._place = Place(read_picture(background, (height, width), film.shrunk), film.images)
@@ -50,6 +55,23 @@ class Masking:
                 "masks: what is behind the object is taken from the median of all frames; a picture of"
                 " the place without it (background) is better"
             )
+
+    def _offset(self) -> float:
+        """By how much given masks are too large [pixels]."""
+        given = [i for i, mask in enumerate(self._film.masks) if mask is not None]
+        some = np.unique(np.linspace(0, len(given) - 1, min(_EDGE_FRAMES, len(given))).astype(int))
+        offsets = []
+        for i in (given[k] for k in some):
+            mask = self._film.masks[i]
+            assert mask is not None
+            offsets.append(edge_offset(mask, self._image(i), self._seen(i)))
+        offset = common_offset(offsets)
+        if offset:
+            self.notes.append(
+                f"masks: their edge lies {abs(offset):.1f} pixels {'outside' if offset > 0 else 'inside'} the"
+                " edge that the frames show; they were moved by that"
+            )
+        return offset
 
     def _is_plain(self) -> bool:
         try:
@@ -88,7 +110,11 @@ class Masking:
         if self._last is not None and self._last[0] == i:
             return self._last[1]
         if self.source == "given":
-            return self._film.masks[i]
+            mask = self._film.masks[i]
+            if mask is not None and self._too_large:
+                mask = moved_edge(mask, -self._too_large)
+            self._last = None if mask is None else (i, mask)
+            return mask
         if self.source == "plain":
             try:
                 mask = background_mask(self._view(i))

@@ -38,6 +38,10 @@ _TILE = 6
 _BLUR = 3.0
 """Standard deviation of the blur B of the paper's second term [pixels]."""
 
+_COLOURED_EDGE = 6.0
+"""By which variances grow where colours alone say where the object ends: light passes its rim, and its shadow
+lies beside it (measured in rendered films, with their true poses)."""
+
 _SMALL = 0.02
 """Predicted move [pixels] that ends the search."""
 
@@ -358,9 +362,10 @@ def _refined(
     fit = overlap(target.mask[window], shape, target.seen[window])
     # What the mask has elsewhere does not fit either.
     fit *= target.mask[window].sum() / max(target.mask[window].sum() + beside, 1e-9)
-    return Refined(
-        place, rows.cost, fit, rows.colour_error, hessian, _covariance(rows, hessian, index), window, shape
-    )
+    covariance = _covariance(rows, hessian, index)
+    if target.behind is not None:
+        covariance = _COLOURED_EDGE * covariance
+    return Refined(place, rows.cost, fit, rows.colour_error, hessian, covariance, window, shape)
 
 
 def _covariance(rows: _Rows, hessian: np.ndarray, index: np.ndarray) -> np.ndarray:

@@ -44,8 +44,9 @@ class Tracked(NamedTuple):
         quality: Overlap of each mask with the silhouette, as intersection over union, shape (T,).
         colour_error: Usual difference of colours of each frame, in sRGB, shape (T,).
         lamps: Light that the film is under.
-        ambiguity: How well the next-best orientation explains the first frame: its difference of colours over
-            that of the best; ∞ if none has a silhouette that fits as well. Near 1 the start may be another.
+        ambiguity: How well the next-best orientation explains the first frame: its difference of colours and
+            of their pattern over that of the best; ∞ if none has a silhouette that fits as well. Near 1 the
+            start may be another.
         overlays: Silhouettes at these poses, None where there is none.
         messages: What a user should know, in sentences.
         seconds: Time a frame took [s], the search at the start not included.

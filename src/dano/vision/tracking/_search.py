@@ -8,7 +8,7 @@ the picture says, and compared again.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from dano.maths import quat_conjugate, quat_from_matrix, quat_log, quat_multiply
@@ -37,9 +37,11 @@ _COARSE = 26
 _AREA = 40.0
 """Pixels that a mask must have for a search."""
 
-
 _SPECKLE = 1.2
 """Standard deviation of the blur that takes the noise of pixels away [pixels]."""
+
+_FINE = 1.0, 3.0
+"""Standard deviations of the filters between which a pattern is fine [pixels]."""
 
 
 class Start(NamedTuple):
@@ -107,17 +109,33 @@ def half_turns(subject: Subject, place: Placement) -> list[Placement]:
 
 
 def unlikeness(subject: Subject, target: Target, start: Start) -> float:
-    """Root mean square difference of colours where the object is, noise of single pixels averaged out."""
+    """How much colours differ where the object is, and how little their pattern agrees; a pure number.
+
+    The first factor is the root mean square difference, noise of single pixels averaged out: which faces are
+    seen. The second is one less the correlation of what is fine, such as writing, which light hardly changes.
+    """
     window = start.refined.window
     shape, colour = silhouette(subject, start.refined.place, start.light.lamps, target.camera, window)
     inside = (shape > 0.95) & (target.mask[window] > 0.7) & target.seen[window]
     inside = ndimage.binary_erosion(inside, iterations=2)
     if inside.sum() < _AREA:
         return float("inf")
-    away = np.where(inside[..., None], colour / np.maximum(shape, 0.5)[..., None] - target.image[window], 0)
-    share = np.maximum(ndimage.gaussian_filter(inside.astype(float), _SPECKLE), 1e-3)
-    smooth = ndimage.gaussian_filter(away, (_SPECKLE, _SPECKLE, 0)) / share[..., None]
-    return float(np.sqrt(np.mean(smooth[inside] ** 2)))
+    look, image = colour / np.maximum(shape, 0.5)[..., None], target.image[window]
+    away = _smooth(look - image, inside, _SPECKLE)[inside]
+    fine, given = (
+        (_smooth(x, inside, _FINE[0]) - _smooth(x, inside, _FINE[1]))[inside] for x in (look, image)
+    )
+    alike = np.sum(fine * given) / max(float(np.linalg.norm(fine) * np.linalg.norm(given)), 1e-12)
+    return float(np.sqrt(np.mean(away**2)) * (1 - alike))
+
+
+def _smooth(
+    values: Float[np.ndarray, "height width 3"], inside: Bool[np.ndarray, "height width"], sigma: float
+) -> Float[np.ndarray, "height width 3"]:
+    """Gaussian mean [pixels] over what is inside."""
+    share = np.maximum(ndimage.gaussian_filter(inside.astype(float), sigma), 1e-3)
+    kept = np.where(inside[..., None], values, 0)
+    return ndimage.gaussian_filter(kept, (sigma, sigma, 0)) / share[..., None]
 
 
 def score(refined: Refined) -> float:

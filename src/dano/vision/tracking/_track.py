@@ -130,6 +130,8 @@ class _Walk:
             if searched or count < _LIGHT_EVERY or count % _LIGHT_EVERY == 0:
                 known = self._light.known
                 self._learn(i, found)
+                if count > _LIGHT_EVERY:
+                    self._light.find_sun()
                 if self._light.known and not known:
                     # Colours count only now.
                     found = self._fine(i, found.place, self._light) or found
@@ -142,6 +144,7 @@ class _Walk:
 
     def _settle(self) -> None:
         """Refine the first frames again, under the light that several frames tell."""
+        self._light.find_sun()
         for j, found in enumerate(self._found):
             if found is not None:
                 self._found[j] = self._fine(j, found.place, self._light) or found
