@@ -1,6 +1,7 @@
 """Kinematics and dynamics of robots, with MuJoCo on the same file as the other opinion."""
 
 import dataclasses
+import re
 import xml.etree.ElementTree as ET
 
 import jax
@@ -170,6 +171,19 @@ def test_inverse_kinematics():
     # Stretched out: the shoulder stands at 0.11 m, and the arm is 0.51 m long.
     reach = np.hypot(2.0, 0.11) - 0.51
     np.testing.assert_allclose(far.position_errors[0], reach, rtol=1e-3)
+    assert far.singular
+    assert not found.singular
+    assert re.search(r"'tool' is 149\d mm away .* singular configuration", far.reason)
+    # Straight up and told to come down along the arm: no joint pulls that way, to first order.
+    pulled = robot.state(scene, dict(lift=0.0, bend=0.0))
+    above, _, _ = robot.place(scene, pulled, "tool")
+    stuck = dano.inverse_kinematics(
+        robot, scene, pulled, [dano.Target("tool", above - np.array([0, 0, 0.1]))], posture_weight=0.0
+    )
+    assert stuck.reached or "singular configuration" in stuck.reason
+    low = dano.inverse_kinematics(robot, scene, start, [dano.Target("tool", (-0.1, 0.0, -0.3))])
+    assert not low.reached
+    assert "away from its target" in low.reason
     with pytest.raises(ValueError, match=r"did you mean 'tool'"):
         dano.inverse_kinematics(robot, scene, start, [dano.Target("tol", position)])
     with pytest.raises(ValueError, match="got neither"):

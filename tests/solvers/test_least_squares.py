@@ -154,6 +154,46 @@ def test_blocks_that_bend_hold_up_no_others():
     assert any(0 < changed.sum() < 8 for changed in pairs)
 
 
+def test_a_block_that_hardly_answers_does_not_run_off():
+    """As the speed of a joint that sticks: it changes next to nothing, until it breaks away."""
+    t = np.array([1.0, 2.0, 3.0])
+    truth, turns = 0.7, np.array([0.3, -0.2, 0.0])
+    weak = np.array([0.0, 0.0, 1.0])
+
+    def answer(z):
+        away = np.maximum(np.abs(z) - 1, 0)
+        stuck, slope = 1e-9 * z + 1e3 * np.sign(z) * away**2, 1e-9 + 2e3 * away
+        return np.where(weak, stuck, z), np.where(weak, slope, 1.0)
+
+    seen = truth * t + answer(turns)[0][:, None] + 1e-3 * np.sin(7 * np.arange(9)).reshape(3, 3)
+
+    def linearize(x, z):
+        moved, slope = answer(z)
+        r = x[0] * t + moved[:, None] - seen
+        return NormalEquations(
+            0.5 * np.sum(r**2),
+            np.array([np.sum(r * t)]),
+            np.array([[3 * t @ t]]),
+            np.sum(r, axis=1)[:, None] * slope[:, None],
+            (3 * slope**2)[:, None, None],
+            (t.sum() * slope)[:, None, None],
+            0.5 * np.sum(r**2, axis=1),
+        )
+
+    found = bounded_least_squares(
+        linearize,
+        np.array([-4.0]),
+        lower=np.array([-5.0]),
+        upper=np.array([5.0]),
+        start_blocks=np.zeros(3),
+        retract=lambda blocks, change: blocks + change[:, 0],
+        max_iterations=100,
+    )
+    assert found.x[0] == pytest.approx(truth, abs=2e-3)
+    np.testing.assert_allclose(found.blocks[:2], turns[:2], atol=5e-3)
+    assert abs(found.blocks[2]) < 1.1
+
+
 def test_a_direction_without_curvature_stays_where_it_is():
     flat = lambda x: np.array([x[0] - 1.0]), lambda x: np.array([[1.0, 0.0]])
     found = solve(flat, (0.0, 0.3), (-2, -2), (2, 2))

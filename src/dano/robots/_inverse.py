@@ -21,6 +21,10 @@ from dano.solvers import bounded_least_squares, NormalEquations
 # What a gap in a loop counts for, beside a target's distance.
 _LOOPS = 100.0
 
+# Ratio of the smallest to the largest singular value of a Jacobian below which it counts as singular: a
+# degree and a half from a stretched elbow.
+_SINGULAR = 1e-3
+
 
 class Target(eqx.Module):
     """Where a link should be; what is None is left free.
@@ -75,7 +79,9 @@ class InverseKinematics(NamedTuple):
         position_errors: Distance of each target [m]; NaN where it has no position.
         angle_errors: Angle of each target [rad]; NaN where it has no orientation.
         at_limits: Coordinates that lie on a limit.
-        reason: Why the search ended.
+        singular: Whether the arm is where some motion of the links needs infinite speeds of the joints, e.g.
+            stretched, or with two axes in line.
+        reason: Which target was missed, by how much and why, or why the search ended.
     """
 
     state: State
@@ -83,6 +89,7 @@ class InverseKinematics(NamedTuple):
     position_errors: np.ndarray
     angle_errors: np.ndarray
     at_limits: tuple[int, ...]
+    singular: bool
     reason: str
 
 
@@ -150,9 +157,37 @@ def inverse_kinematics(
     errors = np.array([_errors(robot, scene, found, target) for target in targets])
     tight = np.flatnonzero((solution.x <= lower) | (solution.x >= upper))
     met = bool(np.nanmax(errors[:, 0], initial=0) <= 1e-4 and np.nanmax(errors[:, 1], initial=0) <= 1e-3)
-    return InverseKinematics(
-        found, met, errors[:, 0], errors[:, 1], tuple(map(int, tight)), solution.stop.value
-    )
+    residual, slope = _linearized(robot.place, scene, resting, tuple(targets), solution.x)
+    singular = _is_singular(slope)
+    reason = solution.stop.value
+    if not met:
+        layout = scene.layout
+        pulls = np.abs(slope.T @ residual) > _SINGULAR * np.linalg.norm(slope) * np.linalg.norm(residual)
+        held = set(tight[pulls[tight]].tolist())
+        names = [scene.names[layout.children[joint]] for joint, _, place in layout.dofs if place in held]
+        reason = _missed_because(targets, errors, names, singular and not pulls.any())
+    return InverseKinematics(found, met, errors[:, 0], errors[:, 1], tuple(map(int, tight)), singular, reason)
+
+
+def _is_singular(slope: np.ndarray) -> bool:
+    """Whether joints cannot move targets in a direction in which they usually can."""
+    values = np.linalg.svd(slope, compute_uv=False)
+    return bool(values[-1] < _SINGULAR * values[0])
+
+
+def _missed_because(targets: Sequence[Target], errors: np.ndarray, limited: list[str], blocked: bool) -> str:
+    worst = int(np.argmax(np.nan_to_num(errors).sum(axis=1)))
+    distance, angle = errors[worst]
+    off = [f"{1e3 * distance:.4g} mm"] * bool(distance > 0) + [f"{np.degrees(angle):.3g}°"] * bool(angle > 0)
+    text = f"link {targets[worst].link!r} is {' and '.join(off)} away from its target"
+    if limited:
+        return f"{text}; joints at a limit: {', '.join(limited)}"
+    if blocked:
+        return (
+            f"{text}, and no joint moves it there from this singular configuration (a stretched arm, or two"
+            " axes in line): the target is out of reach, or start at another posture"
+        )
+    return f"{text}, the nearest that the search found: the target is out of reach, or start at another state"
 
 
 def _limits(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

@@ -90,6 +90,8 @@ _ROUGH = 100
 # Curvature over a parameter's range, as a share of the largest there is, that may be rounding: a parameter
 # with less stays about where it is instead of running off.
 _FLAT = 1e-10
+# Share of the largest curvature of an unknown among blocks that counts as the least: a tenth of the scale.
+_ALIKE = 1e-2
 # A step is accepted if it reduces the loss by at least this share of the model's prediction.
 _SUFFICIENT = 1e-4
 # A step that brings less than this share is poor: blocks whose loss grew try again, damped more and more.
@@ -265,9 +267,14 @@ def _solution(x, blocks, normal, stop, losses, evaluations) -> Solution:
 
 
 def _scales(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
-    """Diagonals D of the Hessians, which measure damping and slopes; 1 where there is no curvature."""
+    """Diagonals D of the Hessians, which measure damping and slopes; 1 where there is no curvature.
+
+    Where a block tells next to nothing of an unknown, such as the speed of a joint that sticks, what other
+    blocks tell of the like measures it.
+    """
     shared = np.diag(normal.hessian)
     private = np.diagonal(normal.block_hessian, axis1=1, axis2=2)
+    private = np.maximum(private, _ALIKE * np.max(private, axis=0, initial=0))
     return np.where(shared > 0, shared, 1.0), np.where(private > 0, private, 1.0)
 
 

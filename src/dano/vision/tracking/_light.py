@@ -16,7 +16,7 @@ _DIRECTIONS = 16
 """Directions that lamps may come from, evenly spread."""
 
 _OTHER = np.cos(np.radians(40))
-"""Cosine of the angle around the sun in which no other lamp is looked for: it would only share the sun's power."""
+"""Cosine of the angle around the sun without other lamps: they would only share its power."""
 
 _TURN = 0.2
 """First turn of the search for the sun [rad]: half the distance of neighbouring directions."""
@@ -25,7 +25,7 @@ _TRIES = 30
 """Directions that this search tries: two angles to a degree."""
 
 _FAR_OFF = 0.1
-"""Difference of colours [sRGB] from which a pixel says nothing of the sun, e.g. in a shadow of something else."""
+"""Difference of colours [sRGB] from which a pixel says nothing of the sun, e.g. in the shadow of a hand."""
 
 _FLAT = 0.02
 """Weight of the wish for little light, by which lamps that no pixel can tell apart share theirs."""
