@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 import dano
-from dano.report import view
+from dano.report import view, write_view
 from dano.report._page import image, table, video, warnings, write_page
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -79,6 +79,22 @@ def test_the_viewer_opens_on_what_moves(tmp_path):
     rows, columns = np.nonzero(orange[:, :380])
     assert orange.mean() > 0.01
     assert abs(np.median(columns) - 300) < 60 and abs(np.median(rows) - 200) < 90
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine; DANO_BROWSER names one")
+@pytest.mark.skipif(find_spec("viser") is None, reason="needs the extra view")
+def test_the_page_in_one_file_opens_without_errors(tmp_path):
+    bodies = [
+        dano.Body("ball", dano.Sphere(0.05), mass=0.1),
+        dano.Body("floor", dano.HalfSpace(), fixed=True),
+    ]
+    scene = dano.Scene.create(bodies, [dano.Contact("ball", "floor")])
+    run = dano.simulate(scene, scene.initial_state(ball={"position": (0.0, 0.0, 0.2)}), 30)
+    write_view(scene, run, tmp_path / "run.html")
+    assert console_errors(tmp_path / "run.html", tmp_path / "profile", tmp_path / "page.png") == []
+    picture = np.asarray(Image.open(tmp_path / "page.png").convert("RGB")).astype(int)
+    assert (picture[..., 0] - picture[..., 2] > 25).mean() > 0.005
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine; DANO_BROWSER names one")

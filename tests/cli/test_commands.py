@@ -328,7 +328,30 @@ def test_view_shows_the_run(run, scene, tmp_path, monkeypatch):
     assert run("view", out, "--port", 9000).code == 0
     ((shown, trajectory), options) = seen[0]
     assert shown.names == trajectory.names == ("egg", "floor")
-    assert options == {"port": 9000}
+    assert options == {"port": 9000, "looks": {}, "beside": None, "again": None}
+
+
+def test_view_simulates_a_scene_and_again_with_other_parameters(run, scene, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr("dano.report.view", lambda *given, **options: seen.append((given, options)))
+    assert run("view", scene).code == 0
+    ((shown, trajectory), options) = seen[0]
+    again = options["again"](shown)
+    np.testing.assert_allclose(again.states.position, trajectory.states.position, atol=1e-6)
+    heavy = options["again"](shown.replace_body("egg", mass_scale=2.0))
+    assert heavy.names == trajectory.names
+
+
+def test_view_writes_a_page_with_a_second_run(run, scene, tmp_path):
+    pytest.importorskip("viser")
+    out, page = tmp_path / "run.npz", tmp_path / "page.html"
+    assert run("simulate", scene, "-o", out).code == 0
+    answer = run("view", out, "--beside", out, "--page", page)
+    assert (answer.code, answer.out.strip()) == (0, f"wrote {page}")
+    text = page.read_text(encoding="utf-8")
+    assert text.lower().startswith("<!doctype html>")
+    assert len(text) > 100_000
+    assert run("view", out, "--page", tmp_path / "page.png").code == 2
 
 
 @pytest.fixture

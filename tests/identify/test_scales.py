@@ -10,6 +10,7 @@ from dano.identify import Errors
 from dano.identify._identify import _missed
 from dano.identify._scales import check_scales
 from dano.identify._uncertainty import _width
+from dano.maths import quat_exp, quat_rotate
 
 SCENE = dano.Scene.create([dano.Body("ball", dano.Sphere(0.05), mass=1.0)], timestep=0.005)
 
@@ -50,11 +51,11 @@ def test_bodies_beside_the_plane_that_carries_them_are_said(height, text, tilt):
     box = dano.Body("box", dano.Box((0.05, 0.05, 0.05)), mass=1.0)
     floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
     scene = dano.Scene.create([box, floor], [dano.Contact("box", "floor")], timestep=0.005)
-    turn = dano.maths.quat_exp(np.array([tilt, 0.0, 0.0]))
+    turn = quat_exp(np.array([tilt, 0.0, 0.0]))
     state = scene.initial_state(floor={"position": (0.0, 0.1, 0.2), "orientation": turn})
     times = np.arange(12) / 30
     local = np.stack([0.05 * times, 0 * times, height + 0 * times], axis=1)
-    position = np.asarray(dano.maths.quat_rotate(turn, local)) + np.array([0.0, 0.1, 0.2])
+    position = np.asarray(quat_rotate(turn, local)) + np.array([0.0, 0.1, 0.2])
     motion = dano.Motion.create(times, ("box",), position=position, orientation=np.tile(turn, (12, 1)))
     falling = motion.position - 4.9 * times[:, None, None] ** 2 * np.array([0.0, 0.0, -1.0])
     with warnings.catch_warnings(record=True) as said:

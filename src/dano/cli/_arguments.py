@@ -435,14 +435,19 @@ class Plan:
 
 @dataclass(frozen=True)
 class View:
-    """Look at a saved run in the browser.
+    """Look at a run, a scene or an object in the browser.
 
     Attributes:
-        run: A trajectory written by `dano simulate`.
+        run: A trajectory written by `dano simulate`; or a scene file (.toml) or a neural object (.dano),
+            which is simulated, and again when a slider of the page moves.
+        beside: Another run of the same bodies, drawn translucent over the first.
+        page: Where to write the page as one file that can be sent to others (.html), instead of serving it.
         port: Port of the page on this computer.
     """
 
     run: Positional[Path]
+    beside: Path | None = None
+    page: Path | None = None
     port: int = 8080
 
     def __call__(self) -> None:

@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ from dano.cli import running
 from dano.cli._arguments import Demo, Simulate, View
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
+from dano.engine import simulate as simulate_scene
 from dano.objects import NeuralObject
+from dano.scene import Scene, Trajectory
 
 SCENES = ("drop", "collision")
 DEMO_FPS, DEMO_SIZE = 24, (560, 350)
@@ -60,12 +63,34 @@ def view(command: View) -> None:
     """See `dano view --help`."""
     if not 0 < command.port < 65536:
         raise ValueError(f"port must lie between 1 and 65535, got {command.port}")
+    if command.page is not None:
+        check_output(command.page, command.run, suffix=".html")
     progress = Progress()
-    loaded = scene_file.load_run(command.run, progress=progress)
+    again = None
+    if command.run.suffix.lower() in (".toml", ".dano"):
+        loaded = load(command.run, None, None)
+        trajectory = running.roll_out(loaded, progress, running.Clock()).trajectory
+        again = partial(_again, loaded)
+    else:
+        run = scene_file.load_run(command.run, progress=progress)
+        loaded, trajectory = run.source, run.trajectory
+    beside = None
+    if command.beside is not None:
+        beside = scene_file.load_run(command.beside, progress=progress).trajectory
     progress.close()
-    from dano.report import view as show
+    looks = loaded.looks()
+    from dano.report import view as show, write_view
 
-    show(loaded.scene, loaded.trajectory, port=command.port)
+    if command.page is not None:
+        write_view(loaded.scene, trajectory, command.page, looks=looks, beside=beside)
+        put(f"wrote {command.page}")
+        return
+    show(loaded.scene, trajectory, looks=looks, beside=beside, again=again, port=command.port)
+
+
+def _again(loaded: scene_file.SceneFile, scene: Scene) -> Trajectory:
+    """A scene file's run with other parameters."""
+    return simulate_scene(scene, loaded.state, loaded.n_steps, controls=loaded.controls)
 
 
 def demo(command: Demo) -> None:

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
 
 from dano.fields import HalfSpace
@@ -113,7 +114,7 @@ def _check_planes(scene: Scene, state: State | None, motion: Motion, row: int) -
         normal, offset = np.asarray(plane.shape.normal_direction), float(plane.shape.offset)
         if state is not None:
             i = scene.index(other)
-            normal = np.asarray(quat_rotate(state.orientation[i], normal))
+            normal = np.asarray(quat_rotate(state.orientation[i], jnp.asarray(normal)))
             offset += float(
                 normal @ np.asarray(state.position[i] - quat_rotate(state.orientation[i], plane.com))
             )

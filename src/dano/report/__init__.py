@@ -22,4 +22,4 @@ from dano.report._training import (
     write_training_report as write_training_report,
 )
 from dano.report._video import render_trajectory as render_trajectory
-from dano.report._viewer import view as view, Viewer as Viewer
+from dano.report.viewing import view as view, Viewer as Viewer, write_view as write_view

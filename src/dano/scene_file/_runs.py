@@ -22,10 +22,15 @@ _LAW_BEFORE = "centroid"
 
 @dataclass(frozen=True)
 class Run:
-    """A saved trajectory and the scene that it came from."""
+    """A saved trajectory and what it came from."""
 
     trajectory: Trajectory
-    scene: Scene
+    source: SceneFile
+
+    @property
+    def scene(self) -> Scene:
+        """The scene that it came from."""
+        return self.source.scene
 
 
 def drop_scene(object_path: str | os.PathLike[str]) -> str:
@@ -96,12 +101,13 @@ def load_run(path: str | os.PathLike[str], *, progress: Progress | None = None) 
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path} is not a valid run: its scene is not readable") from error
     with located(f"{path}: the scene of this run cannot be built"):
-        scene = parse_scene(text, origin, default_law=law, progress=progress).scene
-    if scene.names != trajectory.names:
+        source_file = parse_scene(text, origin, default_law=law, progress=progress)
+    names = source_file.scene.names
+    if names != trajectory.names:
         raise ValueError(
-            f"{path} is not a valid run: its bodies {trajectory.names} are not its scene's {scene.names}"
+            f"{path} is not a valid run: its bodies {trajectory.names} are not its scene's {names}"
         )
-    return Run(trajectory, scene)
+    return Run(trajectory, source_file)
 
 
 def _lowest_point(made: NeuralObject, orientation: np.ndarray) -> float:

@@ -1,0 +1,261 @@
+"""What the browser shows of a run: bodies, contact forces, trails, centres of mass."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dano.fields import AbstractShape
+from dano.maths import Pose, quat_from_matrix, quat_to_matrix
+from dano.report._resample import poses_at
+from dano.report._stage import Touches, touches
+from dano.report.viewing._meshes import body_mesh
+from dano.scene import Body, Scene, Trajectory
+from dano.vision import Camera, checked_colour, Item, LearnedField, PALETTE
+
+_GHOST = 0.35
+"""Opacity of the bodies of a second run."""
+
+_TRAIL = 200
+"""Points of a trail."""
+
+
+class Shown(NamedTuple):
+    """What is shown beside the bodies."""
+
+    contacts: bool = True
+    trails: bool = False
+    centres: bool = False
+
+
+class Numbers(NamedTuple):
+    """Numbers over a run.
+
+    Attributes:
+        times: [s].
+        energy: Kinetic and potential energy of what moves freely [J].
+        force: Sum of the contact forces' lengths [N]; None without contacts.
+    """
+
+    times: Float[np.ndarray, " T"]
+    energy: Float[np.ndarray, " T"]
+    force: Float[np.ndarray, " T"] | None
+
+
+class Drawn:
+    """A run in a viser server (host).
+
+    Attributes:
+        numbers: Energy and contact force over the run.
+        touched: Contact forces; None without contacts.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        scene: Scene,
+        trajectory: Trajectory,
+        looks: Mapping[str, LearnedField],
+        beside: Trajectory | None,
+    ):
+        self._scene, self._server = server.scene, server
+        self._bodies = scene
+        self._runs = [trajectory] if beside is None else [trajectory, beside]
+        self._handles: list[list[Any]] = []
+        sizes = [body.size for body in scene.bodies if np.isfinite(body.size)]
+        self._length = 0.3 * float(np.median(sizes)) if sizes else 1.0
+        self._scene.set_up_direction("+z")
+        self._coms = [np.asarray(body.com + body.com_offset, np.float64) for body in scene.bodies]
+        self._place(scene, looks)
+        self._aim(scene)
+        self._forces: Any = None
+        self._extras: list[Any] = []
+        self.replace(scene, trajectory)
+
+    def replace(self, scene: Scene, trajectory: Trajectory) -> None:
+        """Show another run of the same bodies in place of the first."""
+        self._bodies, self._runs[0] = scene, trajectory
+        self._coms = [np.asarray(body.com + body.com_offset, np.float64) for body in scene.bodies]
+        times = np.asarray(trajectory.times, np.float64)
+        self.touched = touches(scene, trajectory, times)
+        force = None if self.touched is None else np.linalg.norm(self.touched.forces, axis=-1).sum(axis=-1)
+        self.numbers = Numbers(times, _energy(scene, trajectory), force)
+
+    def _place(self, scene: Scene, looks: Mapping[str, LearnedField]) -> None:
+        colours = [np.rint(255 * checked_colour(name)).astype(int) for name in PALETTE]
+        for which in range(len(self._runs)):
+            handles, used = [], 0
+            for i, body in enumerate(scene.bodies):
+                name = f"/run_{which}/{i}_{body.name}"
+                plane = None if body.shape is None else _plane(body.shape)
+                if plane is not None:
+                    if which == 0:
+                        _add_floor(self._scene, name, plane, 40 * self._length)
+                    handles.append(None)
+                    continue
+                handle = self._scene.add_frame(name, show_axes=False)
+                opacity = None if which == 0 else _GHOST
+                _add_body(
+                    self._scene, name, body, looks.get(body.name), colours[used % len(colours)], opacity
+                )
+                handles.append(handle)
+                used += 1
+            self._handles.append(handles)
+
+    def _aim(self, scene: Scene) -> None:
+        """Let the page open on the bodies that move, near enough to see them, over the whole run."""
+        moving = [i for i, body in enumerate(scene.bodies) if not body.fixed and np.isfinite(body.size)]
+        if not moving:
+            return
+        runs = [np.asarray(run.states.position, np.float64)[:, moving].reshape(-1, 3) for run in self._runs]
+        places = np.concatenate(runs)
+        radii = np.resize([0.5 * scene.bodies[i].size for i in moving], len(places))
+        camera = Camera.framing(places, radii, width=3, height=2, margin=0.15)
+        start = self._server.initial_camera
+        start.up, start.fov = (0.0, 0.0, 1.0), camera.vertical_fov
+        start.position, start.look_at = tuple(camera.position), tuple(camera.look_at)
+
+    def show(self, time: float, shown: Shown) -> None:
+        """Move everything to a time [s]."""
+        with self._server.atomic():
+            for handles, run in zip(self._handles, self._runs, strict=True):
+                position, orientation = poses_at(run, np.array([time]))
+                for i, handle in enumerate(handles):
+                    if handle is not None:
+                        handle.wxyz = orientation[0, i]
+                        handle.position = position[0, i] - quat_to_matrix(orientation[0, i]) @ self._coms[i]
+            self._show_forces(time, shown.contacts)
+
+    def _show_forces(self, time: float, wanted: bool) -> None:
+        if self._forces is not None:
+            self._forces.remove()
+            self._forces = None
+        if self.touched is None or not wanted:
+            return
+        times = self.numbers.times
+        ends = _arrow_ends(self.touched, int(np.searchsorted(times, time, side="right") - 1), self._length)
+        if len(ends):
+            thick = 0.03 * self._length
+            self._forces = self._scene.add_arrows(
+                "/forces",
+                ends.astype(np.float32),
+                (214, 40, 57),
+                shaft_radius=thick,
+                head_radius=2.5 * thick,
+                head_length=6 * thick,
+            )
+
+    def show_extras(self, shown: Shown) -> None:
+        """Draw trails, and centres of mass with principal axes, or take them away."""
+        for handle in self._extras:
+            handle.remove()
+        self._extras = []
+        for i, body in enumerate(self._bodies.bodies):
+            if body.fixed or self._handles[0][i] is None:
+                continue
+            if shown.trails:
+                path = np.asarray(self._runs[0].states.position, np.float64)[:, i]
+                path = path[:: max(1, len(path) // _TRAIL)].astype(np.float32)
+                lines = np.stack([path[:-1], path[1:]], axis=1)
+                self._extras.append(
+                    self._scene.add_line_segments(
+                        f"/trails/{i}", lines, (120, 124, 132), thickness=0.03 * self._length
+                    )
+                )
+            if shown.centres:
+                # Columns: principal axes in the body's frame.
+                _, axes = np.linalg.eigh(np.asarray(body.inertia, np.float64))
+                self._extras.append(
+                    self._scene.add_frame(
+                        f"/run_0/{i}_{body.name}/centre",
+                        axes_length=2.2 * self._length,
+                        axes_radius=0.04 * self._length,
+                        origin_radius=0.12 * self._length,
+                        origin_color=(20, 20, 20),
+                        wxyz=_quaternion(axes),
+                        position=self._coms[i],
+                    )
+                )
+
+
+def _energy(scene: Scene, trajectory: Trajectory) -> Float[np.ndarray, " T"]:
+    """Kinetic energy, and potential energy in gravity, less its least [J]."""
+    states = trajectory.states
+    rows = [i for i, body in enumerate(scene.bodies) if not body.fixed]
+    total = np.zeros(len(trajectory.times))
+    gravity = np.asarray(scene.gravity, np.float64)
+    for i in rows:
+        body = scene.bodies[i]
+        scale = float(body.mass_scale)
+        mass, inertia = scale * float(body.mass), scale * np.asarray(body.inertia, np.float64)
+        speed, spin = (np.asarray(x[:, i], np.float64) for x in (states.velocity, states.omega))
+        total += 0.5 * mass * np.sum(speed**2, axis=1) + 0.5 * np.einsum("ti,ij,tj->t", spin, inertia, spin)
+        total -= mass * np.asarray(states.position[:, i], np.float64) @ gravity
+    return total - total.min()
+
+
+def _quaternion(axes: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
+    right = axes * np.sign(np.linalg.det(axes))
+    return np.asarray(quat_from_matrix(right))
+
+
+def _arrow_ends(touched: Touches, step: int, length: float) -> np.ndarray:
+    """Tails and heads of the force arrows of a step [m, W], (n, 2, 3)."""
+    rows = np.flatnonzero(touched.shares[step] > 0.02)
+    force = touched.forces[step, rows]
+    direction = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
+    tails = touched.points[step, rows]
+    return np.stack([tails, tails + length * touched.shares[step, rows, None] * direction], axis=1)
+
+
+def _plane(shape: AbstractShape) -> np.ndarray | None:
+    if np.all(np.isfinite(np.asarray(shape.bounds))):
+        return None
+    return Item(shape, Pose()).plane
+
+
+def _add_floor(scene: Any, name: str, plane: np.ndarray, size: float) -> None:
+    normal = plane[:3]
+    # The quaternion that turns z into the normal; antiparallel ones turn about x.
+    w = 1 + normal[2]
+    quaternion = np.array([w, -normal[1], normal[0], 0.0]) if w > 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
+    scene.add_grid(
+        name,
+        width=size,
+        height=size,
+        plane="xy",
+        cell_size=size / 40,
+        section_size=size / 8,
+        plane_color=(240, 241, 243),
+        plane_opacity=1.0,
+        wxyz=quaternion / np.linalg.norm(quaternion),
+        position=plane[3] * normal,
+    )
+
+
+def _add_body(
+    scene: Any, name: str, body: Body, look: LearnedField | None, colour: np.ndarray, opacity: float | None
+) -> None:
+    """Triangles of a body in its field frame, under a frame that is moved."""
+    mesh = body_mesh(body, look)
+    if mesh is None:
+        assert body.object is not None
+        points = np.asarray(body.object.samples.points, np.float32)
+        size = 1.3 * body.size / np.sqrt(len(points))
+        scene.add_point_cloud(f"{name}/samples", points, tuple(int(c) for c in colour), point_size=size)
+        return
+    if mesh.colours is None or opacity is not None:
+        scene.add_mesh_simple(
+            f"{name}/shape",
+            mesh.vertices,
+            mesh.faces,
+            color=tuple(int(c) for c in colour),
+            opacity=opacity,
+            side="double",
+        )
+        return
+    import trimesh
+
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False)
+    scene.add_mesh_trimesh(f"{name}/shape", solid)
