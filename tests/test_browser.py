@@ -27,7 +27,7 @@ def console_errors(page: Path | str, folder: Path, picture: Path | None = None) 
     shown = ["--dump-dom"] if picture is None else [f"--screenshot={picture}", "--window-size=600,400"]
     command = [
         *(BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0"),
-        *("--allow-file-access-from-files", f"--user-data-dir={folder}", "--virtual-time-budget=3000"),
+        *("--allow-file-access-from-files", f"--user-data-dir={folder}", "--virtual-time-budget=4000"),
         *(*shown, page if isinstance(page, str) else page.as_uri()),
     ]
     answer = subprocess.run(command, capture_output=True, text=True, timeout=240)

@@ -12,8 +12,8 @@ from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, PosedS
 from dano.scene import Body
 from dano.vision import LearnedField, placement
 
-_RESOLUTION = 96
-"""Nodes along the longest side of an object: triangles of a hundredth of its size."""
+_RESOLUTION = 64
+"""Nodes along the longest side of an object: triangles of a sixtieth of its size."""
 
 
 class BodyMesh(NamedTuple):
