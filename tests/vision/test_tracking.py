@@ -226,6 +226,33 @@ def test_the_start_is_found_among_all_orientations(bunny, camera, filmed):
     assert (np.degrees(turn.max()) < 5, shift.max() < 0.1) == (True, True), (turn, shift)
 
 
+def test_of_several_things_the_object_is_found_and_two_alike_are_said(bunny, camera):
+    position, orientation = path(2)
+    wide = camera.replaced(width=150, centre=np.array([75.0, 36.0]))
+    beside = position + np.array([0.16, 0.02, 0.0])
+    frames, masks, mixed, both = [], [], [], []
+    for p, other, q in zip(position, beside, orientation, strict=True):
+        (one, here), (two, there) = (drawn(bunny, wide, x, q) for x in (p, other))
+        frames.append(np.where(there[..., None] > 0.02, two, one))
+        masks.append(np.maximum(here, there))
+        # A box instead of the second one, somewhat larger.
+        box = np.zeros(here.shape, bool)
+        box[20:55, 100:140] = True
+        mixed.append(np.where(box[..., None], np.uint8([200, 180, 160]), one))
+        both.append(np.maximum(here, box))
+    options = TrackOptions(rays=700, views=48, turns=16, candidates=3)
+    found = track(film_of(mixed, both), bunny, wide, options)
+    shift, _ = errors(found, position, orientation, slice(0, 2))
+    assert (found.status, shift.max() < 0.1) == (("tracked", "tracked"), True)
+    assert not any("look like the object" in text for text in found.messages)
+    found = track(film_of(frames, masks), bunny, wide, options)
+    assert found.status == ("tracked", "tracked")
+    assert any("2 things in frame 0 look like the object" in text for text in found.messages)
+    given = track(film_of(frames, masks), bunny, wide, options, start=(beside[0], orientation[0]))
+    shift, _ = errors(given, beside, orientation, slice(0, 2))
+    assert shift.max() < 0.1
+
+
 def test_the_paper_s_loss_and_a_hand_in_front(bunny, camera, filmed):
     position, orientation, frames, masks = filmed
     hidden = [mask.copy() for mask in masks[:2]]

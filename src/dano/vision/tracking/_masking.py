@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from dano.vision.capture import background_mask, Light, PosedCamera, View
@@ -20,6 +20,16 @@ _EDGE_FRAMES = 8
 
 BLIND = 0.5
 """Share of the silhouette that must not be hidden."""
+
+
+_JOINED = 2
+"""Distance [pixels] up to which parts of a mask are one thing, which a shadow or a string cuts in two."""
+
+_SPECK = 0.2
+"""Share of the largest thing's area from which another one counts: the object may be further away."""
+
+_MOST_THINGS = 6
+"""Things that are looked at, largest first."""
 
 
 class Masking:
@@ -106,6 +116,20 @@ class Masking:
         seen = self._seen(i)
         return Target(camera, self._image(i).astype(np.float64), mask * seen, seen)
 
+    def parts(self, i: int, camera: PosedCamera) -> list[Target]:
+        """A frame once for each separate thing that its mask shows, largest first; none if there is no mask.
+
+        What else there is counts as hidden, so that an object may be one of several.
+        """
+        whole = self.alone(i, camera)
+        if whole is None:
+            return []
+        if not whole.seen.all():
+            # Something in front may cut one thing in two.
+            return [whole]
+        labels = _things(whole.mask)
+        return [_without(whole, (labels > 0) & (labels != k)) for k in range(1, labels.max() + 1)] or [whole]
+
     def _alone(self, i: int) -> np.ndarray | None:
         if self._last is not None and self._last[0] == i:
             return self._last[1]
@@ -147,7 +171,10 @@ class Masking:
         """
         if self.source != "object":
             target = self.alone(i, camera)
-            if target is None or self._place is None:
+            if target is None:
+                return None
+            target = _near(target, window_of(subject, place, camera, 1.0))
+            if self._place is None:
                 return target
             return target._replace(behind=self._place.seen_in(target.image, target.mask < 0.05))
         window = window_of(subject, place, camera, 1.5)
@@ -170,3 +197,32 @@ class Masking:
         if inside.sum() > 100:
             self._colours = [*self._colours, target.image[window][inside]][-4:]
             self._palette = Palette(np.concatenate(self._colours))
+
+
+def _things(mask: Float[np.ndarray, "height width"]) -> Int[np.ndarray, "height width"]:
+    """Numbers of the separate things in a mask, from 1 for the largest; specks and background are 0."""
+    labels, count = ndimage.label(ndimage.binary_dilation(mask > 0.5, iterations=_JOINED))
+    areas = ndimage.sum_labels(mask, labels, np.arange(1, count + 1))
+    result = np.zeros(mask.shape, int)
+    for number, k in enumerate(np.argsort(-areas)[:_MOST_THINGS]):
+        if areas[k] >= _SPECK * areas.max():
+            result[labels == k + 1] = number + 1
+    return result
+
+
+def _without(target: Target, others: Bool[np.ndarray, "height width"]) -> Target:
+    """A frame without what its mask shows elsewhere."""
+    if not others.any():
+        return target
+    return target._replace(mask=np.where(others, 0, target.mask), seen=target.seen & ~others)
+
+
+def _near(target: Target, window: tuple[slice, slice] | None) -> Target:
+    """A frame with the things alone that lie, for the most part, where the object is expected."""
+    if window is None:
+        return target
+    labels = _things(target.mask)
+    numbers = np.arange(1, labels.max() + 1)
+    inside = ndimage.sum_labels(target.mask[window], labels[window], numbers)
+    here = numbers[inside > 0.5 * ndimage.sum_labels(target.mask, labels, numbers)]
+    return _without(target, (labels > 0) & ~np.isin(labels, here)) if len(here) else target

@@ -33,6 +33,9 @@ _FOUND = 0.75
 _ALIKE = 0.02
 """By which overlaps of starts may differ for colours to decide."""
 
+_TWIN = 1.5
+"""Ratio of the scores of two things in a frame up to which both look like the object."""
+
 _OTHER = np.radians(12)
 """Angle from which a start is another one."""
 
@@ -194,9 +197,30 @@ class _Walk:
         """Look for the object in all orientations; now and then only."""
         if self._missed % self._options.search_every:
             return None
-        target = self._masking.alone(i, self._camera)
-        if target is None:
+        parts = self._masking.parts(i, self._camera)
+        found = [one for target in parts if (one := self._searched_in(i, target)) is not None]
+        if not found:
             return None
+        best, ambiguity = min(found, key=lambda pair: pair[0].score)
+        if not self._light.known:
+            self._ambiguity = ambiguity
+            self._note_alike(i, best, [one for one, _ in found if one is not best])
+        self._light = best.light
+        return best.refined
+
+    def _note_alike(self, i: int, best: Start, others: list[Start]) -> None:
+        """Say it if more than one thing in a frame looks like the object."""
+        like = [one for one in others if one.score < _TWIN * best.score]
+        if like:
+            middles = np.stack([self._subject.middle(one.refined.place) for one in (best, *like)])
+            places = [f"({x:.0f}, {y:.0f})" for x, y, _ in self._camera.project(middles)]
+            self._masking.notes.append(
+                f"{len(like) + 1} things in frame {self._film.names[i]} look like the object; the one at"
+                f" pixel {places[0]} was taken, others are at {', '.join(places[1:])}: give start for another"
+            )
+
+    def _searched_in(self, i: int, target: Target) -> tuple[Start, float] | None:
+        """The likeliest start for one thing that a frame shows, and how clearly it is."""
         starts = search(self._subject, target, self._options, self._random)
         # At low resolution a wrong pose may look as good as the right one, so all are finished.
         finished = [self._finished(i, start.refined.place, start.light) for start in starts]
@@ -207,11 +231,7 @@ class _Walk:
             self._finished(i, place, finer[0].light)
             for place in half_turns(self._subject, finer[0].refined.place)
         ]
-        best, ambiguity = self._likeliest(target, [*finer, *(s for s in turned if s is not None)])
-        if not self._light.known:
-            self._ambiguity = ambiguity
-        self._light = best.light
-        return best.refined
+        return self._likeliest(target, [*finer, *(s for s in turned if s is not None)])
 
     def _likeliest(self, target: Target, starts: list[Start]) -> tuple[Start, float]:
         """Of starts whose silhouettes fit alike, the one whose colours fit best; and how clearly."""
