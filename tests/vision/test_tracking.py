@@ -278,6 +278,8 @@ def test_what_is_wrong_is_said(bunny, camera, filmed):
         ValueError, match="size of the film, 96 × 72 pixels, got 72 × 96, as if the film were turned"
     ):
         track(film, bunny, wide, ROUGH)
+    with pytest.raises(ValueError, match="orientation of start"):
+        track(film, bunny, camera, ROUGH, start=(np.zeros(3), np.zeros(4)))
     with pytest.raises(ValueError, match="masks='given'"):
         track(film_of(frames[:2], [None, None]), bunny, camera, TrackOptions(masks="given"))
     nothing = [np.zeros_like(m) for m in masks[:2]]

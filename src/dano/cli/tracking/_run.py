@@ -27,7 +27,7 @@ def track(command: Track) -> None:
     film = filmed(command.filming, command.video, command.rate, progress)
     start = None
     if command.start is not None:
-        start = np.array(command.start[:3]), np.array(command.start[3:]) / np.linalg.norm(command.start[3:])
+        start = np.array(command.start[:3]), np.array(command.start[3:])
     found = find_poses(
         film,
         field,

@@ -7,7 +7,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply
+from dano.maths import (
+    checked_array,
+    checked_quaternion,
+    quat_conjugate,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+)
 from dano.progress import Progress
 from dano.vision.capture import PosedCamera
 from dano.vision.radiance import LearnedField
@@ -71,15 +78,17 @@ def track(
         progress: Told how far it is.
 
     Raises:
-        ValueError: If the camera does not fit the film, there is no mask to be had, or the object is in no
-            frame.
+        ValueError: If the camera does not fit the film, the start is no pose, there is no mask to be had, or
+            the object is in no frame.
     """
     chosen = options or TrackOptions()
     film.check_size(camera)
     walk = _Walk(film, field, camera, chosen, background)
     first = None
     if start is not None:
-        first = Placement(np.asarray(start[0], np.float64), np.asarray(start[1], np.float64))
+        place = checked_array("position of start", start[0], (3,))
+        turn = checked_quaternion("orientation of start", start[1])
+        first = Placement(np.asarray(place, np.float64), np.asarray(turn, np.float64))
     if first is not None:
         walk.begin(first)
     tell = progress or (lambda text, share: None)
