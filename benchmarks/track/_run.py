@@ -139,7 +139,11 @@ def _tracked(case: Case, source: str) -> list[Row]:
     film = case.film if source == "given" else case.film._replace(masks=[None] * len(case.film.masks))
     began = time.process_time()
     background = None if source == "given" else case.background
-    found = track(film, case.field, case.camera, case.options(source), background=background)
+    try:
+        found = track(film, case.field, case.camera, case.options(source), background=background)
+    except ValueError as error:
+        n = len(film.times)
+        return [Row(group, "frames tracked", 0, "", n, at_least=True, note=f"of {n}: {error}"[:60])]
     processor = (time.process_time() - began) / len(film.times)
     place, turn, distance = _errors(case, found)
     known = np.isfinite(place)

@@ -40,6 +40,9 @@ _FOUND = 0.75
 _ALIKE = 0.02
 """By which overlaps of starts may differ for colours to decide."""
 
+_UNLIKE = 0.1
+"""Usual difference of colours [sRGB] from which a thing is another one: a blurred, noisy object has 0.055."""
+
 _TWIN = 1.5
 """Ratio of the scores of two things in a frame up to which both look like the object."""
 
@@ -240,7 +243,8 @@ class _Walk:
             self._finished(i, place, finer[0].light)
             for place in half_turns(self._subject, finer[0].refined.place)
         ]
-        return self._likeliest(target, [*finer, *(s for s in turned if s is not None)])
+        best, ambiguity = self._likeliest(target, [*finer, *(s for s in turned if s is not None)])
+        return None if self._is_another(best.refined) else (best, ambiguity)
 
     def _likeliest(self, target: Target, starts: list[Start]) -> tuple[Start, float]:
         """Of starts whose silhouettes fit alike, the one whose colours fit best; and how clearly."""
@@ -285,9 +289,13 @@ class _Walk:
         if self._masking.hidden(i, window) > 1 - BLIND:
             return None, HIDDEN
         found = self._refined(i, before, self._light)
-        if found is None or found.overlap < self._options.lost:
+        if found is None or found.overlap < self._options.lost or self._is_another(found):
             return None, LOST
         return found, TRACKED
+
+    def _is_another(self, found: Refined) -> bool:
+        """Whether colours say that a thing of the right shape is another one."""
+        return self._options.loss == "photometric" and found.colour_error > _UNLIKE
 
     def _refined(self, i: int, before: Placement, light: LightFit) -> Refined | None:
         """The pose near an expected one; also from beside it if that fits worse than usual."""
