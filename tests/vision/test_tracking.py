@@ -238,7 +238,7 @@ def test_of_several_things_the_object_is_found_and_two_alike_are_said(bunny, cam
         # A box instead of the second one, somewhat larger.
         box = np.zeros(here.shape, bool)
         box[20:55, 100:140] = True
-        mixed.append(np.where(box[..., None], np.uint8([200, 180, 160]), one))
+        mixed.append(np.where(box[..., None], np.array([200, 180, 160], np.uint8), one))
         both.append(np.maximum(here, box))
     options = TrackOptions(rays=700, views=48, turns=16, candidates=3)
     found = track(film_of(mixed, both), bunny, wide, options)
