@@ -97,7 +97,7 @@ def test_bad_input_files(command, kind, run, egg, tmp_path):
 
 
 def test_one_kind_for_another(run, egg, field, scene, tmp_path):
-    for command, source in (("inspect", field), ("view", egg), ("view", field)):
+    for command, source in (("inspect", field), ("view", field)):
         answer = run(command, source)
         assert answer.code == 2
         assert source.name in answer.err
