@@ -60,13 +60,11 @@ class Drawn:
         beside: Trajectory | None,
     ):
         self._scene, self._server = server.scene, server
-        self._bodies = scene
         self._runs = [trajectory] if beside is None else [trajectory, beside]
         self._handles: list[list[Any]] = []
         sizes = [body.size for body in scene.bodies if np.isfinite(body.size)]
         self._length = 0.3 * float(np.median(sizes)) if sizes else 1.0
         self._scene.set_up_direction("+z")
-        self._coms = [np.asarray(body.com + body.com_offset, np.float64) for body in scene.bodies]
         self._place(scene, looks)
         self._aim(scene)
         self._forces: Any = None

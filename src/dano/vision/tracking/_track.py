@@ -87,13 +87,10 @@ def track(
     chosen = options or TrackOptions()
     film.check_size(camera)
     walk = _Walk(film, field, camera, chosen, background)
-    first = None
     if start is not None:
         place = checked_array("position of start", start[0], (3,))
         turn = checked_quaternion("orientation of start", start[1])
-        first = Placement(np.asarray(place, np.float64), np.asarray(turn, np.float64))
-    if first is not None:
-        walk.begin(first)
+        walk.begin(Placement(np.asarray(place, np.float64), np.asarray(turn, np.float64)))
     tell = progress or (lambda text, share: None)
     for i in range(len(film.times)):
         tell(f"tracking, frame {film.names[i]}", i / len(film.times))
