@@ -68,6 +68,20 @@ def value_and_slope_at(
     return value, jnp.stack([x, y, z])
 
 
+def smooth_slope_at(grid: Float[Array, "nx ny nz"], u: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    """Central differences at the nodes, interpolated between them, in index units.
+
+    Unlike the slope of the interpolated values, it does not jump between cells, so that what depends on it
+    has derivatives.
+    """
+    slopes = []
+    for axis in range(3):
+        # One cell to either side: the difference of interpolated values is the interpolated difference.
+        step = jnp.asarray(np.eye(3)[:, axis : axis + 1], u.dtype)
+        slopes.append(0.5 * (value_at(grid, u + step) - value_at(grid, u - step)))
+    return jnp.stack(slopes)
+
+
 def rows_at(grid: Float[Array, "nx ny nz k"], u: Float[Array, "3 n"]) -> Float[Array, "n k"]:
     """Vectors of k numbers at points in index units."""
     shape = grid.shape[:3]
