@@ -19,7 +19,6 @@ from dano.cli._arguments import (
     Data,
     Demo,
     Export,
-    Identify,
     Import,
     Inspect,
     Plan,
@@ -29,6 +28,7 @@ from dano.cli._arguments import (
     View,
 )
 from dano.cli.checking import Check
+from dano.cli.identifying import Identify
 from dano.cli.tracking import Track
 from dano.names import did_you_mean
 

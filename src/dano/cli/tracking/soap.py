@@ -16,10 +16,10 @@ import numpy as np
 
 import dano
 from dano.archive import replacing
-from dano.cli._arguments import Filming, Train
+from dano.cli._arguments import Train
 from dano.cli._console import Progress, put, put_json
 from dano.cli._learn import train
-from dano.cli.tracking._arguments import Track
+from dano.cli.tracking._arguments import Filming, Track
 from dano.cli.tracking._run import track
 from dano.cli.tracking.filming import camera_of, filmed, options_of
 from dano.identify import load_motion

@@ -10,10 +10,10 @@ import numpy as np
 
 from dano import scene_file
 from dano.archive import checked_output, replacing
-from dano.cli._arguments import Identify
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import missing_for_pictures
+from dano.cli.identifying._arguments import Identify
 from dano.identify import Identification, identify as fit_parameters, load_motion, Motion, Parameter
 from dano.names import did_you_mean
 from dano.scene import Scene
