@@ -255,13 +255,14 @@ class Inspect:
 
 @dataclass(frozen=True)
 class Simulate:
-    """Simulate a scene, or drop an object onto a floor.
+    """Simulate a scene, or drop an object onto a floor. Of two scenes: both, to compare them.
 
     Attributes:
         scene: A scene file (.toml), or a neural object (.dano) that is dropped onto a floor.
-        output: Where to write the trajectory, usually *.npz.
-        video: Where to write a video (.mp4).
-        strip: Where to write a picture of several moments side by side (.png).
+        beside: Another one, to compare with.
+        output: Where to write the trajectory, usually *.npz; of two scenes the folder for both.
+        video: Where to write a video (.mp4); two scenes are side by side in it.
+        strip: Where to write a picture of several moments side by side (.png); two scenes have a row each.
         steps: Number of steps; default: the scene's.
         timestep: Timestep [s]; default: the scene's.
         camera: fixed: sees all bodies all the time; follow: shifts with those that move; auto: follows if
@@ -273,6 +274,7 @@ class Simulate:
     """
 
     scene: Positional[Path]
+    beside: Positional[Path | None] = None
     output: Output = UNNAMED
     video: Path | None = None
     strip: Path | None = None

@@ -21,5 +21,8 @@ from dano.report._training import (
     MassEstimates as MassEstimates,
     write_training_report as write_training_report,
 )
-from dano.report._video import render_trajectory as render_trajectory
+from dano.report._video import (
+    render_side_by_side as render_side_by_side,
+    render_trajectory as render_trajectory,
+)
 from dano.report.viewing import view as view, Viewer as Viewer, write_view as write_view
