@@ -181,8 +181,7 @@ def test_arrows_of_two_runs_have_one_scale(run: Run):
         runs.append((scene, rest))
     style = _video._Style(20, SIZE, 1.0, True, True, "auto", None)
     takes = [_video._take(scene, rest, stage(scene), 21, style) for scene, rest in runs]
-    touched = [take.touched for take in _video._with_equal_arrows(takes)]
-    assert touched[0] is not None and touched[1] is not None
+    touched = [take.touched for take in _video._with_equal_arrows(takes) if take.touched is not None]
     small, large = (each.shares[-1, 0] for each in touched)
     assert large == pytest.approx(2 * small, rel=1e-3) and 0 < large < 2.5
 
