@@ -6,8 +6,9 @@ import signal
 import numpy as np
 import pytest
 
+from dano.archive import Pace
 from dano.cli import _console
-from dano.cli.running import _checkpoint, _rollout, Clock
+from dano.cli.running import _rollout, Clock
 
 
 def arrays(path) -> dict[str, np.ndarray]:
@@ -56,8 +57,8 @@ def test_an_interrupted_run_goes_on_with_the_same_bits(number, run, scene, tmp_p
 
 
 def test_a_run_that_was_killed_has_left_its_pieces(run, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(_checkpoint, "_EVERY", 0.0)
-    monkeypatch.setattr(_checkpoint, "_SHARE", 0)
+    monkeypatch.setattr(Pace, "every", 0.0)
+    monkeypatch.setattr(Pace, "share", 0)
 
     def kill():
         raise MemoryError  # stands for an end without any clearing up
@@ -76,8 +77,8 @@ def test_a_run_that_was_killed_has_left_its_pieces(run, scene, tmp_path, monkeyp
 
 @pytest.mark.usefixtures("interruptible")
 def test_the_second_of_two_runs_goes_on_without_the_first(run, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(_checkpoint, "_EVERY", 0.0)
-    monkeypatch.setattr(_checkpoint, "_SHARE", 0)
+    monkeypatch.setattr(Pace, "every", 0.0)
+    monkeypatch.setattr(Pace, "share", 0)
     monkeypatch.setattr(_rollout, "WORTH", 0.0)
     words = ("simulate", scene, scene, "-o", tmp_path / "both")
     with monkeypatch.context() as patched:
