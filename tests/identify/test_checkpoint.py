@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +17,7 @@ from dano.identify._checkpoint import Checkpoint
 NOISE = {"position": 1e-4, "orientation": 2e-3}
 
 
-def spring_case():
+def spring_case() -> "Case":
     """The force of a spring, searched from six starts that end in several minima."""
 
     class Spring(eqx.Module):
@@ -36,7 +37,7 @@ def spring_case():
     return scene, dano.Motion.from_trajectory(run, every=10), [stiffness], options
 
 
-def basin_case():
+def basin_case() -> "Case":
     """Tied windows that begin in a wrong basin: minimisations with others in between."""
     scene = dano.Scene.create([dano.Body("ball", dano.Sphere(0.05), mass=0.5)], [], timestep=0.01)
     start = scene.initial_state(ball={"velocity": (1.0, 0.0, 0.0), "omega": (0.0, 0.0, 40.0)})
@@ -45,6 +46,9 @@ def basin_case():
     motion = dataclasses.replace(seen, omega=omega, velocity=np.full_like(omega, np.nan))
     gravity = dano.Parameter("g", lambda s: s.gravity, -20.0, 20.0, start=[0.0, 0.0, -5.0])
     return scene, motion, [gravity], dict(initial="states", window=4, continuity=(1e3, 1.0), noise=NOISE)
+
+
+Case = tuple[dano.Scene, dano.Motion, list[dano.Parameter], dict[str, Any]]
 
 
 def same(one: dano.Identification, other: dano.Identification) -> None:
@@ -122,10 +126,11 @@ def test_a_checkpoint_of_another_search_is_refused(tmp_path):
             raise KeyboardInterrupt
 
     def search(**other):
-        given = {"scene": scene, "observed": motion, "parameters": parameters}
+        given: dict[str, Any] = {"scene": scene, "observed": motion, "parameters": parameters}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
-            return dano.identify(**given | options | {"progress": stop} | other)
+            keywords: Any = given | options | {"progress": stop} | other
+            return dano.identify(**keywords)
 
     search(checkpoint=path)
     before = path.read_bytes()

@@ -20,7 +20,7 @@ class Identify:
         parameter: Unknown parameters, each as NAME:LOWER:UPPER or NAME:LOWER:UPPER:START, e.g.
             soap,table.sliding_friction:0:1 or soap.mass_scale:0.2:5:1.
         output: Where to write the result (.json).
-        report: Where to write a page with the motions, residuals, losses and a film (.html).
+        report: Where to write a page with the motions, residuals, losses and films (.html).
         body: Name of the body that moved, for files that do not name it.
         initial: What to estimate of the initial states: nothing (given), velocities, or all (states);
             default: velocities if the motions have none, else nothing.
@@ -40,6 +40,7 @@ class Identify:
             Needs --look and --camera.
         look: What the body in the film looks like: what `dano train` wrote, or trained_bunny or trained_soap.
         filming: How the film was taken.
+        resume: Go on with a search that was interrupted or killed; the result is the same.
         json: Print one JSON object instead of text.
     """
 
@@ -64,6 +65,7 @@ class Identify:
     video: Path | None = None
     look: str | None = None
     filming: OmitArgPrefixes[Filming] = Filming()
+    resume: bool = False
     json: bool = False
 
     def __call__(self) -> None:
