@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -118,7 +119,11 @@ class Checkpoint:
             members |= _members("now_", iterate, simulations)
             members |= {f"now_{name}": getattr(iterate, name) for name in ("damping", "growth", "slow")}
             members |= {"now_shared_spread": iterate.spread[0], "now_private_spread": iterate.spread[1]}
-        self._pace.write(self._path, {name: np.asarray(value) for name, value in members.items()})
+        try:
+            self._pace.write(self._path, {name: np.asarray(value) for name, value in members.items()})
+        except OSError as error:
+            # A full disk must not cost what has been found.
+            warnings.warn(f"checkpoint {self._path} could not be written: {error}", stacklevel=2)
 
 
 def _members(prefix: str, found: Solution | Iterate, simulations: int) -> dict[str, Any]:
