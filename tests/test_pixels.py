@@ -13,6 +13,7 @@ from vision.models import learned
 import dano
 from dano.identify import Motion
 from dano.pixels import draw_frames, film, identify_in_film
+from dano.report import draw_simulated, write_identification_report
 from dano.vision import Camera, Film, LearnedField, Light, PosedCamera, SurfaceModel, TrackOptions
 
 STEPS, EVERY = 12, 6
@@ -92,7 +93,7 @@ def test_derivatives_inside_a_picture_are_differences(look):
 
     def at(aside):
         position = jnp.stack([aside, 0.0 * aside, 0.0 * aside])[None, None]
-        colour, opacity = draw_frames([hard], position, np.array([[[1.0, 0, 0, 0]]]), camera, lamps)
+        colour, opacity = draw_frames([hard], position, jnp.array([[[1.0, 0, 0, 0]]]), camera, lamps)
         return colour[0].astype(jnp.float64), opacity[0]
 
     slope = np.asarray(jax.jit(jax.jacfwd(lambda x: at(x)[0]))(0.0))
@@ -133,7 +134,7 @@ def watched(scene, look):
 
 
 @pytest.mark.slow
-def test_friction_is_found_from_pixels(scene, look, watched):
+def test_friction_is_found_from_pixels(scene, look, watched, tmp_path):
     taken, camera, motion = watched
     random = np.random.default_rng(1)
     # Poses that are wrong by 5 % of the ball's radius tell friction badly; the pixels tell it well.
@@ -160,6 +161,33 @@ def test_friction_is_found_from_pixels(scene, look, watched):
     assert abs(after / 0.3 - 1) < 0.02
     assert abs(after - 0.3) < 0.5 * abs(before - 0.3)
     assert len(found.history) >= 3
+    check_page(found, taken, look, camera, tmp_path)
+
+
+def check_page(found, taken, look, camera, folder):
+    """What the page says of the film: both values, the film, and the simulation where the body is."""
+    Image = pytest.importorskip("PIL.Image")
+    simulated = draw_simulated(taken, found, look, camera)
+    for seen, drawn in zip(taken.images, simulated, strict=True):
+        # Drawn over the film, at a motion that is nearly right, in the light that was found.
+        assert np.abs(drawn.astype(int) - seen).mean() < 4
+    Image.fromarray(np.full((40, 56, 3), 9, np.uint8)).save(folder / "place.png")
+    bare = draw_simulated(taken, found, look, camera, background=folder / "place.png")
+    apart = [np.abs(drawn.astype(int) - 9).max(axis=2) > 30 for drawn in bare]
+    for covered, mask in zip(apart, taken.masks, strict=True):
+        assert np.mean(covered == (mask > 0.5)) > 0.95
+    write_identification_report(folder / "fit.html", found, film=taken, simulated=simulated)
+    page = (folder / "fit.html").read_text()
+    assert page.count("<video") == 2 and "from poses" in page and "from pixels" in page
+    for fit in (found.poses, found.fit):
+        assert f"<td>{fit.values['mu']:.6g}</td><td>{fit.standard_errors['mu']:.3g}</td>" in page
+    with pytest.raises(ValueError, match="film must be given for a fit of a film"):
+        write_identification_report(folder / "none.html", found)
+    with pytest.raises(ValueError, match="simulated must be as many as frames, 5, got 4"):
+        write_identification_report(folder / "none.html", found, film=taken, simulated=simulated[:4])
+    with pytest.raises(ValueError, match="this fit is of poses"):
+        write_identification_report(folder / "none.html", found.fit, film=taken, simulated=simulated)
+    assert not (folder / "none.html").exists()
 
 
 def test_motions_that_do_not_belong_to_a_film_are_refused(scene, look, watched):

@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import tempfile
+import time
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -141,6 +142,33 @@ def write_archive(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]
     """
     with replacing(path) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+class Pace:
+    """How often work in progress is written: so seldom that it costs next to nothing.
+
+    Attributes:
+        every: Seconds at least between two times: less is sooner done again than written.
+        share: Writing takes at most one of so many parts of the time.
+    """
+
+    every = 2.0
+    share = 20
+
+    def __init__(self) -> None:
+        self._written = time.monotonic()
+        self._price = 0.0
+
+    def due(self) -> bool:
+        """Whether it is time to write."""
+        return time.monotonic() - self._written > max(self.every, self.share * self._price)
+
+    def write(self, path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write arrays as `write_archive` does, and remember what it cost."""
+        began = time.monotonic()
+        write_archive(path, arrays)
+        self._written = time.monotonic()
+        self._price = self._written - began
 
 
 class Arrays:

@@ -15,6 +15,7 @@ from cli.conftest import ellipsoid_values
 
 import dano
 from dano.cli import _scenes
+from dano.cli._outputs import run_files
 from dano.fields import GridField, save_field
 from dano.scene_file import _objects as shipped, _pieces, load_run, load_scene
 
@@ -260,6 +261,64 @@ def test_simulate_draws(run, scene, tmp_path, monkeypatch):
     ((_, trajectory, video), options) = calls[0]
     assert trajectory.names == ("egg", "floor")
     assert (video, options["strip"]) == (paths[1], paths[2])
+
+
+def test_two_scenes_are_simulated_and_filmed_side_by_side(run, scene, tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(
+        "dano.report.render_side_by_side", lambda *given, **options: calls.append((given, options))
+    )
+    other, folder = tmp_path / "rough.toml", tmp_path / "both"
+    other.write_text(scene.read_text(encoding="utf-8").replace("n_steps = 400", "n_steps = 200"))
+    answer = run("simulate", scene, other, "-o", folder, "--video", tmp_path / "both.mp4", "--json")
+    assert answer.code == 0, answer.err
+    assert answer.err == f"dano: writing {folder / 'scene_run.npz'} and {folder / 'rough_run.npz'}\n"
+    report = json.loads(answer.out)
+    assert report["video"] == str(tmp_path / "both.mp4")
+    assert [each["scene"] for each in report["runs"]] == [str(scene), str(other)]
+    runs = [dano.Trajectory.load(each["run"]) for each in report["runs"]]
+    assert [len(each.converged) for each in runs] == [400, 200]
+    (((scenes, trajectories, video), options),) = calls
+    assert [each.names for each in scenes] == [("egg", "floor")] * 2 and video == tmp_path / "both.mp4"
+    np.testing.assert_array_equal(trajectories[1].states.position, runs[1].states.position)
+    assert options["labels"] == ["scene", "rough"]
+    # What is there is kept, and scenes of one name have runs of their own.
+    (tmp_path / "again").mkdir()
+    shutil.copy(other, tmp_path / "again" / "rough.toml")
+    monkeypatch.chdir(tmp_path)
+    answer = run("simulate", "rough.toml", "again/rough.toml", "--steps", 200, "--strip", "both.png")
+    assert answer.code == 0, answer.err
+    assert answer.err == "dano: writing rough_run.npz and rough_run_2.npz\n"
+    assert calls[1][1]["labels"] == ["rough.toml", "again/rough.toml"]
+    assert "== again/rough.toml ==" in answer.out
+    assert "`dano view rough_run.npz --beside rough_run_2.npz` shows them in the browser" in answer.out
+    assert run_files(Path(), [scene, other, other], resume=False)[1:] == [
+        Path("rough_run_3.npz"),
+        Path("rough_run_4.npz"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            "scene.toml scene.toml -o run.npz",
+            "output must be a folder for the runs of two scenes, got run.npz",
+        ),
+        ("scene.toml scene.toml -o scene.toml", "output must be a folder for the runs of two scenes"),
+        ("scene.toml scene.toml -o no/where", "must be in an existing directory"),
+        ("scene.toml none.toml", "must be an existing file, got none.toml"),
+        ("scene.toml scene.toml scene.toml", "too many arguments: scene.toml; see dano simulate --help"),
+        ("scene.toml scene.toml --video both.avi", "must end in .mp4"),
+    ],
+)
+def test_bad_pairs_of_scenes_are_refused(run, scene, tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(_scenes, "load", lambda *_: pytest.fail("work has begun"))
+    before = sorted(tmp_path.iterdir())
+    answer = run("simulate", *words.split())
+    assert (answer.code, answer.err.count("\n")) == (2, 1) and message in answer.err
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_unconverged_steps_are_said(run, scene, tmp_path, monkeypatch):

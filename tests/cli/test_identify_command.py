@@ -2,6 +2,8 @@
 
 import json
 import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -148,11 +150,88 @@ def test_an_interrupted_search_keeps_its_best_and_says_so(files, run, monkeypatc
         "identify", files / "scene.toml", files / "slide.csv", "-p", "ball,floor.sliding_friction:0:1:0.6",
         "-o", files / "fit.json", "--report", files / "fit.html",
     )  # fmt: skip
+    # What the search was replaced by keeps nothing.
     assert (answer.code, answer.err) == (130, "dano: interrupted; the values are the best so far\n")
     result = json.loads((files / "fit.json").read_text())
     assert result["values"] == {"ball,floor.sliding_friction": pytest.approx(0.6)}
     assert "interrupted" in result["stop"] and not result["converged"]
     assert not (files / "fit.html").exists()
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_an_interrupted_search_says_how_it_goes_on(files, run, monkeypatch):
+    words = (
+        "identify", files / "scene.toml", files / "slide.npz", "-p", "ball,floor.sliding_friction:0:1:0.6",
+    )  # fmt: skip
+    whole, part = files / "whole.json", files / "part.json"
+    assert run(*words, "-o", whole).code == 0
+    with monkeypatch.context() as patched:
+        patched.setattr(Problem, "linearize", failing_after(3, lambda: signal.raise_signal(signal.SIGINT)))
+        answer = run(*words, "-o", part)
+    said = "dano: interrupted; the values are the best so far, --resume goes on\n"
+    assert (answer.code, answer.err) == (130, said)
+    assert (files / "part.checkpoint.npz").exists()
+    answer = run(*words, "-o", part, "--resume", "--huber", 2.0)
+    assert answer.code == 2 and "part.checkpoint.npz must be of this search" in answer.err
+    assert run(*words, "-o", part, "--resume").code == 0
+    assert not (files / "part.checkpoint.npz").exists()
+    assert_same(whole, part)
+    assert "resume needs --output" in run(*words, "--resume").err
+    film = ("--video", "film.mp4", "--look", "trained_soap", "--camera", "camera.json", "--resume")
+    assert "leave out --resume, or --video" in run(*words, "-o", part, *film).err
+
+
+KILLED = """
+import os, signal, sys
+from dano.archive import Pace
+from dano.cli import main
+from dano.identify._problem import Problem
+Pace.every, Pace.share = 0.0, 0
+linearize, calls = Problem.linearize, []
+def until(self, x, start):
+    calls.append(x)
+    if len(calls) > 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return linearize(self, x, start)
+Problem.linearize = until
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.slow
+def test_a_search_in_a_process_that_was_killed_goes_on(files, run):
+    words = (
+        "identify", files / "scene.toml", files / "slide.npz", "-p", "ball,floor.sliding_friction:0:1:0.6",
+    )  # fmt: skip
+    whole, part = files / "whole.json", files / "part.json"
+    assert run(*words, "-o", whole).code == 0
+    killed = subprocess.run([sys.executable, "-c", KILLED, *map(str, words), "-o", part], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert not part.exists() and (files / "part.checkpoint.npz").exists()
+    assert run(*words, "-o", part, "--resume").code == 0
+    assert sorted(path.name for path in files.glob("part*")) == ["part.json"]
+    assert_same(whole, part)
+
+
+def failing_after(count, send):
+    """`linearize`, in which something happens after so many calls."""
+    calls = []
+    usual = Problem.linearize
+
+    def linearize(self, *state):
+        calls.append(state)
+        if len(calls) > count:
+            send()
+        return usual(self, *state)
+
+    return linearize
+
+
+def assert_same(whole, part) -> None:
+    first, second = (json.loads(path.read_text()) for path in (whole, part))
+    for result in (first, second):
+        del result["seconds"]
+    assert first == second
 
 
 def test_units_are_checked_before_the_search(files, run, monkeypatch):

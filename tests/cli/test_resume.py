@@ -6,8 +6,9 @@ import signal
 import numpy as np
 import pytest
 
+from dano.archive import Pace
 from dano.cli import _console
-from dano.cli.running import _checkpoint, _rollout, Clock
+from dano.cli.running import _rollout, Clock
 
 
 def arrays(path) -> dict[str, np.ndarray]:
@@ -56,8 +57,8 @@ def test_an_interrupted_run_goes_on_with_the_same_bits(number, run, scene, tmp_p
 
 
 def test_a_run_that_was_killed_has_left_its_pieces(run, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(_checkpoint, "_EVERY", 0.0)
-    monkeypatch.setattr(_checkpoint, "_SHARE", 0)
+    monkeypatch.setattr(Pace, "every", 0.0)
+    monkeypatch.setattr(Pace, "share", 0)
 
     def kill():
         raise MemoryError  # stands for an end without any clearing up
@@ -72,6 +73,27 @@ def test_a_run_that_was_killed_has_left_its_pieces(run, scene, tmp_path, monkeyp
     assert answer.code == 2 and "run.checkpoint.npz must be of this scene" in answer.err
     assert run("simulate", scene, "-o", tmp_path / "run.npz", "--resume").code == 0
     assert not kept.exists()
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_the_second_of_two_runs_goes_on_without_the_first(run, scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(Pace, "every", 0.0)
+    monkeypatch.setattr(Pace, "share", 0)
+    monkeypatch.setattr(_rollout, "WORTH", 0.0)
+    words = ("simulate", scene, scene, "-o", tmp_path / "both")
+    with monkeypatch.context() as patched:
+        patched.setattr(_rollout, "run_piece", interrupting(25, lambda: signal.raise_signal(signal.SIGINT)))
+        assert run(*words).code == 130
+    pieces, piece = [], _rollout.run_piece
+    monkeypatch.setattr(_rollout, "run_piece", lambda *given: pieces.append(given) or piece(*given))
+    assert run(*words, "--resume").code == 0
+    # The last piece of a run is not kept; a single piece is run once more to tell compiling from running.
+    assert len(pieces) == 2 + 15
+    names = ["scene_run.npz", "scene_run_2.npz"]
+    assert sorted(path.name for path in (tmp_path / "both").iterdir()) == names
+    first, second = (arrays(tmp_path / "both" / name) for name in names)
+    for name, value in first.items():
+        np.testing.assert_array_equal(value, second[name], err_msg=name)
 
 
 def test_progress_is_told_in_files_too(monkeypatch, capsys):

@@ -9,8 +9,9 @@ import pytest
 from vision.models import learned
 
 import dano
-from dano.report import _framing, CAMERAS, draw_object, render_trajectory, view
+from dano.report import _framing, _video, CAMERAS, draw_object, render_side_by_side, render_trajectory, view
 from dano.report._object import with_error
+from dano.report._overlay import draw_label
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import stage
 from dano.report.viewing._drawn import Shown
@@ -134,6 +135,85 @@ def test_video_has_every_frame_and_moves(run: Run, tmp_path):
     assert sorted(tmp_path.iterdir()) == [path, strip]
 
 
+def stopped(run: Run, steps: int) -> Run:
+    """The run up to a step."""
+    scene, whole = run
+    states = jax.tree.map(lambda x: x[: steps + 1], whole.states)
+    residuals, iterations, converged = (
+        x[:steps] for x in (whole.residuals, whole.iterations, whole.converged)
+    )
+    times = whole.times[: steps + 1]
+    return scene, dano.Trajectory(times, states, residuals, iterations, converged, whole.names)
+
+
+def test_two_runs_are_side_by_side_and_the_shorter_one_stands_at_its_end(run: Run, tmp_path):
+    path, strip = tmp_path / "both.mp4", tmp_path / "both.png"
+    (scene, whole), (_, half) = run, stopped(run, 25)
+    render_side_by_side(
+        (scene, scene), (whole, half), path, fps=20, size=SIZE, clock=False, camera="fixed", strip=strip
+    )
+    with av.open(path) as container:
+        frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
+    assert len(frames) == 11  # as long as the longer one
+    width = SIZE[0]
+    assert frames[0].shape[:2] == (SIZE[1], 2 * width + 2)
+    orange = [f[..., 0] - f[..., 2] > 60 for f in frames]
+    left, right = (
+        [np.mean(np.nonzero(ball[:, part])[1]) for ball in orange]
+        for part in (slice(width), slice(width + 2, None))
+    )
+    # The same camera and clock: until the second run stops, the halves are the same.
+    np.testing.assert_allclose(left[:6], right[:6], atol=0.3)
+    np.testing.assert_allclose(right[5:], right[5], atol=0.3)
+    assert left[-1] > left[5] + 20
+    with Image.open(strip) as sheet:
+        assert sheet.size == (4 * width + 3 * 2, 2 * SIZE[1] + 2)
+
+
+def test_arrows_of_two_runs_have_one_scale(run: Run):
+    """At rest one sphere weighs twice the other: its arrow is twice as long."""
+    scene, _ = run
+    runs = []
+    for mass in (1.0, 2.0):
+        body = dano.Body("ball", dano.Sphere(0.2), mass=mass)
+        scene = dano.Scene.create([body, scene.bodies[1]], [dano.Contact("ball", "floor")], timestep=0.01)
+        rest = dano.simulate(scene, scene.initial_state(ball=dict(position=(0, 0, 0.2))), 100)
+        runs.append((scene, rest))
+    style = _video._Style(20, SIZE, 1.0, True, True, "auto", None)
+    takes = [_video._take(scene, rest, stage(scene), 21, style) for scene, rest in runs]
+    touched = [take.touched for take in _video._with_equal_arrows(takes) if take.touched is not None]
+    small, large = (each.shares[-1, 0] for each in touched)
+    assert large == pytest.approx(2 * small, rel=1e-3) and 0 < large < 2.5
+
+
+def test_a_label_stays_in_its_corner():
+    grey = np.full((120, 200, 3), 200, np.uint8)
+    for text in ("drop", "a/very/long/path/that/does/not/fit/into/a/small/picture/drop"):
+        rows, columns = np.nonzero((draw_label(grey, text) < 100).all(axis=2))
+        assert 0 < len(rows) and rows.max() < 120 / 6
+        assert columns.min() < 8 and columns.max() < 200 - 4
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"scenes": 1}, "scenes must be two, for left and right, got 1"),
+        ({"trajectories": 3}, "trajectories must be two, for left and right, got 3"),
+        ({"labels": ("one",)}, "labels must be two"),
+        ({"labels": "ab"}, "labels must be a list of"),
+        ({"looks": [None]}, "looks must be two"),
+        ({"size": (8000, 64)}, "size must be two even numbers from 16 to 4056"),
+        ({"path": None}, "path or strip"),
+    ],
+)
+def test_bad_pairs_are_refused(run: Run, tmp_path, options, message):
+    count = {"scenes": 2, "trajectories": 2} | options
+    given = {"scenes": [run[0]] * count.pop("scenes"), "trajectories": [run[1]] * count.pop("trajectories")}
+    with pytest.raises(ValueError, match=message):
+        render_side_by_side(**{"path": tmp_path / "run.mp4", "size": SIZE} | count | given)
+    assert not list(tmp_path.iterdir())
+
+
 def test_moving_bodies_fill_a_third_of_the_height_and_stay_in_view(run: Run):
     scene, trajectory = run
     drawn = stage(scene)
@@ -141,10 +221,11 @@ def test_moving_bodies_fill_a_third_of_the_height_and_stay_in_view(run: Run):
     # Ten times as far: a camera that stands still would show specks.
     position = 10 * np.asarray(trajectory.states.position)
     orientation = np.asarray(trajectory.states.orientation)
-    moving, _ = _framing._points(scene, drawn, position, orientation)
+    seen = _framing.seen_of(scene, drawn, position, orientation)
+    moving = seen.moving
     fills, cameras = {}, []
     for how in CAMERAS:
-        cameras = _framing.cameras_for(scene, drawn, position, orientation, 0.01, (640, 400), how)
+        cameras = _framing.cameras_for(seen, 0.01, (640, 400), how)
         assert len(cameras) == n
         fills[how] = _framing._least_fill(cameras, moving)
         for camera, points in zip(cameras, moving, strict=True):

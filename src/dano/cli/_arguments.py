@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import arg, OmitArgPrefixes, Positional
+from tyro.conf import arg, Positional
 
 from dano.building import BuildOptions
 
@@ -255,13 +255,14 @@ class Inspect:
 
 @dataclass(frozen=True)
 class Simulate:
-    """Simulate a scene, or drop an object onto a floor.
+    """Simulate a scene, or drop an object onto a floor. Of two scenes: both, to compare them.
 
     Attributes:
         scene: A scene file (.toml), or a neural object (.dano) that is dropped onto a floor.
-        output: Where to write the trajectory, usually *.npz.
-        video: Where to write a video (.mp4).
-        strip: Where to write a picture of several moments side by side (.png).
+        beside: Another one, to compare with.
+        output: Where to write the trajectory, usually *.npz; of two scenes the folder for both.
+        video: Where to write a video (.mp4); two scenes are side by side in it.
+        strip: Where to write a picture of several moments side by side (.png); two scenes have a row each.
         steps: Number of steps; default: the scene's.
         timestep: Timestep [s]; default: the scene's.
         camera: fixed: sees all bodies all the time; follow: shifts with those that move; auto: follows if
@@ -273,6 +274,7 @@ class Simulate:
     """
 
     scene: Positional[Path]
+    beside: Positional[Path | None] = None
     output: Output = UNNAMED
     video: Path | None = None
     strip: Path | None = None
@@ -289,115 +291,6 @@ class Simulate:
         from dano.cli import _scenes
 
         _scenes.simulate(self)
-
-
-@dataclass(frozen=True)
-class Filming:
-    """How the film was taken, and what tells the object from the rest.
-
-    Attributes:
-        camera: Intrinsics and pose of the camera: a .json file as of `dano poses`, with one frame.
-        focal: Focal length, or two, across and down [pixels], instead of --camera.
-        centre: Principal point [pixels]; default: the middle.
-        distortion: k1 k2 p1 p2 of OpenCV's model.
-        eye: Where the camera is [m], z up, instead of --camera.
-        look_at: Where it looks [m].
-        masks: Folder with a mask for each frame, bright where the object is.
-        mask_source: Where masks come from: given, static (unlike the place without the object), plain (unlike
-            a background of one colour), object (like the object where it is expected); auto: given ones, else
-            plain, else object.
-        background: Picture of the place without the object.
-        occluders: Folder with a mask for each frame, bright where something hides the object.
-        slow_motion: How many times slower the video plays than it was filmed.
-        shutter: How long a frame is exposed [s], if what moves is blurred.
-        readout: How much later the last row of a frame is exposed than the first (rolling shutter) [s].
-        every: Take every so many-th frame.
-        loss: What is minimised: photometric, silhouette, or the paper's two terms.
-        rays: Most pixels of a frame.
-        seed: Seed of all random numbers.
-    """
-
-    camera: Path | None = None
-    focal: tuple[float, ...] = ()
-    centre: tuple[float, float] | None = None
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    eye: tuple[float, float, float] | None = None
-    look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    masks: Path | None = None
-    mask_source: Literal["auto", "given", "static", "plain", "object"] = "auto"
-    background: Path | None = None
-    occluders: Path | None = None
-    slow_motion: float = 1.0
-    shutter: float = 0.0
-    readout: float = 0.0
-    every: int = 1
-    loss: Literal["photometric", "silhouette", "paper"] = "photometric"
-    rays: int = 2048
-    seed: int = 0
-
-
-@dataclass(frozen=True)
-class Identify:
-    """Find the parameters of a scene from observed motions of its bodies, with error bars.
-
-    Attributes:
-        scene: Scene file (.toml).
-        motions: Observed motions (.npz, .csv): times [s], positions [m], quaternions. The guide
-            "Identification" lists the columns.
-        parameter: Unknown parameters, each as NAME:LOWER:UPPER or NAME:LOWER:UPPER:START, e.g.
-            soap,table.sliding_friction:0:1 or soap.mass_scale:0.2:5:1.
-        output: Where to write the result (.json).
-        report: Where to write a page with the motions, residuals, losses and a film (.html).
-        body: Name of the body that moved, for files that do not name it.
-        initial: What to estimate of the initial states: nothing (given), velocities, or all (states);
-            default: velocities if the motions have none, else nothing.
-        position_noise: Standard deviation of observed positions [m].
-        rotation_noise: Standard deviation of observed orientations [rad].
-        huber: Number of standard deviations beyond which residuals count linearly.
-        window: Cut motions into windows of this many frames; default: do not cut.
-        continuity: Allowed gap between a window's end and the next one's start, in standard deviations;
-            default: any.
-        starts: Number of points within the bounds to start from.
-        held_out: Motions that are not fitted; the error on them is measured.
-        order: Order of the quaternions in the files.
-        point: What positions refer to: centre of mass (com) or origin of the field's frame (origin).
-        rate: Frames per second, for files without times.
-        timestep: Timestep of the simulation [s]; default: the scene's.
-        video: The film that the one motion was tracked in: its pixels are fitted through the simulation.
-            Needs --look and --camera.
-        look: What the body in the film looks like: what `dano train` wrote, or trained_bunny or trained_soap.
-        filming: How the film was taken.
-        json: Print one JSON object instead of text.
-    """
-
-    scene: Positional[Path]
-    motions: Positional[tuple[Path, ...]]
-    parameter: Annotated[tuple[str, ...], arg(aliases=["-p"])]
-    output: Annotated[Path | None, arg(aliases=["-o"])] = None
-    report: Path | None = None
-    body: str | None = None
-    initial: Literal["given", "velocities", "states"] | None = None
-    position_noise: float | None = None
-    rotation_noise: float | None = None
-    huber: float | None = None
-    window: int | None = None
-    continuity: float | None = None
-    starts: int = 1
-    held_out: tuple[Path, ...] = ()
-    order: Literal["wxyz", "xyzw"] = "wxyz"
-    point: Literal["com", "origin"] | None = None
-    rate: float | None = None
-    timestep: float | None = None
-    video: Path | None = None
-    look: str | None = None
-    filming: OmitArgPrefixes[Filming] = Filming()
-    json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _identify
-
-        _identify.identify(self)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Checks before any work starts: where results go, and whether what draws them is installed."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,8 @@ def named(command: Callable[[], None]) -> Callable[[], None]:
     if getattr(command, "output", None) is not UNNAMED:
         return command
     fields: Any = command
+    if isinstance(command, Simulate) and command.beside is not None:
+        return dataclasses.replace(command, output=Path())
     if isinstance(command, Poses):
         source = command.images
         folder = source.parent if source.name == "images" else source
@@ -56,11 +58,29 @@ def named(command: Callable[[], None]) -> Callable[[], None]:
     return dataclasses.replace(fields, output=output)
 
 
-def free_path(path: Path) -> Path:
-    """The path, or the first of path_2, path_3, … at which there is nothing."""
+def run_files(folder: Path, scenes: Sequence[Path], *, resume: bool) -> list[Path]:
+    """Where the runs of some scenes go in a folder: each has a name of its own.
+
+    What is there already is kept, unless earlier runs are to go on.
+    """
+    paths: list[Path] = []
+    for scene in scenes:
+        usual = folder / (_stem(scene) + _NAMED_AFTER[Simulate][1])
+        paths.append(free_path(usual, taken=paths, keep=not resume))
+    return paths
+
+
+def free_path(path: Path, *, taken: Sequence[Path] = (), keep: bool = True) -> Path:
+    """The path, or the first of path_2, path_3, … that is free.
+
+    Args:
+        path: The path.
+        taken: Others that are not free.
+        keep: Whether a path is not free if there is something.
+    """
     stem, dot, ending = path.name.partition(".")
     free, number = path, 1
-    while free.exists() or free.is_symlink():
+    while free in taken or (keep and (free.exists() or free.is_symlink())):
         number += 1
         free = path.with_name(f"{stem}_{number}{dot}{ending}")
     return free

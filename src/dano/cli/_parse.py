@@ -19,7 +19,6 @@ from dano.cli._arguments import (
     Data,
     Demo,
     Export,
-    Identify,
     Import,
     Inspect,
     Plan,
@@ -29,6 +28,7 @@ from dano.cli._arguments import (
     View,
 )
 from dano.cli.checking import Check
+from dano.cli.identifying import Identify
 from dano.cli.tracking import Track
 from dano.names import did_you_mean
 
@@ -109,6 +109,8 @@ def parse(argv: Sequence[str]) -> Callable[[], None]:
         if not stop.code:
             raise
     text = _unboxed(said.getvalue())
+    if further := re.match(r"Unrecognized options: ([^-].*)", text):
+        raise ValueError(f"too many arguments: {further[1]}; see dano {words[0]} --help")
     unknown = re.match(r"Unrecognized options: (--[\w-]+)", text)
     options = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(row.kind)]
     hint = did_you_mean(unknown[1], options) if unknown else ""

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from dano import scene_file
-from dano.archive import replacing
+from dano.archive import checked_input, replacing
 from dano.checks import checked_number
 from dano.cli import running
 from dano.cli._arguments import Demo, Simulate, View
 from dano.cli._console import Progress, put, put_json, say
-from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
+from dano.cli._outputs import check_distinct, check_output, missing_for_pictures, run_files
 from dano.engine import simulate as simulate_scene
 from dano.objects import NeuralObject
 from dano.scene import Scene, Trajectory
@@ -28,35 +28,73 @@ DEMO_FPS, DEMO_SIZE = 24, (560, 350)
 
 def simulate(command: Simulate) -> None:
     """See `dano simulate --help`."""
-    scene, output, video, strip = command.scene, command.output, command.video, command.strip
-    check_output(output, scene)
+    video, strip = command.video, command.strip
+    scenes = [command.scene] if command.beside is None else [command.scene, command.beside]
+    outputs = _outputs(command, scenes)
     for picture, suffix in ((video, ".mp4"), (strip, ".png")):
         if picture is not None:
-            check_output(picture, scene, suffix=suffix)
+            check_output(picture, *scenes, suffix=suffix)
             if missing := missing_for_pictures(video=suffix == ".mp4"):
                 raise ImportError(missing)
     checked_number("slow_motion", command.slow_motion, above=0)
-    check_distinct(output=output, video=video, strip=strip)
+    check_distinct(output=outputs[0], video=video, strip=strip)
     clock = running.Clock(since_start=running.is_program())
     clock("reading the scene")
-    loaded = load(scene, command.steps, command.timestep)
-    for path in (output, video, strip):
-        if path is not None:
-            check_output(path, *loaded.inputs())
+    loaded = [load(scene, command.steps, command.timestep) for scene in scenes]
     if video is not None or strip is not None:
         from dano.report import frame_count
 
-        frame_count(loaded.n_steps * float(loaded.scene.timestep), command.slow_motion)
-    report = _run(loaded, command, clock)
+        frame_count(max(each.n_steps * float(each.scene.timestep) for each in loaded), command.slow_motion)
+    if len(loaded) > 1:
+        command.output.mkdir(exist_ok=True)
+        say(f"writing {outputs[0]} and {outputs[1]}")
+    for path in (*outputs, video, strip):
+        if path is not None:
+            check_output(path, *(source for each in loaded for source in each.inputs()))
+    reports = _run(loaded, outputs, command, clock)
+    _tell(command, reports, clock)
+    for report in reports:
+        running.warn_unconverged(report)
+
+
+def _outputs(command: Simulate, scenes: list[Path]) -> list[Path]:
+    """Where the trajectories go.
+
+    Raises:
+        ValueError: If they cannot be written, or a scene is missing.
+    """
+    for scene in scenes:
+        checked_input(scene)
+    if len(scenes) == 1:
+        check_output(command.output, scenes[0])
+        return [command.output]
+    folder = command.output
+    if not folder.is_dir() and (folder.exists() or folder.suffix.lower() == ".npz"):
+        raise ValueError(f"output must be a folder for the runs of two scenes, got {folder}")
+    if not folder.is_dir():
+        check_output(folder)
+    return run_files(folder, scenes, resume=command.resume)
+
+
+def _tell(command: Simulate, reports: list[dict[str, Any]], clock: running.Clock) -> None:
+    """Print what came out, and where it is."""
+    drawn = {key: str(path) for key in ("video", "strip") if (path := getattr(command, key)) is not None}
     if command.json:
-        put_json({"scene": str(scene), **report, "seconds": clock.parts()})
-    else:
+        numbers = reports[0] if len(reports) == 1 else {"runs": reports}
+        put_json({**numbers, **drawn, "seconds": clock.parts()})
+        return
+    for report in reports:
+        if len(reports) > 1:
+            put(f"== {report['scene']} ==")
         running.print_rollout(report)
         put()
-        put(clock.told())
+    put(clock.told())
+    for report in reports:
         _print_files(report)
-        put(f"`dano view {output}` shows it in the browser")
-    running.warn_unconverged(report)
+    _print_files(drawn)
+    names = [[body["name"] for body in report["bodies"]] for report in reports]
+    both = f" --beside {reports[1]['run']}" if len(reports) > 1 and names[0] == names[1] else ""
+    put(f"`dano view {reports[0]['run']}{both}` shows {'them' if both else 'it'} in the browser")
 
 
 def view(command: View) -> None:
@@ -257,32 +295,46 @@ def load(path: Path, steps: int | None, timestep: float | None) -> scene_file.Sc
     return loaded
 
 
-def _run(loaded: scene_file.SceneFile, command: Simulate, clock: running.Clock) -> dict[str, Any]:
+def _run(
+    loaded: list[scene_file.SceneFile], outputs: list[Path], command: Simulate, clock: running.Clock
+) -> list[dict[str, Any]]:
     """Simulate, save and draw; what came out in numbers."""
-    video, strip = command.video, command.strip
-    kept = running.Checkpoint(command.output, loaded)
-    rollout, report = _simulated(loaded, command.output, clock, kept, resume=command.resume)
+    scenes, reports, rollouts = (command.scene, command.beside), [], []
+    kept = [running.Checkpoint(output, each) for output, each in zip(outputs, loaded, strict=True)]
+    for scene, each, output, checkpoint in zip(scenes, loaded, outputs, kept, strict=False):
+        rollout, report = _simulated(each, output, clock, checkpoint, resume=command.resume)
+        rollouts.append(rollout)
+        reports.append({"scene": str(scene), **report})
+    # Only now: if the second run is stopped, the first need not be run again.
+    for checkpoint in kept:
+        checkpoint.remove()
     clock("drawing")
-    if video is not None or strip is not None:
-        from dano.report import render_trajectory
+    if command.video is not None or command.strip is not None:
+        _draw(loaded, [rollout.trajectory for rollout in rollouts], command)
+    return reports
 
-        progress = Progress()
-        render_trajectory(
-            loaded.scene,
-            rollout.trajectory,
-            video,
-            strip=strip,
-            slow_motion=command.slow_motion,
-            camera=command.camera,
-            size=command.size,
-            looks=loaded.looks(),
-            progress=progress,
-        )
-        progress.close()
-    for key, picture in (("video", video), ("strip", strip)):
-        if picture is not None:
-            report[key] = str(picture)
-    return report
+
+def _draw(loaded: list[scene_file.SceneFile], trajectories: list[Trajectory], command: Simulate) -> None:
+    """A film of one run, or of two side by side."""
+    from dano.report import render_side_by_side, render_trajectory
+
+    progress = Progress()
+    options: dict[str, Any] = {
+        "strip": command.strip,
+        "slow_motion": command.slow_motion,
+        "camera": command.camera,
+        "size": command.size,
+        "progress": progress,
+    }
+    scenes, looks = [each.scene for each in loaded], [each.looks() for each in loaded]
+    if command.beside is None:
+        render_trajectory(scenes[0], trajectories[0], command.video, looks=looks[0], **options)
+    else:
+        labels = [command.scene.stem, command.beside.stem]
+        if labels[0] == labels[1]:
+            labels = [str(command.scene), str(command.beside)]
+        render_side_by_side(scenes, trajectories, command.video, labels=labels, looks=looks, **options)
+    progress.close()
 
 
 def _simulated(
@@ -298,8 +350,6 @@ def _simulated(
     rollout = running.roll_out(loaded, progress, clock, kept, resume=resume)
     clock("writing")
     scene_file.save_run(output, rollout.trajectory, loaded)
-    if kept is not None:
-        kept.remove()
     clock("contact forces")
     progress("contact forces", 0.0)
     report = {**running.describe(rollout, loaded.scene), "run": str(output)}

@@ -1,6 +1,7 @@
 """The verb: from observed motions to parameters, with error bars."""
 
 import dataclasses
+import os
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -9,8 +10,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from dano.checks import checked_function, checked_items, checked_kind
+from dano.checks import checked_function, checked_items, checked_kind, checked_path
 from dano.engine import AbstractEngine, checked_engine, Policy
+from dano.identify._checkpoint import Checkpoint, digest_of
 from dano.identify._joint_log import joint_table
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Parameter, space_of, values_at, with_values
@@ -49,6 +51,8 @@ def identify(
     tolerance: float = 0.1,
     batch: int | None = None,
     engine: AbstractEngine | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    resume: bool = False,
     progress: Callable[[str, float], None] | None = None,
 ) -> Identification:
     """Find the parameters of a scene with which it moves as observed.
@@ -79,38 +83,28 @@ def identify(
         tolerance: Stop when the predicted move of the parameters is below this, in standard errors.
         batch: Windows that a device simulates at once; default one on a CPU, many on a GPU.
         engine: Default `VariationalEngine()`.
+        checkpoint: File (.npz) that a long search is kept in while it runs, and when interrupted.
+        resume: Go on from `checkpoint` if it exists; the result is as if the search had never stopped.
         progress: Called with a description and the share done. Ctrl-C returns the best so far.
 
     Returns:
-        Values, standard errors, what is not determined, and the fitted motion. What failed or is left open
-        is said in `messages` and raises a RuntimeWarning; odd units of motions raise a UserWarning.
+        Values, standard errors, what is not determined, and the fitted motion. What failed or is left open is
+        in `messages` and raises a RuntimeWarning; odd units of motions raise a UserWarning.
 
     Raises:
-        ValueError: If motions, parameters and scene do not fit each other or make too much work, or an
-            option is out of range.
+        ValueError: If an argument is out of range, does not fit the others, or makes too much work.
     """
-    checked_kind("scene", scene, Scene)
-    parameters = checked_items("parameters", parameters, Parameter)
-    motions = _motions("observed", observed)
-    _check_states(scene, state)
-    _check_controls(controls)
-    if progress is not None:
-        checked_function("progress", progress)
-    if not motions:
-        raise ValueError("observed must hold at least one motion, got none")
+    _check(scene, state, controls, progress)
+    motions = _motions("observed", observed, least=1)
     chosen = estimated(initial, motions)
-    setup = Setup(
-        space_of(scene, controls, _started(parameters, after)),
-        scene,
-        controls,
-        chosen,
-        Noise(deviations(scene, motions, noise), huber),
-        Windowing.create(window, continuity, chosen),
-        Search(starts, seed, jacobian, max_iterations, tolerance, batch),
-        checked_engine(engine),
-    )
+    space = space_of(scene, controls, _started(parameters, after))
+    deviation = Noise(deviations(scene, motions, noise), huber)
+    windows = Windowing.create(window, continuity, chosen)
+    search = Search(starts, seed, jacobian, max_iterations, tolerance, batch)
+    setup = Setup(space, scene, controls, chosen, deviation, windows, search, checked_engine(engine))
     check_scales(scene, motions, window, state if isinstance(state, State) else None)
-    found = _fitted(setup, motions, _motions("held_out", held_out), state, after, progress)
+    kept = _kept(checkpoint, resume, setup, motions, state, after)
+    found = _fitted(setup, motions, _motions("held_out", held_out), state, after, kept, progress)
     for message in found.messages:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
     return found
@@ -122,6 +116,7 @@ def _fitted(
     held: tuple[Motion, ...],
     state: State | Sequence[State | None] | None,
     after: Identification | None,
+    kept: Checkpoint,
     progress: Callable[[str, float], None] | None,
 ) -> Identification:
     """Searches from all starts, and measures the error on what is held out."""
@@ -131,15 +126,39 @@ def _fitted(
     if after is not None:
         problem.begin_near(after.initial_states, after.initial)
     tell("compiling", 0.0)
-    solutions = _searched(problem, setup.search, tell)
+    solutions = _searched(problem, setup.search, kept, tell)
     held_errors = _held_out(setup, held, state, solutions[0])
     found = _identification(setup, problem, motions, solutions, held_errors, began)
     tell("done", 1.0)
     return found
 
 
+def _kept(
+    path: str | os.PathLike[str] | None,
+    resume: bool,
+    setup: Setup,
+    motions: tuple[Motion, ...],
+    state: Any,
+    after: Identification | None,
+) -> Checkpoint:
+    """Where the search is kept; with `resume`, what was kept there."""
+    if path is None:
+        if resume:
+            raise ValueError("resume needs a checkpoint to go on from, got checkpoint None")
+        return Checkpoint(None, "")
+    file = checked_path("checkpoint", path)
+    if file.suffix.lower() != ".npz":
+        raise ValueError(f"checkpoint must end in .npz, got {file}")
+    begun = None if after is None else after.initial_states
+    kept = Checkpoint(file, digest_of(setup, motions, state, begun))
+    if resume:
+        kept.read()
+    return kept
+
+
 def _started(parameters: Sequence[Parameter], after: Identification | None) -> list[Parameter]:
     """The parameters, with the values of an earlier fit as starts."""
+    parameters = checked_items("parameters", parameters, Parameter)
     values = {} if after is None else after.values
     return [dataclasses.replace(each, start=values.get(each.name, each.start)) for each in parameters]
 
@@ -155,16 +174,18 @@ def _held_out(
     return _errors(problem.plan, held, problem.simulate(fixed.x, fixed.blocks))
 
 
-def _searched(problem: Problem, search: Search, tell: Callable[[str, float], None]) -> list[Solution]:
+def _searched(
+    problem: Problem, search: Search, kept: Checkpoint, tell: Callable[[str, float], None]
+) -> list[Solution]:
     """Where the search from each start ended, best first."""
     solutions = []
-    points = problem.points(search.starts)
+    points = kept.points(lambda: problem.points(search.starts))
     for k, x in enumerate(points):
 
         def said(i: int, loss: float, k: int = k) -> None:
             tell(f"fitting, loss {loss:.6g}", (k + i / search.max_iterations) / len(points))
 
-        solutions.append(problem.search(x, search.max_iterations, search.tolerance, said))
+        solutions.append(problem.search(x, search.max_iterations, search.tolerance, said, kept=kept))
         if solutions[-1].stop is Stop.INTERRUPTED:
             break
     return sorted(solutions, key=lambda s: s.normal.loss)
@@ -222,24 +243,28 @@ def _identification(
     )
 
 
-def _motions(name: str, observed: Observed | Sequence[Any]) -> tuple[Motion, ...]:
+def _motions(name: str, observed: Observed | Sequence[Any], *, least: int = 0) -> tuple[Motion, ...]:
     one = isinstance(observed, (Motion, Trajectory))
     items = checked_items(name, [observed] if one else observed, Motion, Trajectory)
+    if len(items) < least:
+        raise ValueError(f"{name} must hold at least one motion, got none")
     return tuple(item if isinstance(item, Motion) else Motion.from_trajectory(item) for item in items)
 
 
-def _check_states(scene: Scene, state: State | Sequence[State | None] | None) -> None:
-    """Check the initial states that were given."""
+def _check(scene: Any, state: Any, controls: Any, progress: Any) -> None:
+    """Check the scene, initial states that were given, and what drives the motions.
+
+    Shapes of controls are checked when they are cut to the motions.
+    """
+    checked_kind("scene", scene, Scene)
     for one in _listed(state):
         if one is not None:
             scene.check_state(one)
-
-
-def _check_controls(controls: Any) -> None:
-    """Check what drives the motions; shapes are checked when it is cut to them."""
     for one in _listed(controls):
         if one is not None and not callable(one):
             checked_kind("controls", one, Control)
+    if progress is not None:
+        checked_function("progress", progress)
 
 
 def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.engine import device_mesh
+from dano.identify._checkpoint import Checkpoint
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._residuals import Linearized, linearized, Model, moved
 from dano.identify._settings import Setup
@@ -186,12 +187,28 @@ class Problem:
         return points + [tried[i] for i in order[: starts - 1]]
 
     def search(
-        self, x: np.ndarray, max_iterations: int, tolerance: float, tell, free: bool = True
+        self,
+        x: np.ndarray,
+        max_iterations: int,
+        tolerance: float,
+        tell,
+        free: bool = True,
+        kept: Checkpoint | None = None,
     ) -> Solution:
-        """Minimise from x; with `free` false over the initial states alone."""
+        """Minimise from x; with `free` false over the initial states alone.
+
+        Args:
+            x: Coordinates of the parameters.
+            max_iterations: Steps of each minimisation.
+            tolerance: Of the predicted move of the parameters [standard errors].
+            tell: Called with the number of steps and the loss; or None.
+            free: Whether the parameters move.
+            kept: Where minimisations are kept; None to keep nothing.
+        """
 
         def minimise(x, blocks, tolerance: float, held: bool = not free) -> Solution:
-            return bounded_least_squares(
+            begun = functools.partial(
+                bounded_least_squares,
                 self.linearize,
                 x,
                 lower=x if held else self.space.lower,
@@ -205,6 +222,9 @@ class Problem:
                 perfect=0.5 * self.plan.n_data * float(jnp.finfo(self.plan.start.position.dtype).eps) ** 0.75,
                 progress=tell,
             )
+            if kept is None:
+                return begun()
+            return kept.minimised(self, lambda since, keep: begun(since=since, keep=keep))
 
         if self.jumps is None:
             return minimise(x, self.plan.start, tolerance)

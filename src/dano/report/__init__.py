@@ -7,13 +7,16 @@ from dano.report._comparison import (
     write_comparison_report as write_comparison_report,
 )
 from dano.report._framing import CAMERAS as CAMERAS
-from dano.report._identification import write_identification_report as write_identification_report
+from dano.report._identification import (
+    draw_simulated as draw_simulated,
+    write_film_report as write_film_report,
+    write_identification_report as write_identification_report,
+)
 from dano.report._object import draw_object as draw_object
 from dano.report._plan import draw_controls as draw_controls, film_plan as film_plan
 from dano.report._resample import frame_count as frame_count
 from dano.report._tracking import (
     draw_tracked as draw_tracked,
-    write_film_report as write_film_report,
     write_tracking_report as write_tracking_report,
 )
 from dano.report._training import (
@@ -21,5 +24,8 @@ from dano.report._training import (
     MassEstimates as MassEstimates,
     write_training_report as write_training_report,
 )
-from dano.report._video import render_trajectory as render_trajectory
+from dano.report._video import (
+    render_side_by_side as render_side_by_side,
+    render_trajectory as render_trajectory,
+)
 from dano.report.viewing import view as view, Viewer as Viewer, write_view as write_view

@@ -1,6 +1,7 @@
 """Where films are taken from: all in view, and as large as that allows."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -23,43 +24,91 @@ _POINTS = 100
 _CALM = (0.5, 0.35, 0.25, 0.17, 0.12, 0.08, 0.05, 0.03)
 
 
-def camera_for(scene: Scene, drawn: Stage, trajectory: Trajectory, width: int, height: int) -> Camera:
-    """A camera that sees every bounded body all the time, from across the main direction of motion."""
-    position = np.asarray(trajectory.states.position, dtype=np.float64)
-    orientation = np.asarray(trajectory.states.orientation, dtype=np.float64)
-    steps = np.unique(np.linspace(0, len(position) - 1, 60).astype(int))
-    moving, still = _points(scene, drawn, position[steps], orientation[steps])
-    return _fixed(moving, still, _direction(scene, drawn, position[steps], moving, still), width, height)
+class Seen(NamedTuple):
+    """What cameras keep in view.
+
+    Attributes:
+        moving: Points on bodies that may move [m, W] in each frame.
+        still: Points on fixed bodies [m, W].
+        paths: Centres of mass [m, W] of each body that may move.
+    """
+
+    moving: Float[np.ndarray, "frames n 3"]
+    still: Float[np.ndarray, "m 3"]
+    paths: list[Float[np.ndarray, "frames 3"]]
+
+    @property
+    def points(self) -> Float[np.ndarray, "k 3"]:
+        """All points of all frames."""
+        return np.concatenate([self.moving.reshape(-1, 3), self.still])
 
 
-def cameras_for(
+def seen_of(
     scene: Scene,
     drawn: Stage,
     position: Float[np.ndarray, "frames bodies 3"],
     orientation: Float[np.ndarray, "frames bodies 4"],
-    step: float,
-    size: tuple[int, int],
-    how: str = "auto",
-) -> list[Camera]:
-    """Cameras of the frames of a film.
+) -> Seen:
+    """What a film of a run shall show: its bounded bodies.
 
     Args:
         scene: The scene.
         drawn: What of it is drawn.
         position: Of the centres of mass in each frame [m, W].
         orientation: Of the bodies.
+    """
+    moving, still, paths = [np.zeros((len(position), 0, 3))], [np.zeros((0, 3))], []
+    for item, row, com in zip(drawn.items, drawn.rows, drawn.offsets, strict=True):
+        if item.plane is not None:
+            continue
+        if not scene.bodies[row].fixed:
+            paths.append(position[:, row])
+        if item.shape is None:
+            continue
+        outline = _outline(scene.bodies[row], item.shape) - com
+        turns = quat_to_matrix(orientation[:, row])
+        placed = position[:, None, row] + np.einsum("tij,nj->tni", turns, outline)
+        if scene.bodies[row].fixed:
+            still.append(placed[0])
+        else:
+            moving.append(placed)
+    return Seen(np.concatenate(moving, axis=1), np.concatenate(still), paths)
+
+
+def together(runs: Sequence[Seen]) -> Seen:
+    """What is seen of several runs, as if all of it were in one place."""
+    return Seen(
+        np.concatenate([run.moving for run in runs], axis=1),
+        np.concatenate([run.still for run in runs]),
+        [path for run in runs for path in run.paths],
+    )
+
+
+def camera_for(scene: Scene, drawn: Stage, trajectory: Trajectory, width: int, height: int) -> Camera:
+    """A camera that sees every bounded body all the time, from across the main direction of motion."""
+    position = np.asarray(trajectory.states.position, dtype=np.float64)
+    orientation = np.asarray(trajectory.states.orientation, dtype=np.float64)
+    steps = np.unique(np.linspace(0, len(position) - 1, 60).astype(int))
+    return _fixed(seen_of(scene, drawn, position[steps], orientation[steps]), width, height)
+
+
+def cameras_for(seen: Seen, step: float, size: tuple[int, int], how: str = "auto") -> list[Camera]:
+    """Cameras of the frames of a film.
+
+    Args:
+        seen: What they keep in view.
         step: Simulated time between two frames [s].
         size: Width and height [pixels].
         how: One of `CAMERAS`. A following camera keeps its direction and shifts; "auto" follows if bodies
             would otherwise fill less than a third of the height.
     """
-    moving, still = _points(scene, drawn, position, orientation)
-    direction = _direction(scene, drawn, position, moving, still)
-    fixed = _fixed(moving, still, direction, *size)
+    moving = seen.moving
+    fixed = _fixed(seen, *size)
     if how == "fixed" or not moving.shape[1]:
-        return [fixed] * len(position)
+        return [fixed] * len(moving)
     if how == "auto" and _least_fill([fixed] * len(moving), moving) >= LEAST:
-        return [fixed] * len(position)
+        return [fixed] * len(moving)
+    direction = _direction(seen)
     nearest = _following(moving, direction, 0, size)
     # Bodies far apart cannot fill it: then nearly what can be had.
     wanted = min(LEAST, 0.9 * _least_fill(nearest, moving))
@@ -98,35 +147,16 @@ def _framed(points: Float[np.ndarray, "n 3"], direction: np.ndarray, width: int,
     return Camera.framing(points, none, direction=direction, width=width, height=height, margin=_MARGIN)
 
 
-def _fixed(moving, still, direction: np.ndarray, width: int, height: int) -> Camera:
-    points = np.concatenate([moving.reshape(-1, 3), still])
-    if not len(points):
+def _fixed(seen: Seen, width: int, height: int) -> Camera:
+    if not len(seen.points):
         return Camera((3.0, -8.0, 4.0), width=width, height=height)
-    return _framed(points, direction, width, height)
+    return _framed(seen.points, _direction(seen), width, height)
 
 
 def _least_fill(cameras: Sequence[Camera], moving: Float[np.ndarray, "frames n 3"]) -> float:
     """Share of the height that the moving bodies fill, together, in the frame where they fill least."""
     heights = (np.ptp(c.project(points)[:, 1]) / c.height for c, points in zip(cameras, moving, strict=True))
     return float(min(heights))
-
-
-def _points(
-    scene: Scene, drawn: Stage, position: np.ndarray, orientation: np.ndarray
-) -> tuple[Float[np.ndarray, "frames n 3"], Float[np.ndarray, "m 3"]]:
-    """Points on bounded bodies [m, W]: on those that move in each frame, and on fixed ones."""
-    moving, still = [np.zeros((len(position), 0, 3))], [np.zeros((0, 3))]
-    for item, row, com in zip(drawn.items, drawn.rows, drawn.offsets, strict=True):
-        if item.shape is None or item.plane is not None:
-            continue
-        outline = _outline(scene.bodies[row], item.shape) - com
-        turns = quat_to_matrix(orientation[:, row])
-        placed = position[:, None, row] + np.einsum("tij,nj->tni", turns, outline)
-        if scene.bodies[row].fixed:
-            still.append(placed[0])
-        else:
-            moving.append(placed)
-    return np.concatenate(moving, axis=1), np.concatenate(still)
 
 
 def _outline(body: Body, shape: AbstractShape) -> Float[np.ndarray, "n 3"]:
@@ -144,14 +174,9 @@ def _outline(body: Body, shape: AbstractShape) -> Float[np.ndarray, "n 3"]:
     return 0.5 * (lower + upper) + 0.5 * (upper - lower) * corners
 
 
-def _direction(scene: Scene, drawn: Stage, position: np.ndarray, moving, still) -> np.ndarray:
+def _direction(seen: Seen) -> np.ndarray:
     """Where cameras look: across the main direction of motion, a little from the side and from above."""
-    points = np.concatenate([moving.reshape(-1, 3), still])
-    if not len(points):
-        return np.array([0.0, 1.0, _DOWN])
-    bounded = [row for row, item in zip(drawn.rows, drawn.items, strict=True) if item.plane is None]
-    paths = [position[:, row, :2] for row in bounded if not scene.bodies[row].fixed]
-    right = _main_direction(points, paths)
+    right = _main_direction(seen.points, [path[:, :2] for path in seen.paths])
     # Seen a little from the side, motion along the screen still shows depth.
     ahead = np.array([-right[1], right[0]])
     ahead = 0.94 * ahead + 0.34 * right

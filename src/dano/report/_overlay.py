@@ -67,8 +67,8 @@ def draw_clock(
     result = Image.fromarray(picture)
     draw = ImageDraw.Draw(result)
     height = camera.height
-    font = ImageFont.load_default(size=max(10.0, height / 24))
-    margin, base = height / 30, height - height / 30
+    font, margin = ImageFont.load_default(size=_letters(height)), height / 30
+    base = height - margin
     draw.text((margin, base), f"{time:.2f} s", font=font, fill=_DOT, anchor="ls")
     metre = 1 / (camera.pixel_angle * distance)
     length = round_below(camera.width / 5 / metre)
@@ -76,6 +76,28 @@ def draw_clock(
     draw.line([left, base, right, base], fill=_DOT, width=max(2, height // 200))
     draw.text((right, base - height / 60), length_text(length), font=font, fill=_DOT, anchor="rs")
     return np.asarray(result)
+
+
+def draw_label(
+    picture: UInt8[np.ndarray, "height width 3"], text: str
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The picture with a text in its upper left corner, without its beginning if it is too long."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    result = Image.fromarray(picture)
+    height, width, _ = picture.shape
+    font, margin = ImageFont.load_default(size=_letters(height)), height / 30
+    shown = text = " ".join(text.split())
+    while text and font.getlength(shown) > width - 2 * margin:
+        text = text[1:]
+        shown = f"…{text}"
+    ImageDraw.Draw(result).text((margin, margin), shown, font=font, fill=_DOT, anchor="la")
+    return np.asarray(result)
+
+
+def _letters(height: int) -> float:
+    """Size of letters [pixels] in a picture of a height."""
+    return max(10.0, height / 24)
 
 
 def round_below(x: float) -> float:

@@ -1,6 +1,5 @@
 """Pictures of plans: a film with ghosts where the goals are, and the controls over time."""
 
-import contextlib
 import os
 from collections.abc import Mapping
 
@@ -13,7 +12,7 @@ from dano.progress import Progress
 from dano.report._framing import camera_for
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import Stage, stage
-from dano.report._video import encoder, moments_of, require, side_by_side, write_png
+from dano.report._video import moments_of, require, write_film
 from dano.scene import Scene
 from dano.vision import Camera, Item, LearnedField, render
 
@@ -75,23 +74,7 @@ def film_plan(
         return np.round((1 - _GHOST) * image + _GHOST * both.astype(float)).astype(np.uint8)
 
     moments = moments_of(position, _MOMENTS)
-    frames = range(len(times)) if video is not None else moments.tolist()
-    kept = []
-    with contextlib.ExitStack() as stack:
-        add = None
-        if video is not None:
-            file = stack.enter_context(replacing(video))
-            add = stack.enter_context(encoder(file, fps, camera.width, camera.height))
-        for count, frame in enumerate(frames):
-            image = picture(frame)
-            if add is not None:
-                add(image)
-            if frame in moments:
-                kept.append(image)
-            if progress is not None:
-                progress("drawing", (count + 1) / len(frames))
-    if still is not None:
-        write_png(still, side_by_side(kept))
+    write_film(lambda frame: [picture(frame)], len(times), moments, (video, still), fps, progress)
 
 
 def _ghosts(scene: Scene, task: Task, plan: Plan, drawn: Stage) -> list[Item]:

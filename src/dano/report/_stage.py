@@ -13,6 +13,9 @@ from dano.maths import Pose, quat_to_matrix
 from dano.scene import Body, Scene, Trajectory
 from dano.vision import Item, LearnedField, PALETTE
 
+_MOST_SHARE = 2.5
+"""Longest arrow of a force, in those of the usual one (chosen by eye)."""
+
 
 def check_run(scene: Scene, trajectory: Trajectory) -> None:
     """Check that a trajectory is one of a scene, with at least one step, and finite.
@@ -114,12 +117,19 @@ class Touches(NamedTuple):
     Attributes:
         points: Centroids of the overlaps [m, W], (frames, contacts, 3).
         forces: On the first body of each contact [N, W], (frames, contacts, 3).
-        shares: Force over the largest of the trajectory, (frames, contacts); zero where nothing touches.
+        shares: Force over the usual one, (frames, contacts); zero where nothing touches.
+        usual: Usual force [N], for arrows; zero if nothing touches at all.
     """
 
     points: Float[np.ndarray, "frames contacts 3"]
     forces: Float[np.ndarray, "frames contacts 3"]
     shares: Float[np.ndarray, "frames contacts"]
+    usual: float
+
+    def beside(self, usual: float) -> "Touches":
+        """The same with another usual force, so that arrows can be compared with those of other runs."""
+        shares = np.clip(np.linalg.norm(self.forces, axis=-1) / usual, 0, _MOST_SHARE)
+        return self._replace(shares=np.where(self.shares > 0, shares, 0.0), usual=usual)
 
 
 def touches(scene: Scene, trajectory: Trajectory, times: Float[np.ndarray, " frames"]) -> Touches | None:
@@ -133,6 +143,7 @@ def touches(scene: Scene, trajectory: Trajectory, times: Float[np.ndarray, " fra
     size = np.linalg.norm(forces, axis=-1)
     # A landing is a hundred times the weight; what matters to the eye is the usual force, so the rest is
     # clipped.
-    usual = float(np.quantile(size[size > 1e-9], 0.8)) if np.any(size > 1e-9) else 1.0
-    shares = np.where((overlap > 0) & np.isfinite(points).all(axis=-1), np.clip(size / usual, 0, 2.5), 0.0)
-    return Touches(points, forces, shares)
+    usual = float(np.quantile(size[size > 1e-9], 0.8)) if np.any(size > 1e-9) else 0.0
+    shares = np.clip(size / (usual or 1.0), 0, _MOST_SHARE)
+    shares = np.where((overlap > 0) & np.isfinite(points).all(axis=-1), shares, 0.0)
+    return Touches(points, forces, shares, usual)

@@ -1,6 +1,5 @@
 """The report of a tracked film: silhouettes over frames, how they fit, how sure the poses are."""
 
-import html
 import io
 import os
 from collections.abc import Sequence
@@ -9,8 +8,6 @@ import numpy as np
 from jaxtyping import UInt8
 from scipy import ndimage
 
-from dano.pixels import FilmFit
-from dano.report._identification import values_table
 from dano.report._page import image, table, video, warnings, write_page
 from dano.report._video import encoder, require
 from dano.vision import Film, Tracked
@@ -21,11 +18,8 @@ _SHOWN = 8
 _FPS = 12
 """Of the film in the page: slow enough to look at silhouettes."""
 
-_WIDTH = 460
+WIDTH = 460
 """Of a picture in the page [CSS pixels]."""
-
-_PAIRS, _THUMB = 4, 96
-"""Moments in which film and simulation are shown side by side; width of a photograph [CSS pixels]."""
 
 _LINE = np.array([255, 64, 32])
 """Colour of silhouettes (chosen: rare in photographs)."""
@@ -42,7 +36,7 @@ def draw_tracked(film: Film, tracked: Tracked, index: int) -> UInt8[np.ndarray, 
         tracked: What was found.
         index: Which frame.
     """
-    frame = _enlarged(film.images[index])
+    frame = enlarged(film.images[index])
     overlay = tracked.overlays[index]
     if overlay is None:
         return frame
@@ -71,7 +65,7 @@ def write_tracking_report(path: str | os.PathLike[str], film: Film, tracked: Tra
     require("av")
     shown = np.unique(np.linspace(0, len(tracked.times) - 1, _SHOWN).astype(int)).tolist()
     pictures = "".join(
-        f"<figure>{image(draw_tracked(film, tracked, i) / 255, _WIDTH)}<figcaption>"
+        f"<figure>{image(draw_tracked(film, tracked, i) / 255, WIDTH)}<figcaption>"
         f"{tracked.times[i]:.3f} s, {tracked.status[i]}</figcaption></figure>"
         for i in shown
     )
@@ -91,80 +85,22 @@ def write_tracking_report(path: str | os.PathLike[str], film: Film, tracked: Tra
     )
 
 
-def write_film_report(
-    path: str | os.PathLike[str],
-    film: Film,
-    found: FilmFit,
-    simulated: Sequence[UInt8[np.ndarray, "height width 3"]],
-    *,
-    title: str,
-    photographs: Sequence[UInt8[np.ndarray, "_ _ 3"]] = (),
-    notes: Sequence[str] = (),
-) -> None:
-    """Write a page with the film beside the simulation that was fitted to it, and what was found.
-
-    Args:
-        path: Where to; written whole or not at all.
-        film: The frames.
-        found: What its pixels say.
-        simulated: The simulation as the camera of the film would see it, a picture for each frame.
-        title: Heading.
-        photographs: Pictures that the object was learned from, if they shall be shown.
-        notes: Sentences below the heading.
-
-    Raises:
-        ValueError: If `path` is a directory or lies in none, or there are more or fewer pictures than frames.
-        ImportError: If pillow or av is missing.
-    """
-    if len(simulated) != len(film.times):
-        raise ValueError(f"simulated must be as many as frames, {len(film.times)}, got {len(simulated)}")
-    require("PIL", "pillow")
-    require("av")
-    pairs = [
-        np.concatenate([draw_tracked(film, found.tracked, i), _enlarged(simulated[i])], axis=1)
-        for i in range(len(simulated))
-    ]
-    shown = np.unique(np.linspace(0, len(pairs) - 1, _PAIRS).astype(int)).tolist()
-    stills = "".join(
-        f"<figure>{image(pairs[i] / 255, 2 * _WIDTH)}<figcaption>{film.times[i]:.3f} s</figcaption></figure>"
-        for i in shown
-    )
-    learned = "".join(image(picture / 255, _THUMB) for picture in photographs)
-    write_page(
-        path,
-        title,
-        [
-            *(f"<p>{html.escape(text)}</p>" for text in notes),
-            f"<h2>Photographs that the object was learned from</h2><div class='views'>{learned}</div>"
-            if learned
-            else "",
-            "<h2>Left: the film, with the outline of the simulated object. Right: the simulation,"
-            " rendered</h2>",
-            _encoded(pairs),
-            "<h2>From the pixels of the film</h2>",
-            values_table(found.fit),
-            "<h2>From tracked poses alone</h2>",
-            values_table(found.poses),
-            warnings([*found.fit.messages, *found.tracked.messages]),
-            f'<h2>Frames</h2><div class="views">{stills}</div>',
-        ],
-    )
-
-
 def _film(film: Film, tracked: Tracked) -> str:
-    return _encoded([draw_tracked(film, tracked, i) for i in range(len(tracked.times))])
+    return encoded([draw_tracked(film, tracked, i) for i in range(len(tracked.times))])
 
 
-def _encoded(pictures: Sequence[np.ndarray]) -> str:
+def encoded(pictures: Sequence[np.ndarray]) -> str:
+    """Pictures as a film in a page."""
     height, width = (n - n % 2 for n in pictures[0].shape[:2])
     buffer = io.BytesIO()
     with encoder(buffer, _FPS, width, height) as add:
         for picture in pictures:
             add(picture[:height, :width])
-    return video(buffer.getvalue(), 2 * _WIDTH)
+    return video(buffer.getvalue(), 2 * WIDTH)
 
 
-def _enlarged(picture: np.ndarray) -> np.ndarray:
+def enlarged(picture: np.ndarray) -> np.ndarray:
+    """A picture as large as those of `draw_tracked`."""
     return np.repeat(np.repeat(picture, _FINE, axis=0), _FINE, axis=1)
 
 

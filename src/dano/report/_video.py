@@ -2,9 +2,9 @@
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -13,17 +13,45 @@ from dano.archive import checked_output, replacing
 from dano.checks import checked_choice, checked_function, checked_items, checked_kind, checked_path
 from dano.extras import optional
 from dano.progress import Progress
-from dano.report._framing import CAMERAS, cameras_for
-from dano.report._overlay import draw_clock, draw_touches
+from dano.report._framing import CAMERAS, cameras_for, Seen, seen_of, together
+from dano.report._overlay import draw_clock, draw_label, draw_touches
 from dano.report._resample import frame_times, poses_at
-from dano.report._stage import check_run, stage, touches
+from dano.report._stage import check_run, Stage, stage, Touches, touches
 from dano.scene import Scene, Trajectory
 from dano.vision import Camera, LearnedField, render
 
 MOST_PIXELS = 8192
 """Longest side of a film: what common decoders of H.264 can show."""
+_MOST_OF_HALF = MOST_PIXELS // 2 - 40
+"""The same of one of two pictures with a line between them."""
 _STRIP_MOMENTS = 6
 """Moments in a picture strip: two rows of three (convention)."""
+_ROW_MOMENTS = 4
+"""Moments in a row of a picture strip of two runs (convention)."""
+
+
+class _Style(NamedTuple):
+    """How runs are filmed: arguments of `render_trajectory`."""
+
+    fps: int
+    size: tuple[int, int]
+    slow_motion: int | float
+    contact_points: bool
+    clock: bool
+    camera: Camera | str
+    progress: Progress | None
+
+
+class _Take(NamedTuple):
+    """A run as a film shows it: what is drawn of it, and where that is in each frame."""
+
+    seen: Seen
+    drawn: Stage
+    times: Float[np.ndarray, " frames"]
+    position: Float[np.ndarray, "frames bodies 3"]
+    orientation: Float[np.ndarray, "frames bodies 4"]
+    touched: Touches | None
+    label: str
 
 
 def render_trajectory(
@@ -69,65 +97,91 @@ def render_trajectory(
             is a directory, lies in none, or has another ending.
         ImportError: If av or pillow is missing.
     """
+    style = _Style(fps, size, slow_motion, contact_points, clock, camera, progress)
+    style, outputs = _checked(style, [(scene, trajectory)], path, strip)
+    count = len(frame_times(trajectory, fps, slow_motion))
+    _film([_take(scene, trajectory, stage(scene, colours, looks), count, style)], style, outputs)
+
+
+def render_side_by_side(
+    scenes: Sequence[Scene],
+    trajectories: Sequence[Trajectory],
+    path: str | os.PathLike[str] | None,
+    *,
+    labels: Sequence[str] = ("", ""),
+    looks: Sequence[Mapping[str, LearnedField] | None] = (None, None),
+    fps: int = 30,
+    size: tuple[int, int] = (640, 400),
+    slow_motion: int | float = 1.0,
+    contact_points: bool = True,
+    clock: bool = True,
+    strip: str | os.PathLike[str] | None = None,
+    camera: Camera | str = "auto",
+    progress: Progress | None = None,
+) -> None:
+    """Film two runs beside one another, to compare them.
+
+    Both begin together and are seen by the same camera, which keeps the bodies of both in view. The one that
+    ends first stands still until the other ends. Arrows of equal length are equal forces.
+
+    Args:
+        scenes: Two scenes, left and right; they may be the same.
+        trajectories: What happened in them.
+        path: The video, ending in .mp4; None for none.
+        labels: What is written over the two halves.
+        looks: What bodies have learned to look like, for each scene as in `render_trajectory`.
+        fps: Frames per second of the video.
+        size: Width and height of a half [pixels], even numbers.
+        slow_motion: How many times slower than life the video plays.
+        contact_points: Whether to draw where bodies touch, and the contact force as an arrow.
+        clock: Whether to draw the time, and a bar that says how long things are in the middle of the motion.
+        strip: A PNG with some moments, a row for each run; None for none.
+        camera: As in `render_trajectory`.
+        progress: Called with a description and the share done.
+
+    Raises:
+        ValueError: If there are not two of everything, or as `render_trajectory` says.
+        ImportError: If av or pillow is missing.
+    """
+    scenes = _two("scenes", scenes, Scene)
+    trajectories = _two("trajectories", trajectories, Trajectory)
+    labels = _two("labels", labels, str)
+    looks = _two("looks", looks, Mapping, type(None))
+    style = _Style(fps, size, slow_motion, contact_points, clock, camera, progress)
+    style, outputs = _checked(style, list(zip(scenes, trajectories, strict=True)), path, strip)
+    count = max(len(frame_times(trajectory, fps, slow_motion)) for trajectory in trajectories)
+    takes = [
+        _take(scene, trajectory, stage(scene, None, look), count, style, label)
+        for scene, trajectory, label, look in zip(scenes, trajectories, labels, looks, strict=True)
+    ]
+    _film(_with_equal_arrows(takes), style, outputs)
+
+
+def _two(name: str, values: Any, *kinds: type) -> tuple[Any, ...]:
+    values = checked_items(name, values, *kinds)
+    if len(values) != 2:
+        raise ValueError(f"{name} must be two, for left and right, got {len(values)}")
+    return values
+
+
+def _checked(
+    style: _Style, runs: Sequence[tuple[Scene, Trajectory]], path: Any, strip: Any
+) -> tuple[_Style, tuple[Path | None, Path | None]]:
+    """How to film, and output paths, after checks that need no work."""
+    camera, size = style.camera, style.size
     if isinstance(camera, str):
         checked_choice("camera", camera, CAMERAS)
     else:
         checked_kind("camera", camera, Camera, hint=f", or one of {', '.join(CAMERAS)}")
         size = camera.width, camera.height
-    outputs = _checked(scene, trajectory, path, strip, size)
-    if progress is not None:
-        checked_function("progress", progress)
-    times = frame_times(trajectory, fps, slow_motion)
-    drawn = stage(scene, colours, looks)
-    touched = touches(scene, trajectory, times) if contact_points else None
-    length = 0.55 * float(np.median([item.radius for item in drawn.items if item.plane is None] or [1.0]))
-    position, orientation = poses_at(trajectory, times)
-    if isinstance(camera, str):
-        step = 1 / (fps * slow_motion)
-        cameras = cameras_for(scene, drawn, position, orientation, step, size, camera)
-    else:
-        cameras = [camera] * len(times)
-    bounded = [row for row, item in zip(drawn.rows, drawn.items, strict=True) if item.plane is None]
-
-    def picture(frame: int) -> UInt8[np.ndarray, "height width 3"]:
-        eye = cameras[frame]
-        image = render(drawn.posed(position[frame], orientation[frame]), eye, floor=False)
-        image = image if touched is None else draw_touches(image, eye, touched, frame, length)
-        if not clock:
-            return image
-        middle = position[frame, bounded or drawn.rows].mean(axis=0)
-        distance = max(float((middle - eye.position) @ eye.axes[2]), 1e-3)
-        return draw_clock(image, eye, float(times[frame]), distance)
-
-    moments = moments_of(position, _STRIP_MOMENTS)
-    frames = range(len(times)) if outputs[0] is not None else moments.tolist()
-    kept = []
-    with contextlib.ExitStack() as stack:
-        add = None
-        if outputs[0] is not None:
-            file = stack.enter_context(replacing(outputs[0]))
-            add = stack.enter_context(encoder(file, fps, *size))
-        for count, frame in enumerate(frames):
-            image = picture(frame)
-            if add is not None:
-                add(image)
-            if outputs[1] is not None and frame in moments:
-                kept.append(image)
-            if progress is not None:
-                progress("drawing", (count + 1) / len(frames))
-    if outputs[1] is not None:
-        write_png(outputs[1], side_by_side(kept))
-
-
-def _checked(scene, trajectory, path, strip, size) -> tuple[Path | None, Path | None]:
-    """Output paths, after checks that need no work."""
     if path is None and strip is None:
         raise ValueError("path or strip must be given, got None for both")
-    check_run(scene, trajectory)
-    size = checked_items("size", size, int)
-    if len(size) != 2 or not all(16 <= n <= MOST_PIXELS and n % 2 == 0 for n in size):
+    for scene, trajectory in runs:
+        check_run(scene, trajectory)
+    size, most = checked_items("size", size, int), MOST_PIXELS if len(runs) == 1 else _MOST_OF_HALF
+    if len(size) != 2 or not all(16 <= n <= most and n % 2 == 0 for n in size):
         raise ValueError(
-            f"size must be two even numbers from 16 to {MOST_PIXELS} pixels (video codecs need them even),"
+            f"size must be two even numbers from 16 to {most} pixels (video codecs need them even),"
             f" got {list(size)}"
         )
     checked = []
@@ -138,7 +192,106 @@ def _checked(scene, trajectory, path, strip, size) -> tuple[Path | None, Path | 
     if path is not None:
         require("av")
     require("PIL", "pillow")
-    return checked[0], checked[1]
+    if style.progress is not None:
+        checked_function("progress", style.progress)
+    return style._replace(size=(size[0], size[1])), (checked[0], checked[1])
+
+
+def _take(
+    scene: Scene, trajectory: Trajectory, drawn: Stage, count: int, style: _Style, label: str = ""
+) -> _Take:
+    """A run at the times of so many frames; after its end it stands still."""
+    since = np.arange(count) / (style.fps * style.slow_motion)
+    known = np.asarray(trajectory.times, dtype=np.float64)
+    times = np.minimum(known[0] + since, known[-1])
+    position, orientation = poses_at(trajectory, times)
+    touched = touches(scene, trajectory, times) if style.contact_points else None
+    seen = seen_of(scene, drawn, position, orientation)
+    return _Take(seen, drawn, times, position, orientation, touched, label)
+
+
+def _with_equal_arrows(takes: Sequence[_Take]) -> list[_Take]:
+    """The takes with arrows that are as long in all of them for the same force."""
+    usual = max((take.touched.usual for take in takes if take.touched is not None), default=0.0)
+    if usual == 0:
+        return list(takes)
+    return [
+        take if take.touched is None else take._replace(touched=take.touched.beside(usual)) for take in takes
+    ]
+
+
+def _film(takes: Sequence[_Take], style: _Style, outputs: tuple[Path | None, Path | None]) -> None:
+    """Draw runs from left to right, all from the same camera."""
+    count = len(takes[0].times)
+    if isinstance(style.camera, str):
+        step = 1 / (style.fps * style.slow_motion)
+        cameras = cameras_for(together([take.seen for take in takes]), step, style.size, style.camera)
+    else:
+        cameras = [style.camera] * count
+    sizes = [item.radius for take in takes for item in take.drawn.items if item.plane is None]
+    arrow = 0.55 * float(np.median(sizes or [1.0]))
+    position = np.concatenate([take.position for take in takes], axis=1)
+    moments = moments_of(position, _STRIP_MOMENTS if len(takes) == 1 else _ROW_MOMENTS)
+
+    def pictures(frame: int) -> list[np.ndarray]:
+        return [_picture(take, cameras[frame], frame, arrow, style.clock) for take in takes]
+
+    write_film(pictures, count, moments, outputs, style.fps, style.progress)
+
+
+def _picture(
+    take: _Take, camera: Camera, frame: int, arrow: float, clock: bool
+) -> UInt8[np.ndarray, "height width 3"]:
+    """A frame of a run; `arrow`: length [m] of a usual force."""
+    drawn, position = take.drawn, take.position[frame]
+    image = render(drawn.posed(position, take.orientation[frame]), camera, floor=False)
+    if take.touched is not None:
+        image = draw_touches(image, camera, take.touched, frame, arrow)
+    if clock:
+        bounded = [row for row, item in zip(drawn.rows, drawn.items, strict=True) if item.plane is None]
+        middle = position[bounded or drawn.rows].mean(axis=0)
+        distance = max(float((middle - camera.position) @ camera.axes[2]), 1e-3)
+        image = draw_clock(image, camera, float(take.times[frame]), distance)
+    return draw_label(image, take.label) if take.label else image
+
+
+def write_film(
+    pictures: Callable[[int], Sequence[UInt8[np.ndarray, "height width 3"]]],
+    count: int,
+    moments: Int[np.ndarray, " moments"],
+    outputs: tuple[Path | None, Path | None],
+    fps: int,
+    progress: Progress | None,
+) -> None:
+    """Draw the frames of a video, a strip of some moments, or both.
+
+    Args:
+        pictures: What a frame shows, from left to right; as many in each.
+        count: Number of frames.
+        moments: Frames in the strip. What stands side by side in the video has a row each.
+        outputs: The video and the strip; None for none.
+        fps: Frames per second.
+        progress: Called with a description and the share done.
+    """
+    video, strip = outputs
+    frames = range(count) if video is not None else moments.tolist()
+    kept, add = [], None
+    with contextlib.ExitStack() as stack:
+        for done, frame in enumerate(frames):
+            images = pictures(frame)
+            if video is not None:
+                whole = side_by_side(images)
+                if add is None:
+                    file = stack.enter_context(replacing(video))
+                    add = stack.enter_context(encoder(file, fps, whole.shape[1], whole.shape[0]))
+                add(whole)
+            if strip is not None and frame in moments:
+                kept.append(images)
+            if progress is not None:
+                progress("drawing", (done + 1) / len(frames))
+    if strip is not None:
+        rows = [image for row in zip(*kept, strict=True) for image in row]
+        write_png(strip, side_by_side(rows, None if len(kept[0]) == 1 else len(kept)))
 
 
 @contextlib.contextmanager
@@ -171,17 +324,22 @@ def moments_of(position: Float[np.ndarray, "frames bodies 3"], n: int) -> Int[np
     return np.unique(np.interp(np.linspace(0, way[-1], n), way, np.arange(len(way))).round().astype(int))
 
 
-def side_by_side(images: list[np.ndarray]) -> np.ndarray:
-    """Pictures from left to right, three a row, with a thin white line between them."""
-    per_row = 3 if len(images) > 3 else len(images)
+def side_by_side(images: Sequence[np.ndarray], per_row: int | None = None) -> np.ndarray:
+    """Pictures from left to right with a thin white line between them; default: three a row."""
+    per_row = per_row or (3 if len(images) > 3 else len(images))
     height, width, _ = images[0].shape
     n_rows = -(-len(images) // per_row)
-    gap = max(2, height // 100)
+    gap = _gap(height)
     sheet = np.full((n_rows * (height + gap) - gap, per_row * (width + gap) - gap, 3), 255, dtype=np.uint8)
     for i, image in enumerate(images):
         top, left = (i // per_row) * (height + gap), (i % per_row) * (width + gap)
         sheet[top : top + height, left : left + width] = image
     return sheet
+
+
+def _gap(height: int) -> int:
+    """Pixels between pictures: an even number, as codecs want the whole to be."""
+    return 2 * max(1, height // 200)
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:

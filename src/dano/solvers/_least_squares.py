@@ -80,6 +80,30 @@ class Solution(NamedTuple):
     evaluations: int
 
 
+class Iterate(NamedTuple):
+    """Where a minimisation is between two steps, and all that the next one depends on.
+
+    Attributes:
+        x: Shared unknowns.
+        blocks: Private unknowns.
+        losses: Loss at the start and after each accepted step.
+        damping: Of the next step.
+        growth: By what the damping grows if that one fails.
+        slow: Steps in a row that brought next to nothing.
+        spread: Scales of the shared and of the private unknowns.
+        evaluations: How often `linearize` was called.
+    """
+
+    x: np.ndarray
+    blocks: Any
+    losses: tuple[float, ...]
+    damping: float
+    growth: float
+    slow: int
+    spread: tuple[np.ndarray, np.ndarray]
+    evaluations: int
+
+
 # At the start, and its limits: shares of the diagonal of the normal equations, from rounding to "no step".
 _DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-15, 1e12
@@ -114,6 +138,8 @@ def bounded_least_squares(
     tolerance: float = 1e-10,
     perfect: float = 0.0,
     progress: Callable[[int, float], None] | None = None,
+    keep: Callable[[Iterate], None] | None = None,
+    since: Iterate | None = None,
 ) -> Solution:
     """Minimise a sum of squares within bounds.
 
@@ -130,58 +156,95 @@ def bounded_least_squares(
         perfect: Stop when the loss is no larger: what is left is rounding.
         progress: Called with the number of accepted steps and the loss. An interrupt (Ctrl-C) ends the
             minimisation with the best point so far.
+        keep: Called before each step with what it depends on.
+        since: What `keep` was called with: the minimisation goes on there as if it had never stopped.
 
     Raises:
         ValueError: If shapes differ, a bound is NaN or crossed, the start lies outside, or the loss is not
             finite there.
     """
     x, lower, upper = _checked(start, lower, upper)
-    blocks, normal = start_blocks, linearize(x, start_blocks)
-    if not np.isfinite(normal.loss):
-        raise ValueError(f"loss must be finite at the start {x.tolist()}, got {normal.loss}")
-    losses, damping, growth, evaluations, slow = [float(normal.loss)], _DAMPING, 2.0, 1, 0
-    spread, span = _scales(normal), _span(x, lower, upper)
+    span = _span(x, lower, upper)
+    now, normal = _begun(linearize, x, start_blocks, since)
     try:
-        for iteration in range(max_iterations + 1):
+        for iteration in range(len(now.losses) - 1, max_iterations + 1):
+            if keep is not None:
+                keep(now)
+            loss = now.losses[-1]
             if progress is not None:
-                progress(iteration, losses[-1])
-            if losses[-1] <= max(perfect, np.finfo(float).tiny):
-                return _solution(x, blocks, normal, Stop.PERFECT, losses, evaluations)
-            box = lower - x, upper - x
+                progress(iteration, loss)
+            if loss <= max(perfect, np.finfo(float).tiny):
+                return _solution(now, normal, Stop.PERFECT)
+            box = lower - now.x, upper - now.x
             floor = _FLAT * np.max(np.diag(normal.hessian) * span**2, initial=0) / span**2
-            change, _, hoped = _step(normal, 0.0, floor, spread, *box)
-            if hoped <= tolerance * losses[-1]:
-                return _solution(x, blocks, normal, Stop.LOSS, losses, evaluations)
-            if normal.block_gradient.size == 0 and _negligible(change, x):
-                return _solution(x, blocks, normal, Stop.STEP, losses, evaluations)
+            change, _, hoped = _step(normal, 0.0, floor, now.spread, *box)
+            if hoped <= tolerance * loss:
+                return _solution(now, normal, Stop.LOSS)
+            if normal.block_gradient.size == 0 and _negligible(change, now.x):
+                return _solution(now, normal, Stop.STEP)
             if iteration == max_iterations:
                 break
-            while True:
-                change, block_change, promised = _step(normal, damping, floor, spread, *box)
-                if promised <= tolerance * losses[-1] or damping > _MOST_DAMPING:
-                    stop = _without_step(hoped, tolerance * losses[-1])
-                    return _solution(x, blocks, normal, stop, losses, evaluations)
-                at = np.clip(x + change, lower, upper)
-                trial = functools.partial(_tried, linearize, retract, normal, at, blocks)
-                first = trial(block_change, promised)
-                best, again = _shortened(trial, first, normal, change, block_change, damping, spread)
-                evaluations += 1 + again
-                if best.gain > _SUFFICIENT:
-                    break
-                damping, growth = damping * growth, 2 * growth
-            if best is first:
-                damping, growth, slow = _relaxed(damping, best.gain), 2.0, 0
-            else:
-                damping, growth = damping * growth, 2 * growth
-                slow = slow + 1 if normal.loss - best.normal.loss <= tolerance * normal.loss else 0
-            x, blocks, normal = at, best.blocks, best.normal
-            spread = tuple(np.maximum(new, old) for new, old in zip(_scales(normal), spread, strict=True))
-            losses.append(float(normal.loss))
-            if slow == _SLOW:
-                return _solution(x, blocks, normal, Stop.LOSS, losses, evaluations)
+            step = functools.partial(
+                _step, normal, floor=floor, spread=now.spread, lower=box[0], upper=box[1]
+            )
+            trial = functools.partial(_tried, linearize, retract, normal, (lower, upper), now)
+            now, following = _followed(now, normal, step, trial, tolerance * loss)
+            if following is None:
+                return _solution(now, normal, _without_step(hoped, tolerance * loss))
+            normal = following
+            if now.slow == _SLOW:
+                return _solution(now, normal, Stop.LOSS)
     except KeyboardInterrupt:
-        return _solution(x, blocks, normal, Stop.INTERRUPTED, losses, evaluations)
-    return _solution(x, blocks, normal, Stop.ITERATIONS, losses, evaluations)
+        return _solution(now, normal, Stop.INTERRUPTED)
+    return _solution(now, normal, Stop.ITERATIONS)
+
+
+def _begun(linearize, x: np.ndarray, blocks: Any, since: Iterate | None) -> tuple[Iterate, NormalEquations]:
+    """Where the first step begins, and the model there.
+
+    Raises:
+        ValueError: If the loss is not finite there.
+    """
+    if since is not None:
+        return since, linearize(since.x, since.blocks)
+    normal = linearize(x, blocks)
+    if not np.isfinite(normal.loss):
+        raise ValueError(f"loss must be finite at the start {x.tolist()}, got {normal.loss}")
+    return Iterate(x, blocks, (float(normal.loss),), _DAMPING, 2.0, 0, _scales(normal), 1), normal
+
+
+def _followed(
+    now: Iterate,
+    normal: NormalEquations,
+    step: Callable[..., tuple[np.ndarray, np.ndarray, float]],
+    tried: Callable[..., "_Trial"],
+    negligible: float,
+) -> tuple[Iterate, NormalEquations | None]:
+    """The next point, whose loss is less, and the model there; the same and None if no step reduces it."""
+    damping, growth, evaluations = now.damping, now.growth, now.evaluations
+    while True:
+        change, block_change, promised = step(damping)
+        if promised <= negligible or damping > _MOST_DAMPING:
+            return now._replace(evaluations=evaluations), None
+        trial = functools.partial(tried, change)
+        first = trial(block_change, promised)
+        best, again = _shortened(trial, first, normal, change, block_change, damping, now.spread)
+        evaluations += 1 + again
+        if best.gain > _SUFFICIENT:
+            break
+        damping, growth = damping * growth, 2 * growth
+    slow = 0
+    if best is first:
+        damping, growth = _relaxed(damping, best.gain), 2.0
+    else:
+        damping, growth = damping * growth, 2 * growth
+        slow = now.slow + 1 if normal.loss - best.normal.loss <= negligible else 0
+    larger = [np.maximum(new, old) for new, old in zip(_scales(best.normal), now.spread, strict=True)]
+    losses = (*now.losses, float(best.normal.loss))
+    following = Iterate(
+        best.x, best.blocks, losses, damping, growth, slow, (larger[0], larger[1]), evaluations
+    )
+    return following, best.normal
 
 
 def _checked(start: Any, lower: Any, upper: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -223,16 +286,17 @@ def _without_step(hoped: float, negligible: float) -> Stop:
 class _Trial(NamedTuple):
     """A step that was tried: where it led, and the share of the promise that it kept."""
 
+    x: np.ndarray
     blocks: Any
     normal: NormalEquations
     gain: float
     promised: float
 
 
-def _tried(linearize, retract, normal, at, blocks, block_change: np.ndarray, promised: float) -> _Trial:
-    moved = retract(blocks, block_change)
+def _tried(linearize, retract, normal, bounds, now: Iterate, change, block_change, promised: float) -> _Trial:
+    at, moved = np.clip(now.x + change, *bounds), retract(now.blocks, block_change)
     following = linearize(at, moved)
-    return _Trial(moved, following, _gain(normal, following, promised), promised)
+    return _Trial(at, moved, following, _gain(normal, following, promised), promised)
 
 
 def _shortened(
@@ -262,8 +326,8 @@ def _shortened(
     return best, count
 
 
-def _solution(x, blocks, normal, stop, losses, evaluations) -> Solution:
-    return Solution(x, blocks, normal, stop, np.array(losses), evaluations)
+def _solution(now: Iterate, normal: NormalEquations, stop: Stop) -> Solution:
+    return Solution(now.x, now.blocks, normal, stop, np.array(now.losses), now.evaluations)
 
 
 def _scales(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:

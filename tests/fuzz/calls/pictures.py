@@ -341,6 +341,36 @@ def _pictures(w: World) -> Iterator[Call]:
         },
         {"path": "", "strip": "", "scene": "", "colours": "", "looks": ""},
     )
+    two = {"one": [w.scene], "none": [], "another": [3, 4], "number": 3, "nothing": None}
+    yield Call(
+        "report.render_side_by_side",
+        report.render_side_by_side,
+        {
+            "scenes": [w.scene] * 2,
+            "trajectories": [w.trajectory] * 2,
+            "path": w.folder / "out.mp4",
+            "size": (32, 32),
+        },
+        {
+            "scenes": {**two, "another": [w.scene, w.door]},
+            "trajectories": {**two, "one": [w.trajectory]},
+            "path": {**kinds.target(w.folder, ".mp4"), "another ending": w.folder / "out.gif"},
+            "strip": {**kinds.target(w.folder, ".png"), "another ending": w.folder / "out.gif"},
+            "labels": {**two, "one": ["left"], "text": "ab"},
+            "looks": {
+                "unknown": [{"wall": None}, None],
+                "number": 3,
+                "one": [None],
+                "no look": [{"ball": 3}, {}],
+            },
+            "size": size,
+            "fps": {**POSITIVE, "huge": 10**9},
+            "slow_motion": {**POSITIVE, "huge": 1e12},
+            "camera": instance(optional=True),
+            "progress": FUNCTION,
+        },
+        {"path": "", "strip": "", "scenes": "", "trajectories": "", "looks": ""},
+    )
     yield Call(
         "report.draw_object",
         report.draw_object,

@@ -159,8 +159,15 @@ def _identify(w: World) -> Iterator[Call]:
             "window": OPTIONAL_COUNT,
             "starts": COUNT,
             "continuity": OPTIONAL_POSITIVE,
+            "checkpoint": {**kinds.target(w.folder, ".npz"), "another ending": w.folder / "out.txt"},
         },
-        {"controls": "control", "observed": "", "parameters": "parameter", "state": "state"},
+        {
+            "checkpoint": "",
+            "controls": "control",
+            "observed": "",
+            "parameters": "parameter",
+            "state": "state",
+        },
     )
     times = {
         "backwards": [0.2, 0.1, 0.0],

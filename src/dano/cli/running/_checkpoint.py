@@ -1,7 +1,6 @@
 """What a long run has simulated so far, in a file beside its output: a killed run goes on with it."""
 
 import hashlib
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,16 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano import __version__
-from dano.archive import read_archive, write_archive
+from dano.archive import Pace, read_archive
 from dano.scene import JOINT_QUANTITIES, State, state_arrays, STATE_SIZES, Trajectory
 from dano.scene_file import SceneFile
 
 _FORM, _VERSION = "dano-checkpoint", 1
 _REPORTED = ("residuals", "iterations", "converged")
-_EVERY = 2.0
-"""A shorter run is sooner made again than written [s]."""
-_SHARE = 20
-"""Writing takes at most one of so many parts of the time."""
 
 
 class Checkpoint:
@@ -35,8 +30,7 @@ class Checkpoint:
         self.path = output.with_name(f"{output.stem}.checkpoint.npz") if regular else None
         self._digest = _digest(loaded)
         self._names = loaded.scene.names
-        self._written = time.monotonic()
-        self._price = 0.0
+        self._pace = Pace()
 
     def read(self) -> list[Trajectory]:
         """The pieces that an earlier run has left; none if there is no file.
@@ -59,10 +53,8 @@ class Checkpoint:
 
     def keep(self, pieces: Sequence[Trajectory], *, now: bool = False) -> None:
         """Write the pieces, if it is time to, or at once."""
-        waited = time.monotonic() - self._written
-        if self.path is None or not (now or waited > max(_EVERY, _SHARE * self._price)):
+        if self.path is None or not (now or self._pace.due()):
             return
-        began = time.monotonic()
         arrays = {
             f"{name}_{i}": np.asarray(value)
             for i, piece in enumerate(pieces)
@@ -72,9 +64,7 @@ class Checkpoint:
             )
         }
         about = {"format": _FORM, "version": _VERSION, "digest": self._digest, "pieces": len(pieces)}
-        write_archive(self.path, {**{name: np.array(value) for name, value in about.items()}, **arrays})
-        self._written = time.monotonic()
-        self._price = self._written - began
+        self._pace.write(self.path, {**{name: np.array(value) for name, value in about.items()}, **arrays})
 
     def remove(self) -> None:
         """Remove the file: the run is complete."""

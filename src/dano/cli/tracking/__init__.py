@@ -1,3 +1,3 @@
-"""`dano track`."""
+"""`dano track`, and how films are taken."""
 
-from dano.cli.tracking._arguments import Track as Track
+from dano.cli.tracking._arguments import Filming as Filming, Track as Track

@@ -1,11 +1,57 @@
-"""The command's arguments, and nothing that is slow to import."""
+"""Arguments of `dano track` and how films were taken, and nothing that is slow to import."""
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from dano.cli._arguments import Filming, Output, UNNAMED
+from dano.cli._arguments import Output, UNNAMED
+
+
+@dataclass(frozen=True)
+class Filming:
+    """How the film was taken, and what tells the object from the rest.
+
+    Attributes:
+        camera: Intrinsics and pose of the camera: a .json file as of `dano poses`, with one frame.
+        focal: Focal length, or two, across and down [pixels], instead of --camera.
+        centre: Principal point [pixels]; default: the middle.
+        distortion: k1 k2 p1 p2 of OpenCV's model.
+        eye: Where the camera is [m], z up, instead of --camera.
+        look_at: Where it looks [m].
+        masks: Folder with a mask for each frame, bright where the object is.
+        mask_source: Where masks come from: given, static (unlike the place without the object), plain (unlike
+            a background of one colour), object (like the object where it is expected); auto: given ones, else
+            plain, else object.
+        background: Picture of the place without the object.
+        occluders: Folder with a mask for each frame, bright where something hides the object.
+        slow_motion: How many times slower the video plays than it was filmed.
+        shutter: How long a frame is exposed [s], if what moves is blurred.
+        readout: How much later the last row of a frame is exposed than the first (rolling shutter) [s].
+        every: Take every so many-th frame.
+        loss: What is minimised: photometric, silhouette, or the paper's two terms.
+        rays: Most pixels of a frame.
+        seed: Seed of all random numbers.
+    """
+
+    camera: Path | None = None
+    focal: tuple[float, ...] = ()
+    centre: tuple[float, float] | None = None
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    eye: tuple[float, float, float] | None = None
+    look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    masks: Path | None = None
+    mask_source: Literal["auto", "given", "static", "plain", "object"] = "auto"
+    background: Path | None = None
+    occluders: Path | None = None
+    slow_motion: float = 1.0
+    shutter: float = 0.0
+    readout: float = 0.0
+    every: int = 1
+    loss: Literal["photometric", "silhouette", "paper"] = "photometric"
+    rays: int = 2048
+    seed: int = 0
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dano.cli._arguments import Filming
+from dano.cli.tracking._arguments import Filming
 from dano.progress import Progress
 from dano.scene_file import asset_look
 from dano.vision import Camera, Film, LearnedField, load_camera, PosedCamera, read_film, TrackOptions

@@ -11,20 +11,19 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 import dano
 from dano.archive import replacing
-from dano.cli._arguments import Filming, Train
+from dano.cli._arguments import Train
 from dano.cli._console import Progress, put, put_json
 from dano.cli._learn import train
-from dano.cli.tracking._arguments import Track
+from dano.cli.tracking._arguments import Filming, Track
 from dano.cli.tracking._run import track
 from dano.cli.tracking.filming import camera_of, filmed, options_of
 from dano.identify import load_motion
 from dano.objects import NeuralObject
-from dano.pixels import draw_frames, FilmFit, identify_in_film
+from dano.pixels import FilmFit, identify_in_film
 from dano.vision import Film, LearnedField, load_capture, PosedCamera, View
 
 _CASE = "soap_case.zip"
@@ -164,7 +163,7 @@ def _identify(command: Track, case: Path, page: Path, result: Path) -> None:
 def _write_page(
     page: Path, film: Film, found: FilmFit, look: LearnedField, camera: PosedCamera, case: Path, truth: dict
 ) -> None:
-    from dano.report import write_film_report
+    from dano.report import draw_simulated, write_film_report
 
     value, error = float(found.fit.values["friction"]), float(found.fit.standard_errors["friction"])
     views = load_capture(case / "photographs").split("train")
@@ -173,7 +172,7 @@ def _write_page(
         page,
         film,
         found,
-        _simulated(film, found, look, camera, case / "table.png"),
+        draw_simulated(film, found, look, camera, background=case / "table.png"),
         title="A bar of soap, from photographs and a film",
         photographs=[_over_white(view) for view in some],
         notes=[
@@ -190,35 +189,3 @@ def _over_white(view: View) -> np.ndarray:
     mask = np.ones(view.image.shape[:2]) if view.mask is None else np.asarray(view.mask)
     picture = view.image * mask[..., None] + (1 - mask[..., None])
     return np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
-
-
-def _simulated(
-    film: Film, found: FilmFit, look: LearnedField, camera: PosedCamera, table: Path
-) -> list[np.ndarray]:
-    """The simulated object over the table, as the film's camera would see it."""
-    from PIL import Image
-
-    with Image.open(table) as picture:
-        place = np.asarray(picture.convert("RGB"))
-    windows = [overlay.window for overlay in found.tracked.overlays if overlay is not None]
-    top, left = (min(window[axis].start for window in windows) for axis in (0, 1))
-    bottom, right = (max(window[axis].stop for window in windows) for axis in (0, 1))
-    y, x = np.mgrid[top:bottom, left:right] + 0.5
-    motion = found.fit.fitted[0]
-    colour, _ = draw_frames(
-        [look],
-        jnp.asarray(motion.position),
-        jnp.asarray(motion.orientation),
-        camera,
-        found.lamps,
-        pixels=np.stack([x.ravel(), y.ravel()], axis=1),
-        background=place[top:bottom, left:right].reshape(-1, 3) / 255,
-    )
-    pictures = []
-    for values in np.asarray(colour):
-        frame = place.copy()
-        frame[top:bottom, left:right] = np.rint(255 * np.clip(values, 0, 1)).reshape(
-            bottom - top, right - left, 3
-        )
-        pictures.append(frame)
-    return pictures

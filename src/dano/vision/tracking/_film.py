@@ -72,6 +72,21 @@ class Film(NamedTuple):
             focal=original.focal / k, centre=original.centre / k, width=self.size[0], height=self.size[1]
         )
 
+    def place(self, file: str | Path) -> Float[np.ndarray, "height width 3"]:
+        """A picture of the place without the object, as the frames are read, in [0, 1].
+
+        Raises:
+            ValueError: If it cannot be read or has another size than the frames.
+        """
+        pixels, k = _averaged(_picture(Path(file))[..., :3], self.shrunk), self.shrunk
+        (width, height), found = self.size, pixels.shape
+        if found[:2] != (height, width):
+            raise ValueError(
+                f"background must have the size of the frames, {width * k} × {height * k},"
+                f" got {found[1] * k} × {found[0] * k}"
+            )
+        return pixels.astype(np.float32) / 255
+
 
 def read_film(
     path: str | Path,
@@ -181,23 +196,6 @@ def _picture(file: Path) -> np.ndarray:
             return np.asarray(upright.convert("RGBA" if "A" in upright.mode else "RGB"))
     except Exception as error:  # each of pillow's readers raises its own kinds
         raise ValueError(f"{file}: cannot be read as a picture ({error})") from error
-
-
-def read_picture(
-    file: str | Path, shape: tuple[int, int], shrunk: int
-) -> Float[np.ndarray, "height width 3"]:
-    """A picture of the place without the object, as frames of a film are read, in [0, 1].
-
-    Raises:
-        ValueError: If it cannot be read or has another size than the frames.
-    """
-    pixels = _averaged(_picture(Path(file))[..., :3], shrunk)
-    if pixels.shape[:2] != shape:
-        raise ValueError(
-            f"background must have the size of the frames, {shape[1] * shrunk} × {shape[0] * shrunk},"
-            f" got {pixels.shape[1] * shrunk} × {pixels.shape[0] * shrunk}"
-        )
-    return pixels.astype(np.float32) / 255
 
 
 def _averaged(pixels: np.ndarray, k: int) -> np.ndarray:

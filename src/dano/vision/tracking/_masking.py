@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from dano.vision.capture import background_mask, Light, PosedCamera, View
 from dano.vision.tracking._edges import common_offset, edge_offset, moved_edge
-from dano.vision.tracking._film import Film, read_picture
+from dano.vision.tracking._film import Film
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._refine import silhouette, Target, window_of
@@ -57,8 +57,7 @@ class Masking:
             )
         self._too_large = self._offset() if self.source == "given" else 0.0
         if background is not None:
-            width, height = film.size
-            self._place = Place(read_picture(background, (height, width), film.shrunk), film.images)
+            self._place = Place(film.place(background), film.images)
         elif self.source in ("static", "object"):
             self._place = Place.of_film(film.images)
             self.notes.append(

@@ -2,7 +2,6 @@
 
 import json
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -10,24 +9,82 @@ import numpy as np
 
 from dano import scene_file
 from dano.archive import checked_output, replacing
-from dano.cli._arguments import Identify
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import missing_for_pictures
+from dano.cli.identifying._arguments import Identify
 from dano.identify import Identification, identify as fit_parameters, load_motion, Motion, Parameter
 from dano.names import did_you_mean
 from dano.scene import Scene
 from dano.solvers import Stop
 
 if TYPE_CHECKING:
-    from dano.pixels import FilmFit
+    from dano.cli.identifying._film import Seen
 
 _OF_BODIES = ("mass_scale", "com_offset", "inertia", "mass", "com")
 
 
 def identify(command: Identify) -> None:
     """See `dano identify --help`."""
-    scene, output, report = command.scene, command.output, command.report
+    kept = _checked(command)
+    fit_pixels = None
+    if command.video is not None:
+        # Here, because most fits are of poses.
+        from dano.cli.identifying._film import film_of
+
+        fit_pixels = film_of(command)
+    # An interrupted search returns its best so far.
+    progress = Progress(stops=False)
+    loaded = scene_file.load_scene(command.scene, timestep=command.timestep, progress=progress)
+    chosen = [_parameter(text, loaded.scene) for text in command.parameter]
+    found, others = (
+        [_motion(path, command, loaded.scene) for path in paths]
+        for paths in (command.motions, command.held_out)
+    )
+    settings = {"state": loaded.state, "controls": loaded.controls, "held_out": others} | _options(command)
+    with warnings.catch_warnings():
+        # They are in the result, and said at the end.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        seen = None
+        if fit_pixels is None:
+            keeping = {"checkpoint": kept, "resume": command.resume}
+            fit = fit_parameters(loaded.scene, found, chosen, progress=progress, **keeping, **settings)
+        else:
+            seen = fit_pixels(loaded.scene, found[0], chosen, progress, settings)
+            fit = seen.found.fit
+    progress.close()
+    result = {
+        "scene": str(command.scene),
+        "motions": [str(path) for path in command.motions],
+        **fit.to_dict(),
+        **({} if seen is None else {"film": seen.numbers(command)}),
+    }
+    if command.output is not None:
+        with replacing(command.output) as file:
+            file.write((json.dumps(result, indent=2, ensure_ascii=False) + "\n").encode())
+    stopped = interrupted() or any(minimum.stop is Stop.INTERRUPTED for minimum in fit.minima)
+    if command.report is not None and not stopped:
+        progress("drawing", 0.0)
+        _write_report(command, fit, seen)
+        progress.close()
+    _tell(command, fit, seen, result, stopped=stopped)
+    if stopped:
+        goes_on = kept is not None and kept.exists()
+        raise KeyboardInterrupt("the values are the best so far" + (", --resume goes on" * goes_on))
+    if kept is not None:
+        kept.unlink(missing_ok=True)
+    for message in fit.messages:
+        say(f"warning: {message}")
+
+
+def _checked(command: Identify) -> Path | None:
+    """Where the search is kept, after checks that need no work; None for nowhere.
+
+    Raises:
+        ValueError: If a file cannot be written, or arguments do not fit each other.
+        ImportError: If what draws the report is missing.
+    """
+    output, report = command.output, command.report
     for label, file, suffix in (("output", output, ".json"), ("report", report, ".html")):
         if file is not None:
             if file.suffix.lower() != suffix:
@@ -37,133 +94,50 @@ def identify(command: Identify) -> None:
         raise ImportError(missing)
     if not command.motions:
         raise ValueError("motions must name at least one file, got none")
-    fit_pixels = _film_of(command)
-    # An interrupted search returns its best so far.
-    progress = Progress(stops=False)
-    loaded = scene_file.load_scene(scene, timestep=command.timestep, progress=progress)
-    chosen = [_parameter(text, loaded.scene) for text in command.parameter]
-    found, others = (
-        [_motion(path, command, loaded.scene) for path in paths]
-        for paths in (command.motions, command.held_out)
-    )
-    noise = {"position": command.position_noise, "orientation": command.rotation_noise}
-    given = {key: value for key, value in noise.items() if value is not None}
-    with warnings.catch_warnings():
-        # They are in the result, and said at the end.
-        warnings.simplefilter("ignore", RuntimeWarning)
-        settings: dict[str, Any] = {
-            "state": loaded.state,
-            "controls": loaded.controls,
-            "noise": given or None,
-            "held_out": others,
-            "initial": command.initial,
-            "huber": command.huber,
-            "window": command.window,
-            "continuity": command.continuity,
-            "starts": command.starts,
-        }
-        seen = None
-        if fit_pixels is None:
-            fit = fit_parameters(loaded.scene, found, chosen, progress=progress, **settings)
-        else:
-            seen = fit_pixels(loaded.scene, found[0], chosen, progress, settings)
-            fit = seen.fit
-    progress.close()
-    result = {"scene": str(scene), "motions": [str(path) for path in command.motions], **fit.to_dict()}
-    if seen is not None:
-        result["film"] = _of_film(command, seen)
-    if output is not None:
-        with replacing(output) as file:
-            file.write((json.dumps(result, indent=2, ensure_ascii=False) + "\n").encode())
-    stopped = interrupted() or any(minimum.stop is Stop.INTERRUPTED for minimum in fit.minima)
-    if report is not None and not stopped:
-        from dano.report import write_identification_report
+    if command.video is None and command.look is not None:
+        raise ValueError("look says how the body in a film looks: give --video, too")
+    if output is None:
+        if command.resume:
+            raise ValueError("resume needs --output: the search is kept beside it")
+        return None
+    regular = not output.exists() or output.is_file()
+    return output.with_name(f"{output.stem}.checkpoint.npz") if regular else None
 
-        progress("drawing", 0.0)
-        write_identification_report(report, fit, title=f"Identification: {scene.name}")
-        progress.close()
+
+def _options(command: Identify) -> dict[str, Any]:
+    """Arguments of `dano.identify` that the command has, too."""
+    noise = {"position": command.position_noise, "orientation": command.rotation_noise}
+    names = ("initial", "huber", "window", "continuity", "starts")
+    given = {key: value for key, value in noise.items() if value is not None}
+    return {"noise": given or None, **{name: getattr(command, name) for name in names}}
+
+
+def _write_report(command: Identify, fit: Identification, seen: "Seen | None") -> None:
+    from dano.report import draw_simulated, write_identification_report
+
+    assert command.report is not None
+    title = f"Identification: {command.scene.name}"
+    if seen is None:
+        write_identification_report(command.report, fit, title=title)
+        return
+    film, look, camera, found = seen
+    simulated = draw_simulated(film, found, look, camera, background=command.filming.background)
+    write_identification_report(command.report, found, title=title, film=film, simulated=simulated)
+
+
+def _tell(
+    command: Identify, fit: Identification, seen: "Seen | None", result: dict[str, Any], *, stopped: bool
+) -> None:
+    """Print the result, and where it is."""
     if command.json:
         put_json(result)
-    else:
-        _print(fit)
-        if seen is not None:
-            _print_film(seen)
-        for label, file in (("result", output), ("report", None if stopped else report)):
-            if file is not None:
-                put(f"{label:<10}  {file}")
-    if stopped:
-        raise KeyboardInterrupt("the values are the best so far")
-    for message in fit.messages:
-        say(f"warning: {message}")
-
-
-def _film_of(command: Identify) -> "Callable[..., FilmFit] | None":
-    """What fits the pixels of the film that the command names; None if it names none.
-
-    Raises:
-        ValueError: If the film lacks something, or is of several motions.
-    """
-    if command.video is None:
-        if command.look is not None:
-            raise ValueError("look says how the body in a film looks: give --video, too")
-        return None
-    if command.look is None:
-        raise ValueError("video needs --look: what `dano train` wrote of the body in it")
-    if len(command.motions) != 1:
-        raise ValueError(f"video must be that of the one motion, got {len(command.motions)} motions")
-    # Here, because most fits are of poses.
-    from dano.cli.tracking import filming
-    from dano.pixels import identify_in_film
-
-    filming.check_camera(command.filming)
-    look, video = filming.look_of(command.look, "look"), command.video
-
-    def fit(scene: Scene, motion: Motion, chosen: list[Parameter], progress: Progress, settings) -> "FilmFit":
-        film = filming.filmed(command.filming, video, command.rate, progress)
-        return identify_in_film(
-            scene,
-            film,
-            look,
-            filming.camera_of(command.filming, film),
-            motion,
-            chosen,
-            options=filming.options_of(command.filming),
-            background=command.filming.background,
-            progress=progress,
-            **settings,
-        )
-
-    return fit
-
-
-def _of_film(command: Identify, seen: "FilmFit") -> dict[str, Any]:
-    """What pixels said, beside the poses."""
-    return {
-        "file": str(command.video),
-        "from_poses": {name: np.asarray(value).tolist() for name, value in seen.poses.values.items()},
-        "from_poses_standard_errors": {
-            name: np.asarray(value).tolist() for name, value in seen.poses.standard_errors.items()
-        },
-        "passes": len(seen.history) - 1,
-        "settled": seen.settled,
-        "frames": len(seen.tracked.status),
-        "frames_used": seen.tracked.n_tracked,
-        "colour_error": float(np.nanmedian(seen.tracked.colour_error)),
-        "lamps": [
-            {"towards": np.asarray(lamp.place).tolist(), "power": np.asarray(lamp.colour).tolist()}
-            for lamp in seen.lamps
-        ],
-    }
-
-
-def _print_film(seen: "FilmFit") -> None:
-    put(
-        f"film        pixels of {seen.tracked.n_tracked} of {len(seen.tracked.status)} frames,"
-        f" {len(seen.history) - 1} passes{'' if seen.settled else ', not settled'}; from the poses alone:"
-    )
-    for name, value in seen.poses.values.items():
-        if np.ndim(value) == 0:
-            put(f"{name:<32.32} {value:12.6g} {seen.poses.standard_errors[name]:15.3g}")
+        return
+    _print(fit)
+    if seen is not None:
+        seen.tell()
+    for label, file in (("result", command.output), ("report", None if stopped else command.report)):
+        if file is not None:
+            put(f"{label:<10}  {file}")
 
 
 def _parameter(text: str, scene: Scene) -> Parameter:

@@ -1,0 +1,3 @@
+"""`dano identify`."""
+
+from dano.cli.identifying._arguments import Identify as Identify

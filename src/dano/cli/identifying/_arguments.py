@@ -1,0 +1,75 @@
+"""The command's arguments, and nothing that is slow to import."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import arg, OmitArgPrefixes, Positional
+
+from dano.cli.tracking import Filming
+
+
+@dataclass(frozen=True)
+class Identify:
+    """Find the parameters of a scene from observed motions of its bodies, with error bars.
+
+    Attributes:
+        scene: Scene file (.toml).
+        motions: Observed motions (.npz, .csv): times [s], positions [m], quaternions. The guide
+            "Identification" lists the columns.
+        parameter: Unknown parameters, each as NAME:LOWER:UPPER or NAME:LOWER:UPPER:START, e.g.
+            soap,table.sliding_friction:0:1 or soap.mass_scale:0.2:5:1.
+        output: Where to write the result (.json).
+        report: Where to write a page with the motions, residuals, losses and films (.html).
+        body: Name of the body that moved, for files that do not name it.
+        initial: What to estimate of the initial states: nothing (given), velocities, or all (states);
+            default: velocities if the motions have none, else nothing.
+        position_noise: Standard deviation of observed positions [m].
+        rotation_noise: Standard deviation of observed orientations [rad].
+        huber: Number of standard deviations beyond which residuals count linearly.
+        window: Cut motions into windows of this many frames; default: do not cut.
+        continuity: Allowed gap between a window's end and the next one's start, in standard deviations;
+            default: any.
+        starts: Number of points within the bounds to start from.
+        held_out: Motions that are not fitted; the error on them is measured.
+        order: Order of the quaternions in the files.
+        point: What positions refer to: centre of mass (com) or origin of the field's frame (origin).
+        rate: Frames per second, for files without times.
+        timestep: Timestep of the simulation [s]; default: the scene's.
+        video: The film that the one motion was tracked in: its pixels are fitted through the simulation.
+            Needs --look and --camera.
+        look: What the body in the film looks like: what `dano train` wrote, or trained_bunny or trained_soap.
+        filming: How the film was taken.
+        resume: Go on with a search that was interrupted or killed; the result is the same.
+        json: Print one JSON object instead of text.
+    """
+
+    scene: Positional[Path]
+    motions: Positional[tuple[Path, ...]]
+    parameter: Annotated[tuple[str, ...], arg(aliases=["-p"])]
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    report: Path | None = None
+    body: str | None = None
+    initial: Literal["given", "velocities", "states"] | None = None
+    position_noise: float | None = None
+    rotation_noise: float | None = None
+    huber: float | None = None
+    window: int | None = None
+    continuity: float | None = None
+    starts: int = 1
+    held_out: tuple[Path, ...] = ()
+    order: Literal["wxyz", "xyzw"] = "wxyz"
+    point: Literal["com", "origin"] | None = None
+    rate: float | None = None
+    timestep: float | None = None
+    video: Path | None = None
+    look: str | None = None
+    filming: OmitArgPrefixes[Filming] = Filming()
+    resume: bool = False
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli.identifying import _run
+
+        _run.identify(self)
