@@ -13,8 +13,9 @@ from dano.checks import checked_kind, checked_number
 from dano.exchange import enclosed, level_triangles, signed_distances, Triangles
 from dano.fields import AbstractField, AbstractShape, bake, GridField, SignedDistanceGrid
 from dano.objects import node_values
+from dano.report._overlay import round_below
 from dano.report.viewing._ground import add_ground, add_note, open_on
-from dano.report.viewing._meshes import BodyMesh, shape_mesh, vertex_colours
+from dano.report.viewing._meshes import add_coloured, BodyMesh, shape_mesh, vertex_colours
 from dano.report.viewing._serving import serve, Viewer, write_file
 from dano.vision import checked_colour, LearnedField, PALETTE, usual_level
 
@@ -218,10 +219,7 @@ class _ShownField:
             colour = tuple(int(c) for c in np.rint(255 * checked_colour(PALETTE[0])))
             scene.add_mesh_simple("/field", mesh.vertices, mesh.faces, color=colour, side="double")
         else:
-            import trimesh
-
-            solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False)
-            scene.add_mesh_trimesh("/field", solid)
+            add_coloured(scene, "/field", mesh)
         self.said = _described(mesh, level)
 
     def add_slider(self) -> None:
@@ -229,8 +227,10 @@ class _ShownField:
         gui, level, levels = self._server.gui, self.surface.level, self.surface.levels
         assert level is not None and levels is not None
         self._text = gui.add_markdown(self._panel())
-        low, high = levels
-        bar = gui.add_slider("density of the surface", low, high, (high - low) / 200, level)
+        # Round numbers, which can be read.
+        step = round_below((levels[1] - levels[0]) / 200)
+        low, start, high = (step * round(x / step) for x in (levels[0], level, levels[1]))
+        bar = gui.add_slider("density of the surface", low, high, step, start)
         bar.on_update(self._changed)
 
     def _panel(self) -> str:

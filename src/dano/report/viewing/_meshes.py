@@ -1,6 +1,6 @@
 """Bodies as triangles, in the colours that they have learned."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -87,6 +87,16 @@ def vertex_colours(
 @eqx.filter_jit
 def _seen(model, points, view, light):
     return model.colour(points, view, light)
+
+
+def add_coloured(scene: Any, name: str, mesh: BodyMesh) -> None:
+    """Show triangles in the colours of their vertices in a server of viser."""
+    import trimesh
+
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False)
+    # Asked for once, they are written, too: without them every triangle would be shaded alone.
+    assert len(solid.vertex_normals)
+    scene.add_mesh_trimesh(name, solid)
 
 
 def shape_mesh(shape: AbstractShape) -> BodyMesh:
