@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from dano.exchange import solid_triangles
 from dano.fields import (
@@ -43,7 +43,7 @@ class BodyMesh(NamedTuple):
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
-    colours: Int[np.ndarray, "v 3"] | None
+    colours: UInt8[np.ndarray, "v 3"] | None
 
 
 def body_mesh(body: Body, look: LearnedField | None) -> BodyMesh | None:
@@ -68,7 +68,7 @@ def body_mesh(body: Body, look: LearnedField | None) -> BodyMesh | None:
 
 def vertex_colours(
     look: LearnedField, points: Float[np.ndarray, "v 3"], outward: Float[np.ndarray, "v 3"]
-) -> Int[np.ndarray, "v 3"]:
+) -> UInt8[np.ndarray, "v 3"]:
     """Colours, 0 to 255, of points of a surface, each lit from where it is looked at.
 
     Args:
