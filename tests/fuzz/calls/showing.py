@@ -2,14 +2,11 @@
 
 from collections.abc import Iterator
 
-import numpy as np
-
 import dano
 from dano import gym, report, vision
 from tests.fuzz import kinds
 from tests.fuzz.calls.call import Call
 from tests.fuzz.kinds import (
-    array,
     COUNT,
     FUNCTION,
     instance,
@@ -18,6 +15,7 @@ from tests.fuzz.kinds import (
     POSITIVE,
 )
 from tests.fuzz.world import World
+from tests.report import made_up
 
 PORT = {"zero": 0, "high": 70000, "text": "http", "nan": kinds.NAN, "nothing": None}
 HOST = {"number": 3, "empty": "", "nothing": None}
@@ -58,7 +56,9 @@ def _pages(w: World) -> Iterator[Call]:
         "field": {**instance(), "unbounded": dano.HalfSpace()},
         "level": {**OPTIONAL_POSITIVE, "not reached": 1e9},
     }
-    yield Call("report.view_field", report.view_field, {"field": w.grid, "block": False}, {**bad_field, **served})
+    yield Call(
+        "report.view_field", report.view_field, {"field": w.grid, "block": False}, {**bad_field, **served}
+    )
     yield Call(
         "report.write_field_view",
         report.write_field_view,
@@ -120,31 +120,55 @@ def _reports(w: World) -> Iterator[Call]:
         "report.draw_capture",
         report.draw_capture,
         {"capture": w.capture, "found": 3, "path": w.folder / "out.png"},
-        {"capture": instance(), "found": instance()},
+        {"capture": instance(), "found": instance(), "path": kinds.target(w.folder, ".png")},
+        {"path": ""},
     )
     yield Call(
         "report.write_identification_report",
         report.write_identification_report,
         {"fit": w.fit, **path},
-        {"fit": instance(), **page, **title, "motion": {"negative": -1, "high": 7, "share": 0.5, "text": "a"}},
+        {
+            "fit": instance(),
+            **page,
+            **title,
+            "motion": {"negative": -1, "high": 7, "share": 0.5, "text": "a"},
+        },
         {"path": ""},
     )
+    film, tracked = {"film": made_up.film()}, {"tracked": made_up.tracked()}
+    bad = {"film": instance(), "tracked": instance()}
     yield Call(
         "report.draw_tracked",
         report.draw_tracked,
-        {"film": 3, "tracked": 3, "index": 0},
-        {"film": instance()},
+        {**film, **tracked, "index": 0},
+        {**bad, "index": {"negative": -1, "high": 7, "share": 0.5, "text": "a"}},
     )
-    for name in ("write_tracking_report", "write_film_report"):
-        good = {"film": 3, "tracked" if name == "write_tracking_report" else "found": 3, "title": "a", **path}
-        if name == "write_film_report":
-            good |= {"simulated": []}
-        yield Call(f"report.{name}", getattr(report, name), good, {"film": instance()})
+    yield Call(
+        "report.write_tracking_report",
+        report.write_tracking_report,
+        {**path, **film, **tracked, "title": "a"},
+        {**bad, **page, **title},
+        {"path": ""},
+    )
+    yield Call(
+        "report.write_film_report",
+        report.write_film_report,
+        {**path, **film, "found": made_up.film_fit(w.fit), "simulated": film["film"].images, "title": "a"},
+        {
+            "film": instance(),
+            "found": instance(),
+            "simulated": {"number": 3, "none": [], "numbers": [1, 2, 3]},
+            **page,
+            **title,
+        },
+        {"path": ""},
+    )
     yield Call(
         "report.write_training_report",
         report.write_training_report,
-        {"trained": 3, "capture": w.capture, "made": w.thing, "estimates": 3, "title": "a", **path},
-        {"trained": instance()},
+        {**path, "trained": 3, "capture": w.capture, "made": w.thing, "estimates": 3, "title": "a"},
+        {"trained": instance(), "capture": instance(), "made": instance(), "estimates": instance(), **title},
+        {"capture": "", "made": "", "estimates": "", "title": ""},
     )
     yield Call(
         "report.mass_estimates",
@@ -155,8 +179,16 @@ def _reports(w: World) -> Iterator[Call]:
     yield Call(
         "report.write_comparison_report",
         report.write_comparison_report,
-        {"comparison": 3, **path},
-        {"comparison": instance()},
+        {"comparison": made_up.comparison(), **path},
+        {"comparison": instance(), **page, **title},
+        {"path": ""},
+    )
+    yield Call("report.verdict", report.verdict, {"row": 3}, {"row": instance()})
+    yield Call(
+        "report.draw_rest",
+        report.draw_rest,
+        {"stand": made_up.comparison().scenery[0], "size": 0.2},
+        {"stand": instance(), "size": POSITIVE},
     )
     yield Call(
         "vision.visual_hull",
@@ -179,7 +211,9 @@ def _environments(w: World) -> Iterator[Call]:
     }
     says = {"scene": "", "state": ""}
     yield Call("gym.make_env", gym.make_env, good, bad, says)
-    yield Call("gym.make_vector_env", gym.make_vector_env, {**good, "n_envs": 2}, {**bad, "n_envs": COUNT}, says)
+    yield Call(
+        "gym.make_vector_env", gym.make_vector_env, {**good, "n_envs": 2}, {**bad, "n_envs": COUNT}, says
+    )
 
 
 PARTS = (_pages, _plans, _reports, _environments)
