@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from dano.archive import checked_output, replacing
+from dano.checks import checked_kind
 from dano.report._video import require
 from dano.vision import Capture, Survey
 
@@ -27,7 +28,9 @@ def draw_capture(capture: Capture, found: Survey, path: str | os.PathLike[str]) 
         ValueError: If the path does not end in .png, is a directory, or lies in none.
         ImportError: If matplotlib or pillow is missing.
     """
+    checked_kind("capture", capture, Capture)
     target = checked_output(path)
+    checked_kind("found", found, Survey)
     if target.suffix.lower() != ".png":
         raise ValueError(f"path must end in .png, got {target}")
     require("matplotlib")

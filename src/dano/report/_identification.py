@@ -7,10 +7,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from dano.checks import checked_count, checked_kind
 from dano.identify import Identification, Motion
 from dano.maths import quat_rotate
 from dano.report._framing import camera_for
-from dano.report._page import png, table, video, warnings, write_page
+from dano.report._page import check_page, png, table, video, warnings, write_page
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import stage
 from dano.report._video import encoder, require, side_by_side
@@ -40,8 +41,9 @@ def write_identification_report(
         ValueError: If `path` is a directory or lies in none, or there is no such motion.
         ImportError: If matplotlib, pillow or av is missing.
     """
-    if not 0 <= motion < len(fit.motions):
-        raise ValueError(f"motion must be from 0 to {len(fit.motions) - 1}, got {motion}")
+    checked_kind("fit", fit, Identification)
+    checked_count("motion", motion, 0, len(fit.motions) - 1)
+    check_page(path, title)
     require("matplotlib")
     require("PIL", "pillow")
     require("av")

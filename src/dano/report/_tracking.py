@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import UInt8
 from scipy import ndimage
 
+from dano.checks import checked_count, checked_items, checked_kind
 from dano.pixels import FilmFit
 from dano.report._identification import values_table
-from dano.report._page import image, table, video, warnings, write_page
+from dano.report._page import check_page, image, table, video, warnings, write_page
 from dano.report._video import encoder, require
 from dano.vision import Film, Tracked
 
@@ -41,7 +42,13 @@ def draw_tracked(film: Film, tracked: Tracked, index: int) -> UInt8[np.ndarray, 
         film: The frames.
         tracked: What was found.
         index: Which frame.
+
+    Raises:
+        ValueError: If there is no such frame.
     """
+    checked_kind("film", film, Film)
+    checked_kind("tracked", tracked, Tracked)
+    checked_count("index", index, 0, len(film.images) - 1)
     frame = _enlarged(film.images[index])
     overlay = tracked.overlays[index]
     if overlay is None:
@@ -67,6 +74,9 @@ def write_tracking_report(path: str | os.PathLike[str], film: Film, tracked: Tra
         ValueError: If `path` is a directory or lies in none.
         ImportError: If pillow or av is missing.
     """
+    checked_kind("film", film, Film)
+    checked_kind("tracked", tracked, Tracked)
+    check_page(path, title)
     require("PIL", "pillow")
     require("av")
     shown = np.unique(np.linspace(0, len(tracked.times) - 1, _SHOWN).astype(int)).tolist()
@@ -116,6 +126,10 @@ def write_film_report(
         ValueError: If `path` is a directory or lies in none, or there are more or fewer pictures than frames.
         ImportError: If pillow or av is missing.
     """
+    checked_kind("film", film, Film)
+    checked_kind("found", found, FilmFit)
+    simulated = checked_items("simulated", simulated, np.ndarray)
+    check_page(path, title)
     if len(simulated) != len(film.times):
         raise ValueError(f"simulated must be as many as frames, {len(film.times)}, got {len(simulated)}")
     require("PIL", "pillow")

@@ -74,7 +74,7 @@ def render_trajectory(
     else:
         checked_kind("camera", camera, Camera, hint=f", or one of {', '.join(CAMERAS)}")
         size = camera.width, camera.height
-    outputs = _checked(scene, trajectory, path, strip, size)
+    outputs = check_film(scene, trajectory, path, strip, size)
     if progress is not None:
         checked_function("progress", progress)
     times = frame_times(trajectory, fps, slow_motion)
@@ -119,7 +119,7 @@ def render_trajectory(
         write_png(outputs[1], side_by_side(kept))
 
 
-def _checked(scene, trajectory, path, strip, size) -> tuple[Path | None, Path | None]:
+def check_film(scene, trajectory, path, strip, size) -> tuple[Path | None, Path | None]:
     """Output paths, after checks that need no work."""
     if path is None and strip is None:
         raise ValueError("path or strip must be given, got None for both")

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from dano.checks import checked_count, checked_kind
 from dano.vision.capture import Capture, check_masks, hull_distance, NodeGrid, object_box, View, viewed_ball
 from dano.vision.radiance import Appearance, picture, Sampling, SurfaceModel
 from dano.vision.training._metrics import mask_iou
@@ -63,7 +64,8 @@ def visual_hull(
     Raises:
         ValueError: If masks are missing, empty or full, or the silhouettes have no point in common.
     """
-    views = capture.split("train")
+    views = checked_kind("capture", capture, Capture).split("train")
+    checked_count("resolution", resolution, least=4)
     if not capture.has_masks:
         names = [view.name for view in views if view.mask is None]
         raise ValueError(f"every view must have a mask, but {len(names)} have none: {', '.join(names[:4])}")
@@ -86,7 +88,7 @@ def survey(capture: Capture, resolution: int = 96, *, corners: Corners | None = 
     Raises:
         ValueError: If masks are missing, empty or full, or the silhouettes have no point in common.
     """
-    views = capture.split("train")
+    views = checked_kind("capture", capture, Capture).split("train")
     box, hull = visual_hull(capture, resolution, corners=corners)
     residual = silhouette_residual(views, box, hull)
     gap, direction = widest_gap(views)
