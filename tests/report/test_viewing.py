@@ -211,8 +211,12 @@ def test_pages_of_fields_and_captures_are_written(tmp_path):
     for name in ("ball.html", "capture.html"):
         text = (tmp_path / name).read_text(encoding="utf-8")
         assert text.lower().startswith("<!doctype html>")
-    for show, thing in ((view_field, dano.Sphere(0.1)), (view_capture, bare)):
-        viewer = show(thing, port=free_port(), block=False)
+    ball = dano.Sphere(0.1)
+    for show in (
+        lambda **options: view_field(ball, **options),
+        lambda **options: view_capture(bare, **options),
+    ):
+        viewer = show(port=free_port(), block=False)
         try:
             with urllib.request.urlopen(viewer.url, timeout=10) as answer:
                 assert answer.status == 200

@@ -60,8 +60,8 @@ def film_plan(
     checked_kind("scene", scene, Scene)
     checked_kind("task", task, Task)
     checked_kind("plan", plan, Plan)
-    if checked_optional("camera", camera, Camera) is not None:
-        size = camera.width, camera.height
+    if (eye := checked_optional("camera", camera, Camera)) is not None:
+        size = eye.width, eye.height
     if progress is not None:
         checked_function("progress", progress)
     if path is None and strip is None:
