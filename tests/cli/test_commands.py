@@ -364,7 +364,9 @@ def test_view_shows_fields_and_photographs(run, field, tmp_path, monkeypatch):
         )
     assert run("view", field, "--port", 9000).code == 0
     seen, options = shown["view_field"]
-    np.testing.assert_array_equal(seen.values, load_field(field).values)
+    expected = load_field(field)
+    assert isinstance(seen, GridField) and isinstance(expected, GridField)
+    np.testing.assert_array_equal(seen.values, expected.values)
     assert options == {"port": 9000}
 
     photos = capture(n_train=3, n_test=0, pixels=8)
