@@ -307,6 +307,16 @@ def read_archive(path: str | os.PathLike[str], form: str, version: int) -> dict[
     return data
 
 
+def format_of(path: str | os.PathLike[str]) -> str:
+    """What an archive says that it holds; "" if it says nothing or cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            archive = Arrays(file)
+            return str(archive["format"]) if "format" in archive.names else ""
+    except (OSError, ValueError):
+        return ""
+
+
 def check_format(form: str, version: np.ndarray | None, known: Mapping[str, int]) -> None:
     """Refuse a file whose members `format` and `version` say that it cannot be read.
 

@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cli.conftest import ellipsoid_values
+from vision.photographs import capture, write_transforms
 
 import dano
 from dano.cli import _scenes
 from dano.cli._outputs import run_files
-from dano.fields import GridField, save_field
+from dano.fields import GridField, load_field, save_field
 from dano.scene_file import _objects as shipped, _pieces, load_run, load_scene
 
 
@@ -411,6 +412,52 @@ def test_view_writes_a_page_with_a_second_run(run, scene, tmp_path):
     assert text.lower().startswith("<!doctype html>")
     assert len(text) > 100_000
     assert run("view", out, "--page", tmp_path / "page.png").code == 2
+
+
+@pytest.mark.filterwarnings("default:.*lengths are not metres")
+def test_view_shows_fields_and_photographs(run, field, tmp_path, monkeypatch):
+    shown = {}
+    for name in ("view_field", "view_capture"):
+        monkeypatch.setattr(
+            f"dano.report.{name}", lambda given, name=name, **options: shown.update({name: (given, options)})
+        )
+    assert run("view", field, "--port", 9000).code == 0
+    seen, options = shown["view_field"]
+    expected = load_field(field)
+    assert isinstance(seen, GridField) and isinstance(expected, GridField)
+    np.testing.assert_array_equal(seen.values, expected.values)
+    assert options == {"port": 9000}
+
+    photos = capture(n_train=3, n_test=0, pixels=8)
+    write_transforms(tmp_path, photos, units="arbitrary")
+    for source in (tmp_path, tmp_path / "transforms.json"):
+        answer = run("view", source)
+        assert answer.code == 0
+        assert "lengths are not metres" in answer.err
+        seen, options = shown["view_capture"]
+        assert len(seen.views) == 3
+        assert options == {"port": 8080, "unit": "units (scale not known)"}
+    write_transforms(tmp_path, photos)
+    assert run("view", tmp_path).code == 0
+    assert shown["view_capture"][1]["unit"] == "m"
+
+
+def test_view_says_what_it_takes(run, field, tmp_path):
+    pytest.importorskip("viser")
+    page = tmp_path / "page.html"
+    answer = run("view", field, "--page", page)
+    assert (answer.code, answer.out.strip()) == (0, f"wrote {page}")
+    assert len(page.read_bytes()) > 100_000
+    answer = run("view", field, "--beside", field)
+    assert (answer.code, answer.out) == (2, "")
+    assert "--beside goes with a run" in answer.err
+    motion = dano.Motion.create(np.arange(3.0), ["egg"], position=np.zeros((3, 1, 3)))
+    dano.save_motion(tmp_path / "motion.npz", motion)
+    (tmp_path / "notes.txt").write_text("no field", encoding="utf-8")
+    for name, kind in (("motion.npz", "dano-motion"), ("notes.txt", ".txt")):
+        answer = run("view", tmp_path / name)
+        assert answer.code == 2
+        assert f"{name} must be a run" in answer.err and f"got a {kind} file" in answer.err
 
 
 @pytest.fixture

@@ -9,6 +9,8 @@ import numpy as np
 
 import dano
 from dano.scene_file import load_scene, save_run
+from dano.vision import Capture
+from tests.report import made_up
 
 
 def ball_values() -> np.ndarray:
@@ -116,6 +118,18 @@ class World:
     @functools.cached_property
     def task(self) -> dano.Task:
         return dano.Task(4, [self.actuator], [self.goal])
+
+    @functools.cached_property
+    def plan(self) -> dano.Plan:
+        return made_up.plan(self.task, self.trajectory)
+
+    @functools.cached_property
+    def fit(self) -> dano.Identification:
+        return made_up.fit(self.scene, self.state, self.motion)
+
+    @functools.cached_property
+    def capture(self) -> Capture:
+        return made_up.photographs()
 
     @functools.cached_property
     def key(self) -> jax.Array:

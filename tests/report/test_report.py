@@ -1,6 +1,3 @@
-import socket
-import urllib.request
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,14 +6,12 @@ import pytest
 from vision.models import learned
 
 import dano
-from dano.report import _framing, _video, CAMERAS, draw_object, render_side_by_side, render_trajectory, view
+from dano.report import _framing, _video, CAMERAS, draw_object, render_side_by_side, render_trajectory
 from dano.report._object import with_error
 from dano.report._overlay import draw_label
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import stage
-from dano.report.viewing._drawn import Shown
-from dano.report.viewing._meshes import body_mesh, surface_mesh
-from dano.scene_file import asset_look, build_asset, drop_scene, parse_scene
+from dano.scene_file import drop_scene, parse_scene
 from dano.vision import LearnedField
 
 av = pytest.importorskip("av")
@@ -308,88 +303,6 @@ def test_object_figure_is_a_picture(cube, tmp_path):
 )
 def test_numbers_have_as_many_digits_as_their_error_allows(value, error, text):
     assert with_error(value, error) == text
-
-
-def test_viewer_serves_a_page_and_stops(run):
-    pytest.importorskip("viser")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    viewer = view(*run, port=port, block=False)
-    try:
-        with urllib.request.urlopen(viewer.url, timeout=10) as answer:
-            assert answer.status == 200
-    finally:
-        viewer.stop()
-    viewer.stop()
-    with pytest.raises(OSError):
-        urllib.request.urlopen(viewer.url, timeout=2)
-    with pytest.raises(ValueError, match="port must lie"):
-        view(*run, port=0)
-
-
-def test_numbers_beside_the_viewer_are_those_of_a_fall():
-    """Energy of a ball that falls freely is kept, and a force carries it when it lies."""
-    pytest.importorskip("viser")
-    ball, floor = (
-        dano.Body("ball", dano.Sphere(0.05), mass=0.3),
-        dano.Body("floor", dano.HalfSpace(), fixed=True),
-    )
-    scene = dano.Scene.create([ball, floor], [dano.Contact("ball", "floor")], timestep=2e-3)
-    falls = dano.simulate(scene, scene.initial_state(ball=dict(position=(0, 0, 0.5), omega=(3.0, 0, 1))), 50)
-    lies = dano.simulate(scene, scene.initial_state(ball=dict(position=(0, 0, 0.05))), 400)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    viewer = view(scene, falls, beside=falls, again=lambda changed: lies, port=port, block=False)
-    try:
-        numbers = viewer._drawn.numbers
-        # Of m g h = 0.3 · 9.81 · 0.048 m that it falls; what it keeps is known to the order of the step.
-        assert np.ptp(numbers.energy) < 0.03 * 0.3 * 9.81 * 0.048
-        assert numbers.force is not None
-        assert np.abs(numbers.force).max() < 1e-9
-        viewer._drawn.replace(scene, lies)
-        carried = viewer._drawn.numbers.force
-        assert carried is not None
-        assert carried[-1] == pytest.approx(0.3 * 9.81, rel=1e-3)
-        viewer._drawn.show_extras(Shown(trails=True, centres=True))
-        viewer._drawn.show_extras(Shown())
-    finally:
-        viewer.stop()
-    soap = asset_look("trained_soap")
-    assert soap is not None
-    with pytest.raises(ValueError, match="body must be one of"):
-        view(scene, falls, looks={"bal": soap})
-
-
-def test_meshes_of_objects_have_the_colours_that_were_learned(trained):
-    pytest.importorskip("igl")
-    body, look = trained
-    mesh = body_mesh(body, look)
-    assert mesh is not None and mesh.colours is not None
-    distance = np.asarray(body.object.solid.sdf_jet(jnp.asarray(mesh.vertices.T), 0))
-    assert np.abs(distance).max() < 0.01 * body.size
-    assert mesh.colours.shape == mesh.vertices.shape
-    # The shipped soap is blue where it was photographed.
-    middle = np.median(mesh.colours, axis=0)
-    assert middle[2] > middle[0]
-    plain = body_mesh(body, None)
-    assert plain is not None and plain.colours is None
-
-
-@pytest.fixture(scope="module")
-def trained():
-    return dano.Body("soap", build_asset("trained_soap")), asset_look("trained_soap")
-
-
-def test_meshes_of_shapes_lie_on_their_surface():
-    for shape in (dano.Box((0.3, 0.2, 0.1)), dano.Capsule(0.1, 0.3), dano.Sphere(0.2)):
-        vertices, faces = surface_mesh(shape)
-        distance = np.asarray(shape.sdf_jet(jnp.asarray(vertices.T, dtype=jnp.float64), 0))
-        assert np.abs(distance).max() < 1e-5
-        # Closed and outward: the volume is that of the solid, less what flat triangles cut off.
-        volume = np.sum(np.linalg.det(vertices[faces].astype(np.float64))) / 6
-        assert volume == pytest.approx(float(shape.solid_moments().volume), rel=0.03)
 
 
 def test_a_scale_is_a_round_length_below():

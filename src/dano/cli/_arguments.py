@@ -328,17 +328,19 @@ class Plan:
 
 @dataclass(frozen=True)
 class View:
-    """Look at a run, a scene or an object in the browser.
+    """Look at a run, a scene, an object, a field or photographs with poses in the browser.
 
     Attributes:
-        run: A trajectory written by `dano simulate`; or a scene file (.toml) or a neural object (.dano),
-            which is simulated, and again when a slider of the page moves.
+        source: A run of `dano simulate` (.npz); a scene file (.toml) or a neural object (.dano), which is
+            simulated, and again when a slider of the page moves; a field that `dano build` reads, with a
+            slider for the density of its surface; transforms.json or a folder that holds it, whose cameras
+            are drawn.
         beside: Another run of the same bodies, drawn translucent over the first.
         page: Where to write the page as one file that can be sent to others (.html), instead of serving it.
         port: Port of the page on this computer.
     """
 
-    run: Positional[Path]
+    source: Positional[Path]
     beside: Path | None = None
     page: Path | None = None
     port: int = 8080

@@ -11,15 +11,17 @@ from pathlib import Path
 from typing import Any
 
 from dano import scene_file
-from dano.archive import checked_input, replacing
+from dano.archive import checked_input, format_of, is_own, replacing, TRAJECTORY
 from dano.checks import checked_number
 from dano.cli import running
 from dano.cli._arguments import Demo, Simulate, View
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures, run_files
 from dano.engine import simulate as simulate_scene
+from dano.fields import FIELD_FORMATS, FIELD_SUFFIXES, load_field
 from dano.objects import NeuralObject
 from dano.scene import Scene, Trajectory
+from dano.vision import load_capture
 
 SCENES = ("drop", "collision")
 DEMO_FPS, DEMO_SIZE = 24, (560, 350)
@@ -99,18 +101,46 @@ def _tell(command: Simulate, reports: list[dict[str, Any]], clock: running.Clock
 
 def view(command: View) -> None:
     """See `dano view --help`."""
+    path = command.source
     if not 0 < command.port < 65536:
         raise ValueError(f"port must lie between 1 and 65535, got {command.port}")
     if command.page is not None:
-        check_output(command.page, command.run, suffix=".html")
+        check_output(command.page, path, suffix=".html")
+    kind = _kind(path)
+    if command.beside is not None and kind != "run":
+        raise ValueError(f"--beside goes with a run, a scene or an object, got it with the {kind} {path}")
+    {"run": _view_run, "field": _view_field, "capture": _view_capture}[kind](command)
+
+
+def _kind(path: Path) -> str:
+    """What is to be shown: a "run" or what is simulated to have one, a "field" or a "capture"."""
+    if not path.exists():
+        raise ValueError(f"{path}: no such file or folder")
+    suffix = path.suffix.lower()
+    if path.is_dir() or suffix == ".json":
+        return "capture"
+    form = format_of(path)
+    if suffix in (".toml", ".dano") or form == TRAJECTORY[0]:
+        return "run"
+    if suffix not in FIELD_SUFFIXES or (is_own(form) and form not in FIELD_FORMATS):
+        raise ValueError(
+            f"{path} must be a run (.npz), a scene (.toml), an object (.dano), a field"
+            f" ({', '.join(FIELD_SUFFIXES)}), or photographs with poses (transforms.json or its folder),"
+            f" got a {form or suffix or 'nameless'} file"
+        )
+    return "field"
+
+
+def _view_run(command: View) -> None:
+    """A run; scenes and objects are simulated first."""
     progress = Progress()
     again = None
-    if command.run.suffix.lower() in (".toml", ".dano"):
-        loaded = load(command.run, None, None)
+    if command.source.suffix.lower() in (".toml", ".dano"):
+        loaded = load(command.source, None, None)
         trajectory = running.roll_out(loaded, progress, running.Clock()).trajectory
         again = partial(_again, loaded)
     else:
-        run = scene_file.load_run(command.run, progress=progress)
+        run = scene_file.load_run(command.source, progress=progress)
         loaded, trajectory = run.source, run.trajectory
     beside = None
     if command.beside is not None:
@@ -124,6 +154,41 @@ def view(command: View) -> None:
         put(f"wrote {command.page}")
         return
     show(loaded.scene, trajectory, looks=looks, beside=beside, again=again, port=command.port)
+
+
+def _view_field(command: View) -> None:
+    try:
+        field = load_field(command.source)
+    except ValueError as error:
+        if command.source.suffix.lower() != ".npz" or format_of(command.source):
+            raise
+        raise ValueError(f"{command.source} must be a run of `dano simulate` or a field: {error}") from error
+    from dano.report import view_field, write_field_view
+
+    if command.page is not None:
+        write_field_view(field, command.page)
+        put(f"wrote {command.page}")
+        return
+    view_field(field, port=command.port)
+
+
+def _view_capture(command: View) -> None:
+    capture, unit = load_capture(command.source), _unit(command.source)
+    from dano.report import view_capture, write_capture_view
+
+    if command.page is not None:
+        write_capture_view(capture, command.page, unit=unit)
+        put(f"wrote {command.page}")
+        return
+    view_capture(capture, unit=unit, port=command.port)
+
+
+def _unit(path: Path) -> str:
+    """What lengths of a capture are in: `dano poses` writes where it does not know their scale."""
+    file = path / "transforms.json" if path.is_dir() else path
+    content = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    known = not isinstance(content, dict) or content.get("units") != "arbitrary"
+    return "m" if known else "units (scale not known)"
 
 
 def _again(loaded: scene_file.SceneFile, scene: Scene) -> Trajectory:

@@ -39,4 +39,10 @@ from dano.fields._signed_distance import (
     SignedDistanceGrid as SignedDistanceGrid,
 )
 from dano.fields._spline import degree_of as degree_of
-from dano.fields.readers import is_splats as is_splats, load_field as load_field, save_field as save_field
+from dano.fields.readers import (
+    FIELD_FORMATS as FIELD_FORMATS,
+    FIELD_SUFFIXES as FIELD_SUFFIXES,
+    is_splats as is_splats,
+    load_field as load_field,
+    save_field as save_field,
+)

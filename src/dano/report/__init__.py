@@ -28,4 +28,12 @@ from dano.report._video import (
     render_side_by_side as render_side_by_side,
     render_trajectory as render_trajectory,
 )
-from dano.report.viewing import view as view, Viewer as Viewer, write_view as write_view
+from dano.report.viewing import (
+    view as view,
+    view_capture as view_capture,
+    view_field as view_field,
+    Viewer as Viewer,
+    write_capture_view as write_capture_view,
+    write_field_view as write_field_view,
+    write_view as write_view,
+)

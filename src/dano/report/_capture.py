@@ -6,10 +6,13 @@ from typing import Any
 import numpy as np
 
 from dano.archive import checked_output, replacing
+from dano.checks import checked_kind
 from dano.report._video import require
 from dano.vision import Capture, Survey
 
-_COLOURS = {"train": "#3d7ea6", "test": "#e07a3f", "relight": "#8d6cab"}
+SPLIT_COLOURS = {"train": "#3d7ea6", "test": "#e07a3f", "relight": "#8d6cab"}
+"""Colours of cameras, by what their photographs are for."""
+
 _INK = "#22262b"
 
 
@@ -25,7 +28,9 @@ def draw_capture(capture: Capture, found: Survey, path: str | os.PathLike[str]) 
         ValueError: If the path does not end in .png, is a directory, or lies in none.
         ImportError: If matplotlib or pillow is missing.
     """
+    checked_kind("capture", capture, Capture)
     target = checked_output(path)
+    checked_kind("found", found, Survey)
     if target.suffix.lower() != ".png":
         raise ValueError(f"path must end in .png, got {target}")
     require("matplotlib")
@@ -58,7 +63,7 @@ def _cameras(axes: Any, capture: Capture, found: Survey) -> None:
     shell = shell[:: max(1, len(shell) // 3000)]
     axes.scatter(*(found.box.origin + found.box.spacing * shell).T, s=1.5, color="#8a9199", linewidths=0)
     reach = 0.0
-    for split, colour in _COLOURS.items():
+    for split, colour in SPLIT_COLOURS.items():
         for view in capture.split(split):
             camera = view.camera
             length = 0.12 * float(np.linalg.norm(camera.position - centre))
@@ -80,5 +85,5 @@ def _cameras(axes: Any, capture: Capture, found: Survey) -> None:
         getattr(axes, f"set_{axis}label")(f"{axis} [m]", fontsize=8)
     axes.set_box_aspect((1, 1, 1))
     axes.tick_params(labelsize=7)
-    counts = [f"{len(capture.split(s))} {s}" for s in _COLOURS if capture.split(s)]
+    counts = [f"{len(capture.split(s))} {s}" for s in SPLIT_COLOURS if capture.split(s)]
     axes.set_title(", ".join(counts), fontsize=9, color=_INK)

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from dano.archive import checked_output
+from dano.checks import checked_kind, checked_number
 from dano.comparison import Comparison, Row, Scenery, TIMESTEP
 from dano.exchange import Triangles
-from dano.report._page import image, table, warnings, write_page
+from dano.report._page import check_page, image, table, warnings, write_page
 from dano.report._video import require
 from dano.vision import checked_colour, PALETTE
 
@@ -68,7 +68,8 @@ def write_comparison_report(
         ValueError: If `path` is a directory or lies in none.
         ImportError: If pillow is missing.
     """
-    target = checked_output(path)
+    checked_kind("comparison", comparison, Comparison)
+    check_page(path, title)
     require("PIL", "pillow")
     levels = ", ".join(f"{level:.3g}" for level in comparison.levels)
     intro = (
@@ -94,12 +95,12 @@ def write_comparison_report(
         "<p>The time to make the object itself (<code>dano build</code>, <code>dano train</code>) is in none"
         " of the rows: all start from it.</p>",
     ]
-    write_page(target, title, parts)
+    write_page(path, title, parts)
 
 
 def verdict(row: Row) -> str:
     """What is wrong with a rest, in words."""
-    if math.isnan(row.tilt):
+    if math.isnan(checked_kind("row", row, Row).tilt):
         return row.note
     found = []
     if row.tilt > _FLAT:
@@ -174,6 +175,8 @@ def draw_rest(stand: Scenery, size: float) -> Float[np.ndarray, "height width 3"
         stand: What to draw.
         size: Of the reference [m]; pictures of one comparison have one scale.
     """
+    checked_kind("stand", stand, Scenery)
+    checked_number("size", size, above=0)
     pieces = stand.meshes if "best surface" in stand.row.route else [stand.surface]
     colours = [checked_colour(PALETTE[i % len(PALETTE)]) for i in range(len(pieces))]
     world = [Triangles(mesh.vertices @ stand.rotation.T + stand.origin, mesh.faces) for mesh in pieces]

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import UInt8
 
+from dano.checks import checked_count, checked_items, checked_kind
 from dano.identify import Identification, Motion
 from dano.maths import quat_rotate
 from dano.pixels import draw_frames, FilmFit
 from dano.report._framing import camera_for
-from dano.report._page import image, png, table, video, warnings, write_page
+from dano.report._page import check_page, image, png, table, video, warnings, write_page
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import stage
 from dano.report._tracking import draw_tracked, encoded, enlarged, WIDTH
@@ -59,9 +60,10 @@ def write_identification_report(
             or one too many.
         ImportError: If matplotlib, pillow or av is missing.
     """
+    checked_kind("fit", fit, Identification, FilmFit)
     found = fit.fit if isinstance(fit, FilmFit) else fit
-    if not 0 <= motion < len(found.motions):
-        raise ValueError(f"motion must be from 0 to {len(found.motions) - 1}, got {motion}")
+    checked_count("motion", motion, 0, len(found.motions) - 1)
+    check_page(path, title)
     if isinstance(fit, FilmFit) != (film is not None):
         has = "is of a film" if film is None else "is of poses"
         raise ValueError(f"film must be given for a fit of a film, and for no other: this fit {has}")
@@ -121,6 +123,9 @@ def write_film_report(
         ValueError: If `path` is a directory or lies in none, or there are more or fewer pictures than frames.
         ImportError: If pillow or av is missing.
     """
+    checked_kind("film", film, Film)
+    checked_kind("found", found, FilmFit)
+    check_page(path, title)
     require("PIL", "pillow")
     require("av")
     learned = "".join(image(picture / 255, _THUMB) for picture in photographs)
@@ -158,9 +163,14 @@ def draw_simulated(
         background: Picture of the place without the object; default: the object is drawn over the frames.
 
     Raises:
-        ValueError: If the background is no picture, or has another size than the frames.
+        ValueError: If an argument is of another kind, or the background is no picture or has another size than
+            the frames.
         ImportError: If pillow is missing.
     """
+    checked_kind("film", film, Film)
+    checked_kind("found", found, FilmFit)
+    checked_kind("look", look, LearnedField)
+    checked_kind("camera", camera, PosedCamera)
     places = film.images if background is None else [255 * film.place(background)] * len(film.times)
     pictures = [np.rint(place).astype(np.uint8) for place in places]
     windows = [overlay.window for overlay in found.tracked.overlays if overlay is not None]
@@ -190,6 +200,7 @@ def draw_simulated(
 
 def _beside(film: Film, found: FilmFit, simulated: Sequence[np.ndarray]) -> list[str]:
     """The film with the outline of the simulated object, and the simulation, as a film and as pictures."""
+    simulated = checked_items("simulated", simulated, np.ndarray)
     if len(simulated) != len(film.times):
         raise ValueError(f"simulated must be as many as frames, {len(film.times)}, got {len(simulated)}")
     pairs = [

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dano.archive import replacing
+from dano.archive import checked_output, replacing
+from dano.checks import checked_text
 
 _STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:980px;padding:0 1rem;color:#22262b}
@@ -26,15 +27,25 @@ def write_page(path: str | os.PathLike[str], title: str, parts: Sequence[str]) -
     """Write a page with a heading and parts in HTML, whole or not at all.
 
     Raises:
-        ValueError: If `path` is a directory or lies in none.
+        ValueError: If `path` is a directory or lies in none, or the title is no text.
     """
-    heading = html.escape(title)
+    heading = html.escape(checked_text("title", title))
     page = (
         "<!doctype html><html lang='en'><meta charset='utf-8'>"
         f"<title>{heading}</title><style>{_STYLE}</style><body><h1>{heading}</h1>{''.join(parts)}</body></html>"
     )
     with replacing(path) as file:
         file.write(page.encode())
+
+
+def check_page(path: str | os.PathLike[str], title: str) -> None:
+    """Check where a page goes, and its title, before what is on it is drawn.
+
+    Raises:
+        ValueError: If `path` is a directory or lies in none, or the title is no text.
+    """
+    checked_output(path)
+    checked_text("title", title)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -7,12 +7,13 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dano.archive import checked_output, replacing
+from dano.checks import checked_function, checked_kind, checked_optional
 from dano.plan import Plan, Task
 from dano.progress import Progress
 from dano.report._framing import camera_for
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import Stage, stage
-from dano.report._video import moments_of, require, write_film
+from dano.report._video import check_film, moments_of, require, write_film
 from dano.scene import Scene
 from dano.vision import Camera, Item, LearnedField, render
 
@@ -51,14 +52,18 @@ def film_plan(
         progress: Called with a description and the share done.
 
     Raises:
-        ValueError: If neither output is given, or one cannot be written.
+        ValueError: If the plan is of another scene, a number is out of range, or neither output is given or
+            one cannot be written.
         ImportError: If av or pillow is missing.
     """
-    if path is None and strip is None:
-        raise ValueError("path or strip must be given, got None for both")
-    video = None if path is None else checked_output(path)
-    still = None if strip is None else checked_output(strip)
-    require("PIL", "pillow")
+    checked_kind("scene", scene, Scene)
+    checked_kind("task", task, Task)
+    checked_kind("plan", plan, Plan)
+    if (eye := checked_optional("camera", camera, Camera)) is not None:
+        size = eye.width, eye.height
+    if progress is not None:
+        checked_function("progress", progress)
+    video, still = check_film([(scene, plan.trajectory)], path, strip, size)
     times = frame_times(plan.trajectory, fps, slow_motion)
     drawn = stage(scene, None, looks)
     camera = camera_for(scene, drawn, plan.trajectory, *size) if camera is None else camera
@@ -108,10 +113,14 @@ def draw_controls(task: Task, plan: Plan, path: str | os.PathLike[str]) -> None:
         path: The picture (.png).
 
     Raises:
-        ValueError: If the path cannot be written.
+        ValueError: If the path does not end in .png or cannot be written.
         ImportError: If matplotlib is missing.
     """
+    checked_kind("task", task, Task)
+    checked_kind("plan", plan, Plan)
     output = checked_output(path)
+    if output.suffix.lower() != ".png":
+        raise ValueError(f"path must end in .png, got {output}")
     require("matplotlib")
     from matplotlib.figure import Figure
 

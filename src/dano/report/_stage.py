@@ -17,22 +17,27 @@ _MOST_SHARE = 2.5
 """Longest arrow of a force, in those of the usual one (chosen by eye)."""
 
 
-def check_run(scene: Scene, trajectory: Trajectory) -> None:
+def check_run(scene: Scene, trajectory: Trajectory, name: str = "trajectory") -> None:
     """Check that a trajectory is one of a scene, with at least one step, and finite.
+
+    Args:
+        scene: The scene.
+        trajectory: What may have happened in it.
+        name: Of the argument, for errors.
 
     Raises:
         ValueError: If it is not.
     """
     checked_kind("scene", scene, Scene)
-    checked_kind("trajectory", trajectory, Trajectory)
+    checked_kind(name, trajectory, Trajectory)
     if tuple(trajectory.names) != tuple(scene.names):
         raise ValueError(
-            f"trajectory must be of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
+            f"{name} must be of this scene with bodies {list(scene.names)}, got {list(trajectory.names)}"
         )
     if len(trajectory.times) < 2:
-        raise ValueError(f"trajectory must have at least one step, got {len(trajectory.times)} states")
+        raise ValueError(f"{name} must have at least one step, got {len(trajectory.times)} states")
     if not np.all(np.isfinite(np.asarray(trajectory.states.position))):
-        raise ValueError("trajectory must be finite, got positions that are NaN or infinite")
+        raise ValueError(f"{name} must be finite, got positions that are NaN or infinite")
 
 
 class Stage(NamedTuple):

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import UInt8
 from scipy import ndimage
 
-from dano.report._page import image, table, video, warnings, write_page
+from dano.checks import checked_count, checked_kind
+from dano.report._page import check_page, image, table, video, warnings, write_page
 from dano.report._video import encoder, require
 from dano.vision import Film, Tracked
 
@@ -35,7 +36,13 @@ def draw_tracked(film: Film, tracked: Tracked, index: int) -> UInt8[np.ndarray, 
         film: The frames.
         tracked: What was found.
         index: Which frame.
+
+    Raises:
+        ValueError: If there is no such frame.
     """
+    checked_kind("film", film, Film)
+    checked_kind("tracked", tracked, Tracked)
+    checked_count("index", index, 0, len(film.images) - 1)
     frame = enlarged(film.images[index])
     overlay = tracked.overlays[index]
     if overlay is None:
@@ -61,6 +68,9 @@ def write_tracking_report(path: str | os.PathLike[str], film: Film, tracked: Tra
         ValueError: If `path` is a directory or lies in none.
         ImportError: If pillow or av is missing.
     """
+    checked_kind("film", film, Film)
+    checked_kind("tracked", tracked, Tracked)
+    check_page(path, title)
     require("PIL", "pillow")
     require("av")
     shown = np.unique(np.linspace(0, len(tracked.times) - 1, _SHOWN).astype(int)).tolist()

@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from dano.checks import checked_kind
 from dano.fields import GridField
 from dano.objects import MassProperties, NeuralObject
-from dano.report._page import image, table, warnings, write_page
+from dano.report._page import check_page, image, table, warnings, write_page
 from dano.report._video import require
 from dano.vision import Capture, HistoryEntry, psnr, ssim, Trained, View
 
@@ -54,6 +55,9 @@ def mass_estimates(trained: Trained, made: NeuralObject, grid: GridField) -> Mas
         made: The object built of its field.
         grid: The field baked.
     """
+    checked_kind("trained", trained, Trained)
+    checked_kind("made", made, NeuralObject)
+    checked_kind("grid", grid, GridField)
     mass = float(made.mass.mass)
     box = trained.survey.box
     share = np.clip(0.5 - trained.survey.hull / box.spacing, 0, 1)
@@ -86,6 +90,11 @@ def write_training_report(
         ValueError: If `path` is a directory or lies in none.
         ImportError: If pillow is missing.
     """
+    checked_kind("trained", trained, Trained)
+    checked_kind("capture", capture, Capture)
+    checked_kind("made", made, NeuralObject)
+    checked_kind("estimates", estimates, MassEstimates)
+    check_page(path, title)
     require("PIL", "pillow")
     parts = [_summary(trained, made), warnings(trained.warnings)]
     for split, heading in (

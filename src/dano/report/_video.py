@@ -174,6 +174,21 @@ def _checked(
     else:
         checked_kind("camera", camera, Camera, hint=f", or one of {', '.join(CAMERAS)}")
         size = camera.width, camera.height
+    if style.progress is not None:
+        checked_function("progress", style.progress)
+    outputs = check_film(runs, path, strip, size)
+    return style._replace(size=(size[0], size[1])), outputs
+
+
+def check_film(
+    runs: Sequence[tuple[Scene, Trajectory]], path: Any, strip: Any, size: Any
+) -> tuple[Path | None, Path | None]:
+    """Output paths, after checks that need no work.
+
+    Raises:
+        ValueError: If there is none, one cannot be written, a run is not of its scene, or the size is wrong.
+        ImportError: If av or pillow is missing.
+    """
     if path is None and strip is None:
         raise ValueError("path or strip must be given, got None for both")
     for scene, trajectory in runs:
@@ -192,9 +207,7 @@ def _checked(
     if path is not None:
         require("av")
     require("PIL", "pillow")
-    if style.progress is not None:
-        checked_function("progress", style.progress)
-    return style._replace(size=(size[0], size[1])), (checked[0], checked[1])
+    return checked[0], checked[1]
 
 
 def _take(

@@ -25,6 +25,7 @@ from dano.vision.drawing import (
     placement as placement,
     render as render,
     through as through,
+    usual_level as usual_level,
 )
 from dano.vision.radiance import (
     AbstractMedium as AbstractMedium,
@@ -76,5 +77,6 @@ from dano.vision.training import (
     train as train,
     Trained as Trained,
     TrainOptions as TrainOptions,
+    visual_hull as visual_hull,
     volume as volume,
 )

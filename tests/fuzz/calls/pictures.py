@@ -378,8 +378,6 @@ def _pictures(w: World) -> Iterator[Call]:
         {"obj": instance(), "path": kinds.target(w.folder, ".png")},
         {"path": ""},
     )
-    port = {"zero": 0, "high": 70000, "text": "http", "nan": kinds.NAN, "nothing": None}
-    yield Call("report.view", report.view, {**shown, "block": False}, {**other, "port": port}, {"scene": ""})
     yield Call(
         "report.frame_count",
         report.frame_count,

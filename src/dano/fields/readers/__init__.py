@@ -1,4 +1,9 @@
 """Fields from files of many kinds, and files of fields."""
 
-from dano.fields.readers._io import load_field as load_field, save_field as save_field
+from dano.fields.readers._io import (
+    FIELD_FORMATS as FIELD_FORMATS,
+    FIELD_SUFFIXES as FIELD_SUFFIXES,
+    load_field as load_field,
+    save_field as save_field,
+)
 from dano.fields.readers._splats import is_splats as is_splats

@@ -18,16 +18,6 @@ def load_npz(path: Path, *, interpolation: str | None = None) -> GridField | Sig
     return _grid_from_npz(path, "", interpolation, "a grid: values (nx, ny, nz), origin (3,) and spacing")
 
 
-def format_of(path: Path) -> str:
-    """What an archive says that it holds; "" if it says nothing or cannot be read."""
-    try:
-        with open(path, "rb") as file:
-            archive = Arrays(file)
-            return str(archive["format"]) if "format" in archive.names else ""
-    except (OSError, ValueError):
-        return ""
-
-
 def load_object(path: Path, *, interpolation: str | None = None) -> GridField | SignedDistanceGrid:
     """The grid inside a neural object: members grid_values, grid_origin and grid_spacing of its zip file."""
     expected = (

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dano.archive import FIELD, write_archive
+from dano.archive import FIELD, format_of, write_archive
 from dano.checks import checked_number, checked_path
 from dano.fields._base import AbstractField
 from dano.fields._callable import checked_bounds
@@ -18,7 +18,7 @@ from dano.fields._grid import GridField
 from dano.fields._mesh import mesh_field
 from dano.fields._shapes import AbstractShape
 from dano.fields._signed_distance import SignedDistanceGrid
-from dano.fields.readers._arrays import format_of, load_npy, load_npz, load_object
+from dano.fields.readers._arrays import load_npy, load_npz, load_object
 from dano.fields.readers._instant_ngp import load_snapshot
 from dano.fields.readers._nerfacto import load_checkpoint
 from dano.fields.readers._splats import is_splats, load_splats
@@ -71,6 +71,12 @@ _READERS: dict[str, _Reader] = {
 _MODELS = {"dano-osf": "OSF", "dano-hash-model": "HashModel", "dano-learned-field": "LearnedField"}
 """Classes of `dano.vision` by the format of their files. By name, because `vision` lies above `fields`: it is
 imported only when such a file is read."""
+
+FIELD_FORMATS = FIELD[0], *_MODELS
+"""What files of dano that `load_field` reads say that they hold."""
+
+FIELD_SUFFIXES = tuple(_READERS)
+"""How the names of files end that `load_field` reads."""
 
 SHIPPED = ("bunny", "soap")
 """Density grids in the package, by name."""

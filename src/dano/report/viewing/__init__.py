@@ -1,3 +1,9 @@
-"""Runs in the browser: a page that plays them, with sliders, or one file to send to others."""
+"""Runs, fields and captures in the browser: a page on this computer, or one file to send to others."""
 
-from dano.report.viewing._viewer import view as view, Viewer as Viewer, write_view as write_view
+from dano.report.viewing._capture import (
+    view_capture as view_capture,
+    write_capture_view as write_capture_view,
+)
+from dano.report.viewing._field import view_field as view_field, write_field_view as write_field_view
+from dano.report.viewing._serving import Viewer as Viewer
+from dano.report.viewing._viewer import view as view, write_view as write_view

@@ -10,7 +10,7 @@ from dano.fields import AbstractShape
 from dano.maths import Pose, quat_from_matrix, quat_to_matrix
 from dano.report._resample import poses_at
 from dano.report._stage import Touches, touches
-from dano.report.viewing._meshes import body_mesh
+from dano.report.viewing._meshes import add_coloured, body_mesh
 from dano.scene import Body, Scene, Trajectory
 from dano.vision import Camera, checked_colour, Item, LearnedField, PALETTE
 
@@ -253,7 +253,4 @@ def _add_body(
             side="double",
         )
         return
-    import trimesh
-
-    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False)
-    scene.add_mesh_trimesh(f"{name}/shape", solid)
+    add_coloured(scene, f"{name}/shape", mesh)

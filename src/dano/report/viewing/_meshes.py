@@ -1,19 +1,35 @@
 """Bodies as triangles, in the colours that they have learned."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from dano.exchange import solid_triangles
-from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, PosedShape, Sphere
+from dano.fields import (
+    AbstractShape,
+    Box,
+    Capsule,
+    Cylinder,
+    Ellipsoid,
+    PosedShape,
+    SignedDistanceGrid,
+    Sphere,
+)
 from dano.scene import Body
 from dano.vision import LearnedField, placement
 
 _RESOLUTION = 64
 """Nodes along the longest side of an object: triangles of a sixtieth of its size."""
+
+_FINE = 128
+"""Most nodes of a shape that is shown alone."""
+
+
+_CONVEX = Sphere | Ellipsoid | Capsule | Cylinder | Box
+"""Shapes whose surface rays from the middle find exactly, however thin they are."""
 
 
 class BodyMesh(NamedTuple):
@@ -27,7 +43,7 @@ class BodyMesh(NamedTuple):
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
-    colours: Int[np.ndarray, "v 3"] | None
+    colours: UInt8[np.ndarray, "v 3"] | None
 
 
 def body_mesh(body: Body, look: LearnedField | None) -> BodyMesh | None:
@@ -47,14 +63,54 @@ def body_mesh(body: Body, look: LearnedField | None) -> BodyMesh | None:
     vertices, faces = np.asarray(triangles.vertices, np.float32), np.asarray(triangles.faces, np.uint32)
     if look is None:
         return BodyMesh(vertices, faces, None)
-    outward = jnp.asarray(normals, jnp.float32)
-    colours, _ = _seen(look.model, jnp.asarray(vertices), -outward, outward)
-    return BodyMesh(vertices, faces, np.rint(255 * np.clip(np.asarray(colours), 0, 1)).astype(np.uint8))
+    return BodyMesh(vertices, faces, vertex_colours(look, vertices, normals))
+
+
+def vertex_colours(
+    look: LearnedField, points: Float[np.ndarray, "v 3"], outward: Float[np.ndarray, "v 3"]
+) -> UInt8[np.ndarray, "v 3"]:
+    """Colours, 0 to 255, of points of a surface, each lit from where it is looked at.
+
+    Args:
+        look: What the surface has learned to look like.
+        points: On the surface [m, F].
+        outward: Unit normals there.
+    """
+    count = len(points)
+    # Of one size for many surfaces, or each would be compiled anew.
+    size = 1 << max(0, count - 1).bit_length()
+    at, normals = (jnp.asarray(np.resize(np.asarray(x, np.float32), (size, 3))) for x in (points, outward))
+    colours, _ = _seen(look.model, at, -normals, normals)
+    return np.rint(255 * np.clip(np.asarray(colours)[:count], 0, 1)).astype(np.uint8)
 
 
 @eqx.filter_jit
 def _seen(model, points, view, light):
     return model.colour(points, view, light)
+
+
+def add_coloured(scene: Any, name: str, mesh: BodyMesh) -> None:
+    """Show triangles in the colours of their vertices in a server of viser."""
+    import trimesh
+
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False)
+    # Asked for once, they are written, too: without them every triangle would be shaded alone.
+    assert len(solid.vertex_normals)
+    scene.add_mesh_trimesh(name, solid)
+
+
+def shape_mesh(shape: AbstractShape) -> BodyMesh:
+    """The surface of any bounded shape.
+
+    Raises:
+        ImportError: If libigl is missing.
+        ValueError: If it is too thin to be found.
+    """
+    if isinstance(shape, _CONVEX):
+        return BodyMesh(*surface_mesh(shape), None)
+    nodes = max(shape.distances.shape) if isinstance(shape, SignedDistanceGrid) else _FINE
+    triangles, _ = solid_triangles(shape, min(nodes, _FINE))
+    return BodyMesh(triangles.vertices.astype(np.float32), triangles.faces.astype(np.uint32), None)
 
 
 def surface_mesh(shape: AbstractShape, n: int = 48) -> tuple[np.ndarray, np.ndarray]:
@@ -66,9 +122,7 @@ def surface_mesh(shape: AbstractShape, n: int = 48) -> tuple[np.ndarray, np.ndar
         vertices, faces = surface_mesh(shape.shape, n)
         rotation, position = placement(shape.pose)
         return (vertices @ rotation.T + position).astype(np.float32), faces
-    directions, faces = _cube_sphere(
-        n if isinstance(shape, Sphere | Ellipsoid | Capsule | Cylinder | Box) else 2 * n
-    )
+    directions, faces = _cube_sphere(n if isinstance(shape, _CONVEX) else 2 * n)
     bounds = np.asarray(shape.bounds, dtype=np.float64)
     centre, half = bounds.mean(axis=0), 0.5 * (bounds[1] - bounds[0])
     if isinstance(shape, Ellipsoid | Capsule | Cylinder | Box):

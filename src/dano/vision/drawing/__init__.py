@@ -7,6 +7,7 @@ from dano.vision.drawing._item import (
     level_surface as level_surface,
     PALETTE as PALETTE,
     placement as placement,
+    usual_level as usual_level,
 )
 from dano.vision.drawing._render import render as render
 from dano.vision.drawing._shade import GAMMA as GAMMA

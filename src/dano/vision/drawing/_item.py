@@ -197,15 +197,14 @@ def level_surface(field: GridField, level: int | float | None = None) -> SignedD
 
     Args:
         field: The density.
-        level: Default: half the median of the positive densities above 5 % of the largest.
+        level: Default: `usual_level`.
 
     Raises:
         ValueError: If the density nowhere reaches `level`.
     """
     values = np.asarray(field.values, dtype=np.float64)
     spacing = np.asarray(field.spacing, dtype=np.float64)
-    if level is None:
-        level = 0.5 * float(np.median(values[values > 0.05 * values.max()]))
+    level = usual_level(values) if level is None else level
     inside = np.argwhere(values >= level)
     if len(inside) == 0:
         raise ValueError(f"level must be at most the largest density {values.max():.6g}, got {level:.6g}")
@@ -232,6 +231,11 @@ def level_surface(field: GridField, level: int | float | None = None) -> SignedD
     return SignedDistanceGrid(
         distance.astype(np.float32), origin.astype(np.float32), spacing.astype(np.float32), edge=0.0
     )
+
+
+def usual_level(values: Float[np.ndarray, "nx ny nz"]) -> float:
+    """Where a surface is drawn if nobody says it: half the median of densities above 5 % of the largest."""
+    return 0.5 * float(np.median(values[values > 0.05 * values.max()]))
 
 
 def _learned(field: AbstractField | AbstractModel) -> tuple[AbstractModel | None, AbstractShape | None]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from dano.checks import checked_count, checked_kind
 from dano.vision.capture import Capture, check_masks, hull_distance, NodeGrid, object_box, View, viewed_ball
 from dano.vision.radiance import Appearance, picture, Sampling, SurfaceModel
 from dano.vision.training._metrics import mask_iou
@@ -47,6 +48,34 @@ class Survey(NamedTuple):
     warnings: tuple[str, ...]
 
 
+def visual_hull(
+    capture: Capture, resolution: int = 96, *, corners: Corners | None = None
+) -> tuple[NodeGrid, Float[np.ndarray, "nx ny nz"]]:
+    """What the silhouettes of the training views leave of space.
+
+    Args:
+        capture: Photographs with masks.
+        resolution: Nodes along the longest side of the object's box.
+        corners: Lower and upper corner of that box [m, W]; default: what the silhouettes leave.
+
+    Returns:
+        Nodes around the object, and the signed distance [m] of the hull at these nodes.
+
+    Raises:
+        ValueError: If masks are missing, empty or full, or the silhouettes have no point in common.
+    """
+    views = checked_kind("capture", capture, Capture).split("train")
+    checked_count("resolution", resolution, least=4)
+    if not capture.has_masks:
+        names = [view.name for view in views if view.mask is None]
+        raise ValueError(f"every view must have a mask, but {len(names)} have none: {', '.join(names[:4])}")
+    check_masks(capture.views)
+    lower, upper = object_box(views) if corners is None else corners
+    margin = _MARGIN * float((upper - lower).max())
+    box = NodeGrid.around(lower - margin, upper + margin, resolution)
+    return box, hull_distance(views, box)
+
+
 def survey(capture: Capture, resolution: int = 96, *, corners: Corners | None = None) -> Survey:
     """Check that a capture with masks fits together, and build the visual hull.
 
@@ -59,15 +88,8 @@ def survey(capture: Capture, resolution: int = 96, *, corners: Corners | None = 
     Raises:
         ValueError: If masks are missing, empty or full, or the silhouettes have no point in common.
     """
-    views = capture.split("train")
-    if not capture.has_masks:
-        names = [view.name for view in views if view.mask is None]
-        raise ValueError(f"every view must have a mask, but {len(names)} have none: {', '.join(names[:4])}")
-    check_masks(capture.views)
-    lower, upper = object_box(views) if corners is None else corners
-    margin = _MARGIN * float((upper - lower).max())
-    box = NodeGrid.around(lower - margin, upper + margin, resolution)
-    hull = hull_distance(views, box)
+    views = checked_kind("capture", capture, Capture).split("train")
+    box, hull = visual_hull(capture, resolution, corners=corners)
     residual = silhouette_residual(views, box, hull)
     gap, direction = widest_gap(views)
     warnings = []
