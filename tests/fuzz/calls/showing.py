@@ -164,6 +164,12 @@ def _reports(w: World) -> Iterator[Call]:
         {"path": ""},
     )
     yield Call(
+        "report.draw_simulated",
+        report.draw_simulated,
+        {"film": film["film"], "found": made_up.film_fit(w.fit), "look": 3, "camera": 3},
+        {"film": instance(), "found": instance(), "look": instance()},
+    )
+    yield Call(
         "report.write_training_report",
         report.write_training_report,
         {**path, "trained": 3, "capture": w.capture, "made": w.thing, "estimates": 3, "title": "a"},
