@@ -4,6 +4,7 @@ import hashlib
 import re
 import warnings
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -170,11 +171,9 @@ def digest_of(setup: Setup, motions: Sequence[Motion], *others: Any) -> str:
         motions: What was observed.
         others: Trees of arrays that matter, too.
     """
-    from dano import __version__  # what it is made of is imported before
-
     space = setup.space
     options = setup.initial, setup.noise, setup.windows, setup.search, space.selections
-    said = hashlib.sha256(_stable(f"{__version__} {options}").encode())
+    said = hashlib.sha256(_stable(f"{version('dano')} {options}").encode())
     arrays = [(m.times, m.position, m.orientation, m.velocity, m.omega, m.covariance, m.q) for m in motions]
     said.update(_stable(str([(m.names, m.point, m.lag) for m in motions])).encode())
     trees = setup.scene, setup.controls, setup.engine, space.start, space.lower, space.upper, arrays, others
