@@ -14,7 +14,7 @@ import dano
 from dano.identify import Motion
 from dano.pixels import draw_frames, film, identify_in_film
 from dano.report import draw_simulated, write_identification_report
-from dano.vision import Camera, Film, LearnedField, Light, PosedCamera, SurfaceModel, TrackOptions
+from dano.vision import Camera, Film, GAMMA, LearnedField, Light, PosedCamera, SurfaceModel, TrackOptions
 
 STEPS, EVERY = 12, 6
 
@@ -81,6 +81,31 @@ def test_derivatives_of_pixels_are_differences_at_a_visible_step(pictures):
     # Where an edge passes a sample of a ray, a difference of that size is no derivative.
     assert max(apart) < 0.35, apart
     assert max(together) < 0.2, together
+
+
+@pytest.mark.slow
+def test_an_open_shutter_blurs_along_the_way_and_loses_no_light(scene, look):
+    state = scene.initial_state(ball={"position": (-0.2, 0, 0.3), "velocity": (2.0, 0, 0)})
+    camera = Camera((0.1, -1.8, 0.7), (0.1, 0, 0.3), width=24, height=16)
+    lamps = (Light((0.3, -0.6, 0.8)),)
+    sharp, blurred = (
+        film(scene, state, STEPS, {"ball": look}, camera, lamps, every=EVERY, shutter=shutter)
+        for shutter in (0.0, 0.08)
+    )
+    columns, spread = np.arange(24), []
+    for seen in (sharp, blurred):
+        covered = np.asarray(seen.opacity[1], np.float64).reshape(16, 24).sum(axis=0)
+        middle = (covered * columns).sum() / covered.sum()
+        spread.append((covered.sum(), middle, (covered * (columns - middle) ** 2).sum() / covered.sum()))
+    (area, middle, variance), (blurred_area, blurred_middle, blurred_variance) = spread
+    assert blurred_area == pytest.approx(area, rel=0.02)
+    assert blurred_middle == pytest.approx(middle, abs=0.1)
+    # A way of w pixels, in five equal parts: the variance of their middles is w² (1 − 1/25)/12.
+    speed = float(dano.simulate(scene, state, EVERY).states.velocity[-1, 0, 0])
+    way = 0.08 * speed / (camera.pixel_angle * 1.9)
+    assert blurred_variance - variance == pytest.approx(0.08 * way**2, rel=0.15)
+    light, blurred_light = ((np.maximum(x.colour[1], 0) ** GAMMA).sum() for x in (sharp, blurred))
+    assert blurred_light == pytest.approx(light, rel=0.05)
 
 
 def test_derivatives_inside_a_picture_are_differences(look):

@@ -14,17 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.checks import checked_count, checked_kind
+from dano.checks import checked_count, checked_kind, checked_number
 from dano.engine import AbstractEngine, Policy, simulate
 from dano.maths import Numbers, quat_normalize, quat_rotate, quat_to_matrix
 from dano.scene import Control, Scene, State
-from dano.vision import AbstractCamera, AbstractModel, LearnedField, Light, Part, Sampling, through
+from dano.vision import AbstractCamera, AbstractModel, GAMMA, LearnedField, Light, Part, Sampling, through
 
 FILM_SAMPLING = Sampling(48, 16, 3)
 """How finely rays are sampled: a picture to compare, not one to look at."""
 
 _EDGE = 4.0
 """Sharpness of a silhouette times the width of a pixel at the object."""
+
+_MOMENTS = 5
+"""Pictures that a blurred frame is the mean of: enough for some pixels of blur."""
 
 
 class Frames(NamedTuple):
@@ -53,6 +56,7 @@ def film(
     every: int = 1,
     pixels: Float[np.ndarray, "n 2"] | None = None,
     background: Numbers = (0.0, 0.0, 0.0),
+    shutter: float = 0.0,
     sampling: Sampling = FILM_SAMPLING,
     engine: AbstractEngine | None = None,
 ) -> Frames:
@@ -74,12 +78,13 @@ def film(
         pixels: Image coordinates (x to the right, y downwards) of the pixels wanted; default: all, row by
             row. Fewer cost less, e.g. those near silhouettes.
         background: sRGB behind the bodies, of one colour (3,) or of every pixel (n, 3).
+        shutter: How long a frame is exposed, half before and half after its time [s]; what moves is blurred.
         sampling: How finely rays are sampled.
         engine: As in `simulate`.
 
     Raises:
-        ValueError: If a look is of no body, there is none, there is no light, `every` is < 1, or the
-            background has another shape.
+        ValueError: If a look is of no body, there is none, there is no light, `every` is < 1, `shutter` is
+            negative, or the background has another shape.
     """
     checked_kind("scene", scene, Scene)
     scene.check_state(state)
@@ -87,14 +92,13 @@ def film(
     checked_kind("camera", camera, AbstractCamera)
     checked_kind("looks", looks, Mapping)
     every = checked_count("every", every)
+    shutter = checked_number("shutter", shutter, least=0)
     _check(scene, looks, lights)
     trajectory = simulate(scene, state, n_steps, controls=controls, engine=engine)
     at = np.arange(0, n_steps + 1, every)
-    rows = np.array([scene.index(name) for name in looks])
-    orientation = quat_normalize(trajectory.states.orientation[at][:, rows])
-    arms = jnp.stack([scene.bodies[i].com + scene.bodies[i].com_offset for i in rows])
-    arms = jnp.broadcast_to(arms.astype(orientation.dtype), (*orientation.shape[:2], 3))
-    position = trajectory.states.position[at][:, rows] - quat_rotate(orientation, arms)
+    during = (np.arange(_MOMENTS) + 0.5) / _MOMENTS - 0.5 if shutter else np.zeros(1)
+    steps = at[:, None].astype(np.float64) + during[None] * (shutter / jnp.asarray(scene.timestep))
+    position, orientation = _placed(scene, trajectory.states, list(looks), steps.ravel())
     colour, opacity = draw_frames(
         list(looks.values()),
         position,
@@ -105,7 +109,31 @@ def film(
         background=background,
         sampling=sampling,
     )
+    if shutter:
+        # Light adds up linearly while the shutter is open.
+        light = jnp.maximum(colour, 1e-6).reshape(*steps.shape, *colour.shape[1:]) ** GAMMA
+        colour = jnp.mean(light, axis=1) ** (1 / GAMMA)
+        opacity = jnp.mean(opacity.reshape(*steps.shape, -1), axis=1)
     return Frames(colour, opacity, trajectory.times[at])
+
+
+def _placed(
+    scene: Scene, states: State, names: Sequence[str], steps: Float[Array, " n"]
+) -> tuple[Float[Array, "n k 3"], Float[Array, "n k 4"]]:
+    """Origins [m, W] and orientations of bodies at times in steps, clipped to those of the rollout."""
+    rows = np.array([scene.index(name) for name in names])
+    last = len(states.position) - 1
+    steps = jnp.clip(steps, 0, last)
+    # Integer steps are taken as they are: their share of the next one is 0.
+    before = jnp.clip(jnp.floor(steps).astype(jnp.int32), 0, max(last - 1, 0))
+    share = (steps - before.astype(steps.dtype)).astype(states.position.dtype)[:, None, None]
+    after = jnp.minimum(before + 1, last)
+    x, q = states.position[:, rows], quat_normalize(states.orientation[:, rows])
+    near = jnp.where(jnp.sum(q[before] * q[after], axis=-1, keepdims=True) < 0, -q[after], q[after])
+    orientation = quat_normalize((1 - share) * q[before] + share * near)
+    arms = jnp.stack([scene.bodies[i].com + scene.bodies[i].com_offset for i in rows])
+    arms = jnp.broadcast_to(arms.astype(orientation.dtype), (*orientation.shape[:2], 3))
+    return (1 - share) * x[before] + share * x[after] - quat_rotate(orientation, arms), orientation
 
 
 def draw_frames(

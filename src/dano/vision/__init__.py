@@ -18,6 +18,7 @@ from dano.vision.capture import (
 from dano.vision.drawing import (
     checked_colour as checked_colour,
     compose as compose,
+    GAMMA as GAMMA,
     Item as Item,
     level_surface as level_surface,
     PALETTE as PALETTE,
