@@ -402,6 +402,7 @@ def _pictures(w: World) -> Iterator[Call]:
             "looks": {"unknown": {"wall": None}, "none": {}, "number": 3},
             "camera": instance(),
             "every": COUNT,
+            "shutter": NON_NEGATIVE,
         },
         {"looks": ""},
     )
