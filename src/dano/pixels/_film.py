@@ -97,7 +97,7 @@ def film(
     trajectory = simulate(scene, state, n_steps, controls=controls, engine=engine)
     at = np.arange(0, n_steps + 1, every)
     during = (np.arange(_MOMENTS) + 0.5) / _MOMENTS - 0.5 if shutter else np.zeros(1)
-    steps = at[:, None].astype(np.float64) + during[None] * (shutter / jnp.asarray(scene.timestep))
+    steps = jnp.asarray(at[:, None] + 0.0) + jnp.asarray(during[None] * shutter) / scene.timestep
     position, orientation = _placed(scene, trajectory.states, list(looks), steps.ravel())
     colour, opacity = draw_frames(
         list(looks.values()),
