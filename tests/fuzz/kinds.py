@@ -40,6 +40,18 @@ CHOICE: Bad = {"unknown": "nonsense", "number": 3, "thing": Thing()}
 KEY: Bad = {"number": 0, "text": "key", "many": np.zeros((3, 2), np.uint32)}
 LIST: Bad = {"number": 3, "wrong items": [3], "thing": Thing()}
 FUNCTION: Bad = {"number": 3, "text": "f"}
+SIZE: Bad = {
+    "odd": (33, 32),
+    "tiny": (2, 2),
+    "one": (32,),
+    "text": "big",
+    "nan": (NAN, 32),
+    "number": 32,
+    "huge": (10**6, 10**6),
+}
+"""Of pictures."""
+LOOKS: Bad = {"unknown": {"wall": None}, "number": 3, "no look": {"ball": 3}}
+"""Of bodies, by name."""
 
 
 def instance(*, optional: bool = False) -> Bad:

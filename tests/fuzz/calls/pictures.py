@@ -312,15 +312,6 @@ def _vision(w: World) -> Iterator[Call]:
 
 
 def _pictures(w: World) -> Iterator[Call]:
-    size = {
-        "odd": (33, 32),
-        "tiny": (2, 2),
-        "one": (32,),
-        "text": "big",
-        "nan": (kinds.NAN, 32),
-        "number": 32,
-        "huge": (10**6, 10**6),
-    }
     shown = {"scene": w.scene, "trajectory": w.trajectory}
     other = {"scene": {**instance(), "another": w.door}, "trajectory": instance()}
     yield Call(
@@ -331,12 +322,12 @@ def _pictures(w: World) -> Iterator[Call]:
             **other,
             "path": {**kinds.target(w.folder, ".mp4"), "another ending": w.folder / "out.gif"},
             "strip": {**kinds.target(w.folder, ".png"), "another ending": w.folder / "out.gif"},
-            "size": size,
+            "size": kinds.SIZE,
             "fps": {**POSITIVE, "huge": 10**9},
             "slow_motion": {**POSITIVE, "huge": 1e12},
             "camera": instance(optional=True),
             "colours": {"unknown": {"wall": "#ffffff"}, "no colour": {"ball": "octarine"}, "number": 3},
-            "looks": {"unknown": {"wall": None}, "number": 3, "no look": {"ball": 3}},
+            "looks": kinds.LOOKS,
             "progress": FUNCTION,
         },
         {"path": "", "strip": "", "scene": "", "colours": "", "looks": ""},
@@ -363,7 +354,7 @@ def _pictures(w: World) -> Iterator[Call]:
                 "one": [None],
                 "no look": [{"ball": 3}, {}],
             },
-            "size": size,
+            "size": kinds.SIZE,
             "fps": {**POSITIVE, "huge": 10**9},
             "slow_motion": {**POSITIVE, "huge": 1e12},
             "camera": instance(optional=True),

@@ -19,16 +19,6 @@ from tests.report import made_up
 
 PORT = {"zero": 0, "high": 70000, "text": "http", "nan": kinds.NAN, "nothing": None}
 HOST = {"number": 3, "empty": "", "nothing": None}
-SIZE = {
-    "odd": (33, 32),
-    "tiny": (2, 2),
-    "one": (32,),
-    "text": "big",
-    "nan": (kinds.NAN, 32),
-    "number": 32,
-    "huge": (10**6, 10**6),
-}
-LOOKS = {"unknown": {"wall": None}, "number": 3, "no look": {"ball": 3}}
 
 
 def _pages(w: World) -> Iterator[Call]:
@@ -36,7 +26,7 @@ def _pages(w: World) -> Iterator[Call]:
     bad_run = {
         "scene": {**instance(), "another": w.door},
         "trajectory": instance(),
-        "looks": LOOKS,
+        "looks": kinds.LOOKS,
         "beside": {**instance(optional=True), "another": dano.simulate(w.door, w.open_door, 2)},
     }
     says = {"scene": "", "looks": ""}
@@ -96,9 +86,9 @@ def _plans(w: World) -> Iterator[Call]:
             "strip": {**kinds.target(w.folder, ".png"), "another ending": w.folder / "out.gif"},
             "fps": {**POSITIVE, "huge": 10**9},
             "slow_motion": {**POSITIVE, "huge": 1e12},
-            "size": SIZE,
+            "size": kinds.SIZE,
             "camera": instance(optional=True),
-            "looks": LOOKS,
+            "looks": kinds.LOOKS,
             "progress": FUNCTION,
         },
         {"path": "", "strip": "", "scene": "", "looks": ""},

@@ -95,7 +95,7 @@ def add_coloured(scene: Any, name: str, mesh: BodyMesh) -> None:
 
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False)
     # Asked for once, they are written, too: without them every triangle would be shaded alone.
-    assert len(solid.vertex_normals)
+    _ = solid.vertex_normals
     scene.add_mesh_trimesh(name, solid)
 
 
