@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import ndimage
 from vision.models import learned
 
 import dano
 from dano.identify import Motion
-from dano.pixels import film, identify_in_film
+from dano.pixels import draw_frames, film, identify_in_film
 from dano.report import draw_simulated, write_identification_report
-from dano.vision import Camera, Film, GAMMA, LearnedField, Light, PosedCamera, TrackOptions
+from dano.vision import Camera, Film, GAMMA, LearnedField, Light, PosedCamera, SurfaceModel, TrackOptions
 
 STEPS, EVERY = 12, 6
 
@@ -105,6 +106,30 @@ def test_an_open_shutter_blurs_along_the_way_and_loses_no_light(scene, look):
     assert blurred_variance - variance == pytest.approx(0.08 * way**2, rel=0.15)
     light, blurred_light = ((np.maximum(x.colour[1], 0) ** GAMMA).sum() for x in (sharp, blurred))
     assert blurred_light == pytest.approx(light, rel=0.05)
+
+
+def test_derivatives_inside_a_picture_are_differences(look):
+    """Where nothing appears or disappears: pixels on the ball before it and after it moves."""
+    box = look.model.box
+    ball = np.linalg.norm(box.nodes, axis=1).reshape(box.shape) - 0.3
+    hard = LearnedField.from_model(SurfaceModel.create(ball, box, look.model.appearance), 400.0)
+    camera = Camera((0, -1.0, 0.5), (0, 0, 0), width=48, height=32)
+    lamps = (Light((0.3, -0.6, 0.8)),)
+
+    def at(aside):
+        position = jnp.stack([aside, 0.0 * aside, 0.0 * aside])[None, None]
+        colour, opacity = draw_frames([hard], position, jnp.array([[[1.0, 0, 0, 0]]]), camera, lamps)
+        return colour[0].astype(jnp.float64), opacity[0]
+
+    slope = np.asarray(jax.jit(jax.jacfwd(lambda x: at(x)[0]))(0.0))
+    step = 0.5 * 0.8 * camera.pixel_angle  # half a pixel
+    (high, over), (low, under) = (jax.jit(at)(s * step) for s in (1.0, -1.0))
+    difference = np.asarray(high - low) / (2 * step)
+    inside = ndimage.minimum_filter(np.minimum(over, under).reshape(32, 48), 5).ravel() > 0.99
+    assert inside.mean() > 0.1
+    apart = np.linalg.norm((slope - difference)[inside]) / np.linalg.norm(difference[inside])
+    # The slope of an interpolated normal is right to the size of a cell over the radius, 8 %.
+    assert apart < 0.25, apart
 
 
 @pytest.mark.slow

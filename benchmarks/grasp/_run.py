@@ -70,7 +70,8 @@ class Hand:
         moved = self.guess.copy()
         moved[:, 0] = grasp[0]
         moved[:, 1] += grasp[1] - moved[0, 1]
-        moved[:, 2] = -grasp[2]
+        closes = moved[:, 2] < 0
+        moved[closes, 2] *= grasp[2] / -moved[-1, 2]
         return moved
 
     def held(self, state: dano.State, values: Float[Array, "T 3"]) -> Held:

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -65,6 +66,13 @@ COMMANDS = (
         ("scene.toml",),
         {"-o": ".npz", "--video": ".mp4", "--strip": ".png"},
         {"--steps": (*COUNT, "100000000000"), "--timestep": POSITIVE, "--slow-motion": POSITIVE},
+    ),
+    Command(
+        ("simulate", "scene.toml", "other.toml", "-o", "pair"),
+        ("scene.toml", "other.toml"),
+        {"--video": ".mp4", "--strip": ".png"},
+        {"--steps": (*COUNT, "100000000000"), "--timestep": POSITIVE, "--slow-motion": POSITIVE},
+        ("--camera",),
     ),
     Command(("check", "scene.toml"), ("scene.toml",), {}, {"--steps": COUNT, "--timestep": POSITIVE}),
     Command(
@@ -173,6 +181,7 @@ def _hostile(world: World) -> dict[str, bytes]:
     for name in ("field.npz", "thing.dano", "motion.npz", "scene.toml", "scene_run.npz"):
         world.saved(name)
     (world.folder / "scene_run.npz").rename(world.folder / "run.npz")
+    shutil.copy(world.folder / "scene.toml", world.folder / "other.toml")
     (world.folder / "task.toml").write_text("[[goals]]\nbody = 'wall'\n", encoding="utf-8")
     (world.folder / "film.mp4").write_bytes(b"no film")
     (world.folder / "photos").mkdir()

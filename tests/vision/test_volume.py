@@ -4,7 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import ndimage
 
+from dano.vision.radiance._trilinear import smooth_slope_at
 from dano.vision.radiance._volume import (
     composite,
     density_alpha,
@@ -68,3 +70,22 @@ def test_importance_edges_divide_the_weight_equally():
     np.testing.assert_allclose(fine[0, 1:6], inside, atol=1e-6)
     even = importance_edges(edges, jnp.zeros((1, 4)), 4, None)
     np.testing.assert_allclose(even[0], [0, 0.25, 0.5, 0.75, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize("n_points", [5, 500])
+def test_smooth_slopes_are_interpolated_central_differences(n_points):
+    """At few points and at many, where they are computed in another way."""
+    random = np.random.default_rng(1)
+    x, y, z = np.meshgrid(*(np.arange(n, dtype=float) for n in (6, 5, 7)), indexing="ij")
+    grid = x**2 + 3 * x * y - z**2 + 0.1 * random.normal(size=x.shape)
+    u = random.uniform(0, np.array([[4.999], [3.999], [5.999]]), (3, n_points))
+    # Edges repeated, so that a difference beyond the grid is half of the one-sided one.
+    padded = np.pad(grid, 1, mode="edge")
+    inner = slice(1, -1)
+    nodes = [
+        (padded[2:, inner, inner] - padded[:-2, inner, inner]) / 2,
+        (padded[inner, 2:, inner] - padded[inner, :-2, inner]) / 2,
+        (padded[inner, inner, 2:] - padded[inner, inner, :-2]) / 2,
+    ]
+    expected = [ndimage.map_coordinates(node, u, order=1) for node in nodes]
+    np.testing.assert_allclose(smooth_slope_at(jnp.asarray(grid), jnp.asarray(u)), expected, atol=1e-9)

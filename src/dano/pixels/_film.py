@@ -20,7 +20,7 @@ from dano.maths import Numbers, quat_normalize, quat_rotate, quat_to_matrix
 from dano.scene import Control, Scene, State
 from dano.vision import AbstractCamera, AbstractModel, GAMMA, LearnedField, Light, Part, Sampling, through
 
-FILM_SAMPLING = Sampling(48, 16, 3)
+FILM_SAMPLING = Sampling(48, 16, 3, moves=True)
 """How finely rays are sampled: a picture to compare, not one to look at."""
 
 _EDGE = 4.0

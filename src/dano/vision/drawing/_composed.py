@@ -89,6 +89,8 @@ class Part(eqx.Module):
             edges = importance_edges(
                 edges, self.model.interest(rays, edges, self.sharpness), sampling.fine, None
             )
+            if sampling.moves:
+                edges = self.model.attached(rays, edges, self.sharpness)
             return edges, self.model.alpha(rays, edges, self.sharpness)
 
         def none() -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dano.fields import CallableField
 from dano.vision.capture import NodeGrid, Rays
 from dano.vision.radiance._appearance import Appearance, Share
-from dano.vision.radiance._trilinear import value_and_slope_at, value_at
+from dano.vision.radiance._trilinear import smooth_slope_at, value_and_slope_at, value_at
 from dano.vision.radiance._volume import (
     composite,
     density_alpha,
@@ -26,6 +26,13 @@ from dano.vision.radiance._volume import (
     surface_alpha,
     surface_interest,
 )
+
+_GRAZING = 0.35, 0.55
+"""Slopes of the distance along a ray below which it grazes a surface, and above which it meets it.
+
+By measurement: with these, derivatives inside a bunny's picture are closest to differences, and those of its
+silhouette do not get worse.
+"""
 
 
 class Seen(NamedTuple):
@@ -51,11 +58,14 @@ class Sampling(NamedTuple):
         coarse: Sections that look for the object, without derivatives.
         fine: Sections around it, which give the opacity.
         colours: Of these, those seen most, whose colour is computed.
+        moves: Whether derivatives see the sections move with the surface. Without it they stand still, which is
+            wrong for what is seen inside an outline, and better behaved far from a match.
     """
 
     coarse: int = 48
     fine: int = 16
     colours: int = 5
+    moves: bool = False
 
 
 DRAWING = Sampling(96, 32, 8)
@@ -91,6 +101,13 @@ class AbstractModel(eqx.Module):
     ) -> Float[Array, "rays sections"]:
         """How much of what is seen is decided in sections: where to sample finely."""
         return section_weights(self.alpha(rays, edges, sharpness))
+
+    def attached(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays edges"]:
+        """The same edges, with derivatives as if they moved along the rays with what is seen there."""
+        del rays, sharpness
+        return edges
 
 
 class AbstractMedium(AbstractModel):
@@ -132,6 +149,24 @@ class AbstractSurface(AbstractModel):
         length = jnp.maximum(rays.far - rays.near, 1e-9)
         blurred = jnp.minimum(sharpness, 2 * (edges.shape[1] - 1) / length)[:, None]
         return surface_interest(self.distance_at(rays.at(edges)).reshape(edges.shape), blurred)
+
+    def attached(
+        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
+    ) -> Float[Array, "rays edges"]:
+        """See `AbstractModel.attached`: with where a ray meets the surface (implicit function theorem).
+
+        Without it the colour would stand still in space while the surface moves. Rays that graze keep their
+        edges: what they see is decided where they are closest to the surface, which has no first derivative
+        along the ray.
+        """
+        edges = jax.lax.stop_gradient(edges)
+        middle, step = edges[:, edges.shape[1] // 2], jax.lax.stop_gradient(0.5 / jnp.asarray(sharpness))
+        before, after = (self.distance_at(rays.at((middle + s * step)[:, None])) for s in (-1, 1))
+        slope = jax.lax.stop_gradient((after - before) / (2 * step))
+        height = 0.5 * (before + after)
+        share = jnp.clip((-slope - _GRAZING[0]) / (_GRAZING[1] - _GRAZING[0]), 0, 1)
+        shift = share * (height - jax.lax.stop_gradient(height)) / jnp.maximum(-slope, _GRAZING[0])
+        return edges + shift[:, None]
 
 
 class _Density(eqx.Module):
@@ -262,8 +297,8 @@ class SurfaceModel(_OnNodes, AbstractSurface):
         light: Float[Array, "n 3"],
         view_share: Share = 1.0,
     ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-        """See `AbstractModel.colour`; normals are the gradient of the distance."""
-        _, slope = value_and_slope_at(self.distance, self._index(points))
+        """See `AbstractModel.colour`; normals are the gradient of the distance, continuous between cells."""
+        slope = smooth_slope_at(self.distance, self._index(points))
         normal = slope.T * jax.lax.rsqrt(jnp.sum(slope * slope, axis=0) + 1e-12)[:, None]
         return self.appearance(points, normal, view, light, view_share), normal
 

@@ -68,6 +68,30 @@ def value_and_slope_at(
     return value, jnp.stack([x, y, z])
 
 
+def smooth_slope_at(grid: Float[Array, "nx ny nz"], u: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    """Central differences at the nodes, interpolated between them, in index units.
+
+    Unlike the slope of the interpolated values, it does not jump between cells, so that what depends on it
+    has derivatives.
+    """
+    # The same numbers in two ways: at many points, all nodes' differences are three times faster to learn by.
+    if 64 * u.shape[1] > grid.size:
+        padded = jnp.pad(grid, 1, mode="edge")
+        inner = slice(1, -1)
+        slopes = [
+            0.5 * (padded[2:, inner, inner] - padded[:-2, inner, inner]),
+            0.5 * (padded[inner, 2:, inner] - padded[inner, :-2, inner]),
+            0.5 * (padded[inner, inner, 2:] - padded[inner, inner, :-2]),
+        ]
+        return rows_at(jnp.stack(slopes, axis=-1), u).T
+    slopes = []
+    for axis in range(3):
+        # One cell to either side: the difference of interpolated values is the interpolated difference.
+        step = jnp.asarray(np.eye(3)[:, axis : axis + 1], u.dtype)
+        slopes.append(0.5 * (value_at(grid, u + step) - value_at(grid, u - step)))
+    return jnp.stack(slopes)
+
+
 def rows_at(grid: Float[Array, "nx ny nz k"], u: Float[Array, "3 n"]) -> Float[Array, "n k"]:
     """Vectors of k numbers at points in index units."""
     shape = grid.shape[:3]
