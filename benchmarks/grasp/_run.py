@@ -26,9 +26,9 @@ GROUP = "Grasp: bad first grasps of the bunny"
 LIFT, SLIP, HOLD = 0.1, 1e-3, 200  # m, m, steps of 10 ms
 # Where first grasps lie: along the bunny [m], height [m], grip [N].
 RANGES = ((-0.06, 0.06), (0.02, 0.11), (5.0, 25.0))
-SEARCH = SamplingOptions(passes=5, samples=16, knots=1, deviation=0.3, best=0.25, least=0.02)
+SEARCH = SamplingOptions(passes=5, samples=16, knots=1, deviation=0.3, best=0.25, least=0.02, first="even")
 # As many rollouts, with controls that may change over time as they like.
-FREE = dataclasses.replace(SEARCH, knots=8)
+FREE = dataclasses.replace(SEARCH, knots=8, first="normal")
 
 
 @dataclass(frozen=True)

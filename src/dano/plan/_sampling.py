@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.checks import checked_count, checked_number
+from dano.checks import checked_choice, checked_count, checked_number
 from dano.solvers import TrajectoryProblem
 
 
@@ -33,6 +33,9 @@ class SamplingOptions:
             the first ones moved by as much at all times.
         deviation: First standard deviation, as a share of the bounds.
         least: Deviation that is always left.
+        first: How the first pass draws: "normal", by `deviation` around the first controls; or "even", a Latin
+            hypercube over all moves that keep the first controls within their bounds, for tasks whose cost
+            says nothing until a sequence is nearly right.
         temperature: Of MPPI, as a share of the spread of costs.
         price: First price of violations, and `last_price` the last.
         last_price: See `price`.
@@ -45,6 +48,7 @@ class SamplingOptions:
     knots: int = 8
     deviation: float = 0.4
     least: float = 0.01
+    first: str = "normal"
     temperature: float = 0.1
     price: float = 10.0
     last_price: float = 1e3
@@ -56,6 +60,7 @@ class SamplingOptions:
         Raises:
             ValueError: If one is out of range.
         """
+        checked_choice("first", self.first, ("normal", "even"))
         for name in ("passes", "samples", "knots"):
             checked_count(name, getattr(self, name))
         checked_number("best", self.best, above=0, most=1)
@@ -120,9 +125,11 @@ def sampled(
     try:
         for turn, price in enumerate(prices):
             key, draw = jax.random.split(key)
-            knots = mean[None] + spread[None] * jax.random.normal(
-                draw, (options.samples, *mean.shape), mean.dtype
-            )
+            if turn == 0 and options.first == "even":
+                knots = _even(controls, least, most, (options.samples, *mean.shape), draw)
+            else:
+                shape = (options.samples, *mean.shape)
+                knots = mean[None] + spread[None] * jax.random.normal(draw, shape, mean.dtype)
             knots = knots.at[0].set(mean)
             sequences = controls[None] + jnp.einsum("tk,skm->stm", jnp.asarray(lift), knots)
             sequences = jnp.clip(sequences, *(jnp.broadcast_to(b, sequences.shape) for b in (least, most)))
@@ -143,6 +150,16 @@ def sampled(
         interrupted = True
     final = np.inf if best_terms is None else best_terms[0] + 0.5 * options.last_price * best_terms[1]
     return Sampled(best, final, np.array(history), time.perf_counter() - began, interrupted)
+
+
+def _even(controls: Array, least: Array, most: Array, shape: tuple[int, int, int], key: Array) -> Array:
+    """A Latin hypercube over the moves that keep all controls within their bounds, shape (samples, knots, m)."""
+    from scipy.stats import qmc  # slow to import
+
+    seed = int(jax.random.randint(key, (), 0, np.iinfo(np.int32).max))
+    shares = qmc.LatinHypercube(shape[1] * shape[2], rng=seed).random(shape[0]).reshape(shape)
+    low, high = jnp.minimum(least - controls.min(axis=0), 0), jnp.maximum(most - controls.max(axis=0), 0)
+    return low + (high - low) * jnp.asarray(shares, controls.dtype)
 
 
 def _moved(knots: Array, priced: Array, mean: Array, method: str, options: SamplingOptions):
