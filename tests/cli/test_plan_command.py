@@ -135,6 +135,7 @@ def test_commands_of_motors_are_controls_of_a_task(tmp_path):
         ("max_seconds = 600.0", "max_seconds = 0.0", "max_seconds must be > 0 s, got 0.0"),
         ("max_seconds = 600.0", 'method = "lqr"', "method must be one of .*; did you mean 'ilqr'"),
         ("max_seconds = 600.0", "softening = [2.0]", "softening must be factors between 0 and 1"),
+        ("max_seconds = 600.0", 'first = "evn"', "first must be one of .*; did you mean 'even'"),
         ("[search]", "[search", "must be a TOML task file"),
     ],
 )

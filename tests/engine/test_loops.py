@@ -99,7 +99,7 @@ def gaps_of(scene, states):
     return np.asarray(jax.vmap(scene.closing.gaps)(states.position, states.orientation))
 
 
-@pytest.mark.parametrize("kind", ["point", "weld"])
+@pytest.mark.parametrize("kind", ["point", pytest.param("weld", marks=pytest.mark.slow)])
 def test_loops_swing_in_mujoco_as_here(swung, kind):
     pytest.importorskip("mujoco")
     scene, state, run = swung
@@ -199,7 +199,7 @@ def chain(closed, weld=False):
     return scene
 
 
-@pytest.fixture(scope="module", params=["point", "weld"])
+@pytest.fixture(scope="module", params=["point", pytest.param("weld", marks=pytest.mark.slow)])
 def tumbling(request):
     """The same chain as a tree and by a loop, from the same two poses."""
     weld = request.param == "weld"

@@ -285,3 +285,24 @@ def test_sampling_moves_the_first_guess(pushing):
     moved = np.asarray(made.values) - guess
     np.testing.assert_allclose(moved, np.broadcast_to(moved[:1], moved.shape), atol=1e-12)
     assert np.abs(moved).max() > 0
+
+
+def test_a_first_pass_may_cover_all_that_bounds_allow(puck):
+    """16 N for a second move 2 kg by 4 m; samples near the first guess of 0 N do not know of it."""
+    task = dano.Task(
+        N_STEPS,
+        [dano.Actuator("puck", limit=20.0, axes="x", cost=0.0)],
+        [dano.Goal("puck", position=(4.0, 0.0, 0.0), axes="x", within=1e-2)],
+    )
+    forces = {}
+    for first in ("normal", "even"):
+        options = dano.SamplingOptions(passes=1, samples=16, knots=1, deviation=1e-3, first=first)
+        guess = np.zeros((N_STEPS, 1))
+        made = dano.plan(puck, puck.initial_state(), task, method="cem", controls=guess, sampling=options)
+        forces[first] = np.asarray(made.values)[:, 0]
+    assert np.abs(forces["normal"]).max() < 1
+    # A sample in every 2.5 N, but for the first two, which are the guess: no more than three of these away.
+    assert np.all(np.abs(forces["even"] - 16) < 7.5)
+    assert np.all(np.abs(forces["even"]) <= 20)
+    with pytest.raises(ValueError, match="first must be one of normal, even, got 'sobol'"):
+        dano.SamplingOptions(first="sobol")

@@ -42,6 +42,7 @@ def test_overlapping_media_share_one_transmittance():
     assert seen.opacity[8, 8] == pytest.approx(1 - math.exp(-2 * a - 1.9 * b), rel=2e-3)
 
 
+@pytest.mark.slow
 def test_the_order_of_the_list_is_of_no_account():
     model = learned()
     items = [

@@ -33,6 +33,7 @@ def volume(hull: np.ndarray) -> float:
     return float(np.mean(hull < 0))
 
 
+@pytest.mark.slow
 def test_bites_out_of_few_masks_are_doubted_and_the_hull_is_whole_again(photos: Capture):
     whole = survey(photos, RESOLUTION)
     shadowed = {5, 21}

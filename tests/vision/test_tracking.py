@@ -226,6 +226,7 @@ def test_the_start_is_found_among_all_orientations(bunny, camera, filmed):
     assert (np.degrees(turn.max()) < 5, shift.max() < 0.1) == (True, True), (turn, shift)
 
 
+@pytest.mark.slow
 def test_of_several_things_the_object_is_found_and_two_alike_are_said(bunny, camera):
     position, orientation = path(2)
     wide = camera.replaced(width=150, centre=np.array([75.0, 36.0]))

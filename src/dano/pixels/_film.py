@@ -24,8 +24,8 @@ FILM_SAMPLING = Sampling(24, 16, 8, moves=True)
 """How finely rays are sampled: a picture to compare, not one to look at.
 
 By measurement, inside pictures of a ball and of the shipped bunny: colours are three times closer to those of
-many samples than with (48, 16, 3), and derivatives twice. Few coarse sections look for a wide layer, so that the
-fine ones hold all of the soft surface.
+many samples than with (48, 16, 3), and derivatives twice. Few coarse sections look for a wide layer, so that
+the fine ones hold all of the soft surface.
 """
 
 _EDGE = 4.0

@@ -11,7 +11,7 @@ from dano.plan._plan import (
     plan as plan,
 )
 from dano.plan._problem import problem_of as problem_of
-from dano.plan._sampling import SamplingOptions as SamplingOptions
+from dano.plan._sampling import FIRST_DRAWS as FIRST_DRAWS, SamplingOptions as SamplingOptions
 from dano.plan._softening import softened as softened
 from dano.plan._task import (
     Actuator as Actuator,

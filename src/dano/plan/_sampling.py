@@ -20,6 +20,9 @@ from jaxtyping import Array, Float
 from dano.checks import checked_choice, checked_count, checked_number
 from dano.solvers import TrajectoryProblem
 
+FIRST_DRAWS = "normal", "even"
+"""How the first pass may draw."""
+
 
 @dataclasses.dataclass(frozen=True)
 class SamplingOptions:
@@ -33,9 +36,9 @@ class SamplingOptions:
             the first ones moved by as much at all times.
         deviation: First standard deviation, as a share of the bounds.
         least: Deviation that is always left.
-        first: How the first pass draws: "normal", by `deviation` around the first controls; or "even", a Latin
-            hypercube over all moves that keep the first controls within their bounds, for tasks whose cost
-            says nothing until a sequence is nearly right.
+        first: How the first pass draws: "normal", by `deviation` around the first controls; or "even", a
+            Latin hypercube over all moves that keep the first controls within their bounds, for tasks whose
+            cost says nothing until a sequence is nearly right.
         temperature: Of MPPI, as a share of the spread of costs.
         price: First price of violations, and `last_price` the last.
         last_price: See `price`.
@@ -60,7 +63,7 @@ class SamplingOptions:
         Raises:
             ValueError: If one is out of range.
         """
-        checked_choice("first", self.first, ("normal", "even"))
+        checked_choice("first", self.first, FIRST_DRAWS)
         for name in ("passes", "samples", "knots"):
             checked_count(name, getattr(self, name))
         checked_number("best", self.best, above=0, most=1)
@@ -153,13 +156,14 @@ def sampled(
 
 
 def _even(controls: Array, least: Array, most: Array, shape: tuple[int, int, int], key: Array) -> Array:
-    """A Latin hypercube over the moves that keep all controls within their bounds, shape (samples, knots, m)."""
+    """A Latin hypercube over the moves that keep all controls within their bounds: samples, knots, m."""
     from scipy.stats import qmc  # slow to import
 
     seed = int(jax.random.randint(key, (), 0, np.iinfo(np.int32).max))
     shares = qmc.LatinHypercube(shape[1] * shape[2], rng=seed).random(shape[0]).reshape(shape)
-    low, high = jnp.minimum(least - controls.min(axis=0), 0), jnp.maximum(most - controls.max(axis=0), 0)
-    return low + (high - low) * jnp.asarray(shares, controls.dtype)
+    lowest = jnp.minimum(least - controls.min(axis=0), 0)[None, None]
+    highest = jnp.maximum(most - controls.max(axis=0), 0)[None, None]
+    return lowest + (highest - lowest) * jnp.asarray(shares, controls.dtype)
 
 
 def _moved(knots: Array, priced: Array, mean: Array, method: str, options: SamplingOptions):

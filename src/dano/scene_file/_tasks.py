@@ -12,7 +12,7 @@ import numpy as np
 
 from dano.archive import checked_input
 from dano.names import did_you_mean
-from dano.plan import Actuator, Goal, KINDS, Limit, Method, METHODS, QUANTITIES, Task
+from dano.plan import Actuator, FIRST_DRAWS, Goal, KINDS, Limit, Method, METHODS, QUANTITIES, Task
 from dano.scene import Scene
 from dano.scene_file._table import is_number, located, Table
 
@@ -21,7 +21,7 @@ _ACTUATOR = ("body", "kind", "limit", "lower", "upper", "axes", "cost", "start")
 _GOAL = ("body", *QUANTITIES, "running", "final", "required", "within", "axes")
 _LIMIT = ("body", "quantity", "lower", "upper", "axes")
 _SEARCH_COUNTS = ("max_iterations", "passes", "samples", "knots")
-_SEARCH = ("method", "explore", "softening", "seed", "max_seconds", *_SEARCH_COUNTS, "deviation")
+_SEARCH = ("method", "explore", "softening", "seed", "max_seconds", *_SEARCH_COUNTS, "deviation", "first")
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class Search:
         samples: In a pass; None: the default.
         knots: Moments at which they draw; None: the default.
         deviation: First deviation, as a share of the bounds; None: the default.
+        first: How the first pass draws, "normal" or "even"; None: the default.
     """
 
     method: Method
@@ -51,6 +52,7 @@ class Search:
     samples: int | None
     knots: int | None
     deviation: float | None
+    first: str | None
 
 
 @dataclass(frozen=True)
@@ -221,6 +223,7 @@ def _search(top: Table) -> Search:
     deviation = table.number("deviation") if "deviation" in table else None
     if deviation is not None and deviation <= 0:
         raise table.wrong("deviation", "> 0")
+    first = table.word("first", FIRST_DRAWS) if "first" in table else None
     method = cast(Method, table.word("method", METHODS, "ilqr"))
     seed = table.integer("seed", 0)
-    return Search(method, explore, softening, seed, seconds, **counts, deviation=deviation)
+    return Search(method, explore, softening, seed, seconds, **counts, deviation=deviation, first=first)

@@ -327,6 +327,7 @@ def _plan(w: World) -> Iterator[Call]:
             "knots": COUNT,
             "best": POSITIVE,
             "deviation": POSITIVE,
+            "first": {"unknown": "sobol", "nothing": None, "number": 3},
             "temperature": POSITIVE,
             "max_seconds": OPTIONAL_POSITIVE,
         },

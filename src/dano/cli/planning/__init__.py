@@ -56,8 +56,9 @@ def _found(loaded, given, command: Plan, progress: Progress) -> Planned:
     if search.max_iterations is not None:
         options = options._replace(max_iterations=search.max_iterations)
     sampling = SamplingOptions(max_seconds=search.max_seconds)
-    counts = {name: getattr(search, name) for name in ("passes", "samples", "knots", "deviation")}
-    sampling = dataclasses.replace(sampling, **{name: n for name, n in counts.items() if n is not None})
+    names = ("passes", "samples", "knots", "deviation", "first")
+    asked = {name: getattr(search, name) for name in names}
+    sampling = dataclasses.replace(sampling, **{name: x for name, x in asked.items() if x is not None})
     most = options.max_iterations * options.max_updates
 
     def tell(stage: str, iteration: int, cost: float) -> bool:

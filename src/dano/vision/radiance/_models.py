@@ -58,8 +58,8 @@ class Sampling(NamedTuple):
         coarse: Sections that look for the object, without derivatives.
         fine: Sections around it, which give the opacity.
         colours: Of these, those seen most, whose colour is computed.
-        moves: Whether derivatives see the sections move with the surface. Without it they stand still, which is
-            wrong for what is seen inside an outline, and better behaved far from a match.
+        moves: Whether derivatives see the sections move with the surface. Without it they stand still, which
+            is wrong for what is seen inside an outline, and better behaved far from a match.
     """
 
     coarse: int = 48
