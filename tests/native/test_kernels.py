@@ -193,8 +193,8 @@ def test_solves_steps_alike(heap, held, monkeypatch):
     for state in states:
         (velocities, jacobian, report), (expected, slopes, slow) = both(state)
         assert bool(report.converged) and bool(slow.converged)
-        # Where an impact is so stiff that rounding of its terms leaves a residual, velocities differ by a share
-        # of it: up to 0.004 over the heaps of twelve seeds, and not the same on every processor.
+        # Where an impact is so stiff that rounding of its terms leaves a residual, velocities differ by a
+        # share of it: up to 0.004 over the heaps of twelve seeds, and not the same on every processor.
         residual = max(float(report.residual), float(slow.residual))
         np.testing.assert_allclose(velocities, expected, rtol=0, atol=1e-8 + 0.02 * residual)
         np.testing.assert_allclose(jacobian, slopes, rtol=1e-5, atol=1e-6 * float(jnp.abs(slopes).max()))
