@@ -129,7 +129,7 @@ def sampled(
         for turn, price in enumerate(prices):
             key, draw = jax.random.split(key)
             if turn == 0 and options.first == "even":
-                knots = _even(controls, least, most, (options.samples, *mean.shape), draw)
+                knots = _even(controls, least, most, options.samples, len(mean), draw)
             else:
                 shape = (options.samples, *mean.shape)
                 knots = mean[None] + spread[None] * jax.random.normal(draw, shape, mean.dtype)
@@ -155,12 +155,13 @@ def sampled(
     return Sampled(best, final, np.array(history), time.perf_counter() - began, interrupted)
 
 
-def _even(controls: Array, least: Array, most: Array, shape: tuple[int, int, int], key: Array) -> Array:
+def _even(controls: Array, least: Array, most: Array, samples: int, knots: int, key: Array) -> Array:
     """A Latin hypercube over the moves that keep all controls within their bounds: samples, knots, m."""
     from scipy.stats import qmc  # slow to import
 
     seed = int(jax.random.randint(key, (), 0, np.iinfo(np.int32).max))
-    shares = qmc.LatinHypercube(shape[1] * shape[2], rng=seed).random(shape[0]).reshape(shape)
+    m = controls.shape[1]
+    shares = qmc.LatinHypercube(knots * m, rng=seed).random(samples).reshape(samples, knots, m)
     lowest = jnp.minimum(least - controls.min(axis=0), 0)[None, None]
     highest = jnp.maximum(most - controls.max(axis=0), 0)[None, None]
     return lowest + (highest - lowest) * jnp.asarray(shares, controls.dtype)
