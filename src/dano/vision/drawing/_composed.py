@@ -25,10 +25,10 @@ from dano.vision.radiance import (
     AbstractSurface,
     composite,
     DRAWING,
-    importance_edges,
     Picture,
     Sampling,
     section_weights,
+    sections,
     Share,
     stratified_edges,
     tiles,
@@ -85,13 +85,7 @@ class Part(eqx.Module):
         """Edges (n, fine + 1) of sections around what is opaque, and their opacity (n, fine)."""
 
         def found() -> tuple[Array, Array]:
-            edges = stratified_edges(rays.near, rays.far, sampling.coarse, None)
-            edges = importance_edges(
-                edges, self.model.interest(rays, edges, self.sharpness), sampling.fine, None
-            )
-            if sampling.moves:
-                edges = self.model.attached(rays, edges, self.sharpness)
-            return edges, self.model.alpha(rays, edges, self.sharpness)
+            return sections(self.model, rays, self.sharpness, sampling)
 
         def none() -> tuple[Array, Array]:
             edges = jnp.broadcast_to(rays.near[:, None], (len(rays.near), sampling.fine + 1))

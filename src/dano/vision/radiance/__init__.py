@@ -10,6 +10,7 @@ from dano.vision.radiance._models import (
     DensityModel as DensityModel,
     DRAWING as DRAWING,
     Sampling as Sampling,
+    sections as sections,
     see as see,
     Seen as Seen,
     SurfaceModel as SurfaceModel,
@@ -18,7 +19,6 @@ from dano.vision.radiance._osf import OSF as OSF
 from dano.vision.radiance._picture import Picture as Picture, picture as picture, tiles as tiles
 from dano.vision.radiance._volume import (
     composite as composite,
-    importance_edges as importance_edges,
     section_weights as section_weights,
     stratified_edges as stratified_edges,
     transmittance as transmittance,

@@ -176,6 +176,19 @@ class _Density(eqx.Module):
         return self.model.density_at(points)
 
 
+def sections(
+    model: AbstractModel, rays: Rays, sharpness: Share, sampling: Sampling, key: PRNGKeyArray | None = None
+) -> tuple[Float[Array, "rays edges"], Float[Array, "rays sections"]]:
+    """Edges of the fine sections, around what coarse ones found, and their opacity; arguments as of `see`."""
+    keys = (None, None) if key is None else jax.random.split(key)
+    edges = stratified_edges(rays.near, rays.far, sampling.coarse, keys[0])
+    # Weights for sampling are not differentiated: `importance_edges` stops their gradient.
+    edges = importance_edges(edges, model.interest(rays, edges, sharpness), sampling.fine, keys[1])
+    if sampling.moves:
+        edges = model.attached(rays, edges, sharpness)
+    return edges, model.alpha(rays, edges, sharpness)
+
+
 def see(
     model: AbstractModel,
     rays: Rays,
@@ -195,11 +208,8 @@ def see(
         view_share: See `Appearance`.
         key: Random key for jitter of the sections; None for none.
     """
-    keys = (None, None) if key is None else jax.random.split(key)
-    edges = stratified_edges(rays.near, rays.far, sampling.coarse, keys[0])
-    # Weights for sampling are not differentiated: `importance_edges` stops their gradient.
-    edges = importance_edges(edges, model.interest(rays, edges, sharpness), sampling.fine, keys[1])
-    weights = section_weights(model.alpha(rays, edges, sharpness))
+    edges, alpha = sections(model, rays, sharpness, sampling, key)
+    weights = section_weights(alpha)
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
     _, chosen = jax.lax.top_k(jax.lax.stop_gradient(weights), sampling.colours)
     some = jnp.take_along_axis(weights, chosen, axis=1)
