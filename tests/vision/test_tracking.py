@@ -8,17 +8,18 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
+from dano import HalfSpace, Pose
 from dano.cli import main
 from dano.identify import load_motion
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate, quat_to_matrix
 from dano.scene_file import asset_look
-from dano.vision import adjust_poses, Film, Light, PosedCamera, track, TrackOptions
+from dano.vision import adjust_poses, Camera, compose, Film, Item, Light, PosedCamera, track, TrackOptions
 from dano.vision.drawing import GAMMA
 from dano.vision.tracking._edges import common_offset, edge_offset, moved_edge
-from dano.vision.tracking._light import LightFit
+from dano.vision.tracking._light import LightFit, ShadowFit
 from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.tracking._refine import Refined
-from dano.vision.tracking._segments import like_object, overlap, Place, unlike_place
+from dano.vision.tracking._segments import bare_brightness, like_object, overlap, Place, unlike_place
 from dano.vision.tracking._subject import Subject
 from dano.vision.tracking._sureness import covariance_of, unobservable
 
@@ -291,6 +292,8 @@ def test_what_is_wrong_is_said(bunny, camera, filmed):
         track(film_of(shaky, [None] * 4), bunny, camera, TrackOptions(masks="static"))
     with pytest.raises(ValueError, match="masks must be one of"):
         TrackOptions(masks="magic")
+    with pytest.raises(ValueError, match="table must be finite, got nan"):
+        TrackOptions(table=float("nan"))
     with pytest.raises(ValueError, match="rays must be ≥ 256, got 3"):
         TrackOptions(rays=3)
 
@@ -358,6 +361,46 @@ def test_the_sun_is_found_between_the_directions_that_lamps_have(bunny, camera):
     light.find_sun()
     assert before > 8
     assert off() < 5
+
+
+@pytest.mark.parametrize("sun", [(-0.5, -0.35, 0.79), (0.7, 0.3, 0.5)])
+def test_the_shadow_on_a_table_says_where_the_sun_is(bunny, sun):
+    towards = np.array(sun) / np.linalg.norm(sun)
+    camera = Camera((0.14, -0.42, 0.3), (0.0, 0.0, 0.03), width=160, height=120)
+    lamps, table = [Light(towards, intensity=0.8)], Item(HalfSpace())
+    rng = np.random.default_rng(3)
+    texture = ndimage.gaussian_filter(rng.uniform(0.6, 1.0, (120, 160)), 1.0)[..., None]
+    bare = compose([table], camera, lamps, ambient=0.3).colour * texture
+    shadows, nothing = ShadowFit(Subject(bunny), 0.0), ShadowFit(Subject(bunny), 0.0)
+    for x, angle in ((-0.03, 0.4), (0.02, 1.5)):
+        place = Placement(np.array([x, 0.01, 0.0]), np.array([np.cos(angle / 2), 0, 0, np.sin(angle / 2)]))
+        pose = Pose(place.position, quaternion=place.orientation)
+        seen = compose([Item(bunny, pose), table], camera, lamps, ambient=0.3)
+        free = ~ndimage.binary_dilation(seen.identity == 0, iterations=2)
+        noise = 0.01 * rng.normal(size=bare.shape)
+        # A third less exposure, which shades are relative to.
+        image = np.clip(0.85 * seen.colour * texture + noise, 0, 1)
+        shadows.add(place, camera, image, np.sum(bare**GAMMA, axis=2), free)
+        nothing.add(place, camera, np.clip(0.85 * bare + noise, 0, 1), np.sum(bare**GAMMA, axis=2), free)
+    found = shadows.sun()
+    assert found is not None
+    assert np.degrees(np.arccos(found @ towards)) < 2
+    assert nothing.sun() is None
+
+
+def test_a_table_is_bright_where_the_object_passes_with_its_shadow():
+    bare = np.random.default_rng(4).uniform(0.3, 0.9, (20, 30))
+    frames, masks = [], []
+    for k in range(8):
+        image, mask = np.tile(bare[..., None], (1, 1, 3)), np.zeros((20, 30), np.float32)
+        image[5:12, 3 * k + 2 : 3 * k + 6] *= 0.7
+        mask[5:12, 3 * k : 3 * k + 3] = 1
+        image[mask > 0] = 1.0
+        frames.append(np.rint(255 * image).astype(np.uint8))
+        masks.append(mask)
+    found = bare_brightness(frames, masks)
+    np.testing.assert_allclose(found, 3 * bare**GAMMA, rtol=0.02)
+    assert np.isnan(bare_brightness(frames, [np.ones((20, 30), np.float32)] * 8)).all()
 
 
 def ramp():

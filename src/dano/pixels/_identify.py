@@ -1,5 +1,6 @@
 """Parameters of a scene from the pixels of a film, through the simulation."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -7,7 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dano.checks import checked_count, checked_kind
+from dano.fields import HalfSpace
 from dano.identify import Identification, identify, Motion, Parameter
+from dano.maths import quat_rotate
 from dano.progress import Progress
 from dano.scene import Scene
 from dano.vision import adjust_poses, Film, LearnedField, Light, PosedCamera, Tracked, TrackOptions
@@ -17,6 +20,12 @@ _SETTLED = 0.1
 
 _LIGHT_PASSES = 2
 """Passes in which the light is fitted: after that poses are right, and it would only follow the noise."""
+
+_LEVEL = 0.999
+"""Least z of the unit normal of a level table: 2.5°."""
+
+_SUNK = 0.25
+"""Share of the body's size by which the origin of its frame may lie below the table."""
 
 
 class FilmFit(NamedTuple):
@@ -71,7 +80,8 @@ def identify_in_film(
         camera: Which took the film.
         motion: Poses of that one body, as `Motion.from_tracked` gives them, at the film's times.
         parameters: What is unknown.
-        options: How pixels are compared, as for `track`.
+        options: How pixels are compared, as for `track`; without a `table` the scene's level half-space below
+            the body is taken for it, if there is one.
         background: Picture of the place without the object.
         passes: Steps on pixels at most.
         progress: Told how far it is.
@@ -87,6 +97,7 @@ def identify_in_film(
     _check(film, motion, settings)
     passes = checked_count("passes", passes)
     body = motion.names[0]
+    options = _with_table(scene, motion, options or TrackOptions())
     before = identify(scene, motion, parameters, progress=progress, **settings)
     fit, history, settled, lamps = before, [before.values], False, None
     found = None
@@ -112,6 +123,22 @@ def identify_in_film(
             break
     assert found is not None
     return FilmFit(fit, before, found, tuple(history), settled)
+
+
+def _with_table(scene: Scene, motion: Motion, options: TrackOptions) -> TrackOptions:
+    """The options with the height of the scene's highest level half-space below the body."""
+    if options.table is not None:
+        return options
+    reach = float(np.nanmax(motion.position[..., 2])) + _SUNK * scene.body(motion.names[0]).size
+    state, heights = scene.initial_state(), []
+    for body, at, turn in zip(scene.bodies, state.position, state.orientation, strict=True):
+        if not (body.fixed and isinstance(body.shape, HalfSpace)):
+            continue
+        up, middle = body.shape.normal_direction, quat_rotate(turn, body.com)
+        if float(quat_rotate(turn, up)[2]) > _LEVEL:
+            heights.append(float((at - middle)[2] + body.shape.offset))
+    below = [height for height in heights if height <= reach]
+    return dataclasses.replace(options, table=max(below)) if below else options
 
 
 def _moved(before: Identification, after: Identification) -> float:

@@ -29,6 +29,7 @@ class Filming:
         slow_motion: How many times slower the video plays than it was filmed.
         shutter: How long a frame is exposed [s], if what moves is blurred.
         readout: How much later the last row of a frame is exposed than the first (rolling shutter) [s].
+        table: Height z of a level table under the object [m]: its shadow there says where the sun is.
         every: Take every so many-th frame.
         loss: What is minimised: photometric, silhouette, or the paper's two terms.
         rays: Most pixels of a frame.
@@ -48,6 +49,7 @@ class Filming:
     slow_motion: float = 1.0
     shutter: float = 0.0
     readout: float = 0.0
+    table: float | None = None
     every: int = 1
     loss: Literal["photometric", "silhouette", "paper"] = "photometric"
     rays: int = 2048

@@ -44,6 +44,7 @@ def options_of(filming: Filming) -> TrackOptions:
         rays=filming.rays,
         shutter=filming.shutter,
         readout=filming.readout,
+        table=filming.table,
         seed=filming.seed,
     )
 

@@ -72,7 +72,7 @@ def adjust_poses(
             raise ValueError(f"{name} must have shape ({n}, {width}), got {np.shape(array)}")
     subject, near = Subject(field), film.camera(camera)
     places = _places(film, subject, np.asarray(position), np.asarray(orientation), chosen)
-    masking, light = Masking(film, chosen, background), LightFit(subject, keep=_LIGHT_FRAMES)
+    masking, light = Masking(film, chosen, background), LightFit(subject, _LIGHT_FRAMES, chosen.table)
     if lamps is not None:
         light.lamps, light.known = lamps, True
     elif chosen.loss == "photometric":
@@ -162,4 +162,5 @@ def _learn_light(
             shape, _ = silhouette(subject, place, light.lamps, camera, window)
             learn_light(subject, target, place, window, shape, light)
             masking.learn(target, window, shape)
+            masking.learn_shadow(i, target, place, light)
     light.find_sun()

@@ -1,13 +1,19 @@
-"""Light of a film, from how a known object looks in it: a few far lamps whose powers fit best."""
+"""Light of a film: a few far lamps whose powers fit best how a known object looks, and the sun by its shadow.
+
+Shades on the object say roughly where the sun is, as far as the learned look is right. The shadow on a level
+table says it to a degree or two: there the outline of the object is all that counts.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.optimize import minimize, nnls
 
 from dano.vision.capture import AbstractCamera, Light
 from dano.vision.drawing import GAMMA
 from dano.vision.tracking._placement import Placement
-from dano.vision.tracking._subject import Subject
+from dano.vision.tracking._subject import CHUNK, Subject
 
 LAMPS = 3
 """Lamps that a film is lit by: a sun, a sky, and what a table throws back."""
@@ -33,6 +39,33 @@ _FLAT = 0.02
 _MOST_PIXELS = 700
 """Of a frame that lamps are fitted to: forty times the directions (convention)."""
 
+_SHADOW_FRAMES = 3
+"""Frames whose shadows count: two are enough for 2° (rendered films)."""
+
+_SHADOW_REACH = 3.0
+"""Radii of the object up to which its shadow is looked for."""
+
+_SHADOW_TURN = 0.25
+"""First turn of the search for the sun by its shadow [rad]: half the distance of neighbouring directions."""
+
+_SHADOW_TRIES = 40
+"""Directions that this search tries."""
+
+_LOWEST = 0.15
+"""Least height of a sun above the table, as the sine of its angle: shadows are longer than the picture."""
+
+_SUN_WIDTH = 0.009
+"""Angle under which the sun is seen [rad]."""
+
+_SURE = 25.0
+"""By how much the logarithm of the likelihood must grow with a shadow for it to be one."""
+
+_SHADE_NOISE = 0.01
+"""Standard deviation of shades of the table, least."""
+
+_DARK = 0.01
+"""Linear brightness of a table below which it shows no shadow."""
+
 
 def unlit() -> tuple[Light, ...]:
     """Lamps before anything is known: white from above and from two sides."""
@@ -48,8 +81,9 @@ class LightFit:
         known: Whether they were fitted to anything.
     """
 
-    def __init__(self, subject: Subject, keep: int = 6):
+    def __init__(self, subject: Subject, keep: int = 6, table: float | None = None):
         self.lamps = unlit()
+        self._shadows = None if table is None else ShadowFit(subject, table)
         self.known = False
         self._subject = subject
         self._keep = keep
@@ -57,10 +91,7 @@ class LightFit:
         self._seen: list[np.ndarray] = []
         self._views: list[tuple[Placement, AbstractCamera, np.ndarray]] = []
         self._sun: np.ndarray | None = None
-        turn = np.pi * (3 - np.sqrt(5)) * np.arange(_DIRECTIONS)
-        z = 1 - 2 * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
-        flat = np.sqrt(1 - z**2)
-        self._places = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+        self._places = _spread(-1.0)
 
     def add(
         self,
@@ -89,25 +120,44 @@ class LightFit:
         self.lamps = self._fitted()
         self.known = True
 
+    def add_shadow(
+        self,
+        place: Placement,
+        camera: AbstractCamera,
+        image: Float[np.ndarray, "height width 3"],
+        bare: Float[np.ndarray, "height width"],
+        free: Bool[np.ndarray, "height width"],
+    ) -> None:
+        """Take the shadow on the table in a frame into account; nothing happens if no table is known.
+
+        Args:
+            place: Where the object is in the frame.
+            camera: From where.
+            image: sRGB.
+            bare: Linear brightness of every pixel without the object and its shadow; NaN where unknown.
+            free: Pixels that show the place and neither the object nor what hides it.
+        """
+        if self._shadows is not None:
+            self._shadows.add(place, camera, image, bare, free)
+
     def find_sun(self) -> None:
-        """Turn the strongest lamp, with a sky and a ground beside it, to where colours fit best."""
+        """Turn the strongest lamp to where the shadow says, or without a shadow to where colours fit best."""
         if not self.known or not self._subject.lit:
             return
+        by_shadow = None if self._shadows is None else self._shadows.sun()
+        self._sun = self._sun_by_colours() if by_shadow is None else by_shadow
+        self.lamps = self._fitted()
+
+    def _sun_by_colours(self) -> np.ndarray:
+        """Where the strongest lamp fits colours best, with a sky and a ground beside it."""
         strongest = max(self.lamps, key=lambda lamp: float(np.sum(lamp.colour)))
         towards = np.asarray(strongest.place if self._sun is None else self._sun, np.float64)
-        side = np.cross(towards, np.eye(3)[np.argmin(np.abs(towards))])
-        side /= np.linalg.norm(side)
-        across = np.stack([side, np.cross(towards, side)])
         rows, seen = np.concatenate(self._rows), np.concatenate(self._seen)
         above = self._places[:, 2] > 0
         around = np.stack([rows[..., above].mean(axis=-1), rows[..., ~above].mean(axis=-1)], axis=-1)
 
-        def turned(angles: np.ndarray) -> np.ndarray:
-            place = towards + angles @ across
-            return place / np.linalg.norm(place)
-
-        def unlike(angles: np.ndarray) -> float:
-            column = np.concatenate([self._column(view, turned(angles)) for view in self._views])
+        def unlike(place: np.ndarray) -> float:
+            column = np.concatenate([self._column(view, place) for view in self._views])
             total = 0.0
             for c in range(3):
                 mixed = np.concatenate([column[:, c, None], around[:, c]], axis=1)
@@ -116,12 +166,7 @@ class LightFit:
                 total += float(np.mean(np.minimum(away**2, _FAR_OFF**2)))
             return total
 
-        corners = _TURN * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        best = minimize(
-            unlike, np.zeros(2), method="Nelder-Mead", options={"maxfev": _TRIES, "initial_simplex": corners}
-        )
-        self._sun = turned(best.x)
-        self.lamps = self._fitted()
+        return _best_direction(unlike, towards, _TURN, _TRIES)
 
     def _column(self, view: tuple[Placement, AbstractCamera, np.ndarray], towards: np.ndarray) -> np.ndarray:
         """Light that pixels of a frame get from a lamp of power one (n, 3)."""
@@ -158,3 +203,122 @@ def _powers(rows: np.ndarray, seen: np.ndarray) -> np.ndarray:
         usual = max(1.48 * float(np.median(away)), 1e-3)
         weight = np.maximum(seen, 0.01) ** (1 / GAMMA - 1) / np.sqrt(1 + (away / (2 * usual)) ** 2)
     return answer
+
+
+class _Shadow(NamedTuple):
+    """What a frame shows of the table around the object.
+
+    Attributes:
+        place: Where the object is.
+        points: Points of the table [m, W], shape (n, 3).
+        shade: Their linear brightness over that without the object (n,).
+        sky: Share of the sky's light that the object keeps from them (n,).
+        noise: Standard deviation of `shade`.
+    """
+
+    place: Placement
+    points: np.ndarray
+    shade: np.ndarray
+    sky: np.ndarray
+    noise: float
+
+
+class ShadowFit:
+    """Where the sun is, from the shadow of a known object on a level table (host)."""
+
+    def __init__(self, subject: Subject, table: float):
+        self._subject, self._table = subject, table
+        self._frames: list[_Shadow] = []
+        self._above = _spread(0.0)
+        self._random = np.random.default_rng(0)
+
+    def add(self, place: Placement, camera: AbstractCamera, image: np.ndarray, bare, free) -> None:
+        """See `LightFit.add_shadow`."""
+        height = camera.position[2] - self._table
+        if height <= 0:
+            return
+        y, x = np.nonzero(free & (bare > _DARK))
+        directions = camera.directions(np.stack([x, y], axis=1) + 0.5)
+        down = directions[:, 2] < 0
+        y, x, directions = y[down], x[down], directions[down]
+        points = camera.position - height / directions[:, 2:] * directions
+        near = np.linalg.norm((points - self._subject.middle(place))[:, :2], axis=1)
+        rows = np.flatnonzero(near < _SHADOW_REACH * self._subject.radius)
+        if len(rows) < CHUNK:
+            return
+        rows = np.sort(self._random.choice(rows, CHUNK, replace=False))
+        points, y, x = points[rows], y[rows], x[rows]
+        shade = np.sum(image[y, x] ** GAMMA, axis=1) / bare[y, x]
+        sky = sum(up[2] * self._hidden(place, points, up) for up in self._above) / self._above[:, 2].sum()
+        noise = 1.48 * float(np.median(np.abs(shade - np.median(shade))))
+        one = _Shadow(place, points, shade, np.asarray(sky), max(noise, _SHADE_NOISE))
+        self._frames = [*self._frames, one][-_SHADOW_FRAMES:]
+
+    def sun(self) -> Float[np.ndarray, "3"] | None:
+        """Direction towards the sun; None if no shadow says where it is."""
+        if not self._frames:
+            return None
+
+        def unlike(towards: np.ndarray) -> float:
+            if towards[2] < _LOWEST:
+                return np.inf
+            return sum(_unlikely(one, self._hidden(one.place, one.points, towards)) for one in self._frames)
+
+        begin = min(self._above, key=unlike)
+        best = _best_direction(unlike, begin, _SHADOW_TURN, _SHADOW_TRIES)
+        without = sum(_unlikely(one, np.zeros(len(one.shade))) for one in self._frames)
+        return best if without - unlike(best) > _SURE else None
+
+    def _hidden(self, place: Placement, points: np.ndarray, towards: np.ndarray) -> np.ndarray:
+        """How much of the light from a direction the object keeps from points, 0 to 1."""
+        away = self._subject.middle(place) - points
+        ahead = away @ towards
+        aside = np.sum(away**2, axis=1) - ahead**2
+        near = (aside < (1.1 * self._subject.radius) ** 2) & (ahead > -self._subject.radius)
+        hidden = np.zeros(len(points))
+        if near.any():
+            rays = np.tile(towards, (int(near.sum()), 1))
+            hidden[near] = self._subject.see(place, unlit(), points[near], rays, _SUN_WIDTH).opacity
+        return hidden
+
+
+def _unlikely(one: _Shadow, hidden: np.ndarray) -> float:
+    """−log likelihood of the shades of a frame where so much of the sun is hidden (Cauchy's distribution).
+
+    Shades are exposure, less a share of what is hidden of the sun, less one of what is hidden of the sky.
+    """
+    sunny = hidden.any()
+    columns = [np.ones(len(hidden)), -one.sky, *([-hidden] if sunny else [])]
+    a, weight, away = np.stack(columns, axis=1), np.ones(len(hidden)), one.shade
+    for _ in range(4):
+        found = np.linalg.lstsq(weight[:, None] * a, weight * one.shade, rcond=None)[0]
+        away = (a @ found - one.shade) / one.noise
+        weight = 1 / np.sqrt(1 + away**2)
+    if sunny and found[2] < 0:
+        # Nothing shines out of a shadow.
+        return _unlikely(one, np.zeros(len(hidden)))
+    return float(np.sum(np.log1p(away**2)))
+
+
+def _spread(lowest: float) -> Float[np.ndarray, "_ 3"]:
+    """Unit vectors spread evenly over the part of the sphere above a height."""
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(_DIRECTIONS)
+    z = 1 - (1 - lowest) * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
+    flat = np.sqrt(1 - z**2)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+
+
+def _best_direction(unlike, begin: np.ndarray, turn: float, tries: int) -> Float[np.ndarray, "3"]:
+    """The direction where a function is least, near another one; `turn` is the first step [rad]."""
+    side = np.cross(begin, np.eye(3)[np.argmin(np.abs(begin))])
+    side /= np.linalg.norm(side)
+    across = np.stack([side, np.cross(begin, side)])
+
+    def turned(angles: np.ndarray) -> np.ndarray:
+        place = begin + angles @ across
+        return place / np.linalg.norm(place)
+
+    corners = turn * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    options = {"maxfev": tries, "initial_simplex": corners}
+    best = minimize(lambda angles: unlike(turned(angles)), np.zeros(2), method="Nelder-Mead", options=options)
+    return turned(best.x)

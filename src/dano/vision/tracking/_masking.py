@@ -1,5 +1,6 @@
 """The masks of a film, from wherever its options say."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -7,12 +8,14 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from dano.vision.capture import background_mask, Light, PosedCamera, View
+from dano.vision.drawing import GAMMA
 from dano.vision.tracking._edges import common_offset, edge_offset, moved_edge
 from dano.vision.tracking._film import Film
+from dano.vision.tracking._light import LightFit
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._refine import silhouette, Target, window_of
-from dano.vision.tracking._segments import like_object, Palette, Place, unlike_place
+from dano.vision.tracking._segments import bare_brightness, like_object, Palette, Place, unlike_place
 from dano.vision.tracking._subject import Subject
 
 _EDGE_FRAMES = 8
@@ -21,6 +24,8 @@ _EDGE_FRAMES = 8
 BLIND = 0.5
 """Share of the silhouette that must not be hidden."""
 
+_SHADOW_GAP = 3
+"""Pixels around the object that say nothing of its shadow."""
 
 _JOINED = 2
 """Distance [pixels] up to which parts of a mask are one thing, which a shadow or a string cuts in two."""
@@ -102,6 +107,20 @@ class Masking:
         if occluder is None:
             return np.ones(self._film.images[i].shape[:2], bool)
         return occluder < 0.05
+
+    @functools.cached_property
+    def _bare(self) -> Float[np.ndarray, "height width"] | None:
+        """Linear brightness of the place without object and shadow, NaN where unknown; or None."""
+        if self._place is not None:
+            return np.sum(self._place.colours.astype(np.float64) ** GAMMA, axis=2)
+        return None if self.source != "given" else bare_brightness(self._film.images, self._film.masks)
+
+    def learn_shadow(self, i: int, target: Target, place: Placement, light: LightFit) -> None:
+        """Take the shadow of an object in a frame into account for the light."""
+        if self._bare is None:
+            return
+        mask = ndimage.binary_dilation(target.mask > 0.02, iterations=_SHADOW_GAP)
+        light.add_shadow(place, target.camera, target.image, self._bare, ~mask & self._seen(i))
 
     def hidden(self, i: int, window: tuple[slice, slice]) -> float:
         """Share of a window that something else hides."""

@@ -31,6 +31,8 @@ class TrackOptions:
             time of a frame is the middle of its exposure.
         readout: How much later the last row of a frame is exposed than the first (rolling shutter) [s]; the
             time of a frame is that of its middle row.
+        table: Height z of a level table [m, W] under the object, whose shadow on it says where the sun is;
+            None: no table is known, and colours say it, less well.
         seed: Of all random numbers.
     """
 
@@ -44,6 +46,7 @@ class TrackOptions:
     search_every: int = 3
     shutter: float = 0.0
     readout: float = 0.0
+    table: float | None = None
     seed: int = 0
 
     def __post_init__(self):
@@ -55,5 +58,7 @@ class TrackOptions:
         for name in ("shutter", "readout"):
             if not 0 <= checked_number(name, getattr(self, name)) < 1:
                 raise ValueError(f"{name} must be ≥ 0 and < 1 s, got {getattr(self, name)}")
+        if self.table is not None:
+            checked_number("table", self.table)
         if not 0 < self.lost < 1:
             raise ValueError(f"lost must lie between 0 and 1, got {self.lost}")

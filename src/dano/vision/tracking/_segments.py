@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from dano.fields import largest_part
+from dano.vision.drawing import GAMMA
 
 _BINS = 16
 """Bins of each colour channel of what the object looks like."""
@@ -17,6 +18,9 @@ _SHADOW_PRIOR = 0.4
 
 _OFTEN = 40
 """Frames that the median of the place is taken of."""
+
+_BRIGHTER = 0.25
+"""Share of the frames that are brighter than what is taken for the place without a shadow."""
 
 _STILL = 0.05
 """Usual change of a pixel over a film, in sRGB, up to which the camera stands still."""
@@ -89,6 +93,27 @@ class Place:
         # Far from everything that is free the place is as bright as in the picture of it.
         shade = (sums[0] + _SHADE_PRIOR) / (sums[1] + _SHADE_PRIOR)
         return np.clip(shade, *_SHADE_RANGE)[..., None] * self.colours
+
+
+def bare_brightness(
+    images: list[np.ndarray], masks: list[np.ndarray | None]
+) -> Float[np.ndarray, "height width"]:
+    """Linear brightness of what the object hides now and then and its shadow passes; NaN where always hidden.
+
+    Shadows darken: of the frames in which a pixel is free, one of the brighter ones tells.
+    """
+    rows = np.linspace(0, len(images) - 1, min(len(images), _OFTEN)).astype(int)
+    light = np.stack([np.sum((images[i] / np.float32(255)) ** np.float32(GAMMA), axis=2) for i in rows])
+    for one, i in zip(light, rows, strict=True):
+        mask = masks[i]
+        if mask is None:
+            one[:] = -1
+        else:
+            one[ndimage.binary_dilation(mask > 0.02)] = -1
+    count = np.sum(light >= 0, axis=0)
+    light = np.sort(light, axis=0)
+    at = len(light) - 1 - np.floor(_BRIGHTER * np.maximum(count - 1, 0)).astype(int)
+    return np.where(count > 0, np.take_along_axis(light, at[None], axis=0)[0], np.nan).astype(np.float64)
 
 
 class Palette:

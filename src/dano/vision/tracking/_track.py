@@ -108,7 +108,7 @@ class _Walk:
         self._subject = Subject(field)
         self._camera = film.camera(camera)
         self._masking = Masking(film, options, background)
-        self._light = LightFit(self._subject)
+        self._light = LightFit(self._subject, table=options.table)
         self._random = np.random.default_rng(options.seed)
         self._found: list[Refined | None] = []
         self._status: list[str] = []
@@ -267,7 +267,7 @@ class _Walk:
         found = self._fine(i, place, light)
         if found is None:
             return None
-        own = LightFit(self._subject)
+        own = LightFit(self._subject, table=self._options.table)
         target = self._masking.near(i, self._subject, found.place, light.lamps, self._camera, 2.0)
         if target is not None and self._options.loss == "photometric":
             learn_light(self._subject, target, found.place, found.window, found.silhouette, own)
@@ -360,6 +360,7 @@ class _Walk:
         if target is not None:
             learn_light(self._subject, target, found.place, found.window, found.silhouette, self._light)
             self._masking.learn(target, found.window, found.silhouette)
+            self._masking.learn_shadow(i, target, found.place, self._light)
 
     def result(self) -> Tracked:
         """What was found.
