@@ -198,16 +198,16 @@ def test_new_plans_on_the_way_make_up_for_another_mass(pushing, pushed):
 
 
 def test_new_plans_may_take_the_steps_of_the_plant(pushing, pushed):
-    """A hand at h/4 hits the cube at another speed than at h; new plans that know it end at the goal."""
+    """One new plan, midway in the push: it is enough only if it knows what the rest does at h/4."""
     scene, state, task = pushing
     plant = dataclasses.replace(scene, timestep=scene.timestep / 4)
-    errors = {}
+    missed = {}
     for name, believed in (("h", scene), ("h/4", plant)):
-        run = dano.follow(plant, state, task, pushed, scene=believed, substeps=4, every=14, feedback=False)
+        run = dano.follow(plant, state, task, pushed, scene=believed, substeps=4, every=20, feedback=False)
         assert run.states.position.shape[0] == 4 * task.n_steps + 1 and run.converged
-        errors[name] = run.goals[0]
-    assert errors["h/4"].reached, errors
-    assert errors["h/4"].error < 0.5 * errors["h"].error, errors
+        assert [replan.reached for replan in run.replans] == [True]
+        missed[name] = run.goals[0].error
+    assert missed["h/4"] < 1e-3 and missed["h/4"] < 0.2 * missed["h"], missed
 
 
 def test_a_step_of_the_task_may_hold_several_of_the_scene(puck):
