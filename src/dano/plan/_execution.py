@@ -99,16 +99,11 @@ def follow(
         ValueError: If timesteps do not fit, or `scene` is missing.
     """
     began, engine = time.perf_counter(), checked_engine(engine)
-    checked_kind("plant", plant, Scene)
-    checked_count("substeps", substeps)
-    if every is not None:
-        checked_count("every", every)
-    n_steps = checked_kind("task", task, Task).n_steps
-    checked_kind("plan", plan, Plan)
     checked_optional("options", options, TrajectoryOptions)
     _check(plant, state, task, plan, scene, substeps, every)
     finer = 1 if scene is None else _substeps("scene", scene, plan)
-    scales, length = Scales.of(task), every or n_steps
+    scales, n_steps = Scales.of(task), task.n_steps
+    length = every or n_steps
     nominal = jax.tree.map(lambda x: x[:-1], plan.trajectory.states)
     now, values, gains = plant.filled(state), plan.values, plan.gains
     pieces: list[State] = []
@@ -117,7 +112,7 @@ def follow(
     solved = True
     solution = plan.solution
     for step in range(0, n_steps, length):
-        if every is not None and step and scene is not None:
+        if step and scene is not None:
             started = time.perf_counter()
             problem = problem_of(scene, task, engine, n_steps - step, finer)
             solution = _again(problem, now, scales.scaled(values), solution, length, options)
@@ -127,16 +122,13 @@ def follow(
             gains = solution.gains * scales.width[None, :, None]
             nominal = jax.tree.map(lambda x: x[:-1], solution.states)
         n = min(length, n_steps - step)
-        at = slice(step, step + n) if every is None or not step else slice(0, n)
-        rows = jax.tree.map(lambda x, at=at: x[at], (nominal, values, gains))
-        run = _run(plant, task, engine, now, rows, jnp.asarray(1.0 if feedback else 0.0), substeps)
-        states, applied, good = run
+        rows = jax.tree.map(lambda x, n=n: x[:n], (nominal, values, gains))
+        states, applied, good = _run(plant, task, engine, now, rows, jnp.asarray(float(feedback)), substeps)
         now = jax.tree.map(lambda x: x[-1], states)
         pieces.append(states)
         used.append(np.asarray(applied))
         solved = solved and bool(good)
-        if every is not None and step + n < n_steps:
-            values = _moved(values, n)
+        values = _moved(values, n)
     first = jax.tree.map(lambda x: x[None], plant.filled(state))
     whole = jax.tree.map(lambda *parts: jnp.concatenate(parts), first, *pieces)
     return Execution(
@@ -206,8 +198,13 @@ def _run(plant: Scene, task: Task, engine, start: State, rows, feedback, substep
 def _check(
     plant: Scene, state: State, task: Task, plan: Plan, scene: Scene | None, substeps: int, every
 ) -> None:
-    plant.check_state(state)
-    task.check(plant)
+    checked_kind("plant", plant, Scene).check_state(state)
+    checked_kind("task", task, Task).check(plant)
+    checked_kind("plan", plan, Plan)
+    checked_optional("scene", scene, Scene)
+    checked_count("substeps", substeps)
+    if every is not None:
+        checked_count("every", every)
     if every is not None and scene is None:
         raise ValueError("scene must be given with every: new plans are made in it")
     if len(plan.values) != task.n_steps:
