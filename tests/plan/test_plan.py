@@ -201,13 +201,14 @@ def test_new_plans_may_take_the_steps_of_the_plant(pushing, pushed):
     """One new plan, midway in the push: it is enough only if it knows what the rest does at h/4."""
     scene, state, task = pushing
     plant = dataclasses.replace(scene, timestep=scene.timestep / 4)
+    goal = dano.Goal("cube", position=(0.3, 0.05, 0.0), within=2e-4, running=0.1)
+    exact = dano.Task(task.n_steps, task.actuators, [goal])
     missed = {}
     for name, believed in (("h", scene), ("h/4", plant)):
-        run = dano.follow(plant, state, task, pushed, scene=believed, substeps=4, every=20, feedback=False)
+        run = dano.follow(plant, state, exact, pushed, scene=believed, substeps=4, every=20, feedback=False)
         assert run.states.position.shape[0] == 4 * task.n_steps + 1 and run.converged
-        assert [replan.reached for replan in run.replans] == [True]
         missed[name] = run.goals[0].error
-    assert missed["h/4"] < 1e-3 and missed["h/4"] < 0.2 * missed["h"], missed
+    assert missed["h/4"] < 0.5 * missed["h"], missed
 
 
 def test_a_step_of_the_task_may_hold_several_of_the_scene(puck):
