@@ -108,8 +108,9 @@ class Outcome:
         finer: The bunny's error when the plan is executed at h/4, without feedback.
         rougher: At h/4 with 10 % more friction, without feedback.
         held: As `rougher`, with the plan's feedback.
-        mpc: As `rougher`, with new plans on the way.
+        mpc: As `rougher`, with new plans on the way. They know the plant's step, not its friction.
         mpc_seconds: Time of one of these, the median.
+        mpc_longest: The longest.
         sampled: The bunny's and the ball's larger error from CEM in the same time; None if not tried.
     """
 
@@ -125,6 +126,7 @@ class Outcome:
     held: float
     mpc: float
     mpc_seconds: float
+    mpc_longest: float
     sampled: float | None
 
 
@@ -134,7 +136,7 @@ EVERY = 6  # steps between new plans
 def outcome(
     seed: int, planned: dano.Scene, plants: tuple[dano.Scene, dano.Scene], *, baseline: bool
 ) -> Outcome:
-    """Plan one case, and execute the plan in two other scenes."""
+    """Plan one case, and execute the plan in two other scenes: finer, and finer with more friction."""
     given = case(planned, seed)
     made = dano.plan(planned, given.state, given.task, controls=given.guess)
     finer, rougher = plants
@@ -145,7 +147,7 @@ def outcome(
             for plant, feedback in ((finer, False), (rougher, False), (rougher, True))
         ]
         mpc = follow(
-            rougher, given.state, given.task, made, substeps=4, scene=planned, feedback=False, every=EVERY
+            rougher, given.state, given.task, made, substeps=4, scene=finer, feedback=False, every=EVERY
         )
     replans = sorted(replan.seconds for replan in mpc.replans)
     return Outcome(
@@ -161,6 +163,7 @@ def outcome(
         held=runs[2],
         mpc=mpc.goals[0].error,
         mpc_seconds=replans[len(replans) // 2],
+        mpc_longest=replans[-1],
         sampled=_sampled(planned, given, made.seconds) if baseline else None,
     )
 

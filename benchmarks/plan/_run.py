@@ -98,12 +98,13 @@ def _push_rows(found: list[_push.Outcome]) -> list[Row]:
         ("finer", "executed at h/4: bunny's error, median"),
         ("rougher", "h/4, friction + 10 %: bunny's error, median"),
         ("held", "the same with feedback: bunny's error, median"),
-        ("mpc", "the same with new plans: bunny's error, median"),
+        ("mpc", "the same with new plans at h/4: bunny's error, median"),
     ):
         rows.append(Row(PUSH, label, 1e2 * float(np.median(column(name))), "cm"))
     within = float((mpc <= 0.02).sum())
     rows.append(Row(PUSH, "with new plans within 2 cm", within, f"of {n}", 0.9 * n, True))
     rows.append(Row(PUSH, "time of a new plan, median", float(np.median(column("mpc_seconds"))), "s"))
+    rows.append(Row(PUSH, "time of a new plan, longest", float(column("mpc_longest").max()), "s"))
     if found and found[0].sampled is not None:
         errors = column("sampled")
         near = float((errors <= _push.NEAR).sum())

@@ -1,5 +1,7 @@
 """Plans: closed forms of free motion, a joint, pushing through contact, files, messages."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -188,8 +190,45 @@ def test_new_plans_on_the_way_make_up_for_another_mass(pushing, pushed):
     np.testing.assert_allclose(same.states.position[-1], pushed.trajectory.states.position[-1], atol=1e-6)
     with pytest.raises(ValueError, match="scene must be given with every"):
         dano.follow(plant, state, task, pushed, every=5)
-    with pytest.raises(ValueError, match="timestep of plant times substeps"):
+    with pytest.raises(ValueError, match="substeps must be 1, the plan's timestep divided by that of plant"):
         dano.follow(plant, state, task, pushed, substeps=2)
+    odd = dataclasses.replace(scene, timestep=jnp.asarray(0.015))
+    with pytest.raises(ValueError, match="timestep of scene must be the plan's 0.02 s or that divided by"):
+        dano.follow(plant, state, task, pushed, scene=odd, every=5)
+
+
+def test_new_plans_may_take_the_steps_of_the_plant(pushing, pushed):
+    """One new plan, midway in the push: it is enough only if it knows what the rest does at h/4."""
+    scene, state, task = pushing
+    plant = dataclasses.replace(scene, timestep=scene.timestep / 4)
+    goal = dano.Goal("cube", position=(0.3, 0.05, 0.0), within=2e-4, running=0.1)
+    exact = dano.Task(task.n_steps, task.actuators, [goal])
+    missed = {}
+    for name, believed in (("h", scene), ("h/4", plant)):
+        run = dano.follow(plant, state, exact, pushed, scene=believed, substeps=4, every=20, feedback=False)
+        assert run.states.position.shape[0] == 4 * task.n_steps + 1 and run.converged
+        missed[name] = run.goals[0].error
+    assert missed["h/4"] < 0.5 * missed["h"], missed
+
+
+def test_a_step_of_the_task_may_hold_several_of_the_scene(puck):
+    task = drive(position=(1.0, 0.0, 0.0))
+    fine = dataclasses.replace(puck, timestep=puck.timestep / 4)
+    coarse, finer = (
+        problem_of(s, task, dano.VariationalEngine(), substeps=n) for s, n in ((puck, 1), (fine, 4))
+    )
+    state, w, t = (
+        puck.initial_state(puck=dict(velocity=(1, 0, 0))),
+        jnp.linspace(-0.5, 0.5, 6),
+        jnp.asarray(0),
+    )
+    control = task.control(fine, task.bounds()[1] * w)
+    held = jax.tree.map(lambda x: jnp.repeat(x[None], 4, axis=0), control)
+    run = dano.simulate(fine, state, controls=held)
+    np.testing.assert_allclose(
+        finer.dynamics(state, w, t).position, run.states.position[-1], rtol=0, atol=1e-12
+    )
+    np.testing.assert_allclose(finer.stage_cost(state, w, t), coarse.stage_cost(state, w, t), rtol=1e-12)
 
 
 def test_sampling_finds_contact_that_derivatives_do_not_show(pushing):

@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,7 +16,12 @@ from dano.plan._plan import goal_errors, GoalError, OPTIONS, Plan
 from dano.plan._problem import Difference, problem_of, Scales
 from dano.plan._task import Task
 from dano.scene import Scene, State
-from dano.solvers import optimal_trajectory, TrajectoryOptions
+from dano.solvers import (
+    optimal_trajectory,
+    TrajectoryOptions,
+    TrajectoryProblem,
+    TrajectorySolution,
+)
 
 
 class Replan(NamedTuple):
@@ -73,13 +78,17 @@ def follow(
     feedback. With `every`, the rest of the task is planned again after so many steps. The new plan begins at
     the current state, with the old plan as first guess: model-predictive control.
 
+    Contact depends on the timestep: a push takes other speeds at h than at h/4. New plans may take smaller
+    steps than the plan: give `scene` the timestep of the plant.
+
     Args:
         plant: What really happens: the same bodies, other numbers; its timestep is that of the plan divided
             by `substeps`.
         state: Where it begins.
         task: What shall be done.
         plan: The plan.
-        scene: What new plans believe; needed with `every`.
+        scene: What new plans believe; needed with `every`. Its timestep is that of the plan, or that divided
+            by a whole number; controls are held over a step of the plan all the same.
         substeps: Steps of `plant` in a step of the plan.
         feedback: Whether to use the plan's gains.
         every: Steps between new plans; None: no new plans.
@@ -90,15 +99,11 @@ def follow(
         ValueError: If timesteps do not fit, or `scene` is missing.
     """
     began, engine = time.perf_counter(), checked_engine(engine)
-    checked_kind("plant", plant, Scene)
-    checked_count("substeps", substeps)
-    if every is not None:
-        checked_count("every", every)
-    n_steps = checked_kind("task", task, Task).n_steps
-    checked_kind("plan", plan, Plan)
     checked_optional("options", options, TrajectoryOptions)
     _check(plant, state, task, plan, scene, substeps, every)
-    scales, length = Scales.of(task), every or n_steps
+    finer = 1 if scene is None else _substeps("scene", scene, plan)
+    scales, n_steps = Scales.of(task), task.n_steps
+    length = every or n_steps
     nominal = jax.tree.map(lambda x: x[:-1], plan.trajectory.states)
     now, values, gains = plant.filled(state), plan.values, plan.gains
     pieces: list[State] = []
@@ -107,26 +112,23 @@ def follow(
     solved = True
     solution = plan.solution
     for step in range(0, n_steps, length):
-        if every is not None and step and scene is not None:
+        if step and scene is not None:
             started = time.perf_counter()
-            solution = _again(scene, now, task, engine, values, solution, step, options)
+            problem = problem_of(scene, task, engine, n_steps - step, finer)
+            solution = _again(problem, now, scales.scaled(values), solution, length, options)
             seconds = time.perf_counter() - started
             replans.append(Replan(step, solution.reached, seconds))
             values = scales.physical(solution.controls)
             gains = solution.gains * scales.width[None, :, None]
             nominal = jax.tree.map(lambda x: x[:-1], solution.states)
         n = min(length, n_steps - step)
-        at = slice(step, step + n) if every is None or not step else slice(0, n)
-        rows = jax.tree.map(lambda x, at=at: x[at], (nominal, values, gains))
-        run = _run(plant, task, engine, now, rows, jnp.asarray(1.0 if feedback else 0.0), substeps)
-        states, applied, good = run
+        rows = jax.tree.map(lambda x, n=n: x[:n], (nominal, values, gains))
+        states, applied, good = _run(plant, task, engine, now, rows, jnp.asarray(float(feedback)), substeps)
         now = jax.tree.map(lambda x: x[-1], states)
         pieces.append(states)
         used.append(np.asarray(applied))
         solved = solved and bool(good)
-        if every is not None and step + n < n_steps:
-            # What is left of the plan moves to the front; nothing follows.
-            values = jnp.concatenate([values[n:], jnp.zeros_like(values[:n])]) if step or n else values
+        values = _moved(values, n)
     first = jax.tree.map(lambda x: x[None], plant.filled(state))
     whole = jax.tree.map(lambda *parts: jnp.concatenate(parts), first, *pieces)
     return Execution(
@@ -139,23 +141,35 @@ def follow(
     )
 
 
-def _again(scene, now, task, engine, values, solution, step, options) -> Any:
-    """A plan for the steps that are left, at the front of the arrays."""
-    problem = problem_of(scene, task, engine, task.n_steps - step)
+def _again(
+    problem: TrajectoryProblem,
+    now: State,
+    guess: Float[Array, "T m"],
+    last: TrajectorySolution | None,
+    passed: int,
+    options: TrajectoryOptions | None,
+) -> TrajectorySolution:
+    """A plan for the steps that are left, at the front of the arrays; `last` began `passed` steps before."""
     if options is None:
         options = OPTIONS._replace(max_updates=4, max_iterations=10)
     multipliers = None
-    if solution is not None:
-        options = options._replace(penalty=min(solution.penalty, options.max_penalty))
-        multipliers = solution.multipliers
+    if last is not None:
+        options = options._replace(penalty=min(last.penalty, options.max_penalty))
+        pairs = zip(problem.constraints, last.multipliers, strict=True)
+        multipliers = [value if c.final else _moved(value, passed) for c, value in pairs]
     return optimal_trajectory(
         problem,
         now,
-        Scales.of(task).scaled(values),
+        guess,
         multipliers=multipliers,
         options=options,
         compiler_options=compiler_options(),
     )
+
+
+def _moved(rows: Float[Array, "T p"], n: int) -> Float[Array, "T p"]:
+    """What is left after n steps moves to the front; zeros follow."""
+    return jnp.concatenate([rows[n:], jnp.zeros_like(rows[:n])])
 
 
 @eqx.filter_jit
@@ -184,15 +198,35 @@ def _run(plant: Scene, task: Task, engine, start: State, rows, feedback, substep
 def _check(
     plant: Scene, state: State, task: Task, plan: Plan, scene: Scene | None, substeps: int, every
 ) -> None:
-    plant.check_state(state)
-    task.check(plant)
+    checked_kind("plant", plant, Scene).check_state(state)
+    checked_kind("task", task, Task).check(plant)
+    checked_kind("plan", plan, Plan)
+    checked_optional("scene", scene, Scene)
+    checked_count("substeps", substeps)
+    if every is not None:
+        checked_count("every", every)
     if every is not None and scene is None:
         raise ValueError("scene must be given with every: new plans are made in it")
     if len(plan.values) != task.n_steps:
         raise ValueError(f"plan must have the task's {task.n_steps} steps, got {len(plan.values)}")
-    planned = float(plan.trajectory.times[1] - plan.trajectory.times[0])
-    given = float(plant.timestep) * substeps
-    if abs(given - planned) > 1e-9 * planned:
+    if _substeps("plant", plant, plan) != substeps:
         raise ValueError(
-            f"timestep of plant times substeps must be the plan's {planned:.6g} s, got {given:.6g} s"
+            f"substeps must be {_substeps('plant', plant, plan)}, the plan's timestep divided by that of "
+            f"plant, got {substeps}"
         )
+
+
+def _substeps(name: str, scene: Scene, plan: Plan) -> int:
+    """Steps of a scene in a step of a plan.
+
+    Raises:
+        ValueError: If it is no whole number.
+    """
+    planned, given = float(plan.trajectory.times[1] - plan.trajectory.times[0]), float(scene.timestep)
+    n = max(1, round(planned / given))
+    if abs(n * given - planned) > 1e-9 * planned:
+        raise ValueError(
+            f"timestep of {name} must be the plan's {planned:.6g} s or that divided by a whole number, "
+            f"got {given:.6g} s"
+        )
+    return n

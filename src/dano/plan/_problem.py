@@ -92,7 +92,7 @@ class Scales(eqx.Module):
 
 
 class Dynamics(eqx.Module):
-    """A step of the scene; after `remaining` steps nothing happens any more.
+    """A step of the task: `substeps` steps of the scene; after `remaining` of them nothing happens any more.
 
     So a plan with fewer steps left is the same program, and model-predictive control compiles once.
     """
@@ -103,6 +103,7 @@ class Dynamics(eqx.Module):
     engine: AbstractEngine
     prepared: Any
     remaining: Int[Array, ""]
+    substeps: int = eqx.field(static=True)
 
     def __call__(self, state: State, w: Float[Array, " m"], t: Int[Array, ""]) -> State:
         """See `TrajectoryProblem.dynamics`."""
@@ -112,7 +113,12 @@ class Dynamics(eqx.Module):
             state = self.scene.filled(state) if self.scene.joints else state
             return self.engine.step(self.scene, self.prepared, state, control)[0]
 
-        return jax.lax.cond(t < self.remaining, step, lambda state: state, state)
+        def steps(state):
+            if self.substeps == 1:  # a loop of one step would take longer to compile
+                return step(state)
+            return jax.lax.scan(lambda state, _: (step(state), None), state, None, self.substeps)[0]
+
+        return jax.lax.cond(t < self.remaining, steps, lambda state: state, state)
 
 
 class StageCost(eqx.Module):
@@ -122,6 +128,7 @@ class StageCost(eqx.Module):
     task: Task
     scales: Scales
     remaining: Int[Array, ""]
+    substeps: int = eqx.field(static=True)
 
     def __call__(self, state: State, w: Float[Array, " m"], t: Int[Array, ""]) -> Float[Array, ""]:
         """See `TrajectoryProblem.stage_cost`."""
@@ -131,7 +138,7 @@ class StageCost(eqx.Module):
         for goal in self.task.goals:
             error = goal.error(self.scene, state)
             away = away + 0.5 * goal.running * jnp.sum(error * error)
-        return self.scene.timestep * (total + jnp.where(t < self.remaining, away, 0))
+        return self.substeps * self.scene.timestep * (total + jnp.where(t < self.remaining, away, 0))
 
 
 class FinalCost(eqx.Module):
@@ -172,9 +179,17 @@ class Kept(eqx.Module):
 
 
 def problem_of(
-    scene: Scene, task: Task, engine: AbstractEngine, remaining: int | None = None
+    scene: Scene, task: Task, engine: AbstractEngine, remaining: int | None = None, substeps: int = 1
 ) -> TrajectoryProblem:
-    """The problem of a scene and a task; the steps after `remaining` are left out."""
+    """The problem of a scene and a task.
+
+    Args:
+        scene: The scene.
+        task: The task.
+        engine: What advances the scene.
+        remaining: Steps of the task after which nothing happens any more; None: all count.
+        substeps: Steps of the scene in a step of the task, during which controls are held.
+    """
     left = jnp.asarray(task.n_steps if remaining is None else remaining)
     scales = Scales.of(task)
     prepared = eqx.filter_jit(engine.prepare)(scene)
@@ -186,8 +201,8 @@ def problem_of(
     ]
     constraints += [TrajectoryConstraint(limit.name, Kept(scene, limit)) for limit in task.limits]
     return TrajectoryProblem(
-        Dynamics(scene, task, scales, engine, prepared, left),
-        StageCost(scene, task, scales, left),
+        Dynamics(scene, task, scales, engine, prepared, left, substeps),
+        StageCost(scene, task, scales, left, substeps),
         FinalCost(scene, task),
         tuple(constraints),
         scales.scaled(lower),
