@@ -39,8 +39,8 @@ from dano.scene import (
     triples,
 )
 
-# Angle by which joints may turn a body in a step [rad]: from 180° on a turn reads as one the other way.
-_LARGEST_TURN = 2.8
+LARGEST_TURN = 2.8
+"""Angle by which joints may turn a body in a step [rad]: from 180° on a turn reads as one the other way."""
 
 
 class Tree(eqx.Module):
@@ -219,7 +219,7 @@ def turns_too_far(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]) -> Arr
         at = np.array([d for d, (j, i, _) in enumerate(layout.dofs) if j in balls and i == 0], int)
         turns = turns.at[at].set(safe_norm(moved[triples(first)]))
     moved_by = np.array(layout.moved_by, float).reshape(layout.bodies, -1)
-    return jnp.any(jnp.asarray(moved_by, y.dtype) @ turns > _LARGEST_TURN)
+    return jnp.any(jnp.asarray(moved_by, y.dtype) @ turns > LARGEST_TURN)
 
 
 def _moved(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]) -> Float[Array, " j"]:

@@ -107,6 +107,16 @@ def doubles(buffer, dtype):
 
 
 @kernel
+def numbers(buffer, dtype):
+    """A copy of `vector` of 64-bit numbers."""
+    source = vector(buffer, dtype)
+    result = np.empty(source.size)
+    for i in range(source.size):
+        result[i] = source[i]
+    return result
+
+
+@kernel
 def cube(buffer, dtype):
     """Numbers of a buffer with three axes."""
     shape = shape_of(buffer)

@@ -1,0 +1,317 @@
+"""The equations of a step of trees, and their derivative, summed from the tips of trees to their roots.
+
+What every body's momentum misses is a force and a moment at the origin of its tree. What a velocity of a
+joint makes of it is its motion at the start of the step times the sum over all bodies beyond that joint. The
+derivative by a velocity is that sum's: each body's part of it is a 6 × 6 matrix, linear in the motion at the
+end of the step, and sixteen numbers say the sum of such matrices.
+"""
+
+from collections import namedtuple
+
+import numpy as np
+
+from dano.native._assembling import FADE, RESOLVED, shares
+from dano.native._compiling import kernel
+from dano.native._tree_frames import (
+    add,
+    BODY,
+    cross,
+    dot,
+    four,
+    INERTIA,
+    KIND,
+    MASS,
+    minus,
+    ORIGIN,
+    PARENT,
+    PLACE,
+    put,
+    ROOT,
+    rotate,
+    rotate_back,
+    SHIFT,
+    slopes_of_turn,
+    spin_of,
+    three,
+    times,
+    TURN,
+    WIDTH,
+)
+
+# Columns of what is summed: mass, mass times levers at start and end, and the part of moments by turns.
+_LEVER, _LEVER_AFTER, _BLOCK, _SUMMED = 1, 4, 7, 16
+# Columns of the table of a step's bodies: inertia [W], momentum before joints push (linear, angular; W), spin.
+TURNED_INERTIA, IMPULSE, _STEP_COLUMNS = 0, 9, 15
+
+Room = namedtuple("Room", "poses known ways first last given twists wrenches summed residual matrix")
+"""Arrays of a step: poses (bodies and world, 7), what is known of joints (nodes, 12), ways (nodes, 7), motions
+at start and end (nodes, 6, 6), the table above (nodes, 15), twists [W], sums of momenta, sums of derivatives;
+residual (k,), and its derivative (k, k)."""
+
+
+@kernel
+def room_for(n_bodies, n_nodes, k):
+    """Arrays for a step; the world counts as a body."""
+    return Room(
+        np.empty((n_bodies, 7)),
+        np.empty((n_nodes, 12)),
+        np.empty((n_nodes, 7)),
+        np.empty((n_nodes, 6, 6)),
+        np.empty((n_nodes, 6, 6)),
+        np.empty((n_nodes, _STEP_COLUMNS)),
+        np.empty((n_nodes, 6)),
+        np.empty((n_nodes, 6)),
+        np.empty((n_nodes, _SUMMED)),
+        np.empty(k),
+        np.empty((k, k)),
+    )
+
+
+@kernel
+def _inertial(given, n, v):
+    """Inertia of a node's body times a vector."""
+    return (
+        dot(three(given, n, TURNED_INERTIA), v),
+        dot(three(given, n, TURNED_INERTIA + 3), v),
+        dot(three(given, n, TURNED_INERTIA + 6), v),
+    )
+
+
+@kernel
+def turn_inertia(bodies, i, turn, given, n):
+    """R J Rᵀ of a body."""
+    rows = (three(bodies, i, INERTIA), three(bodies, i, INERTIA + 3), three(bodies, i, INERTIA + 6))
+    for k in range(3):
+        axis = (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0)
+        own = rotate_back(turn, axis)
+        spun = (dot(rows[0], own), dot(rows[1], own), dot(rows[2], own))
+        x, y, z = rotate(turn, spun)
+        given[n, TURNED_INERTIA + k], given[n, TURNED_INERTIA + 3 + k], given[n, TURNED_INERTIA + 6 + k] = (
+            x,
+            y,
+            z,
+        )
+
+
+@kernel
+def momentum_before(given, n, spin, h, rules):
+    """Angular momentum [W] with which a body comes from a step with a spin [W]."""
+    squared = 0.25 * h * h * dot(spin, spin)
+    share, _, torque, _ = shares(squared, rules[RESOLVED], rules[FADE])
+    whole = _inertial(given, n, spin)
+    return add(times(share, whole), times(-0.5 * h * torque, cross(spin, whole)))
+
+
+@kernel
+def _put_summed(summed, n, mass, lever, after, rows):
+    """A body's part of the derivative; `rows` say how its moment depends on turns."""
+    summed[n, 0] = mass
+    put(summed, n, _LEVER, times(mass, lever))
+    put(summed, n, _LEVER_AFTER, times(mass, after))
+    across = mass * dot(lever, after)
+    for k in range(3):
+        put(summed, n, _BLOCK + 3 * k, minus(rows[k], times(mass * after[k], lever)))
+        summed[n, _BLOCK + 4 * k] += across
+
+
+@kernel
+def _put_wrench(wrenches, n, force, moment, lever):
+    put(wrenches, n, 0, add(moment, cross(lever, force)))
+    put(wrenches, n, 3, force)
+
+
+@kernel
+def _turned_rows(given, n, spin, h, rules):
+    """Momentum [W] of a spin at its end of a step, and its derivative by turns of that end, over h.
+
+    With D = ∂P/∂ω and the A = α 1 + β ω ωᵀ − ½ [ω]× of `turn_slopes`, that is h D A.
+    """
+    squared = 0.25 * h * h * dot(spin, spin)
+    share, share_slope, torque, torque_slope = shares(squared, rules[RESOLVED], rules[FADE])
+    alpha, beta = slopes_of_turn(spin, h, rules[RESOLVED])
+    a, b, c = (
+        three(given, n, TURNED_INERTIA),
+        three(given, n, TURNED_INERTIA + 3),
+        three(given, n, TURNED_INERTIA + 6),
+    )
+    whole = (dot(a, spin), dot(b, spin), dot(c, spin))
+    crossed, half = cross(spin, whole), 0.5 * h * torque
+    along = add(times(share_slope, whole), times(0.5 * h * torque_slope, crossed))
+    along = times(0.25 * h * h, along)
+    x, y, z = spin
+    p, q, r = whole
+    # rows of ω × J − [J ω]×
+    first = minus(minus(times(y, c), times(z, b)), (0.0, -r, q))
+    second = minus(minus(times(z, a), times(x, c)), (r, 0.0, -p))
+    third = minus(minus(times(x, b), times(y, a)), (-q, p, 0.0))
+    first = add(add(times(share, a), times(half, first)), times(along[0], spin))
+    second = add(add(times(share, b), times(half, second)), times(along[1], spin))
+    third = add(add(times(share, c), times(half, third)), times(along[2], spin))
+    rows = (
+        _times_turn(first, spin, alpha, beta, h),
+        _times_turn(second, spin, alpha, beta, h),
+        _times_turn(third, spin, alpha, beta, h),
+    )
+    return add(times(share, whole), times(half, crossed)), rows
+
+
+@kernel
+def _times_turn(row, spin, alpha, beta, h):
+    """A row times h A."""
+    inner = add(times(alpha, row), times(beta * dot(row, spin), spin))
+    return times(h, minus(inner, times(0.5, cross(row, spin))))
+
+
+@kernel
+def find_twists(nodes, y, h, rules, room):
+    """Velocity and spin [W] of each node's body in a step, from its way."""
+    for n in range(nodes.shape[0]):
+        if nodes[n, KIND] == ROOT:
+            for k in range(6):
+                room.twists[n, k] = y[nodes[n, PLACE] + k]
+        else:
+            put(room.twists, n, 0, times(1.0 / h, three(room.ways, n, SHIFT)))
+            put(room.twists, n, 3, spin_of(four(room.ways, n, TURN), h, rules[RESOLVED]))
+
+
+@kernel
+def missing_momenta(nodes, bodies, h, rules, room):
+    """What each body's momentum misses, and the derivative."""
+    given = room.given
+    for n in range(nodes.shape[0]):
+        i, mass = nodes[n, BODY], bodies[nodes[n, BODY], MASS]
+        lever = minus(three(room.poses, i, 0), three(room.poses, nodes[n, ORIGIN], 0))
+        spin = three(room.twists, n, 3)
+        momentum, rows = _turned_rows(given, n, spin, h, rules)
+        force = minus(times(mass, three(room.twists, n, 0)), three(given, n, IMPULSE))
+        moment = minus(momentum, three(given, n, IMPULSE + 3))
+        _put_wrench(room.wrenches, n, force, moment, lever)
+        _put_summed(room.summed, n, mass, lever, add(lever, three(room.ways, n, SHIFT)), rows)
+
+
+@kernel
+def momenta_before(nodes, bodies, room):
+    """The same of what bodies come with, and of the generalised mass at the start."""
+    given = room.given
+    for n in range(nodes.shape[0]):
+        i = nodes[n, BODY]
+        lever = minus(three(room.poses, i, 0), three(room.poses, nodes[n, ORIGIN], 0))
+        rows = (
+            three(given, n, TURNED_INERTIA),
+            three(given, n, TURNED_INERTIA + 3),
+            three(given, n, TURNED_INERTIA + 6),
+        )
+        _put_wrench(room.wrenches, n, three(given, n, IMPULSE), three(given, n, IMPULSE + 3), lever)
+        _put_summed(room.summed, n, bodies[i, MASS], lever, lever, rows)
+
+
+@kernel
+def _after(summed, n, spin, velocity):
+    """Moment and force of the summed derivative on a motion at the end of the step."""
+    lever, after = three(summed, n, _LEVER), three(summed, n, _LEVER_AFTER)
+    block = (
+        dot(three(summed, n, _BLOCK), spin),
+        dot(three(summed, n, _BLOCK + 3), spin),
+        dot(three(summed, n, _BLOCK + 6), spin),
+    )
+    return add(block, cross(lever, velocity)), add(times(summed[n, 0], velocity), cross(spin, after))
+
+
+@kernel
+def _before(summed, n, spin, velocity):
+    """The same transposed, on a motion at the start."""
+    lever, after = three(summed, n, _LEVER), three(summed, n, _LEVER_AFTER)
+    block = add(
+        add(
+            times(spin[0], three(summed, n, _BLOCK)),
+            times(spin[1], three(summed, n, _BLOCK + 3)),
+        ),
+        times(spin[2], three(summed, n, _BLOCK + 6)),
+    )
+    return add(block, cross(after, velocity)), add(times(summed[n, 0], velocity), cross(spin, lever))
+
+
+@kernel
+def _product(a, b, n, i):
+    """Product of two pairs of vectors, the second a row of motions."""
+    return dot(a[0], three(b[n], i, 0)) + dot(a[1], three(b[n], i, 3))
+
+
+@kernel
+def gather(nodes, first, last, room):
+    """Residual and derivative by generalised velocities.
+
+    Args:
+        nodes: Table of nodes.
+        first: Motions at the start of the step, shape (nodes, 6, 6).
+        last: Motions at its end, over h.
+        room: Momenta and their derivatives in `wrenches` and `summed`, which are used up; the results go to
+            `residual` and `matrix`.
+    """
+    summed, wrenches, residual, matrix = room.summed, room.wrenches, room.residual, room.matrix
+    residual[:] = 0.0
+    matrix[:] = 0.0
+    for n in range(nodes.shape[0] - 1, -1, -1):
+        wrench = (three(wrenches, n, 0), three(wrenches, n, 3))
+        for i in range(nodes[n, WIDTH]):
+            row = nodes[n, PLACE] + i
+            residual[row] += _product(wrench, first, n, i)
+            right = _after(summed, n, three(last[n], i, 0), three(last[n], i, 3))
+            left = _before(summed, n, three(first[n], i, 0), three(first[n], i, 3))
+            for j in range(nodes[n, WIDTH]):
+                matrix[nodes[n, PLACE] + j, row] += _product(right, first, n, j)
+            up = nodes[n, PARENT]
+            while up >= 0:
+                for j in range(nodes[up, WIDTH]):
+                    column = nodes[up, PLACE] + j
+                    matrix[row, column] += _product(left, last, up, j)
+                    matrix[column, row] += _product(right, first, up, j)
+                up = nodes[up, PARENT]
+        up = nodes[n, PARENT]
+        if up >= 0:
+            for k in range(6):
+                wrenches[up, k] += wrenches[n, k]
+            for k in range(_SUMMED):
+                summed[up, k] += summed[n, k]
+
+
+@kernel
+def factor(matrix):
+    """Factors in place: the matrix is U L, with ones on the diagonal of U, which is not stored.
+
+    From the last velocity to the first, as trees are, so that branches stay apart; without exchanges: the
+    matrix is inertia plus dissipation, its pivots stay away from singular.
+    """
+    for p in range(matrix.shape[0] - 1, -1, -1):
+        for i in range(p):
+            if matrix[i, p] != 0.0:
+                share = matrix[i, p] / matrix[p, p]
+                matrix[i, p] = share
+                for j in range(p):
+                    matrix[i, j] -= share * matrix[p, j]
+
+
+@kernel
+def solve_factored(matrix, right):
+    """Solve in place with what `factor` found."""
+    k = matrix.shape[0]
+    for p in range(k - 1, -1, -1):
+        for i in range(p):
+            right[i] -= matrix[i, p] * right[p]
+    for p in range(k):
+        for j in range(p):
+            right[p] -= matrix[p, j] * right[j]
+        right[p] /= matrix[p, p]
+
+
+@kernel
+def inverse_diagonal(matrix, r, column):
+    """Entry (r, r) of the inverse of a symmetric matrix, from `factor`; `column` is used up."""
+    column[:] = 0.0
+    column[r] = 1.0
+    total = 0.0
+    for p in range(r, -1, -1):
+        for i in range(p):
+            column[i] -= matrix[i, p] * column[p]
+        total += column[p] * column[p] / matrix[p, p]
+    return total

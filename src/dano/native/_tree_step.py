@@ -1,0 +1,440 @@
+"""A step of bodies on joints that touch nothing, from state to state.
+
+The equations are those of `dano.engine._trees`, solved by Newton's method with its line search, with the
+unknowns of kinks that `dano.engine.joints` describes taken out of the linear systems. XLA runs such a step as
+some hundred operations on small arrays, each with a cost of its own; here a pass goes once along the trees.
+"""
+
+import math
+from collections import namedtuple
+
+import numba
+import numpy as np
+
+from dano.native._assembling import ENOUGH, GIVE_UP, RESOLVED
+from dano.native._compiling import fingerprint, kernel
+from dano.native._ffi import (
+    doubles,
+    inputs,
+    numbers,
+    outputs,
+    register,
+    SIGNATURE,
+    table,
+    tells_version,
+    vector,
+)
+from dano.native._line_search import accepts, begin_search, LENGTH, narrow
+from dano.native._tree_balance import (
+    factor,
+    find_twists,
+    gather,
+    IMPULSE,
+    inverse_diagonal,
+    missing_momenta,
+    momenta_before,
+    momentum_before,
+    room_for,
+    solve_factored,
+    turn_inertia,
+)
+from dano.native._tree_frames import (
+    add,
+    AXIS,
+    BALL,
+    BODY,
+    dot,
+    exponential,
+    four,
+    JOINT,
+    KIND,
+    largest_turn,
+    logarithm,
+    MASS,
+    motions_at_start,
+    move,
+    multiply,
+    OFFSET,
+    ORIENTATION,
+    place,
+    PLACE,
+    put,
+    put_four,
+    RATIO,
+    ROOT,
+    rotate,
+    rotate_back,
+    SHIFT,
+    three,
+    times,
+    TURN,
+    turn_of,
+    TURNED,
+)
+from dano.native._tree_laws import ARMATURE, force_of, RAMPS, resolve, set_ramps, smooth
+
+# Settings: h, gravity [W].
+_H, _GRAVITY = 0, 1
+# Rules after those that `_assembling` names: tolerance over (1 + size), rounding of the dtype, what that of poses
+# adds to size, speed at which friction sticks, stiffness of limits, largest turn.
+_RELATIVE, _EPSILON, _POSES, _STICKS, _STOPS, _LARGEST = range(12, 18)
+# Columns of the table of coordinates: whether a motor does what it is told to, row among those with kinks or −1.
+_CONSTANT, _ROUGH = range(2)
+
+Given = namedtuple("Given", "nodes coordinates bodies joints laws settings rules roots q v effort command")
+"""What a step does not change: tables; the number of velocities of free bodies; coordinates of joints, their
+velocities before, efforts and commands."""
+Kinks = namedtuple("Kinks", "ramps weight dual change gap slope")
+"""Of the coordinates with kinks: ramps, ρ [kg m²/s or kg/s], the forces λ as unknowns and their change in a
+step of Newton's method, by how much speeds miss what the forces make of them, slopes of the ramps there."""
+
+
+@kernel
+def _unit(rows, i, k):
+    """Make a vector of a row one of length 1; returns what its length was."""
+    v = three(rows, i, k)
+    length = math.sqrt(dot(v, v))
+    if length > 0.0:
+        put(rows, i, k, times(1.0 / length, v))
+    return length
+
+
+@kernel
+def _unit_turn(x):
+    size = 1.0 / math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2] + x[3] * x[3])
+    return size * x[0], size * x[1], size * x[2], size * x[3]
+
+
+@kernel
+def _tidy(nodes, joints):
+    """Directions of joints to the rounding of 64 bits; a longer axis makes more of a coordinate."""
+    for n in range(nodes.shape[0]):
+        j = nodes[n, JOINT]
+        if j >= 0:
+            length = _unit(joints, j, AXIS)
+            joints[j, RATIO] *= length
+            joints[j, OFFSET] *= length
+            put_four(joints, j, ORIENTATION, _unit_turn(four(joints, j, ORIENTATION)))
+
+
+@kernel
+def _begin(given, state, force, torque, room, y):
+    """What is known at the start of a step, and the velocities to start from."""
+    nodes, bodies, settings = given.nodes, given.bodies, given.settings
+    h, gravity = settings[_H], (settings[_GRAVITY], settings[_GRAVITY + 1], settings[_GRAVITY + 2])
+    position, orientation, velocity, omega = state
+    world = position.shape[0]
+    for i in range(world):
+        put(room.poses, i, 0, three(position, i, 0))
+        put_four(room.poses, i, TURNED, _unit_turn(four(orientation, i, 0)))
+    put(room.poses, world, 0, (0.0, 0.0, 0.0))
+    put_four(room.poses, world, TURNED, (1.0, 0.0, 0.0, 0.0))
+    place(nodes, given.joints, bodies, given.q, given.roots, room.poses, room.known)
+    motions_at_start(nodes, given.joints, room.poses, room.known, room.first)
+    for n in range(nodes.shape[0]):
+        i = nodes[n, BODY]
+        turn = four(room.poses, i, TURNED)
+        turn_inertia(bodies, i, turn, room.given, n)
+        spin = rotate(turn, three(omega, i, 0))
+        linear = times(bodies[i, MASS], add(three(velocity, i, 0), times(h, gravity)))
+        angular = momentum_before(room.given, n, spin, h, given.rules)
+        if force.shape[0] > 0:
+            linear = add(linear, times(h, three(force, i, 0)))
+            angular = add(angular, times(h, three(torque, i, 0)))
+        put(room.given, n, IMPULSE, linear)
+        put(room.given, n, IMPULSE + 3, angular)
+        if nodes[n, KIND] == ROOT:
+            at = nodes[n, PLACE]
+            y[at], y[at + 1], y[at + 2] = three(velocity, i, 0)
+            y[at + 3], y[at + 4], y[at + 5] = spin
+    for c in range(given.v.size):
+        y[given.roots + c] = given.v[c]
+
+
+@kernel
+def _weigh(given, room, kinks, scale, y):
+    """Factors that turn momenta into velocities, and what has kinks; returns the size of the velocities."""
+    rules, laws, roots = given.rules, given.laws, given.roots
+    momenta_before(given.nodes, given.bodies, room)
+    gather(given.nodes, room.first, room.first, room)
+    for c in range(given.q.size):
+        room.matrix[roots + c, roots + c] += laws[c, ARMATURE]
+    size = 0.0
+    for k in range(scale.size):
+        scale[k] = 1.0 / room.matrix[k, k]
+        size = max(size, abs(scale[k] * room.residual[k]))
+    if kinks.dual.size > 0:
+        factor(room.matrix)
+    h, column = given.settings[_H], np.empty(scale.size)
+    for c in range(given.q.size):
+        r = given.coordinates[c, _ROUGH]
+        if r >= 0:
+            weight = 1.0 / inverse_diagonal(room.matrix, roots + c, column)
+            kinks.weight[r] = weight / h
+            constant, q, command = given.coordinates[c, _CONSTANT] > 0, given.q[c], given.command[c]
+            sticks, stops = rules[_STICKS], rules[_STOPS]
+            set_ramps(laws, c, constant, q, command, h, weight, sticks, stops, kinks.ramps, r)
+            kinks.dual[r] = force_of(kinks.ramps, r, y[roots + c])
+    reach = 0.0
+    for i in range(room.poses.shape[0]):
+        for k in range(3):
+            reach = max(reach, abs(room.poses[i, k]))
+    return size + rules[_POSES] * rules[_EPSILON] ** 0.25 * (1.0 + reach) / h
+
+
+@kernel
+def _evaluate(given, room, kinks, y, dual):
+    """Residual and its derivative by velocities, without the ramps; and where these are."""
+    h, rules = given.settings[_H], given.rules
+    nodes, joints, resolved = given.nodes, given.joints, rules[RESOLVED]
+    move(nodes, joints, room.poses, room.known, y, h, resolved, room.ways, room.last)
+    find_twists(given.nodes, y, h, rules, room)
+    missing_momenta(given.nodes, given.bodies, h, rules, room)
+    gather(given.nodes, room.first, room.last, room)
+    for c in range(given.q.size):
+        k, constant = given.roots + c, given.coordinates[c, _CONSTANT] > 0
+        momentum, slope = smooth(
+            given.laws, c, constant, given.q[c], given.v[c], given.effort[c], given.command[c], h, y[k]
+        )
+        room.residual[k] += momentum
+        room.matrix[k, k] += slope
+        r = given.coordinates[c, _ROUGH]
+        if r >= 0:
+            weight = kinks.weight[r]
+            speed, kinks.slope[r] = resolve(kinks.ramps, r, weight, dual[r] + weight * y[k])
+            kinks.gap[r] = speed - y[k]
+            room.residual[k] += h * dual[r]
+
+
+@kernel
+def _measure(given, room, kinks, scale, y, dual):
+    """Largest residual, and the size of its terms [m/s]."""
+    error = rounding = 0.0
+    for k in range(y.size):
+        missed = abs(scale[k] * room.residual[k])
+        size = 0.0
+        for j in range(y.size):
+            size += abs(room.matrix[k, j] * y[j])
+        c = k - given.roots
+        r = given.coordinates[c, _ROUGH] if c >= 0 else -1
+        if r >= 0:
+            size += given.settings[_H] * abs(dual[r])
+            share = 1.0 / (kinks.weight[r] + kinks.slope[r])
+            rounding = max(rounding, share * (kinks.slope[r] * abs(y[k]) + abs(dual[r])))
+            missed = max(missed, abs(kinks.gap[r]))
+        error = missed if missed > error or math.isnan(missed) else error
+        rounding = max(rounding, scale[k] * size)
+    return error, rounding
+
+
+@kernel
+def _work(given, room, kinks, change):
+    """Work of the residual along a step of Newton's method."""
+    work = 0.0
+    for k in range(change.size):
+        work += change[k] * room.residual[k]
+    for r in range(kinks.change.size):
+        work += given.settings[_H] * kinks.change[r] * kinks.gap[r]
+    return work
+
+
+@kernel
+def _find_change(given, room, kinks, change):
+    """A step of Newton's method. The equation of a force λ gives its change from that of its speed.
+
+    dλ = slope dy − (ρ + slope) gap, which leaves a system for the velocities alone.
+    """
+    h, roots = given.settings[_H], given.roots
+    for k in range(change.size):
+        change[k] = -room.residual[k]
+    for c in range(given.q.size):
+        r, k = given.coordinates[c, _ROUGH], roots + c
+        if r >= 0:
+            room.matrix[k, k] += h * kinks.slope[r]
+            change[k] += h * (kinks.weight[r] + kinks.slope[r]) * kinks.gap[r]
+    factor(room.matrix)
+    solve_factored(room.matrix, change)
+    for c in range(given.q.size):
+        r = given.coordinates[c, _ROUGH]
+        if r >= 0:
+            slope = kinks.slope[r]
+            kinks.change[r] = slope * change[roots + c] - (kinks.weight[r] + slope) * kinks.gap[r]
+
+
+@kernel
+def _finish(given, room, kinks, y, change, scale, error):
+    """A last step, which takes what is left to rounding, as Newton's method does near a root.
+
+    Velocities with kinks become those that fit their forces. Returns the residual, or before a step that
+    does not help that of before.
+    """
+    dual = kinks.dual + kinks.change
+    better = y + change
+    for attempt in range(2):
+        for c in range(given.q.size):
+            r, k = given.coordinates[c, _ROUGH], given.roots + c
+            if r >= 0:
+                weight = kinks.weight[r]
+                speed, _ = resolve(kinks.ramps, r, weight, dual[r] + weight * better[k])
+                dual[r] += weight * (better[k] - speed)
+                better[k] = speed
+        _evaluate(given, room, kinks, better, dual)
+        after, _ = _measure(given, room, kinks, scale, better, dual)
+        if attempt == 1 or after <= error:
+            break
+        dual[:] = kinks.dual
+        better[:] = y
+    y[:] = better
+    return min(after, error)
+
+
+@kernel
+def _solve(given, room, kinks, y, scale, size, max_iterations):
+    """The loop of `dano.engine._newton`: velocities y in place; residual, passes, whether it converged."""
+    rules = given.rules
+    change, search = np.zeros(y.size), np.zeros(6)
+    tried, dual = np.empty(y.size), np.empty(kinks.dual.size)
+    begin_search(0.0, search)
+    passes, solved, error = -1, False, np.inf
+    while passes < max_iterations and not solved:
+        for k in range(y.size):
+            tried[k] = y[k] + search[LENGTH] * change[k]
+        for r in range(dual.size):
+            dual[r] = kinks.dual[r] + search[LENGTH] * kinks.change[r]
+        _evaluate(given, room, kinks, tried, dual)
+        passes += 1
+        work = _work(given, room, kinks, change)
+        if not accepts(work, rules[ENOUGH], rules[GIVE_UP], search):
+            narrow(work, search)
+            continue
+        y[:] = tried
+        kinks.dual[:] = dual
+        error, rounding = _measure(given, room, kinks, scale, y, dual)
+        tolerance = max(rules[_RELATIVE] * (1.0 + size), 16.0 * rules[_EPSILON] * rounding)
+        solved = error <= tolerance
+        _find_change(given, room, kinks, change)
+        begin_search(_work(given, room, kinks, change), search)
+    if not solved:
+        change[:] = 0.0
+        kinks.change[:] = 0.0
+    return _finish(given, room, kinks, y, change, scale, error), passes, solved
+
+
+@kernel
+def _end(given, room, y, found, dtype):
+    """Write the state at the end; rows of bodies that do not move are there already."""
+    nodes, h, resolved, roots = given.nodes, given.settings[_H], given.rules[RESOLVED], given.roots
+    position, orientation = table(found[0], dtype), table(found[1], dtype)
+    velocity, omega = table(found[2], dtype), table(found[3], dtype)
+    q, v = np.empty(given.q.size), vector(found[5], dtype)
+    for c in range(given.q.size):
+        q[c], v[c] = given.q[c] + h * y[roots + c], y[roots + c]
+    for n in range(nodes.shape[0]):
+        i, at = nodes[n, BODY], nodes[n, PLACE] - roots
+        turn = four(room.poses, i, TURNED)
+        put(velocity, i, 0, three(room.twists, n, 0))
+        put(omega, i, 0, rotate_back(turn, three(room.twists, n, 3)))
+        if nodes[n, KIND] == ROOT:
+            put(room.poses, i, 0, add(three(room.poses, i, 0), three(room.ways, n, SHIFT)))
+            put_four(room.poses, i, TURNED, _unit_turn(multiply(four(room.ways, n, TURN), turn)))
+        elif nodes[n, KIND] == BALL:
+            own = turn_of((v[at], v[at + 1], v[at + 2]), h, resolved)
+            q[at], q[at + 1], q[at + 2] = logarithm(
+                multiply(exponential((given.q[at], given.q[at + 1], given.q[at + 2])), own)
+            )
+    place(nodes, given.joints, given.bodies, q, roots, room.poses, room.known)
+    for n in range(nodes.shape[0]):
+        i = nodes[n, BODY]
+        put(position, i, 0, three(room.poses, i, 0))
+        put_four(orientation, i, 0, four(room.poses, i, TURNED))
+    vector(found[4], dtype)[:] = q
+
+
+@kernel
+def _put_derivative(given, room, kinks, scale, whole):
+    """The derivative of the velocities' equations by velocities, kinks included, in velocities."""
+    for i in range(whole.shape[0]):
+        for j in range(whole.shape[0]):
+            whole[i, j] = scale[i] * room.matrix[i, j]
+    for c in range(given.q.size if whole.size > 0 else 0):
+        r, k = given.coordinates[c, _ROUGH], given.roots + c
+        if r >= 0:
+            whole[k, k] += scale[k] * given.settings[_H] * kinks.slope[r]
+
+
+@kernel
+def _given(buffers, dtype):
+    """What a call frame says of a step that stays."""
+    nodes, coordinates = table(buffers[10], numba.int32), table(buffers[11], numba.int32)
+    joints, q, v = doubles(buffers[13], dtype), numbers(buffers[4], dtype), numbers(buffers[5], dtype)
+    effort, command = numbers(buffers[8], dtype), numbers(buffers[9], dtype)
+    _tidy(nodes, joints)
+    roots = 0
+    for n in range(nodes.shape[0]):
+        roots += 6 if nodes[n, KIND] == ROOT else 0
+    return Given(
+        nodes,
+        coordinates,
+        doubles(buffers[12], dtype),
+        joints,
+        doubles(buffers[14], dtype),
+        numbers(buffers[15], dtype),
+        numbers(buffers[16], dtype),
+        roots,
+        q,
+        v,
+        effort if effort.size == q.size else np.zeros(q.size),
+        command if command.size == q.size else np.zeros(q.size),
+    )
+
+
+@kernel
+def _answer(frame, dtype):
+    """Make the step that a call frame holds; see `dano.engine` for the order of its buffers."""
+    buffers, found = inputs(frame), outputs(frame)
+    given = _given(buffers, dtype)
+    state = (
+        doubles(buffers[0], dtype),
+        doubles(buffers[1], dtype),
+        doubles(buffers[2], dtype),
+        doubles(buffers[3], dtype),
+    )
+    for k in range(4):
+        table(found[k], dtype)[:] = state[k]
+    n_kinks = 0
+    for c in range(given.q.size):
+        n_kinks += given.coordinates[c, _ROUGH] >= 0
+    y = np.empty(given.roots + given.q.size)
+    scale, room = np.empty(y.size), room_for(given.bodies.shape[0], given.nodes.shape[0], y.size)
+    kinks = Kinks(
+        np.empty((n_kinks, RAMPS, 4)),
+        np.empty(n_kinks),
+        np.zeros(n_kinks),
+        np.zeros(n_kinks),
+        np.zeros(n_kinks),
+        np.zeros(n_kinks),
+    )
+    _begin(given, state, doubles(buffers[6], dtype), doubles(buffers[7], dtype), room, y)
+    size = _weigh(given, room, kinks, scale, y)
+    limits = vector(buffers[17], numba.int32)
+    residual, passes, solved = _solve(given, room, kinks, y, scale, size, limits[0])
+    turned = largest_turn(given.nodes, given.joints, y, given.settings[_H], room.known[:, 0])
+    _put_derivative(given, room, kinks, scale, table(found[7], dtype))
+    vector(found[6], dtype)[:] = y[: vector(found[6], dtype).size]
+    _end(given, room, y, found, dtype)
+    vector(found[8], dtype)[0] = residual
+    vector(found[9], numba.int32)[0] = passes
+    vector(found[10], numba.uint8)[0] = solved and turned <= given.rules[_LARGEST]
+    return 0
+
+
+def define(dtype: str) -> str:
+    """Compile or load the step for "float64" or "float32", make it known to JAX and return its name."""
+    sources, real = fingerprint(), numba.from_dtype(np.dtype(dtype))
+
+    @numba.cfunc(SIGNATURE, cache=True)
+    def handler(frame):
+        _ = sources  # makes it part of the key on disk
+        return 0 if tells_version(frame) else _answer(frame, real)
+
+    return register(f"dano_step_{dtype}", handler)
