@@ -123,6 +123,15 @@ def cube(buffer, dtype):
     return numba.carray(_pointer(_words(buffer, _BUFFER_WORDS)[_DATA], dtype), (shape[0], shape[1], shape[2]))
 
 
+@kernel
+def part(whole, at, shape):
+    """An array in an array of 64-bit numbers, from a place on; it does not keep the whole alive.
+
+    Slices do, which costs more than to allocate small arrays one by one.
+    """
+    return numba.carray(_pointer(whole.ctypes.data + 8 * at, numba.float64), shape)
+
+
 def register(name: str, handler) -> str:
     """Make a handler, a `numba.cfunc` of `SIGNATURE`, known to JAX; returns the name."""
     function = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(handler.address)

@@ -12,6 +12,7 @@ import numpy as np
 
 from dano.native._assembling import FADE, RESOLVED, shares
 from dano.native._compiling import kernel
+from dano.native._ffi import part
 from dano.native._tree_frames import (
     add,
     BODY,
@@ -28,7 +29,6 @@ from dano.native._tree_frames import (
     put,
     ROOT,
     rotate,
-    rotate_back,
     SHIFT,
     slopes_of_turn,
     spin_of,
@@ -40,31 +40,34 @@ from dano.native._tree_frames import (
 
 # Columns of what is summed: mass, mass times levers at start and end, and the part of moments by turns.
 _LEVER, _LEVER_AFTER, _BLOCK, _SUMMED = 1, 4, 7, 16
-# Columns of the table of a step's bodies: inertia [W], momentum before joints push (linear, angular; W), spin.
+# Columns of what is given of a node's body: inertia, linear and angular momentum before joints push [W].
 TURNED_INERTIA, IMPULSE, _STEP_COLUMNS = 0, 9, 15
 
-Room = namedtuple("Room", "poses known ways first last given twists wrenches summed residual matrix")
-"""Arrays of a step: poses (bodies and world, 7), what is known of joints (nodes, 12), ways (nodes, 7), motions
-at start and end (nodes, 6, 6), the table above (nodes, 15), twists [W], sums of momenta, sums of derivatives;
-residual (k,), and its derivative (k, k)."""
+Room = namedtuple("Room", "whole poses known ways first last given twists wrenches summed residual matrix")
+"""Arrays of a step, and the one of which they are parts.
+
+Of bodies and the world the poses (7 numbers); of nodes what is known of their joints (12), ways (7), motions
+at start and end (6, 6), what is given of their bodies, twists [W], sums of momenta and of derivatives; of
+velocities the residual and its derivative.
+"""
 
 
 @kernel
 def room_for(n_bodies, n_nodes, k):
-    """Arrays for a step; the world counts as a body."""
-    return Room(
-        np.empty((n_bodies, 7)),
-        np.empty((n_nodes, 12)),
-        np.empty((n_nodes, 7)),
-        np.empty((n_nodes, 6, 6)),
-        np.empty((n_nodes, 6, 6)),
-        np.empty((n_nodes, _STEP_COLUMNS)),
-        np.empty((n_nodes, 6)),
-        np.empty((n_nodes, 6)),
-        np.empty((n_nodes, _SUMMED)),
-        np.empty(k),
-        np.empty((k, k)),
-    )
+    """Arrays for a step, parts of one; the world counts as a body."""
+    n, at = n_nodes, 0
+    whole = np.empty(7 * n_bodies + (31 + 72 + _STEP_COLUMNS + _SUMMED) * n + k + k * k)
+    poses, at = part(whole, at, (n_bodies, 7)), at + 7 * n_bodies
+    known, at = part(whole, at, (n, 12)), at + 12 * n
+    ways, at = part(whole, at, (n, 7)), at + 7 * n
+    first, at = part(whole, at, (n, 6, 6)), at + 36 * n
+    last, at = part(whole, at, (n, 6, 6)), at + 36 * n
+    given, at = part(whole, at, (n, _STEP_COLUMNS)), at + _STEP_COLUMNS * n
+    twists, at = part(whole, at, (n, 6)), at + 6 * n
+    wrenches, at = part(whole, at, (n, 6)), at + 6 * n
+    summed, at = part(whole, at, (n, _SUMMED)), at + _SUMMED * n
+    residual, matrix = part(whole, at, k), part(whole, at + k, (k, k))
+    return Room(whole, poses, known, ways, first, last, given, twists, wrenches, summed, residual, matrix)
 
 
 @kernel
@@ -80,17 +83,16 @@ def _inertial(given, n, v):
 @kernel
 def turn_inertia(bodies, i, turn, given, n):
     """R J Rᵀ of a body."""
-    rows = (three(bodies, i, INERTIA), three(bodies, i, INERTIA + 3), three(bodies, i, INERTIA + 6))
+    x, y, z = rotate(turn, (1.0, 0.0, 0.0)), rotate(turn, (0.0, 1.0, 0.0)), rotate(turn, (0.0, 0.0, 1.0))
     for k in range(3):
-        axis = (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0)
-        own = rotate_back(turn, axis)
-        spun = (dot(rows[0], own), dot(rows[1], own), dot(rows[2], own))
-        x, y, z = rotate(turn, spun)
-        given[n, TURNED_INERTIA + k], given[n, TURNED_INERTIA + 3 + k], given[n, TURNED_INERTIA + 6 + k] = (
-            x,
-            y,
-            z,
+        # a row of R J, whose columns are J times those of Rᵀ
+        row = (x[k], y[k], z[k])
+        a, b, c = (
+            dot(row, three(bodies, i, INERTIA)),
+            dot(row, three(bodies, i, INERTIA + 3)),
+            dot(row, three(bodies, i, INERTIA + 6)),
         )
+        put(given, n, TURNED_INERTIA + 3 * k, add(add(times(a, x), times(b, y)), times(c, z)))
 
 
 @kernel
@@ -165,12 +167,13 @@ def _times_turn(row, spin, alpha, beta, h):
 @kernel
 def find_twists(nodes, y, h, rules, room):
     """Velocity and spin [W] of each node's body in a step, from its way."""
+    per_h = 1.0 / h
     for n in range(nodes.shape[0]):
         if nodes[n, KIND] == ROOT:
             for k in range(6):
                 room.twists[n, k] = y[nodes[n, PLACE] + k]
         else:
-            put(room.twists, n, 0, times(1.0 / h, three(room.ways, n, SHIFT)))
+            put(room.twists, n, 0, times(per_h, three(room.ways, n, SHIFT)))
             put(room.twists, n, 3, spin_of(four(room.ways, n, TURN), h, rules[RESOLVED]))
 
 
@@ -238,7 +241,7 @@ def _product(a, b, n, i):
 
 
 @kernel
-def gather(nodes, first, last, room):
+def gather(nodes, first, last, room, symmetric):
     """Residual and derivative by generalised velocities.
 
     Args:
@@ -247,27 +250,31 @@ def gather(nodes, first, last, room):
         last: Motions at its end, over h.
         room: Momenta and their derivatives in `wrenches` and `summed`, which are used up; the results go to
             `residual` and `matrix`.
+        symmetric: Whether the derivative is, because both motions are the same.
     """
     summed, wrenches, residual, matrix = room.summed, room.wrenches, room.residual, room.matrix
     residual[:] = 0.0
     matrix[:] = 0.0
     for n in range(nodes.shape[0] - 1, -1, -1):
+        up, place = nodes[n, PARENT], nodes[n, PLACE]
         wrench = (three(wrenches, n, 0), three(wrenches, n, 3))
         for i in range(nodes[n, WIDTH]):
-            row = nodes[n, PLACE] + i
+            row = place + i
             residual[row] += _product(wrench, first, n, i)
-            right = _after(summed, n, three(last[n], i, 0), three(last[n], i, 3))
             left = _before(summed, n, three(first[n], i, 0), three(first[n], i, 3))
+            right = left
+            if not symmetric:
+                right = _after(summed, n, three(last[n], i, 0), three(last[n], i, 3))
             for j in range(nodes[n, WIDTH]):
-                matrix[nodes[n, PLACE] + j, row] += _product(right, first, n, j)
-            up = nodes[n, PARENT]
-            while up >= 0:
-                for j in range(nodes[up, WIDTH]):
-                    column = nodes[up, PLACE] + j
-                    matrix[row, column] += _product(left, last, up, j)
-                    matrix[column, row] += _product(right, first, up, j)
-                up = nodes[up, PARENT]
-        up = nodes[n, PARENT]
+                matrix[place + j, row] += _product(right, first, n, j)
+            other = up
+            while other >= 0:
+                for j in range(nodes[other, WIDTH]):
+                    column = nodes[other, PLACE] + j
+                    across = _product(right, first, other, j)
+                    matrix[column, row] += across
+                    matrix[row, column] += across if symmetric else _product(left, last, other, j)
+                other = nodes[other, PARENT]
         if up >= 0:
             for k in range(6):
                 wrenches[up, k] += wrenches[n, k]
@@ -280,12 +287,15 @@ def factor(matrix):
     """Factors in place: the matrix is U L, with ones on the diagonal of U, which is not stored.
 
     From the last velocity to the first, as trees are, so that branches stay apart; without exchanges: the
-    matrix is inertia plus dissipation, its pivots stay away from singular.
+    matrix is inertia plus dissipation, its pivots stay away from singular. The inverse of the diagonal of L
+    is stored.
     """
     for p in range(matrix.shape[0] - 1, -1, -1):
+        inverse = 1.0 / matrix[p, p]
+        matrix[p, p] = inverse
         for i in range(p):
             if matrix[i, p] != 0.0:
-                share = matrix[i, p] / matrix[p, p]
+                share = matrix[i, p] * inverse
                 matrix[i, p] = share
                 for j in range(p):
                     matrix[i, j] -= share * matrix[p, j]
@@ -301,7 +311,7 @@ def solve_factored(matrix, right):
     for p in range(k):
         for j in range(p):
             right[p] -= matrix[p, j] * right[j]
-        right[p] /= matrix[p, p]
+        right[p] *= matrix[p, p]
 
 
 @kernel
@@ -313,5 +323,5 @@ def inverse_diagonal(matrix, r, column):
     for p in range(r, -1, -1):
         for i in range(p):
             column[i] -= matrix[i, p] * column[p]
-        total += column[p] * column[p] / matrix[p, p]
+        total += column[p] * column[p] * matrix[p, p]
     return total

@@ -12,8 +12,8 @@ import math
 from dano.native._compiling import kernel
 
 # Columns of the table of nodes: body, node and body on which it hangs (−1 and the number of bodies for the
-# world), kind, row among the joints, place of its first velocity, number of velocities, body at which its tree
-# is looked at.
+# world), kind, row among the joints, place of its first velocity, number of velocities, body at which its
+# tree is looked at.
 BODY, PARENT, CARRIER, KIND, JOINT, PLACE, WIDTH, ORIGIN = range(8)
 # Kinds of nodes, joints in the order of `dano.scene.JOINT_KINDS`.
 HINGE, SLIDE, _WELD, BALL, PLANAR, ROOT = range(6)
@@ -56,31 +56,31 @@ def put_four(rows, i, k, values):
 
 @kernel
 def add(a, b):
-    """a + b."""
+    """A + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @kernel
 def minus(a, b):
-    """a − b."""
+    """A − b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @kernel
 def times(s, a):
-    """s a."""
+    """S a."""
     return s * a[0], s * a[1], s * a[2]
 
 
 @kernel
 def dot(a, b):
-    """a · b."""
+    """A · b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @kernel
 def cross(a, b):
-    """a × b."""
+    """A × b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
@@ -357,7 +357,10 @@ def move(nodes, joints, poses, known, y, h, resolved, ways, motions):
 
 @kernel
 def largest_turn(nodes, joints, y, h, sums):
-    """Largest sum of the angles by which joints turn a body in a step [rad], see `turns_too_far`."""
+    """Largest sum of the angles by which joints turn a body in a step [rad], see `turns_too_far`.
+
+    The first column of `sums` is used up.
+    """
     largest = 0.0
     for n in range(nodes.shape[0]):
         kind, at = nodes[n, KIND], nodes[n, PLACE]
@@ -368,6 +371,6 @@ def largest_turn(nodes, joints, y, h, sums):
             angle = abs(h * y[at + 2])
         elif kind == BALL:
             angle = h * math.sqrt(y[at] ** 2 + y[at + 1] ** 2 + y[at + 2] ** 2)
-        sums[n] = angle + (sums[nodes[n, PARENT]] if nodes[n, PARENT] >= 0 else 0.0)
-        largest = sums[n] if sums[n] > largest else largest
+        sums[n, 0] = angle + (sums[nodes[n, PARENT], 0] if nodes[n, PARENT] >= 0 else 0.0)
+        largest = max(largest, sums[n, 0])
     return largest

@@ -56,8 +56,8 @@ from dano.native._tree_frames import (
     multiply,
     OFFSET,
     ORIENTATION,
-    place,
     PLACE,
+    place,
     put,
     put_four,
     RATIO,
@@ -75,10 +75,11 @@ from dano.native._tree_laws import ARMATURE, force_of, RAMPS, resolve, set_ramps
 
 # Settings: h, gravity [W].
 _H, _GRAVITY = 0, 1
-# Rules after those that `_assembling` names: tolerance over (1 + size), rounding of the dtype, what that of poses
-# adds to size, speed at which friction sticks, stiffness of limits, largest turn.
+# Rules after those that `_assembling` names: tolerance over (1 + size), rounding of the dtype, what that of
+# poses adds to size, speed at which friction sticks, stiffness of limits, largest turn.
 _RELATIVE, _EPSILON, _POSES, _STICKS, _STOPS, _LARGEST = range(12, 18)
-# Columns of the table of coordinates: whether a motor does what it is told to, row among those with kinks or −1.
+# Columns of the table of coordinates: whether a motor does what it is told to, and the row among those with
+# kinks, or −1.
 _CONSTANT, _ROUGH = range(2)
 
 Given = namedtuple("Given", "nodes coordinates bodies joints laws settings rules roots q v effort command")
@@ -87,6 +88,13 @@ velocities before, efforts and commands."""
 Kinks = namedtuple("Kinks", "ramps weight dual change gap slope")
 """Of the coordinates with kinks: ramps, ρ [kg m²/s or kg/s], the forces λ as unknowns and their change in a
 step of Newton's method, by how much speeds miss what the forces make of them, slopes of the ramps there."""
+
+
+@kernel
+def _copy(source, target):
+    for i in range(source.shape[0]):
+        for k in range(source.shape[1]):
+            target[i, k] = source[i, k]
 
 
 @kernel
@@ -126,7 +134,8 @@ def _begin(given, state, force, torque, room, y):
     world = position.shape[0]
     for i in range(world):
         put(room.poses, i, 0, three(position, i, 0))
-        put_four(room.poses, i, TURNED, _unit_turn(four(orientation, i, 0)))
+        put_four(room.poses, i, TURNED, four(orientation, i, 0))
+        put_four(room.poses, i, TURNED, _unit_turn(four(room.poses, i, TURNED)))
     put(room.poses, world, 0, (0.0, 0.0, 0.0))
     put_four(room.poses, world, TURNED, (1.0, 0.0, 0.0, 0.0))
     place(nodes, given.joints, bodies, given.q, given.roots, room.poses, room.known)
@@ -152,11 +161,12 @@ def _begin(given, state, force, torque, room, y):
 
 
 @kernel
-def _weigh(given, room, kinks, scale, y):
+def _weigh(given, room, kinks, rows):
     """Factors that turn momenta into velocities, and what has kinks; returns the size of the velocities."""
     rules, laws, roots = given.rules, given.laws, given.roots
+    y, scale, column = rows[0], rows[1], rows[2]
     momenta_before(given.nodes, given.bodies, room)
-    gather(given.nodes, room.first, room.first, room)
+    gather(given.nodes, room.first, room.first, room, True)
     for c in range(given.q.size):
         room.matrix[roots + c, roots + c] += laws[c, ARMATURE]
     size = 0.0
@@ -165,7 +175,7 @@ def _weigh(given, room, kinks, scale, y):
         size = max(size, abs(scale[k] * room.residual[k]))
     if kinks.dual.size > 0:
         factor(room.matrix)
-    h, column = given.settings[_H], np.empty(scale.size)
+    h = given.settings[_H]
     for c in range(given.q.size):
         r = given.coordinates[c, _ROUGH]
         if r >= 0:
@@ -183,14 +193,20 @@ def _weigh(given, room, kinks, scale, y):
 
 
 @kernel
+def _go(given, room, y):
+    """How bodies move in a step with velocities y."""
+    nodes, h, resolved = given.nodes, given.settings[_H], given.rules[RESOLVED]
+    move(nodes, given.joints, room.poses, room.known, y, h, resolved, room.ways, room.last)
+    find_twists(nodes, y, h, given.rules, room)
+
+
+@kernel
 def _evaluate(given, room, kinks, y, dual):
     """Residual and its derivative by velocities, without the ramps; and where these are."""
     h, rules = given.settings[_H], given.rules
-    nodes, joints, resolved = given.nodes, given.joints, rules[RESOLVED]
-    move(nodes, joints, room.poses, room.known, y, h, resolved, room.ways, room.last)
-    find_twists(given.nodes, y, h, rules, room)
+    _go(given, room, y)
     missing_momenta(given.nodes, given.bodies, h, rules, room)
-    gather(given.nodes, room.first, room.last, room)
+    gather(given.nodes, room.first, room.last, room, False)
     for c in range(given.q.size):
         k, constant = given.roots + c, given.coordinates[c, _CONSTANT] > 0
         momentum, slope = smooth(
@@ -262,38 +278,37 @@ def _find_change(given, room, kinks, change):
 
 
 @kernel
-def _finish(given, room, kinks, y, change, scale, error):
-    """A last step, which takes what is left to rounding, as Newton's method does near a root.
+def _finish(given, room, kinks, y, change, derivatives):
+    """A last step, not looked at: near a root it takes what is left to rounding.
 
-    Velocities with kinks become those that fit their forces. Returns the residual, or before a step that
-    does not help that of before.
+    Velocities with kinks become those that fit their forces.
     """
-    dual = kinks.dual + kinks.change
-    better = y + change
-    for attempt in range(2):
-        for c in range(given.q.size):
-            r, k = given.coordinates[c, _ROUGH], given.roots + c
-            if r >= 0:
-                weight = kinks.weight[r]
-                speed, _ = resolve(kinks.ramps, r, weight, dual[r] + weight * better[k])
-                dual[r] += weight * (better[k] - speed)
-                better[k] = speed
-        _evaluate(given, room, kinks, better, dual)
-        after, _ = _measure(given, room, kinks, scale, better, dual)
-        if attempt == 1 or after <= error:
-            break
-        dual[:] = kinks.dual
-        better[:] = y
-    y[:] = better
-    return min(after, error)
+    for k in range(y.size):
+        y[k] += change[k]
+    for c in range(given.q.size):
+        r, k = given.coordinates[c, _ROUGH], given.roots + c
+        if r >= 0:
+            weight, dual = kinks.weight[r], kinks.dual[r] + kinks.change[r]
+            speed, _ = resolve(kinks.ramps, r, weight, dual + weight * y[k])
+            kinks.dual[r] = dual + weight * (y[k] - speed)
+            y[k] = speed
+    if derivatives:
+        _evaluate(given, room, kinks, y, kinks.dual)
+    else:
+        _go(given, room, y)
 
 
 @kernel
-def _solve(given, room, kinks, y, scale, size, max_iterations):
-    """The loop of `dano.engine._newton`: velocities y in place; residual, passes, whether it converged."""
+def _solve(given, room, kinks, rows, size, max_iterations, derivatives):
+    """The loop of `dano.engine._newton`; the first of the rows is where it begins, and becomes the solution.
+
+    Returns:
+        Residual before a last step, passes, whether it converged.
+    """
     rules = given.rules
-    change, search = np.zeros(y.size), np.zeros(6)
-    tried, dual = np.empty(y.size), np.empty(kinks.dual.size)
+    y, scale, change, tried = rows[0], rows[1], rows[2], rows[3]
+    search, dual = np.zeros(6), np.empty(kinks.dual.size)
+    change[:] = 0.0
     begin_search(0.0, search)
     passes, solved, error = -1, False, np.inf
     while passes < max_iterations and not solved:
@@ -317,7 +332,8 @@ def _solve(given, room, kinks, y, scale, size, max_iterations):
     if not solved:
         change[:] = 0.0
         kinks.change[:] = 0.0
-    return _finish(given, room, kinks, y, change, scale, error), passes, solved
+    _finish(given, room, kinks, y, change, derivatives)
+    return error, passes, solved
 
 
 @kernel
@@ -364,28 +380,39 @@ def _put_derivative(given, room, kinks, scale, whole):
 
 @kernel
 def _given(buffers, dtype):
-    """What a call frame says of a step that stays."""
-    nodes, coordinates = table(buffers[10], numba.int32), table(buffers[11], numba.int32)
-    joints, q, v = doubles(buffers[13], dtype), numbers(buffers[4], dtype), numbers(buffers[5], dtype)
-    effort, command = numbers(buffers[8], dtype), numbers(buffers[9], dtype)
+    """What a call frame says of a step that stays.
+
+    Numbers of 32 bits become such of 64 where they meet one; what meets only its like is copied.
+    """
+    nodes, joints = table(buffers[10], numba.int32), doubles(buffers[13], dtype)
     _tidy(nodes, joints)
     roots = 0
     for n in range(nodes.shape[0]):
         roots += 6 if nodes[n, KIND] == ROOT else 0
     return Given(
         nodes,
-        coordinates,
-        doubles(buffers[12], dtype),
+        table(buffers[11], numba.int32),
+        table(buffers[12], dtype),
         joints,
-        doubles(buffers[14], dtype),
+        table(buffers[14], dtype),
         numbers(buffers[15], dtype),
-        numbers(buffers[16], dtype),
+        vector(buffers[16], dtype),
         roots,
-        q,
-        v,
-        effort if effort.size == q.size else np.zeros(q.size),
-        command if command.size == q.size else np.zeros(q.size),
+        numbers(buffers[4], dtype),
+        vector(buffers[5], dtype),
+        vector(buffers[8], dtype),
+        vector(buffers[9], dtype),
     )
+
+
+@kernel
+def _kinks(given):
+    """Room for coordinates with kinks."""
+    count = 0
+    for c in range(given.q.size):
+        count += given.coordinates[c, _ROUGH] >= 0
+    rows = np.zeros((5, count))
+    return Kinks(np.empty((count, RAMPS, 4)), rows[0], rows[1], rows[2], rows[3], rows[4])
 
 
 @kernel
@@ -394,33 +421,24 @@ def _answer(frame, dtype):
     buffers, found = inputs(frame), outputs(frame)
     given = _given(buffers, dtype)
     state = (
-        doubles(buffers[0], dtype),
-        doubles(buffers[1], dtype),
-        doubles(buffers[2], dtype),
-        doubles(buffers[3], dtype),
+        table(buffers[0], dtype),
+        table(buffers[1], dtype),
+        table(buffers[2], dtype),
+        table(buffers[3], dtype),
     )
     for k in range(4):
-        table(found[k], dtype)[:] = state[k]
-    n_kinks = 0
-    for c in range(given.q.size):
-        n_kinks += given.coordinates[c, _ROUGH] >= 0
-    y = np.empty(given.roots + given.q.size)
-    scale, room = np.empty(y.size), room_for(given.bodies.shape[0], given.nodes.shape[0], y.size)
-    kinks = Kinks(
-        np.empty((n_kinks, RAMPS, 4)),
-        np.empty(n_kinks),
-        np.zeros(n_kinks),
-        np.zeros(n_kinks),
-        np.zeros(n_kinks),
-        np.zeros(n_kinks),
-    )
-    _begin(given, state, doubles(buffers[6], dtype), doubles(buffers[7], dtype), room, y)
-    size = _weigh(given, room, kinks, scale, y)
-    limits = vector(buffers[17], numba.int32)
-    residual, passes, solved = _solve(given, room, kinks, y, scale, size, limits[0])
-    turned = largest_turn(given.nodes, given.joints, y, given.settings[_H], room.known[:, 0])
-    _put_derivative(given, room, kinks, scale, table(found[7], dtype))
-    vector(found[6], dtype)[:] = y[: vector(found[6], dtype).size]
+        _copy(state[k], table(found[k], dtype))
+    rows, kinks = np.empty((4, given.roots + given.q.size)), _kinks(given)
+    room, y = room_for(given.bodies.shape[0], given.nodes.shape[0], rows.shape[1]), rows[0]
+    _begin(given, state, table(buffers[6], dtype), table(buffers[7], dtype), room, y)
+    size = _weigh(given, room, kinks, rows)
+    end, whole = vector(found[6], dtype), table(found[7], dtype)
+    most = vector(buffers[17], numba.int32)[0]
+    residual, passes, solved = _solve(given, room, kinks, rows, size, most, end.size > 0)
+    turned = largest_turn(given.nodes, given.joints, y, given.settings[_H], room.known)
+    _put_derivative(given, room, kinks, rows[1], whole)
+    for k in range(end.size):
+        end[k] = y[k]
     _end(given, room, y, found, dtype)
     vector(found[8], dtype)[0] = residual
     vector(found[9], numba.int32)[0] = passes

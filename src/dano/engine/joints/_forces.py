@@ -25,8 +25,10 @@ from dano.scene import JointLaws
 STICKS = 1e-7
 """Speed [rad/s or m/s] at which friction has its full size: joints that stick creep by no more."""
 STOPS = 1e4
-"""How much stiffer a limit is than what the coordinate weighs per h²: with an acceleration a, a coordinate ends
-a h² times the inverse of this beyond its limit."""
+"""How much stiffer a limit is than what the coordinate weighs per h².
+
+With an acceleration a, a coordinate ends a h² times the inverse of this beyond its limit.
+"""
 
 
 class Ramps(NamedTuple):

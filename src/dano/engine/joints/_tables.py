@@ -38,10 +38,11 @@ class TreeTables(eqx.Module):
 
     @property
     def nodes(self) -> Int[np.ndarray, "nodes 8"]:
-        """Of each node body, node and body on which it hangs, kind, joint, place of its first velocity, number
-        of velocities, and the body from which its tree is looked at.
+        """How nodes hang on each other; parents come before children.
 
-        −1 stands for none, n for the world. Parents come before children.
+        Of each node its body, node and body on which it hangs, kind, joint, place of its first velocity,
+        number of velocities, and the body from which its tree is looked at. −1 stands for none, n for the
+        world.
         """
         layout = self.layout
         rows = [(i, -1, layout.bodies, _ROOT, -1, 6 * k, 6, i) for k, i in enumerate(layout.free)]
@@ -58,7 +59,7 @@ class TreeTables(eqx.Module):
 
     @property
     def coordinates(self) -> Int[np.ndarray, "c 2"]:
-        """Whether a motor does what it is told to, and the place among coordinates with kinks, −1 for others."""
+        """Whether a motor does what it is told to, and the place among those with kinks, or −1."""
         places = {c: r for r, c in enumerate(self.rough)}
         rows = [(constant, places.get(c, -1)) for c, constant in enumerate(self.constant)]
         return np.array(rows, np.int32).reshape(-1, 2)
