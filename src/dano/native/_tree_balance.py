@@ -96,12 +96,12 @@ def turn_inertia(bodies, i, turn, given, n):
 
 
 @kernel
-def momentum_before(given, n, spin, h, rules):
-    """Angular momentum [W] with which a body comes from a step with a spin [W]."""
+def angular_momentum(given, n, spin, h, sign, rules):
+    """Angular momentum [W] of a spin [W], see `dano.engine._rigid`: after a step (+) or before it (−)."""
     squared = 0.25 * h * h * dot(spin, spin)
     share, _, torque, _ = shares(squared, rules[RESOLVED], rules[FADE])
     whole = _inertial(given, n, spin)
-    return add(times(share, whole), times(-0.5 * h * torque, cross(spin, whole)))
+    return add(times(share, whole), times(0.5 * sign * h * torque, cross(spin, whole)))
 
 
 @kernel
@@ -123,22 +123,19 @@ def _put_wrench(wrenches, n, force, moment, lever):
 
 
 @kernel
-def _turned_rows(given, n, spin, h, rules):
-    """Momentum [W] of a spin at its end of a step, and its derivative by turns of that end, over h.
+def _slopes_of_spin(given, n, spin, h, rules):
+    """Derivative of the momentum after a step [W] by turns of the body's end, over h; as rows.
 
     With D = ∂P/∂ω and the A = α 1 + β ω ωᵀ − ½ [ω]× of `turn_slopes`, that is h D A.
     """
     squared = 0.25 * h * h * dot(spin, spin)
     share, share_slope, torque, torque_slope = shares(squared, rules[RESOLVED], rules[FADE])
     alpha, beta = slopes_of_turn(spin, h, rules[RESOLVED])
-    a, b, c = (
-        three(given, n, TURNED_INERTIA),
-        three(given, n, TURNED_INERTIA + 3),
-        three(given, n, TURNED_INERTIA + 6),
-    )
-    whole = (dot(a, spin), dot(b, spin), dot(c, spin))
-    crossed, half = cross(spin, whole), 0.5 * h * torque
-    along = add(times(share_slope, whole), times(0.5 * h * torque_slope, crossed))
+    a = three(given, n, TURNED_INERTIA)
+    b = three(given, n, TURNED_INERTIA + 3)
+    c = three(given, n, TURNED_INERTIA + 6)
+    whole, half = _inertial(given, n, spin), 0.5 * h * torque
+    along = add(times(share_slope, whole), times(0.5 * h * torque_slope, cross(spin, whole)))
     along = times(0.25 * h * h, along)
     x, y, z = spin
     p, q, r = whole
@@ -149,12 +146,11 @@ def _turned_rows(given, n, spin, h, rules):
     first = add(add(times(share, a), times(half, first)), times(along[0], spin))
     second = add(add(times(share, b), times(half, second)), times(along[1], spin))
     third = add(add(times(share, c), times(half, third)), times(along[2], spin))
-    rows = (
+    return (
         _times_turn(first, spin, alpha, beta, h),
         _times_turn(second, spin, alpha, beta, h),
         _times_turn(third, spin, alpha, beta, h),
     )
-    return add(times(share, whole), times(half, crossed)), rows
 
 
 @kernel
@@ -178,34 +174,45 @@ def find_twists(nodes, y, h, rules, room):
 
 
 @kernel
+def _lever(nodes, n, poses):
+    """From the origin of its tree to a body's centre of mass at the start of a step."""
+    return minus(three(poses, nodes[n, BODY], 0), three(poses, nodes[n, ORIGIN], 0))
+
+
+@kernel
 def missing_momenta(nodes, bodies, h, rules, room):
-    """What each body's momentum misses, and the derivative."""
+    """What each body's momentum misses."""
     given = room.given
     for n in range(nodes.shape[0]):
-        i, mass = nodes[n, BODY], bodies[nodes[n, BODY], MASS]
-        lever = minus(three(room.poses, i, 0), three(room.poses, nodes[n, ORIGIN], 0))
-        spin = three(room.twists, n, 3)
-        momentum, rows = _turned_rows(given, n, spin, h, rules)
-        force = minus(times(mass, three(room.twists, n, 0)), three(given, n, IMPULSE))
-        moment = minus(momentum, three(given, n, IMPULSE + 3))
-        _put_wrench(room.wrenches, n, force, moment, lever)
-        _put_summed(room.summed, n, mass, lever, add(lever, three(room.ways, n, SHIFT)), rows)
+        force = times(bodies[nodes[n, BODY], MASS], three(room.twists, n, 0))
+        moment = angular_momentum(given, n, three(room.twists, n, 3), h, 1, rules)
+        force, moment = minus(force, three(given, n, IMPULSE)), minus(moment, three(given, n, IMPULSE + 3))
+        _put_wrench(room.wrenches, n, force, moment, _lever(nodes, n, room.poses))
+
+
+@kernel
+def momentum_slopes(nodes, bodies, h, rules, room):
+    """The derivative of each body's momentum."""
+    for n in range(nodes.shape[0]):
+        lever = _lever(nodes, n, room.poses)
+        rows = _slopes_of_spin(room.given, n, three(room.twists, n, 3), h, rules)
+        after = add(lever, three(room.ways, n, SHIFT))
+        _put_summed(room.summed, n, bodies[nodes[n, BODY], MASS], lever, after, rows)
 
 
 @kernel
 def momenta_before(nodes, bodies, room):
-    """The same of what bodies come with, and of the generalised mass at the start."""
+    """What bodies come with, and the same as the above of their masses at the start."""
     given = room.given
     for n in range(nodes.shape[0]):
-        i = nodes[n, BODY]
-        lever = minus(three(room.poses, i, 0), three(room.poses, nodes[n, ORIGIN], 0))
+        lever = _lever(nodes, n, room.poses)
         rows = (
             three(given, n, TURNED_INERTIA),
             three(given, n, TURNED_INERTIA + 3),
             three(given, n, TURNED_INERTIA + 6),
         )
         _put_wrench(room.wrenches, n, three(given, n, IMPULSE), three(given, n, IMPULSE + 3), lever)
-        _put_summed(room.summed, n, bodies[i, MASS], lever, lever, rows)
+        _put_summed(room.summed, n, bodies[nodes[n, BODY], MASS], lever, lever, rows)
 
 
 @kernel
@@ -241,26 +248,36 @@ def _product(a, b, n, i):
 
 
 @kernel
-def gather(nodes, first, last, room, symmetric):
-    """Residual and derivative by generalised velocities.
+def gather_momenta(nodes, room):
+    """Momenta of bodies as generalised ones in `residual`; `wrenches` are used up."""
+    wrenches, residual = room.wrenches, room.residual
+    residual[:] = 0.0
+    for n in range(nodes.shape[0] - 1, -1, -1):
+        wrench = (three(wrenches, n, 0), three(wrenches, n, 3))
+        for i in range(nodes[n, WIDTH]):
+            residual[nodes[n, PLACE] + i] += _product(wrench, room.first, n, i)
+        up = nodes[n, PARENT]
+        if up >= 0:
+            for k in range(6):
+                wrenches[up, k] += wrenches[n, k]
+
+
+@kernel
+def gather_slopes(nodes, last, room, symmetric):
+    """Derivative of generalised momenta by generalised velocities in `matrix`; `summed` is used up.
 
     Args:
         nodes: Table of nodes.
-        first: Motions at the start of the step, shape (nodes, 6, 6).
-        last: Motions at its end, over h.
-        room: Momenta and their derivatives in `wrenches` and `summed`, which are used up; the results go to
-            `residual` and `matrix`.
-        symmetric: Whether the derivative is, because both motions are the same.
+        last: Motions at the end of the step, over h, shape (nodes, 6, 6).
+        room: Arrays.
+        symmetric: Whether the derivative is, because motions at the end are those at the start.
     """
-    summed, wrenches, residual, matrix = room.summed, room.wrenches, room.residual, room.matrix
-    residual[:] = 0.0
+    summed, first, matrix = room.summed, room.first, room.matrix
     matrix[:] = 0.0
     for n in range(nodes.shape[0] - 1, -1, -1):
         up, place = nodes[n, PARENT], nodes[n, PLACE]
-        wrench = (three(wrenches, n, 0), three(wrenches, n, 3))
         for i in range(nodes[n, WIDTH]):
             row = place + i
-            residual[row] += _product(wrench, first, n, i)
             left = _before(summed, n, three(first[n], i, 0), three(first[n], i, 3))
             right = left
             if not symmetric:
@@ -276,8 +293,6 @@ def gather(nodes, first, last, room, symmetric):
                     matrix[row, column] += across if symmetric else _product(left, last, other, j)
                 other = nodes[other, PARENT]
         if up >= 0:
-            for k in range(6):
-                wrenches[up, k] += wrenches[n, k]
             for k in range(_SUMMED):
                 summed[up, k] += summed[n, k]
 

@@ -19,13 +19,18 @@ def _clip(x, low, high):
 
 @kernel
 def smooth(laws, c, constant, q, v, effort, command, h, y):
-    """Momentum that springs, damping, armature and efforts take, and its slope: see `JointForces.smooth`."""
-    damping, armature, stiffness = laws[c, DAMPING], laws[c, ARMATURE], laws[c, STIFFNESS]
-    momentum = h * (damping * y - effort) + armature * (y - v)
-    momentum += h * stiffness * (q + 0.25 * h * (y - v) - laws[c, REST])
+    """Momentum that springs, damping, armature and efforts take: see `JointForces.smooth`."""
+    momentum = h * (laws[c, DAMPING] * y - effort) + laws[c, ARMATURE] * (y - v)
+    momentum += h * laws[c, STIFFNESS] * (q + 0.25 * h * (y - v) - laws[c, REST])
     if constant:
         momentum -= h * laws[c, GEAR] * _clip(command, laws[c, LEAST_EFFORT], laws[c, MOST_EFFORT])
-    return momentum, h * damping + armature + 0.25 * h * h * stiffness
+    return momentum
+
+
+@kernel
+def smooth_slope(laws, c, h):
+    """Its slope by y."""
+    return h * laws[c, DAMPING] + laws[c, ARMATURE] + 0.25 * h * h * laws[c, STIFFNESS]
 
 
 @kernel

@@ -26,14 +26,16 @@ from dano.native._ffi import (
 )
 from dano.native._line_search import accepts, begin_search, LENGTH, narrow
 from dano.native._tree_balance import (
+    angular_momentum,
     factor,
     find_twists,
-    gather,
+    gather_momenta,
+    gather_slopes,
     IMPULSE,
     inverse_diagonal,
     missing_momenta,
     momenta_before,
-    momentum_before,
+    momentum_slopes,
     room_for,
     solve_factored,
     turn_inertia,
@@ -71,7 +73,7 @@ from dano.native._tree_frames import (
     turn_of,
     TURNED,
 )
-from dano.native._tree_laws import ARMATURE, force_of, RAMPS, resolve, set_ramps, smooth
+from dano.native._tree_laws import ARMATURE, force_of, RAMPS, resolve, set_ramps, smooth, smooth_slope
 
 # Settings: h, gravity [W].
 _H, _GRAVITY = 0, 1
@@ -85,9 +87,10 @@ _CONSTANT, _ROUGH = range(2)
 Given = namedtuple("Given", "nodes coordinates bodies joints laws settings rules roots q v effort command")
 """What a step does not change: tables; the number of velocities of free bodies; coordinates of joints, their
 velocities before, efforts and commands."""
-Kinks = namedtuple("Kinks", "ramps weight dual change gap slope")
+Kinks = namedtuple("Kinks", "ramps weight dual change gap slope factored")
 """Of the coordinates with kinks: ramps, ρ [kg m²/s or kg/s], the forces λ as unknowns and their change in a
-step of Newton's method, by how much speeds miss what the forces make of them, slopes of the ramps there."""
+step of Newton's method, by how much speeds miss what the forces make of them, slopes of the ramps there, and
+slopes for which the derivative is factored."""
 
 
 @kernel
@@ -146,7 +149,7 @@ def _begin(given, state, force, torque, room, y):
         turn_inertia(bodies, i, turn, room.given, n)
         spin = rotate(turn, three(omega, i, 0))
         linear = times(bodies[i, MASS], add(three(velocity, i, 0), times(h, gravity)))
-        angular = momentum_before(room.given, n, spin, h, given.rules)
+        angular = angular_momentum(room.given, n, spin, h, -1, given.rules)
         if force.shape[0] > 0:
             linear = add(linear, times(h, three(force, i, 0)))
             angular = add(angular, times(h, three(torque, i, 0)))
@@ -166,7 +169,8 @@ def _weigh(given, room, kinks, rows):
     rules, laws, roots = given.rules, given.laws, given.roots
     y, scale, column = rows[0], rows[1], rows[2]
     momenta_before(given.nodes, given.bodies, room)
-    gather(given.nodes, room.first, room.first, room, True)
+    gather_momenta(given.nodes, room)
+    gather_slopes(given.nodes, room.first, room, True)
     for c in range(given.q.size):
         room.matrix[roots + c, roots + c] += laws[c, ARMATURE]
     size = 0.0
@@ -202,18 +206,15 @@ def _go(given, room, y):
 
 @kernel
 def _evaluate(given, room, kinks, y, dual):
-    """Residual and its derivative by velocities, without the ramps; and where these are."""
-    h, rules = given.settings[_H], given.rules
+    """Residual of the balance, and what the ramps make of its forces."""
+    h = given.settings[_H]
     _go(given, room, y)
-    missing_momenta(given.nodes, given.bodies, h, rules, room)
-    gather(given.nodes, room.first, room.last, room, False)
+    missing_momenta(given.nodes, given.bodies, h, given.rules, room)
+    gather_momenta(given.nodes, room)
     for c in range(given.q.size):
-        k, constant = given.roots + c, given.coordinates[c, _CONSTANT] > 0
-        momentum, slope = smooth(
-            given.laws, c, constant, given.q[c], given.v[c], given.effort[c], given.command[c], h, y[k]
-        )
-        room.residual[k] += momentum
-        room.matrix[k, k] += slope
+        k, constant, command = given.roots + c, given.coordinates[c, _CONSTANT] > 0, given.command[c]
+        q, v, effort = given.q[c], given.v[c], given.effort[c]
+        room.residual[k] += smooth(given.laws, c, constant, q, v, effort, command, h, y[k])
         r = given.coordinates[c, _ROUGH]
         if r >= 0:
             weight = kinks.weight[r]
@@ -223,24 +224,42 @@ def _evaluate(given, room, kinks, y, dual):
 
 
 @kernel
-def _measure(given, room, kinks, scale, y, dual):
-    """Largest residual, and the size of its terms [m/s]."""
-    error = rounding = 0.0
-    for k in range(y.size):
+def _differentiate(given, room):
+    """Derivative of the balance by velocities where `_evaluate` was last, without the ramps."""
+    h = given.settings[_H]
+    momentum_slopes(given.nodes, given.bodies, h, given.rules, room)
+    gather_slopes(given.nodes, room.last, room, False)
+    for c in range(given.q.size):
+        room.matrix[given.roots + c, given.roots + c] += smooth_slope(given.laws, c, h)
+
+
+@kernel
+def _error(room, kinks, scale):
+    """Largest residual [m/s]."""
+    error = 0.0
+    for k in range(scale.size):
         missed = abs(scale[k] * room.residual[k])
+        error = missed if missed > error or math.isnan(missed) else error
+    for r in range(kinks.gap.size):
+        error = max(error, abs(kinks.gap[r]))
+    return error
+
+
+@kernel
+def _rounding(given, room, kinks, scale, y):
+    """Size of the residual's terms [m/s]."""
+    rounding = 0.0
+    for k in range(y.size):
         size = 0.0
         for j in range(y.size):
             size += abs(room.matrix[k, j] * y[j])
-        c = k - given.roots
-        r = given.coordinates[c, _ROUGH] if c >= 0 else -1
+        r = given.coordinates[k - given.roots, _ROUGH] if k >= given.roots else -1
         if r >= 0:
-            size += given.settings[_H] * abs(dual[r])
+            size += given.settings[_H] * abs(kinks.dual[r])
             share = 1.0 / (kinks.weight[r] + kinks.slope[r])
-            rounding = max(rounding, share * (kinks.slope[r] * abs(y[k]) + abs(dual[r])))
-            missed = max(missed, abs(kinks.gap[r]))
-        error = missed if missed > error or math.isnan(missed) else error
+            rounding = max(rounding, share * (kinks.slope[r] * abs(y[k]) + abs(kinks.dual[r])))
         rounding = max(rounding, scale[k] * size)
-    return error, rounding
+    return rounding
 
 
 @kernel
@@ -255,26 +274,43 @@ def _work(given, room, kinks, change):
 
 
 @kernel
+def _factor(given, room, kinks):
+    """Factors of the derivative with the ramps, which take the place of the derivative."""
+    for c in range(given.q.size):
+        r, k = given.coordinates[c, _ROUGH], given.roots + c
+        if r >= 0:
+            room.matrix[k, k] += given.settings[_H] * kinks.slope[r]
+            kinks.factored[r] = kinks.slope[r]
+    factor(room.matrix)
+
+
+@kernel
 def _find_change(given, room, kinks, change):
     """A step of Newton's method. The equation of a force λ gives its change from that of its speed.
 
     dλ = slope dy − (ρ + slope) gap, which leaves a system for the velocities alone.
     """
-    h, roots = given.settings[_H], given.roots
     for k in range(change.size):
         change[k] = -room.residual[k]
     for c in range(given.q.size):
-        r, k = given.coordinates[c, _ROUGH], roots + c
+        r = given.coordinates[c, _ROUGH]
         if r >= 0:
-            room.matrix[k, k] += h * kinks.slope[r]
-            change[k] += h * (kinks.weight[r] + kinks.slope[r]) * kinks.gap[r]
-    factor(room.matrix)
+            pushed = (kinks.weight[r] + kinks.slope[r]) * kinks.gap[r]
+            change[given.roots + c] += given.settings[_H] * pushed
     solve_factored(room.matrix, change)
     for c in range(given.q.size):
         r = given.coordinates[c, _ROUGH]
         if r >= 0:
-            slope = kinks.slope[r]
-            kinks.change[r] = slope * change[roots + c] - (kinks.weight[r] + slope) * kinks.gap[r]
+            pushed = (kinks.weight[r] + kinks.slope[r]) * kinks.gap[r]
+            kinks.change[r] = kinks.slope[r] * change[given.roots + c] - pushed
+
+
+@kernel
+def _same(a, b):
+    for r in range(a.size):
+        if a[r] != b[r]:
+            return False
+    return True
 
 
 @kernel
@@ -294,6 +330,7 @@ def _finish(given, room, kinks, y, change, derivatives):
             y[k] = speed
     if derivatives:
         _evaluate(given, room, kinks, y, kinks.dual)
+        _differentiate(given, room)
     else:
         _go(given, room, y)
 
@@ -324,9 +361,14 @@ def _solve(given, room, kinks, rows, size, max_iterations, derivatives):
             continue
         y[:] = tried
         kinks.dual[:] = dual
-        error, rounding = _measure(given, room, kinks, scale, y, dual)
-        tolerance = max(rules[_RELATIVE] * (1.0 + size), 16.0 * rules[_EPSILON] * rounding)
-        solved = error <= tolerance
+        error, enough = _error(room, kinks, scale), rules[_RELATIVE] * (1.0 + size)
+        # At a root the derivative of the pass before serves for the last step, if no kink lies between.
+        solved = passes > 0 and error <= enough and _same(kinks.slope, kinks.factored)
+        if not solved:
+            _differentiate(given, room)
+            rounding = _rounding(given, room, kinks, scale, y)
+            solved = error <= max(enough, 16.0 * rules[_EPSILON] * rounding)
+            _factor(given, room, kinks)
         _find_change(given, room, kinks, change)
         begin_search(_work(given, room, kinks, change), search)
     if not solved:
@@ -411,8 +453,8 @@ def _kinks(given):
     count = 0
     for c in range(given.q.size):
         count += given.coordinates[c, _ROUGH] >= 0
-    rows = np.zeros((5, count))
-    return Kinks(np.empty((count, RAMPS, 4)), rows[0], rows[1], rows[2], rows[3], rows[4])
+    rows = np.zeros((6, count))
+    return Kinks(np.empty((count, RAMPS, 4)), rows[0], rows[1], rows[2], rows[3], rows[4], rows[5])
 
 
 @kernel
