@@ -91,7 +91,7 @@ def native_tree_step(
     k = tables.layout.n_velocities if derivatives else 0
     epsilon = float(jnp.finfo(dtype).eps)
     relative = epsilon**0.75 if options.tolerance is None else options.tolerance
-    none, nothing = jnp.zeros((0, 3), dtype), jnp.zeros_like(state.q)
+    none, nothing = np.zeros((0, 3), dtype), np.zeros(state.q.shape, dtype)
     force, torque = (none, none) if control is None else (control.force, control.torque)
     driven = (None, None) if control is None else (control.effort, control.command)
     effort, command = (nothing if x is None else x for x in driven)

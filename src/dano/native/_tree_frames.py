@@ -28,6 +28,8 @@ TURNED = 3
 PIVOT, FRAME = 0, 3
 # Columns of the way of a body: the turn, and the shift of its centre of mass.
 TURN, SHIFT = 0, 4
+# Below this, of the square of half an angle [rad²], four terms of a series are exact.
+_SERIES = 1e-3
 
 
 @kernel
@@ -139,6 +141,16 @@ def logarithm(q):
     if sine == 0.0:
         return 0.0, 0.0, 0.0
     return times(2.0 * sign * math.atan2(sine, sign * q[0]) / sine, u)
+
+
+@kernel
+def _turn_about(axis, half):
+    """The turn about a unit axis by twice an angle."""
+    s = half * half
+    if s < _SERIES:
+        sine = half * (1.0 - s / 6.0 * (1.0 - s / 20.0 * (1.0 - s / 42.0)))
+        return _quaternion(1.0 - s / 2.0 * (1.0 - s / 12.0 * (1.0 - s / 30.0)), times(sine, axis))
+    return _quaternion(math.cos(half), times(math.sin(half), axis))
 
 
 @kernel
@@ -331,8 +343,7 @@ def move(nodes, joints, poses, known, y, h, resolved, ways, motions):
             moved = add(three(ways, up, SHIFT), swing(before, arm))
         own, spin = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         if kind == HINGE:
-            half = 0.5 * h * share * y[at]
-            own = _quaternion(math.cos(half), times(math.sin(half), axis))
+            own = _turn_about(axis, 0.5 * h * share * y[at])
         elif kind == SLIDE:
             moved = add(moved, rotate(before, times(h * share * y[at], axis)))
         elif kind == BALL:
@@ -342,8 +353,7 @@ def move(nodes, joints, poses, known, y, h, resolved, ways, motions):
         elif kind == PLANAR:
             path = add(times(y[at], three(known, n, FRAME)), times(y[at + 1], three(known, n, FRAME + 3)))
             moved = add(moved, rotate(before, times(h, path)))
-            half = 0.5 * h * y[at + 2]
-            own = _quaternion(math.cos(half), times(math.sin(half), axis))
+            own = _turn_about(axis, 0.5 * h * y[at + 2])
         turn = multiply(before, own)
         put_four(ways, n, TURN, turn)
         put(ways, n, SHIFT, add(moved, swing(turn, minus(x, pivot))))

@@ -7,9 +7,10 @@ from dano.native._compiling import kernel
 # Columns of the table of laws, see `JointLaws` of `dano.scene`: what no joint has is 0, or endless.
 DAMPING, ARMATURE, STIFFNESS, REST, FRICTION, LEAST, MOST = range(7)
 GEAR, PULL, DRIVE, LEAST_EFFORT, MOST_EFFORT = range(7, 12)
-# Rows of the ramps of a coordinate: friction, two limits, motor; and columns of a ramp.
-RAMPS = 4
-_SLOPE, _CENTRE, _LOW, _HIGH = range(4)
+# Rows of the ramps of a coordinate: friction, two limits, motor; columns of a ramp: slope, centre, least and
+# most force, the speeds at which it reaches these, and there ρ y + g(y) with all ramps in g.
+RAMPS, COLUMNS = 4, 8
+_SLOPE, _CENTRE, _LOW, _HIGH, _BEGIN, _END, _AT_BEGIN, _AT_END = range(COLUMNS)
 
 
 @kernel
@@ -42,6 +43,20 @@ def _set_ramp(ramps, r, i, slope, centre, low, high):
 @kernel
 def set_ramps(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r):
     """What has kinks: see `JointForces.ramps`; written to row r."""
+    _set_forces(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r)
+    for i in range(RAMPS):
+        slope, centre = ramps[r, i, _SLOPE], ramps[r, i, _CENTRE]
+        for end in range(2):
+            # A ramp without an end ends nowhere.
+            kink, value = math.inf if end else -math.inf, math.inf if end else -math.inf
+            if slope > 0.0 and math.isfinite(ramps[r, i, _LOW + end]):
+                kink = centre + ramps[r, i, _LOW + end] / slope
+                value = weight / h * kink + force_of(ramps, r, kink)
+            ramps[r, i, _BEGIN + end], ramps[r, i, _AT_BEGIN + end] = kink, value
+
+
+@kernel
+def _set_forces(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r):
     rubs = laws[c, FRICTION]
     _set_ramp(ramps, r, 0, rubs / sticks, 0.0, -rubs, rubs)
     stiff = stops * weight / h
@@ -67,8 +82,9 @@ def force_of(ramps, r, y):
     """Sum of the ramps of row r at a speed."""
     total = 0.0
     for i in range(RAMPS):
-        ramp = ramps[r, i, _SLOPE] * (y - ramps[r, i, _CENTRE])
-        total += _clip(ramp, ramps[r, i, _LOW], ramps[r, i, _HIGH])
+        if ramps[r, i, _SLOPE] > 0.0:
+            ramp = ramps[r, i, _SLOPE] * (y - ramps[r, i, _CENTRE])
+            total += _clip(ramp, ramps[r, i, _LOW], ramps[r, i, _HIGH])
     return total
 
 
@@ -78,18 +94,15 @@ def resolve(ramps, r, weight, w):
     low, high = -math.inf, math.inf
     for i in range(RAMPS):
         if ramps[r, i, _SLOPE] > 0.0:
-            for end in range(_LOW, _HIGH + 1):
-                kink = ramps[r, i, _CENTRE] + ramps[r, i, end] / ramps[r, i, _SLOPE]
-                if math.isfinite(kink):
-                    if weight * kink + force_of(ramps, r, kink) <= w:
-                        low = max(low, kink)
-                    else:
-                        high = min(high, kink)
+            for end in range(2):
+                kink = ramps[r, i, _BEGIN + end]
+                if ramps[r, i, _AT_BEGIN + end] <= w:
+                    low = max(low, kink)
+                else:
+                    high = min(high, kink)
     slope = 0.0
     for i in range(RAMPS):
-        steep, centre = ramps[r, i, _SLOPE], ramps[r, i, _CENTRE]
-        if steep > 0.0:
-            begins, ends = centre + ramps[r, i, _LOW] / steep, centre + ramps[r, i, _HIGH] / steep
-            slope += steep if begins <= low and ends >= high else 0.0
+        steep = ramps[r, i, _SLOPE]
+        slope += steep if steep > 0.0 and ramps[r, i, _BEGIN] <= low and ramps[r, i, _END] >= high else 0.0
     start = low if math.isfinite(low) else high if math.isfinite(high) else 0.0
     return start + (w - weight * start - force_of(ramps, r, start)) / (weight + slope), slope

@@ -73,7 +73,16 @@ from dano.native._tree_frames import (
     turn_of,
     TURNED,
 )
-from dano.native._tree_laws import ARMATURE, force_of, RAMPS, resolve, set_ramps, smooth, smooth_slope
+from dano.native._tree_laws import (
+    ARMATURE,
+    COLUMNS,
+    force_of,
+    RAMPS,
+    resolve,
+    set_ramps,
+    smooth,
+    smooth_slope,
+)
 
 # Settings: h, gravity [W].
 _H, _GRAVITY = 0, 1
@@ -83,6 +92,8 @@ _RELATIVE, _EPSILON, _POSES, _STICKS, _STOPS, _LARGEST = range(12, 18)
 # Columns of the table of coordinates: whether a motor does what it is told to, and the row among those with
 # kinks, or −1.
 _CONSTANT, _ROUGH = range(2)
+# What the square of a length of 1 may miss by rounding.
+_ROUNDED = 1e-15
 
 Given = namedtuple("Given", "nodes coordinates bodies joints laws settings rules roots q v effort command")
 """What a step does not change: tables; the number of velocities of free bodies; coordinates of joints, their
@@ -104,16 +115,21 @@ def _copy(source, target):
 def _unit(rows, i, k):
     """Make a vector of a row one of length 1; returns what its length was."""
     v = three(rows, i, k)
-    length = math.sqrt(dot(v, v))
-    if length > 0.0:
-        put(rows, i, k, times(1.0 / length, v))
+    squared = dot(v, v)
+    if squared == 0.0 or abs(squared - 1.0) < _ROUNDED:
+        return 1.0
+    length = math.sqrt(squared)
+    put(rows, i, k, times(1.0 / length, v))
     return length
 
 
 @kernel
-def _unit_turn(x):
-    size = 1.0 / math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2] + x[3] * x[3])
-    return size * x[0], size * x[1], size * x[2], size * x[3]
+def _unit_turn(q):
+    squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
+    if abs(squared - 1.0) < _ROUNDED:
+        return q
+    size = 1.0 / math.sqrt(squared)
+    return size * q[0], size * q[1], size * q[2], size * q[3]
 
 
 @kernel
@@ -454,7 +470,7 @@ def _kinks(given):
     for c in range(given.q.size):
         count += given.coordinates[c, _ROUGH] >= 0
     rows = np.zeros((6, count))
-    return Kinks(np.empty((count, RAMPS, 4)), rows[0], rows[1], rows[2], rows[3], rows[4], rows[5])
+    return Kinks(np.empty((count, RAMPS, COLUMNS)), rows[0], rows[1], rows[2], rows[3], rows[4], rows[5])
 
 
 @kernel
