@@ -75,8 +75,8 @@ def _step_of_trees(
 
     @advance.def_jvp
     def _(primals, tangents):
-        tables, *given = primals
-        following, report, y, jacobian = native_tree_step(tables, *given[1:], options, derivatives=True)
+        tables, scene, state, control = primals
+        following, report, y, jacobian = native_tree_step(tables, state, control, options, derivatives=True)
 
         def again(scene, state, control):
             pairs = structure_of(scene)
@@ -85,7 +85,7 @@ def _step_of_trees(
             end = solved(problem, y, jacobian, pairs)
             return advance_tree(scene, problem.tree, state, end, scene.timestep)
 
-        _, change = by_autodiff(again, tuple(given), tuple(tangents[1:]))
+        _, change = by_autodiff(again, (scene, state, control), tangents[1:])
         return (following, report), (change, jax.tree.map(lambda _: None, report))
 
     return advance(prepared.trees, scene, state, control)
