@@ -30,6 +30,8 @@ PIVOT, FRAME = 0, 3
 TURN, SHIFT = 0, 4
 # Below this, of the square of half an angle [rad²], four terms of a series are exact.
 _SERIES = 1e-3
+# What the square of a length of 1 may miss by rounding.
+_ROUNDED = 1e-15
 
 
 @kernel
@@ -213,6 +215,40 @@ def _plane_axes(axis):
     first = minus(start, times(dot(start, axis), axis))
     first = times(1.0 / math.sqrt(dot(first, first)), first)
     return first, cross(axis, first)
+
+
+@kernel
+def _unit(rows, i, k):
+    """Make a vector of a row one of length 1; returns what its length was."""
+    v = three(rows, i, k)
+    squared = dot(v, v)
+    if squared == 0.0 or abs(squared - 1.0) < _ROUNDED:
+        return 1.0
+    length = math.sqrt(squared)
+    put(rows, i, k, times(1.0 / length, v))
+    return length
+
+
+@kernel
+def unit_turn(q):
+    """The quaternion of length 1 along one of about that length."""
+    squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
+    if abs(squared - 1.0) < _ROUNDED:
+        return q
+    size = 1.0 / math.sqrt(squared)
+    return size * q[0], size * q[1], size * q[2], size * q[3]
+
+
+@kernel
+def tidy(nodes, joints):
+    """Directions of joints to the rounding of 64 bits; a longer axis makes more of a coordinate."""
+    for n in range(nodes.shape[0]):
+        j = nodes[n, JOINT]
+        if j >= 0:
+            length = _unit(joints, j, AXIS)
+            joints[j, RATIO] *= length
+            joints[j, OFFSET] *= length
+            put_four(joints, j, ORIENTATION, unit_turn(four(joints, j, ORIENTATION)))
 
 
 @kernel

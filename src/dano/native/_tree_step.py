@@ -42,13 +42,10 @@ from dano.native._tree_balance import (
 )
 from dano.native._tree_frames import (
     add,
-    AXIS,
     BALL,
     BODY,
-    dot,
     exponential,
     four,
-    JOINT,
     KIND,
     largest_turn,
     logarithm,
@@ -56,22 +53,21 @@ from dano.native._tree_frames import (
     motions_at_start,
     move,
     multiply,
-    OFFSET,
-    ORIENTATION,
     PLACE,
     place,
     put,
     put_four,
-    RATIO,
     ROOT,
     rotate,
     rotate_back,
     SHIFT,
     three,
+    tidy,
     times,
     TURN,
     turn_of,
     TURNED,
+    unit_turn,
 )
 from dano.native._tree_laws import (
     ARMATURE,
@@ -92,8 +88,6 @@ _RELATIVE, _EPSILON, _POSES, _STICKS, _STOPS, _LARGEST = range(12, 18)
 # Columns of the table of coordinates: whether a motor does what it is told to, and the row among those with
 # kinks, or −1.
 _CONSTANT, _ROUGH = range(2)
-# What the square of a length of 1 may miss by rounding.
-_ROUNDED = 1e-15
 
 Given = namedtuple("Given", "nodes coordinates bodies joints laws settings rules roots q v effort command")
 """What a step does not change: tables; the number of velocities of free bodies; coordinates of joints, their
@@ -112,39 +106,6 @@ def _copy(source, target):
 
 
 @kernel
-def _unit(rows, i, k):
-    """Make a vector of a row one of length 1; returns what its length was."""
-    v = three(rows, i, k)
-    squared = dot(v, v)
-    if squared == 0.0 or abs(squared - 1.0) < _ROUNDED:
-        return 1.0
-    length = math.sqrt(squared)
-    put(rows, i, k, times(1.0 / length, v))
-    return length
-
-
-@kernel
-def _unit_turn(q):
-    squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
-    if abs(squared - 1.0) < _ROUNDED:
-        return q
-    size = 1.0 / math.sqrt(squared)
-    return size * q[0], size * q[1], size * q[2], size * q[3]
-
-
-@kernel
-def _tidy(nodes, joints):
-    """Directions of joints to the rounding of 64 bits; a longer axis makes more of a coordinate."""
-    for n in range(nodes.shape[0]):
-        j = nodes[n, JOINT]
-        if j >= 0:
-            length = _unit(joints, j, AXIS)
-            joints[j, RATIO] *= length
-            joints[j, OFFSET] *= length
-            put_four(joints, j, ORIENTATION, _unit_turn(four(joints, j, ORIENTATION)))
-
-
-@kernel
 def _begin(given, state, force, torque, room, y):
     """What is known at the start of a step, and the velocities to start from."""
     nodes, bodies, settings = given.nodes, given.bodies, given.settings
@@ -154,7 +115,7 @@ def _begin(given, state, force, torque, room, y):
     for i in range(world):
         put(room.poses, i, 0, three(position, i, 0))
         put_four(room.poses, i, TURNED, four(orientation, i, 0))
-        put_four(room.poses, i, TURNED, _unit_turn(four(room.poses, i, TURNED)))
+        put_four(room.poses, i, TURNED, unit_turn(four(room.poses, i, TURNED)))
     put(room.poses, world, 0, (0.0, 0.0, 0.0))
     put_four(room.poses, world, TURNED, (1.0, 0.0, 0.0, 0.0))
     place(nodes, given.joints, bodies, given.q, given.roots, room.poses, room.known)
@@ -410,7 +371,7 @@ def _end(given, room, y, found, dtype):
         put(omega, i, 0, rotate_back(turn, three(room.twists, n, 3)))
         if nodes[n, KIND] == ROOT:
             put(room.poses, i, 0, add(three(room.poses, i, 0), three(room.ways, n, SHIFT)))
-            put_four(room.poses, i, TURNED, _unit_turn(multiply(four(room.ways, n, TURN), turn)))
+            put_four(room.poses, i, TURNED, unit_turn(multiply(four(room.ways, n, TURN), turn)))
         elif nodes[n, KIND] == BALL:
             own = turn_of((v[at], v[at + 1], v[at + 2]), h, resolved)
             q[at], q[at + 1], q[at + 2] = logarithm(
@@ -443,7 +404,7 @@ def _given(buffers, dtype):
     Numbers of 32 bits become such of 64 where they meet one; what meets only its like is copied.
     """
     nodes, joints = table(buffers[10], numba.int32), doubles(buffers[13], dtype)
-    _tidy(nodes, joints)
+    tidy(nodes, joints)
     roots = 0
     for n in range(nodes.shape[0]):
         roots += 6 if nodes[n, KIND] == ROOT else 0
