@@ -2,12 +2,19 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from dano.engine._balance import jacobian_in_bodies, to_body, to_velocity, to_world
 from dano.engine._newton import Report, SolverOptions
 from dano.engine._primal_dual import RULES, TIERS
 from dano.engine._problem import Pairs, Problem
+from dano.engine._trees import LARGEST_TURN
+from dano.engine.joints import STICKS, STOPS, TreeTables
+from dano.scene import Control, State
+
+POSES = 8.0
+"""How many times the rounding of a pose a step's equations may miss, where the tolerance is its power 3/4."""
 
 
 def is_native(problem: Problem) -> bool:
@@ -66,3 +73,53 @@ def native_root(
     residual, passes, solved = report
     whole = jacobian_in_bodies(problem, jacobian) if derivatives else jnp.zeros((6 * m, 6 * m), dtype)
     return to_body(problem, velocities), whole, Report(residual, passes.astype(int), solved > 0)
+
+
+def native_tree_step(
+    tables: TreeTables, state: State, control: Control | None, options: SolverOptions, *, derivatives: bool
+) -> tuple[State, Report, Float[Array, " k"], Float[Array, "k k"]]:
+    """A step of bodies on joints that touch nothing.
+
+    Returns:
+        The state at its end, the report, and if asked for the generalised velocities and the Jacobian of
+        their residual (of no size unless asked for).
+    """
+    from dano.native import tree_step_name  # compiles or loads the kernel, so only where it is used
+
+    assert state.q is not None and state.v is not None
+    dtype = state.position.dtype
+    k = tables.layout.n_velocities if derivatives else 0
+    epsilon = float(jnp.finfo(dtype).eps)
+    relative = epsilon**0.75 if options.tolerance is None else options.tolerance
+    none, nothing = np.zeros((0, 3), dtype), np.zeros(state.q.shape, dtype)
+    force, torque = (none, none) if control is None else (control.force, control.torque)
+    driven = (None, None) if control is None else (control.effort, control.command)
+    effort, command = (nothing if x is None else x for x in driven)
+    arrays = (state.position, state.orientation, state.velocity, state.omega, state.q, state.v)
+    *following, y, jacobian, residual, passes, solved = jax.ffi.ffi_call(
+        tree_step_name(dtype),
+        (
+            *(jax.ShapeDtypeStruct(x.shape, dtype) for x in arrays),
+            jax.ShapeDtypeStruct((k,), dtype),
+            jax.ShapeDtypeStruct((k, k), dtype),
+            jax.ShapeDtypeStruct((1,), dtype),
+            jax.ShapeDtypeStruct((1,), jnp.int32),
+            jax.ShapeDtypeStruct((1,), bool),
+        ),
+        vmap_method="sequential",
+    )(
+        *arrays,
+        force,
+        torque,
+        effort,
+        command,
+        tables.nodes,
+        tables.coordinates,
+        tables.bodies,
+        tables.joints,
+        tables.laws,
+        tables.settings,
+        np.array([*RULES, relative, epsilon, POSES, STICKS, STOPS, LARGEST_TURN], dtype),
+        np.array([options.max_iterations], np.int32),
+    )
+    return State(*following), Report(residual[0], passes[0].astype(int), solved[0]), y, jacobian

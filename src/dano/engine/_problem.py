@@ -33,6 +33,7 @@ from dano.engine._newton import inverse3
 from dano.engine._rigid import angular_momentum, turned
 from dano.engine._sequential import one_at_a_time
 from dano.engine._trees import build_tree, Tree, tree_mobilities
+from dano.engine.joints import tree_tables, TreeTables
 from dano.maths import matmul, matvec, quat_to_matrix
 from dano.scene import colliders, Control, Poses, pressing_pairs, Scene, State, step_twists
 
@@ -45,12 +46,14 @@ class Prepared(eqx.Module):
         material: Of the contacts with point laws, the fields of `Material` one below the other.
         impacts: How they treat impacts.
         capacity: Chunks of points that a step has room for (static).
+        trees: Tables of the trees, where machine code makes the whole step; else None.
     """
 
     geometry: Geometry | None
     material: Float[Array, "13 k"] | None
     impacts: Impacts | None
     capacity: int = eqx.field(static=True)
+    trees: TreeTables | None = None
 
 
 class Problem(eqx.Module):
@@ -126,7 +129,9 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
     if scene.others is not None:
         groups.append((scene.others.law, scene.others.pair_params))
     if not groups:
-        return Prepared(None, None, None, 0)
+        # On a CPU; a step of free bodies alone is short, and one with contact or loops needs more than trees.
+        whole = scene.joints and not scene.contacts and not scene.loops and jax.default_backend() == "cpu"
+        return Prepared(None, None, None, 0, tree_tables(scene) if whole else None)
     h = scene.timestep
     gravity = jnp.sqrt(jnp.sum(scene.gravity**2))
     material = materials(groups, h, gravity)

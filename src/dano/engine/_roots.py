@@ -22,7 +22,7 @@ from dano.engine._balance import (
     world_momenta,
     world_patches,
 )
-from dano.engine._kernels import is_native, native_root
+from dano.engine._kernels import is_native, native_root, POSES
 from dano.engine._newton import newton, solve_small, SolverOptions
 from dano.engine._primal_dual import Balance, primal_dual
 from dano.engine._problem import Pairs, Problem
@@ -31,8 +31,6 @@ from dano.engine._trees import closure_of, loop_gaps, mass_matrix, rough_of, Tre
 from dano.engine.joints import Closure, Rough
 from dano.maths import matmul, matvec
 
-# How many times the rounding of a pose a step's equations may miss, where the tolerance is its power 3/4.
-_POSES = 8.0
 # Shares of the restitution that a step with impacts tries, until contact adds no energy. Newton's restitution
 # may add some where friction reverses the slip (Kane and Levinson 1985, Dynamics: Theory and Applications).
 # Without rebound contact only dissipates.
@@ -77,22 +75,56 @@ def solve(problem: Problem, start: Array, pairs: Pairs, options: SolverOptions):
     def _(primals, tangents):
         problem, start = primals
         velocities, jacobian, report, share = find_root(problem, start, derivatives=True)
-        # The inverse, not a solve: the tangent must be linear in `change` for reverse mode to transpose it.
-        inverse = solve_small(jacobian, jnp.eye(jacobian.shape[0], dtype=jacobian.dtype))
-        velocities, inverse, share = (checkpoint_name(x, KEPT) for x in (velocities, inverse, share))
-        d_problem = tangents[0]
-        d_report = jax.tree.map(lambda _: None, report)
-        if not jax.tree.leaves(d_problem):
-            return (velocities, report), (jnp.zeros_like(velocities), d_report)
-        _, change = by_autodiff(
-            lambda p: step_residual(velocities, p.rebounding(share), pairs), (problem,), (d_problem,)
-        )
-        return (velocities, report), (-matvec(inverse, change).reshape(velocities.shape), d_report)
+        velocities, inverse, share = _kept(velocities, jacobian, share)
+        change = _change(problem, tangents[0], velocities, inverse, share, pairs)
+        return (velocities, report), (change, jax.tree.map(lambda _: None, report))
 
     if not _closes(problem):
         return root(problem, start)
     velocities, report = root(problem, jnp.concatenate([start, _no_forces(problem)]))
     return velocities[: start.shape[0]], report
+
+
+def solved(
+    problem: Problem, velocities: Float[Array, " k"], jacobian: Float[Array, "k k"], pairs: Pairs
+) -> Float[Array, " k"]:
+    """Velocities at the end of a step that are known, which change with the step as those of `solve` do.
+
+    Args:
+        problem: The step.
+        velocities: Its solution.
+        jacobian: Of its residual there.
+        pairs: Static structure.
+    """
+    velocities, inverse, share = _kept(velocities, jacobian, jnp.ones((), velocities.dtype))
+
+    @eqx.filter_custom_jvp
+    def root(problem, velocities, inverse):
+        return velocities
+
+    @root.def_jvp
+    def _(primals, tangents):
+        problem, velocities, inverse = primals
+        return velocities, _change(problem, tangents[0], velocities, inverse, share, pairs)
+
+    return root(problem, velocities, inverse)
+
+
+def _kept(velocities: Array, jacobian: Array, share: Array):
+    """The solution of a step, the inverse of its Jacobian and its share, which reverse mode keeps."""
+    # The inverse, not a solve: the tangent must be linear in a change for reverse mode to transpose it.
+    inverse = solve_small(jacobian, jnp.eye(jacobian.shape[0], dtype=jacobian.dtype))
+    return (checkpoint_name(x, KEPT) for x in (velocities, inverse, share))
+
+
+def _change(problem: Problem, change, velocities: Array, inverse: Array, share: Array, pairs: Pairs) -> Array:
+    """How the solution of a step changes with the step: the implicit function theorem."""
+    if not jax.tree.leaves(change):
+        return jnp.zeros_like(velocities)
+    _, missing = by_autodiff(
+        lambda p: step_residual(velocities, p.rebounding(share), pairs), (problem,), (change,)
+    )
+    return -matvec(inverse, missing).reshape(velocities.shape)
 
 
 def _passive(find, problem: Problem, start: Array):
@@ -199,7 +231,7 @@ def _root_of_trees(problem: Problem, start: Float[Array, " k"], pairs: Pairs, op
     # Velocities come out of differences of poses: rounding in these counts 1/h times, and a light link feels
     # that of heavy ones.
     epsilon, reach = float(jnp.finfo(start.dtype).eps), 1 + jnp.max(jnp.abs(tree.position))
-    size = size + _POSES * epsilon**0.25 * reach / problem.timestep
+    size = size + POSES * epsilon**0.25 * reach / problem.timestep
     rough = _rough(problem, tree)
     closure = _closure(problem, tree) if _closes(problem) else None
     forces = start[k:]

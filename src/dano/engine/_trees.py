@@ -12,7 +12,9 @@ part of y as a free body does by its spin; q⁺ is the rotation vector of what i
 
 These are the discrete Euler–Lagrange equations of the whole (the discrete null space method: Betsch and
 Leyendecker 2006), so bodies on joints have the order and the conservation of free ones, and joints hold
-exactly. Contact sees bodies move by J_i(q) y + c_i, which is V_i at the old velocities.
+exactly. Contact sees bodies move by J_i(q) y + c_i, which is V_i at the old velocities. On a CPU and where
+nothing touches, machine code makes the whole step by these equations (see `_kernels`); only its derivatives
+come from here.
 """
 
 import equinox as eqx
@@ -39,8 +41,8 @@ from dano.scene import (
     triples,
 )
 
-# Angle by which joints may turn a body in a step [rad]: from 180° on a turn reads as one the other way.
-_LARGEST_TURN = 2.8
+LARGEST_TURN = 2.8
+"""Angle by which joints may turn a body in a step [rad]: from 180° on a turn reads as one the other way."""
 
 
 class Tree(eqx.Module):
@@ -219,7 +221,7 @@ def turns_too_far(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]) -> Arr
         at = np.array([d for d, (j, i, _) in enumerate(layout.dofs) if j in balls and i == 0], int)
         turns = turns.at[at].set(safe_norm(moved[triples(first)]))
     moved_by = np.array(layout.moved_by, float).reshape(layout.bodies, -1)
-    return jnp.any(jnp.asarray(moved_by, y.dtype) @ turns > _LARGEST_TURN)
+    return jnp.any(jnp.asarray(moved_by, y.dtype) @ turns > LARGEST_TURN)
 
 
 def _moved(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]) -> Float[Array, " j"]:

@@ -38,7 +38,7 @@ MIX, RENEWED = 10, 11
 
 
 @kernel
-def _shares(squared, resolved, fade):
+def shares(squared, resolved, fade):
     """m, m′/x, g and g′/x of `dano.engine._rigid` at x² = (h |ω|/2)²."""
     if squared <= resolved * resolved:
         root = math.sqrt(1.0 - squared)
@@ -68,7 +68,7 @@ def _add_own(body, velocity, h, rules, residual, block):
         omega[k] = rotation[0, k] * velocity[3] + rotation[1, k] * velocity[4] + rotation[2, k] * velocity[5]
         block[k, k] = mass
     squared = omega[0] * omega[0] + omega[1] * omega[1] + omega[2] * omega[2]
-    share, share_slope, torque, torque_slope = _shares(0.25 * h * h * squared, rules[RESOLVED], rules[FADE])
+    share, share_slope, torque, torque_slope = shares(0.25 * h * h * squared, rules[RESOLVED], rules[FADE])
     for k in range(3):
         spin[k] = inertia[k, 0] * omega[0] + inertia[k, 1] * omega[1] + inertia[k, 2] * omega[2]
     for k in range(3):

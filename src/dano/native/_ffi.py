@@ -107,10 +107,29 @@ def doubles(buffer, dtype):
 
 
 @kernel
+def numbers(buffer, dtype):
+    """A copy of `vector` of 64-bit numbers."""
+    source = vector(buffer, dtype)
+    result = np.empty(source.size)
+    for i in range(source.size):
+        result[i] = source[i]
+    return result
+
+
+@kernel
 def cube(buffer, dtype):
     """Numbers of a buffer with three axes."""
     shape = shape_of(buffer)
     return numba.carray(_pointer(_words(buffer, _BUFFER_WORDS)[_DATA], dtype), (shape[0], shape[1], shape[2]))
+
+
+@kernel
+def part(whole, at, shape):
+    """An array in an array of 64-bit numbers, from a place on; it does not keep the whole alive.
+
+    Slices do, which costs more than to allocate small arrays one by one.
+    """
+    return numba.carray(_pointer(whole.ctypes.data + 8 * at, numba.float64), shape)
 
 
 def register(name: str, handler) -> str:

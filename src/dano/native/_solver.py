@@ -47,15 +47,8 @@ from dano.native._ffi import (
     tells_version,
     vector,
 )
-from dano.native._law import (
-    DRIFT,
-    fit_duals,
-    follow,
-)
-
-# A line search: work of the residual along the step at the accepted point, share to try, the bracket and the
-# works at its ends.
-_BEGUN, _LENGTH, _LOW, _LOW_WORK, _HIGH, _HIGH_WORK = range(6)
+from dano.native._law import DRIFT, fit_duals, follow
+from dano.native._line_search import accepts, begin_search, LENGTH, narrow
 
 
 @kernel
@@ -151,38 +144,6 @@ def _scales(bodies, scale):
 
 
 @kernel
-def _accepts(work, rules, search):
-    """Whether a share of the step is good enough, see `Search.accepts` of `dano.engine`."""
-    bracketed = search[_HIGH] > 0.0
-    limit = rules[ENOUGH] * abs(search[_BEGUN])
-    misses = work > limit or (bracketed and work < -limit) or math.isnan(work)
-    narrow = bracketed and search[_HIGH] - search[_LOW] < rules[GIVE_UP]
-    return not misses or narrow or search[_BEGUN] >= 0.0
-
-
-@kernel
-def _begin_search(begun, search):
-    search[_BEGUN], search[_LENGTH] = begun, 1.0
-    search[_LOW], search[_LOW_WORK], search[_HIGH], search[_HIGH_WORK] = 0.0, begun, 0.0, 0.0
-
-
-@kernel
-def _narrow(work, search):
-    """Bracket and next share of a line search after a miss, see `Search.narrowed` of `dano.engine`."""
-    length, high = search[_LENGTH], search[_HIGH]
-    if not work < 0.0:
-        search[_LOW_WORK] *= 0.5
-        search[_HIGH], search[_HIGH_WORK] = length, work
-    else:
-        search[_LOW], search[_LOW_WORK] = length, work
-        if high != 0.0:
-            search[_HIGH_WORK] *= 0.5
-    portion = -search[_LOW_WORK] / (search[_HIGH_WORK] - search[_LOW_WORK])
-    portion = min(max(portion, 0.1), 0.9) if not math.isnan(portion) else 0.1
-    search[_LENGTH] = search[_LOW] + portion * (search[_HIGH] - search[_LOW])
-
-
-@kernel
 def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iterations, whole):
     """The loop of `dano.engine._primal_dual.primal_dual`.
 
@@ -212,15 +173,15 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
     _copy(start, best)
     _scales(bodies, scale)
     _fit_all(points, groups, apart, start)
-    _begin_search(0.0, search)
+    begin_search(0.0, search)
     level, budget, iteration, mix = 0, tiers[0, 3], 0, 0.0
     share, solved, before, best_error = 1.0, False, np.inf, np.inf
     while not solved and iteration < max_iterations and level < tiers.shape[0]:
         softness, searches, holds = tiers[level, 0], tiers[level, 2] > 0.0, tiers[level, 4] > 0.0
-        pass_[0], pass_[1], pass_[2], pass_[3] = search[_LENGTH], softness, tiers[level, 4], mix
+        pass_[0], pass_[1], pass_[2], pass_[3] = search[LENGTH], softness, tiers[level, 4], mix
         for i in range(m):
             for k in range(6):
-                tried[i, k] = accepted[i, k] + search[_LENGTH] * step[i, k]
+                tried[i, k] = accepted[i, k] + search[LENGTH] * step[i, k]
         unfit, push, renewed = assemble(
             bodies, tried, points, groups, apart, h, rules, pass_, residual, matrix, used
         )
@@ -229,7 +190,7 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
         hard = softness == 1.0
         enough = tolerance if hard else max(tolerance, rules[SOFT_TOLERANCE] * 1e-7 * softness)
         small = error <= enough
-        accept = small or not searches or _accepts(work, rules, search)
+        accept = small or not searches or accepts(work, rules[ENOUGH], rules[GIVE_UP], search)
         solved = small and hard and (unfit <= epsilon ** rules[FIT] * push or before <= enough)
         if hard and error < best_error:
             best_error = error
@@ -248,14 +209,14 @@ def solve(bodies, points, groups, apart, start, settings, tiers, rules, max_iter
         begins = harder and level < tiers.shape[0] and tiers[level, 4] > 0.0
         mix = 1.0 if begins else rules[MIX] if accept and small and holds else 0.0
         if not accept:
-            _narrow(work, search)
+            narrow(work, search)
         else:
             _copy(tried, accepted)
             if not solved:
                 _find_step(matrix, spare, residual, step, used, part, order, count, later)
                 _follow_all(points, groups, apart, step)
                 # The next pass is no longer of the same function where bounds are renewed: it is accepted.
-                _begin_search(0.0 if mix > 0.0 else _work(step, residual), search)
+                begin_search(0.0 if mix > 0.0 else _work(step, residual), search)
             before = error
         iteration += 1
     _copy(accepted if solved else best, start)

@@ -1,4 +1,11 @@
-"""What acts on joint coordinates in a step, and how a step solves for what has kinks."""
+"""What acts on joint coordinates in a step, how a step solves for what has kinks, and trees as tables."""
 
 from dano.engine.joints._closure import Closure as Closure
-from dano.engine.joints._forces import JointForces as JointForces, Ramps as Ramps, Rough as Rough
+from dano.engine.joints._forces import (
+    JointForces as JointForces,
+    Ramps as Ramps,
+    Rough as Rough,
+    STICKS as STICKS,
+    STOPS as STOPS,
+)
+from dano.engine.joints._tables import tree_tables as tree_tables, TreeTables as TreeTables

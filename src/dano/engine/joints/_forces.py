@@ -22,11 +22,13 @@ from jaxtyping import Array, Float
 
 from dano.scene import JointLaws
 
-# Speed [rad/s or m/s] at which friction has its full size: joints that stick creep by no more.
-_STICKS = 1e-7
-# How much stiffer a limit is than what the coordinate weighs per h²: with an acceleration a, a coordinate
-# ends a h² times the inverse of this beyond its limit.
-_STOPS = 1e4
+STICKS = 1e-7
+"""Speed [rad/s or m/s] at which friction has its full size: joints that stick creep by no more."""
+STOPS = 1e4
+"""How much stiffer a limit is than what the coordinate weighs per h².
+
+With an acceleration a, a coordinate ends a h² times the inverse of this beyond its limit.
+"""
 
 
 class Ramps(NamedTuple):
@@ -113,9 +115,9 @@ class JointForces(eqx.Module):
         found = []
         if laws.friction is not None:
             most = laws.friction[rows]
-            found.append((most / _STICKS, jnp.zeros_like(q), -most, most))
+            found.append((most / STICKS, jnp.zeros_like(q), -most, most))
         if laws.limits is not None:
-            stiff, (least, most) = _STOPS * weight / h, laws.limits[rows].T
+            stiff, (least, most) = STOPS * weight / h, laws.limits[rows].T
             none, endless = jnp.zeros_like(q), jnp.full_like(q, jnp.inf)
             for end, low, high in ((least, -endless, none), (most, none, endless)):
                 bounded = jnp.isfinite(end)
