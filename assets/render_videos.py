@@ -145,10 +145,12 @@ def push(times: np.ndarray) -> np.ndarray:
     return np.stack([x, np.full_like(x, 0.005), np.full_like(x, BLOCK[2])], axis=1)
 
 
-# It turns by more than once before it lands. After half a turn the circle of the centre of mass cannot be told
-# from a change of velocity: poses within 0.5 mm then leave 3.3 mm, here 0.7 mm.
+# It turns by more than once before it lands. After half a turn the circle of the centre of mass cannot be
+# told from another velocity: with poses within 0.5 mm it is known to 3.3 mm then, here to 0.7 mm.
 _LOADED = tumble(
-    (-0.10, -0.05, 0.085, 0.8, 0.4, -0.3, 0.2), (0.15, 0.07, 0.83, 5, 16, -14), moved_by=(0.0042, -0.003, 0.003)
+    (-0.10, -0.05, 0.085, 0.8, 0.4, -0.3, 0.2),
+    (0.15, 0.07, 0.83, 5, 16, -14),
+    moved_by=(0.0042, -0.003, 0.003),
 )
 
 FILMS = {
