@@ -403,6 +403,18 @@ def test_a_table_is_bright_where_the_object_passes_with_its_shadow():
     assert np.isnan(bare_brightness(frames, [np.ones((20, 30), np.float32)] * 8)).all()
 
 
+def test_a_fast_spin_is_followed_from_the_first_frame_on(bunny, camera):
+    """31° a frame, which nothing tells before the third one."""
+    position, orientation = path(5, spin=(0.2, 0.4, -0.3))
+    frames, masks = zip(
+        *(drawn(bunny, camera, p, q) for p, q in zip(position, orientation, strict=True)), strict=True
+    )
+    found = track(film_of(frames, masks), bunny, camera, ROUGH, start=(position[0], orientation[0]))
+    assert found.n_tracked == 5
+    _, turn = errors(found, position, orientation, slice(None))
+    assert np.degrees(turn).max() < 5
+
+
 def ramp():
     values = np.random.default_rng(0).integers(0, 255, (SIZE[1], SIZE[0], 3))
     return values.astype(np.uint8)

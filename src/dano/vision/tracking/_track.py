@@ -52,6 +52,9 @@ _OTHER = np.radians(12)
 _WORSE = 0.03
 """By how much less than usually a silhouette must overlap for other poses to be tried."""
 
+_NEAR = 4
+"""Frames between two that say where the object is in others near them."""
+
 _ASIDE = np.radians(15)
 """By how much these are turned."""
 
@@ -95,6 +98,7 @@ def track(
     for i in range(len(film.times)):
         tell(f"tracking, frame {film.names[i]}", i / len(film.times))
         walk.step(i)
+    walk.look_again()
     return walk.result()
 
 
@@ -168,17 +172,37 @@ class _Walk:
         seen = [j for j in range(i) if self._found[j] is not None]
         if not seen or self._missed > self._options.search_every:
             return None
-        times, last = self._film.times, self._place(seen[-1])
+        last = self._place(seen[-1])
         if len(seen) < 2 or seen[-1] - seen[-2] > 3:
             return last
-        share = (times[i] - times[seen[-1]]) / (times[seen[-1]] - times[seen[-2]])
-        earlier = self._place(seen[-2])
-        turn = quat_log(quat_multiply(quat_conjugate(earlier.orientation), last.orientation))
+        return dataclasses.replace(self._carried(seen[-2], seen[-1], i), drift=last.drift)
+
+    def _carried(self, j: int, k: int, i: int) -> Placement:
+        """The pose in frame i at the constant velocity that leads from frame j to k."""
+        times, first, second = self._film.times, self._place(j), self._place(k)
+        share = (times[i] - times[k]) / (times[k] - times[j])
+        turn = quat_log(quat_multiply(quat_conjugate(first.orientation), second.orientation))
         return Placement(
-            last.position + share * (last.position - earlier.position),
-            quat_multiply(last.orientation, quat_exp(share * turn)),
-            last.drift,
+            second.position + share * (second.position - first.position),
+            quat_multiply(second.orientation, quat_exp(share * turn)),
         )
+
+    def look_again(self) -> None:
+        """Begin once more in frames that fit worse than usual, or were lost: where frames around them say.
+
+        What spins fast is not near its first pose in the second frame, and nothing tells yet how it moves.
+        """
+        fits = {i: found.overlap for i, found in enumerate(self._found) if found is not None}
+        usual = np.median(list(fits.values())) if fits else 0.0
+        good = [i for i, fit in fits.items() if fit > usual - _WORSE]
+        for i, other in enumerate(self._found):
+            before, after = [j for j in good if j < i][-2:], [j for j in good if j > i][:2]
+            pair = [before[-1], after[0]] if before and after else [*before, *after]
+            if i in good or len(pair) < 2 or max(*pair, i) - min(*pair, i) > _NEAR:
+                continue
+            found, status = self._followed(i, self._carried(pair[0], pair[1], i))
+            if found is not None and (other is None or score(found) < score(other)):
+                self._found[i], self._status[i] = self._exposed(i, found) or found, status
 
     def _exposed(self, i: int, found: Refined) -> Refined:
         """The pose once more, with how the object moves while the frame is exposed."""
