@@ -374,7 +374,7 @@ def test_the_shadow_on_a_table_says_where_the_sun_is(bunny, sun):
     shadows, nothing = ShadowFit(Subject(bunny), 0.0), ShadowFit(Subject(bunny), 0.0)
     for x, angle in ((-0.03, 0.4), (0.02, 1.5)):
         place = Placement(np.array([x, 0.01, 0.0]), np.array([np.cos(angle / 2), 0, 0, np.sin(angle / 2)]))
-        pose = Pose(place.position, quaternion=place.orientation)
+        pose = Pose(place.position, place.orientation)
         seen = compose([Item(bunny, pose), table], camera, lamps, ambient=0.3)
         free = ~ndimage.binary_dilation(seen.identity == 0, iterations=2)
         noise = 0.01 * rng.normal(size=bare.shape)

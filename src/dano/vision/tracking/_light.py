@@ -63,6 +63,9 @@ _SURE = 25.0
 _SHADE_NOISE = 0.01
 """Standard deviation of shades of the table, least."""
 
+_REWEIGHTED = 4
+"""Fits of shades by least squares, each weighted by what the one before missed (convention)."""
+
 _DARK = 0.01
 """Linear brightness of a table below which it shows no shadow."""
 
@@ -289,11 +292,11 @@ def _unlikely(one: _Shadow, hidden: np.ndarray) -> float:
     """
     sunny = hidden.any()
     columns = [np.ones(len(hidden)), -one.sky, *([-hidden] if sunny else [])]
-    a, weight, away = np.stack(columns, axis=1), np.ones(len(hidden)), one.shade
-    for _ in range(4):
+    a, away, found = np.stack(columns, axis=1), np.zeros(len(hidden)), np.zeros(len(columns))
+    for _ in range(_REWEIGHTED):
+        weight = 1 / np.sqrt(1 + away**2)
         found = np.linalg.lstsq(weight[:, None] * a, weight * one.shade, rcond=None)[0]
         away = (a @ found - one.shade) / one.noise
-        weight = 1 / np.sqrt(1 + away**2)
     if sunny and found[2] < 0:
         # Nothing shines out of a shadow.
         return _unlikely(one, np.zeros(len(hidden)))
