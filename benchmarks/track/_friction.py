@@ -50,12 +50,17 @@ def fit_film(
 
 
 def fit_centre_of_mass(name: str, found: Tracked, frames: int) -> np.ndarray:
-    """Centre of mass [m, object's frame] of what flies, from its first frames; the state is unknown, too."""
+    """Centre of mass [m, object's frame] of what flies, from its first frames.
+
+    State and inertia are unknown, too: what moves the centre of mass changes how the object turns.
+    """
     built = build_asset(f"trained_{name}")
     scene = dano.Scene.create(bodies=[dano.Body(name, built)], timestep=1 / 240)
     motion = Motion.from_tracked(found, name)
     away = dano.Parameter("away", lambda s: s.body(name).com_offset, -0.03, 0.03)
+    inertia = dano.Parameter("inertia", lambda s: s.body(name).inertia)
     with warnings.catch_warnings():
+        # The scale of the inertia does not show in free flight, and identify says so.
         warnings.simplefilter("ignore", RuntimeWarning)
-        fit = identify(scene, motion.part(0, frames), [away], initial="states")
+        fit = identify(scene, motion.part(0, frames), [away, inertia], initial="states")
     return np.asarray(built.mass.com) + np.asarray(fit.values["away"])

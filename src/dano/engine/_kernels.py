@@ -108,17 +108,11 @@ def native_tree_step(
         ),
         vmap_method="sequential",
     )(
-        *arrays,
-        force,
-        torque,
-        effort,
-        command,
+        # Machine code reads numbers of one type.
+        *(x.astype(dtype) for x in (*arrays, force, torque, effort, command)),
         tables.nodes,
         tables.coordinates,
-        tables.bodies,
-        tables.joints,
-        tables.laws,
-        tables.settings,
+        *(x.astype(dtype) for x in (tables.bodies, tables.joints, tables.laws, tables.settings)),
         np.array([*RULES, relative, epsilon, POSES, STICKS, STOPS, LARGEST_TURN], dtype),
         np.array([options.max_iterations], np.int32),
     )
