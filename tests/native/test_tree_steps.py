@@ -156,6 +156,8 @@ def test_single_precision(all_kinds):
     for name in ("position", "orientation", "velocity", "omega", "q", "v"):
         assert getattr(step, name).dtype == jnp.float32
         np.testing.assert_allclose(getattr(step, name), getattr(exact, name), atol=1e-3, err_msg=name)
+    mixed = dano.step(all_kinds, state, short(control))
+    np.testing.assert_allclose(mixed.velocity, exact.velocity, rtol=0, atol=1e-4)
 
 
 def test_momenta_of_a_chain_stay_to_rounding():
