@@ -371,7 +371,7 @@ def test_the_shadow_on_a_table_says_where_the_sun_is(bunny, sun):
     rng = np.random.default_rng(3)
     texture = ndimage.gaussian_filter(rng.uniform(0.6, 1.0, (120, 160)), 1.0)[..., None]
     bare = compose([table], camera, lamps, ambient=0.3).colour * texture
-    shadows, nothing = ShadowFit(Subject(bunny), 0.0), ShadowFit(Subject(bunny), 0.0)
+    shadows, nothing = (ShadowFit(Subject(bunny), 0.0, keep=6) for _ in range(2))
     for x, angle in ((-0.03, 0.4), (0.02, 1.5)):
         place = Placement(np.array([x, 0.01, 0.0]), np.array([np.cos(angle / 2), 0, 0, np.sin(angle / 2)]))
         pose = Pose(place.position, place.orientation)

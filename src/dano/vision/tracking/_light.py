@@ -39,17 +39,17 @@ _FLAT = 0.02
 _MOST_PIXELS = 700
 """Of a frame that lamps are fitted to: forty times the directions (convention)."""
 
-_SHADOW_FRAMES = 3
-"""Frames whose shadows count: two are enough for 2° (rendered films)."""
-
 _SHADOW_REACH = 3.0
 """Radii of the object up to which its shadow is looked for."""
 
-_SHADOW_TURN = 0.25
-"""First turn of the search for the sun by its shadow [rad]: half the distance of neighbouring directions."""
+_SHADOW_STARTS = 64
+"""Directions that this search begins with: 18° apart, as far as the shadow of a flat thing still overlaps."""
+
+_SHADOW_TURN = 0.15
+"""Its first turn [rad]: half the distance of neighbouring directions."""
 
 _SHADOW_TRIES = 40
-"""Directions that this search tries."""
+"""Directions that it tries then."""
 
 _LOWEST = 0.15
 """Least height of a sun above the table, as the sine of its angle: shadows are longer than the picture."""
@@ -86,7 +86,7 @@ class LightFit:
 
     def __init__(self, subject: Subject, keep: int = 6, table: float | None = None):
         self.lamps = unlit()
-        self._shadows = None if table is None else ShadowFit(subject, table)
+        self._shadows = None if table is None else ShadowFit(subject, table, keep)
         self.known = False
         self._subject = subject
         self._keep = keep
@@ -94,7 +94,7 @@ class LightFit:
         self._seen: list[np.ndarray] = []
         self._views: list[tuple[Placement, AbstractCamera, np.ndarray]] = []
         self._sun: np.ndarray | None = None
-        self._places = _spread(-1.0)
+        self._places = _spread(-1.0, _DIRECTIONS)
 
     def add(
         self,
@@ -229,10 +229,11 @@ class _Shadow(NamedTuple):
 class ShadowFit:
     """Where the sun is, from the shadow of a known object on a level table (host)."""
 
-    def __init__(self, subject: Subject, table: float):
-        self._subject, self._table = subject, table
+    def __init__(self, subject: Subject, table: float, keep: int):
+        self._subject, self._table, self._keep = subject, table, keep
+        self._sun: np.ndarray | None = None
         self._frames: list[_Shadow] = []
-        self._above = _spread(0.0)
+        self._above = _spread(0.0, _DIRECTIONS)
         self._random = np.random.default_rng(0)
 
     def add(self, place: Placement, camera: AbstractCamera, image: np.ndarray, bare, free) -> None:
@@ -255,7 +256,7 @@ class ShadowFit:
         sky = sum(up[2] * self._hidden(place, points, up) for up in self._above) / self._above[:, 2].sum()
         noise = 1.48 * float(np.median(np.abs(shade - np.median(shade))))
         one = _Shadow(place, points, shade, np.asarray(sky), max(noise, _SHADE_NOISE))
-        self._frames = [*self._frames, one][-_SHADOW_FRAMES:]
+        self._frames = [*self._frames, one][-self._keep :]
 
     def sun(self) -> Float[np.ndarray, "3"] | None:
         """Direction towards the sun; None if no shadow says where it is."""
@@ -267,10 +268,11 @@ class ShadowFit:
                 return np.inf
             return sum(_unlikely(one, self._hidden(one.place, one.points, towards)) for one in self._frames)
 
-        begin = min(self._above, key=unlike)
+        begin = min(_spread(_LOWEST, _SHADOW_STARTS), key=unlike) if self._sun is None else self._sun
         best = _best_direction(unlike, begin, _SHADOW_TURN, _SHADOW_TRIES)
         without = sum(_unlikely(one, np.zeros(len(one.shade))) for one in self._frames)
-        return best if without - unlike(best) > _SURE else None
+        self._sun = best if without - unlike(best) > _SURE else None
+        return self._sun
 
     def _hidden(self, place: Placement, points: np.ndarray, towards: np.ndarray) -> np.ndarray:
         """How much of the light from a direction the object keeps from points, 0 to 1."""
@@ -303,10 +305,10 @@ def _unlikely(one: _Shadow, hidden: np.ndarray) -> float:
     return float(np.sum(np.log1p(away**2)))
 
 
-def _spread(lowest: float) -> Float[np.ndarray, "_ 3"]:
+def _spread(lowest: float, count: int) -> Float[np.ndarray, "_ 3"]:
     """Unit vectors spread evenly over the part of the sphere above a height."""
-    turn = np.pi * (3 - np.sqrt(5)) * np.arange(_DIRECTIONS)
-    z = 1 - (1 - lowest) * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    z = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
     flat = np.sqrt(1 - z**2)
     return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
 
