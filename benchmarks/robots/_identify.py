@@ -115,7 +115,7 @@ def rows(group: str, panda: Path, arm: Path, seeds: int) -> list[Row]:
 def _regions(group: str, name: str, case: Case, made: Sequence[dano.Identification]) -> Row:
     size = len(made[0].labels)
     found = [distance(fit, case) for fit in made]
-    inside = sum(d < chi2.ppf(0.95, size) for d in found)
+    inside = float(np.sum(np.array(found) < chi2.ppf(0.95, size)))
     note = f"squared errors over their covariance: {np.mean(found):.1f} in the mean, expected {size}"
     return Row(group, f"{name}: 95 % regions that hold the truth", inside, f"of {len(made)}", note=note)
 
