@@ -13,6 +13,7 @@ from vision.models import learned
 import dano
 from dano.identify import Motion
 from dano.pixels import draw_frames, film, identify_in_film
+from dano.pixels._identify import _with_table
 from dano.report import draw_simulated, write_identification_report
 from dano.vision import Camera, Film, GAMMA, LearnedField, Light, PosedCamera, SurfaceModel, TrackOptions
 
@@ -30,6 +31,27 @@ def scene():
     law = dano.CentroidLaw(stiction_velocity=1e-4)
     bodies = [dano.Body("ball", dano.Sphere(0.3), mass=1.0), dano.Body("floor", dano.HalfSpace(), fixed=True)]
     return dano.Scene.create(bodies, [dano.Contact("ball", "floor", params, law)], timestep=0.02)
+
+
+def test_the_table_of_a_film_is_the_highest_level_plane_below_the_body():
+    tilted = (np.cos(0.2), np.sin(0.2), 0.0, 0.0)
+    planes = {"floor": -0.5, "table": 0.1, "ceiling": 2.0}
+    bodies = [dano.Body(name, dano.HalfSpace(offset=height), fixed=True) for name, height in planes.items()]
+    bodies += [dano.Body("ramp", dano.HalfSpace((0, np.sin(0.4), np.cos(0.4)), 0.2), fixed=True)]
+    bodies += [dano.Body("ball", dano.Sphere(0.05), mass=1.0)]
+    scene = dano.Scene.create(bodies, timestep=0.01)
+    motion = Motion.create(np.arange(2) / 30, "ball", position=np.array([[[0, 0, 0.2]], [[0.1, 0, 0.16]]]))
+    assert _with_table(scene, motion, TrackOptions()).table == pytest.approx(0.1)
+    assert _with_table(scene, motion, TrackOptions(table=0.3)).table == 0.3
+    below = dataclasses.replace(motion, position=motion.position - [0, 0, 1.0])
+    assert _with_table(scene, below, TrackOptions()).table is None
+    # A plane stands where its body does: its normal turns with it.
+    solid = dano.Body("slope", dano.HalfSpace((0, 0, 1), 0.3), fixed=True)
+    plane = solid.half_space_at(jnp.array([0.0, 0.0, 0.5]), jnp.array(tilted))
+    assert plane is not None
+    normal, offset = plane
+    np.testing.assert_allclose(normal, [0, -np.sin(0.4), np.cos(0.4)], atol=1e-6)
+    assert offset == pytest.approx(0.3 + 0.5 * np.cos(0.4), abs=1e-6)
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from dano.fields import HalfSpace
 from dano.identify._motion import Motion
-from dano.maths import quat_rotate, quat_to_matrix
+from dano.maths import quat_to_matrix
 from dano.scene import Scene, State
 
 _FASTEST = 340.0
@@ -109,15 +108,14 @@ def _check_planes(scene: Scene, state: State | None, motion: Motion, row: int) -
     planes = {a if b == name else b for a, b in scene.pairs if name in (a, b)}
     for other in sorted(planes):
         plane = scene.body(other)
-        if not plane.fixed or not isinstance(plane.shape, HalfSpace):
-            continue
-        normal, offset = np.asarray(plane.shape.normal_direction), float(plane.shape.offset)
+        pose = plane.com, jnp.array([1.0, 0.0, 0.0, 0.0])
         if state is not None:
             i = scene.index(other)
-            normal = np.asarray(quat_rotate(state.orientation[i], jnp.asarray(normal)))
-            offset += float(
-                normal @ np.asarray(state.position[i] - quat_rotate(state.orientation[i], plane.com))
-            )
+            pose = state.position[i], state.orientation[i]
+        there = plane.half_space_at(*pose)
+        if not plane.fixed or there is None:
+            continue
+        normal, offset = there
         gaps = _gaps(body, motion, row, known, normal, offset)
         text = _beside(gaps, motion.times[known], body.size)
         if text:

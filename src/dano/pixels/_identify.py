@@ -8,9 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dano.checks import checked_count, checked_kind
-from dano.fields import HalfSpace
 from dano.identify import Identification, identify, Motion, Parameter
-from dano.maths import quat_rotate
 from dano.progress import Progress
 from dano.scene import Scene
 from dano.vision import adjust_poses, Film, LearnedField, Light, PosedCamera, Tracked, TrackOptions
@@ -132,11 +130,9 @@ def _with_table(scene: Scene, motion: Motion, options: TrackOptions) -> TrackOpt
     reach = float(np.nanmax(motion.position[..., 2])) + _SUNK * scene.body(motion.names[0]).size
     state, heights = scene.initial_state(), []
     for body, at, turn in zip(scene.bodies, state.position, state.orientation, strict=True):
-        if not (body.fixed and isinstance(body.shape, HalfSpace)):
-            continue
-        up, middle = body.shape.normal_direction, quat_rotate(turn, body.com)
-        if float(quat_rotate(turn, up)[2]) > _LEVEL:
-            heights.append(float((at - middle)[2] + body.shape.offset))
+        plane = body.half_space_at(at, turn)
+        if body.fixed and plane is not None and plane[0][2] > _LEVEL:
+            heights.append(plane[1] / float(plane[0][2]))
     below = [height for height in heights if height <= reach]
     return dataclasses.replace(options, table=max(below)) if below else options
 

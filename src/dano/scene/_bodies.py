@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_optional, checked_text
 from dano.contact import Collider, ContactParams, Part, SampleSet, Support, SurfaceSet
-from dano.fields import AbstractField, AbstractShape, Ellipsoid, SignedDistanceGrid, Sphere
-from dano.maths import checked_array, floating, Numbers
+from dano.fields import AbstractField, AbstractShape, Ellipsoid, HalfSpace, SignedDistanceGrid, Sphere
+from dano.maths import checked_array, floating, Numbers, quat_rotate
 from dano.objects import checked_inertia, MassProperties, NeuralObject
 
 # Orientations over which the support of a body is sampled.
@@ -239,6 +239,21 @@ class Body(eqx.Module):
             rotation=rotation,
             origin=position + arm,
         )
+
+    def half_space_at(
+        self, position: Float[Array, "3"], orientation: Float[Array, "4"]
+    ) -> tuple[Float[np.ndarray, "3"], float] | None:
+        """Unit normal [W] and distance from the origin [m] of its plane; None if it is no half-space.
+
+        Args:
+            position: Of its centre of mass [m, W].
+            orientation: wxyz.
+        """
+        if not isinstance(self.shape, HalfSpace):
+            return None
+        normal = np.asarray(quat_rotate(orientation, self.shape.normal_direction))
+        origin = np.asarray(position - quat_rotate(orientation, self.com))
+        return normal, float(self.shape.offset) + float(normal @ origin)
 
 
 def _directions(n: int) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize, nnls
 
+from dano.maths import even_directions
 from dano.vision.capture import AbstractCamera, Light
 from dano.vision.drawing import GAMMA
 from dano.vision.tracking._placement import Placement
@@ -82,10 +83,12 @@ class LightFit:
     Attributes:
         lamps: The lamps found so far.
         known: Whether they were fitted to anything.
+        sees_shadows: Whether a table is known, on which the object throws them.
     """
 
     def __init__(self, subject: Subject, keep: int = 6, table: float | None = None):
         self.lamps = unlit()
+        self.sees_shadows = table is not None
         self._shadows = None if table is None else ShadowFit(subject, table, keep)
         self.known = False
         self._subject = subject
@@ -94,7 +97,7 @@ class LightFit:
         self._seen: list[np.ndarray] = []
         self._views: list[tuple[Placement, AbstractCamera, np.ndarray]] = []
         self._sun: np.ndarray | None = None
-        self._places = _spread(-1.0, _DIRECTIONS)
+        self._places = even_directions(_DIRECTIONS)
 
     def add(
         self,
@@ -232,8 +235,9 @@ class ShadowFit:
     def __init__(self, subject: Subject, table: float, keep: int):
         self._subject, self._table, self._keep = subject, table, keep
         self._sun: np.ndarray | None = None
+        self._lamps = unlit()
         self._frames: list[_Shadow] = []
-        self._above = _spread(0.0, _DIRECTIONS)
+        self._above = even_directions(_DIRECTIONS, 0.0)
         self._random = np.random.default_rng(0)
 
     def add(self, place: Placement, camera: AbstractCamera, image: np.ndarray, bare, free) -> None:
@@ -268,7 +272,7 @@ class ShadowFit:
                 return np.inf
             return sum(_unlikely(one, self._hidden(one.place, one.points, towards)) for one in self._frames)
 
-        begin = min(_spread(_LOWEST, _SHADOW_STARTS), key=unlike) if self._sun is None else self._sun
+        begin = min(even_directions(_SHADOW_STARTS, _LOWEST), key=unlike) if self._sun is None else self._sun
         best = _best_direction(unlike, begin, _SHADOW_TURN, _SHADOW_TRIES)
         without = sum(_unlikely(one, np.zeros(len(one.shade))) for one in self._frames)
         self._sun = best if without - unlike(best) > _SURE else None
@@ -283,7 +287,7 @@ class ShadowFit:
         hidden = np.zeros(len(points))
         if near.any():
             rays = np.tile(towards, (int(near.sum()), 1))
-            hidden[near] = self._subject.see(place, unlit(), points[near], rays, _SUN_WIDTH).opacity
+            hidden[near] = self._subject.see(place, self._lamps, points[near], rays, _SUN_WIDTH).opacity
         return hidden
 
 
@@ -303,14 +307,6 @@ def _unlikely(one: _Shadow, hidden: np.ndarray) -> float:
         # Nothing shines out of a shadow.
         return _unlikely(one, np.zeros(len(hidden)))
     return float(np.sum(np.log1p(away**2)))
-
-
-def _spread(lowest: float, count: int) -> Float[np.ndarray, "_ 3"]:
-    """Unit vectors spread evenly over the part of the sphere above a height."""
-    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
-    z = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
-    flat = np.sqrt(1 - z**2)
-    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
 
 
 def _best_direction(unlike, begin: np.ndarray, turn: float, tries: int) -> Float[np.ndarray, "3"]:

@@ -117,7 +117,7 @@ class Masking:
 
     def learn_shadow(self, i: int, target: Target, place: Placement, light: LightFit) -> None:
         """Take the shadow of an object in a frame into account for the light."""
-        if self._bare is None:
+        if not light.sees_shadows or self._bare is None:
             return
         mask = ndimage.binary_dilation(target.mask > 0.02, iterations=_SHADOW_GAP)
         light.add_shadow(place, target.camera, target.image, self._bare, ~mask & self._seen(i))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from dano.maths import quat_conjugate, quat_from_matrix, quat_log, quat_multiply
+from dano.maths import even_directions, quat_conjugate, quat_from_matrix, quat_log, quat_multiply
 from dano.vision.capture import Light
 from dano.vision.tracking._light import LAMPS, LightFit
 from dano.vision.tracking._options import TrackOptions
@@ -203,10 +203,7 @@ def _sampled(image: np.ndarray, smooth: float, at: np.ndarray) -> np.ndarray:
 
 def _views(count: int) -> Float[np.ndarray, "views 3 3"]:
     """Axes of cameras around the object (F): rows to the right, downwards, forwards."""
-    z = 1 - 2 * (np.arange(count) + 0.5) / count
-    angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)
-    flat = np.sqrt(1 - z**2)
-    forward = -np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
+    forward = -even_directions(count)
     aside = np.where(np.abs(forward[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[0.0, 1.0, 0.0]])
     right = np.cross(forward, aside)
     right /= np.linalg.norm(right, axis=1, keepdims=True)

@@ -195,12 +195,13 @@ class _Walk:
         fits = {i: found.overlap for i, found in enumerate(self._found) if found is not None}
         usual = np.median(list(fits.values())) if fits else 0.0
         good = [i for i, fit in fits.items() if fit > usual - _WORSE]
-        for i, other in enumerate(self._found):
+        for i in sorted(set(range(len(self._found))) - set(good)):
             before, after = [j for j in good if j < i][-2:], [j for j in good if j > i][:2]
             pair = [before[-1], after[0]] if before and after else [*before, *after]
-            if i in good or len(pair) < 2 or max(*pair, i) - min(*pair, i) > _NEAR:
+            if len(pair) < 2 or max(*pair, i) - min(*pair, i) > _NEAR:
                 continue
             found, status = self._followed(i, self._carried(pair[0], pair[1], i))
+            other = self._found[i]
             if found is not None and (other is None or score(found) < score(other)):
                 self._found[i], self._status[i] = self._exposed(i, found) or found, status
 

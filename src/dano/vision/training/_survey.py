@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dano.checks import checked_count, checked_kind
+from dano.maths import even_directions
 from dano.vision.capture import Capture, check_masks, hull_distance, NodeGrid, object_box, View, viewed_ball
 from dano.vision.radiance import Appearance, picture, Sampling, SurfaceModel
 from dano.vision.training._metrics import mask_iou
@@ -140,11 +141,7 @@ def widest_gap(views: Sequence[View]) -> tuple[float, Float[np.ndarray, "3"]]:
     centre, _ = viewed_ball(views)
     towards = np.stack([view.camera.position - centre for view in views])
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    n = 2000
-    z = 1 - 2 * (np.arange(n) + 0.5) / n
-    angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
-    flat = np.sqrt(1 - z**2)
-    sphere = np.asarray([flat * np.cos(angle), flat * np.sin(angle), z]).T
+    sphere = even_directions(2000)
     nearest = np.arccos(np.clip((sphere @ towards.T).max(axis=1), -1, 1))
     worst = int(np.argmax(nearest))
     return float(nearest[worst]), sphere[worst]
