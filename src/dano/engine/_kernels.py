@@ -10,7 +10,7 @@ from dano.engine._newton import Report, SolverOptions
 from dano.engine._primal_dual import RULES, TIERS
 from dano.engine._problem import Pairs, Problem
 from dano.engine._trees import LARGEST_TURN
-from dano.engine.joints import STICKS, STOPS, TreeTables
+from dano.engine.joints import changing, STICKS, STOPS, TreeTables
 from dano.scene import Control, State
 
 POSES = 8.0
@@ -76,44 +76,92 @@ def native_root(
 
 
 def native_tree_step(
-    tables: TreeTables, state: State, control: Control | None, options: SolverOptions, *, derivatives: bool
-) -> tuple[State, Report, Float[Array, " k"], Float[Array, "k k"]]:
-    """A step of bodies on joints that touch nothing.
+    tables: TreeTables, state: State, control: Control | None, options: SolverOptions
+) -> tuple[State, Report, Float[Array, " k"]]:
+    """A step of bodies on joints that touch nothing: the state at its end, the report, and its velocities."""
+    from dano.native.trees import tree_step_name  # compiles or loads the kernel, so only where it is used
 
-    Returns:
-        The state at its end, the report, and if asked for the generalised velocities and the Jacobian of
-        their residual (of no size unless asked for).
+    dtype = state.position.dtype
+    arrays = _parts(state)
+    *following, y, residual, passes, solved = jax.ffi.ffi_call(
+        tree_step_name(dtype),
+        (
+            *(jax.ShapeDtypeStruct(x.shape, dtype) for x in arrays),
+            jax.ShapeDtypeStruct((tables.layout.n_velocities,), dtype),
+            jax.ShapeDtypeStruct((1,), dtype),
+            jax.ShapeDtypeStruct((1,), jnp.int32),
+            jax.ShapeDtypeStruct((1,), bool),
+        ),
+        vmap_method="sequential",
+    )(*_tree_inputs(tables, state, control, options), np.array([options.max_iterations], np.int32))
+    return State(*following), Report(residual[0], passes[0].astype(int), solved[0]), y
+
+
+def native_tree_change(given, tangents, y: Float[Array, " k"], options: SolverOptions) -> State:
+    """How the end of a step of bodies on joints changes, by the implicit function theorem.
+
+    Args:
+        given: Tables, state and control.
+        tangents: Their changes; None where there is none.
+        y: Generalised velocities at the end.
+        options: Of the step.
     """
-    from dano.native import tree_step_name  # compiles or loads the kernel, so only where it is used
+    from dano.native.trees import tree_slopes_name
 
+    tables, state, control = given
+    of_tables, of_state, of_control = tangents
+    none = (None,) * 4
+    changes = [
+        *_parts(of_state),
+        *(none if control is None else (getattr(of_control, name) for name in _CONTROLS)),
+        *(getattr(of_tables, name) for name in _TABLES),
+    ]
+    chosen = changing(tables, [x is not None for x in changes])
+    dtype, parts = state.position.dtype, _parts(state)
+    if not len(chosen):
+        return State(*(jnp.zeros_like(x) for x in parts))
+    sizes = [x.size for x in parts]
+    slopes = jax.ffi.ffi_call(
+        tree_slopes_name(dtype),
+        jax.ShapeDtypeStruct((len(chosen), sum(sizes)), dtype),
+        vmap_method="sequential",
+    )(*_tree_inputs(tables, state, control, options), y.astype(dtype), chosen)
+    change = jnp.concatenate(
+        [_at(x, chosen[chosen[:, 0] == k, 1:]).astype(dtype) for k, x in enumerate(changes) if x is not None]
+    )
+    ends = jnp.split(change @ slopes, np.cumsum(sizes)[:-1])
+    return State(*(end.reshape(x.shape) for end, x in zip(ends, parts, strict=True)))
+
+
+_CONTROLS = ("force", "torque", "effort", "command")
+_TABLES = ("bodies", "joints", "laws", "settings")
+
+
+def _parts(state: State) -> tuple:
+    return state.position, state.orientation, state.velocity, state.omega, state.q, state.v
+
+
+def _at(values: Array, places: np.ndarray) -> Float[Array, " n"]:
+    """Some numbers of a table, or of a vector."""
+    rows, columns = places.T
+    return values.ravel()[rows * values.shape[-1] + columns]
+
+
+def _tree_inputs(tables: TreeTables, state: State, control: Control | None, options: SolverOptions) -> list:
+    """What the kernels of trees read, in their order."""
     assert state.q is not None and state.v is not None
     dtype = state.position.dtype
-    k = tables.layout.n_velocities if derivatives else 0
     epsilon = float(jnp.finfo(dtype).eps)
     relative = epsilon**0.75 if options.tolerance is None else options.tolerance
     none, nothing = np.zeros((0, 3), dtype), np.zeros(state.q.shape, dtype)
     force, torque = (none, none) if control is None else (control.force, control.torque)
     driven = (None, None) if control is None else (control.effort, control.command)
     effort, command = (nothing if x is None else x for x in driven)
-    arrays = (state.position, state.orientation, state.velocity, state.omega, state.q, state.v)
-    *following, y, jacobian, residual, passes, solved = jax.ffi.ffi_call(
-        tree_step_name(dtype),
-        (
-            *(jax.ShapeDtypeStruct(x.shape, dtype) for x in arrays),
-            jax.ShapeDtypeStruct((k,), dtype),
-            jax.ShapeDtypeStruct((k, k), dtype),
-            jax.ShapeDtypeStruct((1,), dtype),
-            jax.ShapeDtypeStruct((1,), jnp.int32),
-            jax.ShapeDtypeStruct((1,), bool),
-        ),
-        vmap_method="sequential",
-    )(
+    return [
         # Machine code reads numbers of one type.
-        *(x.astype(dtype) for x in (*arrays, force, torque, effort, command)),
+        *(x.astype(dtype) for x in (*_parts(state), force, torque, effort, command)),
         tables.nodes,
         tables.coordinates,
-        *(x.astype(dtype) for x in (tables.bodies, tables.joints, tables.laws, tables.settings)),
+        *(getattr(tables, name).astype(dtype) for name in _TABLES),
         np.array([*RULES, relative, epsilon, POSES, STICKS, STOPS, LARGEST_TURN], dtype),
-        np.array([options.max_iterations], np.int32),
-    )
-    return State(*following), Report(residual[0], passes[0].astype(int), solved[0]), y, jacobian
+    ]

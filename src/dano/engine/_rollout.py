@@ -300,19 +300,19 @@ def _jitted_linearize(engine, scene, state, control):
     if control is None:
         control = Control(jnp.zeros_like(state.position), jnp.zeros_like(state.position))
     prepared = engine.prepare(scene)
-    nominal, _ = engine.step(scene, prepared, scene.filled(state), control)
 
     def perturbed(change, input_change):
         of_bodies, *of_joints = jnp.split(change, [12 * n, 12 * n + k])
         moved = _with_joints(retract(state, rows, of_bodies.reshape(n, 12)), *of_joints)
-        pushes = input_change[: 6 * n].reshape(n, 6)
-        force = control.force.at[rows].add(pushes[:, :3])
-        torque = control.torque.at[rows].add(pushes[:, 3:])
-        effort = control.effort
+        force, torque, effort = control.force, control.torque, control.effort
+        if n:
+            pushes = input_change[: 6 * n].reshape(n, 6)
+            force, torque = force.at[rows].add(pushes[:, :3]), torque.at[rows].add(pushes[:, 3:])
         if k:
             effort = input_change[6 * n :] + (0 if effort is None else effort)
         given = Control(force, torque, effort, control.command)
         following, _ = engine.step(scene, prepared, scene.filled(moved), given)
+        nominal = jax.lax.stop_gradient(following)
         gone = difference(nominal, following, rows).ravel()
         if nominal.q is None or nominal.v is None:
             return gone

@@ -85,31 +85,6 @@ def solve(problem: Problem, start: Array, pairs: Pairs, options: SolverOptions):
     return velocities[: start.shape[0]], report
 
 
-def solved(
-    problem: Problem, velocities: Float[Array, " k"], jacobian: Float[Array, "k k"], pairs: Pairs
-) -> Float[Array, " k"]:
-    """Velocities at the end of a step that are known, which change with the step as those of `solve` do.
-
-    Args:
-        problem: The step.
-        velocities: Its solution.
-        jacobian: Of its residual there.
-        pairs: Static structure.
-    """
-    velocities, inverse, share = _kept(velocities, jacobian, jnp.ones((), velocities.dtype))
-
-    @eqx.filter_custom_jvp
-    def root(problem, velocities, inverse):
-        return velocities
-
-    @root.def_jvp
-    def _(primals, tangents):
-        problem, velocities, inverse = primals
-        return velocities, _change(problem, tangents[0], velocities, inverse, share, pairs)
-
-    return root(problem, velocities, inverse)
-
-
 def _kept(velocities: Array, jacobian: Array, share: Array):
     """The solution of a step, the inverse of its Jacobian and its share, which reverse mode keeps."""
     # The inverse, not a solve: the tangent must be linear in a change for reverse mode to transpose it.

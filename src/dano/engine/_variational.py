@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from dano.contact import AbstractPatchLaw, by_autodiff, find, Patch, Points, Softening
+from dano.contact import AbstractPatchLaw, find, Patch, Points, Softening
 from dano.engine._balance import chunk_wrenches, contact_wrenches, to_body, to_world
-from dano.engine._kernels import native_tree_step
+from dano.engine._kernels import native_tree_change, native_tree_step
 from dano.engine._newton import Report, SolverOptions
 from dano.engine._problem import (
     build_problem,
@@ -33,8 +33,9 @@ from dano.engine._problem import (
     structure_of,
 )
 from dano.engine._rigid import turned
-from dano.engine._roots import as_solved, solve, solved
+from dano.engine._roots import as_solved, solve
 from dano.engine._trees import advance_tree, generalised, turns_too_far
+from dano.engine.joints import TreeTables
 from dano.maths import quat_to_matrix, safe_normalize
 from dano.scene import Control, Scene, State
 
@@ -47,7 +48,7 @@ def step(
     if not pairs.moving:
         return state, Report(jnp.zeros((), state.position.dtype), jnp.asarray(0), jnp.asarray(True))
     if prepared.trees is not None:
-        following, report = _step_of_trees(scene, prepared, state, control, options)
+        following, report = _step_of_trees(prepared.trees, state, control, options)
         return following, jax.lax.stop_gradient(report)
     problem, found = build_problem(scene, prepared, state, control, pairs)
     h, tree = scene.timestep, problem.tree
@@ -65,30 +66,21 @@ def step(
 
 
 def _step_of_trees(
-    scene: Scene, prepared: Prepared, state: State, control: Control | None, options: SolverOptions
+    tables: TreeTables, state: State, control: Control | None, options: SolverOptions
 ) -> tuple[State, Report]:
-    """The step in machine code. Its derivatives are those of the equations that the other steps solve."""
+    """The step in machine code, as are its derivatives."""
 
     @eqx.filter_custom_jvp
-    def advance(tables, scene, state, control):
-        return native_tree_step(tables, state, control, options, derivatives=False)[:2]
+    def advance(tables, state, control):
+        return native_tree_step(tables, state, control, options)[:2]
 
     @advance.def_jvp
     def _(primals, tangents):
-        tables, scene, state, control = primals
-        following, report, y, jacobian = native_tree_step(tables, state, control, options, derivatives=True)
-
-        def again(scene, state, control):
-            pairs = structure_of(scene)
-            problem, _ = build_problem(scene, prepared, state, control, pairs)
-            assert problem.tree is not None
-            end = solved(problem, y, jacobian, pairs)
-            return advance_tree(scene, problem.tree, state, end, scene.timestep)
-
-        _, change = by_autodiff(again, (scene, state, control), tangents[1:])
+        following, report, y = native_tree_step(*primals, options)
+        change = native_tree_change(primals, tangents, y, options)
         return (following, report), (change, jax.tree.map(lambda _: None, report))
 
-    return advance(prepared.trees, scene, state, control)
+    return advance(tables, state, control)
 
 
 def touch(scene: Scene, prepared: Prepared, state: State) -> Patch:

@@ -29,11 +29,3 @@ def finder_name(dtype: DTypeLike) -> str:
     from dano.native._finding import define
 
     return define(np.dtype(dtype).name)
-
-
-@functools.cache
-def tree_step_name(dtype: DTypeLike) -> str:
-    """Name for `jax.ffi.ffi_call` of a step of bodies on joints, for numbers of a floating type."""
-    from dano.native._tree_step import define
-
-    return define(np.dtype(dtype).name)

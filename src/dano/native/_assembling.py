@@ -40,17 +40,17 @@ MIX, RENEWED = 10, 11
 @kernel
 def shares(squared, resolved, fade):
     """m, m′/x, g and g′/x of `dano.engine._rigid` at x² = (h |ω|/2)²."""
-    if squared <= resolved * resolved:
-        root = math.sqrt(1.0 - squared)
+    if squared.real <= resolved * resolved:
+        root = np.sqrt(1.0 - squared)
         return root, -1.0 / root, 1.0, 0.0
     root = math.sqrt(1.0 - resolved * resolved)
     first_slope = root - resolved * resolved / root
-    x = math.sqrt(squared)
+    x = np.sqrt(squared)
     y = x - resolved
-    fading = math.exp(-y / fade)
+    fading = np.exp(-y / fade)
     product = resolved * root + y - (1.0 - first_slope) * fade * (1.0 - fading)
     slope = 1.0 - (1.0 - first_slope) * fading
-    torque = math.exp(-((y / fade) ** 2))
+    torque = np.exp(-((y / fade) ** 2))
     return product / x, (slope - product / x) / squared, torque, -2.0 * y / (fade * fade * x) * torque
 
 

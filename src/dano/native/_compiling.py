@@ -14,6 +14,6 @@ kernel = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapp
 def fingerprint() -> int:
     """A number for the sources of all kernels: as a closure of a handler it is part of the key on disk."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     return int.from_bytes(digest.digest()[:7])

@@ -8,4 +8,8 @@ from dano.engine.joints._forces import (
     STICKS as STICKS,
     STOPS as STOPS,
 )
-from dano.engine.joints._tables import tree_tables as tree_tables, TreeTables as TreeTables
+from dano.engine.joints._tables import (
+    changing as changing,
+    tree_tables as tree_tables,
+    TreeTables as TreeTables,
+)

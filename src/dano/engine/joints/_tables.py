@@ -1,7 +1,8 @@
 """Trees as tables of numbers, in the order in which `dano.native` reads them."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -65,8 +66,32 @@ class TreeTables(eqx.Module):
         return np.array(rows, np.int32).reshape(-1, 2)
 
 
+def changing(tables: TreeTables, perturbed: Sequence[bool]) -> Int[np.ndarray, "changes 3"]:
+    """By which numbers of a step its end is differentiated: table, row and column of each.
+
+    Tables are those of a state (position, orientation, velocity, omega, q, v), of a control (force, torque,
+    effort, command) and of a scene (bodies, joints, laws, settings). Vectors have one row.
+
+    Args:
+        tables: Of the scene.
+        perturbed: Which of these tables change.
+    """
+    layout = tables.layout
+    n, c = layout.bodies, len(tables.constant)
+    moving = np.array(layout.moving, int)
+    # Bodies on joints stand where their coordinates say.
+    standing = np.setdiff1d(np.arange(n), np.array(layout.children, int))
+    rows = [(standing, 3), (standing, 4), (moving, 3), (moving, 3), (range(1), c), (range(1), c)]
+    rows += [(moving, 3), (moving, 3), (range(1), c), (range(1), c)]
+    rows += [(range(n), 13), (range(len(layout.parents)), 15), (range(c), 12), (range(1), 4)]
+    found = [
+        (k, i, j) for k, (some, width) in enumerate(rows) if perturbed[k] for i in some for j in range(width)
+    ]
+    return np.array(found, np.int32).reshape(-1, 3)
+
+
 def tree_tables(scene: Scene) -> TreeTables:
-    """The tables of a scene with joints. They are not differentiated."""
+    """The tables of a scene with joints."""
     dtype, chains = scene.timestep.dtype, scene.chains
     layout = chains.layout
     rows = []
@@ -76,7 +101,7 @@ def tree_tables(scene: Scene) -> TreeTables:
         rows.append(jnp.concatenate([own, chains.com[i]]).astype(dtype))
     parts = (chains.axis, chains.anchor, chains.position, chains.orientation)
     joints = jnp.concatenate([*parts, chains.ratio[:, None], chains.shift[:, None]], axis=1)
-    tables = TreeTables(
+    return TreeTables(
         jnp.stack([*rows, jnp.zeros(13, dtype)]),
         joints,
         _law_rows(chains.laws, dtype),
@@ -85,7 +110,6 @@ def tree_tables(scene: Scene) -> TreeTables:
         chains.laws.constant,
         chains.laws.rough,
     )
-    return jax.lax.stop_gradient(tables)
 
 
 def _law_rows(laws: JointLaws, dtype) -> Float[Array, "c 12"]:

@@ -25,7 +25,7 @@ from dano.native._ffi import (
     vector,
 )
 from dano.native._line_search import accepts, begin_search, LENGTH, narrow
-from dano.native._tree_balance import (
+from dano.native.trees._balance import (
     angular_momentum,
     factor,
     find_twists,
@@ -40,7 +40,7 @@ from dano.native._tree_balance import (
     solve_factored,
     turn_inertia,
 )
-from dano.native._tree_frames import (
+from dano.native.trees._frames import (
     add,
     BALL,
     BODY,
@@ -69,7 +69,7 @@ from dano.native._tree_frames import (
     TURNED,
     unit_turn,
 )
-from dano.native._tree_laws import (
+from dano.native.trees._laws import (
     ARMATURE,
     COLUMNS,
     force_of,
@@ -81,13 +81,13 @@ from dano.native._tree_laws import (
 )
 
 # Settings: h, gravity [W].
-_H, _GRAVITY = 0, 1
+H, _GRAVITY = 0, 1
 # Rules after those that `_assembling` names: tolerance over (1 + size), rounding of the dtype, what that of
 # poses adds to size, speed at which friction sticks, stiffness of limits, largest turn.
-_RELATIVE, _EPSILON, _POSES, _STICKS, _STOPS, _LARGEST = range(12, 18)
+_RELATIVE, _EPSILON, _POSES, STICKS, STOPS, _LARGEST = range(12, 18)
 # Columns of the table of coordinates: whether a motor does what it is told to, and the row among those with
 # kinks, or −1.
-_CONSTANT, _ROUGH = range(2)
+CONSTANT, ROUGH = range(2)
 
 Given = namedtuple("Given", "nodes coordinates bodies joints laws settings rules roots q v effort command")
 """What a step does not change: tables; the number of velocities of free bodies; coordinates of joints, their
@@ -99,17 +99,18 @@ slopes for which the derivative is factored."""
 
 
 @kernel
-def _copy(source, target):
+def copy(source, target):
+    """Copy a table."""
     for i in range(source.shape[0]):
         for k in range(source.shape[1]):
             target[i, k] = source[i, k]
 
 
 @kernel
-def _begin(given, state, force, torque, room, y):
+def begin(given, state, force, torque, room, y):
     """What is known at the start of a step, and the velocities to start from."""
     nodes, bodies, settings = given.nodes, given.bodies, given.settings
-    h, gravity = settings[_H], (settings[_GRAVITY], settings[_GRAVITY + 1], settings[_GRAVITY + 2])
+    h, gravity = settings[H], (settings[_GRAVITY], settings[_GRAVITY + 1], settings[_GRAVITY + 2])
     position, orientation, velocity, omega = state
     world = position.shape[0]
     for i in range(world):
@@ -141,7 +142,7 @@ def _begin(given, state, force, torque, room, y):
 
 
 @kernel
-def _weigh(given, room, kinks, rows):
+def weigh(given, room, kinks, rows):
     """Factors that turn momenta into velocities, and what has kinks; returns the size of the velocities."""
     rules, laws, roots = given.rules, given.laws, given.roots
     y, scale, column = rows[0], rows[1], rows[2]
@@ -156,14 +157,14 @@ def _weigh(given, room, kinks, rows):
         size = max(size, abs(scale[k] * room.residual[k]))
     if kinks.dual.size > 0:
         factor(room.matrix)
-    h = given.settings[_H]
+    h = given.settings[H]
     for c in range(given.q.size):
-        r = given.coordinates[c, _ROUGH]
+        r = given.coordinates[c, ROUGH]
         if r >= 0:
             weight = 1.0 / inverse_diagonal(room.matrix, roots + c, column)
             kinks.weight[r] = weight / h
-            constant, q, command = given.coordinates[c, _CONSTANT] > 0, given.q[c], given.command[c]
-            sticks, stops = rules[_STICKS], rules[_STOPS]
+            constant, q, command = given.coordinates[c, CONSTANT] > 0, given.q[c], given.command[c]
+            sticks, stops = rules[STICKS], rules[STOPS]
             set_ramps(laws, c, constant, q, command, h, weight, sticks, stops, kinks.ramps, r)
             kinks.dual[r] = force_of(kinks.ramps, r, y[roots + c])
     reach = 0.0
@@ -174,25 +175,33 @@ def _weigh(given, room, kinks, rows):
 
 
 @kernel
-def _go(given, room, y):
+def go(given, room, y):
     """How bodies move in a step with velocities y."""
-    nodes, h, resolved = given.nodes, given.settings[_H], given.rules[RESOLVED]
+    nodes, h, resolved = given.nodes, given.settings[H], given.rules[RESOLVED]
     move(nodes, given.joints, room.poses, room.known, y, h, resolved, room.ways, room.last)
     find_twists(nodes, y, h, given.rules, room)
 
 
 @kernel
-def _evaluate(given, room, kinks, y, dual):
-    """Residual of the balance, and what the ramps make of its forces."""
-    h = given.settings[_H]
-    _go(given, room, y)
+def balance(given, room, y):
+    """Residual of the balance without what has kinks."""
+    h = given.settings[H]
+    go(given, room, y)
     missing_momenta(given.nodes, given.bodies, h, given.rules, room)
     gather_momenta(given.nodes, room)
     for c in range(given.q.size):
-        k, constant, command = given.roots + c, given.coordinates[c, _CONSTANT] > 0, given.command[c]
+        k, constant, command = given.roots + c, given.coordinates[c, CONSTANT] > 0, given.command[c]
         q, v, effort = given.q[c], given.v[c], given.effort[c]
         room.residual[k] += smooth(given.laws, c, constant, q, v, effort, command, h, y[k])
-        r = given.coordinates[c, _ROUGH]
+
+
+@kernel
+def evaluate(given, room, kinks, y, dual):
+    """Residual of the balance, and what the ramps make of its forces."""
+    h = given.settings[H]
+    balance(given, room, y)
+    for c in range(given.q.size):
+        k, r = given.roots + c, given.coordinates[c, ROUGH]
         if r >= 0:
             weight = kinks.weight[r]
             speed, kinks.slope[r] = resolve(kinks.ramps, r, weight, dual[r] + weight * y[k])
@@ -201,9 +210,9 @@ def _evaluate(given, room, kinks, y, dual):
 
 
 @kernel
-def _differentiate(given, room):
-    """Derivative of the balance by velocities where `_evaluate` was last, without the ramps."""
-    h = given.settings[_H]
+def differentiate(given, room):
+    """Derivative of the balance by velocities where `evaluate` was last, without the ramps."""
+    h = given.settings[H]
     momentum_slopes(given.nodes, given.bodies, h, given.rules, room)
     gather_slopes(given.nodes, room.last, room, False)
     for c in range(given.q.size):
@@ -230,9 +239,9 @@ def _rounding(given, room, kinks, scale, y):
         size = 0.0
         for j in range(y.size):
             size += abs(room.matrix[k, j] * y[j])
-        r = given.coordinates[k - given.roots, _ROUGH] if k >= given.roots else -1
+        r = given.coordinates[k - given.roots, ROUGH] if k >= given.roots else -1
         if r >= 0:
-            size += given.settings[_H] * abs(kinks.dual[r])
+            size += given.settings[H] * abs(kinks.dual[r])
             share = 1.0 / (kinks.weight[r] + kinks.slope[r])
             rounding = max(rounding, share * (kinks.slope[r] * abs(y[k]) + abs(kinks.dual[r])))
         rounding = max(rounding, scale[k] * size)
@@ -246,17 +255,17 @@ def _work(given, room, kinks, change):
     for k in range(change.size):
         work += change[k] * room.residual[k]
     for r in range(kinks.change.size):
-        work += given.settings[_H] * kinks.change[r] * kinks.gap[r]
+        work += given.settings[H] * kinks.change[r] * kinks.gap[r]
     return work
 
 
 @kernel
-def _factor(given, room, kinks):
+def factor_with_ramps(given, room, kinks):
     """Factors of the derivative with the ramps, which take the place of the derivative."""
     for c in range(given.q.size):
-        r, k = given.coordinates[c, _ROUGH], given.roots + c
+        r, k = given.coordinates[c, ROUGH], given.roots + c
         if r >= 0:
-            room.matrix[k, k] += given.settings[_H] * kinks.slope[r]
+            room.matrix[k, k] += given.settings[H] * kinks.slope[r]
             kinks.factored[r] = kinks.slope[r]
     factor(room.matrix)
 
@@ -270,13 +279,13 @@ def _find_change(given, room, kinks, change):
     for k in range(change.size):
         change[k] = -room.residual[k]
     for c in range(given.q.size):
-        r = given.coordinates[c, _ROUGH]
+        r = given.coordinates[c, ROUGH]
         if r >= 0:
             pushed = (kinks.weight[r] + kinks.slope[r]) * kinks.gap[r]
-            change[given.roots + c] += given.settings[_H] * pushed
+            change[given.roots + c] += given.settings[H] * pushed
     solve_factored(room.matrix, change)
     for c in range(given.q.size):
-        r = given.coordinates[c, _ROUGH]
+        r = given.coordinates[c, ROUGH]
         if r >= 0:
             pushed = (kinks.weight[r] + kinks.slope[r]) * kinks.gap[r]
             kinks.change[r] = kinks.slope[r] * change[given.roots + c] - pushed
@@ -291,7 +300,7 @@ def _same(a, b):
 
 
 @kernel
-def _finish(given, room, kinks, y, change, derivatives):
+def _finish(given, room, kinks, y, change):
     """A last step, not looked at: near a root it takes what is left to rounding.
 
     Velocities with kinks become those that fit their forces.
@@ -299,21 +308,17 @@ def _finish(given, room, kinks, y, change, derivatives):
     for k in range(y.size):
         y[k] += change[k]
     for c in range(given.q.size):
-        r, k = given.coordinates[c, _ROUGH], given.roots + c
+        r, k = given.coordinates[c, ROUGH], given.roots + c
         if r >= 0:
             weight, dual = kinks.weight[r], kinks.dual[r] + kinks.change[r]
             speed, _ = resolve(kinks.ramps, r, weight, dual + weight * y[k])
             kinks.dual[r] = dual + weight * (y[k] - speed)
             y[k] = speed
-    if derivatives:
-        _evaluate(given, room, kinks, y, kinks.dual)
-        _differentiate(given, room)
-    else:
-        _go(given, room, y)
+    go(given, room, y)
 
 
 @kernel
-def _solve(given, room, kinks, rows, size, max_iterations, derivatives):
+def _solve(given, room, kinks, rows, size, max_iterations):
     """The loop of `dano.engine._newton`; the first of the rows is where it begins, and becomes the solution.
 
     Returns:
@@ -330,7 +335,7 @@ def _solve(given, room, kinks, rows, size, max_iterations, derivatives):
             tried[k] = y[k] + search[LENGTH] * change[k]
         for r in range(dual.size):
             dual[r] = kinks.dual[r] + search[LENGTH] * kinks.change[r]
-        _evaluate(given, room, kinks, tried, dual)
+        evaluate(given, room, kinks, tried, dual)
         passes += 1
         work = _work(given, room, kinks, change)
         if not accepts(work, rules[ENOUGH], rules[GIVE_UP], search):
@@ -342,26 +347,25 @@ def _solve(given, room, kinks, rows, size, max_iterations, derivatives):
         # At a root the derivative of the pass before serves for the last step, if no kink lies between.
         solved = passes > 0 and error <= enough and _same(kinks.slope, kinks.factored)
         if not solved:
-            _differentiate(given, room)
+            differentiate(given, room)
             rounding = _rounding(given, room, kinks, scale, y)
             solved = error <= max(enough, 16.0 * rules[_EPSILON] * rounding)
-            _factor(given, room, kinks)
+            factor_with_ramps(given, room, kinks)
         _find_change(given, room, kinks, change)
         begin_search(_work(given, room, kinks, change), search)
     if not solved:
         change[:] = 0.0
         kinks.change[:] = 0.0
-    _finish(given, room, kinks, y, change, derivatives)
+    _finish(given, room, kinks, y, change)
     return error, passes, solved
 
 
 @kernel
-def _end(given, room, y, found, dtype):
+def put_end(given, room, y, end):
     """Write the state at the end; rows of bodies that do not move are there already."""
-    nodes, h, resolved, roots = given.nodes, given.settings[_H], given.rules[RESOLVED], given.roots
-    position, orientation = table(found[0], dtype), table(found[1], dtype)
-    velocity, omega = table(found[2], dtype), table(found[3], dtype)
-    q, v = np.empty(given.q.size), vector(found[5], dtype)
+    nodes, h, resolved, roots = given.nodes, given.settings[H], given.rules[RESOLVED], given.roots
+    position, orientation, velocity, omega, ends, v = end
+    q = np.empty_like(given.q)
     for c in range(given.q.size):
         q[c], v[c] = given.q[c] + h * y[roots + c], y[roots + c]
     for n in range(nodes.shape[0]):
@@ -382,23 +386,22 @@ def _end(given, room, y, found, dtype):
         i = nodes[n, BODY]
         put(position, i, 0, three(room.poses, i, 0))
         put_four(orientation, i, 0, four(room.poses, i, TURNED))
-    vector(found[4], dtype)[:] = q
+    ends[:] = q
 
 
 @kernel
-def _put_derivative(given, room, kinks, scale, whole):
-    """The derivative of the velocities' equations by velocities, kinks included, in velocities."""
-    for i in range(whole.shape[0]):
-        for j in range(whole.shape[0]):
-            whole[i, j] = scale[i] * room.matrix[i, j]
-    for c in range(given.q.size if whole.size > 0 else 0):
-        r, k = given.coordinates[c, _ROUGH], given.roots + c
-        if r >= 0:
-            whole[k, k] += scale[k] * given.settings[_H] * kinks.slope[r]
+def state_of(buffers, dtype):
+    """Positions, orientations, velocities and spins of bodies in the first buffers of a call frame."""
+    return (
+        table(buffers[0], dtype),
+        table(buffers[1], dtype),
+        table(buffers[2], dtype),
+        table(buffers[3], dtype),
+    )
 
 
 @kernel
-def _given(buffers, dtype):
+def given_of(buffers, dtype):
     """What a call frame says of a step that stays.
 
     Numbers of 32 bits become such of 64 where they meet one; what meets only its like is copied.
@@ -425,11 +428,11 @@ def _given(buffers, dtype):
 
 
 @kernel
-def _kinks(given):
+def kinks_of(given):
     """Room for coordinates with kinks."""
     count = 0
     for c in range(given.q.size):
-        count += given.coordinates[c, _ROUGH] >= 0
+        count += given.coordinates[c, ROUGH] >= 0
     rows = np.zeros((6, count))
     return Kinks(np.empty((count, RAMPS, COLUMNS)), rows[0], rows[1], rows[2], rows[3], rows[4], rows[5])
 
@@ -438,30 +441,22 @@ def _kinks(given):
 def _answer(frame, dtype):
     """Make the step that a call frame holds; see `dano.engine` for the order of its buffers."""
     buffers, found = inputs(frame), outputs(frame)
-    given = _given(buffers, dtype)
-    state = (
-        table(buffers[0], dtype),
-        table(buffers[1], dtype),
-        table(buffers[2], dtype),
-        table(buffers[3], dtype),
-    )
+    given = given_of(buffers, dtype)
+    state = state_of(buffers, dtype)
     for k in range(4):
-        _copy(state[k], table(found[k], dtype))
-    rows, kinks = np.empty((4, given.roots + given.q.size)), _kinks(given)
+        copy(state[k], table(found[k], dtype))
+    rows, kinks = np.empty((4, given.roots + given.q.size)), kinks_of(given)
     room, y = room_for(given.bodies.shape[0], given.nodes.shape[0], rows.shape[1]), rows[0]
-    _begin(given, state, table(buffers[6], dtype), table(buffers[7], dtype), room, y)
-    size = _weigh(given, room, kinks, rows)
-    end, whole = vector(found[6], dtype), table(found[7], dtype)
+    begin(given, state, table(buffers[6], dtype), table(buffers[7], dtype), room, y)
+    size = weigh(given, room, kinks, rows)
     most = vector(buffers[17], numba.int32)[0]
-    residual, passes, solved = _solve(given, room, kinks, rows, size, most, end.size > 0)
-    turned = largest_turn(given.nodes, given.joints, y, given.settings[_H], room.known)
-    _put_derivative(given, room, kinks, rows[1], whole)
-    for k in range(end.size):
-        end[k] = y[k]
-    _end(given, room, y, found, dtype)
-    vector(found[8], dtype)[0] = residual
-    vector(found[9], numba.int32)[0] = passes
-    vector(found[10], numba.uint8)[0] = solved and turned <= given.rules[_LARGEST]
+    residual, passes, solved = _solve(given, room, kinks, rows, size, most)
+    turned = largest_turn(given.nodes, given.joints, y, given.settings[H], room.known)
+    vector(found[6], dtype)[:] = y
+    put_end(given, room, y, state_of(found, dtype) + (vector(found[4], dtype), vector(found[5], dtype)))
+    vector(found[7], dtype)[0] = residual
+    vector(found[8], numba.int32)[0] = passes
+    vector(found[9], numba.uint8)[0] = solved and turned <= given.rules[_LARGEST]
     return 0
 
 

@@ -15,7 +15,8 @@ _SLOPE, _CENTRE, _LOW, _HIGH, _BEGIN, _END, _AT_BEGIN, _AT_END = range(COLUMNS)
 
 @kernel
 def _clip(x, low, high):
-    return min(max(x, low), high)
+    # by real parts, for derivatives: see `_frames`
+    return low if x.real < low.real else high if x.real > high.real else x
 
 
 @kernel
@@ -43,7 +44,7 @@ def _set_ramp(ramps, r, i, slope, centre, low, high):
 @kernel
 def set_ramps(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r):
     """What has kinks: see `JointForces.ramps`; written to row r."""
-    _set_forces(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r)
+    set_forces(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r)
     for i in range(RAMPS):
         slope, centre = ramps[r, i, _SLOPE], ramps[r, i, _CENTRE]
         for end in range(2):
@@ -56,23 +57,24 @@ def set_ramps(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r)
 
 
 @kernel
-def _set_forces(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r):
+def set_forces(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r):
+    """The first four columns of these ramps."""
     rubs = laws[c, FRICTION]
     _set_ramp(ramps, r, 0, rubs / sticks, 0.0, -rubs, rubs)
     stiff = stops * weight / h
     for i in range(2):
         end = laws[c, LEAST + i]
-        bounded = math.isfinite(end)
+        bounded = math.isfinite(end.real)
         low, high = (-math.inf, 0.0) if i == 0 else (0.0, math.inf)
         _set_ramp(ramps, r, 1 + i, stiff if bounded else 0.0, (end - q) / h if bounded else 0.0, low, high)
     gear, pull, drive = laws[c, GEAR], laws[c, PULL], laws[c, DRIVE]
     slope = 0.0 if constant else gear * gear * (drive + h * pull)
-    if not slope > 0.0:
+    if not slope.real > 0.0:
         _set_ramp(ramps, r, 3, 0.0, 0.0, -math.inf, math.inf)
         return
-    asked = pull * (command - gear * q) if pull > 0.0 else drive * command
+    asked = pull * (command - gear * q) if pull.real > 0.0 else drive * command
     low, high = -gear * laws[c, MOST_EFFORT], -gear * laws[c, LEAST_EFFORT]
-    if gear < 0.0:
+    if gear.real < 0.0:
         low, high = high, low
     _set_ramp(ramps, r, 3, slope, gear * asked / slope, low, high)
 
@@ -82,7 +84,7 @@ def force_of(ramps, r, y):
     """Sum of the ramps of row r at a speed."""
     total = 0.0
     for i in range(RAMPS):
-        if ramps[r, i, _SLOPE] > 0.0:
+        if ramps[r, i, _SLOPE].real > 0.0:
             ramp = ramps[r, i, _SLOPE] * (y - ramps[r, i, _CENTRE])
             total += _clip(ramp, ramps[r, i, _LOW], ramps[r, i, _HIGH])
     return total

@@ -13,7 +13,7 @@ import numpy as np
 from dano.native._assembling import FADE, RESOLVED, shares
 from dano.native._compiling import kernel
 from dano.native._ffi import part
-from dano.native._tree_frames import (
+from dano.native.trees._frames import (
     add,
     BODY,
     cross,
@@ -260,6 +260,17 @@ def gather_momenta(nodes, room):
         if up >= 0:
             for k in range(6):
                 wrenches[up, k] += wrenches[n, k]
+
+
+@kernel
+def pull(nodes, n, force, moment, room, generalised):
+    """Set the generalised momenta that a momentum of one node's body is."""
+    generalised[:] = 0.0
+    wrench = (add(moment, cross(_lever(nodes, n, room.poses), force)), force)
+    while n >= 0:
+        for i in range(nodes[n, WIDTH]):
+            generalised[nodes[n, PLACE] + i] += _product(wrench, room.first, n, i)
+        n = nodes[n, PARENT]
 
 
 @kernel

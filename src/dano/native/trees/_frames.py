@@ -5,9 +5,14 @@ joints, each with the body that hangs on it. Vectors and quaternions (wxyz) are 
 
 A step is not taken as the difference of two poses, which would round velocities to the rounding of a place
 over h. Each body has the turn and the shift by which it moves, found from those of its parent.
+
+All functions take complex numbers, too, and choose by real parts: so a small imaginary part on the way in
+comes out as a derivative (see `_slopes`).
 """
 
 import math
+
+import numpy as np
 
 from dano.native._compiling import kernel
 
@@ -125,45 +130,54 @@ def rotate_back(q, v):
 
 
 @kernel
+def _angle(sine, cosine):
+    """Angle whose sine and cosine are in this ratio."""
+    across = sine * cosine.real - cosine * sine.real
+    along = cosine * cosine.real + sine * sine.real
+    # The second term is 0 for real numbers; of complex ones it is the imaginary part, which is small.
+    return math.atan2(sine.real, cosine.real) + across / along
+
+
+@kernel
 def exponential(v):
     """Quaternion of a rotation vector."""
-    angle = math.sqrt(dot(v, v))
+    angle = np.sqrt(dot(v, v))
     if angle == 0.0:
         return 1.0, 0.0, 0.0, 0.0
-    x, y, z = times(math.sin(0.5 * angle) / angle, v)
-    return math.cos(0.5 * angle), x, y, z
+    x, y, z = times(np.sin(0.5 * angle) / angle, v)
+    return np.cos(0.5 * angle), x, y, z
 
 
 @kernel
 def logarithm(q):
     """Shortest rotation vector of a quaternion."""
-    sign = -1.0 if q[0] < 0.0 else 1.0
+    sign = -1.0 if q[0].real < 0.0 else 1.0
     u = (q[1], q[2], q[3])
-    sine = math.sqrt(dot(u, u))
+    sine = np.sqrt(dot(u, u))
     if sine == 0.0:
         return 0.0, 0.0, 0.0
-    return times(2.0 * sign * math.atan2(sine, sign * q[0]) / sine, u)
+    return times(2.0 * sign * _angle(sine, sign * q[0]) / sine, u)
 
 
 @kernel
 def _turn_about(axis, half):
     """The turn about a unit axis by twice an angle."""
     s = half * half
-    if s < _SERIES:
+    if s.real < _SERIES:
         sine = half * (1.0 - s / 6.0 * (1.0 - s / 20.0 * (1.0 - s / 42.0)))
         return _quaternion(1.0 - s / 2.0 * (1.0 - s / 12.0 * (1.0 - s / 30.0)), times(sine, axis))
-    return _quaternion(math.cos(half), times(math.sin(half), axis))
+    return _quaternion(np.cos(half), times(np.sin(half), axis))
 
 
 @kernel
 def _shape_of_turn(omega, h, resolved):
     """Cos a, sin a / x and x² of a step, see `dano.engine._rigid`."""
     squared = 0.25 * h * h * dot(omega, omega)
-    if squared <= resolved * resolved:
-        return math.sqrt(1.0 - squared), 1.0, squared
-    x = math.sqrt(squared)
+    if squared.real <= resolved * resolved:
+        return np.sqrt(1.0 - squared), 1.0, squared
+    x = np.sqrt(squared)
     angle = x + math.asin(resolved) - resolved
-    return math.cos(angle), math.sin(angle) / x, squared
+    return np.cos(angle), np.sin(angle) / x, squared
 
 
 @kernel
@@ -179,20 +193,20 @@ def slopes_of_turn(omega, h, resolved):
     """α and β of α 1 + β ω ωᵀ − ½ [ω]×: see `turn_slopes` of `dano.engine`."""
     cosine, sine, squared = _shape_of_turn(omega, h, resolved)
     across = cosine / sine
-    along = (1.0 - across) / squared if squared > resolved * resolved else 0.0
+    along = (1.0 - across) / squared if squared.real > resolved * resolved else 0.0
     return across / h, 0.25 * h * along
 
 
 @kernel
 def spin_of(turn, h, resolved):
     """Spin [W] of a step that turns a body, by 180° at most: see `step_twists` of `dano.scene`."""
-    sign = -1.0 if turn[0] < 0.0 else 1.0
+    sign = -1.0 if turn[0].real < 0.0 else 1.0
     sine = times(sign, (turn[1], turn[2], turn[3]))
     squared = dot(sine, sine)
-    if squared <= resolved * resolved:
+    if squared.real <= resolved * resolved:
         return times(2.0 / h, sine)
-    size = math.sqrt(squared)
-    angle = math.atan2(size, abs(turn[0]))
+    size = np.sqrt(squared)
+    angle = _angle(size, sign * turn[0])
     return times(2.0 / h * (resolved - math.asin(resolved) + angle) / size, sine)
 
 
@@ -211,9 +225,9 @@ def _turned_back(omega, v, h, resolved):
 @kernel
 def _plane_axes(axis):
     """See `plane_axes` of `dano.scene`."""
-    start = (1.0, 0.0, 0.0) if abs(axis[0]) < 0.99 else (0.0, 1.0, 0.0)
+    start = (1.0, 0.0, 0.0) if abs(axis[0].real) < 0.99 else (0.0, 1.0, 0.0)
     first = minus(start, times(dot(start, axis), axis))
-    first = times(1.0 / math.sqrt(dot(first, first)), first)
+    first = times(1.0 / np.sqrt(dot(first, first)), first)
     return first, cross(axis, first)
 
 
@@ -222,9 +236,9 @@ def _unit(rows, i, k):
     """Make a vector of a row one of length 1; returns what its length was."""
     v = three(rows, i, k)
     squared = dot(v, v)
-    if squared == 0.0 or abs(squared - 1.0) < _ROUNDED:
+    if squared == 0.0 or (squared.imag == 0.0 and abs(squared.real - 1.0) < _ROUNDED):
         return 1.0
-    length = math.sqrt(squared)
+    length = np.sqrt(squared)
     put(rows, i, k, times(1.0 / length, v))
     return length
 
@@ -233,9 +247,9 @@ def _unit(rows, i, k):
 def unit_turn(q):
     """The quaternion of length 1 along one of about that length."""
     squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
-    if abs(squared - 1.0) < _ROUNDED:
+    if squared.imag == 0.0 and abs(squared.real - 1.0) < _ROUNDED:
         return q
-    size = 1.0 / math.sqrt(squared)
+    size = 1.0 / np.sqrt(squared)
     return size * q[0], size * q[1], size * q[2], size * q[3]
 
 
