@@ -1,6 +1,7 @@
 """The verb: the pose of a known object in every frame of a film."""
 
 import dataclasses
+import functools
 import time
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.tracking._refine import aligned, refine, Refined, Target, window_of
 from dano.vision.tracking._result import HIDDEN, LOST, OUTSIDE, TRACKED, Tracked, tracked
-from dano.vision.tracking._search import half_turns, learn_light, score, search, Start, unlikeness
+from dano.vision.tracking._search import colours_of, half_turns, learn_light, score, search, Start, unlikeness
 from dano.vision.tracking._subject import CHUNK, Subject
 
 _COARSE = 24
@@ -121,6 +122,10 @@ class _Walk:
         self._ambiguity = np.inf
         self._seconds: list[float] = []
 
+    @functools.cached_property
+    def _colours(self) -> Float[np.ndarray, "n 3"]:
+        return colours_of(self._subject)
+
     def begin(self, place: Placement) -> None:
         """Take a pose for the one in the first frame."""
         self._given = place
@@ -188,7 +193,13 @@ class _Walk:
         )
 
     def look_again(self) -> None:
-        """Begin once more in frames that fit worse than usual, or were lost: where frames around them say.
+        """Begin once more in frames that fit worse than usual, or were lost: where other frames say."""
+        self._look_between()
+        if self._look_back():
+            self._look_between()
+
+    def _look_between(self) -> None:
+        """Begin where frames around say.
 
         What spins fast is not near its first pose in the second frame, and nothing tells yet how it moves.
         """
@@ -204,6 +215,23 @@ class _Walk:
             other = self._found[i]
             if found is not None and (other is None or score(found) < score(other)):
                 self._found[i], self._status[i] = self._exposed(i, found) or found, status
+
+    def _look_back(self) -> bool:
+        """Follow the object backwards into frames where it was lost before it was found, if it is there.
+
+        It may come into the picture beside something else, and be alone only later.
+        """
+        count = sum(found is not None for found in self._found)
+        for i in reversed(range(len(self._found) - 1)):
+            if self._found[i] is not None or self._found[i + 1] is None:
+                continue
+            further = i + 2 < len(self._found) and self._found[i + 2] is not None
+            after = self._place(i + 1)
+            carried = self._carried(i + 2, i + 1, i) if further else after
+            found, status = self._followed(i, dataclasses.replace(carried, drift=after.drift))
+            if found is not None:
+                self._found[i], self._status[i] = self._exposed(i, found), status
+        return sum(found is not None for found in self._found) > count
 
     def _exposed(self, i: int, found: Refined) -> Refined:
         """The pose once more, with how the object moves while the frame is exposed."""
@@ -231,7 +259,9 @@ class _Walk:
         """Look for the object in all orientations; now and then only."""
         if self._missed % self._options.search_every:
             return None
-        parts = self._masking.parts(i, self._camera)
+        # Other masks are taken to show the object alone, or know nothing else to be there.
+        colours = self._colours if self._masking.source == "object" else None
+        parts = self._masking.parts(i, self._camera, colours)
         found = [one for target in parts if (one := self._searched_in(i, target)) is not None]
         if not found:
             return None
