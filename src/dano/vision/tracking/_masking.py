@@ -225,7 +225,7 @@ class Masking:
         image = self._image(i)
         mask = np.zeros(image.shape[:2], np.float32)
         seen = self._seen(i).copy()
-        look = None if self._palette is None else colour
+        look = None if len(self._colours) < 4 else colour
         found = like_object(image[window], expected, blur, self._palette, self._place, window, look)
         mask[window] = found.mask
         seen[window] &= ~found.other
@@ -234,7 +234,9 @@ class Masking:
             free = seen.copy()
             free[window] &= ~ndimage.binary_dilation(expected > 0.02, iterations=int(np.ceil(blur)))
             behind = self._place.seen_in(image, free & (mask < 0.05))
-        return Target(camera, image.astype(np.float64), mask, seen, behind)
+        # Beside something else it is not known where the object ends.
+        sure = not found.other.any()
+        return Target(camera, image.astype(np.float64), mask, seen, behind, sure)
 
     def learn(self, target: Target, window: tuple[slice, slice], shape: np.ndarray) -> None:
         """Take the object's colours in a frame into account, where it surely is."""

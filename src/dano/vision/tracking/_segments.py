@@ -253,7 +253,7 @@ def like_object(
     ratio = ratio + np.log(prior / (1 - prior))
     if place is None:
         return Segments(_main(ratio), np.zeros(ratio.shape, bool))
-    other = _other(image, near, own + np.log(prior), behind + np.log(1 - prior))
+    other = _other(image, near, own, behind + np.log(1 - prior))
     if not other.any():
         return Segments(_main(ratio), other)
     return Segments(_main(np.where(other, -12, ratio), _PIECE), other)

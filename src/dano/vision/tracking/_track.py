@@ -53,6 +53,9 @@ _OTHER = np.radians(12)
 _WORSE = 0.03
 """By how much less than usually a silhouette must overlap for other poses to be tried."""
 
+_PALER = 1.5
+"""How many times larger than usual the difference of colours must be for that."""
+
 _NEAR = 4
 """Frames between two that say where the object is in others near them."""
 
@@ -194,18 +197,20 @@ class _Walk:
 
     def look_again(self) -> None:
         """Begin once more in frames that fit worse than usual, or were lost: where other frames say."""
-        self._look_between()
-        if self._look_back():
+        # What is usual is known only when most frames are right.
+        if self._look_between() | self._look_back():
             self._look_between()
 
-    def _look_between(self) -> None:
-        """Begin where frames around say.
+    def _look_between(self) -> bool:
+        """Begin where frames around say; returns whether some fit better.
 
         What spins fast is not near its first pose in the second frame, and nothing tells yet how it moves.
         """
-        fits = {i: found.overlap for i, found in enumerate(self._found) if found is not None}
-        usual = np.median(list(fits.values())) if fits else 0.0
-        good = [i for i, fit in fits.items() if fit > usual - _WORSE]
+        fits = {i: (found.overlap, found.colour_error) for i, found in enumerate(self._found) if found}
+        overlap, colour = np.median(list(fits.values()), axis=0) if fits else (0.0, 0.0)
+        # Colours that are not known are no worse.
+        good = [i for i, fit in fits.items() if fit[0] > overlap - _WORSE and not fit[1] > _PALER * colour]
+        better = False
         for i in sorted(set(range(len(self._found))) - set(good)):
             before, after = [j for j in good if j < i][-2:], [j for j in good if j > i][:2]
             pair = [before[-1], after[0]] if before and after else [*before, *after]
@@ -214,7 +219,8 @@ class _Walk:
             found, status = self._followed(i, self._carried(pair[0], pair[1], i))
             other = self._found[i]
             if found is not None and (other is None or score(found) < score(other)):
-                self._found[i], self._status[i] = self._exposed(i, found) or found, status
+                self._found[i], self._status[i], better = self._exposed(i, found) or found, status, True
+        return better
 
     def _look_back(self) -> bool:
         """Follow the object backwards into frames where it was lost before it was found, if it is there.
