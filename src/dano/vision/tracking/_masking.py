@@ -15,7 +15,14 @@ from dano.vision.tracking._light import LightFit
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._refine import silhouette, Target, window_of
-from dano.vision.tracking._segments import bare_brightness, like_object, Palette, Place, unlike_place
+from dano.vision.tracking._segments import (
+    bare_brightness,
+    like_object,
+    Palette,
+    Place,
+    uncommon,
+    unlike_place,
+)
 from dano.vision.tracking._subject import Subject
 
 _EDGE_FRAMES = 8
@@ -32,6 +39,12 @@ _JOINED = 2
 
 _SPECK = 0.2
 """Share of the largest thing's area from which another one counts: the object may be further away."""
+
+_GAP = 0.06
+"""Width of gaps that are closed in what is left of a thing, as a share of the root of its area."""
+
+_JOINED_SHARE = 0.1
+"""Share of a thing's area that has other colours than the object from which something is joined to it."""
 
 _MOST_THINGS = 6
 """Things that are looked at, largest first."""
@@ -120,7 +133,7 @@ class Masking:
         if not light.sees_shadows or self._bare is None:
             return
         mask = ndimage.binary_dilation(target.mask > 0.02, iterations=_SHADOW_GAP)
-        light.add_shadow(place, target.camera, target.image, self._bare, ~mask & self._seen(i))
+        light.add_shadow(place, target.camera, target.image, self._bare, ~mask & target.seen)
 
     def hidden(self, i: int, window: tuple[slice, slice]) -> float:
         """Share of a window that something else hides."""
@@ -134,10 +147,18 @@ class Masking:
         seen = self._seen(i)
         return Target(camera, self._image(i).astype(np.float64), mask * seen, seen)
 
-    def parts(self, i: int, camera: PosedCamera) -> list[Target]:
+    def parts(
+        self, i: int, camera: PosedCamera, colours: Float[np.ndarray, "n 3"] | None = None
+    ) -> list[Target]:
         """A frame once for each separate thing that its mask shows, largest first; none if there is no mask.
 
-        What else there is counts as hidden, so that an object may be one of several.
+        What else there is counts as hidden, so that an object may be one of several. Things that look as if
+        something else were joined to the object come once more without that.
+
+        Args:
+            i: The frame.
+            camera: From where.
+            colours: sRGB of the object from all sides; None: nothing is joined to it.
         """
         whole = self.alone(i, camera)
         if whole is None:
@@ -146,7 +167,9 @@ class Masking:
             # Something in front may cut one thing in two.
             return [whole]
         labels = _things(whole.mask)
-        return [_without(whole, (labels > 0) & (labels != k)) for k in range(1, labels.max() + 1)] or [whole]
+        things = [_without(whole, (labels > 0) & (labels != k)) for k in range(1, labels.max() + 1)]
+        divided = [] if colours is None else [_divided(one, colours) for one in things]
+        return [*(things or [whole]), *(one for one in divided if one is not None)]
 
     def _alone(self, i: int) -> np.ndarray | None:
         if self._last is not None and self._last[0] == i:
@@ -198,16 +221,22 @@ class Masking:
         window = window_of(subject, place, camera, 1.5)
         if window is None:
             return None
-        expected, _ = silhouette(subject, place, lamps, camera, window)
+        expected, colour = silhouette(subject, place, lamps, camera, window)
         image = self._image(i)
         mask = np.zeros(image.shape[:2], np.float32)
-        mask[window] = like_object(image[window], expected, blur, self._palette, self._place, window)
+        seen = self._seen(i).copy()
+        look = None if len(self._colours) < 4 else colour
+        found = like_object(image[window], expected, blur, self._palette, self._place, window, look)
+        mask[window] = found.mask
+        seen[window] &= ~found.other
         behind = None
         if self._place is not None:
-            free = np.ones(mask.shape, bool)
-            free[window] = ~ndimage.binary_dilation(expected > 0.02, iterations=int(np.ceil(blur)))
+            free = seen.copy()
+            free[window] &= ~ndimage.binary_dilation(expected > 0.02, iterations=int(np.ceil(blur)))
             behind = self._place.seen_in(image, free & (mask < 0.05))
-        return Target(camera, image.astype(np.float64), mask, self._seen(i), behind)
+        # Beside something else it is not known where the object ends.
+        sure = not found.other.any()
+        return Target(camera, image.astype(np.float64), mask, seen, behind, sure)
 
     def learn(self, target: Target, window: tuple[slice, slice], shape: np.ndarray) -> None:
         """Take the object's colours in a frame into account, where it surely is."""
@@ -233,6 +262,23 @@ def _without(target: Target, others: Bool[np.ndarray, "height width"]) -> Target
     if not others.any():
         return target
     return target._replace(mask=np.where(others, 0, target.mask), seen=target.seen & ~others)
+
+
+def _divided(target: Target, colours: Float[np.ndarray, "n 3"]) -> Target | None:
+    """A frame without what has other colours than the object; None if that is little, or nearly all."""
+    thing = target.mask > 0.5
+    other = uncommon(target.image, thing, colours)
+    if not _JOINED_SHARE < other.sum() / max(thing.sum(), 1) < 1 - _JOINED_SHARE:
+        return None
+    rest = _without(target, ndimage.binary_dilation(other, iterations=2))
+    labels = _things(rest.mask)
+    main = (labels == 1) & (rest.mask > 0.5)
+    gap = max(1, round(_GAP * np.sqrt(main.sum())))
+    padded = np.pad(main, gap)
+    closed = ndimage.binary_fill_holes(ndimage.binary_closing(padded, iterations=gap))
+    assert closed is not None
+    mask = np.maximum(rest.mask, closed[gap:-gap, gap:-gap])
+    return _without(rest._replace(mask=np.where(rest.seen, mask, 0)), labels > 1)
 
 
 def _near(target: Target, window: tuple[slice, slice] | None) -> Target:

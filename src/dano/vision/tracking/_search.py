@@ -28,6 +28,9 @@ _GRID = 24
 _REACH = 1.7
 """Half the side of that grid, in roots of the silhouette's area."""
 
+_SIDES = 24
+"""Directions from which the object's colours are collected."""
+
 _DIFFERENT = np.radians(18)
 """Least angle between candidates."""
 
@@ -99,6 +102,12 @@ def search(
             _learn(subject, coarse, found, light)
             starts.append(Start(found, light, score(found)))
     return sorted(starts, key=lambda s: s.score)
+
+
+def colours_of(subject: Subject) -> Float[np.ndarray, "n 3"]:
+    """The object's sRGB from all sides, under white lamps beside the camera."""
+    views = [_view(subject, axes) for axes in _views(_SIDES)]
+    return np.concatenate([colour[opacity > 0.95] for opacity, colour, _ in views])
 
 
 def half_turns(subject: Subject, place: Placement) -> list[Placement]:

@@ -1,7 +1,9 @@
 """Masks of films: what is unlike the place, and like the object where it is expected."""
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from dano.fields import largest_part
@@ -36,6 +38,28 @@ _SHADE_PRIOR = 1e-3
 
 _SHADE_RANGE = (0.15, 1.5)
 """Least and largest shade."""
+
+_OTHER_PRIOR = 0.02
+"""How likely something else is that has a colour never seen: seldom is anything."""
+
+_BESIDE_PRIOR = 0.2
+"""How likely something else is that is seen beside the object."""
+
+_TINTS = 40
+"""Bins of the shares of red and green in a colour."""
+
+_TINT_BLUR = 1.5
+"""Standard deviation of the blur that takes the noise of tints away [pixels]."""
+
+_UNCOMMON = 1.0
+"""Logarithm of how much oftener a colour must be than on the object: of a block that pushed a bunny it was 2,
+of the bunny itself more than 1 in 5 % of its pixels."""
+
+_LOOK_NOISE = 0.07
+"""Standard deviation of a pixel of the object from how it is rendered, in sRGB: `_UNLIKE` is more."""
+
+_PIECE = 0.1
+"""Share of the largest part's area from which another one belongs to an object that something cuts."""
 
 
 class Place:
@@ -141,6 +165,58 @@ def unlike_place(
     return _main(ratio)
 
 
+def uncommon(
+    image: Float[np.ndarray, "height width 3"],
+    thing: Bool[np.ndarray, "height width"],
+    colours: Float[np.ndarray, "n 3"],
+) -> Bool[np.ndarray, "height width"]:
+    """Where a thing has colours that it shows much oftener than the object: there it is something else.
+
+    Colours are compared as shares of red and green light, which hardly depend on how the object is lit.
+
+    Args:
+        image: A frame.
+        thing: Where the thing is.
+        colours: sRGB of the object from all sides.
+    """
+    share = ndimage.gaussian_filter(thing.astype(float), _TINT_BLUR) + 1e-3
+    smooth = ndimage.gaussian_filter(image * thing[..., None], (_TINT_BLUR, _TINT_BLUR, 0)) / share[..., None]
+    here, whole = _tint(smooth), np.zeros(thing.shape)
+    ratio = _log_frequency(here[thing], here) - _log_frequency(_tint(colours), here)
+    whole[thing] = np.clip(ratio[thing], -4, 4)
+    ratio = ndimage.gaussian_filter(whole, _TINT_BLUR) / share
+    return ndimage.binary_opening(thing & (ratio > _UNCOMMON), iterations=2)
+
+
+def _tint(colours: Float[np.ndarray, "*shape 3"]) -> Int[np.ndarray, "*shape 2"]:
+    """Bins of the shares of red and green."""
+    light = np.maximum(colours, 1e-3) ** GAMMA
+    return np.minimum(_TINTS * light[..., :2] / light.sum(axis=-1, keepdims=True), _TINTS - 1).astype(int)
+
+
+def _log_frequency(
+    tints: Int[np.ndarray, "n 2"], here: Int[np.ndarray, "height width 2"]
+) -> Float[np.ndarray, "height width"]:
+    counts = np.zeros((_TINTS, _TINTS))
+    np.add.at(counts, tuple(tints.T), 1.0)
+    smooth = ndimage.gaussian_filter(counts, 0.7)
+    # As in a palette, a share of everything is possible.
+    frequency = 0.97 * smooth / max(smooth.sum(), 1e-9) + 0.03 / _TINTS**2
+    return np.log(frequency[here[..., 0], here[..., 1]])
+
+
+class Segments(NamedTuple):
+    """What the pixels of a picture show.
+
+    Attributes:
+        mask: Where the object is, 0 to 1.
+        other: Where something else is, neither the object nor the place: a hand, or what pushes it.
+    """
+
+    mask: Float[np.ndarray, "height width"]
+    other: Bool[np.ndarray, "height width"]
+
+
 def like_object(
     image: Float[np.ndarray, "height width 3"],
     expected: Float[np.ndarray, "height width"],
@@ -148,7 +224,8 @@ def like_object(
     palette: Palette | None,
     place: Place | None,
     window: tuple[slice, slice],
-) -> Float[np.ndarray, "height width"]:
+    colour: Float[np.ndarray, "height width 3"] | None = None,
+) -> Segments:
     """What looks like the object near where it is expected, and unlike what is around it.
 
     Args:
@@ -158,34 +235,91 @@ def like_object(
         palette: Colours of the object; None: those of this frame where it is expected.
         place: What is seen where it is not; None: the colours around it.
         window: Where in the frame the part lies.
+        colour: Rendered over black at the expected pose; None: it is not known how the object is lit.
     """
     core, near = expected > 0.9, ndimage.binary_dilation(expected > 0.1, iterations=int(np.ceil(blur)) + 1)
     if palette is None:
         inner = ndimage.binary_erosion(core, iterations=int(np.ceil(blur)))
         palette = Palette(image[inner if inner.sum() > _LEAST_AREA else core])
     around = Palette(image[~near]) if (~near).sum() > _LEAST_AREA else None
-    other = None if place is None else place.log_likelihood(image, window)
-    if other is None:
-        other = np.zeros(image.shape[:2]) if around is None else around.log_likelihood(image)
-    ratio = ndimage.gaussian_filter(np.clip(palette.log_likelihood(image) - other, -6, 6), 0.8)
+    behind = None if place is None else place.log_likelihood(image, window)
+    if behind is None:
+        behind = np.zeros(image.shape[:2]) if around is None else around.log_likelihood(image)
+    own = palette.log_likelihood(image)
+    if colour is not None:
+        own = np.logaddexp(own, _as_rendered(image, expected, colour, blur)) - np.log(2)
+    ratio = ndimage.gaussian_filter(np.clip(own - behind, -6, 6), 0.8)
     prior = np.clip(ndimage.gaussian_filter(expected, blur), 0.02, 0.98)
-    return _main(ratio + np.log(prior / (1 - prior)))
+    ratio = ratio + np.log(prior / (1 - prior))
+    if place is None:
+        return Segments(_main(ratio), np.zeros(ratio.shape, bool))
+    other = _other(image, near, own, behind + np.log(1 - prior))
+    if not other.any():
+        return Segments(_main(ratio), other)
+    return Segments(_main(np.where(other, -12, ratio), _PIECE), other)
 
 
-def _main(log_ratio: np.ndarray) -> np.ndarray:
-    """Probabilities, of the largest part only, its holes filled."""
+def _as_rendered(
+    image: Float[np.ndarray, "height width 3"],
+    expected: Float[np.ndarray, "height width"],
+    colour: Float[np.ndarray, "height width 3"],
+    blur: float,
+) -> Float[np.ndarray, "height width"]:
+    """Logarithm of the density of colours that are rendered around each pixel: normal in each channel."""
+    away = max(0.5 * blur, 0.5)
+    share = ndimage.gaussian_filter(expected, away) + 1e-3
+    look = colour / np.maximum(expected, 0.1)[..., None]
+    mean, square = (
+        ndimage.gaussian_filter(expected[..., None] * x, (away, away, 0)) / share[..., None]
+        for x in (look, look**2)
+    )
+    variance = np.maximum(square - mean**2, 0) + _LOOK_NOISE**2
+    return -0.5 * np.sum((image - mean) ** 2 / variance + np.log(2 * np.pi * variance), axis=2)
+
+
+def _other(
+    image: Float[np.ndarray, "height width 3"],
+    near: Bool[np.ndarray, "height width"],
+    own: Float[np.ndarray, "height width"],
+    behind: Float[np.ndarray, "height width"],
+) -> Bool[np.ndarray, "height width"]:
+    """Where neither the object nor the place is likely, whose logarithms of densities are given.
+
+    Something else may have any colour; those which are seen beside the object and are not the place's are
+    likelier.
+    """
+    strange = ~near & (ndimage.gaussian_filter(np.clip(behind, -8, 8), 1.0) < np.log(_OTHER_PRIOR))
+    strange = ndimage.binary_opening(strange, iterations=2)
+    density = np.full(image.shape[:2], np.log(_OTHER_PRIOR))
+    if strange.sum() > _LEAST_AREA:
+        beside = Palette(image[strange]).log_likelihood(image) + np.log(_BESIDE_PRIOR)
+        density = np.logaddexp(density, beside)
+    ratio = ndimage.gaussian_filter(np.clip(density - np.maximum(own, behind), -6, 6), 1.0)
+    # Single pixels are noise, and those at its edge are mixed.
+    return ndimage.binary_dilation(ndimage.binary_opening(ratio > 0, iterations=2))
+
+
+def _main(log_ratio: np.ndarray, piece: float = 1.0) -> np.ndarray:
+    """Probabilities, of the largest part and those of a share of its area, their holes filled."""
     solid = log_ratio > 0
     if solid.sum() < _LEAST_AREA:
         return np.zeros(log_ratio.shape, np.float32)
     solid = ndimage.binary_opening(solid) if solid.sum() > 10 * _LEAST_AREA else solid
     if not solid.any():
         return np.zeros(log_ratio.shape, np.float32)
-    whole = ndimage.binary_fill_holes(largest_part(solid))
+    whole = ndimage.binary_fill_holes(largest_part(solid) if piece == 1 else _pieces(solid, piece))
     assert whole is not None
     soft = 1 / (1 + np.exp(-np.clip(log_ratio, -12, 12)))
     near = ndimage.binary_dilation(whole)
     core = ndimage.binary_erosion(whole)
     return np.where(core, 1.0, np.where(near, soft, 0.0)).astype(np.float32)
+
+
+def _pieces(solid: Bool[np.ndarray, "height width"], share: float) -> Bool[np.ndarray, "height width"]:
+    """The parts that have at least a share of the largest one's area."""
+    labels, count = ndimage.label(solid)
+    areas = ndimage.sum_labels(solid, labels, np.arange(1, count + 1))
+    return np.isin(labels, 1 + np.flatnonzero(areas >= share * areas.max()))
 
 
 def overlap(

@@ -1,6 +1,7 @@
 """The verb: the pose of a known object in every frame of a film."""
 
 import dataclasses
+import functools
 import time
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.tracking._refine import aligned, refine, Refined, Target, window_of
 from dano.vision.tracking._result import HIDDEN, LOST, OUTSIDE, TRACKED, Tracked, tracked
-from dano.vision.tracking._search import half_turns, learn_light, score, search, Start, unlikeness
+from dano.vision.tracking._search import colours_of, half_turns, learn_light, score, search, Start, unlikeness
 from dano.vision.tracking._subject import CHUNK, Subject
 
 _COARSE = 24
@@ -51,6 +52,9 @@ _OTHER = np.radians(12)
 
 _WORSE = 0.03
 """By how much less than usually a silhouette must overlap for other poses to be tried."""
+
+_PALER = 1.5
+"""How many times larger than usual the difference of colours must be for that."""
 
 _NEAR = 4
 """Frames between two that say where the object is in others near them."""
@@ -121,6 +125,10 @@ class _Walk:
         self._ambiguity = np.inf
         self._seconds: list[float] = []
 
+    @functools.cached_property
+    def _colours(self) -> Float[np.ndarray, "n 3"]:
+        return colours_of(self._subject)
+
     def begin(self, place: Placement) -> None:
         """Take a pose for the one in the first frame."""
         self._given = place
@@ -188,13 +196,21 @@ class _Walk:
         )
 
     def look_again(self) -> None:
-        """Begin once more in frames that fit worse than usual, or were lost: where frames around them say.
+        """Begin once more in frames that fit worse than usual, or were lost: where other frames say."""
+        # What is usual is known only when most frames are right.
+        if self._look_between() | self._look_back():
+            self._look_between()
+
+    def _look_between(self) -> bool:
+        """Begin where frames around say; returns whether some fit better.
 
         What spins fast is not near its first pose in the second frame, and nothing tells yet how it moves.
         """
-        fits = {i: found.overlap for i, found in enumerate(self._found) if found is not None}
-        usual = np.median(list(fits.values())) if fits else 0.0
-        good = [i for i, fit in fits.items() if fit > usual - _WORSE]
+        fits = {i: (found.overlap, found.colour_error) for i, found in enumerate(self._found) if found}
+        overlap, colour = np.median(list(fits.values()), axis=0) if fits else (0.0, 0.0)
+        # Colours that are not known are no worse.
+        good = [i for i, fit in fits.items() if fit[0] > overlap - _WORSE and not fit[1] > _PALER * colour]
+        better = False
         for i in sorted(set(range(len(self._found))) - set(good)):
             before, after = [j for j in good if j < i][-2:], [j for j in good if j > i][:2]
             pair = [before[-1], after[0]] if before and after else [*before, *after]
@@ -203,7 +219,25 @@ class _Walk:
             found, status = self._followed(i, self._carried(pair[0], pair[1], i))
             other = self._found[i]
             if found is not None and (other is None or score(found) < score(other)):
-                self._found[i], self._status[i] = self._exposed(i, found) or found, status
+                self._found[i], self._status[i], better = self._exposed(i, found) or found, status, True
+        return better
+
+    def _look_back(self) -> bool:
+        """Follow the object backwards into frames where it was lost before it was found, if it is there.
+
+        It may come into the picture beside something else, and be alone only later.
+        """
+        count = sum(found is not None for found in self._found)
+        for i in reversed(range(len(self._found) - 1)):
+            if self._found[i] is not None or self._found[i + 1] is None:
+                continue
+            further = i + 2 < len(self._found) and self._found[i + 2] is not None
+            after = self._place(i + 1)
+            carried = self._carried(i + 2, i + 1, i) if further else after
+            found, status = self._followed(i, dataclasses.replace(carried, drift=after.drift))
+            if found is not None:
+                self._found[i], self._status[i] = self._exposed(i, found), status
+        return sum(found is not None for found in self._found) > count
 
     def _exposed(self, i: int, found: Refined) -> Refined:
         """The pose once more, with how the object moves while the frame is exposed."""
@@ -231,7 +265,9 @@ class _Walk:
         """Look for the object in all orientations; now and then only."""
         if self._missed % self._options.search_every:
             return None
-        parts = self._masking.parts(i, self._camera)
+        # Other masks are taken to show the object alone, or know nothing else to be there.
+        colours = self._colours if self._masking.source == "object" else None
+        parts = self._masking.parts(i, self._camera, colours)
         found = [one for target in parts if (one := self._searched_in(i, target)) is not None]
         if not found:
             return None

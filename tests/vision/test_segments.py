@@ -1,0 +1,104 @@
+"""What the pixels of a film show: the object, the place in sun and shadow, or something else."""
+
+import numpy as np
+from scipy import ndimage
+
+from dano.vision.drawing import GAMMA
+from dano.vision.tracking._segments import (
+    bare_brightness,
+    like_object,
+    overlap,
+    Palette,
+    Place,
+    uncommon,
+    unlike_place,
+)
+
+
+def test_a_place_is_seen_in_the_frame_s_shadow_and_exposure():
+    random = np.random.default_rng(3)
+    colours = random.uniform(0.2, 0.8, (40, 50, 3)).astype(np.float32)
+    place = Place(colours, [np.rint(255 * colours).astype(np.uint8)])
+    shade = np.where(np.arange(50) < 25, 0.5, 0.9)[None, :, None]
+    image = shade * colours
+    free = np.ones((40, 50), bool)
+    free[15:25, 20:30] = False
+    image[~free] = 0.1
+    seen = place.seen_in(image, free)
+    np.testing.assert_allclose(seen[:, :15], 0.5 * colours[:, :15], rtol=0.02)
+    np.testing.assert_allclose(seen[:, 40:], 0.9 * colours[:, 40:], rtol=0.02)
+    inside = seen[~free] / colours[~free]
+    assert inside.min() > 0.45
+    assert inside.max() < 0.95
+
+
+def test_a_table_is_bright_where_the_object_passes_with_its_shadow():
+    bare = np.random.default_rng(4).uniform(0.3, 0.9, (20, 30))
+    frames, masks = [], []
+    for k in range(8):
+        image, mask = np.tile(bare[..., None], (1, 1, 3)), np.zeros((20, 30), np.float32)
+        image[5:12, 3 * k + 2 : 3 * k + 6] *= 0.7
+        mask[5:12, 3 * k : 3 * k + 3] = 1
+        image[mask > 0] = 1.0
+        frames.append(np.rint(255 * image).astype(np.uint8))
+        masks.append(mask)
+    found = bare_brightness(frames, masks)
+    np.testing.assert_allclose(found, 3 * bare**GAMMA, rtol=0.02)
+    assert np.isnan(bare_brightness(frames, [np.ones((20, 30), np.float32)] * 8)).all()
+
+
+def test_shadows_are_no_object_and_colours_tell_what_is():
+    rng = np.random.default_rng(2)
+    place = ndimage.gaussian_filter(rng.uniform(0.2, 0.8, (80, 100, 3)), (2, 2, 0))
+    truth = np.zeros((80, 100))
+    truth[20:50, 30:60] = 1
+    shadow = np.zeros((80, 100))
+    shadow[40:60, 50:85] = 1
+    image = place * (1 - 0.4 * shadow[..., None])
+    image = np.where(truth[..., None] > 0, [0.1, 0.3, 0.9], image) + 0.01 * rng.normal(size=(80, 100, 3))
+    frames = [np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)] * 2
+    known = Place(place, frames)
+    assert overlap(unlike_place(image, known), truth) > 0.9
+    expected = np.roll(truth, (3, -3), axis=(0, 1))
+    window = (slice(0, 80), slice(0, 100))
+    assert overlap(like_object(image, expected, 4.0, None, known, window).mask, truth) > 0.93
+    assert overlap(like_object(image, expected, 4.0, None, None, window).mask, truth) > 0.85
+
+
+def test_something_else_beside_the_object_is_neither_it_nor_the_place():
+    rng = np.random.default_rng(2)
+    place = ndimage.gaussian_filter(rng.uniform(0.2, 0.8, (80, 100, 3)), (2, 2, 0))
+    known = Place(place, [np.rint(255 * place).astype(np.uint8)] * 2)
+    window = (slice(0, 80), slice(0, 100))
+    truth, block = np.zeros((80, 100), bool), np.zeros((80, 100), bool)
+    truth[20:50, 30:60] = True
+    # It hides a quarter of the object, and ends beside it.
+    block[25:55, 52:90] = True
+    blue, brown = np.array([0.1, 0.3, 0.9]), np.array([0.65, 0.2, 0.1])
+    image = np.where(truth[..., None], blue, place)
+    noise = 0.01 * rng.normal(size=image.shape)
+    alone = like_object(image + noise, truth * 1.0, 2.0, None, known, window)
+    assert not alone.other.any()
+    assert overlap(alone.mask, truth * 1.0) > 0.95
+    colours = Palette((image + noise)[truth])
+    image = np.where(block[..., None], brown, image)
+    found = like_object(image + noise, truth * 1.0, 2.0, colours, known, window)
+    assert overlap(found.other * 1.0, block * 1.0) > 0.85
+    visible = truth & ~block
+    assert overlap(found.mask, visible * 1.0, ~found.other) > 0.9
+    # Where it is rendered in that colour, it is the object.
+    own = like_object(image + noise, 1.0 * (truth | block), 2.0, colours, known, window, image)
+    assert not own.other.any()
+
+
+def test_colours_that_the_object_seldom_has_are_something_else_in_any_light():
+    rng = np.random.default_rng(3)
+    thing = np.zeros((60, 80), bool)
+    thing[10:50, 10:70] = True
+    paint = np.array([[0.2, 0.4, 0.8], [0.3, 0.7, 0.3]])[rng.integers(0, 2, (6, 8))]
+    image = ndimage.gaussian_filter(np.kron(paint, np.ones((10, 10, 1))), (2, 2, 0))
+    colours = 0.6 ** (1 / GAMMA) * image[thing] + 0.02 * rng.normal(size=(thing.sum(), 3))
+    assert uncommon(image, thing, colours).sum() < 0.05 * thing.sum()
+    block = thing & (np.arange(80) >= 50)
+    joined = np.where(block[..., None], [0.7, 0.6, 0.4], image) + 0.02 * rng.normal(size=image.shape)
+    assert overlap(uncommon(joined, thing, colours) * 1.0, block * 1.0) > 0.8
