@@ -39,6 +39,10 @@ from dano.native.trees._step import (
 
 # Squares of it are nothing beside 1, and no product of it with what a step has is rounded to 0.
 _SMALL = 1e-30
+# Tables in the order of `changing` of `dano.engine.joints`.
+_POSITION, _ORIENTATION, _VELOCITY, _OMEGA, _Q, _V = range(6)
+_FORCE, _TORQUE, _EFFORT, _COMMAND = range(6, 10)
+_BODIES, _JOINTS, _LAWS, _SETTINGS = range(10, 14)
 # Buffers of a call: those of a step, velocities at its end, and by what derivatives are taken.
 _END, _CHANGED = 17, 18
 
@@ -127,26 +131,26 @@ def _answer(frame, dtype):
         _complex(given.laws),
         _complex_row(given.settings),
     )
-    joints = np.zeros(tables[11].shape, np.complex128)
+    joints = np.zeros(tables[_JOINTS].shape, np.complex128)
     wide_given = Given(
         given.nodes,
         given.coordinates,
-        tables[10],
+        tables[_BODIES],
         joints,
-        tables[12],
-        tables[13][0],
+        tables[_LAWS],
+        tables[_SETTINGS][0],
         given.rules,
         given.roots,
-        tables[4][0],
-        tables[5][0],
-        tables[8][0],
-        tables[9][0],
+        tables[_Q][0],
+        tables[_V][0],
+        tables[_EFFORT][0],
+        tables[_COMMAND][0],
     )
     ends = (
-        np.zeros(tables[0].shape, np.complex128),
-        np.zeros(tables[1].shape, np.complex128),
-        np.zeros(tables[2].shape, np.complex128),
-        np.zeros(tables[3].shape, np.complex128),
+        np.zeros(tables[_POSITION].shape, np.complex128),
+        np.zeros(tables[_ORIENTATION].shape, np.complex128),
+        np.zeros(tables[_VELOCITY].shape, np.complex128),
+        np.zeros(tables[_OMEGA].shape, np.complex128),
     )
     coordinates = (np.zeros(given.q.size, np.complex128), np.zeros(given.q.size, np.complex128))
     wide = Wide(wide_given, tables, _complex_room(room), np.zeros(kinks.ramps.shape, np.complex128))
@@ -162,16 +166,16 @@ def _answer(frame, dtype):
         slopes[n, :] = 0.0
         if not math.isfinite(tables[kind][row, column].real):
             continue
-        if kind == 2 or kind == 3 or kind == 6 or kind == 7:
+        if kind == _VELOCITY or kind == _OMEGA or kind == _FORCE or kind == _TORQUE:
             _change_momentum(given, state, room, kind, node_of[row], row, column, change)
         else:
             _put(tables, kind, row, column, _SMALL)
-            if kind == 12:
+            if kind == _LAWS:
                 _change_law(wide, kinks, row, y, change)
-            elif kind == 5 or kind == 8 or kind == 9:
+            elif kind == _V or kind == _EFFORT or kind == _COMMAND:
                 _change_law(wide, kinks, column, y, change)
             else:
-                joints[:, :] = tables[11]
+                joints[:, :] = tables[_JOINTS]
                 tidy(given.nodes, joints)
                 _change_all(wide, kinks, y, change, ends, coordinates)
                 _write(ends, coordinates, slopes[n])
@@ -193,14 +197,14 @@ def _put(tables, kind, row, column, value):
 def _differentiate_end(wide, y, ends, coordinates, by_y):
     """By how much the end of a step changes with its velocities."""
     given, tables, room, _ = wide
-    given.joints[:, :] = tables[11]
+    given.joints[:, :] = tables[_JOINTS]
     tidy(given.nodes, given.joints)
     state, moved = (tables[0], tables[1], tables[2], tables[3]), np.empty(y.size, np.complex128)
     for k in range(4):
         ends[k][:, :] = tables[k]
     for k in range(y.size):
         # The end of a step takes the place of its start.
-        begin(given, state, tables[6], tables[7], room, moved)
+        begin(given, state, tables[_FORCE], tables[_TORQUE], room, moved)
         moved[:] = y
         moved[k] = complex(y[k], _SMALL)
         go(given, room, moved)
@@ -218,11 +222,11 @@ def _change_momentum(given, state, room, kind, node, body, column, change):
     """Generalised momenta by a velocity, spin, force or torque: the equations are linear in the first."""
     h, axis = given.settings[H], _unit(column)
     nothing = (0.0, 0.0, 0.0)
-    if kind == 2:
+    if kind == _VELOCITY:
         pull(given.nodes, node, times(given.bodies[body, MASS], axis), nothing, room, change)
-    elif kind == 6:
+    elif kind == _FORCE:
         pull(given.nodes, node, times(h, axis), nothing, room, change)
-    elif kind == 7:
+    elif kind == _TORQUE:
         pull(given.nodes, node, nothing, times(h, axis), room, change)
     else:
         turn, omega = four(room.poses, body, TURNED), three(state[3], body, 0)
@@ -260,7 +264,7 @@ def _change_all(wide, kinks, y, change, ends, coordinates):
     """What a number changes in the equations, as in `_change_law`, and at the end of the step besides."""
     given, tables, room, ramps = wide
     state, moved = (tables[0], tables[1], tables[2], tables[3]), np.empty(y.size, np.complex128)
-    begin(given, state, tables[6], tables[7], room, moved)
+    begin(given, state, tables[_FORCE], tables[_TORQUE], room, moved)
     moved[:] = y
     balance(given, room, moved)
     for k in range(y.size):
