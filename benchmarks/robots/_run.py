@@ -1,7 +1,6 @@
 """The Panda: a step, and its mass matrix, beside MuJoCo and frax; energy and motion of free swinging."""
 
 import dataclasses
-import importlib.util
 import time
 import xml.etree.ElementTree as ET
 from importlib.resources import files
@@ -24,6 +23,7 @@ from benchmarks._measure import (
     warm_up,
 )
 from benchmarks.robots import _chains, _identify
+from benchmarks.robots.push import panda
 from dano.robots import Robot
 
 STEPS = 1000
@@ -39,7 +39,7 @@ FOUND = "Found from logs"
 def run() -> None:
     arguments = parse_arguments("Measure a robot beside MuJoCo and frax.")
     load = load_average()
-    path = _panda()
+    path = panda()
     if path is None:
         rows = [skipped(SPEED, "all of it", "the package frax, which ships the Panda, is not installed")]
     else:
@@ -53,13 +53,6 @@ def run() -> None:
     # Other programs slow down what is timed, most of all what reads much memory.
     settings = {"steps": STEPS, "timestep": TIMESTEP, "shared": load_average() > SHARED}
     report("robots", rows, settings, load, arguments.json)
-
-
-def _panda() -> Path | None:
-    found = importlib.util.find_spec("frax")
-    if found is None or not found.submodule_search_locations:
-        return None
-    return Path(found.submodule_search_locations[0]) / "assets" / "franka_panda" / "panda.urdf"
 
 
 def _speed_rows(robot: Robot, path: Path, repeats: int) -> list[Row]:

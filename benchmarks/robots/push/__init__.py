@@ -1,0 +1,3 @@
+"""The Panda pushes the shipped bunny with torques of its joints."""
+
+from benchmarks.robots.push._case import panda as panda

@@ -1,0 +1,81 @@
+"""Step, derivatives and plans of the Panda that pushes the bunny."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import dano
+from benchmarks._measure import (
+    compiled,
+    load_average,
+    parse_arguments,
+    report,
+    Row,
+    skipped,
+    summary,
+    time_in_turn,
+)
+from benchmarks.robots.push import _case
+
+SPEED = "The Panda pushes the bunny, paper's law"
+PLANS = "Plans with the torques of its joints, random starts and goals"
+CASES = 3
+
+
+def run() -> None:
+    """Measure, print and report."""
+    arguments = parse_arguments("The Panda pushes the bunny with torques of its joints.")
+    load, path = load_average(), _case.panda()
+    if path is None:
+        rows = [skipped(SPEED, "all of it", "the package frax, which ships the Panda, is not installed")]
+    else:
+        robot, scene = _case.scene(path)
+        rest = _case.rested()
+        cases = [_case.case(robot, scene, rest, seed) for seed in range(1 if arguments.quick else CASES + 1)]
+        rows = _speed_rows(scene, cases[0], 3 if arguments.quick else 15)
+        if not arguments.quick:
+            rows += _plan_rows(scene, cases)
+    settings = {"timestep": _case.TIMESTEP, "steps": _case.N_STEPS, "quick": arguments.quick}
+    report("robots-push", rows, settings, load, arguments.json)
+
+
+def _speed_rows(scene: dano.Scene, given: _case.Case, repeats: int) -> list[Row]:
+    """A step of the push, and its derivatives by state and controls where the tool touches."""
+    controls = jax.vmap(lambda effort: dano.joint_control(scene, effort))(jnp.asarray(given.guess))
+
+    def rollout(state):
+        return dano.simulate(scene, state, controls=controls).states
+
+    run, to_compile = compiled(rollout, given.state)
+    states = jax.tree.map(lambda x: x[:-1], run(given.state))
+
+    def derivatives(states):
+        return jax.lax.map(lambda each: dano.linearize(scene, *each), (states, controls))
+
+    slopes, to_differentiate = compiled(derivatives, states)
+    calls = {"step": lambda: run(given.state), "A and B": lambda: slopes(states)}
+    times = time_in_turn(calls, repeats)
+    step, both = (summary(1e6 * times[name] / _case.N_STEPS)[0] for name in calls)
+    return [
+        Row(SPEED, "a step", step, "µs", 150),
+        Row(SPEED, "A and B", both, "µs", 300),
+        Row(SPEED, "a rollout, to compile", to_compile, "s", 10),
+        Row(SPEED, "A and B, to compile", to_differentiate, "s", 10),
+    ]
+
+
+def _plan_rows(scene: dano.Scene, cases: list[_case.Case]) -> list[Row]:
+    """Errors and times of plans; the first one has compilation in it and counts for that alone."""
+    made = [dano.plan(scene, case.state, case.task, controls=case.guess) for case in cases]
+    for plan in made:
+        print(plan.seconds, plan.message, [goal.error for goal in plan.goals], flush=True)
+    errors = np.array([[goal.error for goal in plan.goals] for plan in made[1:]])
+    seconds = np.array([plan.seconds for plan in made[1:]])
+    n, near = len(errors), float((errors.max(axis=1) <= _case.NEAR).sum())
+    return [
+        Row(PLANS, "bunny and tool within 2 cm", near, f"of {n}", n, at_least=True),
+        Row(PLANS, "bunny's error, largest", 1e3 * float(errors[:, 0].max()), "mm"),
+        Row(PLANS, "tool's error, largest", 1e3 * float(errors[:, 1].max()), "mm"),
+        Row(PLANS, "time of a plan, longest", float(seconds.max()), "s", 300),
+        Row(PLANS, "the first plan, with compilation", made[0].seconds, "s"),
+    ]
