@@ -2,11 +2,13 @@
 
 import dataclasses
 import importlib.util
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 import dano
 from benchmarks._subjects import shipped_bunny
@@ -67,8 +69,31 @@ def rested() -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(state.position[0]), np.asarray(state.orientation[0])
 
 
-def case(robot: dano.Robot, given: dano.Scene, rest: tuple[np.ndarray, np.ndarray], seed: int) -> Case:
-    """A random start, and a goal to the side of where a straight push brings the bunny."""
+def pusher(robot: dano.Robot, given: dano.Scene) -> Callable[[Array, dano.State, Array], dano.Control]:
+    """Torques that draw the hand along places, one for each step, in operational space."""
+    last, joints = robot.bodies[-1].name, len(robot.bodies)
+
+    def push(ways: Float[Array, "T 3"], state: dano.State, time: Float[Array, ""]) -> dano.Control:
+        goal = ways[jnp.round(time / TIMESTEP).astype(int)]
+        position, _, jacobian = robot.place(given, state, last)
+        speed = jnp.array([AHEAD / (N_STEPS * TIMESTEP), 0.0, 0.0])
+        wanted = STIFFNESS * (goal - position) + DAMPING * (speed - jacobian[:3, -joints:] @ state.v)
+        torque = dano.operational_space_torque(robot, given, state, last, wanted)
+        return dano.joint_control(given, torque)
+
+    return push
+
+
+def case(robot: dano.Robot, given: dano.Scene, push, rest: tuple[np.ndarray, np.ndarray], seed: int) -> Case:
+    """A random start, and a goal to the side of where a straight push brings the bunny.
+
+    Args:
+        robot: The arm.
+        given: The scene.
+        push: From `pusher`.
+        rest: From `rested`.
+        seed: Of the numbers drawn.
+    """
     draw = np.random.default_rng(seed).uniform(-1, 1, 4)
     turn = quat_from_axis_angle((0.0, 0.0, 1.0), np.pi * draw[0])
     place = np.append(BUNNY + SPREAD * draw[1:3], rest[0][2])
@@ -79,21 +104,11 @@ def case(robot: dano.Robot, given: dano.Scene, rest: tuple[np.ndarray, np.ndarra
     target = dano.Target(names[-1], position=hand, orientation=(0.0, 1.0, 0.0, 0.0))
     found = dano.inverse_kinematics(robot, given, first, [target])
     assert found.reached, found.reason
-    state = found.state
-    ways = jnp.asarray(hand) + jnp.linspace(0, 1, N_STEPS)[:, None] * jnp.array([AHEAD, 0.0, 0.0])
-
-    def push(state: dano.State, time) -> dano.Control:
-        goal = ways[jnp.round(time / TIMESTEP).astype(int)]
-        position, _, jacobian = robot.place(given, state, names[-1])
-        speed = jnp.array([AHEAD / (N_STEPS * TIMESTEP), 0.0, 0.0])
-        wanted = STIFFNESS * (goal - position) + DAMPING * (speed - jacobian[:3, -len(names) :] @ state.v)
-        return dano.joint_control(
-            given, dano.operational_space_torque(robot, given, state, names[-1], wanted)
-        )
-
-    states = dano.simulate(given, state, N_STEPS, controls=push).states
+    ways = jnp.asarray(hand + np.linspace(0, 1, N_STEPS)[:, None] * [AHEAD, 0.0, 0.0])
+    pushed = jax.tree_util.Partial(push, ways)
+    states = dano.simulate(given, found.state, N_STEPS, controls=pushed).states
     times = TIMESTEP * jnp.arange(N_STEPS)
-    guess = jax.vmap(push)(jax.tree.map(lambda x: x[:-1], states), times).effort
+    guess = jax.vmap(pushed)(jax.tree.map(lambda x: x[:-1], states), times).effort
     index = {body.name: i for i, body in enumerate(given.bodies)}
     ends = {name: np.asarray(states.position)[-1, index[name]] for name in ("bunny", "tool")}
     ends["bunny"] = ends["bunny"] + (0.0, ASIDE * draw[3], 0.0)
@@ -103,4 +118,4 @@ def case(robot: dano.Robot, given: dano.Scene, rest: tuple[np.ndarray, np.ndarra
         [Actuator(name, "effort", limit=limit, cost=1e-7) for name, limit in efforts.items()],
         [Goal(name, position=at, running=10.0, final=10.0, within=WITHIN) for name, at in ends.items()],
     )
-    return Case(state, task, np.asarray(guess))
+    return Case(found.state, task, np.asarray(guess))

@@ -30,8 +30,10 @@ def run() -> None:
         rows = [skipped(SPEED, "all of it", "the package frax, which ships the Panda, is not installed")]
     else:
         robot, scene = _case.scene(path)
-        rest = _case.rested()
-        cases = [_case.case(robot, scene, rest, seed) for seed in range(1 if arguments.quick else CASES + 1)]
+        rest, push = _case.rested(), _case.pusher(robot, scene)
+        cases = [
+            _case.case(robot, scene, push, rest, seed) for seed in range(1 if arguments.quick else CASES + 1)
+        ]
         rows = _speed_rows(scene, cases[0], 3 if arguments.quick else 15)
         if not arguments.quick:
             rows += _plan_rows(scene, cases)
