@@ -22,7 +22,7 @@ LAMPS = 3
 _DIRECTIONS = 16
 """Directions that lamps may come from, evenly spread."""
 
-_OTHER = np.cos(np.radians(40))
+_OTHER = np.cos(np.radians(60))
 """Cosine of the angle around the sun without other lamps: they would only share its power."""
 
 _TURN = 0.2
