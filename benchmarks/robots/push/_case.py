@@ -74,6 +74,7 @@ def pusher(robot: dano.Robot, given: dano.Scene) -> Callable[[Array, dano.State,
     last, joints = robot.bodies[-1].name, len(robot.bodies)
 
     def push(ways: Float[Array, "T 3"], state: dano.State, time: Float[Array, ""]) -> dano.Control:
+        assert state.v is not None
         goal = ways[jnp.round(time / TIMESTEP).astype(int)]
         position, _, jacobian = robot.place(given, state, last)
         speed = jnp.array([AHEAD / (N_STEPS * TIMESTEP), 0.0, 0.0])
@@ -97,7 +98,7 @@ def case(robot: dano.Robot, given: dano.Scene, push, rest: tuple[np.ndarray, np.
     draw = np.random.default_rng(seed).uniform(-1, 1, 4)
     turn = quat_from_axis_angle((0.0, 0.0, 1.0), np.pi * draw[0])
     place = np.append(BUNNY + SPREAD * draw[1:3], rest[0][2])
-    bunny = {"position": place, "orientation": quat_multiply(turn, rest[1])}
+    bunny = {"position": place, "orientation": quat_multiply(turn, jnp.asarray(rest[1]))}
     hand = np.array([place[0] - BEHIND, place[1], HEIGHT + 0.2])
     names = [body.name for body in robot.bodies]
     first = given.initial_state(bunny=bunny, **{n: {"q": q} for n, q in zip(names, READY, strict=True)})

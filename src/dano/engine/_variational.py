@@ -76,7 +76,8 @@ def _step_of_trees(
 
     @advance.def_jvp
     def _(primals, tangents):
-        following, report, y = native_tree_step(*primals, options)
+        tables, state, control = primals
+        following, report, y = native_tree_step(tables, state, control, options)
         change = native_tree_change(primals, tangents, y, options)
         return (following, report), (change, jax.tree.map(lambda _: None, report))
 
