@@ -83,7 +83,10 @@ def changing(tables: TreeTables, perturbed: Sequence[bool]) -> Int[np.ndarray, "
     standing = np.setdiff1d(np.arange(n), np.array(layout.children, int))
     rows = [(standing, 3), (standing, 4), (moving, 3), (moving, 3), (range(1), c), (range(1), c)]
     rows += [(moving, 3), (moving, 3), (range(1), c), (range(1), c)]
-    rows += [(range(n), 13), (range(len(layout.parents)), 15), (range(c), 12), (range(1), 4)]
+    # The last row of bodies is the world's.
+    rows += [(range(n), tables.bodies.shape[1])]
+    rows += [(range(len(x)), x.shape[1]) for x in (tables.joints, tables.laws)]
+    rows += [(range(1), tables.settings.size)]
     found = [
         (k, i, j) for k, (some, width) in enumerate(rows) if perturbed[k] for i in some for j in range(width)
     ]

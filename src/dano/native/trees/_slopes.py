@@ -47,8 +47,9 @@ _BODIES, _JOINTS, _LAWS, _SETTINGS = range(10, 14)
 _END, _CHANGED = 17, 18
 
 
-Wide = namedtuple("Wide", "given tables room ramps")
-"""Of a step with complex numbers: what it is given, the tables that this is in, and room."""
+Wide = namedtuple("Wide", "given tables state room ramps ends coordinates")
+"""Of a step with complex numbers: what it is given, all tables that this is in, those of the state, room, and
+where its end is written to: poses and velocities of bodies, q and v."""
 
 
 @kernel
@@ -153,10 +154,18 @@ def _answer(frame, dtype):
         np.zeros(tables[_OMEGA].shape, np.complex128),
     )
     coordinates = (np.zeros(given.q.size, np.complex128), np.zeros(given.q.size, np.complex128))
-    wide = Wide(wide_given, tables, _complex_room(room), np.zeros(kinks.ramps.shape, np.complex128))
+    wide = Wide(
+        wide_given,
+        tables,
+        (tables[_POSITION], tables[_ORIENTATION], tables[_VELOCITY], tables[_OMEGA]),
+        _complex_room(room),
+        np.zeros(kinks.ramps.shape, np.complex128),
+        ends,
+        coordinates,
+    )
     changed, slopes = table(buffers[_CHANGED], numba.int32), table(outputs(frame)[0], dtype)
     by_y = np.empty((y.size, slopes.shape[1]))
-    _differentiate_end(wide, y, ends, coordinates, by_y)
+    _differentiate_end(wide, y, by_y)
     node_of = np.full(given.bodies.shape[0], -1)
     for n in range(given.nodes.shape[0]):
         node_of[given.nodes[n, BODY]] = n
@@ -177,8 +186,8 @@ def _answer(frame, dtype):
             else:
                 joints[:, :] = tables[_JOINTS]
                 tidy(given.nodes, joints)
-                _change_all(wide, kinks, y, change, ends, coordinates)
-                _write(ends, coordinates, slopes[n])
+                _change_all(wide, kinks, y, change)
+                _write(wide, slopes[n])
             _put(tables, kind, row, column, 0.0)
         solve_factored(room.matrix, change)
         for k in range(y.size):
@@ -194,22 +203,21 @@ def _put(tables, kind, row, column, value):
 
 
 @kernel
-def _differentiate_end(wide, y, ends, coordinates, by_y):
+def _differentiate_end(wide, y, by_y):
     """By how much the end of a step changes with its velocities."""
-    given, tables, room, _ = wide
+    given, tables, room, moved = wide.given, wide.tables, wide.room, np.empty(y.size, np.complex128)
     given.joints[:, :] = tables[_JOINTS]
     tidy(given.nodes, given.joints)
-    state, moved = (tables[0], tables[1], tables[2], tables[3]), np.empty(y.size, np.complex128)
     for k in range(4):
-        ends[k][:, :] = tables[k]
+        wide.ends[k][:, :] = wide.state[k]
     for k in range(y.size):
         # The end of a step takes the place of its start.
-        begin(given, state, tables[_FORCE], tables[_TORQUE], room, moved)
+        begin(given, wide.state, tables[_FORCE], tables[_TORQUE], room, moved)
         moved[:] = y
         moved[k] = complex(y[k], _SMALL)
         go(given, room, moved)
-        put_end(given, room, moved, ends + coordinates)
-        _write(ends, coordinates, by_y[k])
+        put_end(given, room, moved, wide.ends + wide.coordinates)
+        _write(wide, by_y[k])
 
 
 @kernel
@@ -239,12 +247,12 @@ def _change_momentum(given, state, room, kind, node, body, column, change):
 @kernel
 def _change_law(wide, kinks, c, y, change):
     """What a number that acts on one coordinate changes in the equations, with the sign of a momentum."""
-    given, _, _, ramps = wide
+    given = wide.given
     change[:] = 0.0
     k, h, constant = given.roots + c, given.settings[H], given.coordinates[c, CONSTANT] > 0
     q, v, effort, command = given.q[c], given.v[c], given.effort[c], given.command[c]
     momentum = smooth(given.laws, c, constant, q, v, effort, command, h, y[k])
-    change[k] = -(momentum + _ramps(given, kinks, ramps, c, y[k])).imag / _SMALL
+    change[k] = -(momentum + _ramps(given, kinks, wide.ramps, c, y[k])).imag / _SMALL
 
 
 @kernel
@@ -260,27 +268,26 @@ def _ramps(given, kinks, ramps, c, y):
 
 
 @kernel
-def _change_all(wide, kinks, y, change, ends, coordinates):
+def _change_all(wide, kinks, y, change):
     """What a number changes in the equations, as in `_change_law`, and at the end of the step besides."""
-    given, tables, room, ramps = wide
-    state, moved = (tables[0], tables[1], tables[2], tables[3]), np.empty(y.size, np.complex128)
-    begin(given, state, tables[_FORCE], tables[_TORQUE], room, moved)
+    given, tables, room, moved = wide.given, wide.tables, wide.room, np.empty(y.size, np.complex128)
+    begin(given, wide.state, tables[_FORCE], tables[_TORQUE], room, moved)
     moved[:] = y
     balance(given, room, moved)
     for k in range(y.size):
         missing = room.residual[k]
         if k >= given.roots:
-            missing += _ramps(given, kinks, ramps, k - given.roots, y[k])
+            missing += _ramps(given, kinks, wide.ramps, k - given.roots, y[k])
         change[k] = -missing.imag / _SMALL
     for k in range(4):
-        ends[k][:, :] = tables[k]
-    put_end(given, room, moved, ends + coordinates)
+        wide.ends[k][:, :] = wide.state[k]
+    put_end(given, room, moved, wide.ends + wide.coordinates)
 
 
 @kernel
-def _write(ends, coordinates, row):
-    """The imaginary parts of a state, one after the other, over `_SMALL`."""
-    at = 0
+def _write(wide, row):
+    """The imaginary parts of the end of a step, one after the other, over `_SMALL`."""
+    ends, coordinates, at = wide.ends, wide.coordinates, 0
     for k in range(4):
         for i in range(ends[k].shape[0]):
             for j in range(ends[k].shape[1]):

@@ -46,6 +46,10 @@ _GAP = 0.06
 _JOINED_SHARE = 0.1
 """Share of a thing's area that has other colours than the object from which something is joined to it."""
 
+_REMEMBERED = 4
+"""Frames whose colours of the object are kept. Before there are so many, the light that they tell is not
+known well enough to say how the object looks."""
+
 _MOST_THINGS = 6
 """Things that are looked at, largest first."""
 
@@ -225,7 +229,7 @@ class Masking:
         image = self._image(i)
         mask = np.zeros(image.shape[:2], np.float32)
         seen = self._seen(i).copy()
-        look = None if len(self._colours) < 4 else colour
+        look = None if len(self._colours) < _REMEMBERED else colour
         found = like_object(image[window], expected, blur, self._palette, self._place, window, look)
         mask[window] = found.mask
         seen[window] &= ~found.other
@@ -242,7 +246,7 @@ class Masking:
         """Take the object's colours in a frame into account, where it surely is."""
         inside = (shape > 0.95) & (target.mask[window] > 0.5) & target.seen[window]
         if inside.sum() > 100:
-            self._colours = [*self._colours, target.image[window][inside]][-4:]
+            self._colours = [*self._colours, target.image[window][inside]][-_REMEMBERED:]
             self._palette = Palette(np.concatenate(self._colours))
 
 

@@ -197,8 +197,9 @@ class _Walk:
 
     def look_again(self) -> None:
         """Begin once more in frames that fit worse than usual, or were lost: where other frames say."""
+        better, more = self._look_between(), self._look_back()
         # What is usual is known only when most frames are right.
-        if self._look_between() | self._look_back():
+        if better or more:
             self._look_between()
 
     def _look_between(self) -> bool:
