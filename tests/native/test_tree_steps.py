@@ -15,6 +15,13 @@ from dano.engine._problem import prepare
 from dano.scene import Control, State
 
 H = 2e-3
+# What steps are differentiated by, besides parameters of contacts.
+MOVING = (
+    *("position", "orientation", "velocity", "omega", "q", "v", "force", "torque", "effort", "command"),
+    *("mass", "mass_scale", "com", "com_offset", "axis", "anchor", "ratio", "shift", "timestep", "gravity"),
+    *("damping", "armature", "stiffness", "rest", "friction", "limits", "motor"),
+    *("smoothing", "regularizer", "stiction_velocity"),
+)
 
 
 def scene_of(joints, *, bodies=(), gravity=(0, 0, -9.81)):
@@ -125,19 +132,35 @@ def test_derivatives_alike():
     ]
     scene = scene_of(joints, bodies=[dano.Body("base", dano.Box((0.2, 0.1, 0.05)), mass=2.0)])
     states, controls = random_states(scene, [2.0])
-    given = jax.tree.map(lambda x: x[0], (states, controls))
-    numbers, rest = eqx.partition((scene, *given), eqx.is_inexact_array)
-    rng = np.random.default_rng(0)
+    compare_derivatives(scene, *jax.tree.map(lambda x: x[0], (states, controls)))
+
+
+def random_way(numbers, rng, moves):
+    """A random change of all that steps are differentiated by.
+
+    Inertias stay symmetric, quaternions of length 1; what is fixed has no velocity.
+    """
 
     def allowed(path, number):
         way, name = jnp.asarray(rng.normal(size=number.shape)), jax.tree_util.keystr(path)
         if name.endswith(".orientation"):
-            return way - number * jnp.sum(way * number, axis=-1, keepdims=True) / jnp.sum(
-                number**2, axis=-1, keepdims=True
-            )
-        return 0.5 * (way + way.T) if name.endswith(".inertia") else way
+            along = jnp.sum(way * number, axis=-1, keepdims=True)
+            return way - number * along / jnp.sum(number**2, axis=-1, keepdims=True)
+        if name.endswith(".inertia"):
+            return 0.5 * (way + way.T)
+        if name.endswith((".velocity", ".omega")):
+            return way * jnp.broadcast_to(moves, way.shape)
+        # Samples and shapes of bodies say where they touch; that is not a matter of this code.
+        return way if name.split(".")[-1] in MOVING or ".params." in name else jnp.zeros_like(way)
 
-    way = jax.tree_util.tree_map_with_path(allowed, numbers)
+    return jax.tree_util.tree_map_with_path(allowed, numbers)
+
+
+def compare_derivatives(scene, *given):
+    """The derivative of a step along a random way, in machine code, by XLA, and in reverse mode."""
+    numbers, rest = eqx.partition((scene, *given), eqx.is_inexact_array)
+    rng, moves = np.random.default_rng(0), np.array([[not body.fixed] for body in scene.bodies], float)
+    way = random_way(numbers, rng, moves)
 
     def end(numbers, native):
         moved, state, control = eqx.combine(numbers, rest)
@@ -155,6 +178,102 @@ def test_derivatives_alike():
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * float(jnp.abs(expected).max()))
     slope = sum(jnp.vdot(a, b) for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(way), strict=True))
     np.testing.assert_allclose(slope, weights @ found, rtol=1e-9)
+
+
+def touching(law, joints=None):
+    """A floating tree whose last body and root touch a floor, a ball and each other, with the paper's law."""
+    ball = dano.Body("ball", dano.Sphere(0.15), mass=0.7)
+    floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
+    base = dano.Body("base", dano.Box((0.4, 0.3, 0.2)), mass=2.0)
+    tip = dano.Body("tip", dano.Box((0.3, 0.2, 0.2)), mass=0.8, com=(0.02, -0.03, 0.01))
+    arm = dano.Body("arm", dano.Capsule(0.05, 0.2), mass=0.5)
+    joints = [
+        dano.Joint("base", "arm", axis=(0, 1, 0), position=(0.2, 0, 0), damping=0.1),
+        dano.Joint("arm", "tip", "ball", position=(0.1, 0.05, 0), friction=0.1),
+    ]
+    pairs = [("base", "floor"), ("floor", "tip"), ("tip", "ball"), ("base", "tip"), ("ball", "floor")]
+    contacts = [dano.Contact(*pair, dano.ContactParams(sliding_friction=0.4), law) for pair in pairs]
+    return dano.Scene.create([ball, base, arm, tip, floor], contacts, joints=joints, timestep=H)
+
+
+def pressed_states(scene, count):
+    """States in which all touch: some fall, some slide, some rest; stacked, with controls."""
+    rng = np.random.default_rng(3)
+    states, controls = [], []
+    for k in range(count):
+        speed = [0.0, 0.3, 2.0][k % 3]
+        turn = np.array([1, 0.02, -0.03, 0]) + 0.02 * rng.normal(size=4)
+        base = dict(
+            position=(0, 0, 0.085),
+            orientation=turn / np.linalg.norm(turn),
+            velocity=speed * rng.normal(size=3),
+            omega=speed * rng.normal(size=3),
+        )
+        arm, tip = dict(q=0.1, v=speed * rng.normal()), dict(q=0.1 * rng.normal(size=3), v=speed * np.ones(3))
+        ball = dict(position=(0.47, 0.1, 0.14), velocity=speed * rng.normal(size=3))
+        states.append(scene.initial_state(base=base, arm=arm, tip=tip, ball=ball))
+        push = scene.control()
+        controls.append(dataclasses.replace(push, effort=jnp.asarray(rng.normal(size=4))))
+    return jax.tree.map(lambda *x: jnp.stack(x), *states), jax.tree.map(lambda *x: jnp.stack(x), *controls)
+
+
+LAWS = {
+    "smooth": dano.CentroidLaw(),
+    "adhesive": dano.CentroidLaw(adhesive=True, smoothing=10.0),
+    "sticking": dano.CentroidLaw(stiction_velocity=1e-7),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_steps_in_contact_alike(name):
+    """Bodies of a tree on a floor, on a free body and on each other; friction that creeps or sticks."""
+    scene = touching(LAWS[name])
+    states, controls = pressed_states(scene, 9)
+    patches = jax.vmap(lambda s: _variational.touch(scene, prepare(scene, None), s).overlap)(states)
+    assert (np.asarray(patches) > 0).all(axis=0).sum() >= 4
+
+    @jax.jit
+    def both(states, controls):
+        return [
+            jax.lax.map(lambda x, n=n: stepped(scene, *x, native=n), (states, controls))
+            for n in (True, False)
+        ]
+
+    (found, report), (expected, slow) = both(states, controls)
+    assert bool(slow.converged.all()) and bool(report.converged.all())
+    for key in ("position", "orientation", "velocity", "omega", "q", "v"):
+        a, b = getattr(found, key), getattr(expected, key)
+        np.testing.assert_allclose(a, b, rtol=0, atol=2e-8 * (1 + float(jnp.abs(b).max())), err_msg=key)
+
+
+def test_derivatives_in_contact_alike():
+    """By all numbers of scene, state and control, of contacts, too."""
+    scene = touching(LAWS["smooth"])
+    states, controls = pressed_states(scene, 3)
+    compare_derivatives(scene, *jax.tree.map(lambda x: x[1], (states, controls)))
+
+
+def test_filled_states_alike(all_kinds, monkeypatch):
+    """Poses and velocities of bodies on joints, and their derivatives, in machine code and by XLA."""
+    states, _ = random_states(all_kinds, [0.0, 1.0, 20.0])
+    numbers, rest = eqx.partition((all_kinds.chains, states), eqx.is_inexact_array)
+    moves = np.array([[not body.fixed] for body in all_kinds.bodies], float)
+    way = random_way(numbers, np.random.default_rng(2), moves)
+    # The axis of a planar joint has length 1.
+    axis, change = numbers[0].axis, way[0].axis
+    change = change - axis * jnp.sum(axis * change, axis=1, keepdims=True)
+    way = eqx.tree_at(lambda w: w[0].axis, way, change)
+
+    def fill(numbers):
+        chains, given = eqx.combine(numbers, rest)
+        return jax.vmap(lambda state: dano.scene.filled(chains, state, jnp.asarray(H)))(given)
+
+    found = jax.jit(lambda: jax.jvp(fill, (numbers,), (way,)))()
+    monkeypatch.setattr("dano.scene._frames.fills_natively", lambda: False)
+    expected = jax.jit(lambda: jax.jvp(fill, (numbers,), (way,)))()
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        # XLA's velocities are differences of poses, which rounds to 1e-16 / h.
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * (1 + float(jnp.abs(b).max())))
 
 
 def test_single_precision(all_kinds):
@@ -189,8 +308,14 @@ def test_momenta_of_a_chain_stay_to_rounding():
 
 
 def test_which_steps_are_native(all_kinds):
-    """Those of trees without contact and loops; scenes with either go the way of all others."""
+    """Those of trees without loops whose contacts have the paper's law; others go the way of all scenes."""
     assert prepare(all_kinds, None).trees is not None
+    assert prepare(touching(LAWS["smooth"]), None).trees is not None
+
+    class Other(dano.CentroidLaw):
+        pass
+
+    assert prepare(touching(Other()), None).trees is None
     bodies = [dano.Body("a", dano.Sphere(0.1), mass=1.0), dano.Body("b", dano.Sphere(0.1), mass=1.0)]
     floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
     hinges = [dano.Joint(None, name, position=(x, 0, 1)) for name, x in (("a", 0.0), ("b", 1.0))]
@@ -198,6 +323,6 @@ def test_which_steps_are_native(all_kinds):
     contact = dano.Contact("a", "floor")
     apart = dano.Scene.create(bodies, timestep=H)
     closed = dano.Scene.create(bodies, joints=hinges, loops=[loop], timestep=H)
-    touching = dano.Scene.create([*bodies, floor], [contact], joints=hinges, timestep=H)
-    for scene in (apart, closed, touching):
+    points = dano.Scene.create([*bodies, floor], [contact], joints=hinges, timestep=H)
+    for scene in (apart, closed, points):
         assert prepare(scene, None).trees is None

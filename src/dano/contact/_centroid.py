@@ -1,5 +1,7 @@
 """The centroid law: one wrench at the centroid of the overlap, as in the paper."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -51,6 +53,8 @@ class CentroidLaw(AbstractPatchLaw):
             does.
     """
 
+    N_NUMBERS: ClassVar[int] = 11
+
     smoothing: Float[Array, ""]
     regularizer: Float[Array, ""]
     stiction_velocity: Float[Array, ""] | None
@@ -99,6 +103,19 @@ class CentroidLaw(AbstractPatchLaw):
                 "rolling_friction": PAPER["rolling_friction"] * size,
             }
         )
+
+    def numbers(self, params: ContactParams) -> Float[Array, "11"]:
+        """All numbers of a contact as machine code reads them.
+
+        Two parameters each of the normal force and of sliding, torsional and rolling friction, then those of
+        the law; no stiction velocity is 0.
+        """
+        params = params.filled(**PAPER)
+        stiction = 0.0 if self.stiction_velocity is None else self.stiction_velocity
+        read = ("spring", "damper", "sliding_friction", "sliding_drag", "torsional_friction")
+        read += ("torsional_drag", "rolling_friction", "rolling_drag")
+        of_law = (self.smoothing, self.regularizer, stiction)
+        return jnp.stack([*(jnp.asarray(getattr(params, name)) for name in read), *map(jnp.asarray, of_law)])
 
     def wrench(self, patch: Patch, params, twist, timestep, softening: Softening = HARD):
         """See `AbstractContactLaw.wrench`; parameters that no scene has filled in are the paper's."""

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.engine._balance import jacobian_in_bodies, to_body, to_velocity, to_world
-from dano.engine._newton import Report, SolverOptions
+from dano.engine._newton import levels_of, Report, SOFT_TOLERANCE, SolverOptions
 from dano.engine._primal_dual import RULES, TIERS
 from dano.engine._problem import Pairs, Problem
 from dano.engine._trees import LARGEST_TURN
@@ -75,12 +75,15 @@ def native_root(
     return to_body(problem, velocities), whole, Report(residual, passes.astype(int), solved > 0)
 
 
-def native_tree_step(
-    tables: TreeTables, state: State, control: Control | None, options: SolverOptions
-) -> tuple[State, Report, Float[Array, " k"]]:
-    """A step of bodies on joints that touch nothing: the state at its end, the report, and its velocities."""
+Step = tuple[TreeTables, State, Control | None, Float[Array, "p 7"]]
+"""Of a step of bodies on joints: tables of the scene, state, control and patches."""
+
+
+def native_tree_step(given: Step, options: SolverOptions) -> tuple[State, Report, Float[Array, " k"]]:
+    """A step of bodies on joints: the state at its end, the report, and its generalised velocities."""
     from dano.native.trees import tree_step_name  # compiles or loads the kernel, so only where it is used
 
+    tables, state, _, _ = given
     dtype = state.position.dtype
     arrays = _parts(state)
     *following, y, residual, passes, solved = jax.ffi.ffi_call(
@@ -93,48 +96,54 @@ def native_tree_step(
             jax.ShapeDtypeStruct((1,), bool),
         ),
         vmap_method="sequential",
-    )(*_tree_inputs(tables, state, control, options), np.array([options.max_iterations], np.int32))
+    )(
+        *_tree_inputs(given, options),
+        levels_of(tables.softens, options.max_iterations).astype(dtype),
+        np.array([options.max_iterations], np.int32),
+    )
     return State(*following), Report(residual[0], passes[0].astype(int), solved[0]), y
 
 
-def native_tree_change(given, tangents, y: Float[Array, " k"], options: SolverOptions) -> State:
+def native_tree_change(given: Step, tangents, y: Float[Array, " k"], options: SolverOptions) -> State:
     """How the end of a step of bodies on joints changes, by the implicit function theorem.
 
     Args:
-        given: Tables, state and control.
-        tangents: Their changes; None where there is none.
+        given: The step.
+        tangents: Its changes; None where there is none.
         y: Generalised velocities at the end.
         options: Of the step.
     """
     from dano.native.trees import tree_slopes_name
 
-    tables, state, control = given
-    of_tables, of_state, of_control = tangents
+    tables, state, control, _ = given
+    of_tables, of_state, of_control, of_patches = tangents
     none = (None,) * 4
     changes = [
         *_parts(of_state),
         *(none if control is None else (getattr(of_control, name) for name in _CONTROLS)),
         *(getattr(of_tables, name) for name in _TABLES),
+        of_patches,
     ]
     chosen = changing(tables, [x is not None for x in changes])
     dtype, parts = state.position.dtype, _parts(state)
     if not len(chosen):
         return State(*(jnp.zeros_like(x) for x in parts))
-    sizes = [x.size for x in parts]
-    slopes = jax.ffi.ffi_call(
+    k, size, count = tables.layout.n_velocities, sum(x.size for x in parts), sum(chosen[:, 3] >= 0)
+    momenta, by_momentum, ends = jax.ffi.ffi_call(
         tree_slopes_name(dtype),
-        jax.ShapeDtypeStruct((len(chosen), sum(sizes)), dtype),
+        tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((len(chosen), k), (k, size), (count, size))),
         vmap_method="sequential",
-    )(*_tree_inputs(tables, state, control, options), y.astype(dtype), chosen)
+    )(*_tree_inputs(given, options), y.astype(dtype), chosen)
     change = jnp.concatenate(
-        [_at(x, chosen[chosen[:, 0] == k, 1:]).astype(dtype) for k, x in enumerate(changes) if x is not None]
+        [_at(x, chosen[chosen[:, 0] == k, 1:3]).astype(dtype) for k, x in enumerate(changes) if x is not None]
     )
-    ends = jnp.split(change @ slopes, np.cumsum(sizes)[:-1])
-    return State(*(end.reshape(x.shape) for end, x in zip(ends, parts, strict=True)))
+    moved = (change @ momenta) @ by_momentum + change[chosen[:, 3] >= 0] @ ends
+    found = jnp.split(moved, np.cumsum([x.size for x in parts])[:-1])
+    return State(*(end.reshape(x.shape) for end, x in zip(found, parts, strict=True)))
 
 
 _CONTROLS = ("force", "torque", "effort", "command")
-_TABLES = ("bodies", "joints", "laws", "settings")
+_TABLES = ("bodies", "joints", "laws", "settings", "contacts")
 
 
 def _parts(state: State) -> tuple:
@@ -147,8 +156,9 @@ def _at(values: Array, places: np.ndarray) -> Float[Array, " n"]:
     return values.ravel()[rows * values.shape[-1] + columns]
 
 
-def _tree_inputs(tables: TreeTables, state: State, control: Control | None, options: SolverOptions) -> list:
+def _tree_inputs(given: Step, options: SolverOptions) -> list:
     """What the kernels of trees read, in their order."""
+    tables, state, control, patches = given
     assert state.q is not None and state.v is not None
     dtype = state.position.dtype
     epsilon = float(jnp.finfo(dtype).eps)
@@ -157,11 +167,14 @@ def _tree_inputs(tables: TreeTables, state: State, control: Control | None, opti
     force, torque = (none, none) if control is None else (control.force, control.torque)
     driven = (None, None) if control is None else (control.effort, control.command)
     effort, command = (nothing if x is None else x for x in driven)
+    rules = [*RULES, relative, epsilon, POSES, STICKS, STOPS, LARGEST_TURN, SOFT_TOLERANCE]
     return [
         # Machine code reads numbers of one type.
         *(x.astype(dtype) for x in (*_parts(state), force, torque, effort, command)),
-        tables.nodes,
+        tables.layout.nodes,
         tables.coordinates,
         *(getattr(tables, name).astype(dtype) for name in _TABLES),
-        np.array([*RULES, relative, epsilon, POSES, STICKS, STOPS, LARGEST_TURN], dtype),
+        patches.astype(dtype),
+        tables.pairs,
+        np.array(rules, dtype),
     ]

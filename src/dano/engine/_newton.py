@@ -44,7 +44,7 @@ _TIERS = (
 # Passes after which a level of each tier is left.
 _BUDGETS = (6, 8, 12)
 # Residual to which the levels above one are solved, per stiction velocity of theirs [m/s].
-_SOFT_TOLERANCE = 1e-8
+SOFT_TOLERANCE = 1e-8
 
 
 class _Schedule(NamedTuple):
@@ -65,19 +65,27 @@ class _Schedule(NamedTuple):
     budget: Int[Array, " levels"]
 
     @classmethod
-    def create(cls, tiers, budgets, dtype) -> "_Schedule":
-        """The levels of tiers like `_TIERS`, and how many passes each of their levels has."""
-        scale = np.concatenate([scales for _, scales in tiers])
-        lengths = [len(scales) for _, scales in tiers]
-        ends = np.cumsum(lengths)
-        nexts = np.append(ends[:-1], -1)
-        return cls(
-            jnp.asarray(scale, dtype),
-            jnp.asarray(np.concatenate([[held, *scales[:-1]] for held, scales in tiers]), dtype),
-            jnp.asarray(np.isin(np.arange(len(scale)), ends - 1)),
-            jnp.asarray(np.repeat(nexts, lengths)),
-            jnp.asarray(np.repeat(budgets, lengths)),
-        )
+    def create(cls, table: Float[np.ndarray, "levels 5"], dtype) -> "_Schedule":
+        """From a table like `levels_of`."""
+        scale, held, last, restart, budget = table.T
+        numbers = jnp.asarray(scale, dtype), jnp.asarray(held, dtype)
+        return cls(*numbers, jnp.asarray(last > 0), *(jnp.asarray(x.astype(int)) for x in (restart, budget)))
+
+
+def levels_of(softens: bool, max_iterations: int) -> Float[np.ndarray, "levels 5"]:
+    """The levels of a solve; columns are the attributes of `_Schedule`. One if friction does not stick."""
+    tiers, budgets = (_TIERS, _BUDGETS) if softens else (_TIERS[:1], (max_iterations + 1,))
+    scale = np.concatenate([scales for _, scales in tiers])
+    lengths = [len(scales) for _, scales in tiers]
+    ends = np.cumsum(lengths)
+    columns = [
+        scale,
+        np.concatenate([[held, *scales[:-1]] for held, scales in tiers]),
+        np.isin(np.arange(len(scale)), ends - 1),
+        np.repeat(np.append(ends[:-1], -1), lengths),
+        np.repeat(budgets, lengths),
+    ]
+    return np.stack(columns, axis=1).astype(float)
 
 
 # What a pass of the Newton loop does: a step; look where it stands, with the sticking samples of the softer
@@ -210,9 +218,7 @@ class _Loop(NamedTuple):
         schedule = self.schedule
         remaining, tolerance = self.error(it)
         last, steps = schedule.last[it.level], it.action == _STEP
-        enough = jnp.where(
-            last, tolerance, jnp.maximum(tolerance, _SOFT_TOLERANCE * schedule.scale[it.level])
-        )
+        enough = jnp.where(last, tolerance, jnp.maximum(tolerance, SOFT_TOLERANCE * schedule.scale[it.level]))
         spent = (it.budget <= 0) & (remaining > enough)
         harder = steps & ~last & ((remaining <= enough) | spent)
         restart = steps & last & spent & (schedule.restart[it.level] >= 0)
@@ -257,8 +263,7 @@ def newton(
     Returns:
         The last accepted point, the Jacobian there, and the report.
     """
-    tiers, budgets = (_TIERS, _BUDGETS) if softens else (_TIERS[:1], (options.max_iterations + 1,))
-    schedule = _Schedule.create(tiers, budgets, start.dtype)
+    schedule = _Schedule.create(levels_of(softens, options.max_iterations), start.dtype)
     loop = _Loop(evaluate, start, scale, size, options, softens, schedule)
 
     # Pass −1 moves nowhere and only evaluates, so that the residual is compiled once.

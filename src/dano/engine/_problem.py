@@ -33,7 +33,7 @@ from dano.engine._newton import inverse3
 from dano.engine._rigid import angular_momentum, turned
 from dano.engine._sequential import one_at_a_time
 from dano.engine._trees import build_tree, Tree, tree_mobilities
-from dano.engine.joints import tree_tables, TreeTables
+from dano.engine.joints import in_tables, tree_tables, TreeTables
 from dano.maths import matmul, matvec, quat_to_matrix
 from dano.scene import colliders, Control, Poses, pressing_pairs, Scene, State, step_twists
 
@@ -129,8 +129,9 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
     if scene.others is not None:
         groups.append((scene.others.law, scene.others.pair_params))
     if not groups:
-        # On a CPU; a step of free bodies alone is short, and one with contact or loops needs more than trees.
-        whole = scene.joints and not scene.contacts and not scene.loops and jax.default_backend() == "cpu"
+        # On a CPU; a step of free bodies alone is short, and one with loops needs more than trees.
+        known = scene.joints and not scene.loops and all(in_tables(contact.law) for contact in scene.contacts)
+        whole = known and jax.default_backend() == "cpu"
         return Prepared(None, None, None, 0, tree_tables(scene) if whole else None)
     h = scene.timestep
     gravity = jnp.sqrt(jnp.sum(scene.gravity**2))

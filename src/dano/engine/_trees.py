@@ -12,8 +12,9 @@ part of y as a free body does by its spin; q⁺ is the rotation vector of what i
 
 These are the discrete Euler–Lagrange equations of the whole (the discrete null space method: Betsch and
 Leyendecker 2006), so bodies on joints have the order and the conservation of free ones, and joints hold
-exactly. Contact sees bodies move by J_i(q) y + c_i, which is V_i at the old velocities. On a CPU and where
-nothing touches, machine code makes the whole step by these equations, and its derivatives (see `_kernels`).
+exactly. Contact sees bodies move by J_i(q) y + c_i, which is V_i at the old velocities. On a CPU, and where
+contacts have the paper's law, machine code makes the whole step by these equations, and its derivatives (see
+`_kernels`).
 """
 
 import equinox as eqx

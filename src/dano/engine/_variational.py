@@ -35,7 +35,7 @@ from dano.engine._problem import (
 from dano.engine._rigid import turned
 from dano.engine._roots import as_solved, solve
 from dano.engine._trees import advance_tree, generalised, turns_too_far
-from dano.engine.joints import TreeTables
+from dano.engine.joints import patch_rows, TreeTables
 from dano.maths import quat_to_matrix, safe_normalize
 from dano.scene import Control, Scene, State
 
@@ -48,7 +48,8 @@ def step(
     if not pairs.moving:
         return state, Report(jnp.zeros((), state.position.dtype), jnp.asarray(0), jnp.asarray(True))
     if prepared.trees is not None:
-        following, report = _step_of_trees(prepared.trees, state, control, options)
+        patches = find_patches(scene, state, tuple(quat_to_matrix(q) for q in state.orientation))
+        following, report = _step_of_trees(prepared.trees, state, control, patches, options)
         return following, jax.lax.stop_gradient(report)
     problem, found = build_problem(scene, prepared, state, control, pairs)
     h, tree = scene.timestep, problem.tree
@@ -66,22 +67,26 @@ def step(
 
 
 def _step_of_trees(
-    tables: TreeTables, state: State, control: Control | None, options: SolverOptions
+    tables: TreeTables,
+    state: State,
+    control: Control | None,
+    patches: tuple[Patch, ...],
+    options: SolverOptions,
 ) -> tuple[State, Report]:
     """The step in machine code, as are its derivatives."""
+    given = tables, state, control, patch_rows(patches, state.position.dtype)
 
     @eqx.filter_custom_jvp
-    def advance(tables, state, control):
-        return native_tree_step(tables, state, control, options)[:2]
+    def advance(given):
+        return native_tree_step(given, options)[:2]
 
     @advance.def_jvp
     def _(primals, tangents):
-        tables, state, control = primals
-        following, report, y = native_tree_step(tables, state, control, options)
-        change = native_tree_change(primals, tangents, y, options)
+        following, report, y = native_tree_step(primals[0], options)
+        change = native_tree_change(primals[0], tangents[0], y, options)
         return (following, report), (change, jax.tree.map(lambda _: None, report))
 
-    return advance(tables, state, control)
+    return advance(given)
 
 
 def touch(scene: Scene, prepared: Prepared, state: State) -> Patch:

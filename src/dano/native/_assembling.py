@@ -38,17 +38,24 @@ MIX, RENEWED = 10, 11
 
 
 @kernel
+def root(x):
+    """Square root of a positive number; of a complex one to first order in its small imaginary part."""
+    size = math.sqrt(x.real)
+    return size + (x - x.real) * (0.5 / size)
+
+
+@kernel
 def shares(squared, resolved, fade):
     """m, m′/x, g and g′/x of `dano.engine._rigid` at x² = (h |ω|/2)²."""
     if squared.real <= resolved * resolved:
-        root = np.sqrt(1.0 - squared)
-        return root, -1.0 / root, 1.0, 0.0
-    root = math.sqrt(1.0 - resolved * resolved)
-    first_slope = root - resolved * resolved / root
-    x = np.sqrt(squared)
+        cosine = root(1.0 - squared)
+        return cosine, -1.0 / cosine, 1.0, 0.0
+    cosine = math.sqrt(1.0 - resolved * resolved)
+    first_slope = cosine - resolved * resolved / cosine
+    x = root(squared)
     y = x - resolved
     fading = np.exp(-y / fade)
-    product = resolved * root + y - (1.0 - first_slope) * fade * (1.0 - fading)
+    product = resolved * cosine + y - (1.0 - first_slope) * fade * (1.0 - fading)
     slope = 1.0 - (1.0 - first_slope) * fading
     torque = np.exp(-((y / fade) ** 2))
     return product / x, (slope - product / x) / squared, torque, -2.0 * y / (fade * fade * x) * torque

@@ -9,6 +9,9 @@ import numba
 # division by zero gives infinities and NaNs, as in XLA. Only handlers are kept on disk, whole: Numba compiles
 # a kernel again when its own file changes, but not when one that it calls does.
 kernel = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+# Without the counts of who refers to an array, which cost more than small kernels do, at run time and to
+# compile. Such a kernel makes no arrays, and returns none that were made.
+lean = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
 
 
 def fingerprint() -> int:

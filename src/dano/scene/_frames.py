@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
+from dano.scene._filling import fill, fills_natively
 from dano.scene._joint_laws import joint_laws, JointLaws
 from dano.scene._joints import Joint, Layout
 from dano.scene._states import State
@@ -66,6 +67,12 @@ class Chains(eqx.Module):
     def kinds(self) -> tuple[str, ...]:
         """Of the joints."""
         return self.layout.kinds
+
+    @property
+    def table(self) -> Float[Array, "j 15"]:
+        """Axis, anchor, position, orientation, ratio and shift of each joint."""
+        parts = (self.axis, self.anchor, self.position, self.orientation)
+        return jnp.concatenate([*parts, self.ratio[:, None], self.shift[:, None]], axis=1)
 
     def mass_matrix(
         self, jacobian: Float[Array, "m 6 k"], mass: Float[Array, " m"], inertia: Float[Array, "m 3 3"]
@@ -289,6 +296,8 @@ def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:
     if not layout.children:
         return state
     assert state.q is not None and state.v is not None
+    if fills_natively():
+        return fill(chains.table, chains.com, layout, state, h, RESOLVED)
     rows = np.array(layout.children)
     now = place_links(chains, state.position, state.orientation, state.q)
     # Where the roots were a step before.

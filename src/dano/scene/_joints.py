@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from dano.checks import checked_choice, checked_optional, checked_text
 from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
@@ -199,6 +199,28 @@ class Layout(NamedTuple):
             if not self.follows[joint]:
                 owners[place] = joint
         return tuple(owners[place] for place in range(self.n_joints))
+
+    @property
+    def nodes(self) -> Int[np.ndarray, "nodes 8"]:
+        """How nodes hang on each other; parents come before children.
+
+        A node is a body that moves freely, or a joint with the body that hangs on it.
+        Of each node its body, node and body on which it hangs, kind, joint, place of its first velocity,
+        number of velocities, and the body from which its tree is looked at. −1 stands for none, n for the
+        world.
+        """
+        root = len(JOINT_KINDS)
+        rows = [(i, -1, self.bodies, root, -1, 6 * k, 6, i) for k, i in enumerate(self.free)]
+        place = {row[0]: k for k, row in enumerate(rows)}
+        for j in (j for level in self.levels for j in level):
+            parent, child, kind = self.parents[j], self.children[j], self.kinds[j]
+            up = place.get(parent, -1)
+            first = 6 * len(self.free) + max(self.coordinates[j], 0)
+            origin = rows[up][-1] if up >= 0 else child
+            place[child] = len(rows)
+            width = sum(joint == j for joint, _, _ in self.dofs)
+            rows.append((child, up, parent, JOINT_KINDS.index(kind), j, first, width, origin))
+        return np.array(rows, np.int32)
 
     def width(self, joint: int) -> int:
         """How many coordinates of its own a joint has."""

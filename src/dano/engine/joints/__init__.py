@@ -10,6 +10,8 @@ from dano.engine.joints._forces import (
 )
 from dano.engine.joints._tables import (
     changing as changing,
+    in_tables as in_tables,
+    patch_rows as patch_rows,
     tree_tables as tree_tables,
     TreeTables as TreeTables,
 )

@@ -1,62 +1,51 @@
 """Trees as tables of numbers, in the order in which `dano.native` reads them."""
 
 from collections.abc import Sequence
+from typing import TypeGuard
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dano.scene import JOINT_KINDS, JointLaws, Layout, Scene
+from dano.contact import AbstractContactLaw, CentroidLaw, Patch
+from dano.scene import JointLaws, Layout, Scene
 
-_ROOT = len(JOINT_KINDS)
+# Tables of `changing` that say where bodies are: position, orientation, q, bodies, joints, settings.
+_PLACING = (0, 1, 4, 10, 11, 13)
+PATCH = 7
+"""Numbers of a patch: overlap, centroid and normal, see `dano.contact.Patch`."""
 
 
 class TreeTables(eqx.Module):
     """The trees of a scene for machine code; n bodies, j joints, c joint coordinates.
 
-    A node is a body that moves freely, or a joint with the body that hangs on it.
-
     Attributes:
         bodies: Mass [kg], inertia [kg m², B] and centre of mass [m, F] of each, and a row of zeros for the
             world, shape (n + 1, 13); zero mass and inertia of fixed ones.
-        joints: Axis, anchor, position, orientation, ratio and shift of each, see `Chains`; shape (j, 15).
+        joints: See `Chains.table`.
         laws: Damping, armature, stiffness, rest, friction, two limits and five numbers of a motor of each
             coordinate, see `JointLaws`; shape (c, 12). What no joint has is 0, or endless.
         settings: Timestep [s] and gravity [m/s²], shape (4,).
+        contacts: Parameters of each of p contacts with the paper's law and its smoothing, regularizer and
+            stiction velocity, 0 for none; shape (p, 11). See `CentroidLaw`.
         layout: Structure (static).
         constant: See `JointLaws`, as is the next (static).
         rough: See there (static).
+        touching: Bodies of each contact, and whether it is adhesive (static).
+        softens: Whether friction of contacts sticks (static).
     """
 
     bodies: Float[Array, "n 13"]
     joints: Float[Array, "j 15"]
     laws: Float[Array, "c 12"]
     settings: Float[Array, "4"]
+    contacts: Float[Array, "p 11"]
     layout: Layout = eqx.field(static=True)
     constant: tuple[bool, ...] = eqx.field(static=True)
     rough: tuple[int, ...] = eqx.field(static=True)
-
-    @property
-    def nodes(self) -> Int[np.ndarray, "nodes 8"]:
-        """How nodes hang on each other; parents come before children.
-
-        Of each node its body, node and body on which it hangs, kind, joint, place of its first velocity,
-        number of velocities, and the body from which its tree is looked at. −1 stands for none, n for the
-        world.
-        """
-        layout = self.layout
-        rows = [(i, -1, layout.bodies, _ROOT, -1, 6 * k, 6, i) for k, i in enumerate(layout.free)]
-        place = {row[0]: k for k, row in enumerate(rows)}
-        for j in (j for level in layout.levels for j in level):
-            parent, child, kind = layout.parents[j], layout.children[j], layout.kinds[j]
-            up = place.get(parent, -1)
-            first = 6 * len(layout.free) + max(layout.coordinates[j], 0)
-            origin = rows[up][-1] if up >= 0 else child
-            place[child] = len(rows)
-            width = sum(joint == j for joint, _, _ in layout.dofs)
-            rows.append((child, up, parent, JOINT_KINDS.index(kind), j, first, width, origin))
-        return np.array(rows, np.int32)
+    touching: tuple[tuple[int, int, bool], ...] = eqx.field(static=True)
+    softens: bool = eqx.field(static=True)
 
     @property
     def coordinates(self) -> Int[np.ndarray, "c 2"]:
@@ -65,12 +54,22 @@ class TreeTables(eqx.Module):
         rows = [(constant, places.get(c, -1)) for c, constant in enumerate(self.constant)]
         return np.array(rows, np.int32).reshape(-1, 2)
 
+    @property
+    def pairs(self) -> Int[np.ndarray, "p 3"]:
+        """Nodes of the bodies of each contact, −1 for one that does not move, and whether it is adhesive."""
+        places = {int(row[0]): n for n, row in enumerate(self.layout.nodes)}
+        rows = [(places.get(a, -1), places.get(b, -1), pulls) for a, b, pulls in self.touching]
+        return np.array(rows, np.int32).reshape(-1, 3)
 
-def changing(tables: TreeTables, perturbed: Sequence[bool]) -> Int[np.ndarray, "changes 3"]:
+
+def changing(tables: TreeTables, perturbed: Sequence[bool]) -> Int[np.ndarray, "changes 4"]:
     """By which numbers of a step its end is differentiated: table, row and column of each.
 
+    The last column counts those that say where bodies are, not only how they are pushed; −1 for the others.
+
     Tables are those of a state (position, orientation, velocity, omega, q, v), of a control (force, torque,
-    effort, command) and of a scene (bodies, joints, laws, settings). Vectors have one row.
+    effort, command), of a scene (bodies, joints, laws, settings, contacts) and of patches. Vectors have one
+    row.
 
     Args:
         tables: Of the scene.
@@ -87,32 +86,52 @@ def changing(tables: TreeTables, perturbed: Sequence[bool]) -> Int[np.ndarray, "
     rows += [(range(n), tables.bodies.shape[1])]
     rows += [(range(len(x)), x.shape[1]) for x in (tables.joints, tables.laws)]
     rows += [(range(1), tables.settings.size)]
+    rows += [(range(len(tables.contacts)), width) for width in (tables.contacts.shape[1], PATCH)]
     found = [
         (k, i, j) for k, (some, width) in enumerate(rows) if perturbed[k] for i in some for j in range(width)
     ]
-    return np.array(found, np.int32).reshape(-1, 3)
+    placing = [kind in _PLACING for kind, _, _ in found]
+    places = np.where(placing, np.cumsum(placing) - 1, -1)
+    return np.concatenate([np.reshape(found, (-1, 3)), places[:, None]], axis=1).astype(np.int32)
 
 
 def tree_tables(scene: Scene) -> TreeTables:
     """The tables of a scene with joints."""
     dtype, chains = scene.timestep.dtype, scene.chains
     layout = chains.layout
+    known = [(c, c.law) for c in scene.contacts if in_tables(c.law)]
     rows = []
     for i, body in enumerate(scene.bodies):
         moves = float(i in layout.moving)
         own = moves * body.mass_scale * jnp.concatenate([body.mass[None], body.inertia.ravel()])
         rows.append(jnp.concatenate([own, chains.com[i]]).astype(dtype))
-    parts = (chains.axis, chains.anchor, chains.position, chains.orientation)
-    joints = jnp.concatenate([*parts, chains.ratio[:, None], chains.shift[:, None]], axis=1)
     return TreeTables(
         jnp.stack([*rows, jnp.zeros(13, dtype)]),
-        joints,
+        chains.table,
         _law_rows(chains.laws, dtype),
         jnp.concatenate([scene.timestep[None], scene.gravity]).astype(dtype),
+        _rows([law.numbers(c.params) for c, law in known], CentroidLaw.N_NUMBERS, dtype),
         layout,
         chains.laws.constant,
         chains.laws.rough,
+        tuple((scene.index(c.a), scene.index(c.b), law.adhesive) for c, law in known),
+        any(law.stiction for _, law in known),
     )
+
+
+def patch_rows(patches: Sequence[Patch], dtype) -> Float[Array, "p 7"]:
+    """Patches as a table."""
+    return _rows([jnp.concatenate([x.overlap[None], x.centroid, x.normal]) for x in patches], PATCH, dtype)
+
+
+def _rows(rows: Sequence[Array], width: int, dtype) -> Float[Array, "n k"]:
+    """Rows as a table, of which there may be none."""
+    return jnp.stack(rows).astype(dtype) if rows else jnp.zeros((0, width), dtype)
+
+
+def in_tables(law: AbstractContactLaw) -> TypeGuard[CentroidLaw]:
+    """Whether machine code knows a law; one that is derived from the paper's may be another."""
+    return type(law) is CentroidLaw
 
 
 def _law_rows(laws: JointLaws, dtype) -> Float[Array, "c 12"]:

@@ -20,3 +20,11 @@ def tree_slopes_name(dtype: DTypeLike) -> str:
     from dano.native.trees._slopes import define
 
     return define(np.dtype(dtype).name)
+
+
+@functools.cache
+def filling_names(dtype: DTypeLike) -> tuple[str, str]:
+    """Names for `jax.ffi.ffi_call` of where bodies on joints are, and of the derivative of it."""
+    from dano.native.trees._filling import define
+
+    return define(np.dtype(dtype).name)

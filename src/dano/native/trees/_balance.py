@@ -11,7 +11,7 @@ from collections import namedtuple
 import numpy as np
 
 from dano.native._assembling import FADE, RESOLVED, shares
-from dano.native._compiling import kernel
+from dano.native._compiling import kernel, lean
 from dano.native._ffi import part
 from dano.native.trees._frames import (
     add,
@@ -42,19 +42,23 @@ from dano.native.trees._frames import (
 _LEVER, _LEVER_AFTER, _BLOCK, _SUMMED = 1, 4, 7, 16
 # Columns of what is given of a node's body: inertia, linear and angular momentum before joints push [W].
 TURNED_INERTIA, IMPULSE, _STEP_COLUMNS = 0, 9, 15
+# Settings: h, gravity [W].
+H, GRAVITY = 0, 1
 
-Room = namedtuple("Room", "whole poses known ways first last given twists wrenches summed residual matrix")
+Room = namedtuple(
+    "Room", "whole poses known ways first last given twists wrenches summed residual matrix touch"
+)
 """Arrays of a step, and the one of which they are parts.
 
 Of bodies and the world the poses (7 numbers); of nodes what is known of their joints (12), ways (7), motions
 at start and end (6, 6), what is given of their bodies, twists [W], sums of momenta and of derivatives; of
-velocities the residual and its derivative.
+velocities the residual and its derivative; what is known of contacts, see `_patches`.
 """
 
 
 @kernel
-def room_for(n_bodies, n_nodes, k):
-    """Arrays for a step, parts of one; the world counts as a body."""
+def room_for(n_bodies, n_nodes, k, touch):
+    """Arrays for a step, parts of one but for those of contacts; the world counts as a body."""
     n, at = n_nodes, 0
     whole = np.empty(7 * n_bodies + (31 + 72 + _STEP_COLUMNS + _SUMMED) * n + k + k * k)
     poses, at = part(whole, at, (n_bodies, 7)), at + 7 * n_bodies
@@ -67,10 +71,12 @@ def room_for(n_bodies, n_nodes, k):
     wrenches, at = part(whole, at, (n, 6)), at + 6 * n
     summed, at = part(whole, at, (n, _SUMMED)), at + _SUMMED * n
     residual, matrix = part(whole, at, k), part(whole, at + k, (k, k))
-    return Room(whole, poses, known, ways, first, last, given, twists, wrenches, summed, residual, matrix)
+    return Room(
+        whole, poses, known, ways, first, last, given, twists, wrenches, summed, residual, matrix, touch
+    )
 
 
-@kernel
+@lean
 def _inertial(given, n, v):
     """Inertia of a node's body times a vector."""
     return (
@@ -80,7 +86,7 @@ def _inertial(given, n, v):
     )
 
 
-@kernel
+@lean
 def turn_inertia(bodies, i, turn, given, n):
     """R J Rᵀ of a body."""
     x, y, z = rotate(turn, (1.0, 0.0, 0.0)), rotate(turn, (0.0, 1.0, 0.0)), rotate(turn, (0.0, 0.0, 1.0))
@@ -95,7 +101,7 @@ def turn_inertia(bodies, i, turn, given, n):
         put(given, n, TURNED_INERTIA + 3 * k, add(add(times(a, x), times(b, y)), times(c, z)))
 
 
-@kernel
+@lean
 def angular_momentum(given, n, spin, h, sign, rules):
     """Angular momentum [W] of a spin [W], see `dano.engine._rigid`: after a step (+) or before it (−)."""
     squared = 0.25 * h * h * dot(spin, spin)
@@ -104,7 +110,7 @@ def angular_momentum(given, n, spin, h, sign, rules):
     return add(times(share, whole), times(0.5 * sign * h * torque, cross(spin, whole)))
 
 
-@kernel
+@lean
 def _put_summed(summed, n, mass, lever, after, rows):
     """A body's part of the derivative; `rows` say how its moment depends on turns."""
     summed[n, 0] = mass
@@ -116,13 +122,13 @@ def _put_summed(summed, n, mass, lever, after, rows):
         summed[n, _BLOCK + 4 * k] += across
 
 
-@kernel
+@lean
 def _put_wrench(wrenches, n, force, moment, lever):
     put(wrenches, n, 0, add(moment, cross(lever, force)))
     put(wrenches, n, 3, force)
 
 
-@kernel
+@lean
 def _slopes_of_spin(given, n, spin, h, rules):
     """Derivative of the momentum after a step [W] by turns of the body's end, over h; as rows.
 
@@ -153,14 +159,14 @@ def _slopes_of_spin(given, n, spin, h, rules):
     )
 
 
-@kernel
+@lean
 def _times_turn(row, spin, alpha, beta, h):
     """A row times h A."""
     inner = add(times(alpha, row), times(beta * dot(row, spin), spin))
     return times(h, minus(inner, times(0.5, cross(row, spin))))
 
 
-@kernel
+@lean
 def find_twists(nodes, y, h, rules, room):
     """Velocity and spin [W] of each node's body in a step, from its way."""
     per_h = 1.0 / h
@@ -173,13 +179,13 @@ def find_twists(nodes, y, h, rules, room):
             put(room.twists, n, 3, spin_of(four(room.ways, n, TURN), h, rules[RESOLVED]))
 
 
-@kernel
+@lean
 def _lever(nodes, n, poses):
     """From the origin of its tree to a body's centre of mass at the start of a step."""
     return minus(three(poses, nodes[n, BODY], 0), three(poses, nodes[n, ORIGIN], 0))
 
 
-@kernel
+@lean
 def missing_momenta(nodes, bodies, h, rules, room):
     """What each body's momentum misses."""
     given = room.given
@@ -190,7 +196,7 @@ def missing_momenta(nodes, bodies, h, rules, room):
         _put_wrench(room.wrenches, n, force, moment, _lever(nodes, n, room.poses))
 
 
-@kernel
+@lean
 def momentum_slopes(nodes, bodies, h, rules, room):
     """The derivative of each body's momentum."""
     for n in range(nodes.shape[0]):
@@ -200,7 +206,7 @@ def momentum_slopes(nodes, bodies, h, rules, room):
         _put_summed(room.summed, n, bodies[nodes[n, BODY], MASS], lever, after, rows)
 
 
-@kernel
+@lean
 def momenta_before(nodes, bodies, room):
     """What bodies come with, and the same as the above of their masses at the start."""
     given = room.given
@@ -215,7 +221,7 @@ def momenta_before(nodes, bodies, room):
         _put_summed(room.summed, n, bodies[nodes[n, BODY], MASS], lever, lever, rows)
 
 
-@kernel
+@lean
 def _after(summed, n, spin, velocity):
     """Moment and force of the summed derivative on a motion at the end of the step."""
     lever, after = three(summed, n, _LEVER), three(summed, n, _LEVER_AFTER)
@@ -227,7 +233,7 @@ def _after(summed, n, spin, velocity):
     return add(block, cross(lever, velocity)), add(times(summed[n, 0], velocity), cross(spin, after))
 
 
-@kernel
+@lean
 def _before(summed, n, spin, velocity):
     """The same transposed, on a motion at the start."""
     lever, after = three(summed, n, _LEVER), three(summed, n, _LEVER_AFTER)
@@ -241,13 +247,13 @@ def _before(summed, n, spin, velocity):
     return add(block, cross(after, velocity)), add(times(summed[n, 0], velocity), cross(spin, lever))
 
 
-@kernel
+@lean
 def _product(a, b, n, i):
     """Product of two pairs of vectors, the second a row of motions."""
     return dot(a[0], three(b[n], i, 0)) + dot(a[1], three(b[n], i, 3))
 
 
-@kernel
+@lean
 def gather_momenta(nodes, room):
     """Momenta of bodies as generalised ones in `residual`; `wrenches` are used up."""
     wrenches, residual = room.wrenches, room.residual
@@ -262,18 +268,17 @@ def gather_momenta(nodes, room):
                 wrenches[up, k] += wrenches[n, k]
 
 
-@kernel
-def pull(nodes, n, force, moment, room, generalised):
-    """Set the generalised momenta that a momentum of one node's body is."""
-    generalised[:] = 0.0
-    wrench = (add(moment, cross(_lever(nodes, n, room.poses), force)), force)
+@lean
+def pull(nodes, n, force, moment, poses, first, generalised):
+    """Add the generalised momenta that a momentum of one node's body is."""
+    wrench = (add(moment, cross(_lever(nodes, n, poses), force)), force)
     while n >= 0:
         for i in range(nodes[n, WIDTH]):
-            generalised[nodes[n, PLACE] + i] += _product(wrench, room.first, n, i)
+            generalised[nodes[n, PLACE] + i] += _product(wrench, first, n, i)
         n = nodes[n, PARENT]
 
 
-@kernel
+@lean
 def gather_slopes(nodes, last, room, symmetric):
     """Derivative of generalised momenta by generalised velocities in `matrix`; `summed` is used up.
 
@@ -308,7 +313,7 @@ def gather_slopes(nodes, last, room, symmetric):
                 summed[up, k] += summed[n, k]
 
 
-@kernel
+@lean
 def factor(matrix):
     """Factors in place: the matrix is U L, with ones on the diagonal of U, which is not stored.
 
@@ -327,7 +332,7 @@ def factor(matrix):
                     matrix[i, j] -= share * matrix[p, j]
 
 
-@kernel
+@lean
 def solve_factored(matrix, right):
     """Solve in place with what `factor` found."""
     k = matrix.shape[0]
@@ -340,7 +345,7 @@ def solve_factored(matrix, right):
         right[p] *= matrix[p, p]
 
 
-@kernel
+@lean
 def inverse_diagonal(matrix, r, column):
     """Entry (r, r) of the inverse of a symmetric matrix, from `factor`; `column` is used up."""
     column[:] = 0.0

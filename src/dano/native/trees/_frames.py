@@ -12,9 +12,8 @@ comes out as a derivative (see `_slopes`).
 
 import math
 
-import numpy as np
-
-from dano.native._compiling import kernel
+from dano.native._assembling import root
+from dano.native._compiling import lean
 
 # Columns of the table of nodes: body, node and body on which it hangs (−1 and the number of bodies for the
 # world), kind, row among the joints, place of its first velocity, number of velocities, body at which its
@@ -33,72 +32,87 @@ TURNED = 3
 PIVOT, FRAME = 0, 3
 # Columns of the way of a body: the turn, and the shift of its centre of mass.
 TURN, SHIFT = 0, 4
-# Below this, of the square of half an angle [rad²], four terms of a series are exact.
+# Below this, of the square of half an angle [rad²], five terms of a series are exact.
 _SERIES = 1e-3
 # What the square of a length of 1 may miss by rounding.
 _ROUNDED = 1e-15
 
 
-@kernel
+@lean
 def three(rows, i, k):
     """Three numbers of a row from column k on."""
     return rows[i, k], rows[i, k + 1], rows[i, k + 2]
 
 
-@kernel
+@lean
 def four(rows, i, k):
     """Four numbers of a row from column k on."""
     return rows[i, k], rows[i, k + 1], rows[i, k + 2], rows[i, k + 3]
 
 
-@kernel
+@lean
 def put(rows, i, k, values):
     """Set three numbers of a row."""
     rows[i, k], rows[i, k + 1], rows[i, k + 2] = values
 
 
-@kernel
+@lean
 def put_four(rows, i, k, values):
     """Set four numbers of a row."""
     rows[i, k], rows[i, k + 1], rows[i, k + 2], rows[i, k + 3] = values
 
 
-@kernel
+@lean
+def copy(source, target):
+    """Copy a table."""
+    for i in range(source.shape[0]):
+        for k in range(source.shape[1]):
+            target[i, k] = source[i, k]
+
+
+@lean
+def copy_row(source, target):
+    """Copy a vector."""
+    for k in range(source.size):
+        target[k] = source[k]
+
+
+@lean
 def add(a, b):
     """A + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@kernel
+@lean
 def minus(a, b):
     """A − b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@kernel
+@lean
 def times(s, a):
     """S a."""
     return s * a[0], s * a[1], s * a[2]
 
 
-@kernel
+@lean
 def dot(a, b):
     """A · b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@kernel
+@lean
 def cross(a, b):
     """A × b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@kernel
+@lean
 def _quaternion(w, v):
     return w, v[0], v[1], v[2]
 
 
-@kernel
+@lean
 def multiply(p, q):
     """The rotation q followed by p."""
     return (
@@ -109,7 +123,7 @@ def multiply(p, q):
     )
 
 
-@kernel
+@lean
 def swing(q, v):
     """By how much a rotation changes a vector."""
     u = (q[1], q[2], q[3])
@@ -117,19 +131,19 @@ def swing(q, v):
     return add(times(q[0], t), cross(u, t))
 
 
-@kernel
+@lean
 def rotate(q, v):
     """The vector after a rotation."""
     return add(v, swing(q, v))
 
 
-@kernel
+@lean
 def rotate_back(q, v):
     """The vector before a rotation."""
     return rotate((q[0], -q[1], -q[2], -q[3]), v)
 
 
-@kernel
+@lean
 def _angle(sine, cosine):
     """Angle whose sine and cosine are in this ratio."""
     across = sine * cosine.real - cosine * sine.real
@@ -138,49 +152,72 @@ def _angle(sine, cosine):
     return math.atan2(sine.real, cosine.real) + across / along
 
 
-@kernel
+@lean
+def _sine_cosine(x):
+    """Both of an angle; of a complex one to first order in its small imaginary part."""
+    sine, cosine, rest = math.sin(x.real), math.cos(x.real), x - x.real
+    return sine + cosine * rest, cosine - sine * rest
+
+
+@lean
 def exponential(v):
     """Quaternion of a rotation vector."""
-    angle = np.sqrt(dot(v, v))
-    if angle == 0.0:
-        return 1.0, 0.0, 0.0, 0.0
-    x, y, z = times(np.sin(0.5 * angle) / angle, v)
-    return np.cos(0.5 * angle), x, y, z
+    squared = 0.25 * dot(v, v)
+    if squared.real < _SERIES:
+        return _quaternion(_cosine_near_0(squared), times(0.5 * _sine_near_0(squared), v))
+    half = root(squared)
+    sine, cosine = _sine_cosine(half)
+    return _quaternion(cosine, times(0.5 * sine / half, v))
 
 
-@kernel
+@lean
+def _sine_near_0(s):
+    """Sin x / x at s = x²."""
+    return 1.0 - s / 6.0 * (1.0 - s / 20.0 * (1.0 - s / 42.0 * (1.0 - s / 72.0)))
+
+
+@lean
+def _cosine_near_0(s):
+    """Cos x at s = x²."""
+    return 1.0 - s / 2.0 * (1.0 - s / 12.0 * (1.0 - s / 30.0 * (1.0 - s / 56.0)))
+
+
+@lean
 def logarithm(q):
     """Shortest rotation vector of a quaternion."""
     sign = -1.0 if q[0].real < 0.0 else 1.0
-    u = (q[1], q[2], q[3])
-    sine = np.sqrt(dot(u, u))
-    if sine == 0.0:
-        return 0.0, 0.0, 0.0
-    return times(2.0 * sign * _angle(sine, sign * q[0]) / sine, u)
+    u, cosine = (q[1], q[2], q[3]), sign * q[0]
+    squared = dot(u, u)
+    if squared.real < _SERIES * cosine.real * cosine.real:
+        s = squared / (cosine * cosine)
+        ratio = (1.0 - s / 3.0 + s * s / 5.0 - s * s * s / 7.0 + s * s * s * s / 9.0) / cosine
+        return times(2.0 * sign * ratio, u)
+    sine = root(squared)
+    return times(2.0 * sign * _angle(sine, cosine) / sine, u)
 
 
-@kernel
+@lean
 def _turn_about(axis, half):
     """The turn about a unit axis by twice an angle."""
     s = half * half
     if s.real < _SERIES:
-        sine = half * (1.0 - s / 6.0 * (1.0 - s / 20.0 * (1.0 - s / 42.0)))
-        return _quaternion(1.0 - s / 2.0 * (1.0 - s / 12.0 * (1.0 - s / 30.0)), times(sine, axis))
-    return _quaternion(np.cos(half), times(np.sin(half), axis))
+        return _quaternion(_cosine_near_0(s), times(half * _sine_near_0(s), axis))
+    sine, cosine = _sine_cosine(half)
+    return _quaternion(cosine, times(sine, axis))
 
 
-@kernel
+@lean
 def _shape_of_turn(omega, h, resolved):
     """Cos a, sin a / x and x² of a step, see `dano.engine._rigid`."""
     squared = 0.25 * h * h * dot(omega, omega)
     if squared.real <= resolved * resolved:
-        return np.sqrt(1.0 - squared), 1.0, squared
-    x = np.sqrt(squared)
-    angle = x + math.asin(resolved) - resolved
-    return np.cos(angle), np.sin(angle) / x, squared
+        return root(1.0 - squared), 1.0, squared
+    x = root(squared)
+    sine, cosine = _sine_cosine(x + math.asin(resolved) - resolved)
+    return cosine, sine / x, squared
 
 
-@kernel
+@lean
 def turn_of(omega, h, resolved):
     """The turn of a step with a spin, of unit length; both in the same frame."""
     cosine, sine, _ = _shape_of_turn(omega, h, resolved)
@@ -188,7 +225,7 @@ def turn_of(omega, h, resolved):
     return cosine, x, y, z
 
 
-@kernel
+@lean
 def slopes_of_turn(omega, h, resolved):
     """α and β of α 1 + β ω ωᵀ − ½ [ω]×: see `turn_slopes` of `dano.engine`."""
     cosine, sine, squared = _shape_of_turn(omega, h, resolved)
@@ -197,7 +234,7 @@ def slopes_of_turn(omega, h, resolved):
     return across / h, 0.25 * h * along
 
 
-@kernel
+@lean
 def spin_of(turn, h, resolved):
     """Spin [W] of a step that turns a body, by 180° at most: see `step_twists` of `dano.scene`."""
     sign = -1.0 if turn[0].real < 0.0 else 1.0
@@ -205,12 +242,12 @@ def spin_of(turn, h, resolved):
     squared = dot(sine, sine)
     if squared.real <= resolved * resolved:
         return times(2.0 / h, sine)
-    size = np.sqrt(squared)
+    size = root(squared)
     angle = _angle(size, sign * turn[0])
     return times(2.0 / h * (resolved - math.asin(resolved) + angle) / size, sine)
 
 
-@kernel
+@lean
 def _turned_back(omega, v, h, resolved):
     """Inverse of the matrix of `slopes_of_turn` times a vector, by cofactors."""
     alpha, beta = slopes_of_turn(omega, h, resolved)
@@ -222,38 +259,38 @@ def _turned_back(omega, v, h, resolved):
     return times(1.0 / dot(a, cross(b, c)), whole)
 
 
-@kernel
+@lean
 def _plane_axes(axis):
     """See `plane_axes` of `dano.scene`."""
     start = (1.0, 0.0, 0.0) if abs(axis[0].real) < 0.99 else (0.0, 1.0, 0.0)
     first = minus(start, times(dot(start, axis), axis))
-    first = times(1.0 / np.sqrt(dot(first, first)), first)
+    first = times(1.0 / root(dot(first, first)), first)
     return first, cross(axis, first)
 
 
-@kernel
+@lean
 def _unit(rows, i, k):
     """Make a vector of a row one of length 1; returns what its length was."""
     v = three(rows, i, k)
     squared = dot(v, v)
     if squared == 0.0 or (squared.imag == 0.0 and abs(squared.real - 1.0) < _ROUNDED):
         return 1.0
-    length = np.sqrt(squared)
+    length = root(squared)
     put(rows, i, k, times(1.0 / length, v))
     return length
 
 
-@kernel
+@lean
 def unit_turn(q):
     """The quaternion of length 1 along one of about that length."""
     squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
     if squared.imag == 0.0 and abs(squared.real - 1.0) < _ROUNDED:
         return q
-    size = 1.0 / np.sqrt(squared)
+    size = 1.0 / root(squared)
     return size * q[0], size * q[1], size * q[2], size * q[3]
 
 
-@kernel
+@lean
 def tidy(nodes, joints):
     """Directions of joints to the rounding of 64 bits; a longer axis makes more of a coordinate."""
     for n in range(nodes.shape[0]):
@@ -265,7 +302,7 @@ def tidy(nodes, joints):
             put_four(joints, j, ORIENTATION, unit_turn(four(joints, j, ORIENTATION)))
 
 
-@kernel
+@lean
 def place(nodes, joints, bodies, q, roots, poses, known):
     """Poses of the bodies on joints from those of the others.
 
@@ -312,14 +349,14 @@ def place(nodes, joints, bodies, q, roots, poses, known):
         put_four(poses, child, TURNED, hangs)
 
 
-@kernel
+@lean
 def turns(kind, part):
     """Whether a motion of a node is a turn."""
     last = part == 2 if kind == PLANAR else part >= 3
     return kind == HINGE or kind == BALL or ((kind == PLANAR or kind == ROOT) and last)
 
 
-@kernel
+@lean
 def direction(known, n, kind, part):
     """Direction of a motion at the start of a step [W]."""
     if kind == HINGE or kind == SLIDE:
@@ -330,7 +367,7 @@ def direction(known, n, kind, part):
     return three(known, n, FRAME + 3 * part)
 
 
-@kernel
+@lean
 def _put_motion(motions, n, part, turning, along, lever):
     """A motion as spin, and velocity of what is at the origin of the tree, from which the lever leads."""
     if turning:
@@ -341,7 +378,7 @@ def _put_motion(motions, n, part, turning, along, lever):
         put(motions[n], part, 3, along)
 
 
-@kernel
+@lean
 def motions_at_start(nodes, joints, poses, known, motions):
     """What each velocity of a node does at the start of a step, shape (nodes, 6, 6)."""
     for n in range(nodes.shape[0]):
@@ -355,7 +392,7 @@ def motions_at_start(nodes, joints, poses, known, motions):
             _put_motion(motions, n, part, turns(kind, part), along, lever)
 
 
-@kernel
+@lean
 def move(nodes, joints, poses, known, y, h, resolved, ways, motions):
     """The way of each node's body in a step with velocities y, and what these do at its end, over h.
 
@@ -415,7 +452,7 @@ def move(nodes, joints, poses, known, y, h, resolved, ways, motions):
             _put_motion(motions, n, part, turns(kind, part), rotate(before, along), lever)
 
 
-@kernel
+@lean
 def largest_turn(nodes, joints, y, h, sums):
     """Largest sum of the angles by which joints turn a body in a step [rad], see `turns_too_far`.
 

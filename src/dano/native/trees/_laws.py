@@ -2,7 +2,7 @@
 
 import math
 
-from dano.native._compiling import kernel
+from dano.native._compiling import lean
 
 # Columns of the table of laws, see `JointLaws` of `dano.scene`: what no joint has is 0, or endless.
 DAMPING, ARMATURE, STIFFNESS, REST, FRICTION, LEAST, MOST = range(7)
@@ -13,13 +13,13 @@ RAMPS, COLUMNS = 4, 8
 _SLOPE, _CENTRE, _LOW, _HIGH, _BEGIN, _END, _AT_BEGIN, _AT_END = range(COLUMNS)
 
 
-@kernel
+@lean
 def _clip(x, low, high):
     # by real parts, for derivatives: see `_frames`
     return low if x.real < low.real else high if x.real > high.real else x
 
 
-@kernel
+@lean
 def smooth(laws, c, constant, q, v, effort, command, h, y):
     """Momentum that springs, damping, armature and efforts take: see `JointForces.smooth`."""
     momentum = h * (laws[c, DAMPING] * y - effort) + laws[c, ARMATURE] * (y - v)
@@ -29,19 +29,19 @@ def smooth(laws, c, constant, q, v, effort, command, h, y):
     return momentum
 
 
-@kernel
+@lean
 def smooth_slope(laws, c, h):
     """Its slope by y."""
     return h * laws[c, DAMPING] + laws[c, ARMATURE] + 0.25 * h * h * laws[c, STIFFNESS]
 
 
-@kernel
+@lean
 def _set_ramp(ramps, r, i, slope, centre, low, high):
     ramps[r, i, _SLOPE], ramps[r, i, _CENTRE] = slope, centre
     ramps[r, i, _LOW], ramps[r, i, _HIGH] = low, high
 
 
-@kernel
+@lean
 def set_ramps(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r):
     """What has kinks: see `JointForces.ramps`; written to row r."""
     set_forces(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r)
@@ -56,7 +56,7 @@ def set_ramps(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r)
             ramps[r, i, _BEGIN + end], ramps[r, i, _AT_BEGIN + end] = kink, value
 
 
-@kernel
+@lean
 def set_forces(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r):
     """The first four columns of these ramps."""
     rubs = laws[c, FRICTION]
@@ -79,7 +79,7 @@ def set_forces(laws, c, constant, q, command, h, weight, sticks, stops, ramps, r
     _set_ramp(ramps, r, 3, slope, gear * asked / slope, low, high)
 
 
-@kernel
+@lean
 def force_of(ramps, r, y):
     """Sum of the ramps of row r at a speed."""
     total = 0.0
@@ -90,7 +90,7 @@ def force_of(ramps, r, y):
     return total
 
 
-@kernel
+@lean
 def resolve(ramps, r, weight, w):
     """The y with weight · y + g(y) = w, and the slope of g there: see `Ramps.resolve`."""
     low, high = -math.inf, math.inf
