@@ -1,7 +1,6 @@
 """A scene in which the Panda pushes the shipped bunny, and tasks with random starts and goals."""
 
 import dataclasses
-import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,26 +11,19 @@ from jaxtyping import Array, Float
 
 import dano
 from benchmarks._subjects import shipped_bunny
-from dano.maths import quat_from_axis_angle, quat_multiply
+from dano.maths import quat_conjugate, quat_from_axis_angle, quat_log, quat_multiply
 from dano.plan import Actuator, Goal, Task
 
 TIMESTEP, N_STEPS = 0.02, 50
 RADIUS, FRICTION = 0.04, 0.3  # of the tool [m], of bunny and floor
 READY = np.array([0.0, 0.3, 0.0, -2.2, 0.0, 2.5, 0.8])  # from where inverse kinematics begins [rad]
+DOWN = (0.0, 1.0, 0.0, 0.0)  # orientation of the hand
 HEIGHT, BEHIND = 0.05, 0.105  # of the tool, and its distance from the bunny [m]
 BUNNY = np.array([0.55, 0.0])  # m
 AHEAD, ASIDE, SPREAD = 0.12, 0.04, 0.03  # m: how far the tool pushes, goals lie aside, starts differ
 STIFFNESS, DAMPING = 120.0, 20.0  # 1/s², 1/s
 NEAR, WITHIN = 0.02, 0.01  # m
 """Errors that count as reached, and of a component that plans are asked for."""
-
-
-def panda() -> Path | None:
-    """The file of the arm, if the package that ships it is installed."""
-    found = importlib.util.find_spec("frax")
-    if found is None or not found.submodule_search_locations:
-        return None
-    return Path(found.submodule_search_locations[0]) / "assets" / "franka_panda" / "panda.urdf"
 
 
 def scene(path: Path) -> tuple[dano.Robot, dano.Scene]:
@@ -70,15 +62,17 @@ def rested() -> tuple[np.ndarray, np.ndarray]:
 
 
 def pusher(robot: dano.Robot, given: dano.Scene) -> Callable[[Array, dano.State, Array], dano.Control]:
-    """Torques that draw the hand along places, one for each step, in operational space."""
+    """Torques that draw the hand along places, one for each step, in operational space, without turning it."""
     last, joints = robot.bodies[-1].name, len(robot.bodies)
 
     def push(ways: Float[Array, "T 3"], state: dano.State, time: Float[Array, ""]) -> dano.Control:
         assert state.v is not None
         goal = ways[jnp.round(time / TIMESTEP).astype(int)]
-        position, _, jacobian = robot.place(given, state, last)
-        speed = jnp.array([AHEAD / (N_STEPS * TIMESTEP), 0.0, 0.0])
-        wanted = STIFFNESS * (goal - position) + DAMPING * (speed - jacobian[:3, -joints:] @ state.v)
+        position, orientation, jacobian = robot.place(given, state, last)
+        turned = quat_log(quat_multiply(jnp.array(DOWN), quat_conjugate(orientation)))
+        speed = jnp.array([AHEAD / (N_STEPS * TIMESTEP), 0.0, 0.0, 0.0, 0.0, 0.0])
+        missing = jnp.concatenate([goal - position, turned])
+        wanted = STIFFNESS * missing + DAMPING * (speed - jacobian[:, -joints:] @ state.v)
         torque = dano.operational_space_torque(robot, given, state, last, wanted)
         return dano.joint_control(given, torque)
 
@@ -102,7 +96,7 @@ def case(robot: dano.Robot, given: dano.Scene, push, rest: tuple[np.ndarray, np.
     hand = np.array([place[0] - BEHIND, place[1], HEIGHT + 0.2])
     names = [body.name for body in robot.bodies]
     first = given.initial_state(bunny=bunny, **{n: {"q": q} for n, q in zip(names, READY, strict=True)})
-    target = dano.Target(names[-1], position=hand, orientation=(0.0, 1.0, 0.0, 0.0))
+    target = dano.Target(names[-1], position=hand, orientation=DOWN)
     found = dano.inverse_kinematics(robot, given, first, [target])
     assert found.reached, found.reason
     ways = jnp.asarray(hand + np.linspace(0, 1, N_STEPS)[:, None] * [AHEAD, 0.0, 0.0])

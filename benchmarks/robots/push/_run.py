@@ -15,7 +15,7 @@ from benchmarks._measure import (
     summary,
     time_in_turn,
 )
-from benchmarks.robots.push import _case
+from benchmarks.robots.push import _case, panda
 
 SPEED = "The Panda pushes the bunny, paper's law"
 PLANS = "Plans with the torques of its joints, random starts and goals"
@@ -25,7 +25,7 @@ CASES = 3
 def run() -> None:
     """Measure, print and report."""
     arguments = parse_arguments("The Panda pushes the bunny with torques of its joints.")
-    load, path = load_average(), _case.panda()
+    load, path = load_average(), panda()
     if path is None:
         rows = [skipped(SPEED, "all of it", "the package frax, which ships the Panda, is not installed")]
     else:

@@ -132,13 +132,15 @@ class StageCost(eqx.Module):
 
     def __call__(self, state: State, w: Float[Array, " m"], t: Int[Array, ""]) -> Float[Array, ""]:
         """See `TrajectoryProblem.stage_cost`."""
-        u = self.scales.physical(w)
-        total = 0.5 * jnp.sum(self.task.prices() * u * u)
-        away = jnp.zeros_like(total)
+        return 0.5 * jnp.sum(self.residuals(state, w, t) ** 2)
+
+    def residuals(self, state: State, w: Float[Array, " m"], t: Int[Array, ""]) -> Float[Array, " r"]:
+        """See `TrajectoryProblem.stage_residuals`."""
+        counts = (t < self.remaining).astype(w.dtype)
+        terms = [jnp.sqrt(self.task.prices()) * self.scales.physical(w)]
         for goal in self.task.goals:
-            error = goal.error(self.scene, state)
-            away = away + 0.5 * goal.running * jnp.sum(error * error)
-        return self.substeps * self.scene.timestep * (total + jnp.where(t < self.remaining, away, 0))
+            terms.append(counts * jnp.sqrt(goal.running) * goal.error(self.scene, state))
+        return jnp.sqrt(self.substeps * self.scene.timestep) * jnp.concatenate(terms)
 
 
 class FinalCost(eqx.Module):
@@ -149,11 +151,12 @@ class FinalCost(eqx.Module):
 
     def __call__(self, state: State) -> Float[Array, ""]:
         """See `TrajectoryProblem.final_cost`."""
-        total = jnp.zeros((), state.position.dtype)
-        for goal in self.task.goals:
-            error = goal.error(self.scene, state)
-            total = total + 0.5 * goal.final * jnp.sum(error * error)
-        return total
+        return 0.5 * jnp.sum(self.residuals(state) ** 2)
+
+    def residuals(self, state: State) -> Float[Array, " r"]:
+        """See `TrajectoryProblem.final_residuals`."""
+        terms = [jnp.sqrt(goal.final) * goal.error(self.scene, state) for goal in self.task.goals]
+        return jnp.concatenate([*terms, jnp.zeros(0, state.position.dtype)])
 
 
 class Reached(eqx.Module):
@@ -200,14 +203,17 @@ def problem_of(
         if goal.required
     ]
     constraints += [TrajectoryConstraint(limit.name, Kept(scene, limit)) for limit in task.limits]
+    stage, final = StageCost(scene, task, scales, left, substeps), FinalCost(scene, task)
     return TrajectoryProblem(
         Dynamics(scene, task, scales, engine, prepared, left, substeps),
-        StageCost(scene, task, scales, left, substeps),
-        FinalCost(scene, task),
+        stage,
+        final,
         tuple(constraints),
         scales.scaled(lower),
         scales.scaled(upper),
         Retract(scene),
         Difference(scene),
+        stage.residuals,
+        final.residuals,
         parallel=False,
     )

@@ -240,9 +240,10 @@ def _model(problem: TrajectoryProblem, multipliers: Multipliers, states, control
         def moved(change):
             return problem.retract(x, change[:n]), u + change[n:]
 
-        zero = jnp.zeros(n + m, u.dtype)
+        zero, terms = jnp.zeros(n + m, u.dtype), problem.stage_residuals
         return _quadratic(
             lambda d: problem.stage_cost(*moved(d), t),
+            None if terms is None else lambda d: terms(*moved(d), t),
             [(c, lambda d, c=c: c.function(*moved(d), t)) for c in stages],
             values,
             multipliers.penalty,
@@ -251,9 +252,10 @@ def _model(problem: TrajectoryProblem, multipliers: Multipliers, states, control
         )
 
     g, G = jax.vmap(stage)(inner, controls, steps, rows)
-    last = indexed(states, -1)
+    last, end_terms = indexed(states, -1), problem.final_residuals
     end_gradient, end_hessian = _quadratic(
         lambda d: problem.final_cost(problem.retract(last, d)),
+        None if end_terms is None else lambda d: end_terms(problem.retract(last, d)),
         [(c, lambda d, c=c: c.function(problem.retract(last, d))) for c in ends],
         [value for value, here in zip(multipliers.values, at, strict=True) if not here],
         multipliers.penalty,
@@ -284,8 +286,29 @@ def _linear(problem: TrajectoryProblem, inner, following, controls, steps):
     return jax.vmap(one)(inputs) if problem.parallel else jax.lax.map(one, inputs)
 
 
-def _quadratic(cost, constraints: list[tuple[TrajectoryConstraint, Any]], values, mu, zero, convex: bool):
-    """Gradient and Hessian of a cost and its constraints; of constraints as Gauss and Newton take them."""
+def _quadratic(
+    cost, residuals, constraints: list[tuple[TrajectoryConstraint, Any]], values, mu, zero, convex: bool
+):
+    """Gradient and Hessian of a cost and its constraints.
+
+    Hessians of constraints, and of costs with residuals, are those of Gauss and Newton.
+    """
+    if residuals is None:
+        gradient, hessian = _second_order(cost, zero, convex)
+    else:
+        J, value = jax.jacfwd(lambda d: (residuals(d),) * 2, has_aux=True)(zero)
+        gradient, hessian = J.T @ value, J.T @ J
+    for (constraint, function), multiplier in zip(constraints, values, strict=True):
+        J, value = jax.jacfwd(lambda d, f=function: (f(d),) * 2, has_aux=True)(zero)
+        pressure = pressed(constraint, value, multiplier, mu)
+        active = jnp.ones_like(value) if constraint.equality else (pressure > 0).astype(value.dtype)
+        gradient = gradient + J.T @ pressure
+        hessian = hessian + J.T @ ((mu * active)[:, None] * J)
+    return gradient, hessian
+
+
+def _second_order(cost, zero, convex: bool):
+    """Gradient and Hessian of a cost, the latter without negative eigenvalues."""
 
     def slope(change):
         gradient = jax.grad(cost)(change)
@@ -295,12 +318,6 @@ def _quadratic(cost, constraints: list[tuple[TrajectoryConstraint, Any]], values
     if not convex:
         eigenvalues, vectors = jnp.linalg.eigh(0.5 * (hessian + hessian.T))
         hessian = (vectors * jnp.maximum(eigenvalues, 0)[None]) @ vectors.T
-    for (constraint, function), multiplier in zip(constraints, values, strict=True):
-        J, value = jax.jacfwd(lambda d, f=function: (f(d),) * 2, has_aux=True)(zero)
-        pressure = pressed(constraint, value, multiplier, mu)
-        active = jnp.ones_like(value) if constraint.equality else (pressure > 0).astype(value.dtype)
-        gradient = gradient + J.T @ pressure
-        hessian = hessian + J.T @ ((mu * active)[:, None] * J)
     return gradient, hessian
 
 

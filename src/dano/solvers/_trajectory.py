@@ -93,6 +93,9 @@ class TrajectoryProblem(eqx.Module):
         upper: As `lower`.
         retract: x ⊞ δ.
         difference: difference(x, y) = y ⊟ x, shape (n,).
+        stage_residuals: r(x, u, t) of costs that are ℓ = ½ r·r; their Hessians are then taken as Gauss and
+            Newton do, from first derivatives. None where costs are none of this kind.
+        final_residuals: The same of ℓ_T.
         convex: Whether the Hessians of the costs are known to have no negative eigenvalue; otherwise negative
             ones are set to zero (static).
         parallel: Whether derivatives of all steps are taken at once; otherwise one step after the other,
@@ -107,6 +110,8 @@ class TrajectoryProblem(eqx.Module):
     upper: Float[Array, "..."] | None = None
     retract: Callable[[Any, Array], Any] = added
     difference: Callable[[Any, Any], Array] = subtracted
+    stage_residuals: Callable[..., Float[Array, " r"]] | None = None
+    final_residuals: Callable[..., Float[Array, " r"]] | None = None
     convex: bool = eqx.field(static=True, default=False)
     parallel: bool = eqx.field(static=True, default=True)
 
