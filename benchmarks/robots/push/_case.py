@@ -26,7 +26,7 @@ NEAR, WITHIN = 0.02, 0.01  # m
 """Errors that count as reached, and of a component that plans are asked for."""
 
 
-def scene(path: Path) -> tuple[dano.Robot, dano.Scene]:
+def scene(path: Path, timestep: float = TIMESTEP) -> tuple[dano.Robot, dano.Scene]:
     """The arm with a ball for a tool, the bunny and a floor, with the paper's law."""
     robot, bunny = dano.load_urdf(path, collision=False), shipped_bunny()
     tool = dano.Body("tool", dano.Sphere(RADIUS), mass=0.2)
@@ -38,7 +38,7 @@ def scene(path: Path) -> tuple[dano.Robot, dano.Scene]:
         [*robot.bodies, tool, dano.Body("bunny", bunny.bunny), floor],
         [dano.Contact(a, b, params, bunny.law()) for a, b in pairs],
         joints=[*robot.joints, weld],
-        timestep=TIMESTEP,
+        timestep=timestep,
     )
     return robot, made
 
@@ -62,7 +62,7 @@ def rested() -> tuple[np.ndarray, np.ndarray]:
 
 
 def pusher(robot: dano.Robot, given: dano.Scene) -> Callable[[Array, dano.State, Array], dano.Control]:
-    """Torques that draw the hand along places, one for each step, in operational space, without turning it."""
+    """Torques that draw the hand along places, one for each step, and do not turn it."""
     last, joints = robot.bodies[-1].name, len(robot.bodies)
 
     def push(ways: Float[Array, "T 3"], state: dano.State, time: Float[Array, ""]) -> dano.Control:

@@ -16,10 +16,11 @@ from benchmarks._measure import (
     time_in_turn,
 )
 from benchmarks.robots.push import _case, panda
+from dano.plan import follow
 
 SPEED = "The Panda pushes the bunny, paper's law"
 PLANS = "Plans with the torques of its joints, random starts and goals"
-CASES = 3
+CASES = 20
 
 
 def run() -> None:
@@ -32,11 +33,11 @@ def run() -> None:
         robot, scene = _case.scene(path)
         rest, push = _case.rested(), _case.pusher(robot, scene)
         cases = [
-            _case.case(robot, scene, push, rest, seed) for seed in range(1 if arguments.quick else CASES + 1)
+            _case.case(robot, scene, push, rest, seed) for seed in range(1 if arguments.quick else CASES)
         ]
         rows = _speed_rows(scene, cases[0], 3 if arguments.quick else 15)
         if not arguments.quick:
-            rows += _plan_rows(scene, cases)
+            rows += _plan_rows(scene, _case.scene(path, _case.TIMESTEP / 4)[1], cases)
     settings = {"timestep": _case.TIMESTEP, "steps": _case.N_STEPS, "quick": arguments.quick}
     report("robots-push", rows, settings, load, arguments.json)
 
@@ -66,18 +67,31 @@ def _speed_rows(scene: dano.Scene, given: _case.Case, repeats: int) -> list[Row]
     ]
 
 
-def _plan_rows(scene: dano.Scene, cases: list[_case.Case]) -> list[Row]:
-    """Errors and times of plans; the first one has compilation in it and counts for that alone."""
-    made = [dano.plan(scene, case.state, case.task, controls=case.guess) for case in cases]
-    for plan in made:
-        print(plan.seconds, plan.message, [goal.error for goal in plan.goals], flush=True)
-    errors = np.array([[goal.error for goal in plan.goals] for plan in made[1:]])
-    seconds = np.array([plan.seconds for plan in made[1:]])
+def _plan_rows(scene: dano.Scene, finer: dano.Scene, cases: list[_case.Case]) -> list[Row]:
+    """Errors and times of plans; the first one is made twice, because compilation is in its time."""
+    warm = dano.plan(scene, cases[0].state, cases[0].task, controls=cases[0].guess)
+    made, held = [], []
+    for case in cases:
+        plan = dano.plan(scene, case.state, case.task, controls=case.guess)
+        done = follow(finer, case.state, case.task, plan, substeps=4, feedback=True)
+        made.append(plan)
+        held.append(max(goal.error for goal in done.goals))
+        print(round(plan.seconds, 1), plan.message, [goal.error for goal in plan.goals], held[-1], flush=True)
+    errors = np.array([[goal.error for goal in plan.goals] for plan in made])
+    seconds = np.array([plan.seconds for plan in made])
     n, near = len(errors), float((errors.max(axis=1) <= _case.NEAR).sum())
     return [
-        Row(PLANS, "bunny and tool within 2 cm", near, f"of {n}", n, at_least=True),
+        Row(PLANS, "bunny and tool within 2 cm", near, f"of {n}", 0.9 * n, at_least=True),
+        Row(PLANS, "bunny's error, median", 1e3 * float(np.median(errors[:, 0])), "mm"),
         Row(PLANS, "bunny's error, largest", 1e3 * float(errors[:, 0].max()), "mm"),
         Row(PLANS, "tool's error, largest", 1e3 * float(errors[:, 1].max()), "mm"),
+        Row(
+            PLANS,
+            "larger error at a quarter of the step, with feedback, median",
+            1e3 * float(np.median(held)),
+            "mm",
+        ),
+        Row(PLANS, "time of a plan, median", float(np.median(seconds)), "s"),
         Row(PLANS, "time of a plan, longest", float(seconds.max()), "s", 300),
-        Row(PLANS, "the first plan, with compilation", made[0].seconds, "s"),
+        Row(PLANS, "the first plan, with compilation", warm.seconds, "s"),
     ]

@@ -3,7 +3,7 @@
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -96,7 +96,7 @@ def optimal_trajectory(
 
 
 def _solved(problem, dual: Multipliers, iterate: Iterate, options: TrajectoryOptions, watch: "_Watch"):
-    n_done, hopeless, history = 0, 0, []
+    n_done, hopeless, history, best = 0, 0, [], None
     before, tolerance = np.inf, max(options.tolerance, _FIRST_TOLERANCE if problem.constraints else 0.0)
     stop = TrajectoryStop.ITERATIONS
     for update in range(max(1, options.max_updates)):
@@ -104,6 +104,10 @@ def _solved(problem, dual: Multipliers, iterate: Iterate, options: TrajectoryOpt
         n_done, status = update + 1, int(iterate.status)
         cost, worst = watch.looked(iterate)
         history.append((cost, worst[0].amount))
+        # Multipliers that cannot be satisfied grow until they lead away: the best trajectory is kept.
+        rank = max(worst[0].amount, options.constraint_tolerance), cost
+        if best is None or rank < best.rank:
+            best = _Best(rank, iterate, dual)
         if halted is not None:
             stop = halted
             break
@@ -123,7 +127,11 @@ def _solved(problem, dual: Multipliers, iterate: Iterate, options: TrajectoryOpt
         growth = np.array(options.penalty_growth if poor and update else 1.0)
         dual, iterate = _updated(problem, dual, iterate, growth, np.array(options.max_penalty))
         before, tolerance = worst[0].amount, max(options.tolerance, 0.1 * tolerance)
+    assert best is not None
+    n_iterations, iterate, dual = int(iterate.iterations), best.iterate, best.dual
     cost, worst = watch.looked(iterate)
+    if stop is TrajectoryStop.INFEASIBLE and worst[0].amount <= options.constraint_tolerance:
+        stop = TrajectoryStop.STUCK
     return TrajectorySolution(
         iterate.states,
         iterate.controls,
@@ -133,11 +141,19 @@ def _solved(problem, dual: Multipliers, iterate: Iterate, options: TrajectoryOpt
         cost,
         worst,
         stop,
-        int(iterate.iterations),
+        n_iterations,
         n_done,
         np.array(history).reshape(-1, 2),
         time.perf_counter() - watch.began,
     )
+
+
+class _Best(NamedTuple):
+    """The trajectory with the smallest violation, and of those that meet all constraints the cheapest."""
+
+    rank: tuple[float, float]
+    iterate: Iterate
+    dual: Multipliers
 
 
 class _Watch:
