@@ -21,11 +21,11 @@ def fills_natively() -> bool:
 @eqx.filter_custom_jvp
 def _fill(tables, layout: Layout, resolved: float) -> Float[Array, "j 13"]:
     """Poses and velocities of the bodies on joints."""
-    from dano.native.trees import filling_names  # compiles or loads the kernel, so only where it is used
+    from dano.native.trees import tree_filling_name  # compiles or loads the kernel, so only where it is used
 
     dtype = tables[0].dtype
     return jax.ffi.ffi_call(
-        filling_names(dtype)[0],
+        tree_filling_name(dtype),
         jax.ShapeDtypeStruct((len(layout.children), _ROW), dtype),
         vmap_method="sequential",
     )(*tables, layout.nodes, np.array([resolved], dtype))
@@ -33,7 +33,7 @@ def _fill(tables, layout: Layout, resolved: float) -> Float[Array, "j 13"]:
 
 @_fill.def_jvp
 def _(primals, tangents):
-    from dano.native.trees import filling_names
+    from dano.native.trees import tree_filling_slopes_name
 
     (tables, layout, resolved), (changes, _, _) = primals, tangents
     rows, dtype = _fill(tables, layout, resolved), tables[0].dtype
@@ -41,7 +41,7 @@ def _(primals, tangents):
     if not len(chosen):
         return rows, jnp.zeros_like(rows)
     slopes = jax.ffi.ffi_call(
-        filling_names(dtype)[1],
+        tree_filling_slopes_name(dtype),
         jax.ShapeDtypeStruct((len(chosen), rows.size), dtype),
         vmap_method="sequential",
     )(*tables, layout.nodes, np.array([resolved], dtype), chosen)

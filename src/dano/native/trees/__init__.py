@@ -1,4 +1,4 @@
-"""Steps of bodies on joints in machine code, and their derivatives."""
+"""Bodies on joints in machine code: where they are, their steps, and the derivatives of both."""
 
 import functools
 
@@ -23,8 +23,16 @@ def tree_slopes_name(dtype: DTypeLike) -> str:
 
 
 @functools.cache
-def filling_names(dtype: DTypeLike) -> tuple[str, str]:
-    """Names for `jax.ffi.ffi_call` of where bodies on joints are, and of the derivative of it."""
+def tree_filling_name(dtype: DTypeLike) -> str:
+    """Name for `jax.ffi.ffi_call` of where bodies on joints are and how they move."""
     from dano.native.trees._filling import define
 
     return define(np.dtype(dtype).name)
+
+
+@functools.cache
+def tree_filling_slopes_name(dtype: DTypeLike) -> str:
+    """Name for `jax.ffi.ffi_call` of the derivative of that."""
+    from dano.native.trees._filling import define_slopes
+
+    return define_slopes(np.dtype(dtype).name)

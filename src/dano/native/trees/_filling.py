@@ -195,18 +195,25 @@ def _answer_slopes(frame, dtype):
     return 0
 
 
-def define(dtype: str) -> tuple[str, str]:
-    """Compile or load both for "float64" or "float32", make them known to JAX; returns their names."""
+def define(dtype: str) -> str:
+    """Compile or load the filling for "float64" or "float32", make it known to JAX; returns its name."""
     sources, real = fingerprint(), numba.from_dtype(np.dtype(dtype))
 
     @numba.cfunc(SIGNATURE, cache=True)
-    def fill(frame):
+    def handler(frame):
         _ = sources  # makes it part of the key on disk
         return 0 if tells_version(frame) else _answer(frame, real)
 
+    return register(f"dano_fill_{dtype}", handler)
+
+
+def define_slopes(dtype: str) -> str:
+    """Its derivative likewise."""
+    sources, real = fingerprint(), numba.from_dtype(np.dtype(dtype))
+
     @numba.cfunc(SIGNATURE, cache=True)
-    def slopes(frame):
+    def handler(frame):
         _ = sources  # makes it part of the key on disk
         return 0 if tells_version(frame) else _answer_slopes(frame, real)
 
-    return register(f"dano_fill_{dtype}", fill), register(f"dano_fill_slopes_{dtype}", slopes)
+    return register(f"dano_fill_slopes_{dtype}", handler)

@@ -308,7 +308,7 @@ class _Walk:
     def _likeliest(self, target: Target, starts: list[Start]) -> tuple[Start, float]:
         """Of starts whose silhouettes fit alike, the one whose colours fit best; and how clearly."""
         most = max(start.refined.overlap for start in starts)
-        alike = [start for start in starts if start.refined.overlap > most - _ALIKE]
+        alike = _distinct([start for start in starts if start.refined.overlap > most - _ALIKE])
         if self._options.loss != "photometric":
             alike = sorted(alike, key=lambda s: s.score)
             values = [start.score for start in alike]
@@ -316,13 +316,7 @@ class _Walk:
             found = [(unlikeness(self._subject, target, start), start) for start in alike]
             found.sort(key=lambda pair: pair[0])
             values, alike = [value for value, _ in found], [start for _, start in found]
-        turned = quat_conjugate(alike[0].refined.place.orientation)
-        others = [
-            value / max(values[0], 1e-9)
-            for value, start in zip(values, alike, strict=True)
-            if np.linalg.norm(quat_log(quat_multiply(turned, start.refined.place.orientation))) > _OTHER
-        ]
-        return alike[0], min(others, default=np.inf)
+        return alike[0], min((value / max(values[0], 1e-9) for value in values[1:]), default=np.inf)
 
     def _finished(self, i: int, place: Placement, light: LightFit) -> Start | None:
         """A start at full resolution, under the light that it implies itself."""
@@ -446,3 +440,14 @@ class _Walk:
             ambiguity=self._ambiguity,
             seconds=self._seconds,
         )
+
+
+def _distinct(starts: list[Start]) -> list[Start]:
+    """Of starts that are nearly the same pose the one that fits best."""
+    kept: list[Start] = []
+    for start in sorted(starts, key=lambda s: s.score):
+        turned = quat_conjugate(start.refined.place.orientation)
+        others = (other.refined.place.orientation for other in kept)
+        if all(np.linalg.norm(quat_log(quat_multiply(turned, other))) > _OTHER for other in others):
+            kept.append(start)
+    return kept
