@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from dano.native._compiling import kernel
+from dano.native._compiling import kernel, lean
 from dano.native._law import (
     ALONG,
     ARM,
@@ -37,14 +37,14 @@ WHOLE, GROWS, SHRINKS, LEAST, FIT, SOFT_TOLERANCE, ENOUGH, GIVE_UP, RESOLVED, FA
 MIX, RENEWED = 10, 11
 
 
-@kernel
+@lean
 def root(x):
     """Square root of a positive number; of a complex one to first order in its small imaginary part."""
     size = math.sqrt(x.real)
     return size + (x - x.real) * (0.5 / size)
 
 
-@kernel
+@lean
 def shares(squared, resolved, fade):
     """m, m′/x, g and g′/x of `dano.engine._rigid` at x² = (h |ω|/2)²."""
     if squared.real <= resolved * resolved:
@@ -61,14 +61,16 @@ def shares(squared, resolved, fade):
     return product / x, (slope - product / x) / squared, torque, -2.0 * y / (fade * fade * x) * torque
 
 
-@kernel
-def _add_own(body, velocity, h, rules, residual, block):
-    """Momentum that a body gains in the step beyond gravity and controls [W], and its derivative."""
-    rotation, inertia = np.empty((3, 3)), np.empty((3, 3))
+@lean
+def _add_own(body, velocity, h, rules, spare, residual, block):
+    """Momentum that a body gains in the step beyond gravity and controls [W], and its derivative.
+
+    `spare` are five 3 × 3 matrices that are used up.
+    """
+    rotation, inertia, inner, half = spare[0], spare[1], spare[2], spare[3]
     for k in range(9):
         rotation[k // 3, k % 3], inertia[k // 3, k % 3] = body[ROTATION + k], body[INERTIA + k]
-    omega, spin, missing = np.empty(3), np.empty(3), np.empty(3)
-    inner, half = np.empty((3, 3)), np.empty((3, 3))
+    omega, spin, missing = spare[4, 0], spare[4, 1], spare[4, 2]
     mass = body[MASS]
     for k in range(3):
         residual[k] = mass * velocity[k] - body[IMPULSE + k]
@@ -160,7 +162,7 @@ def tabulate(rows, chunks, n, body_rows, material, stiffness, between, h):
     return points[:used], groups[: g + 1], apart[: g + 1]
 
 
-@kernel
+@lean
 def relative(velocities, a, b, apart, twist):
     """Twist at the first body's centre of mass relative to the second body [W]; a or b may not move."""
     m = velocities.shape[0]
@@ -175,7 +177,7 @@ def relative(velocities, a, b, apart, twist):
             twist[k] -= v[k]
 
 
-@kernel
+@lean
 def motion(row, twist):
     """Separating speed and slip of a point without its drift, see `dano.contact.motion_at`."""
     x = twist[0] + twist[4] * row[ARM + 2] - twist[5] * row[ARM + 1]
@@ -187,7 +189,7 @@ def motion(row, twist):
     return rate, x - along * row[NORMAL], y - along * row[NORMAL + 1], z - along * row[NORMAL + 2]
 
 
-@kernel
+@lean
 def _six(row, column, out):
     """A vector at a point and its moment."""
     for k in range(3):
@@ -196,7 +198,7 @@ def _six(row, column, out):
         out[3 + k] = row[ARM + a] * row[column + b] - row[ARM + b] * row[column + a]
 
 
-@kernel
+@lean
 def _add_point(row, slope, wrench, six):
     """Add a point's wrench and its derivative by the twist at the first body's centre of mass.
 
@@ -252,9 +254,9 @@ def _add_point(row, slope, wrench, six):
     slope[5, 4] += grip * y * z
 
 
-@kernel
-def _scatter(slope, wrench, apart, a, b, residual, matrix):
-    """Take a group's wrench, and its derivative, from the balance of both bodies.
+@lean
+def _scatter(slope, wrench, apart, a, b, by_second, residual, matrix):
+    """Take a group's wrench, and its derivative, from the balance of both bodies; `by_second` is used up.
 
     The twist of the second body at the first's centre of mass is T V with T = [[1, −D], [0, 1]] and
     D v = between × v, so it feels −Tᵀ times the wrench on the first.
@@ -263,7 +265,6 @@ def _scatter(slope, wrench, apart, a, b, residual, matrix):
     x, y, z = apart[0], apart[1], apart[2]
     if b < m:
         # columns by the second body: S T, whose last columns are S₂ − S₁ D
-        by_second = np.empty((6, 6))
         for r in range(6):
             p, q, s = slope[r, 0], slope[r, 1], slope[r, 2]
             by_second[r, 0], by_second[r, 1], by_second[r, 2] = p, q, s
@@ -318,13 +319,14 @@ def assemble(bodies, velocities, points, groups, apart, h, rules, pass_, residua
         How far duals are from fitting, all pressure, and how much held friction bounds changed [N s].
     """
     length, softness, holds, mix = pass_[0], pass_[1], pass_[2] > 0.0, pass_[3]
-    m = bodies.shape[0]
+    m, spare = bodies.shape[0], np.empty((5, 3, 3))
     for i in range(m):
         for j in range(m):
             if used[i, j]:
                 _clear(matrix[i, j])
-        _add_own(bodies[i], velocities[i], h, rules, residual[i], matrix[i, i])
+        _add_own(bodies[i], velocities[i], h, rules, spare, residual[i], matrix[i, i])
     slope, wrench, twist, six = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty((6, 6))
+    by_second = np.empty((6, 6))
     unfit = push = renewed = 0.0
     for g in range(groups.shape[0]):
         a, b = groups[g, 2], groups[g, 3]
@@ -348,11 +350,11 @@ def assemble(bodies, velocities, points, groups, apart, h, rules, pass_, residua
                 push += weight * row[PRESSURE]
             renewed += row[WEIGHT] * abs(row[HELD] - held)
         if presses:
-            _scatter(slope, wrench, apart[g], a, b, residual, matrix)
+            _scatter(slope, wrench, apart[g], a, b, by_second, residual, matrix)
     return unfit, push, renewed
 
 
-@kernel
+@lean
 def _clear(block):
     for r in range(6):
         for c in range(6):

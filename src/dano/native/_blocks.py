@@ -7,7 +7,7 @@ pivots stay away from singular.
 
 import numpy as np
 
-from dano.native._compiling import kernel
+from dano.native._compiling import kernel, lean
 
 
 @kernel
@@ -65,11 +65,11 @@ def solve_blocks(matrix, right, order, count, later):
         later: The neighbours.
     """
     m = right.shape[0]
-    row = np.empty(6)
+    row, swaps = np.empty(6), np.empty(6, np.int64)
     for step in range(m):
         k = order[step]
         pivot = matrix[k, k]
-        _invert(pivot)
+        _invert(pivot, swaps)
         n = count[k]
         for a in range(n):
             i = later[k, a]
@@ -109,7 +109,7 @@ def solve_blocks(matrix, right, order, count, later):
             right[k, r] = row[r]
 
 
-@kernel
+@lean
 def _subtract_product(target, a, b):
     for r in range(6):
         for t in range(6):
@@ -118,10 +118,9 @@ def _subtract_product(target, a, b):
                 target[r, c] -= x * b[t, c]
 
 
-@kernel
-def _invert(a):
-    """Invert a 6 × 6 matrix in place: Gauss–Jordan with row exchanges."""
-    swaps = np.empty(6, np.int64)
+@lean
+def _invert(a, swaps):
+    """Invert a 6 × 6 matrix in place: Gauss–Jordan with row exchanges; `swaps` are used up."""
     for k in range(6):
         best = k
         for r in range(k + 1, 6):

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from dano.native import RUN
-from dano.native._compiling import fingerprint, kernel
+from dano.native._compiling import fingerprint, kernel, lean
 from dano.native._ffi import (
     cube,
     doubles,
@@ -72,7 +72,7 @@ from dano.native._solids import distance
 STEEPEST = 1.5
 
 
-@kernel
+@lean
 def _meeting(a, b, counts, side, settings, solid, whole, atlas, probes, runs, left, placed, scratch):
     """Share of the step after which geometry is taken, see `dano.contact.meeting`."""
     h, sink = settings[H], side[SINK]
@@ -113,7 +113,7 @@ def _meeting(a, b, counts, side, settings, solid, whole, atlas, probes, runs, le
     return math.floor(share * settings[SHARES]) / settings[SHARES]
 
 
-@kernel
+@lean
 def _may_meet(counts, way, solid, whole, atlas, probes, runs, left, placed, scratch):
     """Probes that lie no further from the solid than anything moves in a step, into `left`; their number.
 
@@ -145,7 +145,7 @@ def _may_meet(counts, way, solid, whole, atlas, probes, runs, left, placed, scra
     return found
 
 
-@kernel
+@lean
 def _distance_of(placed, x, y, z, solid, whole, atlas, scratch):
     """Signed distance [m] of a point of the first body [F]."""
     apply(placed, POINTS, x, y, z, scratch, 30)
@@ -155,7 +155,7 @@ def _distance_of(placed, x, y, z, solid, whole, atlas, scratch):
     return distance(solid, whole, atlas, x, y, z, scratch, False)
 
 
-@kernel
+@lean
 def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, same_way, turned, found, scratch):
     """Arm, normal, moment [W], depth, rate, area and drift of a sample into `found`; whether it may press.
 
@@ -218,7 +218,7 @@ def _sample(turning, solid, whole, atlas, placed, block, lane, half, lead, same_
     return 1
 
 
-@kernel
+@lean
 def _find_drift(placed, x, y, z, rx, ry, rz, nx, ny, nz, found, scratch):
     """Half of what the velocity changes by until the predicted place, see `dano.contact.Points.drift`."""
     sx, sy, sz = placed[TURNS], placed[TURNS + 1], placed[TURNS + 2]
@@ -237,7 +237,7 @@ def _find_drift(placed, x, y, z, rx, ry, rz, nx, ny, nz, found, scratch):
     apply(placed, WORLD, wx, wy, wz, found, 12)
 
 
-@kernel
+@lean
 def _list_block(turning, target, placed, blocks, n, how, lists, used, filled, sums, scratch):
     """List the samples of a block that may press; returns the full chunks and the places of the next one.
 
@@ -301,7 +301,7 @@ def _list_block(turning, target, placed, blocks, n, how, lists, used, filled, su
     return used, filled
 
 
-@kernel
+@lean
 def _list_pair(count, target, placed, reach, surfaces, how, lists, used, sums, scratch):
     """List the samples of a body that may press, see `_list_block`; returns the chunks in use."""
     (blocks, balls, runs), (solid, whole, atlas) = surfaces, target
@@ -324,7 +324,7 @@ def _list_pair(count, target, placed, reach, surfaces, how, lists, used, sums, s
     return used + 1 if lane > 0 else used
 
 
-@kernel
+@lean
 def _impact(a, b, sums, hit_speed, instant, settings):
     """Stiffness [Pa/m] with which an impact ends within the step, 0 if there is none."""
     area, load = sums[0], sums[1]
@@ -347,7 +347,7 @@ def _impact(a, b, sums, hit_speed, instant, settings):
     return 2.0 ** np.rint(math.log2(stiffness))
 
 
-@kernel
+@lean
 def _label(name, share, stiffness, first, end, of_chunk, labels):
     """What the chunks of a pair have in common."""
     for c in range(first, end):
@@ -430,7 +430,7 @@ def _find(
     return used
 
 
-@kernel
+@lean
 def _clear(rows, value):
     for i in range(rows.shape[0]):
         for k in range(rows.shape[1]):

@@ -2,7 +2,7 @@
 
 import math
 
-from dano.native._compiling import kernel
+from dano.native._compiling import lean
 
 # Columns of the table of points: arm, normal, moment, h times area, then the constants of the law.
 ARM, NORMAL, MOMENT, WEIGHT = 0, 3, 6, 9
@@ -21,7 +21,7 @@ HELD = 54
 COLUMNS = 55
 
 
-@kernel
+@lean
 def set_constants(row, material, h, depth, rate, stiffness):
     """The constants of a point from its contact's material, see `dano.contact.constants`.
 
@@ -54,7 +54,7 @@ def set_constants(row, material, h, depth, rate, stiffness):
     row[STICTION] = material[7]
 
 
-@kernel
+@lean
 def find_pressure(row, rate, softness):
     """Pressure at a separating speed with the dual in `row[GOING]`, see `dano.contact.pressure`.
 
@@ -88,7 +88,7 @@ def find_pressure(row, rate, softness):
         row[PRESSURE] = row[FALL] = row[SHIFT] = 0.0
 
 
-@kernel
+@lean
 def bound(row, p):
     """Largest friction b(p) [Pa] and its derivative."""
     lightness = row[FRICTION_PRESSURE] / (row[FRICTION_PRESSURE] + p)
@@ -99,7 +99,7 @@ def bound(row, p):
     )
 
 
-@kernel
+@lean
 def linearize(row, rate, slip_x, slip_y, slip_z, length, softness, holds, mix):
     """One linearisation of the law, see `dano.contact.linearized`; duals are taken at a share of the step.
 
@@ -147,7 +147,7 @@ def linearize(row, rate, slip_x, slip_y, slip_z, length, softness, holds, mix):
     return True
 
 
-@kernel
+@lean
 def follow(row, rate, slip_x, slip_y, slip_z):
     """Make what was tried last the accepted duals, and find their change when the motion changes."""
     along = row[ALONG] * slip_x + row[ALONG + 1] * slip_y + row[ALONG + 2] * slip_z
@@ -160,7 +160,7 @@ def follow(row, rate, slip_x, slip_y, slip_z):
     row[CHANGES + 3] = min(max(going + row[MISS] + row[SLOPE] * rate, -1.0), 1.0) - going
 
 
-@kernel
+@lean
 def fit_duals(row, rate, slip_x, slip_y, slip_z):
     """Duals that fit given velocities; held bounds are renewed before they are used."""
     row[HELD] = 0.0

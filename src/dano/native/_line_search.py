@@ -6,20 +6,20 @@ the bracket of shares and the works at its ends.
 
 import math
 
-from dano.native._compiling import kernel
+from dano.native._compiling import lean
 
 BEGUN, LENGTH, LOW, LOW_WORK, HIGH, HIGH_WORK = range(6)
 """Places in a search."""
 
 
-@kernel
+@lean
 def begin_search(begun, search):
     """Try the whole step first; the residual does the work `begun` along it at its beginning."""
     search[BEGUN], search[LENGTH] = begun, 1.0
     search[LOW], search[LOW_WORK], search[HIGH], search[HIGH_WORK] = 0.0, begun, 0.0, 0.0
 
 
-@kernel
+@lean
 def accepts(work, enough, give_up, search):
     """Whether a share of the step is good enough, see `Search.accepts` of `dano.engine`."""
     bracketed = search[HIGH] > 0.0
@@ -29,7 +29,7 @@ def accepts(work, enough, give_up, search):
     return not misses or close or search[BEGUN] >= 0.0
 
 
-@kernel
+@lean
 def narrow(work, search):
     """Bracket and next share of a line search after a miss, see `Search.narrowed` of `dano.engine`."""
     length, high = search[LENGTH], search[HIGH]

@@ -3,7 +3,7 @@
 import math
 
 from dano.native import HALF_SPACE
-from dano.native._compiling import kernel
+from dano.native._compiling import lean
 from dano.native._solids import distance, KIND
 
 # Columns of the table of bodies: position, orientation (wxyz), orientation at the end of the step, velocity,
@@ -29,7 +29,7 @@ POINTS, ORIGIN, VECTORS, WORLD, CENTRE, MOVES, TURNS = 0, 9, 12, 21, 30, 33, 36
 LOWEST, AXIS_AT, STRETCH, ARMS, ARM_ORIGIN, FACING, PLACED = 39, 42, 45, 46, 55, 58, 61
 
 
-@kernel
+@lean
 def _matrix(q, at, out, to):
     """Rotation of a quaternion q[at:], row by row into out[to:]."""
     w, x, y, z = q[at], q[at + 1], q[at + 2], q[at + 3]
@@ -38,7 +38,7 @@ def _matrix(q, at, out, to):
     out[to + 6], out[to + 7], out[to + 8] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
 
 
-@kernel
+@lean
 def apply(a, at, x, y, z, out, to):
     """A 3 × 3 matrix a[at:], row by row, times a vector, into out[to:]."""
     for k in range(3):
@@ -46,13 +46,13 @@ def apply(a, at, x, y, z, out, to):
         out[to + k] = a[row] * x + a[row + 1] * y + a[row + 2] * z
 
 
-@kernel
+@lean
 def _apply_transposed(a, at, x, y, z, out, to):
     for k in range(3):
         out[to + k] = a[at + k] * x + a[at + 3 + k] * y + a[at + 6 + k] * z
 
 
-@kernel
+@lean
 def _product(a, at, b, of, out, to):
     """Product of two 3 × 3 matrices; `out` is none of them."""
     for r in range(3):
@@ -64,7 +64,7 @@ def _product(a, at, b, of, out, to):
             )
 
 
-@kernel
+@lean
 def _moved(body, share, h, out):
     """Position (0:3) and rotation (3:12) of a body after a share of the step."""
     squared = 0.0
@@ -79,13 +79,13 @@ def _moved(body, share, h, out):
         out[k] = body[POSITION + k] + share * h * body[VELOCITY + k]
 
 
-@kernel
+@lean
 def norm(a, at):
     """Length of the vector a[at:]."""
     return math.sqrt(a[at] * a[at] + a[at + 1] * a[at + 1] + a[at + 2] * a[at + 2])
 
 
-@kernel
+@lean
 def _face(out, solid, whole, atlas, x, y, z, scratch):
     """Direction from a point to the solid in the axes of the samples' body, into scratch[30:33]; distance."""
     apart = distance(solid, whole, atlas, x, y, z, scratch, True)
@@ -94,14 +94,14 @@ def _face(out, solid, whole, atlas, x, y, z, scratch):
     return apart
 
 
-@kernel
+@lean
 def _direct(a, at):
     length = max(norm(a, at), 1e-12)
     for k in range(3):
         a[at + k] /= length
 
 
-@kernel
+@lean
 def _towards(settings, x, y, z, out, to, scratch, at):
     """A rotation that takes z to a unit vector, see `dano.contact`."""
     px, py, pz = -settings[POLE], -settings[POLE + 1], -settings[POLE + 2]
@@ -126,7 +126,7 @@ def _towards(settings, x, y, z, out, to, scratch, at):
     _product(scratch, at, settings, FROM_Z, out, to)
 
 
-@kernel
+@lean
 def place(a, b, turning, settings, share, solid, whole, atlas, out, scratch):
     """The pair of bodies after a share of the step at the old velocities, see `dano.contact.place`."""
     h = settings[H]
@@ -170,7 +170,7 @@ def place(a, b, turning, settings, share, solid, whole, atlas, out, scratch):
     _align(a, turning, settings, scratch[30], scratch[31], scratch[32], out, POINTS, VECTORS, scratch)
 
 
-@kernel
+@lean
 def place_arms(a, b, turning, side, share, settings, out, scratch):
     """Arms of samples for a pair that `place` has placed, see `dano.contact.place`."""
     h = settings[H]
@@ -201,7 +201,7 @@ def place_arms(a, b, turning, side, share, settings, out, scratch):
         out[LOWEST + k] = (out[ARM_ORIGIN + k] - out[ARMS + 3 * k + 2]) / slower
 
 
-@kernel
+@lean
 def _face_solid(a, turning, settings, solid, whole, atlas, out, scratch):
     """Direction from where bodies touch to the solid in the axes of the samples' body, to scratch[30:33]."""
     x, y, z = out[ORIGIN], out[ORIGIN + 1], out[ORIGIN + 2]
@@ -232,7 +232,7 @@ def _face_solid(a, turning, settings, solid, whole, atlas, out, scratch):
         k += 1
 
 
-@kernel
+@lean
 def _align(a, turning, settings, x, y, z, out, to, areas, scratch):
     """Turn samples that face a direction (x, y, z) of their body; out[to:] holds the body's rotation.
 
@@ -266,7 +266,7 @@ def _align(a, turning, settings, x, y, z, out, to, areas, scratch):
     out[STRETCH] = max(p, max(q, r))
 
 
-@kernel
+@lean
 def is_near(a, b, margin, h, solid, whole, atlas, scratch):
     """Whether two bodies may meet within the step, by the balls around them."""
     _matrix(a, ORIENTATION, scratch, 30)

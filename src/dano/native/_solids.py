@@ -5,7 +5,7 @@ import math
 import numba
 
 from dano.native import BOX, CAPSULE, CYLINDER, ELLIPSOID, GRID, HALF_SPACE
-from dano.native._compiling import kernel
+from dano.native._compiling import lean
 
 # Columns of the table of solids: size, position and rotation of the solid in its field's frame (x = s R y + p
 # for y in the solid's own), then what the kind has: normal and offset; radius; half extents and rounding;
@@ -18,7 +18,7 @@ _BISECTIONS, _STEPS = 5, 7  # of the search for the closest point of an ellipsoi
 _EPSILON = 2.220446049250313e-16
 
 
-@kernel
+@lean
 def distance(solid, whole, atlas, x, y, z, out, slopes):
     """Signed distance [m] of a point in the field frame, and its gradient; or a lower bound on the distance.
 
@@ -67,7 +67,7 @@ def distance(solid, whole, atlas, x, y, z, out, slopes):
     return factor * d
 
 
-@kernel
+@lean
 def _box(solid, a, b, c, out):
     rounding = solid[OWN + 3]
     out[0] = abs(a) - (solid[OWN] - rounding)
@@ -93,7 +93,7 @@ def _box(solid, a, b, c, out):
     return value - rounding
 
 
-@kernel
+@lean
 def _cylinder(solid, a, b, c, out):
     radius = math.sqrt(a * a + b * b)
     across, along = radius - solid[OWN], abs(c) - solid[OWN + 1]
@@ -112,7 +112,7 @@ def _cylinder(solid, a, b, c, out):
     return value
 
 
-@kernel
+@lean
 def _ellipsoid(solid, a, b, c, out):
     smallest = min(solid[OWN], min(solid[OWN + 1], solid[OWN + 2]))
     shift = smallest * smallest
@@ -154,7 +154,7 @@ def _ellipsoid(solid, a, b, c, out):
     return (s - shift) * length
 
 
-@kernel
+@lean
 def _weights(f, degree, out, at):
     """Weights of the nodes of a stencil and their derivatives, see `dano.fields._spline`, four of each."""
     g = 1.0 - f
@@ -171,7 +171,7 @@ def _weights(f, degree, out, at):
         out[at + 6], out[at + 7] = g * (2.0 - 1.5 * g), 0.5 * f * f
 
 
-@kernel
+@lean
 def _grid(solid, whole, atlas, a, b, c, out, slopes):
     """The spline of a grid, and beyond its border the way to it, see `SignedDistanceGrid`."""
     degree = whole[DEGREE]

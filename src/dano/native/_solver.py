@@ -34,7 +34,7 @@ from dano.native._assembling import (
     WHOLE,
 )
 from dano.native._blocks import elimination, solve_blocks
-from dano.native._compiling import fingerprint, kernel
+from dano.native._compiling import fingerprint, kernel, lean
 from dano.native._ffi import (
     cube,
     doubles,
@@ -51,7 +51,7 @@ from dano.native._law import DRIFT, fit_duals, follow
 from dano.native._line_search import accepts, begin_search, LENGTH, narrow
 
 
-@kernel
+@lean
 def _copy(source, target):
     for i in range(source.shape[0]):
         for k in range(source.shape[1]):
@@ -80,7 +80,7 @@ def _fit_all(points, groups, apart, velocities):
             fit_duals(row, rate, x + row[DRIFT], y + row[DRIFT + 1], z + row[DRIFT + 2])
 
 
-@kernel
+@lean
 def _measure(matrix, residual, step, velocities, scale, used):
     """Work of the residual along the step, largest residual [m/s], and the size of its terms [m/s]."""
     error = rounding = 0.0
@@ -98,7 +98,7 @@ def _measure(matrix, residual, step, velocities, scale, used):
     return _work(step, residual), error, rounding
 
 
-@kernel
+@lean
 def _work(step, residual):
     work = 0.0
     for i in range(step.shape[0]):
@@ -123,7 +123,7 @@ def _find_step(matrix, spare, residual, step, used, part, order, count, later):
             step[i, k] *= part
 
 
-@kernel
+@lean
 def _spread(matrix, used, whole):
     """Blocks as one matrix."""
     m = matrix.shape[0]
@@ -134,7 +134,7 @@ def _spread(matrix, used, whole):
                     whole[6 * i + r, 6 * j + c] = matrix[i, j, r, c] if used[i, j] else 0.0
 
 
-@kernel
+@lean
 def _scales(bodies, scale):
     """Factors that turn momenta into velocities, shape (m, 6): 1/m, and 3/tr J."""
     for i in range(bodies.shape[0]):
