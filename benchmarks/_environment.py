@@ -1,10 +1,17 @@
 """Settings that must stand before NumPy and JAX are imported."""
 
 import os
+import sys
 
 
 def use_float64_on_cpu() -> None:
-    """Precision and device of both benchmarks."""
+    """Precision and device of the benchmarks.
+
+    Raises:
+        RuntimeError: If JAX is imported already and would not heed them.
+    """
+    if "jax" in sys.modules:
+        raise RuntimeError("JAX is imported before its settings: a package of benchmarks imports it")
     os.environ["JAX_ENABLE_X64"] = "1"
     os.environ["JAX_PLATFORMS"] = "cpu"
     os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "0"  # a warm cache would pass for a fast compiler

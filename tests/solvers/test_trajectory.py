@@ -156,6 +156,28 @@ def test_a_goal_out_of_reach_is_said_with_the_constraint_and_how_much_is_missing
     assert worst.amount > 50.0 - furthest[0] - 1e-6
     assert "constraints are not met" in found.describe() and "goal: violated by" in found.describe()
     assert told[-1].violation.name == "goal" and told[-1].iteration == found.iterations
+    # It is the trajectory that comes closest, whatever multipliers did afterwards.
+    assert worst.amount == found.history[:, 1].min()
+
+
+def test_costs_with_residuals_have_the_same_minimum():
+    """Gauss and Newton's Hessian is exact where residuals are linear, and near where they are not."""
+
+    def away(x, u, t):
+        return jnp.concatenate([jnp.sin(x[:1]) - 0.2, 0.3 * x[1:], 0.1 * u])
+
+    def end(x):
+        return 3.0 * x - jnp.array([0.5, 0.0])
+
+    def half(residuals):
+        return lambda *given: 0.5 * jnp.sum(residuals(*given) ** 2)
+
+    exact = TrajectoryProblem(moves, half(away), half(end))
+    quick = TrajectoryProblem(moves, half(away), half(end), stage_residuals=away, final_residuals=end)
+    options = TrajectoryOptions(tolerance=1e-12)
+    a, b = (solve(problem, options=options) for problem in (exact, quick))
+    assert abs(a.cost - b.cost) < 1e-9 * a.cost
+    np.testing.assert_allclose(b.controls, a.controls, rtol=0, atol=1e-4)
 
 
 def test_a_warm_start_needs_fewer_iterations():
