@@ -132,7 +132,7 @@ def test_derivatives_alike():
     ]
     scene = scene_of(joints, bodies=[dano.Body("base", dano.Box((0.2, 0.1, 0.05)), mass=2.0)])
     states, controls = random_states(scene, [2.0])
-    compare_derivatives(scene, *jax.tree.map(lambda x: x[0], (states, controls)))
+    assert_derivatives_agree(scene, *jax.tree.map(lambda x: x[0], (states, controls)))
 
 
 def random_way(numbers, rng, moves):
@@ -156,7 +156,7 @@ def random_way(numbers, rng, moves):
     return jax.tree_util.tree_map_with_path(allowed, numbers)
 
 
-def compare_derivatives(scene, *given):
+def assert_derivatives_agree(scene, *given):
     """The derivative of a step along a random way, in machine code, by XLA, and in reverse mode."""
     numbers, rest = eqx.partition((scene, *given), eqx.is_inexact_array)
     rng, moves = np.random.default_rng(0), np.array([[not body.fixed] for body in scene.bodies], float)
@@ -250,7 +250,7 @@ def test_derivatives_in_contact_alike():
     """By all numbers of scene, state and control, of contacts, too."""
     scene = touching(LAWS["smooth"])
     states, controls = pressed_states(scene, 3)
-    compare_derivatives(scene, *jax.tree.map(lambda x: x[1], (states, controls)))
+    assert_derivatives_agree(scene, *jax.tree.map(lambda x: x[1], (states, controls)))
 
 
 def test_filled_states_alike(all_kinds, monkeypatch):

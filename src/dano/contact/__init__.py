@@ -7,7 +7,12 @@ from dano.contact._colliders import (
     Support as Support,
     SurfaceSet as SurfaceSet,
 )
-from dano.contact._derivatives import by_autodiff as by_autodiff, KEPT as KEPT
+from dano.contact._derivatives import (
+    by_autodiff as by_autodiff,
+    changes_of as changes_of,
+    KEPT as KEPT,
+    numbers_of as numbers_of,
+)
 from dano.contact._distributed import (
     combined as combined,
     DistributedLaw as DistributedLaw,

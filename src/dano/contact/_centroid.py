@@ -1,7 +1,5 @@
 """The centroid law: one wrench at the centroid of the overlap, as in the paper."""
 
-from typing import ClassVar
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -52,8 +50,6 @@ class CentroidLaw(AbstractPatchLaw):
         adhesive: Whether F_n may pull once bodies separate faster than k/d, as the reference implementation
             does.
     """
-
-    N_NUMBERS: ClassVar[int] = 11
 
     smoothing: Float[Array, ""]
     regularizer: Float[Array, ""]

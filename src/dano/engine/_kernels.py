@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.contact import changes_of
 from dano.engine._balance import jacobian_in_bodies, to_body, to_velocity, to_world
 from dano.engine._newton import levels_of, Report, SOFT_TOLERANCE, SolverOptions
 from dano.engine._primal_dual import RULES, TIERS
@@ -134,9 +135,9 @@ def native_tree_change(given: Step, tangents, y: Float[Array, " k"], options: So
         tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((len(chosen), k), (k, size), (count, size))),
         vmap_method="sequential",
     )(*_tree_inputs(given, options), y.astype(dtype), chosen)
-    change = jnp.concatenate(
-        [_at(x, chosen[chosen[:, 0] == k, 1:3]).astype(dtype) for k, x in enumerate(changes) if x is not None]
-    )
+    # Machine code reads and writes numbers of one type.
+    changes = [None if x is None else x.astype(dtype) for x in changes]
+    change = changes_of(changes, chosen[:, :3])
     moved = (change @ momenta) @ by_momentum + change[chosen[:, 3] >= 0] @ ends
     found = jnp.split(moved, np.cumsum([x.size for x in parts])[:-1])
     return State(*(end.reshape(x.shape) for end, x in zip(found, parts, strict=True)))
@@ -148,12 +149,6 @@ _TABLES = ("bodies", "joints", "laws", "settings", "contacts")
 
 def _parts(state: State) -> tuple:
     return state.position, state.orientation, state.velocity, state.omega, state.q, state.v
-
-
-def _at(values: Array, places: np.ndarray) -> Float[Array, " n"]:
-    """Some numbers of a table, or of a vector."""
-    rows, columns = places.T
-    return values.ravel()[rows * values.shape[-1] + columns]
 
 
 def _tree_inputs(given: Step, options: SolverOptions) -> list:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from dano.contact import changes_of, numbers_of
 from dano.scene._joints import Layout
 from dano.scene._states import State
 
@@ -45,9 +46,7 @@ def _(primals, tangents):
         jax.ShapeDtypeStruct((len(chosen), rows.size), dtype),
         vmap_method="sequential",
     )(*tables, layout.nodes, np.array([resolved], dtype), chosen)
-    places = [(x, chosen[chosen[:, 0] == k, 1:].T) for k, x in enumerate(changes) if x is not None]
-    change = jnp.concatenate([x.ravel()[i * x.shape[1] + j] for x, (i, j) in places])
-    return rows, (change @ slopes).reshape(rows.shape)
+    return rows, (changes_of(changes, chosen) @ slopes).reshape(rows.shape)
 
 
 def fill(
@@ -79,11 +78,4 @@ def _changing(
     moving = [i for i in carriers if i in layout.free]
     joined = sorted((set(layout.parents) | set(layout.children)) - {layout.bodies})
     rows = [carriers, carriers, moving, moving, [0], [0], joined, range(len(layout.children)), [0]]
-    found = [
-        (k, i, j)
-        for k, (some, shape) in enumerate(zip(rows, shapes, strict=True))
-        if perturbed[k]
-        for i in some
-        for j in range(shape[1])
-    ]
-    return np.array(found, np.int32).reshape(-1, 3)
+    return numbers_of(zip(rows, (width for _, width in shapes), strict=True), perturbed)

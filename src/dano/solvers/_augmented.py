@@ -107,7 +107,7 @@ def _solved(problem, dual: Multipliers, iterate: Iterate, options: TrajectoryOpt
         # Multipliers that cannot be satisfied grow until they lead away: the best trajectory is kept.
         rank = max(worst[0].amount, options.constraint_tolerance), cost
         if best is None or rank < best.rank:
-            best = _Best(rank, iterate, dual)
+            best = _Best(rank, cost, worst, iterate, dual)
         if halted is not None:
             stop = halted
             break
@@ -128,20 +128,18 @@ def _solved(problem, dual: Multipliers, iterate: Iterate, options: TrajectoryOpt
         dual, iterate = _updated(problem, dual, iterate, growth, np.array(options.max_penalty))
         before, tolerance = worst[0].amount, max(options.tolerance, 0.1 * tolerance)
     assert best is not None
-    n_iterations, iterate, dual = int(iterate.iterations), best.iterate, best.dual
-    cost, worst = watch.looked(iterate)
-    if stop is TrajectoryStop.INFEASIBLE and worst[0].amount <= options.constraint_tolerance:
+    if stop is TrajectoryStop.INFEASIBLE and best.worst[0].amount <= options.constraint_tolerance:
         stop = TrajectoryStop.STUCK
     return TrajectorySolution(
-        iterate.states,
-        iterate.controls,
-        iterate.policy.K,
-        dual.values,
-        float(dual.penalty),
-        cost,
-        worst,
+        best.iterate.states,
+        best.iterate.controls,
+        best.iterate.policy.K,
+        best.dual.values,
+        float(best.dual.penalty),
+        best.cost,
+        best.worst,
         stop,
-        n_iterations,
+        int(iterate.iterations),
         n_done,
         np.array(history).reshape(-1, 2),
         time.perf_counter() - watch.began,
@@ -152,6 +150,8 @@ class _Best(NamedTuple):
     """The trajectory with the smallest violation, and of those that meet all constraints the cheapest."""
 
     rank: tuple[float, float]
+    cost: float
+    worst: tuple[Violation, ...]
     iterate: Iterate
     dual: Multipliers
 

@@ -296,15 +296,19 @@ def _quadratic(
     if residuals is None:
         gradient, hessian = _second_order(cost, zero, convex)
     else:
-        J, value = jax.jacfwd(lambda d: (residuals(d),) * 2, has_aux=True)(zero)
+        J, value = _jacobian_and_value(residuals, zero)
         gradient, hessian = J.T @ value, J.T @ J
     for (constraint, function), multiplier in zip(constraints, values, strict=True):
-        J, value = jax.jacfwd(lambda d, f=function: (f(d),) * 2, has_aux=True)(zero)
+        J, value = _jacobian_and_value(function, zero)
         pressure = pressed(constraint, value, multiplier, mu)
         active = jnp.ones_like(value) if constraint.equality else (pressure > 0).astype(value.dtype)
         gradient = gradient + J.T @ pressure
         hessian = hessian + J.T @ ((mu * active)[:, None] * J)
     return gradient, hessian
+
+
+def _jacobian_and_value(function, zero):
+    return jax.jacfwd(lambda d: (function(d),) * 2, has_aux=True)(zero)
 
 
 def _second_order(cost, zero, convex: bool):

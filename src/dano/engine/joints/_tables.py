@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dano.contact import AbstractContactLaw, CentroidLaw, Patch
+from dano.contact import AbstractContactLaw, CentroidLaw, numbers_of, Patch
 from dano.scene import JointLaws, Layout, Scene
 
 # Tables of `changing` that say where bodies are: position, orientation, q, bodies, joints, settings.
 _PLACING = (0, 1, 4, 10, 11, 13)
+CONTACT = 11
+"""Numbers of a contact: see `CentroidLaw.numbers`."""
 PATCH = 7
 """Numbers of a patch: overlap, centroid and normal, see `dano.contact.Patch`."""
 
@@ -87,12 +89,10 @@ def changing(tables: TreeTables, perturbed: Sequence[bool]) -> Int[np.ndarray, "
     rows += [(range(len(x)), x.shape[1]) for x in (tables.joints, tables.laws)]
     rows += [(range(1), tables.settings.size)]
     rows += [(range(len(tables.contacts)), width) for width in (tables.contacts.shape[1], PATCH)]
-    found = [
-        (k, i, j) for k, (some, width) in enumerate(rows) if perturbed[k] for i in some for j in range(width)
-    ]
-    placing = [kind in _PLACING for kind, _, _ in found]
+    found = numbers_of(rows, perturbed)
+    placing = np.isin(found[:, 0], _PLACING)
     places = np.where(placing, np.cumsum(placing) - 1, -1)
-    return np.concatenate([np.reshape(found, (-1, 3)), places[:, None]], axis=1).astype(np.int32)
+    return np.concatenate([found, places[:, None]], axis=1).astype(np.int32)
 
 
 def tree_tables(scene: Scene) -> TreeTables:
@@ -110,7 +110,7 @@ def tree_tables(scene: Scene) -> TreeTables:
         chains.table,
         _law_rows(chains.laws, dtype),
         jnp.concatenate([scene.timestep[None], scene.gravity]).astype(dtype),
-        _rows([law.numbers(c.params) for c, law in known], CentroidLaw.N_NUMBERS, dtype),
+        _rows([law.numbers(c.params) for c, law in known], CONTACT, dtype),
         layout,
         chains.laws.constant,
         chains.laws.rough,

@@ -5,7 +5,8 @@ lies for each, and turns about the line of sight are made by turning pictures. T
 the picture says, and compared again.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -45,6 +46,9 @@ _SPECKLE = 1.2
 
 _FINE = 1.0, 3.0
 """Standard deviations of the filters between which a pattern is fine [pixels]."""
+
+
+Item = TypeVar("Item")
 
 
 class Start(NamedTuple):
@@ -200,7 +204,7 @@ def _guesses(subject: Subject, target: Target, options: TrackOptions) -> list[_G
             place = _placed(subject, target, axes, turn, middle, root, centre * width, size * width)
             guesses.append(_Guess(place, value))
     guesses.sort(key=lambda g: g.score)
-    return _different(guesses, 2 * options.candidates)
+    return distinct(guesses, lambda guess: guess.place, _DIFFERENT, 2 * options.candidates)
 
 
 def _sampled(image: np.ndarray, smooth: float, at: np.ndarray) -> np.ndarray:
@@ -290,15 +294,23 @@ def _placed(subject: Subject, target: Target, axes, turn, middle, root, centre, 
     return subject.around(camera.position + away * forward, quat_from_matrix(rotation))
 
 
-def _different(guesses: list[_Guess], count: int) -> list[_Guess]:
-    chosen: list[_Guess] = []
-    for guess in guesses:
-        if len(chosen) == count:
+def distinct(
+    ranked: Sequence[Item], place: Callable[[Item], Placement], least: float, count: int | None = None
+) -> list[Item]:
+    """Of things with poses, best first, those that are turned by more than an angle from all better ones.
+
+    Args:
+        ranked: The things.
+        place: The pose of one.
+        least: The angle [rad].
+        count: Most things; None: all.
+    """
+    kept: list[Item] = []
+    for item in ranked:
+        if len(kept) == count:
             break
-        turned = quat_conjugate(guess.place.orientation)
-        angles = [
-            np.linalg.norm(quat_log(quat_multiply(turned, other.place.orientation))) for other in chosen
-        ]
-        if all(angle > _DIFFERENT for angle in angles):
-            chosen.append(guess)
-    return chosen
+        turned = quat_conjugate(place(item).orientation)
+        others = (place(other).orientation for other in kept)
+        if all(np.linalg.norm(quat_log(quat_multiply(turned, other))) > least for other in others):
+            kept.append(item)
+    return kept

@@ -26,7 +26,16 @@ from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.tracking._refine import aligned, refine, Refined, Target, window_of
 from dano.vision.tracking._result import HIDDEN, LOST, OUTSIDE, TRACKED, Tracked, tracked
-from dano.vision.tracking._search import colours_of, half_turns, learn_light, score, search, Start, unlikeness
+from dano.vision.tracking._search import (
+    colours_of,
+    distinct,
+    half_turns,
+    learn_light,
+    score,
+    search,
+    Start,
+    unlikeness,
+)
 from dano.vision.tracking._subject import CHUNK, Subject
 
 _COARSE = 24
@@ -308,9 +317,9 @@ class _Walk:
     def _likeliest(self, target: Target, starts: list[Start]) -> tuple[Start, float]:
         """Of starts whose silhouettes fit alike, the one whose colours fit best; and how clearly."""
         most = max(start.refined.overlap for start in starts)
-        alike = _distinct([start for start in starts if start.refined.overlap > most - _ALIKE])
+        alike = sorted((s for s in starts if s.refined.overlap > most - _ALIKE), key=lambda s: s.score)
+        alike = distinct(alike, lambda start: start.refined.place, _OTHER)
         if self._options.loss != "photometric":
-            alike = sorted(alike, key=lambda s: s.score)
             values = [start.score for start in alike]
         else:
             found = [(unlikeness(self._subject, target, start), start) for start in alike]
@@ -440,14 +449,3 @@ class _Walk:
             ambiguity=self._ambiguity,
             seconds=self._seconds,
         )
-
-
-def _distinct(starts: list[Start]) -> list[Start]:
-    """Of starts that are nearly the same pose the one that fits best."""
-    kept: list[Start] = []
-    for start in sorted(starts, key=lambda s: s.score):
-        turned = quat_conjugate(start.refined.place.orientation)
-        others = (other.refined.place.orientation for other in kept)
-        if all(np.linalg.norm(quat_log(quat_multiply(turned, other))) > _OTHER for other in others):
-            kept.append(start)
-    return kept
