@@ -167,7 +167,7 @@ def _times_turn(row, spin, alpha, beta, h):
 
 
 @lean
-def find_twists(nodes, y, h, rules, room):
+def find_twists(nodes, y, h, resolved, room):
     """Velocity and spin [W] of each node's body in a step, from its way."""
     per_h = 1.0 / h
     for n in range(nodes.shape[0]):
@@ -176,7 +176,7 @@ def find_twists(nodes, y, h, rules, room):
                 room.twists[n, k] = y[nodes[n, PLACE] + k]
         else:
             put(room.twists, n, 0, times(per_h, three(room.ways, n, SHIFT)))
-            put(room.twists, n, 3, spin_of(four(room.ways, n, TURN), h, rules[RESOLVED]))
+            put(room.twists, n, 3, spin_of(four(room.ways, n, TURN), h, resolved))
 
 
 @lean

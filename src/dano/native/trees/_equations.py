@@ -34,11 +34,11 @@ from dano.native.trees._balance import (
 from dano.native.trees._frames import (
     add,
     BALL,
+    ball_after,
     BODY,
-    exponential,
     four,
+    free_velocities,
     KIND,
-    logarithm,
     MASS,
     motions_at_start,
     move,
@@ -51,6 +51,7 @@ from dano.native.trees._frames import (
     rotate,
     rotate_back,
     SHIFT,
+    stand,
     three,
     tidy,
     times,
@@ -101,13 +102,7 @@ def begin(given, state, force, torque, room, y):
     nodes, bodies, settings = given.nodes, given.bodies, given.settings
     h, gravity = settings[H], (settings[GRAVITY], settings[GRAVITY + 1], settings[GRAVITY + 2])
     position, orientation, velocity, omega = state
-    world = position.shape[0]
-    for i in range(world):
-        put(room.poses, i, 0, three(position, i, 0))
-        put_four(room.poses, i, TURNED, four(orientation, i, 0))
-        put_four(room.poses, i, TURNED, unit_turn(four(room.poses, i, TURNED)))
-    put(room.poses, world, 0, (0.0, 0.0, 0.0))
-    put_four(room.poses, world, TURNED, (1.0, 0.0, 0.0, 0.0))
+    stand(position, orientation, room.poses)
     place(nodes, given.joints, bodies, given.q, given.roots, room.poses, room.known)
     motions_at_start(nodes, given.joints, room.poses, room.known, room.first)
     for n in range(nodes.shape[0]):
@@ -176,7 +171,7 @@ def go(given, room, y):
     """How bodies move in a step with velocities y."""
     nodes, h, resolved = given.nodes, given.settings[H], given.rules[RESOLVED]
     move(nodes, given.joints, room.poses, room.known, y, h, resolved, room.ways, room.last)
-    find_twists(nodes, y, h, given.rules, room)
+    find_twists(nodes, y, h, resolved, room)
 
 
 @lean
@@ -246,9 +241,7 @@ def put_end(given, room, y, q, end):
             put_four(room.poses, i, TURNED, unit_turn(multiply(four(room.ways, n, TURN), turn)))
         elif nodes[n, KIND] == BALL:
             own = turn_of((v[at], v[at + 1], v[at + 2]), h, resolved)
-            q[at], q[at + 1], q[at + 2] = logarithm(
-                multiply(exponential((given.q[at], given.q[at + 1], given.q[at + 2])), own)
-            )
+            q[at], q[at + 1], q[at + 2] = ball_after((given.q[at], given.q[at + 1], given.q[at + 2]), own)
     place(nodes, given.joints, given.bodies, q, roots, room.poses, room.known)
     for n in range(nodes.shape[0]):
         i = nodes[n, BODY]
@@ -277,9 +270,6 @@ def given_of(buffers, dtype):
     """
     nodes, joints = table(buffers[10], numba.int32), doubles(buffers[13], dtype)
     tidy(nodes, joints)
-    roots = 0
-    for n in range(nodes.shape[0]):
-        roots += 6 if nodes[n, KIND] == ROOT else 0
     return Given(
         nodes,
         table(buffers[11], numba.int32),
@@ -291,7 +281,7 @@ def given_of(buffers, dtype):
         table(buffers[17], dtype),
         table(buffers[18], numba.int32),
         vector(buffers[19], dtype),
-        roots,
+        free_velocities(nodes),
         numbers(buffers[4], dtype),
         vector(buffers[5], dtype),
         vector(buffers[8], dtype),

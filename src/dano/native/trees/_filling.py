@@ -9,20 +9,19 @@ from collections import namedtuple
 import numba
 import numpy as np
 
-from dano.native._assembling import RESOLVED
 from dano.native._compiling import fingerprint, kernel, lean
 from dano.native._ffi import inputs, outputs, register, SIGNATURE, table, tells_version, vector
 from dano.native.trees._balance import find_twists
 from dano.native.trees._frames import (
     BALL,
+    ball_after,
     BODY,
     COM,
     copy,
-    exponential,
     four,
+    free_velocities,
     JOINT,
     KIND,
-    logarithm,
     minus,
     move,
     multiply,
@@ -33,15 +32,15 @@ from dano.native.trees._frames import (
     ROOT,
     rotate,
     rotate_back,
+    stand,
     three,
     tidy,
     times,
     turn_of,
     TURNED,
-    unit_turn,
 )
+from dano.native.trees._wide import SMALL
 
-_SMALL = 1e-30
 # Numbers of a body: position, orientation, velocity, omega.
 _ROW = 13
 # Tables in the order of `dano.scene`: those of a state, centres of mass, joints, timestep.
@@ -71,17 +70,7 @@ def _room_for(n_bodies, nodes, n_joints, k, c, kind):
 
 
 @lean
-def _stand(tables, room):
-    """Poses of all bodies as they are given, and of the world."""
-    world = room.poses.shape[0] - 1
-    for i in range(world):
-        put(room.poses, i, 0, three(tables[_POSITION], i, 0))
-        put_four(room.poses, i, TURNED, unit_turn(four(tables[_ORIENTATION], i, 0)))
-    put_four(room.poses, world, TURNED, (1.0, 0.0, 0.0, 0.0))
-
-
-@lean
-def _go_back(nodes, tables, rules, roots, room):
+def _go_back(nodes, tables, resolved, roots, room):
     """Poses of a step before, and the velocities that lead from there."""
     h, q, v = tables[_TIMESTEP][0, 0], tables[_Q], tables[_V]
     for c in range(room.q.size):
@@ -94,35 +83,35 @@ def _go_back(nodes, tables, rules, roots, room):
             room.y[at], room.y[at + 1], room.y[at + 2] = velocity
             room.y[at + 3], room.y[at + 4], room.y[at + 5] = rotate(turn, omega)
             put(room.poses, i, 0, minus(three(room.poses, i, 0), times(h, velocity)))
-            put_four(room.poses, i, TURNED, multiply(turn, turn_of(times(-1.0, omega), h, rules[RESOLVED])))
+            put_four(room.poses, i, TURNED, multiply(turn, turn_of(times(-1.0, omega), h, resolved)))
         elif nodes[n, KIND] == BALL:
             at -= roots
-            own = turn_of((-v[0, at], -v[0, at + 1], -v[0, at + 2]), h, rules[RESOLVED])
-            room.q[at], room.q[at + 1], room.q[at + 2] = logarithm(
-                multiply(exponential((q[0, at], q[0, at + 1], q[0, at + 2])), own)
+            own = turn_of((-v[0, at], -v[0, at + 1], -v[0, at + 2]), h, resolved)
+            room.q[at], room.q[at + 1], room.q[at + 2] = ball_after(
+                (q[0, at], q[0, at + 1], q[0, at + 2]), own
             )
 
 
 @lean
-def _fill(nodes, tables, rules, roots, room):
+def _fill(nodes, tables, resolved, roots, room):
     """Position, orientation, velocity and omega of the body of each joint."""
     for i in range(tables[_COM].shape[0]):
         put(room.bodies, i, COM, three(tables[_COM], i, 0))
     copy(tables[_JOINTS], room.joints)
     tidy(nodes, room.joints)
     h = tables[_TIMESTEP][0, 0]
-    _stand(tables, room)
-    _go_back(nodes, tables, rules, roots, room)
+    stand(tables[_POSITION], tables[_ORIENTATION], room.poses)
+    _go_back(nodes, tables, resolved, roots, room)
     place(nodes, room.joints, room.bodies, room.q, roots, room.poses, room.known)
-    move(nodes, room.joints, room.poses, room.known, room.y, h, rules[RESOLVED], room.ways, room.last)
-    find_twists(nodes, room.y, h, rules, room)
+    move(nodes, room.joints, room.poses, room.known, room.y, h, resolved, room.ways, room.last)
+    find_twists(nodes, room.y, h, resolved, room)
     for n in range(nodes.shape[0]):
         j = nodes[n, JOINT]
         if j >= 0:
             put(room.rows, j, 7, three(room.twists, n, 0))
             spin = three(room.twists, n, 3)
             put(room.rows, j, 10, rotate_back(four(room.poses, nodes[n, BODY], TURNED), spin))
-    _stand(tables, room)
+    stand(tables[_POSITION], tables[_ORIENTATION], room.poses)
     place(nodes, room.joints, room.bodies, tables[_Q][0], roots, room.poses, room.known)
     for n in range(nodes.shape[0]):
         j, i = nodes[n, JOINT], nodes[n, BODY]
@@ -144,7 +133,7 @@ def _wide(buffer, dtype, kind):
 
 @kernel
 def _given(buffers, dtype, kind):
-    """Tables of a call frame, nodes, the number of velocities of free bodies, rules, and room."""
+    """Tables of a call frame, nodes, number of velocities of free bodies, `RESOLVED`, and room."""
     tables = (
         _wide(buffers[0], dtype, kind),
         _wide(buffers[1], dtype, kind),
@@ -156,19 +145,17 @@ def _given(buffers, dtype, kind):
         _wide(buffers[7], dtype, kind),
         _wide(buffers[8], dtype, kind),
     )
-    nodes, roots, rules = table(buffers[9], numba.int32), 0, np.zeros(RESOLVED + 1)
-    for n in range(nodes.shape[0]):
-        roots += 6 if nodes[n, KIND] == ROOT else 0
-    rules[RESOLVED] = vector(buffers[10], dtype)[0]
+    nodes, resolved = table(buffers[9], numba.int32), vector(buffers[10], dtype)[0]
+    roots = free_velocities(nodes)
     bodies, joints, c = tables[_POSITION].shape[0] + 1, tables[_JOINTS].shape[0], tables[_Q].shape[1]
-    return tables, nodes, roots, rules, _room_for(bodies, nodes, joints, roots + c, c, kind)
+    return tables, nodes, roots, resolved, _room_for(bodies, nodes, joints, roots + c, c, kind)
 
 
 @kernel
 def _answer(frame, dtype):
     """Fill the state of a call frame; see `dano.scene` for the order of its buffers."""
-    tables, nodes, roots, rules, room = _given(inputs(frame), dtype, np.float64)
-    _fill(nodes, tables, rules, roots, room)
+    tables, nodes, roots, resolved, room = _given(inputs(frame), dtype, np.float64)
+    _fill(nodes, tables, resolved, roots, room)
     found = table(outputs(frame)[0], dtype)
     for j in range(found.shape[0]):
         for k in range(found.shape[1]):
@@ -180,17 +167,17 @@ def _answer(frame, dtype):
 def _answer_slopes(frame, dtype):
     """Find the derivative of this by given numbers."""
     buffers = inputs(frame)
-    tables, nodes, roots, rules, room = _given(buffers, dtype, np.complex128)
+    tables, nodes, roots, resolved, room = _given(buffers, dtype, np.complex128)
     changed, slopes = table(buffers[11], numba.int32), table(outputs(frame)[0], dtype)
     for n in range(changed.shape[0]):
         numbers, i, k = tables[changed[n, 0]], changed[n, 1], changed[n, 2]
-        numbers[i, k] = complex(numbers[i, k].real, _SMALL)
-        _fill(nodes, tables, rules, roots, room)
+        numbers[i, k] = complex(numbers[i, k].real, SMALL)
+        _fill(nodes, tables, resolved, roots, room)
         numbers[i, k] = numbers[i, k].real
         at = 0
         for j in range(room.rows.shape[0]):
             for c in range(_ROW):
-                slopes[n, at] = room.rows[j, c].imag / _SMALL
+                slopes[n, at] = room.rows[j, c].imag / SMALL
                 at += 1
     return 0
 

@@ -78,6 +78,26 @@ def copy_row(source, target):
 
 
 @lean
+def free_velocities(nodes):
+    """Number of velocities of the bodies that move freely, which come first."""
+    count = 0
+    for n in range(nodes.shape[0]):
+        count += 6 if nodes[n, KIND] == ROOT else 0
+    return count
+
+
+@lean
+def stand(position, orientation, poses):
+    """Set the poses of all bodies as they are given, and of the world."""
+    world = position.shape[0]
+    for i in range(world):
+        put(poses, i, 0, three(position, i, 0))
+        put_four(poses, i, TURNED, unit_turn(four(orientation, i, 0)))
+    put(poses, world, 0, (0.0, 0.0, 0.0))
+    put_four(poses, world, TURNED, (1.0, 0.0, 0.0, 0.0))
+
+
+@lean
 def add(a, b):
     """A + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
@@ -194,6 +214,12 @@ def logarithm(q):
         return times(2.0 * sign * ratio, u)
     sine = root(squared)
     return times(2.0 * sign * _angle(sine, cosine) / sine, u)
+
+
+@lean
+def ball_after(q, turn):
+    """Coordinates of a ball joint after a turn, seen from the child."""
+    return logarithm(multiply(exponential(q), turn))
 
 
 @lean

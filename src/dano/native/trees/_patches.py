@@ -302,16 +302,26 @@ def _divided(normal, velocity):
 
 
 @lean
-def wrench(patches, law, pairs, c, velocity, spin, softness):
-    """Force and moment on the first body: see `CentroidLaw.wrench`."""
+def _resisted(patches, law, pairs, c, velocity, spin, softness):
+    """Normal; slip, drilling and rolling; normal force, see `_normal_force`; resistances to the three."""
     n = three(patches, c, NORMAL)
     rate, slip = _divided(n, velocity)
     turn, roll = _divided(n, spin)
     drill = times(turn, n)
-    size, _, sign = _normal_force(patches, law, pairs, c, rate)
-    slides, _ = _resistance(slip, law, c, _SLIDING, softness)
-    drills, _ = _resistance(drill, law, c, _TORSION, softness)
-    rolls, _ = _resistance(roll, law, c, _ROLLING, softness)
+    resistances = (
+        _resistance(slip, law, c, _SLIDING, softness),
+        _resistance(drill, law, c, _TORSION, softness),
+        _resistance(roll, law, c, _ROLLING, softness),
+    )
+    return n, (slip, drill, roll), _normal_force(patches, law, pairs, c, rate), resistances
+
+
+@lean
+def wrench(patches, law, pairs, c, velocity, spin, softness):
+    """Force and moment on the first body: see `CentroidLaw.wrench`."""
+    n, (slip, drill, roll), (size, _, sign), ((slides, _), (drills, _), (rolls, _)) = _resisted(
+        patches, law, pairs, c, velocity, spin, softness
+    )
     force = times(size, minus(times(sign, n), times(slides, slip)))
     return force, times(-size, add(times(drills, drill), times(rolls, roll)))
 
@@ -319,14 +329,10 @@ def wrench(patches, law, pairs, c, velocity, spin, softness):
 @lean
 def set_slope(patches, law, pairs, c, velocity, spin, softness, slope):
     """The derivative of the wrench by the twist, shape (6, 6)."""
-    n = three(patches, c, NORMAL)
-    rate, slip = _divided(n, velocity)
-    turn, roll = _divided(n, spin)
-    drill = times(turn, n)
-    size, fall, sign = _normal_force(patches, law, pairs, c, rate)
-    slides, slide_along = _resistance(slip, law, c, _SLIDING, softness)
-    drills, drill_along = _resistance(drill, law, c, _TORSION, softness)
-    rolls, roll_along = _resistance(roll, law, c, _ROLLING, softness)
+    n, (slip, drill, roll), (size, fall, sign), (sliding, drilling, rolling) = _resisted(
+        patches, law, pairs, c, velocity, spin, softness
+    )
+    (slides, slide_along), (drills, drill_along), (rolls, roll_along) = sliding, drilling, rolling
     force = minus(times(sign, n), times(slides, slip))
     moment = times(-1.0, add(times(drills, drill), times(rolls, roll)))
     for i in range(3):
