@@ -12,7 +12,7 @@ import dano
 from dano.engine import _variational
 from dano.engine._newton import SolverOptions
 from dano.engine._problem import prepare
-from dano.scene import Control, State
+from dano.scene import Control, filled, State
 
 H = 2e-3
 # What steps are differentiated by, besides parameters of contacts.
@@ -266,7 +266,7 @@ def test_filled_states_alike(all_kinds, monkeypatch):
 
     def fill(numbers):
         chains, given = eqx.combine(numbers, rest)
-        return jax.vmap(lambda state: dano.scene.filled(chains, state, jnp.asarray(H)))(given)
+        return jax.vmap(lambda state: filled(chains, state, jnp.asarray(H)))(given)
 
     found = jax.jit(lambda: jax.jvp(fill, (numbers,), (way,)))()
     monkeypatch.setattr("dano.scene._frames.fills_natively", lambda: False)
@@ -315,7 +315,9 @@ def test_which_steps_are_native(all_kinds):
     class Other(dano.CentroidLaw):
         pass
 
-    assert prepare(touching(Other()), None).trees is None
+    law = LAWS["smooth"]
+    other = Other(law.smoothing, law.regularizer, law.stiction_velocity, law.adhesive)
+    assert prepare(touching(other), None).trees is None
     bodies = [dano.Body("a", dano.Sphere(0.1), mass=1.0), dano.Body("b", dano.Sphere(0.1), mass=1.0)]
     floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
     hinges = [dano.Joint(None, name, position=(x, 0, 1)) for name, x in (("a", 0.0), ("b", 1.0))]
