@@ -4,8 +4,8 @@ import os
 import sys
 
 
-def use_float64_on_cpu() -> None:
-    """Precision and device of the benchmarks.
+def use_float64() -> None:
+    """Precision of the benchmarks; on a CPU, or where JAX_PLATFORMS says.
 
     Raises:
         RuntimeError: If JAX is imported already and would not heed them.
@@ -13,8 +13,14 @@ def use_float64_on_cpu() -> None:
     if "jax" in sys.modules:
         raise RuntimeError("JAX is imported before its settings: a package of benchmarks imports it")
     os.environ["JAX_ENABLE_X64"] = "1"
-    os.environ["JAX_PLATFORMS"] = "cpu"
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "0"  # a warm cache would pass for a fast compiler
+
+
+def use_float64_on_cpu() -> None:
+    """The same for what measures the time of processors, so always on a CPU."""
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    use_float64()
 
 
 def pin_to_one_core() -> None:

@@ -171,8 +171,10 @@ def _machine() -> str:
     try:
         flags = Path("/proc/cpuinfo").read_text().split()
     except OSError:
-        return words
-    return words + next((f", {said}" for flag, said in _VECTORS.items() if flag in flags), "")
+        flags = []
+    words += next((f", {said}" for flag, said in _VECTORS.items() if flag in flags), "")
+    device = jax.local_devices()[0]
+    return words if device.platform == "cpu" else f"{words}; {device.device_kind}"
 
 
 _VECTORS = {"avx512f": "AVX-512", "avx2": "AVX2", "asimd": "NEON"}

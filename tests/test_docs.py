@@ -31,7 +31,7 @@ def test_python_blocks_run(page: str, tmp_path: Path):
     # One process a page, its blocks joined: a page may change JAX's configuration, as its reader would.
     command = [sys.executable, "-c", PROGRAMS[page]]
     # A page runs each program briefly, so code without LLVM's optimisations is done sooner.
-    flags = f"{os.environ['XLA_FLAGS']} --xla_backend_optimization_level=0"
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY / "src"), "XLA_FLAGS": flags}
     answer = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert answer.returncode == 0, answer.stderr

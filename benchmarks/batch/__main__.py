@@ -2,10 +2,10 @@
 
 import os
 
+from benchmarks import _environment
+
 if __name__ == "__main__":
-    os.environ["JAX_ENABLE_X64"] = "1"
-    os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "0"  # a warm cache would pass for a fast compiler
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    _environment.use_float64()
     # Two devices of one core each; a GPU does not care.
     flags = "--xla_force_host_platform_device_count=2 --xla_cpu_multi_thread_eigen=false"
     os.environ["XLA_FLAGS"] = (

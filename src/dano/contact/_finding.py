@@ -40,7 +40,7 @@ from dano.contact._placing import (
     unit,
 )
 from dano.contact._points import CHUNK, cross, dot, Found, over_chunks, Points, ROUND
-from dano.maths import matmul, matvec
+from dano.maths import matmul, matvec, product
 
 # Blocks whose samples are looked at together.
 _TOGETHER = 8
@@ -282,7 +282,9 @@ def _impact_sums(rows: Float[Array, "15 n"], depth: Float[Array, " n"]) -> Float
     weight = rows[11] * jnp.maximum(depth, 0)
     rate = rows[10] - dot(rows[3:6], rows[12:])
     area = jnp.sum(jnp.where(depth > 0, rows[11], 0))
-    return jnp.concatenate([jnp.stack([area, jnp.sum(weight), jnp.sum(weight * rate)]), rows[:6] @ weight])
+    return jnp.concatenate(
+        [jnp.stack([area, jnp.sum(weight), jnp.sum(weight * rate)]), product(rows[:6], weight)]
+    )
 
 
 def _impact_stiffness(links: Links, side: Side, placed, sums, impacts: Impacts, h) -> Float[Array, ""]:

@@ -19,7 +19,7 @@ from dano.checks import checked_kind
 from dano.contact._colliders import BLOCK, Collider, SampleSet, Support, SYMMETRIC
 from dano.contact._derivatives import by_autodiff, keep
 from dano.fields import AbstractField, AbstractShape, GridField, HalfSpace, PosedField, PosedShape, Sphere
-from dano.maths import contract, matmul, matvec, safe_normalize
+from dano.maths import contract, einsum, matmul, matvec, product, safe_normalize
 
 
 class Patch(eqx.Module):
@@ -186,7 +186,7 @@ def _moments(t: Float[Array, " n"], samples: SampleSet) -> Float[Array, "4"]:
 
 def _depth(plane, samples: SampleSet) -> Float[Array, " n"]:
     """The t of the smooth step (`dano.fields.occupancy`) of each sample, in a band of unit width."""
-    return jnp.clip(0.5 - plane @ samples.points, 0, 1)
+    return jnp.clip(0.5 - product(plane, samples.points), 0, 1)
 
 
 def _symmetric(weights: Float[Array, " n"], products: Float[Array, "10 n"]) -> Float[Array, "4 4"]:
@@ -205,13 +205,13 @@ def _dense_jvp(primals, tangents):
     to_field, field, samples = primals
     if jax.tree.leaves(tangents[1:]):
         return by_autodiff(_dense_sums, primals, tangents)
-    value, jacobian = _features_and_jacobian(field, to_field @ samples.points)
+    value, jacobian = _features_and_jacobian(field, product(to_field, samples.points))
     sums, derivative = keep(*_accumulate(value, jacobian, samples.points, samples.products, samples.weights))
-    return sums, jnp.einsum("kab,ab->k", derivative, tangents[0])
+    return sums, einsum("kab,ab->k", derivative, tangents[0])
 
 
 def _dense_sums(to_field, field, samples: SampleSet):
-    value = _all_features(field, to_field @ samples.points)
+    value = _all_features(field, product(to_field, samples.points))
     return jnp.concatenate(
         [contract(samples.weights * value[0], samples.points), contract(value[1:], samples.weights)]
     )
@@ -248,11 +248,11 @@ def _culled_jvp(primals, tangents):
         # The map of the support only says what may be skipped: without it the sums are the same.
         return by_autodiff(_dense_sums, primals[:3], tangents[:3])
     sums, derivative = keep(*_culled_sums(*primals, derivative=True))
-    return sums, jnp.einsum("kab,ab->k", derivative, tangents[0])
+    return sums, einsum("kab,ab->k", derivative, tangents[0])
 
 
 def _culled_sums(to_field, field, samples: SampleSet, support: Support | None, *, derivative: bool):
-    centers = to_field @ jnp.concatenate([samples.centers.T, jnp.ones_like(samples.centers.T[:1])])
+    centers = product(to_field, jnp.concatenate([samples.centers.T, jnp.ones_like(samples.centers.T[:1])]))
     if support is not None:
         clearance = support.lower_bound(centers)
     else:
@@ -282,7 +282,7 @@ def _culled_sums(to_field, field, samples: SampleSet, support: Support | None, *
 
 def _block_sums(to_field, field, points, products, weights, *, derivative: bool):
     """Sums and, if asked, their derivative (7, 3, 4) over some samples."""
-    x = to_field @ points
+    x = product(to_field, points)
     if not derivative:
         value = _grid_features(field, x) if isinstance(field, GridField) else _all_features(field, x)
         sums = [contract(weights * value[0], points), contract(value[1:], weights)]

@@ -27,6 +27,7 @@ from dano.contact import (
     Pressure,
     updated,
 )
+from dano.maths import einsum
 
 # Chunks of points that a batch takes together in short lists, and in longer ones: a batch costs some 60
 # operations, however small it is.
@@ -271,11 +272,11 @@ def _slopes(arm, normal, moment, linear: Linear, weight: Float[Array, "c p"]) ->
     )
     right = jnp.concatenate([along_normal, six(linear.along), across], axis=2)
     left, right = jax.lax.optimization_barrier((left, right))
-    total = jnp.einsum("acp,bcp->cab", left, right)
+    total = einsum("acp,bcp->cab", left, right)
     x, y, z = arm
     products = jnp.stack([jnp.ones_like(x), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z])
     moments = jax.lax.optimization_barrier(jnp.sum((weight * linear.grip)[None] * products, axis=2))
-    return total - jnp.einsum("abk,kc->cab", jnp.asarray(_DRAG, x.dtype), moments)
+    return total - einsum("abk,kc->cab", jnp.asarray(_DRAG, x.dtype), moments)
 
 
 def _drag_of_moments() -> np.ndarray:

@@ -16,7 +16,7 @@ from dano.contact import (
 from dano.engine._assembly import sum_wrenches
 from dano.engine._problem import grouped, Pairs, Problem
 from dano.engine._rigid import angular_jacobian, angular_momentum
-from dano.maths import matmul, matvec, skew
+from dano.maths import einsum, matmul, matvec, skew
 
 # The second body of a contact feels the opposite wrench and counts negative in the relative twist.
 _SIGNS = (1, -1)
@@ -119,7 +119,7 @@ def world_patches(problem: Problem, world: Float[Array, "m 6"], pairs: Pairs, so
     m, turn = world.shape[0], to_world_matrices(problem)
     momenta, slopes = patch_momenta(to_body(problem, world), problem, pairs, softening)
     jacobian = patch_jacobian(problem, pairs, slopes, {}).reshape(m, 6, m, 6)
-    jacobian = jnp.einsum("iab,ibjc,jdc->iajd", turn, jacobian, turn)
+    jacobian = einsum("iab,ibjc,jdc->iajd", turn, jacobian, turn)
     return jax.vmap(matvec)(turn, momenta), jacobian
 
 
@@ -133,7 +133,7 @@ def to_world_matrices(problem: Problem) -> Float[Array, "m 6 6"]:
 def jacobian_in_bodies(problem: Problem, jacobian: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """A derivative of momenta by velocities [W] as one of R, spins and angular momenta in B."""
     m, turn = problem.mass.shape[0], to_world_matrices(problem)
-    back = jnp.einsum("iba,ibjc,jcd->iajd", turn, jacobian.reshape(m, 6, m, 6), turn)
+    back = einsum("iba,ibjc,jcd->iajd", turn, jacobian.reshape(m, 6, m, 6), turn)
     return to_velocity(problem)[:, None] * back.reshape(6 * m, 6 * m)
 
 

@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dano.engine._assembly import assemble, first_memory, Table, Trial
 from dano.engine._newton import ENOUGH, GIVE_UP, Report, Search, solve_small, SolverOptions
 from dano.engine._rigid import FADE
+from dano.maths import product
 from dano.scene import RESOLVED
 
 # The levels of a solve: softness of stiction, in multiples of the stiction velocity; share of a step that is
@@ -217,7 +218,7 @@ def _looking(balance, table: Table, scale: Float[Array, " k"], spread):
 
     def turns(v):
         """Twists of bodies, or changes of them, in proportion to (generalised) velocities."""
-        return (v if spread is None else spread[0] @ v).reshape(m, 6)
+        return (v if spread is None else product(spread[0], v)).reshape(m, 6)
 
     def look(it: _Iterate, softness, holds):
         step, length = it.search.direction, it.search.length
@@ -231,8 +232,8 @@ def _looking(balance, table: Table, scale: Float[Array, " k"], spread):
         residual = -jnp.sum(sums.blocks[:m, :, :, 6], axis=1).ravel()
         jacobian = -sums.blocks[:m, :m, :, :6].transpose(0, 2, 1, 3).reshape(n, n)
         if spread is not None:
-            residual = free.residual + spread[0].T @ residual
-            jacobian = spread[0].T @ jacobian @ spread[0]
+            residual = free.residual + product(spread[0].T, residual)
+            jacobian = product(product(spread[0].T, jacobian), spread[0])
         if free.coupled is not None:
             jacobian = jacobian + free.coupled.reshape(jacobian.shape)
         scaled = scale[:, None] * jacobian
@@ -243,7 +244,7 @@ def _looking(balance, table: Table, scale: Float[Array, " k"], spread):
 
 
 def _initial(table: Table, start: Float[Array, " k"], spread) -> _Iterate:
-    twists = start if spread is None else spread[0] @ start + spread[1]
+    twists = start if spread is None else product(spread[0], start) + spread[1]
     return _Iterate(
         start,
         first_memory(table, twists.reshape(-1, 6)),

@@ -29,7 +29,7 @@ from dano.engine._problem import Pairs, Problem
 from dano.engine._sequential import one_at_a_time
 from dano.engine._trees import closure_of, loop_gaps, mass_matrix, rough_of, Tree, tree_balance
 from dano.engine.joints import Closure, Rough
-from dano.maths import matmul, matvec
+from dano.maths import einsum, matmul, matvec
 
 # Shares of the restitution that a step with impacts tries, until contact adds no energy. Newton's restitution
 # may add some where friction reverses the slip (Kane and Levinson 1985, Dynamics: Theory and Applications).
@@ -221,7 +221,7 @@ def _root_of_trees(problem: Problem, start: Float[Array, " k"], pairs: Pairs, op
         residual, jacobian = _tree_momenta(problem, tree, y)
         if problem.patches:
             momenta, slopes = world_patches(problem, tree.twists(y), pairs, softening)
-            pulled = jnp.einsum("iak,iajb,jbl->kl", tree.jacobian, slopes, tree.jacobian)
+            pulled = einsum("iak,iajb,jbl->kl", tree.jacobian, slopes, tree.jacobian)
             residual, jacobian = residual - tree.pulled(momenta), jacobian + pulled
         if rough is not None:
             residual, jacobian = rough.extended(unknowns[:n], residual, jacobian)

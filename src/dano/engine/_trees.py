@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 from dano.engine._newton import inverse3
 from dano.engine._rigid import turn_slopes, turned
 from dano.engine.joints import Closure, JointForces, Rough
-from dano.maths import matmul, matvec, quat_exp, quat_log, quat_to_matrix, safe_norm
+from dano.maths import einsum, matmul, matvec, product, quat_exp, quat_log, quat_to_matrix, safe_norm
 from dano.scene import (
     Chains,
     Control,
@@ -70,11 +70,11 @@ class Tree(eqx.Module):
 
     def twists(self, y: Float[Array, " k"]) -> Float[Array, "m 6"]:
         """How bodies move as contact sees it [m/s; rad/s, W]."""
-        return jnp.einsum("mak,k->ma", self.jacobian, y) + self.offset
+        return einsum("mak,k->ma", self.jacobian, y) + self.offset
 
     def pulled(self, momenta: Float[Array, "m 6"]) -> Float[Array, " k"]:
         """Momenta of bodies [W] as generalised ones."""
-        return jnp.einsum("mak,ma->k", self.jacobian, momenta)
+        return einsum("mak,ma->k", self.jacobian, momenta)
 
 
 def build_tree(scene: Scene, state: State, control: Control | None) -> tuple[Tree, Poses]:
@@ -100,7 +100,7 @@ def build_tree(scene: Scene, state: State, control: Control | None) -> tuple[Tre
     y = generalised(scene, state, state.orientation)
     ahead = _ahead(tree, y, h)
     moved = _world_twists(tree, ahead, y, h)
-    return eqx.tree_at(lambda t: t.offset, tree, moved - jnp.einsum("mak,k->ma", jacobian, y)), ahead
+    return eqx.tree_at(lambda t: t.offset, tree, moved - einsum("mak,k->ma", jacobian, y)), ahead
 
 
 def generalised(scene: Scene, state: State, orientation: Float[Array, "n 4"]) -> Float[Array, " k"]:
@@ -129,8 +129,8 @@ def tree_balance(tree: Tree, y: Float[Array, " k"], own, h: Float[Array, ""]):
     roots = 6 * len(tree.chains.layout.free)
     own, slope = tree.forces.smooth(y[roots:])
     residual = tree.pulled(momenta).at[roots:].add(own)
-    by_y = jnp.einsum("mab,mbk->mak", slopes, _twist_slopes(tree, ahead, y, h))
-    jacobian = jnp.einsum("mak,mal->kl", tree.jacobian, by_y)
+    by_y = einsum("mab,mbk->mak", slopes, _twist_slopes(tree, ahead, y, h))
+    jacobian = einsum("mak,mal->kl", tree.jacobian, by_y)
     places = np.arange(roots, len(y))
     return residual, jacobian.at[places, places].add(slope)
 
@@ -183,7 +183,7 @@ def tree_mobilities(tree: Tree, mass: Float[Array, " m"], inertia: Float[Array, 
     is 1/m for a free body.
     """
     inverse = jnp.linalg.inv(mass_matrix(tree, mass, inertia))
-    both = jnp.einsum("mak,kl,mbl->mab", tree.jacobian, inverse, tree.jacobian)
+    both = einsum("mak,kl,mbl->mab", tree.jacobian, inverse, tree.jacobian)
     push = both[:, :3, :3]
     return jnp.sqrt(jnp.sum(push * push, axis=(1, 2)) / 3), both[:, 3:, 3:]
 
@@ -221,7 +221,7 @@ def turns_too_far(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]) -> Arr
         at = np.array([d for d, (j, i, _) in enumerate(layout.dofs) if j in balls and i == 0], int)
         turns = turns.at[at].set(safe_norm(moved[triples(first)]))
     moved_by = np.array(layout.moved_by, float).reshape(layout.bodies, -1)
-    return jnp.any(jnp.asarray(moved_by, y.dtype) @ turns > LARGEST_TURN)
+    return jnp.any(product(jnp.asarray(moved_by, y.dtype), turns) > LARGEST_TURN)
 
 
 def _moved(tree: Tree, y: Float[Array, " k"], h: Float[Array, ""]) -> Float[Array, " j"]:
@@ -269,7 +269,7 @@ def _twist_slopes(
 ) -> Float[Array, "m 6 k"]:
     """Derivative of `_world_twists` by y."""
     turns, slopes = _end_slopes(tree, ahead, y, h)
-    return jnp.concatenate([slopes[:, :3] / h, jnp.einsum("mab,mbk->mak", turns, slopes[:, 3:])], axis=1)
+    return jnp.concatenate([slopes[:, :3] / h, einsum("mab,mbk->mak", turns, slopes[:, 3:])], axis=1)
 
 
 def _end_slopes(tree: Tree, ahead: Poses, y: Float[Array, " k"], h: Float[Array, ""]):
@@ -295,7 +295,7 @@ def _end_slopes(tree: Tree, ahead: Poses, y: Float[Array, " k"], h: Float[Array,
     for place, body in reversed(list(enumerate(free))):
         mine = slopes[:, :, 6 * place : 6 * place + 6]
         inverse = inverse3(turns[layout.moving.index(int(body))])
-        columns = [mine[:, :, :3] * h, jnp.einsum("mab,bc->mac", mine[:, :, 3:], inverse), *columns]
+        columns = [mine[:, :, :3] * h, einsum("mab,bc->mac", mine[:, :, 3:], inverse), *columns]
     return turns, jnp.concatenate(columns, axis=2)
 
 
@@ -309,5 +309,5 @@ def _with_balls(tree: Tree, slopes: Float[Array, "m 6 j"], v: Float[Array, " j"]
         three = slice(int(place), int(place) + 3)
         back = quat_to_matrix(turned(jnp.eye(4, dtype=v.dtype)[0], v[three], h)).T
         turn = matmul(back, inverse3(turn_slopes(v[three], h)))
-        columns = columns.at[:, :, three].set(jnp.einsum("mab,bc->mac", slopes[:, :, three], turn))
+        columns = columns.at[:, :, three].set(einsum("mab,bc->mac", slopes[:, :, three], turn))
     return columns

@@ -12,7 +12,7 @@ from dano.fields._base import AbstractField, check_order, Jet
 from dano.fields._grid import GridField
 from dano.fields._shapes import AbstractShape, checked_edge, scaled_moments, SolidMoments
 from dano.fields._signed_distance import SignedDistanceGrid
-from dano.maths import checked_array, Pose
+from dano.maths import checked_array, einsum, Pose, product
 
 
 @overload
@@ -109,26 +109,26 @@ def posed_bounds(bounds: Float[Array, "2 3"], pose: Pose) -> Float[Array, "2 3"]
     finite = jnp.isfinite(bounds)
     safe = jnp.where(finite, bounds, 0)
     matrix = pose.matrix.astype(bounds.dtype)
-    centre = matrix @ (0.5 * (safe[0] + safe[1])) + pose.position.astype(bounds.dtype)
-    reach = jnp.abs(matrix) @ (0.5 * (safe[1] - safe[0]))
+    centre = product(matrix, 0.5 * (safe[0] + safe[1])) + pose.position.astype(bounds.dtype)
+    reach = product(jnp.abs(matrix), 0.5 * (safe[1] - safe[0]))
     infinite = jnp.stack([jnp.full_like(reach, -jnp.inf), jnp.full_like(reach, jnp.inf)])
     return jnp.where(jnp.all(finite), jnp.stack([centre - reach, centre + reach]), infinite)
 
 
 def _to_inner(pose: Pose, x: Float[Array, "3"]) -> Float[Array, "3"]:
-    return pose.matrix.astype(x.dtype).T @ (x - pose.position.astype(x.dtype))
+    return product(pose.matrix.astype(x.dtype).T, x - pose.position.astype(x.dtype))
 
 
 def _posed_jet(jet_of: Callable[[Array, int], Jet], pose: Pose, x: Float[Array, "3 n"], order: int) -> Jet:
     """Jet of a moved function through the (possibly fast) jet of the inner one: ∇ ↦ R ∇, ∇∇ ↦ R ∇∇ Rᵀ."""
     check_order(order)
     matrix = pose.matrix.astype(x.dtype)
-    jet = jet_of(matrix.T @ (x - pose.position.astype(x.dtype)[:, None]), order)
+    jet = jet_of(product(matrix.T, x - pose.position.astype(x.dtype)[:, None]), order)
     if order == 0:
         return jet
     value, gradient, *hessian = jet
-    rotated = tuple(jnp.einsum("ia,abn,jb->ijn", matrix, h, matrix) for h in hessian)
-    return value, matrix @ gradient, *rotated
+    rotated = tuple(einsum("ia,abn,jb->ijn", matrix, h, matrix) for h in hessian)
+    return value, product(matrix, gradient), *rotated
 
 
 class PosedField(AbstractField):
@@ -153,7 +153,7 @@ class PosedField(AbstractField):
 
     def outward(self, x: Float[Array, "3"]) -> Float[Array, "3"]:
         """Outward direction of the inner field, turned with it."""
-        return self.pose.matrix.astype(x.dtype) @ self.field.outward(_to_inner(self.pose, x))
+        return product(self.pose.matrix.astype(x.dtype), self.field.outward(_to_inner(self.pose, x)))
 
     def jet(self, x: Float[Array, "3 n"], order: int) -> Jet:
         """See `AbstractField.jet`."""
@@ -197,7 +197,7 @@ class PosedShape(AbstractShape):
 
     def outward(self, x: Float[Array, "3"]) -> Float[Array, "3"]:
         """Outward direction of the inner shape, turned with it."""
-        return self.pose.matrix.astype(x.dtype) @ self.shape.outward(_to_inner(self.pose, x))
+        return product(self.pose.matrix.astype(x.dtype), self.shape.outward(_to_inner(self.pose, x)))
 
     def sdf_jet(self, x: Float[Array, "3 n"], order: int) -> Jet:
         """See `AbstractShape.sdf_jet`."""
@@ -209,8 +209,10 @@ class PosedShape(AbstractShape):
         if moments is None:
             return None
         matrix = self.pose.matrix.astype(moments.centroid.dtype)
-        centroid = matrix @ moments.centroid + self.pose.position.astype(moments.centroid.dtype)
-        return SolidMoments(moments.volume, centroid, matrix @ moments.second_moment @ matrix.T)
+        centroid = product(matrix, moments.centroid) + self.pose.position.astype(moments.centroid.dtype)
+        return SolidMoments(
+            moments.volume, centroid, product(product(matrix, moments.second_moment), matrix.T)
+        )
 
 
 def _scaled_jet(

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from dano.fields._base import AbstractField, check_order, Jet
 from dano.fields._spline import border, degree_of, multi_indices, nonnegative_coefficients, spline_jet
-from dano.maths import checked_array, checked_floating, is_traced, Numbers
+from dano.maths import checked_array, checked_floating, is_traced, Numbers, product
 
 
 class DensityMoments(NamedTuple):
@@ -148,13 +148,13 @@ class GridField(AbstractField):
         axes = [jnp.arange(n, dtype=dtype) * spacing[axis] for axis, n in enumerate(self.shape)]
         total = jnp.sum(values)
         sums = [jnp.sum(values, axis=tuple({0, 1, 2} - {axis})) for axis in range(3)]
-        mean = jnp.stack([axes[axis] @ sums[axis] for axis in range(3)]) / total
+        mean = jnp.stack([product(axes[axis], sums[axis]) for axis in range(3)]) / total
         centred = [axes[axis] - mean[axis] for axis in range(3)]
         own = total * (self._degree + 1) / 12 * spacing**2
-        diagonal = jnp.stack([centred[axis] ** 2 @ sums[axis] for axis in range(3)]) + own
-        xy = centred[0] @ jnp.sum(values, axis=2) @ centred[1]
-        xz = centred[0] @ jnp.sum(values, axis=1) @ centred[2]
-        yz = centred[1] @ jnp.sum(values, axis=0) @ centred[2]
+        diagonal = jnp.stack([product(centred[axis] ** 2, sums[axis]) for axis in range(3)]) + own
+        xy = product(product(centred[0], jnp.sum(values, axis=2)), centred[1])
+        xz = product(product(centred[0], jnp.sum(values, axis=1)), centred[2])
+        yz = product(product(centred[1], jnp.sum(values, axis=0)), centred[2])
         second = jnp.stack(
             [
                 jnp.stack([diagonal[0], xy, xz]),

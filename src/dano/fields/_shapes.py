@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from dano.fields._base import AbstractField, check_order, Jet, vmapped_jet
-from dano.maths import checked_array, column_norm, is_traced, Numbers, safe_normalize
+from dano.maths import checked_array, column_norm, is_traced, Numbers, product, safe_normalize
 
 DEFAULT_EDGE = 0.005
 """Edge width of a shape that states none, as a fraction of its size.
@@ -253,7 +253,7 @@ class HalfSpace(AbstractPrimitive):
 
     def sdf(self, x: Float[Array, "3 *batch"]) -> Float[Array, "*batch"]:
         """Height [m] of `x` [m, F] above the plane (exact)."""
-        return self.normal_direction.astype(x.dtype) @ x - self.offset.astype(x.dtype)
+        return product(self.normal_direction.astype(x.dtype), x) - self.offset.astype(x.dtype)
 
     def _first_jet(self, x: Float[Array, "3 n"]) -> tuple[Float[Array, " n"], Float[Array, "3 n"]]:
         normal = self.normal_direction.astype(x.dtype)

@@ -15,7 +15,7 @@ from dano.identify._joint_log import joint_table
 from dano.identify._parameters import Selection, with_values
 from dano.identify._starts import Start
 from dano.identify._windows import Windows
-from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
+from dano.maths import einsum, quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
 from dano.scene import Control, Scene, State
 
 
@@ -288,7 +288,7 @@ def _whitened(model: Model, rows: Float[Array, "f b q 3"], whitening: Float[Arra
     numbers = np.concatenate([3 * ("position", "orientation").index(key) + np.arange(3) for key in poses])
     part = whitening[:, :, numbers][..., numbers]
     flat = rows[:, :, np.array(index)].reshape(*rows.shape[:2], len(numbers))
-    white = jnp.einsum("fbij,fbj->fbi", part, flat)
+    white = einsum("fbij,fbj->fbi", part, flat)
     return rows.at[:, :, np.array(index)].set(white.reshape(*rows.shape[:2], len(index), 3))
 
 

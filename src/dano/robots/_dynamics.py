@@ -15,6 +15,7 @@ from dano.checks import checked_kind
 from dano.maths import (
     checked_array,
     checked_floating,
+    einsum,
     Numbers,
     quat_exp,
     quat_log,
@@ -184,13 +185,13 @@ def _needed(scene: Scene, state: State, acceleration: Float[Array, " k"]):
     zero, one = jnp.zeros((), scene.timestep.dtype), jnp.ones((), scene.timestep.dtype)
     (_, omega), (gained, turning), jacobian = jax.jvp(twists, (zero,), (one,), has_aux=True)
     force = mass[:, None] * (gained[rows] - scene.gravity[None])
-    spin = jnp.einsum("mab,mb->ma", inertia, omega[rows])
-    torque = jnp.einsum("mab,mb->ma", inertia, turning[rows]) + jnp.cross(omega[rows], spin)
+    spin = einsum("mab,mb->ma", inertia, omega[rows])
+    torque = einsum("mab,mb->ma", inertia, turning[rows]) + jnp.cross(omega[rows], spin)
     return force, torque, jacobian, rows
 
 
 def _pulled(jacobian: Float[Array, "m 6 k"], force: Array, torque: Array) -> Float[Array, " k"]:
-    return jnp.einsum("mak,ma->k", jacobian, jnp.concatenate([force, torque], axis=1))
+    return einsum("mak,ma->k", jacobian, jnp.concatenate([force, torque], axis=1))
 
 
 def drifted(scene: Scene, state: State, share: Float[Array, ""]) -> State:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
+from dano.maths import einsum, product, quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
 from dano.scene._filling import fill, fills_natively
 from dano.scene._joint_laws import joint_laws, JointLaws
 from dano.scene._joints import Joint, Layout
@@ -85,7 +85,7 @@ class Chains(eqx.Module):
             inertia: Theirs [kg m², W].
         """
         linear, angular = jacobian[:, :3], jacobian[:, 3:]
-        whole = jnp.einsum("m,mak,mal->kl", mass, linear, linear) + jnp.einsum(
+        whole = einsum("m,mak,mal->kl", mass, linear, linear) + einsum(
             "mak,mab,mbl->kl", angular, inertia, angular
         )
         armature = self.laws.armature
@@ -170,7 +170,7 @@ def place_links(
     if planes.size:
         own = q[triples(first)]
         turn = turn.at[planes].set(own[:, 2:] * chains.axis[planes])
-        path = path.at[planes].set(jnp.einsum("ma,mab->mb", own[:, :2], plane_axes(chains.axis[planes])))
+        path = path.at[planes].set(einsum("ma,mab->mb", own[:, :2], plane_axes(chains.axis[planes])))
     # The world is the last row.
     origin = jnp.concatenate([position - quat_rotate(orientation, chains.com), jnp.zeros((1, 3), q.dtype)])
     turned = jnp.concatenate([orientation, jnp.array([[1.0, 0.0, 0.0, 0.0]], q.dtype)])
@@ -206,7 +206,7 @@ def link_jacobian(chains: Chains, poses: Poses) -> Float[Array, "n 6 k"]:
     """
     layout, dtype = chains.layout, poses.position.dtype
     n, f = layout.bodies, len(layout.free)
-    eye = np.eye(3)
+    eye = np.eye(3, dtype=dtype)
     roots = jnp.zeros((n, 6, f, 6), dtype)
     standing = [(i, r) for i, r in enumerate(layout.roots) if r >= 0]
     if standing:
@@ -229,7 +229,7 @@ def link_jacobian(chains: Chains, poses: Poses) -> Float[Array, "n 6 k"]:
         places = np.array([place for _, _, place in layout.dofs])
         share = jnp.zeros((len(rows), layout.n_joints), dtype)
         share = share.at[np.arange(len(rows)), places].set(chains.ratio[rows])
-        columns = jnp.einsum("nda,dk->nka", columns, share)
+        columns = einsum("nda,dk->nka", columns, share)
     return jnp.concatenate([roots.reshape(n, 6, 6 * f), columns.transpose(0, 2, 1)], axis=2)
 
 
@@ -375,8 +375,8 @@ def joint_values(chains: Chains, state: State) -> tuple[Float[Array, " k"], Floa
     if first.size:
         axes = quat_rotate(rest[first][:, None], plane_axes(chains.axis[planes]))
         places = triples(first)[:, :2]
-        q = q.at[places].set(jnp.einsum("mab,mb->ma", axes, way[first]))
-        v = v.at[places].set(jnp.einsum("mab,mb->ma", axes, moving[first]))
+        q = q.at[places].set(einsum("mab,mb->ma", axes, way[first]))
+        v = v.at[places].set(einsum("mab,mb->ma", axes, moving[first]))
     return q, v
 
 
@@ -398,9 +398,9 @@ def frames_of(chains: Chains, state: State) -> Frames:
         columns = slice(6 * place + 3, 6 * place + 6)
         # Columns are images of the world's axes; those of the body's are their combinations.
         axes = quat_rotate(poses.orientation[i][None], jnp.eye(3, dtype=dtype)).T
-        jacobian = jacobian.at[:, :, columns].set(jacobian[:, :, columns] @ axes)
+        jacobian = jacobian.at[:, :, columns].set(product(jacobian[:, :, columns], axes))
     speeds = jnp.concatenate([state.velocity[free], state.omega[free]], axis=1).ravel()
     if state.v is not None:
         speeds = jnp.concatenate([speeds, state.v])
-    twists = jacobian @ speeds
+    twists = product(jacobian, speeds)
     return Frames(poses.position, poses.orientation, twists[:, :3], twists[:, 3:], jacobian)

@@ -156,7 +156,11 @@ def minimise(
     def unfinished(i: Iterate) -> Array:
         return (i.status == RUNNING) & (i.iterations < last)
 
-    return jax.lax.while_loop(unfinished, lambda i: _iteration(problem, multipliers, i, tolerance), iterate)
+    # As `dano.maths.product`, for all products in here.
+    with jax.default_matmul_precision("highest"):
+        return jax.lax.while_loop(
+            unfinished, lambda i: _iteration(problem, multipliers, i, tolerance), iterate
+        )
 
 
 def _iteration(problem: TrajectoryProblem, multipliers: Multipliers, i: Iterate, tolerance) -> Iterate:

@@ -25,7 +25,7 @@ Progress = Callable[[str, float], None]
 
 # Rollouts that a device computes at once: more no longer fit a core's cache, fewer leave a GPU idle.
 _BATCH = {"cpu": 32}
-_BATCH_ELSEWHERE = 1024
+_BATCH_ELSEWHERE = 8192
 # A chunk is so many batches, if what it keeps stays below so many bytes.
 _BATCHES, _BYTES = 8, 64 * 2**20
 # So long [s] another machine's files may take to appear.
@@ -188,7 +188,7 @@ def rollouts(
         path: Folder to write to, chunk by chunk, instead of memory (extra `batch`). If it is there, complete
             chunks are kept and the others simulated. Processes need a file system that all of them see.
         batch_size: Rollouts that a device simulates at once; default 32 on a CPU, where more of them leave
-            the cache, and 1024 elsewhere.
+            the cache, and 8192 elsewhere.
         chunk_size: Rollouts between two calls of `progress`, and in a file; a multiple of `batch_size`.
             Default up to eight batches, fewer if few rollouts share many devices or much is kept.
         devices: Some of `jax.local_devices()`; default all.

@@ -6,6 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.maths import einsum, product
+
 
 class Closure(NamedTuple):
     """What closes the loops of a step.
@@ -31,7 +33,7 @@ class Closure(NamedTuple):
     @classmethod
     def create(cls, slopes: Float[Array, "c k"], inverse_mass: Float[Array, "k k"], h: Float[Array, ""]):
         """The closure of a step from the slopes at its start and the inverse of the generalised mass."""
-        light = jnp.max(jnp.einsum("ck,kl,cl->c", slopes, inverse_mass, slopes))
+        light = jnp.max(einsum("ck,kl,cl->c", slopes, inverse_mass, slopes))
         return cls(slopes, float(np.sqrt(jnp.finfo(slopes.dtype).eps)) * h * h * light, h)
 
     @property
@@ -45,7 +47,7 @@ class Closure(NamedTuple):
 
     def pulled(self, forces: Float[Array, " c"]) -> Float[Array, " k"]:
         """Generalised momenta that forces give in a step."""
-        return self.h * (forces @ self.slopes)
+        return self.h * product(forces, self.slopes)
 
     def extended(
         self,

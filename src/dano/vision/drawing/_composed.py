@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.fields import AbstractShape, GridField
+from dano.maths import product
 from dano.vision.capture import AbstractCamera, box_interval, Light, Rays
 from dano.vision.drawing._item import Item, placement
 from dano.vision.drawing._shade import GAMMA
@@ -73,7 +74,7 @@ class Part(eqx.Module):
             direction: Unit vectors [W].
             limit: Distance [m] at which each ray ends, shape (n,).
         """
-        o, d = (origin - self.position[None]) @ self.rotation, direction @ self.rotation
+        o, d = product(origin - self.position[None], self.rotation), product(direction, self.rotation)
         lower, upper = self.model.bounds.astype(o.dtype)[:, :, None]
         near, far = box_interval(lower, upper, o.T, d.T)
         far = jnp.minimum(far, limit)
@@ -309,7 +310,7 @@ def _composed(parts, planes, lamps, origin, directions, ambient, sampling):
         light = jnp.full((n, 3), ambient, jnp.float32)
         for lamp in lamps[len(parts) + j]:
             towards, away, power = lamp.at(points)
-            facing = jnp.maximum(towards @ plane.normal, 0)
+            facing = jnp.maximum(product(towards, plane.normal), 0)
             reached = _reaching(parts, points, towards, away)
             light = light + (facing * reached)[:, None] * power
         colour = colour + share[:, None] * _encoded(light * plane.albedo[None])
@@ -437,7 +438,7 @@ def radiance(parts, i, lamps, world, local, view, ambient):
     if isinstance(part.model, PaintedSolid):
         _, normals = part.model.colour(local, view, view)
         # From above its own soft edge, which would darken it.
-        start = world + (4 / part.sharpness) * (normals @ part.rotation.T)
+        start = world + (4 / part.sharpness) * product(normals, part.rotation.T)
     for lamp in lamps:
         towards, away, power = lamp.at(world)
         sent, _ = part.model.colour(local, view, as_learned(part, lamp, towards, world))
@@ -456,8 +457,8 @@ def as_learned(part, lamp, towards, world):
         bounds = part.model.bounds
         far = 100 * jnp.max(bounds[1] - bounds[0]).astype(world.dtype)
         place = jnp.asarray(lamp.place)[None] if lamp.near else world + far * towards
-        return jnp.broadcast_to((place - part.position[None]) @ part.rotation, world.shape)
-    return towards @ part.rotation
+        return jnp.broadcast_to(product(place - part.position[None], part.rotation), world.shape)
+    return product(towards, part.rotation)
 
 
 def _reaching(parts, points, towards, away):
@@ -486,8 +487,8 @@ def reached_through(
 
 def _to_plane(plane: Plane, origins: Array, directions: Array) -> Float[Array, " n"]:
     """Distance to a plane seen from above; infinite otherwise."""
-    height = origins @ plane.normal - plane.offset
-    fall = -(directions @ plane.normal)
+    height = product(origins, plane.normal) - plane.offset
+    fall = -product(directions, plane.normal)
     return jnp.where((height > 0) & (fall > 1e-6), height / jnp.maximum(fall, 1e-6), jnp.inf)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.fields import AbstractShape, GridField
+from dano.maths import product
 from dano.vision.capture import box_interval
 
 CHUNK = 2048
@@ -34,7 +35,7 @@ _CAUTION = 0.95
 
 
 def _local(rotation: Array, position: Array, origins: Array, directions: Array) -> tuple[Array, Array]:
-    return rotation.T @ (origins - position[:, None]), rotation.T @ directions
+    return product(rotation.T, origins - position[:, None]), product(rotation.T, directions)
 
 
 def _unit(vectors: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
@@ -110,8 +111,8 @@ def march(
 def normals_at(placed: Placed, points: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
     """Unit normals [W] of a shape at points [m, W] of its surface."""
     shape, rotation, position = placed
-    _, gradient = shape.sdf_jet(rotation.T @ (points - position[:, None]), 1)
-    return rotation @ _unit(gradient)
+    _, gradient = shape.sdf_jet(product(rotation.T, points - position[:, None]), 1)
+    return product(rotation, _unit(gradient))
 
 
 @jax.jit
@@ -222,4 +223,4 @@ def transmitted(
     start = (jnp.ones_like(enter), jnp.zeros_like(enter), jnp.zeros_like(o))
     clear, depth, normal = jax.lax.fori_loop(jnp.int32(0), jnp.int32(n_steps), advance, start)
     opacity = 1 - clear
-    return opacity, depth / jnp.maximum(opacity, 1e-6), rotation @ _unit(normal)
+    return opacity, depth / jnp.maximum(opacity, 1e-6), product(rotation, _unit(normal))

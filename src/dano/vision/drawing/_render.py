@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int, UInt8
 from scipy import ndimage
 
 from dano.checks import checked_items, checked_kind
-from dano.maths import checked_array, Numbers
+from dano.maths import checked_array, Numbers, product
 from dano.vision.capture import AbstractCamera, Camera
 from dano.vision.drawing._composed import part_of, radiance, reached_through, through
 from dano.vision.drawing._item import checked_colour, Item, placement
@@ -303,7 +303,7 @@ def _sent(part, lamps, points, view, lamp, ambient):
     A look that was learned under known lamps answers each direction of lamp and sky by itself; one that was
     not holds the light of its photographs, and is but darkened where others stand in the way.
     """
-    local, towards = (points.T - part.position[None]) @ part.rotation, view.T @ part.rotation
+    local, towards = product(points.T - part.position[None], part.rotation), product(view.T, part.rotation)
     if not part.model.appearance.lit:
         sent, _ = part.model.colour(local, towards, jnp.zeros_like(local))
         return jnp.maximum(sent, 0).T ** GAMMA * (0.45 * lamp + 0.55 * ambient)[None]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dano.maths import quat_exp, quat_to_matrix
+from dano.maths import einsum, quat_exp, quat_to_matrix
 from dano.vision.capture import Rays, View
 
 
@@ -68,8 +68,8 @@ class Adjustment(eqx.Module):
             view: Which view each belongs to.
         """
         corrections = self.corrections
-        turn = jnp.einsum("vij,vi->vj", self.axes, corrections[:, :3] * self.angle[:, None])
-        shift = jnp.einsum("vij,vi->vj", self.axes, corrections[:, 3:] * self.length[:, None])
+        turn = einsum("vij,vi->vj", self.axes, corrections[:, :3] * self.angle[:, None])
+        shift = einsum("vij,vi->vj", self.axes, corrections[:, 3:] * self.length[:, None])
         direction = rays.direction + jnp.cross(turn[view], rays.direction)
         direction = direction * jax.lax.rsqrt(jnp.sum(direction**2, axis=1, keepdims=True))
         return rays._replace(origin=rays.origin + shift[view], direction=direction)
