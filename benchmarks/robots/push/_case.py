@@ -26,13 +26,15 @@ NEAR, WITHIN = 0.02, 0.01  # m
 """Errors that count as reached, and of a component that plans are asked for."""
 
 
-def scene(path: Path, timestep: float = TIMESTEP) -> tuple[dano.Robot, dano.Scene]:
+def scene(
+    path: Path, timestep: float = TIMESTEP, friction: float = FRICTION
+) -> tuple[dano.Robot, dano.Scene]:
     """The arm with a ball for a tool, the bunny and a floor, with the paper's law."""
     robot, bunny = dano.load_urdf(path, collision=False), shipped_bunny()
     tool = dano.Body("tool", dano.Sphere(RADIUS), mass=0.2)
     weld = dano.Joint(robot.bodies[-1].name, "tool", "weld", position=(0, 0, 0.2))
     floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
-    params = bunny.params(sliding_friction=FRICTION)
+    params = bunny.params(sliding_friction=friction)
     pairs = [("bunny", "floor"), ("tool", "bunny")]
     made = dano.Scene.create(
         [*robot.bodies, tool, dano.Body("bunny", bunny.bunny), floor],

@@ -1,6 +1,11 @@
 """Plans: controls that bring bodies to goals, through contact."""
 
-from dano.plan._execution import Execution as Execution, follow as follow, Replan as Replan
+from dano.plan._execution import (
+    Execution as Execution,
+    follow as follow,
+    NEW_PLANS as NEW_PLANS,
+    Replan as Replan,
+)
 from dano.plan._plan import (
     GoalError as GoalError,
     load_controls as load_controls,

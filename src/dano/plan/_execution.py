@@ -13,15 +13,17 @@ from jaxtyping import Array, Float
 from dano.checks import checked_count, checked_kind, checked_optional
 from dano.engine import AbstractEngine, checked_engine, compiler_options
 from dano.plan._plan import goal_errors, GoalError, OPTIONS, Plan
-from dano.plan._problem import Difference, problem_of, Scales
+from dano.plan._problem import Difference, problem_of, Scales, VIOLATION
 from dano.plan._task import Task
 from dano.scene import Scene, State
-from dano.solvers import (
-    optimal_trajectory,
-    TrajectoryOptions,
-    TrajectoryProblem,
-    TrajectorySolution,
-)
+from dano.solvers import optimal_trajectory, TrajectoryOptions
+
+NEW_PLANS = OPTIONS._replace(max_updates=1, max_iterations=15, penalty=1e5)
+"""Of new plans on the way: goals and limits as costs.
+
+With multipliers goals would be met to the last digit. But a new plan is carried out for some steps only, in a
+scene that it does not know: that would be lost, and each update of multipliers takes as long as this plan.
+"""
 
 
 class Replan(NamedTuple):
@@ -92,7 +94,7 @@ def follow(
         substeps: Steps of `plant` in a step of the plan.
         feedback: Whether to use the plan's gains.
         every: Steps between new plans; None: no new plans.
-        options: Of new plans; default: few iterations.
+        options: Of new plans; default `NEW_PLANS` of this module.
         engine: Default `VariationalEngine()`.
 
     Raises:
@@ -110,14 +112,20 @@ def follow(
     used: list[np.ndarray] = []
     replans: list[Replan] = []
     solved = True
-    solution = plan.solution
     for step in range(0, n_steps, length):
         if step and scene is not None:
             started = time.perf_counter()
             problem = problem_of(scene, task, engine, n_steps - step, finer)
-            solution = _again(problem, now, scales.scaled(values), solution, length, options)
+            solution = optimal_trajectory(
+                problem,
+                now,
+                scales.scaled(values),
+                options=options or NEW_PLANS,
+                compiler_options=compiler_options(),
+            )
             seconds = time.perf_counter() - started
-            replans.append(Replan(step, solution.reached, seconds))
+            reached = all(violation.amount <= VIOLATION for violation in solution.violations)
+            replans.append(Replan(step, reached, seconds))
             values = scales.physical(solution.controls)
             gains = solution.gains * scales.width[None, :, None]
             nominal = jax.tree.map(lambda x: x[:-1], solution.states)
@@ -138,32 +146,6 @@ def follow(
         solved,
         tuple(replans),
         time.perf_counter() - began,
-    )
-
-
-def _again(
-    problem: TrajectoryProblem,
-    now: State,
-    guess: Float[Array, "T m"],
-    last: TrajectorySolution | None,
-    passed: int,
-    options: TrajectoryOptions | None,
-) -> TrajectorySolution:
-    """A plan for the steps that are left, at the front of the arrays; `last` began `passed` steps before."""
-    if options is None:
-        options = OPTIONS._replace(max_updates=4, max_iterations=10)
-    multipliers = None
-    if last is not None:
-        options = options._replace(penalty=min(last.penalty, options.max_penalty))
-        pairs = zip(problem.constraints, last.multipliers, strict=True)
-        multipliers = [value if c.final else _moved(value, passed) for c, value in pairs]
-    return optimal_trajectory(
-        problem,
-        now,
-        guess,
-        multipliers=multipliers,
-        options=options,
-        compiler_options=compiler_options(),
     )
 
 

@@ -10,7 +10,7 @@ from dano.vision.capture import Light
 from dano.vision.tracking._film import Film
 from dano.vision.tracking._refine import Refined
 from dano.vision.tracking._subject import Subject
-from dano.vision.tracking._sureness import covariance_of, unobservable
+from dano.vision.tracking._sureness import covariance_of, Poses, steadied, unobservable
 
 _CLEAR = 1.05
 """Ratio of how starts fit up to which a message says so."""
@@ -108,12 +108,17 @@ def tracked(
             quality[i], colour[i] = one.overlap, one.colour_error
             overlays[i] = Overlay(one.window, one.silhouette)
     known = [one for one in found if one is not None]
+    poses, moved = steadied(film.times, Poses(position, orientation, covariance), subject.size)
     texts = [*film.notes, *notes, *unobservable(known, subject), *_messages(film, status, ambiguity)]
+    if moved.any():
+        names = [film.names[i] for i in np.flatnonzero(moved)]
+        texts.append(
+            f"{len(names)} frames show so little of the object that their poses lean on the frames around"
+            f" them: {', '.join(names[:6])}{' …' * (len(names) > 6)}"
+        )
     return Tracked(
         film.times,
-        position,
-        orientation,
-        covariance,
+        *poses,
         tuple(status),
         quality,
         colour,

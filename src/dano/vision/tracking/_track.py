@@ -71,6 +71,12 @@ _NEAR = 4
 _ASIDE = np.radians(15)
 """By how much these are turned."""
 
+_NEARLY = 0.02, np.radians(2)
+"""Share of the size, and angle, by which a pose may be beside the one that other frames lead to."""
+
+_PULL = 0.01
+"""What so much costs in a score, which is known to about as much."""
+
 
 def track(
     film: Film,
@@ -226,28 +232,55 @@ class _Walk:
             pair = [before[-1], after[0]] if before and after else [*before, *after]
             if len(pair) < 2 or max(*pair, i) - min(*pair, i) > _NEAR:
                 continue
-            found, status = self._followed(i, self._carried(pair[0], pair[1], i))
-            other = self._found[i]
-            if found is not None and (other is None or score(found) < score(other)):
-                self._found[i], self._status[i], better = self._exposed(i, found) or found, status, True
+            better = self._taken_up(i, self._carried(pair[0], pair[1], i)) or better
         return better
 
     def _look_back(self) -> bool:
-        """Follow the object backwards into frames where it was lost before it was found, if it is there.
+        """Follow the object backwards into frames where it was lost, or is not where later frames lead.
 
-        It may come into the picture beside something else, and be alone only later.
+        It may come into the picture beside something else, and be alone only later; it may have been hidden
+        and taken up again beside its place; and in the first frames nothing tells how it moves.
         """
-        count = sum(found is not None for found in self._found)
+        better = False
         for i in reversed(range(len(self._found) - 1)):
-            if self._found[i] is not None or self._found[i + 1] is None:
+            if self._found[i + 1] is None:
                 continue
+            known, after = self._found[i], self._place(i + 1)
             further = i + 2 < len(self._found) and self._found[i + 2] is not None
-            after = self._place(i + 1)
             carried = self._carried(i + 2, i + 1, i) if further else after
-            found, status = self._followed(i, dataclasses.replace(carried, drift=after.drift))
-            if found is not None:
-                self._found[i], self._status[i] = self._exposed(i, found), status
-        return sum(found is not None for found in self._found) > count
+            if known is not None and (not further or self._off(known.place, carried) < 1):
+                continue
+            better = self._taken_up(i, dataclasses.replace(carried, drift=after.drift)) or better
+        return better
+
+    def _taken_up(self, i: int, expected: Placement) -> bool:
+        """Track a frame once more from an expected pose; returns whether the answer is another one.
+
+        Of poses that fit alike the one nearer to where it was expected is likelier.
+        """
+        found, status = self._followed(i, expected)
+        # The coarse levels see further, but what is hidden in part may lead them away.
+        near = self._fine(i, expected, self._light) if status in (TRACKED, LOST) else None
+        known = [
+            one
+            for one in (self._found[i], found, None if near is None or not self._is_it(near) else near)
+            if one is not None
+        ]
+        if not known:
+            return False
+        best = min(known, key=lambda one: score(one) + _PULL * self._off(one.place, expected))
+        if best is self._found[i]:
+            return False
+        self._found[i], self._status[i] = self._exposed(i, best), TRACKED
+        return True
+
+    def _off(self, place: Placement, expected: Placement) -> float:
+        """How far a pose is from an expected one, in units of `_NEARLY`."""
+        moved = self._subject.middle(place) - self._subject.middle(expected)
+        turned = quat_log(quat_multiply(quat_conjugate(expected.orientation), place.orientation))
+        return float(
+            np.linalg.norm(moved) / (_NEARLY[0] * self._subject.size) + np.linalg.norm(turned) / _NEARLY[1]
+        )
 
     def _exposed(self, i: int, found: Refined) -> Refined:
         """The pose once more, with how the object moves while the frame is exposed."""
@@ -351,9 +384,13 @@ class _Walk:
         if self._masking.hidden(i, window) > 1 - BLIND:
             return None, HIDDEN
         found = self._refined(i, before, self._light)
-        if found is None or found.overlap < self._options.lost or self._is_another(found):
+        if found is None or not self._is_it(found):
             return None, LOST
         return found, TRACKED
+
+    def _is_it(self, found: Refined) -> bool:
+        """Whether shape and colours are the object's."""
+        return found.overlap >= self._options.lost and not self._is_another(found)
 
     def _is_another(self, found: Refined) -> bool:
         """Whether colours say that a thing of the right shape is another one."""
