@@ -185,6 +185,10 @@ def test_new_plans_on_the_way_make_up_for_another_mass(pushing, pushed):
     again = dano.follow(plant, state, task, pushed, scene=scene, every=10, feedback=False)
     assert [replan.step for replan in again.replans] == [10, 20, 30]
     assert again.goals[0].error < 0.5 * blind.goals[0].error
+    # Where new plans know the scene, they say that they reach what the first one did, and do.
+    sure = dano.follow(scene, state, task, pushed, scene=scene, every=20, feedback=False)
+    assert all(replan.reached for replan in sure.replans)
+    assert sure.goals[0].error <= 2 * pushed.goals[0].within
     assert again.values.shape == pushed.values.shape and again.converged
     same = dano.follow(scene, state, task, pushed)
     np.testing.assert_allclose(same.states.position[-1], pushed.trajectory.states.position[-1], atol=1e-6)
