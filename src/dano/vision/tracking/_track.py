@@ -258,23 +258,21 @@ class _Walk:
 
         Of poses that fit alike the one nearer to where it was expected is likelier.
         """
-        before, (found, status) = self._found[i], self._followed(i, expected)
-        # What is known of the light has changed since, and costs can only be compared under the same.
-        known = None if before is None else self._fine(i, before.place, self._light)
+        found, status = self._followed(i, expected)
         # The coarse levels see further, but what is hidden in part may lead them away.
         near = self._fine(i, expected, self._light) if status in (TRACKED, LOST) else None
-        others = [one for one in (found, near) if one is not None and self._is_it(one)]
-        if not others:
+        known = [
+            one
+            for one in (self._found[i], found, None if near is None or not self._is_it(near) else near)
+            if one is not None
+        ]
+        if not known:
             return False
-        best = min(others, key=lambda one: self._unlikely(one, expected))
-        if known is not None and self._unlikely(known, expected) <= self._unlikely(best, expected):
+        best = min(known, key=lambda one: score(one) + _PULL * self._off(one.place, expected))
+        if best is self._found[i]:
             return False
         self._found[i], self._status[i] = self._exposed(i, best), TRACKED
         return True
-
-    def _unlikely(self, found: Refined, expected: Placement) -> float:
-        """Score of a pose, with how far it is from an expected one."""
-        return score(found) + _PULL * self._off(found.place, expected)
 
     def _off(self, place: Placement, expected: Placement) -> float:
         """How far a pose is from an expected one, in units of `_NEARLY`."""
@@ -392,7 +390,7 @@ class _Walk:
 
     def _is_it(self, found: Refined) -> bool:
         """Whether shape and colours are the object's."""
-        return found.overlap >= self._options.lost and not self._is_another(found)
+        return bool(found.overlap >= self._options.lost) and not self._is_another(found)
 
     def _is_another(self, found: Refined) -> bool:
         """Whether colours say that a thing of the right shape is another one."""
