@@ -30,12 +30,12 @@ def seen(position, orientation, rows, reach, seed=0) -> Poses:
         covariance[i] += reach**2 * np.outer(way, way)
         noise[i] += reach * rng.normal() * way
     turned = orientation * Rotation.from_rotvec(noise[:, 3:])
-    return Poses(position + noise[:, :3], turned.as_quat(scalar_first=True), covariance)
+    return Poses(position + noise[:, :3], np.roll(turned.as_quat(), 1, axis=1), covariance)
 
 
 def off(poses: Poses, position, orientation) -> np.ndarray:
     """Errors of position [m] and rotation vector [rad]."""
-    turned = orientation.inv() * Rotation.from_quat(poses.orientation, scalar_first=True)
+    turned = orientation.inv() * Rotation.from_quat(np.roll(poses.orientation, -1, axis=1))
     return np.concatenate([poses.position - position, turned.as_rotvec()], axis=1)
 
 

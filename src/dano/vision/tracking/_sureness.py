@@ -128,7 +128,7 @@ def steadied(
         return poses, moved
     fours = np.arange(len(known) - 3)[:, None] + np.arange(4)
     rates = _third_differences(times[known][fours])
-    place, turn = poses.position[known], Rotation.from_quat(poses.orientation[known], scalar_first=True)
+    place, turn = poses.position[known], Rotation.from_quat(np.roll(poses.orientation[known], -1, axis=1))
 
     def jerks(place: np.ndarray, turn: Rotation) -> np.ndarray:
         """Third differences, in sizes and [rad]."""
@@ -166,7 +166,7 @@ def steadied(
     moved[rows] = True
     result = Poses(*(x.copy() for x in poses))
     result.position[rows] = place[unsure]
-    result.orientation[rows] = turn[unsure].as_quat(scalar_first=True)
+    result.orientation[rows] = np.roll(turn[unsure].as_quat(), 1, axis=1)
     result.covariance[rows] = blocks
     return result, moved
 
