@@ -52,9 +52,8 @@ def scene_of(law) -> dano.Scene:
 def test_products_of_a_step_have_all_digits(law, monkeypatch):
     scene = scene_of(law)
     state = scene.initial_state(pair={"position": (0, 0, 0.09)})
-    monkeypatch.setattr(
-        jax, "default_backend", lambda: "gpu"
-    )  # what machine code does on CPUs is in there, too
+    # What machine code does on CPUs is in the program, too.
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     numbers, rest = eqx.partition(short((scene, state)), eqx.is_inexact_array)
 
     def step(numbers):

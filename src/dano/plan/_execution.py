@@ -16,7 +16,7 @@ from dano.plan._plan import goal_errors, GoalError, OPTIONS, Plan
 from dano.plan._problem import Difference, problem_of, Scales, VIOLATION
 from dano.plan._task import Task
 from dano.scene import Scene, State
-from dano.solvers import optimal_trajectory, TrajectoryOptions
+from dano.solvers import optimal_trajectory, TrajectoryOptions, TrajectorySolution
 
 NEW_PLANS = OPTIONS._replace(max_updates=1, max_iterations=15, penalty=1e5)
 """Of new plans on the way: goals and limits as costs.
@@ -94,7 +94,7 @@ def follow(
         substeps: Steps of `plant` in a step of the plan.
         feedback: Whether to use the plan's gains.
         every: Steps between new plans; None: no new plans.
-        options: Of new plans; default `NEW_PLANS` of this module.
+        options: Of new plans; default `dano.plan.NEW_PLANS`.
         engine: Default `VariationalEngine()`.
 
     Raises:
@@ -114,18 +114,9 @@ def follow(
     solved = True
     for step in range(0, n_steps, length):
         if step and scene is not None:
-            started = time.perf_counter()
-            problem = problem_of(scene, task, engine, n_steps - step, finer)
-            solution = optimal_trajectory(
-                problem,
-                now,
-                scales.scaled(values),
-                options=options or NEW_PLANS,
-                compiler_options=compiler_options(),
-            )
-            seconds = time.perf_counter() - started
-            reached = all(violation.amount <= VIOLATION for violation in solution.violations)
-            replans.append(Replan(step, reached, seconds))
+            guess = scales.scaled(values)
+            solution, replan = _again(scene, task, engine, now, guess, step, finer, options or NEW_PLANS)
+            replans.append(replan)
             values = scales.physical(solution.controls)
             gains = solution.gains * scales.width[None, :, None]
             nominal = jax.tree.map(lambda x: x[:-1], solution.states)
@@ -147,6 +138,24 @@ def follow(
         tuple(replans),
         time.perf_counter() - began,
     )
+
+
+def _again(
+    scene: Scene,
+    task: Task,
+    engine: AbstractEngine,
+    now: State,
+    guess: Float[Array, "T m"],
+    step: int,
+    substeps: int,
+    options: TrajectoryOptions,
+) -> tuple[TrajectorySolution, Replan]:
+    """A plan from a step of the task on, at the front of the arrays."""
+    began = time.perf_counter()
+    problem = problem_of(scene, task, engine, task.n_steps - step, substeps)
+    solution = optimal_trajectory(problem, now, guess, options=options, compiler_options=compiler_options())
+    reached = all(violation.amount <= VIOLATION for violation in solution.violations)
+    return solution, Replan(step, reached, time.perf_counter() - began)
 
 
 def _moved(rows: Float[Array, "T p"], n: int) -> Float[Array, "T p"]:

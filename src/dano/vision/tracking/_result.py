@@ -109,13 +109,7 @@ def tracked(
             overlays[i] = Overlay(one.window, one.silhouette)
     known = [one for one in found if one is not None]
     poses, moved = steadied(film.times, Poses(position, orientation, covariance), subject.size)
-    texts = [*film.notes, *notes, *unobservable(known, subject), *_messages(film, status, ambiguity)]
-    if moved.any():
-        names = [film.names[i] for i in np.flatnonzero(moved)]
-        texts.append(
-            f"{len(names)} frames show so little of the object that their poses lean on the frames around"
-            f" them: {', '.join(names[:6])}{' …' * (len(names) > 6)}"
-        )
+    texts = [*film.notes, *notes, *unobservable(known, subject), *_messages(film, status, moved, ambiguity)]
     return Tracked(
         film.times,
         *poses,
@@ -130,8 +124,8 @@ def tracked(
     )
 
 
-def _messages(film: Film, status: Sequence[str], ambiguity: float) -> list[str]:
-    """What a user should know of frames without a pose, and of the start."""
+def _messages(film: Film, status: Sequence[str], moved: np.ndarray, ambiguity: float) -> list[str]:
+    """What a user should know of frames without a pose, or with one that was moved, and of the start."""
     texts = []
     for kind, words in (
         (LOST, "the object was lost (its mask does not fit the silhouette)"),
@@ -140,10 +134,21 @@ def _messages(film: Film, status: Sequence[str], ambiguity: float) -> list[str]:
     ):
         names = [n for n, s in zip(film.names, status, strict=True) if s == kind]
         if names:
-            texts.append(f"{words} in {len(names)} frames: {', '.join(names[:6])}{' …' * (len(names) > 6)}")
+            texts.append(f"{words} in {len(names)} frames: {_first_of(names)}")
+    if moved.any():
+        names = [film.names[i] for i in np.flatnonzero(moved)]
+        texts.append(
+            f"{len(names)} frames show so little of the object that their poses lean on the frames around"
+            f" them: {_first_of(names)}"
+        )
     if ambiguity < _CLEAR:
         texts.append(
             "another orientation explains the first frame nearly as well: the object may be turned by a"
             " symmetry of its shape; give start if it is"
         )
     return texts
+
+
+def _first_of(names: Sequence[str]) -> str:
+    """The first names of a list, in words."""
+    return ", ".join(names[:6]) + " …" * (len(names) > 6)

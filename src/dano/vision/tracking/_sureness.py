@@ -118,13 +118,14 @@ def steadied(
     Returns:
         The poses, and which were moved.
     """
-    known = np.flatnonzero(np.isfinite(poses.position[:, 0]))
+    known, moved = np.flatnonzero(np.isfinite(poses.position[:, 0])), np.zeros(len(times), bool)
+    if len(known) < _FEW:
+        return poses, moved
     unit = np.repeat([size, 1.0], 3)
     scaled = poses.covariance[known] / np.outer(unit, unit)
-    doubt = np.sqrt(np.linalg.eigvalsh(scaled)[:, -1]) if len(known) else np.zeros(0)
-    unsure = doubt > _UNSURE * np.median(doubt) if len(known) else np.zeros(0, bool)
-    moved = np.zeros(len(times), bool)
-    if len(known) - unsure.sum() < _FEW or not unsure.any():
+    doubt = np.sqrt(np.linalg.eigvalsh(scaled)[:, -1])
+    unsure = doubt > _UNSURE * np.median(doubt)
+    if np.sum(~unsure) < _FEW or not unsure.any():
         return poses, moved
     fours = np.arange(len(known) - 3)[:, None] + np.arange(4)
     rates = _third_differences(times[known][fours])

@@ -261,14 +261,12 @@ class _Walk:
         found, status = self._followed(i, expected)
         # The coarse levels see further, but what is hidden in part may lead them away.
         near = self._fine(i, expected, self._light) if status in (TRACKED, LOST) else None
-        known = [
-            one
-            for one in (self._found[i], found, None if near is None or not self._is_it(near) else near)
-            if one is not None
-        ]
-        if not known:
+        if near is not None and not self._is_it(near):
+            near = None
+        poses = [one for one in (self._found[i], found, near) if one is not None]
+        if not poses:
             return False
-        best = min(known, key=lambda one: score(one) + _PULL * self._off(one.place, expected))
+        best = min(poses, key=lambda one: score(one) + _PULL * self._off(one.place, expected))
         if best is self._found[i]:
             return False
         self._found[i], self._status[i] = self._exposed(i, best), TRACKED
