@@ -1,0 +1,341 @@
+"""A primal–dual Newton method for the velocities of bodies that touch (docs/theory/integrator.md, "The solve").
+
+Unknowns are the end-of-step velocities V of all bodies that move, in world axes, and for every point the
+friction λ and the direction s of its hysteresis. A pass linearises the momentum balance and the equations of λ
+and s, eliminates these point by point, solves for dV, takes the whole step, and projects λ and s onto
+|λ| ≤ b(p), |s| ≤ 1. What is left after the elimination is the law's own residual, whatever λ and s are; the
+Jacobian uses the current λ instead of its limit, so it is right before directions of slip have settled. A solve
+ends when the residual is small and λ and s fit the velocities, so that the Jacobian is that of the law, too.
+
+Full steps can cycle. A solve that has not converged within a few passes takes shares of steps, smaller after
+each step that made the residual larger; then it goes on with a line search, then from softer friction in
+levels. Where that cycles, too, friction mostly presses a point in, which raises its friction. Then the bounds b
+are held: the equations are those of a convex function, and a line search finds their root. The bounds are
+renewed by halves until they fit, and the solve goes on with the law as it is. What does not converge ends where
+its residual was smallest.
+"""
+
+import warp as wp
+
+from dano.engine.kernels.assembly import assemble, fit_duals, follow_duals, Trial
+from dano.engine.kernels.lanes import total, wait
+from dano.engine.kernels.linear_solve import copy_blocks, find_pattern, solve_blocks
+from dano.engine.kernels.tables import Room, Scene
+from dano.physics.features import LANES
+from dano.physics.real import HALF, INFINITY, ONE, real, vec6, ZERO
+
+LEVELS = 11
+"""Number of levels of a solve."""
+_LEVELS = wp.constant(LEVELS)
+# In the first level steps are whole for so many passes, then shares that grow and shrink by these factors and
+# are no less than the last: on recorded piles of 8 to 64 bodies half the passes of fixed shares, or as many.
+_WHOLE = wp.constant(4)
+_GROWS, _SHRINKS, _LEAST = wp.constant(real(1.1)), wp.constant(real(0.8)), wp.constant(real(0.2))
+# Residual to which soft levels are solved, over the softened stiction velocity [m/s].
+_SOFT_TOLERANCE = wp.constant(real(1e-3))
+# Share of the held friction bounds that is renewed at once, and change that ends it, over all pressure.
+_MIX, _RENEWED = wp.constant(real(0.5)), wp.constant(real(1e-6))
+# A step is accepted when what the residual does along it fell to this share; when the bracket around the zero
+# of that is narrower than this share of the step, it is accepted as it is.
+_ENOUGH, _GIVE_UP = wp.constant(real(0.5)), wp.constant(real(0.01))
+# Stiction velocity that levels are multiples of [m/s].
+_STICTION = wp.constant(real(1e-7))
+
+
+@wp.struct
+class Options:
+    """When a solve stops.
+
+    Attributes:
+        tolerance: Residual over (1 + size) that counts as solved.
+        rounding: Of the numbers.
+        fit: What duals may miss, in shares of all pressure.
+        max_passes: Passes after which a solve gives up.
+    """
+
+    tolerance: real
+    rounding: real
+    fit: real
+    max_passes: int
+
+
+@wp.struct
+class Level:
+    """How a level of a solve is solved.
+
+    Attributes:
+        softness: Multiplies the stiction velocity.
+        share: Of a step that is taken.
+        searches: Whether a line search runs.
+        budget: Passes.
+        holds: Whether friction bounds are held.
+    """
+
+    softness: real
+    share: real
+    searches: bool
+    budget: int
+    holds: bool
+
+
+@wp.struct
+class Search:
+    """A line search along Newton's step, for a zero of the work of the residual along it.
+
+    Attributes:
+        begun: Work at the accepted point.
+        length: Share of the step to try.
+        low: Largest share known to be too short, and the work there.
+        low_work: …
+        high: Smallest share known to be too long, 0 if none, and the work there.
+        high_work: …
+    """
+
+    begun: real
+    length: real
+    low: real
+    low_work: real
+    high: real
+    high_work: real
+
+
+@wp.struct
+class Measured:
+    """What a pass finds.
+
+    Attributes:
+        work: Of the residual along the step.
+        error: Largest residual over mass or inertia [m/s, rad/s].
+        size: Largest sum of the terms of a row of the Jacobian [m/s].
+    """
+
+    work: real
+    error: real
+    size: real
+
+
+@wp.struct
+class Solved:
+    """How a solve ended.
+
+    Attributes:
+        residual: Largest residual over mass or inertia [m/s, rad/s].
+        passes: How many it took.
+        converged: Whether it converged.
+    """
+
+    residual: real
+    passes: int
+    converged: bool
+
+
+@wp.func
+def level_of(number: int) -> Level:
+    """A level: friction as it is; with a line search; softer and softer; hard again; held; hard; short steps."""
+    level = Level()
+    level.softness = ONE
+    level.share = ONE
+    level.searches = True
+    level.budget = 30
+    level.holds = False
+    if number == 0:
+        level.searches = False
+        level.budget = 100
+    elif number >= 2 and number <= 6:
+        level.softness = wp.pow(real(10.0), real(7 - number))
+        level.budget = 8
+    elif number == 8:
+        level.softness = real(100.0)
+        level.budget = 150
+        level.holds = True
+    elif number >= 10:
+        level.share = real(0.4)
+        level.searches = False
+        level.budget = 100
+    return level
+
+
+@wp.func
+def begin_search(begun: real) -> Search:
+    """Try the whole step first."""
+    search = Search()
+    search.begun = begun
+    search.length = ONE
+    search.low_work = begun
+    return search
+
+
+@wp.func
+def accepts(search: Search, work: real) -> bool:
+    """Whether a share of the step is good enough."""
+    bracketed = search.high > ZERO
+    limit = _ENOUGH * wp.abs(search.begun)
+    misses = work > limit or (bracketed and work < -limit) or wp.isnan(work)
+    close = bracketed and search.high - search.low < _GIVE_UP
+    return not misses or close or search.begun >= ZERO
+
+
+@wp.func
+def narrowed(search: Search, work: real) -> Search:
+    """The next share after a miss: regula falsi with halved ends (Illinois)."""
+    after = search
+    if not (work < ZERO):
+        after.low_work = HALF * search.low_work
+        after.high = search.length
+        after.high_work = work
+    else:
+        after.low = search.length
+        after.low_work = work
+        if search.high != ZERO:
+            after.high_work = HALF * search.high_work
+    portion = -after.low_work / (after.high_work - after.low_work)
+    if wp.isnan(portion):
+        portion = real(0.1)
+    portion = wp.min(wp.max(portion, real(0.1)), real(0.9))
+    after.length = after.low + portion * (after.high - after.low)
+    return after
+
+
+@wp.func
+def measure(scene: Scene, room: Room, world: int) -> Measured:
+    """Of the residual and Jacobian at the velocities that were tried."""
+    m = scene.moving.shape[0]
+    found = Measured()
+    for i in range(m):
+        residual = room.residual[world, i]
+        scale = room.scale[world, i]
+        found.work += wp.dot(room.step[world, i], residual)
+        size = vec6()
+        for j in range(m):
+            if room.used[world, i * m + j] > 0:
+                size += absolute_product(room, world, i * m + j, room.tried[world, j])
+        for k in range(6):
+            missed = wp.abs(scale[k] * residual[k])
+            if missed > found.error or wp.isnan(missed):
+                found.error = missed
+            found.size = wp.max(found.size, scale[k] * size[k])
+    return found
+
+
+@wp.func
+def absolute_product(room: Room, world: int, block: int, v: vec6) -> vec6:
+    """Σ |a_rc v_c| of each row of a block."""
+    a = room.blocks[world, block]
+    found = vec6()
+    for r in range(6):
+        for c in range(6):
+            found[r] = found[r] + wp.abs(a[r, c] * v[c])
+    return found
+
+
+@wp.func
+def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: real, options: Options) -> Solved:
+    """Velocities at the end of a step, in `room.velocity`, from those that it holds.
+
+    Args:
+        scene: The scene.
+        room: With points, laws, momenta and scales of the step.
+        world: Which world.
+        lane: Which lane of it.
+        n_found: Number of pairs that are near.
+        size: Magnitude of the terms in the residual [m/s], to which rounding in it is relative.
+        options: When to stop.
+    """
+    m = scene.moving.shape[0]
+    if lane == 0:
+        for i in range(m):
+            room.best[world, i] = room.velocity[world, i]
+            room.step[world, i] = vec6()
+    fit_duals(scene, room, world, lane, n_found)
+    found = Solved()
+    search = begin_search(ZERO)
+    number = int(0)
+    level = level_of(0)
+    budget = level.budget
+    mix = real(0.0)
+    share = real(1.0)
+    before = real(INFINITY)
+    best = real(INFINITY)
+    wait()
+    while not found.converged and found.passes < options.max_passes and number < _LEVELS:
+        if lane == 0:
+            for i in range(m):
+                room.tried[world, i] = room.velocity[world, i] + search.length * room.step[world, i]
+        wait()
+        trial = Trial()
+        trial.length = search.length
+        trial.softness = level.softness
+        trial.holds = level.holds
+        trial.mix = mix
+        fit = assemble(scene, room, world, lane, n_found, trial)
+        wait()
+        seen = measure(scene, room, world)
+        tolerance = wp.max(options.tolerance * (ONE + size), real(16.0) * options.rounding * seen.size)
+        hard = level.softness == ONE
+        enough = tolerance
+        if not hard:
+            enough = wp.max(tolerance, _SOFT_TOLERANCE * _STICTION * level.softness)
+        small = seen.error <= enough
+        accept = small or not level.searches or accepts(search, seen.work)
+        # Where rounding keeps duals from fitting, a second small residual has to do.
+        found.converged = small and hard and (fit.unfit <= options.fit * fit.push or before <= enough)
+        improves = hard and seen.error < best
+        if improves:
+            best = seen.error
+        # Once the residual falls as it should, there is nothing to be damped.
+        if seen.error < before:
+            share = wp.min(share * _GROWS, ONE)
+        else:
+            share = wp.max(share * _SHRINKS, _LEAST)
+        if number > 0 or found.passes < _WHOLE:
+            share = ONE
+        part = level.share * share
+        if seen.error < HALF * before:
+            part = ONE
+        spent = budget <= 0
+        settled = not level.holds or spent or (mix > ZERO and mix < ONE and fit.renewed <= _RENEWED * fit.push)
+        harder = accept and ((small and not hard and settled) or (not small and spent))
+        budget -= 1
+        mix = ZERO
+        if accept and small and level.holds:
+            mix = _MIX
+        if harder:
+            number += 1
+            level = level_of(number)
+            budget = level.budget
+            if level.holds:
+                mix = ONE
+        wait()
+        if not accept:
+            search = narrowed(search, seen.work)
+        else:
+            if lane == 0:
+                for i in range(m):
+                    room.velocity[world, i] = room.tried[world, i]
+            if not found.converged:
+                if lane == 0:
+                    copy_blocks(room, world, m)
+                    for i in range(m):
+                        room.step[world, i] = -room.residual[world, i]
+                    solve_blocks(room, world, m)
+                    for i in range(m):
+                        room.step[world, i] = part * room.step[world, i]
+                wait()
+                follow_duals(scene, room, world, lane, n_found, search.length)
+                # The next pass is no longer of the same function where bounds are renewed: it is accepted.
+                begun = real(0.0)
+                if mix == ZERO:
+                    for i in range(m):
+                        begun += wp.dot(room.step[world, i], room.residual[world, i])
+                search = begin_search(begun)
+            before = seen.error
+        if improves and lane == 0:
+            for i in range(m):
+                room.best[world, i] = room.tried[world, i]
+        found.passes += 1
+    if not found.converged and lane == 0:
+        for i in range(m):
+            room.velocity[world, i] = room.best[world, i]
+    wait()
+    found.residual = wp.where(found.converged, before, best)
+    return found

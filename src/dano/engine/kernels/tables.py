@@ -1,0 +1,251 @@
+"""What kernels read and write: a scene, what a launch is given, and the room that a world works in.
+
+Arrays have the world as their first axis. Rows of real numbers come from JAX and are read as structures, whose
+fields stand in the order of the row; whole numbers are the same for all worlds.
+"""
+
+import warp as wp
+
+from dano.physics.distances import Solids
+from dano.physics.pairs import BodyState
+from dano.physics.point_law import Duals, Linear, Material, PointLaw
+from dano.physics.real import mat33, mat66, real, vec3, vec4, vec6
+from dano.physics.samples import Point, Sample
+
+BLOCK = 16
+"""Samples of a block."""
+RUN = 4
+"""Blocks that the search looks at together first."""
+
+
+@wp.struct
+class Body:
+    """A body of a scene.
+
+    Attributes:
+        mass: [kg].
+        inertia: About the centre of mass [kg m², B].
+        com: Centre of mass [m, F].
+        scale: Semi-axes of a ball or an ellipsoid, ones for others [m].
+        middle: Centre of a ball around the body [m, F].
+        radius: Of that ball [m].
+    """
+
+    mass: real
+    inertia: mat33
+    com: vec3
+    scale: vec3
+    middle: vec3
+    radius: real
+
+
+@wp.struct
+class BodyIndex:
+    """Whole numbers of a body.
+
+    Attributes:
+        row: Place among the bodies that move, or −1.
+        first_block: Of its samples.
+        blocks: How many it has.
+        first_probe: Of the points that say how deep it is, coarsely if there are many samples.
+        probes: How many it has.
+        turning: How its samples turn.
+        first_leaf: Of its solid.
+        leaves: How many its solid has.
+    """
+
+    row: wp.int32
+    first_block: wp.int32
+    blocks: wp.int32
+    first_probe: wp.int32
+    probes: wp.int32
+    turning: wp.int32
+    first_leaf: wp.int32
+    leaves: wp.int32
+
+
+@wp.struct
+class SamplePair:
+    """Samples of one body (first) that may press on the solid of another (second).
+
+    Attributes:
+        share: Share of the contact's stiffness that this pair carries [1].
+        follows: 1 where points follow the second body, which rolls on the first, else 0.
+        sink: Depth up to which predicted geometry is taken [m].
+        margin: Distance within which samples count as near [m].
+    """
+
+    share: real
+    follows: real
+    sink: real
+    margin: real
+
+
+@wp.struct
+class PairIndex:
+    """Whole numbers of a pair: its bodies and its contact."""
+
+    first: wp.int32
+    second: wp.int32
+    contact: wp.int32
+
+
+@wp.struct
+class Scene:
+    """What stays constant over a rollout.
+
+    Attributes:
+        bodies: Shape (worlds, n).
+        body_index: Shape (n,).
+        moving: Bodies that move, shape (m,).
+        samples: Of all bodies, in blocks, shape (worlds, samples).
+        balls: Centre [m, F] and radius [m] of a ball around each block, shape (worlds, blocks).
+        runs: Balls around each block and those after it, `RUN` in all.
+        probes: Points that say how deep a body is [m, F].
+        solids: What samples press on.
+        pairs: Shape (worlds, pairs).
+        pair_index: Shape (pairs,).
+        materials: Of the contacts with point laws, shape (worlds, contacts).
+        gravity: [m/s²], shape (worlds, 1).
+        timestep: h [s], shape (worlds, 1).
+    """
+
+    bodies: wp.array2d(dtype=Body)
+    body_index: wp.array(dtype=BodyIndex)
+    moving: wp.array(dtype=wp.int32)
+    samples: wp.array2d(dtype=Sample)
+    balls: wp.array2d(dtype=vec4)
+    runs: wp.array2d(dtype=vec4)
+    probes: wp.array2d(dtype=vec3)
+    solids: Solids
+    pairs: wp.array2d(dtype=SamplePair)
+    pair_index: wp.array(dtype=PairIndex)
+    materials: wp.array2d(dtype=Material)
+    gravity: wp.array2d(dtype=vec3)
+    timestep: wp.array2d(dtype=real)
+
+
+@wp.struct
+class StateRow:
+    """Configuration and motion of a body: see `dano.scene.State`."""
+
+    position: vec3
+    orientation: vec4
+    velocity: vec3
+    omega: vec3
+
+
+@wp.struct
+class Push:
+    """Control of a body in a step: force [N, W] and torque [N m, W]."""
+
+    force: vec3
+    torque: vec3
+
+
+@wp.struct
+class StepReport:
+    """What a step says of itself.
+
+    Attributes:
+        residual: Largest that is left of the equations over mass or inertia [m/s, rad/s].
+        passes: Of the solver.
+        solved: 1 where the equations were solved.
+        overflow: 1 where more points touch than there is room for.
+        rebound: Share of the restitution with which contact adds no energy.
+    """
+
+    residual: real
+    passes: real
+    solved: real
+    overflow: real
+    rebound: real
+
+
+@wp.struct
+class FoundPoint:
+    """Where a point was found: its sample, its entry among the pairs found, whether it presses back."""
+
+    sample: wp.int32
+    pair: wp.int32
+    presses_back: wp.int32
+
+
+@wp.struct
+class FoundPair:
+    """A pair that is near in a step.
+
+    Attributes:
+        pair: Index among the pairs.
+        first: First of its points in a lane's list.
+        end: Beyond its last.
+        critical: Probe that says when the bodies meet, −1 where they do not within the step.
+        share: τ.
+        impact_stiffness: Of an impact [Pa/m], zero if there is none.
+        toward: Direction that samples which turn face [F].
+        com_difference: From the second body's centre of mass to the first's [m, W].
+    """
+
+    pair: wp.int32
+    first: wp.int32
+    end: wp.int32
+    critical: wp.int32
+    share: real
+    impact_stiffness: real
+    toward: vec3
+    com_difference: vec3
+
+
+@wp.struct
+class Room:
+    """Where a world works: arrays that nothing outside reads.
+
+    Attributes:
+        bodies: State of each body at the start of the step.
+        momentum: That each moving body has before contact [kg m/s; kg m²/s, W].
+        inertia: Of each moving body [kg m², W].
+        found: Pairs that are near, shape (worlds, pairs · lanes).
+        where: Of each point where it was found, shape (worlds, capacity).
+        points: The points.
+        laws: Their constants.
+        duals: At the accepted velocities.
+        changes: Of the duals by the whole step.
+        linear: The law as it was linearised last.
+        near: Probes that may meet a solid within the step.
+        blocks: Of the Jacobian, shape (worlds, m · m).
+        spare: The same, used up by the solve.
+        used: Whether a block is not zero.
+        order: Of elimination; later neighbours; their numbers.
+        later: …
+        counts: …
+        velocity: Accepted, of each moving body [m/s; rad/s, W].
+        tried: …
+        best: Where the residual was smallest.
+        step: Of Newton's method.
+        residual: Of each moving body [kg m/s; kg m²/s, W].
+        scale: Turns momenta into velocities [1/kg; 1/(kg m²)].
+    """
+
+    bodies: wp.array2d(dtype=BodyState)
+    momentum: wp.array2d(dtype=vec6)
+    inertia: wp.array2d(dtype=mat33)
+    found: wp.array2d(dtype=FoundPair)
+    where: wp.array2d(dtype=FoundPoint)
+    points: wp.array2d(dtype=Point)
+    laws: wp.array2d(dtype=PointLaw)
+    duals: wp.array2d(dtype=Duals)
+    changes: wp.array2d(dtype=Duals)
+    linear: wp.array2d(dtype=Linear)
+    near: wp.array2d(dtype=wp.int32)
+    blocks: wp.array2d(dtype=mat66)
+    spare: wp.array2d(dtype=mat66)
+    used: wp.array2d(dtype=wp.int32)
+    order: wp.array2d(dtype=wp.int32)
+    later: wp.array2d(dtype=wp.int32)
+    counts: wp.array2d(dtype=wp.int32)
+    velocity: wp.array2d(dtype=vec6)
+    tried: wp.array2d(dtype=vec6)
+    best: wp.array2d(dtype=vec6)
+    step: wp.array2d(dtype=vec6)
+    residual: wp.array2d(dtype=vec6)
+    scale: wp.array2d(dtype=vec6)

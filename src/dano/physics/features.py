@@ -1,0 +1,18 @@
+"""What the kernels of a scene must know: code for anything else is left out when they are built.
+
+These are the values of a build that knows everything. `dano.engine` builds kernels for a scene with those that
+it needs (see `dano.engine._instances`), which compiles and runs several times as fast.
+"""
+
+KINDS = frozenset(range(7))
+"""Kinds of leaves of solids, see `distances`."""
+DEGREES = frozenset({1, 2, 3})
+"""Degrees of the splines of sampled distances."""
+UNIONS = True
+"""Whether a solid has several leaves."""
+TURNING = frozenset({0, 1, 2})
+"""How samples turn with their bodies, see `pairs`."""
+LANES = 1
+"""Lanes of a world: 1 on a CPU, 32 on a GPU."""
+WIDE = True
+"""Whether numbers have 64 bits."""

@@ -1,0 +1,342 @@
+"""The distributed law at a point (docs/theory/contact.md, "Pressure and friction at a sample").
+
+    F = A p (n − b(p)/p u / max(|u|, v_s)),   p = k max(0, d − D),   b(p) = μ (1 − φ p/(p + p₀)) p
+
+Friction and hysteresis are set-valued maps u/max(|u|, v_s) of a tiny v_s. A solver that knows them by their
+values only has to search for where bodies stick. So the law is also written without a quotient, with the
+friction λ and the direction s of the hysteresis as unknowns of their own, the *duals*,
+
+    max(|u|, v_s) λ + b(p) u = 0,  |λ| ≤ b(p)        max(|v_n|, v_s) s − v_n = 0,  |s| ≤ 1
+
+(Chan, Golub, Mulet 1999; Andersen et al. 2000, for sums of norms). `linearized` is the derivative of this form.
+"""
+
+import warp as wp
+
+from dano.physics.real import ONE, real, vec3, ZERO
+from dano.physics.samples import Point
+
+
+@wp.struct
+class Material:
+    """What the traction at a point depends on besides geometry and velocity.
+
+    Attributes:
+        stiffness: k [Pa/m].
+        restitution: e [1].
+        restitution_velocity: v_e [m/s].
+        hysteresis: σ [1].
+        friction: μ [1].
+        friction_fading: φ [1].
+        friction_pressure: p₀ [Pa].
+        stiction: v_s [m/s].
+        ahead: θ h, how far ahead the depth is taken [s].
+        timestep: h [s].
+        instant: 1 where impacts end within the step, 0 where they are left to the spring.
+        bounce: Slowest rebound of an impact, and slowest approach that is one [m/s].
+        uplift: An overlap of depth d separates at most at √(uplift · d), if that exceeds v_e [m/s²].
+    """
+
+    stiffness: real
+    restitution: real
+    restitution_velocity: real
+    hysteresis: real
+    friction: real
+    friction_fading: real
+    friction_pressure: real
+    stiction: real
+    ahead: real
+    timestep: real
+    instant: real
+    bounce: real
+    uplift: real
+
+
+@wp.struct
+class PointLaw:
+    """What of the law does not change within a step.
+
+    Attributes:
+        stiffness: k [Pa/m].
+        depth: d [m].
+        damped: (ρ − σ) d⁺ [m].
+        lost: σ d⁺ [m].
+        ahead: θ h [s].
+        restitution_velocity: v_e, or the speed at which a deep overlap may separate, if larger [m/s].
+        friction: μ [1].
+        fading: φ [1].
+        friction_pressure: p₀ [Pa].
+        stiction: v_s [m/s].
+        sharp: 1 where the damping has its full size from v_e on, so that bodies are pushed apart no faster.
+    """
+
+    stiffness: real
+    depth: real
+    damped: real
+    lost: real
+    ahead: real
+    restitution_velocity: real
+    friction: real
+    fading: real
+    friction_pressure: real
+    stiction: real
+    sharp: real
+
+
+@wp.struct
+class Pressure:
+    """Pressure, and its derivatives.
+
+    Attributes:
+        value: p [Pa].
+        damping: −∂p/∂v_n, s eliminated [Pa s/m].
+        direction_by_speed: ∂s/∂v_n [s/m].
+        direction_change: Change of s that makes it fit the velocity.
+        change: Change of the pressure that comes with it [Pa].
+    """
+
+    value: real
+    damping: real
+    direction_by_speed: real
+    direction_change: real
+    change: real
+
+
+@wp.struct
+class Bound:
+    """Largest friction b(p) [Pa] and its derivative by p."""
+
+    value: real
+    marginal: real
+
+
+@wp.struct
+class Duals:
+    """Unknowns of the law besides the velocities: λ [Pa], and s, 1 where the surface comes out, −1 going in."""
+
+    friction: vec3
+    direction: real
+
+
+@wp.struct
+class Motion:
+    """How a point moves relative to the second body: separating speed, and slip across the normal [m/s]."""
+
+    rate: real
+    slip: vec3
+
+
+@wp.struct
+class Linear:
+    """The law at given velocities, and its derivatives at given duals, duals eliminated.
+
+    The traction is p n + λ + friction_change, whatever the duals, and its derivative
+
+        −f n dv_n + (b′ f dv_n) c − g du − l (û · du),    c = u / max(|u|, v_s).
+
+    Attributes:
+        pressure: p and its derivatives.
+        friction: λ, projected onto |λ| ≤ b(p) [Pa].
+        friction_change: Change of λ that makes it fit the velocities [Pa].
+        grip: g [Pa s/m].
+        turning: l [Pa s/m], zero where the point sticks.
+        slip_direction: û, unit slip, zero where the point sticks.
+        by_pressure: b′ f c [Pa s/m].
+        held: Largest friction that is held [Pa].
+    """
+
+    pressure: Pressure
+    friction: vec3
+    friction_change: vec3
+    grip: real
+    turning: vec3
+    slip_direction: vec3
+    by_pressure: vec3
+    held: real
+
+
+@wp.func
+def point_law(material: Material, point: Point, impact_stiffness: real) -> PointLaw:
+    """The constants of a point.
+
+    In an impact that ends within the step, points are to rebound with e times their approaching speed; if
+    that is too slow to matter, to touch the surface without going deeper, whatever is left of their way.
+
+    Args:
+        material: Of the contact.
+        point: The point.
+        impact_stiffness: Of an impact [Pa/m]; zero if there is none.
+    """
+    law = PointLaw()
+    # Impacts that end within the step have had their restitution: what presses on gives nothing back.
+    squared = material.restitution * material.restitution
+    loss = wp.where(material.instant > ZERO, ONE, (ONE - squared) / (ONE + squared))
+    kept = wp.min(material.hysteresis, loss)
+    law.stiffness = material.stiffness
+    law.depth = point.depth
+    law.ahead = material.ahead
+    sunk = wp.max(point.depth, ZERO)
+    if impact_stiffness > ZERO:
+        rebound = -material.restitution * point.approach
+        law.stiffness = impact_stiffness
+        law.ahead = material.timestep
+        sunk = ZERO
+        law.depth = wp.min(point.depth, ZERO)
+        if rebound > material.bounce:
+            law.depth = material.timestep * rebound
+    law.damped = (loss - kept) * sunk
+    law.lost = kept * sunk
+    law.restitution_velocity = wp.sqrt(
+        wp.max(material.restitution_velocity * material.restitution_velocity, material.uplift * sunk)
+    )
+    law.friction = material.friction
+    law.fading = material.friction_fading
+    law.friction_pressure = material.friction_pressure
+    law.stiction = material.stiction
+    law.sharp = material.instant
+    return law
+
+
+@wp.func
+def pressure(law: PointLaw, rate: real, direction: real, stiction: real) -> Pressure:
+    """Pressure p = k max(0, d − D) at a separating speed v_n.
+
+    D is what the separating speed takes off the depth d, the larger of
+
+    - d⁺ ((ρ − σ) s(v_n / v_e) + σ c(v_n / v_s)) with s(x) = x / √(1 + x²), c(x) = x / max(|x|, 1) and
+      ρ = (1 − e²)/(1 + e²): the force going in exceeds that going out by 1/e² whatever the path, so an impact
+      returns e² of its energy. Slower than v_e all but the share σ ≤ ρ becomes a damper; σ is lost however
+      slow the motion, which stops rolling and rocking. Where impacts end within the step, ρ = 1 and s(x) is
+      x up to its limits ±1, and v_e grows with the depth: nothing is pushed out faster;
+    - θ h v_n: the depth at the end of the step, or in its middle, instead of its start, which makes the
+      spring implicit.
+
+    Args:
+        law: Constants of the point.
+        rate: v_n [m/s].
+        direction: The dual s of c(v_n / v_s), which only the derivatives depend on.
+        stiction: v_s, softened or not [m/s].
+    """
+    found = Pressure()
+    scaled = rate / law.restitution_velocity
+    saturation = wp.clamp(scaled, -ONE, ONE)
+    saturation_slope = wp.where(wp.abs(scaled) < ONE, ONE, ZERO)
+    if law.sharp == ZERO:
+        inverse = ONE / wp.sqrt(ONE + scaled * scaled)
+        saturation = scaled * inverse
+        saturation_slope = inverse * inverse * inverse
+    slow = wp.max(wp.abs(rate), stiction)
+    fitting = rate / slow
+    away = wp.where(wp.abs(rate) > stiction, direction * wp.sign(rate), ZERO)
+    found.direction_by_speed = (ONE - away) / slow
+    found.direction_change = fitting - direction
+    by_loss = law.damped * saturation + law.lost * fitting
+    by_time = law.ahead * rate
+    lossy = wp.abs(by_loss) > wp.abs(by_time)
+    left = law.depth - wp.where(lossy, by_loss, by_time)
+    if left > ZERO:
+        found.value = law.stiffness * left
+        if lossy:
+            slower = law.damped / law.restitution_velocity * saturation_slope
+            found.damping = law.stiffness * (slower + law.lost * found.direction_by_speed)
+            found.change = -law.stiffness * law.lost * found.direction_change
+        else:
+            found.damping = law.stiffness * law.ahead
+    return found
+
+
+@wp.func
+def friction_bound(law: PointLaw, p: real) -> Bound:
+    """b(p) = μ (1 − φ p/(p + p₀)) p."""
+    found = Bound()
+    lightness = law.friction_pressure / (law.friction_pressure + p)
+    found.value = law.friction * (ONE - law.fading * (ONE - lightness)) * p
+    found.marginal = law.friction * (ONE - law.fading * (ONE - lightness * lightness))
+    return found
+
+
+@wp.func
+def point_motion(point: Point, velocity: vec3, spin: vec3) -> Motion:
+    """Motion of a point, less its extra slip, from the first body's twist relative to the second, at its centre."""
+    motion = Motion()
+    u = velocity + wp.cross(spin, point.arm)
+    motion.rate = wp.dot(point.normal, velocity) + wp.dot(point.moment, spin)
+    motion.slip = u - wp.dot(point.normal, u) * point.normal
+    return motion
+
+
+@wp.func
+def traction(law: PointLaw, point: Point, velocity: vec3, spin: vec3) -> vec3:
+    """The law: pressure and friction [Pa] at a point that moves relative to the second body."""
+    motion = point_motion(point, velocity, spin)
+    slip = motion.slip + point.extra_slip
+    p = pressure(law, motion.rate, ZERO, law.stiction).value
+    bound = friction_bound(law, p)
+    return p * point.normal - (bound.value / wp.max(wp.length(slip), law.stiction)) * slip
+
+
+@wp.func
+def fitting_duals(law: PointLaw, motion: Motion) -> Duals:
+    """Duals that fit given velocities."""
+    duals = Duals()
+    duals.direction = motion.rate / wp.max(wp.abs(motion.rate), law.stiction)
+    p = pressure(law, motion.rate, duals.direction, law.stiction).value
+    bound = friction_bound(law, p)
+    duals.friction = (-bound.value / wp.max(wp.length(motion.slip), law.stiction)) * motion.slip
+    return duals
+
+
+@wp.func
+def linearized(law: PointLaw, motion: Motion, duals: Duals, softness: real, holds: bool, mix: real, held: real) -> Linear:
+    """One linearisation of the law with its duals.
+
+    Args:
+        law: Constants of the point.
+        motion: Of the point.
+        duals: The duals.
+        softness: Multiplies the stiction velocity.
+        holds: Whether the largest friction is the one that is held, whatever the pressure.
+        mix: Share of that one which is renewed first, from the pressure as it is.
+        held: That one [Pa].
+    """
+    found = Linear()
+    stiction = law.stiction * softness
+    found.pressure = pressure(law, motion.rate, duals.direction, stiction)
+    bound = friction_bound(law, found.pressure.value)
+    limit = bound.value
+    marginal = bound.marginal
+    found.held = held
+    if holds:
+        found.held = held + mix * (limit - held)
+        limit = found.held
+        marginal = ZERO
+    speed = wp.length(motion.slip)
+    slow = wp.max(speed, stiction)
+    size = wp.length(duals.friction)
+    found.friction = duals.friction
+    if size > limit:
+        found.friction = (limit / size) * duals.friction
+    gain = motion.slip / slow
+    found.friction_change = -found.friction - limit * gain
+    found.grip = limit / slow
+    if speed > stiction:
+        found.turning = found.friction / slow
+        found.slip_direction = gain
+    found.by_pressure = (marginal * found.pressure.damping) * gain
+    return found
+
+
+@wp.func
+def following_duals(found: Linear, duals: Duals, change: Motion) -> Duals:
+    """The duals after the motion changed, from the linearisation before."""
+    after = Duals()
+    after.friction = (
+        found.friction
+        + found.friction_change
+        + change.rate * found.by_pressure
+        - found.grip * change.slip
+        - wp.dot(found.slip_direction, change.slip) * found.turning
+    )
+    s = duals.direction + found.pressure.direction_change + found.pressure.direction_by_speed * change.rate
+    after.direction = wp.clamp(s, -ONE, ONE)
+    return after

@@ -1,0 +1,158 @@
+"""What a sample of a surface is to the solid of another body (docs/theory/contact.md, "Finding contact")."""
+
+import warp as wp
+
+from dano.physics.distances import Distance
+from dano.physics.features import TURNING
+from dano.physics.pairs import AXIS, BALL, FIXED, PairPose
+from dano.physics.real import HALF, ONE, real, vec3, ZERO
+
+_FIXED = wp.constant(FIXED)
+_AXIS = wp.constant(AXIS)
+_BALL = wp.constant(BALL)
+# A sample faces the other way if its normal and that of the solid differ by less than 60°: the cosine.
+_TURNED = wp.constant(real(0.5))
+
+
+@wp.struct
+class Sample:
+    """A sample of a surface: where it is [m, F] and its vector area [m², F]."""
+
+    point: vec3
+    area: vec3
+
+
+@wp.struct
+class Point:
+    """A point contact of the first body with the second, in world axes.
+
+    Geometry is that of the predicted configuration, moved back along with the first body's centre of mass, so
+    that forces act on one line for both bodies.
+
+    Attributes:
+        arm: From the first body's centre of mass to the point [m].
+        normal: Unit normal out of the second body, toward the first.
+        moment: Moment of a unit pressure about the first body's centre of mass [m]: arm × normal, without what
+            a body that rolls on a smooth surface would feel of single samples.
+        extra_slip: What is added to the slip [m/s]: the part along the surface of half the change of the
+            point's velocity within the step, for samples that keep facing the second body.
+        depth: Below the second body's surface at the end of the step if nothing moved in it [m].
+        rate: Separating speed at the old velocities [m/s].
+        approach: Separating speed with which the step begins [m/s].
+        area: That faces the second body [m²].
+    """
+
+    arm: vec3
+    normal: vec3
+    moment: vec3
+    extra_slip: vec3
+    depth: real
+    rate: real
+    approach: real
+    area: real
+
+
+@wp.func
+def solid_normal(gradient: vec3) -> vec3:
+    """Unit normal; far below the surface of a sampled distance the gradient may vanish."""
+    return gradient / wp.sqrt(wp.max(wp.dot(gradient, gradient), real(1e-12)))
+
+
+@wp.func
+def position_in_solid(pose: PairPose, point: vec3) -> vec3:
+    """Where a sample is in the frame of the solid [m]."""
+    return pose.points * point + pose.origin
+
+
+@wp.func
+def facing_area(pose: PairPose, sample: Sample, normal: vec3) -> real:
+    """The part of a sample's area that faces the solid [m²]; negative if it faces the other way."""
+    return -wp.dot(pose.vectors * sample.area, normal)
+
+
+@wp.func
+def is_turned(pose: PairPose, sample: Sample, d: Distance, facing: real) -> bool:
+    """Whether a sample lies in the solid and faces the same way as its surface."""
+    return d.value < ZERO and -facing > _TURNED * wp.length(pose.vectors * sample.area)
+
+
+@wp.func
+def drift(pose: PairPose, ahead: vec3, arm: vec3, normal: vec3) -> vec3:
+    """Half of what the velocity of a point changes by within the step [m/s], in solid axes.
+
+    What touches is another place each time. At most the slip at the predicted place, so that friction gives
+    no energy.
+
+    Args:
+        pose: The pair.
+        ahead: From the first body's centre of mass to the point in the predicted configuration [m].
+        arm: The arm that forces have.
+        normal: Unit normal.
+    """
+    change = wp.cross(pose.spin, HALF * (ahead - arm))
+    nearing = wp.dot(normal, change) * normal
+    across = change - nearing
+    u = pose.velocity + wp.cross(pose.spin, ahead)
+    slip = u - wp.dot(normal, u) * normal
+    squared = wp.dot(across, across)
+    most = wp.dot(slip, slip)
+    if squared > most:
+        across = wp.where(most > ZERO, wp.sqrt(wp.max(most, real(1e-300)) / squared), ZERO) * across
+    return nearing + across
+
+
+@wp.func
+def point_contact(
+    pose: PairPose,
+    sample: Sample,
+    d: Distance,
+    turning: int,
+    presses_back: bool,
+    stiffness_share: real,
+    lead: real,
+) -> Point:
+    """The point contact of a sample.
+
+    Args:
+        pose: The pair of bodies.
+        sample: The sample.
+        d: Of the solid at the sample.
+        turning: How samples turn with their body.
+        presses_back: Whether the sample lies in the solid and faces the other way: then it presses along its
+            own normal with all of its area, as a fluid would.
+        stiffness_share: Share of the area that counts.
+        lead: τ h [s].
+    """
+    point = Point()
+    normal = solid_normal(d.gradient)
+    area = facing_area(pose, sample, normal)
+    if presses_back:
+        vector = pose.vectors * sample.area
+        area = wp.length(vector)
+        normal = -vector / area
+    arm = pose.arms * sample.point + pose.arm_offset
+    moment = wp.cross(arm, normal)
+    if wp.static(BALL in TURNING):
+        if turning == _BALL:
+            # The surface of a ball that turns does not move: all samples feel what the lowest of them does.
+            moment = wp.cross(pose.lowest, normal)
+    if wp.static(AXIS in TURNING):
+        if turning == _AXIS:
+            # … and about an axis nothing of the spin about it.
+            moment = moment - wp.dot(pose.axis, moment) * pose.axis
+    rate = wp.dot(pose.velocity, normal) + wp.dot(pose.spin, moment)
+    point.arm = pose.rotation * arm
+    point.normal = pose.rotation * normal
+    point.moment = pose.rotation * moment
+    point.depth = lead * rate - d.value
+    point.rate = rate
+    point.approach = rate
+    point.area = stiffness_share * area
+    if wp.static(len(TURNING) > 1):
+        if turning != _FIXED:
+            ahead = position_in_solid(pose, sample.point) - pose.com
+            changed = drift(pose, ahead, arm, normal)
+            nearing = wp.dot(normal, changed)
+            point.approach = rate - nearing
+            point.extra_slip = pose.rotation * (changed - nearing * normal)
+    return point
