@@ -32,6 +32,7 @@ from dano.contact import (
 from dano.engine._newton import inverse3
 from dano.engine._rigid import angular_momentum, turned
 from dano.engine._sequential import one_at_a_time
+from dano.engine._tables import scene_tables, Tables
 from dano.engine._trees import build_tree, Tree, tree_mobilities
 from dano.engine.joints import in_tables, tree_tables, TreeTables
 from dano.maths import matmul, matvec, quat_to_matrix
@@ -47,6 +48,7 @@ class Prepared(eqx.Module):
         impacts: How they treat impacts.
         capacity: Chunks of points that a step has room for (static).
         trees: Tables of the trees, where machine code makes the whole step; else None.
+        tables: Tables of the scene, where kernels make the whole step; else None.
     """
 
     geometry: Geometry | None
@@ -54,6 +56,7 @@ class Prepared(eqx.Module):
     impacts: Impacts | None
     capacity: int = eqx.field(static=True)
     trees: TreeTables | None = None
+    tables: Tables | None = None
 
 
 class Problem(eqx.Module):
@@ -151,7 +154,14 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
         sampled = [body.surface.points.shape[1] for body in scene.bodies if body.surface is not None]
         capacity = -(-sum(sampled) // CHUNK)
     impacts = Impacts(material.instant > 0, material.bounce)
-    return Prepared(geometry, jnp.stack(material), impacts, capacity)
+    tables = scene_tables(scene) if _has_kernels(scene) else None
+    return Prepared(geometry, jnp.stack(material), impacts, capacity, tables=tables)
+
+
+def _has_kernels(scene: Scene) -> bool:
+    """Whether kernels make the whole step of a scene."""
+    alone = all(isinstance(contact.law, DistributedLaw) for contact in scene.contacts)
+    return jax.default_backend() == "cpu" and alone and not scene.joints and not scene.loops
 
 
 def structure_of(scene: Scene) -> Pairs:

@@ -272,6 +272,8 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
             wrench = total6(wrench)
             jacobian = total66(jacobian)
             if lane == 0:
+                if room.wrenches.shape[1] > 0:
+                    room.wrenches[world, f] = wrench
                 add_contact(scene, room, world, found, m, wrench, jacobian)
     fit.unfit = total(fit.unfit)
     fit.push = total(fit.push)

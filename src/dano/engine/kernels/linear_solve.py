@@ -118,3 +118,12 @@ def copy_blocks(room: Room, world: int, m: int):
     for k in range(m * m):
         if room.used[world, k] > 0:
             room.spare[world, k] = room.blocks[world, k]
+
+
+@wp.func
+def copy_transposed_blocks(room: Room, world: int, m: int):
+    """Copy the transpose of the Jacobian into `spare`."""
+    for i in range(m):
+        for j in range(m):
+            if room.used[world, i * m + j] > 0:
+                room.spare[world, j * m + i] = wp.transpose(room.blocks[world, i * m + j])

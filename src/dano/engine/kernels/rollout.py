@@ -34,6 +34,7 @@ class Launch:
         states: At the end of each step, written to, shape (worlds, steps · n).
         reports: Written to, shape (worlds, steps).
         n_steps: Number of steps.
+        n_directions: Number of directions in which a derivative is taken.
         first_world: World of the first block of lanes.
         options: When a solve stops.
     """
@@ -43,6 +44,7 @@ class Launch:
     states: wp.array2d(dtype=StateRow)
     reports: wp.array2d(dtype=StepReport)
     n_steps: int
+    n_directions: int
     first_world: int
     options: Options
 

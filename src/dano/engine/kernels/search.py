@@ -50,12 +50,10 @@ class Meeting:
     Attributes:
         share: τ, share of the step after which geometry is taken.
         critical: Probe that has sunk in by then, −1 where none does within the step.
-        toward: Direction that samples which turn face then [F].
     """
 
     share: real
     critical: int
-    toward: vec3
 
 
 @wp.struct
@@ -120,17 +118,22 @@ def is_near(scene: Scene, world: int, a: BodyState, b: BodyState, first: int, se
 
 
 @wp.func
+def facing(scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, share: real, h: real) -> vec3:
+    """Direction that samples of the first body face after a share of the step [F]."""
+    solid = solid_of_body(scene, world, second)
+    index = scene.body_index[first]
+    scale = scene.bodies[world, first].scale
+    return facing_direction(scene.solids, world, solid, a, b, share, h, index.turning, scale)
+
+
+@wp.func
 def posed(
     scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, share: real, h: real, follows: real
 ) -> PairPose:
     """Pose of a pair after a share of the step."""
-    index = scene.body_index[first]
-    solid = solid_of_body(scene, world, second)
-    scale = scene.bodies[world, first].scale
-    toward = facing_direction(
-        scene.solids, world, solid, a, b, share, h, index.turning, scale
-    )
-    return pair_pose(a, b, share, h, toward, index.turning, scale, follows)
+    toward = facing(scene, world, a, b, first, second, share, h)
+    turning = scene.body_index[first].turning
+    return pair_pose(a, b, share, h, toward, turning, scene.bodies[world, first].scale, follows)
 
 
 @wp.func
@@ -400,6 +403,7 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
             found.critical = met.critical
             found.share = met.share
             found.com_difference = pose.com_difference
+            found.toward = facing(scene, world, a, b, index.first, index.second, met.share, h)
             material = scene.materials[world, index.contact]
             found.impact_stiffness = impact_stiffness(a, b, sums, material)
             room.found[world, n_found * _LANES + lane] = found

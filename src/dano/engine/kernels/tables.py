@@ -6,7 +6,7 @@ fields stand in the order of the row; whole numbers are the same for all worlds.
 
 import warp as wp
 
-from dano.physics.distances import Solids
+from dano.physics.distances import Leaf, Solids
 from dano.physics.pairs import BodyState
 from dano.physics.point_law import Duals, Linear, Material, PointLaw
 from dano.physics.real import mat33, mat66, real, vec3, vec4, vec6
@@ -224,6 +224,10 @@ class Room:
         step: Of Newton's method.
         residual: Of each moving body [kg m/s; kg m²/s, W].
         scale: Turns momenta into velocities [1/kg; 1/(kg m²)].
+        state_bar: Derivatives by the states at the start of a step.
+        after_bar: By those at its end.
+        wrenches: Impulse of each pair that is near, at the first body's centre of mass [N s, N m s, W].
+        missing: Changes of the equations of a step, shape (worlds, directions · m).
     """
 
     bodies: wp.array2d(dtype=BodyState)
@@ -249,3 +253,30 @@ class Room:
     step: wp.array2d(dtype=vec6)
     residual: wp.array2d(dtype=vec6)
     scale: wp.array2d(dtype=vec6)
+    state_bar: wp.array2d(dtype=StateRow)
+    after_bar: wp.array2d(dtype=StateRow)
+    wrenches: wp.array2d(dtype=vec6)
+    missing: wp.array2d(dtype=vec6)
+
+
+@wp.struct
+class Changes:
+    """Numbers that belong to what a rollout is given and to what it finds: derivatives by them, or changes.
+
+    Arrays without columns are not asked for, or do not change. Those of changes hold one direction after the
+    other.
+
+    Attributes: those of `Scene` and `Launch` with the same names; `coefficients` are those of `Solids`.
+    """
+
+    bodies: wp.array2d(dtype=Body)
+    samples: wp.array2d(dtype=Sample)
+    leaves: wp.array2d(dtype=Leaf)
+    coefficients: wp.array2d(dtype=real)
+    pairs: wp.array2d(dtype=SamplePair)
+    materials: wp.array2d(dtype=Material)
+    gravity: wp.array2d(dtype=vec3)
+    timestep: wp.array2d(dtype=real)
+    state: wp.array2d(dtype=StateRow)
+    pushes: wp.array2d(dtype=Push)
+    states: wp.array2d(dtype=StateRow)
