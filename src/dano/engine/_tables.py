@@ -116,26 +116,33 @@ def _flattened(leaf: _Leaf) -> list[_Leaf]:
     return [leaf]
 
 
-def features_of(scene: Scene) -> Features:
-    """What kernels must know of a scene with point contacts."""
-    leaves, degrees, turning, unions = set(), set(), set(), False
-    distances = {name: number for number, name in enumerate(_kind_names())}
-    for body in scene.bodies:
-        if body.solid is not None:
-            parts = leaves_of(body.solid, scene.timestep.dtype)
-            unions = unions or len(parts) > 1
-            leaves |= {distances[_KINDS[type(part.shape)][0]] for part in parts}
-            degrees |= {
-                degree_of(part.shape.interpolation)
-                for part in parts
-                if isinstance(part.shape, SignedDistanceGrid)
-            }
-        if body.surface is not None:
-            turning.add(_TURNING[body.surface.turning])
+# Kinds, ways of turning and degrees that builds know, from the smallest on. Few builds serve all scenes: each
+# takes some seconds to compile, once on a machine.
+_PLANES, _PRIMITIVES, _GRIDS = frozenset({0}), frozenset(range(6)), frozenset({0, 6})
+_STILL, _TURNS = frozenset({0}), frozenset({0, 1, 2})
+
+
+def features_of(scene: Scene, pairs: Sequence[tuple[int, int, int]]) -> Features:
+    """The smallest build that knows what the pairs of a scene need."""
+    kinds, degrees, turning, unions = set(), set(), set(), False
+    numbers = {name: number for number, name in enumerate(_kind_names())}
+    for first, second, _ in pairs:
+        solid, surface = scene.bodies[second].solid, scene.bodies[first].surface
+        assert solid is not None and surface is not None
+        parts = leaves_of(solid, scene.timestep.dtype)
+        unions = unions or len(parts) > 1
+        kinds |= {numbers[_KINDS[type(part.shape)][0]] for part in parts}
+        degrees |= {
+            degree_of(part.shape.interpolation) for part in parts if isinstance(part.shape, SignedDistanceGrid)
+        }
+        turning.add(_TURNING[surface.turning])
+    every = _PRIMITIVES | _GRIDS
+    known = next(each for each in (_PLANES, _PRIMITIVES, _GRIDS, every) if kinds <= each)
+    of_grids = frozenset({2}) if degrees <= {2} else frozenset({1, 2, 3})
     return Features(
-        KINDS=frozenset(leaves),
-        DEGREES=frozenset(degrees),
-        TURNING=frozenset(turning | {0}),
+        KINDS=known,
+        DEGREES=of_grids if 6 in known else frozenset(),
+        TURNING=_STILL if turning <= _STILL else _TURNS,
         UNIONS=unions,
     )
 
@@ -164,9 +171,10 @@ def scene_tables(scene: Scene) -> Tables:
     Raises:
         ValueError: If a shape is not one that kernels know.
     """
-    features, dtype = features_of(scene), scene.timestep.dtype
-    kernels = instance(features, "dano.engine.kernels.tables")
+    dtype = scene.timestep.dtype
     pairs = pressing_pairs(scene.bodies, scene.point_pairs)
+    features = features_of(scene, pairs)
+    kernels = instance(features, "dano.engine.kernels.tables")
     used = {i for pair in pairs for i in pair[:2]}
     bodies = [body if i in used else body.unused() for i, body in enumerate(scene.bodies)]
     surfaces, surface_index = _surfaces(scene, bodies, dtype)
