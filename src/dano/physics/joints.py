@@ -86,16 +86,9 @@ class Displacement:
 
 @wp.struct
 class JointMove:
-    """How a body on a joint moves in a step.
-
-    Attributes:
-        displacement: Of the body.
-        carried: Turn of the body that carries the joint [W].
-        pivot: Shift of the pivot [m, W].
-    """
+    """How a body on a joint moves in a step: its displacement, and the shift of the pivot [m, W]."""
 
     displacement: Displacement
-    carried: quat
     pivot: vec3
 
 
@@ -106,10 +99,10 @@ def turn_about(axis: vec3, half: real) -> quat:
     cosine = ONE
     sine = half
     if s < _SERIES:
-        cosine = ONE - s / TWO * (ONE - s / real(12.0) * (ONE - s / real(30.0) * (ONE - s / real(56.0))))
-        sine = half * (
-            ONE - s / real(6.0) * (ONE - s / real(20.0) * (ONE - s / real(42.0) * (ONE - s / real(72.0))))
-        )
+        c = ONE - real(1.0 / 30.0) * s * (ONE - real(1.0 / 56.0) * s)
+        cosine = ONE - HALF * s * (ONE - real(1.0 / 12.0) * s * c)
+        c = ONE - real(1.0 / 42.0) * s * (ONE - real(1.0 / 72.0) * s)
+        sine = half - half * real(1.0 / 6.0) * s * (ONE - real(1.0 / 20.0) * s * c)
     else:
         cosine = wp.cos(half)
         sine = wp.sin(half)
@@ -249,7 +242,6 @@ def hanging_move(
         moved += turned_by(before, h * (y[0] * frame.first + y[1] * frame.second))
         own = turn_about(frame.axis, HALF * h * y[2])
     turn = before * own
-    found.carried = before
     found.pivot = moved
     found.displacement.turn = turn
     found.displacement.shift = moved + change_by_turn(turn, lever)

@@ -83,27 +83,29 @@ def begin_body(scene: Scene, room: Room, world: int, i: int, row: StateRow, push
     state.com = body.com
     size = ZERO
     if m >= 0:
+        b = m
+        is_alone = True
+        hangs = False
+        if wp.static(TREES):
+            node = scene.trees.nodes[m]
+            b = node.place // 6
+            is_alone = node.alone > 0
+            hangs = node.kind != _ROOT
         rotation = matrix(state.orientation)
         inertia = turned_inertia(rotation, body.inertia)
         spin = rotation * row.omega
-        state.ahead = turned(state.orientation, row.omega, h)
-        state.velocity = row.velocity
-        state.spin = spin
-        state.inverse_mass = ONE / body.mass
-        state.inverse_inertia = wp.inverse(inertia)
+        if not hangs:
+            state.ahead = turned(state.orientation, row.omega, h)
+            state.velocity = row.velocity
+            state.spin = spin
+        if is_alone:
+            state.inverse_mass = ONE / body.mass
+            state.inverse_inertia = wp.inverse(inertia)
         linear = body.mass * (row.velocity + h * scene.gravity[world, 0]) + h * push.force
         angular = angular_momentum(spin, inertia, h, -ONE) + h * push.torque
         room.momentum[world, m] = joined(linear, angular)
         room.inertia[world, m] = inertia
-        b = m
-        is_alone = True
-        if wp.static(TREES):
-            node = scene.trees.nodes[m]
-            b = -1
-            if node.kind == _ROOT:
-                b = node.place // 6
-            is_alone = node.alone > 0
-        if b >= 0:
+        if not hangs:
             room.velocity[world, b] = joined(row.velocity, spin)
         if is_alone:
             by_mass = ONE / body.mass
@@ -182,6 +184,16 @@ def advance_hanging(room: Room, world: int, node: int, i: int, row: StateRow) ->
     after.velocity = linear_part(twist)
     after.omega = wp.quat_rotate_inv(room.bodies[world, i].orientation, angular_part(twist))
     return after
+
+
+@wp.func
+def was_tried(scene: Scene, room: Room, world: int) -> bool:
+    """Whether the solution is what was tried last, of which displacements are known."""
+    same = bool(True)
+    for b in range(scene.n_blocks):
+        for k in range(6):
+            same = same and room.velocity[world, b][k] == room.tried[world, b][k]
+    return same
 
 
 @wp.func
@@ -310,7 +322,8 @@ def rollout(scene: Scene, room: Room, launch: Launch):
             report.overflow = wp.where(overflow, ONE, ZERO)
             report.rebound = rebound
             if wp.static(TREES):
-                move_trees(scene, room, world, room.velocity, scene.timestep[world, 0])
+                if not was_tried(scene, room, world):
+                    move_trees(scene, room, world, room.velocity, scene.timestep[world, 0])
                 if turns_too_far(scene, room, world):
                     report.solved = ZERO
             launch.reports[world, t] = report

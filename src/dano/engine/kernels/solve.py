@@ -24,14 +24,16 @@ from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.balance import (
     add_tree_slopes,
     eliminate_joint_duals,
+    finish_joint_duals,
     fit_joint_duals,
     follow_joint_duals,
     measure_joints,
     resolve_joints,
+    same_mode,
     solve_trees,
 )
 from dano.physics.features import LANES, TREES
-from dano.physics.real import HALF, INFINITY, ONE, real, vec6, ZERO
+from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec6, ZERO
 
 LEVELS = 11
 """Number of levels of a solve."""
@@ -246,17 +248,25 @@ def largest_error(scene: Scene, room: Room, world: int) -> real:
 
 
 @wp.func
-def newton_step(scene: Scene, room: Room, world: int, share: real):
-    """A share of Newton's step from what was tried, in `room.step`."""
+def newton_step(scene: Scene, room: Room, world: int, share: real, keeps: bool):
+    """A share of Newton's step from what was tried, in `room.step`.
+
+    Args:
+        scene: The scene.
+        room: Room.
+        world: Which world.
+        share: The share.
+        keeps: Whether trees have the derivative of the step before.
+    """
     m = scene.n_blocks
     copy_blocks(room, world, m)
     for i in range(m):
         room.step[world, i] = -room.residual[world, i]
     if wp.static(TREES):
-        eliminate_joint_duals(scene, room, world)
+        eliminate_joint_duals(scene, room, world, keeps)
     solve_blocks(room, world, m)
     if wp.static(TREES):
-        solve_trees(scene, room, world)
+        solve_trees(scene, room, world, keeps)
     for i in range(m):
         room.step[world, i] = share * room.step[world, i]
 
@@ -308,6 +318,7 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
     share = real(1.0)
     before = real(INFINITY)
     best = real(INFINITY)
+    keeps = bool(False)
     wait()
     while not found.converged and found.passes < options.max_passes and number < _LEVELS:
         if lane == 0:
@@ -322,11 +333,18 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
         fit = assemble(scene, room, world, lane, n_found, trial)
         wait()
         if wp.static(TREES):
-            # A root needs no derivative.
-            if n_found > 0 or largest_error(scene, room, world) > options.tolerance * (ONE + size):
-                wait()
-                if lane == 0:
-                    add_tree_slopes(scene, room, world)
+            # A root needs no derivative. Close to it that of the pass before serves: its relative error is
+            # about twice the factor by which the last step made the residual smaller.
+            needs = bool(True)
+            if n_found == 0:
+                missed = largest_error(scene, room, world)
+                enough = options.tolerance * (ONE + size)
+                keeps = TWO * missed * missed <= enough * before and same_mode(scene, room, world)
+                keeps = keeps and found.passes > 0 and search.length == ONE
+                needs = missed > enough and not keeps
+            wait()
+            if lane == 0 and needs:
+                add_tree_slopes(scene, room, world)
             wait()
         seen = measure(scene, room, world)
         tolerance = wp.max(options.tolerance * (ONE + size), real(16.0) * options.rounding * seen.size)
@@ -373,7 +391,7 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
                     room.velocity[world, i] = room.tried[world, i]
             if not found.converged:
                 if lane == 0:
-                    newton_step(scene, room, world, part)
+                    newton_step(scene, room, world, part, keeps)
                     if wp.static(TREES):
                         follow_joint_duals(scene, room, world, search.length, part)
                 wait()
@@ -396,6 +414,13 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
             room.velocity[world, i] = room.best[world, i]
     if wp.static(TREES):
         if found.converged and lane == 0:
+            if keeps:
+                # What the derivative of a pass before has left, to rounding.
+                newton_step(scene, room, world, ONE, True)
+                follow_joint_duals(scene, room, world, search.length, ONE)
+                for i in range(m):
+                    room.velocity[world, i] = room.velocity[world, i] + room.step[world, i]
+                finish_joint_duals(scene, room, world)
             resolve_joints(scene, room, world)
     wait()
     found.residual = wp.where(found.converged, before, best)

@@ -19,7 +19,13 @@ from dano.engine.kernels.trees.factor import (
     solve_factored,
     spread_over_blocks,
 )
-from dano.engine.kernels.trees.kinematics import move_trees, see_from_contact, start_motions, unknown_of
+from dano.engine.kernels.trees.kinematics import (
+    end_motions,
+    move_trees,
+    see_from_contact,
+    start_motions,
+    unknown_of,
+)
 from dano.engine.kernels.trees.tables import Node
 from dano.physics.composites import (
     by_end_motion,
@@ -285,6 +291,7 @@ def add_tree_slopes(scene: Scene, room: Room, world: int):
             turning = spin_momentum_by_end(spin, room.inertia[world, n], h)
             mass = scene.bodies[world, node.body].mass
             room.trees.composites[world, n] = composite(mass, lever, after, turning)
+    end_motions(scene, room, world, room.tried, h)
     gather_slopes(scene, room, world, room.trees.end, False)
     for c in range(scene.trees.coordinates.shape[0]):
         u = scene.trees.coordinates[c].place
@@ -329,8 +336,15 @@ def measure_joints(scene: Scene, room: Room, world: int) -> JointsMeasured:
 
 
 @wp.func
-def eliminate_joint_duals(scene: Scene, room: Room, world: int):
-    """Take the duals out of the linear system for a step: `room.step` and the matrices that are used up."""
+def eliminate_joint_duals(scene: Scene, room: Room, world: int, keeps: bool):
+    """Take the duals out of the linear system for a step: `room.step` and the matrices that are used up.
+
+    Args:
+        scene: The scene.
+        room: Room.
+        world: Which world.
+        keeps: Whether matrices of trees that touch nothing are factored already.
+    """
     h = scene.timestep[world, 0]
     m = scene.n_blocks
     for c in range(scene.trees.coordinates.shape[0]):
@@ -343,10 +357,22 @@ def eliminate_joint_duals(scene: Scene, room: Room, world: int):
             pushed = h * dual_change(state.resolved, state.rho, y, ZERO)
             room.step[world, b][u % 6] -= pushed
             stiff = h * state.resolved.slope
+            room.trees.joints[world, c].factored = state.resolved.slope
             if room.trees.coupled[world, scene.trees.blocks[b].tree] > 0:
                 room.spare[world, b * m + b][u % 6, u % 6] += stiff
-            else:
+            elif not keeps:
                 room.trees.diagonal[world, u] = room.trees.diagonal[world, u] + stiff
+
+
+@wp.func
+def same_mode(scene: Scene, room: Room, world: int) -> bool:
+    """Whether joints stick, slip and stop as they did where the matrix was factored last."""
+    same = bool(True)
+    for c in range(scene.trees.coordinates.shape[0]):
+        if scene.trees.coordinates[c].nonsmooth > 0:
+            state = room.trees.joints[world, c]
+            same = same and state.resolved.slope == state.factored
+    return same
 
 
 @wp.func
@@ -372,9 +398,23 @@ def follow_joint_duals(scene: Scene, room: Room, world: int, length: real, share
 
 
 @wp.func
-def solve_trees(scene: Scene, room: Room, world: int):
-    """Newton's step of the trees that touch nothing, from `room.step` in place."""
-    factor(scene, room, world)
+def finish_joint_duals(scene: Scene, room: Room, world: int):
+    """Accept the duals at the end of the whole step, where nothing is tried any more."""
+    for c in range(scene.trees.coordinates.shape[0]):
+        coordinate = scene.trees.coordinates[c]
+        if coordinate.nonsmooth > 0:
+            y = unknown_of(room.velocity, world, coordinate.place)
+            state = room.trees.joints[world, c]
+            dual = state.dual + state.change
+            room.trees.joints[world, c].dual = dual
+            room.trees.joints[world, c].resolved = resolved(state.ramps, state.rho, dual, y)
+
+
+@wp.func
+def solve_trees(scene: Scene, room: Room, world: int, keeps: bool):
+    """Newton's step of the trees that touch nothing, from `room.step` in place; see `eliminate_joint_duals`."""
+    if not keeps:
+        factor(scene, room, world)
     solve_factored(scene, room, world)
 
 

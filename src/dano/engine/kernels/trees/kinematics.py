@@ -20,6 +20,7 @@ from dano.physics.joints import (
     motion_share,
     motion_twist,
     ROOT,
+    turned_by,
 )
 from dano.physics.real import ONE, quat, real, vec3, vec6, ZERO
 from dano.physics.rotations import spin_of_turn, turn_of_step
@@ -109,19 +110,11 @@ def start_motions(scene: Scene, room: Room, world: int):
 def move_root(room: Room, world: int, n: int, node: Node, velocities: wp.array2d(dtype=vec6), h: real):
     """How a body that moves freely moves with what it carries."""
     y = velocities[world, node.place // 6]
-    spin = angular_part(y)
     moved = Displacement()
-    moved.turn = turn_of_step(spin, h)
+    moved.turn = turn_of_step(angular_part(y), h)
     moved.shift = h * linear_part(y)
     room.trees.displacements[world, n] = moved
     room.trees.twists[world, n] = y
-    turning = end_by_spin(spin, h)
-    frame = JointFrame()
-    for part in range(6):
-        along = motion_direction(node.kind, frame, part)
-        if part >= 3:
-            along = turning * along
-        room.trees.end[world, node.motion + part] = motion_twist(part >= 3, along, moved.shift)
 
 
 @wp.func
@@ -140,19 +133,13 @@ def move_hanging(
     move = hanging_move(node.kind, share, frame, parent, arm, position - frame.pivot, y, h)
     moved = move.displacement
     room.trees.displacements[world, n] = moved
+    room.trees.pivots[world, n] = move.pivot
     room.trees.twists[world, n] = joined((ONE / h) * moved.shift, spin_of_turn(moved.turn, h))
-    lever = frame.pivot + move.pivot - room.bodies[world, node.origin].position
-    for part in range(node.width):
-        along = share * motion_direction(node.kind, frame, part)
-        if node.kind == _BALL:
-            along = end_by_spin(joint_spin(frame, y), h) * along
-        along = wp.quat_rotate(move.carried, along)
-        room.trees.end[world, node.motion + part] = motion_twist(is_turn(node.kind, part), along, lever)
 
 
 @wp.func
 def move_trees(scene: Scene, room: Room, world: int, velocities: wp.array2d(dtype=vec6), h: real):
-    """Displacements and twists of all bodies of trees in a step, and what velocities do at its end, over h."""
+    """Displacements and twists of all bodies of trees in a step."""
     for n in range(scene.trees.nodes.shape[0]):
         node = scene.trees.nodes[n]
         if node.alone == 0:
@@ -160,6 +147,37 @@ def move_trees(scene: Scene, room: Room, world: int, velocities: wp.array2d(dtyp
                 move_root(room, world, n, node, velocities, h)
             else:
                 move_hanging(scene, room, world, n, node, velocities, h)
+
+
+@wp.func
+def end_motions(scene: Scene, room: Room, world: int, velocities: wp.array2d(dtype=vec6), h: real):
+    """What each generalised velocity does at the end of the step that `move_trees` found, over h."""
+    for n in range(scene.trees.nodes.shape[0]):
+        node = scene.trees.nodes[n]
+        if node.alone == 0:
+            frame = JointFrame()
+            share = ONE
+            before = quat(ZERO, ZERO, ZERO, ONE)
+            lever = vec3()
+            if node.kind == _ROOT:
+                lever = room.trees.displacements[world, n].shift
+            else:
+                frame = room.trees.frames[world, n]
+                share = motion_share(node.kind, scene.trees.joints[world, node.joint])
+                before = displacement_of(room, world, node.parent).turn
+                lever = frame.pivot + room.trees.pivots[world, n]
+                lever = lever - room.bodies[world, node.origin].position
+            turning = wp.identity(n=3, dtype=real)
+            if node.kind == _ROOT:
+                turning = end_by_spin(angular_part(velocities[world, node.place // 6]), h)
+            elif node.kind == _BALL:
+                turning = end_by_spin(joint_spin(frame, velocities_of(velocities, world, node)), h)
+            for part in range(node.width):
+                along = share * motion_direction(node.kind, frame, part)
+                if node.kind == _BALL or (node.kind == _ROOT and part >= 3):
+                    along = turning * along
+                along = turned_by(before, along)
+                room.trees.end[world, node.motion + part] = motion_twist(is_turn(node.kind, part), along, lever)
 
 
 @wp.func

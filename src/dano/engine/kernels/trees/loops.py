@@ -4,7 +4,7 @@ import warp as wp
 
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.factor import add_to_block
-from dano.engine.kernels.trees.kinematics import displacement_of, unknown_of
+from dano.engine.kernels.trees.kinematics import displacement_of, end_motions, unknown_of
 from dano.engine.kernels.trees.tables import LoopIndex
 from dano.physics.features import WIDE
 from dano.physics.loops import gap_by_twist, loop_compliance, loop_gap, LoopEnd
@@ -137,6 +137,7 @@ def add_loop_side(scene: Scene, room: Room, world: int, row: int, forces: vec6, 
 def add_loops(scene: Scene, room: Room, world: int):
     """Gaps and what forces in loops give, at what is tried, and the derivative of both."""
     m = scene.n_blocks
+    end_motions(scene, room, world, room.tried, scene.timestep[world, 0])
     for row in range(scene.trees.loop_index.shape[0]):
         index = scene.trees.loop_index[row]
         first = end_after(room, world, index.first_body, index.first)

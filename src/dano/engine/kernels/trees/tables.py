@@ -6,7 +6,7 @@ from dano.physics.composites import Composite
 from dano.physics.joint_laws import JointDrive, JointLaw, Ramps, Resolved
 from dano.physics.joints import Displacement, Joint, JointFrame
 from dano.physics.loops import Loop
-from dano.physics.real import real, vec6
+from dano.physics.real import real, vec3, vec6
 
 
 @wp.struct
@@ -156,6 +156,7 @@ class JointState:
         dual: λ at the accepted velocities [N m or N].
         change: Of λ by the whole step of the solver.
         resolved: (ρ + g)⁻¹(λ + ρ y) at what was tried last.
+        factored: Slope of g with which the Jacobian was factored last.
     """
 
     drive: JointDrive
@@ -164,6 +165,7 @@ class JointState:
     dual: real
     change: real
     resolved: Resolved
+    factored: real
 
 
 @wp.struct
@@ -173,6 +175,7 @@ class TreeRoom:
     Attributes:
         frames: Joint of each node, shape (worlds, m).
         displacements: Of the body of each node in a step.
+        pivots: Shift of its joint's pivot [m, W].
         twists: Velocity and spin of that body [W].
         offsets: c of the twist J y + c by which contact sees it move [m/s; rad/s, W].
         wrenches: What the bodies from each node on miss, at the origin of the tree.
@@ -194,6 +197,7 @@ class TreeRoom:
 
     frames: wp.array2d(dtype=JointFrame)
     displacements: wp.array2d(dtype=Displacement)
+    pivots: wp.array2d(dtype=vec3)
     twists: wp.array2d(dtype=vec6)
     offsets: wp.array2d(dtype=vec6)
     wrenches: wp.array2d(dtype=vec6)
