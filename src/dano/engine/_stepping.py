@@ -59,6 +59,7 @@ def _plan(
     epsilon = float(jnp.finfo(dtype).eps)
     relative = epsilon**0.75 if options.tolerance is None else options.tolerance
     numbers = {
+        "scene.n_blocks": tables.whole.arrays["scene.moving"].shape[0],
         "launch.n_steps": n_steps,
         "launch.options.tolerance": relative,
         "launch.options.rounding": epsilon,

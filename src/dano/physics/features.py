@@ -12,6 +12,10 @@ UNIONS = True
 """Whether a solid has several leaves."""
 TURNING = frozenset({0, 1, 2})
 """How samples turn with their bodies, see `pairs`."""
+TREES = True
+"""Whether bodies hang on joints."""
+LOOPS = True
+"""Whether chains of joints are closed, see `loops`."""
 LANES = 1
 """Lanes of a world: 1 on a CPU, 32 on a GPU."""
 WIDE = True

@@ -4,11 +4,23 @@ import warp as wp
 
 from dano.engine.kernels.lanes import total, total6, total66
 from dano.engine.kernels.tables import FoundPair, Room, Scene
-from dano.physics.features import LANES
+from dano.engine.kernels.trees.balance import add_tree_momentum
+from dano.engine.kernels.trees.contact import add_pulled, body_twist, free_block
+from dano.engine.kernels.trees.loops import add_loops
+from dano.physics.features import LANES, LOOPS, TREES
 from dano.physics.momentum import angular_momentum, angular_momentum_jacobian
 from dano.physics.point_law import Duals, fitting_duals, following_duals, Linear, linearized, Motion, point_motion
 from dano.physics.real import mat33, mat66, ONE, real, vec3, vec6, ZERO
 from dano.physics.samples import Point
+from dano.physics.twists import (
+    angular_part,
+    joined,
+    joined_blocks,
+    linear_part,
+    relative_twist,
+    shift,
+    Twist,
+)
 
 _LANES = wp.constant(LANES)
 
@@ -45,62 +57,6 @@ class Trial:
     mix: real
 
 
-@wp.struct
-class Twist:
-    """Velocity [m/s] and spin [rad/s]."""
-
-    velocity: vec3
-    spin: vec3
-
-
-@wp.func
-def linear_part(x: vec6) -> vec3:
-    """Velocity or force."""
-    return vec3(x[0], x[1], x[2])
-
-
-@wp.func
-def angular_part(x: vec6) -> vec3:
-    """Spin or moment."""
-    return vec3(x[3], x[4], x[5])
-
-
-@wp.func
-def joined(a: vec3, b: vec3) -> vec6:
-    """Linear and angular part as one."""
-    return vec6(a[0], a[1], a[2], b[0], b[1], b[2])
-
-
-@wp.func
-def joined_blocks(a: mat33, b: mat33, c: mat33, d: mat33) -> mat66:
-    """The 6 × 6 matrix [[a, b], [c, d]]."""
-    return mat66(
-        a[0, 0], a[0, 1], a[0, 2], b[0, 0], b[0, 1], b[0, 2],
-        a[1, 0], a[1, 1], a[1, 2], b[1, 0], b[1, 1], b[1, 2],
-        a[2, 0], a[2, 1], a[2, 2], b[2, 0], b[2, 1], b[2, 2],
-        c[0, 0], c[0, 1], c[0, 2], d[0, 0], d[0, 1], d[0, 2],
-        c[1, 0], c[1, 1], c[1, 2], d[1, 0], d[1, 1], d[1, 2],
-        c[2, 0], c[2, 1], c[2, 2], d[2, 0], d[2, 1], d[2, 2],
-    )  # fmt: skip
-
-
-@wp.func
-def shift(com_difference: vec3) -> mat66:
-    """T: twist of the second body → its twist at the first body's centre of mass; Tᵀ takes wrenches back."""
-    eye = wp.identity(n=3, dtype=real)
-    return joined_blocks(eye, -wp.skew(com_difference), mat33(), eye)
-
-
-@wp.func
-def relative_twist(first: vec6, second: vec6, com_difference: vec3) -> Twist:
-    """Of the first body relative to the second, at the first body's centre of mass [W]."""
-    twist = Twist()
-    spin = angular_part(second)
-    twist.velocity = linear_part(first) - linear_part(second) - wp.cross(spin, com_difference)
-    twist.spin = angular_part(first) - spin
-    return twist
-
-
 @wp.func
 def row_of(values: wp.array2d(dtype=vec6), world: int, row: int) -> vec6:
     """Of a body by its row, zero for one that does not move."""
@@ -110,11 +66,28 @@ def row_of(values: wp.array2d(dtype=vec6), world: int, row: int) -> vec6:
 
 
 @wp.func
-def pair_twist(scene: Scene, world: int, found: FoundPair, velocities: wp.array2d(dtype=vec6)) -> Twist:
-    """Relative twist of the bodies of a pair at given velocities."""
+def pair_twist(
+    scene: Scene, room: Room, world: int, found: FoundPair, velocities: wp.array2d(dtype=vec6), offset: real
+) -> Twist:
+    """Relative twist of the bodies of a pair at given velocities.
+
+    Args:
+        scene: The scene.
+        room: Room.
+        world: Which world.
+        found: The pair.
+        velocities: Unknowns of the step.
+        offset: 1 for the twist, 0 for how it changes with a change of the unknowns.
+    """
     index = scene.pair_index[found.pair]
-    first = row_of(velocities, world, scene.body_index[index.first].row)
-    second = row_of(velocities, world, scene.body_index[index.second].row)
+    a = scene.body_index[index.first].row
+    b = scene.body_index[index.second].row
+    if wp.static(TREES):
+        moved = body_twist(scene, room, world, a, velocities, offset)
+        other = body_twist(scene, room, world, b, velocities, offset)
+        return relative_twist(moved, other, found.com_difference)
+    first = row_of(velocities, world, a)
+    second = row_of(velocities, world, b)
     return relative_twist(first, second, found.com_difference)
 
 
@@ -130,7 +103,7 @@ def fit_duals(scene: Scene, room: Room, world: int, lane: int, n_found: int):
     """Duals that fit the accepted velocities."""
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
-        twist = pair_twist(scene, world, found, room.velocity)
+        twist = pair_twist(scene, room, world, found, room.velocity, ONE)
         for k in range(found.first, found.end):
             point = room.points[world, k]
             motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
@@ -145,7 +118,7 @@ def follow_duals(scene: Scene, room: Room, world: int, lane: int, n_found: int, 
     """Accept the duals at a share of the last step; find their change along the new one, in `room.step`."""
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
-        twist = pair_twist(scene, world, found, room.step)
+        twist = pair_twist(scene, room, world, found, room.step, ZERO)
         for k in range(found.first, found.end):
             linear = room.linear[world, k]
             duals = room.duals[world, k]
@@ -193,17 +166,21 @@ def clear_blocks(room: Room, world: int, m: int):
 @wp.func
 def add_momentum(scene: Scene, room: Room, world: int, m: int, h: real):
     """What each body's momentum gains in the step beyond what it comes with, and the derivative."""
-    for i in range(m):
-        body = scene.bodies[world, scene.moving[i]]
-        v = room.tried[world, i]
-        spin = angular_part(v)
-        inertia = room.inertia[world, i]
-        linear = body.mass * linear_part(v)
-        angular = angular_momentum(spin, inertia, h, ONE)
-        room.residual[world, i] = joined(linear, angular) - room.momentum[world, i]
-        eye = wp.identity(n=3, dtype=real)
-        turning = angular_momentum_jacobian(spin, inertia, h)
-        room.blocks[world, i * m + i] = joined_blocks(body.mass * eye, mat33(), mat33(), turning)
+    for i in range(scene.moving.shape[0]):
+        b = i
+        if wp.static(TREES):
+            b = free_block(scene, i)
+        if b >= 0:
+            body = scene.bodies[world, scene.moving[i]]
+            v = room.tried[world, b]
+            spin = angular_part(v)
+            inertia = room.inertia[world, i]
+            linear = body.mass * linear_part(v)
+            angular = angular_momentum(spin, inertia, h, ONE)
+            room.residual[world, b] = joined(linear, angular) - room.momentum[world, i]
+            eye = wp.identity(n=3, dtype=real)
+            turning = angular_momentum_jacobian(spin, inertia, h)
+            room.blocks[world, b * m + b] = joined_blocks(body.mass * eye, mat33(), mat33(), turning)
 
 
 @wp.func
@@ -214,6 +191,9 @@ def add_contact(
     index = scene.pair_index[found.pair]
     a = scene.body_index[index.first].row
     b = scene.body_index[index.second].row
+    if wp.static(TREES):
+        add_pulled(scene, room, world, a, b, found.com_difference, wrench, jacobian)
+        return
     if a >= 0:
         room.residual[world, a] -= wrench
         room.blocks[world, a * m + a] -= jacobian
@@ -232,14 +212,18 @@ def add_contact(
 def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, trial: Trial) -> Fit:
     """Residual and Jacobian as momenta at the velocities that are tried, with duals at a share of the step."""
     h = scene.timestep[world, 0]
-    m = scene.moving.shape[0]
+    m = scene.n_blocks
     fit = Fit()
     if lane == 0:
         clear_blocks(room, world, m)
         add_momentum(scene, room, world, m, h)
+        if wp.static(TREES):
+            add_tree_momentum(scene, room, world, trial.length, True)
+        if wp.static(LOOPS):
+            add_loops(scene, room, world)
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
-        twist = pair_twist(scene, world, found, room.tried)
+        twist = pair_twist(scene, room, world, found, room.tried, ONE)
         wrench = vec6()
         jacobian = mat66()
         presses = ZERO

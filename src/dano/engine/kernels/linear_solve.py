@@ -8,57 +8,67 @@ pivots stay away from singular.
 import warp as wp
 
 from dano.engine.kernels.tables import Room, Scene
-from dano.physics.features import LANES
+from dano.engine.kernels.trees.pattern import couple, couple_pair, couple_trees, mark_tree, mark_trees
+from dano.physics.features import LANES, TREES
 from dano.physics.real import mat66, ONE, real, vec6, ZERO
 
 _LANES = wp.constant(LANES)
 
 
 @wp.func
-def couple(room: Room, world: int, m: int, i: int, j: int):
-    """Say that two bodies share a block."""
-    room.used[world, i * m + j] = 1
-    room.used[world, j * m + i] = 1
-
-
-@wp.func
 def find_pattern(scene: Scene, room: Room, world: int, n_found: int):
-    """Which bodies share a block, with what elimination fills in; its order, and later neighbours."""
-    m = scene.moving.shape[0]
+    """Which blocks are coupled, with what elimination fills in; its order, and later neighbours.
+
+    Trees that touch nothing are not in it: see `dano.engine.kernels.trees.factor`.
+    """
+    m = scene.n_blocks
     for k in range(m * m):
         room.used[world, k] = 0
     for i in range(m):
         room.used[world, i * m + i] = 1
+    if wp.static(TREES):
+        mark_trees(scene, room, world)
     for f in range(n_found):
         index = scene.pair_index[room.found[world, f * _LANES].pair]
         a = scene.body_index[index.first].row
         b = scene.body_index[index.second].row
-        if a >= 0 and b >= 0:
+        if wp.static(TREES):
+            couple_pair(scene, room, world, a, b)
+            mark_tree(scene, room, world, a)
+            mark_tree(scene, room, world, b)
+        elif a >= 0 and b >= 0:
             couple(room, world, m, a, b)
     for i in range(m):
         room.counts[world, i] = -1
+        room.order[world, i] = -1
+    if wp.static(TREES):
+        couple_trees(scene, room, world)
     for step in range(m):
         best = int(-1)
-        fewest = m + 1
+        fewest = 2 * m + 1
         for i in range(m):
             if room.counts[world, i] < 0:
                 degree = int(0)
+                if wp.static(TREES):
+                    # Forces in loops have nothing on the diagonal before all that they push is eliminated.
+                    degree = m * scene.trees.blocks[i].is_loop
                 for j in range(m):
                     if room.counts[world, j] < 0 and j != i:
                         degree += room.used[world, i * m + j]
                 if degree < fewest:
                     fewest = degree
                     best = i
-        room.order[world, step] = best
-        n = int(0)
-        for j in range(m):
-            if j != best and room.counts[world, j] < 0 and room.used[world, best * m + j] > 0:
-                room.later[world, best * m + n] = j
-                n += 1
-        room.counts[world, best] = n
-        for a in range(n):
-            for b in range(a + 1, n):
-                couple(room, world, m, room.later[world, best * m + a], room.later[world, best * m + b])
+        if best >= 0:
+            room.order[world, step] = best
+            n = int(0)
+            for j in range(m):
+                if j != best and room.counts[world, j] < 0 and room.used[world, best * m + j] > 0:
+                    room.later[world, best * m + n] = j
+                    n += 1
+            room.counts[world, best] = n
+            for a in range(n):
+                for b in range(a + 1, n):
+                    couple(room, world, m, room.later[world, best * m + a], room.later[world, best * m + b])
 
 
 @wp.func
@@ -93,23 +103,25 @@ def solve_blocks(room: Room, world: int, m: int):
     """Solve `spare` x = x in place, x in `room.step`; `spare` is used up."""
     for s in range(m):
         k = room.order[world, s]
-        pivot = inverse(room.spare[world, k * m + k])
-        room.spare[world, k * m + k] = pivot
-        n = room.counts[world, k]
-        for a in range(n):
-            i = room.later[world, k * m + a]
-            below = room.spare[world, i * m + k] * pivot
-            room.step[world, i] -= below * room.step[world, k]
-            for b in range(n):
-                j = room.later[world, k * m + b]
-                room.spare[world, i * m + j] -= below * room.spare[world, k * m + j]
+        if k >= 0:
+            pivot = inverse(room.spare[world, k * m + k])
+            room.spare[world, k * m + k] = pivot
+            n = room.counts[world, k]
+            for a in range(n):
+                i = room.later[world, k * m + a]
+                below = room.spare[world, i * m + k] * pivot
+                room.step[world, i] -= below * room.step[world, k]
+                for b in range(n):
+                    j = room.later[world, k * m + b]
+                    room.spare[world, i * m + j] -= below * room.spare[world, k * m + j]
     for t in range(m):
         k = room.order[world, m - 1 - t]
-        x = room.step[world, k]
-        for a in range(room.counts[world, k]):
-            i = room.later[world, k * m + a]
-            x -= room.spare[world, k * m + i] * room.step[world, i]
-        room.step[world, k] = room.spare[world, k * m + k] * x
+        if k >= 0:
+            x = room.step[world, k]
+            for a in range(room.counts[world, k]):
+                i = room.later[world, k * m + a]
+                x -= room.spare[world, k * m + i] * room.step[world, i]
+            room.step[world, k] = room.spare[world, k * m + k] * x
 
 
 @wp.func

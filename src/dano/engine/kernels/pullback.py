@@ -13,7 +13,7 @@ from dano.engine.kernels.adjoint import (
     state_work,
     Virtual,
 )
-from dano.engine.kernels.assembly import assemble, fit_duals, joined, row_of, Trial
+from dano.engine.kernels.assembly import assemble, fit_duals, row_of, Trial
 from dano.engine.kernels.lanes import total, total3, total33, wait
 from dano.engine.kernels.linear_solve import copy_transposed_blocks, find_pattern, solve_blocks
 from dano.engine.kernels.rollout import begin_body, Launch
@@ -26,6 +26,7 @@ from dano.physics.point_law import Material
 from dano.physics.real import HALF, mat33, ONE, quat, real, vec3, vec4, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz
 from dano.physics.samples import position_in_solid, Sample
+from dano.physics.twists import joined
 
 _LANES = wp.constant(LANES)
 _BALL = wp.constant(BALL)

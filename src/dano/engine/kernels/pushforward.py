@@ -8,7 +8,7 @@ depends on is that of reverse mode with a unit virtual velocity, and serves all 
 import warp as wp
 
 from dano.engine.kernels.adjoint import advance_work, momentum_work, Virtual
-from dano.engine.kernels.assembly import angular_part, joined, linear_part, row_of
+from dano.engine.kernels.assembly import row_of
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
 from dano.engine.kernels.pullback import pull_body, pull_pair, row_before, settle
@@ -19,6 +19,7 @@ from dano.physics.features import LANES
 from dano.physics.point_law import Material
 from dano.physics.real import ONE, real, vec3, vec4, vec6, ZERO
 from dano.physics.samples import Sample
+from dano.physics.twists import angular_part, joined, linear_part
 
 _LANES = wp.constant(LANES)
 

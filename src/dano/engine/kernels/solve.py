@@ -21,8 +21,19 @@ from dano.engine.kernels.assembly import assemble, fit_duals, follow_duals, Tria
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, find_pattern, solve_blocks
 from dano.engine.kernels.tables import Room, Scene
-from dano.physics.features import LANES
-from dano.physics.real import HALF, INFINITY, ONE, real, vec6, ZERO
+from dano.engine.kernels.trees.balance import (
+    add_tree_slopes,
+    eliminate_joint_duals,
+    finish_joint_duals,
+    fit_joint_duals,
+    follow_joint_duals,
+    measure_joints,
+    resolve_joints,
+    same_mode,
+    solve_trees,
+)
+from dano.physics.features import LANES, TREES
+from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec6, ZERO
 
 LEVELS = 11
 """Number of levels of a solve."""
@@ -199,8 +210,13 @@ def narrowed(search: Search, work: real) -> Search:
 @wp.func
 def measure(scene: Scene, room: Room, world: int) -> Measured:
     """Of the residual and Jacobian at the velocities that were tried."""
-    m = scene.moving.shape[0]
+    m = scene.n_blocks
     found = Measured()
+    if wp.static(TREES):
+        of_joints = measure_joints(scene, room, world)
+        found.work = of_joints.work
+        found.error = of_joints.error
+        found.size = wp.max(of_joints.size, room.trees.sizes[world, 1])
     for i in range(m):
         residual = room.residual[world, i]
         scale = room.scale[world, i]
@@ -215,6 +231,44 @@ def measure(scene: Scene, room: Room, world: int) -> Measured:
                 found.error = missed
             found.size = wp.max(found.size, scale[k] * size[k])
     return found
+
+
+@wp.func
+def largest_error(scene: Scene, room: Room, world: int) -> real:
+    """Largest residual over mass or inertia at the velocities that were tried [m/s, rad/s]."""
+    error = measure_joints(scene, room, world).error
+    for i in range(scene.n_blocks):
+        residual = room.residual[world, i]
+        scale = room.scale[world, i]
+        for k in range(6):
+            missed = wp.abs(scale[k] * residual[k])
+            if missed > error or wp.isnan(missed):
+                error = missed
+    return error
+
+
+@wp.func
+def newton_step(scene: Scene, room: Room, world: int, share: real, keeps: bool):
+    """A share of Newton's step from what was tried, in `room.step`.
+
+    Args:
+        scene: The scene.
+        room: Room.
+        world: Which world.
+        share: The share.
+        keeps: Whether trees have the derivative of the step before.
+    """
+    m = scene.n_blocks
+    copy_blocks(room, world, m)
+    for i in range(m):
+        room.step[world, i] = -room.residual[world, i]
+    if wp.static(TREES):
+        eliminate_joint_duals(scene, room, world, keeps)
+    solve_blocks(room, world, m)
+    if wp.static(TREES):
+        solve_trees(scene, room, world, keeps)
+    for i in range(m):
+        room.step[world, i] = share * room.step[world, i]
 
 
 @wp.func
@@ -241,21 +295,30 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
         size: Magnitude of the terms in the residual [m/s], to which rounding in it is relative.
         options: When to stop.
     """
-    m = scene.moving.shape[0]
+    m = scene.n_blocks
     if lane == 0:
         for i in range(m):
             room.best[world, i] = room.velocity[world, i]
             room.step[world, i] = vec6()
+        if wp.static(TREES):
+            fit_joint_duals(scene, room, world)
     fit_duals(scene, room, world, lane, n_found)
     found = Solved()
     search = begin_search(ZERO)
     number = int(0)
     level = level_of(0)
     budget = level.budget
+    if wp.static(TREES):
+        if n_found == 0:
+            # Without contact nothing cycles but joints, which a line search stops.
+            number = 1
+            level.searches = True
+            budget = options.max_passes
     mix = real(0.0)
     share = real(1.0)
     before = real(INFINITY)
     best = real(INFINITY)
+    keeps = bool(False)
     wait()
     while not found.converged and found.passes < options.max_passes and number < _LEVELS:
         if lane == 0:
@@ -269,6 +332,20 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
         trial.mix = mix
         fit = assemble(scene, room, world, lane, n_found, trial)
         wait()
+        if wp.static(TREES):
+            # A root needs no derivative. Close to it that of the pass before serves: its relative error is
+            # about twice the factor by which the last step made the residual smaller.
+            needs = bool(True)
+            if n_found == 0:
+                missed = largest_error(scene, room, world)
+                enough = options.tolerance * (ONE + size)
+                keeps = TWO * missed * missed <= enough * before and same_mode(scene, room, world)
+                keeps = keeps and found.passes > 0 and search.length == ONE
+                needs = missed > enough and not keeps
+            wait()
+            if lane == 0 and needs:
+                add_tree_slopes(scene, room, world)
+            wait()
         seen = measure(scene, room, world)
         tolerance = wp.max(options.tolerance * (ONE + size), real(16.0) * options.rounding * seen.size)
         hard = level.softness == ONE
@@ -314,17 +391,16 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
                     room.velocity[world, i] = room.tried[world, i]
             if not found.converged:
                 if lane == 0:
-                    copy_blocks(room, world, m)
-                    for i in range(m):
-                        room.step[world, i] = -room.residual[world, i]
-                    solve_blocks(room, world, m)
-                    for i in range(m):
-                        room.step[world, i] = part * room.step[world, i]
+                    newton_step(scene, room, world, part, keeps)
+                    if wp.static(TREES):
+                        follow_joint_duals(scene, room, world, search.length, part)
                 wait()
                 follow_duals(scene, room, world, lane, n_found, search.length)
                 # The next pass is no longer of the same function where bounds are renewed: it is accepted.
                 begun = real(0.0)
                 if mix == ZERO:
+                    if wp.static(TREES):
+                        begun = measure_joints(scene, room, world).work
                     for i in range(m):
                         begun += wp.dot(room.step[world, i], room.residual[world, i])
                 search = begin_search(begun)
@@ -336,6 +412,16 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
     if not found.converged and lane == 0:
         for i in range(m):
             room.velocity[world, i] = room.best[world, i]
+    if wp.static(TREES):
+        if found.converged and lane == 0:
+            if keeps:
+                # What the derivative of a pass before has left, to rounding.
+                newton_step(scene, room, world, ONE, True)
+                follow_joint_duals(scene, room, world, search.length, ONE)
+                for i in range(m):
+                    room.velocity[world, i] = room.velocity[world, i] + room.step[world, i]
+                finish_joint_duals(scene, room, world)
+            resolve_joints(scene, room, world)
     wait()
     found.residual = wp.where(found.converged, before, best)
     return found

@@ -6,6 +6,7 @@ fields stand in the order of the row; whole numbers are the same for all worlds.
 
 import warp as wp
 
+from dano.engine.kernels.trees.tables import TreeRoom, Trees
 from dano.physics.distances import Leaf, Solids
 from dano.physics.pairs import BodyState
 from dano.physics.point_law import Duals, Linear, Material, PointLaw
@@ -44,7 +45,7 @@ class BodyIndex:
     """Whole numbers of a body.
 
     Attributes:
-        row: Place among the bodies that move, or −1.
+        row: Place among the bodies that move, or −1; of bodies on joints their node.
         first_block: Of its samples.
         blocks: How many it has.
         first_probe: Of the points that say how deep it is, coarsely if there are many samples.
@@ -95,9 +96,10 @@ class Scene:
     """What stays constant over a rollout.
 
     Attributes:
+        n_blocks: Blocks of six unknowns: one of each free body, and those that joints and loops need.
         bodies: Shape (worlds, n).
         body_index: Shape (n,).
-        moving: Bodies that move, shape (m,).
+        moving: Bodies that move, shape (m,); with joints in the order of nodes.
         samples: Of all bodies, in blocks, shape (worlds, samples).
         balls: Centre [m, F] and radius [m] of a ball around each block, shape (worlds, blocks).
         runs: Balls around each block and those after it, `RUN` in all.
@@ -108,8 +110,10 @@ class Scene:
         materials: Of the contacts with point laws, shape (worlds, contacts).
         gravity: [m/s²], shape (worlds, 1).
         timestep: h [s], shape (worlds, 1).
+        trees: Bodies on joints.
     """
 
+    n_blocks: wp.int32
     bodies: wp.array2d(dtype=Body)
     body_index: wp.array(dtype=BodyIndex)
     moving: wp.array(dtype=wp.int32)
@@ -123,6 +127,7 @@ class Scene:
     materials: wp.array2d(dtype=Material)
     gravity: wp.array2d(dtype=vec3)
     timestep: wp.array2d(dtype=real)
+    trees: Trees
 
 
 @wp.struct
@@ -212,18 +217,20 @@ class Room:
         changes: Of the duals by the whole step.
         linear: The law as it was linearised last.
         near: Probes that may meet a solid within the step.
-        blocks: Of the Jacobian, shape (worlds, m · m).
+        blocks: Of the Jacobian, shape (worlds, blocks · blocks).
         spare: The same, used up by the solve.
         used: Whether a block is not zero.
         order: Of elimination; later neighbours; their numbers.
         later: …
         counts: …
-        velocity: Accepted, of each moving body [m/s; rad/s, W].
+        velocity: Accepted, of each free body [m/s; rad/s, W], or six coordinates of joints; (worlds, blocks).
+        old: Those of the step before; only with joints.
         tried: …
         best: Where the residual was smallest.
         step: Of Newton's method.
-        residual: Of each moving body [kg m/s; kg m²/s, W].
+        residual: What each block misses [kg m/s; kg m²/s, W].
         scale: Turns momenta into velocities [1/kg; 1/(kg m²)].
+        trees: Room for bodies on joints.
         state_bar: Derivatives by the states at the start of a step.
         after_bar: By those at its end.
         wrenches: Impulse of each pair that is near, at the first body's centre of mass [N s, N m s, W].
@@ -248,11 +255,13 @@ class Room:
     later: wp.array2d(dtype=wp.int32)
     counts: wp.array2d(dtype=wp.int32)
     velocity: wp.array2d(dtype=vec6)
+    old: wp.array2d(dtype=vec6)
     tried: wp.array2d(dtype=vec6)
     best: wp.array2d(dtype=vec6)
     step: wp.array2d(dtype=vec6)
     residual: wp.array2d(dtype=vec6)
     scale: wp.array2d(dtype=vec6)
+    trees: TreeRoom
     state_bar: wp.array2d(dtype=StateRow)
     after_bar: wp.array2d(dtype=StateRow)
     wrenches: wp.array2d(dtype=vec6)
