@@ -198,6 +198,12 @@ def point_law(material: Material, point: Point, impact_stiffness: real) -> Point
 
 
 @wp.func
+def is_apart(law: PointLaw, rate: real) -> bool:
+    """Whether a point that is not sunk in stays out: then d − θ h v_n says all."""
+    return law.depth <= ZERO and law.depth - law.ahead * rate <= ZERO
+
+
+@wp.func
 def pressure(law: PointLaw, rate: real, direction: real, stiction: real) -> Pressure:
     """Pressure p = k max(0, d − D) at a separating speed v_n.
 
@@ -225,10 +231,10 @@ def pressure(law: PointLaw, rate: real, direction: real, stiction: real) -> Pres
         inverse = ONE / wp.sqrt(ONE + scaled * scaled)
         saturation = scaled * inverse
         saturation_slope = inverse * inverse * inverse
-    slow = wp.max(wp.abs(rate), stiction)
-    fitting = rate / slow
+    inverse_slow = ONE / wp.max(wp.abs(rate), stiction)
+    fitting = rate * inverse_slow
     away = wp.where(wp.abs(rate) > stiction, direction * wp.sign(rate), ZERO)
-    found.direction_by_speed = (ONE - away) / slow
+    found.direction_by_speed = (ONE - away) * inverse_slow
     found.direction_change = fitting - direction
     by_loss = law.damped * saturation + law.lost * fitting
     by_time = law.ahead * rate
@@ -311,16 +317,16 @@ def linearized(law: PointLaw, motion: Motion, duals: Duals, softness: real, hold
         limit = found.held
         marginal = ZERO
     speed = wp.length(motion.slip)
-    slow = wp.max(speed, stiction)
+    inverse_slow = ONE / wp.max(speed, stiction)
     size = wp.length(duals.friction)
     found.friction = duals.friction
     if size > limit:
         found.friction = (limit / size) * duals.friction
-    gain = motion.slip / slow
+    gain = inverse_slow * motion.slip
     found.friction_change = -found.friction - limit * gain
-    found.grip = limit / slow
+    found.grip = limit * inverse_slow
     if speed > stiction:
-        found.turning = found.friction / slow
+        found.turning = inverse_slow * found.friction
         found.slip_direction = gain
     found.by_pressure = (marginal * found.pressure.damping) * gain
     return found

@@ -9,7 +9,16 @@ from dano.engine.kernels.trees.contact import add_pulled, body_twist, free_block
 from dano.engine.kernels.trees.loops import add_loops
 from dano.physics.features import LANES, LOOPS, TREES
 from dano.physics.momentum import angular_momentum, angular_momentum_jacobian
-from dano.physics.point_law import Duals, fitting_duals, following_duals, Linear, linearized, Motion, point_motion
+from dano.physics.point_law import (
+    Duals,
+    fitting_duals,
+    following_duals,
+    is_apart,
+    Linear,
+    linearized,
+    Motion,
+    point_motion,
+)
 from dano.physics.real import mat33, mat66, ONE, real, vec3, vec6, ZERO
 from dano.physics.samples import Point
 from dano.physics.twists import (
@@ -38,6 +47,29 @@ class Fit:
     unfit: real
     push: real
     renewed: real
+
+
+@wp.struct
+class Quarters:
+    """A derivative of wrenches by twists, by its quarters, and sums of grip, which belong to all of them.
+
+    Attributes:
+        vv: Force by velocity.
+        vw: Force by spin.
+        wv: Moment by velocity.
+        ww: Moment by spin.
+        grip: Σ g.
+        grip_arm: Σ g r.
+        grip_square: Σ g r rᵀ.
+    """
+
+    vv: mat33
+    vw: mat33
+    wv: mat33
+    ww: mat33
+    grip: real
+    grip_arm: vec3
+    grip_square: mat33
 
 
 @wp.struct
@@ -121,37 +153,63 @@ def follow_duals(scene: Scene, room: Room, world: int, lane: int, n_found: int, 
         twist = pair_twist(scene, room, world, found, room.step, ZERO)
         for k in range(found.first, found.end):
             linear = room.linear[world, k]
-            duals = room.duals[world, k]
-            changes = room.changes[world, k]
             tried = Duals()
-            tried.friction = linear.friction
-            tried.direction = duals.direction + length * changes.direction
-            after = following_duals(linear, tried, point_motion(room.points[world, k], twist.velocity, twist.spin))
+            changes = Duals()
+            if linear.pressure.value > ZERO or linear.grip > ZERO:
+                before = room.duals[world, k].direction
+                tried.friction = linear.friction
+                tried.direction = before + length * room.changes[world, k].direction
+                change = point_motion(room.points[world, k], twist.velocity, twist.spin)
+                after = following_duals(linear, tried, change)
+                changes.friction = after.friction - tried.friction
+                changes.direction = after.direction - tried.direction
             room.duals[world, k] = tried
-            changes.friction = after.friction - tried.friction
-            changes.direction = after.direction - tried.direction
             room.changes[world, k] = changes
 
 
 @wp.func
-def point_jacobian(point: Point, linear: Linear) -> mat66:
-    """Derivative of a point's wrench per area by the twist at the first body's centre of mass.
+def add_point_jacobian(sums: Quarters, point: Point, linear: Linear, weight: real) -> Quarters:
+    """Add the derivative of a point's impulse by the twist at the first body's centre of mass.
 
-    With a6 = (a, r × a) and n6 = (n, moment) that is
+    With a6 = (a, r × a), n6 = (n, moment), h times its area w, and X v = r × v that is
 
-        c6 n6ᵀ − f n6 n6ᵀ − l6 û6ᵀ − g (Σ_k e6_k e6_kᵀ − (n, r × n) (n, r × n)ᵀ).
+        w (c6 n6ᵀ − f n6 n6ᵀ − l6 û6ᵀ − g (E − (n, r × n) (n, r × n)ᵀ)),    E = Σ_k e6_k e6_kᵀ = [[1, −X], [X, −X²]].
     """
     r = point.arm
     n = point.normal
-    normal = joined(n, point.moment)
-    across = joined(n, wp.cross(r, n))
-    lean = joined(linear.by_pressure, wp.cross(r, linear.by_pressure)) - linear.pressure.damping * normal
-    turning = joined(linear.turning, wp.cross(r, linear.turning))
-    along = joined(linear.slip_direction, wp.cross(r, linear.slip_direction))
+    grip = weight * linear.grip
+    lean = weight * linear.by_pressure
+    damping = weight * linear.pressure.damping
+    a = lean - damping * n
+    a_moment = wp.cross(r, lean) - damping * point.moment
+    across = wp.cross(r, n)
+    g = grip * n
+    g_moment = grip * across
+    sums.vv += wp.outer(a, n) + wp.outer(g, n)
+    sums.vw += wp.outer(a, point.moment) + wp.outer(g, across)
+    sums.wv += wp.outer(a_moment, n) + wp.outer(g_moment, n)
+    sums.ww += wp.outer(a_moment, point.moment) + wp.outer(g_moment, across)
+    if wp.length_sq(linear.turning) > ZERO:
+        l = weight * linear.turning
+        l_moment = wp.cross(r, l)
+        along = wp.cross(r, linear.slip_direction)
+        sums.vv -= wp.outer(l, linear.slip_direction)
+        sums.vw -= wp.outer(l, along)
+        sums.wv -= wp.outer(l_moment, linear.slip_direction)
+        sums.ww -= wp.outer(l_moment, along)
+    sums.grip += grip
+    sums.grip_arm += grip * r
+    sums.grip_square += wp.outer(grip * r, r)
+    return sums
+
+
+@wp.func
+def whole_jacobian(sums: Quarters) -> mat66:
+    """The derivative that is summed by its quarters; − g E is added for all points at once."""
     eye = wp.identity(n=3, dtype=real)
-    x = wp.skew(r)
-    whole = joined_blocks(eye, -x, x, -(x * x))
-    return wp.outer(lean, normal) - wp.outer(turning, along) - linear.grip * (whole - wp.outer(across, across))
+    x = wp.skew(sums.grip_arm)
+    square = wp.trace(sums.grip_square) * eye - sums.grip_square  # −Σ g X²
+    return joined_blocks(sums.vv - sums.grip * eye, sums.vw + x, sums.wv - x, sums.ww - square)
 
 
 @wp.func
@@ -225,36 +283,39 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
         found = room.found[world, f * _LANES + lane]
         twist = pair_twist(scene, room, world, found, room.tried, ONE)
         wrench = vec6()
-        jacobian = mat66()
+        quarters = Quarters()
         presses = ZERO
         for k in range(found.first, found.end):
             point = room.points[world, k]
             law = room.laws[world, k]
             motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
-            duals = room.duals[world, k]
-            changes = room.changes[world, k]
-            duals.friction = duals.friction + trial.length * changes.friction
-            duals.direction = duals.direction + trial.length * changes.direction
-            held = room.linear[world, k].held
-            linear = linearized(law, motion, duals, trial.softness, trial.holds, trial.mix, held)
-            room.linear[world, k] = linear
-            weight = h * point.area
-            fit.renewed += weight * wp.abs(linear.held - held)
-            if linear.pressure.value > ZERO or linear.grip > ZERO:
-                presses = ONE
-                force = linear.pressure.value * point.normal
-                friction = linear.friction + linear.friction_change
-                moment = linear.pressure.value * point.moment + wp.cross(point.arm, friction)
-                wrench += weight * joined(force + friction, moment)
-                jacobian += weight * point_jacobian(point, linear)
-                change = linear.friction_change
-                fit.unfit += weight * (
-                    wp.abs(change[0]) + wp.abs(change[1]) + wp.abs(change[2]) + wp.abs(linear.pressure.change)
-                )
-                fit.push += weight * linear.pressure.value
+            if is_apart(law, motion.rate) and not trial.holds:
+                room.linear[world, k].pressure.value = ZERO
+                room.linear[world, k].grip = ZERO
+            else:
+                duals = room.duals[world, k]
+                changes = room.changes[world, k]
+                duals.friction = duals.friction + trial.length * changes.friction
+                duals.direction = duals.direction + trial.length * changes.direction
+                held = room.linear[world, k].held
+                linear = linearized(law, motion, duals, trial.softness, trial.holds, trial.mix, held)
+                room.linear[world, k] = linear
+                weight = h * point.area
+                fit.renewed += weight * wp.abs(linear.held - held)
+                if linear.pressure.value > ZERO or linear.grip > ZERO:
+                    presses = ONE
+                    friction = linear.friction + linear.friction_change
+                    force = weight * (linear.pressure.value * point.normal + friction)
+                    moment = weight * (linear.pressure.value * point.moment + wp.cross(point.arm, friction))
+                    wrench += joined(force, moment)
+                    quarters = add_point_jacobian(quarters, point, linear, weight)
+                    change = linear.friction_change
+                    missed = wp.abs(change[0]) + wp.abs(change[1]) + wp.abs(change[2])
+                    fit.unfit += weight * (missed + wp.abs(linear.pressure.change))
+                    fit.push += weight * linear.pressure.value
         if total(presses) > ZERO:
             wrench = total6(wrench)
-            jacobian = total66(jacobian)
+            jacobian = total66(whole_jacobian(quarters))
             if lane == 0:
                 if room.wrenches.shape[1] > 0:
                     room.wrenches[world, f] = wrench

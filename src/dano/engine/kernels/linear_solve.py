@@ -10,7 +10,8 @@ import warp as wp
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.pattern import couple, couple_pair, couple_trees, mark_tree, mark_trees
 from dano.physics.features import LANES, TREES
-from dano.physics.real import mat66, ONE, real, vec6, ZERO
+from dano.physics.real import mat33, mat66
+from dano.physics.twists import joined_blocks
 
 _LANES = wp.constant(LANES)
 
@@ -72,30 +73,25 @@ def find_pattern(scene: Scene, room: Room, world: int, n_found: int):
 
 
 @wp.func
-def inverse(a: mat66) -> mat66:
-    """Inverse by Gauss–Jordan elimination with row exchanges."""
-    inverted = wp.identity(n=6, dtype=real)
-    for k in range(6):
-        best = k
-        for r in range(k + 1, 6):
-            if wp.abs(a[r, k]) > wp.abs(a[best, k]):
-                best = r
-        pivot = a[best]
-        own = inverted[best]
-        if best != k:
-            a[best] = a[k]
-            inverted[best] = inverted[k]
-        scale = ONE / pivot[k]
-        pivot = pivot * scale
-        own = own * scale
-        a[k] = pivot
-        inverted[k] = own
-        for r in range(6):
-            if r != k:
-                factor = a[r, k]
-                a[r] = a[r] - factor * pivot
-                inverted[r] = inverted[r] - factor * own
-    return inverted
+def quarter(a: mat66, row: int, column: int) -> mat33:
+    """The 3 × 3 part of a block that begins at a row and a column."""
+    return mat33(
+        a[row, column], a[row, column + 1], a[row, column + 2],
+        a[row + 1, column], a[row + 1, column + 1], a[row + 1, column + 2],
+        a[row + 2, column], a[row + 2, column + 1], a[row + 2, column + 2],
+    )  # fmt: skip
+
+
+@wp.func
+def inverse(m: mat66) -> mat66:
+    """Inverse by the Schur complement of its first 3 × 3 part: mass plus dissipation, away from singular."""
+    a = wp.inverse(quarter(m, 0, 0))
+    b = quarter(m, 0, 3)
+    c = quarter(m, 3, 0)
+    left = c * a
+    s = wp.inverse(quarter(m, 3, 3) - left * b)
+    right = a * b * s
+    return joined_blocks(a + right * left, -right, -(s * left), s)
 
 
 @wp.func
