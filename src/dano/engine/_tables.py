@@ -80,10 +80,13 @@ class _Leaf(NamedTuple):
     rotation: Float[Array, "3 3"]
 
 
-def kind_of(solid: AbstractShape) -> str | None:
-    """Name of a kind of leaf; None if kernels do not know the shape."""
-    entry = _KINDS.get(type(solid))
-    return None if entry is None else entry[0]
+def is_known(solid: AbstractShape) -> bool:
+    """Whether kernels know a solid and all its parts."""
+    if isinstance(solid, UnionShape):
+        return all(is_known(part) for part in solid.shapes)
+    if isinstance(solid, ScaledShape | PosedShape):
+        return is_known(solid.shape)
+    return type(solid) in _KINDS
 
 
 def leaves_of(solid: AbstractShape, dtype: DTypeLike) -> list[_Leaf]:
