@@ -81,17 +81,26 @@ def every_solid():
 
     solids = distances.Solids()
     rows = {name: np.asarray(tables.rows[f"scene.solids.{name}"]) for name in ("leaves", "coefficients")}
-    solids.leaves = wp.array(rows["leaves"].view(distances.Leaf.numpy_dtype()), dtype=distances.Leaf, device="cpu").reshape((1, -1))
+    solids.leaves = wp.array(
+        rows["leaves"].view(distances.Leaf.numpy_dtype()), dtype=distances.Leaf, device="cpu"
+    ).reshape((1, -1))
     solids.coefficients = wp.array(rows["coefficients"].reshape(1, -1), dtype=real, device="cpu")
     kinds = tables.whole.arrays["scene.solids.kinds"]
-    solids.kinds = wp.array(kinds.view(distances.LeafKind.numpy_dtype()).ravel(), dtype=distances.LeafKind, device="cpu")
+    solids.kinds = wp.array(
+        kinds.view(distances.LeafKind.numpy_dtype()).ravel(), dtype=distances.LeafKind, device="cpu"
+    )
     index = tables.whole.arrays["scene.body_index"]
 
     def distance(name, points):
         k = 1 + list(SOLIDS).index(name)
         found, least = wp.zeros(len(points), vec4, device="cpu"), wp.zeros(len(points), real, device="cpu")
         given = wp.array(points, dtype=vec3, device="cpu")
-        wp.launch(asked, len(points), [solids, int(index[k, 6]), int(index[k, 7]), given, found, least], device="cpu")
+        wp.launch(
+            asked,
+            len(points),
+            [solids, int(index[k, 6]), int(index[k, 7]), given, found, least],
+            device="cpu",
+        )
         return found.numpy(), least.numpy()
 
     return distance
@@ -279,7 +288,10 @@ class _Viscous(AbstractContactLaw):
 
 def test_laws_that_no_step_would_ask():
     """They are refused before the first step, by name."""
-    bodies = [dano.Body("ball", dano.Sphere(0.03), mass=1.0), dano.Body("floor", dano.HalfSpace(), fixed=True)]
+    bodies = [
+        dano.Body("ball", dano.Sphere(0.03), mass=1.0),
+        dano.Body("floor", dano.HalfSpace(), fixed=True),
+    ]
     params = dano.ContactParams(stiffness=1e5)
     scene = dano.Scene.create(bodies, [dano.Contact("ball", "floor", params, law=_Viscous())], timestep=H)
     with pytest.raises(ValueError, match="_Viscous"):

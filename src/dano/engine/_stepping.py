@@ -18,7 +18,12 @@ CHUNK = 16
 
 
 def rollout(
-    tables: Tables, state: State, controls: Control | None, n_steps: int, capacity: int, options: SolverOptions
+    tables: Tables,
+    state: State,
+    controls: Control | None,
+    n_steps: int,
+    capacity: int,
+    options: SolverOptions,
 ) -> tuple[State, Report]:
     """States at the ends of steps, and their reports; arrays with a leading axis of steps.
 
@@ -54,7 +59,13 @@ def _still_joints(state: State, n_steps: int):
 
 
 def _plan(
-    tables: Tables, inputs: dict[str, Array], n: int, n_steps: int, capacity: int, options: SolverOptions, dtype
+    tables: Tables,
+    inputs: dict[str, Array],
+    n: int,
+    n_steps: int,
+    capacity: int,
+    options: SolverOptions,
+    dtype,
 ) -> Plan:
     epsilon = float(jnp.finfo(dtype).eps)
     relative = epsilon**0.75 if options.tolerance is None else options.tolerance

@@ -136,7 +136,9 @@ def features_of(scene: Scene, pairs: Sequence[tuple[int, int, int]]) -> Features
         unions = unions or len(parts) > 1
         kinds |= {numbers[_KINDS[type(part.shape)][0]] for part in parts}
         degrees |= {
-            degree_of(part.shape.interpolation) for part in parts if isinstance(part.shape, SignedDistanceGrid)
+            degree_of(part.shape.interpolation)
+            for part in parts
+            if isinstance(part.shape, SignedDistanceGrid)
         }
         turning.add(_TURNING[surface.turning])
     every = _PRIMITIVES | _GRIDS
@@ -324,7 +326,9 @@ def _solids(scene: Scene, bodies: Sequence[Body], used: set[int], features: Feat
     return arrays, index
 
 
-def solids_kinds(scene: Scene, bodies: Sequence[Body], used: set[int], dtype: DTypeLike) -> Int[np.ndarray, "k 6"]:
+def solids_kinds(
+    scene: Scene, bodies: Sequence[Body], used: set[int], dtype: DTypeLike
+) -> Int[np.ndarray, "k 6"]:
     """Kind, first coefficient, nodes along each axis and degree of each leaf."""
     leaves, _ = _solid_leaves(scene, bodies, used, dtype)
     names, rows, at = _kind_names(), [], 0

@@ -18,14 +18,14 @@ from dano.engine.kernels.lanes import total, total3, total33, wait
 from dano.engine.kernels.linear_solve import copy_transposed_blocks, find_pattern, solve_blocks
 from dano.engine.kernels.rollout import begin_body, Launch
 from dano.engine.kernels.search import find_contacts, fix_laws, posed, solid_of_body
-from dano.engine.kernels.tables import Body, Changes, FoundPair, Push, Room, Scene, StateRow, StepReport
-from dano.physics.distances import Distance, leaf_distance, nearest_leaf, Solid
+from dano.engine.kernels.tables import Changes, FoundPair, Push, Room, Scene, StateRow
+from dano.physics.distances import leaf_distance, nearest_leaf, Solid
 from dano.physics.features import LANES, TURNING, UNIONS
-from dano.physics.pairs import AXIS, BALL, BodyState, first_touch, PairPose, position_after, rotation_after
+from dano.physics.pairs import BALL, BodyState, first_touch, PairPose, position_after, rotation_after
 from dano.physics.point_law import Material
-from dano.physics.real import HALF, mat33, ONE, quat, real, vec3, vec4, vec6, ZERO
-from dano.physics.rotations import from_wxyz, matrix, to_wxyz
-from dano.physics.samples import position_in_solid, Sample
+from dano.physics.real import mat33, ONE, real, vec3, ZERO
+from dano.physics.rotations import matrix
+from dano.physics.samples import position_in_solid
 from dano.physics.twists import joined
 
 _LANES = wp.constant(LANES)
