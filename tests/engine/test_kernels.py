@@ -1,3 +1,4 @@
+# pyright: reportInvalidTypeForm=false
 """Kernels of a step: distances, linear systems, and steps and their derivatives against XLA's."""
 
 from typing import Any
@@ -183,6 +184,12 @@ def listed(points, found):
     return dict(zip(zip(*names, strict=True), np.stack(rows, axis=1), strict=True))
 
 
+def shares_of(found):
+    """Shares of the step after which geometry was taken."""
+    assert found is not None
+    return found.share
+
+
 def test_solves_steps_alike(heap):
     """The states of XLA's solver after a step, where geometry is that of its end."""
     scene, states = heap
@@ -193,7 +200,7 @@ def test_solves_steps_alike(heap):
         problem, found = build_problem(scene, prepared, state, None, pairs)
         start = jnp.concatenate([state.velocity, state.omega], axis=1)[: len(pairs.moving)]
         velocities, report = solve(problem, start, pairs, options)
-        return _advance(state, velocities, scene.timestep, pairs), report, jnp.all(found.share == 1)
+        return _advance(state, velocities, scene.timestep, pairs), report, jnp.all(shares_of(found) == 1)
 
     compared = 0
     for state in states:

@@ -7,12 +7,11 @@ share of it on each core, on a GPU a block of lanes each.
 """
 
 import concurrent.futures
-import contextlib
 import ctypes
 import functools
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -24,6 +23,7 @@ from jax.interpreters import batching, mlir
 
 from dano.engine._ffi import register
 from dano.engine._instances import Features, instance
+from dano.engine._warp import compiled_kernel
 
 
 class Shape(NamedTuple):
@@ -71,13 +71,7 @@ class Plan:
     @functools.cached_property
     def function(self) -> Any:
         """The kernel, compiled or loaded."""
-        import warp as wp
-
-        with _quietly():
-            wp.init()
-            kernel = getattr(instance(self.features, self.module), self.kernel)
-            wp.load_module(kernel.module, device="cpu")
-        return kernel
+        return compiled_kernel(lambda: getattr(instance(self.features, self.module), self.kernel))
 
     def target(self, batched: tuple[bool, ...], n_worlds: int, dtype: np.dtype) -> str:
         """Name for `jax.ffi.ffi_call` of launches of so many worlds with numbers of a type."""
@@ -89,19 +83,6 @@ class Plan:
             register(name, launcher if dtype == np.float64 else _Widened(launcher), "cpu")
             self._targets[key] = name
         return self._targets[key]
-
-
-@contextlib.contextmanager
-def _quietly() -> Iterator[None]:
-    """Warp without its words about devices and compiled modules."""
-    import warp as wp
-
-    level = wp.config.log_level
-    wp.config.log_level = wp.LOG_ERROR
-    try:
-        yield
-    finally:
-        wp.config.log_level = level
 
 
 _numbers = iter(range(10**12))

@@ -100,7 +100,7 @@ def leaves_of(solid: AbstractShape, dtype: DTypeLike) -> list[_Leaf]:
 
 
 def _flattened(leaf: _Leaf) -> list[_Leaf]:
-    """With x = s R y + p for y in the axes of the leaf's shape, the same for the shapes that it is made of."""
+    """With x = s R y + p for y in the axes of the leaf's shape, the same for the shapes in it."""
     shape, factor, position, rotation = leaf
     if isinstance(shape, ScaledShape):
         return _flattened(_Leaf(shape.shape, factor * shape.factor.astype(factor.dtype), position, rotation))
@@ -272,7 +272,7 @@ def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
 
 
 def _probes(surface: SurfaceSet) -> Float[Array, "k 3"]:
-    """Points that say how deep a surface is: its samples, or where they are many the centres of their blocks."""
+    """Points that say how deep a surface is: its samples, or if they are many the centres of blocks."""
     return surface.points[:3].T if surface.radii.shape[0] <= _FEW_BLOCKS else surface.centers
 
 
