@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+import dano
 from reference_step.distances import signed_distance
 from reference_step.law import Law, laws_of
 from reference_step.rotations import cross_matrix
@@ -113,7 +114,7 @@ class Pair:
 
         if self.turning == "axis":
             return look(np.zeros(3))[1]
-        S = np.asarray(self.body.scale)
+        S = semi_axes(self.body.shape)
         return first_touch(look, S)
 
     def turned(self, toward):
@@ -124,14 +125,19 @@ class Pair:
         if self.turning == "axis":
             Q = about_z(toward)
             return points @ Q.T, vectors @ Q.T
-        S = np.asarray(self.body.scale)
+        S = semi_axes(self.body.shape)
         Q = from_z(-unit(S * toward))
         return S * (points @ Q.T), np.prod(S) / S * (vectors @ Q.T)
 
     def lowest(self, toward):
         """The point [m, F] of a ball or an ellipsoid that comes closest."""
-        S = np.asarray(self.body.scale)
+        S = semi_axes(self.body.shape)
         return S * (from_z(-unit(S * toward)) @ np.array([0, 0, -1]))
+
+
+def semi_axes(shape):
+    """Of a ball or an ellipsoid [m]."""
+    return np.full(3, shape.radius) if isinstance(shape, dano.Sphere) else np.asarray(shape.semi_axes)
 
 
 def first_touch(look, S):
@@ -189,14 +195,16 @@ def meeting(scene, bodies, side):
     way = np.linalg.norm(bodies.velocity[side.i] - bodies.velocity[side.j]) + spins @ [radius, radius + apart]
     if h * way <= limit:
         return 1.0
-    if scene.bodies[side.i].surface.turning != "fixed":
-        w = np.zeros(3)  # what faces the other body does not turn with its own
+    turning = scene.bodies[side.i].surface.turning
 
     def look(share):
         """Whether a sample is too deep and goes in, and the share within which none can get there."""
         pair = Pair(scene, bodies, side, share)
         distance, normal = pair.distance(pair.places)
-        velocity = u + np.cross(w, pair.places - pair.x)
+        # What faces the other body does not turn with its own, a cylinder's samples not about its axis.
+        axis = pair.R[:, 2]
+        turns = {"fixed": w, "axis": w - (w @ axis) * axis, "ball": 0 * w}[turning]
+        velocity = u + np.cross(turns, pair.places - pair.x)
         deep, goes_in = distance <= -limit, np.sum(normal * velocity, axis=1) < 0
         speed = np.maximum(np.linalg.norm(velocity, axis=1), 1e-12)
         safe = np.where(deep, np.inf, (distance + limit) / (1.5 * h * speed))

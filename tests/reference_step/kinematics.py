@@ -176,7 +176,7 @@ class Kinematics:
             spin = momentum(R.T @ v[3:], J, h, 1) - momentum(R.T @ before[3:], J, h, -1)
             gained[i] = np.r_[bodies.mass[i] * (v[:3] - before[:3] - h * bodies.gravity), R @ spin]
             if control is not None:
-                gained[i] -= h * np.r_[control.force[i], control.torque[i]]
+                gained[i] -= h * np.r_[np.asarray(control.force)[i], np.asarray(control.torque)[i]]
         return gained
 
     def gaps(self, y):

@@ -153,20 +153,22 @@ class Wrench(NamedTuple):
 
 def wrench(points, velocities, softness=1.0):
     """What points do at velocities and spins of all bodies [m/s, rad/s; W], shape (n, 6)."""
-    away, n, A = points.com_difference, points.normal, points.area
+    away, n, A = points.com_difference, points.normal, points.area[:, None]
     u, w = np.split(relative(points) @ velocities[[points.first, points.second]].ravel(), 2)
     rate = n @ u + points.moment @ w
-    full = u + np.cross(w, points.arm) + points.drift
-    across = np.eye(3) - n[:, :, None] * n[:, None]
-    found = traction(points.law, points, rate, np.einsum("nij,nj->ni", across, full), softness)
+    full = u + points.drift - points.arm @ cross_matrix(w)  # u + w × r
+    slip = full - np.sum(full * n, axis=1, keepdims=True) * n
+    found = traction(points.law, points, rate, slip, softness)
     press = np.concatenate([n, points.moment], axis=1)  # what a unit pressure does, and ∂v_n/∂(twist)
-    # What friction does: force and moment of each direction. Its transpose is ∂(full)/∂(twist).
-    rub = np.concatenate([np.broadcast_to(np.eye(3), across.shape), cross_matrices(points.arm)], axis=1)
-    first = press.T @ (A * found.p) + np.einsum("nai,n,ni->a", rub, A, found.f)
-    slope = np.einsum("na,n,nb->ab", press, A * found.p_slope, press)
-    slope += np.einsum("nai,n,ni,nb->ab", rub, A, found.f_slope, press)
-    slope += np.einsum("nai,n,nij,njk,nbk->ab", rub, A, found.f_matrix, across, rub, optimize=True)
-    return Wrench(first, -np.concatenate([first[:3], first[3:] + np.cross(away, first[:3])]), slope)
+    # What friction does: force and moment of each direction, (n, 6, 3). Its transpose is ∂(full)/∂(twist).
+    arms = np.array([cross_matrix(r) for r in points.arm]).reshape(-1, 3, 3)
+    rub = np.concatenate([np.broadcast_to(np.eye(3), arms.shape), arms], axis=1)
+    first = press.T @ (A[:, 0] * found.p) + np.sum(rub @ (A * found.f)[:, :, None], axis=0)[:, 0]
+    slope = press.T @ (A * press * found.p_slope[:, None])
+    slope += np.sum(rub @ (A * found.f_slope)[:, :, None] * press[:, None], axis=0)
+    grips = rub @ (A[:, :, None] * found.f_matrix) @ (np.eye(3) - n[:, :, None] * n[:, None])
+    slope += np.sum(grips @ rub.transpose(0, 2, 1), axis=0)
+    return Wrench(first, -np.r_[first[:3], first[3:] + np.cross(away, first[:3])], slope)
 
 
 def relative(points):
@@ -176,8 +178,3 @@ def relative(points):
     """
     eye, zero = np.eye(3), np.zeros((3, 3))
     return np.block([[eye, zero, -eye, cross_matrix(points.com_difference)], [zero, eye, zero, -eye]])
-
-
-def cross_matrices(arms):
-    """[r]× of each arm: moments of unit forces."""
-    return np.array([cross_matrix(r) for r in arms]).reshape(-1, 3, 3)

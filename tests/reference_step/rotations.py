@@ -11,8 +11,9 @@ SLOPE = ROOT - RESOLVED**2 / ROOT
 
 def multiply(p, q):
     """Hamilton product p ⊗ q of quaternions wxyz."""
-    w, v = p[0] * q[0] - p[1:] @ q[1:], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])
-    return np.array([w, *v])
+    w, x, y, z = p
+    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return left @ q
 
 
 def conjugate(q):
@@ -22,7 +23,7 @@ def conjugate(q):
 def matrix(q):
     """Rotation matrix of a unit quaternion: columns are the turned axes."""
     w, v = q[0], q[1:]
-    return np.outer(v, v) * 2 + (w * w - v @ v) * np.eye(3) + 2 * w * cross_matrix(v)
+    return 2 * v[:, None] * v + (w * w - v @ v) * np.eye(3) + 2 * w * cross_matrix(v)
 
 
 def cross_matrix(v):
@@ -55,7 +56,7 @@ def momentum(omega, inertia, h, sign):
         m = (c + x - (1 - SLOPE) * FADE * (1 - np.exp(-y / FADE))) / x
         g = np.exp(-((y / FADE) ** 2))
     spin = inertia @ omega
-    return m * spin + sign * g * h / 2 * np.cross(omega, spin)
+    return m * spin + sign * g * h / 2 * cross_matrix(omega) @ spin
 
 
 def turn(omega, h):

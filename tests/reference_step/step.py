@@ -6,6 +6,7 @@ from reference_step.collision import find
 from reference_step.joint_law import JointLaw
 from reference_step.kinematics import Kinematics
 from reference_step.law import relative, wrench
+from reference_step.patches import patch_map, patch_wrench, patches_of
 
 SOLVED, GOOD = 1e-12, 1e-9
 """What a step may miss, see `missed`: where a search ends, and what counts as a root if it gets no further."""
@@ -29,8 +30,10 @@ class Step:
         self.joints = JointLaw(self.kinematics, control)
         self.given = find(self.scene, self.kinematics.bodies, shares)
         self.points = list(self.given)
+        self.patches = patches_of(self.scene, self.kinematics.bodies)
         self.loops = self.kinematics.gap_slopes()
         self.start = np.r_[self.kinematics.start, np.zeros(len(self.loops))]
+        self.kept = None, None
         self.scale = 1 / np.r_[np.diag(self.kinematics.mass_matrix), np.full(len(self.loops), self.h)]
 
     def residual(self, unknowns, softness=1.0):
@@ -43,11 +46,19 @@ class Step:
         """∂R/∂(y, λ): that of momenta and gaps by differences, that of the laws in closed form."""
         y, loads = np.split(unknowns, [len(self.kinematics.start)])
         slopes = np.diag(self.joints.forces(y, softness)[1]) - self.contact(y, softness)[1]
-        size = 1e-5 * (1 + np.abs(y).max(initial=0))
-        columns = [(self.momenta(y + e) - self.momenta(y - e)) / (2 * size) for e in size * np.eye(len(y))]
-        by_y = np.array(columns).T + self.h * np.r_[slopes, np.zeros((len(loads), len(y)))]
+        by_y = self.momenta_jacobian(y) + self.h * np.r_[slopes, np.zeros((len(loads), len(y)))]
         by_loads = np.r_[-self.h * self.loops.T, np.zeros((len(loads), len(loads)))]
         return self.scale[:, None] * np.c_[by_y, by_loads]
+
+    def momenta_jacobian(self, y):
+        """∂(momenta)/∂y by differences; kept while y changes little, because it takes most of the time."""
+        at, slopes = self.kept
+        size = 1 + np.abs(y).max(initial=0)
+        if at is None or np.abs(y - at).max(initial=0) > 1e-2 * size:
+            steps = 1e-5 * size * np.eye(len(y))
+            slopes = np.array([self.momenta(y + e) - self.momenta(y - e) for e in steps]).T / (2e-5 * size)
+            self.kept = y, slopes
+        return slopes
 
     def momenta(self, y):
         """Σ Jᵀ (P(V(y)) − P⁻ − h f), and the gaps of loops at the end."""
@@ -63,6 +74,10 @@ class Step:
             force += J[points.first].T @ found.first + J[points.second].T @ found.second
             T = relative(points) @ np.r_[J[points.first], J[points.second]]
             slopes += T.T @ found.slope @ T
+        for patch in self.patches:
+            T = patch_map(patch) @ np.r_[J[patch.first], J[patch.second]]
+            found, slope = patch_wrench(patch, V, softness)
+            force, slopes = force + T.T @ found, slopes + T.T @ slope @ T
         return force, slopes
 
     def take_restitution(self, share):
@@ -79,13 +94,16 @@ class Step:
         return np.sum(work) > 1e-3 * np.sum(np.abs(work))
 
 
-def newton(step, start, softness):
-    """Newton's method with shortened steps, from a start: the unknowns, and how much they miss, see `missed`."""
-    x, best = start, (np.inf, start)
+def newton(step, start, softness, enough):
+    """Newton's method with shortened steps, until the equations miss enough: the unknowns, and see `missed`."""
+    x, best, idle = start, (np.inf, start), 0
     for _ in range(50):
         R, slope = step.residual(x, softness), step.jacobian(x, softness)
-        best = min(best, (missed(R, slope, x), x), key=lambda found: found[0])
-        if best[0] <= SOLVED:
+        error = missed(R, slope, x)
+        if error < 0.5 * best[0]:
+            best, idle = (error, x), 0
+        idle += 1
+        if best[0] <= enough or (best[0] <= GOOD and idle > 4):
             break
         change, tried = np.linalg.lstsq(slope, -R, rcond=1e-14)[0], []
         for share in (1.0, 0.5, 0.2, 0.1, 0.03, 0.01, 0.001):
@@ -108,7 +126,7 @@ def root(step):
     Raises:
         ArithmeticError: If none is found.
     """
-    x, error = newton(step, step.start, 1.0)
+    x, error = newton(step, step.start, 1.0, SOLVED)
     for factor in (4.0, 1.5):
         if error > GOOD:
             x, error = followed(step, factor)
@@ -121,8 +139,8 @@ def followed(step, factor):
     """The root followed while stiction velocities shrink by a factor; where nothing slips it moves on a line."""
     last, x, softness = None, step.start, SOFTEST
     while True:
-        solved, error = newton(step, x, softness)
-        if softness <= 1:
+        solved, error = newton(step, x, softness, SOLVED if softness == 1 else GOOD)
+        if softness == 1:
             return solved, error
         lower = max(softness / factor, 1.0)
         ahead = 0.0 if last is None else (solved - last[1]) / (softness - last[0])
