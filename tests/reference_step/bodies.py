@@ -3,8 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-
-from reference_step.rotations import matrix, turn, multiply
+from reference_step.rotations import matrix, multiply, turn
 
 
 class Bodies(NamedTuple):
@@ -79,9 +78,6 @@ def read(scene, state):
         spin=np.einsum("nij,nj->ni", rotations, omega),
         inverse_mass=np.where(moves, 1 / mass, 0),
         inverse_inertia=np.array(
-            [
-                m * R @ np.linalg.inv(J) @ R.T
-                for m, R, J in zip(moves, rotations, inertia, strict=True)
-            ]
+            [m * R @ np.linalg.inv(J) @ R.T for m, R, J in zip(moves, rotations, inertia, strict=True)]
         ),
     )

@@ -3,11 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-
-import dano
 from reference_step.distances import signed_distance
 from reference_step.law import Law, laws_of
 from reference_step.rotations import cross_matrix
+
+import dano
 
 IMPACT = 1000.0
 """An impact is so many times as stiff as the spring that reverses the motion within a step."""
@@ -76,7 +76,7 @@ def presses(first, second):
 
 
 def samples_of(body):
-    """Points [m, F] and vector areas [m², F] of a body's surface, (n, 3); without those that fill up blocks."""
+    """Points [m, F] and vector areas [m², F] of a body's surface, (n, 3), without what fills up blocks."""
     points, vectors = np.asarray(body.surface.points)[:3].T, np.asarray(body.surface.vectors).T
     real = np.any(vectors != 0, axis=1)
     return points[real], vectors[real]
@@ -87,7 +87,11 @@ class Pair:
 
     def __init__(self, scene, bodies, side, share):
         i, j = side.i, side.j
-        self.body, self.solid, self.turning = scene.bodies[i], scene.bodies[j].solid, scene.bodies[i].surface.turning
+        self.body, self.solid, self.turning = (
+            scene.bodies[i],
+            scene.bodies[j].solid,
+            scene.bodies[i].surface.turning,
+        )
         self.com, self.other_com = bodies.com[i], bodies.com[j]
         self.x, self.R = bodies.pose(i, share)
         self.other_x, self.other_R = bodies.pose(j, share)
@@ -102,7 +106,9 @@ class Pair:
 
     def distance(self, places):
         """Distance to the solid and its normal [W] at places [m, W]."""
-        distance, normal = signed_distance(self.solid, (places - self.other_x) @ self.other_R + self.other_com)
+        distance, normal = signed_distance(
+            self.solid, (places - self.other_x) @ self.other_R + self.other_com
+        )
         return distance, normal @ self.other_R.T
 
     def facing(self):
@@ -148,7 +154,7 @@ def first_touch(look, S):
         S: Semi-axes [m].
     """
     least, root = S.min(), np.sqrt(0.7) * S.min() / S.max()
-    x = last = np.zeros(3)
+    x = last = direction = np.zeros(3)
     for k in range(12):
         start = x - 0.7 * (least / S) ** 2 * x
         distance, direction = look(start)

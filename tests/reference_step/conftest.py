@@ -1,7 +1,6 @@
 """The engine that is judged."""
 
 import pytest
-
 from reference_step.under_test import Engine, ENGINES
 
 

@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-
 from reference_step.kinematics import factor_of
 
 STICKING = 1e-7

@@ -1,12 +1,11 @@
-"""Where bodies are and how they move: free ones, and those on joints (docs/theory/integrator.md, docs/joints.md).
+"""Where bodies are and how they move, free or on joints: docs/theory/integrator.md, docs/joints.md.
 
 Generalised velocities y are velocity and spin [W] of each free body, then one number for each joint
-coordinate. Poses are functions of what a step makes of them, x(q ⊕ h y); everything else is derived from these.
+coordinate. Poses are functions of what a step makes of them, x(q ⊕ h y); all else is derived from these.
 """
 
 import jax
 import numpy as np
-
 from reference_step.bodies import read
 from reference_step.rotations import (
     conjugate,
@@ -34,34 +33,36 @@ class Kinematics:
         jacobian: J = ∂x/∂q at the start, shape (n, 6, k).
         offset: c, so that J y + c is the step's motion at the old y, shape (n, 6).
         mass_matrix: Σ Jᵀ M J and the armatures, shape (k, k).
-        joint_rows: Of each joint the places of its coordinates among y; of one that mimics those of its leader.
+        joint_rows: Of each joint the places of its coordinates among y, or of those of the one it mimics.
     """
 
     def __init__(self, scene, state):
         scene = jax.tree.map(np.asarray, scene)  # quicker to read
         self.scene, self.bodies, self.h = scene, read(scene, state), float(scene.timestep)
-        names = scene.names
-        self.hangs = {names.index(joint.child): joint for joint in scene.joints}
+        self.names, self.joints, self.closing = list(scene.names), scene.joints, scene.loops
+        self.hangs = {self.names.index(joint.child): joint for joint in self.joints}
         moves = self.bodies.moves
-        self.free = [i for i in range(len(names)) if moves[i] and i not in self.hangs]
+        self.free = [i for i in range(len(self.names)) if moves[i] and i not in self.hangs]
         self.joint_rows, size = {}, 6 * len(self.free)
-        for joint in scene.joints:
+        for joint in self.joints:
             if joint.mimics is None:
                 width = {"hinge": 1, "slide": 1, "ball": 3, "planar": 3, "weld": 0}[joint.kind]
                 self.joint_rows[joint.child], size = list(range(size, size + width)), size + width
-        for joint in scene.joints:
+        for joint in self.joints:
             if joint.mimics is not None:
                 self.joint_rows[joint.child] = self.joint_rows[joint.mimics]
         roots = [np.r_[self.bodies.velocity[i], self.bodies.spin[i]] for i in self.free]
         joints = [] if state.v is None else [np.asarray(state.v)]
         self.start = np.concatenate([*roots, *joints, np.zeros(0)])
-        self.q = np.concatenate([np.zeros(6 * len(self.free)), *([] if state.q is None else [np.asarray(state.q)])])
+        self.q = np.concatenate(
+            [np.zeros(6 * len(self.free)), *([] if state.q is None else [np.asarray(state.q)])]
+        )
         self.now = self.placed(0 * self.start)
         self._complete()
 
     def _complete(self):
         """What follows from the poses of the start, of a step before, and of a step ahead."""
-        bodies, n, h = self.bodies, len(self.bodies.mass), self.h
+        bodies, h = self.bodies, self.h
         earlier, ahead = self.placed(-self.start), self.placed(self.start)
         position, orientation = (np.array(x) for x in zip(*self.now, strict=True))
         R = np.array([matrix(q) for q in orientation])
@@ -76,11 +77,9 @@ class Kinematics:
         self.offset = self.twists(self.start) - self.jacobian @ self.start
         seen = self.seen(self.start)
         inertia = R @ bodies.inertia @ R.transpose(0, 2, 1)
-        M = sum(
-            bodies.mass[i] * J[:3].T @ J[:3] + J[3:].T @ inertia[i] @ J[3:]
-            for i, J in enumerate(self.jacobian)
-        )
-        for joint in self.scene.joints:
+        v, w = self.jacobian[:, :3], self.jacobian[:, 3:]
+        M = np.einsum("n,nak,nal->kl", bodies.mass, v, v) + np.einsum("nak,nab,nbl->kl", w, inertia, w)
+        for joint in self.joints:
             if joint.armature is not None:
                 rows = self.joint_rows[joint.child]
                 M[rows, rows] += float(joint.armature) * factor_of(joint) ** 2
@@ -125,12 +124,16 @@ class Kinematics:
             joint = self.hangs[i]
             origin, q = np.zeros(3), np.array([1, 0, 0, 0])
             if joint.parent is not None:
-                parent = self.scene.index(joint.parent)
+                parent = self.names.index(joint.parent)
                 x, q = place(parent)
                 origin = x - matrix(q) @ com[parent]
             turned, path = self.joint_turn(joint, y)
             rest = multiply(q, np.asarray(joint.orientation))
-            pivot = origin + matrix(q) @ np.asarray(joint.position) + matrix(rest) @ (np.asarray(joint.anchor) + path)
+            pivot = (
+                origin
+                + matrix(q) @ np.asarray(joint.position)
+                + matrix(rest) @ (np.asarray(joint.anchor) + path)
+            )
             child = multiply(rest, turned)
             found[i] = pivot + matrix(child) @ (com[i] - np.asarray(joint.anchor)), child
             done.add(i)
@@ -182,10 +185,10 @@ class Kinematics:
     def gaps(self, y):
         """φ: how far loops are open after a step; distances [m, W], then turns of welds [rad]."""
         poses, distances, turns = self.placed(y), [], []
-        for loop in self.scene.loops:
+        for loop in self.closing:
             ends = []
             for name, point in ((loop.first, loop.position), (loop.second, loop.anchor)):
-                i = None if name is None else self.scene.index(name)
+                i = None if name is None else self.names.index(name)
                 x, q = (np.zeros(3), np.array([1, 0, 0, 0])) if i is None else poses[i]
                 com = 0 if i is None else self.bodies.com[i]
                 ends.append((x + matrix(q) @ (np.asarray(point) - com), q))
@@ -207,7 +210,7 @@ class Kinematics:
         poses, twists, rows = self.placed(y), self.twists(y), slice(6 * len(self.free), None)
         omega = [matrix(q).T @ V[3:] for (_, q), V in zip(self.now, twists, strict=True)]
         q = (self.q + self.h * y)[rows]
-        for joint in self.scene.joints:
+        for joint in self.joints:
             if joint.kind == "ball":
                 places = np.array(self.joint_rows[joint.child])
                 q[places - rows.start] = logarithm(self.joint_turn(joint, y)[0])

@@ -1,9 +1,8 @@
-"""The law of a point: docs/theory/contact.md, "Pressure and friction at a sample" to "Friction that fades"."""
+"""The law of a point: docs/theory/contact.md, from "Pressure and friction at a sample" on."""
 
 from typing import NamedTuple
 
 import numpy as np
-
 from reference_step.rotations import cross_matrix
 
 

@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-
-import dano
 from reference_step.distances import signed_distance, spline
 from reference_step.rotations import cross_matrix, matrix
+
+import dano
 
 PAPER = {"spring": 3e4, "damper": 3e5, "sliding_drag": 0.1, "torsional_friction": 0.01, "torsional_drag": 0.0}
 PAPER |= {"rolling_friction": 0.01, "rolling_drag": 0.0}
@@ -42,7 +42,9 @@ def patches_of(scene, bodies):
             i, j = scene.index(contact.a), scene.index(contact.b)
             psi, chi, n = overlap(scene, bodies, contact, i, j)
             if psi > 0:
-                found.append(Patch(i, j, contact, psi, chi, n, (chi - bodies.position[i], chi - bodies.position[j])))
+                found.append(
+                    Patch(i, j, contact, psi, chi, n, (chi - bodies.position[i], chi - bodies.position[j]))
+                )
     return found
 
 
@@ -94,7 +96,7 @@ def density_of(body, contact, x):
 
 
 def outward(shape, x, normal):
-    """The direction of a shape in the sum of normals: it grows with the distance from the middle of round ones."""
+    """The direction of a shape in the sum of normals; that of round ones grows away from the middle."""
     if isinstance(shape, dano.Sphere):
         return x
     if isinstance(shape, dano.Ellipsoid):
@@ -157,7 +159,9 @@ def resistance(law, projection, velocity, params, kind, softness):
         v_s = float(law.stiction_velocity) * softness
         gain, gain_slope = 1 / max(speed, v_s), -1 / speed**2 if speed > v_s else 0.0
     direction = u / speed if speed > 0 else u
-    return -(mu * gain + drag) * u, -(mu * gain + drag) * projection - mu * gain_slope * np.outer(u, direction)
+    return -(mu * gain + drag) * u, -(mu * gain + drag) * projection - mu * gain_slope * np.outer(
+        u, direction
+    )
 
 
 def patch_map(patch):

@@ -1,12 +1,14 @@
 """Scenes that the tests of this folder share: few, because each is compiled."""
 
 import functools
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from reference_step.rotations import matrix
 
 import dano
-from reference_step.rotations import matrix
 
 H = 2e-3
 UPRIGHT, TILTED = (1.0, 0.0, 0.0, 0.2), (1.0, 0.3, 0.2, 0.1)
@@ -33,8 +35,9 @@ def lump():
     bumps = (((0.02, 0.0, 0.0), 0.02), ((-0.02, -0.01, -0.01), 0.017), ((-0.01, 0.03, 0.01), 0.012))
     density = sum(np.exp(-np.sum((x - middle) ** 2, axis=-1) / (2 * width**2)) for middle, width in bumps)
     field = dano.GridField(density, (-0.07,) * 3, axis[1] - axis[0])
-    options = dict(n_samples=300, density_range=(0.3, 10.0), mass_scale=2000.0)
-    return dano.NeuralObject.from_field(field, **options, key=jax.random.key(0))
+    return dano.NeuralObject.from_field(
+        field, n_samples=300, density_range=(0.3, 10.0), mass_scale=2000.0, key=jax.random.key(0)
+    )
 
 
 @functools.cache
@@ -62,7 +65,7 @@ def pile():
     return dano.Scene.create(bodies, others=material, timestep=H)
 
 
-PAIRS = {
+PAIRS: dict[str, Any] = {
     "box on table": (dano.Box((0.05, 0.04, 0.03)), TABLE, None, dict(restitution=0.5, sliding_friction=0.4)),
     "ball on table": (dano.Sphere(0.05), TABLE, None, dict(restitution=0.5)),
     "ellipsoid on table": (dano.Ellipsoid((0.05, 0.04, 0.03)), TABLE, None, dict(restitution=0.5)),
@@ -88,7 +91,7 @@ SPINS = (10.0, 200.0, 600.0, 1100.0, 2000.0)
 
 @functools.cache
 def states(name):
-    """What a pair of `PAIRS` starts from, by name; `gap` is the height of its lowest point above the other body."""
+    """What a pair of `PAIRS` starts from, by name; `gap` is the height of its lowest point."""
     top = {"table": 0.03, "floor": 0.0, "roll": 0.08}[pair(name).bodies[1].name]
     lying = LYING if name in ("cylinder on floor", "capsule on floor") else UPRIGHT
     found = {
@@ -115,6 +118,7 @@ def placed(name, top, given, gap=-2e-4, x=0.004):
     body = scene.bodies[0]
     given = dict(given)
     gap, x = given.pop("gap", gap), given.pop("x", x)
+    assert body.surface is not None
     points = np.asarray(body.scale)[:, None] * np.asarray(body.surface.points)[:3]
     q = np.array(given["orientation"])
     down = matrix(q / np.linalg.norm(q))[2] @ (points - np.asarray(body.com)[:, None])
@@ -154,6 +158,102 @@ def met():
     state = scene.initial_state(
         a=dict(position=(0.0, 0.0, 0.0), velocity=(0.3, 0, 0), omega=(1, 2, 3)),
         b=dict(position=(0.085, 0.01, 0.0), orientation=TILTED, velocity=(-0.5, 0.1, 0), omega=(0, 20, 3)),
-        box=dict(position=(0.0, 0.0, 0.066), orientation=(1, 0.1, 0, 0), velocity=(0, 0, -0.4), omega=(300, 0, 9)),
+        box=dict(
+            position=(0.0, 0.0, 0.066), orientation=(1, 0.1, 0, 0), velocity=(0, 0, -0.4), omega=(300, 0, 9)
+        ),
     )
     return scene, state
+
+
+@functools.cache
+def tree():
+    """All kinds of joints and laws: a tree on a body that floats, another on a fixed one, a body alone."""
+    position = dano.Motor("position", stiffness=200.0, damping=5.0, gear=-1.5, limits=(-3, 2))
+    velocity = dano.Motor("velocity", damping=5.0, limits=(-1, 2))
+    effort = dano.Motor(gear=2.0, limits=(-1, 2))
+    joints = [
+        ("base", "arm", "hinge", dict(limits=(-0.1, 0.3), damping=0.1, armature=0.05, motor=position)),
+        ("arm", "rod", "slide", dict(friction=2.0, stiffness=30.0, rest=0.1)),
+        ("arm", "copy", "hinge", dict(mimics="arm", ratio=-1.7, shift=0.2, friction=0.4, armature=0.01)),
+        ("copy", "hand", "ball", dict(damping=0.1, friction=0.2, stiffness=3.0)),
+        ("hand", "tip", "weld", {}),
+        ("base", "cart", "planar", dict(friction=1.0, damping=0.2)),
+        ("wall", "door", "hinge", dict(limits=(-np.inf, 0.2), motor=velocity)),
+        ("door", "bolt", "slide", dict(limits=(-0.2, 0.2), motor=effort)),
+    ]
+    box = dano.Box((0.2, 0.1, 0.05))
+    bodies = [
+        dano.Body("alone", dano.Box((0.1, 0.05, 0.02)), mass=0.5),
+        dano.Body("base", box, mass=2.0),
+        dano.Body("wall", box, fixed=True),
+    ]
+    return on_joints(joints, bodies)
+
+
+def on_joints(joints, bodies=(), **options):
+    """Boxes of random sizes on joints at random places, given as (parent, name, kind, laws)."""
+    rng, bodies, made = np.random.default_rng(5), list(bodies), []
+    for parent, name, kind, laws in joints:
+        box = dano.Box(tuple(rng.uniform(0.03, 0.2, 3)))
+        bodies.append(dano.Body(name, box, mass=rng.uniform(0.3, 2), com=rng.uniform(-0.05, 0.05, 3)))
+        where = {key: rng.uniform(-0.2, 0.2, 3) for key in ("anchor", "position")}
+        turn = rng.normal(size=4)
+        made.append(
+            dano.Joint(parent, name, kind, axis=rng.normal(size=3), orientation=turn, **where, **laws)
+        )
+    return dano.Scene.create(bodies, joints=made, timestep=H, **options)
+
+
+def random_motion(scene, speed, spin, seed=7):
+    """A state in which joints move at about a speed and free bodies turn at about a spin; and a control."""
+    rng, n, k = np.random.default_rng(seed), len(scene.bodies), scene.layout.n_joints
+    moves = np.array([[not body.fixed] for body in scene.bodies], float)
+    turn = rng.normal(size=(n, 4))
+    parts = (
+        rng.uniform(-1, 1, (n, 3)),
+        turn / np.linalg.norm(turn, axis=1, keepdims=True),
+        moves * rng.normal(size=(n, 3)),
+        spin * moves * rng.normal(size=(n, 3)) / np.sqrt(3),
+        rng.uniform(-0.4, 0.4, k),
+        speed * rng.normal(size=k),
+    )
+    pushes = (
+        rng.normal(size=(n, 3)),
+        0.1 * rng.normal(size=(n, 3)),
+        rng.normal(size=k),
+        3 * rng.normal(size=k),
+    )
+    control = dano.Control(*(jnp.asarray(x) for x in pushes))
+    return scene.filled(dano.State(*(jnp.asarray(x) for x in parts))), control
+
+
+@functools.cache
+def linkage():
+    """A crank, a coupler and a rocker that a loop closes, and a weld that closes a chain of two balls."""
+    lengths = {"crank": 0.2, "coupler": 0.5, "rocker": 0.4}
+    bodies = [dano.Body(name, dano.Box((x / 2, 0.01, 0.01)), mass=x) for name, x in lengths.items()]
+    places = {"crank": (None, 0.1), "coupler": ("crank", 0.35), "rocker": (None, 0.65)}
+    joints = [
+        dano.Joint(on, name, axis=(0, 1, 0), anchor=(-lengths[name] / 2, 0, 0), position=(x, 0, 0))
+        for name, (on, x) in places.items()
+    ]
+    loop = dano.Loop("coupler", "rocker", position=(0.25, 0, 0), anchor=(0.2, 0, 0))
+    return dano.Scene.create(bodies, joints=joints, loops=[loop], timestep=H)
+
+
+@functools.cache
+def door():
+    """A door on a hinge that pushes a ball, by the default law or by the paper's."""
+    bodies = [
+        dano.Body("door", dano.Box((0.4, 0.02, 0.5)), mass=8.0),
+        dano.Body("ball", dano.Sphere(0.1), mass=2.0),
+    ]
+    hinge = dano.Joint(
+        None, "door", axis=(0, 0, 1), anchor=(-0.4, 0, 0), position=(0.4, 0, 0.6), damping=0.5, friction=0.1
+    )
+    return tuple(
+        dano.Scene.create(
+            bodies, [dano.Contact("door", "ball", law=law)], joints=[hinge], timestep=H, gravity=(0, 0, 0)
+        )
+        for law in (dano.DistributedLaw(), dano.CentroidLaw(stiction_velocity=1e-7))
+    )

@@ -1,7 +1,6 @@
 """One step: docs/theory/integrator.md. Everything is a root R(y) = 0, searched with a plain Newton method."""
 
 import numpy as np
-
 from reference_step.collision import find
 from reference_step.joint_law import JointLaw
 from reference_step.kinematics import Kinematics
@@ -9,7 +8,7 @@ from reference_step.law import relative, wrench
 from reference_step.patches import patch_map, patch_wrench, patches_of
 
 SOLVED, GOOD = 1e-12, 1e-9
-"""What a step may miss, see `missed`: where a search ends, and what counts as a root if it gets no further."""
+"""What a step may miss, see `missed`, where a search ends, and for a root if it gets no further."""
 SOFTEST = 1e6
 """The solver begins with stiction velocities so many times as large."""
 
@@ -94,10 +93,10 @@ class Step:
         return np.sum(work) > 1e-3 * np.sum(np.abs(work))
 
 
-def newton(step, start, softness, enough):
-    """Newton's method with shortened steps, until the equations miss enough: the unknowns, and see `missed`."""
+def newton(step, start, softness, enough, most=50):
+    """Newton's method with shortened steps, until little is missed: the unknowns, and what they miss."""
     x, best, idle = start, (np.inf, start), 0
-    for _ in range(50):
+    for _ in range(most):
         R, slope = step.residual(x, softness), step.jacobian(x, softness)
         error = missed(R, slope, x)
         if error < 0.5 * best[0]:
@@ -121,12 +120,12 @@ def missed(R, slope, x):
 
 
 def root(step):
-    """y of a step: the root next to the old velocities, or followed from large stiction velocities to its own.
+    """y of a step: the root near the old velocities, or followed from large stiction velocities to its own.
 
     Raises:
         ArithmeticError: If none is found.
     """
-    x, error = newton(step, step.start, 1.0, SOLVED)
+    x, error = newton(step, step.start, 1.0, SOLVED, 12)
     for factor in (4.0, 1.5):
         if error > GOOD:
             x, error = followed(step, factor)
@@ -136,7 +135,7 @@ def root(step):
 
 
 def followed(step, factor):
-    """The root followed while stiction velocities shrink by a factor; where nothing slips it moves on a line."""
+    """The root followed while stiction velocities shrink by a factor; with nothing slipping, on a line."""
     last, x, softness = None, step.start, SOFTEST
     while True:
         solved, error = newton(step, x, softness, SOLVED if softness == 1 else GOOD)
@@ -155,9 +154,9 @@ def step(scene, state, control=None, shares=None):
     """
     equations = Step(scene, state, control, shares)
     hits = any(np.any(points.impact > 0) for points in equations.points)
-    for tenth in range(10, -1, -1):
-        equations.take_restitution(tenth / 10)
+    y, tenths = root(equations), 10
+    while hits and tenths > 0 and equations.adds_energy(y):
+        tenths -= 1
+        equations.take_restitution(tenths / 10)
         y = root(equations)
-        if not (hits and equations.adds_energy(y)):
-            break
     return equations.kinematics.end(y), equations

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from reference_step import scenes
+from reference_step.collision import find, first_touch, meeting, Pair, samples_of, sides_of
+from reference_step.kinematics import Kinematics
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 import dano
-from reference_step import scenes
-from reference_step.collision import find, first_touch, meeting, Pair, samples_of, sides_of
-from reference_step.kinematics import Kinematics
 
 CASES = [
     *((name, what) for name in scenes.PAIRS for what in ("sliding", "tilted", "hitting", "deep")),
@@ -37,7 +37,9 @@ def test_listed_points_of_many_bodies(engine):
 
 def assert_same_points(scene, state, found):
     kinematics = Kinematics(scene, state)
-    expected = find(kinematics.scene, kinematics.bodies, {side: each["share"] for side, each in found.items()})
+    expected = find(
+        kinematics.scene, kinematics.bodies, {side: each["share"] for side, each in found.items()}
+    )
     assert [(points.first, points.second) for points in expected] != []
     assert {(points.first, points.second) for points in expected} == set(found)
     for points in expected:
@@ -67,10 +69,14 @@ def test_moment_of_meeting(engine, name, what):
 def test_meeting_in_closed_form():
     """A ball that falls on a floor reaches its limit, 1 % of its size, after (gap + limit)/(h v)."""
     scene = dano.Scene.create(
-        [dano.Body("a", dano.Sphere(0.05), mass=1.0), scenes.FLOOR], [dano.Contact("a", "floor")], timestep=scenes.H
+        [dano.Body("a", dano.Sphere(0.05), mass=1.0), scenes.FLOOR],
+        [dano.Contact("a", "floor")],
+        timestep=scenes.H,
     )
     for speed, exact in ((1.0, 1.0), (2.0, 0.75), (100.0, 0.015)):
-        state = scene.initial_state(a=dict(position=(0, 0, 0.052), velocity=(0.3, 0, -speed), omega=(10, 20, 30)))
+        state = scene.initial_state(
+            a=dict(position=(0, 0, 0.052), velocity=(0.3, 0, -speed), omega=(10, 20, 30))
+        )
         kinematics = Kinematics(scene, state)
         sides = sides_of(kinematics.scene)
         # The extent of a shape has half of its edge on each side, 0.5 %.
@@ -84,7 +90,9 @@ def test_a_fast_body_does_not_pass_a_thin_wall_unseen():
     plate = dano.Body("plate", dano.Box((0.2, 0.2, 1e-4)), fixed=True)
     box = dano.Body("a", dano.Box((0.05, 0.04, 0.03)), mass=1.0)
     scene = dano.Scene.create([box, plate], [dano.Contact("a", "plate")], timestep=scenes.H)
-    state = scene.initial_state(a=dict(position=(0, 0, 0.2), velocity=(0, 0, -300.0), orientation=scenes.TILTED))
+    state = scene.initial_state(
+        a=dict(position=(0, 0, 0.2), velocity=(0, 0, -300.0), orientation=scenes.TILTED)
+    )
     kinematics = Kinematics(scene, state)
     side = sides_of(kinematics.scene)[0]
     share = meeting(kinematics.scene, kinematics.bodies, side)

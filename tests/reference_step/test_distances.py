@@ -1,11 +1,11 @@
-"""Signed distances and their gradients: the engine against the reference, the reference against brute force."""
+"""Signed distances and gradients: the engine against the reference, the reference against brute force."""
 
 import numpy as np
 import pytest
+from reference_step.distances import signed_distance
 
 import dano
 from dano.fields import SignedDistanceGrid
-from reference_step.distances import signed_distance
 
 
 def sampled(interpolation):

@@ -4,11 +4,10 @@ import warnings
 
 import numpy as np
 import pytest
-
 from reference_step import scenes
 from reference_step.kinematics import Kinematics
 from reference_step.rotations import matrix, momentum
-from reference_step.step import step, Step
+from reference_step.step import Step, step
 
 QUANTITIES = ("position", "orientation", "velocity", "omega")
 CASES = [(name, what) for name in scenes.PAIRS for what in scenes.names(name)]
@@ -54,7 +53,8 @@ def test_steps_of_many_bodies(engine):
     """A pile with a ball that hits it; two objects and a box that meet in flight; controls."""
     for scene, state in (scenes.piled(), scenes.met()):
         body = scene.names[0]
-        control = scene.control(**{body: dict(force=(0.3, -0.2, 0.1), torque=(0.01, 0.02, -0.03))})
+        push: dict = dict(force=(0.3, -0.2, 0.1), torque=(0.01, 0.02, -0.03))
+        control = scene.control(**{body: push})
         found, shares = stepped(engine, scene, state, control)
         assert_close(found, step(scene, state, control, shares)[0], 1e-11)
 

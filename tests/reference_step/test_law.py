@@ -1,8 +1,7 @@
-"""The law of a point: the engine against the reference, and the reference's derivatives against differences."""
+"""The law of a point: the engine against the reference, its derivatives against differences."""
 
 import numpy as np
 import pytest
-
 from reference_step.collision import Points
 from reference_step.law import Law, pressure, traction, wrench
 

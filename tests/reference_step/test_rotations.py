@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from reference_step import rotations
 from reference_step.rotations import momentum, spin_between, turn
 
@@ -30,7 +29,9 @@ def test_slow_spins_conserve_momentum():
     """P⁻ of a step is P of the same, seen from its end: free motion keeps its angular momentum."""
     omega = 800 * AXIS
     R = rotations.matrix(turn(omega, H))
-    np.testing.assert_allclose(R @ momentum(omega, INERTIA, H, -1), momentum(omega, INERTIA, H, 1), rtol=1e-12)
+    np.testing.assert_allclose(
+        R @ momentum(omega, INERTIA, H, -1), momentum(omega, INERTIA, H, 1), rtol=1e-12
+    )
 
 
 def test_fast_spins_go_on_where_slow_ones_end():

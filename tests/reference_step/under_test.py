@@ -10,7 +10,7 @@ import numpy as np
 
 import dano
 from dano import contact
-from dano.engine._problem import links_of, prepare
+from dano.engine._problem import build_problem, links_of, prepare, structure_of
 from dano.engine._rigid import angular_momentum, turned
 
 CHUNK = 16
@@ -22,8 +22,8 @@ class Engine(NamedTuple):
     Attributes:
         name: Of the engine.
         step: From scene, state and control (or None) to the next state.
-        find: From scene and state to the point contacts: by (sampled body, other body) a dict of `share` (τ) and
-            the arrays `arm`, `normal`, `moment`, `depth`, `rate`, `area`, `drift`, `impact` of `Points`.
+        find: From scene and state to the point contacts: by (sampled body, other body) a dict of `share` (τ)
+            and the arrays `arm`, `normal`, `moment`, `depth`, `rate`, `area`, `drift`, `impact` of `Points`.
         traction: From a `Law`, `Points`, separating speeds (n,) and slips (n, 3) to pressure and friction.
         distance: From a solid and points (n, 3) to signed distances and gradients.
         momentum: From ω, J, h and a sign to P(ω) (+1) or P⁻(ω) (−1).
@@ -46,18 +46,21 @@ class Engine(NamedTuple):
 @eqx.filter_jit
 def _found(scene, state):
     prepared, h = prepare(scene, None), scene.timestep
+    if scene.joints:
+        problem, where = build_problem(scene, prepared, state, None, structure_of(scene))
+        return problem.points, where
     assert prepared.geometry is not None and prepared.impacts is not None
     return contact.find(prepared.geometry, links_of(scene, state, h), prepared.impacts, h, prepared.capacity)
 
 
 def _find(scene, state):
+    if not scene.point_pairs:
+        return {}
     points, where = jax.tree.map(np.asarray, _found(scene, state))
     assert not where.overflow
     found = {}
     for side in sorted({(int(points.first[c]), int(points.second[c])) for c in range(int(where.count))}):
-        chunks = [
-            c for c in range(int(where.count)) if (int(points.first[c]), int(points.second[c])) == side
-        ]
+        chunks = [c for c in range(int(where.count)) if (int(points.first[c]), int(points.second[c])) == side]
         rows = points.rows[:, chunks].reshape(15, -1)
         rows = np.r_[rows, np.repeat(points.stiffness[chunks], CHUNK)[None]][:, rows[11] > 0]
         parts = np.split(rows.T, np.cumsum([3, 3, 3, 1, 1, 1, 3]), axis=1)
@@ -102,14 +105,22 @@ def _distance(solid, x):
     return np.asarray(distance), np.asarray(gradient).T
 
 
+def _momentum(omega, inertia, h, sign):
+    return np.asarray(angular_momentum(jnp.asarray(omega), jnp.asarray(inertia), jnp.asarray(h), sign))
+
+
+def _turned(q, omega, h):
+    return np.asarray(turned(jnp.asarray(q), jnp.asarray(omega), jnp.asarray(h)))
+
+
 TODAY = Engine(
     name="dano",
     step=dano.step,
     find=_find,
     traction=_traction,
     distance=_distance,
-    momentum=lambda *given: np.asarray(angular_momentum(*map(jnp.asarray, given[:3]), given[3])),
-    turned=lambda *given: np.asarray(turned(*map(jnp.asarray, given))),
+    momentum=_momentum,
+    turned=_turned,
     # Rounded down to 1/32, and searched until it changes by less than a hundredth.
     meeting_error=1 / 32 + 0.01,
     meeting_samples=256,
