@@ -70,6 +70,11 @@ class Tables(eqx.Module):
     whole: Whole = eqx.field(static=True)
     features: Features = eqx.field(static=True)
 
+    @property
+    def moving(self) -> Int[np.ndarray, " m"]:
+        """Bodies that move."""
+        return self.whole.arrays["scene.moving"]
+
 
 class _Leaf(NamedTuple):
     """A part of a solid: a shape that is no union, and its pose, as in `dano.physics.distances.Leaf`."""

@@ -189,7 +189,7 @@ def meeting(
 
     At the end of the step, unless a body would be driven deeper into the other than `SamplePair.sink` by then:
     on the far side of a thin wall, normals push the wrong way. Then when it has sunk that far: the root of the
-    depth of the deepest probe, found by advancing as far as none can go deeper, again and again.
+    depth of the deepest probe, by Newton's method, which begins as far as none can go deeper.
     """
     met = Meeting()
     met.critical = -1
@@ -224,13 +224,14 @@ def meeting(
         closest = least(further)
         if closest < further:
             critical = -1
-        further = wp.max(closest, ZERO)
-        share += further
+        before = share
+        share = wp.max(share + closest, ZERO)
         k += 1
         if share >= ONE:
+            met.critical = -1
             return met
-        met.critical = critical
-        if further <= _MET:
+        met.critical = wp.where(share > ZERO, critical, -1)
+        if wp.abs(share - before) <= _MET:
             k = _ADVANCES
     met.share = share
     return met
