@@ -1,0 +1,131 @@
+"""Convex hulls and convex pieces of meshes, and the signed distance of a hull."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dano.checks import checked_count
+from dano.extras import optional
+from dano.fields._mesh import mesh_moments
+from dano.fields._redistance import spread_distances
+from dano.fields._signed_distance import SignedDistanceGrid
+
+Mesh = tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "f 3"]]
+"""Vertices [m] and faces."""
+
+_MARGIN = 3
+"""Cells around a hull, and within which distances outside are exact."""
+
+_CHUNK = 4096
+"""Nodes whose distances to all planes are in memory at once."""
+
+
+def convex_hull(points: Float[np.ndarray, "n 3"]) -> Mesh:
+    """The convex hull of points [m], with outward faces.
+
+    Raises:
+        ValueError: If they lie in a plane.
+    """
+    vertices, faces, _ = _hull(points)
+    return vertices, faces
+
+
+def convex_pieces(mesh: Mesh, threshold: float, most: int | None = None) -> list[Mesh]:
+    """Convex pieces of a mesh by CoACD (Wei et al. 2022).
+
+    Args:
+        mesh: What to cut; need not be closed.
+        threshold: Largest concavity of a piece, as a share of the size; in [0.01, 1].
+        most: Most pieces; None: as many as it takes.
+
+    Raises:
+        ImportError: If coacd is missing.
+    """
+    coacd = load_coacd()
+    coacd.set_log_level("error")
+    parts = coacd.run_coacd(
+        coacd.Mesh(*mesh), threshold=threshold, max_convex_hull=-1 if most is None else most, seed=0
+    )
+    # Its own triangles may be turned inside out.
+    return [convex_hull(np.asarray(vertices, np.float64)) for vertices, _ in parts]
+
+
+def load_coacd() -> Any:
+    """The package CoACD.
+
+    Raises:
+        ImportError: If it is missing.
+    """
+    return optional("coacd", "a convex decomposition needs coacd", "export")
+
+
+def hull_field(points: Float[np.ndarray, "n 3"], resolution: int = 48) -> SignedDistanceGrid:
+    """The convex hull of points [m] as a sampled signed distance, with moments in closed form.
+
+    Inside, the distance is that to the nearest of its planes. Outside it is exact within three cells, and
+    further away the distance to the closest surface point of the nearest such node.
+
+    Args:
+        points: At least four that span a volume, shape (n, 3).
+        resolution: Nodes along the longest axis, from 8 to 512.
+
+    Raises:
+        ImportError: If trimesh or libigl is missing.
+        ValueError: If the points lie in a plane, or are so flat that no node lies inside.
+    """
+    resolution = checked_count("resolution", resolution, least=8, most=512)
+    trimesh = optional("trimesh", "hulls of meshes need trimesh", "mesh")
+    igl = optional("igl", "signed distances of meshes need libigl", "mesh")
+    vertices, faces, planes = _hull(points)
+    lower, upper = vertices.min(axis=0), vertices.max(axis=0)
+    # Thin plates need nodes inside, too.
+    spacing = min(float((upper - lower).max()) / (resolution - 1), float((upper - lower).min()) / 4)
+    spacing = max(spacing, float((upper - lower).max()) / 511)
+    shape = np.ceil((upper - lower) / spacing).astype(int) + 1 + 2 * _MARGIN
+    origin = 0.5 * (lower + upper) - 0.5 * spacing * (shape - 1)
+    nodes = origin + spacing * np.argwhere(np.ones(shape, bool))
+    level, nearest = _deepest(nodes, planes)
+    near = np.abs(level) <= _MARGIN * spacing
+    closest = nodes[near] - level[near, None] * planes[nearest[near], :3]
+    beyond = level[near] > 0
+    closest[beyond] = igl.point_mesh_squared_distance(nodes[near][beyond], vertices, faces)[2]
+    distances, _ = spread_distances(near.reshape(shape), closest, origin, np.full(3, spacing))
+    inside = level.reshape(shape) <= 0
+    distances = np.where(inside, level.reshape(shape), distances)
+    if not distances.min() < 0:
+        raise ValueError(
+            f"points must span a volume of which some nodes lie inside, got a hull of"
+            f" {(upper - lower).tolist()} m with nodes {spacing:.3g} m apart"
+        )
+    solid = trimesh.Trimesh(vertices, faces, process=False)
+    return SignedDistanceGrid(distances, origin, spacing, moments=mesh_moments(solid))
+
+
+def _hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, outward faces, and planes n · x + d ≤ 0 of a hull."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError) as error:
+        raise ValueError(
+            f"points must span a volume, got {len(points)} in a plane or fewer than 4"
+        ) from error
+    used, faces = np.unique(hull.simplices, return_inverse=True)
+    vertices, faces = np.asarray(points, np.float64)[used], faces.reshape(-1, 3)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return vertices, faces, np.unique(hull.equations.round(12), axis=0)
+
+
+def _deepest(nodes: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Largest signed distance of each node to any plane, and to which."""
+    level, nearest = np.empty(len(nodes)), np.empty(len(nodes), int)
+    for first in range(0, len(nodes), _CHUNK):
+        some = slice(first, first + _CHUNK)
+        heights = nodes[some] @ planes[:, :3].T + planes[:, 3]
+        nearest[some] = heights.argmax(axis=1)
+        level[some] = heights[np.arange(len(heights)), nearest[some]]
+    return level, nearest
