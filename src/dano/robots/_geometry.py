@@ -28,7 +28,7 @@ from dano.fields import (
 )
 from dano.maths import Pose
 from dano.names import did_you_mean
-from dano.robots.formats import Placed, Solid
+from dano.robots.formats import Placed, read_collada, Solid
 
 COLLISION = ("hull", "distance", "pieces", "none")
 """What links touch with in place of meshes."""
@@ -159,8 +159,10 @@ def _read(solid: Solid) -> Triangles:
     """Vertices and faces of a mesh; several parts of a file are one."""
     if solid.triangles is not None:
         return solid.triangles
-    trimesh = optional("trimesh", "reading meshes needs trimesh", "mesh")
     assert solid.path is not None
+    if solid.path.suffix.lower() == ".dae":
+        return read_collada(solid.path)
+    trimesh = optional("trimesh", "reading meshes needs trimesh", "mesh")
     try:
         mesh = trimesh.load_mesh(solid.path)
     except Exception as error:  # each of trimesh's readers raises its own kinds
@@ -173,10 +175,10 @@ def _read(solid: Solid) -> Triangles:
 
 
 def _scaled(mesh: Triangles, scale: Sequence[float]) -> Triangles:
-    """A mesh by its scales along the axes; a mirrored one keeps its outside."""
-    vertices, faces = mesh
-    turned = np.prod(scale) < 0
-    return vertices * np.array(scale), faces[:, ::-1] if turned else faces
+    """A mesh by its scales along the axes, without points of no face; a mirrored one keeps its outside."""
+    used, faces = np.unique(mesh[1], return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    return mesh[0][used] * np.array(scale), faces[:, ::-1] if np.prod(scale) < 0 else faces
 
 
 def _distance(mesh: Triangles) -> SignedDistanceGrid:

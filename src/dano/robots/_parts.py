@@ -22,6 +22,7 @@ from dano.robots._inertia import (
 )
 from dano.robots.formats import (
     Description,
+    GRAVCOMP,
     held_at,
     Lacking,
     Placed,
@@ -84,9 +85,11 @@ def without_lacking(description: Description, ignored: Sequence[str]) -> Descrip
     # What hangs on tendons is gone with them.
     if "tendons" in ignored:
         left = [each for each in left if "tendon" not in each.text]
-    if left:
+    # Weight is for who simulates: kinematics need none of it.
+    refused = [each for each in left if each.feature != GRAVCOMP]
+    if refused:
         raise ValueError(f"{description.source}: {lacking_text(left)}")
-    return description
+    return dataclasses.replace(description, lacking=tuple(left))
 
 
 def lacking_text(lacking: Sequence[Lacking]) -> str:

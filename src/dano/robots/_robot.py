@@ -77,10 +77,11 @@ class Robot:
             **options: Of `Scene.create`, such as `timestep`. `gravity` is that of the file if it has one.
 
         Raises:
-            ValueError: As `Scene.create`.
+            ValueError: As `Scene.create` and `check_simulated`.
         """
         bodies, joints = checked_items("bodies", bodies, Body), checked_items("joints", joints, Joint)
         loops = checked_items("loops", loops, Loop)
+        self.check_simulated()
         if self.gravity is not None:
             options = {"gravity": self.gravity, **options}
         return Scene.create(
@@ -90,6 +91,17 @@ class Robot:
             loops=[*self.loops, *loops],
             **options,
         )
+
+    def check_simulated(self) -> None:
+        """Check that nothing is left in the file that a simulation would do wrong.
+
+        Raises:
+            ValueError: If bodies have a weight that the file compensates (`gravcomp`).
+        """
+        for each in self.description.lacking:
+            raise ValueError(
+                f"{self.description.source}: {each.text}; ignore=[{each.feature!r}] leaves it out"
+            )
 
     def contacts_with(self, *others: str | Body, params: ContactParams | None = None) -> list[Contact]:
         """Contacts of the robot's bodies that have a shape with other bodies of the scene.

@@ -1,5 +1,6 @@
 """Robots' files: what they say, as plain numbers. One file a format."""
 
+from dano.robots.formats._collada import read_collada as read_collada
 from dano.robots.formats._description import (
     Connection as Connection,
     Description as Description,
@@ -15,6 +16,7 @@ from dano.robots.formats._description import (
 )
 from dano.robots.formats._lacking import (
     checked_ignore as checked_ignore,
+    GRAVCOMP as GRAVCOMP,
     IGNORABLE as IGNORABLE,
     WEIGHTLESS as WEIGHTLESS,
 )

@@ -6,6 +6,9 @@ import numpy as np
 
 from dano.robots.formats._description import Lacking
 
+GRAVCOMP = "gravcomp"
+"""Name of compensated weight."""
+
 WEIGHTLESS = "weightless joints"
 """Name of joints that move nothing with mass."""
 
@@ -17,7 +20,7 @@ IGNORABLE = {
     "equalities": "equalities that are neither loops nor linear",
     "fluid": "drag by density and viscosity",
     "free joints": "damping, friction, armature and springs of free joints",
-    "gravcomp": "compensated weight of bodies",
+    GRAVCOMP: "compensated weight of bodies",
     "height fields": "shapes that are height fields or signed distances",
     "mimics of nothing": "joints that mimic one which does not exist",
     "nonlinear springs": "springs and dampers that are not linear",
@@ -56,7 +59,7 @@ def lacking_of(model: Any, mujoco: Any) -> list[Lacking]:
         )
     names = [model.body(i).name or f"body {i}" for i in np.flatnonzero(model.body_gravcomp)]
     if names:
-        say("gravcomp", f"gravcomp of {_listed(names)} is not 0: dano lets gravity act on all bodies alike")
+        say(GRAVCOMP, f"gravcomp of {_listed(names)} is not 0: dano lets gravity act on all bodies alike")
     acting = [name for t in range(model.ntendon) if (name := _acting_tendon(model, t))]
     if acting:
         say("tendons", f"{_listed(acting)}: dano has no tendons")
