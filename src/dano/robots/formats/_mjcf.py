@@ -224,6 +224,7 @@ class _Reader:
         if self.off("EQUALITY"):
             return joints
         rows = {joint.name: row for row, joint in enumerate(joints)}
+        homes = {joint.name: joint.home for joint in joints}
         joints, done, held = list(joints), set(), {}
         for e in range(model.neq):
             if int(model.eq_type[e]) != int(self.mujoco.mjtEq.mjEQ_JOINT) or not model.eq_active0[e]:
@@ -237,17 +238,16 @@ class _Reader:
                 self.lacking.append(Lacking("equalities", text))
                 continue
             done.add(name)
-            home = joints[row].home
             # Polynomials are of the distances from the pose of the file.
             if leader < 0:
-                held[name] = home + shift
+                held[name] = homes[name] + shift
                 joints[row] = held_at(joints[row], held[name])
                 continue
             if (drive := joints[row].drive) is not None:
                 text = f"actuator {drive.name!r} drives joint {name!r}, which follows another"
                 self.lacking.append(Lacking(OTHER, text))
                 joints[row] = dataclasses.replace(joints[row], drive=None)
-            shift += home - ratio * joints[rows[self.joints[leader]]].home
+            shift += homes[name] - ratio * homes[self.joints[leader]]
             joints[row] = dataclasses.replace(joints[row], mimics=(self.joints[leader], ratio, shift))
         return without_followers(joints, held)
 
