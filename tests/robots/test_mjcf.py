@@ -7,7 +7,7 @@ from engine.trees import coordinates
 
 import dano
 from dano.maths import quat_to_matrix
-from dano.robots import robot_doubts
+from dano.robots import read_robot, robot_doubts
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -81,9 +81,8 @@ def test_several_joints_references_and_gravity(tmp_path):
     np.testing.assert_allclose(robot.place(scene, at_home, "b")[0], still.body("b").xpos, atol=1e-12)
     assert robot.home["turn"] == 0.5
     # The file's spring of a ball is that of the rotation vector.
-    ball = scene.joint("b")
     np.testing.assert_allclose(-2 * coordinates(state)[0][3:], data.qfrc_spring[3:], atol=1e-12)
-    assert float(ball.stiffness) == 2.0
+    assert scene.joint("b").stiffness == 2.0
 
 
 EQUAL = (
@@ -228,7 +227,7 @@ def test_what_dano_has_not_is_refused_by_name(feature, tmp_path):
     with pytest.raises(ValueError, match=rf"{message}.*ignore=\['{feature}'\] leaves it out"):
         dano.load_mjcf(path, collision=False).scene()
     assert dano.load_mjcf(path, collision=False, ignore=feature).scene().names
-    assert any(feature in doubt for doubt in robot_doubts(dano.robots.read_robot(path)))
+    assert any(feature in doubt for doubt in robot_doubts(read_robot(path)))
     with pytest.raises(ValueError, match="ignore must hold some of"):
         dano.load_mjcf(path, ignore="everything")
 

@@ -137,13 +137,13 @@ def test_links_without_mass_between_joints(tmp_path):
     mujoco = pytest.importorskip("mujoco")
     along = '<axis xyz="{0}"/>'
     parts = link("a") + link("b", "") + link("c", EMPTY) + link("d")
-    for name, ends, axis, kind in (
+    for name, (above, below), axis, kind in (
         ("x", "ab", "1 0 0", "prismatic"),
         ("y", "bc", "0 1 0", "prismatic"),
         ("z", "cd", "0 0 1", "continuous"),
     ):
         limit = '<limit lower="-1" upper="1"/>'
-        parts += joint(name, *ends, along.format(axis) + limit, kind=kind)
+        parts += joint(name, above, below, along.format(axis) + limit, kind=kind)
     robot = dano.load_urdf(urdf(tmp_path, parts))
     scene = robot.scene()
     model = mujoco.MjModel.from_xml_string(

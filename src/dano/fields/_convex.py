@@ -12,7 +12,7 @@ from dano.fields._redistance import spread_distances
 from dano.fields._signed_distance import SignedDistanceGrid
 from dano.maths import even_directions
 
-Mesh = tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "f 3"]]
+Mesh = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]
 """Vertices [m] and faces."""
 
 _MARGIN = 3
@@ -38,11 +38,13 @@ def convex_hull(points: Float[np.ndarray, "n 3"]) -> Mesh:
     return vertices, faces
 
 
-def convex_pieces(mesh: Mesh, threshold: float, most: int | None = None) -> list[Mesh]:
+def convex_pieces(
+    mesh: tuple[np.ndarray, np.ndarray], threshold: float, most: int | None = None
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Convex pieces of a mesh by CoACD (Wei et al. 2022).
 
     Args:
-        mesh: What to cut; need not be closed.
+        mesh: What to cut, vertices [m] and faces; need not be closed.
         threshold: Largest concavity of a piece, as a share of the size; in [0.01, 1].
         most: Most pieces; None: as many as it takes.
 
