@@ -25,6 +25,7 @@ from dano.robots.formats import (
     checked_ignore,
     Connection,
     Description,
+    EQUALITIES,
     Placed,
     rotation_of,
     Solid,
@@ -92,7 +93,7 @@ def build_robot(
         efforts={joint.name: _largest_effort(joint) for joint in own},
         touching=tuple(touching),
         description=description,
-        loops=tuple(_loop(tie, frames) for tie in description.ties),
+        loops=tuple(_loop(tie, frames) for tie in _closing(description, frames, moving, prefix, ignored)),
         places=places,
         home={joint.name: joint.home for joint in own},
         gravity=description.gravity,
@@ -188,6 +189,31 @@ def _largest_effort(joint: Connection) -> float:
     if joint.drive is None:
         return joint.effort
     return min(joint.effort, abs(joint.drive.gear) * max(map(abs, joint.drive.limits)))
+
+
+def _closing(
+    description: Description,
+    frames: Frames,
+    moving: Sequence[Connection],
+    prefix: str,
+    ignored: Sequence[str],
+) -> list[Tie]:
+    """The ties of which at least one body hangs on a joint.
+
+    Raises:
+        ValueError: If there are others that are not to be left out.
+    """
+    hanging = {prefix + joint.child for joint in moving}
+    found = []
+    for tie in description.ties:
+        if {frames[tie.first][0], frames[tie.second][0]} & hanging:
+            found.append(tie)
+        elif EQUALITIES not in ignored:
+            raise ValueError(
+                f"{description.source}: an equality ties {tie.first!r} and {tie.second!r}, and neither hangs"
+                f" on a joint: dano ties chains of joints; ignore=[{EQUALITIES!r}] leaves it out"
+            )
+    return found
 
 
 def _loop(tie: Tie, frames: Frames) -> Loop:

@@ -16,6 +16,7 @@ from dano.robots.formats._description import (
 )
 from dano.robots.formats._lacking import (
     checked_ignore as checked_ignore,
+    EQUALITIES as EQUALITIES,
     GRAVCOMP as GRAVCOMP,
     IGNORABLE as IGNORABLE,
     WEIGHTLESS as WEIGHTLESS,

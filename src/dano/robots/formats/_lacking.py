@@ -9,6 +9,9 @@ from dano.robots.formats._description import Lacking
 GRAVCOMP = "gravcomp"
 """Name of compensated weight."""
 
+EQUALITIES = "equalities"
+"""Name of equalities that are neither loops of joints nor linear."""
+
 WEIGHTLESS = "weightless joints"
 """Name of joints that move nothing with mass."""
 
@@ -17,7 +20,7 @@ IGNORABLE = {
     "other actuators": "actuators that are no motor or servo of one joint",
     "crossed limits": "limits whose lower exceeds the upper: Bullet takes that as none",
     "ball limits": "ranges of ball joints",
-    "equalities": "equalities that are neither loops nor linear",
+    EQUALITIES: "equalities that are neither loops of joints nor linear",
     "fluid": "drag by density and viscosity",
     "free joints": "damping, friction, armature and springs of free joints",
     GRAVCOMP: "compensated weight of bodies",

@@ -22,7 +22,7 @@ from dano.robots.formats._description import (
     Tie,
     without_followers,
 )
-from dano.robots.formats._lacking import lacking_of
+from dano.robots.formats._lacking import EQUALITIES, lacking_of
 
 _WORLD = "world"
 
@@ -235,7 +235,7 @@ class _Reader:
             if any(rest) or joints[row].kind not in ("hinge", "slide") or name in done:
                 kind = f"the polynomial {[shift, ratio, *rest]}" if any(rest) else "more than one equality"
                 text = f"joint {name!r} follows {kind}: dano has linear ones"
-                self.lacking.append(Lacking("equalities", text))
+                self.lacking.append(Lacking(EQUALITIES, text))
                 continue
             done.add(name)
             # Polynomials are of the distances from the pose of the file.
@@ -263,7 +263,7 @@ class _Reader:
             if kind is None:
                 name = model.equality(e).name or f"equality {e}"
                 text = f"{name!r} ties tendons or soft bodies: dano ties joints and bodies"
-                self.lacking.append(Lacking("equalities", text))
+                self.lacking.append(Lacking(EQUALITIES, text))
                 continue
             ends = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
             data = model.eq_data[e]
