@@ -181,6 +181,29 @@ def test_motors_do_what_those_of_mujoco_do(tmp_path):
     assert not dano.load_mjcf(path, collision=False, ignore="actuators").scene().driven
 
 
+def test_written_again(tmp_path):
+    """What is exported is read as the same: chains, references, motors, equalities, the world."""
+    world = (
+        '<geom name="floor" type="plane" size="1 1 1" pos="0 0 -.1"/>' + SEVERAL + EQUAL.replace('"a"', '"e"')
+    )
+    equality = '<equality><joint joint1="b" joint2="turn" polycoef=".1 2 0 0 0"/></equality>'
+    motor = '<actuator><position name="m" joint="roll" kp="20" kv="1" gear="2" ctrlrange="-1 1"/></actuator>'
+    path = written(tmp_path, world.replace('body name="b"', 'body name="d"', 1), MOON + equality + motor)
+    robot = dano.load_mjcf(path)
+    dano.export_robot(robot, tmp_path / "again.xml")
+    again = dano.load_mjcf(tmp_path / "again.xml")
+    assert again.joint_names.keys() == robot.joint_names.keys()
+    assert (again.drives, again.home, again.gravity) == (robot.drives, robot.home, robot.gravity)
+    assert again.surroundings == ("floor",)
+    scene, other = robot.scene(), again.scene()
+    q = dict(up=0.1, turn=0.3, roll=-0.4, ball=(0.1, 0.2, 0.3), e=0.5, c=0.6)
+    masses = [dano.mass_matrix(s, r.state(s, q)) for s, r in ((scene, robot), (other, again))]
+    np.testing.assert_allclose(masses[1], masses[0], atol=1e-9)
+    for name in ("a", "b", "c", "d", "e"):
+        places = [r.place(s, r.state(s, q), name)[0] for s, r in ((scene, robot), (other, again))]
+        np.testing.assert_allclose(places[1], places[0], atol=1e-12)
+
+
 HINGE = body("a", '<joint name="a" axis="0 1 0"/>')
 TENDON = '<tendon><fixed name="t"{0}><joint joint="a" coef="1"/></fixed></tendon>'
 LACKING = {

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dano.maths import quat_multiply, quat_rotate
-from dano.robots.formats import Connection, Description, displaced, Link, Placed, rotation_of
+from dano.robots.formats import at_home, Connection, Description, Link, Placed, rotation_of
 
 # Mass and inertia of a link that has none but carries some, as a share of what it carries: a body must have
 # some, and a billionth is far below what any file knows of the mass that it adds to.
@@ -123,11 +123,6 @@ def carried_inertials(
         parts += [(Link(child, *found[child]), place) for child, place in hanging.get(name, [])]
         found[name] = combined_inertia(parts)
     return found
-
-
-def at_home(joint: Connection) -> Placed:
-    """Place of the child in the pose of the file."""
-    return displaced(joint, joint.home) if joint.home else joint.place
 
 
 def motions(joint: Connection) -> np.ndarray:

@@ -9,7 +9,6 @@ import numpy as np
 from dano.checks import shown
 from dano.maths import Pose
 from dano.robots._inertia import (
-    at_home,
     carried_inertials,
     chained,
     completed,
@@ -21,6 +20,7 @@ from dano.robots._inertia import (
     weightless_joints,
 )
 from dano.robots.formats import (
+    at_home,
     Description,
     GRAVCOMP,
     held_at,

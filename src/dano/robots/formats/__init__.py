@@ -2,9 +2,9 @@
 
 from dano.robots.formats._collada import read_collada as read_collada
 from dano.robots.formats._description import (
+    at_home as at_home,
     Connection as Connection,
     Description as Description,
-    displaced as displaced,
     Drive as Drive,
     held_at as held_at,
     Lacking as Lacking,

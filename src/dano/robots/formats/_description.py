@@ -267,6 +267,11 @@ def displaced(joint: Connection, q: float) -> Placed:
     return Placed(tuple(map(float, position)), tuple(map(float, turned)))
 
 
+def at_home(joint: Connection) -> Placed:
+    """Place of the child's frame in the parent's in the pose of the file."""
+    return displaced(joint, joint.home) if joint.home else joint.place
+
+
 def held_at(joint: Connection, q: float) -> Connection:
     """A hinge or a slide that stays at a coordinate [rad or m]: a weld."""
     return Connection(joint.name, "weld", joint.parent, joint.child, displaced(joint, q))

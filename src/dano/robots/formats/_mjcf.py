@@ -41,7 +41,7 @@ def read_mjcf(path: Path, *, balance_inertia: bool = False) -> Description:
         ImportError: If mujoco is missing.
         ValueError: If MuJoCo refuses the file.
     """
-    mujoco = optional("mujoco", "reading files of MuJoCo needs mujoco", "mujoco")
+    mujoco = optional("mujoco", "reading files of MuJoCo needs mujoco", "robots")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         spec.compiler.balanceinertia = spec.compiler.balanceinertia or balance_inertia
