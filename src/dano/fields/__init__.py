@@ -19,6 +19,12 @@ from dano.fields._compose import (
     UnionField as UnionField,
     UnionShape as UnionShape,
 )
+from dano.fields._convex import (
+    convex_hull as convex_hull,
+    convex_pieces as convex_pieces,
+    hull_field as hull_field,
+    load_coacd as load_coacd,
+)
 from dano.fields._ellipsoid import Ellipsoid as Ellipsoid
 from dano.fields._grid import DensityMoments as DensityMoments, GridField as GridField
 from dano.fields._hash_grid import HashGrid as HashGrid

@@ -108,11 +108,11 @@ def mesh_field(
         )
     if thin:
         warnings.warn(f"{name}: {thin}", stacklevel=2)
-    moments = None if overlap else _moments(solid.whole)
+    moments = None if overlap else mesh_moments(solid.whole)
     return SignedDistanceGrid(distances, origin, spacing, interpolation, edge=edge, moments=moments)
 
 
-def _moments(solid: "trimesh.Trimesh") -> SolidMoments:
+def mesh_moments(solid: "trimesh.Trimesh") -> SolidMoments:
     """Of a mesh without overlaps, in closed form."""
     inertia = np.asarray(solid.moment_inertia)
     second_moment = 0.5 * np.trace(inertia) * np.eye(3) - inertia

@@ -36,7 +36,7 @@ from dano.scene import (
     State,
 )
 from dano.scene_file._objects import asset_look, build_asset, build_object, Progress
-from dano.scene_file._robots import read_robots, robot_files
+from dano.scene_file._robots import common_gravity, read_robots, robot_files
 from dano.scene_file._schedule import read_schedule, Schedule
 from dano.scene_file._table import located, Table
 
@@ -229,9 +229,12 @@ def parse_scene(
     steps = _steps(top, h) if n_steps is None else n_steps
     if steps < 1:
         raise ValueError(f"{path}: n_steps must be ≥ 1, got {steps}")
-    gravity = top.vector("gravity", 3, (0.0, 0.0, -9.81))
     tables = top.tables("bodies")
     robots = read_robots(top, path.parent)
+    usual = None
+    if "gravity" not in top:
+        usual = common_gravity(str(path), [robot for robot, _ in robots])
+    gravity = top.vector("gravity", 3, usual or (0.0, 0.0, -9.81))
     if not tables and not robots:
         raise ValueError(f"{path}: needs at least one [[bodies]] table")
     n_bodies = len(tables) + sum(len(robot.bodies) for robot, _ in robots)
@@ -456,7 +459,8 @@ def _may_meet(a: str, b: str, robots: Sequence[Robot]) -> bool:
     """Whether bodies have shapes to touch with, and are not links of one robot."""
     for robot in robots:
         own = [body.name for body in robot.bodies]
-        if (a in own and b in own) or any(x in own and x not in robot.touching for x in (a, b)):
+        linked = a in own and b in own and not {a, b} & set(robot.surroundings)
+        if linked or any(x in own and x not in robot.touching for x in (a, b)):
             return False
     return True
 
