@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 
 from dano.checks import checked_path
 from dano.progress import Progress
-from dano.vision.capture import PosedCamera
+from dano.vision.capture import PosedCamera, read_mask, read_picture
 from dano.vision.structure import picture_files, timed_frames, VIDEOS
 
 _LONGEST = 800
@@ -185,17 +185,10 @@ def _frames(source: Path, rate: int | float | None) -> Iterator[tuple[str, float
 
 
 def _picture(file: Path) -> np.ndarray:
-    """Pixels with 8 bits a channel, upright, with alpha if there is any."""
-    try:
-        from PIL import Image, ImageOps
-    except ImportError as error:
-        raise ImportError("reading pictures needs pillow: pip install 'dano[train]'") from error
-    try:
-        with Image.open(file) as picture:
-            upright = ImageOps.exif_transpose(picture)
-            return np.asarray(upright.convert("RGBA" if "A" in upright.mode else "RGB"))
-    except Exception as error:  # each of pillow's readers raises its own kinds
-        raise ValueError(f"{file}: cannot be read as a picture ({error})") from error
+    """Pixels with 8 bits a channel, upright, with alpha if anything is transparent."""
+    picture = read_picture(file)
+    channels = [picture.colours] if picture.alpha is None else [picture.colours, picture.alpha[..., None]]
+    return np.rint(255 * np.concatenate(channels, axis=2)).astype(np.uint8)
 
 
 def _averaged(pixels: np.ndarray, k: int) -> np.ndarray:
@@ -219,9 +212,7 @@ def _masks(
         raise ValueError(f"{name} must be as many as frames, {count}, got {len(files)} in {folder}")
     found: list[np.ndarray | None] = []
     for file in files:
-        pixels = _picture(file)
-        values = pixels[..., 3] if pixels.shape[2] == 4 else pixels[..., :3].max(axis=2)
-        values = _averaged(values, shrunk)
+        values = _averaged(np.rint(255 * read_mask(file)).astype(np.uint8), shrunk)
         if values.shape != tuple(shape):
             raise ValueError(
                 f"{name} must have the size of the frames, {shape[1] * shrunk} × {shape[0] * shrunk}, but"
