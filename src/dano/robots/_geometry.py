@@ -1,12 +1,12 @@
 """Shapes of links: primitives, and meshes as signed distances that are kept in the user's cache folder."""
 
 import hashlib
-import os
 import warnings
 from pathlib import Path
 
 import numpy as np
 
+from dano.caches import cache_folder
 from dano.fields import (
     AbstractShape,
     Box,
@@ -84,7 +84,7 @@ def _mesh(path: Path, where: str) -> AbstractShape:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            made = mesh_field(path, _RESOLUTION)
+            made = mesh_field(path, _RESOLUTION, scale=1.0)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
     if kept is not None:
@@ -98,13 +98,8 @@ def _mesh(path: Path, where: str) -> AbstractShape:
 
 
 def _cache_file(path: Path) -> Path | None:
-    """Where the field of a mesh is kept: `$DANO_CACHE_DIR`, or the user's cache folder; None if `off`."""
-    chosen = os.environ.get("DANO_CACHE_DIR")
-    if chosen == "off":
-        return None
-    try:
-        usual = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dano"
-    except RuntimeError:
+    """Where the field of a mesh is kept; None if there is no folder for caches."""
+    if (folder := cache_folder()) is None:
         return None
     digest = hashlib.sha256(path.read_bytes() + f"{path.suffix} {_RESOLUTION} {_VERSION}".encode())
-    return (Path(chosen) if chosen else usual) / "meshes" / f"{digest.hexdigest()[:32]}.npz"
+    return folder / "meshes" / f"{digest.hexdigest()[:32]}.npz"
