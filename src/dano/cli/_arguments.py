@@ -194,6 +194,7 @@ class Import:
         resolution: Nodes along the longest axis, for files that hold no grid; default 128, for meshes as many
             as their walls need.
         interpolation: How the grid is interpolated between its nodes; default: as the format has it.
+        skip_nan: Gaussian splats: leave out those with numbers that are not finite; how many is said.
         hollow: Gaussian splats: do not fill the inside. Splats lie on surfaces, so their inside is empty.
         spacing: Voxels (.npy): distance between voxels in the file's units; default: longest side 1.
         origin: Voxels (.npy): centre of the first voxel.
@@ -215,6 +216,7 @@ class Import:
     orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     resolution: int | None = None
     interpolation: Literal["linear", "quadratic", "cubic"] | None = None
+    skip_nan: bool = False
     hollow: bool = False
     spacing: float | None = None
     origin: tuple[float, float, float] | None = None

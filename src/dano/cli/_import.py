@@ -42,7 +42,11 @@ def import_field(command: Import) -> None:
         sampled = {} if resolution is None else {"resolution": resolution}
     elif splats:
         # Gaussians thinner than the distance between nodes would fall between them: a shell full of pores.
-        lower, upper = np.asarray(load_field(file, crop=box).bounds)
+        with warnings.catch_warnings():
+            # Said when it is read below.
+            warnings.simplefilter("ignore", UserWarning)
+            bad: dict[str, Any] = {"skip_nan": True} if command.skip_nan else {}
+            lower, upper = np.asarray(load_field(file, crop=box, **bad).bounds)
         sampled = {"min_width": 0.5 * float(np.max(upper - lower)) / (nodes - 1)}
     unit = {"scale": command.scale, "units": command.units}
     field = load_field(file, crop=box, **unit, pose=pose, **sampled, **_of_format(command))
@@ -79,6 +83,7 @@ def _of_format(command: Import) -> dict[str, Any]:
         "grid": command.grid,
         "cascade": command.cascade,
         "module": command.module,
+        "skip_nan": command.skip_nan or None,
         "undo_transform": False if command.keep_transform else None,
     }
     return {name: value for name, value in options.items() if value is not None}

@@ -21,7 +21,8 @@ from dano.fields.meshes import checked_units, mesh_field, MESH_SUFFIXES
 from dano.fields.readers._arrays import load_npy, load_npz, load_object
 from dano.fields.readers._instant_ngp import load_snapshot
 from dano.fields.readers._nerfacto import load_checkpoint
-from dano.fields.readers._splats import is_splats, load_splats
+from dano.fields.readers._splat_files import is_splats
+from dano.fields.readers._splats import load_splats
 from dano.fields.readers._torch_module import load_callable, load_module
 from dano.fields.readers._vdb import load_vdb
 from dano.maths import Numbers, Pose
@@ -55,7 +56,7 @@ _CHECKPOINT = (
     "disable_scene_contraction",
 )
 _MESH = _Reader(mesh_field, ("resolution", "interpolation", "edge"))
-_SPLATS = _Reader(load_splats, ("min_width",), crops=True)
+_SPLATS = _Reader(load_splats, ("min_width", "skip_nan"), crops=True)
 _READERS: dict[str, _Reader] = {
     ".npz": _Reader(load_npz, ("interpolation",)),
     ".npy": _Reader(load_npy, ("spacing", "origin", "interpolation", "signed_distance")),
@@ -100,8 +101,8 @@ def load_field(
       `signed_distance=True` if they are distances, negative inside.
     - `.obj`, `.stl`, `.off`, `.glb`, `.gltf`, `.ply`, `.3mf`, `.dae`, `.step`: a triangle mesh; options of
       `mesh_field`, which says what it mends.
-    - `.ply` with Gaussian splats: their occupancy; option `min_width`, the least standard deviation of a
-      Gaussian.
+    - `.ply` with Gaussian splats, flat (2DGS) and packed (`.compressed.ply`) ones, too: their occupancy;
+      options `min_width`, the least standard deviation of a Gaussian, and `skip_nan`.
     - `.ckpt`: a nerfstudio checkpoint (nerfacto, splatfacto); option `undo_transform`, and nerfacto's sizes
       where no config.yml tells them.
     - `.ingp`, `.msgpack`: the density grid of an instant-ngp snapshot; options `cascade`, `interpolation`.
