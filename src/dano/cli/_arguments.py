@@ -74,6 +74,7 @@ class Poses:
     Attributes:
         images: Folder of photographs (or one with `images` in it), or a video, whose frames are written
             beside the output.
+        further: More of them, of the same object in the same place.
         output: Where to write the cameras, such as transforms.json.
         masks: Folder with a mask for each photograph, bright where the object is; default: `masks` in or
             beside the folder of photographs, or their alpha channel.
@@ -92,7 +93,9 @@ class Poses:
         distortion: Known k1 k2 p1 p2 of OpenCV's model.
         lens: What is estimated of the lens: radial (focal length and k1), pinhole (focal length), full (two
             focal lengths, k1, k2, p1, p2).
-        frames: Most frames of a video.
+        frames: Most frames of a video, or of several together.
+        since: Take frames of videos from this time on [s].
+        until: Take frames of videos up to this time [s].
         features: Most points of a photograph.
         model: Which model to write if photographs fall into several, from 1, the largest.
         seed: Seed of all random numbers.
@@ -100,6 +103,7 @@ class Poses:
     """
 
     images: Positional[Path]
+    further: Positional[tuple[Path, ...]] = ()
     output: Output = UNNAMED
     masks: Path | None = None
     features_on: Literal["auto", "everything", "object", "surroundings"] = "auto"
@@ -113,6 +117,8 @@ class Poses:
     distortion: tuple[float, float, float, float] | None = None
     lens: Literal["radial", "pinhole", "full"] = "radial"
     frames: int = 80
+    since: Annotated[float | None, arg(name="from")] = None
+    until: Annotated[float | None, arg(name="to")] = None
     features: int = 3000
     model: int = 1
     seed: int = 0
