@@ -7,9 +7,9 @@ from jaxtyping import Float, Int
 
 from dano.checks import checked_count
 from dano.extras import optional
-from dano.fields._mesh import mesh_moments
 from dano.fields._redistance import spread_distances
 from dano.fields._signed_distance import SignedDistanceGrid
+from dano.fields.meshes import mesh_moments
 from dano.maths import even_directions
 
 Mesh = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]

@@ -1,13 +1,13 @@
 """Shapes of links: primitives, and what stands for meshes, which is kept in the user's cache folder."""
 
 import hashlib
-import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from dano.caches import cache_folder
 from dano.checks import shown
 from dano.extras import optional
 from dano.fields import (
@@ -189,13 +189,8 @@ def _distance(mesh: Triangles) -> SignedDistanceGrid:
 
 
 def _cache_file(solid: Solid, kind: str) -> Path | None:
-    """Where the shape of a mesh is kept: `$DANO_CACHE_DIR`, or the user's cache folder; None if `off`."""
-    chosen = os.environ.get("DANO_CACHE_DIR")
-    if chosen == "off":
-        return None
-    try:
-        usual = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dano"
-    except RuntimeError:
+    """Where the shape of a mesh is kept; None if there is no folder for caches."""
+    if (folder := cache_folder()) is None:
         return None
     digest = hashlib.sha256(f"{kind} {solid.numbers} {_RESOLUTION} {_HULL_RESOLUTION} {_VERSION}".encode())
     if solid.triangles is not None:
@@ -203,4 +198,4 @@ def _cache_file(solid: Solid, kind: str) -> Path | None:
             digest.update(np.ascontiguousarray(array).tobytes())
     elif solid.path is not None:
         digest.update(solid.path.suffix.encode() + solid.path.read_bytes())
-    return (Path(chosen) if chosen else usual) / "meshes" / f"{digest.hexdigest()[:32]}.npz"
+    return folder / "meshes" / f"{digest.hexdigest()[:32]}.npz"
