@@ -266,7 +266,7 @@ def add_contact(
             room.blocks[world, b * m + a] += back * jacobian
 
 
-@wp.func
+@wp.func(inline=True)
 def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, trial: Trial) -> Fit:
     """Residual and Jacobian as momenta at the velocities that are tried, with duals at a share of the step."""
     h = scene.timestep[world, 0]

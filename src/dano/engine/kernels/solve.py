@@ -49,6 +49,8 @@ _MIX, _RENEWED = wp.constant(real(0.5)), wp.constant(real(1e-6))
 # A step is accepted when what the residual does along it fell to this share; when the bracket around the zero
 # of that is narrower than this share of the step, it is accepted as it is.
 _ENOUGH, _GIVE_UP = wp.constant(real(0.5)), wp.constant(real(0.01))
+# Residual over the rounding of velocities beside which nothing is left to take.
+_EXACT = wp.constant(real(4.0))
 # Stiction velocity that levels are multiples of [m/s].
 _STICTION = wp.constant(real(1e-7))
 
@@ -227,7 +229,7 @@ def measure(scene: Scene, room: Room, world: int) -> Measured:
                 size += absolute_product(room, world, i * m + j, room.tried[world, j])
         for k in range(6):
             missed = wp.abs(scale[k] * residual[k])
-            if missed > found.error or wp.isnan(missed):
+            if not (missed <= found.error):
                 found.error = missed
             found.size = wp.max(found.size, scale[k] * size[k])
     return found
@@ -242,12 +244,12 @@ def largest_error(scene: Scene, room: Room, world: int) -> real:
         scale = room.scale[world, i]
         for k in range(6):
             missed = wp.abs(scale[k] * residual[k])
-            if missed > error or wp.isnan(missed):
+            if not (missed <= error):
                 error = missed
     return error
 
 
-@wp.func
+@wp.func(inline=True)
 def newton_step(scene: Scene, room: Room, world: int, share: real, keeps: bool):
     """A share of Newton's step from what was tried, in `room.step`.
 
@@ -282,7 +284,7 @@ def absolute_product(room: Room, world: int, block: int, v: vec6) -> vec6:
     return found
 
 
-@wp.func
+@wp.func(inline=True)
 def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: real, options: Options) -> Solved:
     """Velocities at the end of a step, in `room.velocity`, from those that it holds.
 
@@ -319,6 +321,8 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
     before = real(INFINITY)
     best = real(INFINITY)
     keeps = bool(False)
+    finishes = bool(False)
+    needs = bool(True)
     wait()
     while not found.converged and found.passes < options.max_passes and number < _LEVELS:
         if lane == 0:
@@ -333,14 +337,16 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
         fit = assemble(scene, room, world, lane, n_found, trial)
         wait()
         if wp.static(TREES):
-            # A root needs no derivative. Close to it that of the pass before serves: its relative error is
-            # about twice the factor by which the last step made the residual smaller.
-            needs = bool(True)
+            # A root needs no derivative, a first step only the mass. Close to a root the derivative of the
+            # pass before serves: its relative error is about twice the factor by which the last step made the
+            # residual smaller.
+            needs = True
             if n_found == 0:
                 missed = largest_error(scene, room, world)
                 enough = options.tolerance * (ONE + size)
-                keeps = TWO * missed * missed <= enough * before and same_mode(scene, room, world)
-                keeps = keeps and found.passes > 0 and search.length == ONE
+                close = TWO * missed * missed <= enough * before and search.length == ONE
+                begins = found.passes == 0
+                keeps = (begins or close) and same_mode(scene, room, world, begins)
                 needs = missed > enough and not keeps
             wait()
             if lane == 0 and needs:
@@ -389,7 +395,13 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
             if lane == 0:
                 for i in range(m):
                     room.velocity[world, i] = room.tried[world, i]
-            if not found.converged:
+            if wp.static(TREES):
+                if n_found == 0 and found.converged and seen.error > _EXACT * options.rounding * (ONE + size):
+                    # A last step, not looked at, takes what is left to rounding.
+                    finishes = True
+                    keeps = not needs
+                    part = ONE
+            if finishes or not found.converged:
                 if lane == 0:
                     newton_step(scene, room, world, part, keeps)
                     if wp.static(TREES):
@@ -414,10 +426,7 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
             room.velocity[world, i] = room.best[world, i]
     if wp.static(TREES):
         if found.converged and lane == 0:
-            if keeps:
-                # What the derivative of a pass before has left, to rounding.
-                newton_step(scene, room, world, ONE, True)
-                follow_joint_duals(scene, room, world, search.length, ONE)
+            if finishes:
                 for i in range(m):
                     room.velocity[world, i] = room.velocity[world, i] + room.step[world, i]
                 finish_joint_duals(scene, room, world)

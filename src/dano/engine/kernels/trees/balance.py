@@ -49,6 +49,9 @@ from dano.physics.momentum import angular_momentum
 from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
 from dano.physics.twists import angular_part, joined, linear_part, wrench_at
 
+# What springs and dampers make of the Jacobian, over the mass, up to which that alone serves for a first step.
+_LIGHT = wp.constant(real(0.01))
+
 
 @wp.func
 def lever_of(room: Room, world: int, node: Node) -> vec3:
@@ -117,7 +120,9 @@ def gather_slopes(scene: Scene, room: Room, world: int, last: wp.array2d(dtype=v
                         own = wp.dot(room.trees.start[world, above.motion + j], right)
                         add_entry(scene, room, world, v, u, own)
                         if symmetric:
-                            add_entry(scene, room, world, u, v, own)
+                            # Motions of joints that mimic one above them share its unknown.
+                            if u <= v:
+                                add_entry(scene, room, world, u, v, own)
                         else:
                             other = wp.dot(left, last[world, above.motion + j])
                             add_entry(scene, room, world, u, v, other)
@@ -145,6 +150,14 @@ def momenta_before(scene: Scene, room: Room, world: int) -> real:
         u = scene.trees.coordinates[c].place
         armature = scene.trees.laws[world, c].armature
         room.trees.diagonal[world, u] = room.trees.diagonal[world, u] + armature
+    room.trees.sizes[world, 3] = ZERO
+    for c in range(scene.trees.coordinates.shape[0]):
+        u = scene.trees.coordinates[c].place
+        law = scene.trees.laws[world, c]
+        room.trees.joints[world, c].factored = ZERO
+        other = joint_momentum_slope(law, scene.timestep[world, 0]) - law.armature
+        if other > _LIGHT * room.trees.diagonal[world, u]:
+            room.trees.sizes[world, 3] = ONE
     size = real(0.0)
     for k in range(scene.trees.order.shape[0]):
         u = scene.trees.order[k]
@@ -365,9 +378,16 @@ def eliminate_joint_duals(scene: Scene, room: Room, world: int, keeps: bool):
 
 
 @wp.func
-def same_mode(scene: Scene, room: Room, world: int) -> bool:
-    """Whether joints stick, slip and stop as they did where the matrix was factored last."""
-    same = bool(True)
+def same_mode(scene: Scene, room: Room, world: int, begins: bool) -> bool:
+    """Whether the matrix that was factored last has the modes of joints: which stick, slip or stop.
+
+    Args:
+        scene: The scene.
+        room: Room.
+        world: Which world.
+        begins: Whether that is the mass.
+    """
+    same = not begins or room.trees.sizes[world, 3] == ZERO
     for c in range(scene.trees.coordinates.shape[0]):
         if scene.trees.coordinates[c].nonsmooth > 0:
             state = room.trees.joints[world, c]

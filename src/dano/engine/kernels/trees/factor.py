@@ -47,7 +47,7 @@ def in_solve(scene: Scene, room: Room, world: int, u: int) -> bool:
 
 @wp.func
 def factor_mass(scene: Scene, room: Room, world: int):
-    """Factor a symmetric matrix: of it only the diagonal and `upper` are read."""
+    """Factor a symmetric matrix, of which only the diagonal and `upper` are read: as `factor` does."""
     for k in range(scene.trees.order.shape[0]):
         p = scene.trees.order[scene.trees.order.shape[0] - 1 - k]
         unknown = scene.trees.unknowns[p]
@@ -60,6 +60,7 @@ def factor_mass(scene: Scene, room: Room, world: int):
             own = room.trees.upper[world, unknown.first + t]
             share = own * inverse
             room.trees.upper[world, unknown.first + t] = share
+            room.trees.lower[world, unknown.first + t] = own
             room.trees.diagonal[world, i] = room.trees.diagonal[world, i] - share * own
             for s in range(t):
                 at = above.first + s

@@ -192,7 +192,8 @@ class TreeRoom:
         turned: Angle by which joints turn each node's body in a step [rad].
         coupled: 1 for trees that touch something in the step, or are closed by loops.
         sizes: Magnitude of the velocities [m/s], of the terms in the residual of trees that touch nothing
-            [m/s], and the compliance of loops [m s/N], shape (worlds, 3).
+            [m/s], the compliance of loops [m s/N], and 1 where springs or dampers are strong, shape
+            (worlds, 4).
     """
 
     frames: wp.array2d(dtype=JointFrame)
