@@ -1,13 +1,14 @@
 """Derivatives of rollouts: rules of JAX around launches of kernels (docs/gradients.md).
 
-The forward derivative is a function that is linear in the changes of the inputs, with a kernel of its own; its
-transpose, reverse mode, is another. Both are those of the implicit function theorem at each step's root.
+The forward derivative is a function that is linear in the changes of the inputs, with a kernel of its own;
+its transpose, reverse mode, is another. Both are those of the implicit function theorem at each step's root.
 """
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -61,7 +62,7 @@ ad.primitive_jvps[launch_p] = _jvp
 @tangent_p.def_abstract_eval
 def _(*inputs, plan, batched, n_worlds, which, differs, n_directions):
     shape = plan.outputs["launch.states"]
-    return jax.core.ShapedArray((n_worlds, n_directions, *shape), inputs[0].dtype)
+    return ShapedArray((n_worlds, n_directions, *shape), inputs[0].dtype)
 
 
 @tangent_p.def_impl
@@ -126,10 +127,7 @@ def _batched(inputs, axes, *, plan, batched, n_worlds, which, differs, n_directi
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
     parameters: dict[str, Any] = {"plan": plan, "which": which}
     if all(axis is None for axis in axes[:n]):
-        changes = [
-            jnp.moveaxis(x, axis, 1) if axis is not None else jnp.broadcast_to(x[:, None], (x.shape[0], size, *x.shape[1:]))
-            for x, axis in zip(inputs[n:], axes[n:], strict=True)
-        ]  # fmt: skip
+        changes = [_spread(x, axis, size) for x, axis in zip(inputs[n:], axes[n:], strict=True)]
         changes = [x.reshape(x.shape[0], size * n_directions, *x.shape[3:]) for x in changes]
         found = tangent_p.bind(
             *inputs[:n], *changes, **parameters, batched=batched, n_worlds=n_worlds, differs=differs,
@@ -157,12 +155,17 @@ def _batched(inputs, axes, *, plan, batched, n_worlds, which, differs, n_directi
 batching.primitive_batchers[tangent_p] = _batched
 
 
+def _spread(change, axis, size: int):
+    """A change with an axis of directions after that of worlds."""
+    if axis is not None:
+        return jnp.moveaxis(change, axis, 1)
+    return jnp.broadcast_to(change[:, None], (change.shape[0], size, *change.shape[1:]))
+
+
 def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) -> Plan:
     names = list(forward.inputs)
-    changes = {
-        f"changes.{CHANGING[names[i]]}": Shape(n_directions * forward.inputs[names[i]].rows, forward.inputs[names[i]].width)
-        for i in which
-    }  # fmt: skip
+    chosen = {names[i]: forward.inputs[names[i]] for i in which}
+    changes = {f"changes.{CHANGING[k]}": Shape(n_directions * x.rows, x.width) for k, x in chosen.items()}
     states = forward.outputs["launch.states"]
     return plan(
         "dano.engine.kernels.derivatives.pushforward",
@@ -178,7 +181,9 @@ def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) 
 
 def _pushforward_room(forward: Plan, n_directions: int) -> dict[str, int]:
     n, m = forward.room["room.bodies"], forward.room["room.momentum"]
-    rows = {f"bars.{CHANGING[name]}": forward.inputs[name].rows for name in CHANGING if name in forward.inputs}
+    rows = {
+        f"bars.{CHANGING[name]}": forward.inputs[name].rows for name in CHANGING if name in forward.inputs
+    }
     rows.pop("bars.coefficients", None)
     return {
         **dict.fromkeys(("room.state_bar", "room.after_bar"), n),

@@ -7,22 +7,23 @@ share of it on each core, on a GPU a block of lanes each.
 """
 
 import concurrent.futures
-import contextlib
 import ctypes
 import functools
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import batching, mlir
 
 from dano.engine._ffi import register
 from dano.engine._instances import Features, instance
+from dano.engine._warp import compiled_kernel
 
 
 class Shape(NamedTuple):
@@ -70,13 +71,7 @@ class Plan:
     @functools.cached_property
     def function(self) -> Any:
         """The kernel, compiled or loaded."""
-        import warp as wp
-
-        with _quietly():
-            wp.init()
-            kernel = getattr(instance(self.features, self.module), self.kernel)
-            wp.load_module(kernel.module, device="cpu")
-        return kernel
+        return compiled_kernel(lambda: getattr(instance(self.features, self.module), self.kernel))
 
     def target(self, batched: tuple[bool, ...], n_worlds: int, dtype: np.dtype) -> str:
         """Name for `jax.ffi.ffi_call` of launches of so many worlds with numbers of a type."""
@@ -88,19 +83,6 @@ class Plan:
             register(name, launcher if dtype == np.float64 else _Widened(launcher), "cpu")
             self._targets[key] = name
         return self._targets[key]
-
-
-@contextlib.contextmanager
-def _quietly() -> Iterator[None]:
-    """Warp without its words about devices and compiled modules."""
-    import warp as wp
-
-    level = wp.config.log_level
-    wp.config.log_level = wp.LOG_ERROR
-    try:
-        yield
-    finally:
-        wp.config.log_level = level
 
 
 _numbers = iter(range(10**12))
@@ -174,7 +156,10 @@ class _CpuLauncher:
         n = min(self.n_worlds, n_cores())
         ends = [self.n_worlds * (k + 1) // n for k in range(n)]
         begins = [0, *ends[:-1]]
-        return [_Share(self.plan, self.batched, self.n_worlds, b, e - b) for b, e in zip(begins, ends, strict=True)]
+        return [
+            _Share(self.plan, self.batched, self.n_worlds, b, e - b)
+            for b, e in zip(begins, ends, strict=True)
+        ]
 
 
 class _Widened:
@@ -241,10 +226,14 @@ class _Share:
             setattr(owner, field, array)
         for place, length in plan.room.items():
             owner, field, dtype = _found(arguments, place)
-            memory = wp.zeros(max(length, 1), dtype=dtype, device="cpu")
+            memory: Any = wp.zeros(max(length, 1), dtype=dtype, device="cpu")
             # One world after the other works in the same room.
             array = wp.array(
-                ptr=memory.ptr, dtype=dtype, shape=(n_worlds, length), strides=(0, memory.strides[0]), device="cpu"
+                ptr=memory.ptr,
+                dtype=dtype,
+                shape=(n_worlds, length),
+                strides=(0, memory.strides[0]),
+                device="cpu",
             )
             self._kept.append(memory)
             setattr(owner, field, array)
@@ -264,8 +253,8 @@ class _Share:
         ]
 
 
-def _found(arguments: dict[str, Any], place: str):
-    """Structure that has a place such as "scene.solids.leaves", the field's name, and what an array there holds."""
+def _found(arguments: dict[str, Any], place: str) -> tuple[Any, str, Any]:
+    """What has a place such as "scene.solids.leaves", the field's name, and what an array there holds."""
     first, *path, field = place.split(".")
     owner = arguments[first]
     for name in path:
@@ -308,7 +297,7 @@ def launch(plan: Plan, inputs: dict[str, Any]) -> dict[str, Any]:
 @launch_p.def_abstract_eval
 def _(*inputs, plan, batched, n_worlds):
     dtype = inputs[0].dtype
-    return [jax.core.ShapedArray((n_worlds, *shape), dtype) for shape in plan.outputs.values()]
+    return [ShapedArray((n_worlds, *shape), dtype) for shape in plan.outputs.values()]
 
 
 @launch_p.def_impl
@@ -327,12 +316,8 @@ mlir.register_lowering(launch_p, mlir.lower_fun(_lowered, multiple_results=True)
 
 def _batched(inputs, axes, *, plan, batched, n_worlds):
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
-    rows = [
-        merged(x, axis, was, size, n_worlds) for x, axis, was in zip(inputs, axes, batched, strict=True)
-    ]
-    differs = tuple(
-        was or axis is not None for was, axis in zip(batched, axes, strict=True)
-    )
+    rows = [merged(x, axis, was, size, n_worlds) for x, axis, was in zip(inputs, axes, batched, strict=True)]
+    differs = tuple(was or axis is not None for was, axis in zip(batched, axes, strict=True))
     found = launch_p.bind(*rows, plan=plan, batched=differs, n_worlds=size * n_worlds)
     return [x.reshape(size, n_worlds, *x.shape[1:]) for x in found], [0] * len(found)
 

@@ -103,7 +103,7 @@ def leaves_of(solid: AbstractShape, dtype: DTypeLike) -> list[_Leaf]:
 
 
 def _flattened(leaf: _Leaf) -> list[_Leaf]:
-    """With x = s R y + p for y in the axes of the leaf's shape, the same for the shapes that it is made of."""
+    """With x = s R y + p for y in the axes of the leaf's shape, the same for the shapes in it."""
     shape, factor, position, rotation = leaf
     if isinstance(shape, ScaledShape):
         return _flattened(_Leaf(shape.shape, factor * shape.factor.astype(factor.dtype), position, rotation))
@@ -139,7 +139,9 @@ def features_of(scene: Scene, pairs: Sequence[tuple[int, int, int]]) -> Features
         unions = unions or len(parts) > 1
         kinds |= {numbers[_KINDS[type(part.shape)][0]] for part in parts}
         degrees |= {
-            degree_of(part.shape.interpolation) for part in parts if isinstance(part.shape, SignedDistanceGrid)
+            degree_of(part.shape.interpolation)
+            for part in parts
+            if isinstance(part.shape, SignedDistanceGrid)
         }
         turning.add(_TURNING[surface.turning])
     every = _PRIMITIVES | _GRIDS
@@ -274,7 +276,7 @@ def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
 
 
 def _probes(surface: SurfaceSet) -> Float[Array, "k 3"]:
-    """Points that say how deep a surface is: its samples, or where they are many the centres of their blocks."""
+    """Points that say how deep a surface is: its samples, or if they are many the centres of blocks."""
     return surface.points[:3].T if surface.radii.shape[0] <= _FEW_BLOCKS else surface.centers
 
 
@@ -328,7 +330,9 @@ def _solids(scene: Scene, bodies: Sequence[Body], used: set[int], features: Feat
     return arrays, index
 
 
-def solids_kinds(scene: Scene, bodies: Sequence[Body], used: set[int], dtype: DTypeLike) -> Int[np.ndarray, "k 6"]:
+def solids_kinds(
+    scene: Scene, bodies: Sequence[Body], used: set[int], dtype: DTypeLike
+) -> Int[np.ndarray, "k 6"]:
     """Kind, first coefficient, nodes along each axis and degree of each leaf."""
     leaves, _ = _solid_leaves(scene, bodies, used, dtype)
     names, rows, at = _kind_names(), [], 0

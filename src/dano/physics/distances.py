@@ -317,7 +317,7 @@ def quadratic_slopes(f: real) -> vec3:
 def cubic_weights(f: real) -> vec4:
     """Weights of four nodes for a place f in [0, 1] from the second one (B-spline of degree 3)."""
     g = ONE - f
-    third = real(2.0 / 3.0)
+    third = TWO / real(3.0)
     return vec4(
         g * g * g / real(6.0),
         third - f * f * (ONE - HALF * f),

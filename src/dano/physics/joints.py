@@ -99,10 +99,10 @@ def turn_about(axis: vec3, half: real) -> quat:
     cosine = ONE
     sine = half
     if s < _SERIES:
-        c = ONE - real(1.0 / 30.0) * s * (ONE - real(1.0 / 56.0) * s)
-        cosine = ONE - HALF * s * (ONE - real(1.0 / 12.0) * s * c)
-        c = ONE - real(1.0 / 42.0) * s * (ONE - real(1.0 / 72.0) * s)
-        sine = half - half * real(1.0 / 6.0) * s * (ONE - real(1.0 / 20.0) * s * c)
+        c = ONE - ONE / real(30.0) * s * (ONE - ONE / real(56.0) * s)
+        cosine = ONE - HALF * s * (ONE - ONE / real(12.0) * s * c)
+        c = ONE - ONE / real(42.0) * s * (ONE - ONE / real(72.0) * s)
+        sine = half - half * ONE / real(6.0) * s * (ONE - ONE / real(20.0) * s * c)
     else:
         cosine = wp.cos(half)
         sine = wp.sin(half)

@@ -7,7 +7,7 @@ import warp as wp
 
 from dano.physics.distances import Distance, Solid, solid_distance, Solids
 from dano.physics.features import TURNING
-from dano.physics.real import HALF, mat33, ONE, quat, real, vec3, ZERO
+from dano.physics.real import mat33, ONE, quat, real, vec3, ZERO
 from dano.physics.rotations import direction, interpolated, matrix, rotation_from_z
 
 FIXED, AXIS, BALL = 0, 1, 2

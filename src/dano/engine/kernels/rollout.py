@@ -21,7 +21,7 @@ from dano.physics.features import LANES, LOOPS, TREES
 from dano.physics.joints import ROOT
 from dano.physics.momentum import angular_momentum, turned_inertia
 from dano.physics.pairs import BodyState
-from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
+from dano.physics.real import ONE, real, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
 from dano.physics.twists import angular_part, joined, linear_part
 

@@ -7,19 +7,27 @@ is listed if the old velocities take it into the other body by the end of the st
 import warp as wp
 
 from dano.engine.kernels.lanes import least, total, total3
-from dano.engine.kernels.tables import BLOCK, Body, BodyIndex, FoundPair, FoundPoint, Room, RUN, SamplePair, Scene
-from dano.physics.features import LANES
+from dano.engine.kernels.tables import (
+    BLOCK,
+    Body,
+    FoundPair,
+    FoundPoint,
+    Room,
+    RUN,
+    SamplePair,
+    Scene,
+)
 from dano.physics.distances import HALF_SPACE, Solid, solid_clearance, solid_distance, solid_of
+from dano.physics.features import LANES
 from dano.physics.pairs import (
     approach,
     BodyState,
     facing_direction,
     pair_pose,
     PairPose,
-    position_after,
 )
-from dano.physics.point_law import fitting_duals, Material, point_law, point_motion
-from dano.physics.real import INFINITY, ONE, real, TWO, vec3, vec4, ZERO
+from dano.physics.point_law import Material, point_law
+from dano.physics.real import INFINITY, ONE, real, TWO, vec3, ZERO
 from dano.physics.rotations import matrix
 from dano.physics.samples import (
     facing_area,

@@ -18,8 +18,8 @@ its residual was smallest.
 import warp as wp
 
 from dano.engine.kernels.assembly import assemble, fit_duals, follow_duals, Trial
-from dano.engine.kernels.lanes import total, wait
-from dano.engine.kernels.linear_solve import copy_blocks, find_pattern, solve_blocks
+from dano.engine.kernels.lanes import wait
+from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.balance import (
     add_tree_slopes,
@@ -32,7 +32,7 @@ from dano.engine.kernels.trees.balance import (
     same_mode,
     solve_trees,
 )
-from dano.physics.features import LANES, TREES
+from dano.physics.features import TREES
 from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec6, ZERO
 
 LEVELS = 11

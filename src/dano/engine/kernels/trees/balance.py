@@ -30,7 +30,6 @@ from dano.engine.kernels.trees.tables import Node
 from dano.physics.composites import (
     by_end_motion,
     by_start_motion,
-    Composite,
     composite,
     spin_momentum_by_end,
     summed,

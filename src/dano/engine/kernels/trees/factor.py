@@ -10,7 +10,7 @@ import warp as wp
 
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.kinematics import unknown_of
-from dano.engine.kernels.trees.tables import Node, Unknown
+from dano.engine.kernels.trees.tables import Node
 from dano.physics.real import mat66, ONE, real, vec6, ZERO
 
 

@@ -5,7 +5,6 @@ import warp as wp
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.factor import add_to_block
 from dano.engine.kernels.trees.kinematics import displacement_of, end_motions, unknown_of
-from dano.engine.kernels.trees.tables import LoopIndex
 from dano.physics.features import WIDE
 from dano.physics.loops import gap_by_twist, loop_compliance, loop_gap, LoopEnd
 from dano.physics.real import ONE, quat, real, vec6, ZERO
