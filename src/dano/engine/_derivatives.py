@@ -81,7 +81,7 @@ def _pullback_plan(forward: Plan, which: tuple[int, ...]) -> Plan:
     inputs = {**_places(forward), "bars.states": forward.outputs["launch.states"]}
     outputs = {f"bars.{CHANGING[name]}": forward.inputs[name] for name in wanted}
     return plan(
-        "dano.engine.kernels.pullback",
+        "dano.engine.kernels.derivatives.pullback",
         "pullback",
         forward.features,
         inputs,
@@ -168,7 +168,7 @@ def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) 
     changes = {f"changes.{CHANGING[k]}": Shape(n_directions * x.rows, x.width) for k, x in chosen.items()}
     states = forward.outputs["launch.states"]
     return plan(
-        "dano.engine.kernels.pushforward",
+        "dano.engine.kernels.derivatives.pushforward",
         "pushforward",
         forward.features,
         {**_places(forward), **changes},

@@ -11,6 +11,7 @@ from jaxtyping import Array, DTypeLike, Float, Int
 
 from dano.contact import DistributedLaw, Material, materials, SurfaceSet
 from dano.engine._instances import Features, instance
+from dano.engine.joints import structure_of_trees, tree_rows, TreeStructure
 from dano.fields import (
     AbstractShape,
     Box,
@@ -64,11 +65,13 @@ class Tables(eqx.Module):
         rows: Real numbers by place in a kernel's parameters, arrays of rows.
         whole: Whole numbers (static).
         features: What kernels must know of the scene (static).
+        structure: How bodies hang together (static).
     """
 
     rows: dict[str, Float[Array, "rows width"]]
     whole: Whole = eqx.field(static=True)
     features: Features = eqx.field(static=True)
+    structure: TreeStructure = eqx.field(static=True)
 
     @property
     def moving(self) -> Int[np.ndarray, " m"]:
@@ -154,8 +157,8 @@ def features_of(scene: Scene, pairs: Sequence[tuple[int, int, int]]) -> Features
         DEGREES=of_grids if 6 in known else frozenset(),
         TURNING=_STILL if turning <= _STILL else _TURNS,
         UNIONS=unions,
-        TREES=False,
-        LOOPS=False,
+        TREES=bool(scene.joints),
+        LOOPS=bool(scene.loops),
     )
 
 
@@ -191,10 +194,8 @@ def scene_tables(scene: Scene) -> Tables:
     bodies = [body if i in used else body.unused() for i, body in enumerate(scene.bodies)]
     surfaces, surface_index = _surfaces(scene, bodies, dtype)
     solids, solid_index = _solids(scene, bodies, used, features, dtype)
-    moving = scene.layout.moving
-    place = {i: k for k, i in enumerate(moving)}
-    rows = [place.get(i, -1) for i in range(len(bodies))]
-    index = np.array([[rows[i], *surface_index[i], *solid_index[i]] for i in range(len(bodies))], np.int32)
+    structure = structure_of_trees(scene, used)
+    index = [[row, *surface_index[i], *solid_index[i]] for i, row in enumerate(structure.rows)]
     extents = jnp.stack([_extent(body) for body in bodies]).astype(dtype)
     com = jnp.stack([body.com + body.com_offset for body in bodies]).astype(dtype)
     mass = jnp.stack([body.mass * body.mass_scale for body in bodies]).astype(dtype)
@@ -219,12 +220,15 @@ def scene_tables(scene: Scene) -> Tables:
         "scene.timestep": scene.timestep[None, None],
     }
     whole = {
-        "scene.body_index": index,
-        "scene.moving": np.array(moving, np.int32),
+        "scene.body_index": np.array(index, np.int32),
+        "scene.moving": structure.moving,
         "scene.pair_index": pair_index,
         "scene.solids.kinds": solids_kinds(scene, bodies, used, dtype),
     }
-    return Tables(arrays, Whole(whole), features)
+    if scene.joints:
+        of_trees, whole_of_trees = tree_rows(scene, structure)
+        arrays, whole = {**arrays, **of_trees}, {**whole, **whole_of_trees}
+    return Tables(arrays, Whole(whole), features, structure)
 
 
 # Radius of a half-space, which has none.

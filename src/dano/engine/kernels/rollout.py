@@ -16,7 +16,7 @@ from dano.engine.kernels.trees.kinematics import (
     turns_too_far,
     unknown_of,
 )
-from dano.engine.kernels.trees.loops import add_loops, begin_loops
+from dano.engine.kernels.trees.loops import add_loops, begin_loops, forces_of
 from dano.physics.features import LANES, LOOPS, TREES
 from dano.physics.joints import ROOT
 from dano.physics.momentum import angular_momentum, turned_inertia
@@ -49,6 +49,7 @@ class Launch:
         states: At the end of each step, written to, shape (worlds, steps · n).
         qs: Joint coordinates at the end of each step, written to, shape (worlds, steps · k).
         vs: Their velocities; the same.
+        forces: Of loops in each step [N, N m], written to, shape (worlds, steps · loops).
         reports: Written to, shape (worlds, steps).
         n_steps: Number of steps.
         n_directions: Number of directions in which a derivative is taken.
@@ -65,6 +66,7 @@ class Launch:
     states: wp.array2d(dtype=StateRow)
     qs: wp.array2d(dtype=real)
     vs: wp.array2d(dtype=real)
+    forces: wp.array2d(dtype=vec6)
     reports: wp.array2d(dtype=StepReport)
     n_steps: int
     n_directions: int
@@ -212,6 +214,10 @@ def advance_trees(scene: Scene, room: Room, world: int, launch: Launch, t: int):
         room.bodies[world, i].position = row.position
         room.bodies[world, i].orientation = from_wxyz(row.orientation)
     place_trees(scene, room, world, launch.qs, t * k)
+    if wp.static(LOOPS):
+        n_loops = scene.trees.loop_index.shape[0]
+        for row in range(n_loops):
+            launch.forces[world, t * n_loops + row] = forces_of(scene, room.velocity, world, row)
     for j in range(scene.trees.nodes.shape[0]):
         i = scene.trees.nodes[j].body
         if scene.trees.nodes[j].kind != _ROOT:

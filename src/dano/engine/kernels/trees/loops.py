@@ -39,6 +39,16 @@ def end_after(room: Room, world: int, body: int, node: int) -> LoopEnd:
 
 
 @wp.func
+def forces_of(scene: Scene, values: wp.array2d(dtype=vec6), world: int, row: int) -> vec6:
+    """Forces in a loop among the unknowns [N, N m]; zero of those that it has not."""
+    index = scene.trees.loop_index[row]
+    forces = vec6()
+    for c in range(index.width):
+        forces[c] = unknown_of(values, world, index.place + c)
+    return forces
+
+
+@wp.func
 def spread_loop_side(scene: Scene, room: Room, world: int, row: int, is_second: bool):
     """Add the derivative of a gap by velocities that move one side, at the start, to `room.trees.spread`."""
     index = scene.trees.loop_index[row]
@@ -142,10 +152,9 @@ def add_loops(scene: Scene, room: Room, world: int):
         first = end_after(room, world, index.first_body, index.first)
         second = end_after(room, world, index.second_body, index.second)
         gap = loop_gap(scene.trees.loops[world, row], first, second)
-        forces = vec6()
+        forces = forces_of(scene, room.tried, world, row)
         for c in range(index.width):
             u = index.place + c
-            forces[c] = unknown_of(room.tried, world, u)
             room.residual[world, u // 6][u % 6] += gap[c]
             add_to_block(room, world, m, u, u, room.trees.sizes[world, 2])
         add_loop_side(scene, room, world, row, forces, False)

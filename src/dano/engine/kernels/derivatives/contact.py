@@ -1,34 +1,25 @@
-"""Reverse mode of a rollout: one launch that goes from the last step to the first (docs/gradients.md)."""
+"""Derivatives of contact: by the states of two bodies that touch, from a virtual work (docs/gradients.md)."""
 
 import warp as wp
 
-from dano.engine.kernels.adjoint import (
-    advance_work,
+from dano.engine.kernels.derivatives.adjoint import (
     distance_work,
     facing_work,
-    momentum_work,
     pair_work,
     point_work,
     probe_distance,
-    state_work,
     Virtual,
 )
-from dano.engine.kernels.assembly import assemble, fit_duals, row_of, Trial
-from dano.engine.kernels.lanes import total, total3, total33, wait
-from dano.engine.kernels.linear_solve import copy_transposed_blocks, find_pattern, solve_blocks
-from dano.engine.kernels.rollout import begin_body, Launch
-from dano.engine.kernels.search import find_contacts, fix_laws, posed, solid_of_body
-from dano.engine.kernels.tables import Changes, FoundPair, Push, Room, Scene, StateRow
+from dano.engine.kernels.lanes import total, total3, total33
+from dano.engine.kernels.search import posed, solid_of_body
+from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
 from dano.physics.distances import leaf_distance, nearest_leaf, Solid
 from dano.physics.features import LANES, TURNING, UNIONS
 from dano.physics.pairs import BALL, BodyState, first_touch, PairPose, position_after, rotation_after
 from dano.physics.point_law import Material
 from dano.physics.real import mat33, ONE, real, vec3, ZERO
-from dano.physics.rotations import matrix
 from dano.physics.samples import position_in_solid
-from dano.physics.twists import joined
 
-_LANES = wp.constant(LANES)
 _BALL = wp.constant(BALL)
 
 
@@ -161,7 +152,15 @@ def summed_body(a: BodyState, b: BodyState) -> BodyState:
 
 @wp.func
 def pull_points(
-    scene: Scene, room: Room, bars: Changes, world: int, lane: int, found: FoundPair, pose: PairPose, rebound: real, twists: Virtual
+    scene: Scene,
+    room: Room,
+    bars: Changes,
+    world: int,
+    lane: int,
+    found: FoundPair,
+    pose: PairPose,
+    rebound: real,
+    twists: Virtual,
 ) -> tuple[PairPose, real, real]:
     """Derivatives by the pose of a pair, τ and h from its points; adds those by samples, solids and materials."""
     index = scene.pair_index[found.pair]
@@ -228,7 +227,7 @@ def solved_fixed_point(
     """(1 − ∂G/∂x)⁻ᵀ x̄ of the search for the first touch, x = G(x)."""
     rows = mat33()
     zero = vec3()
-    k = int(0)
+    k = 0
     while k < 3:
         unit = vec3()
         unit[k] = ONE
@@ -292,7 +291,14 @@ def pull_facing(
 
 @wp.func
 def pull_pair(
-    scene: Scene, room: Room, bars: Changes, world: int, lane: int, found: FoundPair, rebound: real, twists: Virtual
+    scene: Scene,
+    room: Room,
+    bars: Changes,
+    world: int,
+    lane: int,
+    found: FoundPair,
+    rebound: real,
+    twists: Virtual,
 ) -> PairBar:
     """Derivatives by the states of a pair's bodies; adds those by samples, solids and materials."""
     index = scene.pair_index[found.pair]
@@ -365,170 +371,3 @@ def scaled_body(s: real, a: BodyState) -> BodyState:
     a.spin *= s
     a.com *= s
     return a
-
-
-@wp.func
-def add_row(bars: wp.array2d(dtype=StateRow), world: int, i: int, bar: StateRow):
-    """Add a derivative by a state."""
-    bars[world, i].position += bar.position
-    bars[world, i].orientation += bar.orientation
-    bars[world, i].velocity += bar.velocity
-    bars[world, i].omega += bar.omega
-
-
-@wp.func
-def pull_body(scene: Scene, room: Room, bars: Changes, world: int, i: int, row: StateRow, bar: BodyState):
-    """Add derivatives by a body's row and properties from those by its state."""
-    h = scene.timestep[world, 0]
-    body = scene.bodies[world, i]
-    moves = scene.body_index[i].row >= 0
-    by_body, by_row, by_h, _a, _b = wp.grad(state_work)(body, row, h, moves, bar)
-    add_row(room.state_bar, world, i, by_row)
-    if bars.bodies.shape[1] > 0:
-        bars.bodies[world, i].com += by_body.com
-    if bars.timestep.shape[1] > 0:
-        bars.timestep[world, 0] += by_h
-
-
-@wp.func
-def pull_momentum(
-    scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, t: int, i: int, row: StateRow
-):
-    """Add derivatives through the momentum that a body comes with, gravity and control."""
-    h = scene.timestep[world, 0]
-    n = scene.body_index.shape[0]
-    m = scene.body_index[i].row
-    body = scene.bodies[world, i]
-    push = Push()
-    if launch.pushes.shape[1] > 0:
-        push = launch.pushes[world, t * n + i]
-    by_body, by_row, by_push, by_gravity, by_h, _a, _b = wp.grad(momentum_work)(
-        body, row, push, scene.gravity[world, 0], h, room.velocity[world, m], room.step[world, m]
-    )
-    add_row(room.state_bar, world, i, by_row)
-    if bars.bodies.shape[1] > 0:
-        bars.bodies[world, i].mass += by_body.mass
-        bars.bodies[world, i].inertia += by_body.inertia
-    if bars.pushes.shape[1] > 0:
-        bars.pushes[world, t * n + i] = by_push
-    if bars.gravity.shape[1] > 0:
-        bars.gravity[world, 0] += by_gravity
-    if bars.timestep.shape[1] > 0:
-        bars.timestep[world, 0] += by_h
-
-
-@wp.func
-def pull_advance(scene: Scene, room: Room, bars: Changes, world: int, i: int, row: StateRow, after: StateRow):
-    """Derivatives by the velocities and the row of a body from those by its row at the end of a step."""
-    h = scene.timestep[world, 0]
-    m = scene.body_index[i].row
-    if m >= 0:
-        by_row, by_velocity, by_h, _a = wp.grad(advance_work)(row, room.velocity[world, m], h, after)
-        room.state_bar[world, i] = by_row
-        room.residual[world, m] = by_velocity
-        if bars.timestep.shape[1] > 0:
-            bars.timestep[world, 0] += by_h
-    else:
-        room.state_bar[world, i] = after
-
-
-@wp.func
-def row_before(scene: Scene, launch: Launch, world: int, t: int, i: int) -> StateRow:
-    """State of a body at the start of a step."""
-    n = scene.body_index.shape[0]
-    if t == 0:
-        return launch.state[world, i]
-    return launch.states[world, (t - 1) * n + i]
-
-
-@wp.func
-def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: int) -> int:
-    """A step at its solution: points, laws and the Jacobian; returns the number of pairs that are near."""
-    n = scene.body_index.shape[0]
-    for i in range(n):
-        push = Push()
-        begin_body(scene, room, world, i, row_before(scene, launch, world, t, i), push)
-        m = scene.body_index[i].row
-        if m >= 0:
-            row = launch.states[world, t * n + i]
-            spin = matrix(room.bodies[world, i].orientation) * row.omega
-            room.velocity[world, m] = joined(row.velocity, spin)
-            room.tried[world, m] = joined(row.velocity, spin)
-    wait()
-    n_found, _overflow = find_contacts(scene, room, world, lane)
-    wait()
-    if lane == 0:
-        find_pattern(scene, room, world, n_found)
-    fix_laws(scene, room, world, lane, n_found, launch.reports[world, t].rebound)
-    fit_duals(scene, room, world, lane, n_found)
-    wait()
-    trial = Trial()
-    trial.softness = ONE
-    assemble(scene, room, world, lane, n_found, trial)
-    wait()
-    return n_found
-
-
-@wp.kernel(enable_backward=False)
-def pullback(scene: Scene, room: Room, launch: Launch, bars: Changes):
-    """Derivatives by everything that a rollout is given, from those by the states at the ends of its steps."""
-    block, lane = wp.tid()
-    world = launch.first_world + block
-    n = scene.body_index.shape[0]
-    m = scene.moving.shape[0]
-    if lane == 0:
-        for i in range(n):
-            room.after_bar[world, i] = StateRow()
-    for s in range(launch.n_steps):
-        t = launch.n_steps - 1 - s
-        n_found = settle(scene, room, launch, world, lane, t)
-        if lane == 0:
-            for i in range(n):
-                add_row(room.after_bar, world, i, bars.states[world, t * n + i])
-                pull_advance(
-                    scene, room, bars, world, i, row_before(scene, launch, world, t, i), room.after_bar[world, i]
-                )
-            # (∂R/∂V)ᵀ λ = V̄
-            copy_transposed_blocks(room, world, m)
-            for k in range(m):
-                room.step[world, k] = room.residual[world, k]
-            solve_blocks(room, world, m)
-            for i in range(n):
-                if scene.body_index[i].row >= 0:
-                    pull_momentum(
-                        scene, room, bars, launch, world, t, i, row_before(scene, launch, world, t, i)
-                    )
-        wait()
-        for f in range(n_found):
-            found = room.found[world, f * _LANES + lane]
-            index = scene.pair_index[found.pair]
-            twists = Virtual()
-            first = scene.body_index[index.first].row
-            second = scene.body_index[index.second].row
-            twists.first = row_of(room.velocity, world, first)
-            twists.second = row_of(room.velocity, world, second)
-            twists.first_virtual = row_of(room.step, world, first)
-            twists.second_virtual = row_of(room.step, world, second)
-            bar = pull_pair(scene, room, bars, world, lane, found, launch.reports[world, t].rebound, twists)
-            if lane == 0:
-                pull_body(
-                    scene, room, bars, world, index.first, row_before(scene, launch, world, t, index.first), bar.first
-                )
-                pull_body(
-                    scene, room, bars, world, index.second, row_before(scene, launch, world, t, index.second),
-                    bar.second,
-                )  # fmt: skip
-                if bars.bodies.shape[1] > 0:
-                    bars.bodies[world, index.first].scale += bar.scale
-                if bars.timestep.shape[1] > 0:
-                    bars.timestep[world, 0] += bar.timestep
-                if bars.pairs.shape[1] > 0:
-                    bars.pairs[world, found.pair].sink += bar.sink
-        wait()
-        if lane == 0:
-            for i in range(n):
-                room.after_bar[world, i] = room.state_bar[world, i]
-        wait()
-    if lane == 0 and bars.state.shape[1] > 0:
-        for i in range(n):
-            bars.state[world, i] = room.after_bar[world, i]

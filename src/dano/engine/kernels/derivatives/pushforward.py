@@ -7,11 +7,13 @@ depends on is that of reverse mode with a unit virtual velocity, and serves all 
 
 import warp as wp
 
-from dano.engine.kernels.adjoint import advance_work, momentum_work, Virtual
 from dano.engine.kernels.assembly import row_of
+from dano.engine.kernels.derivatives.adjoint import advance_work, momentum_work, Virtual
+from dano.engine.kernels.derivatives.bodies import pull_body, row_before
+from dano.engine.kernels.derivatives.contact import pull_pair
+from dano.engine.kernels.derivatives.pullback import settle
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
-from dano.engine.kernels.pullback import pull_body, pull_pair, row_before, settle
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Body, Changes, FoundPair, Push, Room, SamplePair, Scene, StateRow
 from dano.physics.distances import Leaf
@@ -38,9 +40,7 @@ def row_product(a: StateRow, b: StateRow) -> real:
 @wp.func
 def body_product(a: Body, b: Body) -> real:
     """⟨a, b⟩ of what bodies are."""
-    return (
-        a.mass * b.mass + wp.ddot(a.inertia, b.inertia) + wp.dot(a.com, b.com) + wp.dot(a.scale, b.scale)
-    )
+    return a.mass * b.mass + wp.ddot(a.inertia, b.inertia) + wp.dot(a.com, b.com) + wp.dot(a.scale, b.scale)
 
 
 @wp.func
@@ -104,7 +104,9 @@ def clear_pair(scene: Scene, room: Room, bars: Changes, world: int, lane: int, f
 
 
 @wp.func
-def row_change(launch: Launch, changes: Changes, world: int, t: int, i: int, direction: int, n: int) -> StateRow:
+def row_change(
+    launch: Launch, changes: Changes, world: int, t: int, i: int, direction: int, n: int
+) -> StateRow:
     """Change of a body's state at the start of a step."""
     if t == 0:
         if changes.state.shape[1] == 0:
@@ -115,7 +117,16 @@ def row_change(launch: Launch, changes: Changes, world: int, t: int, i: int, dir
 
 @wp.func
 def change_of_pair(
-    scene: Scene, room: Room, launch: Launch, changes: Changes, bars: Changes, world: int, lane: int, t: int, found: FoundPair, direction: int
+    scene: Scene,
+    room: Room,
+    launch: Launch,
+    changes: Changes,
+    bars: Changes,
+    world: int,
+    lane: int,
+    t: int,
+    found: FoundPair,
+    direction: int,
 ) -> real:
     """Change of an equation of a pair in a direction, from its derivatives."""
     n = scene.body_index.shape[0]
@@ -125,10 +136,13 @@ def change_of_pair(
     )
     if index.first != index.second:
         change += row_product(
-            room.state_bar[world, index.second], row_change(launch, changes, world, t, index.second, direction, n)
+            room.state_bar[world, index.second],
+            row_change(launch, changes, world, t, index.second, direction, n),
         )
     if changes.bodies.shape[1] > 0:
-        change += body_product(bars.bodies[world, index.first], changes.bodies[world, direction * n + index.first])
+        change += body_product(
+            bars.bodies[world, index.first], changes.bodies[world, direction * n + index.first]
+        )
         change += body_product(
             bars.bodies[world, index.second], changes.bodies[world, direction * n + index.second]
         )
@@ -191,9 +205,7 @@ def add_shift(
 
 
 @wp.func
-def push_momentum(
-    scene: Scene, room: Room, launch: Launch, changes: Changes, world: int, t: int, i: int
-):
+def push_momentum(scene: Scene, room: Room, launch: Launch, changes: Changes, world: int, t: int, i: int):
     """Add what the changes make of the momentum that a body comes with, in all directions."""
     n = scene.body_index.shape[0]
     m = scene.moving.shape[0]
@@ -202,7 +214,7 @@ def push_momentum(
     push = Push()
     if launch.pushes.shape[1] > 0:
         push = launch.pushes[world, t * n + i]
-    k = int(0)
+    k = 0
     while k < 6:
         by_body, by_row, by_push, by_gravity, by_h, _a, _b = wp.grad(momentum_work)(
             scene.bodies[world, i], row_before(scene, launch, world, t, i), push, scene.gravity[world, 0], h,
@@ -239,7 +251,9 @@ def unit_row(k: int) -> StateRow:
 
 
 @wp.func
-def push_advance(scene: Scene, room: Room, launch: Launch, changes: Changes, world: int, t: int, i: int, d: int):
+def push_advance(
+    scene: Scene, room: Room, launch: Launch, changes: Changes, world: int, t: int, i: int, d: int
+):
     """Change of a body's state at the end of a step, from those at its start and of its velocities."""
     n = scene.body_index.shape[0]
     row = scene.body_index[i].row
@@ -248,7 +262,7 @@ def push_advance(scene: Scene, room: Room, launch: Launch, changes: Changes, wor
     if row >= 0:
         h = scene.timestep[world, 0]
         end = StateRow()
-        k = int(0)
+        k = 0
         while k < 13:
             by_row, by_velocity, by_h, _a = wp.grad(advance_work)(
                 row_before(scene, launch, world, t, i), room.velocity[world, row], h, unit_row(k)
@@ -287,13 +301,15 @@ def pushforward(scene: Scene, room: Room, launch: Launch, changes: Changes, bars
             twists = Virtual()
             twists.first = row_of(room.velocity, world, scene.body_index[index.first].row)
             twists.second = row_of(room.velocity, world, scene.body_index[index.second].row)
-            k = int(0)
+            k = 0
             while k < 6:
                 clear_pair(scene, room, bars, world, lane, found)
                 wait()
                 # The first body's virtual velocity is measured from the second's: only it moves.
                 twists.first_virtual = unit_vector(k)
-                bar = pull_pair(scene, room, bars, world, lane, found, launch.reports[world, t].rebound, twists)
+                bar = pull_pair(
+                    scene, room, bars, world, lane, found, launch.reports[world, t].rebound, twists
+                )
                 if lane == 0:
                     pull_body(
                         scene, room, bars, world, index.first,
