@@ -12,8 +12,7 @@ import dano
 from dano import contact
 from dano.engine._problem import build_problem, links_of, prepare, structure_of
 from dano.engine._rigid import angular_momentum, turned
-from dano.engine._stepping import listed_points
-from dano.engine._tables import scene_tables
+from dano.engine.launching import listed_points, scene_tables
 
 CHUNK = 16
 

@@ -278,7 +278,7 @@ def _mesh_distances(
     vertices, faces = _arrays(solid)
     # An exact query costs 12 µs; only nodes near the surface need one. Vertices of a mesh whose edges are
     # shorter than a cell mark them: no surface point is then further than 1.5 cells from a marked node.
-    fine, small = trimesh.remesh.subdivide_to_size(vertices, faces, max_edge=spacing, max_iter=32)
+    fine, small = trimesh.remesh.subdivide_to_size(vertices, faces, max_edge=spacing, max_iter=32)[:2]
     marked = np.zeros(shape, dtype=bool)
     marked[tuple(np.rint((fine - origin) / spacing).astype(int).T)] = True
     near = ndimage.distance_transform_edt(~marked) <= 3

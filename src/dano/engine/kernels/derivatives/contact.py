@@ -162,7 +162,7 @@ def pull_points(
     rebound: real,
     twists: Virtual,
 ) -> tuple[PairPose, real, real]:
-    """Derivatives by the pose of a pair, τ and h from its points; adds those by samples, solids and materials."""
+    """Derivatives by the pose of a pair, τ and h; adds those by samples, solids and materials."""
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
     turning = scene.body_index[index.first].turning
@@ -184,8 +184,8 @@ def pull_points(
             (
                 by_pose, by_sample, by_distance, _a, _b, by_share_of, by_share, by_h, by_material, _c, _d, _e,
             ) = wp.grad(point_work)(
-                pose, sample, d, turning, where.presses_back > 0, pair.share, found.share, h, material, rebound,
-                found.impact_stiffness, twists,
+                pose, sample, d, turning, where.presses_back > 0, pair.share, found.share, h, material,
+                rebound, found.impact_stiffness, twists,
             )  # fmt: skip
             _f, _g, by_solid, by_x, _h = wp.grad(distance_work)(scene.solids, world, solid, x, by_distance)
             add_leaf(bars, world, solid, by_solid)
@@ -227,7 +227,7 @@ def solved_fixed_point(
     """(1 − ∂G/∂x)⁻ᵀ x̄ of the search for the first touch, x = G(x)."""
     rows = mat33()
     zero = vec3()
-    k = 0
+    k = int(0)
     while k < 3:
         unit = vec3()
         unit[k] = ONE

@@ -49,7 +49,7 @@ def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: i
 
 @wp.kernel(enable_backward=False)
 def pullback(scene: Scene, room: Room, launch: Launch, bars: Changes):
-    """Derivatives by everything that a rollout is given, from those by the states at the ends of its steps."""
+    """Derivatives by all that a rollout is given, from those by the states at the ends of its steps."""
     block, lane = wp.tid()
     world = launch.first_world + block
     n = scene.body_index.shape[0]

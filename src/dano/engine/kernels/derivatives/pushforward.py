@@ -214,7 +214,7 @@ def push_momentum(scene: Scene, room: Room, launch: Launch, changes: Changes, wo
     push = Push()
     if launch.pushes.shape[1] > 0:
         push = launch.pushes[world, t * n + i]
-    k = 0
+    k = int(0)
     while k < 6:
         by_body, by_row, by_push, by_gravity, by_h, _a, _b = wp.grad(momentum_work)(
             scene.bodies[world, i], row_before(scene, launch, world, t, i), push, scene.gravity[world, 0], h,
@@ -262,7 +262,7 @@ def push_advance(
     if row >= 0:
         h = scene.timestep[world, 0]
         end = StateRow()
-        k = 0
+        k = int(0)
         while k < 13:
             by_row, by_velocity, by_h, _a = wp.grad(advance_work)(
                 row_before(scene, launch, world, t, i), room.velocity[world, row], h, unit_row(k)
@@ -301,7 +301,7 @@ def pushforward(scene: Scene, room: Room, launch: Launch, changes: Changes, bars
             twists = Virtual()
             twists.first = row_of(room.velocity, world, scene.body_index[index.first].row)
             twists.second = row_of(room.velocity, world, scene.body_index[index.second].row)
-            k = 0
+            k = int(0)
             while k < 6:
                 clear_pair(scene, room, bars, world, lane, found)
                 wait()

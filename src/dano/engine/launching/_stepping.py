@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dano.engine import _derivatives  # noqa: F401  rules for derivatives of launches
-from dano.engine._launch import launch, Plan, plan, Shape
 from dano.engine._newton import Report, SolverOptions
-from dano.engine._tables import Tables
 from dano.engine.joints import tree_lengths
+from dano.engine.launching import _derivatives  # noqa: F401  rules for derivatives of launches
+from dano.engine.launching._launch import launch, Plan, plan, Shape
+from dano.engine.launching._tables import Tables
 from dano.scene import Control, State
 
 _MODULE = "dano.engine.kernels.rollout"
@@ -91,9 +91,7 @@ def listed_points(tables: Tables, state: State, capacity: int) -> dict[str, Arra
     outputs = {"listing.points": Shape(points, sum(_POINT.values())), "listing.overflow": Shape(1, 1)}
     room, numbers = _room(tables, shapes, n, points), {"scene.n_blocks": tables.structure.n_blocks}
     module = "dano.engine.kernels.listing"
-    chosen = plan(
-        module, "listing", tables.features, shapes, outputs, tables.whole.arrays, room, numbers
-    )
+    chosen = plan(module, "listing", tables.features, shapes, outputs, tables.whole.arrays, room, numbers)
     found = launch(chosen, inputs)
     ends = np.cumsum(list(_POINT.values()))[:-1]
     parts = jnp.split(found["listing.points"], ends, axis=1)
