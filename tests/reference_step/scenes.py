@@ -107,6 +107,7 @@ def states(name):
         found["on its end"] = dict(orientation=UPRIGHT)
     if top == 0.03:
         found["at the edge"] = dict(x=0.21, gap=-0.006, velocity=(-0.3, 0.1, -0.01))
+        found["inside"] = dict(orientation=TILTED, gap=-0.065)
     for spin in SPINS:
         found[f"spinning at {spin:.0f} rad/s"] = dict(omega=(0.01 * spin, 0.02 * spin, spin))
     return {key: placed(name, top, {**A, "orientation": lying, **change}) for key, change in found.items()}
@@ -136,6 +137,8 @@ def names(name):
     some = ["at rest", "slow", "sliding", "tilted", "hitting", "deep", "rolling"]
     some += {"cylinder on floor": ["on its end"]}.get(name, [])
     some += ["at the edge"] if name.endswith("on table") else []
+    # Of a box that deep forces are so large that the plain search of the reference finds no root.
+    some += ["inside"] if name in ("ball on table", "ellipsoid on table") else []
     return [*some, *(f"spinning at {spin:.0f} rad/s" for spin in SPINS)]
 
 
