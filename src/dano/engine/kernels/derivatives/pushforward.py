@@ -11,7 +11,7 @@ from dano.engine.kernels.assembly import row_of
 from dano.engine.kernels.derivatives.adjoint import advance_work, momentum_work, Virtual
 from dano.engine.kernels.derivatives.bodies import pull_body, row_before
 from dano.engine.kernels.derivatives.contact import pull_pair
-from dano.engine.kernels.derivatives.pullback import settle
+from dano.engine.kernels.derivatives.equations import settle
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
 from dano.engine.kernels.rollout import Launch
