@@ -116,7 +116,7 @@ def _pulling_room(forward: Plan) -> dict[str, int]:
     """Lengths of what a world needs besides for derivatives of a step's equations."""
     room = dict.fromkeys(("room.state_bar", "room.after_bar"), forward.room["room.bodies"])
     if "room.trees.joints" in forward.room:
-        names = ("chains", "chain_bars", "hanging_bars")
+        names = ("chains", "chain_bars", "hanging_bars", "asked")
         room |= {f"room.trees.{name}": forward.room["room.trees.frames"] for name in names}
         names = ("q_bar", "v_bar", "q_after", "v_after")
         room |= {f"room.trees.{name}": forward.room["room.trees.joints"] for name in names}
@@ -212,21 +212,18 @@ def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) 
         {**_places(forward), **changes},
         ends,
         forward.whole,
-        {**forward.room, **_pushforward_room(forward, n_directions)},
+        {**forward.room, **_pushforward_room(forward, which, n_directions)},
         {**forward.numbers, "launch.n_directions": n_directions},
     )
 
 
-def _pushforward_room(forward: Plan, n_directions: int) -> dict[str, int]:
-    m = forward.room["room.momentum"]
-    rows = {
-        f"bars.{CHANGING[name]}": forward.inputs[name].rows for name in CHANGING if name in forward.inputs
-    }
-    rows.pop("bars.coefficients", None)
+def _pushforward_room(forward: Plan, which: tuple[int, ...], n_directions: int) -> dict[str, int]:
+    names = list(forward.inputs)
+    rows = {f"bars.{CHANGING[names[i]]}": forward.inputs[names[i]].rows for i in which}
     return {
         **_pulling_room(forward),
         **rows,
-        "room.missing": n_directions * m,
+        "room.missing": n_directions * forward.room["room.velocity"],
         "room.wrenches": forward.room["room.found"],
     }
 

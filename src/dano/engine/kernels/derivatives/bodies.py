@@ -8,6 +8,7 @@ from dano.engine.kernels.tables import Changes, Push, Room, Scene, StateRow
 from dano.physics.features import TREES
 from dano.physics.joints import ROOT
 from dano.physics.pairs import BodyState
+from dano.physics.real import vec6, ZERO
 
 _ROOT = wp.constant(ROOT)
 
@@ -79,11 +80,21 @@ def pull_momentum(
 
 
 @wp.func
+def is_zero(row: StateRow) -> bool:
+    """Whether nothing is asked of a body."""
+    size = wp.length_sq(row.position) + wp.length_sq(row.orientation)
+    return size + wp.length_sq(row.velocity) + wp.length_sq(row.omega) == ZERO
+
+
+@wp.func
 def pull_advance(scene: Scene, room: Room, bars: Changes, world: int, i: int, row: StateRow, after: StateRow):
     """Derivatives by the velocities and the row of a body from those by its row at the end of a step."""
     h = scene.timestep[world, 0]
     m = scene.body_index[i].row
-    if m >= 0:
+    if m >= 0 and is_zero(after):
+        room.state_bar[world, i] = StateRow()
+        room.residual[world, block_of(scene, m)] = vec6()
+    elif m >= 0:
         b = block_of(scene, m)
         by_row, by_velocity, by_h, _a = wp.grad(advance_work)(row, room.velocity[world, b], h, after)
         room.state_bar[world, i] = by_row

@@ -243,7 +243,7 @@ def solved_fixed_point(
     """(1 − ∂G/∂x)⁻ᵀ x̄ of the search for the first touch, x = G(x)."""
     rows = mat33()
     zero = vec3()
-    k = 0
+    k = int(0)
     while k < 3:
         unit = vec3()
         unit[k] = ONE

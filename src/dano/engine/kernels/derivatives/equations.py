@@ -4,15 +4,25 @@ import warp as wp
 
 from dano.engine.kernels.assembly import assemble, fit_duals, row_of, Trial
 from dano.engine.kernels.derivatives.adjoint import after_adjoints, Virtual
-from dano.engine.kernels.derivatives.bodies import block_of, hangs, pull_body, pull_momentum, row_before
+from dano.engine.kernels.derivatives.bodies import (
+    block_of,
+    hangs,
+    pull_advance,
+    pull_body,
+    pull_momentum,
+    row_before,
+)
 from dano.engine.kernels.derivatives.contact import PairBar, pull_pair
 from dano.engine.kernels.derivatives.trees import (
     add_hanging,
     add_timestep,
+    ask_of_end,
     follow_chains,
     pull_chains,
+    pull_coordinates,
     pull_laws,
     pull_loops,
+    pull_places,
     settle_trees,
     transpose_entries,
 )
@@ -23,6 +33,7 @@ from dano.engine.kernels.search import find_contacts, fix_laws
 from dano.engine.kernels.tables import Changes, FoundPair, Push, Room, Scene
 from dano.engine.kernels.trees.balance import (
     add_tree_slopes,
+    clear_trees,
     eliminate_joint_duals,
     fit_joint_duals,
     solve_trees,
@@ -104,6 +115,12 @@ def twist_of(scene: Scene, room: Room, world: int, row: int, values: wp.array2d(
     return row_of(values, world, row)
 
 
+@wp.func
+def is_moved(values: wp.array2d(dtype=vec6), world: int, block: int) -> bool:
+    """Whether virtual velocities in a block are not zero; what is not a number is not."""
+    return not (wp.length_sq(values[world, block]) == ZERO)
+
+
 @after_adjoints
 @wp.func
 def pull_touching(
@@ -144,6 +161,26 @@ def pull_touching(
 
 @after_adjoints
 @wp.func
+def pull_end(scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, t: int):
+    """Derivatives by what a step begins with, and by its velocities, from those by its end.
+
+    The latter are in `room.residual`. Chains are those without virtual velocities, see `follow_chains`.
+    """
+    if wp.static(TREES):
+        clear_trees(scene, world, room.residual)
+        pull_places(scene, room, bars, launch, world, t)
+    for i in range(scene.body_index.shape[0]):
+        if not hangs(scene, scene.body_index[i].row):
+            before = row_before(scene, launch, world, t, i)
+            pull_advance(scene, room, bars, world, i, before, room.after_bar[world, i])
+    if wp.static(TREES):
+        ask_of_end(scene, room, world)
+        pull_coordinates(scene, room, bars, world)
+        pull_chains(scene, room, bars, launch, world, t)
+
+
+@after_adjoints
+@wp.func
 def pull_equations(
     scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, lane: int, t: int, n_found: int
 ):
@@ -151,7 +188,7 @@ def pull_equations(
     if lane == 0:
         for i in range(scene.body_index.shape[0]):
             row = scene.body_index[i].row
-            if row >= 0 and not hangs(scene, row):
+            if row >= 0 and not hangs(scene, row) and is_moved(room.step, world, block_of(scene, row)):
                 pull_momentum(scene, room, bars, launch, world, t, i, row_before(scene, launch, world, t, i))
     wait()
     for f in range(n_found):
@@ -164,9 +201,11 @@ def pull_equations(
         twists.second = twist_of(scene, room, world, second, room.velocity, ONE)
         twists.first_virtual = twist_of(scene, room, world, first, room.step, ZERO)
         twists.second_virtual = twist_of(scene, room, world, second, room.step, ZERO)
-        bar = pull_pair(scene, room, bars, world, lane, found, launch.reports[world, t].rebound, twists)
-        if lane == 0:
-            pull_touching(scene, room, bars, launch, world, t, found, bar)
+        moved = wp.length_sq(twists.first_virtual) + wp.length_sq(twists.second_virtual)
+        if not (moved == ZERO):
+            bar = pull_pair(scene, room, bars, world, lane, found, launch.reports[world, t].rebound, twists)
+            if lane == 0:
+                pull_touching(scene, room, bars, launch, world, t, found, bar)
     wait()
     if wp.static(TREES):
         if lane == 0:

@@ -2,16 +2,9 @@
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.adjoint import after_adjoints
-from dano.engine.kernels.derivatives.bodies import add_row, hangs, pull_advance, row_before
-from dano.engine.kernels.derivatives.equations import pull_equations, settle, solve_transposed
-from dano.engine.kernels.derivatives.trees import (
-    ask_of_end,
-    follow_chains,
-    pull_chains,
-    pull_coordinates,
-    pull_places,
-)
+from dano.engine.kernels.derivatives.bodies import add_row
+from dano.engine.kernels.derivatives.equations import pull_end, pull_equations, settle, solve_transposed
+from dano.engine.kernels.derivatives.trees import follow_chains
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Changes, Room, Scene, StateRow
@@ -42,27 +35,6 @@ def add_asked(scene: Scene, room: Room, bars: Changes, world: int, t: int):
         room.trees.v_after[world, c] = room.trees.v_after[world, c] + bars.vs[world, t * k + c]
 
 
-@after_adjoints
-@wp.func
-def pull_end(scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, t: int):
-    """Derivatives by what a step begins with, and by its velocities, from those by its end.
-
-    The latter are in `room.residual`.
-    """
-    if wp.static(TREES):
-        clear_trees(scene, world, room.residual)
-        pull_places(scene, room, bars, launch, world, t)
-    for i in range(scene.body_index.shape[0]):
-        if not hangs(scene, scene.body_index[i].row):
-            before = row_before(scene, launch, world, t, i)
-            pull_advance(scene, room, bars, world, i, before, room.after_bar[world, i])
-    if wp.static(TREES):
-        ask_of_end(scene, room, world)
-        pull_coordinates(scene, room, bars, world)
-        follow_chains(scene, room, launch, world, t)
-        pull_chains(scene, room, bars, launch, world, t)
-
-
 @wp.func
 def go_back(scene: Scene, room: Room, world: int):
     """The start of a step is the end of the one before."""
@@ -85,6 +57,9 @@ def pullback(scene: Scene, room: Room, launch: Launch, bars: Changes):
         n_found = settle(scene, room, launch, world, lane, t)
         if lane == 0:
             add_asked(scene, room, bars, world, t)
+            if wp.static(TREES):
+                clear_trees(scene, world, room.step)
+                follow_chains(scene, room, launch, world, t)
             pull_end(scene, room, bars, launch, world, t)
             solve_transposed(scene, room, world)
         wait()

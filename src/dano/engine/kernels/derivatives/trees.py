@@ -17,7 +17,6 @@ from dano.engine.kernels.derivatives.tree_adjoint import (
 )
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Changes, Push, Room, Scene, StateRow
-from dano.engine.kernels.trees.balance import clear_trees
 from dano.engine.kernels.trees.kinematics import unknown_of, velocities_of
 from dano.engine.kernels.trees.loops import forces_of
 from dano.engine.kernels.trees.tables import Chain, HangingBar, Node
@@ -124,6 +123,7 @@ def add_chain(scene: Scene, room: Room, world: int, node: int, body: int, bar: C
         sums.change += bar.change
         sums.work += bar.work
         room.trees.chain_bars[world, node] = sums
+        room.trees.asked[world, node] = 1
     else:
         add_place(room.state_bar, world, body, bar.position, bar.orientation)
 
@@ -183,6 +183,7 @@ def add_hanging(room: Room, world: int, node: int, state: BodyState, twist: vec6
     sums.twist += twist
     sums.work += work
     room.trees.hanging_bars[world, node] = sums
+    room.trees.asked[world, node] = 1
 
 
 @wp.func
@@ -247,7 +248,8 @@ def pull_chains(scene: Scene, room: Room, bars: Changes, launch: Launch, world: 
     for k in range(m):
         n = m - 1 - k
         node = scene.trees.nodes[n]
-        if node.alone == 0:
+        work = room.trees.chains[world, n].work
+        if node.alone == 0 and (room.trees.asked[world, n] > 0 or not (wp.length_sq(work) == ZERO)):
             if node.kind == _ROOT:
                 b = node.place // 6
                 row = row_before(scene, launch, world, t, node.body)
@@ -266,6 +268,7 @@ def pull_chains(scene: Scene, room: Room, bars: Changes, launch: Launch, world: 
                 pull_hanging(scene, room, bars, launch, world, t, n)
             room.trees.chain_bars[world, n] = Chain()
             room.trees.hanging_bars[world, n] = HangingBar()
+            room.trees.asked[world, n] = 0
 
 
 @wp.func
@@ -288,11 +291,12 @@ def pull_places(scene: Scene, room: Room, bars: Changes, launch: Launch, world: 
     for k in range(m):
         n = m - 1 - k
         node = scene.trees.nodes[n]
-        if node.kind != _ROOT:
+        asked = room.after_bar[world, node.body]
+        size = wp.length_sq(asked.position) + wp.length_sq(asked.orientation)
+        if node.kind != _ROOT and not (size == ZERO):
             q = vec3()
             for part in range(node.width):
                 q[part] = launch.qs[world, t * scene.trees.coordinates.shape[0] + node.coordinate + part]
-            asked = room.after_bar[world, node.body]
             _a, by_joint, by_carrier, by_com, by_q, _b, _c = wp.grad(placing_work)(
                 node.kind,
                 scene.trees.joints[world, node.joint],
@@ -348,7 +352,8 @@ def ask_of_end(scene: Scene, room: Room, world: int):
             room.state_bar[world, node.body] = StateRow()
         room.trees.hanging_bars[world, n] = bar
         room.trees.chain_bars[world, n] = Chain()
-    clear_trees(scene, world, room.step)
+        size = wp.length_sq(bar.velocity) + wp.length_sq(bar.omega)
+        room.trees.asked[world, n] = wp.where(size == ZERO, 0, 1)
 
 
 @wp.func
@@ -358,6 +363,9 @@ def pull_laws(scene: Scene, room: Room, bars: Changes, world: int, t: int):
     k = scene.trees.coordinates.shape[0]
     for c in range(k):
         coordinate = scene.trees.coordinates[c]
+        virtual = unknown_of(room.step, world, coordinate.place)
+        if virtual == ZERO:
+            continue
         state = room.trees.joints[world, c]
         law = scene.trees.laws[world, c]
         law.least_effort = wp.max(law.least_effort, -_ENDLESS)
@@ -369,7 +377,7 @@ def pull_laws(scene: Scene, room: Room, bars: Changes, world: int, t: int):
             unknown_of(room.velocity, world, coordinate.place),
             h * state.rho,
             coordinate.nonsmooth > 0,
-            unknown_of(room.step, world, coordinate.place),
+            virtual,
         )
         room.trees.q_bar[world, c] = room.trees.q_bar[world, c] + by_drive.q
         room.trees.v_bar[world, c] = room.trees.v_bar[world, c] + by_drive.v

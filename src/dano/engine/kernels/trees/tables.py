@@ -238,6 +238,7 @@ class TreeRoom:
         chains: How the body of each node stands and moves; this and the next are for derivatives.
         chain_bars: Derivatives by these.
         hanging_bars: By what else is asked of bodies on joints.
+        asked: Whether some of these are not zero.
         q_bar: By joint coordinates at the start of a step, shape (worlds, coordinates).
         v_bar: By their velocities there.
         q_after: By coordinates at its end.
@@ -266,6 +267,7 @@ class TreeRoom:
     chains: wp.array2d(dtype=Chain)
     chain_bars: wp.array2d(dtype=Chain)
     hanging_bars: wp.array2d(dtype=HangingBar)
+    asked: wp.array2d(dtype=wp.int32)
     q_bar: wp.array2d(dtype=real)
     v_bar: wp.array2d(dtype=real)
     q_after: wp.array2d(dtype=real)
