@@ -29,7 +29,7 @@ from dano.engine.kernels.tables import Body, Changes, FoundPair, Push, Room, Sam
 from dano.physics.distances import Leaf
 from dano.physics.features import LANES
 from dano.physics.point_law import Material
-from dano.physics.real import ONE, real, vec3, vec6, ZERO
+from dano.physics.real import real, vec3, vec6, ZERO
 from dano.physics.samples import Sample
 from dano.physics.twists import angular_part, joined, linear_part
 
