@@ -12,12 +12,11 @@ import warp as wp
 
 import dano
 from dano.contact import AbstractContactLaw, find
-from dano.engine._instances import instance
 from dano.engine._newton import SolverOptions
 from dano.engine._problem import build_problem, links_of, prepare, structure_of
 from dano.engine._roots import solve
-from dano.engine._tables import scene_tables
 from dano.engine._variational import _advance
+from dano.engine.launching import instance, scene_tables
 from dano.fields import SignedDistanceGrid
 from dano.maths import Pose
 

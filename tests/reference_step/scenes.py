@@ -22,7 +22,7 @@ TABLE = dano.Body("table", dano.Box((0.2, 0.2, 0.03)), fixed=True)
 def pair(name):
     """A body "a" on something fixed."""
     shape, other, law, params = PAIRS[name]
-    body = dano.Body("a", shape() if callable(shape) else shape, mass=None if callable(shape) else 1.0)
+    body = dano.Body("a", lump()) if shape is lump else dano.Body("a", shape, mass=1.0)
     contact = dano.Contact("a", other.name, dano.ContactParams(**params), law)
     return dano.Scene.create([body, other], [contact], timestep=H)
 

@@ -25,9 +25,10 @@ CASES: dict[str, Any] = {
 def case(name):
     """A scene of two bodies, and a state in which they overlap."""
     shape, other, law, z = CASES[name]
-    first = dano.Body("a", shape()) if callable(shape) else dano.Body("a", shape, mass=1.0)
+    first = dano.Body("a", scenes.lump()) if shape is scenes.lump else dano.Body("a", shape, mass=1.0)
     if not isinstance(other, dano.Body):
-        other = dano.Body("b", other()) if callable(other) else dano.Body("b", other, fixed=True)
+        lump = other is scenes.lump
+        other = dano.Body("b", scenes.lump()) if lump else dano.Body("b", other, fixed=True)
     scene = dano.Scene.create([first, other], [dano.Contact("a", other.name, law=law)], timestep=scenes.H)
     moves = dict(velocity=(0.3, 0.1, -0.02), omega=(1.0, 2.0, 3.0))
     still = dict(velocity=(0, 0, 0), omega=(0, 0, 0))

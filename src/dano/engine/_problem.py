@@ -32,9 +32,9 @@ from dano.contact import (
 from dano.engine._newton import inverse3
 from dano.engine._rigid import angular_momentum, turned
 from dano.engine._sequential import one_at_a_time
-from dano.engine._tables import is_known, scene_tables, Tables
 from dano.engine._trees import build_tree, Tree, tree_mobilities
 from dano.engine.joints import in_tables, tree_tables, TreeTables
+from dano.engine.launching import is_known, scene_tables, Tables
 from dano.maths import matmul, matvec, quat_to_matrix
 from dano.scene import colliders, Control, Poses, pressing_pairs, Scene, State, step_twists
 

@@ -34,9 +34,9 @@ from dano.engine._problem import (
 )
 from dano.engine._rigid import turned
 from dano.engine._roots import as_solved, solve
-from dano.engine._stepping import rollout as launched
 from dano.engine._trees import advance_tree, generalised, turns_too_far
 from dano.engine.joints import patch_rows, TreeTables
+from dano.engine.launching import rollout as launched
 from dano.maths import quat_to_matrix, safe_normalize
 from dano.scene import Control, Scene, State
 

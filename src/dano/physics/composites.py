@@ -16,7 +16,7 @@ from dano.physics.twists import angular_part, joined, linear_part
 
 @wp.struct
 class Composite:
-    """By how much the momentum of bodies at the origin of their tree changes with a motion at the end of a step.
+    """Change of the momentum of bodies, at the origin of their tree, with a motion at the end of a step.
 
     Attributes:
         mass: [kg].

@@ -129,7 +129,7 @@ def inverse_or_zero(x: real) -> real:
 
 @wp.func
 def half_space_distance(leaf: Leaf, y: vec3) -> Distance:
-    """n · y − offset."""
+    """Distance n · y − offset."""
     d = Distance()
     d.value = wp.dot(leaf.sizes, y) - leaf.length
     d.gradient = leaf.sizes
@@ -270,7 +270,7 @@ def adj_ellipsoid_root(x: vec3, semi_axes: vec3, adj_ret: real):
 
 @wp.func
 def ellipsoid_distance(leaf: Leaf, y: vec3) -> Distance:
-    """t |y/(t + a²)| with t such that a² y/(t + a²) lies on the surface (Eberly, *Distance to an ellipsoid*)."""
+    """Distance t |y/(t + a²)|, with a² y/(t + a²) on the surface (Eberly, *Distance to an ellipsoid*)."""
     d = Distance()
     a = leaf.sizes
     # Off the symmetry planes, on which the closest point of an inner point is not unique.
@@ -386,10 +386,14 @@ def grid_distance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec
         (y[2] - leaf.sizes[2]) / leaf.spacing[2],
     )
     last = vec3(
-        real(kind.nodes_x - 2 * border - 1), real(kind.nodes_y - 2 * border - 1), real(kind.nodes_z - 2 * border - 1)
+        real(kind.nodes_x - 2 * border - 1),
+        real(kind.nodes_y - 2 * border - 1),
+        real(kind.nodes_z - 2 * border - 1),
     )
     closest = vec3(
-        wp.min(wp.max(u[0], ZERO), last[0]), wp.min(wp.max(u[1], ZERO), last[1]), wp.min(wp.max(u[2], ZERO), last[2])
+        wp.min(wp.max(u[0], ZERO), last[0]),
+        wp.min(wp.max(u[1], ZERO), last[1]),
+        wp.min(wp.max(u[2], ZERO), last[2]),
     )
     away = wp.cw_mul(u - closest, leaf.spacing)
     first_x = first_node(closest[0], kind.nodes_x, degree)
@@ -401,7 +405,9 @@ def grid_distance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec
     # The node from which a place in the stencil is measured: the first, or the second of more than two.
     origin = wp.where(degree == 1, 0, 1) - border
     f = vec3(
-        closest[0] - real(first_x + origin), closest[1] - real(first_y + origin), closest[2] - real(first_z + origin)
+        closest[0] - real(first_x + origin),
+        closest[1] - real(first_y + origin),
+        closest[2] - real(first_z + origin),
     )
     d = Distance()
     if wp.static(1 in DEGREES):
@@ -536,7 +542,7 @@ def solid_clearance(solids: Solids, world: int, solid: Solid, x: vec3) -> real:
 
 @wp.func
 def solid_distance(solids: Solids, world: int, solid: Solid, x: vec3) -> Distance:
-    """Signed distance of a solid and its gradient, at a point [m, F]; of a union, that of the nearest leaf."""
+    """Signed distance of a solid and its gradient at a point [m, F]; of a union, of its nearest leaf."""
     if wp.static(UNIONS):
         solid = nearest_leaf(solids, world, solid, x)
     return leaf_distance(solids, world, solid.kind, solid.leaf, x)

@@ -68,7 +68,7 @@ class JointFrame:
 
 @wp.struct
 class Carrier:
-    """What a joint hangs on: centre of mass [m, W], orientation, and centre of mass in the field frame [m, F]."""
+    """What a joint hangs on: centre of mass [m, W], orientation, centre of mass in its frame [m, F]."""
 
     position: vec3
     orientation: quat

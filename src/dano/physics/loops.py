@@ -1,8 +1,8 @@
 """Loops: what closes a chain of bodies on joints (docs/theory/integrator.md, "Bodies on joints").
 
 Forces λ [N, N m] act along the derivatives of the gaps at the start of the step, as those of the discrete
-Euler–Lagrange equations with constraints do, and the gaps vanish at its end (SHAKE; Hairer, Lubich and Wanner,
-*Geometric Numerical Integration*, VII.1.4).
+Euler–Lagrange equations with constraints do, and the gaps vanish at its end (SHAKE; Hairer, Lubich and
+Wanner, *Geometric Numerical Integration*, VII.1.4).
 """
 
 import warp as wp

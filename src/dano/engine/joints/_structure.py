@@ -7,7 +7,7 @@ come the forces in loops.
 
 import functools
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Int
@@ -18,7 +18,8 @@ _SIX = 6
 _WELD = 6
 
 
-class TreeStructure(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class TreeStructure:
     """Tables of whole numbers, rows in the order of the structures that `dano.engine.kernels` reads them as.
 
     Attributes:
@@ -82,7 +83,9 @@ def tree_structure(
         for n in (first, second):
             if n >= 0:
                 closed[nodes.tree[n]] = 1
-    coordinates = [(places[c], c < len(constant) and constant[c], c in nonsmooth) for c in range(layout.n_joints)]
+    coordinates = [
+        (places[c], c < len(constant) and constant[c], c in nonsmooth) for c in range(layout.n_joints)
+    ]
     bodies = nodes.rows[:, 0]
     of_body = np.full(layout.bodies, -1, np.int32)
     of_body[bodies] = np.arange(len(bodies))
@@ -132,7 +135,7 @@ class _Nodes:
         self.root = [n for n in range(len(top)) if top[n] == n]
         trees = [n for n in self.root if n in carries | hanging]
         self.top = top
-        self.tree = [trees.index(t) if t in trees else -1 for t in top]
+        self.tree = [trees.index(int(t)) if t in trees else -1 for t in top]
 
     def _moved_together(self) -> list[list[int]]:
         groups: dict[int, list[int]] = {}

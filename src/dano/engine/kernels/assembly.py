@@ -1,4 +1,4 @@
-"""Sums over the points that press: what a step's equations miss, and their derivative, by blocks of two bodies."""
+"""Sums over the points that press: the residual of a step and its derivative, by blocks of two bodies."""
 
 import warp as wp
 
@@ -173,7 +173,8 @@ def add_point_jacobian(sums: Quarters, point: Point, linear: Linear, weight: rea
 
     With a6 = (a, r × a), n6 = (n, moment), h times its area w, and X v = r × v that is
 
-        w (c6 n6ᵀ − f n6 n6ᵀ − l6 û6ᵀ − g (E − (n, r × n) (n, r × n)ᵀ)),    E = Σ_k e6_k e6_kᵀ = [[1, −X], [X, −X²]].
+        w (c6 n6ᵀ − f n6 n6ᵀ − l6 û6ᵀ − g (E − (n, r × n) (n, r × n)ᵀ)),    E = Σ_k e6_k e6_kᵀ = [[1, −X],
+        [X, −X²]].
     """
     r = point.arm
     n = point.normal
@@ -268,7 +269,7 @@ def add_contact(
 
 @wp.func(inline=True)
 def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, trial: Trial) -> Fit:
-    """Residual and Jacobian as momenta at the velocities that are tried, with duals at a share of the step."""
+    """Residual and Jacobian as momenta at the velocities that are tried, duals at a share of the step."""
     h = scene.timestep[world, 0]
     m = scene.n_blocks
     fit = Fit()

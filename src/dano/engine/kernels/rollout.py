@@ -1,4 +1,4 @@
-"""The loop over steps: a rollout of a world is one call, a rollout of many one launch (docs/theory/integrator.md)."""
+"""The loop over steps: a rollout of one world or of many is one launch (docs/theory/integrator.md)."""
 
 import warp as wp
 
@@ -270,7 +270,6 @@ def rollout(scene: Scene, room: Room, launch: Launch):
     block, lane = wp.tid()
     world = launch.first_world + block
     n = scene.body_index.shape[0]
-    h = scene.timestep[world, 0]
     for t in range(launch.n_steps):
         size = real(0.0)
         for i in range(n):

@@ -107,13 +107,17 @@ def solid_of_body(scene: Scene, world: int, body: int) -> Solid:
 
 
 @wp.func
-def is_near(scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, margin: real, h: real) -> bool:
+def is_near(
+    scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, margin: real, h: real
+) -> bool:
     """Whether two bodies may meet within the step, by the balls around them."""
     body = scene.bodies[world, first]
     other = scene.bodies[world, second]
     x = middle_of(body, a)
-    reach = body.radius + margin + h * (
-        wp.length(a.velocity - b.velocity) + wp.length(a.spin) * wp.length(body.middle - body.com)
+    reach = (
+        body.radius
+        + margin
+        + h * (wp.length(a.velocity - b.velocity) + wp.length(a.spin) * wp.length(body.middle - body.com))
     )
     solid = solid_of_body(scene, world, second)
     if solid.kind.kind == _HALF_SPACE:
@@ -126,7 +130,9 @@ def is_near(scene: Scene, world: int, a: BodyState, b: BodyState, first: int, se
 
 
 @wp.func
-def facing(scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, share: real, h: real) -> vec3:
+def facing(
+    scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, share: real, h: real
+) -> vec3:
     """Direction that samples of the first body face after a share of the step [F]."""
     solid = solid_of_body(scene, world, second)
     index = scene.body_index[first]
@@ -136,7 +142,15 @@ def facing(scene: Scene, world: int, a: BodyState, b: BodyState, first: int, sec
 
 @wp.func
 def posed(
-    scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, share: real, h: real, follows: real
+    scene: Scene,
+    world: int,
+    a: BodyState,
+    b: BodyState,
+    first: int,
+    second: int,
+    share: real,
+    h: real,
+    follows: real,
 ) -> PairPose:
     """Pose of a pair after a share of the step."""
     toward = facing(scene, world, a, b, first, second, share, h)
@@ -148,7 +162,7 @@ def posed(
 def find_near_probes(
     scene: Scene, room: Room, world: int, lane: int, pose: PairPose, first: int, second: int, way: real
 ) -> int:
-    """Probes that lie no further from the solid than anything moves in a step, into `room.near`; their number.
+    """Probes no further from the solid than anything moves in a step, into `room.near`; their number.
 
     Samples that keep facing the solid do not move with their body: then it is all of them.
     """
@@ -183,13 +197,22 @@ def find_near_probes(
 
 @wp.func
 def meeting(
-    scene: Scene, room: Room, world: int, lane: int, a: BodyState, b: BodyState, pair: SamplePair, first: int, second: int, h: real
+    scene: Scene,
+    room: Room,
+    world: int,
+    lane: int,
+    a: BodyState,
+    b: BodyState,
+    pair: SamplePair,
+    first: int,
+    second: int,
+    h: real,
 ) -> Meeting:
     """When the geometry of a pair is taken.
 
-    At the end of the step, unless a body would be driven deeper into the other than `SamplePair.sink` by then:
-    on the far side of a thin wall, normals push the wrong way. Then when it has sunk that far: the root of the
-    depth of the deepest probe, found by advancing as far as none can go deeper, again and again.
+    At the end of the step, unless a body would be driven deeper into the other than `SamplePair.sink` by
+    then: on the far side of a thin wall, normals push the wrong way. Then when it has sunk that far: the
+    root of the depth of the deepest probe, by Newton's method, which begins as far as none can go deeper.
     """
     met = Meeting()
     met.critical = -1
@@ -197,7 +220,9 @@ def meeting(
     index = scene.body_index[first]
     solid = solid_of_body(scene, world, second)
     body = scene.bodies[world, first]
-    turn = wp.length(a.spin) * body.radius + wp.length(b.spin) * (body.radius + wp.length(a.position - b.position))
+    turn = wp.length(a.spin) * body.radius + wp.length(b.spin) * (
+        body.radius + wp.length(a.position - b.position)
+    )
     way = h * (wp.length(a.velocity - b.velocity) + turn)
     if way <= pair.sink:
         return met
@@ -224,13 +249,14 @@ def meeting(
         closest = least(further)
         if closest < further:
             critical = -1
-        further = wp.max(closest, ZERO)
-        share += further
+        before = share
+        share = wp.max(share + closest, ZERO)
         k += 1
         if share >= ONE:
+            met.critical = -1
             return met
-        met.critical = critical
-        if further <= _MET:
+        met.critical = wp.where(share > ZERO, critical, -1)
+        if wp.abs(share - before) <= _MET:
             k = _ADVANCES
     met.share = share
     return met

@@ -1,18 +1,19 @@
-"""A primal–dual Newton method for the velocities of bodies that touch (docs/theory/integrator.md, "The solve").
+"""A primal–dual Newton method for the velocities of bodies that touch (docs/theory/integrator.md).
 
 Unknowns are the end-of-step velocities V of all bodies that move, in world axes, and for every point the
-friction λ and the direction s of its hysteresis. A pass linearises the momentum balance and the equations of λ
-and s, eliminates these point by point, solves for dV, takes the whole step, and projects λ and s onto
-|λ| ≤ b(p), |s| ≤ 1. What is left after the elimination is the law's own residual, whatever λ and s are; the
-Jacobian uses the current λ instead of its limit, so it is right before directions of slip have settled. A solve
-ends when the residual is small and λ and s fit the velocities, so that the Jacobian is that of the law, too.
+friction λ and the direction s of its hysteresis. A pass linearises the momentum balance and the equations
+of λ and s, eliminates these point by point, solves for dV, takes the whole step, and projects λ and s
+onto |λ| ≤ b(p), |s| ≤ 1. What is left after the elimination is the law's own residual, whatever λ and s
+are; the Jacobian uses the current λ instead of its limit, so it is right before directions of slip have
+settled. A solve ends when the residual is small and λ and s fit the velocities, so that the Jacobian is
+that of the law, too.
 
 Full steps can cycle. A solve that has not converged within a few passes takes shares of steps, smaller after
 each step that made the residual larger; then it goes on with a line search, then from softer friction in
-levels. Where that cycles, too, friction mostly presses a point in, which raises its friction. Then the bounds b
-are held: the equations are those of a convex function, and a line search finds their root. The bounds are
-renewed by halves until they fit, and the solve goes on with the law as it is. What does not converge ends where
-its residual was smallest.
+levels. Where that cycles, too, friction mostly presses a point in, which raises its friction. Then the
+bounds b are held: the equations are those of a convex function, and a line search finds their root. The
+bounds are renewed by halves until they fit, and the solve goes on with the law as it is. What does not
+converge ends where its residual was smallest.
 """
 
 import warp as wp
@@ -32,7 +33,7 @@ from dano.engine.kernels.trees.balance import (
     same_mode,
     solve_trees,
 )
-from dano.physics.features import TREES
+from dano.physics.features import LOOPS, TREES
 from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec6, ZERO
 
 LEVELS = 11
@@ -144,7 +145,7 @@ class Solved:
 
 @wp.func
 def level_of(number: int) -> Level:
-    """A level: friction as it is; with a line search; softer and softer; hard again; held; hard; short steps."""
+    """Friction as it is; with a line search; softer and softer; hard again; held; hard; short steps."""
     level = Level()
     level.softness = ONE
     level.share = ONE
@@ -285,7 +286,9 @@ def absolute_product(room: Room, world: int, block: int, v: vec6) -> vec6:
 
 
 @wp.func(inline=True)
-def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: real, options: Options) -> Solved:
+def solve(
+    scene: Scene, room: Room, world: int, lane: int, n_found: int, size: real, options: Options
+) -> Solved:
     """Velocities at the end of a step, in `room.velocity`, from those that it holds.
 
     Args:
@@ -339,15 +342,16 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
         if wp.static(TREES):
             # A root needs no derivative, a first step only the mass. Close to a root the derivative of the
             # pass before serves: its relative error is about twice the factor by which the last step made the
-            # residual smaller.
+            # residual smaller. Trees that loops close are solved by blocks, which every pass has to fill.
             needs = True
-            if n_found == 0:
-                missed = largest_error(scene, room, world)
-                enough = options.tolerance * (ONE + size)
-                close = TWO * missed * missed <= enough * before and search.length == ONE
-                begins = found.passes == 0
-                keeps = (begins or close) and same_mode(scene, room, world, begins)
-                needs = missed > enough and not keeps
+            if wp.static(not LOOPS):
+                if n_found == 0:
+                    missed = largest_error(scene, room, world)
+                    enough = options.tolerance * (ONE + size)
+                    close = TWO * missed * missed <= enough * before and search.length == ONE
+                    begins = found.passes == 0
+                    keeps = (begins or close) and same_mode(scene, room, world, begins)
+                    needs = missed > enough and not keeps
             wait()
             if lane == 0 and needs:
                 add_tree_slopes(scene, room, world)
@@ -376,7 +380,9 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
         if seen.error < HALF * before:
             part = ONE
         spent = budget <= 0
-        settled = not level.holds or spent or (mix > ZERO and mix < ONE and fit.renewed <= _RENEWED * fit.push)
+        settled = (
+            not level.holds or spent or (mix > ZERO and mix < ONE and fit.renewed <= _RENEWED * fit.push)
+        )
         harder = accept and ((small and not hard and settled) or (not small and spent))
         budget -= 1
         mix = ZERO

@@ -1,7 +1,7 @@
 """What kernels read and write: a scene, what a launch is given, and the room that a world works in.
 
-Arrays have the world as their first axis. Rows of real numbers come from JAX and are read as structures, whose
-fields stand in the order of the row; whole numbers are the same for all worlds.
+Arrays have the world as their first axis. Rows of real numbers come from JAX and are read as structures,
+whose fields stand in the order of the row; whole numbers are the same for all worlds.
 """
 
 import warp as wp

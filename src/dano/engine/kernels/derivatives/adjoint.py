@@ -1,8 +1,9 @@
 """What a step's equations depend on, as numbers whose gradients are derivatives (docs/gradients.md).
 
-At the root of R(V; θ) = 0 the implicit function theorem gives θ̄ = −(∂R/∂θ)ᵀ λ with (∂R/∂V)ᵀ λ = V̄. So with λ as
-*virtual velocities* of the bodies, −λ · R is the work of impulses along them: a sum over bodies and points. Each
-term is one of the functions below, made of the formulas of the step itself, and `wp.grad` differentiates it.
+At the root of R(V; θ) = 0 the implicit function theorem gives θ̄ = −(∂R/∂θ)ᵀ λ with (∂R/∂V)ᵀ λ = V̄. So
+with λ as *virtual velocities* of the bodies, −λ · R is the work of impulses along them: a sum over bodies
+and points. Each term is one of the functions below, made of the formulas of the step itself, and
+`wp.grad` differentiates it.
 """
 
 from types import CodeType

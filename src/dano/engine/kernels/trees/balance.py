@@ -1,8 +1,8 @@
 """The momentum balance of bodies on joints (docs/theory/integrator.md, "Bodies on joints").
 
-What every body's momentum misses is a wrench at the origin of its tree. What a velocity of a joint makes of it
-is its motion at the start of the step times the sum over all bodies beyond that joint; the derivative by a
-velocity is that sum's. Sums go from the tips of trees to their roots.
+What every body's momentum misses is a wrench at the origin of its tree. What a velocity of a joint makes
+of it is its motion at the start of the step times the sum over all bodies beyond that joint; the
+derivative by a velocity is that sum's. Sums go from the tips of trees to their roots.
 """
 
 import warp as wp
@@ -48,7 +48,8 @@ from dano.physics.momentum import angular_momentum
 from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
 from dano.physics.twists import angular_part, joined, linear_part, wrench_at
 
-# What springs and dampers make of the Jacobian, over the mass, up to which that alone serves for a first step.
+# What springs and dampers make of the Jacobian, over the mass, up to which that alone serves for a first
+# step.
 _LIGHT = wp.constant(real(0.01))
 
 
@@ -431,7 +432,7 @@ def finish_joint_duals(scene: Scene, room: Room, world: int):
 
 @wp.func
 def solve_trees(scene: Scene, room: Room, world: int, keeps: bool):
-    """Newton's step of the trees that touch nothing, from `room.step` in place; see `eliminate_joint_duals`."""
+    """Newton's step of trees that touch nothing, from `room.step` in place; see `eliminate_joint_duals`."""
     if not keeps:
         factor(scene, room, world)
     solve_factored(scene, room, world)

@@ -111,4 +111,3 @@ def add_pulled(
         add_slopes(scene, room, world, b, b, -(back * by_second))
         add_slopes(scene, room, world, a, b, by_second)
         add_slopes(scene, room, world, b, a, back * jacobian)
-

@@ -1,9 +1,9 @@
 """Linear systems of trees: unknowns that move a body in common are coupled, those of two branches are not.
 
 Elimination goes from the tips to the root: what an unknown is coupled with are its ancestors, and nothing is
-filled in (Featherstone 2005, Int. J. Robotics Research 24). Matrices are inertia plus dissipation: their pivots
-stay away from singular. After `factor` the matrix is U L with ones on the diagonal of U; `diagonal` holds the
-inverse of that of L.
+filled in (Featherstone 2005, Int. J. Robotics Research 24). Matrices are inertia plus dissipation: their
+pivots stay away from singular. After `factor` the matrix is U L with ones on the diagonal of U;
+`diagonal` holds the inverse of that of L.
 """
 
 import warp as wp

@@ -105,7 +105,9 @@ def start_motions(scene: Scene, room: Room, world: int):
                 share = motion_share(node.kind, scene.trees.joints[world, node.joint])
             for part in range(node.width):
                 along = share * motion_direction(node.kind, frame, part)
-                room.trees.start[world, node.motion + part] = motion_twist(is_turn(node.kind, part), along, lever)
+                room.trees.start[world, node.motion + part] = motion_twist(
+                    is_turn(node.kind, part), along, lever
+                )
 
 
 @wp.func
@@ -179,7 +181,9 @@ def end_motions(scene: Scene, room: Room, world: int, velocities: wp.array2d(dty
                 if node.kind == _BALL or (node.kind == _ROOT and part >= 3):
                     along = turning * along
                 along = turned_by(before, along)
-                room.trees.end[world, node.motion + part] = motion_twist(is_turn(node.kind, part), along, lever)
+                room.trees.end[world, node.motion + part] = motion_twist(
+                    is_turn(node.kind, part), along, lever
+                )
 
 
 @wp.func

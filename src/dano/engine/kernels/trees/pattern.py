@@ -69,7 +69,7 @@ def couple_loops(scene: Scene, room: Room, world: int):
 
 @wp.func
 def couple_trees(scene: Scene, room: Room, world: int):
-    """Couple the blocks of trees that touch something or are closed by loops; leave out those of the others."""
+    """Couple the blocks of trees that touch something or are closed by loops, not those of the others."""
     m = scene.n_blocks
     for i in range(m):
         tree = scene.trees.blocks[i].tree

@@ -12,7 +12,7 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from dano.engine._warp import begin
+from dano.engine.launching._warp import begin
 
 _FEATURES = "dano.physics.features"
 _PACKAGES = ("dano.physics", "dano.engine.kernels")

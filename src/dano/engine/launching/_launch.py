@@ -21,9 +21,9 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
-from dano.engine._ffi import register
-from dano.engine._instances import Features, instance
-from dano.engine._warp import compiled_kernel
+from dano.engine.launching._ffi import register
+from dano.engine.launching._instances import Features, instance
+from dano.engine.launching._warp import compiled_kernel
 
 
 class Shape(NamedTuple):

@@ -4,18 +4,23 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
-from dano.engine import _derivatives  # noqa: F401  rules for derivatives of launches
-from dano.engine._launch import launch, Plan, plan, Shape
 from dano.engine._newton import Report, SolverOptions
-from dano.engine._tables import Tables
 from dano.engine.joints import tree_lengths
+from dano.engine.launching import _derivatives  # noqa: F401  rules for derivatives of launches
+from dano.engine.launching._launch import launch, Plan, plan, Shape
+from dano.engine.launching._tables import Tables
 from dano.scene import Control, State
 
 _MODULE = "dano.engine.kernels.rollout"
 # Numbers of a body's state, of a push on it, and of what a step reports: see `dano.engine.kernels.tables`.
 _STATE, _PUSH, _REPORT, _WRENCH = 13, 6, 5, 6
+# Numbers of a listed point, see `dano.engine.kernels.listing`, and where each quantity begins.
+_POINT = {"first": 1, "second": 1, "contact": 1, "sample": 1, "share": 1, "impact_stiffness": 1}
+_POINT |= {"arm": 3, "normal": 3, "moment": 3, "extra_slip": 3}
+_POINT |= {"depth": 1, "rate": 1, "approach": 1, "area": 1}
 CHUNK = 16
 """Points that `VariationalEngine.capacity` counts as one."""
 
@@ -67,6 +72,34 @@ def _given(state: State, controls: Control | None, dtype) -> dict[str, Array]:
             if values is not None and values.size:
                 inputs[f"launch.{name}"] = values.reshape(-1, 1)
     return inputs
+
+
+def listed_points(tables: Tables, state: State, capacity: int) -> dict[str, Array]:
+    """The point contacts of a step, as arrays by quantity; rows without area are empty.
+
+    Args:
+        tables: Of the scene.
+        state: At the start of the step.
+        capacity: Room for points, in chunks.
+
+    Returns:
+        Quantities of `dano.engine.kernels.listing.ListedPoint`, and "overflow": whether there were more.
+    """
+    n, points = state.position.shape[0], CHUNK * capacity
+    inputs = {**tables.rows, **_given(state, None, state.position.dtype)}
+    shapes = {name: Shape(*x.shape) for name, x in inputs.items()}
+    outputs = {"listing.points": Shape(points, sum(_POINT.values())), "listing.overflow": Shape(1, 1)}
+    room, numbers = _room(tables, shapes, n, points), {"scene.n_blocks": tables.structure.n_blocks}
+    module = "dano.engine.kernels.listing"
+    chosen = plan(module, "listing", tables.features, shapes, outputs, tables.whole.arrays, room, numbers)
+    found = launch(chosen, inputs)
+    ends = np.cumsum(list(_POINT.values()))[:-1]
+    parts = jnp.split(found["listing.points"], ends, axis=1)
+    quantities = {
+        name: part[:, 0] if width == 1 else part
+        for (name, width), part in zip(_POINT.items(), parts, strict=True)
+    }
+    return {**quantities, "overflow": found["listing.overflow"][0, 0] > 0}
 
 
 def _plan(

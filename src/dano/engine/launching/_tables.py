@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, DTypeLike, Float, Int
 
 from dano.contact import DistributedLaw, Material, materials, SurfaceSet
-from dano.engine._instances import Features, instance
 from dano.engine.joints import structure_of_trees, tree_rows, TreeStructure
+from dano.engine.launching._instances import Features, instance
 from dano.fields import (
     AbstractShape,
     Box,
@@ -72,6 +72,11 @@ class Tables(eqx.Module):
     whole: Whole = eqx.field(static=True)
     features: Features = eqx.field(static=True)
     structure: TreeStructure = eqx.field(static=True)
+
+    @property
+    def moving(self) -> Int[np.ndarray, " m"]:
+        """Bodies that move."""
+        return self.whole.arrays["scene.moving"]
 
 
 class _Leaf(NamedTuple):

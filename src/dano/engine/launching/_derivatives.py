@@ -12,7 +12,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from dano.engine._launch import launch_p, merged, Plan, plan, Shape
+from dano.engine.launching._launch import launch_p, merged, Plan, plan, Shape
 
 CHANGING = {
     "scene.bodies": "bodies",

@@ -1,13 +1,17 @@
 """Warp as kernels need it: quiet, with a folder to keep what it compiled, and a word when that takes long."""
 
+import atexit
 import contextlib
 import functools
 import os
+import shutil
 import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
+
+from dano.caches import cache_folder
 
 _WORTH_A_WORD = 2.0
 """Seconds after which compiling is said."""
@@ -24,7 +28,13 @@ def compiled_kernel(made: Callable[[], Any]) -> Any:
     begin()
     with _quietly(), _said("compiling the simulator for this machine, once …"):
         kernel = made()
-        wp.load_module(kernel.module, device="cpu")
+        try:
+            wp.load_module(kernel.module, device="cpu")
+        except OSError as error:
+            folder = wp.config.kernel_cache_dir
+            raise OSError(
+                f"the simulator cannot be compiled in {folder}: {error}; DANO_CACHE_DIR names another folder"
+            ) from error
     return kernel
 
 
@@ -33,22 +43,22 @@ def begin() -> None:
     """Start Warp; before any of its functions is made, which would start it with words."""
     import warp as wp
 
+    _find_cache()
     with _quietly(), _without_stderr():
         wp.init()
-    _find_cache()
 
 
 def _find_cache() -> None:
-    """Let Warp keep what it compiles in a folder of this process where its own cannot be written to."""
+    """Have Warp keep what it compiles among dano's caches, or for this process where nothing is kept."""
     import warp as wp
 
-    folder = wp.config.kernel_cache_dir
-    try:
-        os.makedirs(folder, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return
-    except OSError:
-        wp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="dano-kernels-")
+    if wp.config.kernel_cache_dir is not None:
+        return
+    folder = cache_folder()
+    kept = tempfile.mkdtemp(prefix="dano-kernels-") if folder is None else str(folder / "kernels")
+    if folder is None:
+        atexit.register(shutil.rmtree, kept, ignore_errors=True)
+    wp.config.kernel_cache_dir = kept
 
 
 @contextlib.contextmanager
