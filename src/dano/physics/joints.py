@@ -7,7 +7,15 @@ over h. Each body has the displacement by which it moves, found from that of the
 import warp as wp
 
 from dano.physics.real import HALF, mat33, ONE, quat, real, TWO, vec3, vec4, vec6, ZERO
-from dano.physics.rotations import exponential, from_wxyz, logarithm, plane_axis, spin_by_end, turn_of_step
+from dano.physics.rotations import (
+    exponential,
+    from_wxyz,
+    logarithm,
+    plane_axis,
+    spin_by_end,
+    spin_of_turn,
+    turn_of_step,
+)
 from dano.physics.twists import joined
 
 HINGE, SLIDE, WELD, BALL, PLANAR, ROOT = range(6)
@@ -82,6 +90,18 @@ class Displacement:
 
     turn: quat
     shift: vec3
+
+
+@wp.func
+def displacement_twist(moved: Displacement, h: real) -> vec6:
+    """Velocity [m/s] and spin [rad/s, W] of a step that moves a body so, by at most 180°."""
+    return joined((ONE / h) * moved.shift, spin_of_turn(moved.turn, h))
+
+
+@wp.func
+def orientation_after(moved: Displacement, orientation: quat) -> quat:
+    """Orientation of a body after a displacement, of unit length."""
+    return wp.normalize(moved.turn * orientation)
 
 
 @wp.struct

@@ -33,7 +33,7 @@ from dano.engine.kernels.trees.balance import (
     same_mode,
     solve_trees,
 )
-from dano.physics.features import TREES
+from dano.physics.features import LOOPS, TREES
 from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec6, ZERO
 
 LEVELS = 11
@@ -342,15 +342,16 @@ def solve(
         if wp.static(TREES):
             # A root needs no derivative, a first step only the mass. Close to a root the derivative of the
             # pass before serves: its relative error is about twice the factor by which the last step made the
-            # residual smaller.
+            # residual smaller. Trees that loops close are solved by blocks, which every pass has to fill.
             needs = True
-            if n_found == 0:
-                missed = largest_error(scene, room, world)
-                enough = options.tolerance * (ONE + size)
-                close = TWO * missed * missed <= enough * before and search.length == ONE
-                begins = found.passes == 0
-                keeps = (begins or close) and same_mode(scene, room, world, begins)
-                needs = missed > enough and not keeps
+            if wp.static(not LOOPS):
+                if n_found == 0:
+                    missed = largest_error(scene, room, world)
+                    enough = options.tolerance * (ONE + size)
+                    close = TWO * missed * missed <= enough * before and search.length == ONE
+                    begins = found.passes == 0
+                    keeps = (begins or close) and same_mode(scene, room, world, begins)
+                    needs = missed > enough and not keeps
             wait()
             if lane == 0 and needs:
                 add_tree_slopes(scene, room, world)

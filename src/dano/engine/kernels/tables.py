@@ -8,6 +8,9 @@ import warp as wp
 
 from dano.engine.kernels.trees.tables import TreeRoom, Trees
 from dano.physics.distances import Leaf, Solids
+from dano.physics.joint_laws import JointLaw
+from dano.physics.joints import Joint
+from dano.physics.loops import Loop
 from dano.physics.pairs import BodyState
 from dano.physics.point_law import Duals, Linear, Material, PointLaw
 from dano.physics.real import mat33, mat66, real, vec3, vec4, vec6
@@ -275,7 +278,7 @@ class Changes:
     Arrays without columns are not asked for, or do not change. Those of changes hold one direction after the
     other.
 
-    Attributes: those of `Scene` and `Launch` with the same names; `coefficients` are those of `Solids`.
+    Attributes: those of `Scene`, `Trees` and `Launch` with the same names; `coefficients` are those of `Solids`.
     """
 
     bodies: wp.array2d(dtype=Body)
@@ -288,4 +291,13 @@ class Changes:
     timestep: wp.array2d(dtype=real)
     state: wp.array2d(dtype=StateRow)
     pushes: wp.array2d(dtype=Push)
+    joints: wp.array2d(dtype=Joint)
+    laws: wp.array2d(dtype=JointLaw)
+    loops: wp.array2d(dtype=Loop)
+    q: wp.array2d(dtype=real)
+    v: wp.array2d(dtype=real)
+    efforts: wp.array2d(dtype=real)
+    commands: wp.array2d(dtype=real)
     states: wp.array2d(dtype=StateRow)
+    qs: wp.array2d(dtype=real)
+    vs: wp.array2d(dtype=real)

@@ -25,10 +25,21 @@ CHANGING = {
     "scene.timestep": "timestep",
     "launch.state": "state",
     "launch.pushes": "pushes",
+    "scene.trees.joints": "joints",
+    "scene.trees.laws": "laws",
+    "scene.trees.loops": "loops",
+    "launch.q": "q",
+    "launch.v": "v",
+    "launch.efforts": "efforts",
+    "launch.commands": "commands",
 }
-"""Inputs by which derivatives are taken, and their names in `dano.engine.kernels.tables.Cotangents`."""
+"""Inputs by which derivatives are taken, and their names in `dano.engine.kernels.tables.Changes`."""
+
+CHANGED = {"launch.states": "states", "launch.qs": "qs", "launch.vs": "vs"}
+"""Outputs that change, and their names there."""
 
 tangent_p = Primitive("dano_rollout_tangent")
+tangent_p.multiple_results = True
 
 
 def _jvp(primals, tangents, *, plan: Plan, batched, n_worlds):
@@ -48,12 +59,15 @@ def _jvp(primals, tangents, *, plan: Plan, batched, n_worlds):
     which = tuple(i for i, _ in changes)
     rows = [t if batched[i] else t[None] for i, t in changes]
     rows = [x[:, None] for x in rows]  # an axis of directions
-    given = tuple(batched) + (True, True)
+    given = (*batched, *(True for _ in found))
     moved = tangent_p.bind(
         *primals, *found, *rows, plan=plan, batched=given, n_worlds=n_worlds, which=which,
         differs=tuple(batched[i] for i in which), n_directions=1,
     )  # fmt: skip
-    return found, [moved[:, 0], *zeros[1:]]
+    changed = dict(zip(_changed(plan), moved, strict=True))
+    return found, [
+        changed[name][:, 0] if name in changed else zero for name, zero in zip(plan.outputs, zeros, strict=True)
+    ]
 
 
 ad.primitive_jvps[launch_p] = _jvp
@@ -61,13 +75,18 @@ ad.primitive_jvps[launch_p] = _jvp
 
 @tangent_p.def_abstract_eval
 def _(*inputs, plan, batched, n_worlds, which, differs, n_directions):
-    shape = plan.outputs["launch.states"]
-    return ShapedArray((n_worlds, n_directions, *shape), inputs[0].dtype)
+    shapes = _changed(plan).values()
+    return [ShapedArray((n_worlds, n_directions, *shape), inputs[0].dtype) for shape in shapes]
 
 
 @tangent_p.def_impl
 def _(*inputs, **parameters):
     return jax.jit(lambda *given: tangent_p.bind(*given, **parameters))(*inputs)
+
+
+def _changed(plan: Plan) -> dict[str, Shape]:
+    """Outputs of a rollout that have derivatives."""
+    return {name: shape for name, shape in plan.outputs.items() if name in CHANGED}
 
 
 def _places(plan: Plan) -> dict[str, Shape]:
@@ -78,7 +97,8 @@ def _places(plan: Plan) -> dict[str, Shape]:
 def _pullback_plan(forward: Plan, which: tuple[int, ...]) -> Plan:
     names = list(forward.inputs)
     wanted = [names[i] for i in which]
-    inputs = {**_places(forward), "bars.states": forward.outputs["launch.states"]}
+    asked = {f"bars.{CHANGED[name]}": shape for name, shape in _changed(forward).items()}
+    inputs = {**_places(forward), **asked}
     outputs = {f"bars.{CHANGING[name]}": forward.inputs[name] for name in wanted}
     return plan(
         "dano.engine.kernels.derivatives.pullback",
@@ -87,14 +107,26 @@ def _pullback_plan(forward: Plan, which: tuple[int, ...]) -> Plan:
         inputs,
         outputs,
         forward.whole,
-        {**forward.room, **dict.fromkeys(("room.state_bar", "room.after_bar"), forward.room["room.bodies"])},
+        {**forward.room, **_pulling_room(forward)},
         forward.numbers,
     )
 
 
-def _transposed(cotangent, *inputs, plan, batched, n_worlds, which, differs, n_directions):
-    if isinstance(cotangent, ad.Zero):
+def _pulling_room(forward: Plan) -> dict[str, int]:
+    """Lengths of what a world needs besides for derivatives of a step's equations."""
+    room = dict.fromkeys(("room.state_bar", "room.after_bar"), forward.room["room.bodies"])
+    if "room.trees.joints" in forward.room:
+        names = ("chains", "chain_bars", "hanging_bars", "asked")
+        room |= {f"room.trees.{name}": forward.room["room.trees.frames"] for name in names}
+        names = ("q_bar", "v_bar", "q_after", "v_after")
+        room |= {f"room.trees.{name}": forward.room["room.trees.joints"] for name in names}
+    return room
+
+
+def _transposed(cotangents, *inputs, plan, batched, n_worlds, which, differs, n_directions):
+    if all(isinstance(x, ad.Zero) for x in cotangents):
         return [None] * len(inputs)
+    bars = [ad.instantiate_zeros(x) for x in cotangents]
     n = len(plan.inputs) + len(plan.outputs)
     residuals, changes = list(inputs[:n]), inputs[n:]
     back = _pullback_plan(plan, which)
@@ -106,13 +138,14 @@ def _transposed(cotangent, *inputs, plan, batched, n_worlds, which, differs, n_d
             residuals[at] = jnp.broadcast_to(residuals[at][None], (n_worlds, *residuals[at].shape))
             batched[at] = True
 
-    def pull(bar):
-        return launch_p.bind(*residuals, bar, plan=back, batched=(*batched, True), n_worlds=n_worlds)
+    def pull(bars):
+        given = (*batched, *(True for _ in bars))
+        return launch_p.bind(*residuals, *bars, plan=back, batched=given, n_worlds=n_worlds)
 
     if n_directions == 1:
-        found = [x[:, None] for x in pull(cotangent[:, 0])]
+        found = [x[:, None] for x in pull([x[:, 0] for x in bars])]
     else:
-        found = jax.vmap(pull, 1, 1)(cotangent)
+        found = jax.vmap(pull, 1, 1)(bars)
     bars = [x if d else jnp.sum(x, axis=0, keepdims=True) for x, d in zip(found, differs, strict=True)]
     return [None] * n + [
         bar if ad.is_undefined_primal(x) else None for x, bar in zip(changes, bars, strict=True)
@@ -133,7 +166,8 @@ def _batched(inputs, axes, *, plan, batched, n_worlds, which, differs, n_directi
             *inputs[:n], *changes, **parameters, batched=batched, n_worlds=n_worlds, differs=differs,
             n_directions=size * n_directions,
         )  # fmt: skip
-        return found.reshape(n_worlds, size, n_directions, *found.shape[2:]), 1
+        split = [x.reshape(n_worlds, size, n_directions, *x.shape[2:]) for x in found]
+        return split, [1] * len(split)
     rows = [
         merged(x, axis, was, size, n_worlds)
         for x, axis, was in zip(inputs[:n], axes[:n], batched, strict=True)
@@ -149,7 +183,8 @@ def _batched(inputs, axes, *, plan, batched, n_worlds, which, differs, n_directi
         *rows, *changes, **parameters, batched=now, n_worlds=size * n_worlds,
         differs=(True,) * len(which), n_directions=n_directions,
     )  # fmt: skip
-    return found.reshape(size, n_worlds, *found.shape[1:]), 0
+    split = [x.reshape(size, n_worlds, *x.shape[1:]) for x in found]
+    return split, [0] * len(split)
 
 
 batching.primitive_batchers[tangent_p] = _batched
@@ -166,29 +201,29 @@ def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) 
     names = list(forward.inputs)
     chosen = {names[i]: forward.inputs[names[i]] for i in which}
     changes = {f"changes.{CHANGING[k]}": Shape(n_directions * x.rows, x.width) for k, x in chosen.items()}
-    states = forward.outputs["launch.states"]
+    ends = {
+        f"changes.{CHANGED[name]}": Shape(n_directions * shape.rows, shape.width)
+        for name, shape in _changed(forward).items()
+    }
     return plan(
         "dano.engine.kernels.derivatives.pushforward",
         "pushforward",
         forward.features,
         {**_places(forward), **changes},
-        {"changes.states": Shape(n_directions * states.rows, states.width)},
+        ends,
         forward.whole,
-        {**forward.room, **_pushforward_room(forward, n_directions)},
+        {**forward.room, **_pushforward_room(forward, which, n_directions)},
         {**forward.numbers, "launch.n_directions": n_directions},
     )
 
 
-def _pushforward_room(forward: Plan, n_directions: int) -> dict[str, int]:
-    n, m = forward.room["room.bodies"], forward.room["room.momentum"]
-    rows = {
-        f"bars.{CHANGING[name]}": forward.inputs[name].rows for name in CHANGING if name in forward.inputs
-    }
-    rows.pop("bars.coefficients", None)
+def _pushforward_room(forward: Plan, which: tuple[int, ...], n_directions: int) -> dict[str, int]:
+    names = list(forward.inputs)
+    rows = {f"bars.{CHANGING[names[i]]}": forward.inputs[names[i]].rows for i in which}
     return {
-        **dict.fromkeys(("room.state_bar", "room.after_bar"), n),
+        **_pulling_room(forward),
         **rows,
-        "room.missing": n_directions * m,
+        "room.missing": n_directions * forward.room["room.velocity"],
         "room.wrenches": forward.room["room.found"],
     }
 
@@ -200,10 +235,11 @@ def _lowered(*inputs, plan, batched, n_worlds, which, differs, n_directions):
         x.reshape(x.shape[0], -1, x.shape[-1])[slice(None) if d else 0]
         for x, d in zip(inputs[n:], differs, strict=True)
     ]
-    (found,) = launch_p.bind(
+    found = launch_p.bind(
         *inputs[:n], *changes, plan=forward, batched=(*batched, *differs), n_worlds=n_worlds
     )
-    return found.reshape(n_worlds, n_directions, *plan.outputs["launch.states"])
+    shapes = _changed(plan).values()
+    return [x.reshape(n_worlds, n_directions, *shape) for x, shape in zip(found, shapes, strict=True)]
 
 
-mlir.register_lowering(tangent_p, mlir.lower_fun(_lowered, multiple_results=False))
+mlir.register_lowering(tangent_p, mlir.lower_fun(_lowered, multiple_results=True))

@@ -195,12 +195,13 @@ def advance_work(row: StateRow, velocity: vec6, h: real, bar: StateRow) -> real:
     )
 
 
-def _need_adjoints(function: Any, seen: set[int]) -> None:
+def need_adjoints(function: Any, seen: set[int] | None = None) -> None:
     """Have Warp generate the adjoint of a function and of all that it calls.
 
     `wp.grad` asks for it by itself where nothing called the function before in the same kernel. Formulas of a
     step have been called before, and would be left without: their derivatives would be zero without a word.
     """
+    seen = set() if seen is None else seen
     if id(function) in seen:
         return
     seen.add(id(function))
@@ -208,7 +209,13 @@ def _need_adjoints(function: Any, seen: set[int]) -> None:
     for name in _names_in(function.func.__code__):
         called = function.func.__globals__.get(name)
         if isinstance(called, wp.Function):
-            _need_adjoints(called, seen)
+            need_adjoints(called, seen)
+
+
+def after_adjoints(function: Any) -> Any:
+    """Have Warp emit a function after all adjoints, as those that call `wp.grad`: it calls one of them."""
+    function.adj.uses_grad_call = True
+    return function
 
 
 def _names_in(code: CodeType) -> set[str]:
@@ -219,4 +226,4 @@ def _names_in(code: CodeType) -> set[str]:
 for _function in (
     point_work, distance_work, probe_distance, pair_work, facing_work, momentum_work, state_work, advance_work
 ):  # fmt: skip
-    _need_adjoints(_function, set())
+    need_adjoints(_function)

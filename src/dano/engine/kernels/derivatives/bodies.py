@@ -5,7 +5,12 @@ import warp as wp
 from dano.engine.kernels.derivatives.adjoint import advance_work, momentum_work, state_work
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Changes, Push, Room, Scene, StateRow
+from dano.physics.features import TREES
+from dano.physics.joints import ROOT
 from dano.physics.pairs import BodyState
+from dano.physics.real import vec6, ZERO
+
+_ROOT = wp.constant(ROOT)
 
 
 @wp.func
@@ -15,6 +20,22 @@ def add_row(bars: wp.array2d(dtype=StateRow), world: int, i: int, bar: StateRow)
     bars[world, i].orientation += bar.orientation
     bars[world, i].velocity += bar.velocity
     bars[world, i].omega += bar.omega
+
+
+@wp.func
+def block_of(scene: Scene, row: int) -> int:
+    """Block of unknowns of a body that moves freely, by its row."""
+    if wp.static(TREES):
+        return scene.trees.nodes[row].place // 6
+    return row
+
+
+@wp.func
+def hangs(scene: Scene, row: int) -> bool:
+    """Whether a body is on a joint, by its row; −1 for one that does not move."""
+    if wp.static(TREES):
+        return row >= 0 and scene.trees.nodes[row].kind != _ROOT
+    return False
 
 
 @wp.func
@@ -38,13 +59,13 @@ def pull_momentum(
     """Add derivatives through the momentum that a body comes with, gravity and control."""
     h = scene.timestep[world, 0]
     n = scene.body_index.shape[0]
-    m = scene.body_index[i].row
+    b = block_of(scene, scene.body_index[i].row)
     body = scene.bodies[world, i]
     push = Push()
     if launch.pushes.shape[1] > 0:
         push = launch.pushes[world, t * n + i]
     by_body, by_row, by_push, by_gravity, by_h, _a, _b = wp.grad(momentum_work)(
-        body, row, push, scene.gravity[world, 0], h, room.velocity[world, m], room.step[world, m]
+        body, row, push, scene.gravity[world, 0], h, room.velocity[world, b], room.step[world, b]
     )
     add_row(room.state_bar, world, i, by_row)
     if bars.bodies.shape[1] > 0:
@@ -59,14 +80,25 @@ def pull_momentum(
 
 
 @wp.func
+def is_zero(row: StateRow) -> bool:
+    """Whether nothing is asked of a body."""
+    size = wp.length_sq(row.position) + wp.length_sq(row.orientation)
+    return size + wp.length_sq(row.velocity) + wp.length_sq(row.omega) == ZERO
+
+
+@wp.func
 def pull_advance(scene: Scene, room: Room, bars: Changes, world: int, i: int, row: StateRow, after: StateRow):
     """Derivatives by the velocities and the row of a body from those by its row at the end of a step."""
     h = scene.timestep[world, 0]
     m = scene.body_index[i].row
-    if m >= 0:
-        by_row, by_velocity, by_h, _a = wp.grad(advance_work)(row, room.velocity[world, m], h, after)
+    if m >= 0 and is_zero(after):
+        room.state_bar[world, i] = StateRow()
+        room.residual[world, block_of(scene, m)] = vec6()
+    elif m >= 0:
+        b = block_of(scene, m)
+        by_row, by_velocity, by_h, _a = wp.grad(advance_work)(row, room.velocity[world, b], h, after)
         room.state_bar[world, i] = by_row
-        room.residual[world, m] = by_velocity
+        room.residual[world, b] = by_velocity
         if bars.timestep.shape[1] > 0:
             bars.timestep[world, 0] += by_h
     else:

@@ -10,11 +10,11 @@ from dano.engine.kernels.derivatives.adjoint import (
     probe_distance,
     Virtual,
 )
-from dano.engine.kernels.lanes import total, total3, total33
+from dano.engine.kernels.lanes import total, total3, total6, total33
 from dano.engine.kernels.search import posed, solid_of_body
 from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
 from dano.physics.distances import leaf_distance, nearest_leaf, Solid
-from dano.physics.features import LANES, TURNING, UNIONS
+from dano.physics.features import LANES, TREES, TURNING, UNIONS
 from dano.physics.pairs import BALL, BodyState, first_touch, PairPose, position_after, rotation_after
 from dano.physics.point_law import Material
 from dano.physics.real import mat33, ONE, real, vec3, ZERO
@@ -33,6 +33,7 @@ class PairBar:
         scale: By the semi-axes of the sampled body.
         timestep: By h.
         sink: By the depth up to which predicted geometry is taken.
+        twists: By twists and virtual twists, of bodies on joints.
     """
 
     first: BodyState
@@ -40,6 +41,7 @@ class PairBar:
     scale: vec3
     timestep: real
     sink: real
+    twists: Virtual
 
 
 @wp.func
@@ -161,8 +163,11 @@ def pull_points(
     pose: PairPose,
     rebound: real,
     twists: Virtual,
-) -> tuple[PairPose, real, real]:
-    """Derivatives by the pose of a pair, τ and h; adds those by samples, solids and materials."""
+) -> tuple[PairPose, real, real, Virtual]:
+    """Derivatives by the pose of a pair, τ, h and twists from its points.
+
+    Adds those by samples, solids and materials.
+    """
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
     turning = scene.body_index[index.first].turning
@@ -173,6 +178,7 @@ def pull_points(
     h_bar = real(0.0)
     material_bar = Material()
     stiffness_share_bar = real(0.0)
+    twists_bar = Virtual()
     for k in range(found.first, found.end):
         linear = room.linear[world, k]
         if linear.pressure.value > ZERO:
@@ -182,10 +188,10 @@ def pull_points(
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
             (
-                by_pose, by_sample, by_distance, _a, _b, by_share_of, by_share, by_h, by_material, _c, _d, _e,
+                by_pose, by_sample, by_distance, _a, _b, by_share_of, by_share, by_h, by_material, _c, _d, by_twists,
             ) = wp.grad(point_work)(
-                pose, sample, d, turning, where.presses_back > 0, pair.share, found.share, h, material,
-                rebound, found.impact_stiffness, twists,
+                pose, sample, d, turning, where.presses_back > 0, pair.share, found.share, h, material, rebound,
+                found.impact_stiffness, twists,
             )  # fmt: skip
             _f, _g, by_solid, by_x, _h = wp.grad(distance_work)(scene.solids, world, solid, x, by_distance)
             add_leaf(bars, world, solid, by_solid)
@@ -200,6 +206,11 @@ def pull_points(
             share_bar += by_share
             h_bar += by_h
             stiffness_share_bar += by_share_of
+            if wp.static(TREES):
+                twists_bar.first += by_twists.first
+                twists_bar.second += by_twists.second
+                twists_bar.first_virtual += by_twists.first_virtual
+                twists_bar.second_virtual += by_twists.second_virtual
     material_bar = total_material(material_bar)
     stiffness_share_bar = total(stiffness_share_bar)
     if lane == 0:
@@ -208,7 +219,12 @@ def pull_points(
             bars.materials[world, index.contact] = whole
         if bars.pairs.shape[1] > 0:
             bars.pairs[world, found.pair].share += stiffness_share_bar
-    return total_pose(pose_bar), total(share_bar), total(h_bar)
+    if wp.static(TREES):
+        twists_bar.first = total6(twists_bar.first)
+        twists_bar.second = total6(twists_bar.second)
+        twists_bar.first_virtual = total6(twists_bar.first_virtual)
+        twists_bar.second_virtual = total6(twists_bar.second_virtual)
+    return total_pose(pose_bar), total(share_bar), total(h_bar), twists_bar
 
 
 @wp.func
@@ -309,8 +325,11 @@ def pull_pair(
     a = room.bodies[world, index.first]
     b = room.bodies[world, index.second]
     pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
-    pose_bar, share_bar, h_bar = pull_points(scene, room, bars, world, lane, found, pose, rebound, twists)
+    pose_bar, share_bar, h_bar, twists_bar = pull_points(
+        scene, room, bars, world, lane, found, pose, rebound, twists
+    )
     bar = PairBar()
+    bar.twists = twists_bar
     toward = found.toward
     by_first, by_second, by_share, by_h, by_toward, _a, by_scale, _b, _c = wp.grad(pair_work)(
         a, b, found.share, h, toward, turning, scale, pair.follows, pose_bar

@@ -9,6 +9,7 @@ from dano.physics.joints import (
     ball_after,
     Carrier,
     Displacement,
+    displacement_twist,
     end_by_spin,
     hanging_move,
     hanging_pose,
@@ -19,12 +20,13 @@ from dano.physics.joints import (
     motion_direction,
     motion_share,
     motion_twist,
+    orientation_after,
     ROOT,
     turned_by,
 )
 from dano.physics.real import ONE, quat, real, vec3, vec6, ZERO
-from dano.physics.rotations import spin_of_turn, turn_of_step
-from dano.physics.twists import angular_part, joined, linear_part, twist_at
+from dano.physics.rotations import turn_of_step
+from dano.physics.twists import angular_part, linear_part, twist_at
 
 _BALL, _ROOT = wp.constant(BALL), wp.constant(ROOT)
 # Angle by which joints may turn a body in a step [rad]: from 180° on a turn reads as one the other way.
@@ -136,7 +138,7 @@ def move_hanging(
     moved = move.displacement
     room.trees.displacements[world, n] = moved
     room.trees.pivots[world, n] = move.pivot
-    room.trees.twists[world, n] = joined((ONE / h) * moved.shift, spin_of_turn(moved.turn, h))
+    room.trees.twists[world, n] = displacement_twist(moved, h)
 
 
 @wp.func
@@ -214,10 +216,9 @@ def see_from_contact(scene: Scene, room: Room, world: int, velocities: wp.array2
                 up = above.parent
             if node.kind != _ROOT:
                 twist = room.trees.twists[world, n]
-                turn = room.trees.displacements[world, n].turn
                 state.velocity = linear_part(twist)
                 state.spin = angular_part(twist)
-                state.ahead = wp.normalize(turn * state.orientation)
+                state.ahead = orientation_after(room.trees.displacements[world, n], state.orientation)
                 room.bodies[world, node.body] = state
                 room.trees.offsets[world, n] = twist - chain_twist(scene, room, world, node, velocities)
 

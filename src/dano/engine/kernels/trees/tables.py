@@ -6,7 +6,8 @@ from dano.physics.composites import Composite
 from dano.physics.joint_laws import JointDrive, JointLaw, Ramps, Resolved
 from dano.physics.joints import Displacement, Joint, JointFrame
 from dano.physics.loops import Loop
-from dano.physics.real import real, vec3, vec6
+from dano.physics.pairs import BodyState
+from dano.physics.real import quat, real, vec3, vec6
 
 
 @wp.struct
@@ -169,6 +170,46 @@ class JointState:
 
 
 @wp.struct
+class Chain:
+    """How a body of a tree stands at the start of a step, and how it moves.
+
+    Attributes:
+        position: Of the centre of mass [m, W].
+        orientation: Body → world.
+        before: How the old velocities move it.
+        after: How those at the end of the step do.
+        change: Twist at the origin of its tree by which the latter differ, by motions at the start.
+        work: Virtual twist there.
+    """
+
+    position: vec3
+    orientation: quat
+    before: Displacement
+    after: Displacement
+    change: vec6
+    work: vec6
+
+
+@wp.struct
+class HangingBar:
+    """By what the equations ask of a body on a joint besides its momentum.
+
+    Attributes:
+        state: By how contact sees it at the start.
+        twist: By the twist that contact sees at the end.
+        work: By its virtual twist.
+        velocity: By its velocity at the end.
+        omega: By its spin there [B].
+    """
+
+    state: BodyState
+    twist: vec6
+    work: vec6
+    velocity: vec3
+    omega: vec3
+
+
+@wp.struct
 class TreeRoom:
     """Where a world works on bodies on joints.
 
@@ -194,6 +235,14 @@ class TreeRoom:
         sizes: Magnitude of the velocities [m/s], of the terms in the residual of trees that touch nothing
             [m/s], the compliance of loops [m s/N], and 1 where springs or dampers are strong, shape
             (worlds, 4).
+        chains: How the body of each node stands and moves; this and the next are for derivatives.
+        chain_bars: Derivatives by these.
+        hanging_bars: By what else is asked of bodies on joints.
+        asked: Whether some of these are not zero.
+        q_bar: By joint coordinates at the start of a step, shape (worlds, coordinates).
+        v_bar: By their velocities there.
+        q_after: By coordinates at its end.
+        v_after: …
     """
 
     frames: wp.array2d(dtype=JointFrame)
@@ -215,3 +264,11 @@ class TreeRoom:
     turned: wp.array2d(dtype=real)
     coupled: wp.array2d(dtype=wp.int32)
     sizes: wp.array2d(dtype=real)
+    chains: wp.array2d(dtype=Chain)
+    chain_bars: wp.array2d(dtype=Chain)
+    hanging_bars: wp.array2d(dtype=HangingBar)
+    asked: wp.array2d(dtype=wp.int32)
+    q_bar: wp.array2d(dtype=real)
+    v_bar: wp.array2d(dtype=real)
+    q_after: wp.array2d(dtype=real)
+    v_after: wp.array2d(dtype=real)

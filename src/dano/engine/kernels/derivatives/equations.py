@@ -1,0 +1,217 @@
+"""A step at its solution, and derivatives of its equations along virtual velocities (docs/gradients.md)."""
+
+import warp as wp
+
+from dano.engine.kernels.assembly import assemble, fit_duals, row_of, Trial
+from dano.engine.kernels.derivatives.adjoint import after_adjoints, Virtual
+from dano.engine.kernels.derivatives.bodies import (
+    block_of,
+    hangs,
+    pull_advance,
+    pull_body,
+    pull_momentum,
+    row_before,
+)
+from dano.engine.kernels.derivatives.contact import PairBar, pull_pair
+from dano.engine.kernels.derivatives.trees import (
+    add_hanging,
+    add_timestep,
+    ask_of_end,
+    follow_chains,
+    pull_chains,
+    pull_coordinates,
+    pull_laws,
+    pull_loops,
+    pull_places,
+    settle_trees,
+    transpose_entries,
+)
+from dano.engine.kernels.lanes import wait
+from dano.engine.kernels.linear_solve import copy_transposed_blocks, find_pattern, solve_blocks
+from dano.engine.kernels.rollout import begin_body, begin_step_of_trees, Launch
+from dano.engine.kernels.search import find_contacts, fix_laws
+from dano.engine.kernels.tables import Changes, FoundPair, Push, Room, Scene
+from dano.engine.kernels.trees.balance import (
+    add_tree_slopes,
+    clear_trees,
+    eliminate_joint_duals,
+    fit_joint_duals,
+    solve_trees,
+)
+from dano.engine.kernels.trees.contact import body_twist
+from dano.engine.kernels.trees.kinematics import place_trees
+from dano.physics.features import LANES, LOOPS, TREES
+from dano.physics.real import ONE, real, vec6, ZERO
+from dano.physics.rotations import matrix
+from dano.physics.twists import joined
+
+_LANES = wp.constant(LANES)
+
+
+@wp.func
+def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: int) -> int:
+    """A step at its solution: points, laws and the Jacobian; returns the number of pairs that are near."""
+    n = scene.body_index.shape[0]
+    for i in range(n):
+        push = Push()
+        begin_body(scene, room, world, i, row_before(scene, launch, world, t, i), push)
+    wait()
+    if wp.static(TREES):
+        if lane == 0:
+            if t > 0:
+                place_trees(scene, room, world, launch.qs, (t - 1) * scene.trees.coordinates.shape[0])
+            begin_step_of_trees(scene, room, world, launch, t)
+        wait()
+    n_found, _overflow = find_contacts(scene, room, world, lane)
+    wait()
+    if lane == 0:
+        find_pattern(scene, room, world, n_found)
+        for i in range(n):
+            m = scene.body_index[i].row
+            if m >= 0 and not hangs(scene, m):
+                row = launch.states[world, t * n + i]
+                spin = matrix(room.bodies[world, i].orientation) * row.omega
+                room.velocity[world, block_of(scene, m)] = joined(row.velocity, spin)
+        if wp.static(TREES):
+            settle_trees(scene, room, launch, world, t)
+            fit_joint_duals(scene, room, world)
+        for b in range(scene.n_blocks):
+            room.tried[world, b] = room.velocity[world, b]
+    wait()
+    fix_laws(scene, room, world, lane, n_found, launch.reports[world, t].rebound)
+    fit_duals(scene, room, world, lane, n_found)
+    wait()
+    trial = Trial()
+    trial.softness = ONE
+    assemble(scene, room, world, lane, n_found, trial)
+    wait()
+    if wp.static(TREES):
+        if lane == 0:
+            add_tree_slopes(scene, room, world)
+        wait()
+    return n_found
+
+
+@wp.func
+def solve_transposed(scene: Scene, room: Room, world: int):
+    """Virtual velocities λ of a settled step, (∂R/∂V)ᵀ λ = V̄, in `room.step`, from V̄ in `room.residual`."""
+    m = scene.n_blocks
+    copy_transposed_blocks(room, world, m)
+    for b in range(m):
+        room.step[world, b] = room.residual[world, b]
+    if wp.static(TREES):
+        transpose_entries(scene, room, world)
+        eliminate_joint_duals(scene, room, world, False)
+    solve_blocks(room, world, m)
+    if wp.static(TREES):
+        solve_trees(scene, room, world, False)
+
+
+@wp.func
+def twist_of(scene: Scene, room: Room, world: int, row: int, values: wp.array2d(dtype=vec6), offset: real) -> vec6:
+    """How contact sees a body move, by its row, with values of the unknowns; see `body_twist`."""
+    if wp.static(TREES):
+        return body_twist(scene, room, world, row, values, offset)
+    return row_of(values, world, row)
+
+
+@wp.func
+def is_moved(values: wp.array2d(dtype=vec6), world: int, block: int) -> bool:
+    """Whether virtual velocities in a block are not zero; what is not a number is not."""
+    return not (wp.length_sq(values[world, block]) == ZERO)
+
+
+@after_adjoints
+@wp.func
+def pull_touching(
+    scene: Scene,
+    room: Room,
+    bars: Changes,
+    launch: Launch,
+    world: int,
+    t: int,
+    found: FoundPair,
+    bar: PairBar,
+):
+    """Add derivatives by the two bodies of a pair."""
+    index = scene.pair_index[found.pair]
+    side = int(0)
+    while side < 2:
+        body = index.first
+        state = bar.first
+        twist = bar.twists.first
+        work = bar.twists.first_virtual
+        if side == 1:
+            body = index.second
+            state = bar.second
+            twist = bar.twists.second
+            work = bar.twists.second_virtual
+        row = scene.body_index[body].row
+        if hangs(scene, row):
+            add_hanging(room, world, row, state, twist, work)
+        else:
+            pull_body(scene, room, bars, world, body, row_before(scene, launch, world, t, body), state)
+        side += 1
+    if bars.bodies.shape[1] > 0:
+        bars.bodies[world, index.first].scale += bar.scale
+    add_timestep(bars, world, bar.timestep)
+    if bars.pairs.shape[1] > 0:
+        bars.pairs[world, found.pair].sink += bar.sink
+
+
+@after_adjoints
+@wp.func
+def pull_end(scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, t: int):
+    """Derivatives by what a step begins with, and by its velocities, from those by its end.
+
+    The latter are in `room.residual`. Chains are those without virtual velocities, see `follow_chains`.
+    """
+    if wp.static(TREES):
+        clear_trees(scene, world, room.residual)
+        pull_places(scene, room, bars, launch, world, t)
+    for i in range(scene.body_index.shape[0]):
+        if not hangs(scene, scene.body_index[i].row):
+            before = row_before(scene, launch, world, t, i)
+            pull_advance(scene, room, bars, world, i, before, room.after_bar[world, i])
+    if wp.static(TREES):
+        ask_of_end(scene, room, world)
+        pull_coordinates(scene, room, bars, world)
+        pull_chains(scene, room, bars, launch, world, t)
+
+
+@after_adjoints
+@wp.func
+def pull_equations(
+    scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, lane: int, t: int, n_found: int
+):
+    """Add derivatives of −λ · R of a settled step, with virtual velocities λ in `room.step`."""
+    if lane == 0:
+        for i in range(scene.body_index.shape[0]):
+            row = scene.body_index[i].row
+            if row >= 0 and not hangs(scene, row) and is_moved(room.step, world, block_of(scene, row)):
+                pull_momentum(scene, room, bars, launch, world, t, i, row_before(scene, launch, world, t, i))
+    wait()
+    for f in range(n_found):
+        found = room.found[world, f * _LANES + lane]
+        index = scene.pair_index[found.pair]
+        first = scene.body_index[index.first].row
+        second = scene.body_index[index.second].row
+        twists = Virtual()
+        twists.first = twist_of(scene, room, world, first, room.velocity, ONE)
+        twists.second = twist_of(scene, room, world, second, room.velocity, ONE)
+        twists.first_virtual = twist_of(scene, room, world, first, room.step, ZERO)
+        twists.second_virtual = twist_of(scene, room, world, second, room.step, ZERO)
+        moved = wp.length_sq(twists.first_virtual) + wp.length_sq(twists.second_virtual)
+        if not (moved == ZERO):
+            bar = pull_pair(scene, room, bars, world, lane, found, launch.reports[world, t].rebound, twists)
+            if lane == 0:
+                pull_touching(scene, room, bars, launch, world, t, found, bar)
+    wait()
+    if wp.static(TREES):
+        if lane == 0:
+            follow_chains(scene, room, launch, world, t)
+            pull_laws(scene, room, bars, world, t)
+            if wp.static(LOOPS):
+                pull_loops(scene, room, bars, world)
+            pull_chains(scene, room, bars, launch, world, t)
+        wait()
