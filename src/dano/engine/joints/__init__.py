@@ -8,6 +8,10 @@ from dano.engine.joints._forces import (
     STICKS as STICKS,
     STOPS as STOPS,
 )
+from dano.engine.joints._structure import (
+    tree_structure as tree_structure,
+    TreeStructure as TreeStructure,
+)
 from dano.engine.joints._tables import (
     changing as changing,
     in_tables as in_tables,
