@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.maths import matmul, matvec, quat_multiply, skew
-from dano.scene import RESOLVED
+from dano.scene import RESOLVED, step_turn, turn_shape
 
 # Over how much of x the momentum of fast spins tends to Jω: a tenth of a turn.
 FADE = 0.15
@@ -72,8 +72,7 @@ def turned(
     orientation: Float[Array, "*n 4"], omega: Float[Array, "*n 3"], h: Float[Array, ""]
 ) -> Float[Array, "*n 4"]:
     """Orientation at the end of a step with a spin [rad/s, B]."""
-    cosine, sine = _turn(omega, h)
-    q = quat_multiply(orientation, jnp.concatenate([cosine, sine * (0.5 * h * omega)], axis=-1))
+    q = quat_multiply(orientation, step_turn(omega, h))
     # Of unit length but for rounding.
     squared = jnp.sum(q * q, axis=-1, keepdims=True)
     return q * (1.5 - 0.5 * squared)
@@ -84,19 +83,9 @@ def turn_slopes(omega: Float[Array, "3"], h: Float[Array, ""]) -> Float[Array, "
 
     That is ½ (√(4/h² − |ω|²) − [ω]×) for slow spins.
     """
-    cosine, sine = (x[0] for x in _turn(omega, h))
+    cosine, sine = (x[0] for x in turn_shape(omega, h))
     squared = 0.25 * h**2 * jnp.sum(omega * omega)
     across = cosine / sine
     along = jnp.where(squared > RESOLVED**2, (1 - across) / jnp.where(squared > 0, squared, 1), 0)
     eye = jnp.eye(3, dtype=omega.dtype)
     return (across * eye + along * (0.25 * h**2) * omega[:, None] * omega[None]) / h - 0.5 * skew(omega)
-
-
-def _turn(omega: Float[Array, "*n 3"], h: Float[Array, ""]):
-    """Cos a and sin a / x, shapes (*n, 1)."""
-    squared = 0.25 * h**2 * jnp.sum(omega * omega, axis=-1, keepdims=True)
-    fast = squared > RESOLVED**2
-    root = jnp.sqrt(1 - jnp.where(fast, RESOLVED**2, squared))
-    x = jnp.sqrt(jnp.where(fast, squared, 1))
-    angle = x + (float(np.arcsin(RESOLVED)) - RESOLVED)
-    return jnp.where(fast, jnp.cos(angle), root), jnp.where(fast, jnp.sin(angle) / x, 1)

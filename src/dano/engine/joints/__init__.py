@@ -13,7 +13,10 @@ from dano.engine.joints._rows import (
     tree_lengths as tree_lengths,
     tree_rows as tree_rows,
 )
-from dano.engine.joints._structure import TreeStructure as TreeStructure
+from dano.engine.joints._structure import (
+    tree_structure as tree_structure,
+    TreeStructure as TreeStructure,
+)
 from dano.engine.joints._tables import (
     changing as changing,
     in_tables as in_tables,

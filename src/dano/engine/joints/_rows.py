@@ -62,10 +62,10 @@ def tree_lengths(structure: TreeStructure) -> dict[str, int]:
             ("frames", "displacements", "pivots", "twists", "offsets", "wrenches", "composites"), m
         ),
         **dict.fromkeys(("start", "end"), structure.motions),
-        **dict.fromkeys(("diagonal", "column", "spread"), unknowns),
+        **dict.fromkeys(("diagonal", "column", "spread", "impulses"), unknowns),
         **dict.fromkeys(("lower", "upper"), structure.entries),
         "columns": len(structure.columns),
-        "joints": len(structure.coordinates),
+        **dict.fromkeys(("joints", "q", "v"), len(structure.coordinates)),
         "turned": m,
         "coupled": len(structure.closed),
         "sizes": 4,

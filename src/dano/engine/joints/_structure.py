@@ -27,7 +27,7 @@ class TreeStructure:
         moving: Body of each node.
         rows: Node of each body, −1 for a fixed one, shape (n,).
         nodes: Shape (m, 14).
-        coordinates: Shape (c, 3).
+        coordinates: Shape (c, 4).
         unknowns: Shape (6 · blocks, 4).
         order: Unknowns of trees, from roots to tips.
         columns: Unknowns that move the bodies that may touch something.
@@ -42,7 +42,7 @@ class TreeStructure:
     moving: Int[np.ndarray, " m"]
     rows: Int[np.ndarray, " n"]
     nodes: Int[np.ndarray, "m 14"]
-    coordinates: Int[np.ndarray, "c 3"]
+    coordinates: Int[np.ndarray, "c 4"]
     unknowns: Int[np.ndarray, "u 4"]
     order: Int[np.ndarray, " o"]
     columns: Int[np.ndarray, " k"]
@@ -83,8 +83,10 @@ def tree_structure(
         for n in (first, second):
             if n >= 0:
                 closed[nodes.tree[n]] = 1
+    balls = {c for j, _, c in layout.dofs if layout.kinds[j] == "ball"}
     coordinates = [
-        (places[c], c < len(constant) and constant[c], c in nonsmooth) for c in range(layout.n_joints)
+        (places[c], c < len(constant) and constant[c], c in nonsmooth, c in balls)
+        for c in range(layout.n_joints)
     ]
     bodies = nodes.rows[:, 0]
     of_body = np.full(layout.bodies, -1, np.int32)
@@ -94,7 +96,7 @@ def tree_structure(
         bodies.astype(np.int32),
         of_body,
         _table(rows, 14),
-        _table(coordinates, 3),
+        _table(coordinates, 4),
         unknowns,
         order,
         np.array(columns, np.int32),

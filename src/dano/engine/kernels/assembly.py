@@ -277,7 +277,7 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
         clear_blocks(room, world, m)
         add_momentum(scene, room, world, m, h)
         if wp.static(TREES):
-            add_tree_momentum(scene, room, world, trial.length, True)
+            add_tree_momentum(scene, room, world, trial.length)
         if wp.static(LOOPS):
             add_loops(scene, room, world)
     for f in range(n_found):

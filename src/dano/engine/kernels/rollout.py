@@ -7,16 +7,16 @@ from dano.engine.kernels.linear_solve import find_pattern
 from dano.engine.kernels.search import find_contacts, fix_laws
 from dano.engine.kernels.solve import Options, solve, Solved
 from dano.engine.kernels.tables import Push, Room, Scene, StateRow, StepReport
-from dano.engine.kernels.trees.balance import add_tree_momentum, begin_joints, begin_trees
+from dano.engine.kernels.trees.balance import begin_joints, begin_trees
 from dano.engine.kernels.trees.contact import free_block
 from dano.engine.kernels.trees.kinematics import (
     advance_coordinates,
-    move_trees,
+    move_trees_again,
     place_trees,
     turns_too_far,
     unknown_of,
 )
-from dano.engine.kernels.trees.loops import add_loops, begin_loops, forces_of
+from dano.engine.kernels.trees.loops import begin_loops, forces_of
 from dano.physics.features import LANES, LOOPS, TREES
 from dano.physics.joints import ROOT
 from dano.physics.momentum import angular_momentum, turned_inertia
@@ -148,24 +148,13 @@ def adds_energy(scene: Scene, room: Room, world: int) -> bool:
                 work += real(0.5) * impulse[k] * mean[k]
                 moved += real(0.5) * wp.abs(impulse[k] * mean[k])
     if wp.static(TREES):
-        # Of trees in generalised velocities; `room.residual` holds what they gain, see `find_impulses`.
         for k in range(scene.trees.order.shape[0]):
             u = scene.trees.order[k]
-            y = unknown_of(room.velocity, world, u)
-            done = unknown_of(room.residual, world, u) * (unknown_of(room.old, world, u) + y)
-            work += real(0.5) * done
-            moved += real(0.5) * wp.abs(done)
+            half = real(0.5) * (unknown_of(room.old, world, u) + unknown_of(room.tried, world, u))
+            done = room.trees.impulses[world, u] * half
+            work += done
+            moved += wp.abs(done)
     return work > _ADDS * moved
-
-
-@wp.func
-def find_impulses(scene: Scene, room: Room, world: int):
-    """What contact and limits give trees in a step, as generalised momenta in `room.residual`."""
-    for b in range(scene.n_blocks):
-        room.tried[world, b] = room.velocity[world, b]
-    add_tree_momentum(scene, room, world, ZERO, False)
-    if wp.static(LOOPS):
-        add_loops(scene, room, world)
 
 
 @wp.func
@@ -205,15 +194,15 @@ def advance_trees(scene: Scene, room: Room, world: int, launch: Launch, t: int):
     """Coordinates at the end of a step, and poses of the bodies on joints, whose velocities are known."""
     n = scene.body_index.shape[0]
     k = scene.trees.coordinates.shape[0]
-    if t == 0:
-        advance_coordinates(scene, room, world, launch.q, 0, launch.qs, launch.vs, 0)
-    else:
-        advance_coordinates(scene, room, world, launch.qs, (t - 1) * k, launch.qs, launch.vs, t * k)
+    advance_coordinates(scene, room, world)
+    for c in range(k):
+        launch.qs[world, t * k + c] = room.trees.q[world, c]
+        launch.vs[world, t * k + c] = room.trees.v[world, c]
     for i in range(n):
         row = launch.states[world, t * n + i]
         room.bodies[world, i].position = row.position
         room.bodies[world, i].orientation = from_wxyz(row.orientation)
-    place_trees(scene, room, world, launch.qs, t * k)
+    place_trees(scene, room, world)
     if wp.static(LOOPS):
         n_loops = scene.trees.loop_index.shape[0]
         for row in range(n_loops):
@@ -226,15 +215,22 @@ def advance_trees(scene: Scene, room: Room, world: int, launch: Launch, t: int):
 
 
 @wp.func
-def begin_step_of_trees(scene: Scene, room: Room, world: int, launch: Launch, t: int):
-    """What is known of trees at the start of a step."""
+def begin_coordinates(scene: Scene, room: Room, world: int, launch: Launch, t: int):
+    """Joint coordinates at the start of a step, and the poses of bodies that follow from them."""
     k = scene.trees.coordinates.shape[0]
-    if t == 0:
-        place_trees(scene, room, world, launch.q, 0)
-        begin_joints(scene, room, world, launch.q, launch.v, 0, launch.efforts, launch.commands, 0)
-    else:
-        at = (t - 1) * k
-        begin_joints(scene, room, world, launch.qs, launch.vs, at, launch.efforts, launch.commands, t * k)
+    for c in range(k):
+        room.trees.q[world, c] = launch.q[world, c]
+        room.trees.v[world, c] = launch.v[world, c]
+        if t > 0:
+            room.trees.q[world, c] = launch.qs[world, (t - 1) * k + c]
+            room.trees.v[world, c] = launch.vs[world, (t - 1) * k + c]
+    place_trees(scene, room, world)
+
+
+@wp.func
+def begin_step_of_trees(scene: Scene, room: Room, world: int, launch: Launch, t: int):
+    """What is known of trees at the start of a step, with the coordinates known."""
+    begin_joints(scene, room, world, launch.efforts, launch.commands, t * scene.trees.coordinates.shape[0])
     for b in range(scene.n_blocks):
         room.old[world, b] = room.velocity[world, b]
     begin_trees(scene, room, world)
@@ -283,6 +279,8 @@ def rollout(scene: Scene, room: Room, launch: Launch):
         wait()
         if wp.static(TREES):
             if lane == 0:
+                if t == 0:
+                    begin_coordinates(scene, room, world, launch, t)
                 begin_step_of_trees(scene, room, world, launch, t)
             wait()
             size = wp.max(size, room.trees.sizes[world, 0])
@@ -309,11 +307,6 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                 restarts += 1
                 again = True
             elif hits and attempt < _REBOUNDS:
-                if wp.static(TREES):
-                    wait()
-                    if lane == 0:
-                        find_impulses(scene, room, world)
-                    wait()
                 if adds_energy(scene, room, world):
                     attempt += 1
                     again = True
@@ -330,7 +323,7 @@ def rollout(scene: Scene, room: Room, launch: Launch):
             report.rebound = rebound
             if wp.static(TREES):
                 if not was_tried(scene, room, world):
-                    move_trees(scene, room, world, room.velocity, scene.timestep[world, 0])
+                    move_trees_again(scene, room, world, room.velocity, scene.timestep[world, 0])
                 if turns_too_far(scene, room, world):
                     report.solved = ZERO
             launch.reports[world, t] = report

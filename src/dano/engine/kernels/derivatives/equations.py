@@ -28,7 +28,7 @@ from dano.engine.kernels.derivatives.trees import (
 )
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import copy_transposed_blocks, find_pattern, solve_blocks
-from dano.engine.kernels.rollout import begin_body, begin_step_of_trees, Launch
+from dano.engine.kernels.rollout import begin_body, begin_coordinates, begin_step_of_trees, Launch
 from dano.engine.kernels.search import find_contacts, fix_laws
 from dano.engine.kernels.tables import Changes, FoundPair, Push, Room, Scene
 from dano.engine.kernels.trees.balance import (
@@ -39,7 +39,6 @@ from dano.engine.kernels.trees.balance import (
     solve_trees,
 )
 from dano.engine.kernels.trees.contact import body_twist
-from dano.engine.kernels.trees.kinematics import place_trees
 from dano.physics.features import LANES, LOOPS, TREES
 from dano.physics.real import ONE, real, vec6, ZERO
 from dano.physics.rotations import matrix
@@ -58,8 +57,7 @@ def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: i
     wait()
     if wp.static(TREES):
         if lane == 0:
-            if t > 0:
-                place_trees(scene, room, world, launch.qs, (t - 1) * scene.trees.coordinates.shape[0])
+            begin_coordinates(scene, room, world, launch, t)
             begin_step_of_trees(scene, room, world, launch, t)
         wait()
     n_found, _overflow = find_contacts(scene, room, world, lane)

@@ -172,9 +172,6 @@ def begin_joints(
     scene: Scene,
     room: Room,
     world: int,
-    q: wp.array2d(dtype=real),
-    v: wp.array2d(dtype=real),
-    at: int,
     efforts: wp.array2d(dtype=real),
     commands: wp.array2d(dtype=real),
     given: int,
@@ -183,11 +180,8 @@ def begin_joints(
 
     Args:
         scene: The scene.
-        room: Room.
+        room: Room, with the coordinates.
         world: Which world.
-        q: Coordinates.
-        v: Their velocities.
-        at: Where both begin.
         efforts: [N m or N]; no columns for none.
         commands: Of motors; the same.
         given: Where both begin.
@@ -201,8 +195,8 @@ def begin_joints(
     for c in range(scene.trees.coordinates.shape[0]):
         coordinate = scene.trees.coordinates[c]
         drive = JointDrive()
-        drive.q = q[world, at + c]
-        drive.v = v[world, at + c]
+        drive.q = room.trees.q[world, c]
+        drive.v = room.trees.v[world, c]
         if efforts.shape[1] > 0:
             drive.effort = efforts[world, given + c]
         if commands.shape[1] > 0:
@@ -256,7 +250,7 @@ def fit_joint_duals(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def add_tree_momentum(scene: Scene, room: Room, world: int, length: real, kinks: bool):
+def add_tree_momentum(scene: Scene, room: Room, world: int, length: real):
     """What trees miss at the velocities that are tried, contact and loops aside.
 
     Args:
@@ -264,7 +258,6 @@ def add_tree_momentum(scene: Scene, room: Room, world: int, length: real, kinks:
         room: Room; residuals of trees are written to.
         world: Which world.
         length: Share of the step of the duals.
-        kinks: Whether what has kinks in the laws of joints is in it.
     """
     h = scene.timestep[world, 0]
     move_trees(scene, room, world, room.tried, h)
@@ -278,13 +271,17 @@ def add_tree_momentum(scene: Scene, room: Room, world: int, length: real, kinks:
             missing = joined(linear, angular) - room.momentum[world, n]
             room.trees.wrenches[world, n] = wrench_at(missing, lever_of(room, world, node))
     gather_momenta(scene, room, world)
+    for k in range(scene.trees.order.shape[0]):
+        u = scene.trees.order[k]
+        room.trees.impulses[world, u] = unknown_of(room.residual, world, u)
     for c in range(scene.trees.coordinates.shape[0]):
         coordinate = scene.trees.coordinates[c]
         u = coordinate.place
         y = unknown_of(room.tried, world, u)
         state = room.trees.joints[world, c]
         taken = joint_momentum(scene.trees.laws[world, c], state.drive, h, y)
-        if kinks and coordinate.nonsmooth > 0:
+        room.trees.impulses[world, u] = room.trees.impulses[world, u] + taken
+        if coordinate.nonsmooth > 0:
             dual = state.dual + length * state.change
             room.trees.joints[world, c].resolved = resolved(state.ramps, state.rho, dual, y)
             taken += h * dual

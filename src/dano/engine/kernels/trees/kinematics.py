@@ -59,16 +59,8 @@ def displacement_of(room: Room, world: int, node: int) -> Displacement:
 
 
 @wp.func
-def place_trees(scene: Scene, room: Room, world: int, q: wp.array2d(dtype=real), first: int):
-    """Poses of the bodies on joints from those of the others.
-
-    Args:
-        scene: The scene.
-        room: With the poses of all bodies, which are written to.
-        world: Which world.
-        q: Joint coordinates of each world.
-        first: Where they begin.
-    """
+def place_trees(scene: Scene, room: Room, world: int):
+    """Poses of the bodies on joints from those of the others and the joint coordinates, all in the room."""
     for n in range(scene.trees.nodes.shape[0]):
         node = scene.trees.nodes[n]
         if node.kind != _ROOT:
@@ -81,7 +73,7 @@ def place_trees(scene: Scene, room: Room, world: int, q: wp.array2d(dtype=real),
                 carrier.com = stands.com
             own = vec3()
             for part in range(node.width):
-                own[part] = q[world, first + node.coordinate + part]
+                own[part] = room.trees.q[world, node.coordinate + part]
             com = scene.bodies[world, node.body].com
             joint = scene.trees.joints[world, node.joint]
             pose = hanging_pose(node.kind, joint, carrier, com, own)
@@ -153,6 +145,12 @@ def move_trees(scene: Scene, room: Room, world: int, velocities: wp.array2d(dtyp
                 move_hanging(scene, room, world, n, node, velocities, h)
 
 
+@wp.func(inline=False)
+def move_trees_again(scene: Scene, room: Room, world: int, velocities: wp.array2d(dtype=vec6), h: real):
+    """The same where time does not count: a copy of it less to compile."""
+    move_trees(scene, room, world, velocities, h)
+
+
 @wp.func
 def end_motions(scene: Scene, room: Room, world: int, velocities: wp.array2d(dtype=vec6), h: real):
     """What each generalised velocity does at the end of the step that `move_trees` found, over h."""
@@ -199,7 +197,7 @@ def chain_twist(scene: Scene, room: Room, world: int, node: Node, velocities: wp
 @wp.func
 def see_from_contact(scene: Scene, room: Room, world: int, velocities: wp.array2d(dtype=vec6), h: real):
     """How contact sees bodies on joints move: by J y + c, which is their twist at the old velocities."""
-    move_trees(scene, room, world, velocities, h)
+    move_trees_again(scene, room, world, velocities, h)
     for n in range(scene.trees.nodes.shape[0]):
         node = scene.trees.nodes[n]
         if node.alone == 0 and node.columns > 0:
@@ -224,42 +222,24 @@ def see_from_contact(scene: Scene, room: Room, world: int, velocities: wp.array2
 
 
 @wp.func
-def advance_coordinates(
-    scene: Scene,
-    room: Room,
-    world: int,
-    before: wp.array2d(dtype=real),
-    at: int,
-    q: wp.array2d(dtype=real),
-    v: wp.array2d(dtype=real),
-    to: int,
-):
-    """Joint coordinates at the end of a step, q⁺ = q + h y, and their velocities.
-
-    Args:
-        scene: The scene.
-        room: With the velocities of the step.
-        world: Which world.
-        before: Coordinates at the start.
-        at: Where they begin.
-        q: Written to.
-        v: Written to.
-        to: Where both begin.
-    """
+def advance_coordinates(scene: Scene, room: Room, world: int):
+    """Joint coordinates at the end of a step, q⁺ = q + h y, and their velocities."""
     h = scene.timestep[world, 0]
-    for c in range(scene.trees.coordinates.shape[0]):
-        y = unknown_of(room.velocity, world, scene.trees.coordinates[c].place)
-        q[world, to + c] = before[world, at + c] + h * y
-        v[world, to + c] = y
     for n in range(scene.trees.nodes.shape[0]):
         node = scene.trees.nodes[n]
         if node.kind == _BALL:
             own = vec3()
             for part in range(3):
-                own[part] = before[world, at + node.coordinate + part]
+                own[part] = room.trees.q[world, node.coordinate + part]
             after = ball_after(own, velocities_of(room.velocity, world, node), h)
             for part in range(3):
-                q[world, to + node.coordinate + part] = after[part]
+                room.trees.q[world, node.coordinate + part] = after[part]
+    for c in range(scene.trees.coordinates.shape[0]):
+        coordinate = scene.trees.coordinates[c]
+        y = unknown_of(room.velocity, world, coordinate.place)
+        if coordinate.of_ball == 0:
+            room.trees.q[world, c] = room.trees.q[world, c] + h * y
+        room.trees.v[world, c] = y
 
 
 @wp.func

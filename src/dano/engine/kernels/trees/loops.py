@@ -135,8 +135,10 @@ def add_loop_side(scene: Scene, room: Room, world: int, row: int, forces: vec6, 
             by_start = gap_by_twist(loop, first, end, moved, is_second)
             moved = twist_at(room.trees.end[world, above.motion + part], after.position - origin)
             by_end = gap_by_twist(loop, first_after, after, moved, is_second)
+            pushed = h * wp.dot(by_start, forces)
+            room.residual[world, u // 6][u % 6] -= pushed
+            room.trees.impulses[world, u] = room.trees.impulses[world, u] - pushed
             for c in range(index.width):
-                room.residual[world, u // 6][u % 6] -= h * by_start[c] * forces[c]
                 add_to_block(room, world, m, u, index.place + c, -h * by_start[c])
                 add_to_block(room, world, m, index.place + c, u, h * by_end[c])
         up = above.parent

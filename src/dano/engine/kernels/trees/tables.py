@@ -55,11 +55,13 @@ class Coordinate:
         place: Among the unknowns.
         constant: 1 where a motor gives what it is told to.
         nonsmooth: 1 where its law has kinks.
+        of_ball: 1 for those of a ball joint.
     """
 
     place: wp.int32
     constant: wp.int32
     nonsmooth: wp.int32
+    of_ball: wp.int32
 
 
 @wp.struct
@@ -214,6 +216,8 @@ class TreeRoom:
     """Where a world works on bodies on joints.
 
     Attributes:
+        q: Joint coordinates at the start of a step, shape (worlds, coordinates).
+        v: Their velocities.
         frames: Joint of each node, shape (worlds, m).
         displacements: Of the body of each node in a step.
         pivots: Shift of its joint's pivot [m, W].
@@ -230,6 +234,8 @@ class TreeRoom:
         upper: What is above it in each column.
         column: Right-hand side, shape (worlds, 6 · blocks).
         spread: The same for six of them at once.
+        impulses: What contact and limits give trees at what was tried last, as generalised momenta, shape
+            (worlds, 6 · blocks).
         turned: Angle by which joints turn each node's body in a step [rad].
         coupled: 1 for trees that touch something in the step, or are closed by loops.
         sizes: Magnitude of the velocities [m/s], of the terms in the residual of trees that touch nothing
@@ -245,6 +251,8 @@ class TreeRoom:
         v_after: …
     """
 
+    q: wp.array2d(dtype=real)
+    v: wp.array2d(dtype=real)
     frames: wp.array2d(dtype=JointFrame)
     displacements: wp.array2d(dtype=Displacement)
     pivots: wp.array2d(dtype=vec3)
@@ -261,6 +269,7 @@ class TreeRoom:
     upper: wp.array2d(dtype=real)
     column: wp.array2d(dtype=real)
     spread: wp.array2d(dtype=vec6)
+    impulses: wp.array2d(dtype=real)
     turned: wp.array2d(dtype=real)
     coupled: wp.array2d(dtype=wp.int32)
     sizes: wp.array2d(dtype=real)
