@@ -13,6 +13,7 @@ friction λ and the direction s of the hysteresis as unknowns of their own, the 
 
 import warp as wp
 
+from dano.physics.friction import Friction, friction, friction_with_dual, following_friction
 from dano.physics.real import ONE, real, vec3, ZERO
 from dano.physics.samples import Point
 
@@ -272,7 +273,7 @@ def traction(law: PointLaw, point: Point, velocity: vec3, spin: vec3) -> vec3:
     slip = motion.slip + point.extra_slip
     p = pressure(law, motion.rate, ZERO, law.stiction).value
     bound = friction_bound(law, p)
-    return p * point.normal - (bound.value / wp.max(wp.length(slip), law.stiction)) * slip
+    return p * point.normal + friction(slip, bound.value, law.stiction)
 
 
 @wp.func
@@ -282,7 +283,7 @@ def fitting_duals(law: PointLaw, motion: Motion) -> Duals:
     duals.direction = motion.rate / wp.max(wp.abs(motion.rate), law.stiction)
     p = pressure(law, motion.rate, duals.direction, law.stiction).value
     bound = friction_bound(law, p)
-    duals.friction = (-bound.value / wp.max(wp.length(motion.slip), law.stiction)) * motion.slip
+    duals.friction = friction(motion.slip, bound.value, law.stiction)
     return duals
 
 
@@ -310,19 +311,13 @@ def linearized(law: PointLaw, motion: Motion, duals: Duals, softness: real, hold
         found.held = held + mix * (limit - held)
         limit = found.held
         marginal = ZERO
-    speed = wp.length(motion.slip)
-    slow = wp.max(speed, stiction)
-    size = wp.length(duals.friction)
-    found.friction = duals.friction
-    if size > limit:
-        found.friction = (limit / size) * duals.friction
-    gain = motion.slip / slow
-    found.friction_change = -found.friction - limit * gain
-    found.grip = limit / slow
-    if speed > stiction:
-        found.turning = found.friction / slow
-        found.slip_direction = gain
-    found.by_pressure = (marginal * found.pressure.damping) * gain
+    own = friction_with_dual(motion.slip, duals.friction, limit, marginal * found.pressure.damping, stiction)
+    found.friction = own.value
+    found.friction_change = own.change
+    found.grip = own.grip
+    found.turning = own.turning
+    found.slip_direction = own.direction
+    found.by_pressure = own.by_rate
     return found
 
 
@@ -330,13 +325,14 @@ def linearized(law: PointLaw, motion: Motion, duals: Duals, softness: real, hold
 def following_duals(found: Linear, duals: Duals, change: Motion) -> Duals:
     """The duals after the motion changed, from the linearisation before."""
     after = Duals()
-    after.friction = (
-        found.friction
-        + found.friction_change
-        + change.rate * found.by_pressure
-        - found.grip * change.slip
-        - wp.dot(found.slip_direction, change.slip) * found.turning
-    )
+    own = Friction()
+    own.value = found.friction
+    own.change = found.friction_change
+    own.by_rate = found.by_pressure
+    own.grip = found.grip
+    own.turning = found.turning
+    own.direction = found.slip_direction
+    after.friction = following_friction(own, change.rate, change.slip)
     s = duals.direction + found.pressure.direction_change + found.pressure.direction_by_speed * change.rate
     after.direction = wp.clamp(s, -ONE, ONE)
     return after

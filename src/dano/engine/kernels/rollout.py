@@ -5,10 +5,11 @@ import warp as wp
 from dano.engine.kernels.assembly import angular_part, joined, linear_part
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import find_pattern
+from dano.engine.kernels.patches import find_patches
 from dano.engine.kernels.search import find_contacts, fix_laws
 from dano.engine.kernels.solve import Options, solve, Solved
 from dano.engine.kernels.tables import Push, Room, Scene, StateRow, StepReport
-from dano.physics.features import LANES
+from dano.physics.features import LANES, PATCHES
 from dano.physics.momentum import angular_momentum, turned_inertia
 from dano.physics.pairs import BodyState
 from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
@@ -153,9 +154,12 @@ def rollout(scene: Scene, room: Room, launch: Launch):
             size = wp.max(size, begin_body(scene, room, world, i, row, push))
         wait()
         n_found, overflow = find_contacts(scene, room, world, lane)
+        n_near = n_found
+        if wp.static(PATCHES):
+            n_near = find_patches(scene, room, world, lane, n_found)
         wait()
         if lane == 0:
-            find_pattern(scene, room, world, n_found)
+            find_pattern(scene, room, world, n_near)
         hits = bool(False)
         for f in range(n_found):
             hits = hits or room.found[world, f * _LANES + lane].impact_stiffness > ZERO

@@ -20,8 +20,9 @@ import warp as wp
 from dano.engine.kernels.assembly import assemble, fit_duals, follow_duals, Trial
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, find_pattern, solve_blocks
+from dano.engine.kernels.patches import add_patches, fit_patch_duals, follow_patch_duals
 from dano.engine.kernels.tables import Room, Scene
-from dano.physics.features import LANES
+from dano.physics.features import LANES, PATCHES
 from dano.physics.real import HALF, INFINITY, ONE, real, vec6, ZERO
 
 LEVELS = 11
@@ -247,6 +248,8 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
             room.best[world, i] = room.velocity[world, i]
             room.step[world, i] = vec6()
     fit_duals(scene, room, world, lane, n_found)
+    if wp.static(PATCHES):
+        fit_patch_duals(scene, room, world, lane, n_found)
     found = Solved()
     search = begin_search(ZERO)
     number = int(0)
@@ -268,6 +271,8 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
         trial.holds = level.holds
         trial.mix = mix
         fit = assemble(scene, room, world, lane, n_found, trial)
+        if wp.static(PATCHES):
+            fit = add_patches(scene, room, world, lane, n_found, trial, fit)
         wait()
         seen = measure(scene, room, world)
         tolerance = wp.max(options.tolerance * (ONE + size), real(16.0) * options.rounding * seen.size)
@@ -322,6 +327,8 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
                         room.step[world, i] = part * room.step[world, i]
                 wait()
                 follow_duals(scene, room, world, lane, n_found, search.length)
+                if wp.static(PATCHES):
+                    follow_patch_duals(scene, room, world, lane, n_found)
                 # The next pass is no longer of the same function where bounds are renewed: it is accepted.
                 begun = real(0.0)
                 if mix == ZERO:
