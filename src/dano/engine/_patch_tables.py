@@ -178,7 +178,7 @@ def patch_tables(
     whole = {
         "scene.patches.contacts": _integers(contacts, 6),
         "scene.patches.side_index": _integers(side_index, 7),
-        "scene.patches.fields.kinds": _integers(fields.kinds, 7),
+        "scene.patches.fields.kinds": _integers(fields.kinds, 6),
     }
     return PatchTables(
         rows,
@@ -306,12 +306,16 @@ class _Fields:
     def _add(self, part: _Part) -> None:
         first = [self.leaf(leaf) for leaf in part.leaves][0]
         self.unions = self.unions or len(part.leaves) > 1
-        map_row, nodes = jnp.ones(6, self.dtype), (0, 0, 0)
+        map_row, nodes = jnp.zeros(9, self.dtype), (0, 0, 0)
         if part.support is not None:
-            nodes = part.support.distance.shape
-            self._distances.append(part.support.distance.ravel().astype(self.dtype))
-            map_row = jnp.concatenate([part.support.origin, part.support.spacing]).astype(self.dtype)
-        self.kinds.append((first, len(part.leaves), int(part.by_gradient), self._n_distances, *nodes))
+            distance, origin, spacing = part.support.distance, part.support.origin, part.support.spacing
+            nodes = distance.shape
+            # No point is further from its nearest node than half a cell's diagonal.
+            bounds = distance - 0.5 * jnp.sqrt(jnp.sum(spacing**2))
+            self._distances.append(bounds.ravel().astype(self.dtype))
+            extent = (jnp.array(nodes, spacing.dtype) - 1) * spacing
+            map_row = jnp.concatenate([origin, extent, 1 / spacing]).astype(self.dtype)
+        self.kinds.append((first, len(part.leaves), int(part.by_gradient), self._n_distances, *nodes[1:]))
         self._n_distances += int(np.prod(nodes))
         self._parts.append(jnp.concatenate([part.edge.astype(self.dtype)[None], map_row]))
 
@@ -337,7 +341,7 @@ class _Fields:
         distances = jnp.concatenate([*self._distances, jnp.zeros(0, self.dtype)])
         return {
             "scene.patches.fields.parts": (
-                jnp.stack(self._parts) if self._parts else jnp.zeros((0, 7), self.dtype)
+                jnp.stack(self._parts) if self._parts else jnp.zeros((0, 10), self.dtype)
             ),
             "scene.patches.fields.distances": distances[:, None],
         }

@@ -10,6 +10,8 @@ DEGREES = frozenset({1, 2, 3})
 """Degrees of the splines of sampled distances and densities."""
 UNIONS = True
 """Whether a solid has several leaves, or a density several parts."""
+POINTS = True
+"""Whether there are contacts with a point law."""
 PATCHES = True
 """Whether there are contacts with a patch law."""
 TURNING = frozenset({0, 1, 2})

@@ -45,13 +45,15 @@ class Part:
 
     Attributes:
         edge: Width of the smooth edge of a solid, 0 for none [m].
-        map_origin: First node of the map of distances to where a grid's density is positive [m, leaf].
-        map_spacing: Between its nodes [m].
+        map_origin: First node of the map that says how far it is to where a grid's density is positive [m, leaf].
+        map_extent: From its first to its last node [m].
+        map_resolution: Its nodes per length [1/m].
     """
 
     edge: real
     map_origin: vec3
-    map_spacing: vec3
+    map_extent: vec3
+    map_resolution: vec3
 
 
 @wp.struct
@@ -64,8 +66,7 @@ class PartKind:
         by_gradient: 1 where the outward direction is the gradient of the distance: of boxes, cylinders, sampled
             distances and unions; 0 where the shape knows a direction of its own.
         first_distance: Place of the first number of the map.
-        map_x: Its nodes along x.
-        map_y: Along y.
+        map_y: Its nodes along y.
         map_z: Along z.
     """
 
@@ -73,7 +74,6 @@ class PartKind:
     leaves: wp.int32
     by_gradient: wp.int32
     first_distance: wp.int32
-    map_x: wp.int32
     map_y: wp.int32
     map_z: wp.int32
 
@@ -85,8 +85,8 @@ class Fields:
     Attributes:
         parts: Shape (worlds, parts).
         kinds: Shape (parts,).
-        distances: Lower bounds on the distance from the nodes of all maps to where the density is positive [m],
-            shape (worlds, nodes).
+        distances: Lower bounds on the distance to where the density is positive [m], from any point whose nearest
+            node it is, of all maps, shape (worlds, nodes).
     """
 
     parts: wp.array2d(dtype=Part)
@@ -144,12 +144,16 @@ class View:
     Attributes:
         rotation: Frame of the samples → frame of the field.
         origin: Of the samples' frame [m, frame of the field].
+        is_plane: Whether the field is one half-space, whose distance is linear in the coordinates of samples.
+        reach: How far from a half-space its density ends: half its edge [m].
         plane: Unit normal of a half-space in the samples' frame, and the plane's distance below its origin [m].
         normal: The unit normal in the field's frame.
     """
 
     rotation: mat33
     origin: vec3
+    is_plane: bool
+    reach: real
     plane: vec4
     normal: vec3
 
@@ -215,11 +219,11 @@ def outward(kind: LeafKind, leaf: Leaf, x: vec3, d: Distance) -> vec3:
 
 
 @wp.func
-def grid_density(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: vec3) -> Density:
-    """The spline φ of a grid, which is zero where no node reaches, and d = −∇φ in units of the leaf."""
+def grid_density(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec3) -> Density:
+    """The spline φ of a grid, which is zero where no node reaches, and d = −∇φ, at a point in axes of the leaf."""
     found = Density()
-    y = in_leaf(leaf, x) - leaf.sizes
-    place = vec3(y[0] / leaf.spacing[0], y[1] / leaf.spacing[1], y[2] / leaf.spacing[2])
+    x = y - leaf.sizes
+    place = vec3(x[0] / leaf.spacing[0], x[1] / leaf.spacing[1], x[2] / leaf.spacing[2])
     reach = HALF * real(kind.degree + 1)
     border = 2 * (kind.degree + 1) + 1
     lowest = wp.min(place[0], wp.min(place[1], place[2]))
@@ -236,14 +240,43 @@ def grid_density(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: vec3
 
 
 @wp.func
-def part_density(solids: Solids, world: int, part: Part, kind: PartKind, solid: Solid, x: vec3) -> Density:
+def map_distance(fields: Fields, world: int, part: Part, kind: PartKind, y: vec3) -> real:
+    """Lower bound on the distance [m] from a point, in axes of the leaf, to where a grid's density is positive.
+
+    Outside the box of the map, with the way b to it and the bound d there, √(b² + d²): the density is in the box.
+    """
+    u = y - part.map_origin
+    inside = vec3(
+        wp.clamp(u[0], ZERO, part.map_extent[0]),
+        wp.clamp(u[1], ZERO, part.map_extent[1]),
+        wp.clamp(u[2], ZERO, part.map_extent[2]),
+    )
+    i = int(inside[0] * part.map_resolution[0] + HALF)
+    j = int(inside[1] * part.map_resolution[1] + HALF)
+    k = int(inside[2] * part.map_resolution[2] + HALF)
+    bound = fields.distances[world, kind.first_distance + (i * kind.map_y + j) * kind.map_z + k]
+    away = u - inside
+    squared = wp.dot(away, away)
+    if squared > ZERO:
+        positive = wp.max(bound, ZERO)
+        bound = wp.sqrt(squared + positive * positive)
+    return bound
+
+
+@wp.func
+def part_density(
+    solids: Solids, fields: Fields, world: int, part: Part, kind: PartKind, solid: Solid, x: vec3
+) -> Density:
     """Density of one part, at a point [m, F]."""
     found = Density()
     is_grid = bool(False)
     if wp.static(DENSITY in KINDS):
         is_grid = solid.kind.kind == _DENSITY
         if is_grid:
-            found = grid_density(solids, world, solid.kind, solid.leaf, x)
+            y = in_leaf(solid.leaf, x)
+            # Most samples that come here lie beside the density, where the map saves the spline.
+            if map_distance(fields, world, part, kind, y) <= ZERO:
+                found = grid_density(solids, world, solid.kind, solid.leaf, y)
     if not is_grid:
         d = solid_distance(solids, world, solid, x)
         found.value = occupancy(d.value, part.edge)
@@ -275,36 +308,15 @@ def field_of(solids: Solids, fields: Fields, world: int, first: int, count: int)
 @wp.func
 def density(solids: Solids, fields: Fields, world: int, field: Field, x: vec3) -> Density:
     """Density of a field at a point [m, F]: that of the densest part."""
-    found = part_density(solids, world, field.part, field.kind, field.solid, x)
+    found = part_density(solids, fields, world, field.part, field.kind, field.solid, x)
     if wp.static(UNIONS):
         for i in range(field.first + 1, field.first + field.count):
             kind = fields.kinds[i]
             solid = part_solid(solids, world, kind)
-            other = part_density(solids, world, fields.parts[world, i], kind, solid, x)
+            other = part_density(solids, fields, world, fields.parts[world, i], kind, solid, x)
             if other.value > found.value:
                 found = other
     return found
-
-
-@wp.func
-def map_distance(fields: Fields, world: int, part: Part, kind: PartKind, y: vec3) -> real:
-    """Lower bound on the distance [m] from a point, in axes of the leaf, to where a grid's density is positive.
-
-    A distance falls by no more than the way gone. From outside the map, the way to its edge counts, too.
-    """
-    s = part.map_spacing
-    u = y - part.map_origin
-    place = vec3(u[0] / s[0], u[1] / s[1], u[2] / s[2])
-    inside = vec3(
-        wp.clamp(place[0], ZERO, real(kind.map_x - 1)),
-        wp.clamp(place[1], ZERO, real(kind.map_y - 1)),
-        wp.clamp(place[2], ZERO, real(kind.map_z - 1)),
-    )
-    node = vec3(wp.round(inside[0]), wp.round(inside[1]), wp.round(inside[2]))
-    at = (int(node[0]) * kind.map_y + int(node[1])) * kind.map_z + int(node[2])
-    way = wp.length(wp.cw_mul(place - node, s))
-    outside = wp.length(wp.cw_mul(place - inside, s))
-    return wp.max(fields.distances[world, kind.first_distance + at] - way, outside)
 
 
 @wp.func
@@ -339,15 +351,6 @@ def field_clearance(solids: Solids, fields: Fields, world: int, field: Field, x:
 
 
 @wp.func
-def is_plane(field: Field) -> bool:
-    """Whether a field is one half-space, whose distance is linear in the coordinates of samples."""
-    plane = bool(False)
-    if wp.static(HALF_SPACE in KINDS):
-        plane = field.solid.kind.kind == _HALF_SPACE and field.count == 1 and field.kind.leaves == 1
-    return plane
-
-
-@wp.func
 def view_of(field: Field, sampled: Frame, queried: Frame) -> View:
     """A field as the samples of another body see it."""
     view = View()
@@ -355,8 +358,10 @@ def view_of(field: Field, sampled: Frame, queried: Frame) -> View:
     view.rotation = inverse * sampled.rotation
     view.origin = inverse * (sampled.origin - queried.origin)
     if wp.static(HALF_SPACE in KINDS):
-        if is_plane(field):
+        view.is_plane = field.solid.kind.kind == _HALF_SPACE and field.count == 1 and field.kind.leaves == 1
+        if view.is_plane:
             leaf = field.solid.leaf
+            view.reach = HALF * field.part.edge
             view.normal = leaf.rotation * leaf.sizes
             n = wp.transpose(view.rotation) * view.normal
             height = wp.dot(view.normal, view.origin - leaf.position) - leaf.factor * leaf.length
@@ -374,9 +379,11 @@ def plane_distance(view: View, point: vec3) -> real:
 def seen_density(solids: Solids, fields: Fields, world: int, field: Field, view: View, point: vec3) -> Density:
     """Density of a field at a point in the samples' frame; the direction is in the field's."""
     found = Density()
-    if is_plane(field):
-        found.value = occupancy(plane_distance(view, point), field.part.edge)
-        found.direction = view.normal
+    if view.is_plane:
+        height = plane_distance(view, point)
+        if height <= view.reach:
+            found.value = occupancy(height, field.part.edge)
+            found.direction = view.normal
     else:
         found = density(solids, fields, world, field, view.rotation * point + view.origin)
     return found
@@ -386,8 +393,8 @@ def seen_density(solids: Solids, fields: Fields, world: int, field: Field, view:
 def seen_clearance(solids: Solids, fields: Fields, world: int, field: Field, view: View, point: vec3) -> real:
     """Lower bound on the distance [m] from a point in the samples' frame to where the density is positive."""
     clearance = ZERO
-    if is_plane(field):
-        clearance = plane_distance(view, point) - HALF * field.part.edge
+    if view.is_plane:
+        clearance = plane_distance(view, point) - view.reach
     else:
         clearance = field_clearance(solids, fields, world, field, view.rotation * point + view.origin)
     return clearance

@@ -92,7 +92,10 @@ def sums_of_samples(
                 sample = scene.patches.samples[world, s]
                 found = seen_density(scene.solids, scene.patches.fields, world, field, view, sample.point)
                 if found.value > ZERO:
-                    sums = added(sums, sample_sums(sample, found))
+                    one = sample_sums(sample, found)
+                    sums.share += one.share
+                    sums.moment += one.moment
+                    sums.direction += one.direction
     return sums
 
 

@@ -9,7 +9,7 @@ from dano.engine.kernels.patches import find_patches
 from dano.engine.kernels.search import find_contacts, fix_laws
 from dano.engine.kernels.solve import Options, solve, Solved
 from dano.engine.kernels.tables import Push, Room, Scene, StateRow, StepReport
-from dano.physics.features import LANES, PATCHES
+from dano.physics.features import LANES, PATCHES, POINTS
 from dano.physics.momentum import angular_momentum, turned_inertia
 from dano.physics.pairs import BodyState
 from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
@@ -153,7 +153,10 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                 push = launch.pushes[world, t * n + i]
             size = wp.max(size, begin_body(scene, room, world, i, row, push))
         wait()
-        n_found, overflow = find_contacts(scene, room, world, lane)
+        n_found = int(0)
+        overflow = bool(False)
+        if wp.static(POINTS):
+            n_found, overflow = find_contacts(scene, room, world, lane)
         n_near = n_found
         if wp.static(PATCHES):
             n_near = find_patches(scene, room, world, lane, n_found)
@@ -171,7 +174,8 @@ def rollout(scene: Scene, room: Room, launch: Launch):
         rebound = real(1.0)
         while again:
             rebound = ONE - real(attempt) / real(_REBOUNDS)
-            fix_laws(scene, room, world, lane, n_found, rebound)
+            if wp.static(POINTS):
+                fix_laws(scene, room, world, lane, n_found, rebound)
             wait()
             solved = solve(scene, room, world, lane, n_found, size, launch.options)
             again = False

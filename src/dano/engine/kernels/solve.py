@@ -22,7 +22,7 @@ from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, find_pattern, solve_blocks
 from dano.engine.kernels.patches import add_patches, fit_patch_duals, follow_patch_duals
 from dano.engine.kernels.tables import Room, Scene
-from dano.physics.features import LANES, PATCHES
+from dano.physics.features import LANES, PATCHES, POINTS
 from dano.physics.real import HALF, INFINITY, ONE, real, vec6, ZERO
 
 LEVELS = 11
@@ -247,7 +247,8 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
         for i in range(m):
             room.best[world, i] = room.velocity[world, i]
             room.step[world, i] = vec6()
-    fit_duals(scene, room, world, lane, n_found)
+    if wp.static(POINTS):
+        fit_duals(scene, room, world, lane, n_found)
     if wp.static(PATCHES):
         fit_patch_duals(scene, room, world, lane, n_found)
     found = Solved()
@@ -326,7 +327,8 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
                     for i in range(m):
                         room.step[world, i] = part * room.step[world, i]
                 wait()
-                follow_duals(scene, room, world, lane, n_found, search.length)
+                if wp.static(POINTS):
+                    follow_duals(scene, room, world, lane, n_found, search.length)
                 if wp.static(PATCHES):
                     follow_patch_duals(scene, room, world, lane, n_found)
                 # The next pass is no longer of the same function where bounds are renewed: it is accepted.
