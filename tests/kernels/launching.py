@@ -65,7 +65,18 @@ class Arguments:
         }
         for place, rows in filled.items():
             self.put(place, rows)
-        of_moving = ("momentum", "inertia", "velocity", "tried", "best", "step", "residual", "scale", "order", "counts")
+        of_moving = (
+            "momentum",
+            "inertia",
+            "velocity",
+            "tried",
+            "best",
+            "step",
+            "residual",
+            "scale",
+            "order",
+            "counts",
+        )
         lengths = {"bodies": n, "found": len(pairs), **dict.fromkeys(of_moving, m)}
         give_room(self.room, {**lengths, **dict.fromkeys(("blocks", "spare", "used", "later"), m * m)})
         of_contacts = dict.fromkeys(self.room.patches._cls.vars, len(pairs))
@@ -75,7 +86,9 @@ class Arguments:
     def of_scene(cls, scene):
         """Those of a scene."""
         rows = [
-            np.concatenate([[b.mass * b.mass_scale], np.ravel(b.inertia * b.mass_scale), b.com + b.com_offset])
+            np.concatenate(
+                [[b.mass * b.mass_scale], np.ravel(b.inertia * b.mass_scale), b.com + b.com_offset]
+            )
             for b in scene.bodies
         ]
         options = {"gravity": np.asarray(scene.gravity), "timestep": float(scene.timestep)}

@@ -1,4 +1,4 @@
-"""Kernels of the centroid law, against its functions in JAX and today's steps."""
+"""Kernels of the centroid law, against its functions in JAX and the steps of the engine."""
 
 import jax
 import jax.numpy as jnp
@@ -61,7 +61,9 @@ def press(
     motion = law.patch_motion(patch.normal, velocity, spin)
     duals = law.fitting_patch_duals(material, patch.overlap, pulls, motion)
     zero = wp.float64(0.0)
-    linear = law.linearized_patch(material, patch.overlap, pulls, motion, duals, wp.float64(1.0), False, zero, zero)
+    linear = law.linearized_patch(
+        material, patch.overlap, pulls, motion, duals, wp.float64(1.0), False, zero, zero
+    )
     linear_wrenches[i, j] = law.patch_wrench(material, patch.normal, motion, linear)
     jacobians[i, j] = law.patch_jacobian(material, patch.normal, motion, linear)
 
@@ -73,7 +75,8 @@ def test_wrench_and_jacobian():
     patch.overlap, patch.normal = 0.02, NORMAL
     shape = (len(LAWS), len(TWISTS))
     found = [
-        wp.zeros(shape, dtype=kind, device="cpu") for kind in (law.PatchWrench, law.PatchWrench, law.PatchJacobian)
+        wp.zeros(shape, dtype=kind, device="cpu")
+        for kind in (law.PatchWrench, law.PatchWrench, law.PatchJacobian)
     ]
     given = [
         wp.array(ptr=rows.ctypes.data, dtype=law.PatchMaterial, shape=(len(LAWS),), device="cpu"),
@@ -136,7 +139,8 @@ def test_overlap():
         plane = dano.Collider(dano.HalfSpace(normal), pose=dano.Pose((0.0, 0.0, -0.03), (1.0, 0.1, 0.0, 0.0)))
         pairs.append((ball_collider, plane) if normal[2] > 0 else (plane, ball_collider))
     listed = [
-        PatchPair(2 * i, 2 * i + 1, a, b, dano.ContactParams(), CentroidLaw()) for i, (a, b) in enumerate(pairs)
+        PatchPair(2 * i, 2 * i + 1, a, b, dano.ContactParams(), CentroidLaw())
+        for i, (a, b) in enumerate(pairs)
     ]
     colliders = [each for pair in pairs for each in pair]
     bodies, states = np.zeros((len(colliders), 13)), np.zeros((len(colliders), 13))
@@ -153,7 +157,7 @@ def test_overlap():
 
 
 def test_steps():
-    """A ball that rolls, a box that comes to rest and sticks, and two objects on each other, as today's steps."""
+    """A ball that rolls, a box that sticks, and two objects on each other, beside steps of the engine."""
     field, samples, _ = blob()
     made = dano.NeuralObject.from_samples(
         points=0.1 * np.asarray(samples.points[:3].T)[:640],

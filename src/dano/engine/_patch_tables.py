@@ -35,7 +35,7 @@ from dano.scene import colliders, Scene, State
 
 # Samples of a block, blocks of a run: see `dano.engine.kernels.tables`.
 _BLOCK, _RUN = 16, 4
-# Numbers of `dano.physics.distances` and `overlap` for kinds of leaves, and what a leaf holds besides its pose.
+# Kinds of leaves in `dano.physics.distances` and `overlap`, and what a leaf holds besides its pose.
 _KINDS: dict[type, tuple[int, Any]] = {
     HalfSpace: (0, lambda s: {"sizes": s.normal_direction, "length": s.offset}),
     Sphere: (1, lambda s: {"sizes": jnp.stack([s.radius, 0 * s.radius, 0 * s.radius])}),
@@ -104,7 +104,9 @@ class _Placed(NamedTuple):
     position: Float[Array, "3"]
     rotation: Float[Array, "3 3"]
 
-    def inside(self, field: AbstractField, pose: Pose | None = None, factor: Array | None = None) -> "_Placed":
+    def inside(
+        self, field: AbstractField, pose: Pose | None = None, factor: Array | None = None
+    ) -> "_Placed":
         """What the field is made of."""
         dtype, position, rotation, size = self.factor.dtype, self.position, self.rotation, self.factor
         if factor is not None:
@@ -116,7 +118,7 @@ class _Placed(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """A part of a field: its leaves, edge width, whether its direction is the distance's gradient, and map."""
+    """A part of a field: its leaves, edge width, whether its direction is the distance's gradient, map."""
 
     leaves: list[_Placed]
     edge: Array
@@ -145,7 +147,12 @@ def patch_pairs(scene: Scene) -> list[PatchPair]:
 
 
 def patch_tables(
-    pairs: Sequence[PatchPair], dtype: DTypeLike, *, n_pairs: int = 0, n_leaves: int = 0, n_coefficients: int = 0
+    pairs: Sequence[PatchPair],
+    dtype: DTypeLike,
+    *,
+    n_pairs: int = 0,
+    n_leaves: int = 0,
+    n_coefficients: int = 0,
 ) -> PatchTables:
     """Tables of contacts.
 
@@ -195,7 +202,9 @@ def patch_tables(
 
 def _known(law: AbstractPatchLaw) -> CentroidLaw:
     if type(law) is not CentroidLaw:
-        raise ValueError(f"law must be CentroidLaw, the only patch law that kernels know, got {type(law).__name__}")
+        raise ValueError(
+            f"law must be CentroidLaw, the only patch law that kernels know, got {type(law).__name__}"
+        )
     return law
 
 
@@ -255,7 +264,9 @@ class _Samples:
     def rows(self) -> dict[str, Array]:
         """Their rows."""
         joined = [jnp.concatenate([s.points[:3], s.weights[None]]).T.astype(self.dtype) for s in self._sets]
-        balls = [jnp.concatenate([s.centers, s.radii[:, None]], axis=1).astype(self.dtype) for s in self._sets]
+        balls = [
+            jnp.concatenate([s.centers, s.radii[:, None]], axis=1).astype(self.dtype) for s in self._sets
+        ]
         none = jnp.zeros((0, 4), self.dtype)
         return {
             "scene.patches.samples": jnp.concatenate([*joined, none]),
@@ -369,7 +380,7 @@ def _parts_of(placed: _Placed, support: Support | None) -> list[_Part]:
         edge = placed.factor * field.edge_width.astype(placed.factor.dtype)
         return [_Part(_leaves_of(placed), edge, not isinstance(inner, _OWN_DIRECTION), None)]
     raise ValueError(
-        "field must be a grid of densities or made of shapes, posed, scaled or joined, for contact to ask it, got "
+        "field must be a grid of densities or made of shapes, posed, scaled or joined, got "
         f"{type(field).__name__}: dano.bake(field).grid is a grid of it"
     )
 
@@ -386,7 +397,7 @@ def _leaves_of(placed: _Placed) -> list[_Placed]:
     if type(shape) not in _KINDS:
         known = ", ".join(kind.__name__ for kind in _KINDS if kind is not GridField)
         raise ValueError(
-            f"shape must be one that contact knows ({known}, posed, scaled or joined), got {type(shape).__name__}:"
-            " a SignedDistanceGrid may stand for any other"
+            f"shape must be one that contact knows ({known}, posed, scaled or joined), got "
+            f"{type(shape).__name__}: a SignedDistanceGrid may stand for any other"
         )
     return [placed]

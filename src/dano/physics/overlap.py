@@ -3,8 +3,8 @@
     ψ = m Σ w φ(x),    ψ χ = m Σ w φ(x) x,    n ∝ Σ w φ(x) d(x)
 
 over the weighted samples of one body in the density φ of another, whose outward direction is d. A field is a
-run of *parts*, and as dense as the densest of them. A part is a solid, inside of which φ is 1 and outside 0 with
-a smooth edge between, or a grid of densities: a leaf of kind `DENSITY`.
+run of *parts*, and as dense as the densest of them. A part is a solid, inside of which φ is 1 and outside 0
+with a smooth edge between, or a grid of densities: a leaf of kind `DENSITY`.
 """
 
 import warp as wp
@@ -35,7 +35,7 @@ _DENSITY, _HALF_SPACE, _GRID = wp.constant(DENSITY), wp.constant(HALF_SPACE), wp
 _SPHERE, _CAPSULE, _ELLIPSOID = wp.constant(SPHERE), wp.constant(CAPSULE), wp.constant(ELLIPSOID)
 # Sampled distances may grow faster than true ones: see the search for point contacts.
 _STEEPEST = wp.constant(real(1.5))
-# Below this share of a body's mass an overlap counts as none: ψ² must not underflow where χ is differentiated.
+# Below this share of a body's mass an overlap counts as none: ψ² must not underflow in derivatives of χ.
 _NEGLIGIBLE = wp.constant(real(1e-12))
 
 
@@ -45,7 +45,7 @@ class Part:
 
     Attributes:
         edge: Width of the smooth edge of a solid, 0 for none [m].
-        map_origin: First node of the map that says how far it is to where a grid's density is positive [m, leaf].
+        map_origin: First node of the map of distances to where a grid's density is positive [m, leaf].
         map_extent: From its first to its last node [m].
         map_resolution: Its nodes per length [1/m].
     """
@@ -63,8 +63,8 @@ class PartKind:
     Attributes:
         first_leaf: Of its solid, or its grid.
         leaves: How many leaves the solid has.
-        by_gradient: 1 where the outward direction is the gradient of the distance: of boxes, cylinders, sampled
-            distances and unions; 0 where the shape knows a direction of its own.
+        by_gradient: 1 where the outward direction is the gradient of the distance: of boxes, cylinders,
+            sampled distances and unions; 0 where the shape knows a direction of its own.
         first_distance: Place of the first number of the map.
         map_y: Its nodes along y.
         map_z: Along z.
@@ -85,8 +85,8 @@ class Fields:
     Attributes:
         parts: Shape (worlds, parts).
         kinds: Shape (parts,).
-        distances: Lower bounds on the distance to where the density is positive [m], from any point whose nearest
-            node it is, of all maps, shape (worlds, nodes).
+        distances: Lower bounds on the distance to where the density is positive [m], from any point whose
+            nearest node it is, of all maps, shape (worlds, nodes).
     """
 
     parts: wp.array2d(dtype=Part)
@@ -146,7 +146,7 @@ class View:
         origin: Of the samples' frame [m, frame of the field].
         is_plane: Whether the field is one half-space, whose distance is linear in the coordinates of samples.
         reach: How far from a half-space its density ends: half its edge [m].
-        plane: Unit normal of a half-space in the samples' frame, and the plane's distance below its origin [m].
+        plane: Unit normal of a half-space in the samples' frame, and the height of their origin above it [m].
         normal: The unit normal in the field's frame.
     """
 
@@ -220,7 +220,7 @@ def outward(kind: LeafKind, leaf: Leaf, x: vec3, d: Distance) -> vec3:
 
 @wp.func
 def grid_density(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec3) -> Density:
-    """The spline φ of a grid, which is zero where no node reaches, and d = −∇φ, at a point in axes of the leaf."""
+    """The spline φ of a grid, zero where no node reaches, and d = −∇φ, at a point in axes of the leaf."""
     found = Density()
     x = y - leaf.sizes
     place = vec3(x[0] / leaf.spacing[0], x[1] / leaf.spacing[1], x[2] / leaf.spacing[2])
@@ -235,15 +235,18 @@ def grid_density(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec3
         d = grid_spline(solids, world, kind, place)
         g = d.gradient
         found.value = d.value
-        found.direction = -(leaf.rotation * vec3(g[0] / leaf.spacing[0], g[1] / leaf.spacing[1], g[2] / leaf.spacing[2]))
+        found.direction = -(
+            leaf.rotation * vec3(g[0] / leaf.spacing[0], g[1] / leaf.spacing[1], g[2] / leaf.spacing[2])
+        )
     return found
 
 
 @wp.func
 def map_distance(fields: Fields, world: int, part: Part, kind: PartKind, y: vec3) -> real:
-    """Lower bound on the distance [m] from a point, in axes of the leaf, to where a grid's density is positive.
+    """Lower bound on the distance [m] from a point, in axes of the leaf, to where the density is positive.
 
-    Outside the box of the map, with the way b to it and the bound d there, √(b² + d²): the density is in the box.
+    Outside the box of the map, with the way b to it and the bound d there, √(b² + d²): what is positive
+    lies in the box.
     """
     u = y - part.map_origin
     inside = vec3(
@@ -269,7 +272,7 @@ def part_density(
 ) -> Density:
     """Density of one part, at a point [m, F]."""
     found = Density()
-    is_grid = bool(False)
+    is_grid = False
     if wp.static(DENSITY in KINDS):
         is_grid = solid.kind.kind == _DENSITY
         if is_grid:
@@ -325,7 +328,7 @@ def part_clearance(
 ) -> real:
     """Lower bound on the distance [m] from a point [m, F] to where a part's density is positive."""
     clearance = ZERO
-    is_grid = bool(False)
+    is_grid = False
     if wp.static(DENSITY in KINDS):
         is_grid = solid.kind.kind == _DENSITY
         if is_grid:
@@ -376,7 +379,9 @@ def plane_distance(view: View, point: vec3) -> real:
 
 
 @wp.func
-def seen_density(solids: Solids, fields: Fields, world: int, field: Field, view: View, point: vec3) -> Density:
+def seen_density(
+    solids: Solids, fields: Fields, world: int, field: Field, view: View, point: vec3
+) -> Density:
     """Density of a field at a point in the samples' frame; the direction is in the field's."""
     found = Density()
     if view.is_plane:
@@ -455,8 +460,9 @@ def patch_of(sums: Sums, mass: real) -> Patch:
 def cap_patch(center: vec3, radius: real, mass: real, normal: vec3, height: real) -> Patch:
     """A homogeneous ball with a half-space, in closed form: the spherical cap below the plane.
 
-    With depth h of the lowest point, V = π h² (3 r − h)/3, and the cap's centroid lies 3 (2 r − h)²/(4 (3 r − h))
-    from the ball's centre. Exact and smooth where sampling would make a ball rattle as it rolls.
+    With depth h of the lowest point, V = π h² (3 r − h)/3, and the cap's centroid lies
+    3 (2 r − h)²/(4 (3 r − h)) from the ball's centre. Exact and smooth where
+    sampling would make a ball rattle as it rolls.
 
     Args:
         center: Of the ball [m, W].

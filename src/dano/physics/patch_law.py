@@ -12,7 +12,7 @@ import math
 
 import warp as wp
 
-from dano.physics.friction import Friction, friction, friction_with_dual, following_friction
+from dano.physics.friction import following_friction, Friction, friction, friction_with_dual
 from dano.physics.overlap import Patch
 from dano.physics.real import mat33, ONE, real, vec3, ZERO
 
@@ -178,12 +178,14 @@ def smooth_gain(material: PatchMaterial, speed: real) -> real:
 
 @wp.func
 def smooth_friction(material: PatchMaterial, u: vec3, bound: real, bound_damping: real) -> Friction:
-    """b c(u) of the smooth direction of friction, and its derivative."""
+    """B c(u) of the smooth direction of friction, and its derivative."""
     found = Friction()
     speed = wp.length(u)
     gain = smooth_gain(material, speed)
     scaled = material.smoothing * speed
-    slope = (_TWO_OVER_PI * material.smoothing / (ONE + scaled * scaled) - gain) / (material.regularizer + speed)
+    slope = (_TWO_OVER_PI * material.smoothing / (ONE + scaled * scaled) - gain) / (
+        material.regularizer + speed
+    )
     found.value = (-bound * gain) * u
     found.by_rate = (bound_damping * gain) * u
     found.grip = bound * gain
@@ -195,7 +197,7 @@ def smooth_friction(material: PatchMaterial, u: vec3, bound: real, bound_damping
 
 @wp.func
 def friction_of(material: PatchMaterial, u: vec3, bound: real) -> vec3:
-    """b c(u), of whichever kind the material has."""
+    """B c(u), of whichever kind the material has."""
     found = vec3()
     if material.stiction > ZERO:
         found = friction(u, bound, material.stiction)
@@ -263,7 +265,9 @@ def linearized_patch(
 
 
 @wp.func
-def patch_wrench(material: PatchMaterial, normal: vec3, motion: PatchMotion, linear: PatchLinear) -> PatchWrench:
+def patch_wrench(
+    material: PatchMaterial, normal: vec3, motion: PatchMotion, linear: PatchLinear
+) -> PatchWrench:
     """The wrench of a linearised law: the law's own, whatever the duals."""
     found = PatchWrench()
     slide = linear.slide.value + linear.slide.change - (linear.drag * material.sliding_drag) * motion.slip

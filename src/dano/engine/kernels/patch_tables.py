@@ -33,8 +33,8 @@ class PatchSideIndex:
         blocks: How many there are.
         first_part: Of the field.
         parts: How many it has.
-        ball: Leaf of the sampled body where it is a ball on a half-space, whose overlap has a closed form; else
-            −1.
+        ball: Leaf of the sampled body where it is a ball on a half-space, whose overlap has a closed form;
+            else −1.
     """
 
     sampled: wp.int32

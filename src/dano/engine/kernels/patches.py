@@ -1,8 +1,8 @@
 """Contacts with a patch law: the overlaps of a step, and what they add to its equations.
 
-Overlaps are those of the configuration at the start of the step. Three filters, each finer than the one before,
-leave out samples that cannot lie in the field: a ball around all of a body, balls around runs of blocks, and
-balls around blocks. What touches is listed in `Room.found` behind the pairs with points.
+Overlaps are those of the configuration at the start of the step. Three filters, each finer than the one
+before, leave out samples that cannot lie in the field: a ball around all of a body, balls around runs of
+blocks, and balls around blocks. What touches is listed in `Room.found` behind the pairs with points.
 """
 
 import warp as wp
@@ -41,7 +41,6 @@ from dano.physics.patch_law import (
     PatchDuals,
     PatchJacobian,
     PatchLinear,
-    PatchMaterial,
     PatchMotion,
     PatchWrench,
 )
@@ -73,7 +72,7 @@ def sums_of_samples(
 ) -> Sums:
     """Sums over the samples of a side, those of a lane only."""
     sums = Sums()
-    beyond = int(0)
+    beyond = 0
     for i in range(lane, index.blocks, _LANES):
         b = index.first_block + i
         listed = True
@@ -100,7 +99,9 @@ def sums_of_samples(
 
 
 @wp.func
-def cap_of(scene: Scene, world: int, ball: int, field: Field, sampled: Frame, queried: Frame, mass: real) -> Patch:
+def cap_of(
+    scene: Scene, world: int, ball: int, field: Field, sampled: Frame, queried: Frame, mass: real
+) -> Patch:
     """Overlap of a ball with a half-space."""
     radius = scene.solids.leaves[world, ball].sizes[0]
     leaf = field.solid.leaf
@@ -131,7 +132,9 @@ def contact_patch(scene: Scene, room: Room, world: int, lane: int, c: int) -> Pa
                 patch.normal = sign * patch.normal
         else:
             view = view_of(field, sampled, queried)
-            if reaches(scene, world, field, view, vec4(side.middle[0], side.middle[1], side.middle[2], side.radius)):
+            if reaches(
+                scene, world, field, view, vec4(side.middle[0], side.middle[1], side.middle[2], side.radius)
+            ):
                 own = sums_of_samples(scene, world, lane, index, field, view)
                 own.share = total(own.share)
                 own.moment = total3(own.moment)
@@ -144,7 +147,9 @@ def contact_patch(scene: Scene, room: Room, world: int, lane: int, c: int) -> Pa
 
 @wp.func
 def find_patches(scene: Scene, room: Room, world: int, lane: int, n_found: int) -> int:
-    """Overlaps of all contacts with a patch law, in `room.patches`; what touches is listed behind `n_found` pairs.
+    """Overlaps of all contacts with a patch law, in `room.patches`.
+
+    What touches is listed behind `n_found` pairs.
 
     Returns:
         Number of pairs that are listed now.
@@ -297,7 +302,13 @@ def add_patches(scene: Scene, room: Room, world: int, lane: int, n_found: int, t
             found = room.found[world, (n_found + k) * _LANES]
             c = contact_of(scene, found)
             add_contact(
-                scene, room, world, found, m, room.patches.wrenches[world, c], room.patches.jacobians[world, c]
+                scene,
+                room,
+                world,
+                found,
+                m,
+                room.patches.wrenches[world, c],
+                room.patches.jacobians[world, c],
             )
     fit.unfit += total(unfit)
     fit.push += total(push)
