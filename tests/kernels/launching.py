@@ -112,9 +112,10 @@ def empty(structure):
     """Arrays without rows, in all places of a structure."""
     for field, variable in structure._cls.vars.items():
         kind = variable.type
-        if hasattr(kind, "vars"):
-            empty(getattr(structure, field))
-        elif hasattr(kind, "ndim"):
+        if not hasattr(kind, "ndim"):
+            if hasattr(kind, "vars"):
+                empty(getattr(structure, field))
+        else:
             setattr(structure, field, wp.zeros((1, 0)[-kind.ndim :], dtype=kind.dtype, device="cpu"))
 
 

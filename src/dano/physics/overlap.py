@@ -272,7 +272,7 @@ def part_density(
 ) -> Density:
     """Density of one part, at a point [m, F]."""
     found = Density()
-    is_grid = False
+    is_grid = bool(False)
     if wp.static(DENSITY in KINDS):
         is_grid = solid.kind.kind == _DENSITY
         if is_grid:
@@ -328,7 +328,7 @@ def part_clearance(
 ) -> real:
     """Lower bound on the distance [m] from a point [m, F] to where a part's density is positive."""
     clearance = ZERO
-    is_grid = False
+    is_grid = bool(False)
     if wp.static(DENSITY in KINDS):
         is_grid = solid.kind.kind == _DENSITY
         if is_grid:

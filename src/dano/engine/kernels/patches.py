@@ -72,7 +72,7 @@ def sums_of_samples(
 ) -> Sums:
     """Sums over the samples of a side, those of a lane only."""
     sums = Sums()
-    beyond = 0
+    beyond = int(0)
     for i in range(lane, index.blocks, _LANES):
         b = index.first_block + i
         listed = True
