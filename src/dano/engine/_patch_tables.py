@@ -321,8 +321,10 @@ class _Fields:
         if part.support is not None:
             distance, origin, spacing = part.support.distance, part.support.origin, part.support.spacing
             nodes = distance.shape
-            # No point is further from its nearest node than half a cell's diagonal.
+            # No point is further from its nearest node than half a cell's diagonal. Where a node is away from
+            # what is positive, nothing is around it, however near what is positive may be.
             bounds = distance - 0.5 * jnp.sqrt(jnp.sum(spacing**2))
+            bounds = jnp.where(distance > 0, jnp.maximum(bounds, jnp.finfo(bounds.dtype).tiny), bounds)
             self._distances.append(bounds.ravel().astype(self.dtype))
             extent = (jnp.array(nodes, spacing.dtype) - 1) * spacing
             map_row = jnp.concatenate([origin, extent, 1 / spacing]).astype(self.dtype)

@@ -197,7 +197,7 @@ def occupancy(distance: real, edge: real) -> real:
     return t * t * (real(3.0) - TWO * t)
 
 
-@wp.func
+@wp.func(inline=True)
 def in_leaf(leaf: Leaf, x: vec3) -> vec3:
     """A point of the field's frame in the axes of a leaf [m]."""
     return (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position))
@@ -218,7 +218,7 @@ def outward(kind: LeafKind, leaf: Leaf, x: vec3, d: Distance) -> vec3:
     return direction
 
 
-@wp.func
+@wp.func(inline=True)
 def grid_density(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec3) -> Density:
     """The spline φ of a grid, zero where no node reaches, and d = −∇φ, at a point in axes of the leaf."""
     found = Density()
@@ -241,7 +241,7 @@ def grid_density(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec3
     return found
 
 
-@wp.func
+@wp.func(inline=True)
 def map_distance(fields: Fields, world: int, part: Part, kind: PartKind, y: vec3) -> real:
     """Lower bound on the distance [m] from a point, in axes of the leaf, to where the density is positive.
 
@@ -266,7 +266,7 @@ def map_distance(fields: Fields, world: int, part: Part, kind: PartKind, y: vec3
     return bound
 
 
-@wp.func
+@wp.func(inline=True)
 def part_density(
     solids: Solids, fields: Fields, world: int, part: Part, kind: PartKind, solid: Solid, x: vec3
 ) -> Density:
@@ -277,7 +277,7 @@ def part_density(
         is_grid = solid.kind.kind == _DENSITY
         if is_grid:
             y = in_leaf(solid.leaf, x)
-            # Most samples that come here lie beside the density, where the map saves the spline.
+            # Most samples that come here lie beside what is positive, where the map saves the spline.
             if map_distance(fields, world, part, kind, y) <= ZERO:
                 found = grid_density(solids, world, solid.kind, solid.leaf, y)
     if not is_grid:
@@ -308,7 +308,7 @@ def field_of(solids: Solids, fields: Fields, world: int, first: int, count: int)
     return field
 
 
-@wp.func
+@wp.func(inline=True)
 def density(solids: Solids, fields: Fields, world: int, field: Field, x: vec3) -> Density:
     """Density of a field at a point [m, F]: that of the densest part."""
     found = part_density(solids, fields, world, field.part, field.kind, field.solid, x)
@@ -322,7 +322,7 @@ def density(solids: Solids, fields: Fields, world: int, field: Field, x: vec3) -
     return found
 
 
-@wp.func
+@wp.func(inline=True)
 def part_clearance(
     solids: Solids, fields: Fields, world: int, part: Part, kind: PartKind, solid: Solid, x: vec3
 ) -> real:
@@ -340,7 +340,7 @@ def part_clearance(
     return clearance
 
 
-@wp.func
+@wp.func(inline=True)
 def field_clearance(solids: Solids, fields: Fields, world: int, field: Field, x: vec3) -> real:
     """Lower bound on the distance [m] from a point [m, F] to where a field's density is positive."""
     clearance = part_clearance(solids, fields, world, field.part, field.kind, field.solid, x)
@@ -372,13 +372,13 @@ def view_of(field: Field, sampled: Frame, queried: Frame) -> View:
     return view
 
 
-@wp.func
+@wp.func(inline=True)
 def plane_distance(view: View, point: vec3) -> real:
     """Signed distance [m] of a half-space from a point in the samples' frame."""
     return view.plane[0] * point[0] + view.plane[1] * point[1] + view.plane[2] * point[2] + view.plane[3]
 
 
-@wp.func
+@wp.func(inline=True)
 def seen_density(
     solids: Solids, fields: Fields, world: int, field: Field, view: View, point: vec3
 ) -> Density:
@@ -394,7 +394,7 @@ def seen_density(
     return found
 
 
-@wp.func
+@wp.func(inline=True)
 def seen_clearance(solids: Solids, fields: Fields, world: int, field: Field, view: View, point: vec3) -> real:
     """Lower bound on the distance [m] from a point in the samples' frame to where the density is positive."""
     clearance = ZERO

@@ -59,14 +59,14 @@ def frame_of(state: BodyState) -> Frame:
     return frame
 
 
-@wp.func
+@wp.func(inline=True)
 def reaches(scene: Scene, world: int, field: Field, view: View, ball: vec4) -> bool:
     """Whether a ball in the samples' frame may reach to where the density is positive."""
     middle = vec3(ball[0], ball[1], ball[2])
     return seen_clearance(scene.solids, scene.patches.fields, world, field, view, middle) <= ball[3]
 
 
-@wp.func
+@wp.func(inline=True)
 def sums_of_samples(
     scene: Scene, world: int, lane: int, index: PatchSideIndex, field: Field, view: View
 ) -> Sums:
@@ -77,13 +77,11 @@ def sums_of_samples(
         b = index.first_block + i
         listed = True
         if wp.static(LANES == 1):
-            if i < beyond:
-                listed = False
-            elif i % _RUN == 0:
-                # Where a run of blocks is out of reach, all of them are.
+            # Where a run of blocks is out of reach, all of them are.
+            if i >= beyond and i % _RUN == 0:
                 if not reaches(scene, world, field, view, scene.patches.runs[world, b]):
                     beyond = i + _RUN
-                    listed = False
+            listed = i >= beyond
         if listed:
             listed = reaches(scene, world, field, view, scene.patches.balls[world, b])
         if listed:
