@@ -30,8 +30,10 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 # photographs that are rendered and trained on would then take twice as long.
 COMPILES_LONG = ("engine/test_gradients.py",)
 
-# Shapes and types are checked while tracing; kernels are compiled by Numba, which takes plain functions only.
-CHECKED = [path.stem for path in (REPOSITORY / "src" / "dano").iterdir() if path.stem != "native"]
+# Shapes and types are checked while tracing; kernels are compiled by Numba and Warp, which take plain
+# functions only.
+COMPILED = ("native", "physics")
+CHECKED = [path.stem for path in (REPOSITORY / "src" / "dano").iterdir() if path.stem not in COMPILED]
 install_import_hook([f"dano.{name}" for name in CHECKED], "beartype.beartype")
 
 

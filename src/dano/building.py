@@ -1,8 +1,11 @@
 """How to make a neural object of a field: what `dano build`, scene files and Python let one choose."""
 
 import dataclasses
+from typing import Literal
 
 from dano.objects import MassModel
+
+Units = Literal["m", "cm", "mm", "in", "ft", "um"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -17,6 +20,7 @@ class BuildOptions:
         mass_scale: Mass per unit of density and cubic metre [kg]; default 1.
         mass: Total mass [kg], instead of the mass scale.
         resolution: Cells along the longest axis for mass integrals and sampling.
+        units: Unit of the lengths in the file; default: as meshes say or their size tells, else metres.
         length: Scale the field so that the object's longest extent is this [m].
         floaters: Parts that are separate from the largest one feel contact, too; those of meshes always do.
         seed: Seed of the random samples.
@@ -28,6 +32,7 @@ class BuildOptions:
     mass_scale: float | None = None
     mass: float | None = None
     resolution: int = 96
+    units: Units | None = None
     length: float | None = None
     floaters: bool = False
     seed: int = 0

@@ -176,5 +176,7 @@ def checked_path(name: str, value: object) -> Path:
 def _known_as(kind: type) -> str:
     """How users write a class: dano.Scene, dano.vision.Camera."""
     package = kind.__module__.split("._")[0]
+    if package == "builtins":
+        return kind.__name__
     public = getattr(sys.modules.get("dano"), kind.__name__, None) is kind
     return f"dano.{kind.__name__}" if public else f"{package}.{kind.__name__}"

@@ -3,11 +3,40 @@
 import difflib
 from collections.abc import Iterable
 
+_ELSEWHERE = {
+    "bodies": ("body", "object", "objects", "link", "geom"),
+    "contacts": ("contact", "pair", "pairs"),
+    "joints": ("joint",),
+    "robots": ("robot",),
+    "loops": ("loop", "equality"),
+    "timestep": ("dt", "step", "time_step", "h"),
+    "n_steps": ("steps",),
+    "duration": ("time", "length", "t_end"),
+    "half_space": ("plane", "ground", "floor", "table", "halfspace"),
+    "sphere": ("ball",),
+    "box": ("cube", "cuboid"),
+    "half_extents": ("size", "extents", "extent", "dimensions", "half_size"),
+    "semi_axes": ("size", "radii", "axes"),
+    "sliding_friction": ("friction", "mu", "friction_coefficient"),
+    "restitution": ("bounce", "bounciness", "elasticity"),
+    "position": ("pos", "xyz", "translation", "location"),
+    "orientation": ("quat", "quaternion", "rotation", "rot", "rpy", "euler"),
+    "velocity": ("vel", "linear_velocity"),
+    "omega": ("angular_velocity", "spin", "angvel"),
+    "object": ("mesh", "file", "path", "model"),
+    "half_length": ("length", "height", "size"),
+    "fixed": ("static", "kinematic"),
+}
+"""What other programs call things that have names here."""
+
 
 def did_you_mean(name: object, valid: Iterable[str]) -> str:
     """What to append, such as "; did you mean 'radius'?" where a valid name is nearly the given one."""
     if not isinstance(name, str):
         return ""
     lower = {word.lower(): word for word in valid}
+    for word in lower.values():
+        if name.lower() in _ELSEWHERE.get(word, ()):
+            return f"; did you mean {word!r}?"
     near = difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.7)
     return f"; did you mean {lower[near[0]]!r}?" if near else ""

@@ -52,26 +52,27 @@ def test_shells_complete_commands(run):
         ("compare mug.dano", "mug_meshes.html"),
     ],
 )
-def test_outputs_are_named_after_inputs(words, name, tmp_path, monkeypatch, capsys):
+def test_outputs_are_named_after_inputs(words, name, tmp_path, monkeypatch):
     here = tmp_path / "here"
     (here / "shots" / "images").mkdir(parents=True)
     monkeypatch.chdir(here)
     command = parse(words.split())
     assert output_of(command) is UNNAMED
-    assert output_of(named(command)) == Path(name)
-    assert capsys.readouterr().err == f"dano: writing {name}\n"
+    ready, line = named(command)
+    assert (output_of(ready), line) == (Path(name), f"wrote {name}")
     assert output_of(parse([*words.split(), "-o", "x"])) == Path("x")
 
 
-def test_what_is_there_is_kept(tmp_path, monkeypatch, capsys):
+def test_what_is_there_is_kept(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for taken in ("mug_run.npz", "mug_run_2.npz", "photos.dano"):
         Path(taken).touch()
-    assert output_of(named(Simulate(Path("mug.dano")))) == Path("mug_run_3.npz")
-    assert "writing mug_run_3.npz, because mug_run.npz is there already" in capsys.readouterr().err
-    assert output_of(named(Train(Path("photos")))) == Path("photos_2.dano")
+    ready, line = named(Simulate(Path("mug.dano")))
+    assert output_of(ready) == Path("mug_run_3.npz")
+    assert line == "wrote mug_run_3.npz, because mug_run.npz was there already"
+    assert output_of(named(Train(Path("photos")))[0]) == Path("photos_2.dano")
     # A training that goes on has its checkpoint beside the first name.
-    assert output_of(named(Train(Path("photos"), resume=True))) == Path("photos.dano")
+    assert output_of(named(Train(Path("photos"), resume=True))[0]) == Path("photos.dano")
     os.symlink("nowhere", "link.npz")
     assert free_path(Path("link.npz")) == Path("link_2.npz")
 
@@ -79,5 +80,5 @@ def test_what_is_there_is_kept(tmp_path, monkeypatch, capsys):
 def test_an_object_is_simulated_without_further_options(run, egg, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     answer = run("simulate", egg, "--steps", 5)
-    assert answer.code == 0 and answer.err == "dano: writing egg_run.npz\n"
+    assert answer.code == 0 and answer.err == "dano: wrote egg_run.npz\n"
     assert Path("egg_run.npz").exists()

@@ -97,13 +97,16 @@ def test_bad_input_files(command, kind, run, egg, tmp_path):
 
 
 def test_one_kind_for_another(run, egg, field, scene, tmp_path):
-    answer = run("inspect", field)
-    assert answer.code == 2
-    assert field.name in answer.err
-    for source in (field, egg.with_suffix(".toml")):
-        answer = run("simulate", source, "-o", tmp_path / "run.npz")
-        assert answer.code == 2
-        assert source.name in answer.err
+    # Of a field an object is built, and that is said.
+    answer = run("inspect", field, "--no-png")
+    assert answer.code == 0 and "an object was built of it with defaults" in answer.err
+    missing = egg.with_suffix(".toml")
+    answer = run("simulate", missing, "-o", tmp_path / "run.npz")
+    assert answer.code == 2 and missing.name in answer.err
+    assert list(tmp_path.iterdir()) == [scene]
+    for word in ("simulate", "inspect"):
+        answer = run(word, "bunn")
+        assert answer.code == 2 and "did you mean 'bunny'?" in answer.err
     assert list(tmp_path.iterdir()) == [scene]
 
 

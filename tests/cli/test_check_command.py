@@ -173,3 +173,40 @@ def test_the_command(run, scene):
     assert report["bodies"][0]["samples"] == 800
     assert run("check", scene, "--seconds", -1).code == 2
     assert jnp.isfinite(report["cost"]["total_seconds"])
+
+
+def test_a_ball_that_starts_in_the_floor_is_above_it():
+    found = foretold(scene_of(z=-0.01))
+    assert "support" not in found
+    deep = foretold(scene_of(z=-0.5))
+    assert "nothing fixed that 'ball' may touch is below it" in deep["support"]
+
+
+@pytest.mark.parametrize(
+    ("radius", "mass", "said"), [(30.0, 0.1, "less than air"), (0.001, 1.0, "than any metal")]
+)
+def test_sizes_and_masses_in_other_units_are_odd(radius, mass, said):
+    text = BALL_ON_FLOOR.format(**{**USUAL, "z": 2 * radius})
+    text = text.replace("radius = 0.05", f"radius = {radius}").replace("mass = 1.0", f"mass = {mass}")
+    assert said in foretold(parse_scene(text, Path("scene.toml")))["sizes"]
+    assert "sizes" not in foretold(scene_of())
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("[[bodies]]", "[[body]]"), "did you mean 'bodies'"),
+        (('shape = "half_space"', 'shape = "plane"'), "did you mean 'half_space'"),
+        (("sliding_friction", "friction"), "did you mean 'sliding_friction'"),
+        (("n_steps = 40", "n_steps = 40\nduration = 1.0"), "say the same, got 1.0 and 40: keep one"),
+        (("n_steps = 40", ""), "needs either duration .s. or n_steps, got neither"),
+        (
+            ('shape = "sphere"\nradius = 0.05', 'shape = "box"\nsize = [1, 1, 1]'),
+            "did you mean 'half_extents'",
+        ),
+    ],
+)
+def test_words_of_other_programs(change, said):
+    text = BALL_ON_FLOOR.format(**USUAL).replace(*change)
+    with pytest.raises(ValueError, match=said):
+        parse_scene(text, Path("scene.toml"))

@@ -118,8 +118,11 @@ def test_import_says_that_a_mesh_is_rather_in_millimetres(run, tmp_path):
     options = ("-o", tmp_path / "box.npz", "--resolution", 16)
     answer = run("import", mesh, *options)
     assert answer.code == 0
-    assert "the field is 137 m wide" in answer.err and "give --scale" in answer.err
-    assert run("import", mesh, *options, "--scale", 0.001).err == ""
+    assert "120 units long" in answer.err and "read as millimetres, 0.12 m" in answer.err
+    for told in (("--scale", 0.001), ("--units", "mm")):
+        assert run("import", mesh, *options, *told).err == ""
+    answer = run("import", mesh, *options, "--scale", 1)
+    assert "the field is 137 m wide" in answer.err and "give --units" in answer.err
 
 
 def test_a_second_part_of_a_mesh_feels_contact(run, tmp_path):

@@ -247,7 +247,7 @@ BAD = {
     "no TOML": ("n_steps = ", "must be a TOML scene file"),
     "unknown key": ("n_steps = 1\nspeed = 2\n" + BODY, "unknown key 'speed'; valid keys are timestep"),
     "no length": (BODY, "either duration [s] or n_steps"),
-    "both lengths": ("n_steps = 1\nduration = 1.0\n" + BODY, "either duration [s] or n_steps"),
+    "both lengths": ("n_steps = 1\nduration = 1.0\n" + BODY, "say the same"),
     "long": ("duration = 1e9\n" + BODY, "steps of 1 bodies, got 1e+11 of 0.01 s"),
     "endless": ("timestep = 1e-300\nduration = 1e300\n" + BODY, "steps of 1 bodies, got inf of"),
     "zero steps": ("n_steps = 0\n" + BODY, "n_steps must be ≥ 1, got 0"),

@@ -1,5 +1,9 @@
 """The same Gaussian written for JAX, NumPy and PyTorch."""
 
+import os
+import subprocess
+import sys
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -109,6 +113,33 @@ def test_a_large_batch_through_the_host_does_not_hang():
     x = jnp.asarray(np.random.default_rng(1).uniform(-0.5, 0.5, (3, 200_000)))
     value = eqx.filter_jit(lambda x: 2 * field.jet(jnp.sin(x), 0))(x)
     np.testing.assert_allclose(value, 2 * gaussian_jax(jnp.sin(x).T), rtol=1e-12)
+
+
+ON_ONE_CORE = """
+import os
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import jax, jax.numpy as jnp, numpy as np
+from dano.fields import CallableField
+field = CallableField(lambda x: np.exp(-np.sum(x**2, axis=1)), [(-1, -1, -1), (1, 1, 1)], "numpy")
+evaluate = jax.jit(lambda x: 2 * field.jet(jnp.sin(x), 0))
+one_by_one = jax.jit(jax.vmap(field.density))
+x = np.random.default_rng(0).uniform(-1, 1, (3, 65_536))
+expected = np.exp(-np.sum(np.sin(x) ** 2, axis=0))
+for k in range(30):
+    got = evaluate(jnp.asarray(x) + 0)
+    assert np.abs(got - 2 * expected).max() < 1e-5, k
+assert np.abs(one_by_one(jnp.sin(x).T) - expected).max() < 1e-5
+print("done")
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system pins no processes")
+def test_numpy_functions_answer_on_a_single_core():
+    # As in a container, under taskset or Slurm: jax.pure_callback of large arrays waits there for ever.
+    done = subprocess.run(
+        [sys.executable, "-c", ON_ONE_CORE], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.stdout == "done\n", done.stderr
 
 
 def test_the_arrays_of_an_equinox_module_are_leaves():

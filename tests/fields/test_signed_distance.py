@@ -1,5 +1,7 @@
 """Shapes from sampled distances and from meshes, against closed forms."""
 
+import contextlib
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -136,7 +138,8 @@ def test_meshes_are_read_scaled_and_repaired(trimesh, tmp_path):
     box.invert()
     path = tmp_path / "box.stl"
     box.export(path)
-    field = mesh_field(path, 24, scale=1e-3)
+    with pytest.warns(UserWarning, match="1 shells were inside out"):
+        field = mesh_field(path, 24, scale=1e-3)
     moments = field.solid_moments()
     assert moments is not None
     volume, centroid, second = moments
@@ -149,9 +152,9 @@ def test_meshes_are_read_scaled_and_repaired(trimesh, tmp_path):
 
 def test_meshes_that_enclose_nothing_are_refused(trimesh, tmp_path):
     box = trimesh.creation.box((0.2, 0.3, 0.4))
-    box.update_faces(np.arange(len(box.faces)) > 0)
-    with pytest.raises(ValueError, match="mesh must be watertight .* got 3 edges"):
-        mesh_field(box)
+    sheet = trimesh.Trimesh(box.vertices, box.faces[:1])
+    with pytest.raises(ValueError, match="the mesh must enclose a volume, got sheets"):
+        mesh_field(sheet)
     garbage = tmp_path / "garbage.obj"
     garbage.write_text("this is no mesh\n")
     with pytest.raises(ValueError, match="garbage.obj"):
@@ -192,7 +195,9 @@ def test_parts_of_a_mesh_make_their_union(trimesh):
         "inside out": ([cube, apart], 1e-3 + 8e-6, True),
     }
     for name, (meshes, volume, closed_form) in cases.items():
-        field = mesh_field(trimesh.util.concatenate(meshes), 64)
+        turned = name == "inside out"
+        with pytest.warns(UserWarning, match="1 shells") if turned else contextlib.nullcontext():
+            field = mesh_field(trimesh.util.concatenate(meshes), 64)
         assert occupied_volume(field) == pytest.approx(volume, rel=5e-3), name
         moments = field.solid_moments()
         assert (moments is not None) == closed_form, name

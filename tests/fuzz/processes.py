@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,6 +27,8 @@ from dano_start import main
 print("started", file=sys.stderr, flush=True)
 main()
 """
+CACHE = tempfile.mkdtemp(prefix="dano-tests-")
+"""What commands compile is compiled once."""
 WAIT = 240
 """Seconds after which a command counts as hanging."""
 MOMENTS = (0.2, 1.0, 2.0, 4.0, 7.0, 11.0)
@@ -53,7 +56,7 @@ def _start(folder: Path, *words: str, limit: int | None = None) -> subprocess.Po
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, str(-1 if limit is None else limit), *words],
         cwd=folder,
-        env={**os.environ, "DANO_CACHE_DIR": "off", "PYTHONPATH": os.pathsep.join(sys.path)},
+        env={**os.environ, "DANO_CACHE_DIR": CACHE, "PYTHONPATH": os.pathsep.join(sys.path)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -496,7 +496,7 @@ def changed(**options):
 def test_bad_input():
     at = lambda path: changed(where=path)  # noqa: E731
     refuse("at least one motion", observed=[])
-    refuse("observed must hold dano.Motion or dano.Trajectory objects", observed=[3])
+    refuse("observed must hold dano.Motion or dano.Trajectory or str or pathlib.Path objects", observed=[3])
     refuse("at least one Parameter", parameters=[])
     refuse("different names", parameters=[FRICTION, FRICTION])
     refuse("lower of parameter 'mu' must be ≤ upper", parameters=changed(lower=2.0))

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from dano.engine._instances import Features, instance
-from dano.engine._patch_tables import patch_pairs, patch_tables
+from dano.engine.launching import Features, instance
+from dano.engine.launching._patch_tables import patch_pairs, patch_tables
 
 # What the tests need, so that each module is compiled once for all of them.
 FEATURES = Features(
@@ -15,6 +15,8 @@ FEATURES = Features(
     TURNING=frozenset({0}),
     UNIONS=True,
     POINTS=False,
+    TREES=False,
+    LOOPS=False,
 )
 _MODULES = {"engine.kernels": ("tables", "rollout", "patches"), "physics": ("patch_law", "overlap", "real")}
 KERNELS = SimpleNamespace(
@@ -45,6 +47,7 @@ class Arguments:
         """
         tables, n, m = patch_tables(pairs, float), len(bodies), len(moving)
         self.scene, self.room = KERNELS.tables.Scene(), KERNELS.tables.Room()
+        self.scene.n_blocks = m
         self.kept: list[np.ndarray] = []
         empty(self.scene)
         empty(self.room)

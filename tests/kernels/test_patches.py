@@ -9,7 +9,7 @@ from kernels.launching import Arguments, KERNELS, rollout, touch
 
 import dano
 from dano.contact import CentroidLaw, SampleSet, Support
-from dano.engine._patch_tables import patch_pairs, patch_tables, PatchPair
+from dano.engine.launching._patch_tables import patch_pairs, patch_tables, PatchPair
 from dano.fields import CallableField, ScaledField
 from dano.maths import quat_from_matrix
 

@@ -31,10 +31,13 @@ BROKEN = {
         link("a", "") + link("b", BODY + MISSING) + joint("j", "a", "b"),
         "mesh must be a file, got .*no.stl, which does not exist",
     ),
-    "no mass": (link("a", "") + link("b", "") + joint("j", "a", "b"), "link 'b': mass must be > 0 kg"),
+    "no mass": (
+        link("a", "") + link("b", "") + joint("j", "a", "b"),
+        "mass must be > 0 kg.* got none for 'j'",
+    ),
     "zero inertia": (
         link("a", "") + link("b", BODY.replace('ixx="1"', 'ixx="0"')) + joint("j", "a", "b"),
-        "link 'b': inertia must be positive",
+        "the inertia about its axis, of what each joint moves by itself, got none for 'j'",
     ),
     "inertia of no body": (
         link("a", "") + link("b", BODY.replace('ixx="1"', 'ixx="5"')) + joint("j", "a", "b"),
@@ -141,11 +144,6 @@ def test_mjcf(tmp_path):
     np.testing.assert_allclose(numbers, [0.3, 0.1, 0.2, 3.0, np.deg2rad(10)])
     assert (third.mimics, float(third.ratio), float(third.shift)) == ("b", 2.0, 0.1)
     assert robot.touching == ("a", "b", "c")
-    path.write_text(
-        '<mujoco><worldbody><body><joint/><joint axis="0 1 0"/><geom size="1"/></body></worldbody></mujoco>'
-    )
-    with pytest.raises(ValueError, match="must have one joint, got 2"):
-        dano.load_mjcf(path)
     path.write_text("<mujoco><nothing/></mujoco>")
     with pytest.raises(ValueError, match="must be a file that MuJoCo reads"):
         dano.load_mjcf(path)

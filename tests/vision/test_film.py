@@ -89,6 +89,32 @@ def test_folders_of_frames_with_alpha_and_masks(tmp_path):
         read_film(frames, rate=30.0, masks=masks)
 
 
+def test_a_part_of_a_film(tmp_path):
+    frames, masks = tmp_path / "frames", tmp_path / "masks"
+    frames.mkdir()
+    masks.mkdir()
+    for i, pixels in enumerate(pictures(12)):
+        Image.fromarray(pixels).save(frames / f"{i:02d}.png")
+        Image.fromarray(np.where(np.arange(256).reshape(16, 16) == i, 255, 0).astype(np.uint8)).resize(
+            (pixels.shape[1], pixels.shape[0]), Image.Resampling.NEAREST
+        ).save(masks / f"{i:02d}.png")
+    film = read_film(frames, rate=10.0, since=0.4, until=0.9, every=2, masks=masks)
+    assert film.names == ("04.png", "06.png", "08.png")
+    np.testing.assert_allclose(film.times, [0, 0.2, 0.4])
+    whole = read_film(frames, rate=10.0, masks=masks)
+    for k, i in enumerate((4, 6, 8)):
+        np.testing.assert_array_equal(film.masks[k], whole.masks[i])
+    video = tmp_path / "v.mp4"
+    write_video(video, pictures(12), [40 * i for i in range(12)])
+    part = read_film(video, since=0.1, until=0.3)
+    np.testing.assert_allclose(part.times, 0.04 * np.arange(5), atol=1e-3)
+    assert part.names == ("3", "4", "5", "6", "7")
+    with pytest.raises(ValueError, match="2 frames from 9 to inf s, got 0"):
+        read_film(video, since=9.0)
+    with pytest.raises(ValueError, match="since must be before until"):
+        read_film(video, since=2.0, until=1.0)
+
+
 def test_large_frames_are_averaged(tmp_path):
     frames = tmp_path / "frames"
     frames.mkdir()

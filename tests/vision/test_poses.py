@@ -284,6 +284,14 @@ def test_a_video_leaves_its_frames_or_nothing(tmp_path: Path):
         estimate_poses(tmp_path / "walk.mp4", frames=tmp_path / "frames")
     with pytest.raises(ValueError, match="frames must be a folder for the frames"):
         estimate_poses(tmp_path / "walk.mp4")
+    part = PoseOptions(frames=10, features=FEW, since=0.05, until=10.0)
+    film(tmp_path / "back.mp4", [camera(0.1 * i, 0.7) for i in range(12)])
+    both = [tmp_path / "walk.mp4", tmp_path / "back.mp4"]
+    with pytest.raises(ValueError, match="new or empty folder"):
+        estimate_poses(both, part, frames=tmp_path / "frames")
+    found = estimate_poses(both, part, frames=tmp_path / "both")
+    assert {p.name.split("_")[0] for p in found.pictures} == {"walk", "back"} and len(found.pictures) == 10
+    assert "walk_000000.png" not in {p.name for p in found.pictures}
     film(tmp_path / "still.mp4", [CAMERAS[0]] * 6)
     with pytest.raises(ValueError, match="nothing moves"):
         estimate_poses(tmp_path / "still.mp4", PoseOptions(frames=5, features=FEW), frames=tmp_path / "none")
@@ -291,7 +299,7 @@ def test_a_video_leaves_its_frames_or_nothing(tmp_path: Path):
     with pytest.raises(ValueError, match="cannot be read as a video"):
         estimate_poses(tmp_path / "broken.mp4", frames=tmp_path / "none")
     left = {path.name for path in tmp_path.iterdir()}
-    assert left == {"walk.mp4", "still.mp4", "broken.mp4", "frames"}
+    assert left == {"walk.mp4", "back.mp4", "still.mp4", "broken.mp4", "frames", "both"}
 
 
 def test_an_upright_video_is_turned(tmp_path: Path):

@@ -62,15 +62,20 @@ def _run(argv: list[str], keep: bool) -> None:
     import jax
 
     from dano.cli._compiled import compiled_programs
+    from dano.cli._console import say
     from dano.cli._outputs import named
 
     jax.config.update("jax_enable_x64", True)
     # Called from another program, JAX's settings are that program's.
-    with compiled_programs() if keep else contextlib.nullcontext(), warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.showwarning = _say_warning
         # What dano says of its results is heard whatever the process makes of warnings, once.
         warnings.simplefilter("default", UserWarning)
-        named(command)()
+        with compiled_programs() if keep else contextlib.nullcontext():
+            command, line = named(command)
+            command()
+            if line is not None:
+                say(line)
 
 
 def _say_warning(message: Warning | str, *_: object, **__: object) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg, Positional
 
-from dano.building import BuildOptions
+from dano.building import BuildOptions, Units
 
 UNNAMED = Path("<named after the input>")
 """Stands for an output that nobody named, see `dano.cli._outputs.named`; help shows it as the default."""
@@ -74,6 +74,7 @@ class Poses:
     Attributes:
         images: Folder of photographs (or one with `images` in it), or a video, whose frames are written
             beside the output.
+        further: More of them, of the same object in the same place.
         output: Where to write the cameras, such as transforms.json.
         masks: Folder with a mask for each photograph, bright where the object is; default: `masks` in or
             beside the folder of photographs, or their alpha channel.
@@ -92,7 +93,9 @@ class Poses:
         distortion: Known k1 k2 p1 p2 of OpenCV's model.
         lens: What is estimated of the lens: radial (focal length and k1), pinhole (focal length), full (two
             focal lengths, k1, k2, p1, p2).
-        frames: Most frames of a video.
+        frames: Most frames of a video, or of several together.
+        since: Take frames of videos from this time on [s].
+        until: Take frames of videos up to this time [s].
         features: Most points of a photograph.
         model: Which model to write if photographs fall into several, from 1, the largest.
         seed: Seed of all random numbers.
@@ -100,6 +103,7 @@ class Poses:
     """
 
     images: Positional[Path]
+    further: Positional[tuple[Path, ...]] = ()
     output: Output = UNNAMED
     masks: Path | None = None
     features_on: Literal["auto", "everything", "object", "surroundings"] = "auto"
@@ -113,6 +117,8 @@ class Poses:
     distortion: tuple[float, float, float, float] | None = None
     lens: Literal["radial", "pinhole", "full"] = "radial"
     frames: int = 80
+    since: Annotated[float | None, arg(name="from")] = None
+    until: Annotated[float | None, arg(name="to")] = None
     features: int = 3000
     model: int = 1
     seed: int = 0
@@ -158,7 +164,7 @@ class Build:
 
     Attributes:
         field: Density grid (.npz with values, origin, spacing), voxels (.npy), mesh (.obj, .stl, …), object
-            (.dano), or what `dano import` reads.
+            (.dano), a shipped one (bunny, soap, …), or what `dano import` reads.
         output: Where to write the object, usually *.dano.
         options: How to make it.
         json: Print one JSON object instead of text.
@@ -183,16 +189,18 @@ class Import:
     Attributes:
         file: nerfstudio checkpoint (.ckpt), instant-ngp snapshot (.ingp, .msgpack), Gaussian splats (.ply),
             OpenVDB or NanoVDB grid (.vdb, .nvdb), PyTorch module (.pt2, .pt, .pth), voxels (.npy, .npz),
-            model of dano (.npz), mesh (.obj, .stl, .ply, .off, .glb, .gltf), or a function as
-            package.module:name.
+            model of dano (.npz), mesh (.obj, .stl, .ply, .off, .glb, .gltf, .3mf, .dae, .step), a shipped one
+            (bunny, soap, trained_bunny, trained_soap), or a function as package.module:name.
         output: Where to write the grid (.npz).
         crop: Box to keep: lowest x y z, highest x y z, in the file's frame and units.
-        scale: Length of a unit of the file [m].
+        scale: Length of a unit of the file [m]; default: as meshes say or their size tells, else 1.
+        units: The same by name.
         position: Moves the scaled field [m].
         orientation: Turns the scaled field before it is moved; quaternion w x y z.
         resolution: Nodes along the longest axis, for files that hold no grid; default 128, for meshes as many
             as their walls need.
         interpolation: How the grid is interpolated between its nodes; default: as the format has it.
+        skip_nan: Gaussian splats: leave out those with numbers that are not finite; how many is said.
         hollow: Gaussian splats: do not fill the inside. Splats lie on surfaces, so their inside is empty.
         spacing: Voxels (.npy): distance between voxels in the file's units; default: longest side 1.
         origin: Voxels (.npy): centre of the first voxel.
@@ -208,11 +216,13 @@ class Import:
     file: Positional[str]
     output: Output = UNNAMED
     crop: tuple[float, float, float, float, float, float] | None = None
-    scale: float = 1.0
+    scale: float | None = None
+    units: Units | None = None
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     resolution: int | None = None
     interpolation: Literal["linear", "quadratic", "cubic"] | None = None
+    skip_nan: bool = False
     hollow: bool = False
     spacing: float | None = None
     origin: tuple[float, float, float] | None = None
@@ -235,7 +245,8 @@ class Inspect:
     """Print an object's mass properties and samples, and draw it; or a robot's tree and what is odd.
 
     Attributes:
-        object: A neural object (.dano), or a robot (.urdf, or a .xml of MuJoCo).
+        object: A neural object (.dano), a shipped one (bunny, soap, trained_bunny, trained_soap), a mesh or
+            field, which is built with defaults, or a robot (.urdf, or a .xml of MuJoCo).
         png: Where to draw it; default: beside the object.
         no_png: Draw nothing.
         json: Print one JSON object instead of text.
@@ -258,7 +269,8 @@ class Simulate:
     """Simulate a scene, or drop an object onto a floor. Of two scenes: both, to compare them.
 
     Attributes:
-        scene: A scene file (.toml), or a neural object (.dano) that is dropped onto a floor.
+        scene: A scene file (.toml); or what is dropped onto a floor: a neural object (.dano), a shipped one
+            (bunny, soap, trained_bunny, trained_soap), or a mesh or field, which is built with defaults.
         beside: Another one, to compare with.
         output: Where to write the trajectory, usually *.npz; of two scenes the folder for both.
         video: Where to write a video (.mp4); two scenes are side by side in it.
@@ -360,7 +372,7 @@ class Export:
     convex pieces. README.md in the folder says what the format cannot hold.
 
     Attributes:
-        object: A neural object (.dano).
+        object: A neural object (.dano), a shipped one (bunny, …), or a mesh or field.
         output: The folder; new, empty, or of an earlier export, which is replaced.
         to: Formats, one or several: mjcf (MuJoCo), urdf (PyBullet, ROS), usd (Isaac), obj (meshes only).
         name: Of the body and the files; default: the object's file's.
@@ -405,7 +417,7 @@ class Compare:
         output: The page (.html).
         field: The density that meshes are made of; default: the object's own, which has no floaters left.
         truth: The true solid (a closed mesh, or a signed distance), in the frame of the object.
-        truth_scale: Length of a unit of its file [m].
+        truth_scale: Length of a unit of its file [m]; default: as meshes say or their size tells, else 1.
         levels: Densities of the surfaces; default: five from near nothing to the density inside.
         drops: Random orientations to drop from.
         no_decomposition: Leave out convex pieces, which take many minutes for a ragged surface.
@@ -417,7 +429,7 @@ class Compare:
     output: Output = UNNAMED
     field: Path | None = None
     truth: Path | None = None
-    truth_scale: float = 1.0
+    truth_scale: float | None = None
     levels: tuple[float, ...] = ()
     drops: int = 3
     no_decomposition: bool = False

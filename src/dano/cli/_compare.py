@@ -6,8 +6,8 @@ from dano.cli._arguments import Compare
 from dano.cli._console import Progress, put, put_json
 from dano.cli._outputs import check_output
 from dano.fields import AbstractShape, load_field
-from dano.objects import NeuralObject
 from dano.report import verdict, write_comparison_report
+from dano.scene_file import load_object
 
 
 def compare(arguments: Compare) -> None:
@@ -15,7 +15,8 @@ def compare(arguments: Compare) -> None:
     inputs = [file for file in (arguments.object, arguments.field, arguments.truth) if file is not None]
     check_output(arguments.output, *inputs, suffix=".html")
     truth = None
-    checked_number("truth_scale", arguments.truth_scale, above=0)
+    if arguments.truth_scale is not None:
+        checked_number("truth_scale", arguments.truth_scale, above=0)
     if arguments.truth is not None:
         truth = load_field(arguments.truth, scale=arguments.truth_scale)
         if not isinstance(truth, AbstractShape):
@@ -24,7 +25,7 @@ def compare(arguments: Compare) -> None:
                 f" {arguments.truth}"
             )
     field = None if arguments.field is None else load_field(arguments.field)
-    made = NeuralObject.load(arguments.object)
+    made = load_object(arguments.object)
     progress = Progress()
     found = comparison.compare(
         made,

@@ -22,7 +22,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-VARIABLE = "DANO_CACHE_DIR"
+from dano.caches import cache_folder
+
 LIMIT = 64 * 2**20
 """Bytes of all entries; beyond, the oldest go."""
 
@@ -39,14 +40,14 @@ _FEATURES = ("vendor_id", "model name", "flags", "Features", "CPU implementer", 
 def compiled_programs() -> Iterator[None]:
     """Let JAX find and keep compiled programs until the block ends; for a process that ends with it, too.
 
-    The folder is `$DANO_CACHE_DIR`, or `dano` in the user's cache folder. Nothing is kept if the variable is
-    `off`, if JAX has a cache already, or where it is not known which instructions the processor has.
+    The folder is in `cache_folder`. Nothing is kept if there is none, if JAX has a cache already, or where it
+    is not known which instructions the processor has.
     """
     try:
         folder = _folder()
         own = None if folder is None else _own_folder(folder)
-    except (OSError, RuntimeError):
-        # No home, a full disk, a folder of somebody else: commands work without.
+    except OSError:
+        # A full disk, a folder of somebody else: commands work without.
         folder = own = None
     if folder is None or own is None:
         yield
@@ -64,15 +65,15 @@ def compiled_programs() -> Iterator[None]:
 
 def _folder() -> Path | None:
     """Where entries for this processor and this compiler are."""
-    chosen = os.environ.get(VARIABLE)
     features = _processor()
-    if chosen in ("", "off") or features is None or not hasattr(os, "getuid"):
+    if features is None or not hasattr(os, "getuid"):
         return None
     import jax
 
     if _setting("jax_compilation_cache_dir") or not _setting("jax_enable_compilation_cache"):
         return None
-    root = Path(chosen or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "dano"))
+    if (root := cache_folder()) is None:
+        return None
     said = "\n".join([jax.__version__, version("jaxlib"), platform.machine(), features])
     folder = root / "compiled" / hashlib.sha256(said.encode()).hexdigest()[:16]
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)

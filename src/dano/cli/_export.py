@@ -6,8 +6,7 @@ from dano.cli._arguments import Export
 from dano.cli._console import Progress, put, put_json
 from dano.contact import ContactParams
 from dano.exchange import check_folder, export_object, Exported
-from dano.objects import NeuralObject
-from dano.vision import LearnedField
+from dano.scene_file import load_object, object_look
 
 
 def export(arguments: Export) -> None:
@@ -15,7 +14,7 @@ def export(arguments: Export) -> None:
     check_folder(arguments.output)
     given = {"sliding_friction": arguments.friction, "restitution": arguments.restitution}
     parameters = ContactParams(**{key: value for key, value in given.items() if value is not None})
-    made = NeuralObject.load(arguments.object)
+    made = load_object(arguments.object)
     name = arguments.name
     if name is None:
         word = re.sub(r"\W", "_", arguments.object.stem, flags=re.ASCII)
@@ -25,7 +24,7 @@ def export(arguments: Export) -> None:
         made,
         arguments.output,
         name=name,
-        look=LearnedField.of_object(arguments.object),
+        look=object_look(arguments.object),
         contact=parameters,
         progress=progress,
         to=arguments.to,

@@ -9,7 +9,15 @@ import numpy as np
 from dano.cli._arguments import Import
 from dano.cli._console import numbers, Progress, put, put_json
 from dano.cli._outputs import check_output
-from dano.fields import bake, GridField, is_splats, load_field, save_field, SignedDistanceGrid
+from dano.fields import (
+    bake,
+    GridField,
+    is_splats,
+    load_field,
+    MESH_SUFFIXES,
+    save_field,
+    SignedDistanceGrid,
+)
 from dano.maths import Pose
 from dano.objects import fill_hollows, node_values
 
@@ -19,7 +27,7 @@ _USUAL = (1e-3, 20.0)
 
 def import_field(command: Import) -> None:
     """See `dano import --help`."""
-    file, output, resolution, scale = command.file, command.output, command.resolution, command.scale
+    file, output, resolution = command.file, command.output, command.resolution
     check_output(output, Path(file), suffix=".npz")
     if resolution is not None and not 4 <= resolution <= 1024:
         raise ValueError(f"resolution must lie between 4 and 1024 nodes, got {resolution}")
@@ -34,9 +42,14 @@ def import_field(command: Import) -> None:
         sampled = {} if resolution is None else {"resolution": resolution}
     elif splats:
         # Gaussians thinner than the distance between nodes would fall between them: a shell full of pores.
-        lower, upper = np.asarray(load_field(file, crop=box).bounds)
+        with warnings.catch_warnings():
+            # Said when it is read below.
+            warnings.simplefilter("ignore", UserWarning)
+            bad: dict[str, Any] = {"skip_nan": True} if command.skip_nan else {}
+            lower, upper = np.asarray(load_field(file, crop=box, **bad).bounds)
         sampled = {"min_width": 0.5 * float(np.max(upper - lower)) / (nodes - 1)}
-    field = load_field(file, crop=box, scale=scale, pose=pose, **sampled, **_of_format(command))
+    unit = {"scale": command.scale, "units": command.units}
+    field = load_field(file, crop=box, **unit, pose=pose, **sampled, **_of_format(command))
     kind, error = type(field).__name__, None
     if not isinstance(field, (GridField, SignedDistanceGrid)):
         interpolation = command.interpolation or "quadratic"
@@ -50,10 +63,11 @@ def import_field(command: Import) -> None:
     report = _described(field, output, file, kind) | {"filled": filled}
     report["bake_error"] = None if error is None else error.rms
     longest = float(np.max(np.ptp(np.asarray(field.bounds), axis=0)))
-    if scale == 1 and not _USUAL[0] <= longest <= _USUAL[1]:
+    stated = command.units is not None or command.scale not in (None, 1.0)
+    if not stated and not _USUAL[0] <= longest <= _USUAL[1]:
         warnings.warn(
-            f"the field is {longest:.3g} m wide; if the file is not in metres, give --scale, the length of"
-            " its unit [m] (0.001 for millimetres)",
+            f"the field is {longest:.3g} m wide; if the file is not in metres, give --units (mm, in, …) or"
+            " --scale, the length of its unit [m]",
             stacklevel=2,
         )
     put_json(report) if command.json else _print(report)
@@ -69,6 +83,7 @@ def _of_format(command: Import) -> dict[str, Any]:
         "grid": command.grid,
         "cascade": command.cascade,
         "module": command.module,
+        "skip_nan": command.skip_nan or None,
         "undo_transform": False if command.keep_transform else None,
     }
     return {name: value for name, value in options.items() if value is not None}
@@ -79,7 +94,7 @@ def _kind(file: str) -> str:
     suffix = Path(file).suffix.lower()
     if suffix == ".ply" and Path(file).is_file():
         return "splats" if is_splats(Path(file)) else "mesh"
-    return "mesh" if suffix in (".obj", ".stl", ".off", ".glb", ".gltf") else ""
+    return "mesh" if suffix in MESH_SUFFIXES else ""
 
 
 def _described(field: GridField | SignedDistanceGrid, output: Path, file: str, kind: str) -> dict[str, Any]:

@@ -47,12 +47,14 @@ def poses(command: Poses) -> None:
         known_length=_known_length(command),
         up=command.up,
         frames=command.frames,
+        since=command.since,
+        until=command.until,
         model=command.model,
         seed=command.seed,
     )
     progress = Progress()
     found = estimate_poses(
-        command.images,
+        [command.images, *command.further] if command.further else command.images,
         options,
         masks=command.masks,
         frames=command.output.with_name(f"{command.output.stem}_frames"),

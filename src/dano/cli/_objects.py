@@ -14,7 +14,7 @@ from dano.cli._outputs import check_output, missing_for_pictures
 from dano.fields import load_field
 from dano.objects import Interior, NeuralObject
 from dano.robots import read_robot, robot_doubts, robot_tree
-from dano.scene_file import build_object
+from dano.scene_file import build_object, load_object
 
 # Names of files that hold robots end so.
 _ROBOTS = (".urdf", ".xml", ".mjcf")
@@ -29,7 +29,7 @@ def build(command: Build) -> None:
     check_output(output, command.field)
     progress = Progress()
     progress("reading the field", 0.0)
-    field = load_field(command.field)
+    field = load_field(command.field, units=options.units)
     made = build_object(field, options, dashes="--", progress=progress)
     progress.close()
     made.save(output)
@@ -57,7 +57,9 @@ def inspect(command: Inspect) -> None:
                 raise ImportError(missing)
             say(f"warning: not drawn, {missing}")
             picture = None
-    made = NeuralObject.load(path)
+    progress = Progress()
+    made = load_object(path, progress=progress)
+    progress.close()
     report = describe(made, path)
     if picture is not None:
         from dano.report import draw_object

@@ -17,7 +17,6 @@ from dano.cli._arguments import (
     Train,
     UNNAMED,
 )
-from dano.cli._console import say
 from dano.cli.tracking import Track
 from dano.extras import is_installed
 
@@ -34,18 +33,18 @@ _NAMED_AFTER: dict[type, tuple[str, str]] = {
 """Commands with the input that their output is named after, and what is appended to its name."""
 
 
-def named(command: Callable[[], None]) -> Callable[[], None]:
-    """The command with a name for its output, and a line that says it, if nobody gave one.
+def named(command: Callable[[], None]) -> tuple[Callable[[], None], str | None]:
+    """The command with a name for its output, and a line that says it once it is there, if nobody gave one.
 
     Outputs go to the current folder under the input's name; cameras go to their photographs, where
     `dano train` looks for them. A number is appended where there is something of this name already, unless an
     earlier training is to go on.
     """
     if getattr(command, "output", None) is not UNNAMED:
-        return command
+        return command, None
     fields: Any = command
     if isinstance(command, Simulate) and command.beside is not None:
-        return dataclasses.replace(command, output=Path())
+        return dataclasses.replace(command, output=Path()), None
     if isinstance(command, Poses):
         source = command.images
         folder = source.parent if source.name == "images" else source
@@ -54,8 +53,8 @@ def named(command: Callable[[], None]) -> Callable[[], None]:
         name, ending = _NAMED_AFTER[type(command)]
         usual = Path(_stem(getattr(fields, name)) + ending)
     output = usual if getattr(fields, "resume", False) else free_path(usual)
-    say(f"writing {output}" + ("" if output == usual else f", because {usual} is there already"))
-    return dataclasses.replace(fields, output=output)
+    line = f"wrote {output}" + ("" if output == usual else f", because {usual} was there already")
+    return dataclasses.replace(fields, output=output), line
 
 
 def run_files(folder: Path, scenes: Sequence[Path], *, resume: bool) -> list[Path]:

@@ -19,6 +19,7 @@ from dano.cli._console import Progress, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures, run_files
 from dano.engine import simulate as simulate_scene
 from dano.fields import FIELD_FORMATS, FIELD_SUFFIXES, load_field
+from dano.names import did_you_mean
 from dano.objects import NeuralObject
 from dano.scene import Scene, Trajectory
 from dano.vision import load_capture
@@ -38,6 +39,10 @@ def simulate(command: Simulate) -> None:
             check_output(picture, *scenes, suffix=suffix)
             if missing := missing_for_pictures(video=suffix == ".mp4"):
                 raise ImportError(missing)
+    if video is not None or strip is not None:
+        from dano.report import checked_size
+
+        checked_size(command.size, len(scenes))
     checked_number("slow_motion", command.slow_motion, above=0)
     check_distinct(output=outputs[0], video=video, strip=strip)
     clock = running.Clock(since_start=running.is_program())
@@ -66,6 +71,10 @@ def _outputs(command: Simulate, scenes: list[Path]) -> list[Path]:
         ValueError: If they cannot be written, or a scene is missing.
     """
     for scene in scenes:
+        if scene_file.is_shipped(scene):
+            continue
+        if not scene.exists() and (hint := did_you_mean(str(scene), scene_file.ASSETS)):
+            raise ValueError(f"scene must be a file or a shipped object, got {scene}{hint}")
         checked_input(scene)
     if len(scenes) == 1:
         check_output(command.output, scenes[0])
@@ -114,8 +123,13 @@ def view(command: View) -> None:
 
 def _kind(path: Path) -> str:
     """What is to be shown: a "run" or what is simulated to have one, a "field" or a "capture"."""
+    if scene_file.is_shipped(path):
+        return "run"
     if not path.exists():
-        raise ValueError(f"{path}: no such file or folder")
+        raise ValueError(
+            f"{path}: no such file or folder, and no shipped object"
+            + did_you_mean(str(path), scene_file.ASSETS)
+        )
     suffix = path.suffix.lower()
     if path.is_dir() or suffix == ".json":
         return "capture"
@@ -135,7 +149,7 @@ def _view_run(command: View) -> None:
     """A run; scenes and objects are simulated first."""
     progress = Progress()
     again = None
-    if command.source.suffix.lower() in (".toml", ".dano"):
+    if command.source.suffix.lower() in (".toml", ".dano") or scene_file.is_shipped(command.source):
         loaded = load(command.source, None, None)
         trajectory = running.roll_out(loaded, progress, running.Clock()).trajectory
         again = partial(_again, loaded)
@@ -350,8 +364,8 @@ class _Artist:
 def load(path: Path, steps: int | None, timestep: float | None) -> scene_file.SceneFile:
     """The scene in a file, or that of an object dropped onto a floor."""
     progress = Progress()
-    if path.suffix.lower() == ".dano":
-        text = scene_file.drop_scene(path)
+    if path.suffix.lower() != ".toml":
+        text = scene_file.drop_scene(path, progress=progress)
         where = path.with_suffix(".toml")
         loaded = scene_file.parse_scene(text, where, timestep=timestep, n_steps=steps, progress=progress)
     else:

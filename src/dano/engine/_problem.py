@@ -34,6 +34,7 @@ from dano.engine._rigid import angular_momentum, turned
 from dano.engine._sequential import one_at_a_time
 from dano.engine._trees import build_tree, Tree, tree_mobilities
 from dano.engine.joints import in_tables, tree_tables, TreeTables
+from dano.engine.launching import is_known, scene_tables, Tables
 from dano.maths import matmul, matvec, quat_to_matrix
 from dano.scene import colliders, Control, Poses, pressing_pairs, Scene, State, step_twists
 
@@ -47,6 +48,7 @@ class Prepared(eqx.Module):
         impacts: How they treat impacts.
         capacity: Chunks of points that a step has room for (static).
         trees: Tables of the trees, where machine code makes the whole step; else None.
+        tables: Tables of the scene, where kernels make the whole step; else None.
     """
 
     geometry: Geometry | None
@@ -54,6 +56,7 @@ class Prepared(eqx.Module):
     impacts: Impacts | None
     capacity: int = eqx.field(static=True)
     trees: TreeTables | None = None
+    tables: Tables | None = None
 
 
 class Problem(eqx.Module):
@@ -125,6 +128,7 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
         scene: The scene.
         capacity: Chunks of point contacts that a step has room for; None chooses by the bodies.
     """
+    check_laws(scene)
     groups = [(c.law, c.params) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
     if scene.others is not None:
         groups.append((scene.others.law, scene.others.pair_params))
@@ -151,7 +155,30 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
         sampled = [body.surface.points.shape[1] for body in scene.bodies if body.surface is not None]
         capacity = -(-sum(sampled) // CHUNK)
     impacts = Impacts(material.instant > 0, material.bounce)
-    return Prepared(geometry, jnp.stack(material), impacts, capacity)
+    tables = scene_tables(scene) if _has_kernels(scene) else None
+    return Prepared(geometry, jnp.stack(material), impacts, capacity, tables=tables)
+
+
+def _has_kernels(scene: Scene) -> bool:
+    """Whether kernels make the whole step of a scene: free bodies of known shapes, with the default law."""
+    alone = all(isinstance(contact.law, DistributedLaw) for contact in scene.contacts)
+    known = all(body.solid is None or is_known(body.solid) for body in scene.bodies)
+    return jax.default_backend() == "cpu" and alone and known and not scene.joints and not scene.loops
+
+
+def check_laws(scene: Scene) -> None:
+    """Check that an engine can turn each contact of a scene into forces.
+
+    Raises:
+        ValueError: If a contact has a law that is neither `DistributedLaw` nor one of a patch.
+    """
+    for contact in scene.contacts:
+        law = contact.law
+        if type(law) is not DistributedLaw and not isinstance(law, AbstractPatchLaw):
+            raise ValueError(
+                f"law of contact ({contact.a!r}, {contact.b!r}) must be a DistributedLaw, a CentroidLaw or "
+                f"another AbstractPatchLaw, got {type(law).__name__}, which no step would ask for forces"
+            )
 
 
 def structure_of(scene: Scene) -> Pairs:

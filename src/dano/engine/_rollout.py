@@ -47,6 +47,12 @@ class AbstractEngine(eqx.Module):
         """The engine with `factor` times the room for contacts that it chose; None if it did not choose."""
         return None
 
+    def rollout(
+        self, scene: Scene, prepared: Any, state: State, controls: Control | None, n_steps: int
+    ) -> tuple[State, Report] | None:
+        """Many timesteps at once; arrays with a leading axis of steps. None: `step` makes each of them."""
+        return None
+
     def touch(self, scene: Scene, prepared: Any, state: State) -> Patch:
         """Overlap of every pair that may touch at a state, arrays in the order of `scene.pairs`.
 
@@ -107,6 +113,13 @@ class VariationalEngine(AbstractEngine):
         """See `AbstractEngine.step`."""
         options = SolverOptions(self.tolerance, self.max_iterations)
         return _variational.step(scene, prepared, state, control, options)
+
+    def rollout(
+        self, scene: Scene, prepared: Any, state: State, controls: Control | None, n_steps: int
+    ) -> tuple[State, Report] | None:
+        """See `AbstractEngine.rollout`."""
+        options = SolverOptions(self.tolerance, self.max_iterations)
+        return _variational.rollout(prepared, state, controls, n_steps, options)
 
     def touch(self, scene: Scene, prepared: Any, state: State) -> Patch:
         """See `AbstractEngine.touch`."""
@@ -261,6 +274,10 @@ def _jitted_step(engine, scene, state, control):
 @compiled
 def _jitted_rollout(engine, scene, state, controls, n_steps, segment):
     prepared, state = engine.prepare(scene), scene.filled(state)
+    if not callable(controls):
+        found = engine.rollout(scene, prepared, state, controls, n_steps)
+        if found is not None:
+            return _with_start(state, found[0]), found[1]
 
     def advance(state, inputs):
         index, control = inputs
@@ -289,8 +306,12 @@ def _jitted_rollout(engine, scene, state, controls, n_steps, segment):
         if whole < n_steps:
             _, tail = scan(last, jax.tree.map(lambda x: x[whole:], steps))
             states, report = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), (states, report), tail)
-    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, states)
-    return states, report
+    return _with_start(state, states), report
+
+
+def _with_start(state: State, states: State) -> State:
+    """States with the one that they begin with."""
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, states)
 
 
 @compiled

@@ -22,7 +22,7 @@ from dano.engine._balance import (
     world_momenta,
     world_patches,
 )
-from dano.engine._kernels import is_native, native_root, POSES
+from dano.engine._kernels import POSES
 from dano.engine._newton import newton, solve_small, SolverOptions
 from dano.engine._primal_dual import Balance, primal_dual
 from dano.engine._problem import Pairs, Problem
@@ -53,12 +53,10 @@ def solve(problem: Problem, start: Array, pairs: Pairs, options: SolverOptions):
         options: When to stop.
     """
 
-    def find_root(problem, start, derivatives: bool):
+    def find_root(problem, start):
         """Velocities, Jacobian and report, and the share of the restitution that adds no energy."""
 
         def find(problem, start):
-            if is_native(problem):
-                return native_root(problem, start, pairs, options, derivatives=derivatives)
             find = _root_of_bodies if problem.tree is None else _root_of_trees
             return find(problem, start, pairs, options)
 
@@ -68,13 +66,13 @@ def solve(problem: Problem, start: Array, pairs: Pairs, options: SolverOptions):
 
     @eqx.filter_custom_jvp
     def root(problem, start):
-        velocities, _, report, _ = find_root(problem, start, derivatives=False)
+        velocities, _, report, _ = find_root(problem, start)
         return velocities, report
 
     @root.def_jvp
     def _(primals, tangents):
         problem, start = primals
-        velocities, jacobian, report, share = find_root(problem, start, derivatives=True)
+        velocities, jacobian, report, share = find_root(problem, start)
         velocities, inverse, share = _kept(velocities, jacobian, share)
         change = _change(problem, tangents[0], velocities, inverse, share, pairs)
         return (velocities, report), (change, jax.tree.map(lambda _: None, report))

@@ -36,6 +36,7 @@ from dano.engine._rigid import turned
 from dano.engine._roots import as_solved, solve
 from dano.engine._trees import advance_tree, generalised, turns_too_far
 from dano.engine.joints import patch_rows, TreeTables
+from dano.engine.launching import rollout as launched
 from dano.maths import quat_to_matrix, safe_normalize
 from dano.scene import Control, Scene, State
 
@@ -47,6 +48,10 @@ def step(
     pairs = structure_of(scene)
     if not pairs.moving:
         return state, Report(jnp.zeros((), state.position.dtype), jnp.asarray(0), jnp.asarray(True))
+    if prepared.tables is not None:
+        controls = None if control is None else jax.tree.map(lambda x: x[None], control)
+        states, report = launched(prepared.tables, state, controls, 1, prepared.capacity, options)
+        return jax.tree.map(lambda x: x[0], (states, report))
     if prepared.trees is not None:
         patches = find_patches(scene, state, tuple(quat_to_matrix(q) for q in state.orientation))
         following, report = _step_of_trees(prepared.trees, state, control, patches, options)
@@ -64,6 +69,15 @@ def step(
     if found is not None:
         report = report._replace(converged=report.converged & ~found.overflow, overflow=found.overflow)
     return following, jax.lax.stop_gradient(report)
+
+
+def rollout(
+    prepared: Prepared, state: State, controls: Control | None, n_steps: int, options: SolverOptions
+) -> tuple[State, Report] | None:
+    """States at the ends of steps in one launch; None where kernels do not make whole steps."""
+    if prepared.tables is None:
+        return None
+    return launched(prepared.tables, state, controls, n_steps, prepared.capacity, options)
 
 
 def _step_of_trees(

@@ -1,12 +1,13 @@
 """Convex pieces that stand for an object in engines whose contacts know convex shapes only."""
 
-from typing import Any, get_args, Literal
+from typing import get_args, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from dano.exchange._triangles import Triangles
-from dano.extras import is_installed, optional
+from dano.extras import is_installed
+from dano.fields import convex_hull as hull_of, convex_pieces, load_coacd
 
 Collision = Literal["auto", "coacd", "hull"]
 
@@ -22,7 +23,7 @@ def chosen_collision(collision: str) -> Literal["coacd", "hull"]:
         raise ValueError(f"collision must be one of {list(get_args(Collision))}, got {collision!r}")
     installed = is_installed("coacd")
     if collision == "coacd" and not installed:
-        _coacd()
+        load_coacd()
     return "hull" if collision == "hull" or not installed else "coacd"
 
 
@@ -32,44 +33,13 @@ def convex_hull(points: Float[np.ndarray, "n 3"]) -> Triangles:
     Raises:
         ValueError: If they lie in a plane.
     """
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        hull = ConvexHull(points)
-    except QhullError as error:
-        raise ValueError(
-            f"points must span a volume, got {len(points)} in a plane or fewer than 4"
-        ) from error
-    used, faces = np.unique(hull.simplices, return_inverse=True)
-    vertices, faces = np.asarray(points, np.float64)[used], faces.reshape(-1, 3)
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return Triangles(vertices, faces)
+    return Triangles(*hull_of(points))
 
 
 def decomposition(mesh: Triangles, threshold: float, most: int | None) -> list[Triangles]:
-    """Convex pieces by CoACD (Wei et al. 2022).
-
-    Args:
-        mesh: What to cut; need not be closed.
-        threshold: Largest concavity of a piece, as a share of the size; in [0.01, 1].
-        most: Most pieces; None: as many as it takes.
+    """Convex pieces by CoACD (Wei et al. 2022), see `dano.fields.convex_pieces`.
 
     Raises:
         ImportError: If coacd is missing.
     """
-    coacd = _coacd()
-    coacd.set_log_level("error")
-    parts = coacd.run_coacd(
-        coacd.Mesh(mesh.vertices, mesh.faces),
-        threshold=threshold,
-        max_convex_hull=-1 if most is None else most,
-        seed=0,
-    )
-    # Its own triangles may be turned inside out.
-    return [convex_hull(np.asarray(vertices, np.float64)) for vertices, _ in parts]
-
-
-def _coacd() -> Any:
-    return optional("coacd", "a convex decomposition needs coacd", "export")
+    return [Triangles(*piece) for piece in convex_pieces((mesh.vertices, mesh.faces), threshold, most)]

@@ -4,7 +4,7 @@ import dataclasses
 import os
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from dano.checks import checked_kind, checked_optional
 from dano.exchange._contents import words
 from dano.exchange._urdf import roll_pitch_yaw
 from dano.maths import quat_to_matrix
-from dano.robots import Connection, Description, Link, Placed, Robot, Solid
+from dano.robots import at_home, Connection, Description, Drive, Link, Placed, Robot, Solid
 from dano.scene import Scene
 
 # What URDF's readers want a number for and have none to mean "any".
@@ -185,8 +185,13 @@ def _urdf_shape(row: ET.Element, solid: Solid, target: Path, link: Link) -> None
 def _mjcf(description: Description, target: Path) -> ET.Element:
     root = ET.Element("mujoco", model=description.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
+    if description.gravity is not None:
+        ET.SubElement(root, "option", gravity=words(np.array(description.gravity)))
     world, equal = ET.SubElement(root, "worldbody"), ET.SubElement(root, "equality")
+    driven = ET.SubElement(root, "actuator")
     held = {joint.child: joint for joint in description.joints}
+    homes = {joint.name: joint.home for joint in description.joints}
+    chains = _chains(description)
     rows: dict[str, ET.Element] = {}
 
     def row_of(name: str) -> ET.Element:
@@ -197,12 +202,15 @@ def _mjcf(description: Description, target: Path) -> ET.Element:
         if joint is None and name == "world":
             rows[name] = world
             return world
-        row = ET.SubElement(world if joint is None else row_of(joint.parent), "body", name=name)
+        chain = chains.get(name, [])
+        row = ET.SubElement(row_of(chain[0].parent) if chain else world, "body", name=name)
         rows[name] = row
-        if joint is not None:
-            row.set("pos", words(np.array(joint.place.position)))
-            row.set("quat", words(np.array(joint.place.orientation)))
-            _mjcf_joint(row, equal, joint, target)
+        if chain:
+            place = at_home(chain[0])
+            row.set("pos", words(np.array(place.position)))
+            row.set("quat", words(np.array(place.orientation)))
+        for each in chain:
+            _mjcf_joint(row, (equal, driven), each, homes, target)
         link = description.link(name)
         if link.mass > 0:
             tensor = link.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
@@ -214,12 +222,15 @@ def _mjcf(description: Description, target: Path) -> ET.Element:
                     "pos": words(np.array(solid.place.position)),
                     "quat": words(np.array(solid.place.orientation)),
                 }
-                shape = {"type": solid.kind, "size": words(np.array(solid.numbers)), "mass": "0"}
+                size = words(np.array(solid.numbers)) if solid.kind != "plane" else "0 0 1"
+                shape = {"type": solid.kind, "size": size, "mass": "0"}
                 ET.SubElement(row, "geom", {**shape, **place, **touches})
         return row
 
+    inner = {joint.parent for chain in chains.values() for joint in chain[1:]}
     for link in description.links:
-        row_of(link.name)
+        if link.name not in inner:
+            row_of(link.name)
     for i, tie in enumerate(description.ties):
         # Sites say where both points are; an anchor would mean those of the joints' zero.
         turns = {tie.first: tie.orientation, tie.second: (1.0, 0.0, 0.0, 0.0)}
@@ -232,7 +243,46 @@ def _mjcf(description: Description, target: Path) -> ET.Element:
     return root
 
 
-def _mjcf_joint(row: ET.Element, equal: ET.Element, joint: Connection, target: Path) -> None:
+def _chains(description: Description) -> dict[str, list[Connection]]:
+    """Joints of each link, with those of links before it that are nothing but a place between two joints.
+
+    MuJoCo has several joints in a body, and refuses a body without mass that moves.
+    """
+    held = {joint.child: joint for joint in description.joints}
+    parents = [joint.parent for joint in description.joints]
+    tied = {link for tie in description.ties for link in (tie.first, tie.second)}
+    bare = {
+        link.name
+        for link in description.links
+        if not (link.mass or link.solids or link.visuals or link.name in tied)
+        and parents.count(link.name) == 1
+        and link.name in held
+        and held[link.name].kind not in ("weld", "floating")
+    }
+    found = {}
+    for name, joint in held.items():
+        chain = [joint]
+        while _stays(at_home(chain[0])) and chain[0].kind != "weld" and chain[0].parent in bare:
+            chain.insert(0, held[chain[0].parent])
+        found[name] = chain
+    return found
+
+
+def _stays(place: Placed) -> bool:
+    """Whether a frame is that of its parent, to rounding."""
+    turned = np.abs(place.orientation[1:]).max()
+    return bool(np.abs(place.position).max() < 1e-12 and turned < 1e-12)
+
+
+def _mjcf_joint(
+    row: ET.Element,
+    sections: tuple[ET.Element, ET.Element],
+    joint: Connection,
+    homes: Mapping[str, float],
+    target: Path,
+) -> None:
+    """A joint in its body's row, and what the sections of equalities and of actuators say of it."""
+    equal, driven = sections
     if joint.kind == "weld":
         return
     if joint.kind == "floating":
@@ -244,17 +294,38 @@ def _mjcf_joint(row: ET.Element, equal: ET.Element, joint: Connection, target: P
     if joint.kind != "ball":
         given["axis"] = words(np.array(joint.axis))
         given |= {"stiffness": repr(joint.stiffness), "springref": repr(joint.rest)}
+        if joint.home:
+            given["ref"] = repr(joint.home)
         if joint.limits is not None:
             given["range"] = words(np.array(joint.limits))
         if np.isfinite(joint.effort):
             given["actuatorfrcrange"] = words(np.array([-joint.effort, joint.effort]))
     given |= {"damping": joint.damping, "frictionloss": joint.friction, "armature": joint.armature}
     ET.SubElement(row, "joint", {key: str(value) for key, value in given.items()})
+    if joint.drive is not None:
+        _mjcf_drive(driven, joint.name, joint.drive)
     if joint.mimics is not None:
         leader, ratio, shift = joint.mimics
+        # MuJoCo measures both from the pose of the file.
+        shift += ratio * homes[leader] - joint.home
         numbers = {
             "joint1": joint.name,
             "joint2": leader,
             "polycoef": words(np.array([shift, ratio, 0, 0, 0])),
         }
         ET.SubElement(equal, "joint", numbers)
+
+
+def _mjcf_drive(driven: ET.Element, joint: str, drive: Drive) -> None:
+    """The actuator; the numbers of a file without any change are those of the file."""
+    given: dict[str, object] = {"name": drive.name, "joint": joint, "gear": repr(drive.gear)}
+    if drive.kind == "position":
+        given |= {"kp": repr(drive.stiffness), "kv": repr(drive.damping)}
+    elif drive.kind == "velocity":
+        given["kv"] = repr(drive.damping)
+    for key, bounds in (("forcerange", drive.limits), ("ctrlrange", drive.commands)):
+        # MuJoCo has no range with one end.
+        if np.any(np.isfinite(bounds)):
+            given[key] = words(np.clip(bounds, -_ENDLESS, _ENDLESS))
+    tag = "motor" if drive.kind == "effort" else drive.kind
+    ET.SubElement(driven, tag, {key: str(value) for key, value in given.items()})

@@ -19,10 +19,15 @@ from dano.fields._compose import (
     UnionField as UnionField,
     UnionShape as UnionShape,
 )
+from dano.fields._convex import (
+    convex_hull as convex_hull,
+    convex_pieces as convex_pieces,
+    hull_field as hull_field,
+    load_coacd as load_coacd,
+)
 from dano.fields._ellipsoid import Ellipsoid as Ellipsoid
 from dano.fields._grid import DensityMoments as DensityMoments, GridField as GridField
 from dano.fields._hash_grid import HashGrid as HashGrid
-from dano.fields._mesh import mesh_field as mesh_field
 from dano.fields._parts import large_parts as large_parts, largest_part as largest_part
 from dano.fields._redistance import redistanced as redistanced, spread_distances as spread_distances
 from dano.fields._shapes import (
@@ -39,6 +44,7 @@ from dano.fields._signed_distance import (
     SignedDistanceGrid as SignedDistanceGrid,
 )
 from dano.fields._spline import degree_of as degree_of
+from dano.fields.meshes import mesh_field as mesh_field, MESH_SUFFIXES as MESH_SUFFIXES, UNITS as UNITS
 from dano.fields.readers import (
     FIELD_FORMATS as FIELD_FORMATS,
     FIELD_SUFFIXES as FIELD_SUFFIXES,

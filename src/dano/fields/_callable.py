@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from dano.callback import batched_callback
 from dano.checks import checked_number
 from dano.fields._base import AbstractField, check_order, Jet, vmapped_jet
 from dano.maths import checked_floating, is_traced, Numbers
@@ -189,8 +190,13 @@ class _HostFunction:
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _host_jet(host: _HostFunction, order: int, x: Float[Array, "*batch 3"]) -> tuple[Array, ...]:
     """Jet of a host function; vmapped calls reach it as one batch."""
-    shapes = tuple(jax.ShapeDtypeStruct(x.shape[:-1] + (3,) * rank, x.dtype) for rank in range(order + 1))
-    return jax.pure_callback(functools.partial(host.jet, order), shapes, x, vmap_method="broadcast_all")
+    if not is_traced(x):
+        return tuple(jnp.asarray(part) for part in host.jet(order, x))
+
+    def shapes(x: Array) -> tuple[jax.ShapeDtypeStruct, ...]:
+        return tuple(jax.ShapeDtypeStruct(x.shape[:-1] + (3,) * rank, x.dtype) for rank in range(order + 1))
+
+    return batched_callback(functools.partial(host.jet, order), shapes, x)
 
 
 @_host_jet.defjvp

@@ -5,6 +5,7 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from dano.engine import AbstractEngine, checked_engine, Policy
 from dano.identify._checkpoint import Checkpoint, digest_of
 from dano.identify._joint_log import joint_table
 from dano.identify._motion import Motion, QUANTITIES
+from dano.identify._motion_files import load_motion
 from dano.identify._parameters import Parameter, space_of, values_at, with_values
 from dano.identify._problem import Problem
 from dano.identify._residuals import Linearized
@@ -27,7 +29,7 @@ from dano.maths import quat_conjugate, quat_log, quat_multiply
 from dano.scene import Control, Scene, State, Trajectory
 from dano.solvers import Solution, Stop
 
-Observed = Motion | Trajectory
+Observed = Motion | Trajectory | str | os.PathLike
 
 
 def identify(
@@ -62,10 +64,12 @@ def identify(
 
     Args:
         scene: The scene, with values for whatever is not a parameter.
-        observed: One motion or several, of any bodies. Each begins at its own first complete frame.
+        observed: One motion or several, of any bodies, or their files (see `load_motion`). Each begins at its
+            own first complete frame. One that names no body is of the only one that moves.
         parameters: What is unknown.
         held_out: Motions that are not fitted, to measure the error on.
-        state: Of bodies that a motion does not hold; one for all motions or one for each.
+        state: Of bodies that a motion does not hold; one for all motions or one for each. Default for
+            the orientation of the only body that moves: as in `Scene.initial_state`, which is said.
         controls: Forces and torques [N, N m] of each step of each motion, or a policy as in `simulate`.
         initial: What to estimate of the state in which each window begins: "given" (nothing), "velocities"
             (with spins), "states" (all), or a list of quantities. Default: what the motion does not hold.
@@ -95,7 +99,8 @@ def identify(
         ValueError: If an argument is out of range, does not fit the others, or makes too much work.
     """
     _check(scene, state, controls, progress)
-    motions = _motions("observed", observed, least=1)
+    motions = _motions("observed", observed, scene, least=1)
+    state = _started_in(scene, motions) if state is None else state
     chosen = estimated(initial, motions)
     space = space_of(scene, controls, _started(parameters, after))
     deviation = Noise(deviations(scene, motions, noise), huber)
@@ -104,7 +109,7 @@ def identify(
     setup = Setup(space, scene, controls, chosen, deviation, windows, search, checked_engine(engine))
     check_scales(scene, motions, window, state if isinstance(state, State) else None)
     kept = _kept(checkpoint, resume, setup, motions, state, after)
-    found = _fitted(setup, motions, _motions("held_out", held_out), state, after, kept, progress)
+    found = _fitted(setup, motions, _motions("held_out", held_out, scene), state, after, kept, progress)
     for message in found.messages:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
     return found
@@ -243,12 +248,35 @@ def _identification(
     )
 
 
-def _motions(name: str, observed: Observed | Sequence[Any], *, least: int = 0) -> tuple[Motion, ...]:
-    one = isinstance(observed, (Motion, Trajectory))
-    items = checked_items(name, [observed] if one else observed, Motion, Trajectory)
+def _motions(
+    name: str, observed: Observed | Sequence[Any], scene: Scene, *, least: int = 0
+) -> tuple[Motion, ...]:
+    one = isinstance(observed, (Motion, Trajectory, str, os.PathLike))
+    items = checked_items(name, [observed] if one else observed, Motion, Trajectory, str, Path)
     if len(items) < least:
         raise ValueError(f"{name} must hold at least one motion, got none")
-    return tuple(item if isinstance(item, Motion) else Motion.from_trajectory(item) for item in items)
+    found = []
+    for item in items:
+        if isinstance(item, Trajectory):
+            item = Motion.from_trajectory(item)
+        motion = item if isinstance(item, Motion) else load_motion(item)
+        found.append(motion.named(scene))
+    return tuple(found)
+
+
+def _started_in(scene: Scene, motions: Sequence[Motion]) -> State | None:
+    """Where the only body begins of which a log holds positions alone; None if there is nothing to assume."""
+    moving = [body for body in scene.bodies if not body.fixed]
+    bare = [m for m in motions if np.isfinite(m.position).any() and not np.isfinite(m.orientation).any()]
+    if len(moving) != 1 or scene.joints or not bare:
+        return None
+    warnings.warn(
+        f"orientations of {moving[0].name!r} were not observed: it begins as scene.initial_state() has it;"
+        " state says otherwise",
+        UserWarning,
+        stacklevel=3,
+    )
+    return scene.initial_state()
 
 
 def _check(scene: Any, state: Any, controls: Any, progress: Any) -> None:

@@ -1,6 +1,7 @@
 """Logs of joint coordinates as motions of the bodies that hang on the joints."""
 
 import dataclasses
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_kind, shown
 from dano.identify._motion import JOINT_NUMBERS, Motion
+from dano.identify.logs import unwrapped
 from dano.maths import checked_floating, checked_numbers, Numbers, quat_rotate
 from dano.scene import Layout, Scene, State
 
@@ -48,7 +50,9 @@ def motion_of_joints(scene: Scene, times: Numbers, q: Numbers, *, state: State |
     Args:
         scene: The scene.
         times: Of the rows of the log [s], shape (T,).
-        q: Coordinates of all joints, in the order of `State.q` [rad or m], shape (T, k).
+        q: Coordinates of all joints, in the order of `State.q` [rad or m], shape (T, k); NaN where they were
+            not observed. Angles of hinges that were kept within one turn are unwrapped, which a UserWarning
+            says.
         state: Where the bodies are that hang on no joint; default: as in `Scene.initial_state`.
 
     Raises:
@@ -66,8 +70,9 @@ def motion_of_joints(scene: Scene, times: Numbers, q: Numbers, *, state: State |
         raise ValueError(f"times must be a vector of increasing numbers [s], got {shown(times)}")
     if rows.shape != (len(stamps), k):
         raise ValueError(f"q must have shape ({len(stamps)}, {k}) as times have it, got {rows.shape}")
-    if not np.all(np.isfinite(np.asarray(rows))):
-        raise ValueError("q must be finite")
+    if np.any(np.isinf(np.asarray(rows))) or not np.any(np.isfinite(np.asarray(rows))):
+        raise ValueError("q must hold finite numbers, or NaN where it was not observed")
+    rows = jnp.asarray(_whole_turns(scene, np.asarray(rows)))
     base = scene.initial_state() if state is None else state
 
     def placed(row):
@@ -85,3 +90,21 @@ def motion_of_joints(scene: Scene, times: Numbers, q: Numbers, *, state: State |
         point="origin",
         q=np.asarray(joint_table(scene.layout, rows))[:, hanging],
     )
+
+
+def _whole_turns(scene: Scene, rows: np.ndarray) -> np.ndarray:
+    """Joint coordinates without the jumps of angles that a log keeps within ±π or from 0 to 2π."""
+    rows, notes = rows.copy(), []
+    for place, j in enumerate(scene.layout.with_coordinates):
+        joint = scene.joints[j]
+        if joint.kind != "hinge":
+            continue
+        if joint.limits is not None and float(np.ptp(np.asarray(joint.limits))) < 2 * np.pi - 0.1:
+            # It cannot turn all the way round: what jumps is no angle that was wrapped.
+            continue
+        rows[:, place], jumps = unwrapped(rows[:, place])
+        if jumps:
+            notes.append(f"angles of the joint of {joint.child!r} jump by 2π {jumps} times and are unwrapped")
+    if notes:
+        warnings.warn("; ".join(notes), UserWarning, stacklevel=3)
+    return rows

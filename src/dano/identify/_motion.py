@@ -8,13 +8,16 @@ import numpy as np
 
 from dano.checks import checked_choice, checked_count, checked_items, checked_kind, checked_number
 from dano.maths import checked_numbers, Numbers, quat_conjugate, quat_log, quat_multiply, quat_rotate
-from dano.scene import Trajectory
+from dano.scene import Scene, Trajectory
 
 if TYPE_CHECKING:
     from dano.vision import Tracked
 
 QUANTITIES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 """What a motion may hold of each body and frame, and how many numbers it has."""
+
+UNNAMED = "(unnamed)"
+"""Name of the body of a file that does not say: `identify` takes the only one that moves."""
 
 JOINT_NUMBERS = 3
 """How many coordinates a joint has at most."""
@@ -79,7 +82,8 @@ class Motion:
             times: [s], shape (T,).
             names: Name or names of the bodies.
             position: [m, W]; NaN where a body was not seen.
-            orientation: Quaternions wxyz, body → world, normalised here; NaN where unknown.
+            orientation: Quaternions wxyz, body → world, normalised here, with signs that do not jump; NaN
+                where unknown.
             velocity: [m/s, W].
             omega: [rad/s, B].
             point: What positions and velocities refer to: "com" or "origin".
@@ -157,6 +161,22 @@ class Motion:
             covariance=tracked.covariance,
             point="origin",
         )
+
+    def named(self, scene: Scene) -> "Motion":
+        """This motion as that of the scene's only body that moves, if nobody named the body.
+
+        Raises:
+            ValueError: If several bodies move, or none does.
+        """
+        if self.names != (UNNAMED,):
+            return self
+        moving = [body.name for body in scene.bodies if not body.fixed]
+        if len(moving) != 1:
+            raise ValueError(
+                f"the motion does not name its body, and of the scene's {moving} move: say which by names="
+                " of load_motion, --body of the command, or columns such as soap.x"
+            )
+        return dataclasses.replace(self, names=(moving[0],))
 
     def part(self, first: int, last: int) -> "Motion":
         """Frames from `first` up to, not including, `last`; times stay as they are."""
@@ -240,7 +260,14 @@ def _unit_quaternions(orientation: np.ndarray) -> np.ndarray:
             "orientation must hold unit quaternions (w, x, y, z), got one of length "
             f"{norms[frame, body]:.4g} at frame {frame}"
         )
-    return orientation / norms[..., None]
+    unit = orientation / norms[..., None]
+    # q and −q are one rotation; programs jump between them. Each goes on from the last one that was seen.
+    for body in range(unit.shape[1]):
+        seen = np.flatnonzero(np.isfinite(unit[:, body]).all(axis=-1))
+        turns = np.sum(unit[seen[1:], body] * unit[seen[:-1], body], axis=-1) < 0
+        flips = np.concatenate([[0], np.cumsum(turns)]) % 2 == 1
+        unit[seen[flips[: len(seen)]], body] *= -1
+    return unit
 
 
 def _slope(times: np.ndarray, values: np.ndarray, when: float, frames: int) -> np.ndarray:

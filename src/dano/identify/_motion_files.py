@@ -1,9 +1,10 @@
 """Motions in files: .npz and .csv."""
 
-import csv
 import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,16 @@ from dano.archive import (
     write_archive,
 )
 from dano.checks import checked_choice, checked_items, checked_kind, checked_number
-from dano.identify._motion import Motion, QUANTITIES
+from dano.identify._motion import Motion, QUANTITIES, UNNAMED
+from dano.identify.logs import (
+    in_metres,
+    LENGTH_UNITS,
+    mended_times,
+    ordered_quaternions,
+    read_table,
+    TIME_UNITS,
+    understood,
+)
 
 _SYNONYMS = {
     "times": ("times", "time", "t", "timestamp"),
@@ -34,51 +44,90 @@ _COLUMNS = {
     "velocity": ("vx", "vy", "vz"),
     "omega": ("wx", "wy", "wz"),
 }
+_TABLES = (".csv", ".txt", ".tum")
+
+
+class _Read(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+        arrays: Times and quantities, and what `Motion.create` takes beside them.
+        names: Of the bodies; () if it does not say.
+        time_unit: Seconds in the unit of its times; None if that is not known.
+        units: SI units in those of its quantities, where these are known.
+        first: What was taken from the times already.
+        order: Of its quaternions; None if that is not known.
+        notes: What to say of it.
+    """
+
+    arrays: dict[str, np.ndarray]
+    names: tuple[str, ...]
+    time_unit: float | None
+    units: dict[str, float]
+    first: int
+    order: str | None
+    notes: list[str]
 
 
 def load_motion(
     path: str | os.PathLike[str],
     *,
     names: str | Sequence[str] | None = None,
-    order: str = "wxyz",
+    order: str | None = None,
     point: str | None = None,
     rate: float | None = None,
+    time_unit: str | None = None,
+    length_unit: str | None = None,
 ) -> Motion:
     """Read a motion.
 
     .npz: what `save_motion` or `Trajectory.save` wrote, or arrays `times` (T,), `position`, `orientation`,
     `velocity`, `omega` of shape (T, ·) or (T, n, ·) (also `time`, `pos`, `quat`, `vel`, …), and `names`;
     `covariance` of shape (T, 6, 6) or (T, n, 6, 6), as `Motion` has it.
-    .csv: a header with `time`, `x, y, z`, `qw, qx, qy, qz`, `vx, vy, vz`, `wx, wy, wz`, each optional but the
-    time; with several bodies `bunny.x` and so on. An empty cell is an unknown number. Units as in `Motion`.
+    .csv, .txt, .tum: a header with `time`, `x, y, z`, `qw, qx, qy, qz`, `vx, vy, vz`, `wx, wy, wz`, each
+    optional but the time; with several bodies `bunny.x` and so on. Also the columns of ROS
+    (`field.pose.position.x`), EuRoC (`p_RS_R_x [m]`) and TUM (without a header), and units in names
+    (`x [mm]`, `time_ms`). An empty cell is an unknown number. Units as in `Motion`.
+
+    Rows that repeat a time or come a little late are left out or sorted. Units and orders that nobody stated
+    are guessed where SI units or wxyz cannot be meant. One UserWarning says what was mended and guessed.
 
     Args:
         path: The file.
-        names: Of the bodies, if the file does not say.
-        order: Of the quaternions in the file.
+        names: Of the bodies, if the file does not say; None: `identify` takes the only one that moves.
+        order: Of the quaternions in an .npz file, "wxyz" or "xyzw". Columns say it by their names.
         point: What positions refer to, if the file does not say; default the centre of mass.
         rate: Frames a second, if the file has no times.
+        time_unit: Of the times: "s", "ms", "us" or "ns".
+        length_unit: Of positions and velocities: "m", "cm" or "mm".
 
     Raises:
-        ValueError: If the file is missing, broken or lacks something, or see `Motion.create`.
+        ValueError: If the file is missing, broken or lacks something, its times jump back by many rows, or
+            see `Motion.create`.
     """
     source = checked_input(path)
-    checked_choice("order", order, ("wxyz", "xyzw"))
+    if order is not None:
+        checked_choice("order", order, ("wxyz", "xyzw"))
     if point is not None:
         checked_choice("point", point, ("com", "origin"))
     if rate is not None:
         rate = checked_number("rate", rate, above=0)
+    for name, value, units in (
+        ("time_unit", time_unit, TIME_UNITS),
+        ("length_unit", length_unit, LENGTH_UNITS),
+    ):
+        if value is not None:
+            checked_choice(name, value, list(units))
     if names is not None:
         names = (names,) if isinstance(names, str) else checked_items("names", names, str)
     suffix = source.suffix.lower()
-    if suffix not in (".npz", ".csv"):
+    if suffix not in (".npz", *_TABLES):
         raise ValueError(f"motion must be an .npz or .csv file, got {source}")
-    arrays, found = _read_npz(source) if suffix == ".npz" else _read_csv(source)
-    chosen = tuple(names or found or ())
-    if not chosen:
-        raise ValueError(f"{source} does not name its bodies: give names")
-    if found and names is not None and set(chosen) <= set(found):
-        rows = [found.index(name) for name in chosen]
+    read = _read_npz(source) if suffix == ".npz" else _read_table(source)
+    arrays = read.arrays
+    chosen = tuple(names or read.names or (UNNAMED,))
+    if read.names and names is not None and set(chosen) <= set(read.names):
+        rows = [read.names.index(name) for name in chosen]
         dimensions = {**dict.fromkeys((*QUANTITIES, "q"), 3), "covariance": 4}
         arrays = {
             key: value[:, rows] if value.ndim == dimensions.get(key) else value
@@ -91,11 +140,11 @@ def load_motion(
         if len(frames) != 1:
             raise ValueError(f"{source} must hold as many rows of each quantity, got {sorted(frames)}")
         arrays["times"] = np.arange(frames.pop()) / rate
-    if order == "xyzw" and "orientation" in arrays:
-        arrays["orientation"] = arrays["orientation"][..., [3, 0, 1, 2]]
+        read = read._replace(time_unit=1.0)
     stated = str(arrays.pop("point", "com" if point is None else point))
     try:
-        return Motion.create(
+        notes = _mend(arrays, read, order, time_unit, length_unit)
+        motion = Motion.create(
             arrays["times"],
             chosen,
             **{key: arrays.get(key) for key in QUANTITIES},
@@ -106,6 +155,43 @@ def load_motion(
         )
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error
+    if notes:
+        warnings.warn(f"{source}: {'; '.join(notes)}", UserWarning, stacklevel=2)
+    return motion
+
+
+def _mend(
+    arrays: dict[str, np.ndarray],
+    read: _Read,
+    order: str | None,
+    time_unit: str | None,
+    length_unit: str | None,
+) -> list[str]:
+    """Put times, units and quaternions of a log right; returns what was done, in words."""
+    notes = list(read.notes)
+    times = np.asarray(arrays["times"], float)
+    if times.ndim != 1 or len(times) < 2:
+        return notes  # said by Motion.create
+    stated = read.time_unit if time_unit is None else TIME_UNITS[time_unit]
+    arrays["times"], rows, said = mended_times(times, stated, read.first)
+    notes += said
+    for key in (*QUANTITIES, "covariance", "q"):
+        if key in arrays and len(arrays[key]) == len(times):
+            arrays[key] = arrays[key][rows]
+    if "orientation" in arrays:
+        turns = arrays["orientation"]
+        arrays["orientation"], said = ordered_quaternions(turns, read.order or order)
+        notes += said
+    length = read.units.get("position") if length_unit is None else LENGTH_UNITS[length_unit]
+    if "position" in arrays and arrays["position"].ndim in (2, 3):
+        place = arrays["position"]
+        length, said = in_metres(arrays["times"], place.reshape(len(place), -1, place.shape[-1]), length)
+        notes += said
+        arrays["position"] = place * length
+    for key, unit in (("velocity", length), ("omega", 1.0)):
+        if key in arrays:
+            arrays[key] = arrays[key] * (read.units.get(key) or unit or 1.0)
+    return notes
 
 
 def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
@@ -131,7 +217,12 @@ def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
     if target.suffix.lower() != ".csv":
         raise ValueError(f"motion must be written to an .npz or .csv file, got {target}")
     prefixes = [""] if len(motion.names) == 1 else [f"{name}." for name in motion.names]
-    header = ["time"] + [p + c for p in prefixes for key in _COLUMNS for c in _COLUMNS[key]]
+    # Where a reader would take them for others, units stand in the names.
+    seconds = " [s]" if mended_times(motion.times, None)[2] else ""
+    metres = " [m]" if in_metres(motion.times, motion.position, None)[1] else ""
+    units = {"position": metres, "velocity": metres and " [m/s]"}
+    header = [f"time{seconds}"]
+    header += [p + c + units.get(key, "") for p in prefixes for key in _COLUMNS for c in _COLUMNS[key]]
     columns = [getattr(motion, key)[:, i] for i in range(len(motion.names)) for key in _COLUMNS]
     table = np.concatenate([motion.times[:, None], *columns], axis=1)
     lines = [",".join(header)]
@@ -140,7 +231,7 @@ def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
         file.write(("\n".join(lines) + "\n").encode())
 
 
-def _read_npz(source: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+def _read_npz(source: Path) -> _Read:
     try:
         with open(source, "rb") as file:
             archive = Arrays(file)
@@ -169,54 +260,45 @@ def _read_npz(source: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
             arrays[key] = data[key]
     if form == TRAJECTORY[0]:
         arrays["lag"] = np.array(0.5 * (arrays["times"][1] - arrays["times"][0]))
-    return arrays, tuple(str(name) for name in np.atleast_1d(data.get("names", [])))
+    names = tuple(str(name) for name in np.atleast_1d(data.get("names", [])))
+    own = is_own(form)
+    units = dict.fromkeys(QUANTITIES, 1.0) if own else {}
+    return _Read(arrays, names, 1.0 if own else None, units, 0, "wxyz" if own else None, [])
 
 
-def _read_csv(source: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+def _read_table(source: Path) -> _Read:
+    table = read_table(source)
     try:
-        rows = list(csv.reader(source.read_text("utf-8-sig").splitlines()))
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{source} must be a text file, got one that is not") from error
-    rows = [row for row in rows if row and not row[0].lstrip().startswith("#")]
-    if len(rows) < 2:
-        raise ValueError(f"{source} must hold a header and at least one row, got {len(rows)} lines")
-    header = [word.strip() for word in rows[0]]
-    if len(set(header)) < len(header):
-        raise ValueError(f"{source} must have different columns, got {header}")
-    table = np.empty((len(rows) - 1, len(header)))
-    for i, row in enumerate(rows[1:]):
-        if len(row) != len(header):
-            raise ValueError(f"{source}: row {i + 1} must hold {len(header)} cells, got {len(row)}")
-        for j, cell in enumerate(row):
-            try:
-                table[i, j] = float(cell) if cell.strip() else np.nan
-            except ValueError as error:
-                raise ValueError(
-                    f"{source}: row {i + 1}, column {header[j]!r}: {cell!r} is no number"
-                ) from error
-    arrays = {}
-    for word in _SYNONYMS["times"]:
-        if word in header:
-            arrays["times"] = table[:, header.index(word)]
-    names = tuple(dict.fromkeys(word.rsplit(".", 1)[0] for word in header if "." in word))
-    prefixes = [f"{name}." for name in names] or [""]
-    for key, columns in _COLUMNS.items():
-        wanted = [[prefix + column for column in columns] for prefix in prefixes]
-        present = [word for group in wanted for word in group if word in header]
-        if not present:
-            continue
-        for group in wanted:
-            missing = [word for word in group if word not in header]
-            if 0 < len(missing) < len(group):
-                raise ValueError(f"{source} must have all of the columns {group}, {missing} are missing")
-        unknown = np.full(len(table), np.nan)
+        columns = understood(table.header)
+    except ValueError as error:
+        raise ValueError(f"{source} {error}") from error
+    if not columns.groups:
+        raise ValueError(
+            f"{source} must have columns such as time, x, y, z, qw, qx, qy, qz, got {list(table.header)}"
+        )
+    arrays, first = {}, 0
+    if columns.times:
+        arrays["times"], first = table.stamps(columns.times[0])
+        for rest in columns.times[1:]:
+            whole = table.numbers(columns.times[0])
+            # Seconds since 1970 and nanoseconds do not fit into one float together.
+            first = int(whole[np.isfinite(whole)].min()) if np.isfinite(whole).any() else 0
+            arrays["times"] = whole - first + 1e-9 * table.numbers(rest)
+    unknown = np.full(len(table.rows), np.nan)
+    for key, bodies in columns.groups.items():
+        size = QUANTITIES[key]
         arrays[key] = np.stack(
             [
-                np.stack([table[:, header.index(w)] if w in header else unknown for w in group], axis=1)
-                for group in wanted
+                np.stack([unknown] * size if places is None else [table.numbers(i) for i in places], axis=1)
+                for places in bodies
             ],
             axis=1,
         )
-    if not any(key in arrays for key in QUANTITIES):
-        raise ValueError(f"{source} must have columns such as time, x, y, z, qw, qx, qy, qz, got {header}")
-    return arrays, names
+    # Where there are no orientations in w, x, y, z they may be in a form that is not read.
+    left = columns.left_out
+    notes = []
+    if left:
+        more = ", …" if len(left) > 6 else ""
+        notes.append(f"columns {', '.join(left[:6])}{more} are not read")
+    names = tuple(name for name in columns.names if name)
+    return _Read(arrays, names, columns.time_unit, columns.unit, first, "wxyz", notes)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.callback import host_callback
 from dano.checks import checked_choice, checked_kind, checked_number
 from dano.contact import Patch
 from dano.engine import AbstractEngine, Report, VariationalEngine
@@ -194,7 +195,7 @@ class MuJoCoEngine(AbstractEngine):
             return found.astype(result.dtype)
 
         arguments = _motion(before), _motion(after), constants, about
-        return jax.pure_callback(host, result, *arguments, vmap_method="sequential")
+        return host_callback(host, result, *arguments)
 
 
 def _checked_options(options: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -291,9 +292,7 @@ def _used(scene: Scene, shapes: tuple[tuple[int, ...], ...]) -> tuple[int, ...]:
 def _advance(twin: Twin, place: _Place, flat: Float[Array, " n"]) -> Float[Array, " m"]:
     """The state after a step in one vector, then the passes of the solver."""
     result = jax.ShapeDtypeStruct((_size_out(place),), flat.dtype)
-    return jax.pure_callback(
-        lambda x: _stepped(twin, place, x).astype(result.dtype), result, flat, vmap_method="sequential"
-    )
+    return host_callback(lambda x: _stepped(twin, place, x).astype(result.dtype), result, flat)
 
 
 @_advance.def_jvp
@@ -304,9 +303,7 @@ def _(primals, tangents):
     if change is None:
         return out, jnp.zeros_like(out)
     result = jax.ShapeDtypeStruct((_size_out(place), len(place.used)), flat.dtype)
-    jacobian = jax.pure_callback(
-        lambda x: _differences(twin, place, x).astype(result.dtype), result, flat, vmap_method="sequential"
-    )
+    jacobian = host_callback(lambda x: _differences(twin, place, x).astype(result.dtype), result, flat)
     return out, jacobian @ change[np.array(place.used)]
 
 

@@ -16,14 +16,6 @@ RUN = 4
 
 
 @functools.cache
-def solver_name(dtype: DTypeLike) -> str:
-    """Name for `jax.ffi.ffi_call` of the solver of a step, for numbers of a floating type."""
-    from dano.native._solver import define
-
-    return define(np.dtype(dtype).name)
-
-
-@functools.cache
 def finder_name(dtype: DTypeLike) -> str:
     """Name for `jax.ffi.ffi_call` of the search for contact, for numbers of a floating type."""
     from dano.native._finding import define

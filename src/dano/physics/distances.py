@@ -131,7 +131,7 @@ def inverse_or_zero(x: real) -> real:
 
 @wp.func
 def half_space_distance(leaf: Leaf, y: vec3) -> Distance:
-    """n · y − offset."""
+    """Distance n · y − offset."""
     d = Distance()
     d.value = wp.dot(leaf.sizes, y) - leaf.length
     d.gradient = leaf.sizes
@@ -272,7 +272,7 @@ def adj_ellipsoid_root(x: vec3, semi_axes: vec3, adj_ret: real):
 
 @wp.func
 def ellipsoid_distance(leaf: Leaf, y: vec3) -> Distance:
-    """t |y/(t + a²)| with t such that a² y/(t + a²) lies on the surface (Eberly, *Distance to an ellipsoid*)."""
+    """Distance t |y/(t + a²)|, with a² y/(t + a²) on the surface (Eberly, *Distance to an ellipsoid*)."""
     d = Distance()
     a = leaf.sizes
     # Off the symmetry planes, on which the closest point of an inner point is not unique.
@@ -549,7 +549,7 @@ def solid_clearance(solids: Solids, world: int, solid: Solid, x: vec3) -> real:
 
 @wp.func
 def solid_distance(solids: Solids, world: int, solid: Solid, x: vec3) -> Distance:
-    """Signed distance of a solid and its gradient, at a point [m, F]; of a union, that of the nearest leaf."""
+    """Signed distance of a solid and its gradient at a point [m, F]; of a union, of its nearest leaf."""
     if wp.static(UNIONS):
         solid = nearest_leaf(solids, world, solid, x)
     return leaf_distance(solids, world, solid.kind, solid.leaf, x)

@@ -1,7 +1,7 @@
 """What the kernels of a scene must know: code for anything else is left out when they are built.
 
-These are the values of a build that knows everything. `dano.engine` builds kernels for a scene with those that
-it needs (see `dano.engine._instances`), which compiles and runs several times as fast.
+These are the values of a build that knows everything. `dano.engine` builds kernels for a scene with those
+that it needs (see `dano.engine.launching._instances`), which compiles and runs several times as fast.
 """
 
 KINDS = frozenset(range(8))
@@ -16,6 +16,10 @@ PATCHES = True
 """Whether there are contacts with a patch law."""
 TURNING = frozenset({0, 1, 2})
 """How samples turn with their bodies, see `pairs`."""
+TREES = True
+"""Whether bodies hang on joints."""
+LOOPS = True
+"""Whether chains of joints are closed, see `loops`."""
 LANES = 1
 """Lanes of a world: 1 on a CPU, 32 on a GPU."""
 WIDE = True

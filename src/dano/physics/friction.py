@@ -8,7 +8,7 @@ velocity. Both contact laws use it, at a point and at a patch. The dual λ is an
 
 import warp as wp
 
-from dano.physics.real import real, vec3
+from dano.physics.real import ONE, real, vec3
 
 
 @wp.struct
@@ -51,16 +51,16 @@ def friction_with_dual(u: vec3, dual: vec3, bound: real, bound_damping: real, st
     """
     found = Friction()
     speed = wp.length(u)
-    slow = wp.max(speed, stiction)
+    inverse_slow = ONE / wp.max(speed, stiction)
     size = wp.length(dual)
     found.value = dual
     if size > bound:
         found.value = (bound / size) * dual
-    gain = u / slow
+    gain = inverse_slow * u
     found.change = -found.value - bound * gain
-    found.grip = bound / slow
+    found.grip = bound * inverse_slow
     if speed > stiction:
-        found.turning = found.value / slow
+        found.turning = inverse_slow * found.value
         found.direction = gain
     found.by_rate = bound_damping * gain
     return found

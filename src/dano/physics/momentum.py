@@ -1,8 +1,8 @@
 """Discrete momentum of a rigid body (docs/theory/integrator.md, "One step" and "Fast spins").
 
 P(ω) = m(x) J ω + g(x) (h/2) ω × Jω is the angular momentum after a step as seen from the orientation at its
-start, P⁻(ω) = m(x) J ω − g(x) (h/2) ω × Jω the one that a step begins with; x = h |ω|/2. Both are equations of
-vectors: they hold in body axes with the inertia J there, and in world axes with R J Rᵀ.
+start, P⁻(ω) = m(x) J ω − g(x) (h/2) ω × Jω the one that a step begins with; x = h |ω|/2. Both are
+equations of vectors: they hold in body axes with the inertia J there, and in world axes with R J Rᵀ.
 """
 
 import math
@@ -33,7 +33,10 @@ class MomentumShares:
 
 @wp.func
 def momentum_shares(omega: vec3, h: real) -> MomentumShares:
-    """m = √(1 − x²), g = 1 up to `RESOLVED`; beyond m x = c + x − (1 − c′) w (1 − e^(−y/w)), g = e^(−(y/w)²)."""
+    """Shares m and g of spin and of its change, and their slopes.
+
+    m = √(1 − x²), g = 1; above `RESOLVED` m x = c + x − (1 − c′) w (1 − e^(−y/w)), g = e^(−(y/w)²).
+    """
     shares = MomentumShares()
     squared = real(0.25) * h * h * wp.dot(omega, omega)
     if squared <= _RESOLVED * _RESOLVED:
@@ -58,7 +61,7 @@ def momentum_shares(omega: vec3, h: real) -> MomentumShares:
 
 @wp.func
 def angular_momentum(omega: vec3, inertia: mat33, h: real, sign: real) -> vec3:
-    """m J ω ± g (h/2) ω × Jω: after a step (sign +1), or before it (−1)."""
+    """Moment m J ω ± g (h/2) ω × Jω: after a step (sign +1), or before it (−1)."""
     shares = momentum_shares(omega, h)
     spin = inertia * omega
     return shares.share * spin + (HALF * sign * h * shares.gyroscopic) * wp.cross(omega, spin)

@@ -7,7 +7,7 @@ import warp as wp
 
 from dano.physics.distances import Distance, Solid, solid_distance, Solids
 from dano.physics.features import TURNING
-from dano.physics.real import HALF, mat33, ONE, quat, real, vec3, ZERO
+from dano.physics.real import mat33, ONE, quat, real, vec3, ZERO
 from dano.physics.rotations import direction, interpolated, matrix, rotation_from_z
 
 FIXED, AXIS, BALL = 0, 1, 2
@@ -99,8 +99,9 @@ def facing_map(turn: mat33, toward: vec3, turning: int, scale: vec3) -> FacingMa
     """Samples that face a direction of their body, in the axes that a rotation takes the body's to.
 
     A ball looks the same from all sides, a cylinder from all around: samples that keep facing the other body
-    let it roll smoothly. Directions d on a unit ball become points S Q d of an ellipsoid with semi-axes S, and
-    areas a become det(S) S⁻¹ Q a, with Q such that the densest samples lie where the ellipsoid comes closest.
+    let it roll smoothly. Directions d on a unit ball become points S Q d of an ellipsoid with semi-axes
+    S, and areas a become det(S) S⁻¹ Q a, with Q such that the densest samples lie where the ellipsoid
+    comes closest.
 
     Args:
         turn: Body → the frame.
@@ -126,7 +127,9 @@ def facing_map(turn: mat33, toward: vec3, turning: int, scale: vec3) -> FacingMa
             facing = rotation_from_z(-direction(wp.cw_mul(scale, toward)))
             volume = scale[0] * scale[1] * scale[2]
             found.points = turn * wp.diag(scale) * facing
-            found.vectors = turn * wp.diag(vec3(volume / scale[0], volume / scale[1], volume / scale[2])) * facing
+            found.vectors = (
+                turn * wp.diag(vec3(volume / scale[0], volume / scale[1], volume / scale[2])) * facing
+            )
     return found
 
 
@@ -183,9 +186,10 @@ def pair_pose(
     pose.arm_offset = pose.origin - pose.com + inverse * ((follows * share * h) * moves)
     if wp.static(len(TURNING) > 1):
         if turning != _FIXED:
-            # What touches a plane with the same normal at the start: forces act there, and depths are those of
-            # the end. Together they are SHAKE's way with a constraint, which neither damps nor drives rolling.
-            # The faster a body spins, the nearer to the end: arms far from where depths are would miss impacts.
+            # What touches a plane with the same normal at the start: forces act there, and depths are
+            # those of the end. Together they are SHAKE's way with a constraint, which neither damps nor
+            # drives rolling. The faster a body spins, the nearer to the end: arms far from where depths
+            # are would miss impacts.
             turn_squared = wp.dot(first.spin, first.spin) * h * h
             fast = wp.min(turn_squared / (_FASTEST * _FASTEST), ONE)
             before = inverse * rotation_after(first, fast * share)
@@ -227,15 +231,13 @@ def shrunk(scale: vec3, least: real, point: vec3) -> vec3:
 
 
 @wp.func
-def first_touch(
-    solids: Solids, world: int, solid: Solid, turn: mat33, origin: vec3, scale: vec3
-) -> vec3:
+def first_touch(solids: Solids, world: int, solid: Solid, turn: mat33, origin: vec3, scale: vec3) -> vec3:
     """Where a step of the search for the first touch of a growing ellipsoid starts, at the end of the search.
 
-    The ellipsoid grows from its centre; it touches the solid first at the point x with the least |S⁻¹ x|, found
-    by projected gradients with momentum (Nesterov 2004, Introductory Lectures on Convex Optimization, section
-    2.2.4). An ellipsoid that has sunk in beside an edge is pressed by the edge; the solid's nearest side is
-    another place. From the result, `closer` gives the direction to the solid.
+    The ellipsoid grows from its centre; it touches the solid first at the point x with the least |S⁻¹ x|,
+    found by projected gradients with momentum (Nesterov 2004, Introductory Lectures on Convex
+    Optimization, section 2.2.4). An ellipsoid that has sunk in beside an edge is pressed by the edge; the
+    solid's nearest side is another place. From the result, `closer` gives the direction to the solid.
     """
     least = wp.min(scale[0], wp.min(scale[1], scale[2]))
     root = wp.sqrt(_PULL) * least / wp.max(scale[0], wp.max(scale[1], scale[2]))
@@ -272,7 +274,7 @@ def facing_direction(
     turning: int,
     scale: vec3,
 ) -> vec3:
-    """Direction from a body whose samples keep facing a solid to that solid, after a share of the step [F]."""
+    """Direction in which the samples of a body face a solid, after a share of the step [F]."""
     toward = vec3(ONE, ZERO, ZERO)
     if wp.static(len(TURNING) > 1):
         inverse = wp.transpose(rotation_after(second, share))
@@ -290,7 +292,7 @@ def facing_direction(
 
 @wp.func
 def approach(pose: PairPose, turning: int, x: vec3, normal: vec3) -> real:
-    """Speed at which a point of the first body, at x in the solid frame, nears the solid at old velocities."""
+    """Speed at which a point x [F] of the first body nears the solid at old velocities [m/s]."""
     u = pose.velocity
     if turning == _FIXED:
         # Samples that keep facing the other body do not turn with theirs.

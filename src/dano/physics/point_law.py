@@ -8,7 +8,8 @@ friction λ and the direction s of the hysteresis as unknowns of their own, the 
 
     max(|u|, v_s) λ + b(p) u = 0,  |λ| ≤ b(p)        max(|v_n|, v_s) s − v_n = 0,  |s| ≤ 1
 
-(Chan, Golub, Mulet 1999; Andersen et al. 2000, for sums of norms). `linearized` is the derivative of this form.
+(Chan, Golub, Mulet 1999; Andersen et al. 2000, for sums of norms). `linearized` is the derivative of this
+form.
 """
 
 import warp as wp
@@ -113,7 +114,7 @@ class Bound:
 
 @wp.struct
 class Duals:
-    """Unknowns of the law besides the velocities: λ [Pa], and s, 1 where the surface comes out, −1 going in."""
+    """Unknowns besides the velocities: λ [Pa], and s, 1 where the surface comes out, −1 going in."""
 
     friction: vec3
     direction: real
@@ -199,6 +200,12 @@ def point_law(material: Material, point: Point, impact_stiffness: real) -> Point
 
 
 @wp.func
+def is_apart(law: PointLaw, rate: real) -> bool:
+    """Whether a point that is not sunk in stays out: then d − θ h v_n says all."""
+    return law.depth <= ZERO and law.depth - law.ahead * rate <= ZERO
+
+
+@wp.func
 def pressure(law: PointLaw, rate: real, direction: real, stiction: real) -> Pressure:
     """Pressure p = k max(0, d − D) at a separating speed v_n.
 
@@ -226,10 +233,10 @@ def pressure(law: PointLaw, rate: real, direction: real, stiction: real) -> Pres
         inverse = ONE / wp.sqrt(ONE + scaled * scaled)
         saturation = scaled * inverse
         saturation_slope = inverse * inverse * inverse
-    slow = wp.max(wp.abs(rate), stiction)
-    fitting = rate / slow
+    inverse_slow = ONE / wp.max(wp.abs(rate), stiction)
+    fitting = rate * inverse_slow
     away = wp.where(wp.abs(rate) > stiction, direction * wp.sign(rate), ZERO)
-    found.direction_by_speed = (ONE - away) / slow
+    found.direction_by_speed = (ONE - away) * inverse_slow
     found.direction_change = fitting - direction
     by_loss = law.damped * saturation + law.lost * fitting
     by_time = law.ahead * rate
@@ -258,7 +265,7 @@ def friction_bound(law: PointLaw, p: real) -> Bound:
 
 @wp.func
 def point_motion(point: Point, velocity: vec3, spin: vec3) -> Motion:
-    """Motion of a point, less its extra slip, from the first body's twist relative to the second, at its centre."""
+    """Motion of a point, less its extra slip, from the relative twist at the first body's centre."""
     motion = Motion()
     u = velocity + wp.cross(spin, point.arm)
     motion.rate = wp.dot(point.normal, velocity) + wp.dot(point.moment, spin)
@@ -288,7 +295,9 @@ def fitting_duals(law: PointLaw, motion: Motion) -> Duals:
 
 
 @wp.func
-def linearized(law: PointLaw, motion: Motion, duals: Duals, softness: real, holds: bool, mix: real, held: real) -> Linear:
+def linearized(
+    law: PointLaw, motion: Motion, duals: Duals, softness: real, holds: bool, mix: real, held: real
+) -> Linear:
     """One linearisation of the law with its duals.
 
     Args:

@@ -1,8 +1,8 @@
 """Types of numbers in formulas: 64 bits wide, or 32 where a GPU is to be fast.
 
-Names are those of the quantities: `real` a number, `vec3` a vector, `mat33` a matrix, `vec6` a twist or wrench
-(linear part first), `mat66` its derivative by another, `quat` a unit quaternion as Warp stores it (x, y, z, w).
-Rows that come from JAX keep quaternions as (w, x, y, z), see `rotations.from_wxyz`.
+Names are those of the quantities: `real` a number, `vec3` a vector, `mat33` a matrix, `vec6` a twist or
+wrench (linear part first), `mat66` its derivative by another, `quat` a unit quaternion as Warp stores it
+(x, y, z, w). Rows that come from JAX keep quaternions as (w, x, y, z), see `rotations.from_wxyz`.
 """
 
 import warp as wp

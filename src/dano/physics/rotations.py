@@ -111,9 +111,7 @@ def exponential(v: vec3) -> quat:
     sine = ZERO  # over the half angle
     if squared < _SERIES:
         s = squared
-        sine = ONE - s / real(6.0) * (
-            ONE - s / real(20.0) * (ONE - s / real(42.0) * (ONE - s / real(72.0)))
-        )
+        sine = ONE - s / real(6.0) * (ONE - s / real(20.0) * (ONE - s / real(42.0) * (ONE - s / real(72.0))))
         cosine = ONE - s / TWO * (ONE - s / real(12.0) * (ONE - s / real(30.0) * (ONE - s / real(56.0))))
     else:
         half = wp.sqrt(squared)

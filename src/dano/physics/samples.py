@@ -5,7 +5,7 @@ import warp as wp
 from dano.physics.distances import Distance
 from dano.physics.features import TURNING
 from dano.physics.pairs import AXIS, BALL, FIXED, PairPose
-from dano.physics.real import HALF, ONE, real, vec3, ZERO
+from dano.physics.real import HALF, real, vec3, ZERO
 
 _FIXED = wp.constant(FIXED)
 _AXIS = wp.constant(AXIS)
@@ -32,7 +32,8 @@ class Point:
     Attributes:
         arm: From the first body's centre of mass to the point [m].
         normal: Unit normal out of the second body, toward the first.
-        moment: Moment of a unit pressure about the first body's centre of mass [m]: arm × normal, without what
+        moment: Moment of a unit pressure about the first body's centre of mass [m]: arm × normal, without
+        what
             a body that rolls on a smooth surface would feel of single samples.
         extra_slip: What is added to the slip [m/s]: the part along the surface of half the change of the
             point's velocity within the step, for samples that keep facing the second body.

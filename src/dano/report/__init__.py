@@ -25,6 +25,7 @@ from dano.report._training import (
     write_training_report as write_training_report,
 )
 from dano.report._video import (
+    checked_size as checked_size,
     render_side_by_side as render_side_by_side,
     render_trajectory as render_trajectory,
 )

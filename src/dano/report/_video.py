@@ -180,6 +180,25 @@ def _checked(
     return style._replace(size=(size[0], size[1])), outputs
 
 
+def checked_size(size: Sequence[int], count: int = 1) -> tuple[int, int]:
+    """Width and height of films and strips [pixels].
+
+    Args:
+        size: Of the picture of a run.
+        count: Runs that are side by side.
+
+    Raises:
+        ValueError: If they are no even numbers in range.
+    """
+    size, most = checked_items("size", size, int), MOST_PIXELS if count == 1 else _MOST_OF_HALF
+    if len(size) != 2 or not all(16 <= n <= most and n % 2 == 0 for n in size):
+        raise ValueError(
+            f"size must be two even numbers from 16 to {most} pixels (video codecs need them even),"
+            f" got {list(size)}"
+        )
+    return size[0], size[1]
+
+
 def check_film(
     runs: Sequence[tuple[Scene, Trajectory]], path: Any, strip: Any, size: Any
 ) -> tuple[Path | None, Path | None]:
@@ -193,12 +212,7 @@ def check_film(
         raise ValueError("path or strip must be given, got None for both")
     for scene, trajectory in runs:
         check_run(scene, trajectory)
-    size, most = checked_items("size", size, int), MOST_PIXELS if len(runs) == 1 else _MOST_OF_HALF
-    if len(size) != 2 or not all(16 <= n <= most and n % 2 == 0 for n in size):
-        raise ValueError(
-            f"size must be two even numbers from 16 to {most} pixels (video codecs need them even),"
-            f" got {list(size)}"
-        )
+    checked_size(size, len(runs))
     checked = []
     for name, output, suffix in (("path", path, ".mp4"), ("strip", strip, ".png")):
         if output is not None and checked_path(name, output).suffix.lower() != suffix:

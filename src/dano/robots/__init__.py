@@ -1,19 +1,6 @@
 """Robots: files of links and joints in, bodies and joints of a scene out; kinematics and dynamics."""
 
-from dano.robots._build import (
-    build_robot as build_robot,
-    load_mjcf as load_mjcf,
-    load_urdf as load_urdf,
-    read_robot as read_robot,
-)
-from dano.robots._description import (
-    Connection as Connection,
-    Description as Description,
-    Link as Link,
-    Placed as Placed,
-    Solid as Solid,
-    Tie as Tie,
-)
+from dano.robots._build import build_robot as build_robot
 from dano.robots._dynamics import (
     bias_forces as bias_forces,
     computed_torque as computed_torque,
@@ -30,6 +17,21 @@ from dano.robots._inverse import (
     InverseKinematics as InverseKinematics,
     Target as Target,
 )
+from dano.robots._loading import (
+    load_mjcf as load_mjcf,
+    load_urdf as load_urdf,
+    read_robot as read_robot,
+)
 from dano.robots._loops import close_loops as close_loops, loop_gaps as loop_gaps
 from dano.robots._operational import operational_space_torque as operational_space_torque
 from dano.robots._robot import Robot as Robot
+from dano.robots.formats import (
+    at_home as at_home,
+    Connection as Connection,
+    Description as Description,
+    Drive as Drive,
+    Link as Link,
+    Placed as Placed,
+    Solid as Solid,
+    Tie as Tie,
+)

@@ -1,41 +1,83 @@
-"""Shapes of links: primitives, and meshes as signed distances that are kept in the user's cache folder."""
+"""Shapes of links: primitives, and what stands for meshes, which is kept in the user's cache folder."""
 
 import hashlib
-import os
 import warnings
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from dano.caches import cache_folder
+from dano.checks import shown
+from dano.extras import optional
 from dano.fields import (
     AbstractShape,
     Box,
     Capsule,
+    convex_pieces,
     Cylinder,
     Ellipsoid,
+    hull_field,
     load_field,
     mesh_field,
     posed,
     save_field,
-    scaled,
+    SignedDistanceGrid,
     Sphere,
     union,
 )
 from dano.maths import Pose
-from dano.robots._description import Placed, Solid
+from dano.names import did_you_mean
+from dano.robots.formats import Placed, read_collada, Solid
 
-# Nodes along the longest axis of a link's mesh.
-_RESOLUTION = 64
-_VERSION = "1"
+COLLISION = ("hull", "distance", "pieces", "none")
+"""What links touch with in place of meshes."""
+# Nodes along the longest axis of a link's mesh, and of a hull.
+_RESOLUTION, _HULL_RESOLUTION = 64, 48
+# Largest concavity of a convex piece, as a share of the size: CoACD's own.
+_CONCAVITY = 0.05
+_VERSION = "2"
+
+Triangles = tuple[np.ndarray, np.ndarray]
 
 
-def shape_of(solids: list[tuple[Solid, Placed]], where: str) -> AbstractShape | None:
-    """The union of solids, each in a frame that has a place in the body's; None without any.
+def checked_collision(collision: bool | str | Mapping[str, str], links: Sequence[str]) -> dict[str, str]:
+    """What stands for the meshes of each link.
 
     Raises:
+        ValueError: If a word or a link is unknown.
+    """
+    if isinstance(collision, bool):
+        collision = "hull" if collision else "none"
+    if isinstance(collision, str):
+        collision = dict.fromkeys(links, collision)
+    if not isinstance(collision, Mapping):
+        raise ValueError(
+            f"collision must be one of {list(COLLISION)}, or such words by links, got {shown(collision)}"
+        )
+    for name, word in collision.items():
+        if name not in links:
+            hint = did_you_mean(name, links)
+            raise ValueError(f"collision must be given for links {list(links)}, got {name!r}{hint}")
+        if word not in COLLISION:
+            raise ValueError(f"collision must be one of {list(COLLISION)}, got {shown(word)}")
+    return {name: collision.get(name, "hull") for name in links}
+
+
+def shape_of(solids: Sequence[tuple[Solid, Placed, str]], where: str) -> AbstractShape | None:
+    """The union of solids, each in a frame that has a place in the body's; None without any.
+
+    Args:
+        solids: Each with the place of its link's frame, and what stands for a mesh, see `COLLISION`.
+        where: For messages.
+
+    Raises:
+        ImportError: If a mesh needs packages that are missing.
         ValueError: If a mesh is missing or encloses no volume, or a measure is not positive.
     """
-    shapes = [_placed(_placed(_shape(solid, where), solid.place), place) for solid, place in solids]
+    shapes = [
+        _placed(_placed(_shape(solid, kind, where), solid.place), place) for solid, place, kind in solids
+    ]
     if not shapes:
         return None
     return shapes[0] if len(shapes) == 1 else union(*shapes)
@@ -47,64 +89,113 @@ def _placed(shape: AbstractShape, place: Placed) -> AbstractShape:
     return posed(shape, Pose(place.position, place.orientation))
 
 
-def _shape(solid: Solid, where: str) -> AbstractShape:
+def _shape(solid: Solid, kind: str, where: str) -> AbstractShape:
     numbers = solid.numbers
-    if solid.kind != "mesh":
-        make = {
-            "box": lambda: Box(numbers),
-            "sphere": lambda: Sphere(*numbers),
-            "cylinder": lambda: Cylinder(*numbers),
-            "capsule": lambda: Capsule(*numbers),
-            "ellipsoid": lambda: Ellipsoid(numbers),
-        }[solid.kind]
-        try:
-            return make()
-        except ValueError as error:
-            raise ValueError(f"{where}: {error}") from error
-    assert solid.path is not None
-    if not solid.path.is_file():
+    if solid.kind == "mesh":
+        return _of_mesh(solid, kind, where)
+    make = {
+        "box": lambda: Box(numbers),
+        "sphere": lambda: Sphere(*numbers),
+        "cylinder": lambda: Cylinder(*numbers),
+        "capsule": lambda: Capsule(*numbers),
+        "ellipsoid": lambda: Ellipsoid(numbers),
+    }[solid.kind]
+    try:
+        return make()
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+
+
+def _of_mesh(solid: Solid, kind: str, where: str) -> AbstractShape:
+    """What stands for a mesh, from the cache if the same was made before."""
+    if solid.path is not None and not solid.path.is_file():
         raise ValueError(
             f"{where}: mesh must be a file, got {solid.path}, which does not exist; "
             "collision=False reads the robot without collision geometry"
         )
-    sizes = np.abs(numbers)
-    if np.ptp(sizes) > 1e-9 * sizes.max() or min(numbers) <= 0:
-        raise ValueError(f"{where}: scale of a mesh must be the same along all axes and > 0, got {numbers}")
-    shape = _mesh(solid.path, where)
-    return shape if numbers[0] == 1 else scaled(shape, numbers[0])
-
-
-def _mesh(path: Path, where: str) -> AbstractShape:
-    """Signed distance of a mesh, from the cache if the same content was read before."""
-    kept = _cache_file(path)
-    if kept is not None and kept.is_file():
-        found = load_field(kept)
-        if isinstance(found, AbstractShape):
-            return found
+    if not all(solid.numbers):
+        raise ValueError(f"{where}: scale of a mesh must not be 0, got {solid.numbers}")
+    name = "mesh" if solid.path is None else str(solid.path)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            made = mesh_field(path, _RESOLUTION)
+        if kind == "pieces":
+            hulls = [hull_field(points, _HULL_RESOLUTION) for points in _pieces(solid)]
+            return hulls[0] if len(hulls) == 1 else union(*hulls)
+        kept = _cache_file(solid, kind)
+        if kept is not None and kept.is_file() and isinstance(found := load_field(kept), SignedDistanceGrid):
+            return found
+        mesh = _scaled(_read(solid), solid.numbers)
+        made = _distance(mesh) if kind == "distance" else hull_field(mesh[0], _HULL_RESOLUTION)
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
-    if kept is not None:
-        try:
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            save_field(made, kept)
-        except OSError:
-            # A full disk, or no home: the mesh is read again the next time.
-            pass
+        raise ValueError(
+            f"{where}: {name}: {error}; collision=… chooses what stands for meshes, of all links or of one"
+        ) from error
+    _keep(kept, lambda path: save_field(made, path))
     return made
 
 
-def _cache_file(path: Path) -> Path | None:
-    """Where the field of a mesh is kept: `$DANO_CACHE_DIR`, or the user's cache folder; None if `off`."""
-    chosen = os.environ.get("DANO_CACHE_DIR")
-    if chosen == "off":
-        return None
+def _pieces(solid: Solid) -> list[np.ndarray]:
+    """Corners of the convex pieces of a mesh [m]; to find them takes seconds."""
+    kept = _cache_file(solid, "pieces")
+    if kept is not None and kept.is_file():
+        with np.load(kept) as found:
+            return [found[key] for key in found.files]
+    pieces = [points for points, _ in convex_pieces(_scaled(_read(solid), solid.numbers), _CONCAVITY)]
+    _keep(kept, lambda path: np.savez(path, *pieces))
+    return pieces
+
+
+def _keep(path: Path | None, write: Callable[[Path], None]) -> None:
+    if path is None:
+        return
     try:
-        usual = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dano"
-    except RuntimeError:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(path)
+    except OSError:
+        # A full disk, or no home: the mesh is read again the next time.
+        pass
+
+
+def _read(solid: Solid) -> Triangles:
+    """Vertices and faces of a mesh; several parts of a file are one."""
+    if solid.triangles is not None:
+        return solid.triangles
+    assert solid.path is not None
+    if solid.path.suffix.lower() == ".dae":
+        return read_collada(solid.path)
+    trimesh = optional("trimesh", "reading meshes needs trimesh", "mesh")
+    try:
+        mesh = trimesh.load_mesh(solid.path)
+    except Exception as error:  # each of trimesh's readers raises its own kinds
+        raise ValueError(f"cannot be read as a triangle mesh ({error})") from error
+    if isinstance(mesh, trimesh.Scene):
+        mesh = mesh.to_mesh()
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise ValueError("must be a triangle mesh with faces, got none")
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
+
+
+def _scaled(mesh: Triangles, scale: Sequence[float]) -> Triangles:
+    """A mesh by its scales along the axes, without points of no face; a mirrored one keeps its outside."""
+    used, faces = np.unique(mesh[1], return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    return mesh[0][used] * np.array(scale), faces[:, ::-1] if np.prod(scale) < 0 else faces
+
+
+def _distance(mesh: Triangles) -> SignedDistanceGrid:
+    trimesh = optional("trimesh", "reading meshes needs trimesh", "mesh")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return mesh_field(trimesh.Trimesh(*mesh, process=False), _RESOLUTION)
+
+
+def _cache_file(solid: Solid, kind: str) -> Path | None:
+    """Where the shape of a mesh is kept; None if there is no folder for caches."""
+    if (folder := cache_folder()) is None:
         return None
-    digest = hashlib.sha256(path.read_bytes() + f"{path.suffix} {_RESOLUTION} {_VERSION}".encode())
-    return (Path(chosen) if chosen else usual) / "meshes" / f"{digest.hexdigest()[:32]}.npz"
+    digest = hashlib.sha256(f"{kind} {solid.numbers} {_RESOLUTION} {_HULL_RESOLUTION} {_VERSION}".encode())
+    if solid.triangles is not None:
+        for array in solid.triangles:
+            digest.update(np.ascontiguousarray(array).tobytes())
+    elif solid.path is not None:
+        digest.update(solid.path.suffix.encode() + solid.path.read_bytes())
+    return folder / "meshes" / f"{digest.hexdigest()[:32]}.npz"

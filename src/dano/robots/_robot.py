@@ -1,7 +1,8 @@
 """Robots: bodies and joints for a scene, and where every link of the file is on them."""
 
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax.numpy as jnp
@@ -10,10 +11,10 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_items, checked_kind
 from dano.contact import ContactParams
-from dano.maths import checked_array, checked_floating, Numbers, quat_multiply, quat_rotate
+from dano.maths import checked_array, checked_floating, is_traced, Numbers, quat_multiply, quat_rotate
 from dano.names import did_you_mean
-from dano.robots._description import Description
-from dano.scene import Body, Contact, Joint, Loop, Scene, State
+from dano.robots.formats import Description, Drive
+from dano.scene import Body, Contact, Control, Joint, Loop, Scene, State
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,8 @@ class Robot:
 
     Attributes:
         name: Of the robot.
-        bodies: One for each group of links that moves as one; the base, too, if it floats or has a shape.
+        bodies: One for each group of links that moves as one; the base, too, if it floats or has a shape, and
+            what the file has in the world.
         joints: Between them, in the order of the file.
         joint_names: Of those with coordinates of their own: the file's names, by the body that hangs on each.
         frames: Of each link of the file: its body (None for the world), position [m] and orientation wxyz in
@@ -32,6 +34,12 @@ class Robot:
         touching: Bodies that have a shape of their own to touch with.
         description: What the file says.
         loops: What closes chains of its joints.
+        places: Position [m, W] and orientation of the frames of bodies that hang on no joint, in the pose of
+            the file.
+        home: Coordinates of the joints in that pose, by their names in the file [rad or m].
+        gravity: Of the file [m/s²]; None if its format has none.
+        drives: Joint and numbers of each actuator of the file, by its name.
+        surroundings: Bodies that stand in the file's world, and on which no joint hangs, such as a floor.
     """
 
     name: str
@@ -44,6 +52,11 @@ class Robot:
     touching: tuple[str, ...]
     description: Description
     loops: tuple[Loop, ...] = ()
+    places: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    home: dict[str, float] = field(default_factory=dict)
+    gravity: tuple[float, float, float] | None = None
+    drives: dict[str, tuple[str, Drive]] = field(default_factory=dict)
+    surroundings: tuple[str, ...] = ()
 
     def scene(
         self,
@@ -61,13 +74,16 @@ class Robot:
             contacts: Contacts; `contacts_with` lists those of the robot.
             joints: Other joints.
             loops: Other loops.
-            **options: Of `Scene.create`, such as `timestep` and `gravity`.
+            **options: Of `Scene.create`, such as `timestep`. `gravity` is that of the file if it has one.
 
         Raises:
-            ValueError: As `Scene.create`.
+            ValueError: As `Scene.create` and `check_simulated`.
         """
         bodies, joints = checked_items("bodies", bodies, Body), checked_items("joints", joints, Joint)
         loops = checked_items("loops", loops, Loop)
+        self.check_simulated()
+        if self.gravity is not None:
+            options = {"gravity": self.gravity, **options}
         return Scene.create(
             [*self.bodies, *bodies],
             contacts,
@@ -76,15 +92,39 @@ class Robot:
             **options,
         )
 
-    def contacts_with(self, *others: str, params: ContactParams | None = None) -> list[Contact]:
-        """Contacts of all bodies that have a shape with other bodies of the scene."""
-        pairs = [(body, other) for body in self.touching for other in others]
-        return [Contact(*pair) if params is None else Contact(*pair, params) for pair in pairs]
+    def check_simulated(self) -> None:
+        """Check that nothing is left in the file that a simulation would do wrong.
+
+        Raises:
+            ValueError: If bodies have a weight that the file compensates (`gravcomp`).
+        """
+        for each in self.description.lacking:
+            raise ValueError(
+                f"{self.description.source}: {each.text}; ignore=[{each.feature!r}] leaves it out"
+            )
+
+    def contacts_with(self, *others: str | Body, params: ContactParams | None = None) -> list[Contact]:
+        """Contacts of the robot's bodies that have a shape with other bodies of the scene.
+
+        What stands still itself, such as the base of an arm, is among them only for a `Body` that moves: two
+        bodies that never move have no contact, and of a name alone it is not known.
+
+        Args:
+            *others: Names of bodies, or bodies.
+            params: Parameters of all these contacts.
+        """
+        fixed = {body.name for body in self.bodies if body.fixed}
+        pairs: list[tuple[str, str]] = []
+        for other in others:
+            moves = isinstance(other, Body) and not other.fixed
+            name = other.name if isinstance(other, Body) else other
+            pairs += [(body, name) for body in self.touching if body != name and (moves or body not in fixed)]
+        return [Contact(a, b) if params is None else Contact(a, b, params) for a, b in pairs]
 
     def start(
         self, q: Mapping[str, Numbers] | None = None, v: Mapping[str, Numbers] | None = None
     ) -> dict[str, dict[str, Numbers]]:
-        """Arguments of `Scene.initial_state`: joints by their names in the file, zero by default.
+        """Arguments of `Scene.initial_state`: joints by their names in the file; by default the file's pose.
 
         Args:
             q: Coordinates [rad or m].
@@ -93,18 +133,17 @@ class Robot:
         Raises:
             ValueError: If a joint is unknown, or a number is not finite.
         """
-        given: dict[str, dict[str, Numbers]] = {}
+        given: dict[str, dict[str, Numbers]] = {
+            self.joint_names[name]: {"q": value} for name, value in self.home.items() if value
+        }
         for key, values in (("q", q), ("v", v)):
-            values = {} if values is None else checked_kind(key, values, Mapping)
-            for name, value in values.items():
-                body, what = self.body_of(name), f"{key} of joint {name!r}"
-                numbers = checked_floating(what, value)
-                given.setdefault(body, {})[key] = checked_array(what, numbers, numbers.shape)
-        first = self.bodies[0]
-        if first.fixed and self.base is not None:
-            position, orientation = (jnp.asarray(x) for x in self.base)
-            com = position + quat_rotate(orientation, first.com.astype(position.dtype))
-            given[first.name] = dict(position=com, orientation=orientation)
+            for body, numbers in self._by_body(key, values).items():
+                given.setdefault(body, {})[key] = numbers
+        bodies = {body.name: body for body in self.bodies}
+        for name, place in self.places.items():
+            position, orientation = (jnp.asarray(x) for x in place)
+            com = position + quat_rotate(orientation, bodies[name].com.astype(position.dtype))
+            given[name] = dict(position=com, orientation=orientation)
         return given
 
     def state(
@@ -118,9 +157,75 @@ class Robot:
 
         Raises:
             ValueError: If a joint is unknown, or as `Scene.initial_state`.
+
+        Warns:
+            RuntimeWarning: If a joint starts beyond its limits.
         """
         checked_kind("scene", scene, Scene)
-        return scene.initial_state(**self.start(q, v), **others)
+        given = self.start(q, v)
+        for name, values in others.items():
+            given[name] = {**given.get(name, {}), **values}
+        return scene.state_of(given, {body: name for name, body in self.joint_names.items()})
+
+    def control(
+        self,
+        scene: Scene,
+        commands: Mapping[str, Numbers] | None = None,
+        efforts: Mapping[str, Numbers] | None = None,
+        **others: dict[str, Numbers],
+    ) -> Control:
+        """Control of one step: actuators and joints by their names in the file.
+
+        Args:
+            scene: A scene with the robot.
+            commands: What actuators of the file are told, within the ranges of the file.
+            efforts: Torques or forces of joints [N m or N], besides those of actuators.
+            **others: As in `Scene.control`.
+
+        Raises:
+            ValueError: If an actuator or a joint is unknown, or a command is out of its range.
+
+        Warns:
+            RuntimeWarning: If an effort is larger than the file says that the joint can have.
+        """
+        checked_kind("scene", scene, Scene)
+        given = {name: dict(values) for name, values in others.items()}
+        for name, value in dict(commands or {}).items():
+            if name not in self.drives:
+                hint = did_you_mean(name, self.drives)
+                raise ValueError(f"command must be of one of {list(self.drives)}, got {name!r}{hint}")
+            joint, drive = self.drives[name]
+            number = checked_array(f"command of {name!r}", value, ())
+            if not is_traced(number) and not drive.commands[0] <= float(number) <= drive.commands[1]:
+                raise ValueError(
+                    f"command of {name!r} must be in {list(drive.commands)}, got {float(number):g}"
+                )
+            given.setdefault(self.joint_names[joint], {})["command"] = number
+        for body, numbers in self._by_body("effort", efforts).items():
+            given.setdefault(body, {})["effort"] = numbers
+        self._warn_of_efforts(efforts or {})
+        return scene.control(**given)
+
+    def _warn_of_efforts(self, efforts: Mapping[str, Numbers]) -> None:
+        for name, value in efforts.items():
+            most = self.efforts[name]
+            if not is_traced(value) and float(np.max(np.abs(np.asarray(value)))) > most:
+                largest = float(np.max(np.abs(np.asarray(value))))
+                warnings.warn(
+                    f"effort of joint {name!r} is {largest:.4g}, and the file says at most {most:.4g}:"
+                    " nothing holds it to that",
+                    RuntimeWarning,
+                    stacklevel=3,
+                )
+
+    def _by_body(self, what: str, values: Mapping[str, Numbers] | None) -> dict[str, Numbers]:
+        """Numbers of joints by the bodies that hang on them."""
+        found: dict[str, Numbers] = {}
+        for name, value in ({} if values is None else checked_kind(what, values, Mapping)).items():
+            label = f"{what} of joint {name!r}"
+            numbers = checked_floating(label, value)
+            found[self.body_of(name)] = checked_array(label, numbers, numbers.shape)
+        return found
 
     def body_of(self, joint: str) -> str:
         """The body that hangs on a joint of the file.

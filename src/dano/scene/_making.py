@@ -1,7 +1,7 @@
 """What is checked when a scene is made, and what its steps have room for."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,6 +16,8 @@ from dano.scene._joints import Joint, Layout, layout_of
 # Share of the smallest body's size by which gravity may move it in a step before a warning says so, and the
 # share that the warning asks for.
 LONGEST_FALL, SHORT_FALL = 0.5, 0.05
+# How far beyond a limit a joint may be that stopped there, for rounding [rad or m].
+_TOUCHED = 1e-6
 # Room for what a body touches besides the floor that it lies on, and for chunks that are not full.
 CHUNKS_A_BODY = 24
 
@@ -109,6 +111,47 @@ def warn_of_long_steps(
         f"{name!r} is {size:.3g} m large; take at most {(SHORT_FALL * size / strength) ** 0.5:.2g} s",
         RuntimeWarning,
         stacklevel=3,
+    )
+
+
+def warn_of_limits(
+    layout: Layout,
+    joints: Sequence[Joint],
+    q: Float[Array, " k"] | None,
+    timestep: Float[Array, ""],
+    names: Mapping[str, str],
+) -> None:
+    """Warn if joints are beyond their limits, from where their first step takes them back.
+
+    Args:
+        layout: Of the scene.
+        joints: Of the scene.
+        q: Coordinates [rad or m].
+        timestep: [s].
+        names: Of joints, by the bodies that hang on them; for messages.
+    """
+    if q is None or is_traced(q, timestep, joints):
+        return
+    found = []
+    for place, j in enumerate(layout.with_coordinates):
+        limits = joints[j].limits
+        if limits is None:
+            continue
+        at, (least, most) = float(q[place]), np.asarray(limits).tolist()
+        beyond = max(least - at, at - most)
+        if beyond > _TOUCHED * max(1.0, abs(at)):
+            name = names.get(joints[j].child, joints[j].child)
+            unit = "m" if joints[j].kind == "slide" else "rad"
+            found.append((beyond, name, at, least, most, unit))
+    if not found:
+        return
+    beyond, name, at, least, most, unit = max(found)
+    more = f" (and {len(found) - 1} other joints)" if len(found) > 1 else ""
+    warnings.warn(
+        f"joint {name!r} starts at {at:.4g} {unit}, beyond its limits {least:.4g} to {most:.4g}{more}:"
+        f" the first step takes it there, at {beyond / float(timestep):.3g} {unit}/s",
+        RuntimeWarning,
+        stacklevel=4,
     )
 
 

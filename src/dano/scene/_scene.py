@@ -25,6 +25,7 @@ from dano.scene._making import (
     room_for,
     structure,
     twins_of,
+    warn_of_limits,
     warn_of_long_steps,
 )
 from dano.scene._motors import Motor
@@ -189,6 +190,18 @@ class Scene(eqx.Module):
         """
         return self.bodies[self.index(name)]
 
+    def joint(self, name: str) -> Joint:
+        """The joint on which a body hangs, by the name of the body.
+
+        Raises:
+            ValueError: If there is no such body, or it hangs on no joint.
+        """
+        self.index(name)
+        children = [joint.child for joint in self.joints]
+        if name not in children:
+            raise ValueError(f"joint must be that of one of {children}, got {name!r}, which hangs on none")
+        return self.joints[children.index(name)]
+
     def contact_index(self, a: str, b: str) -> int:
         """Index of the contact between two bodies, in either order.
 
@@ -309,7 +322,16 @@ class Scene(eqx.Module):
         Raises:
             ValueError: If a body or quantity is unknown, a shape is wrong, a number is not finite, or a
                 quaternion is zero.
+
+        Warns:
+            RuntimeWarning: If a joint starts beyond its limits.
         """
+        return self.state_of(bodies)
+
+    def state_of(
+        self, bodies: Mapping[str, dict[str, Numbers]], joint_names: Mapping[str, str] | None = None
+    ) -> State:
+        """`initial_state` of bodies in a mapping, with names of joints for messages, by their bodies'."""
         rows: dict[str, list[Array]] = {name: [] for name in STATE_SIZES}
         layout = self.layout
         for name in bodies:
@@ -335,6 +357,7 @@ class Scene(eqx.Module):
         if self.joints:
             state = self.filled(dataclasses.replace(state, **self._joint_values(bodies, JOINT_QUANTITIES)))
         self.check_state(state)
+        warn_of_limits(self.layout, self.joints, state.q, self.timestep, joint_names or {})
         return state
 
     def filled(self, state: State) -> State:
@@ -371,7 +394,9 @@ class Scene(eqx.Module):
         self.check_state(state)
         return frames_of(self.chains, state)
 
-    def _joint_values(self, bodies: dict[str, dict[str, Numbers]], keys: Sequence[str]) -> dict[str, Array]:
+    def _joint_values(
+        self, bodies: Mapping[str, dict[str, Numbers]], keys: Sequence[str]
+    ) -> dict[str, Array]:
         """Numbers of the joints that have coordinates, given by their bodies' names; zero by default."""
         names = [(joint.child, joint.width) for joint in self.joints if joint.width]
         dtype = self.timestep.dtype
@@ -455,7 +480,7 @@ class Scene(eqx.Module):
         return Control(jnp.stack(rows["force"]), jnp.stack(rows["torque"]), **of_joints)
 
 
-def _given(what: str, name: str, bodies: dict[str, dict[str, Numbers]]) -> dict[str, Numbers]:
+def _given(what: str, name: str, bodies: Mapping[str, dict[str, Numbers]]) -> dict[str, Numbers]:
     """What was given of a body, by quantity."""
     given = bodies.get(name, {})
     if not isinstance(given, Mapping):

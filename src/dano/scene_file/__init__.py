@@ -16,7 +16,9 @@ from dano.scene_file._objects import (
     ASSETS as ASSETS,
     build_asset as build_asset,
     build_object as build_object,
+    is_shipped as is_shipped,
     load_object as load_object,
+    object_look as object_look,
     Progress as Progress,
 )
 from dano.scene_file._pieces import run_piece as run_piece

@@ -22,6 +22,8 @@ _WAY_PER_WALL = 1e3
 """Measured: the distributed law finds walls of a 2000th of the way in a step, and not of a 4000th."""
 _SINKING = 0.005
 """Share of its size by which a body at rest sinks at default stiffness (see `DistributedLaw`)."""
+_LIGHTEST, _HEAVIEST = 1.0, 25e3
+"""Densities [kg/m³] between those of air (1.2) and osmium (22,600), which no body exceeds."""
 _INSIDE = 2e-3
 """Share of its volume by which a body may start in another: ten times what it sinks by at rest, see above."""
 
@@ -30,7 +32,7 @@ class Finding(NamedTuple):
     """Something that a scene's steps do not resolve, or that is odd.
 
     Attributes:
-        subject: start, support, impacts, spin, walls, masses, samples, timestep, file or solver.
+        subject: start, support, impacts, spin, walls, masses, sizes, samples, timestep, file or solver.
         text: What it is and what would help, in words.
     """
 
@@ -63,7 +65,8 @@ def bounds(scene: Scene, state: State, duration: float) -> list[Bound]:
             found.append(Bound(0.0 if body.fixed else speed, 0.0 if body.fixed else spin, False))
             continue
         down = gravity / strength
-        heights = [h for other in _fixed_partners(scene, i) if (h := _height(scene, state, i, other, down))]
+        partners = _fixed_partners(scene, i)
+        heights = [h for other in partners if (h := _height(scene, state, i, other, down)) is not None]
         falls = not heights
         gained = strength * duration if falls else 0.0
         reached = speed + gained if falls else math.sqrt(speed**2 + 2 * strength * min(heights))
@@ -98,7 +101,9 @@ def _height(scene: Scene, state: State, i: int, other: int, down: np.ndarray) ->
         float(solid.sdf(jnp.asarray(from_it + s * down, scene.timestep.dtype))) for s in (0.0, 1.0)
     )
     closing = inside - further
-    return inside / closing if inside > 0 and closing > 0.05 else None
+    # A body whose middle is in it already, but not all of it, falls no further: what `starts` says.
+    is_above = inside > -0.5 * scene.bodies[i].size
+    return max(inside, 0.0) / closing if is_above and closing > 0.05 else None
 
 
 def forecast(scene: Scene, state: State, limits: list[Bound]) -> list[Finding]:
@@ -108,6 +113,7 @@ def forecast(scene: Scene, state: State, limits: list[Bound]) -> list[Finding]:
         *_spins(scene, limits),
         *(finding for contact in scene.contacts for finding in _pair(scene, state, contact, limits)),
         *_masses(scene),
+        *_densities(scene),
         *_samples(scene),
     ]
 
@@ -254,6 +260,26 @@ def _masses(scene: Scene) -> list[Finding]:
                     "masses",
                     f"{heavy!r} has {ratio:.3g} times the mass of {light!r}: steps in which it lies on it"
                     f" may not converge (up to {_MASS_RATIO:.0f} times they do)",
+                )
+            )
+    return found
+
+
+def _densities(scene: Scene) -> list[Finding]:
+    """Bodies lighter than air or heavier than any metal, for the box around them."""
+    found = []
+    for body in scene.bodies:
+        if body.fixed or (body.object is None and body.shape is None):
+            continue
+        mass, volume = float(body.mass * body.mass_scale), _box_volume(body)
+        if not _LIGHTEST <= mass / max(volume, 1e-300) <= _HEAVIEST:
+            than = "more than any metal has" if mass / max(volume, 1e-300) > 1 else "less than air has"
+            found.append(
+                Finding(
+                    "sizes",
+                    f"{body.name!r} is {body.size:.3g} m long and has {mass:.3g} kg,"
+                    f" {mass / volume:.2g} kg/m³ of the box around it, {than}; are its lengths in metres and"
+                    " its mass in kilograms?",
                 )
             )
     return found

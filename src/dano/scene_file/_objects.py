@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dano.archive import format_of, TRAJECTORY
 from dano.building import BuildOptions
 from dano.checks import checked_path
-from dano.fields import AbstractField, AbstractShape, load_field, scaled
+from dano.fields import AbstractField, AbstractShape, FIELD_SUFFIXES, load_field, scaled
 from dano.names import did_you_mean
 from dano.objects import field_size, NeuralObject
 from dano.scene_file._doubts import border_doubts, mass_doubt, size_doubts
@@ -28,8 +29,10 @@ ASSETS = {"bunny": 1.0, "soap": 0.15, "trained_bunny": 1.0, "trained_soap": 0.15
 """Shipped objects and their masses [kg]."""
 
 _TRAINED = "trained_"
+_WATER = 1000.0
+"""Density [kg/m³] of what is built of a mesh unasked."""
 
-_built: dict[tuple[str, str], NeuralObject] = {}
+_built: dict[tuple[object, ...], NeuralObject] = {}
 
 
 def build_object(
@@ -47,7 +50,8 @@ def build_object(
 
     Args:
         field: Density with finite bounds.
-        options: How to make it; default `BuildOptions()`. A `length` scales the field about its origin.
+        options: How to make it; default `BuildOptions()`. A `length` scales the field about its origin. Its
+            `units` count where files are read, as in `load_object`.
         weighed: Whether the mass is stated elsewhere, so that no warning is needed.
         dashes: What names of options begin with in warnings.
         progress: See there.
@@ -91,26 +95,84 @@ def build_object(
     return made
 
 
-def load_object(source: str | os.PathLike[str], *, progress: Progress | None = None) -> NeuralObject:
+def load_object(
+    source: str | os.PathLike[str],
+    options: BuildOptions | None = None,
+    *,
+    weighed: bool = False,
+    progress: Progress | None = None,
+) -> NeuralObject:
     """A shipped object by its name, or one from a file.
 
     Args:
-        source: "bunny", "soap", "trained_bunny", "trained_soap" (see `build_asset`), or a .dano file. A file
-            of one of these names goes before.
-        progress: Called with a description and the share done while a shipped object is built.
+        source: "bunny", "soap", "trained_bunny", "trained_soap" (see `build_asset`), a .dano file, or a mesh
+            or another field that `load_field` reads, of which an object is built. A file of one of these
+            names goes before.
+        options: How to build it; None: with defaults, which a UserWarning says.
+        weighed: Whether the mass of what is built is stated elsewhere.
+        progress: Called with a description and the share done while an object is built.
 
     Raises:
-        ValueError: If there is neither such a file nor such a name, or the file is not a neural object.
+        ValueError: If there is neither such a file nor such a name, or the file holds neither an object nor a
+            field.
     """
-    checked_path("source", source)
-    if str(source) in ASSETS and not os.path.exists(source):
+    path = checked_path("source", source)
+    if is_shipped(source):
         return build_asset(str(source), progress=progress)
     if not os.path.exists(source) and not Path(source).suffix:
         raise ValueError(
             f"source must be a .dano file or one of {list(ASSETS)}, got {str(source)!r}"
             + did_you_mean(str(source), ASSETS)
         )
-    return NeuralObject.load(source)
+    if path.is_file() and format_of(path) == TRAJECTORY[0]:
+        raise ValueError(f"{path} is a run, not an object: `dano view {path}` shows it")
+    if path.suffix.lower() == ".dano" or path.suffix.lower() not in FIELD_SUFFIXES:
+        return NeuralObject.load(path)
+    return _built_of(path, options, weighed=weighed, progress=progress)
+
+
+def _built_of(
+    path: Path, options: BuildOptions | None, *, weighed: bool, progress: Progress | None
+) -> NeuralObject:
+    """An object of a mesh or field in a file, once in a process for the same file and options."""
+    stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else None
+    key = (str(path.resolve()), stamp, options, jnp.result_type(float).name)
+    if key not in _built:
+        field = load_field(path, units=None if options is None else options.units)
+        if options is not None:
+            _built[key] = build_object(field, options, weighed=weighed, progress=progress)
+            return _built[key]
+        # What a mesh weighs is nowhere in it: as much as water of its size is a likely object.
+        solid = isinstance(field, AbstractShape)
+        usual = BuildOptions(mass_scale=_WATER) if solid else BuildOptions()
+        made = _built[key] = build_object(field, usual, weighed=weighed or solid, progress=progress)
+        mass = f", as dense as water: {float(made.mass.mass):.3g} kg" if solid and not weighed else ""
+        warnings.warn(
+            f"{path}: an object was built of it with defaults{mass}; `dano build {path} -o OBJ.dano` takes"
+            " options, and keeps it",
+            stacklevel=3,
+        )
+    return _built[key]
+
+
+def is_shipped(source: str | os.PathLike[str]) -> bool:
+    """Whether a word names a shipped object, and no file."""
+    return str(source) in ASSETS and not os.path.exists(source)
+
+
+def object_look(source: str | os.PathLike[str]) -> "LearnedField | None":
+    """What an object looks like, if it was learned from photographs: shipped, or in a .dano file.
+
+    Raises:
+        ValueError: If the file cannot be read.
+    """
+    if is_shipped(source):
+        return asset_look(str(source))
+    if Path(source).suffix.lower() != ".dano":
+        return None
+    from dano.vision import LearnedField
+
+    return LearnedField.of_object(Path(source))
 
 
 def build_asset(name: str, *, progress: Progress | None = None) -> NeuralObject:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, cast, get_args, TYPE_CHECKING
 
 from dano.archive import checked_input
-from dano.building import BuildOptions
+from dano.building import BuildOptions, Units
 from dano.checks import checked_choice, checked_count, checked_number, shown
 from dano.contact import AbstractContactLaw, CentroidLaw, ContactParams, DistributedLaw
 from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSpace, load_field, posed, Sphere
@@ -35,8 +35,15 @@ from dano.scene import (
     Scene,
     State,
 )
-from dano.scene_file._objects import asset_look, build_asset, build_object, Progress
-from dano.scene_file._robots import read_robots, robot_files
+from dano.scene_file._objects import (
+    build_asset,
+    build_object,
+    is_shipped,
+    load_object,
+    object_look,
+    Progress,
+)
+from dano.scene_file._robots import common_gravity, read_robots, robot_files
 from dano.scene_file._schedule import read_schedule, Schedule
 from dano.scene_file._table import located, Table
 
@@ -141,7 +148,7 @@ class SceneFile:
         rows = data.get("bodies", [])
         named = [row[kind] for row in rows for kind in ("object", "field") if kind in row]
         folder = self.path.parent
-        files = [folder / Path(name).expanduser() for name in named]
+        files = [path for name in named if isinstance(path := _source(folder, name), Path)]
         return [self.path, *files, *robot_files(data, folder)]
 
     def looks(self) -> dict[str, "LearnedField"]:
@@ -150,12 +157,7 @@ class SceneFile:
         Raises:
             ValueError: If a file cannot be read any more.
         """
-        from dano.vision import LearnedField
-
-        read = {
-            source: asset_look(source) if isinstance(source, str) else LearnedField.of_object(source)
-            for source in set(self.objects.values())
-        }
+        read = {source: object_look(source) for source in set(self.objects.values())}
         return {name: look for name, source in self.objects.items() if (look := read[source]) is not None}
 
 
@@ -229,9 +231,12 @@ def parse_scene(
     steps = _steps(top, h) if n_steps is None else n_steps
     if steps < 1:
         raise ValueError(f"{path}: n_steps must be ≥ 1, got {steps}")
-    gravity = top.vector("gravity", 3, (0.0, 0.0, -9.81))
     tables = top.tables("bodies")
     robots = read_robots(top, path.parent)
+    usual = None
+    if "gravity" not in top:
+        usual = common_gravity(str(path), [robot for robot, _ in robots])
+    gravity = top.vector("gravity", 3, usual or (0.0, 0.0, -9.81))
     if not tables and not robots:
         raise ValueError(f"{path}: needs at least one [[bodies]] table")
     n_bodies = len(tables) + sum(len(robot.bodies) for robot, _ in robots)
@@ -262,7 +267,7 @@ def parse_scene(
             # Coordinates that the file gives stay as they are.
             state = close_loops(scene, state, [name for name, given in start.items() if "q" in given])
     objects = {
-        row["name"]: row["asset"] if "asset" in row else path.parent / Path(row["object"]).expanduser()
+        row["name"]: row["asset"] if "asset" in row else _source(path.parent, row["object"])
         for row in tables
         if "asset" in row or "object" in row
     }
@@ -270,8 +275,13 @@ def parse_scene(
 
 
 def _steps(top: Table, timestep: float) -> int | float:
-    if ("duration" in top) == ("n_steps" in top):
-        raise ValueError(f"{top.where}: needs either duration [s] or n_steps")
+    if "duration" in top and "n_steps" in top:
+        raise ValueError(
+            f"{top.where}: duration [s] and n_steps say the same, got {top.data['duration']!r} and"
+            f" {top.data['n_steps']!r}: keep one"
+        )
+    if "duration" not in top and "n_steps" not in top:
+        raise ValueError(f"{top.where}: needs either duration [s] or n_steps, got neither")
     if "n_steps" in top:
         return top.integer("n_steps", 0)
     duration = top.number("duration")
@@ -301,7 +311,7 @@ def _body(row: Table, folder: Path, built: dict[object, NeuralObject], progress:
     with located(row.where):
         if kinds == ["shape"]:
             return Body(name, _shape(row), **options)
-        row.only((*_BODY, "build") if kinds == ["field"] else _BODY)
+        row.only((*_BODY, "build") if kinds in (["field"], ["object"]) else _BODY)
         return Body(name, _object(row, kinds[0], folder, built, progress), **options)
 
 
@@ -335,22 +345,33 @@ def _object(
     name = row.word(kind)
     if kind == "asset":
         return build_asset(name, progress=progress)
-    path = folder / Path(name).expanduser()
+    source = _source(folder, name)
     build = row.table("build", _BUILD)
-    key = (kind, path, json.dumps(build.data, sort_keys=True))
+    is_object = kind == "object"
+    if is_object and "build" in row and (is_shipped(source) or Path(source).suffix.lower() == ".dano"):
+        raise ValueError(f"build goes with a mesh or a field, got the object {name!r}, which is built")
+    key = (kind, source, json.dumps(build.data, sort_keys=True))
     if key not in built:
         weighed = "mass" in row or "mass_scale" in row
-        built[key] = (
-            NeuralObject.load(path)
-            if kind == "object"
-            else _from_field_file(path, build, weighed=weighed, progress=progress)
-        )
+        if is_object:
+            options = _build_options(build) if "build" in row else None
+            built[key] = load_object(source, options, weighed=weighed, progress=progress)
+        else:
+            options = _build_options(build)
+            field = load_field(source, units=options.units)
+            built[key] = build_object(field, options, weighed=weighed, progress=progress)
     return built[key]
 
 
-def _from_field_file(path: Path, build: Table, *, weighed: bool, progress: Progress | None) -> NeuralObject:
+def _source(folder: Path, name: str) -> Path | str:
+    """A file by its name relative to a folder, or the name of a shipped object if there is no such file."""
+    path = folder / Path(name).expanduser()
+    return name if is_shipped(name) and not path.exists() else path
+
+
+def _build_options(build: Table) -> BuildOptions:
     usual = BuildOptions()
-    options = BuildOptions(
+    return BuildOptions(
         samples=build.integer("samples", usual.samples),
         density_range=cast(tuple[float, float], build.vector("density_range", 2))
         if "density_range" in build
@@ -358,11 +379,11 @@ def _from_field_file(path: Path, build: Table, *, weighed: bool, progress: Progr
         mass_model=cast(MassModel, build.word("mass_model", get_args(MassModel), usual.mass_model)),
         mass_scale=build.number("mass_scale") if "mass_scale" in build else None,
         resolution=build.integer("resolution", usual.resolution),
+        units=cast(Units, build.word("units", get_args(Units))) if "units" in build else None,
         length=build.number("length") if "length" in build else None,
         floaters=build.boolean("floaters", usual.floaters),
         seed=build.integer("seed", usual.seed),
     )
-    return build_object(load_field(path), options, weighed=weighed, progress=progress)
 
 
 def _joints(top: Table, names: Sequence[str]) -> list[Joint]:
@@ -456,7 +477,8 @@ def _may_meet(a: str, b: str, robots: Sequence[Robot]) -> bool:
     """Whether bodies have shapes to touch with, and are not links of one robot."""
     for robot in robots:
         own = [body.name for body in robot.bodies]
-        if (a in own and b in own) or any(x in own and x not in robot.touching for x in (a, b)):
+        linked = a in own and b in own and not {a, b} & set(robot.surroundings)
+        if linked or any(x in own and x not in robot.touching for x in (a, b)):
             return False
     return True
 

@@ -1,5 +1,6 @@
 """Robots of scene files."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ from dano.robots import load_mjcf, load_urdf, Robot
 from dano.scene_file._table import is_number, located, Table
 
 _FORMATS = {"urdf": load_urdf, "mjcf": load_mjcf}
-_KEYS = (*_FORMATS, "base", "prefix", "collision", "joints")
+_KEYS = (*_FORMATS, "base", "prefix", "collision", "ignore", "balance_inertia", "joints")
 
 
 def read_robots(top: Table, folder: Path) -> list[tuple[Robot, dict[str, float]]]:
@@ -33,6 +34,30 @@ def robot_files(data: dict[str, Any], folder: Path) -> list[Path]:
     ]
 
 
+def common_gravity(where: str, robots: Sequence[Robot]) -> tuple[float, float, float] | None:
+    """Gravity of the robots' files [m/s²]; None if they have none.
+
+    Raises:
+        ValueError: If two have different ones.
+    """
+    given = {robot.gravity: robot.name for robot in robots if robot.gravity is not None}
+    if len(given) > 1:
+        (a, first), (b, second) = list(given.items())[:2]
+        raise ValueError(
+            f"{where}: gravity must be given where robots have different ones, got {a} of {first!r} and"
+            f" {b} of {second!r}"
+        )
+    return next(iter(given), None)
+
+
+def _words(table: Table, key: str) -> list[str]:
+    words = table.data.get(key, [])
+    words = [words] if isinstance(words, str) else words
+    if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+        raise ValueError(f"{table.where}: {key} must be a list of strings, got {words!r}")
+    return words
+
+
 def _robot(table: Table, folder: Path) -> tuple[Robot, dict[str, float]]:
     kinds = [kind for kind in _FORMATS if kind in table]
     if len(kinds) != 1:
@@ -48,7 +73,16 @@ def _robot(table: Table, folder: Path) -> tuple[Robot, dict[str, float]]:
         )
     prefix = table.word("prefix") if "prefix" in table else ""
     with located(table.where):
-        robot = _FORMATS[kinds[0]](path, base=base, prefix=prefix, collision=table.boolean("collision", True))
+        robot = _FORMATS[kinds[0]](
+            path,
+            base=base,
+            prefix=prefix,
+            # Words and tables of them are checked where they are read.
+            collision=table.data.get("collision", True),
+            ignore=_words(table, "ignore"),
+            balance_inertia=table.boolean("balance_inertia", False),
+        )
+        robot.check_simulated()
         joints = table.table("joints", list(robot.joint_names)).data
         for name, value in joints.items():
             if not is_number(value):

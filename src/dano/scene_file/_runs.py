@@ -12,7 +12,7 @@ from dano.archive import checked_input
 from dano.maths import Pose
 from dano.objects import NeuralObject
 from dano.scene import Scene, Trajectory
-from dano.scene_file._objects import Progress
+from dano.scene_file._objects import is_shipped, load_object, Progress
 from dano.scene_file._reading import parse_scene, SceneFile
 from dano.scene_file._table import located
 
@@ -33,16 +33,17 @@ class Run:
         return self.source.scene
 
 
-def drop_scene(object_path: str | os.PathLike[str]) -> str:
+def drop_scene(object_path: str | os.PathLike[str], *, progress: Progress | None = None) -> str:
     """Text of a scene in which an object falls, slightly tilted, from 0.3 of its size onto a floor.
 
-    The text names the object by its absolute path.
+    The text names the object by its absolute path, or by its name if it is shipped.
 
     Raises:
-        ValueError: If the file is not a neural object.
+        ValueError: If there is neither an object nor a field to make one of.
     """
-    path = checked_input(object_path).resolve()
-    made = NeuralObject.load(path)
+    shipped = is_shipped(object_path)
+    source = str(object_path) if shipped else str(checked_input(object_path).resolve())
+    made = load_object(source, progress=progress)
     size = made.size
     tilt = np.array([math.cos(0.06), 0.8 * math.sin(0.06), 0.6 * math.sin(0.06), 0.0])
     lowest = _lowest_point(made, tilt)
@@ -59,7 +60,7 @@ restitution = 0.3
 
 [[bodies]]
 name = "object"
-object = {json.dumps(str(path), ensure_ascii=False)}
+object = {json.dumps(source, ensure_ascii=False)}
 position = [0.0, 0.0, {0.3 * size - lowest:.6g}]
 orientation = {[round(float(x), 6) for x in tilt]}
 

@@ -15,7 +15,7 @@ class Identify:
 
     Attributes:
         scene: Scene file (.toml).
-        motions: Observed motions (.npz, .csv): times [s], positions [m], quaternions. The guide
+        motions: Observed motions (.npz, .csv, .txt, .tum): times [s], positions [m], quaternions. The guide
             "Identification" lists the columns.
         parameter: Unknown parameters, each as NAME:LOWER:UPPER or NAME:LOWER:UPPER:START, e.g.
             soap,table.sliding_friction:0:1 or soap.mass_scale:0.2:5:1.
@@ -32,9 +32,11 @@ class Identify:
             default: any.
         starts: Number of points within the bounds to start from.
         held_out: Motions that are not fitted; the error on them is measured.
-        order: Order of the quaternions in the files.
+        order: Order of the quaternions in .npz files; default: wxyz, unless they cannot be meant so.
         point: What positions refer to: centre of mass (com) or origin of the field's frame (origin).
         rate: Frames per second, for files without times.
+        time_unit: Unit of the times in the files; default: as their columns say, or as their size tells.
+        length_unit: Unit of positions and velocities in the files; default likewise.
         timestep: Timestep of the simulation [s]; default: the scene's.
         video: The film that the one motion was tracked in: its pixels are fitted through the simulation.
             Needs --look and --camera.
@@ -58,9 +60,11 @@ class Identify:
     continuity: float | None = None
     starts: int = 1
     held_out: tuple[Path, ...] = ()
-    order: Literal["wxyz", "xyzw"] = "wxyz"
+    order: Literal["wxyz", "xyzw"] | None = None
     point: Literal["com", "origin"] | None = None
     rate: float | None = None
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None
+    length_unit: Literal["m", "cm", "mm"] | None = None
     timestep: float | None = None
     video: Path | None = None
     look: str | None = None

@@ -181,22 +181,18 @@ def _parameter(text: str, scene: Scene) -> Parameter:
     return Parameter(path, where, lower, upper, start=start)
 
 
-def _only_free_body(scene: Scene) -> str | None:
-    free = [body.name for body in scene.bodies if not body.fixed]
-    return free[0] if len(free) == 1 else None
-
-
 def _motion(path: Path, command: Identify, scene: Scene) -> Motion:
     """A motion, of the bodies that the file names unless one was asked for."""
-    reading: dict[str, Any] = {"order": command.order, "point": command.point, "rate": command.rate}
-    name = command.body or _only_free_body(scene)
-    if command.body is None:
-        try:
-            return load_motion(path, **reading)
-        except ValueError as error:
-            if "does not name its bodies" not in str(error) or name is None:
-                raise
-    return load_motion(path, names=name, **reading)
+    motion = load_motion(
+        path,
+        names=command.body,
+        order=command.order,
+        point=command.point,
+        rate=command.rate,
+        time_unit=command.time_unit,
+        length_unit=command.length_unit,
+    )
+    return motion.named(scene)
 
 
 def _print(fit: Identification) -> None:

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import arg, OmitArgPrefixes, Positional
 
 from dano.cli._arguments import Output, UNNAMED
 
@@ -31,6 +31,8 @@ class Filming:
         readout: How much later the last row of a frame is exposed than the first (rolling shutter) [s].
         table: Height z of a level table under the object [m]: its shadow there says where the sun is.
         every: Take every so many-th frame.
+        since: Take frames from this time on [s], as a player shows it.
+        until: Take frames up to this time [s].
         loss: What is minimised: photometric, silhouette, or the paper's two terms.
         rays: Most pixels of a frame.
         seed: Seed of all random numbers.
@@ -51,6 +53,8 @@ class Filming:
     readout: float = 0.0
     table: float | None = None
     every: int = 1
+    since: Annotated[float | None, arg(name="from")] = None
+    until: Annotated[float | None, arg(name="to")] = None
     loss: Literal["photometric", "silhouette", "paper"] = "photometric"
     rays: int = 2048
     seed: int = 0

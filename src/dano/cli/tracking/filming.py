@@ -30,6 +30,8 @@ def filmed(filming: Filming, video: Path, rate: float | None, progress: Progress
         rate=rate,
         slow_motion=filming.slow_motion,
         every=filming.every,
+        since=filming.since,
+        until=filming.until,
         masks=filming.masks,
         occluders=filming.occluders,
         progress=progress,

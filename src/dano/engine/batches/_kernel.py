@@ -11,6 +11,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int
 
 from dano.engine._compiling import compiled
+from dano.engine._newton import Report
 from dano.engine._rollout import AbstractEngine
 from dano.engine.batches._devices import map_rows
 from dano.scene import Control, Scene, State
@@ -76,6 +77,10 @@ def _rollout(inputs: Inputs, program: Program) -> Kept:
         scene = scene(inputs.parameters)
     start, prepared = scene.filled(inputs.state), engine.prepare(scene)
     policy = None if controls is None or isinstance(controls, Control) else controls
+    if policy is None:
+        found = engine.rollout(scene, prepared, start, controls, program.n_steps)
+        if found is not None:
+            return _kept(scene, start, *found, program)
 
     def advance(carry, step):
         (state, first, count, worst), (index, control) = carry, step
@@ -105,3 +110,19 @@ def _rollout(inputs: Inputs, program: Program) -> Kept:
         parts.append(jax.tree.map(lambda leaf: leaf[None], last))
     states = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     return Kept(states, jnp.asarray(scene.timestep), *carry[1:])
+
+
+def _kept(scene: Scene, start: State, states: State, report: Report, program: Program) -> Kept:
+    """What is kept of a rollout that was made at once."""
+    steps = np.arange(program.n_steps)
+    chosen = steps[program.every - 1 :: program.every]
+    if len(chosen) == 0 or chosen[-1] != program.n_steps - 1:
+        chosen = np.append(chosen, program.n_steps - 1)
+    kept = jax.tree.map(lambda x: x[chosen], states)
+    if program.first:
+        kept = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, kept)
+    failed = ~report.converged
+    first = jnp.where(jnp.any(failed), jnp.argmax(failed), -1).astype(jnp.int32)
+    count = jnp.sum(failed, dtype=jnp.int32)
+    worst = jnp.max(report.residual).astype(start.position.dtype)
+    return Kept(kept, jnp.asarray(scene.timestep), first, count, worst)

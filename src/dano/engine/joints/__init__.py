@@ -8,6 +8,12 @@ from dano.engine.joints._forces import (
     STICKS as STICKS,
     STOPS as STOPS,
 )
+from dano.engine.joints._rows import (
+    structure_of_trees as structure_of_trees,
+    tree_lengths as tree_lengths,
+    tree_rows as tree_rows,
+)
+from dano.engine.joints._structure import TreeStructure as TreeStructure
 from dano.engine.joints._tables import (
     changing as changing,
     in_tables as in_tables,

@@ -108,7 +108,7 @@ def tree_tables(scene: Scene) -> TreeTables:
     return TreeTables(
         jnp.stack([*rows, jnp.zeros(13, dtype)]),
         chains.table,
-        _law_rows(chains.laws, dtype),
+        law_rows(chains.laws, dtype),
         jnp.concatenate([scene.timestep[None], scene.gravity]).astype(dtype),
         _rows([law.numbers(c.params) for c, law in known], CONTACT, dtype),
         layout,
@@ -134,7 +134,8 @@ def in_tables(law: AbstractContactLaw) -> TypeGuard[CentroidLaw]:
     return type(law) is CentroidLaw
 
 
-def _law_rows(laws: JointLaws, dtype) -> Float[Array, "c 12"]:
+def law_rows(laws: JointLaws, dtype) -> Float[Array, "c 12"]:
+    """Laws of joint coordinates as a table, see `TreeTables.laws`."""
     none = jnp.zeros_like(laws.damping)
 
     def column(values: Array | None) -> Array:

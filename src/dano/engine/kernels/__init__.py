@@ -1,1 +1,1 @@
-"""Kernels: loops around the formulas of `dano.physics`, in NVIDIA Warp. Importing this package imports Warp."""
+"""Loops around the formulas of `dano.physics`, in NVIDIA Warp. Importing this package imports Warp."""

@@ -1,14 +1,35 @@
-"""Sums over the points that press: what a step's equations miss, and their derivative, by blocks of two bodies."""
+"""Sums over the points that press: the residual of a step and its derivative, by blocks of two bodies."""
 
 import warp as wp
 
 from dano.engine.kernels.lanes import total, total6, total66
 from dano.engine.kernels.tables import FoundPair, Room, Scene
-from dano.physics.features import LANES
+from dano.engine.kernels.trees.balance import add_tree_momentum
+from dano.engine.kernels.trees.contact import add_pulled, body_twist, free_block
+from dano.engine.kernels.trees.loops import add_loops
+from dano.physics.features import LANES, LOOPS, TREES
 from dano.physics.momentum import angular_momentum, angular_momentum_jacobian
-from dano.physics.point_law import Duals, fitting_duals, following_duals, Linear, linearized, Motion, point_motion
+from dano.physics.point_law import (
+    Duals,
+    fitting_duals,
+    following_duals,
+    is_apart,
+    Linear,
+    linearized,
+    Motion,
+    point_motion,
+)
 from dano.physics.real import mat33, mat66, ONE, real, vec3, vec6, ZERO
 from dano.physics.samples import Point
+from dano.physics.twists import (
+    angular_part,
+    joined,
+    joined_blocks,
+    linear_part,
+    relative_twist,
+    shift,
+    Twist,
+)
 
 _LANES = wp.constant(LANES)
 
@@ -29,6 +50,29 @@ class Fit:
 
 
 @wp.struct
+class Quarters:
+    """A derivative of wrenches by twists, by its quarters, and sums of grip, which belong to all of them.
+
+    Attributes:
+        vv: Force by velocity.
+        vw: Force by spin.
+        wv: Moment by velocity.
+        ww: Moment by spin.
+        grip: Σ g.
+        grip_arm: Σ g r.
+        grip_square: Σ g r rᵀ.
+    """
+
+    vv: mat33
+    vw: mat33
+    wv: mat33
+    ww: mat33
+    grip: real
+    grip_arm: vec3
+    grip_square: mat33
+
+
+@wp.struct
 class Trial:
     """What a pass tries.
 
@@ -45,62 +89,6 @@ class Trial:
     mix: real
 
 
-@wp.struct
-class Twist:
-    """Velocity [m/s] and spin [rad/s]."""
-
-    velocity: vec3
-    spin: vec3
-
-
-@wp.func
-def linear_part(x: vec6) -> vec3:
-    """Velocity or force."""
-    return vec3(x[0], x[1], x[2])
-
-
-@wp.func
-def angular_part(x: vec6) -> vec3:
-    """Spin or moment."""
-    return vec3(x[3], x[4], x[5])
-
-
-@wp.func
-def joined(a: vec3, b: vec3) -> vec6:
-    """Linear and angular part as one."""
-    return vec6(a[0], a[1], a[2], b[0], b[1], b[2])
-
-
-@wp.func
-def joined_blocks(a: mat33, b: mat33, c: mat33, d: mat33) -> mat66:
-    """The 6 × 6 matrix [[a, b], [c, d]]."""
-    return mat66(
-        a[0, 0], a[0, 1], a[0, 2], b[0, 0], b[0, 1], b[0, 2],
-        a[1, 0], a[1, 1], a[1, 2], b[1, 0], b[1, 1], b[1, 2],
-        a[2, 0], a[2, 1], a[2, 2], b[2, 0], b[2, 1], b[2, 2],
-        c[0, 0], c[0, 1], c[0, 2], d[0, 0], d[0, 1], d[0, 2],
-        c[1, 0], c[1, 1], c[1, 2], d[1, 0], d[1, 1], d[1, 2],
-        c[2, 0], c[2, 1], c[2, 2], d[2, 0], d[2, 1], d[2, 2],
-    )  # fmt: skip
-
-
-@wp.func
-def shift(com_difference: vec3) -> mat66:
-    """T: twist of the second body → its twist at the first body's centre of mass; Tᵀ takes wrenches back."""
-    eye = wp.identity(n=3, dtype=real)
-    return joined_blocks(eye, -wp.skew(com_difference), mat33(), eye)
-
-
-@wp.func
-def relative_twist(first: vec6, second: vec6, com_difference: vec3) -> Twist:
-    """Of the first body relative to the second, at the first body's centre of mass [W]."""
-    twist = Twist()
-    spin = angular_part(second)
-    twist.velocity = linear_part(first) - linear_part(second) - wp.cross(spin, com_difference)
-    twist.spin = angular_part(first) - spin
-    return twist
-
-
 @wp.func
 def row_of(values: wp.array2d(dtype=vec6), world: int, row: int) -> vec6:
     """Of a body by its row, zero for one that does not move."""
@@ -110,11 +98,28 @@ def row_of(values: wp.array2d(dtype=vec6), world: int, row: int) -> vec6:
 
 
 @wp.func
-def pair_twist(scene: Scene, world: int, found: FoundPair, velocities: wp.array2d(dtype=vec6)) -> Twist:
-    """Relative twist of the bodies of a pair at given velocities."""
+def pair_twist(
+    scene: Scene, room: Room, world: int, found: FoundPair, velocities: wp.array2d(dtype=vec6), offset: real
+) -> Twist:
+    """Relative twist of the bodies of a pair at given velocities.
+
+    Args:
+        scene: The scene.
+        room: Room.
+        world: Which world.
+        found: The pair.
+        velocities: Unknowns of the step.
+        offset: 1 for the twist, 0 for how it changes with a change of the unknowns.
+    """
     index = scene.pair_index[found.pair]
-    first = row_of(velocities, world, scene.body_index[index.first].row)
-    second = row_of(velocities, world, scene.body_index[index.second].row)
+    a = scene.body_index[index.first].row
+    b = scene.body_index[index.second].row
+    if wp.static(TREES):
+        moved = body_twist(scene, room, world, a, velocities, offset)
+        other = body_twist(scene, room, world, b, velocities, offset)
+        return relative_twist(moved, other, found.com_difference)
+    first = row_of(velocities, world, a)
+    second = row_of(velocities, world, b)
     return relative_twist(first, second, found.com_difference)
 
 
@@ -130,7 +135,7 @@ def fit_duals(scene: Scene, room: Room, world: int, lane: int, n_found: int):
     """Duals that fit the accepted velocities."""
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
-        twist = pair_twist(scene, world, found, room.velocity)
+        twist = pair_twist(scene, room, world, found, room.velocity, ONE)
         for k in range(found.first, found.end):
             point = room.points[world, k]
             motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
@@ -145,40 +150,67 @@ def follow_duals(scene: Scene, room: Room, world: int, lane: int, n_found: int, 
     """Accept the duals at a share of the last step; find their change along the new one, in `room.step`."""
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
-        twist = pair_twist(scene, world, found, room.step)
+        twist = pair_twist(scene, room, world, found, room.step, ZERO)
         for k in range(found.first, found.end):
             linear = room.linear[world, k]
-            duals = room.duals[world, k]
-            changes = room.changes[world, k]
             tried = Duals()
-            tried.friction = linear.friction
-            tried.direction = duals.direction + length * changes.direction
-            after = following_duals(linear, tried, point_motion(room.points[world, k], twist.velocity, twist.spin))
+            changes = Duals()
+            if linear.pressure.value > ZERO or linear.grip > ZERO:
+                before = room.duals[world, k].direction
+                tried.friction = linear.friction
+                tried.direction = before + length * room.changes[world, k].direction
+                change = point_motion(room.points[world, k], twist.velocity, twist.spin)
+                after = following_duals(linear, tried, change)
+                changes.friction = after.friction - tried.friction
+                changes.direction = after.direction - tried.direction
             room.duals[world, k] = tried
-            changes.friction = after.friction - tried.friction
-            changes.direction = after.direction - tried.direction
             room.changes[world, k] = changes
 
 
 @wp.func
-def point_jacobian(point: Point, linear: Linear) -> mat66:
-    """Derivative of a point's wrench per area by the twist at the first body's centre of mass.
+def add_point_jacobian(sums: Quarters, point: Point, linear: Linear, weight: real) -> Quarters:
+    """Add the derivative of a point's impulse by the twist at the first body's centre of mass.
 
-    With a6 = (a, r × a) and n6 = (n, moment) that is
+    With a6 = (a, r × a), n6 = (n, moment), h times its area w, and X v = r × v that is
 
-        c6 n6ᵀ − f n6 n6ᵀ − l6 û6ᵀ − g (Σ_k e6_k e6_kᵀ − (n, r × n) (n, r × n)ᵀ).
+        w (c6 n6ᵀ − f n6 n6ᵀ − l6 û6ᵀ − g (E − (n, r × n) (n, r × n)ᵀ)),    E = Σ_k e6_k e6_kᵀ = [[1, −X],
+        [X, −X²]].
     """
     r = point.arm
     n = point.normal
-    normal = joined(n, point.moment)
-    across = joined(n, wp.cross(r, n))
-    lean = joined(linear.by_pressure, wp.cross(r, linear.by_pressure)) - linear.pressure.damping * normal
-    turning = joined(linear.turning, wp.cross(r, linear.turning))
-    along = joined(linear.slip_direction, wp.cross(r, linear.slip_direction))
+    grip = weight * linear.grip
+    lean = weight * linear.by_pressure
+    damping = weight * linear.pressure.damping
+    a = lean - damping * n
+    a_moment = wp.cross(r, lean) - damping * point.moment
+    across = wp.cross(r, n)
+    g = grip * n
+    g_moment = grip * across
+    sums.vv += wp.outer(a, n) + wp.outer(g, n)
+    sums.vw += wp.outer(a, point.moment) + wp.outer(g, across)
+    sums.wv += wp.outer(a_moment, n) + wp.outer(g_moment, n)
+    sums.ww += wp.outer(a_moment, point.moment) + wp.outer(g_moment, across)
+    if wp.length_sq(linear.turning) > ZERO:
+        l = weight * linear.turning
+        l_moment = wp.cross(r, l)
+        along = wp.cross(r, linear.slip_direction)
+        sums.vv -= wp.outer(l, linear.slip_direction)
+        sums.vw -= wp.outer(l, along)
+        sums.wv -= wp.outer(l_moment, linear.slip_direction)
+        sums.ww -= wp.outer(l_moment, along)
+    sums.grip += grip
+    sums.grip_arm += grip * r
+    sums.grip_square += wp.outer(grip * r, r)
+    return sums
+
+
+@wp.func
+def whole_jacobian(sums: Quarters) -> mat66:
+    """The derivative that is summed by its quarters; − g E is added for all points at once."""
     eye = wp.identity(n=3, dtype=real)
-    x = wp.skew(r)
-    whole = joined_blocks(eye, -x, x, -(x * x))
-    return wp.outer(lean, normal) - wp.outer(turning, along) - linear.grip * (whole - wp.outer(across, across))
+    x = wp.skew(sums.grip_arm)
+    square = wp.trace(sums.grip_square) * eye - sums.grip_square  # −Σ g X²
+    return joined_blocks(sums.vv - sums.grip * eye, sums.vw + x, sums.wv - x, sums.ww - square)
 
 
 @wp.func
@@ -193,17 +225,21 @@ def clear_blocks(room: Room, world: int, m: int):
 @wp.func
 def add_momentum(scene: Scene, room: Room, world: int, m: int, h: real):
     """What each body's momentum gains in the step beyond what it comes with, and the derivative."""
-    for i in range(m):
-        body = scene.bodies[world, scene.moving[i]]
-        v = room.tried[world, i]
-        spin = angular_part(v)
-        inertia = room.inertia[world, i]
-        linear = body.mass * linear_part(v)
-        angular = angular_momentum(spin, inertia, h, ONE)
-        room.residual[world, i] = joined(linear, angular) - room.momentum[world, i]
-        eye = wp.identity(n=3, dtype=real)
-        turning = angular_momentum_jacobian(spin, inertia, h)
-        room.blocks[world, i * m + i] = joined_blocks(body.mass * eye, mat33(), mat33(), turning)
+    for i in range(scene.moving.shape[0]):
+        b = i
+        if wp.static(TREES):
+            b = free_block(scene, i)
+        if b >= 0:
+            body = scene.bodies[world, scene.moving[i]]
+            v = room.tried[world, b]
+            spin = angular_part(v)
+            inertia = room.inertia[world, i]
+            linear = body.mass * linear_part(v)
+            angular = angular_momentum(spin, inertia, h, ONE)
+            room.residual[world, b] = joined(linear, angular) - room.momentum[world, i]
+            eye = wp.identity(n=3, dtype=real)
+            turning = angular_momentum_jacobian(spin, inertia, h)
+            room.blocks[world, b * m + b] = joined_blocks(body.mass * eye, mat33(), mat33(), turning)
 
 
 @wp.func
@@ -214,6 +250,9 @@ def add_contact(
     index = scene.pair_index[found.pair]
     a = scene.body_index[index.first].row
     b = scene.body_index[index.second].row
+    if wp.static(TREES):
+        add_pulled(scene, room, world, a, b, found.com_difference, wrench, jacobian)
+        return
     if a >= 0:
         room.residual[world, a] -= wrench
         room.blocks[world, a * m + a] -= jacobian
@@ -228,50 +267,59 @@ def add_contact(
             room.blocks[world, b * m + a] += back * jacobian
 
 
-@wp.func
+@wp.func(inline=True)
 def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, trial: Trial) -> Fit:
-    """Residual and Jacobian as momenta at the velocities that are tried, with duals at a share of the step."""
+    """Residual and Jacobian as momenta at the velocities that are tried, duals at a share of the step."""
     h = scene.timestep[world, 0]
-    m = scene.moving.shape[0]
+    m = scene.n_blocks
     fit = Fit()
     if lane == 0:
         clear_blocks(room, world, m)
         add_momentum(scene, room, world, m, h)
+        if wp.static(TREES):
+            add_tree_momentum(scene, room, world, trial.length, True)
+        if wp.static(LOOPS):
+            add_loops(scene, room, world)
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
-        twist = pair_twist(scene, world, found, room.tried)
+        twist = pair_twist(scene, room, world, found, room.tried, ONE)
         wrench = vec6()
-        jacobian = mat66()
+        quarters = Quarters()
         presses = ZERO
         for k in range(found.first, found.end):
             point = room.points[world, k]
             law = room.laws[world, k]
             motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
-            duals = room.duals[world, k]
-            changes = room.changes[world, k]
-            duals.friction = duals.friction + trial.length * changes.friction
-            duals.direction = duals.direction + trial.length * changes.direction
-            held = room.linear[world, k].held
-            linear = linearized(law, motion, duals, trial.softness, trial.holds, trial.mix, held)
-            room.linear[world, k] = linear
-            weight = h * point.area
-            fit.renewed += weight * wp.abs(linear.held - held)
-            if linear.pressure.value > ZERO or linear.grip > ZERO:
-                presses = ONE
-                force = linear.pressure.value * point.normal
-                friction = linear.friction + linear.friction_change
-                moment = linear.pressure.value * point.moment + wp.cross(point.arm, friction)
-                wrench += weight * joined(force + friction, moment)
-                jacobian += weight * point_jacobian(point, linear)
-                change = linear.friction_change
-                fit.unfit += weight * (
-                    wp.abs(change[0]) + wp.abs(change[1]) + wp.abs(change[2]) + wp.abs(linear.pressure.change)
-                )
-                fit.push += weight * linear.pressure.value
+            if is_apart(law, motion.rate) and not trial.holds:
+                room.linear[world, k].pressure.value = ZERO
+                room.linear[world, k].grip = ZERO
+            else:
+                duals = room.duals[world, k]
+                changes = room.changes[world, k]
+                duals.friction = duals.friction + trial.length * changes.friction
+                duals.direction = duals.direction + trial.length * changes.direction
+                held = room.linear[world, k].held
+                linear = linearized(law, motion, duals, trial.softness, trial.holds, trial.mix, held)
+                room.linear[world, k] = linear
+                weight = h * point.area
+                fit.renewed += weight * wp.abs(linear.held - held)
+                if linear.pressure.value > ZERO or linear.grip > ZERO:
+                    presses = ONE
+                    friction = linear.friction + linear.friction_change
+                    force = weight * (linear.pressure.value * point.normal + friction)
+                    moment = weight * (linear.pressure.value * point.moment + wp.cross(point.arm, friction))
+                    wrench += joined(force, moment)
+                    quarters = add_point_jacobian(quarters, point, linear, weight)
+                    change = linear.friction_change
+                    missed = wp.abs(change[0]) + wp.abs(change[1]) + wp.abs(change[2])
+                    fit.unfit += weight * (missed + wp.abs(linear.pressure.change))
+                    fit.push += weight * linear.pressure.value
         if total(presses) > ZERO:
             wrench = total6(wrench)
-            jacobian = total66(jacobian)
+            jacobian = total66(whole_jacobian(quarters))
             if lane == 0:
+                if room.wrenches.shape[1] > 0:
+                    room.wrenches[world, f] = wrench
                 add_contact(scene, room, world, found, m, wrench, jacobian)
     fit.unfit = total(fit.unfit)
     fit.push = total(fit.push)

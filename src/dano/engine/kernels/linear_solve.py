@@ -8,84 +8,90 @@ pivots stay away from singular.
 import warp as wp
 
 from dano.engine.kernels.tables import Room, Scene
-from dano.physics.features import LANES
-from dano.physics.real import mat66, ONE, real, vec6, ZERO
+from dano.engine.kernels.trees.pattern import couple, couple_pair, couple_trees, mark_tree, mark_trees
+from dano.physics.features import LANES, TREES
+from dano.physics.real import mat33, mat66
+from dano.physics.twists import joined_blocks
 
 _LANES = wp.constant(LANES)
 
 
 @wp.func
-def couple(room: Room, world: int, m: int, i: int, j: int):
-    """Say that two bodies share a block."""
-    room.used[world, i * m + j] = 1
-    room.used[world, j * m + i] = 1
-
-
-@wp.func
 def find_pattern(scene: Scene, room: Room, world: int, n_found: int):
-    """Which bodies share a block, with what elimination fills in; its order, and later neighbours."""
-    m = scene.moving.shape[0]
+    """Which blocks are coupled, with what elimination fills in; its order, and later neighbours.
+
+    Trees that touch nothing are not in it: see `dano.engine.kernels.trees.factor`.
+    """
+    m = scene.n_blocks
     for k in range(m * m):
         room.used[world, k] = 0
     for i in range(m):
         room.used[world, i * m + i] = 1
+    if wp.static(TREES):
+        mark_trees(scene, room, world)
     for f in range(n_found):
         index = scene.pair_index[room.found[world, f * _LANES].pair]
         a = scene.body_index[index.first].row
         b = scene.body_index[index.second].row
-        if a >= 0 and b >= 0:
+        if wp.static(TREES):
+            couple_pair(scene, room, world, a, b)
+            mark_tree(scene, room, world, a)
+            mark_tree(scene, room, world, b)
+        elif a >= 0 and b >= 0:
             couple(room, world, m, a, b)
     for i in range(m):
         room.counts[world, i] = -1
+        room.order[world, i] = -1
+    if wp.static(TREES):
+        couple_trees(scene, room, world)
     for step in range(m):
         best = int(-1)
-        fewest = m + 1
+        fewest = 2 * m + 1
         for i in range(m):
             if room.counts[world, i] < 0:
                 degree = int(0)
+                if wp.static(TREES):
+                    # Forces in loops have nothing on the diagonal before all that they push is eliminated.
+                    degree = m * scene.trees.blocks[i].is_loop
                 for j in range(m):
                     if room.counts[world, j] < 0 and j != i:
                         degree += room.used[world, i * m + j]
                 if degree < fewest:
                     fewest = degree
                     best = i
-        room.order[world, step] = best
-        n = int(0)
-        for j in range(m):
-            if j != best and room.counts[world, j] < 0 and room.used[world, best * m + j] > 0:
-                room.later[world, best * m + n] = j
-                n += 1
-        room.counts[world, best] = n
-        for a in range(n):
-            for b in range(a + 1, n):
-                couple(room, world, m, room.later[world, best * m + a], room.later[world, best * m + b])
+        if best >= 0:
+            room.order[world, step] = best
+            n = int(0)
+            for j in range(m):
+                if j != best and room.counts[world, j] < 0 and room.used[world, best * m + j] > 0:
+                    room.later[world, best * m + n] = j
+                    n += 1
+            room.counts[world, best] = n
+            for a in range(n):
+                for b in range(a + 1, n):
+                    couple(room, world, m, room.later[world, best * m + a], room.later[world, best * m + b])
 
 
 @wp.func
-def inverse(a: mat66) -> mat66:
-    """Inverse by Gauss–Jordan elimination with row exchanges."""
-    inverted = wp.identity(n=6, dtype=real)
-    for k in range(6):
-        best = k
-        for r in range(k + 1, 6):
-            if wp.abs(a[r, k]) > wp.abs(a[best, k]):
-                best = r
-        pivot = a[best]
-        own = inverted[best]
-        if best != k:
-            a[best] = a[k]
-            inverted[best] = inverted[k]
-        scale = ONE / pivot[k]
-        pivot = pivot * scale
-        own = own * scale
-        a[k] = pivot
-        inverted[k] = own
-        for r in range(6):
-            if r != k:
-                factor = a[r, k]
-                a[r] = a[r] - factor * pivot
-                inverted[r] = inverted[r] - factor * own
-    return inverted
+def quarter(a: mat66, row: int, column: int) -> mat33:
+    """The 3 × 3 part of a block that begins at a row and a column."""
+    return mat33(
+        a[row, column], a[row, column + 1], a[row, column + 2],
+        a[row + 1, column], a[row + 1, column + 1], a[row + 1, column + 2],
+        a[row + 2, column], a[row + 2, column + 1], a[row + 2, column + 2],
+    )  # fmt: skip
+
+
+@wp.func
+def inverse(m: mat66) -> mat66:
+    """Inverse by the Schur complement of its first 3 × 3 part: mass plus dissipation, away from singular."""
+    a = wp.inverse(quarter(m, 0, 0))
+    b = quarter(m, 0, 3)
+    c = quarter(m, 3, 0)
+    left = c * a
+    s = wp.inverse(quarter(m, 3, 3) - left * b)
+    right = a * b * s
+    return joined_blocks(a + right * left, -right, -(s * left), s)
 
 
 @wp.func
@@ -93,23 +99,25 @@ def solve_blocks(room: Room, world: int, m: int):
     """Solve `spare` x = x in place, x in `room.step`; `spare` is used up."""
     for s in range(m):
         k = room.order[world, s]
-        pivot = inverse(room.spare[world, k * m + k])
-        room.spare[world, k * m + k] = pivot
-        n = room.counts[world, k]
-        for a in range(n):
-            i = room.later[world, k * m + a]
-            below = room.spare[world, i * m + k] * pivot
-            room.step[world, i] -= below * room.step[world, k]
-            for b in range(n):
-                j = room.later[world, k * m + b]
-                room.spare[world, i * m + j] -= below * room.spare[world, k * m + j]
+        if k >= 0:
+            pivot = inverse(room.spare[world, k * m + k])
+            room.spare[world, k * m + k] = pivot
+            n = room.counts[world, k]
+            for a in range(n):
+                i = room.later[world, k * m + a]
+                below = room.spare[world, i * m + k] * pivot
+                room.step[world, i] -= below * room.step[world, k]
+                for b in range(n):
+                    j = room.later[world, k * m + b]
+                    room.spare[world, i * m + j] -= below * room.spare[world, k * m + j]
     for t in range(m):
         k = room.order[world, m - 1 - t]
-        x = room.step[world, k]
-        for a in range(room.counts[world, k]):
-            i = room.later[world, k * m + a]
-            x -= room.spare[world, k * m + i] * room.step[world, i]
-        room.step[world, k] = room.spare[world, k * m + k] * x
+        if k >= 0:
+            x = room.step[world, k]
+            for a in range(room.counts[world, k]):
+                i = room.later[world, k * m + a]
+                x -= room.spare[world, k * m + i] * room.step[world, i]
+            room.step[world, k] = room.spare[world, k * m + k] * x
 
 
 @wp.func
@@ -118,3 +126,12 @@ def copy_blocks(room: Room, world: int, m: int):
     for k in range(m * m):
         if room.used[world, k] > 0:
             room.spare[world, k] = room.blocks[world, k]
+
+
+@wp.func
+def copy_transposed_blocks(room: Room, world: int, m: int):
+    """Copy the transpose of the Jacobian into `spare`."""
+    for i in range(m):
+        for j in range(m):
+            if room.used[world, i * m + j] > 0:
+                room.spare[world, j * m + i] = wp.transpose(room.blocks[world, i * m + j])

@@ -7,7 +7,7 @@ blocks, and balls around blocks. What touches is listed in `Room.found` behind t
 
 import warp as wp
 
-from dano.engine.kernels.assembly import add_contact, Fit, joined, joined_blocks, pair_twist, Trial, Twist
+from dano.engine.kernels.assembly import add_contact, Fit, pair_twist, Trial
 from dano.engine.kernels.lanes import total, total3, wait
 from dano.engine.kernels.patch_tables import PatchSideIndex
 from dano.engine.kernels.tables import BLOCK, FoundPair, Room, RUN, Scene, StateRow
@@ -46,6 +46,7 @@ from dano.physics.patch_law import (
 )
 from dano.physics.real import mat66, ONE, real, vec3, vec4, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix
+from dano.physics.twists import joined, joined_blocks, Twist
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
 
@@ -193,13 +194,23 @@ def fit_patch_duals(scene: Scene, room: Room, world: int, lane: int, n_found: in
     for k in range(lane, room.patches.count[world, 0], _LANES):
         found = room.found[world, (n_found + k) * _LANES + lane]
         c = contact_of(scene, found)
-        motion = motion_at_patch(room, world, c, pair_twist(scene, world, found, room.velocity))
+        motion = motion_at_patch(room, world, c, pair_twist(scene, room, world, found, room.velocity, ONE))
         overlap = room.patches.patches[world, c].overlap
         adhesive = scene.patches.contacts[c].adhesive > 0
         material = scene.patches.materials[world, c]
         room.patches.duals[world, c] = fitting_patch_duals(material, overlap, adhesive, motion)
         room.patches.changes[world, c] = PatchDuals()
         room.patches.linear[world, c] = PatchLinear()
+
+
+@wp.func
+def any_sticks(scene: Scene, room: Room, world: int, n_found: int) -> bool:
+    """Whether a patch that touches has friction that sticks."""
+    found = bool(False)
+    for k in range(room.patches.count[world, 0]):
+        c = contact_of(scene, room.found[world, (n_found + k) * _LANES])
+        found = found or scene.patches.materials[world, c].stiction > ZERO
+    return found
 
 
 @wp.func
@@ -210,7 +221,7 @@ def follow_patch_duals(scene: Scene, room: Room, world: int, lane: int, n_found:
         c = contact_of(scene, found)
         if scene.patches.materials[world, c].stiction > ZERO:
             linear = room.patches.linear[world, c]
-            change = motion_at_patch(room, world, c, pair_twist(scene, world, found, room.step))
+            change = motion_at_patch(room, world, c, pair_twist(scene, room, world, found, room.step, ZERO))
             after = following_patch_duals(linear, change)
             duals = PatchDuals()
             duals.slide = linear.slide.value
@@ -266,7 +277,7 @@ def add_patches(scene: Scene, room: Room, world: int, lane: int, n_found: int, t
         How well those of points and patches do.
     """
     h = scene.timestep[world, 0]
-    m = scene.moving.shape[0]
+    m = scene.n_blocks
     n = room.patches.count[world, 0]
     unfit = real(0.0)
     push = real(0.0)
@@ -277,7 +288,7 @@ def add_patches(scene: Scene, room: Room, world: int, lane: int, n_found: int, t
         arm = room.patches.arms[world, c]
         patch = room.patches.patches[world, c]
         material = scene.patches.materials[world, c]
-        motion = motion_at_patch(room, world, c, pair_twist(scene, world, found, room.tried))
+        motion = motion_at_patch(room, world, c, pair_twist(scene, room, world, found, room.tried, ONE))
         duals = tried_duals(room, world, c, trial.length)
         held = room.patches.linear[world, c].held
         adhesive = scene.patches.contacts[c].adhesive > 0

@@ -1,21 +1,32 @@
-"""The loop over steps: a rollout of a world is one call, a rollout of many one launch (docs/theory/integrator.md)."""
+"""The loop over steps: a rollout of one world or of many is one launch (docs/theory/integrator.md)."""
 
 import warp as wp
 
-from dano.engine.kernels.assembly import angular_part, joined, linear_part
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import find_pattern
 from dano.engine.kernels.patches import find_patches
 from dano.engine.kernels.search import find_contacts, fix_laws
 from dano.engine.kernels.solve import Options, solve, Solved
 from dano.engine.kernels.tables import Push, Room, Scene, StateRow, StepReport
-from dano.physics.features import LANES, PATCHES, POINTS
+from dano.engine.kernels.trees.balance import add_tree_momentum, begin_joints, begin_trees
+from dano.engine.kernels.trees.contact import free_block
+from dano.engine.kernels.trees.kinematics import (
+    advance_coordinates,
+    move_trees,
+    place_trees,
+    turns_too_far,
+    unknown_of,
+)
+from dano.engine.kernels.trees.loops import add_loops, begin_loops, forces_of
+from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
+from dano.physics.joints import ROOT
 from dano.physics.momentum import angular_momentum, turned_inertia
 from dano.physics.pairs import BodyState
-from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
+from dano.physics.real import ONE, real, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
+from dano.physics.twists import angular_part, joined, linear_part
 
-_LANES = wp.constant(LANES)
+_LANES, _ROOT = wp.constant(LANES), wp.constant(ROOT)
 # Largest share of the restitution first: Newton's restitution may add energy where friction reverses the slip
 # (Kane and Levinson 1985, Dynamics: Theory and Applications). Without rebound contact only dissipates.
 _REBOUNDS = wp.constant(10)
@@ -32,18 +43,34 @@ class Launch:
     Attributes:
         state: At the start, shape (worlds, n).
         pushes: Control of each step, shape (worlds, steps · n); no columns where there is none.
+        q: Joint coordinates at the start [rad or m], shape (worlds, k).
+        v: Their velocities [rad/s or m/s], shape (worlds, k).
+        efforts: Torques [N m] or forces [N] of joints, shape (worlds, steps · k); no columns for none.
+        commands: Of motors; the same.
         states: At the end of each step, written to, shape (worlds, steps · n).
+        qs: Joint coordinates at the end of each step, written to, shape (worlds, steps · k).
+        vs: Their velocities; the same.
+        forces: Of loops in each step [N, N m], written to, shape (worlds, steps · loops).
         reports: Written to, shape (worlds, steps).
         n_steps: Number of steps.
+        n_directions: Number of directions in which a derivative is taken.
         first_world: World of the first block of lanes.
         options: When a solve stops.
     """
 
     state: wp.array2d(dtype=StateRow)
     pushes: wp.array2d(dtype=Push)
+    q: wp.array2d(dtype=real)
+    v: wp.array2d(dtype=real)
+    efforts: wp.array2d(dtype=real)
+    commands: wp.array2d(dtype=real)
     states: wp.array2d(dtype=StateRow)
+    qs: wp.array2d(dtype=real)
+    vs: wp.array2d(dtype=real)
+    forces: wp.array2d(dtype=vec6)
     reports: wp.array2d(dtype=StepReport)
     n_steps: int
+    n_directions: int
     first_world: int
     options: Options
 
@@ -61,28 +88,38 @@ def begin_body(scene: Scene, room: Room, world: int, i: int, row: StateRow, push
     state.com = body.com
     size = ZERO
     if m >= 0:
+        b = m
+        is_alone = True
+        hangs = False
+        if wp.static(TREES):
+            node = scene.trees.nodes[m]
+            b = node.place // 6
+            is_alone = node.alone > 0
+            hangs = node.kind != _ROOT
         rotation = matrix(state.orientation)
         inertia = turned_inertia(rotation, body.inertia)
         spin = rotation * row.omega
-        state.ahead = turned(state.orientation, row.omega, h)
-        state.velocity = row.velocity
-        state.spin = spin
-        state.inverse_mass = ONE / body.mass
-        state.inverse_inertia = wp.inverse(inertia)
+        if not hangs:
+            state.ahead = turned(state.orientation, row.omega, h)
+            state.velocity = row.velocity
+            state.spin = spin
+        if is_alone:
+            state.inverse_mass = ONE / body.mass
+            state.inverse_inertia = wp.inverse(inertia)
         linear = body.mass * (row.velocity + h * scene.gravity[world, 0]) + h * push.force
         angular = angular_momentum(spin, inertia, h, -ONE) + h * push.torque
-        by_mass = ONE / body.mass
-        by_inertia = real(3.0) / wp.trace(inertia)
-        scale = vec6(by_mass, by_mass, by_mass, by_inertia, by_inertia, by_inertia)
-        momentum = joined(linear, angular)
-        room.velocity[world, m] = joined(row.velocity, spin)
-        room.momentum[world, m] = momentum
+        room.momentum[world, m] = joined(linear, angular)
         room.inertia[world, m] = inertia
-        room.scale[world, m] = scale
-        # Angular momenta of bodies are compared in their own axes, as their inertia is.
-        own = wp.transpose(rotation) * angular
-        for k in range(3):
-            size = wp.max(size, wp.max(by_mass * wp.abs(linear[k]), by_inertia * wp.abs(own[k])))
+        if not hangs:
+            room.velocity[world, b] = joined(row.velocity, spin)
+        if is_alone:
+            by_mass = ONE / body.mass
+            by_inertia = real(3.0) / wp.trace(inertia)
+            room.scale[world, b] = vec6(by_mass, by_mass, by_mass, by_inertia, by_inertia, by_inertia)
+            # Angular momenta of bodies are compared in their own axes, as their inertia is.
+            own = wp.transpose(rotation) * angular
+            for k in range(3):
+                size = wp.max(size, wp.max(by_mass * wp.abs(linear[k]), by_inertia * wp.abs(own[k])))
     room.bodies[world, i] = state
     return size
 
@@ -94,28 +131,116 @@ def adds_energy(scene: Scene, room: Room, world: int) -> bool:
     work = real(0.0)
     moved = real(0.0)
     for i in range(scene.moving.shape[0]):
-        body = scene.bodies[world, scene.moving[i]]
-        state = room.bodies[world, scene.moving[i]]
-        v = room.velocity[world, i]
-        angular = angular_momentum(angular_part(v), room.inertia[world, i], h, ONE)
-        impulse = joined(body.mass * linear_part(v), angular) - room.momentum[world, i]
-        mean = joined(state.velocity, state.spin) + v
-        # In the body's axes, in which components of a spin belong to axes of the body.
-        back = wp.transpose(matrix(state.orientation))
-        impulse = joined(linear_part(impulse), back * angular_part(impulse))
-        mean = joined(linear_part(mean), back * angular_part(mean))
-        for k in range(6):
-            work += real(0.5) * impulse[k] * mean[k]
-            moved += real(0.5) * wp.abs(impulse[k] * mean[k])
+        b = i
+        if wp.static(TREES):
+            b = free_block(scene, i)
+        if b >= 0:
+            body = scene.bodies[world, scene.moving[i]]
+            state = room.bodies[world, scene.moving[i]]
+            v = room.velocity[world, b]
+            angular = angular_momentum(angular_part(v), room.inertia[world, i], h, ONE)
+            impulse = joined(body.mass * linear_part(v), angular) - room.momentum[world, i]
+            mean = joined(state.velocity, state.spin) + v
+            # In the body's axes, in which components of a spin belong to axes of the body.
+            back = wp.transpose(matrix(state.orientation))
+            impulse = joined(linear_part(impulse), back * angular_part(impulse))
+            mean = joined(linear_part(mean), back * angular_part(mean))
+            for k in range(6):
+                work += real(0.5) * impulse[k] * mean[k]
+                moved += real(0.5) * wp.abs(impulse[k] * mean[k])
+    if wp.static(TREES):
+        # Of trees in generalised velocities; `room.residual` holds what they gain, see `find_impulses`.
+        for k in range(scene.trees.order.shape[0]):
+            u = scene.trees.order[k]
+            y = unknown_of(room.velocity, world, u)
+            done = unknown_of(room.residual, world, u) * (unknown_of(room.old, world, u) + y)
+            work += real(0.5) * done
+            moved += real(0.5) * wp.abs(done)
     return work > _ADDS * moved
+
+
+@wp.func
+def find_impulses(scene: Scene, room: Room, world: int):
+    """What contact and limits give trees in a step, as generalised momenta in `room.residual`."""
+    for b in range(scene.n_blocks):
+        room.tried[world, b] = room.velocity[world, b]
+    add_tree_momentum(scene, room, world, ZERO, False)
+    if wp.static(LOOPS):
+        add_loops(scene, room, world)
 
 
 @wp.func
 def restart(scene: Scene, room: Room, world: int):
     """Begin from the old velocities."""
+    if wp.static(TREES):
+        for b in range(scene.n_blocks):
+            room.velocity[world, b] = room.old[world, b]
+        return
     for i in range(scene.moving.shape[0]):
         state = room.bodies[world, scene.moving[i]]
         room.velocity[world, i] = joined(state.velocity, state.spin)
+
+
+@wp.func
+def advance_hanging(room: Room, world: int, node: int, i: int, row: StateRow) -> StateRow:
+    """Velocities of a body on a joint at the end of a step; poses follow from its coordinates."""
+    after = row
+    twist = room.trees.twists[world, node]
+    after.velocity = linear_part(twist)
+    after.omega = wp.quat_rotate_inv(room.bodies[world, i].orientation, angular_part(twist))
+    return after
+
+
+@wp.func
+def was_tried(scene: Scene, room: Room, world: int) -> bool:
+    """Whether the solution is what was tried last, of which displacements are known."""
+    same = bool(True)
+    for b in range(scene.n_blocks):
+        for k in range(6):
+            same = same and room.velocity[world, b][k] == room.tried[world, b][k]
+    return same
+
+
+@wp.func
+def advance_trees(scene: Scene, room: Room, world: int, launch: Launch, t: int):
+    """Coordinates at the end of a step, and poses of the bodies on joints, whose velocities are known."""
+    n = scene.body_index.shape[0]
+    k = scene.trees.coordinates.shape[0]
+    if t == 0:
+        advance_coordinates(scene, room, world, launch.q, 0, launch.qs, launch.vs, 0)
+    else:
+        advance_coordinates(scene, room, world, launch.qs, (t - 1) * k, launch.qs, launch.vs, t * k)
+    for i in range(n):
+        row = launch.states[world, t * n + i]
+        room.bodies[world, i].position = row.position
+        room.bodies[world, i].orientation = from_wxyz(row.orientation)
+    place_trees(scene, room, world, launch.qs, t * k)
+    if wp.static(LOOPS):
+        n_loops = scene.trees.loop_index.shape[0]
+        for row in range(n_loops):
+            launch.forces[world, t * n_loops + row] = forces_of(scene, room.velocity, world, row)
+    for j in range(scene.trees.nodes.shape[0]):
+        i = scene.trees.nodes[j].body
+        if scene.trees.nodes[j].kind != _ROOT:
+            launch.states[world, t * n + i].position = room.bodies[world, i].position
+            launch.states[world, t * n + i].orientation = to_wxyz(room.bodies[world, i].orientation)
+
+
+@wp.func
+def begin_step_of_trees(scene: Scene, room: Room, world: int, launch: Launch, t: int):
+    """What is known of trees at the start of a step."""
+    k = scene.trees.coordinates.shape[0]
+    if t == 0:
+        place_trees(scene, room, world, launch.q, 0)
+        begin_joints(scene, room, world, launch.q, launch.v, 0, launch.efforts, launch.commands, 0)
+    else:
+        at = (t - 1) * k
+        begin_joints(scene, room, world, launch.qs, launch.vs, at, launch.efforts, launch.commands, t * k)
+    for b in range(scene.n_blocks):
+        room.old[world, b] = room.velocity[world, b]
+    begin_trees(scene, room, world)
+    if wp.static(LOOPS):
+        begin_loops(scene, room, world)
 
 
 @wp.func
@@ -125,6 +250,11 @@ def advance_body(scene: Scene, room: Room, world: int, i: int, row: StateRow) ->
     m = scene.body_index[i].row
     after = row
     if m >= 0:
+        if wp.static(TREES):
+            node = scene.trees.nodes[m]
+            if node.kind != _ROOT:
+                return advance_hanging(room, world, m, i, row)
+            m = node.place // 6
         v = room.velocity[world, m]
         state = room.bodies[world, i]
         omega = wp.transpose(matrix(state.orientation)) * angular_part(v)
@@ -141,7 +271,6 @@ def rollout(scene: Scene, room: Room, launch: Launch):
     block, lane = wp.tid()
     world = launch.first_world + block
     n = scene.body_index.shape[0]
-    h = scene.timestep[world, 0]
     for t in range(launch.n_steps):
         size = real(0.0)
         for i in range(n):
@@ -153,6 +282,11 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                 push = launch.pushes[world, t * n + i]
             size = wp.max(size, begin_body(scene, room, world, i, row, push))
         wait()
+        if wp.static(TREES):
+            if lane == 0:
+                begin_step_of_trees(scene, room, world, launch, t)
+            wait()
+            size = wp.max(size, room.trees.sizes[world, 0])
         n_found = int(0)
         overflow = bool(False)
         if wp.static(POINTS):
@@ -183,6 +317,11 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                 restarts += 1
                 again = True
             elif hits and attempt < _REBOUNDS:
+                if wp.static(TREES):
+                    wait()
+                    if lane == 0:
+                        find_impulses(scene, room, world)
+                    wait()
                 if adds_energy(scene, room, world):
                     attempt += 1
                     again = True
@@ -197,10 +336,17 @@ def rollout(scene: Scene, room: Room, launch: Launch):
             report.solved = wp.where(solved.converged, ONE, ZERO)
             report.overflow = wp.where(overflow, ONE, ZERO)
             report.rebound = rebound
+            if wp.static(TREES):
+                if not was_tried(scene, room, world):
+                    move_trees(scene, room, world, room.velocity, scene.timestep[world, 0])
+                if turns_too_far(scene, room, world):
+                    report.solved = ZERO
             launch.reports[world, t] = report
             for i in range(n):
                 row = launch.state[world, i]
                 if t > 0:
                     row = launch.states[world, (t - 1) * n + i]
                 launch.states[world, t * n + i] = advance_body(scene, room, world, i, row)
+            if wp.static(TREES):
+                advance_trees(scene, room, world, launch, t)
         wait()

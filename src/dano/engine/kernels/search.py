@@ -7,19 +7,27 @@ is listed if the old velocities take it into the other body by the end of the st
 import warp as wp
 
 from dano.engine.kernels.lanes import least, total, total3
-from dano.engine.kernels.tables import BLOCK, Body, BodyIndex, FoundPair, FoundPoint, Room, RUN, SamplePair, Scene
-from dano.physics.features import LANES
+from dano.engine.kernels.tables import (
+    BLOCK,
+    Body,
+    FoundPair,
+    FoundPoint,
+    Room,
+    RUN,
+    SamplePair,
+    Scene,
+)
 from dano.physics.distances import HALF_SPACE, Solid, solid_clearance, solid_distance, solid_of
+from dano.physics.features import LANES
 from dano.physics.pairs import (
     approach,
     BodyState,
     facing_direction,
     pair_pose,
     PairPose,
-    position_after,
 )
-from dano.physics.point_law import fitting_duals, Material, point_law, point_motion
-from dano.physics.real import INFINITY, ONE, real, TWO, vec3, vec4, ZERO
+from dano.physics.point_law import Material, point_law
+from dano.physics.real import INFINITY, ONE, real, TWO, vec3, ZERO
 from dano.physics.rotations import matrix
 from dano.physics.samples import (
     facing_area,
@@ -50,12 +58,10 @@ class Meeting:
     Attributes:
         share: τ, share of the step after which geometry is taken.
         critical: Probe that has sunk in by then, −1 where none does within the step.
-        toward: Direction that samples which turn face then [F].
     """
 
     share: real
     critical: int
-    toward: vec3
 
 
 @wp.struct
@@ -101,13 +107,17 @@ def solid_of_body(scene: Scene, world: int, body: int) -> Solid:
 
 
 @wp.func
-def is_near(scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, margin: real, h: real) -> bool:
+def is_near(
+    scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, margin: real, h: real
+) -> bool:
     """Whether two bodies may meet within the step, by the balls around them."""
     body = scene.bodies[world, first]
     other = scene.bodies[world, second]
     x = middle_of(body, a)
-    reach = body.radius + margin + h * (
-        wp.length(a.velocity - b.velocity) + wp.length(a.spin) * wp.length(body.middle - body.com)
+    reach = (
+        body.radius
+        + margin
+        + h * (wp.length(a.velocity - b.velocity) + wp.length(a.spin) * wp.length(body.middle - body.com))
     )
     solid = solid_of_body(scene, world, second)
     if solid.kind.kind == _HALF_SPACE:
@@ -120,24 +130,39 @@ def is_near(scene: Scene, world: int, a: BodyState, b: BodyState, first: int, se
 
 
 @wp.func
+def facing(
+    scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, share: real, h: real
+) -> vec3:
+    """Direction that samples of the first body face after a share of the step [F]."""
+    solid = solid_of_body(scene, world, second)
+    index = scene.body_index[first]
+    scale = scene.bodies[world, first].scale
+    return facing_direction(scene.solids, world, solid, a, b, share, h, index.turning, scale)
+
+
+@wp.func
 def posed(
-    scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, share: real, h: real, follows: real
+    scene: Scene,
+    world: int,
+    a: BodyState,
+    b: BodyState,
+    first: int,
+    second: int,
+    share: real,
+    h: real,
+    follows: real,
 ) -> PairPose:
     """Pose of a pair after a share of the step."""
-    index = scene.body_index[first]
-    solid = solid_of_body(scene, world, second)
-    scale = scene.bodies[world, first].scale
-    toward = facing_direction(
-        scene.solids, world, solid, a, b, share, h, index.turning, scale
-    )
-    return pair_pose(a, b, share, h, toward, index.turning, scale, follows)
+    toward = facing(scene, world, a, b, first, second, share, h)
+    turning = scene.body_index[first].turning
+    return pair_pose(a, b, share, h, toward, turning, scene.bodies[world, first].scale, follows)
 
 
 @wp.func
 def find_near_probes(
     scene: Scene, room: Room, world: int, lane: int, pose: PairPose, first: int, second: int, way: real
 ) -> int:
-    """Probes that lie no further from the solid than anything moves in a step, into `room.near`; their number.
+    """Probes no further from the solid than anything moves in a step, into `room.near`; their number.
 
     Samples that keep facing the solid do not move with their body: then it is all of them.
     """
@@ -172,13 +197,22 @@ def find_near_probes(
 
 @wp.func
 def meeting(
-    scene: Scene, room: Room, world: int, lane: int, a: BodyState, b: BodyState, pair: SamplePair, first: int, second: int, h: real
+    scene: Scene,
+    room: Room,
+    world: int,
+    lane: int,
+    a: BodyState,
+    b: BodyState,
+    pair: SamplePair,
+    first: int,
+    second: int,
+    h: real,
 ) -> Meeting:
     """When the geometry of a pair is taken.
 
-    At the end of the step, unless a body would be driven deeper into the other than `SamplePair.sink` by then:
-    on the far side of a thin wall, normals push the wrong way. Then when it has sunk that far: the root of the
-    depth of the deepest probe, found by advancing as far as none can go deeper, again and again.
+    At the end of the step, unless a body would be driven deeper into the other than `SamplePair.sink` by
+    then: on the far side of a thin wall, normals push the wrong way. Then when it has sunk that far: the
+    root of the depth of the deepest probe, by Newton's method, which begins as far as none can go deeper.
     """
     met = Meeting()
     met.critical = -1
@@ -186,7 +220,9 @@ def meeting(
     index = scene.body_index[first]
     solid = solid_of_body(scene, world, second)
     body = scene.bodies[world, first]
-    turn = wp.length(a.spin) * body.radius + wp.length(b.spin) * (body.radius + wp.length(a.position - b.position))
+    turn = wp.length(a.spin) * body.radius + wp.length(b.spin) * (
+        body.radius + wp.length(a.position - b.position)
+    )
     way = h * (wp.length(a.velocity - b.velocity) + turn)
     if way <= pair.sink:
         return met
@@ -213,13 +249,14 @@ def meeting(
         closest = least(further)
         if closest < further:
             critical = -1
-        further = wp.max(closest, ZERO)
-        share += further
+        before = share
+        share = wp.max(share + closest, ZERO)
         k += 1
         if share >= ONE:
+            met.critical = -1
             return met
-        met.critical = critical
-        if further <= _MET:
+        met.critical = wp.where(share > ZERO, critical, -1)
+        if wp.abs(share - before) <= _MET:
             k = _ADVANCES
     met.share = share
     return met
@@ -400,6 +437,7 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
             found.critical = met.critical
             found.share = met.share
             found.com_difference = pose.com_difference
+            found.toward = facing(scene, world, a, b, index.first, index.second, met.share, h)
             material = scene.materials[world, index.contact]
             found.impact_stiffness = impact_stiffness(a, b, sums, material)
             room.found[world, n_found * _LANES + lane] = found

@@ -1,29 +1,41 @@
-"""A primal–dual Newton method for the velocities of bodies that touch (docs/theory/integrator.md, "The solve").
+"""A primal–dual Newton method for the velocities of bodies that touch (docs/theory/integrator.md).
 
 Unknowns are the end-of-step velocities V of all bodies that move, in world axes, and for every point the
-friction λ and the direction s of its hysteresis. A pass linearises the momentum balance and the equations of λ
-and s, eliminates these point by point, solves for dV, takes the whole step, and projects λ and s onto
-|λ| ≤ b(p), |s| ≤ 1. What is left after the elimination is the law's own residual, whatever λ and s are; the
-Jacobian uses the current λ instead of its limit, so it is right before directions of slip have settled. A solve
-ends when the residual is small and λ and s fit the velocities, so that the Jacobian is that of the law, too.
+friction λ and the direction s of its hysteresis. A pass linearises the momentum balance and the equations
+of λ and s, eliminates these point by point, solves for dV, takes the whole step, and projects λ and s
+onto |λ| ≤ b(p), |s| ≤ 1. What is left after the elimination is the law's own residual, whatever λ and s
+are; the Jacobian uses the current λ instead of its limit, so it is right before directions of slip have
+settled. A solve ends when the residual is small and λ and s fit the velocities, so that the Jacobian is
+that of the law, too.
 
 Full steps can cycle. A solve that has not converged within a few passes takes shares of steps, smaller after
 each step that made the residual larger; then it goes on with a line search, then from softer friction in
-levels. Where that cycles, too, friction mostly presses a point in, which raises its friction. Then the bounds b
-are held: the equations are those of a convex function, and a line search finds their root. The bounds are
-renewed by halves until they fit, and the solve goes on with the law as it is. What does not converge ends where
-its residual was smallest.
+levels. Where that cycles, too, friction mostly presses a point in, which raises its friction. Then the
+bounds b are held: the equations are those of a convex function, and a line search finds their root. The
+bounds are renewed by halves until they fit, and the solve goes on with the law as it is. What does not
+converge ends where its residual was smallest.
 """
 
 import warp as wp
 
 from dano.engine.kernels.assembly import assemble, fit_duals, follow_duals, Trial
-from dano.engine.kernels.lanes import total, wait
-from dano.engine.kernels.linear_solve import copy_blocks, find_pattern, solve_blocks
-from dano.engine.kernels.patches import add_patches, fit_patch_duals, follow_patch_duals
+from dano.engine.kernels.lanes import wait
+from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
+from dano.engine.kernels.patches import add_patches, any_sticks, fit_patch_duals, follow_patch_duals
 from dano.engine.kernels.tables import Room, Scene
-from dano.physics.features import LANES, PATCHES, POINTS
-from dano.physics.real import HALF, INFINITY, ONE, real, vec6, ZERO
+from dano.engine.kernels.trees.balance import (
+    add_tree_slopes,
+    eliminate_joint_duals,
+    finish_joint_duals,
+    fit_joint_duals,
+    follow_joint_duals,
+    measure_joints,
+    resolve_joints,
+    same_mode,
+    solve_trees,
+)
+from dano.physics.features import PATCHES, POINTS, TREES
+from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec6, ZERO
 
 LEVELS = 11
 """Number of levels of a solve."""
@@ -39,6 +51,8 @@ _MIX, _RENEWED = wp.constant(real(0.5)), wp.constant(real(1e-6))
 # A step is accepted when what the residual does along it fell to this share; when the bracket around the zero
 # of that is narrower than this share of the step, it is accepted as it is.
 _ENOUGH, _GIVE_UP = wp.constant(real(0.5)), wp.constant(real(0.01))
+# Residual over the rounding of velocities beside which nothing is left to take.
+_EXACT = wp.constant(real(4.0))
 # Stiction velocity that levels are multiples of [m/s].
 _STICTION = wp.constant(real(1e-7))
 
@@ -132,7 +146,7 @@ class Solved:
 
 @wp.func
 def level_of(number: int) -> Level:
-    """A level: friction as it is; with a line search; softer and softer; hard again; held; hard; short steps."""
+    """Friction as it is; with a line search; softer and softer; hard again; held; hard; short steps."""
     level = Level()
     level.softness = ONE
     level.share = ONE
@@ -200,8 +214,13 @@ def narrowed(search: Search, work: real) -> Search:
 @wp.func
 def measure(scene: Scene, room: Room, world: int) -> Measured:
     """Of the residual and Jacobian at the velocities that were tried."""
-    m = scene.moving.shape[0]
+    m = scene.n_blocks
     found = Measured()
+    if wp.static(TREES):
+        of_joints = measure_joints(scene, room, world)
+        found.work = of_joints.work
+        found.error = of_joints.error
+        found.size = wp.max(of_joints.size, room.trees.sizes[world, 1])
     for i in range(m):
         residual = room.residual[world, i]
         scale = room.scale[world, i]
@@ -212,10 +231,48 @@ def measure(scene: Scene, room: Room, world: int) -> Measured:
                 size += absolute_product(room, world, i * m + j, room.tried[world, j])
         for k in range(6):
             missed = wp.abs(scale[k] * residual[k])
-            if missed > found.error or wp.isnan(missed):
+            if not (missed <= found.error):
                 found.error = missed
             found.size = wp.max(found.size, scale[k] * size[k])
     return found
+
+
+@wp.func
+def largest_error(scene: Scene, room: Room, world: int) -> real:
+    """Largest residual over mass or inertia at the velocities that were tried [m/s, rad/s]."""
+    error = measure_joints(scene, room, world).error
+    for i in range(scene.n_blocks):
+        residual = room.residual[world, i]
+        scale = room.scale[world, i]
+        for k in range(6):
+            missed = wp.abs(scale[k] * residual[k])
+            if not (missed <= error):
+                error = missed
+    return error
+
+
+@wp.func(inline=True)
+def newton_step(scene: Scene, room: Room, world: int, share: real, keeps: bool):
+    """A share of Newton's step from what was tried, in `room.step`.
+
+    Args:
+        scene: The scene.
+        room: Room.
+        world: Which world.
+        share: The share.
+        keeps: Whether trees have the derivative of the step before.
+    """
+    m = scene.n_blocks
+    copy_blocks(room, world, m)
+    for i in range(m):
+        room.step[world, i] = -room.residual[world, i]
+    if wp.static(TREES):
+        eliminate_joint_duals(scene, room, world, keeps)
+    solve_blocks(room, world, m)
+    if wp.static(TREES):
+        solve_trees(scene, room, world, keeps)
+    for i in range(m):
+        room.step[world, i] = share * room.step[world, i]
 
 
 @wp.func
@@ -229,8 +286,10 @@ def absolute_product(room: Room, world: int, block: int, v: vec6) -> vec6:
     return found
 
 
-@wp.func
-def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: real, options: Options) -> Solved:
+@wp.func(inline=True)
+def solve(
+    scene: Scene, room: Room, world: int, lane: int, n_found: int, size: real, options: Options
+) -> Solved:
     """Velocities at the end of a step, in `room.velocity`, from those that it holds.
 
     Args:
@@ -242,24 +301,43 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
         size: Magnitude of the terms in the residual [m/s], to which rounding in it is relative.
         options: When to stop.
     """
-    m = scene.moving.shape[0]
+    m = scene.n_blocks
     if lane == 0:
         for i in range(m):
             room.best[world, i] = room.velocity[world, i]
             room.step[world, i] = vec6()
+        if wp.static(TREES):
+            fit_joint_duals(scene, room, world)
     if wp.static(POINTS):
         fit_duals(scene, room, world, lane, n_found)
+    n_near = n_found
     if wp.static(PATCHES):
+        n_near += room.patches.count[world, 0]
         fit_patch_duals(scene, room, world, lane, n_found)
     found = Solved()
     search = begin_search(ZERO)
     number = int(0)
     level = level_of(0)
     budget = level.budget
+    if wp.static(TREES):
+        if n_near == 0:
+            # Without contact nothing cycles but joints, which a line search stops.
+            number = 1
+            level.searches = True
+            budget = options.max_passes
+    if wp.static(PATCHES):
+        if n_found == 0 and n_near > 0:
+            if not any_sticks(scene, room, world, n_found):
+                # Smooth friction is a function: whole steps know no more than a line search.
+                number = 1
+                level.searches = True
     mix = real(0.0)
     share = real(1.0)
     before = real(INFINITY)
     best = real(INFINITY)
+    keeps = bool(False)
+    finishes = bool(False)
+    needs = bool(True)
     wait()
     while not found.converged and found.passes < options.max_passes and number < _LEVELS:
         if lane == 0:
@@ -275,6 +353,22 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
         if wp.static(PATCHES):
             fit = add_patches(scene, room, world, lane, n_found, trial, fit)
         wait()
+        if wp.static(TREES):
+            # A root needs no derivative, a first step only the mass. Close to a root the derivative of the
+            # pass before serves: its relative error is about twice the factor by which the last step made the
+            # residual smaller.
+            needs = True
+            if n_near == 0:
+                missed = largest_error(scene, room, world)
+                enough = options.tolerance * (ONE + size)
+                close = TWO * missed * missed <= enough * before and search.length == ONE
+                begins = found.passes == 0
+                keeps = (begins or close) and same_mode(scene, room, world, begins)
+                needs = missed > enough and not keeps
+            wait()
+            if lane == 0 and needs:
+                add_tree_slopes(scene, room, world)
+            wait()
         seen = measure(scene, room, world)
         tolerance = wp.max(options.tolerance * (ONE + size), real(16.0) * options.rounding * seen.size)
         hard = level.softness == ONE
@@ -299,7 +393,9 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
         if seen.error < HALF * before:
             part = ONE
         spent = budget <= 0
-        settled = not level.holds or spent or (mix > ZERO and mix < ONE and fit.renewed <= _RENEWED * fit.push)
+        settled = (
+            not level.holds or spent or (mix > ZERO and mix < ONE and fit.renewed <= _RENEWED * fit.push)
+        )
         harder = accept and ((small and not hard and settled) or (not small and spent))
         budget -= 1
         mix = ZERO
@@ -318,14 +414,17 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
             if lane == 0:
                 for i in range(m):
                     room.velocity[world, i] = room.tried[world, i]
-            if not found.converged:
+            if wp.static(TREES):
+                if n_near == 0 and found.converged and seen.error > _EXACT * options.rounding * (ONE + size):
+                    # A last step, not looked at, takes what is left to rounding.
+                    finishes = True
+                    keeps = not needs
+                    part = ONE
+            if finishes or not found.converged:
                 if lane == 0:
-                    copy_blocks(room, world, m)
-                    for i in range(m):
-                        room.step[world, i] = -room.residual[world, i]
-                    solve_blocks(room, world, m)
-                    for i in range(m):
-                        room.step[world, i] = part * room.step[world, i]
+                    newton_step(scene, room, world, part, keeps)
+                    if wp.static(TREES):
+                        follow_joint_duals(scene, room, world, search.length, part)
                 wait()
                 if wp.static(POINTS):
                     follow_duals(scene, room, world, lane, n_found, search.length)
@@ -334,6 +433,8 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
                 # The next pass is no longer of the same function where bounds are renewed: it is accepted.
                 begun = real(0.0)
                 if mix == ZERO:
+                    if wp.static(TREES):
+                        begun = measure_joints(scene, room, world).work
                     for i in range(m):
                         begun += wp.dot(room.step[world, i], room.residual[world, i])
                 search = begin_search(begun)
@@ -345,6 +446,13 @@ def solve(scene: Scene, room: Room, world: int, lane: int, n_found: int, size: r
     if not found.converged and lane == 0:
         for i in range(m):
             room.velocity[world, i] = room.best[world, i]
+    if wp.static(TREES):
+        if found.converged and lane == 0:
+            if finishes:
+                for i in range(m):
+                    room.velocity[world, i] = room.velocity[world, i] + room.step[world, i]
+                finish_joint_duals(scene, room, world)
+            resolve_joints(scene, room, world)
     wait()
     found.residual = wp.where(found.converged, before, best)
     return found

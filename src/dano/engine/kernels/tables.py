@@ -1,13 +1,14 @@
 """What kernels read and write: a scene, what a launch is given, and the room that a world works in.
 
-Arrays have the world as their first axis. Rows of real numbers come from JAX and are read as structures, whose
-fields stand in the order of the row; whole numbers are the same for all worlds.
+Arrays have the world as their first axis. Rows of real numbers come from JAX and are read as structures,
+whose fields stand in the order of the row; whole numbers are the same for all worlds.
 """
 
 import warp as wp
 
 from dano.engine.kernels.patch_tables import PatchRoom, PatchTables
-from dano.physics.distances import Solids
+from dano.engine.kernels.trees.tables import TreeRoom, Trees
+from dano.physics.distances import Leaf, Solids
 from dano.physics.pairs import BodyState
 from dano.physics.point_law import Duals, Linear, Material, PointLaw
 from dano.physics.real import mat33, mat66, real, vec3, vec4, vec6
@@ -45,7 +46,7 @@ class BodyIndex:
     """Whole numbers of a body.
 
     Attributes:
-        row: Place among the bodies that move, or −1.
+        row: Place among the bodies that move, or −1; of bodies on joints their node.
         first_block: Of its samples.
         blocks: How many it has.
         first_probe: Of the points that say how deep it is, coarsely if there are many samples.
@@ -96,9 +97,10 @@ class Scene:
     """What stays constant over a rollout.
 
     Attributes:
+        n_blocks: Blocks of six unknowns: one of each free body, and those that joints and loops need.
         bodies: Shape (worlds, n).
         body_index: Shape (n,).
-        moving: Bodies that move, shape (m,).
+        moving: Bodies that move, shape (m,); with joints in the order of nodes.
         samples: Of all bodies, in blocks, shape (worlds, samples).
         balls: Centre [m, F] and radius [m] of a ball around each block, shape (worlds, blocks).
         runs: Balls around each block and those after it, `RUN` in all.
@@ -111,8 +113,10 @@ class Scene:
         gravity: [m/s²], shape (worlds, 1).
         timestep: h [s], shape (worlds, 1).
         patches: Contacts with a patch law.
+        trees: Bodies on joints.
     """
 
+    n_blocks: wp.int32
     bodies: wp.array2d(dtype=Body)
     body_index: wp.array(dtype=BodyIndex)
     moving: wp.array(dtype=wp.int32)
@@ -127,6 +131,7 @@ class Scene:
     gravity: wp.array2d(dtype=vec3)
     timestep: wp.array2d(dtype=real)
     patches: PatchTables
+    trees: Trees
 
 
 @wp.struct
@@ -217,19 +222,25 @@ class Room:
         changes: Of the duals by the whole step.
         linear: The law as it was linearised last.
         near: Probes that may meet a solid within the step.
-        blocks: Of the Jacobian, shape (worlds, m · m).
+        blocks: Of the Jacobian, shape (worlds, blocks · blocks).
         spare: The same, used up by the solve.
         used: Whether a block is not zero.
         order: Of elimination; later neighbours; their numbers.
         later: …
         counts: …
-        velocity: Accepted, of each moving body [m/s; rad/s, W].
+        velocity: Accepted, of each free body [m/s; rad/s, W], or six coordinates of joints; (worlds, blocks).
+        old: Those of the step before; only with joints.
         tried: …
         best: Where the residual was smallest.
         step: Of Newton's method.
-        residual: Of each moving body [kg m/s; kg m²/s, W].
+        residual: What each block misses [kg m/s; kg m²/s, W].
         scale: Turns momenta into velocities [1/kg; 1/(kg m²)].
         patches: Contacts with a patch law.
+        trees: Room for bodies on joints.
+        state_bar: Derivatives by the states at the start of a step.
+        after_bar: By those at its end.
+        wrenches: Impulse of each pair that is near, at the first body's centre of mass [N s, N m s, W].
+        missing: Changes of the equations of a step, shape (worlds, directions · m).
     """
 
     bodies: wp.array2d(dtype=BodyState)
@@ -250,9 +261,38 @@ class Room:
     later: wp.array2d(dtype=wp.int32)
     counts: wp.array2d(dtype=wp.int32)
     velocity: wp.array2d(dtype=vec6)
+    old: wp.array2d(dtype=vec6)
     tried: wp.array2d(dtype=vec6)
     best: wp.array2d(dtype=vec6)
     step: wp.array2d(dtype=vec6)
     residual: wp.array2d(dtype=vec6)
     scale: wp.array2d(dtype=vec6)
     patches: PatchRoom
+    trees: TreeRoom
+    state_bar: wp.array2d(dtype=StateRow)
+    after_bar: wp.array2d(dtype=StateRow)
+    wrenches: wp.array2d(dtype=vec6)
+    missing: wp.array2d(dtype=vec6)
+
+
+@wp.struct
+class Changes:
+    """Numbers that belong to what a rollout is given and to what it finds: derivatives by them, or changes.
+
+    Arrays without columns are not asked for, or do not change. Those of changes hold one direction after the
+    other.
+
+    Attributes: those of `Scene` and `Launch` with the same names; `coefficients` are those of `Solids`.
+    """
+
+    bodies: wp.array2d(dtype=Body)
+    samples: wp.array2d(dtype=Sample)
+    leaves: wp.array2d(dtype=Leaf)
+    coefficients: wp.array2d(dtype=real)
+    pairs: wp.array2d(dtype=SamplePair)
+    materials: wp.array2d(dtype=Material)
+    gravity: wp.array2d(dtype=vec3)
+    timestep: wp.array2d(dtype=real)
+    state: wp.array2d(dtype=StateRow)
+    pushes: wp.array2d(dtype=Push)
+    states: wp.array2d(dtype=StateRow)

@@ -6,4 +6,4 @@ from dano.fields.readers._io import (
     load_field as load_field,
     save_field as save_field,
 )
-from dano.fields.readers._splats import is_splats as is_splats
+from dano.fields.readers._splat_files import is_splats as is_splats

@@ -10,18 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dano.archive import FIELD, format_of, write_archive
-from dano.checks import checked_number, checked_path
+from dano.checks import checked_path
 from dano.fields._base import AbstractField
 from dano.fields._callable import checked_bounds
 from dano.fields._compose import posed, scaled
 from dano.fields._grid import GridField
-from dano.fields._mesh import mesh_field
 from dano.fields._shapes import AbstractShape
 from dano.fields._signed_distance import SignedDistanceGrid
+from dano.fields.meshes import checked_units, mesh_field, MESH_SUFFIXES
 from dano.fields.readers._arrays import load_npy, load_npz, load_object
 from dano.fields.readers._instant_ngp import load_snapshot
 from dano.fields.readers._nerfacto import load_checkpoint
-from dano.fields.readers._splats import is_splats, load_splats
+from dano.fields.readers._splat_files import is_splats
+from dano.fields.readers._splats import load_splats
 from dano.fields.readers._torch_module import load_callable, load_module
 from dano.fields.readers._vdb import load_vdb
 from dano.maths import Numbers, Pose
@@ -55,12 +56,12 @@ _CHECKPOINT = (
     "disable_scene_contraction",
 )
 _MESH = _Reader(mesh_field, ("resolution", "interpolation", "edge"))
-_SPLATS = _Reader(load_splats, ("min_width",), crops=True)
+_SPLATS = _Reader(load_splats, ("min_width", "skip_nan"), crops=True)
 _READERS: dict[str, _Reader] = {
     ".npz": _Reader(load_npz, ("interpolation",)),
     ".npy": _Reader(load_npy, ("spacing", "origin", "interpolation", "signed_distance")),
     ".dano": _Reader(load_object, ("interpolation",)),
-    **dict.fromkeys((".obj", ".stl", ".ply", ".off", ".glb", ".gltf"), _MESH),
+    **dict.fromkeys(MESH_SUFFIXES, _MESH),
     ".ckpt": _Reader(load_checkpoint, _CHECKPOINT, crops=True),
     **dict.fromkeys((".ingp", ".msgpack"), _Reader(load_snapshot, ("cascade", "interpolation"), crops=True)),
     **dict.fromkeys((".vdb", ".nvdb"), _Reader(load_vdb, ("grid", "interpolation"), crops=True)),
@@ -78,15 +79,16 @@ FIELD_FORMATS = FIELD[0], *_MODELS
 FIELD_SUFFIXES = tuple(_READERS)
 """How the names of files end that `load_field` reads."""
 
-SHIPPED = ("bunny", "soap")
-"""Density grids in the package, by name."""
+SHIPPED = ("bunny", "soap", "trained_bunny", "trained_soap")
+"""Fields in the package, by name: density grids, and what was learned from photographs."""
 
 
 def load_field(
     path: str | Path,
     *,
     crop: Numbers | None = None,
-    scale: float = 1.0,
+    scale: int | float | None = None,
+    units: str | None = None,
     pose: Pose | None = None,
     **options: Any,
 ) -> AbstractField:
@@ -97,9 +99,10 @@ def load_field(
       `HashModel`.
     - `.npy`: voxels (nx, ny, nz), booleans or densities; options `spacing`, `origin`, `interpolation`, and
       `signed_distance=True` if they are distances, negative inside.
-    - `.obj`, `.stl`, `.off`, `.glb`, `.gltf`, `.ply`: a watertight triangle mesh; options of `mesh_field`.
-    - `.ply` with Gaussian splats: their occupancy; option `min_width`, the least standard deviation of a
-      Gaussian.
+    - `.obj`, `.stl`, `.off`, `.glb`, `.gltf`, `.ply`, `.3mf`, `.dae`, `.step`: a triangle mesh; options of
+      `mesh_field`, which says what it mends.
+    - `.ply` with Gaussian splats, flat (2DGS) and packed (`.compressed.ply`) ones, too: their occupancy;
+      options `min_width`, the least standard deviation of a Gaussian, and `skip_nan`.
     - `.ckpt`: a nerfstudio checkpoint (nerfacto, splatfacto); option `undo_transform`, and nerfacto's sizes
       where no config.yml tells them.
     - `.ingp`, `.msgpack`: the density grid of an instant-ngp snapshot; options `cascade`, `interpolation`.
@@ -108,7 +111,8 @@ def load_field(
     - `.pt2`, `.pt`, `.pth`: a module (n, 3) → (n,) of torch.export or TorchScript, or weights for the one
       that option `module` = "package.module:name" makes; `crop` is required.
     - `"package.module:name"` instead of a file: that function (n, 3) → (n,); `crop` is required.
-    - `"bunny"`, `"soap"` instead of a file: a density grid that dano ships.
+    - `"bunny"`, `"soap"` instead of a file: a density grid that dano ships; `"trained_bunny"`,
+      `"trained_soap"`: what `dano train` made of photographs of them.
     - `.dano`: the grid stored in a neural object; option `interpolation`.
 
     Args:
@@ -116,7 +120,8 @@ def load_field(
         crop: Lower and upper corner, shape (2, 3), of the part to be kept, in the frame and units of the
             file; for densities. Grids keep the nodes within.
         scale: Length [m] of a unit of the file, applied after `crop`, about the origin. Densities keep their
-            values.
+            values. Default: 1, for meshes as `mesh_field` has it.
+        units: The same by name: "m", "cm", "mm", "in", "ft" or "um".
         pose: Moves the scaled field into the frame F that you want.
         **options: See above. `spacing` and `origin` (centre of the first voxel) place an .npy array, which is
             otherwise centred on the origin with its longest side 1.
@@ -131,20 +136,38 @@ def load_field(
             promises, or an option is not known; the message names the file and what was expected.
         ImportError: If reading it needs a package that is not installed, or a function cannot be imported.
     """
-    scale = checked_number("scale", scale, above=0)
+    factor = checked_units(scale, units)
     if pose is not None and not isinstance(pose, Pose):
         raise ValueError(f"pose must be a dano.maths.Pose, got {type(pose).__name__}")
     box = None if crop is None else np.asarray(checked_bounds(crop, "crop"), np.float64)
-    field = _read(path, box, options)
-    field = scaled(field, scale) if scale != 1 else field
+    field = _read(path, box, options, factor)
     return field if pose is None else posed(field, pose)
 
 
-def _read(path: str | Path, crop: np.ndarray | None, options: dict[str, Any]) -> AbstractField:
+def _read(
+    path: str | Path, crop: np.ndarray | None, options: dict[str, Any], factor: float | None
+) -> AbstractField:
+    """What a file holds, in metres: `factor` is the length of its unit, None where it is not known."""
     checked_path("path", path)
     if str(path) in SHIPPED and not Path(path).exists():
         with as_file(files("dano") / "assets" / f"{path}.npz") as shipped:
-            return _read(shipped, crop, options)
+            return _read(shipped, crop, options, factor)
+    if _is_mesh(path):
+        _check_options(path, f"{Path(path).suffix.lower()} file", options, _MESH.options)
+        field = mesh_field(path, **options, scale=factor)
+        return field if crop is None else _cropped(field, crop, Path(path))
+    field = _of_unit(path, crop, options)
+    return field if factor in (None, 1.0) else scaled(field, factor)
+
+
+def _is_mesh(path: str | Path) -> bool:
+    path = Path(path)
+    suffix = path.suffix.lower()
+    return suffix in MESH_SUFFIXES and not (suffix == ".ply" and path.is_file() and is_splats(path))
+
+
+def _of_unit(path: str | Path, crop: np.ndarray | None, options: dict[str, Any]) -> AbstractField:
+    """What a file that is no mesh holds, in its own unit."""
     if (
         isinstance(path, str)
         and re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", path)
@@ -154,6 +177,11 @@ def _read(path: str | Path, crop: np.ndarray | None, options: dict[str, Any]) ->
         return load_callable(path, crop=crop)
     path = Path(path)
     suffix = path.suffix.lower()
+    if not suffix and not path.exists():
+        raise ValueError(
+            f"{path}: no such file, and none of the shipped {', '.join(SHIPPED)}"
+            + did_you_mean(str(path), SHIPPED)
+        )
     if suffix not in _READERS:
         raise ValueError(
             f"{path}: unknown kind of field {suffix!r}; expected one of {', '.join(_READERS)}"
@@ -165,7 +193,7 @@ def _read(path: str | Path, crop: np.ndarray | None, options: dict[str, Any]) ->
     if suffix == ".npz" and (form := format_of(path)) in _MODELS:
         _check_options(path, f"{form} file", options, ())
         return _of_model(path, _MODELS[form], crop)
-    reader = _SPLATS if suffix == ".ply" and is_splats(path) else _READERS[suffix]
+    reader = _SPLATS if suffix == ".ply" else _READERS[suffix]
     _check_options(path, f"{suffix} file", options, reader.options)
     if reader.crops:
         return reader.read(path, crop=crop, **options)

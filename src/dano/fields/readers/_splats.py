@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from dano.extras import optional
 from dano.fields._callable import CallableField
+from dano.fields.readers._splat_files import read_splats
 from dano.maths import Numbers, quat_to_matrix
 
 REACH = 5.5
@@ -20,19 +20,10 @@ _PAIRS = 1 << 21
 _STRAY = 10.0
 """How many times wider than nine tenths of the Gaussians the box around all must be to be doubted."""
 
-_MEMBERS = ("x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 
-
-def is_splats(path: Path) -> bool:
-    """Whether a .ply file holds Gaussians rather than a mesh or points."""
-    with open(path, "rb") as file:
-        header = file.read(65_536).split(b"end_header")[0]
-    return all(
-        any(line.split()[-1:] == [word] for line in header.splitlines()) for word in (b"opacity", b"scale_2")
-    )
-
-
-def load_splats(path: Path, *, crop: Numbers | None, min_width: float = 0.0) -> CallableField:
+def load_splats(
+    path: Path, *, crop: Numbers | None, min_width: float = 0.0, skip_nan: bool = False
+) -> CallableField:
     """Occupancy of Gaussian splats in a .ply file, in the frame of the file.
 
     φ(x) = 1 − Π (1 − oᵢ exp(−½ (x − μᵢ)ᵀ Σᵢ⁻¹ (x − μᵢ))) with Σᵢ = R diag(s²) Rᵀ: the chance that at least
@@ -40,31 +31,19 @@ def load_splats(path: Path, *, crop: Numbers | None, min_width: float = 0.0) -> 
     never exceeds one.
 
     Args:
-        path: A .ply file with x, y, z, opacity (logit), scale_0–2 (log) and rot_0–3 (wxyz) of each Gaussian.
+        path: A .ply file with x, y, z, opacity (logit), scale_0–2 (log) and rot_0–3 (wxyz) of each Gaussian;
+            flat and packed ones, too (see `read_splats`).
         crop: Box [units of the file]; None: around all Gaussians.
         min_width: Least standard deviation [units of the file] of a Gaussian along any of its axes; half the
             distance between the nodes of a grid leaves no pores in a shell that is sampled there.
+        skip_nan: Leave out Gaussians with numbers that are not finite, which a UserWarning counts.
 
     Raises:
         ValueError: If `min_width` is negative, the file cannot be read, lacks a property, or holds no
             Gaussian or numbers that are not finite.
         ImportError: If plyfile is missing.
     """
-    plyfile = optional("plyfile", "reading Gaussian splats needs plyfile", "import")
-    try:
-        vertices = plyfile.PlyData.read(str(path))["vertex"].data
-        names = vertices.dtype.names
-        if missing := [name for name in _MEMBERS if name not in names]:
-            raise ValueError(f"its vertices have no {', '.join(missing)}")
-        columns = {name: np.asarray(vertices[name], np.float64) for name in _MEMBERS}
-    except (plyfile.PlyParseError, ValueError, KeyError, OSError, EOFError, MemoryError) as error:
-        raise ValueError(f"{path}: expected Gaussian splats with {', '.join(_MEMBERS)}; {error}") from error
-    parameters = {
-        "means": np.stack([columns[n] for n in "xyz"], axis=1),
-        "scales": np.stack([columns[f"scale_{i}"] for i in range(3)], axis=1),
-        "quats": np.stack([columns[f"rot_{i}"] for i in range(4)], axis=1),
-        "opacities": columns["opacity"],
-    }
+    parameters = read_splats(path, skip_nan=skip_nan)
     try:
         return splat_field(parameters, crop, min_width)
     except ValueError as error:

@@ -19,6 +19,12 @@ from dano.vision.capture._masks import (
     with_masks as with_masks,
 )
 from dano.vision.capture._node_grid import NodeGrid as NodeGrid, resampled as resampled
+from dano.vision.capture._pictures import (
+    picture_files as picture_files,
+    PICTURES as PICTURES,
+    read_mask as read_mask,
+    read_picture as read_picture,
+)
 from dano.vision.capture._ray_set import (
     collect as collect,
     rays_of as rays_of,

@@ -13,15 +13,40 @@ from typing import Any
 
 import numpy as np
 
-from dano.checks import checked_count, checked_path
+from dano.checks import checked_count, checked_path, shown
 from dano.vision.capture._camera import PosedCamera
 from dano.vision.capture._capture import Capture, SPLITS, View
 from dano.vision.capture._masks import cut_out
+from dano.vision.capture._pictures import read_mask, read_picture, Turned
 
 _HOLD_OUT = 8
 """Where a capture has no split, one in this many views is held out, as is usual since LLFF."""
 
-_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
+_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
+_FOREIGN = (
+    "is_fisheye",
+    "fisheye",
+    "is_equirectangular",
+    "rolling_shutter",
+    "distortion",
+    "distortion_params",
+)
+_FOREIGN += (
+    "k4",
+    "k5",
+    "k6",
+    "s1",
+    "s2",
+    "s3",
+    "s4",
+    "ftheta_p0",
+    "ftheta_p1",
+    "ftheta_p2",
+    "ftheta_p3",
+    "ftheta_p4",
+)
+"""What other programs say of lenses and shutters that dano does not draw."""
+
 _UNSET = (None, "", [])
 
 
@@ -165,10 +190,12 @@ def _read_transforms(path: Path) -> list[View]:
             raise ValueError(f"{path}: frame {i} must have file_path and transform_matrix")
         name = str(frame["file_path"])
         file = _image_file(path, name)
-        image, mask, cut_out = _pixels(file)
-        if frame.get("mask_path") not in _UNSET:
-            mask, cut_out = _mask(path.parent / str(frame["mask_path"]), image.shape[:2]), False
         values = {**{k: v for k, v in content.items() if k != "frames"}, **frame}
+        picture = read_picture(file, lambda turned, values=values: _is_of_upright(path, turned, values))
+        image, mask, cut_out = picture.over_black, picture.alpha, picture.alpha is not None
+        if frame.get("mask_path") not in _UNSET:
+            mask = read_mask(path.parent / str(frame["mask_path"]), image.shape[:2], picture.orientation)
+            image, cut_out = picture.colours, False
         light, near = _light(path, i, frame)
         views.append(
             View(
@@ -193,7 +220,8 @@ def _read_anno(path: Path) -> list[View]:
             raise ValueError(f"{path}: image {i} must have filename, RT and K")
         name = str(record["filename"])
         folder = "rgba/" if (path.parent / "rgba").is_dir() else ""
-        image, mask, cut_out = _pixels(_image_file(path, folder + name))
+        picture = read_picture(_image_file(path, folder + name))
+        image, mask, cut_out = picture.over_black, picture.alpha, picture.alpha is not None
         try:
             world_to_camera = np.asarray(record["RT"], dtype=np.float64).reshape(3, 4)
             k = np.asarray(record["K"], dtype=np.float64)[:3, :3].reshape(9)
@@ -232,15 +260,53 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def _check_model(path: Path, content: dict[str, Any]) -> None:
-    models = {
-        str(f["camera_model"]) for f in content["frames"] if isinstance(f, dict) and "camera_model" in f
-    }
-    for model in sorted(models | {str(content.get("camera_model", "OPENCV"))}):
-        if model.upper() not in _MODELS:
-            raise ValueError(
-                f"{path}: camera_model must be one of {', '.join(_MODELS)}, got {model}: undistort the"
-                " photographs first"
-            )
+    """Refuse lenses that `PosedCamera` does not know, by whatever key a program says so."""
+    for values in (content, *(f for f in content["frames"] if isinstance(f, dict))):
+        for key in ("camera_model", "camera_type", "lens"):
+            model = values.get(key)
+            if model not in _UNSET and str(model).upper() not in _MODELS:
+                raise ValueError(
+                    f"{path}: {key} must be one of {', '.join(_MODELS)}, got {model}: undistort the"
+                    " photographs first"
+                )
+        for key in _FOREIGN:
+            if key in values and _is_set(values[key]):
+                raise ValueError(
+                    f"{path}: {key} must be false, zero or left out, got {shown(values[key])}: dano knows"
+                    " pinhole cameras with k1, k2, k3, p1, p2 of OpenCV; undistort the photographs first"
+                )
+
+
+def _is_set(value: Any) -> bool:
+    """Whether a flag or numbers say something other than no."""
+    if isinstance(value, str):
+        return value.lower() not in ("", "false", "no", "0", "none")
+    if isinstance(value, (list, tuple)):
+        return any(_is_set(part) for part in value)
+    return bool(value)
+
+
+def _is_of_upright(path: Path, turned: Turned, values: dict[str, Any]) -> bool:
+    """Whether a camera is that of the upright picture, or of the pixels as they are stored.
+
+    COLMAP, instant-ngp and others do not heed how a camera was held; `dano poses` does, and says `units`.
+
+    Raises:
+        ValueError: If it cannot be told.
+    """
+    if "units" in values:
+        return True
+    width, height = turned.size
+    if turned.orientation >= 5 and width != height and "w" in values and "h" in values:
+        try:
+            return (float(values["w"]) > float(values["h"])) != (width > height)
+        except (TypeError, ValueError):
+            pass  # said where the camera is made
+    raise ValueError(
+        f"{path}: {turned.file.name} is stored turned (EXIF orientation {turned.orientation}), and"
+        f" {'w and h do not say' if 'w' in values else 'there are no w and h to say'} whether its camera is"
+        " that of the stored or of the upright pixels: write it upright without the tag, and find poses again"
+    )
 
 
 def _image_file(source: Path, name: str) -> Path:
@@ -250,49 +316,6 @@ def _image_file(source: Path, name: str) -> Path:
         if file.is_file():
             return file
     raise ValueError(f"{source}: image {name} is missing; looked for {base}")
-
-
-def _pixels(file: Path) -> tuple[np.ndarray, np.ndarray | None, bool]:
-    """Colours in [0, 1] (over black where the file has alpha), mask, and whether the file has alpha."""
-    picture = _opened(file)
-    if picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info:
-        rgba = np.asarray(picture.convert("RGBA"), dtype=np.float32) / 255
-        return rgba[..., :3] * rgba[..., 3:], rgba[..., 3], True
-    if picture.mode.startswith("I"):
-        return np.repeat(_sixteen_bits(picture)[..., None], 3, axis=2), None, False
-    return np.asarray(picture.convert("RGB"), dtype=np.float32) / 255, None, False
-
-
-def _mask(file: Path, shape: tuple[int, ...]) -> np.ndarray:
-    if not file.is_file():
-        raise ValueError(f"mask {file} is missing")
-    picture = _opened(file)
-    if picture.mode in ("RGBA", "LA"):
-        picture = picture.getchannel("A")
-    mask = np.asarray(picture.convert("L"), dtype=np.float32) / 255
-    if mask.shape != shape:
-        raise ValueError(f"mask {file} must have the size of its image, {shape}, got {mask.shape}")
-    # Masks written as 0 and 1 instead of 0 and 255.
-    return mask * 255 if 0 < mask.max() <= 1 / 255 else mask
-
-
-def _sixteen_bits(picture: Any) -> np.ndarray:
-    values = np.asarray(picture, dtype=np.float32)
-    return values / (65535 if values.max() > 255 else 255)
-
-
-def _opened(file: Path) -> Any:
-    try:
-        from PIL import Image, ImageOps
-    except ImportError as error:
-        raise ImportError("reading photographs needs pillow: pip install 'dano[train]'") from error
-    try:
-        with Image.open(file) as picture:
-            picture.load()
-            # Cameras note how they were held instead of turning the pixels.
-            return ImageOps.exif_transpose(picture)
-    except Exception as error:  # each of pillow's readers raises its own kinds
-        raise ValueError(f"{file}: cannot be read as an image, it may be cut off ({error})") from error
 
 
 def _camera(path: Path, name: str, values: dict[str, Any], shape: tuple[int, ...]) -> PosedCamera:
@@ -312,8 +335,6 @@ def _camera(path: Path, name: str, values: dict[str, Any], shape: tuple[int, ...
         else:
             raise ValueError("it states neither fl_x nor camera_angle_x")
         centre = (float(values.get("cx", 0.5 * stated[1])), float(values.get("cy", 0.5 * stated[0])))
-        if float(values.get("k4", 0.0)) != 0:
-            raise ValueError("k4 is not supported: undistort the photographs first")
         return PosedCamera(
             values["transform_matrix"],
             focal=np.multiply(focal, scale),

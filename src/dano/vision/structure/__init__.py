@@ -11,4 +11,4 @@ from dano.vision.structure._markers import PlacedMarker as PlacedMarker
 from dano.vision.structure._options import KnownLength as KnownLength, PoseOptions as PoseOptions
 from dano.vision.structure._photographs import picture_files as picture_files, VIDEOS as VIDEOS
 from dano.vision.structure._similarity import pose_errors as pose_errors, PoseErrors as PoseErrors
-from dano.vision.structure._video import timed_frames as timed_frames
+from dano.vision.structure._video import stretch as stretch, timed_frames as timed_frames

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from dano.vision.structure._features import FEWEST_MATCHES, Matches
+from dano.vision.structure._features import FEWEST_MATCHES, Matches, STILL
 from dano.vision.structure._mapping import Model
 from dano.vision.structure._options import FEWEST, PoseOptions
 from dano.vision.structure._photographs import Photograph
@@ -23,9 +23,6 @@ _FEW_COMMON = 60
 _PLAIN = 4.0
 """Standard deviation of grey levels in a picture that shows nothing."""
 
-_STILL = 1.0
-"""Median motion between two pictures [pixels] below which nothing moves."""
-
 _TURNED, _TURNED_SHARE = 1.5, 0.08
 """What a rotation may leave of the motion between two pictures to explain it: pixels, and share."""
 
@@ -38,6 +35,14 @@ def motion_fault(photographs: Sequence[Photograph], matches: Matches, options: P
 
     Checked before cameras are placed, because a model of pictures from one place looks as good as any.
     """
+    still = _stands_still(photographs, matches)
+    if still is not None:
+        masks = "" if _all_masked(photographs) else ", or give masks"
+        return (
+            f"nothing moves between the pictures (points move by {still:.1f} pixels): camera and object stood"
+            f" still, or what is seen is a reflection or the background; look at the object from other sides"
+            f"{masks}"
+        )
     pairs = [
         (pair, found)
         for pair, found in zip(matches.pairs, matches.verified, strict=True)
@@ -56,13 +61,6 @@ def motion_fault(photographs: Sequence[Photograph], matches: Matches, options: P
         for (a, b), found in pairs
     ]
     moved = np.array([np.median(np.linalg.norm(x - y, axis=1)) for x, y, _, _ in points])
-    if np.median(moved) < _STILL:
-        return (
-            f"nothing moves between the pictures (points move by {np.median(moved):.1f} pixels): camera and"
-            f" object"
-            " stood still, or what is seen is a reflection or the background; look at the object from other"
-            " sides, or give masks"
-        )
     longest = max(max(photograph.size) for photograph in photographs)
     focals = list(longest * np.geomspace(0.5, 4, 13)) if options.focals is None else [max(options.focals)]
     left = np.min([[_left_by_rotation(x, y, a, b, f) for x, y, a, b in points] for f in focals], axis=0)
@@ -76,6 +74,23 @@ def motion_fault(photographs: Sequence[Photograph], matches: Matches, options: P
         f" from one"
         " place show no depth"
     )
+
+
+def _stands_still(photographs: Sequence[Photograph], matches: Matches) -> float | None:
+    """How far points move [pixels] if they stand still in most pairs of most pictures; None if they do not.
+
+    Judged by all pairs with similar points. A few pairs among many pictures say nothing: what they share may
+    be noise that every picture has in the same place.
+    """
+    known = np.isfinite(matches.moved)
+    if not np.any(known) or np.mean(matches.moved[known] < STILL) <= 0.5:
+        return None
+    linked = np.unique(matches.pairs[known & (matches.moved < STILL)])
+    return float(np.median(matches.moved[known])) if len(linked) > 0.5 * len(photographs) else None
+
+
+def _all_masked(photographs: Sequence[Photograph]) -> bool:
+    return all(photograph.mask is not None for photograph in photographs)
 
 
 def _left_by_rotation(
@@ -131,12 +146,17 @@ def why_none(photographs: Sequence[Photograph], matches: Matches) -> str:
                 f" does: is it"
                 " a mirror, transparent, or moved between the pictures?"
             )
+        advice = (
+            "their masks leave only the object, which shows too few points: put it on something with a"
+            " pattern (a newspaper, a printed marker) and say features_on='everything'"
+            if _all_masked(photographs)
+            else "a mirror or glass shows something else from every place, give masks and"
+            " features_on='surroundings' for such an object"
+        )
         return (
             f"the pictures have too little in common ({linked} pairs share {FEWEST_MATCHES} points, though"
-            f" each shows"
-            f" {np.median(matches.points):.0f}): take more, from places closer to each other; a mirror or"
-            f" glass shows"
-            " something else from every place, give masks and features_on='surroundings' for such an object"
+            f" each shows {np.median(matches.points):.0f}): take more, from places closer to each other;"
+            f" {advice}"
         )
     strongest = [
         max((n for pair, n in zip(matches.pairs, verified, strict=True) if i in pair), default=0)

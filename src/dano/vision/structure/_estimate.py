@@ -34,7 +34,7 @@ from dano.vision.structure._markers import detect_markers, place_markers, Placed
 from dano.vision.structure._options import FEWEST, PoseOptions
 from dano.vision.structure._photographs import mask_folder, Photograph, picture_files, read_photograph
 from dano.vision.structure._similarity import Similarity
-from dano.vision.structure._video import is_video, write_frames
+from dano.vision.structure._video import is_video, stretch, write_frames
 
 _PLAIN = 6.0
 """Contrast [grey levels] below which surroundings are plain."""
@@ -108,7 +108,8 @@ def estimate_poses(
     """Find where pictures were taken from, by structure from motion.
 
     Args:
-        images: A folder of pictures (or one with `images` in it), a list of pictures, or a video.
+        images: A folder of pictures (or one with `images` in it), a video, or a list of pictures, videos and
+            folders.
         options: How; see there.
         masks: Folder with a mask for each picture, bright where the object is; default: `masks` in or beside
             the folder of pictures, or their alpha channel.
@@ -131,17 +132,68 @@ def estimate_poses(
     # What is missing is said before work starts.
     colmap()
     opencv()
+    between = stretch(options.since, options.until)
+    if not isinstance(images, (str, Path)) and len(images) == 1 and is_video(images[0]):
+        images = images[0]
     if isinstance(images, (str, Path)) and is_video(Path(images)):
         if frames is None:
             raise ValueError("frames must be a folder for the frames of the video, got None")
-        files = write_frames(Path(images), Path(frames), options.frames, told)
+        files = write_frames(Path(images), Path(frames), options.frames, told, between=between)
         try:
             return _from_files(files, options, masks, told, ordered=True)
         except BaseException:
             shutil.rmtree(frames, ignore_errors=True)
             raise
-    listed = Path(images) if isinstance(images, (str, Path)) else [Path(file) for file in images]
-    return _from_files(picture_files(listed), options, masks, told, ordered=False)
+    if isinstance(images, (str, Path)):
+        return _from_files(picture_files(Path(images)), options, masks, told, ordered=False)
+    videos = _videos(images, frames)
+    try:
+        files = _listed(images, videos, frames, options, between, told)
+        return _from_files(picture_files(files), options, masks, told, ordered=False)
+    except BaseException:
+        if videos and frames is not None:
+            shutil.rmtree(frames, ignore_errors=True)
+        raise
+
+
+def _videos(images: Sequence[Path], frames: str | Path | None) -> list[Path]:
+    """Those of a list that are videos, after a check of where their frames go.
+
+    Raises:
+        ValueError: If it holds something, or two videos have one name.
+    """
+    videos = [file for file in images if is_video(file)]
+    if not videos:
+        return []
+    if frames is None:
+        raise ValueError("frames must be a folder for the frames of the videos, got None")
+    if len({video.stem for video in videos}) < len(videos):
+        raise ValueError(f"videos must have different names, got {', '.join(v.name for v in videos)}")
+    place = Path(frames)
+    if place.exists() and (not place.is_dir() or any(place.iterdir())):
+        raise ValueError(f"frames must be a new or empty folder, got {place}")
+    return videos
+
+
+def _listed(
+    images: Sequence[Path],
+    videos: Sequence[Path],
+    frames: str | Path | None,
+    options: PoseOptions,
+    between: tuple[float, float],
+    told: Progress,
+) -> list[Path]:
+    """The pictures of a list: files, those in folders, and frames of videos, which share `options.frames`."""
+    files: list[Path] = []
+    for file in images:
+        if frames is not None and file in videos:
+            Path(frames).mkdir(exist_ok=True)
+            count = max(1, options.frames // len(videos))
+            place = Path(frames) / file.stem
+            files += write_frames(file, place, count, told, prefix=f"{file.stem}_", between=between)
+        else:
+            files += picture_files(file) if file.is_dir() else [file]
+    return files
 
 
 def _from_files(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from scipy import ndimage
 
 from dano.progress import Progress
@@ -31,6 +31,9 @@ _MARGIN = 0.004
 _ALL_PAIRS = 150
 """Pictures of which every pair is compared; of more, neighbours in order and pairs ever further apart."""
 
+STILL = 1.0
+"""Motion between two pictures [pixels] below which a point stands still."""
+
 FEWEST_MATCHES = 12
 """Common points of two pictures below which they are taken for chance."""
 
@@ -47,6 +50,8 @@ class Matches(NamedTuple):
         coordinates: Coordinates x, y of points by picture [pixels of the upright picture].
         pairs: Indices of compared pictures, shape (pairs, 2).
         raw: Number of similar points by pair.
+        moved: Median distance by pair between the places of similar points in its pictures [pixels]; NaN
+            where there are too few.
         verified: Indices of points in both pictures that one motion explains, by pair, each of shape
             (matches, 2).
     """
@@ -56,6 +61,7 @@ class Matches(NamedTuple):
     coordinates: tuple[np.ndarray, ...]
     pairs: Int[np.ndarray, "pairs 2"]
     raw: Int[np.ndarray, " pairs"]
+    moved: Float[np.ndarray, " pairs"]
     verified: tuple[np.ndarray, ...]
 
 
@@ -241,6 +247,10 @@ def _match(database: Path, folder: Path, pairs: list[tuple[str, str]], options: 
     settings.use_gpu = False
     geometry = library.TwoViewGeometryOptions()
     geometry.min_num_inliers = FEWEST_MATCHES
+    # What stays in its place while the rest moves is dust, noise, a frame or a table around a turntable.
+    geometry.filter_stationary_matches = True
+    geometry.stationary_matches_max_error = STILL
+    geometry.detect_watermark = True
     geometry.ransac.random_seed = options.seed
     interruptible(
         library.match_image_pairs,
@@ -263,18 +273,25 @@ def _read(database: Path, photographs: Sequence[Photograph]) -> Matches:
             found = np.asarray(file.read_keypoints(key), dtype=np.float64)
             if len(found):
                 coordinates[i] = found[:, :2] / enlargement(photographs[i])
-        pairs, raw, verified = [], [], []
-        similar = dict(zip(*file.read_num_matches(), strict=True))
-        for key, geometry in zip(*file.read_two_view_geometries(), strict=True):
+        pairs, raw, moved, verified = [], [], [], []
+        similar = dict(zip(*file.read_all_matches(), strict=True))
+        geometries = dict(zip(*file.read_two_view_geometries(), strict=True))
+        for key in dict.fromkeys((*similar, *geometries)):
             first, second = (index[k] for k in library.pair_id_to_image_pair(key))
             pairs.append((first, second))
-            raw.append(int(similar.get(key, 0)))
-            verified.append(np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2))
+            alike = np.asarray(similar.get(key, np.zeros((0, 2))), dtype=np.int64).reshape(-1, 2)
+            raw.append(len(alike))
+            apart = coordinates[first][alike[:, 0]] - coordinates[second][alike[:, 1]]
+            enough = len(alike) >= 2 * FEWEST_MATCHES
+            moved.append(float(np.median(np.linalg.norm(apart, axis=1))) if enough else np.nan)
+            found = geometries[key].inlier_matches if key in geometries else np.zeros((0, 2))
+            verified.append(np.asarray(found, dtype=np.int64).reshape(-1, 2))
     return Matches(
         database=database,
         points=np.array([len(c) for c in coordinates]),
         coordinates=tuple(coordinates),
         pairs=np.array(pairs, dtype=np.int64).reshape(-1, 2),
         raw=np.array(raw, dtype=np.int64),
+        moved=np.array(moved, dtype=np.float64),
         verified=tuple(verified),
     )

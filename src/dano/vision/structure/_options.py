@@ -70,7 +70,9 @@ class PoseOptions:
         known_length: A measured distance; None: there is none.
         up: What shows where up is: "marker" (lies flat), "plane" (most of the surroundings), "cameras" (were
             held level), "none"; "auto": the first of them that can be had.
-        frames: Most frames of a video.
+        frames: Most frames of a video, or of several together.
+        since: Take frames of a video from this time on [s]; None: from its beginning.
+        until: Take frames up to this time [s]; None: to its end.
         model: Which model to keep if the pictures fall into several, from 1, the largest.
         seed: Of everything random.
     """
@@ -86,6 +88,8 @@ class PoseOptions:
     known_length: KnownLength | None = None
     up: str = "auto"
     frames: int = 80
+    since: int | float | None = None
+    until: int | float | None = None
     model: int = 1
     seed: int = 0
 

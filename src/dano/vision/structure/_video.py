@@ -1,5 +1,6 @@
 """Frames of a video: as many as asked for, spread evenly, of each stretch the sharpest."""
 
+import math
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -8,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dano.checks import checked_number
 from dano.progress import Progress
 from dano.vision.structure._photographs import VIDEOS
 from dano.vision.structure._sharpness import blur
@@ -21,7 +23,28 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEOS
 
 
-def write_frames(video: Path, folder: Path, count: int, progress: Progress) -> list[Path]:
+def stretch(since: int | float | None, until: int | float | None) -> tuple[float, float]:
+    """The part of a film between two times [s]; None: from its beginning, to its end.
+
+    Raises:
+        ValueError: If it is empty.
+    """
+    first = -math.inf if since is None else checked_number("since", since)
+    last = math.inf if until is None else checked_number("until", until)
+    if first >= last:
+        raise ValueError(f"since must be before until, got {first:g} and {last:g} s")
+    return first, last
+
+
+def write_frames(
+    video: Path,
+    folder: Path,
+    count: int,
+    progress: Progress,
+    *,
+    prefix: str = "",
+    between: tuple[float, float] = (-math.inf, math.inf),
+) -> list[Path]:
     """Write frames of a video as PNG files, upright, named by their number.
 
     The folder appears when all are written.
@@ -31,6 +54,8 @@ def write_frames(video: Path, folder: Path, count: int, progress: Progress) -> l
         folder: New, or empty.
         count: Most frames.
         progress: Told how far it is.
+        prefix: What names of files begin with.
+        between: Part of the film that they are taken from [s], as `stretch` gives it.
 
     Returns:
         The files, in order.
@@ -51,8 +76,8 @@ def write_frames(video: Path, folder: Path, count: int, progress: Progress) -> l
         partial = Path(temporary) / "frames"
         partial.mkdir()
         names = []
-        for number, pixels in _sharpest(video, count, progress):
-            names.append(f"{number:06d}.png")
+        for number, pixels in _sharpest(video, count, progress, between):
+            names.append(f"{prefix}{number:06d}.png")
             Image.fromarray(pixels).save(partial / names[-1])
         if folder.exists():
             folder.rmdir()
@@ -60,18 +85,25 @@ def write_frames(video: Path, folder: Path, count: int, progress: Progress) -> l
     return [folder / name for name in names]
 
 
-def _sharpest(video: Path, count: int, progress: Progress) -> Iterator[tuple[int, np.ndarray]]:
+def _sharpest(
+    video: Path, count: int, progress: Progress, between: tuple[float, float]
+) -> Iterator[tuple[int, np.ndarray]]:
     """Number and pixels of the sharpest frame of each of `count` stretches of equal length."""
-    total = sum(1 for _ in _decoded(video))
+    first, last = between
+    inside = [first <= (frame.time or 0.0) <= last for frame in _decoded(video)]
+    total, before = sum(inside), inside.index(True) if any(inside) else 0
     if total == 0:
-        raise ValueError(f"{video}: there is no frame in it")
+        part = "" if math.isinf(first) and math.isinf(last) else f" from {first:g} to {last:g} s"
+        raise ValueError(f"{video}: there is no frame in it{part}")
     stretch = max(total / count, 1.0)
     best: tuple[float, int, np.ndarray] | None = None
     for number, frame in enumerate(_decoded(video)):
-        progress("reading frames", number / total)
+        if not inside[number]:
+            continue
+        progress("reading frames", (number - before) / total)
         pixels = _upright(frame)
         measure = blur(_grey(pixels))
-        if best is not None and int(number / stretch) != int((best[1]) / stretch):
+        if best is not None and int((number - before) / stretch) != int((best[1] - before) / stretch):
             yield best[1:]
             best = None
         if best is None or measure < best[0]:

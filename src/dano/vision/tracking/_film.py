@@ -9,8 +9,8 @@ from jaxtyping import Float, UInt8
 
 from dano.checks import checked_path
 from dano.progress import Progress
-from dano.vision.capture import PosedCamera
-from dano.vision.structure import picture_files, timed_frames, VIDEOS
+from dano.vision.capture import PosedCamera, read_mask, read_picture
+from dano.vision.structure import picture_files, stretch, timed_frames, VIDEOS
 
 _LONGEST = 800
 """Longest side of frames that are tracked [pixels]: larger ones are averaged, which costs no accuracy that
@@ -94,6 +94,8 @@ def read_film(
     rate: int | float | None = None,
     slow_motion: int | float = 1.0,
     every: int = 1,
+    since: int | float | None = None,
+    until: int | float | None = None,
     masks: str | Path | None = None,
     occluders: str | Path | None = None,
     progress: Progress | None = None,
@@ -105,7 +107,10 @@ def read_film(
         rate: Frames a second, real ones. Needed for folders; for videos it replaces the times in the file.
         slow_motion: How many times slower the video plays than it was filmed.
         every: Take every so many-th frame.
-        masks: Folder with a mask a frame, bright where the object is, in the order of their names.
+        since: Take frames from this time on [s], as a player shows it; times begin at 0 there.
+        until: Take frames up to this time [s].
+        masks: Folder with a mask for each frame of the film, or for each that is taken, bright where the
+            object is, in the order of their names.
         occluders: The same of what stands in front of the object, such as a hand.
         progress: Told how far it is.
 
@@ -119,19 +124,30 @@ def read_film(
             raise ValueError(f"{name} must be finite and > 0, got {value}")
     if every < 1:
         raise ValueError(f"every must be ≥ 1, got {every}")
+    first, last = stretch(since, until)
     tell = progress or (lambda text, share: None)
     names, stamps, images, alphas, shrunk = [], [], [], [], 1
+    taken, total, within = [], 0, 0
     for i, (name, stamp, pixels) in enumerate(_frames(source, rate)):
-        if i % every:
+        total = i + 1
+        stamp = i / rate if rate is not None else stamp
+        if stamp > last and masks is None and occluders is None:
+            break
+        if not first <= stamp <= last:
             continue
+        within += 1
+        if (within - 1) % every:
+            continue
+        taken.append(i)
         tell("reading frames", 0.0)
         shrunk = -(-max(pixels.shape[:2]) // _LONGEST)
         names.append(name)
-        stamps.append(i / rate if rate is not None else stamp)
+        stamps.append(stamp)
         images.append(_averaged(pixels[..., :3], shrunk))
         alphas.append(None if pixels.shape[2] == 3 else _averaged(pixels[..., 3], shrunk) / np.float32(255))
     if len(images) < _FEWEST:
-        raise ValueError(f"{source}: a film must have at least {_FEWEST} frames, got {len(images)}")
+        chosen = "" if first == -np.inf and last == np.inf else f" from {first:g} to {last:g} s"
+        raise ValueError(f"{source}: a film must have at least {_FEWEST} frames{chosen}, got {len(images)}")
     if wrong := [n for n, im in zip(names, images, strict=True) if im.shape != images[0].shape]:
         raise ValueError(f"{source}: all frames must have one size, {wrong[0]} has another than {names[0]}")
     times = np.array(stamps) / slow_motion
@@ -141,14 +157,13 @@ def read_film(
         raise ValueError(
             f"{source}: times of frames must increase, that of frame {names[bad]} does not: give rate"
         )
-    given = _masks("masks", masks, len(images), images[0].shape[:2], shrunk, every)
+    given = _masks("masks", masks, taken, total, images[0].shape[:2], shrunk)
     return Film(
         tuple(names),
         times,
         images,
         given or alphas,
-        _masks("occluders", occluders, len(images), images[0].shape[:2], shrunk, every)
-        or [None] * len(images),
+        _masks("occluders", occluders, taken, total, images[0].shape[:2], shrunk) or [None] * len(images),
         shrunk,
         tuple(_notes(times, slow_motion, shrunk)),
     )
@@ -185,17 +200,10 @@ def _frames(source: Path, rate: int | float | None) -> Iterator[tuple[str, float
 
 
 def _picture(file: Path) -> np.ndarray:
-    """Pixels with 8 bits a channel, upright, with alpha if there is any."""
-    try:
-        from PIL import Image, ImageOps
-    except ImportError as error:
-        raise ImportError("reading pictures needs pillow: pip install 'dano[train]'") from error
-    try:
-        with Image.open(file) as picture:
-            upright = ImageOps.exif_transpose(picture)
-            return np.asarray(upright.convert("RGBA" if "A" in upright.mode else "RGB"))
-    except Exception as error:  # each of pillow's readers raises its own kinds
-        raise ValueError(f"{file}: cannot be read as a picture ({error})") from error
+    """Pixels with 8 bits a channel, upright, with alpha if anything is transparent."""
+    picture = read_picture(file)
+    channels = [picture.colours] if picture.alpha is None else [picture.colours, picture.alpha[..., None]]
+    return np.rint(255 * np.concatenate(channels, axis=2)).astype(np.uint8)
 
 
 def _averaged(pixels: np.ndarray, k: int) -> np.ndarray:
@@ -207,21 +215,20 @@ def _averaged(pixels: np.ndarray, k: int) -> np.ndarray:
 
 
 def _masks(
-    name: str, folder: str | Path | None, count: int, shape: Sequence[int], shrunk: int, every: int
+    name: str, folder: str | Path | None, taken: Sequence[int], total: int, shape: Sequence[int], shrunk: int
 ) -> list[np.ndarray | None]:
-    """Masks of the frames of a film; empty if there is no folder."""
+    """Masks of the frames of a film that are taken, of so many; empty if there is no folder."""
     if folder is None:
         return []
     files = picture_files(Path(folder))
-    if len(files) >= count * every - every + 1:
-        files = files[::every]
-    if len(files) != count:
-        raise ValueError(f"{name} must be as many as frames, {count}, got {len(files)} in {folder}")
+    if len(files) == total:
+        files = [files[i] for i in taken]
+    if len(files) != len(taken):
+        some = "" if len(taken) == total else f", or as those taken, {len(taken)}"
+        raise ValueError(f"{name} must be as many as frames, {total}{some}, got {len(files)} in {folder}")
     found: list[np.ndarray | None] = []
     for file in files:
-        pixels = _picture(file)
-        values = pixels[..., 3] if pixels.shape[2] == 4 else pixels[..., :3].max(axis=2)
-        values = _averaged(values, shrunk)
+        values = _averaged(np.rint(255 * read_mask(file)).astype(np.uint8), shrunk)
         if values.shape != tuple(shape):
             raise ValueError(
                 f"{name} must have the size of the frames, {shape[1] * shrunk} × {shape[0] * shrunk}, but"

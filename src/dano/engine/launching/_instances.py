@@ -12,6 +12,8 @@ import sys
 from types import ModuleType
 from typing import Any
 
+from dano.engine.launching._warp import begin
+
 _FEATURES = "dano.physics.features"
 _PACKAGES = ("dano.physics", "dano.engine.kernels")
 
@@ -47,6 +49,7 @@ def instance(features: Features, module: str) -> ModuleType:
         features: The features.
         module: Its usual name.
     """
+    begin()
     spec = importlib.util.find_spec(module)
     assert spec is not None and spec.origin is not None and spec.loader is not None
 

@@ -7,12 +7,14 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 import jax.numpy as jnp
 import numpy as np
 
-from dano.checks import checked_count, checked_number, shown
+from dano.checks import checked_count, checked_number
 from dano.extras import optional
 from dano.fields._redistance import spread_distances
 from dano.fields._shapes import SolidMoments
 from dano.fields._signed_distance import SignedDistanceGrid
 from dano.fields._spline import degree_of
+from dano.fields.meshes._reading import checked_units, read_mesh
+from dano.fields.meshes._repair import Repaired, repaired
 from dano.memory import check_nodes
 
 if TYPE_CHECKING:
@@ -34,16 +36,29 @@ _LOST = 0.02
 """Share of the surface that may belong to thinner walls: the tips of wedges and cones always do."""
 
 
+_BESIDE = 0.02
+"""Cells beside a face at which it is asked on which side the inside is: less than walls are thick."""
+
+
+_ASKED = 20_000
+"""Nodes at which winding numbers are compared with normals, to find out whether these tell the inside."""
+
+_CLEAR = 0.1
+"""Cells from the surface from which on winding numbers are taken as exact."""
+
+
 class _Solid(NamedTuple):
     """A mesh as solids whose union it is.
 
     Attributes:
         whole: All faces, outward.
-        parts: Meshes whose components lie in boxes of their own; parts may overlap each other.
+        parts: Meshes whose shells lie in boxes of their own; parts may overlap each other.
+        turned: How many shells were inside out.
     """
 
     whole: "trimesh.Trimesh"
     parts: "list[trimesh.Trimesh]"
+    turned: int
 
 
 def mesh_field(
@@ -52,12 +67,17 @@ def mesh_field(
     *,
     interpolation: str = "quadratic",
     edge: float | None = None,
-    scale: float = 1.0,
+    scale: int | float | None = None,
+    units: str | None = None,
 ) -> SignedDistanceGrid:
-    """The solid inside a watertight triangle mesh, as a sampled signed distance.
+    """The solid inside a triangle mesh, as a sampled signed distance.
 
-    Closed parts of the mesh may overlap or lie inside each other: the solid is their union, where the winding
-    number is positive (Jacobson et al., 2013). A part that is turned inside out within another is a cavity.
+    Closed parts of the mesh may touch, overlap or lie inside each other: the solid is their union, where the
+    winding number is positive (Jacobson et al., 2013). A part that is turned inside out within another is a
+    cavity.
+
+    Holes are closed by flat fans of faces, flipped faces turned like their neighbours, doubled ones left out.
+    A UserWarning says in numbers what was mended, and the share of the surface that was added.
 
     Where parts overlap, the distance inside is that to the surface of the part in which a point lies deepest.
     Distances within three cells of the surface are exact at the nodes; those further away are distances to
@@ -65,28 +85,39 @@ def mesh_field(
     a cell.
 
     Args:
-        mesh: File (.obj, .stl, .ply, .off, .glb, …) or trimesh object.
+        mesh: File (.obj, .stl, .ply, .off, .glb, .gltf, .3mf, .dae, .step) or trimesh object.
         resolution: Nodes along the longest axis of the mesh, from 8 to 512; default: 96, or more if its walls
             are too thin for that.
         interpolation: "linear", "quadratic" or "cubic".
         edge: Width [m] of the smooth edge; None means 0.5 % of the size.
-        scale: Factor from the units of the mesh to metres, for instance 0.001 for millimetres.
+        scale: Metres in the unit of the mesh. Default: as the file says, else metres; files without units
+            that would be longer than 20 m are read in millimetres, which a UserWarning says.
+        units: The same by name: "m", "cm", "mm", "in", "ft" or "um".
 
     Returns:
-        A shape in the frame of the mesh, with the volume moments of the mesh in closed form unless parts of
-        it overlap. Walls that are too thin for the grid raise a UserWarning.
+        A shape in the frame of the mesh, with the volume moments of the mesh in closed form unless it
+        overlaps itself. Walls that are too thin for the grid raise a UserWarning.
 
     Raises:
         ImportError: If trimesh or libigl is missing.
-        ValueError: If the file cannot be read, the mesh is not watertight or encloses no volume, its walls
-            are too thin for any node to lie inside, or an option is out of range.
+        ValueError: If the file cannot be read, the mesh encloses no volume, its walls are too thin for any
+            node to lie inside, or an option is out of range.
     """
     degree_of(interpolation)
     if resolution is not None:
         resolution = checked_count("resolution", resolution, least=8, most=512)
-    scale = checked_number("scale", scale, above=0)
-    name = str(mesh) if isinstance(mesh, (str, Path)) else "mesh"
-    solid = _parts(_load_solid(mesh, scale))
+    if edge is not None:
+        checked_number("edge", edge, least=0)
+    raw = read_mesh(mesh, checked_units(scale, units))
+    name, notes = raw.name, []
+    try:
+        closed = repaired(raw.vertices, raw.faces, _igl())
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    solid = _parts(closed)
+    notes += closed.notes
+    if solid.turned:
+        notes.append(f"{solid.turned} shells were inside out and are turned")
     lower, upper = solid.whole.bounds
     chosen, thin = _resolution(solid, resolution)
     check_nodes(upper - lower, chosen, _BYTES_PER_NODE)
@@ -96,7 +127,8 @@ def mesh_field(
     origin = 0.5 * (lower + upper) - 0.5 * spacing * (shape - 1)
     distances, overlap = None, False
     for part in solid.parts:
-        found = _mesh_distances(part, origin, spacing, shape)
+        found, crosses = _mesh_distances(part, origin, spacing, shape, closed)
+        overlap = overlap or crosses
         if distances is not None:
             overlap = overlap or bool(np.any((found < 0) & (distances < 0)))
             found = np.minimum(found, distances)
@@ -106,13 +138,15 @@ def mesh_field(
             f"{name}: resolution must be so large that some nodes lie inside, got {chosen}, all outside:"
             f" {thin or 'the mesh is too thin'}"
         )
+    if notes:
+        warnings.warn(f"{name}: mended: {'; '.join(notes)}", UserWarning, stacklevel=2)
     if thin:
         warnings.warn(f"{name}: {thin}", stacklevel=2)
-    moments = None if overlap else _moments(solid.whole)
+    moments = None if overlap else mesh_moments(solid.whole)
     return SignedDistanceGrid(distances, origin, spacing, interpolation, edge=edge, moments=moments)
 
 
-def _moments(solid: "trimesh.Trimesh") -> SolidMoments:
+def mesh_moments(solid: "trimesh.Trimesh") -> SolidMoments:
     """Of a mesh without overlaps, in closed form."""
     inertia = np.asarray(solid.moment_inertia)
     second_moment = 0.5 * np.trace(inertia) * np.eye(3) - inertia
@@ -124,30 +158,30 @@ def _moments(solid: "trimesh.Trimesh") -> SolidMoments:
     )
 
 
-def _parts(solid: "trimesh.Trimesh") -> _Solid:
-    """Sort the components of a mesh into solids: cavities go with what encloses them."""
+def _parts(closed: Repaired) -> _Solid:
+    """Sort the shells of a mesh into solids: cavities go with what encloses them."""
     import trimesh
 
-    labels = trimesh.graph.connected_component_labels(solid.face_adjacency, node_count=len(solid.faces))
-    if labels.max() == 0:
-        return _Solid(solid, [solid])
+    labels, vertices, faces = closed.labels, closed.vertices, closed.faces.copy()
     rows = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
-    vertices, faces = np.asarray(solid.vertices), np.array(solid.faces)
-    components = [trimesh.Trimesh(vertices, faces[some], process=False) for some in rows]
-    outward = [k for k, component in enumerate(components) if component.volume > 0]
-    units = {k: [k] for k in outward}
-    for k in range(len(components)):
+    shells = [trimesh.Trimesh(vertices, faces[some], process=False) for some in rows]
+    outward = [k for k, shell in enumerate(shells) if shell.volume > 0]
+    units, turned = {k: [k] for k in outward}, 0
+    for k in range(len(shells)):
         if k in units:
             continue
         point = vertices[faces[rows[k][0]]].mean(axis=0)
-        around = [o for o in outward if _winding(components[o], point) > 0.5]
+        around = [o for o in outward if _winding(shells[o], point) > 0.5]
         if around:
-            units[min(around, key=lambda o: components[o].volume)].append(k)
+            units[min(around, key=lambda o: shells[o].volume)].append(k)
         else:
             # Inside out, and inside nothing: a solid all the same.
             faces[rows[k]] = faces[rows[k]][:, ::-1]
             units[k] = [k]
+            turned += 1
     whole = trimesh.Trimesh(vertices, faces, process=False)
+    if len(shells) == 1:
+        return _Solid(whole, [whole], turned)
     boxes = {k: vertices[faces[rows[k]]].reshape(-1, 3) for k in units}
     corners = {k: (points.min(axis=0), points.max(axis=0)) for k, points in boxes.items()}
     parts: list[list[int]] = []
@@ -160,7 +194,8 @@ def _parts(solid: "trimesh.Trimesh") -> _Solid:
         else:
             parts.append([k])
     chosen = [np.concatenate([rows[c] for k in part for c in units[k]]) for part in parts]
-    return _Solid(whole, [trimesh.Trimesh(vertices, faces[some], process=True) for some in chosen])
+    # Without merging vertices: shells that touch stay as they are.
+    return _Solid(whole, [trimesh.Trimesh(vertices, faces[some], process=False) for some in chosen], turned)
 
 
 def _meet(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> bool:
@@ -228,45 +263,14 @@ def _igl() -> Any:
     return optional("igl", "signed distances of meshes need libigl", "mesh")
 
 
-def _load_solid(mesh: "str | Path | trimesh.Trimesh", scale: float) -> "trimesh.Trimesh":
-    """A watertight mesh with outward faces, in metres."""
-    optional("trimesh", "reading meshes needs trimesh", "mesh")
-    import trimesh
-
-    name = "mesh"
-    if isinstance(mesh, (str, Path)):
-        name = str(mesh)
-        if not Path(mesh).is_file():
-            raise ValueError(f"{name}: no such file; expected a triangle mesh")
-        try:
-            mesh = trimesh.load_mesh(mesh)
-        except Exception as error:  # each of trimesh's readers raises its own kinds
-            raise ValueError(f"{name}: cannot be read as a triangle mesh ({error})") from error
-    if isinstance(mesh, trimesh.Scene):
-        mesh = mesh.to_mesh()
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise ValueError(f"{name} must be a triangle mesh with faces, or its file, got {shown(mesh)}")
-    solid = trimesh.Trimesh(np.asarray(mesh.vertices) * scale, np.asarray(mesh.faces), process=True)
-    # Texture and normal seams duplicate vertices, which tears a closed surface apart.
-    solid.merge_vertices(merge_tex=True, merge_norm=True)
-    solid.update_faces(solid.nondegenerate_faces())
-    if not solid.is_watertight:
-        _, uses = np.unique(solid.edges_sorted, axis=0, return_counts=True)
-        raise ValueError(
-            f"{name}: the mesh must be watertight (each edge shared by two faces), got {np.sum(uses != 2)}"
-            f" edges of {len(uses)} that are not; close its holes first, as trimesh.repair.fill_holes does"
-        )
-    if not solid.is_winding_consistent or solid.volume < 0:
-        trimesh.repair.fix_normals(solid, multibody=True)
-    if not solid.volume > 0:
-        raise ValueError(f"{name}: the mesh must enclose a volume, got {solid.volume} m³")
-    return solid
-
-
 def _mesh_distances(
-    solid: "trimesh.Trimesh", origin: np.ndarray, spacing: float, shape: np.ndarray
-) -> np.ndarray:
-    """Signed distances [m] of all nodes: exact near the surface, see `spread_distances` elsewhere."""
+    solid: "trimesh.Trimesh", origin: np.ndarray, spacing: float, shape: np.ndarray, closed: Repaired
+) -> tuple[np.ndarray, bool]:
+    """Signed distances [m] of all nodes, and whether the mesh overlaps itself.
+
+    Exact near the surface, see `spread_distances` elsewhere. Where faces lie in what others enclose,
+    distances are to those that have the inside on one side only.
+    """
     import trimesh
     from scipy import ndimage
 
@@ -274,7 +278,7 @@ def _mesh_distances(
     vertices, faces = _arrays(solid)
     # An exact query costs 12 µs; only nodes near the surface need one. Vertices of a mesh whose edges are
     # shorter than a cell mark them: no surface point is then further than 1.5 cells from a marked node.
-    fine = trimesh.remesh.subdivide_to_size(vertices, faces, max_edge=spacing, max_iter=32)[0]
+    fine, small = trimesh.remesh.subdivide_to_size(vertices, faces, max_edge=spacing, max_iter=32)[:2]
     marked = np.zeros(shape, dtype=bool)
     marked[tuple(np.rint((fine - origin) / spacing).astype(int).T)] = True
     near = ndimage.distance_transform_edt(~marked) <= 3
@@ -282,5 +286,38 @@ def _mesh_distances(
     signed, _, closest, _ = igl.signed_distance(
         points, vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
     )
+    clear, inside, overlaps = np.abs(signed) > _CLEAR * spacing, signed < 0, False
+    # Normals tell the side at once, but not where a mesh is crossed; winding numbers, which cost as much as
+    # the distances, tell it everywhere but on the surface.
+    asked = np.flatnonzero(clear)
+    if not closed.is_smooth:
+        asked = np.arange(len(points))
+    elif len(asked) > _ASKED:
+        asked = np.random.default_rng(0).choice(asked, _ASKED, replace=False)
+    winding = igl.fast_winding_number(vertices, faces, points[asked])
+    if closed.is_smooth and np.any((winding > 0.5) != inside[asked]):
+        asked = np.arange(len(points))
+        winding = igl.fast_winding_number(vertices, faces, points)
+    if len(asked) == len(points):
+        inside = winding > 0.5
+    overlaps = bool(np.any(((winding > 1.5) | (winding < -0.5)) & clear[asked]))
+    if overlaps or closed.is_crossed:
+        border = _border_faces(vertices, faces, fine, small, spacing)
+        if len(border):
+            _, _, closest = igl.point_mesh_squared_distance(points, fine, border)
     distances, row = spread_distances(near, closest, origin, np.full(3, spacing))
-    return np.copysign(distances, signed[row])
+    return np.where(inside[row], -distances, distances), overlaps
+
+
+def _border_faces(
+    vertices: np.ndarray, faces: np.ndarray, fine: np.ndarray, small: np.ndarray, spacing: float
+) -> np.ndarray:
+    """Those of the small faces of a mesh that have its inside on one side and the outside on the other."""
+    corners = fine[small]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    beside = _BESIDE * spacing * normal / np.where(length > 0, length, 1)
+    middle = corners.mean(axis=1)
+    winding = _igl().fast_winding_number(vertices, faces, np.concatenate([middle - beside, middle + beside]))
+    inner, outer = np.split(winding > 0.5, 2)
+    return np.ascontiguousarray(small[(inner != outer) & (length[:, 0] > 0)], np.int64)

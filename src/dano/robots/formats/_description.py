@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dano.maths import quat_from_axis_angle, quat_multiply, quat_rotate
 from dano.names import did_you_mean
 
 
@@ -22,16 +23,19 @@ class Solid:
 
     Attributes:
         kind: "box" (half extents), "sphere" (radius), "cylinder" and "capsule" (radius, half length),
-            "ellipsoid" (half axes), "mesh" (scales along its axes).
+            "ellipsoid" (half axes), "plane" (none: all below its x and y axes), "mesh" (scales along its
+            axes).
         numbers: Its measures [m], or scales [1].
         place: In the frame of the link.
-        path: Of a mesh.
+        path: Of a mesh that is a file.
+        triangles: Vertices [m] and faces of a mesh that a reader has read already.
     """
 
     kind: str
     numbers: tuple[float, ...]
     place: Placed = Placed()
     path: Path | None = None
+    triangles: tuple[np.ndarray, np.ndarray] | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,29 @@ class Link:
 
 
 @dataclass(frozen=True)
+class Drive:
+    """An actuator of a joint, with the numbers of a `dano.Motor`.
+
+    Attributes:
+        name: Unique among drives.
+        kind: "effort", "position" or "velocity".
+        stiffness: Of "position" [N m/rad or N/m].
+        damping: Of "position" and "velocity" [N m s/rad or N s/m].
+        gear: How far it turns when the joint moves by one [1].
+        limits: Least and largest effort [N m or N].
+        commands: Least and largest command.
+    """
+
+    name: str
+    kind: str
+    stiffness: float = 0.0
+    damping: float = 0.0
+    gear: float = 1.0
+    limits: tuple[float, float] = (-np.inf, np.inf)
+    commands: tuple[float, float] = (-np.inf, np.inf)
+
+
+@dataclass(frozen=True)
 class Connection:
     """A joint of a robot.
 
@@ -74,7 +101,9 @@ class Connection:
         armature: [kg m² or kg].
         stiffness: Of a spring [N m/rad or N/m].
         rest: Where it is slack.
+        home: q in the pose that the file shows [rad or m].
         mimics: Name of the joint that it follows, ratio, shift; None if it does not.
+        drive: Its actuator.
     """
 
     name: str
@@ -91,7 +120,9 @@ class Connection:
     armature: float = 0.0
     stiffness: float = 0.0
     rest: float = 0.0
+    home: float = 0.0
     mimics: tuple[str, float, float] | None = None
+    drive: Drive | None = None
 
 
 @dataclass(frozen=True)
@@ -116,6 +147,19 @@ class Tie:
 
 
 @dataclass(frozen=True)
+class Lacking:
+    """Something in a file that dano has no counterpart of.
+
+    Attributes:
+        feature: By which it may be left out.
+        text: What the file says.
+    """
+
+    feature: str
+    text: str
+
+
+@dataclass(frozen=True)
 class Description:
     """A robot's file.
 
@@ -125,6 +169,10 @@ class Description:
         links: All links.
         joints: All joints.
         ties: What closes loops.
+        world: Name of the root link if it stands for the world; what is welded to it are things of their own.
+        gravity: [m/s²]; None if the format has none.
+        lacking: What must be left out by name.
+        notes: What was read in another way than it is written, one line each.
     """
 
     name: str
@@ -132,6 +180,10 @@ class Description:
     links: tuple[Link, ...]
     joints: tuple[Connection, ...]
     ties: tuple[Tie, ...] = ()
+    world: str | None = None
+    gravity: tuple[float, float, float] | None = None
+    lacking: tuple[Lacking, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def link(self, name: str) -> Link:
         """A link by name."""
@@ -199,6 +251,49 @@ class Description:
                 seen.add(leader)
                 leader = follows[0]
                 follows = kinds[leader].mimics if leader in kinds else None
+
+
+def displaced(joint: Connection, q: float) -> Placed:
+    """Place of the child's frame in the parent's at a coordinate of a hinge or a slide [rad or m]."""
+    position, orientation = np.array(joint.place.position), np.array(joint.place.orientation)
+    axis, anchor = np.array(joint.axis) / np.linalg.norm(joint.axis), np.array(joint.anchor)
+    if joint.kind == "slide":
+        turn, way = np.array([1.0, 0.0, 0.0, 0.0]), q * axis
+    else:
+        turn = np.asarray(quat_from_axis_angle(axis=axis, angle=q))
+        way = anchor - np.asarray(quat_rotate(turn, anchor))
+    position = position + np.asarray(quat_rotate(orientation, way))
+    turned = np.asarray(quat_multiply(orientation, turn))
+    return Placed(tuple(map(float, position)), tuple(map(float, turned)))
+
+
+def at_home(joint: Connection) -> Placed:
+    """Place of the child's frame in the parent's in the pose of the file."""
+    return displaced(joint, joint.home) if joint.home else joint.place
+
+
+def held_at(joint: Connection, q: float) -> Connection:
+    """A hinge or a slide that stays at a coordinate [rad or m]: a weld."""
+    return Connection(joint.name, "weld", joint.parent, joint.child, displaced(joint, q))
+
+
+def without_followers(joints: list[Connection], at: dict[str, float]) -> list[Connection]:
+    """The joints, those that follow one which stays where it is held there, too.
+
+    Args:
+        joints: All joints.
+        at: Coordinates of those that are welds although they could move [rad or m].
+    """
+    joints, at = list(joints), dict(at)
+    held = True
+    while held:
+        held = False
+        for row, joint in enumerate(joints):
+            if joint.mimics is not None and joint.mimics[0] in at:
+                leader, ratio, shift = joint.mimics
+                at[joint.name] = ratio * at[leader] + shift
+                joints[row], held = held_at(joint, at[joint.name]), True
+    return joints
 
 
 def _unique(where: str, what: str, names: list[str]) -> list[str]:

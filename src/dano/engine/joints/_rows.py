@@ -1,0 +1,73 @@
+"""Bodies on joints as rows of numbers, as kernels read them (`dano.engine.kernels.trees.tables`)."""
+
+from collections.abc import Iterable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from dano.engine.joints._structure import tree_structure, TreeStructure
+from dano.engine.joints._tables import law_rows
+from dano.scene import Scene
+
+_SIX = 6
+
+
+def structure_of_trees(scene: Scene, touching: Iterable[int]) -> TreeStructure:
+    """How the bodies of a scene hang together.
+
+    Args:
+        scene: The scene.
+        touching: Bodies that may touch something.
+    """
+    laws, closing = scene.chains.laws, scene.closing
+    loops = ()
+    if closing is not None:
+        ends = zip(closing.first, closing.second, strict=True)
+        loops = tuple((a, b, i in closing.welds) for i, (a, b) in enumerate(ends))
+    return tree_structure(scene.layout, laws.constant, laws.rough, frozenset(touching), loops)
+
+
+def tree_rows(
+    scene: Scene, structure: TreeStructure
+) -> tuple[dict[str, Float[Array, "rows width"]], dict[str, Int[np.ndarray, "..."]]]:
+    """Real and whole numbers by place in a kernel's parameters."""
+    dtype, closing = scene.timestep.dtype, scene.closing
+    loops = jnp.zeros((0, 10), dtype)
+    if closing is not None:
+        loops = jnp.concatenate([closing.position, closing.anchor, closing.orientation], axis=1)
+    rows = {
+        "scene.trees.joints": scene.chains.table.astype(dtype),
+        "scene.trees.laws": law_rows(scene.chains.laws, dtype),
+        "scene.trees.loops": loops.astype(dtype),
+    }
+    whole = {
+        "nodes": structure.nodes,
+        "coordinates": structure.coordinates,
+        "unknowns": structure.unknowns,
+        "order": structure.order,
+        "columns": structure.columns,
+        "blocks": structure.blocks,
+        "closed": structure.closed,
+        "loop_index": structure.loops,
+    }
+    return rows, {f"scene.trees.{name}": values for name, values in whole.items()}
+
+
+def tree_lengths(structure: TreeStructure) -> dict[str, int]:
+    """Lengths of the arrays in which a world works on its trees."""
+    m, unknowns = len(structure.moving), _SIX * structure.n_blocks
+    lengths = {
+        **dict.fromkeys(
+            ("frames", "displacements", "pivots", "twists", "offsets", "wrenches", "composites"), m
+        ),
+        **dict.fromkeys(("start", "end"), structure.motions),
+        **dict.fromkeys(("diagonal", "column", "spread"), unknowns),
+        **dict.fromkeys(("lower", "upper"), structure.entries),
+        "columns": len(structure.columns),
+        "joints": len(structure.coordinates),
+        "turned": m,
+        "coupled": len(structure.closed),
+        "sizes": 4,
+    }
+    return {f"room.trees.{name}": length for name, length in lengths.items()}

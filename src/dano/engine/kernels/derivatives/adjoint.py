@@ -1,0 +1,222 @@
+"""What a step's equations depend on, as numbers whose gradients are derivatives (docs/gradients.md).
+
+At the root of R(V; θ) = 0 the implicit function theorem gives θ̄ = −(∂R/∂θ)ᵀ λ with (∂R/∂V)ᵀ λ = V̄. So
+with λ as *virtual velocities* of the bodies, −λ · R is the work of impulses along them: a sum over bodies
+and points. Each term is one of the functions below, made of the formulas of the step itself, and
+`wp.grad` differentiates it.
+"""
+
+from types import CodeType
+from typing import Any
+
+import warp as wp
+
+from dano.engine.kernels.tables import Body, Push, StateRow
+from dano.physics.distances import Distance, leaf_distance, Solid, Solids
+from dano.physics.momentum import angular_momentum, turned_inertia
+from dano.physics.pairs import (
+    BodyState,
+    closer,
+    pair_pose,
+    PairPose,
+    position_after,
+    rotation_after,
+    seen_from,
+    shrunk,
+)
+from dano.physics.point_law import friction_bound, Material, point_law, point_motion, pressure
+from dano.physics.real import ONE, real, vec3, vec6, ZERO
+from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
+from dano.physics.samples import point_contact, position_in_solid, Sample
+from dano.physics.twists import joined, linear_part, relative_twist
+
+
+@wp.struct
+class Virtual:
+    """Twists of the bodies of a pair [W]: at the end of the step, and virtual ones."""
+
+    first: vec6
+    second: vec6
+    first_virtual: vec6
+    second_virtual: vec6
+
+
+@wp.func
+def point_work(
+    pose: PairPose,
+    sample: Sample,
+    d: Distance,
+    turning: int,
+    presses_back: bool,
+    stiffness_share: real,
+    share: real,
+    h: real,
+    material: Material,
+    rebound: real,
+    impact_stiffness: real,
+    twists: Virtual,
+) -> real:
+    """Work of a point's impulse along the virtual velocities of its bodies."""
+    point = point_contact(pose, sample, d, turning, presses_back, stiffness_share, share * h)
+    if material.instant > ZERO:
+        material.restitution = rebound * material.restitution
+    law = point_law(material, point, impact_stiffness)
+    twist = relative_twist(twists.first, twists.second, pose.com_difference)
+    virtual = relative_twist(twists.first_virtual, twists.second_virtual, pose.com_difference)
+    motion = point_motion(point, twist.velocity, twist.spin)
+    slip = motion.slip + point.extra_slip
+    p = pressure(law, motion.rate, ZERO, law.stiction).value
+    friction = (-friction_bound(law, p).value / wp.max(wp.length(slip), law.stiction)) * slip
+    by_pressure = wp.dot(point.normal, virtual.velocity) + wp.dot(point.moment, virtual.spin)
+    by_friction = wp.dot(friction, virtual.velocity + wp.cross(virtual.spin, point.arm))
+    return h * point.area * (p * by_pressure + by_friction)
+
+
+@wp.func
+def distance_work(solids: Solids, world: int, solid: Solid, x: vec3, bar: Distance) -> real:
+    """⟨bar, distance and gradient of a leaf at x⟩."""
+    d = leaf_distance(solids, world, solid.kind, solid.leaf, x)
+    return bar.value * d.value + wp.dot(bar.gradient, d.gradient)
+
+
+@wp.func
+def probe_distance(
+    solids: Solids,
+    world: int,
+    solid: Solid,
+    first: BodyState,
+    second: BodyState,
+    share: real,
+    h: real,
+    toward: vec3,
+    turning: int,
+    scale: vec3,
+    probe: vec3,
+) -> real:
+    """Distance of a probe from a leaf after a share of the step: −sink at the moment when bodies meet."""
+    pose = pair_pose(first, second, share, h, toward, turning, scale, ZERO)
+    return leaf_distance(solids, world, solid.kind, solid.leaf, position_in_solid(pose, probe)).value
+
+
+@wp.func
+def pair_work(
+    first: BodyState,
+    second: BodyState,
+    share: real,
+    h: real,
+    toward: vec3,
+    turning: int,
+    scale: vec3,
+    follows: real,
+    bar: PairPose,
+) -> real:
+    """⟨bar, pose of a pair⟩."""
+    pose = pair_pose(first, second, share, h, toward, turning, scale, follows)
+    return (
+        wp.ddot(bar.points, pose.points)
+        + wp.dot(bar.origin, pose.origin)
+        + wp.ddot(bar.vectors, pose.vectors)
+        + wp.ddot(bar.rotation, pose.rotation)
+        + wp.dot(bar.com, pose.com)
+        + wp.dot(bar.velocity, pose.velocity)
+        + wp.dot(bar.spin, pose.spin)
+        + wp.dot(bar.com_difference, pose.com_difference)
+        + wp.ddot(bar.arms, pose.arms)
+        + wp.dot(bar.arm_offset, pose.arm_offset)
+        + wp.dot(bar.lowest, pose.lowest)
+        + wp.dot(bar.axis, pose.axis)
+    )
+
+
+@wp.func
+def facing_work(
+    solids: Solids,
+    world: int,
+    solid: Solid,
+    first: BodyState,
+    second: BodyState,
+    share: real,
+    h: real,
+    turning: int,
+    scale: vec3,
+    point: vec3,
+    toward_bar: vec3,
+    touched_bar: vec3,
+) -> real:
+    """⟨bars, direction that samples face, and where one step of the search for it leads from a point⟩."""
+    inverse = wp.transpose(rotation_after(second, share))
+    turn = inverse * rotation_after(first, share)
+    com = inverse * (position_after(first, share, h) - position_after(second, share, h)) + second.com
+    origin = com - turn * first.com
+    if turning == 1:
+        return wp.dot(toward_bar, seen_from(solids, world, solid, turn, origin).gradient)
+    found = closer(solids, world, solid, turn, origin, scale, point)
+    least = wp.min(scale[0], wp.min(scale[1], scale[2]))
+    touched = shrunk(scale, least, point) + wp.max(found.value, ZERO) * found.gradient
+    return wp.dot(toward_bar, found.gradient) + wp.dot(touched_bar, touched)
+
+
+@wp.func
+def momentum_work(
+    body: Body, row: StateRow, push: Push, gravity: vec3, h: real, velocity: vec6, virtual: vec6
+) -> real:
+    """Work of what a body's momentum gains beyond gravity and control, along minus its virtual velocity."""
+    rotation = matrix(from_wxyz(row.orientation))
+    inertia = turned_inertia(rotation, body.inertia)
+    spin = vec3(velocity[3], velocity[4], velocity[5])
+    linear = body.mass * (row.velocity + h * gravity - linear_part(velocity)) + h * push.force
+    before = angular_momentum(rotation * row.omega, inertia, h, -ONE) + h * push.torque
+    return wp.dot(joined(linear, before - angular_momentum(spin, inertia, h, ONE)), virtual)
+
+
+@wp.func
+def state_work(body: Body, row: StateRow, h: real, moves: bool, bar: BodyState) -> real:
+    """⟨bar, what contact sees of a body at the start of a step⟩; quaternions as (x, y, z, w)."""
+    q = from_wxyz(row.orientation)
+    total = wp.dot(bar.position, row.position) + wp.dot(bar.orientation, q) + wp.dot(bar.com, body.com)
+    ahead = q
+    if moves:
+        ahead = turned(q, row.omega, h)
+        total += wp.dot(bar.velocity, row.velocity) + wp.dot(bar.spin, matrix(q) * row.omega)
+    return total + wp.dot(bar.ahead, ahead)
+
+
+@wp.func
+def advance_work(row: StateRow, velocity: vec6, h: real, bar: StateRow) -> real:
+    """⟨bar, state of a body at the end of a step⟩."""
+    q = from_wxyz(row.orientation)
+    v = linear_part(velocity)
+    omega = wp.transpose(matrix(q)) * vec3(velocity[3], velocity[4], velocity[5])
+    return (
+        wp.dot(bar.position, row.position + h * v)
+        + wp.dot(bar.orientation, to_wxyz(turned(q, omega, h)))
+        + wp.dot(bar.velocity, v)
+        + wp.dot(bar.omega, omega)
+    )
+
+
+def _need_adjoints(function: Any, seen: set[int]) -> None:
+    """Have Warp generate the adjoint of a function and of all that it calls.
+
+    `wp.grad` asks for it by itself where nothing called the function before in the same kernel. Formulas of a
+    step have been called before, and would be left without: their derivatives would be zero without a word.
+    """
+    if id(function) in seen:
+        return
+    seen.add(id(function))
+    function.adj.force_adjoint_codegen = True
+    for name in _names_in(function.func.__code__):
+        called = function.func.__globals__.get(name)
+        if isinstance(called, wp.Function):
+            _need_adjoints(called, seen)
+
+
+def _names_in(code: CodeType) -> set[str]:
+    """Global names that a function's code may refer to."""
+    return set(code.co_names).union(*(_names_in(c) for c in code.co_consts if isinstance(c, CodeType)))
+
+
+for _function in (
+    point_work, distance_work, probe_distance, pair_work, facing_work, momentum_work, state_work, advance_work
+):  # fmt: skip
+    _need_adjoints(_function, set())

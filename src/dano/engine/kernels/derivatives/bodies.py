@@ -1,0 +1,82 @@
+"""Derivatives of bodies that move freely: by their rows, from what contact and the end of a step ask."""
+
+import warp as wp
+
+from dano.engine.kernels.derivatives.adjoint import advance_work, momentum_work, state_work
+from dano.engine.kernels.rollout import Launch
+from dano.engine.kernels.tables import Changes, Push, Room, Scene, StateRow
+from dano.physics.pairs import BodyState
+
+
+@wp.func
+def add_row(bars: wp.array2d(dtype=StateRow), world: int, i: int, bar: StateRow):
+    """Add a derivative by a state."""
+    bars[world, i].position += bar.position
+    bars[world, i].orientation += bar.orientation
+    bars[world, i].velocity += bar.velocity
+    bars[world, i].omega += bar.omega
+
+
+@wp.func
+def pull_body(scene: Scene, room: Room, bars: Changes, world: int, i: int, row: StateRow, bar: BodyState):
+    """Add derivatives by a body's row and properties from those by its state."""
+    h = scene.timestep[world, 0]
+    body = scene.bodies[world, i]
+    moves = scene.body_index[i].row >= 0
+    by_body, by_row, by_h, _a, _b = wp.grad(state_work)(body, row, h, moves, bar)
+    add_row(room.state_bar, world, i, by_row)
+    if bars.bodies.shape[1] > 0:
+        bars.bodies[world, i].com += by_body.com
+    if bars.timestep.shape[1] > 0:
+        bars.timestep[world, 0] += by_h
+
+
+@wp.func
+def pull_momentum(
+    scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, t: int, i: int, row: StateRow
+):
+    """Add derivatives through the momentum that a body comes with, gravity and control."""
+    h = scene.timestep[world, 0]
+    n = scene.body_index.shape[0]
+    m = scene.body_index[i].row
+    body = scene.bodies[world, i]
+    push = Push()
+    if launch.pushes.shape[1] > 0:
+        push = launch.pushes[world, t * n + i]
+    by_body, by_row, by_push, by_gravity, by_h, _a, _b = wp.grad(momentum_work)(
+        body, row, push, scene.gravity[world, 0], h, room.velocity[world, m], room.step[world, m]
+    )
+    add_row(room.state_bar, world, i, by_row)
+    if bars.bodies.shape[1] > 0:
+        bars.bodies[world, i].mass += by_body.mass
+        bars.bodies[world, i].inertia += by_body.inertia
+    if bars.pushes.shape[1] > 0:
+        bars.pushes[world, t * n + i] = by_push
+    if bars.gravity.shape[1] > 0:
+        bars.gravity[world, 0] += by_gravity
+    if bars.timestep.shape[1] > 0:
+        bars.timestep[world, 0] += by_h
+
+
+@wp.func
+def pull_advance(scene: Scene, room: Room, bars: Changes, world: int, i: int, row: StateRow, after: StateRow):
+    """Derivatives by the velocities and the row of a body from those by its row at the end of a step."""
+    h = scene.timestep[world, 0]
+    m = scene.body_index[i].row
+    if m >= 0:
+        by_row, by_velocity, by_h, _a = wp.grad(advance_work)(row, room.velocity[world, m], h, after)
+        room.state_bar[world, i] = by_row
+        room.residual[world, m] = by_velocity
+        if bars.timestep.shape[1] > 0:
+            bars.timestep[world, 0] += by_h
+    else:
+        room.state_bar[world, i] = after
+
+
+@wp.func
+def row_before(scene: Scene, launch: Launch, world: int, t: int, i: int) -> StateRow:
+    """State of a body at the start of a step."""
+    n = scene.body_index.shape[0]
+    if t == 0:
+        return launch.state[world, i]
+    return launch.states[world, (t - 1) * n + i]

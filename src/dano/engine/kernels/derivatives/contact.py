@@ -1,0 +1,373 @@
+"""Derivatives of contact: by the states of two bodies that touch, from a virtual work (docs/gradients.md)."""
+
+import warp as wp
+
+from dano.engine.kernels.derivatives.adjoint import (
+    distance_work,
+    facing_work,
+    pair_work,
+    point_work,
+    probe_distance,
+    Virtual,
+)
+from dano.engine.kernels.lanes import total, total3, total33
+from dano.engine.kernels.search import posed, solid_of_body
+from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
+from dano.physics.distances import leaf_distance, nearest_leaf, Solid
+from dano.physics.features import LANES, TURNING, UNIONS
+from dano.physics.pairs import BALL, BodyState, first_touch, PairPose, position_after, rotation_after
+from dano.physics.point_law import Material
+from dano.physics.real import mat33, ONE, real, vec3, ZERO
+from dano.physics.samples import position_in_solid
+
+_BALL = wp.constant(BALL)
+
+
+@wp.struct
+class PairBar:
+    """Derivatives by what a pair of bodies is at the start of a step, from its points.
+
+    Attributes:
+        first: By the state of the sampled body.
+        second: By that of the other.
+        scale: By the semi-axes of the sampled body.
+        timestep: By h.
+        sink: By the depth up to which predicted geometry is taken.
+    """
+
+    first: BodyState
+    second: BodyState
+    scale: vec3
+    timestep: real
+    sink: real
+
+
+@wp.func
+def leaf_at(scene: Scene, world: int, body: int, x: vec3) -> Solid:
+    """The leaf of a body's solid that counts at a point."""
+    solid = solid_of_body(scene, world, body)
+    if wp.static(UNIONS):
+        solid = nearest_leaf(scene.solids, world, solid, x)
+    return solid
+
+
+@wp.func
+def add_leaf(bars: Changes, world: int, solid: Solid, bar: Solid):
+    """Add a derivative by a leaf."""
+    if bars.leaves.shape[1] > 0:
+        i = solid.first
+        bars.leaves[world, i].factor += bar.leaf.factor
+        bars.leaves[world, i].position += bar.leaf.position
+        bars.leaves[world, i].rotation += bar.leaf.rotation
+        bars.leaves[world, i].sizes += bar.leaf.sizes
+        bars.leaves[world, i].length += bar.leaf.length
+        bars.leaves[world, i].spacing += bar.leaf.spacing
+
+
+@wp.func
+def summed_material(a: Material, b: Material) -> Material:
+    """Sum of two derivatives by a material."""
+    a.stiffness += b.stiffness
+    a.restitution += b.restitution
+    a.restitution_velocity += b.restitution_velocity
+    a.hysteresis += b.hysteresis
+    a.friction += b.friction
+    a.friction_fading += b.friction_fading
+    a.friction_pressure += b.friction_pressure
+    a.stiction += b.stiction
+    a.ahead += b.ahead
+    a.timestep += b.timestep
+    a.bounce += b.bounce
+    a.uplift += b.uplift
+    return a
+
+
+@wp.func
+def total_material(a: Material) -> Material:
+    """Sum over the lanes of a world."""
+    if wp.static(LANES > 1):
+        a.stiffness = total(a.stiffness)
+        a.restitution = total(a.restitution)
+        a.restitution_velocity = total(a.restitution_velocity)
+        a.hysteresis = total(a.hysteresis)
+        a.friction = total(a.friction)
+        a.friction_fading = total(a.friction_fading)
+        a.friction_pressure = total(a.friction_pressure)
+        a.stiction = total(a.stiction)
+        a.ahead = total(a.ahead)
+        a.timestep = total(a.timestep)
+        a.bounce = total(a.bounce)
+        a.uplift = total(a.uplift)
+    return a
+
+
+@wp.func
+def summed_pose(a: PairPose, b: PairPose) -> PairPose:
+    """Sum of two derivatives by a pose."""
+    a.points += b.points
+    a.origin += b.origin
+    a.vectors += b.vectors
+    a.rotation += b.rotation
+    a.com += b.com
+    a.velocity += b.velocity
+    a.spin += b.spin
+    a.com_difference += b.com_difference
+    a.arms += b.arms
+    a.arm_offset += b.arm_offset
+    a.lowest += b.lowest
+    a.axis += b.axis
+    return a
+
+
+@wp.func
+def total_pose(a: PairPose) -> PairPose:
+    """Sum over the lanes of a world."""
+    if wp.static(LANES > 1):
+        a.points = total33(a.points)
+        a.origin = total3(a.origin)
+        a.vectors = total33(a.vectors)
+        a.rotation = total33(a.rotation)
+        a.com = total3(a.com)
+        a.velocity = total3(a.velocity)
+        a.spin = total3(a.spin)
+        a.com_difference = total3(a.com_difference)
+        a.arms = total33(a.arms)
+        a.arm_offset = total3(a.arm_offset)
+        a.lowest = total3(a.lowest)
+        a.axis = total3(a.axis)
+    return a
+
+
+@wp.func
+def summed_body(a: BodyState, b: BodyState) -> BodyState:
+    """Sum of two derivatives by the state of a body."""
+    a.position += b.position
+    a.orientation = a.orientation + b.orientation
+    a.ahead = a.ahead + b.ahead
+    a.velocity += b.velocity
+    a.spin += b.spin
+    a.com += b.com
+    return a
+
+
+@wp.func
+def pull_points(
+    scene: Scene,
+    room: Room,
+    bars: Changes,
+    world: int,
+    lane: int,
+    found: FoundPair,
+    pose: PairPose,
+    rebound: real,
+    twists: Virtual,
+) -> tuple[PairPose, real, real]:
+    """Derivatives by the pose of a pair, τ and h; adds those by samples, solids and materials."""
+    index = scene.pair_index[found.pair]
+    pair = scene.pairs[world, found.pair]
+    turning = scene.body_index[index.first].turning
+    material = scene.materials[world, index.contact]
+    h = scene.timestep[world, 0]
+    pose_bar = PairPose()
+    share_bar = real(0.0)
+    h_bar = real(0.0)
+    material_bar = Material()
+    stiffness_share_bar = real(0.0)
+    for k in range(found.first, found.end):
+        linear = room.linear[world, k]
+        if linear.pressure.value > ZERO:
+            where = room.where[world, k]
+            sample = scene.samples[world, where.sample]
+            x = position_in_solid(pose, sample.point)
+            solid = leaf_at(scene, world, index.second, x)
+            d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
+            (
+                by_pose, by_sample, by_distance, _a, _b, by_share_of, by_share, by_h, by_material, _c, _d, _e,
+            ) = wp.grad(point_work)(
+                pose, sample, d, turning, where.presses_back > 0, pair.share, found.share, h, material,
+                rebound, found.impact_stiffness, twists,
+            )  # fmt: skip
+            _f, _g, by_solid, by_x, _h = wp.grad(distance_work)(scene.solids, world, solid, x, by_distance)
+            add_leaf(bars, world, solid, by_solid)
+            # x = points · sample + origin
+            by_pose.points += wp.outer(by_x, sample.point)
+            by_pose.origin += by_x
+            if bars.samples.shape[1] > 0:
+                bars.samples[world, where.sample].point += by_sample.point + wp.transpose(pose.points) * by_x
+                bars.samples[world, where.sample].area += by_sample.area
+            pose_bar = summed_pose(pose_bar, by_pose)
+            material_bar = summed_material(material_bar, by_material)
+            share_bar += by_share
+            h_bar += by_h
+            stiffness_share_bar += by_share_of
+    material_bar = total_material(material_bar)
+    stiffness_share_bar = total(stiffness_share_bar)
+    if lane == 0:
+        if bars.materials.shape[1] > 0:
+            whole = summed_material(bars.materials[world, index.contact], material_bar)
+            bars.materials[world, index.contact] = whole
+        if bars.pairs.shape[1] > 0:
+            bars.pairs[world, found.pair].share += stiffness_share_bar
+    return total_pose(pose_bar), total(share_bar), total(h_bar)
+
+
+@wp.func
+def solved_fixed_point(
+    scene: Scene,
+    world: int,
+    solid: Solid,
+    a: BodyState,
+    b: BodyState,
+    share: real,
+    h: real,
+    scale: vec3,
+    point: vec3,
+    point_bar: vec3,
+) -> vec3:
+    """(1 − ∂G/∂x)⁻ᵀ x̄ of the search for the first touch, x = G(x)."""
+    rows = mat33()
+    zero = vec3()
+    k = int(0)
+    while k < 3:
+        unit = vec3()
+        unit[k] = ONE
+        _a, _b, _c, _d, _e, _f, _g, _h, _i, by_point, _j, _k = wp.grad(facing_work)(
+            scene.solids, world, solid, a, b, share, h, _BALL, scale, point, zero, unit
+        )
+        rows[k] = unit - by_point
+        k += 1
+    return wp.inverse(wp.transpose(rows)) * point_bar
+
+
+@wp.func
+def pull_facing(
+    scene: Scene,
+    bars: Changes,
+    world: int,
+    lane: int,
+    first: int,
+    second: int,
+    a: BodyState,
+    b: BodyState,
+    share: real,
+    toward_bar: vec3,
+    bar: PairBar,
+) -> tuple[PairBar, real]:
+    """Add derivatives through the direction that samples face; returns the one by τ, too.
+
+    A ball or an ellipsoid faces where the search for its first touch ended: a fixed point of the search,
+    differentiated by the implicit function theorem.
+    """
+    h = scene.timestep[world, 0]
+    turning = scene.body_index[first].turning
+    scale = scene.bodies[world, first].scale
+    inverse = wp.transpose(rotation_after(b, share))
+    turn = inverse * rotation_after(a, share)
+    com = inverse * (position_after(a, share, h) - position_after(b, share, h)) + b.com
+    origin = com - turn * a.com
+    point = vec3()
+    solid = leaf_at(scene, world, second, origin)
+    touched_bar = vec3()
+    if wp.static(BALL in TURNING):
+        if turning == _BALL:
+            whole = solid_of_body(scene, world, second)
+            point = first_touch(scene.solids, world, whole, turn, origin, scale)
+            solid = leaf_at(scene, world, second, origin + turn * point)
+            _a, _b, _c, _d, _e, _f, _g, _h, _i, by_point, _j, _k = wp.grad(facing_work)(
+                scene.solids, world, solid, a, b, share, h, turning, scale, point, toward_bar, touched_bar
+            )
+            touched_bar = solved_fixed_point(scene, world, solid, a, b, share, h, scale, point, by_point)
+    _l, _m, by_solid, by_first, by_second, by_share, by_h, _n, by_scale, _o, _p, _q = wp.grad(facing_work)(
+        scene.solids, world, solid, a, b, share, h, turning, scale, point, toward_bar, touched_bar
+    )
+    if lane == 0:
+        add_leaf(bars, world, solid, by_solid)
+    bar.first = summed_body(bar.first, by_first)
+    bar.second = summed_body(bar.second, by_second)
+    bar.scale += by_scale
+    bar.timestep += by_h
+    return bar, by_share
+
+
+@wp.func
+def pull_pair(
+    scene: Scene,
+    room: Room,
+    bars: Changes,
+    world: int,
+    lane: int,
+    found: FoundPair,
+    rebound: real,
+    twists: Virtual,
+) -> PairBar:
+    """Derivatives by the states of a pair's bodies; adds those by samples, solids and materials."""
+    index = scene.pair_index[found.pair]
+    pair = scene.pairs[world, found.pair]
+    turning = scene.body_index[index.first].turning
+    scale = scene.bodies[world, index.first].scale
+    h = scene.timestep[world, 0]
+    a = room.bodies[world, index.first]
+    b = room.bodies[world, index.second]
+    pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
+    pose_bar, share_bar, h_bar = pull_points(scene, room, bars, world, lane, found, pose, rebound, twists)
+    bar = PairBar()
+    toward = found.toward
+    by_first, by_second, by_share, by_h, by_toward, _a, by_scale, _b, _c = wp.grad(pair_work)(
+        a, b, found.share, h, toward, turning, scale, pair.follows, pose_bar
+    )
+    bar.first = by_first
+    bar.second = by_second
+    bar.scale = by_scale
+    bar.timestep = h_bar + by_h
+    share_bar += by_share
+    toward_bar = by_toward
+    if found.critical >= 0:
+        # τ is the root of distance + sink = 0 at the critical probe.
+        probe = scene.probes[world, found.critical]
+        solid = leaf_at(scene, world, index.second, position_in_solid(pose, probe))
+        _d, _e, of_solid, of_first, of_second, of_share, of_h, of_toward, _f, of_scale, _g = wp.grad(
+            probe_distance
+        )(scene.solids, world, solid, a, b, found.share, h, toward, turning, scale, probe)
+        slope = of_share
+        if wp.static(len(TURNING) > 1):
+            if turning > 0:
+                none = PairBar()
+                spare = Changes()
+                _h, along = pull_facing(
+                    scene, spare, world, lane, index.first, index.second, a, b, found.share, of_toward, none
+                )
+                slope += along
+        if slope < ZERO:
+            share = -share_bar / slope
+            bar.first = summed_body(bar.first, scaled_body(share, of_first))
+            bar.second = summed_body(bar.second, scaled_body(share, of_second))
+            bar.scale += share * of_scale
+            bar.timestep += share * of_h
+            bar.sink = share
+            toward_bar += share * of_toward
+            if lane == 0:
+                of_solid.leaf.factor *= share
+                of_solid.leaf.position *= share
+                of_solid.leaf.rotation *= share
+                of_solid.leaf.sizes *= share
+                of_solid.leaf.length *= share
+                of_solid.leaf.spacing *= share
+                add_leaf(bars, world, solid, of_solid)
+    if wp.static(len(TURNING) > 1):
+        if turning > 0:
+            bar, _i = pull_facing(
+                scene, bars, world, lane, index.first, index.second, a, b, found.share, toward_bar, bar
+            )
+    return bar
+
+
+@wp.func
+def scaled_body(s: real, a: BodyState) -> BodyState:
+    """A derivative by the state of a body, times a number."""
+    a.position *= s
+    a.orientation = a.orientation * s
+    a.ahead = a.ahead * s
+    a.velocity *= s
+    a.spin *= s
+    a.com *= s
+    return a

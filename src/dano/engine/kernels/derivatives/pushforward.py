@@ -1,0 +1,343 @@
+"""Forward mode of a rollout: one launch, several directions at once (docs/gradients.md).
+
+The change of a step's end follows from what the change of everything else makes of the step's equations,
+(∂R/∂V) dV = −(∂R/∂θ) dθ. A pair of bodies has six equations; the derivative of each by everything that it
+depends on is that of reverse mode with a unit virtual velocity, and serves all directions.
+"""
+
+import warp as wp
+
+from dano.engine.kernels.assembly import row_of
+from dano.engine.kernels.derivatives.adjoint import advance_work, momentum_work, Virtual
+from dano.engine.kernels.derivatives.bodies import pull_body, row_before
+from dano.engine.kernels.derivatives.contact import pull_pair
+from dano.engine.kernels.derivatives.pullback import settle
+from dano.engine.kernels.lanes import total, wait
+from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
+from dano.engine.kernels.rollout import Launch
+from dano.engine.kernels.tables import Body, Changes, FoundPair, Push, Room, SamplePair, Scene, StateRow
+from dano.physics.distances import Leaf
+from dano.physics.features import LANES
+from dano.physics.point_law import Material
+from dano.physics.real import ONE, real, vec3, vec6, ZERO
+from dano.physics.samples import Sample
+from dano.physics.twists import angular_part, joined, linear_part
+
+_LANES = wp.constant(LANES)
+
+
+@wp.func
+def row_product(a: StateRow, b: StateRow) -> real:
+    """⟨a, b⟩ of rows of states."""
+    return (
+        wp.dot(a.position, b.position)
+        + wp.dot(a.orientation, b.orientation)
+        + wp.dot(a.velocity, b.velocity)
+        + wp.dot(a.omega, b.omega)
+    )
+
+
+@wp.func
+def body_product(a: Body, b: Body) -> real:
+    """⟨a, b⟩ of what bodies are."""
+    return a.mass * b.mass + wp.ddot(a.inertia, b.inertia) + wp.dot(a.com, b.com) + wp.dot(a.scale, b.scale)
+
+
+@wp.func
+def leaf_product(a: Leaf, b: Leaf) -> real:
+    """⟨a, b⟩ of leaves of solids."""
+    return (
+        a.factor * b.factor
+        + wp.dot(a.position, b.position)
+        + wp.ddot(a.rotation, b.rotation)
+        + wp.dot(a.sizes, b.sizes)
+        + a.length * b.length
+        + wp.dot(a.spacing, b.spacing)
+    )
+
+
+@wp.func
+def material_product(a: Material, b: Material) -> real:
+    """⟨a, b⟩ of materials."""
+    return (
+        a.stiffness * b.stiffness
+        + a.restitution * b.restitution
+        + a.restitution_velocity * b.restitution_velocity
+        + a.hysteresis * b.hysteresis
+        + a.friction * b.friction
+        + a.friction_fading * b.friction_fading
+        + a.friction_pressure * b.friction_pressure
+        + a.stiction * b.stiction
+        + a.ahead * b.ahead
+        + a.timestep * b.timestep
+        + a.bounce * b.bounce
+        + a.uplift * b.uplift
+    )
+
+
+@wp.func
+def unit_vector(k: int) -> vec6:
+    """The k-th unit vector."""
+    unit = vec6()
+    unit[k] = ONE
+    return unit
+
+
+@wp.func
+def clear_pair(scene: Scene, room: Room, bars: Changes, world: int, lane: int, found: FoundPair):
+    """Zero the derivatives that a pair adds to."""
+    index = scene.pair_index[found.pair]
+    if lane == 0:
+        room.state_bar[world, index.first] = StateRow()
+        room.state_bar[world, index.second] = StateRow()
+        bars.bodies[world, index.first] = Body()
+        bars.bodies[world, index.second] = Body()
+        bars.materials[world, index.contact] = Material()
+        bars.pairs[world, found.pair] = SamplePair()
+        bars.timestep[world, 0] = ZERO
+        solid = scene.body_index[index.second]
+        for k in range(solid.first_leaf, solid.first_leaf + solid.leaves):
+            bars.leaves[world, k] = Leaf()
+    if bars.samples.shape[1] > 0:
+        for k in range(found.first, found.end):
+            bars.samples[world, room.where[world, k].sample] = Sample()
+
+
+@wp.func
+def row_change(
+    launch: Launch, changes: Changes, world: int, t: int, i: int, direction: int, n: int
+) -> StateRow:
+    """Change of a body's state at the start of a step."""
+    if t == 0:
+        if changes.state.shape[1] == 0:
+            return StateRow()
+        return changes.state[world, direction * n + i]
+    return changes.states[world, (direction * launch.n_steps + t - 1) * n + i]
+
+
+@wp.func
+def change_of_pair(
+    scene: Scene,
+    room: Room,
+    launch: Launch,
+    changes: Changes,
+    bars: Changes,
+    world: int,
+    lane: int,
+    t: int,
+    found: FoundPair,
+    direction: int,
+) -> real:
+    """Change of an equation of a pair in a direction, from its derivatives."""
+    n = scene.body_index.shape[0]
+    index = scene.pair_index[found.pair]
+    change = row_product(
+        room.state_bar[world, index.first], row_change(launch, changes, world, t, index.first, direction, n)
+    )
+    if index.first != index.second:
+        change += row_product(
+            room.state_bar[world, index.second],
+            row_change(launch, changes, world, t, index.second, direction, n),
+        )
+    if changes.bodies.shape[1] > 0:
+        change += body_product(
+            bars.bodies[world, index.first], changes.bodies[world, direction * n + index.first]
+        )
+        change += body_product(
+            bars.bodies[world, index.second], changes.bodies[world, direction * n + index.second]
+        )
+    if changes.materials.shape[1] > 0:
+        at = direction * scene.materials.shape[1] + index.contact
+        change += material_product(bars.materials[world, index.contact], changes.materials[world, at])
+    if changes.pairs.shape[1] > 0:
+        at = direction * scene.pairs.shape[1] + found.pair
+        change += bars.pairs[world, found.pair].share * changes.pairs[world, at].share
+        change += bars.pairs[world, found.pair].sink * changes.pairs[world, at].sink
+    if changes.timestep.shape[1] > 0:
+        change += bars.timestep[world, 0] * changes.timestep[world, direction]
+    if changes.leaves.shape[1] > 0:
+        solid = scene.body_index[index.second]
+        for k in range(solid.first_leaf, solid.first_leaf + solid.leaves):
+            at = direction * scene.solids.leaves.shape[1] + k
+            change += leaf_product(bars.leaves[world, k], changes.leaves[world, at])
+    if changes.samples.shape[1] > 0:
+        of_samples = real(0.0)
+        for k in range(found.first, found.end):
+            s = room.where[world, k].sample
+            moved = changes.samples[world, direction * scene.samples.shape[1] + s]
+            of_samples += wp.dot(bars.samples[world, s].point, moved.point)
+            of_samples += wp.dot(bars.samples[world, s].area, moved.area)
+        change += total(of_samples)
+    return change
+
+
+@wp.func
+def add_change(scene: Scene, room: Room, world: int, found: FoundPair, direction: int, change: real, k: int):
+    """Add the change of an equation of a pair to those of its bodies."""
+    m = scene.moving.shape[0]
+    index = scene.pair_index[found.pair]
+    a = scene.body_index[index.first].row
+    b = scene.body_index[index.second].row
+    if a >= 0:
+        room.missing[world, direction * m + a] += change * unit_vector(k)
+    if b >= 0:
+        # The second body feels −Tᵀ times the wrench on the first.
+        force = linear_part(unit_vector(k))
+        moment = angular_part(unit_vector(k)) + wp.cross(found.com_difference, force)
+        room.missing[world, direction * m + b] -= change * joined(force, moment)
+
+
+@wp.func
+def add_shift(
+    scene: Scene, room: Room, launch: Launch, changes: Changes, world: int, t: int, f: int, direction: int
+):
+    """Add what the change of the way between two bodies makes of the moment on the second."""
+    n = scene.body_index.shape[0]
+    m = scene.moving.shape[0]
+    found = room.found[world, f * _LANES]
+    index = scene.pair_index[found.pair]
+    b = scene.body_index[index.second].row
+    if b >= 0:
+        moved = row_change(launch, changes, world, t, index.first, direction, n).position
+        moved = moved - row_change(launch, changes, world, t, index.second, direction, n).position
+        moment = wp.cross(moved, linear_part(room.wrenches[world, f]))
+        room.missing[world, direction * m + b] -= joined(vec3(), moment)
+
+
+@wp.func
+def push_momentum(scene: Scene, room: Room, launch: Launch, changes: Changes, world: int, t: int, i: int):
+    """Add what the changes make of the momentum that a body comes with, in all directions."""
+    n = scene.body_index.shape[0]
+    m = scene.moving.shape[0]
+    row = scene.body_index[i].row
+    h = scene.timestep[world, 0]
+    push = Push()
+    if launch.pushes.shape[1] > 0:
+        push = launch.pushes[world, t * n + i]
+    k = int(0)
+    while k < 6:
+        by_body, by_row, by_push, by_gravity, by_h, _a, _b = wp.grad(momentum_work)(
+            scene.bodies[world, i], row_before(scene, launch, world, t, i), push, scene.gravity[world, 0], h,
+            room.velocity[world, row], unit_vector(k),
+        )  # fmt: skip
+        for d in range(launch.n_directions):
+            change = row_product(by_row, row_change(launch, changes, world, t, i, d, n))
+            if changes.bodies.shape[1] > 0:
+                change += body_product(by_body, changes.bodies[world, d * n + i])
+            if changes.pushes.shape[1] > 0:
+                moved = changes.pushes[world, (d * launch.n_steps + t) * n + i]
+                change += wp.dot(by_push.force, moved.force) + wp.dot(by_push.torque, moved.torque)
+            if changes.gravity.shape[1] > 0:
+                change += wp.dot(by_gravity, changes.gravity[world, d])
+            if changes.timestep.shape[1] > 0:
+                change += by_h * changes.timestep[world, d]
+            room.missing[world, d * m + row] += change * unit_vector(k)
+        k += 1
+
+
+@wp.func
+def unit_row(k: int) -> StateRow:
+    """A row of a state with a one."""
+    unit = StateRow()
+    if k < 3:
+        unit.position[k] = ONE
+    elif k < 7:
+        unit.orientation[k - 3] = ONE
+    elif k < 10:
+        unit.velocity[k - 7] = ONE
+    else:
+        unit.omega[k - 10] = ONE
+    return unit
+
+
+@wp.func
+def push_advance(
+    scene: Scene, room: Room, launch: Launch, changes: Changes, world: int, t: int, i: int, d: int
+):
+    """Change of a body's state at the end of a step, from those at its start and of its velocities."""
+    n = scene.body_index.shape[0]
+    row = scene.body_index[i].row
+    at = (d * launch.n_steps + t) * n + i
+    moved = row_change(launch, changes, world, t, i, d, n)
+    if row >= 0:
+        h = scene.timestep[world, 0]
+        end = StateRow()
+        k = int(0)
+        while k < 13:
+            by_row, by_velocity, by_h, _a = wp.grad(advance_work)(
+                row_before(scene, launch, world, t, i), room.velocity[world, row], h, unit_row(k)
+            )
+            change = row_product(by_row, moved) + wp.dot(by_velocity, room.step[world, row])
+            if changes.timestep.shape[1] > 0:
+                change += by_h * changes.timestep[world, d]
+            unit = unit_row(k)
+            end.position += change * unit.position
+            end.orientation += change * unit.orientation
+            end.velocity += change * unit.velocity
+            end.omega += change * unit.omega
+            k += 1
+        moved = end
+    changes.states[world, at] = moved
+
+
+@wp.kernel(enable_backward=False)
+def pushforward(scene: Scene, room: Room, launch: Launch, changes: Changes, bars: Changes):
+    """Changes of the states at the ends of steps, from those of everything that a rollout is given."""
+    block, lane = wp.tid()
+    world = launch.first_world + block
+    n = scene.body_index.shape[0]
+    m = scene.moving.shape[0]
+    for t in range(launch.n_steps):
+        n_found = settle(scene, room, launch, world, lane, t)
+        if lane == 0:
+            for k in range(launch.n_directions * m):
+                room.missing[world, k] = vec6()
+            for k in range(m):
+                push_momentum(scene, room, launch, changes, world, t, scene.moving[k])
+        wait()
+        for f in range(n_found):
+            found = room.found[world, f * _LANES + lane]
+            index = scene.pair_index[found.pair]
+            twists = Virtual()
+            twists.first = row_of(room.velocity, world, scene.body_index[index.first].row)
+            twists.second = row_of(room.velocity, world, scene.body_index[index.second].row)
+            k = int(0)
+            while k < 6:
+                clear_pair(scene, room, bars, world, lane, found)
+                wait()
+                # The first body's virtual velocity is measured from the second's: only it moves.
+                twists.first_virtual = unit_vector(k)
+                bar = pull_pair(
+                    scene, room, bars, world, lane, found, launch.reports[world, t].rebound, twists
+                )
+                if lane == 0:
+                    pull_body(
+                        scene, room, bars, world, index.first,
+                        row_before(scene, launch, world, t, index.first), bar.first,
+                    )  # fmt: skip
+                    pull_body(
+                        scene, room, bars, world, index.second,
+                        row_before(scene, launch, world, t, index.second), bar.second,
+                    )  # fmt: skip
+                    bars.bodies[world, index.first].scale += bar.scale
+                    bars.timestep[world, 0] += bar.timestep
+                    bars.pairs[world, found.pair].sink += bar.sink
+                wait()
+                for d in range(launch.n_directions):
+                    change = change_of_pair(scene, room, launch, changes, bars, world, lane, t, found, d)
+                    if lane == 0:
+                        add_change(scene, room, world, found, d, change, k)
+                k += 1
+            if lane == 0:
+                for d in range(launch.n_directions):
+                    add_shift(scene, room, launch, changes, world, t, f, d)
+        wait()
+        if lane == 0:
+            for d in range(launch.n_directions):
+                for k in range(m):
+                    room.step[world, k] = room.missing[world, d * m + k]
+                copy_blocks(room, world, m)
+                solve_blocks(room, world, m)
+                for i in range(n):
+                    push_advance(scene, room, launch, changes, world, t, i, d)
+        wait()

@@ -1,0 +1,95 @@
+"""The point contacts of a step as rows of numbers: for those who look at contact (docs/theory/contact.md)."""
+
+import warp as wp
+
+from dano.engine.kernels.lanes import wait
+from dano.engine.kernels.rollout import begin_body, Launch
+from dano.engine.kernels.search import find_contacts
+from dano.engine.kernels.tables import Push, Room, Scene
+from dano.physics.features import LANES
+from dano.physics.real import real, vec3
+
+_LANES = wp.constant(LANES)
+
+
+@wp.struct
+class ListedPoint:
+    """A point contact, see `dano.physics.samples.Point`, and where it was found; no area where there is none.
+
+    Attributes:
+        first: Index of the body that the point lies on.
+        second: Index of the body that it presses on.
+        contact: Index of the contact.
+        sample: Index of the sample.
+        share: Share of the step after which geometry was taken.
+        impact_stiffness: Of an impact [Pa/m].
+        arm: [m, W].
+        normal: [W].
+        moment: [m, W].
+        extra_slip: [m/s, W].
+        depth: [m].
+        rate: [m/s].
+        approach: [m/s].
+        area: [m²].
+    """
+
+    first: real
+    second: real
+    contact: real
+    sample: real
+    share: real
+    impact_stiffness: real
+    arm: vec3
+    normal: vec3
+    moment: vec3
+    extra_slip: vec3
+    depth: real
+    rate: real
+    approach: real
+    area: real
+
+
+@wp.struct
+class Listing:
+    """What is written: points, shape (worlds, capacity), and whether there were more, shape (worlds, 1)."""
+
+    points: wp.array2d(dtype=ListedPoint)
+    overflow: wp.array2d(dtype=real)
+
+
+@wp.kernel(enable_backward=False)
+def listing(scene: Scene, room: Room, launch: Launch, listing: Listing):
+    """The points that may press within a step from `launch.state`."""
+    block, lane = wp.tid()
+    world = launch.first_world + block
+    for i in range(scene.body_index.shape[0]):
+        push = Push()
+        begin_body(scene, room, world, i, launch.state[world, i], push)
+    wait()
+    n_found, overflow = find_contacts(scene, room, world, lane)
+    if lane == 0:
+        listing.overflow[world, 0] = wp.where(overflow, real(1.0), real(0.0))
+    for k in range(lane, listing.points.shape[1], _LANES):
+        listing.points[world, k] = ListedPoint()
+    wait()
+    for f in range(n_found):
+        found = room.found[world, f * _LANES + lane]
+        index = scene.pair_index[found.pair]
+        for k in range(found.first, found.end):
+            point = room.points[world, k]
+            row = ListedPoint()
+            row.first = real(index.first)
+            row.second = real(index.second)
+            row.contact = real(index.contact)
+            row.sample = real(room.where[world, k].sample)
+            row.share = found.share
+            row.impact_stiffness = found.impact_stiffness
+            row.arm = point.arm
+            row.normal = point.normal
+            row.moment = point.moment
+            row.extra_slip = point.extra_slip
+            row.depth = point.depth
+            row.rate = point.rate
+            row.approach = point.approach
+            row.area = point.area
+            listing.points[world, k] = row

@@ -1,0 +1,1 @@
+"""Bodies on joints in the kernels: kinematics, momentum balance, loops, and their linear systems."""

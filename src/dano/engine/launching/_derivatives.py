@@ -1,0 +1,209 @@
+"""Derivatives of rollouts: rules of JAX around launches of kernels (docs/gradients.md).
+
+The forward derivative is a function that is linear in the changes of the inputs, with a kernel of its own;
+its transpose, reverse mode, is another. Both are those of the implicit function theorem at each step's root.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from dano.engine.launching._launch import launch_p, merged, Plan, plan, Shape
+
+CHANGING = {
+    "scene.bodies": "bodies",
+    "scene.samples": "samples",
+    "scene.solids.leaves": "leaves",
+    "scene.solids.coefficients": "coefficients",
+    "scene.pairs": "pairs",
+    "scene.materials": "materials",
+    "scene.gravity": "gravity",
+    "scene.timestep": "timestep",
+    "launch.state": "state",
+    "launch.pushes": "pushes",
+}
+"""Inputs by which derivatives are taken, and their names in `dano.engine.kernels.tables.Cotangents`."""
+
+tangent_p = Primitive("dano_rollout_tangent")
+
+
+def _jvp(primals, tangents, *, plan: Plan, batched, n_worlds):
+    found = launch_p.bind(*primals, plan=plan, batched=batched, n_worlds=n_worlds)
+    changes = [
+        (i, t) for i, (t, name) in enumerate(zip(tangents, plan.inputs, strict=True))
+        if not isinstance(t, ad.Zero) and name in CHANGING
+    ]  # fmt: skip
+    zeros = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in found]
+    if not changes:
+        return found, zeros
+    if plan.kernel != "rollout":
+        raise NotImplementedError(
+            "second derivatives of a rollout are not available (jax.hessian, or a gradient of a gradient): "
+            "take differences of jax.grad, or Gauss–Newton as dano.identify does; see docs/gradients.md"
+        )
+    which = tuple(i for i, _ in changes)
+    rows = [t if batched[i] else t[None] for i, t in changes]
+    rows = [x[:, None] for x in rows]  # an axis of directions
+    given = tuple(batched) + (True, True)
+    moved = tangent_p.bind(
+        *primals, *found, *rows, plan=plan, batched=given, n_worlds=n_worlds, which=which,
+        differs=tuple(batched[i] for i in which), n_directions=1,
+    )  # fmt: skip
+    return found, [moved[:, 0], *zeros[1:]]
+
+
+ad.primitive_jvps[launch_p] = _jvp
+
+
+@tangent_p.def_abstract_eval
+def _(*inputs, plan, batched, n_worlds, which, differs, n_directions):
+    shape = plan.outputs["launch.states"]
+    return ShapedArray((n_worlds, n_directions, *shape), inputs[0].dtype)
+
+
+@tangent_p.def_impl
+def _(*inputs, **parameters):
+    return jax.jit(lambda *given: tangent_p.bind(*given, **parameters))(*inputs)
+
+
+def _places(plan: Plan) -> dict[str, Shape]:
+    """What derivatives read: the inputs of a rollout, and what it found."""
+    return {**plan.inputs, **plan.outputs}
+
+
+def _pullback_plan(forward: Plan, which: tuple[int, ...]) -> Plan:
+    names = list(forward.inputs)
+    wanted = [names[i] for i in which]
+    inputs = {**_places(forward), "bars.states": forward.outputs["launch.states"]}
+    outputs = {f"bars.{CHANGING[name]}": forward.inputs[name] for name in wanted}
+    return plan(
+        "dano.engine.kernels.derivatives.pullback",
+        "pullback",
+        forward.features,
+        inputs,
+        outputs,
+        forward.whole,
+        {**forward.room, **dict.fromkeys(("room.state_bar", "room.after_bar"), forward.room["room.bodies"])},
+        forward.numbers,
+    )
+
+
+def _transposed(cotangent, *inputs, plan, batched, n_worlds, which, differs, n_directions):
+    if isinstance(cotangent, ad.Zero):
+        return [None] * len(inputs)
+    n = len(plan.inputs) + len(plan.outputs)
+    residuals, changes = list(inputs[:n]), inputs[n:]
+    back = _pullback_plan(plan, which)
+    batched = list(batched)
+    for place, output in back.gradients.items():
+        # Worlds that share coefficients would add to the same derivatives at the same time.
+        at = list(plan.inputs).index(place)
+        if f"{output}" in back.outputs and not batched[at] and n_worlds > 1:
+            residuals[at] = jnp.broadcast_to(residuals[at][None], (n_worlds, *residuals[at].shape))
+            batched[at] = True
+
+    def pull(bar):
+        return launch_p.bind(*residuals, bar, plan=back, batched=(*batched, True), n_worlds=n_worlds)
+
+    if n_directions == 1:
+        found = [x[:, None] for x in pull(cotangent[:, 0])]
+    else:
+        found = jax.vmap(pull, 1, 1)(cotangent)
+    bars = [x if d else jnp.sum(x, axis=0, keepdims=True) for x, d in zip(found, differs, strict=True)]
+    return [None] * n + [
+        bar if ad.is_undefined_primal(x) else None for x, bar in zip(changes, bars, strict=True)
+    ]
+
+
+ad.primitive_transposes[tangent_p] = _transposed
+
+
+def _batched(inputs, axes, *, plan, batched, n_worlds, which, differs, n_directions):
+    n = len(plan.inputs) + len(plan.outputs)
+    size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
+    parameters: dict[str, Any] = {"plan": plan, "which": which}
+    if all(axis is None for axis in axes[:n]):
+        changes = [_spread(x, axis, size) for x, axis in zip(inputs[n:], axes[n:], strict=True)]
+        changes = [x.reshape(x.shape[0], size * n_directions, *x.shape[3:]) for x in changes]
+        found = tangent_p.bind(
+            *inputs[:n], *changes, **parameters, batched=batched, n_worlds=n_worlds, differs=differs,
+            n_directions=size * n_directions,
+        )  # fmt: skip
+        return found.reshape(n_worlds, size, n_directions, *found.shape[2:]), 1
+    rows = [
+        merged(x, axis, was, size, n_worlds)
+        for x, axis, was in zip(inputs[:n], axes[:n], batched, strict=True)
+    ]
+    now = tuple(was or axis is not None for was, axis in zip(batched, axes[:n], strict=True))
+    changes = []
+    for x, axis, was in zip(inputs[n:], axes[n:], differs, strict=True):
+        whole = jnp.moveaxis(x, axis, 0) if axis is not None else jnp.broadcast_to(x[None], (size, *x.shape))
+        if not was:
+            whole = jnp.broadcast_to(whole, (size, n_worlds, *whole.shape[2:]))
+        changes.append(whole.reshape(size * n_worlds, *whole.shape[2:]))
+    found = tangent_p.bind(
+        *rows, *changes, **parameters, batched=now, n_worlds=size * n_worlds,
+        differs=(True,) * len(which), n_directions=n_directions,
+    )  # fmt: skip
+    return found.reshape(size, n_worlds, *found.shape[1:]), 0
+
+
+batching.primitive_batchers[tangent_p] = _batched
+
+
+def _spread(change, axis, size: int):
+    """A change with an axis of directions after that of worlds."""
+    if axis is not None:
+        return jnp.moveaxis(change, axis, 1)
+    return jnp.broadcast_to(change[:, None], (change.shape[0], size, *change.shape[1:]))
+
+
+def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) -> Plan:
+    names = list(forward.inputs)
+    chosen = {names[i]: forward.inputs[names[i]] for i in which}
+    changes = {f"changes.{CHANGING[k]}": Shape(n_directions * x.rows, x.width) for k, x in chosen.items()}
+    states = forward.outputs["launch.states"]
+    return plan(
+        "dano.engine.kernels.derivatives.pushforward",
+        "pushforward",
+        forward.features,
+        {**_places(forward), **changes},
+        {"changes.states": Shape(n_directions * states.rows, states.width)},
+        forward.whole,
+        {**forward.room, **_pushforward_room(forward, n_directions)},
+        {**forward.numbers, "launch.n_directions": n_directions},
+    )
+
+
+def _pushforward_room(forward: Plan, n_directions: int) -> dict[str, int]:
+    n, m = forward.room["room.bodies"], forward.room["room.momentum"]
+    rows = {
+        f"bars.{CHANGING[name]}": forward.inputs[name].rows for name in CHANGING if name in forward.inputs
+    }
+    rows.pop("bars.coefficients", None)
+    return {
+        **dict.fromkeys(("room.state_bar", "room.after_bar"), n),
+        **rows,
+        "room.missing": n_directions * m,
+        "room.wrenches": forward.room["room.found"],
+    }
+
+
+def _lowered(*inputs, plan, batched, n_worlds, which, differs, n_directions):
+    n = len(plan.inputs) + len(plan.outputs)
+    forward = _pushforward_plan(plan, which, n_directions)
+    changes = [
+        x.reshape(x.shape[0], -1, x.shape[-1])[slice(None) if d else 0]
+        for x, d in zip(inputs[n:], differs, strict=True)
+    ]
+    (found,) = launch_p.bind(
+        *inputs[:n], *changes, plan=forward, batched=(*batched, *differs), n_worlds=n_worlds
+    )
+    return found.reshape(n_worlds, n_directions, *plan.outputs["launch.states"])
+
+
+mlir.register_lowering(tangent_p, mlir.lower_fun(_lowered, multiple_results=False))

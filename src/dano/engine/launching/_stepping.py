@@ -1,0 +1,152 @@
+"""Steps and rollouts as launches of kernels."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from dano.engine._newton import Report, SolverOptions
+from dano.engine.joints import tree_lengths
+from dano.engine.launching import _derivatives  # noqa: F401  rules for derivatives of launches
+from dano.engine.launching._launch import launch, Plan, plan, Shape
+from dano.engine.launching._tables import Tables
+from dano.scene import Control, State
+
+_MODULE = "dano.engine.kernels.rollout"
+# Numbers of a body's state, of a push on it, and of what a step reports: see `dano.engine.kernels.tables`.
+_STATE, _PUSH, _REPORT, _WRENCH = 13, 6, 5, 6
+# Numbers of a listed point, see `dano.engine.kernels.listing`, and where each quantity begins.
+_POINT = {"first": 1, "second": 1, "contact": 1, "sample": 1, "share": 1, "impact_stiffness": 1}
+_POINT |= {"arm": 3, "normal": 3, "moment": 3, "extra_slip": 3}
+_POINT |= {"depth": 1, "rate": 1, "approach": 1, "area": 1}
+CHUNK = 16
+"""Points that `VariationalEngine.capacity` counts as one."""
+
+
+def rollout(
+    tables: Tables,
+    state: State,
+    controls: Control | None,
+    n_steps: int,
+    capacity: int,
+    options: SolverOptions,
+) -> tuple[State, Report]:
+    """States at the ends of steps, and their reports; arrays with a leading axis of steps.
+
+    Args:
+        tables: Of the scene.
+        state: At the start.
+        controls: Of each step; None for none.
+        n_steps: Number of steps.
+        capacity: Room for points, in chunks.
+        options: When a solve stops.
+    """
+    dtype = state.position.dtype
+    n = state.position.shape[0]
+    inputs = {**tables.rows, **_given(state, controls, dtype)}
+    found = launch(_plan(tables, inputs, n, n_steps, capacity, options, dtype), inputs)
+    states = found["launch.states"].reshape(n_steps, n, _STATE)
+    position, orientation, velocity, omega = jnp.split(states, (3, 7, 10), axis=2)
+    residual, passes, solved, overflow, _ = found["launch.reports"].T
+    report = Report(residual, passes.astype(int), (solved > 0) & (overflow == 0), overflow > 0)
+    states = State(position, orientation, velocity, omega)
+    if state.q is not None and state.v is not None:
+        none = jnp.zeros((n_steps, state.q.shape[0]), dtype)
+        q, v = (found.get(f"launch.{name}", none).reshape(none.shape) for name in ("qs", "vs"))
+        states = dataclasses.replace(states, q=q, v=v)
+    return states, jax.lax.stop_gradient(report)
+
+
+def _given(state: State, controls: Control | None, dtype) -> dict[str, Array]:
+    """What a launch is given besides a scene."""
+    rows = jnp.concatenate([state.position, state.orientation, state.velocity, state.omega], axis=1)
+    inputs = {"launch.state": rows, "launch.pushes": jnp.zeros((0, _PUSH), dtype)}
+    if state.q is not None and state.v is not None and state.q.size:
+        inputs |= {"launch.q": state.q[:, None], "launch.v": state.v[:, None]}
+    if controls is not None:
+        pushes = jnp.concatenate([controls.force, controls.torque], axis=-1)
+        inputs["launch.pushes"] = pushes.reshape(-1, _PUSH)
+        for name, values in (("efforts", controls.effort), ("commands", controls.command)):
+            if values is not None and values.size:
+                inputs[f"launch.{name}"] = values.reshape(-1, 1)
+    return inputs
+
+
+def listed_points(tables: Tables, state: State, capacity: int) -> dict[str, Array]:
+    """The point contacts of a step, as arrays by quantity; rows without area are empty.
+
+    Args:
+        tables: Of the scene.
+        state: At the start of the step.
+        capacity: Room for points, in chunks.
+
+    Returns:
+        Quantities of `dano.engine.kernels.listing.ListedPoint`, and "overflow": whether there were more.
+    """
+    n, points = state.position.shape[0], CHUNK * capacity
+    inputs = {**tables.rows, **_given(state, None, state.position.dtype)}
+    shapes = {name: Shape(*x.shape) for name, x in inputs.items()}
+    outputs = {"listing.points": Shape(points, sum(_POINT.values())), "listing.overflow": Shape(1, 1)}
+    room, numbers = _room(tables, shapes, n, points), {"scene.n_blocks": tables.structure.n_blocks}
+    module = "dano.engine.kernels.listing"
+    chosen = plan(module, "listing", tables.features, shapes, outputs, tables.whole.arrays, room, numbers)
+    found = launch(chosen, inputs)
+    ends = np.cumsum(list(_POINT.values()))[:-1]
+    parts = jnp.split(found["listing.points"], ends, axis=1)
+    quantities = {
+        name: part[:, 0] if width == 1 else part
+        for (name, width), part in zip(_POINT.items(), parts, strict=True)
+    }
+    return {**quantities, "overflow": found["listing.overflow"][0, 0] > 0}
+
+
+def _plan(
+    tables: Tables,
+    inputs: dict[str, Array],
+    n: int,
+    n_steps: int,
+    capacity: int,
+    options: SolverOptions,
+    dtype,
+) -> Plan:
+    epsilon = float(jnp.finfo(dtype).eps)
+    relative = epsilon**0.75 if options.tolerance is None else options.tolerance
+    numbers = {
+        "scene.n_blocks": tables.structure.n_blocks,
+        "launch.n_steps": n_steps,
+        "launch.options.tolerance": relative,
+        "launch.options.rounding": epsilon,
+        "launch.options.fit": epsilon**0.375,
+        "launch.options.max_passes": options.max_iterations,
+    }
+    shapes = {name: Shape(*x.shape) for name, x in inputs.items()}
+    outputs = {"launch.states": Shape(n_steps * n, _STATE), "launch.reports": Shape(n_steps, _REPORT)}
+    for place, name in (("launch.q", "qs"), ("launch.v", "vs")):
+        if place in shapes:
+            outputs[f"launch.{name}"] = Shape(n_steps * shapes[place].rows, 1)
+    if len(tables.structure.loops):
+        outputs["launch.forces"] = Shape(n_steps * len(tables.structure.loops), _WRENCH)
+    room = _room(tables, shapes, n, CHUNK * capacity)
+    return plan(_MODULE, "rollout", tables.features, shapes, outputs, tables.whole.arrays, room, numbers)
+
+
+def _room(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> dict[str, int]:
+    """Lengths of the arrays that a world works in."""
+    m, pairs = len(tables.structure.moving), len(tables.whole.arrays["scene.pair_index"])
+    blocks = tables.structure.n_blocks
+    lengths = {
+        "bodies": n,
+        **dict.fromkeys(("momentum", "inertia"), m),
+        **dict.fromkeys(("velocity", "old", "tried", "best", "step", "residual", "scale"), blocks),
+        **dict.fromkeys(("order", "counts"), blocks),
+        **dict.fromkeys(("blocks", "spare", "used", "later"), blocks * blocks),
+        **dict.fromkeys(("where", "points", "laws", "duals", "changes", "linear"), points),
+        "found": pairs,
+        "near": shapes["scene.probes"].rows,
+    }
+    room = {f"room.{name}": length for name, length in lengths.items()}
+    if "scene.trees.nodes" in tables.whole.arrays:
+        room |= tree_lengths(tables.structure)
+    return room

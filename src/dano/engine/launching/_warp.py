@@ -1,0 +1,101 @@
+"""Warp as kernels need it: quiet, with a folder to keep what it compiled, and a word when that takes long."""
+
+import atexit
+import contextlib
+import functools
+import os
+import shutil
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from dano.caches import cache_folder
+
+_WORTH_A_WORD = 2.0
+"""Seconds after which compiling is said."""
+
+
+def compiled_kernel(made: Callable[[], Any]) -> Any:
+    """A kernel, compiled for this processor, or loaded where it was compiled before.
+
+    Args:
+        made: Gives the kernel; called when Warp is ready.
+    """
+    import warp as wp
+
+    begin()
+    with _quietly(), _said("compiling the simulator for this machine, once …"):
+        kernel = made()
+        try:
+            wp.load_module(kernel.module, device="cpu")
+        except OSError as error:
+            folder = wp.config.kernel_cache_dir
+            raise OSError(
+                f"the simulator cannot be compiled in {folder}: {error}; DANO_CACHE_DIR names another folder"
+            ) from error
+    return kernel
+
+
+@functools.cache
+def begin() -> None:
+    """Start Warp; before any of its functions is made, which would start it with words."""
+    import warp as wp
+
+    _find_cache()
+    with _quietly(), _without_stderr():
+        wp.init()
+
+
+def _find_cache() -> None:
+    """Have Warp keep what it compiles among dano's caches, or for this process where nothing is kept."""
+    import warp as wp
+
+    if wp.config.kernel_cache_dir is not None:
+        return
+    folder = cache_folder()
+    kept = tempfile.mkdtemp(prefix="dano-kernels-") if folder is None else str(folder / "kernels")
+    if folder is None:
+        atexit.register(shutil.rmtree, kept, ignore_errors=True)
+    wp.config.kernel_cache_dir = kept
+
+
+@contextlib.contextmanager
+def _quietly() -> Iterator[None]:
+    """Without Warp's words about devices and compiled modules."""
+    import warp as wp
+
+    level = wp.config.log_level
+    wp.config.log_level = wp.LOG_ERROR
+    try:
+        yield
+    finally:
+        wp.config.log_level = level
+
+
+@contextlib.contextmanager
+def _without_stderr() -> Iterator[None]:
+    """Without what C code writes to the standard error: that there is no driver of a GPU, on a CPU."""
+    kept = os.dup(2)
+    silent = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silent, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(silent)
+
+
+@contextlib.contextmanager
+def _said(words: str) -> Iterator[None]:
+    """Say in a terminal what takes long."""
+    timer = threading.Timer(_WORTH_A_WORD, lambda: print(f"dano: {words}", file=sys.stderr, flush=True))
+    timer.daemon = True
+    if sys.stderr is not None and sys.stderr.isatty():
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

@@ -1,0 +1,12 @@
+"""Logs as they are recorded: tables of text, what their columns mean, and what of them has to be mended."""
+
+from dano.identify.logs._columns import Columns as Columns, understood as understood
+from dano.identify.logs._mending import (
+    in_metres as in_metres,
+    LENGTH_UNITS as LENGTH_UNITS,
+    mended_times as mended_times,
+    ordered_quaternions as ordered_quaternions,
+    TIME_UNITS as TIME_UNITS,
+    unwrapped as unwrapped,
+)
+from dano.identify.logs._table import read_table as read_table, Table as Table

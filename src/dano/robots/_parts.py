@@ -1,0 +1,183 @@
+"""A robot's file made ready: without what is left out, with places of all groups and what they weigh."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from dano.checks import shown
+from dano.maths import Pose
+from dano.robots._inertia import (
+    carried_inertials,
+    chained,
+    completed,
+    excess,
+    grouped_links,
+    Inertial,
+    own_inertials,
+    ROUNDED,
+    weightless_joints,
+)
+from dano.robots.formats import (
+    at_home,
+    Description,
+    GRAVCOMP,
+    held_at,
+    Lacking,
+    Placed,
+    WEIGHTLESS,
+    without_followers,
+)
+
+FLOATING = "floating"
+
+
+class Parts(NamedTuple):
+    """A description, and what follows from it before there are bodies.
+
+    Attributes:
+        description: The file, without what is left out.
+        groups: Links that move as one.
+        places: Where each group stands in the pose of the file [W].
+        fixed: Groups that never move.
+        free: Groups that move freely.
+    """
+
+    description: Description
+    groups: dict[str, dict[str, Placed]]
+    places: dict[str, Placed]
+    fixed: frozenset[str]
+    free: frozenset[str]
+
+
+def checked_base(base: Pose | str | None, description: Description) -> Placed | None:
+    """Where the root stands; None if it moves freely."""
+    if base is None:
+        return Placed()
+    if isinstance(base, Pose):
+        numbers = (np.asarray(x, float).tolist() for x in (base.position, base.orientation))
+        return Placed(*(tuple(x) for x in numbers))
+    if not (isinstance(base, str) and base == FLOATING):
+        raise ValueError(f"base must be a dano.Pose, 'floating' or None, got {shown(base)}")
+    floats = any(joint.kind == FLOATING for joint in description.joints)
+    if description.world is not None and not floats:
+        raise ValueError(
+            f"base must not be 'floating' where the file says what stands in the world: give the root body of"
+            f" {description.source} a <freejoint/>"
+        )
+    # A file with a floating joint says itself what floats.
+    return Placed() if floats else None
+
+
+def without_lacking(description: Description, ignored: Sequence[str]) -> Description:
+    """The description without what is to be left out.
+
+    Raises:
+        ValueError: If there is something else that dano has no counterpart of.
+    """
+    left = [each for each in description.lacking if each.feature not in ignored]
+    # Whoever leaves out all actuators leaves out the strange ones, too.
+    if "actuators" in ignored:
+        left = [each for each in left if each.feature != "other actuators"]
+        joints = tuple(dataclasses.replace(joint, drive=None) for joint in description.joints)
+        description = dataclasses.replace(description, joints=joints)
+    # What hangs on tendons is gone with them.
+    if "tendons" in ignored:
+        left = [each for each in left if "tendon" not in each.text]
+    # Weight is for who simulates: kinematics need none of it.
+    refused = [each for each in left if each.feature != GRAVCOMP]
+    if refused:
+        raise ValueError(f"{description.source}: {lacking_text(left)}")
+    return dataclasses.replace(description, lacking=tuple(left))
+
+
+def lacking_text(lacking: Sequence[Lacking]) -> str:
+    """One line that says what there is and how it is left out."""
+    names = list(dict.fromkeys(each.feature for each in lacking))
+    others = "" if len(lacking) == 1 else f" (and {len(lacking) - 1} more)"
+    return f"{lacking[0].text}{others}; ignore={names} leaves it out"
+
+
+def parts_of(description: Description, base: Placed | None) -> Parts:
+    """Groups of links, where they stand with the root at `base`, which is None if it moves freely."""
+    groups = grouped_links(description)
+    owner = {link: head for head, members in groups.items() for link in members}
+    held = {joint.child: joint for joint in description.joints if joint.child in groups}
+    places: dict[str, Placed] = {}
+    fixed, free = set(), set()
+    for name in groups:
+        joint = held.get(name)
+        if joint is None:
+            places[name] = Placed() if base is None else base
+            (free if base is None else fixed).add(name)
+            continue
+        head = owner[joint.parent]
+        places[name] = chained(chained(places[head], groups[head][joint.parent]), at_home(joint))
+        if joint.kind == FLOATING:
+            free.add(name)
+        elif joint.kind == "weld":
+            fixed.add(name)
+    return Parts(description, groups, places, frozenset(fixed), frozenset(free))
+
+
+def inertials_of(parts: Parts) -> dict[str, Inertial]:
+    """Mass properties of all groups that move.
+
+    Raises:
+        ValueError: If what moves freely has no mass, or an inertia is impossible.
+    """
+    description, groups = parts.description, parts.groups
+    where = str(description.source)
+    own = own_inertials(description, groups)
+    carried = carried_inertials(description, groups, own)
+    heaviest = max(own.values(), key=lambda each: each[0])
+    found = {}
+    for name in groups:
+        if name in parts.fixed:
+            continue
+        if name in parts.free and not own[name][0] > 0:
+            raise ValueError(
+                f"{where}: link {name!r}: mass must be > 0 kg where a link moves freely, got {own[name][0]}"
+            )
+        try:
+            found[name] = completed(name, own[name], carried[name], heaviest)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from error
+        _check_possible(where, name, found[name][2])
+    return found
+
+
+def _check_possible(where: str, name: str, inertia: np.ndarray) -> None:
+    share = excess(inertia)
+    if share > ROUNDED:
+        moments = [float(f"{x:.4g}") for x in np.linalg.eigvalsh(inertia)]
+        raise ValueError(
+            f"{where}: link {name!r}: inertia must be possible: no principal moment may exceed the sum of the"
+            f" other two, got {moments} kg m², {100 * share:.2g} % too much; balance_inertia=True gives such"
+            " links their mean, as MuJoCo's balanceinertia does"
+        )
+
+
+def without_weightless(description: Description, ignored: Sequence[str]) -> Description:
+    """The description with joints that move nothing with mass held where they are, if they are to be.
+
+    Raises:
+        ValueError: If there are some, and they are not.
+    """
+    groups = grouped_links(description)
+    while names := weightless_joints(description, groups, own_inertials(description, groups)):
+        if WEIGHTLESS not in ignored:
+            shown_names = ", ".join(map(repr, names[:4])) + (" …" if len(names) > 4 else "")
+            raise ValueError(
+                f"{description.source}: mass must be > 0 kg, and the inertia about its axis, of what each"
+                f" joint moves by itself, got none for {shown_names}: give the links mass or the joint"
+                f" armature, or hold it where it is with ignore=[{WEIGHTLESS!r}]"
+            )
+        joints = [
+            held_at(joint, joint.home) if joint.name in names else joint for joint in description.joints
+        ]
+        held = {joint.name: joint.home for joint in description.joints if joint.name in names}
+        description = dataclasses.replace(description, joints=tuple(without_followers(joints, held)))
+        groups = grouped_links(description)
+    return description

@@ -1,0 +1,128 @@
+"""What files of MuJoCo say that dano has no counterpart of: each by a name, to be left out or refused."""
+
+from typing import Any
+
+import numpy as np
+
+from dano.robots.formats._description import Lacking
+
+GRAVCOMP = "gravcomp"
+"""Name of compensated weight."""
+
+EQUALITIES = "equalities"
+"""Name of equalities that are neither loops of joints nor linear."""
+
+WEIGHTLESS = "weightless joints"
+"""Name of joints that move nothing with mass."""
+
+IGNORABLE = {
+    "actuators": "all actuators",
+    "other actuators": "actuators that are no motor or servo of one joint",
+    "crossed limits": "limits whose lower exceeds the upper: Bullet takes that as none",
+    "ball limits": "ranges of ball joints",
+    EQUALITIES: "equalities that are neither loops of joints nor linear",
+    "fluid": "drag by density and viscosity",
+    "free joints": "damping, friction, armature and springs of free joints",
+    GRAVCOMP: "compensated weight of bodies",
+    "height fields": "shapes that are height fields or signed distances",
+    "mimics of nothing": "joints that mimic one which does not exist",
+    "nonlinear springs": "springs and dampers that are not linear",
+    "soft bodies": "flexes",
+    "tendons": "tendons, and what hangs on them",
+    WEIGHTLESS: "joints that move nothing with mass: they stay where they are",
+}
+"""What may be left out of a robot's file by `ignore`."""
+
+
+def checked_ignore(ignore: Any) -> tuple[str, ...]:
+    """Names of what is to be left out.
+
+    Raises:
+        ValueError: If one is unknown.
+    """
+    names = (ignore,) if isinstance(ignore, str) else tuple(ignore)
+    for name in names:
+        if name not in IGNORABLE:
+            raise ValueError(f"ignore must hold some of {list(IGNORABLE)}, got {name!r}")
+    return names
+
+
+def lacking_of(model: Any, mujoco: Any) -> list[Lacking]:
+    """What a model has that dano has not, besides actuators."""
+    found = []
+
+    def say(feature: str, text: str) -> None:
+        found.append(Lacking(feature, text))
+
+    density, viscosity = float(model.opt.density), float(model.opt.viscosity)
+    if density > 0 or viscosity > 0:
+        say(
+            "fluid",
+            f"<option> has density {density:g} kg/m³ and viscosity {viscosity:g} Pa s: dano has no drag",
+        )
+    names = [model.body(i).name or f"body {i}" for i in np.flatnonzero(model.body_gravcomp)]
+    if names:
+        say(GRAVCOMP, f"gravcomp of {_listed(names)} is not 0: dano lets gravity act on all bodies alike")
+    acting = [name for t in range(model.ntendon) if (name := _acting_tendon(model, t))]
+    if acting:
+        say("tendons", f"{_listed(acting)}: dano has no tendons")
+    if model.nflex:
+        say("soft bodies", f"{model.nflex} flexes: dano has rigid bodies only")
+    found += _of_joints(model, mujoco) + _of_geoms(model, mujoco)
+    return found
+
+
+def _acting_tendon(model: Any, t: int) -> str | None:
+    """Name of a tendon that pulls, rubs, weighs or stops by itself; what pulls on it counts elsewhere."""
+    laws = ("limited", "stiffness", "damping", "frictionloss", "armature", "actfrclimited")
+    if any(np.any(getattr(model, f"tendon_{law}", np.zeros((t + 1, 1)))[t]) for law in laws):
+        return model.tendon(t).name or f"tendon {t}"
+    return None
+
+
+def _of_joints(model: Any, mujoco: Any) -> list[Lacking]:
+    found, types = [], mujoco.mjtJoint
+    free, ball = int(types.mjJNT_FREE), int(types.mjJNT_BALL)
+    for j in range(model.njnt):
+        kind, name = int(model.jnt_type[j]), model.joint(j).name or f"joint {j}"
+        first = int(model.jnt_dofadr[j])
+        dofs = slice(first, first + {free: 6, ball: 3}.get(kind, 1))
+        if kind == free:
+            laws = {
+                "damping": model.dof_damping[dofs],
+                "frictionloss": model.dof_frictionloss[dofs],
+                "armature": model.dof_armature[dofs],
+                "stiffness": model.jnt_stiffness[j],
+            }
+            given = [key for key, value in laws.items() if np.any(value)]
+            if given:
+                text = f"the free joint {name!r} has {' and '.join(given)}: dano's free bodies have none"
+                found.append(Lacking("free joints", text))
+        if kind == ball and model.jnt_limited[j]:
+            text = f"the ball joint {name!r} has a range: dano's ball joints have none"
+            found.append(Lacking("ball limits", text))
+        poly = [
+            getattr(model, key, np.zeros((model.nv, 1)))[rows]
+            for key, rows in (("jnt_stiffnesspoly", j), ("dof_dampingpoly", dofs), ("jnt_springyield", j))
+        ]
+        if any(np.any(x) for x in poly):
+            text = f"joint {name!r} has a spring or a damper that is not linear"
+            found.append(Lacking("nonlinear springs", text))
+    return found
+
+
+def _of_geoms(model: Any, mujoco: Any) -> list[Lacking]:
+    types = mujoco.mjtGeom
+    strange = {int(types.mjGEOM_HFIELD): "a height field", int(types.mjGEOM_SDF): "a signed distance"}
+    found = []
+    for g in range(model.ngeom):
+        what = strange.get(int(model.geom_type[g]))
+        if what and (model.geom_contype[g] or model.geom_conaffinity[g]):
+            text = f"geom {model.geom(g).name or g!r} is {what}, which is not read"
+            found.append(Lacking("height fields", text))
+    return found
+
+
+def _listed(names: list[str]) -> str:
+    shown = ", ".join(map(repr, names[:4]))
+    return shown if len(names) <= 4 else f"{shown} and {len(names) - 4} more"

@@ -1,0 +1,83 @@
+"""The numbers of a scene and a state as NumPy arrays; spins in world axes."""
+
+from typing import NamedTuple
+
+import numpy as np
+from reference_step.rotations import matrix, multiply, turn
+
+
+class Bodies(NamedTuple):
+    """All n bodies of a scene at the start of a step of length h [s] with gravity [m/s²].
+
+    Attributes:
+        moves: Whether each body moves, shape (n,).
+        mass: [kg], shape (n,).
+        inertia: About the centre of mass [kg m², B], shape (n, 3, 3).
+        com: Centre of mass [m, F], shape (n, 3).
+        position: Of the centres of mass [m, W], shape (n, 3).
+        orientation: wxyz, shape (n, 4).
+        ahead: Orientations at the end of the step at the old spins.
+        velocity: [m/s, W], zero for a fixed body.
+        spin: [rad/s, W], the same.
+        inverse_mass: 1/m, zero for a fixed body [1/kg].
+        inverse_inertia: [1/(kg m²), W], the same.
+    """
+
+    h: float
+    gravity: np.ndarray
+    moves: np.ndarray
+    mass: np.ndarray
+    inertia: np.ndarray
+    com: np.ndarray
+    position: np.ndarray
+    orientation: np.ndarray
+    ahead: np.ndarray
+    velocity: np.ndarray
+    spin: np.ndarray
+    inverse_mass: np.ndarray
+    inverse_inertia: np.ndarray
+
+    def pose(self, i, share):
+        """Position [m, W] and rotation of a body after a share of the step at the old velocities.
+
+        Centres of mass move on lines; quaternions move on the chord between start and end, normalised.
+        """
+        q = self.orientation[i] + share * (self.ahead[i] - self.orientation[i])
+        return self.position[i] + share * self.h * self.velocity[i], matrix(q / np.linalg.norm(q))
+
+    def relative(self, i, j):
+        """Velocity [m/s] of centre of mass i and spin [rad/s] relative to body j as a rigid frame [W]."""
+        away = self.position[i] - self.position[j]
+        u = self.velocity[i] - self.velocity[j] - np.cross(self.spin[j], away)
+        return u, self.spin[i] - self.spin[j]
+
+
+def read(scene, state):
+    """The bodies of a `dano.Scene` in a `dano.State`, as if all moved freely."""
+    h = float(scene.timestep)
+    moves = np.array([not body.fixed for body in scene.bodies])
+    mass = np.array([float(body.mass * body.mass_scale) for body in scene.bodies])
+    inertia = np.array([np.asarray(body.inertia * body.mass_scale) for body in scene.bodies])
+    com = np.array([np.asarray(body.com + body.com_offset) for body in scene.bodies])
+    position, orientation = np.asarray(state.position), np.asarray(state.orientation)
+    velocity = np.where(moves[:, None], state.velocity, 0)
+    omega = np.where(moves[:, None], state.omega, 0)
+    rotations = np.array([matrix(q) for q in orientation])
+    ahead = np.array([multiply(q, turn(w, h)) for q, w in zip(orientation, omega, strict=True)])
+    return Bodies(
+        h=h,
+        gravity=np.asarray(scene.gravity),
+        moves=moves,
+        mass=mass,
+        inertia=inertia,
+        com=com,
+        position=position,
+        orientation=orientation,
+        ahead=ahead,
+        velocity=velocity,
+        spin=np.einsum("nij,nj->ni", rotations, omega),
+        inverse_mass=np.where(moves, 1 / mass, 0),
+        inverse_inertia=np.array(
+            [m * R @ np.linalg.inv(J) @ R.T for m, R, J in zip(moves, rotations, inertia, strict=True)]
+        ),
+    )

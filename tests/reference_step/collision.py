@@ -1,0 +1,342 @@
+"""Finding contact: docs/theory/contact.md, "Which side is sampled" and from "Finding contact" on."""
+
+from typing import NamedTuple
+
+import numpy as np
+from reference_step.distances import signed_distance
+from reference_step.law import Law, laws_of
+from reference_step.rotations import cross_matrix
+
+import dano
+
+IMPACT = 1000.0
+"""An impact is so many times as stiff as the spring that reverses the motion within a step."""
+POLE = np.array([0.36, -0.48, 0.8])
+FROM_Z = np.array([[0.8, 0.48, -0.36], [0.6, -0.64, 0.48], [0.0, -0.6, -0.8]])
+"""A direction in which upright bodies do not press, and a rotation that takes z to its opposite."""
+
+
+class Side(NamedTuple):
+    """Samples of body i that press on the solid of body j; `half` of each area counts, ½ or 1."""
+
+    i: int
+    j: int
+    law: Law
+    half: float
+
+
+class Points(NamedTuple):
+    """Listed samples of a side, n points; vectors in the world frame, see docs/conventions.md.
+
+    Attributes:
+        first: Index of the sampled body.
+        second: Index of the body that it presses on.
+        law: Parameters.
+        share: τ.
+        com_difference: From the second centre of mass to the first, at the start [m].
+        arm: r [m], shape (n, 3).
+        normal: n.
+        moment: Of a unit pressure about the first centre of mass [m].
+        depth: d of the law [m], shape (n,).
+        rate: v_n⁻ [m/s].
+        area: A [m²].
+        drift: ½ ω⁻ × (r₁ − r₀), its tangential part limited [m/s], shape (n, 3).
+        impact: k_i [Pa/m], zero where there is no impact, shape (n,).
+    """
+
+    first: int
+    second: int
+    law: Law
+    share: float
+    com_difference: np.ndarray
+    arm: np.ndarray
+    normal: np.ndarray
+    moment: np.ndarray
+    depth: np.ndarray
+    rate: np.ndarray
+    area: np.ndarray
+    drift: np.ndarray
+    impact: np.ndarray
+
+
+def sides_of(scene):
+    """Which body's samples press on which other body."""
+    found = []
+    for (a, b), law in zip(scene.point_pairs, laws_of(scene), strict=True):
+        both = [(i, j) for i, j in ((a, b), (b, a)) if presses(scene.bodies[i], scene.bodies[j])]
+        found += [Side(i, j, law, 1 / len(both)) for i, j in both]
+    return found
+
+
+def presses(first, second):
+    if first.surface is None or second.solid is None:
+        return False
+    ball = second.surface is not None and second.surface.turning == "ball"
+    return first.object is not None or first.surface.turning == "ball" or not ball
+
+
+def samples_of(body):
+    """Points [m, F] and vector areas [m², F] of a body's surface, (n, 3), without what fills up blocks."""
+    points, vectors = np.asarray(body.surface.points)[:3].T, np.asarray(body.surface.vectors).T
+    real = np.any(vectors != 0, axis=1)
+    return points[real], vectors[real]
+
+
+class Pair:
+    """Two bodies of a side after a share of the step."""
+
+    def __init__(self, scene, bodies, side, share):
+        i, j = side.i, side.j
+        self.body, self.solid, self.turning = (
+            scene.bodies[i],
+            scene.bodies[j].solid,
+            scene.bodies[i].surface.turning,
+        )
+        self.com, self.other_com = bodies.com[i], bodies.com[j]
+        self.x, self.R = bodies.pose(i, share)
+        self.other_x, self.other_R = bodies.pose(j, share)
+        self.toward = None if self.turning == "fixed" else self.facing()
+        points, vectors = self.turned(self.toward)
+        self.places = self.world(points)
+        self.vectors = vectors @ self.R.T
+
+    def world(self, points):
+        """Points of the first body's field frame in the world."""
+        return self.x + (points - self.com) @ self.R.T
+
+    def distance(self, places):
+        """Distance to the solid and its normal [W] at places [m, W]."""
+        distance, normal = signed_distance(
+            self.solid, (places - self.other_x) @ self.other_R + self.other_com
+        )
+        return distance, normal @ self.other_R.T
+
+    def facing(self):
+        """Direction [F] in which a ball, ellipsoid, cylinder or capsule faces the solid."""
+
+        def look(point):
+            distance, normal = self.distance(self.world(point[None]))
+            return distance[0], -normal[0] @ self.R
+
+        if self.turning == "axis":
+            return look(np.zeros(3))[1]
+        S = semi_axes(self.body.shape)
+        return first_touch(look, S)
+
+    def turned(self, toward):
+        """Samples [m, F] and vector areas [m², F] that face a direction [F]."""
+        points, vectors = samples_of(self.body)
+        if self.turning == "fixed":
+            return points, vectors
+        if self.turning == "axis":
+            Q = about_z(toward)
+            return points @ Q.T, vectors @ Q.T
+        S = semi_axes(self.body.shape)
+        Q = from_z(-unit(S * toward))
+        return S * (points @ Q.T), np.prod(S) / S * (vectors @ Q.T)
+
+    def lowest(self, toward):
+        """The point [m, F] of a ball or an ellipsoid that comes closest."""
+        S = semi_axes(self.body.shape)
+        return S * (from_z(-unit(S * toward)) @ np.array([0, 0, -1]))
+
+
+def semi_axes(shape):
+    """Of a ball or an ellipsoid [m]."""
+    return np.full(3, shape.radius) if isinstance(shape, dano.Sphere) else np.asarray(shape.semi_axes)
+
+
+def first_touch(look, S):
+    """Direction to the point x of a solid with the least |S⁻¹ x|, by projected gradients with momentum.
+
+    Args:
+        look: From a point [F] to its distance from the solid and the direction there.
+        S: Semi-axes [m].
+    """
+    least, root = S.min(), np.sqrt(0.7) * S.min() / S.max()
+    x = last = direction = np.zeros(3)
+    for k in range(12):
+        start = x - 0.7 * (least / S) ** 2 * x
+        distance, direction = look(start)
+        touched = start + max(distance, 0) * direction
+        x = touched + (k > 0) * (1 - root) / (1 + root) * (touched - last)
+        if np.linalg.norm(touched - last) < 1e-6 * least:
+            break
+        last = touched
+    return direction
+
+
+def from_z(direction):
+    """A rotation that takes z to a unit vector: `FROM_Z`, then the shortest turn from the pole's opposite."""
+    axis = np.cross(-POLE, direction)
+    K = cross_matrix(axis)
+    return (np.eye(3) + K + K @ K / (1 - POLE @ direction)) @ FROM_Z
+
+
+def about_z(toward):
+    """The rotation about z that takes x to where a direction points; none if that is along z."""
+    size = np.hypot(toward[0], toward[1])
+    if size <= 1e-6:
+        return np.eye(3)
+    x, y = toward[:2] / size
+    return np.array([[x, -y, 0], [y, x, 0], [0, 0, 1]])
+
+
+def unit(v):
+    return v / np.linalg.norm(v)
+
+
+def limit_of(scene, side):
+    """Depth [m] up to which geometry is predicted."""
+    (_, size, thickness) = np.minimum(*(np.asarray(scene.bodies[k].extent)[3:] for k in (side.i, side.j)))
+    return min(0.01 * size, 0.25 * thickness)
+
+
+def meeting(scene, bodies, side):
+    """τ: the share of the step at which the first sample that goes in is as deep as `limit_of`; else 1."""
+    limit, h = limit_of(scene, side), bodies.h
+    (u, w), radius = bodies.relative(side.i, side.j), float(scene.bodies[side.i].extent[3])
+    apart = np.linalg.norm(bodies.position[side.i] - bodies.position[side.j])
+    spins = np.linalg.norm(bodies.spin[[side.i, side.j]], axis=1)
+    way = np.linalg.norm(bodies.velocity[side.i] - bodies.velocity[side.j]) + spins @ [radius, radius + apart]
+    if h * way <= limit:
+        return 1.0
+    turning = scene.bodies[side.i].surface.turning
+
+    def look(share):
+        """Whether a sample is too deep and goes in, and the share within which none can get there."""
+        pair = Pair(scene, bodies, side, share)
+        distance, normal = pair.distance(pair.places)
+        # What faces the other body does not turn with its own, a cylinder's samples not about its axis.
+        axis = pair.R[:, 2]
+        turns = {"fixed": w, "axis": w - (w @ axis) * axis, "ball": 0 * w}[turning]
+        velocity = u + np.cross(turns, pair.places - pair.x)
+        deep, goes_in = distance <= -limit, np.sum(normal * velocity, axis=1) < 0
+        speed = np.maximum(np.linalg.norm(velocity, axis=1), 1e-12)
+        safe = np.where(deep, np.inf, (distance + limit) / (1.5 * h * speed))
+        return np.any(deep & goes_in), safe.min()
+
+    share = 0.0
+    too_deep, safe = look(share)
+    if too_deep:
+        return share
+    while share < 1:
+        before, share = share, min(share + max(safe, 1e-4), 1.0)
+        too_deep, safe = look(share)
+        if too_deep:
+            return bisected(lambda s: look(s)[0], before, share)
+    return 1.0
+
+
+def bisected(true_from, low, high):
+    """The largest share before something becomes true."""
+    for _ in range(45):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if true_from(middle) else (middle, high)
+    return low
+
+
+def find(scene, bodies, shares=None):
+    """The listed points of every side; `shares` are given τ by (i, j), of those that are not to be exact."""
+    shares = shares or {}
+    found = []
+    for side in sides_of(scene):
+        given = (side.i, side.j) in shares
+        share = shares[side.i, side.j] if given else meeting(scene, bodies, side)
+        found.append(listed(scene, bodies, side, share))
+    return [points for points in found if len(points.area)]
+
+
+def listed(scene, bodies, side, share):
+    """The listed points of a side whose geometry is taken after a share of the step."""
+    i, j, h = side.i, side.j, bodies.h
+    pair = Pair(scene, bodies, side, share)
+    distance, normal = pair.distance(pair.places)
+    facing = -np.sum(pair.vectors * normal, axis=1)
+    size = np.linalg.norm(pair.vectors, axis=1)
+    other = (distance < 0) & (facing < -0.5 * size)  # in the solid, and turned away from its nearest side
+    normal = np.where(other[:, None], -pair.vectors / size[:, None], normal)
+    area = side.half * np.where(other, size, np.maximum(facing, 0))
+
+    u, w = bodies.relative(i, j)
+    after, arm, moment = levers(scene, bodies, side, share, pair, normal)
+    rate = normal @ u + moment @ w
+    drift = drifts(u, w, after, arm, normal) if pair.turning != "fixed" else np.zeros_like(arm)
+    depth = -distance + share * h * rate
+
+    smaller = min(float(scene.bodies[k].extent[4]) for k in (i, j))
+    margin = 0.001 * smaller + 2 * np.linalg.norm(bodies.gravity) * h * h
+    near = (area > 0) & (depth - h * rate > -margin)
+    usual = near & ~other
+    # Where τ < 1 what is about to touch is at most so deep: depths count from there.
+    sunk = np.maximum(-distance + (limit_of(scene, side) if share < 1 else 0), 0)
+    inside_out = np.sum((area * -distance)[other]) > np.sum((area * sunk)[usual])
+    kept = np.concatenate([np.flatnonzero(usual), np.flatnonzero(near & other & inside_out)])
+    hit = usual & (sunk > 0)
+    approach = rate - np.sum(normal * drift, axis=1)
+    stiffness = impact(bodies, side, arm[hit], normal[hit], area[hit], sunk[hit], approach[hit])
+    return Points(
+        first=i,
+        second=j,
+        law=side.law,
+        share=share,
+        com_difference=bodies.position[i] - bodies.position[j],
+        arm=arm[kept],
+        normal=normal[kept],
+        moment=moment[kept],
+        depth=depth[kept],
+        rate=rate[kept],
+        area=area[kept],
+        drift=drift[kept],
+        impact=np.where(usual, stiffness, 0)[kept],
+    )
+
+
+def levers(scene, bodies, side, share, pair, normal):
+    """Arms r₁ of the predicted places and r₀ of the law, and moments of a unit pressure [m, W]."""
+    i, j, h = side.i, side.j, bodies.h
+    after = pair.places - pair.x
+    if pair.turning == "fixed":
+        second = scene.bodies[j].surface
+        follows = second is not None and second.turning != "fixed"
+        arm = after + follows * share * h * (bodies.velocity[i] - bodies.velocity[j])
+        return after, arm, np.cross(arm, normal)
+    angle = h * np.linalg.norm(bodies.spin[i])
+    _, before = bodies.pose(i, share * min(1, (angle / 0.5) ** 2))
+    toward = before.T @ pair.R @ pair.toward
+    arm = (pair.turned(toward)[0] - pair.com) @ before.T
+    if pair.turning == "axis":
+        axis, moment = before[:, 2], np.cross(arm, normal)
+        return after, arm, moment - np.outer(moment @ axis, axis)
+    lowest = before @ (pair.lowest(toward) - pair.com) / max(1, angle)
+    return after, arm, np.cross(lowest, normal)
+
+
+def drifts(u, w, after, arm, normal):
+    """½ ω⁻ × (r₁ − r₀), of which the tangential part is at most the slip at r₁ [m/s, W]."""
+
+    def across(v):
+        return v - np.sum(v * normal, axis=1, keepdims=True) * normal
+
+    change = 0.5 * np.cross(w, after - arm)
+    size = np.linalg.norm(across(change), axis=1)
+    slip = np.linalg.norm(across(u + np.cross(w, after)), axis=1)
+    excess = np.where(size > slip, 1 - slip / np.where(size > 0, size, 1), 0)
+    return change - excess[:, None] * across(change)
+
+
+def impact(bodies, side, arm, normal, area, sunk, approach):
+    """k_i [Pa/m] of the samples of a side that sink in, or zero; rounded to a power of two."""
+    load = np.sum(area * sunk)
+    if side.law.compliant or load == 0:
+        return 0.0
+    weights = area * sunk / load
+    if -(weights @ approach) <= side.law.slowest_rebound:
+        return 0.0
+    r, n = weights @ arm, weights @ normal
+    mobility = bodies.inverse_mass[side.i] + bodies.inverse_mass[side.j]
+    for k, lever in ((side.i, r), (side.j, r + bodies.position[side.i] - bodies.position[side.j])):
+        turning = np.cross(lever, n)
+        mobility += turning @ bodies.inverse_inertia[k] @ turning
+    exact = IMPACT / (bodies.h**2 * mobility * np.sum(area))
+    return 2.0 ** np.round(np.log2(exact))

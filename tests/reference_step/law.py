@@ -1,0 +1,179 @@
+"""The law of a point: docs/theory/contact.md, from "Pressure and friction at a sample" on."""
+
+from typing import NamedTuple
+
+import numpy as np
+from reference_step.rotations import cross_matrix
+
+
+class Law(NamedTuple):
+    """Parameters of a pair of bodies: symbols of docs/theory/contact.md.
+
+    Attributes:
+        k: Stiffness [Pa/m].
+        e: Restitution, which a step with impacts may take less of.
+        v_e: Restitution velocity [m/s].
+        sigma: Hysteresis.
+        mu: Sliding friction.
+        phi: Friction fading.
+        p_0: Friction pressure [Pa].
+        v_s: Stiction velocity [m/s].
+        theta: Implicitness.
+        compliant: Whether impacts are left to the spring.
+        h: Timestep [s].
+        slowest_rebound: v_e + g h [m/s].
+        gravity: g for samples that are deep [m/s²].
+    """
+
+    k: float
+    e: float
+    v_e: float
+    sigma: float
+    mu: float
+    phi: float
+    p_0: float
+    v_s: float
+    theta: float
+    compliant: bool
+    h: float
+    slowest_rebound: float
+    gravity: float
+
+
+PARAMETERS = (
+    "stiffness",
+    "restitution",
+    "restitution_velocity",
+    "hysteresis",
+    "sliding_friction",
+    "friction_fading",
+    "friction_pressure",
+)
+
+
+def laws_of(scene):
+    """The law of each of `scene.point_pairs`."""
+    h, g = float(scene.timestep), float(np.linalg.norm(scene.gravity))
+    groups = [(contact.law, contact.params, 1) for contact in scene.contacts if contact.law.presses]
+    if scene.others is not None:
+        groups.append((scene.others.law, scene.others.pair_params, len(scene.others.pairs)))
+    found = []
+    for law, params, count in groups:
+        columns = [np.broadcast_to(getattr(params, name), count) for name in PARAMETERS]
+        for numbers in np.array(columns).T:
+            k, e, v_e, sigma, mu, phi, p_0 = (float(x) for x in numbers)
+            rest = float(law.stiction_velocity), float(law.implicitness), law.compliant
+            found.append(Law(k, e, v_e, sigma, mu, phi, p_0, *rest, h, v_e + g * h, g if g > 0 else 9.81))
+    return found
+
+
+class Traction(NamedTuple):
+    """Pressure p and friction f of n points, and their derivatives by v_n and u, for a Newton method.
+
+    Attributes:
+        p: [Pa].
+        f: [Pa, W], shape (n, 3).
+        p_slope: ∂p/∂v_n.
+        f_slope: ∂f/∂v_n, shape (n, 3).
+        f_matrix: ∂f/∂u, shape (n, 3, 3).
+    """
+
+    p: np.ndarray
+    f: np.ndarray
+    p_slope: np.ndarray
+    f_slope: np.ndarray
+    f_matrix: np.ndarray
+
+
+def traction(law, points, rate, slip, softness=1.0):
+    """What points feel that separate at `rate` and slip at `slip` [m/s].
+
+    Args:
+        law: Parameters.
+        points: The points.
+        rate: v_n, shape (n,).
+        slip: u [W], shape (n, 3).
+        softness: Multiplies v_s, for a solver on its way.
+    """
+    v_s = law.v_s * softness
+    p, p_slope = pressure(law, points, rate, v_s)
+    light = law.p_0 / (p + law.p_0)
+    bound, bound_slope = law.mu * (1 - law.phi * (1 - light)) * p, law.mu * (1 - law.phi * (1 - light**2))
+    speed = np.linalg.norm(slip, axis=1)
+    slow = np.maximum(speed, v_s)
+    c = slip / slow[:, None]
+    along = np.where(speed > v_s, 1, 0)[:, None, None] * c[:, :, None] * c[:, None]
+    return Traction(
+        p=p,
+        f=-bound[:, None] * c,
+        p_slope=p_slope,
+        f_slope=-(bound_slope * p_slope)[:, None] * c,
+        f_matrix=-(bound / slow)[:, None, None] * (np.eye(3) - along),
+    )
+
+
+def pressure(law, points, rate, v_s):
+    """p [Pa] at separating speeds v_n, and ∂p/∂v_n."""
+    rho = (1 - law.e**2) / (1 + law.e**2) if law.compliant else 1.0
+    sigma = min(law.sigma, rho)
+    deep = np.maximum(points.depth, 0)
+    v_e = np.maximum(law.v_e, np.sqrt(law.gravity * deep) / 5)
+    x = rate / v_e
+    saturation = x / np.sqrt(1 + x**2) if law.compliant else np.clip(x, -1, 1)
+    saturation_slope = (1 + x**2) ** -1.5 if law.compliant else np.where(np.abs(x) < 1, 1, 0)
+    c, c_slope = rate / np.maximum(np.abs(rate), v_s), np.where(np.abs(rate) < v_s, 1 / v_s, 0)
+    D = deep * ((rho - sigma) * saturation + sigma * c)
+    D_slope = deep * ((rho - sigma) * saturation_slope / v_e + sigma * c_slope)
+    implicit = np.abs(D) <= np.abs(law.theta * law.h * rate)
+    left = points.depth - np.where(implicit, law.theta * law.h * rate, D)
+    p = law.k * np.maximum(left, 0)
+    slope = -law.k * (left > 0) * np.where(implicit, law.theta * law.h, D_slope)
+
+    rebound = -law.e * (points.rate - np.sum(points.normal * points.drift, axis=1))
+    goal = np.where(rebound > law.slowest_rebound, law.h * rebound, np.minimum(points.depth, 0))
+    blow = points.impact * np.maximum(goal - law.h * rate, 0)
+    hit = points.impact > 0
+    return np.where(hit, blow, p), np.where(hit, -points.impact * law.h * (blow > 0), slope)
+
+
+class Wrench(NamedTuple):
+    """What the points of a side do; `twist` is (u, w): see `relative`.
+
+    Attributes:
+        first: Force [N] and moment about its centre of mass [N m] on the first body [W], shape (6,).
+        second: On the second body.
+        slope: ∂(first)/∂(twist), shape (6, 6).
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    slope: np.ndarray
+
+
+def wrench(points, velocities, softness=1.0):
+    """What points do at velocities and spins of all bodies [m/s, rad/s; W], shape (n, 6)."""
+    away, n, A = points.com_difference, points.normal, points.area[:, None]
+    u, w = np.split(relative(points) @ velocities[[points.first, points.second]].ravel(), 2)
+    rate = n @ u + points.moment @ w
+    full = u + points.drift - points.arm @ cross_matrix(w)  # u + w × r
+    slip = full - np.sum(full * n, axis=1, keepdims=True) * n
+    found = traction(points.law, points, rate, slip, softness)
+    press = np.concatenate([n, points.moment], axis=1)  # what a unit pressure does, and ∂v_n/∂(twist)
+    # What friction does: force and moment of each direction, (n, 6, 3). Its transpose is ∂(full)/∂(twist).
+    arms = np.array([cross_matrix(r) for r in points.arm]).reshape(-1, 3, 3)
+    rub = np.concatenate([np.broadcast_to(np.eye(3), arms.shape), arms], axis=1)
+    first = press.T @ (A[:, 0] * found.p) + np.sum(rub @ (A * found.f)[:, :, None], axis=0)[:, 0]
+    slope = press.T @ (A * press * found.p_slope[:, None])
+    slope += np.sum(rub @ (A * found.f_slope)[:, :, None] * press[:, None], axis=0)
+    grips = rub @ (A[:, :, None] * found.f_matrix) @ (np.eye(3) - n[:, :, None] * n[:, None])
+    slope += np.sum(grips @ rub.transpose(0, 2, 1), axis=0)
+    return Wrench(first, -np.r_[first[:3], first[3:] + np.cross(away, first[:3])], slope)
+
+
+def relative(points):
+    """From velocities and spins of both bodies, (12,), to those of the first relative to the second, (6,).
+
+    u is the velocity of the first centre of mass against the second body as a rigid frame, w the spin.
+    """
+    eye, zero = np.eye(3), np.zeros((3, 3))
+    return np.block([[eye, zero, -eye, cross_matrix(points.com_difference)], [zero, eye, zero, -eye]])
