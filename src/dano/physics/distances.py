@@ -28,6 +28,8 @@ _GRID = wp.constant(GRID)
 vec2 = wp.types.vector(length=2, dtype=real)
 # Of the search for the closest point of an ellipsoid: halvings of its bracket, then steps of Newton's method.
 _BISECTIONS, _STEPS = wp.constant(5), wp.constant(7)
+# Worked out here: quotients of literals in a kernel have 32 bits.
+_TWO_THIRDS = wp.constant(real(2.0 / 3.0))
 # Points closer to a symmetry plane than this share of a semi-axis count as there: 4 times the rounding.
 _OFF_PLANE = wp.constant(real(9e-16))
 
@@ -317,11 +319,10 @@ def quadratic_slopes(f: real) -> vec3:
 def cubic_weights(f: real) -> vec4:
     """Weights of four nodes for a place f in [0, 1] from the second one (B-spline of degree 3)."""
     g = ONE - f
-    third = TWO / real(3.0)
     return vec4(
         g * g * g / real(6.0),
-        third - f * f * (ONE - HALF * f),
-        third - g * g * (ONE - HALF * g),
+        _TWO_THIRDS - f * f * (ONE - HALF * f),
+        _TWO_THIRDS - g * g * (ONE - HALF * g),
         f * f * f / real(6.0),
     )
 
@@ -376,38 +377,23 @@ def first_node(u: real, nodes: int, degree: int) -> int:
 
 
 @wp.func
-def grid_distance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec3) -> Distance:
-    """The spline of a grid, and beyond its border the way to it besides."""
+def grid_spline(solids: Solids, world: int, kind: LeafKind, place: vec3) -> Distance:
+    """The spline of a grid and its gradient per cell, at a place in cells from the first node inside its border.
+
+    The place is no further beyond the outermost nodes than these reach.
+    """
     degree = kind.degree
     border = degree + 1
-    u = vec3(
-        (y[0] - leaf.sizes[0]) / leaf.spacing[0],
-        (y[1] - leaf.sizes[1]) / leaf.spacing[1],
-        (y[2] - leaf.sizes[2]) / leaf.spacing[2],
-    )
-    last = vec3(
-        real(kind.nodes_x - 2 * border - 1),
-        real(kind.nodes_y - 2 * border - 1),
-        real(kind.nodes_z - 2 * border - 1),
-    )
-    closest = vec3(
-        wp.min(wp.max(u[0], ZERO), last[0]),
-        wp.min(wp.max(u[1], ZERO), last[1]),
-        wp.min(wp.max(u[2], ZERO), last[2]),
-    )
-    away = wp.cw_mul(u - closest, leaf.spacing)
-    first_x = first_node(closest[0], kind.nodes_x, degree)
-    first_y = first_node(closest[1], kind.nodes_y, degree)
-    first_z = first_node(closest[2], kind.nodes_z, degree)
+    first_x = first_node(place[0], kind.nodes_x, degree)
+    first_y = first_node(place[1], kind.nodes_y, degree)
+    first_z = first_node(place[2], kind.nodes_z, degree)
     stride_y = kind.nodes_z
     stride_x = kind.nodes_y * stride_y
     base = kind.first + first_x * stride_x + first_y * stride_y + first_z
     # The node from which a place in the stencil is measured: the first, or the second of more than two.
     origin = wp.where(degree == 1, 0, 1) - border
     f = vec3(
-        closest[0] - real(first_x + origin),
-        closest[1] - real(first_y + origin),
-        closest[2] - real(first_z + origin),
+        place[0] - real(first_x + origin), place[1] - real(first_y + origin), place[2] - real(first_z + origin)
     )
     d = Distance()
     if wp.static(1 in DEGREES):
@@ -431,6 +417,27 @@ def grid_distance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec
                 cubic_weights(f[0]), cubic_weights(f[1]), cubic_weights(f[2]),
                 cubic_slopes(f[0]), cubic_slopes(f[1]), cubic_slopes(f[2]),
             )  # fmt: skip
+    return d
+
+
+@wp.func
+def grid_distance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec3) -> Distance:
+    """The spline of a grid, and beyond its border the way to it besides."""
+    degree = kind.degree
+    border = degree + 1
+    u = vec3(
+        (y[0] - leaf.sizes[0]) / leaf.spacing[0],
+        (y[1] - leaf.sizes[1]) / leaf.spacing[1],
+        (y[2] - leaf.sizes[2]) / leaf.spacing[2],
+    )
+    last = vec3(
+        real(kind.nodes_x - 2 * border - 1), real(kind.nodes_y - 2 * border - 1), real(kind.nodes_z - 2 * border - 1)
+    )
+    closest = vec3(
+        wp.min(wp.max(u[0], ZERO), last[0]), wp.min(wp.max(u[1], ZERO), last[1]), wp.min(wp.max(u[2], ZERO), last[2])
+    )
+    away = wp.cw_mul(u - closest, leaf.spacing)
+    d = grid_spline(solids, world, kind, closest)
     # Moving along an axis on which the point lies outside leaves the closest point where it is.
     beyond = wp.sqrt(wp.dot(away, away))
     inverse = inverse_or_zero(beyond)

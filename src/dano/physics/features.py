@@ -4,12 +4,16 @@ These are the values of a build that knows everything. `dano.engine` builds kern
 that it needs (see `dano.engine.launching._instances`), which compiles and runs several times as fast.
 """
 
-KINDS = frozenset(range(7))
-"""Kinds of leaves of solids, see `distances`."""
+KINDS = frozenset(range(8))
+"""Kinds of leaves of solids, see `distances`, and of densities, see `overlap`."""
 DEGREES = frozenset({1, 2, 3})
-"""Degrees of the splines of sampled distances."""
+"""Degrees of the splines of sampled distances and densities."""
 UNIONS = True
-"""Whether a solid has several leaves."""
+"""Whether a solid has several leaves, or a density several parts."""
+POINTS = True
+"""Whether there are contacts with a point law."""
+PATCHES = True
+"""Whether there are contacts with a patch law."""
 TURNING = frozenset({0, 1, 2})
 """How samples turn with their bodies, see `pairs`."""
 TREES = True

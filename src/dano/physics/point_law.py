@@ -14,6 +14,7 @@ form.
 
 import warp as wp
 
+from dano.physics.friction import Friction, friction, friction_with_dual, following_friction
 from dano.physics.real import ONE, real, vec3, ZERO
 from dano.physics.samples import Point
 
@@ -279,7 +280,7 @@ def traction(law: PointLaw, point: Point, velocity: vec3, spin: vec3) -> vec3:
     slip = motion.slip + point.extra_slip
     p = pressure(law, motion.rate, ZERO, law.stiction).value
     bound = friction_bound(law, p)
-    return p * point.normal - (bound.value / wp.max(wp.length(slip), law.stiction)) * slip
+    return p * point.normal + friction(slip, bound.value, law.stiction)
 
 
 @wp.func
@@ -289,7 +290,7 @@ def fitting_duals(law: PointLaw, motion: Motion) -> Duals:
     duals.direction = motion.rate / wp.max(wp.abs(motion.rate), law.stiction)
     p = pressure(law, motion.rate, duals.direction, law.stiction).value
     bound = friction_bound(law, p)
-    duals.friction = (-bound.value / wp.max(wp.length(motion.slip), law.stiction)) * motion.slip
+    duals.friction = friction(motion.slip, bound.value, law.stiction)
     return duals
 
 
@@ -319,19 +320,13 @@ def linearized(
         found.held = held + mix * (limit - held)
         limit = found.held
         marginal = ZERO
-    speed = wp.length(motion.slip)
-    inverse_slow = ONE / wp.max(speed, stiction)
-    size = wp.length(duals.friction)
-    found.friction = duals.friction
-    if size > limit:
-        found.friction = (limit / size) * duals.friction
-    gain = inverse_slow * motion.slip
-    found.friction_change = -found.friction - limit * gain
-    found.grip = limit * inverse_slow
-    if speed > stiction:
-        found.turning = inverse_slow * found.friction
-        found.slip_direction = gain
-    found.by_pressure = (marginal * found.pressure.damping) * gain
+    own = friction_with_dual(motion.slip, duals.friction, limit, marginal * found.pressure.damping, stiction)
+    found.friction = own.value
+    found.friction_change = own.change
+    found.grip = own.grip
+    found.turning = own.turning
+    found.slip_direction = own.direction
+    found.by_pressure = own.by_rate
     return found
 
 
@@ -339,13 +334,14 @@ def linearized(
 def following_duals(found: Linear, duals: Duals, change: Motion) -> Duals:
     """The duals after the motion changed, from the linearisation before."""
     after = Duals()
-    after.friction = (
-        found.friction
-        + found.friction_change
-        + change.rate * found.by_pressure
-        - found.grip * change.slip
-        - wp.dot(found.slip_direction, change.slip) * found.turning
-    )
+    own = Friction()
+    own.value = found.friction
+    own.change = found.friction_change
+    own.by_rate = found.by_pressure
+    own.grip = found.grip
+    own.turning = found.turning
+    own.direction = found.slip_direction
+    after.friction = following_friction(own, change.rate, change.slip)
     s = duals.direction + found.pressure.direction_change + found.pressure.direction_by_speed * change.rate
     after.direction = wp.clamp(s, -ONE, ONE)
     return after

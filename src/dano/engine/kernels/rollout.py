@@ -4,6 +4,7 @@ import warp as wp
 
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import find_pattern
+from dano.engine.kernels.patches import find_patches
 from dano.engine.kernels.search import find_contacts, fix_laws
 from dano.engine.kernels.solve import Options, solve, Solved
 from dano.engine.kernels.tables import Push, Room, Scene, StateRow, StepReport
@@ -17,7 +18,7 @@ from dano.engine.kernels.trees.kinematics import (
     unknown_of,
 )
 from dano.engine.kernels.trees.loops import begin_loops, forces_of
-from dano.physics.features import LANES, LOOPS, TREES
+from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
 from dano.physics.joints import ROOT
 from dano.physics.momentum import angular_momentum, turned_inertia
 from dano.physics.pairs import BodyState
@@ -284,10 +285,16 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                 begin_step_of_trees(scene, room, world, launch, t)
             wait()
             size = wp.max(size, room.trees.sizes[world, 0])
-        n_found, overflow = find_contacts(scene, room, world, lane)
+        n_found = int(0)
+        overflow = bool(False)
+        if wp.static(POINTS):
+            n_found, overflow = find_contacts(scene, room, world, lane)
+        n_near = n_found
+        if wp.static(PATCHES):
+            n_near = find_patches(scene, room, world, lane, n_found)
         wait()
         if lane == 0:
-            find_pattern(scene, room, world, n_found)
+            find_pattern(scene, room, world, n_near)
         hits = bool(False)
         for f in range(n_found):
             hits = hits or room.found[world, f * _LANES + lane].impact_stiffness > ZERO
@@ -299,7 +306,8 @@ def rollout(scene: Scene, room: Room, launch: Launch):
         rebound = real(1.0)
         while again:
             rebound = ONE - real(attempt) / real(_REBOUNDS)
-            fix_laws(scene, room, world, lane, n_found, rebound)
+            if wp.static(POINTS):
+                fix_laws(scene, room, world, lane, n_found, rebound)
             wait()
             solved = solve(scene, room, world, lane, n_found, size, launch.options)
             again = False

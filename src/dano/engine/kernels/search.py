@@ -398,7 +398,7 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
     end = at + per_lane
     n_found = int(0)
     overflow = bool(False)
-    for p in range(scene.pair_index.shape[0]):
+    for p in range(scene.pairs.shape[1]):
         pair = scene.pairs[world, p]
         index = scene.pair_index[p]
         a = room.bodies[world, index.first]

@@ -21,6 +21,7 @@ import warp as wp
 from dano.engine.kernels.assembly import assemble, fit_duals, follow_duals, Trial
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
+from dano.engine.kernels.patches import add_patches, any_sticks, fit_patch_duals, follow_patch_duals
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.balance import (
     add_tree_slopes,
@@ -33,7 +34,7 @@ from dano.engine.kernels.trees.balance import (
     same_mode,
     solve_trees,
 )
-from dano.physics.features import LOOPS, TREES
+from dano.physics.features import LOOPS, PATCHES, POINTS, TREES
 from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec6, ZERO
 
 LEVELS = 11
@@ -307,18 +308,29 @@ def solve(
             room.step[world, i] = vec6()
         if wp.static(TREES):
             fit_joint_duals(scene, room, world)
-    fit_duals(scene, room, world, lane, n_found)
+    if wp.static(POINTS):
+        fit_duals(scene, room, world, lane, n_found)
+    n_near = n_found
+    if wp.static(PATCHES):
+        n_near += room.patches.count[world, 0]
+        fit_patch_duals(scene, room, world, lane, n_found)
     found = Solved()
     search = begin_search(ZERO)
     number = int(0)
     level = level_of(0)
     budget = level.budget
     if wp.static(TREES):
-        if n_found == 0:
+        if n_near == 0:
             # Without contact nothing cycles but joints, which a line search stops.
             number = 1
             level.searches = True
             budget = options.max_passes
+    if wp.static(PATCHES):
+        if n_found == 0 and n_near > 0:
+            if not any_sticks(scene, room, world, n_found):
+                # Smooth friction is a function: whole steps know no more than a line search.
+                number = 1
+                level.searches = True
     mix = real(0.0)
     share = real(1.0)
     before = real(INFINITY)
@@ -338,6 +350,8 @@ def solve(
         trial.holds = level.holds
         trial.mix = mix
         fit = assemble(scene, room, world, lane, n_found, trial)
+        if wp.static(PATCHES):
+            fit = add_patches(scene, room, world, lane, n_found, trial, fit)
         wait()
         if wp.static(TREES):
             # A root needs no derivative, a first step only the mass. Close to a root the derivative of the
@@ -345,7 +359,7 @@ def solve(
             # residual smaller. Trees that loops close are solved by blocks, which every pass has to fill.
             needs = True
             if wp.static(not LOOPS):
-                if n_found == 0:
+                if n_near == 0:
                     missed = largest_error(scene, room, world)
                     enough = options.tolerance * (ONE + size)
                     close = TWO * missed * missed <= enough * before and search.length == ONE
@@ -402,7 +416,7 @@ def solve(
                 for i in range(m):
                     room.velocity[world, i] = room.tried[world, i]
             if wp.static(TREES):
-                if n_found == 0 and found.converged and seen.error > _EXACT * options.rounding * (ONE + size):
+                if n_near == 0 and found.converged and seen.error > _EXACT * options.rounding * (ONE + size):
                     # A last step, not looked at, takes what is left to rounding.
                     finishes = True
                     keeps = not needs
@@ -413,7 +427,10 @@ def solve(
                     if wp.static(TREES):
                         follow_joint_duals(scene, room, world, search.length, part)
                 wait()
-                follow_duals(scene, room, world, lane, n_found, search.length)
+                if wp.static(POINTS):
+                    follow_duals(scene, room, world, lane, n_found, search.length)
+                if wp.static(PATCHES):
+                    follow_patch_duals(scene, room, world, lane, n_found)
                 # The next pass is no longer of the same function where bounds are renewed: it is accepted.
                 begun = real(0.0)
                 if mix == ZERO:

@@ -6,6 +6,7 @@ whose fields stand in the order of the row; whole numbers are the same for all w
 
 import warp as wp
 
+from dano.engine.kernels.patch_tables import PatchRoom, PatchTables
 from dano.engine.kernels.trees.tables import TreeRoom, Trees
 from dano.physics.distances import Leaf, Solids
 from dano.physics.joint_laws import JointLaw
@@ -109,10 +110,12 @@ class Scene:
         probes: Points that say how deep a body is [m, F].
         solids: What samples press on.
         pairs: Shape (worlds, pairs).
-        pair_index: Shape (pairs,).
+        pair_index: Shape (pairs + contacts with a patch law,): bodies and contact of each pair with samples
+            that press, then of each contact with a patch law, numbered among these.
         materials: Of the contacts with point laws, shape (worlds, contacts).
         gravity: [m/s²], shape (worlds, 1).
         timestep: h [s], shape (worlds, 1).
+        patches: Contacts with a patch law.
         trees: Bodies on joints.
     """
 
@@ -130,6 +133,7 @@ class Scene:
     materials: wp.array2d(dtype=Material)
     gravity: wp.array2d(dtype=vec3)
     timestep: wp.array2d(dtype=real)
+    patches: PatchTables
     trees: Trees
 
 
@@ -212,7 +216,8 @@ class Room:
         bodies: State of each body at the start of the step.
         momentum: That each moving body has before contact [kg m/s; kg m²/s, W].
         inertia: Of each moving body [kg m², W].
-        found: Pairs that are near, shape (worlds, pairs · lanes).
+        found: Pairs that are near, then those whose patches touch, shape (worlds, pairs · lanes) for all rows of
+            `Scene.pair_index`.
         where: Of each point where it was found, shape (worlds, capacity).
         points: The points.
         laws: Their constants.
@@ -233,6 +238,7 @@ class Room:
         step: Of Newton's method.
         residual: What each block misses [kg m/s; kg m²/s, W].
         scale: Turns momenta into velocities [1/kg; 1/(kg m²)].
+        patches: Contacts with a patch law.
         trees: Room for bodies on joints.
         state_bar: Derivatives by the states at the start of a step.
         after_bar: By those at its end.
@@ -264,6 +270,7 @@ class Room:
     step: wp.array2d(dtype=vec6)
     residual: wp.array2d(dtype=vec6)
     scale: wp.array2d(dtype=vec6)
+    patches: PatchRoom
     trees: TreeRoom
     state_bar: wp.array2d(dtype=StateRow)
     after_bar: wp.array2d(dtype=StateRow)

@@ -157,6 +157,7 @@ def features_of(scene: Scene, pairs: Sequence[tuple[int, int, int]]) -> Features
         DEGREES=of_grids if 6 in known else frozenset(),
         TURNING=_STILL if turning <= _STILL else _TURNS,
         UNIONS=unions,
+        PATCHES=False,
         TREES=bool(scene.joints),
         LOOPS=bool(scene.loops),
     )

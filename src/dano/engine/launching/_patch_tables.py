@@ -1,0 +1,405 @@
+"""Contacts with a patch law as rows of numbers, as kernels read them (`dano.engine.kernels.patch_tables`).
+
+Real numbers come from JAX and can be differentiated; whole numbers are found on the host.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, DTypeLike, Float
+
+from dano.contact import AbstractPatchLaw, CentroidLaw, Collider, ContactParams, SampleSet, Support
+from dano.fields import (
+    AbstractField,
+    AbstractShape,
+    Box,
+    Capsule,
+    Cylinder,
+    degree_of,
+    Ellipsoid,
+    GridField,
+    HalfSpace,
+    PosedField,
+    PosedShape,
+    ScaledField,
+    ScaledShape,
+    SignedDistanceGrid,
+    Sphere,
+    UnionField,
+    UnionShape,
+)
+from dano.maths import Pose
+from dano.scene import colliders, Scene, State
+
+# Samples of a block, blocks of a run: see `dano.engine.kernels.tables`.
+_BLOCK, _RUN = 16, 4
+# Kinds of leaves in `dano.physics.distances` and `overlap`, and what a leaf holds besides its pose.
+_KINDS: dict[type, tuple[int, Any]] = {
+    HalfSpace: (0, lambda s: {"sizes": s.normal_direction, "length": s.offset}),
+    Sphere: (1, lambda s: {"sizes": jnp.stack([s.radius, 0 * s.radius, 0 * s.radius])}),
+    Box: (2, lambda s: {"sizes": s.half_extents, "length": s.rounding}),
+    Capsule: (3, lambda s: {"sizes": jnp.stack([s.radius, s.half_length, 0 * s.radius])}),
+    Cylinder: (4, lambda s: {"sizes": jnp.stack([s.radius, s.half_length, 0 * s.radius])}),
+    Ellipsoid: (5, lambda s: {"sizes": s.semi_axes}),
+    SignedDistanceGrid: (6, lambda s: {"sizes": s.origin, "spacing": s.spacing}),
+    GridField: (7, lambda s: {"sizes": s.origin, "spacing": s.spacing}),
+}
+# Shapes with an outward direction of their own; that of others is the gradient of their distance.
+_OWN_DIRECTION = (Sphere, Capsule, Ellipsoid)
+
+
+class PatchPair(NamedTuple):
+    """A contact with a patch law.
+
+    Attributes:
+        first: Index of the body that the wrench acts on.
+        second: Index of the other body.
+        a: The first body; its pose is not read.
+        b: The second body.
+        params: Parameters of the law.
+        law: The law.
+    """
+
+    first: int
+    second: int
+    a: Collider
+    b: Collider
+    params: ContactParams
+    law: AbstractPatchLaw
+
+
+class PatchTables(NamedTuple):
+    """Contacts with a patch law for kernels.
+
+    Attributes:
+        rows: Real numbers by place in a kernel's parameters.
+        whole: Whole numbers by place.
+        leaves: Rows of leaves for `scene.solids.leaves`, behind those that stand there already.
+        leaf_kinds: Rows for `scene.solids.kinds`.
+        coefficients: For `scene.solids.coefficients`.
+        pair_index: Rows for `scene.pair_index`, behind those of pairs with samples that press.
+        kinds: Kinds of leaves (`dano.physics.features`).
+        degrees: Degrees of splines.
+        unions: Whether a field has several parts, or a part several leaves.
+    """
+
+    rows: dict[str, Array]
+    whole: dict[str, np.ndarray]
+    leaves: Float[Array, "leaves 20"]
+    leaf_kinds: np.ndarray
+    coefficients: Float[Array, " coefficients"]
+    pair_index: np.ndarray
+    kinds: frozenset[int]
+    degrees: frozenset[int]
+    unions: bool
+
+
+class _Placed(NamedTuple):
+    """A field in a frame: x = s R y + p for y in its own."""
+
+    field: AbstractField
+    factor: Array
+    position: Float[Array, "3"]
+    rotation: Float[Array, "3 3"]
+
+    def inside(
+        self, field: AbstractField, pose: Pose | None = None, factor: Array | None = None
+    ) -> "_Placed":
+        """What the field is made of."""
+        dtype, position, rotation, size = self.factor.dtype, self.position, self.rotation, self.factor
+        if factor is not None:
+            size = size * factor.astype(dtype)
+        if pose is not None:
+            position = position + size * (rotation @ pose.position.astype(dtype))
+            rotation = rotation @ pose.matrix.astype(dtype)
+        return _Placed(field, size, position, rotation)
+
+
+class _Part(NamedTuple):
+    """A part of a field: its leaves, edge width, whether its direction is the distance's gradient, map."""
+
+    leaves: list[_Placed]
+    edge: Array
+    by_gradient: bool
+    support: Support | None
+
+
+def patch_pairs(scene: Scene) -> list[PatchPair]:
+    """The contacts of a scene that have a patch law.
+
+    Raises:
+        ValueError: If kernels do not know one of the laws.
+    """
+    n = len(scene.bodies)
+    dtype = scene.timestep.dtype
+    unturned = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0], dtype), (n, 1))
+    still = State(jnp.zeros((n, 3), dtype), unturned, jnp.zeros((n, 3), dtype), jnp.zeros((n, 3), dtype))
+    rotations = [jnp.eye(3, dtype=dtype)] * n
+    found = []
+    for contact in scene.contacts:
+        if isinstance(contact.law, AbstractPatchLaw):
+            a, b = colliders(scene.bodies, contact, still, rotations)
+            first, second = scene.index(contact.a), scene.index(contact.b)
+            found.append(PatchPair(first, second, a, b, contact.params, contact.law))
+    return found
+
+
+def patch_tables(
+    pairs: Sequence[PatchPair],
+    dtype: DTypeLike,
+    *,
+    n_pairs: int = 0,
+    n_leaves: int = 0,
+    n_coefficients: int = 0,
+) -> PatchTables:
+    """Tables of contacts.
+
+    Args:
+        pairs: The contacts.
+        dtype: Of real numbers.
+        n_pairs: Rows of `scene.pair_index` that stand before those of the contacts.
+        n_leaves: Leaves that stand before those of fields.
+        n_coefficients: Spline coefficients that do.
+
+    Raises:
+        ValueError: If kernels do not know a law or a field, or a pair has nothing to sum over.
+    """
+    samples, fields = _Samples(dtype), _Fields(dtype, n_leaves, n_coefficients)
+    contacts, materials, sides, side_index, index = [], [], [], [], []
+    for k, pair in enumerate(pairs):
+        own = _sides(pair, samples, fields)
+        law = _known(pair.law)
+        contacts.append((pair.first, pair.second, n_pairs + k, len(sides), len(own), int(law.adhesive)))
+        materials.append(law.numbers(pair.params).astype(dtype))
+        sides += [row for row, _ in own]
+        side_index += [row for _, row in own]
+        index.append((pair.first, pair.second, k))
+    rows = {
+        "scene.patches.materials": jnp.stack(materials) if materials else jnp.zeros((0, 11), dtype),
+        "scene.patches.sides": jnp.stack(sides) if sides else jnp.zeros((0, 5), dtype),
+        **samples.rows(),
+        **fields.rows(),
+    }
+    whole = {
+        "scene.patches.contacts": _integers(contacts, 6),
+        "scene.patches.side_index": _integers(side_index, 7),
+        "scene.patches.fields.kinds": _integers(fields.kinds, 6),
+    }
+    return PatchTables(
+        rows,
+        whole,
+        jnp.stack(fields.leaves) if fields.leaves else jnp.zeros((0, 20), dtype),
+        _integers(fields.leaf_kinds, 6),
+        jnp.concatenate([x.ravel().astype(dtype) for x in fields.coefficients] or [jnp.zeros(0, dtype)]),
+        _integers(index, 3),
+        frozenset(row[0] for row in fields.leaf_kinds),
+        frozenset(row[5] for row in fields.leaf_kinds if row[5] > 0),
+        fields.unions,
+    )
+
+
+def _known(law: AbstractPatchLaw) -> CentroidLaw:
+    if type(law) is not CentroidLaw:
+        raise ValueError(
+            f"law must be CentroidLaw, the only patch law that kernels know, got {type(law).__name__}"
+        )
+    return law
+
+
+def _integers(rows: Sequence[Sequence[int]], width: int) -> np.ndarray:
+    return np.array(rows, np.int32).reshape(-1, width)
+
+
+def _sides(pair: PatchPair, samples: "_Samples", fields: "_Fields"):
+    """Real and whole numbers of the sides of a contact."""
+    bodies = ((pair.first, pair.a), (pair.second, pair.b))
+    found = []
+    for (i, sampled), (j, queried) in (bodies, bodies[::-1]):
+        if isinstance(sampled.field, Sphere) and isinstance(queried.field, HalfSpace):
+            ball = fields.leaf(_still(sampled.field, fields.dtype))
+            row = jnp.zeros(5, fields.dtype)
+            return [(row, (i, j, 0, 0, *fields.place(queried.field, None), ball))]
+        if sampled.samples is not None and queried.field is not None:
+            middle, radius = samples.ball(sampled.samples)
+            scale = queried.density_scale.astype(fields.dtype)
+            row = jnp.concatenate([scale[None], middle, radius[None]])
+            place = fields.place(queried.field, queried.support)
+            found.append((row, (i, j, *samples.place(sampled.samples), *place, -1)))
+    if not found:
+        raise ValueError(
+            "overlap needs contact samples on one side and a density field on the other, got "
+            f"a: samples={pair.a.samples is not None}, field={pair.a.field is not None}; "
+            f"b: samples={pair.b.samples is not None}, field={pair.b.field is not None}"
+        )
+    return found
+
+
+class _Samples:
+    """Weighted samples of all bodies, in blocks; a set that several contacts use stands once."""
+
+    def __init__(self, dtype: DTypeLike):
+        self.dtype = dtype
+        self._sets: list[SampleSet] = []
+        self._places: dict[int, tuple[int, int]] = {}
+        self._blocks = 0
+
+    def place(self, samples: SampleSet) -> tuple[int, int]:
+        """First block of a set, and number of its blocks."""
+        key = id(samples.points)
+        if key not in self._places:
+            n = samples.radii.shape[0]
+            self._places[key] = self._blocks, n
+            self._sets.append(samples)
+            self._blocks += n
+        return self._places[key]
+
+    def ball(self, samples: SampleSet) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+        """Middle and radius of a ball around a set."""
+        points = samples.points[:3].astype(self.dtype)
+        middle = 0.5 * (jnp.min(points, axis=1) + jnp.max(points, axis=1))
+        return middle, jnp.sqrt(jnp.max(jnp.sum((points - middle[:, None]) ** 2, axis=0)))
+
+    def rows(self) -> dict[str, Array]:
+        """Their rows."""
+        joined = [jnp.concatenate([s.points[:3], s.weights[None]]).T.astype(self.dtype) for s in self._sets]
+        balls = [
+            jnp.concatenate([s.centers, s.radii[:, None]], axis=1).astype(self.dtype) for s in self._sets
+        ]
+        none = jnp.zeros((0, 4), self.dtype)
+        return {
+            "scene.patches.samples": jnp.concatenate([*joined, none]),
+            "scene.patches.balls": jnp.concatenate([*balls, none]),
+            "scene.patches.runs": jnp.concatenate([*map(_runs, balls), none]),
+        }
+
+
+def _runs(balls: Float[Array, "b 4"]) -> Float[Array, "b 4"]:
+    """Balls around each block of a body and those after it."""
+    n = balls.shape[0]
+    members = np.minimum(np.arange(n)[:, None] + np.arange(_RUN)[None], n - 1)
+    centers, radii = balls[members, :3], balls[members, 3]
+    middle = jnp.mean(centers, axis=1)
+    reach = jnp.sqrt(jnp.sum((centers - middle[:, None]) ** 2, axis=2)) + radii
+    return jnp.concatenate([middle, jnp.max(reach, axis=1, keepdims=True)], axis=1)
+
+
+class _Fields:
+    """Parts and leaves of all fields; a field that several contacts ask stands once."""
+
+    def __init__(self, dtype: DTypeLike, n_leaves: int, n_coefficients: int):
+        self.dtype = dtype
+        self._first_leaf, self._n_coefficients = n_leaves, n_coefficients
+        self._places: dict[int, tuple[int, int]] = {}
+        self._kept: list[AbstractField] = []
+        self._parts: list[Array] = []
+        self._distances: list[Array] = []
+        self._n_distances = 0
+        self.kinds: list[tuple[int, ...]] = []
+        self.leaves: list[Array] = []
+        self.leaf_kinds: list[tuple[int, ...]] = []
+        self.coefficients: list[Array] = []
+        self.unions = False
+
+    def place(self, field: AbstractField, support: Support | None) -> tuple[int, int]:
+        """First part of a field, and number of its parts."""
+        if id(field) not in self._places:
+            parts = _parts_of(_still(field, self.dtype), support)
+            self._places[id(field)] = len(self.kinds), len(parts)
+            # As long as it is kept, no other object has its identity.
+            self._kept.append(field)
+            self.unions = self.unions or len(parts) > 1
+            for part in parts:
+                self._add(part)
+        return self._places[id(field)]
+
+    def _add(self, part: _Part) -> None:
+        first = [self.leaf(leaf) for leaf in part.leaves][0]
+        self.unions = self.unions or len(part.leaves) > 1
+        map_row, nodes = jnp.zeros(9, self.dtype), (0, 0, 0)
+        if part.support is not None:
+            distance, origin, spacing = part.support.distance, part.support.origin, part.support.spacing
+            nodes = distance.shape
+            # No point is further from its nearest node than half a cell's diagonal. Where a node is away from
+            # what is positive, nothing is around it, however near what is positive may be.
+            bounds = distance - 0.5 * jnp.sqrt(jnp.sum(spacing**2))
+            bounds = jnp.where(distance > 0, jnp.maximum(bounds, jnp.finfo(bounds.dtype).tiny), bounds)
+            self._distances.append(bounds.ravel().astype(self.dtype))
+            extent = (jnp.array(nodes, spacing.dtype) - 1) * spacing
+            map_row = jnp.concatenate([origin, extent, 1 / spacing]).astype(self.dtype)
+        self.kinds.append((first, len(part.leaves), int(part.by_gradient), self._n_distances, *nodes[1:]))
+        self._n_distances += int(np.prod(nodes))
+        self._parts.append(jnp.concatenate([part.edge.astype(self.dtype)[None], map_row]))
+
+    def leaf(self, placed: _Placed) -> int:
+        """Index of a new leaf."""
+        number, own = _KINDS[type(placed.field)]
+        zero = {"sizes": jnp.zeros(3), "length": jnp.zeros(()), "spacing": jnp.ones(3)}
+        numbers = {**zero, **own(placed.field)}
+        pose = [placed.factor[None], placed.position, placed.rotation.ravel()]
+        last = [numbers["sizes"], numbers["length"][None], numbers["spacing"]]
+        self.leaves.append(jnp.concatenate([x.astype(self.dtype) for x in (*pose, *last)]))
+        kind = (number, 0, 0, 0, 0, 0)
+        if isinstance(placed.field, SignedDistanceGrid | GridField):
+            coefficients = placed.field.coefficients
+            kind = (number, self._n_coefficients, *coefficients.shape, degree_of(placed.field.interpolation))
+            self.coefficients.append(coefficients)
+            self._n_coefficients += int(np.prod(coefficients.shape))
+        self.leaf_kinds.append(kind)
+        return self._first_leaf + len(self.leaves) - 1
+
+    def rows(self) -> dict[str, Array]:
+        """Their rows."""
+        distances = jnp.concatenate([*self._distances, jnp.zeros(0, self.dtype)])
+        return {
+            "scene.patches.fields.parts": (
+                jnp.stack(self._parts) if self._parts else jnp.zeros((0, 10), self.dtype)
+            ),
+            "scene.patches.fields.distances": distances[:, None],
+        }
+
+
+def _still(field: AbstractField, dtype: DTypeLike) -> _Placed:
+    return _Placed(field, jnp.ones((), dtype), jnp.zeros(3, dtype), jnp.eye(3, dtype=dtype))
+
+
+def _parts_of(placed: _Placed, support: Support | None) -> list[_Part]:
+    """The parts of a field, the densest of which counts."""
+    field = placed.field
+    if isinstance(field, PosedField):
+        return _parts_of(placed.inside(field.field, pose=field.pose), support)
+    if isinstance(field, ScaledField):
+        return _parts_of(placed.inside(field.field, factor=field.factor), support)
+    if isinstance(field, UnionField):
+        return [part for each in field.fields for part in _parts_of(placed.inside(each), None)]
+    if isinstance(field, GridField):
+        return [_Part([placed], jnp.zeros_like(placed.factor), True, support or Support.create(field))]
+    if isinstance(field, AbstractShape):
+        inner: AbstractShape = field
+        while isinstance(inner, PosedShape | ScaledShape):
+            inner = inner.shape
+        edge = placed.factor * field.edge_width.astype(placed.factor.dtype)
+        return [_Part(_leaves_of(placed), edge, not isinstance(inner, _OWN_DIRECTION), None)]
+    raise ValueError(
+        "field must be a grid of densities or made of shapes, posed, scaled or joined, got "
+        f"{type(field).__name__}: dano.bake(field).grid is a grid of it"
+    )
+
+
+def _leaves_of(placed: _Placed) -> list[_Placed]:
+    """The shapes that a shape is made of."""
+    shape = placed.field
+    if isinstance(shape, PosedShape):
+        return _leaves_of(placed.inside(shape.shape, pose=shape.pose))
+    if isinstance(shape, ScaledShape):
+        return _leaves_of(placed.inside(shape.shape, factor=shape.factor))
+    if isinstance(shape, UnionShape):
+        return [leaf for each in shape.shapes for leaf in _leaves_of(placed.inside(each))]
+    if type(shape) not in _KINDS:
+        known = ", ".join(kind.__name__ for kind in _KINDS if kind is not GridField)
+        raise ValueError(
+            f"shape must be one that contact knows ({known}, posed, scaled or joined), got "
+            f"{type(shape).__name__}: a SignedDistanceGrid may stand for any other"
+        )
+    return [placed]

@@ -1,0 +1,84 @@
+"""Friction as a set-valued map with a dual (docs/theory/integrator.md, "Contacts of the distributed law").
+
+    max(|u|, v_s) λ + b u = 0,   |λ| ≤ b
+
+u is a slip [m/s] or a relative spin [rad/s], λ the friction, b the largest there is and v_s a tiny stiction
+velocity. Both contact laws use it, at a point and at a patch. The dual λ is an unknown of its own.
+"""
+
+import warp as wp
+
+from dano.physics.real import ONE, real, vec3
+
+
+@wp.struct
+class Friction:
+    """Friction at a velocity u, and its derivative at a given dual, the dual eliminated.
+
+    The friction is value + change, whatever the dual, and its derivative
+
+        by_rate dv_n − grip du − turning (direction · du),
+
+    with v_n the separating speed, on which b depends. Units are those of λ: [Pa], [N] or [N m].
+
+    Attributes:
+        value: λ, projected onto |λ| ≤ b.
+        change: Change of λ that makes it fit the velocity.
+        by_rate: Over [m/s].
+        grip: Over a unit of u.
+        turning: Over a unit of u; zero where it sticks.
+        direction: û, zero where it sticks.
+    """
+
+    value: vec3
+    change: vec3
+    by_rate: vec3
+    grip: real
+    turning: vec3
+    direction: vec3
+
+
+@wp.func
+def friction_with_dual(u: vec3, dual: vec3, bound: real, bound_damping: real, stiction: real) -> Friction:
+    """Friction at a velocity, from its dual.
+
+    Args:
+        u: Slip or relative spin.
+        dual: λ.
+        bound: b.
+        bound_damping: −∂b/∂v_n.
+        stiction: v_s, softened or not.
+    """
+    found = Friction()
+    speed = wp.length(u)
+    inverse_slow = ONE / wp.max(speed, stiction)
+    size = wp.length(dual)
+    found.value = dual
+    if size > bound:
+        found.value = (bound / size) * dual
+    gain = inverse_slow * u
+    found.change = -found.value - bound * gain
+    found.grip = bound * inverse_slow
+    if speed > stiction:
+        found.turning = inverse_slow * found.value
+        found.direction = gain
+    found.by_rate = bound_damping * gain
+    return found
+
+
+@wp.func
+def following_friction(found: Friction, rate: real, u: vec3) -> vec3:
+    """The dual after v_n and u changed by so much."""
+    return (
+        found.value
+        + found.change
+        + rate * found.by_rate
+        - found.grip * u
+        - wp.dot(found.direction, u) * found.turning
+    )
+
+
+@wp.func
+def friction(u: vec3, bound: real, stiction: real) -> vec3:
+    """−b u / max(|u|, v_s): the friction, which a dual that fits is equal to."""
+    return (-bound / wp.max(wp.length(u), stiction)) * u
