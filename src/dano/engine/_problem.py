@@ -133,6 +133,8 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
     if scene.others is not None:
         groups.append((scene.others.law, scene.others.pair_params))
     if not groups:
+        if scene.joints and not scene.contacts and _has_kernels(scene):
+            return Prepared(None, None, None, 0, tables=scene_tables(scene))
         # On a CPU; a step of free bodies alone is short, and one with loops needs more than trees.
         known = scene.joints and not scene.loops and all(in_tables(contact.law) for contact in scene.contacts)
         whole = known and jax.default_backend() == "cpu"
@@ -160,10 +162,10 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
 
 
 def _has_kernels(scene: Scene) -> bool:
-    """Whether kernels make the whole step of a scene: free bodies of known shapes, with the default law."""
+    """Whether kernels make the whole step of a scene: bodies of known shapes, with the default law."""
     alone = all(isinstance(contact.law, DistributedLaw) for contact in scene.contacts)
     known = all(body.solid is None or is_known(body.solid) for body in scene.bodies)
-    return jax.default_backend() == "cpu" and alone and known and not scene.joints and not scene.loops
+    return jax.default_backend() == "cpu" and alone and known
 
 
 def check_laws(scene: Scene) -> None:
