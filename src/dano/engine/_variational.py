@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from dano.contact import AbstractPatchLaw, find, Patch, Points, Softening
+from dano.engine import _touching
 from dano.engine._balance import chunk_wrenches, contact_wrenches, to_body, to_world
 from dano.engine._kernels import native_tree_change, native_tree_step
 from dano.engine._newton import Report, SolverOptions
@@ -108,6 +109,8 @@ def touch(scene: Scene, prepared: Prepared, state: State) -> Patch:
 
     Overlap of a pair with a point law is the volume Σ A d [m³].
     """
+    if prepared.tables is not None:
+        return _touching.touch(scene, prepared.tables, prepared.capacity, state)
     found = find_patches(scene, state, tuple(quat_to_matrix(q) for q in state.orientation))
     return _in_order(scene, found, _volumes(scene, prepared, state))
 
@@ -127,6 +130,8 @@ def wrenches(
     Returns:
         One row per pair, in the order of `scene.pairs`.
     """
+    if prepared.tables is not None:
+        return _touching.wrenches(scene, prepared.tables, prepared.capacity, state, following, about)
     pairs = structure_of(scene)
     problem, _ = build_problem(scene, prepared, state, None, pairs)
     if problem.tree is None:

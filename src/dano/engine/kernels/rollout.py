@@ -27,9 +27,13 @@ from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
 from dano.physics.twists import angular_part, joined, linear_part
 
 _LANES, _ROOT = wp.constant(LANES), wp.constant(ROOT)
-# Largest share of the restitution first: Newton's restitution may add energy where friction reverses the slip
-# (Kane and Levinson 1985, Dynamics: Theory and Applications). Without rebound contact only dissipates.
-_REBOUNDS = wp.constant(10)
+REBOUNDS = 10
+"""Steps in which a share of the restitution is lowered, largest share first.
+
+Newton's restitution may add energy where friction reverses the slip (Kane and Levinson 1985, Dynamics: Theory
+and Applications). Without rebound contact only dissipates.
+"""
+_REBOUNDS = wp.constant(REBOUNDS)
 # Energy that contact may add, over what it moves between coordinates: impacts reach their goals to 1e-3.
 _ADDS = wp.constant(real(1e-3))
 # How often a step's solve may begin again.

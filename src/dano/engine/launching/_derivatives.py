@@ -51,6 +51,11 @@ def _jvp(primals, tangents, *, plan: Plan, batched, n_worlds):
     zeros = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in found]
     if not changes:
         return found, zeros
+    if plan.kernel in ("touch", "press", "listing"):
+        raise NotImplementedError(
+            "derivatives of overlaps and contact forces are not available: take those of velocities, which"
+            " change by them; see docs/gradients.md"
+        )
     if plan.kernel != "rollout":
         raise NotImplementedError(
             "second derivatives of a rollout are not available (jax.hessian, or a gradient of a gradient): "

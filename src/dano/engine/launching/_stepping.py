@@ -16,7 +16,7 @@ from dano.scene import Control, State
 
 _MODULE = "dano.engine.kernels.rollout"
 # Numbers of a body's state, of a push on it, and of what a step reports: see `dano.engine.kernels.tables`.
-_STATE, _PUSH, _REPORT, _WRENCH = 13, 6, 5, 6
+STATE, _PUSH, REPORT, WRENCH = 13, 6, 5, 6
 # Numbers of a listed point, see `dano.engine.kernels.listing`, and where each quantity begins.
 _POINT = {"first": 1, "second": 1, "contact": 1, "sample": 1, "share": 1, "impact_stiffness": 1}
 _POINT |= {"arm": 3, "normal": 3, "moment": 3, "extra_slip": 3}
@@ -45,9 +45,9 @@ def rollout(
     """
     dtype = state.position.dtype
     n = state.position.shape[0]
-    inputs = {**tables.rows, **_given(state, controls, dtype)}
+    inputs = {**tables.rows, **given(state, controls, dtype)}
     found = launch(_plan(tables, inputs, n, n_steps, capacity, options, dtype), inputs)
-    states = found["launch.states"].reshape(n_steps, n, _STATE)
+    states = found["launch.states"].reshape(n_steps, n, STATE)
     position, orientation, velocity, omega = jnp.split(states, (3, 7, 10), axis=2)
     residual, passes, solved, overflow, _ = found["launch.reports"].T
     report = Report(residual, passes.astype(int), (solved > 0) & (overflow == 0), overflow > 0)
@@ -59,8 +59,8 @@ def rollout(
     return states, jax.lax.stop_gradient(report)
 
 
-def _given(state: State, controls: Control | None, dtype) -> dict[str, Array]:
-    """What a launch is given besides a scene."""
+def given(state: State, controls: Control | None, dtype) -> dict[str, Array]:
+    """What a launch is given besides a scene: arrays by place."""
     rows = jnp.concatenate([state.position, state.orientation, state.velocity, state.omega], axis=1)
     inputs = {"launch.state": rows, "launch.pushes": jnp.zeros((0, _PUSH), dtype)}
     if state.q is not None and state.v is not None and state.q.size:
@@ -86,10 +86,10 @@ def listed_points(tables: Tables, state: State, capacity: int) -> dict[str, Arra
         Quantities of `dano.engine.kernels.listing.ListedPoint`, and "overflow": whether there were more.
     """
     n, points = state.position.shape[0], CHUNK * capacity
-    inputs = {**tables.rows, **_given(state, None, state.position.dtype)}
+    inputs = {**tables.rows, **given(state, None, state.position.dtype)}
     shapes = {name: Shape(*x.shape) for name, x in inputs.items()}
     outputs = {"listing.points": Shape(points, sum(_POINT.values())), "listing.overflow": Shape(1, 1)}
-    room, numbers = _room(tables, shapes, n, points), {"scene.n_blocks": tables.structure.n_blocks}
+    room, numbers = room_of(tables, shapes, n, points), {"scene.n_blocks": tables.structure.n_blocks}
     module = "dano.engine.kernels.listing"
     chosen = plan(module, "listing", tables.features, shapes, outputs, tables.whole.arrays, room, numbers)
     found = launch(chosen, inputs)
@@ -122,17 +122,17 @@ def _plan(
         "launch.options.max_passes": options.max_iterations,
     }
     shapes = {name: Shape(*x.shape) for name, x in inputs.items()}
-    outputs = {"launch.states": Shape(n_steps * n, _STATE), "launch.reports": Shape(n_steps, _REPORT)}
+    outputs = {"launch.states": Shape(n_steps * n, STATE), "launch.reports": Shape(n_steps, REPORT)}
     for place, name in (("launch.q", "qs"), ("launch.v", "vs")):
         if place in shapes:
             outputs[f"launch.{name}"] = Shape(n_steps * shapes[place].rows, 1)
     if len(tables.structure.loops):
-        outputs["launch.forces"] = Shape(n_steps * len(tables.structure.loops), _WRENCH)
-    room = _room(tables, shapes, n, CHUNK * capacity)
+        outputs["launch.forces"] = Shape(n_steps * len(tables.structure.loops), WRENCH)
+    room = room_of(tables, shapes, n, CHUNK * capacity)
     return plan(_MODULE, "rollout", tables.features, shapes, outputs, tables.whole.arrays, room, numbers)
 
 
-def _room(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> dict[str, int]:
+def room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> dict[str, int]:
     """Lengths of the arrays that a world works in."""
     m, pairs = len(tables.structure.moving), len(tables.whole.arrays["scene.pair_index"])
     blocks = tables.structure.n_blocks

@@ -1,0 +1,164 @@
+"""Where the bodies of a scene touch, and how hard they press on each other in a step that was made."""
+
+import warp as wp
+
+from dano.engine.kernels.derivatives.equations import settle
+from dano.engine.kernels.lanes import total, total3, wait
+from dano.engine.kernels.rollout import begin_body, begin_coordinates, begin_step_of_trees, Launch, REBOUNDS
+from dano.engine.kernels.search import find_contacts
+from dano.engine.kernels.solve import newton_step
+from dano.engine.kernels.tables import Push, Room, Scene
+from dano.engine.kernels.trees.kinematics import unknown_of
+from dano.physics.features import LANES, TREES
+from dano.physics.real import INFINITY, ONE, real, vec3, vec6, ZERO
+from dano.physics.twists import angular_part, linear_part
+
+_LANES, _REBOUNDS = wp.constant(LANES), wp.constant(REBOUNDS)
+
+
+@wp.struct
+class Overlap:
+    """How a pair of `Scene.pair_index` overlaps, as sums over points at depths d, with areas A.
+
+    Attributes:
+        volume: Σ A d [m³].
+        moment: Σ A d x [m⁴, W].
+        direction: Σ A d n [m³, W]: the direction in which the first body is pushed.
+    """
+
+    volume: real
+    moment: vec3
+    direction: vec3
+
+
+@wp.struct
+class Wrench:
+    """What pushes the first body of a pair of `Scene.pair_index`.
+
+    Attributes:
+        force: [N, W].
+        torque: About its centre of mass [N m, W].
+    """
+
+    force: vec3
+    torque: vec3
+
+
+@wp.struct
+class Seen:
+    """What is written, shape (worlds, rows of `Scene.pair_index`)."""
+
+    overlaps: wp.array2d(dtype=Overlap)
+    wrenches: wp.array2d(dtype=Wrench)
+
+
+@wp.func
+def overlap_of(room: Room, world: int, first: int, end: int, place: vec3) -> Overlap:
+    """Sums over points of a lane, whose arms begin at `place`."""
+    found = Overlap()
+    for k in range(first, end):
+        point = room.points[world, k]
+        weight = point.area * wp.max(point.depth, ZERO)
+        found.volume += weight
+        found.moment += weight * (place + point.arm)
+        found.direction += weight * point.normal
+    return found
+
+
+@wp.kernel(enable_backward=False)
+def touch(scene: Scene, room: Room, launch: Launch, seen: Seen):
+    """Overlaps at `launch.state`, in which nothing moves."""
+    block, lane = wp.tid()
+    world = launch.first_world + block
+    for i in range(scene.body_index.shape[0]):
+        push = Push()
+        begin_body(scene, room, world, i, launch.state[world, i], push)
+    for p in range(lane, seen.overlaps.shape[1], _LANES):
+        seen.overlaps[world, p] = Overlap()
+    wait()
+    if wp.static(TREES):
+        if lane == 0:
+            begin_coordinates(scene, room, world, launch, 0)
+            begin_step_of_trees(scene, room, world, launch, 0)
+        wait()
+    n_found, _overflow = find_contacts(scene, room, world, lane)
+    for f in range(n_found):
+        found = room.found[world, f * _LANES + lane]
+        place = room.bodies[world, scene.pair_index[found.pair].first].position
+        own = overlap_of(room, world, found.first, found.end, place)
+        own.volume = total(own.volume)
+        own.moment = total3(own.moment)
+        own.direction = total3(own.direction)
+        if lane == 0:
+            seen.overlaps[world, found.pair] = own
+
+
+@wp.func
+def misses(scene: Scene, room: Room, world: int) -> real:
+    """How far Newton's step from the velocities at the end would lead, forces in loops aside [m/s, rad/s]."""
+    newton_step(scene, room, world, ONE, False)
+    found = real(0.0)
+    if wp.static(TREES):
+        for u in range(scene.trees.unknowns.shape[0]):
+            if scene.trees.blocks[u // 6].is_loop == 0:
+                found = wp.max(found, wp.abs(unknown_of(room.step, world, u)))
+    else:
+        for b in range(scene.n_blocks):
+            for k in range(6):
+                found = wp.max(found, wp.abs(room.step[world, b][k]))
+    return found
+
+
+@wp.func
+def settle_with(scene: Scene, room: Room, launch: Launch, world: int, lane: int, rebound: real) -> int:
+    """The step at its end, with a share of the restitution; returns the number of pairs that are near."""
+    if lane == 0:
+        launch.reports[world, 0].rebound = rebound
+        for k in range(room.wrenches.shape[1]):
+            room.wrenches[world, k] = vec6()
+        for k in range(launch.forces.shape[1]):
+            launch.forces[world, k] = vec6()
+    wait()
+    n_found = settle(scene, room, launch, world, lane, 0)
+    wait()
+    return n_found
+
+
+@wp.kernel(enable_backward=False)
+def press(scene: Scene, room: Room, launch: Launch, seen: Seen):
+    """Wrenches in the step from `launch.state` to `launch.states`.
+
+    With what share of the restitution it was made is not known, nor are its controls and forces in loops: the
+    share that fits best is taken.
+    """
+    block, lane = wp.tid()
+    world = launch.first_world + block
+    h = scene.timestep[world, 0]
+    for p in range(lane, seen.wrenches.shape[1], _LANES):
+        seen.wrenches[world, p] = Wrench()
+    best = real(INFINITY)
+    chosen = real(1.0)
+    hits = bool(True)
+    attempt = int(0)
+    while hits and attempt <= _REBOUNDS:
+        rebound = ONE - real(attempt) / real(_REBOUNDS)
+        n_found = settle_with(scene, room, launch, world, lane, rebound)
+        missed = real(0.0)
+        if lane == 0:
+            missed = misses(scene, room, world)
+        missed = total(missed)
+        if missed < best:
+            best = missed
+            chosen = rebound
+        meets = bool(False)
+        for f in range(n_found):
+            meets = meets or room.found[world, f * _LANES + lane].impact_stiffness > ZERO
+        hits = meets
+        attempt += 1
+    n_found = settle_with(scene, room, launch, world, lane, chosen)
+    if lane == 0:
+        for f in range(n_found):
+            row = Wrench()
+            row.force = linear_part(room.wrenches[world, f]) / h
+            row.torque = angular_part(room.wrenches[world, f]) / h
+            seen.wrenches[world, room.found[world, f * _LANES].pair] = row
