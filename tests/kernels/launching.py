@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from dano.engine.launching import Features, instance
+from dano.engine.launching._leaves import leaf_tables
 from dano.engine.launching._patch_tables import patch_pairs, patch_tables
 
 # What the tests need, so that each module is compiled once for all of them.
@@ -46,6 +47,7 @@ class Arguments:
             timestep: [s].
         """
         tables, n, m = patch_tables(pairs, float), len(bodies), len(moving)
+        leaves = leaf_tables(tables.leaves, float)
         self.scene, self.room = KERNELS.tables.Scene(), KERNELS.tables.Room()
         self.scene.n_blocks = m
         self.kept: list[np.ndarray] = []
@@ -60,9 +62,9 @@ class Arguments:
             "scene.gravity": [gravity],
             "scene.timestep": [[timestep]],
             "scene.pair_index": tables.pair_index,
-            "scene.solids.leaves": tables.leaves,
-            "scene.solids.kinds": tables.leaf_kinds,
-            "scene.solids.coefficients": tables.coefficients[:, None],
+            "scene.solids.leaves": leaves.rows,
+            "scene.solids.kinds": leaves.kinds,
+            "scene.solids.coefficients": leaves.coefficients,
             **tables.rows,
             **tables.whole,
         }

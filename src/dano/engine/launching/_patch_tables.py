@@ -4,20 +4,26 @@ Real numbers come from JAX and can be differentiated; whole numbers are found on
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeGuard
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float
 
-from dano.contact import AbstractPatchLaw, CentroidLaw, Collider, ContactParams, SampleSet, Support
+from dano.contact import (
+    AbstractContactLaw,
+    AbstractPatchLaw,
+    CentroidLaw,
+    Collider,
+    ContactParams,
+    SampleSet,
+    Support,
+)
+from dano.engine.launching._leaves import balls_around_runs, leaves_of, Placed
 from dano.fields import (
     AbstractField,
     AbstractShape,
-    Box,
     Capsule,
-    Cylinder,
-    degree_of,
     Ellipsoid,
     GridField,
     HalfSpace,
@@ -25,27 +31,11 @@ from dano.fields import (
     PosedShape,
     ScaledField,
     ScaledShape,
-    SignedDistanceGrid,
     Sphere,
     UnionField,
-    UnionShape,
 )
-from dano.maths import Pose
 from dano.scene import colliders, Scene, State
 
-# Samples of a block, blocks of a run: see `dano.engine.kernels.tables`.
-_BLOCK, _RUN = 16, 4
-# Kinds of leaves in `dano.physics.distances` and `overlap`, and what a leaf holds besides its pose.
-_KINDS: dict[type, tuple[int, Any]] = {
-    HalfSpace: (0, lambda s: {"sizes": s.normal_direction, "length": s.offset}),
-    Sphere: (1, lambda s: {"sizes": jnp.stack([s.radius, 0 * s.radius, 0 * s.radius])}),
-    Box: (2, lambda s: {"sizes": s.half_extents, "length": s.rounding}),
-    Capsule: (3, lambda s: {"sizes": jnp.stack([s.radius, s.half_length, 0 * s.radius])}),
-    Cylinder: (4, lambda s: {"sizes": jnp.stack([s.radius, s.half_length, 0 * s.radius])}),
-    Ellipsoid: (5, lambda s: {"sizes": s.semi_axes}),
-    SignedDistanceGrid: (6, lambda s: {"sizes": s.origin, "spacing": s.spacing}),
-    GridField: (7, lambda s: {"sizes": s.origin, "spacing": s.spacing}),
-}
 # Shapes with an outward direction of their own; that of others is the gradient of their distance.
 _OWN_DIRECTION = (Sphere, Capsule, Ellipsoid)
 
@@ -76,51 +66,22 @@ class PatchTables(NamedTuple):
     Attributes:
         rows: Real numbers by place in a kernel's parameters.
         whole: Whole numbers by place.
-        leaves: Rows of leaves for `scene.solids.leaves`, behind those that stand there already.
-        leaf_kinds: Rows for `scene.solids.kinds`.
-        coefficients: For `scene.solids.coefficients`.
+        leaves: Leaves for `scene.solids`, behind those that stand there already.
         pair_index: Rows for `scene.pair_index`, behind those of pairs with samples that press.
-        kinds: Kinds of leaves (`dano.physics.features`).
-        degrees: Degrees of splines.
         unions: Whether a field has several parts, or a part several leaves.
     """
 
     rows: dict[str, Array]
     whole: dict[str, np.ndarray]
-    leaves: Float[Array, "leaves 20"]
-    leaf_kinds: np.ndarray
-    coefficients: Float[Array, " coefficients"]
+    leaves: list[Placed]
     pair_index: np.ndarray
-    kinds: frozenset[int]
-    degrees: frozenset[int]
     unions: bool
-
-
-class _Placed(NamedTuple):
-    """A field in a frame: x = s R y + p for y in its own."""
-
-    field: AbstractField
-    factor: Array
-    position: Float[Array, "3"]
-    rotation: Float[Array, "3 3"]
-
-    def inside(
-        self, field: AbstractField, pose: Pose | None = None, factor: Array | None = None
-    ) -> "_Placed":
-        """What the field is made of."""
-        dtype, position, rotation, size = self.factor.dtype, self.position, self.rotation, self.factor
-        if factor is not None:
-            size = size * factor.astype(dtype)
-        if pose is not None:
-            position = position + size * (rotation @ pose.position.astype(dtype))
-            rotation = rotation @ pose.matrix.astype(dtype)
-        return _Placed(field, size, position, rotation)
 
 
 class _Part(NamedTuple):
     """A part of a field: its leaves, edge width, whether its direction is the distance's gradient, map."""
 
-    leaves: list[_Placed]
+    leaves: list[Placed]
     edge: Array
     by_gradient: bool
     support: Support | None
@@ -152,7 +113,7 @@ def patch_tables(
     *,
     n_pairs: int = 0,
     n_leaves: int = 0,
-    n_coefficients: int = 0,
+    twins: Sequence[int] = (),
 ) -> PatchTables:
     """Tables of contacts.
 
@@ -161,12 +122,12 @@ def patch_tables(
         dtype: Of real numbers.
         n_pairs: Rows of `scene.pair_index` that stand before those of the contacts.
         n_leaves: Leaves that stand before those of fields.
-        n_coefficients: Spline coefficients that do.
+        twins: See `Scene.twins`.
 
     Raises:
         ValueError: If kernels do not know a law or a field, or a pair has nothing to sum over.
     """
-    samples, fields = _Samples(dtype), _Fields(dtype, n_leaves, n_coefficients)
+    samples, fields = _Samples(dtype, twins), _Fields(dtype, n_leaves, twins)
     contacts, materials, sides, side_index, index = [], [], [], [], []
     for k, pair in enumerate(pairs):
         own = _sides(pair, samples, fields)
@@ -190,18 +151,19 @@ def patch_tables(
     return PatchTables(
         rows,
         whole,
-        jnp.stack(fields.leaves) if fields.leaves else jnp.zeros((0, 20), dtype),
-        _integers(fields.leaf_kinds, 6),
-        jnp.concatenate([x.ravel().astype(dtype) for x in fields.coefficients] or [jnp.zeros(0, dtype)]),
+        fields.leaves,
         _integers(index, 3),
-        frozenset(row[0] for row in fields.leaf_kinds),
-        frozenset(row[5] for row in fields.leaf_kinds if row[5] > 0),
         fields.unions,
     )
 
 
+def knows_law(law: AbstractContactLaw) -> TypeGuard[CentroidLaw]:
+    """Whether kernels know a patch law; one that is derived from the paper's may be another."""
+    return type(law) is CentroidLaw
+
+
 def _known(law: AbstractPatchLaw) -> CentroidLaw:
-    if type(law) is not CentroidLaw:
+    if not knows_law(law):
         raise ValueError(
             f"law must be CentroidLaw, the only patch law that kernels know, got {type(law).__name__}"
         )
@@ -218,15 +180,15 @@ def _sides(pair: PatchPair, samples: "_Samples", fields: "_Fields"):
     found = []
     for (i, sampled), (j, queried) in (bodies, bodies[::-1]):
         if isinstance(sampled.field, Sphere) and isinstance(queried.field, HalfSpace):
-            ball = fields.leaf(_still(sampled.field, fields.dtype))
+            ball = fields.leaf(Placed.still(sampled.field, fields.dtype))
             row = jnp.zeros(5, fields.dtype)
-            return [(row, (i, j, 0, 0, *fields.place(queried.field, None), ball))]
+            return [(row, (i, j, 0, 0, *fields.place(j, queried.field, None), ball))]
         if sampled.samples is not None and queried.field is not None:
             middle, radius = samples.ball(sampled.samples)
             scale = queried.density_scale.astype(fields.dtype)
             row = jnp.concatenate([scale[None], middle, radius[None]])
-            place = fields.place(queried.field, queried.support)
-            found.append((row, (i, j, *samples.place(sampled.samples), *place, -1)))
+            place = fields.place(j, queried.field, queried.support)
+            found.append((row, (i, j, *samples.place(i, sampled.samples), *place, -1)))
     if not found:
         raise ValueError(
             "overlap needs contact samples on one side and a density field on the other, got "
@@ -239,15 +201,15 @@ def _sides(pair: PatchPair, samples: "_Samples", fields: "_Fields"):
 class _Samples:
     """Weighted samples of all bodies, in blocks; a set that several contacts use stands once."""
 
-    def __init__(self, dtype: DTypeLike):
-        self.dtype = dtype
+    def __init__(self, dtype: DTypeLike, twins: Sequence[int]):
+        self.dtype, self._twins = dtype, twins
         self._sets: list[SampleSet] = []
         self._places: dict[int, tuple[int, int]] = {}
         self._blocks = 0
 
-    def place(self, samples: SampleSet) -> tuple[int, int]:
-        """First block of a set, and number of its blocks."""
-        key = id(samples.points)
+    def place(self, body: int, samples: SampleSet) -> tuple[int, int]:
+        """First block of a body's set, and number of its blocks."""
+        key = self._twins[body] if self._twins else body
         if key not in self._places:
             n = samples.radii.shape[0]
             self._places[key] = self._blocks, n
@@ -271,48 +233,40 @@ class _Samples:
         return {
             "scene.patches.samples": jnp.concatenate([*joined, none]),
             "scene.patches.balls": jnp.concatenate([*balls, none]),
-            "scene.patches.runs": jnp.concatenate([*map(_runs, balls), none]),
+            "scene.patches.runs": jnp.concatenate([*map(balls_around_runs, balls), none]),
         }
-
-
-def _runs(balls: Float[Array, "b 4"]) -> Float[Array, "b 4"]:
-    """Balls around each block of a body and those after it."""
-    n = balls.shape[0]
-    members = np.minimum(np.arange(n)[:, None] + np.arange(_RUN)[None], n - 1)
-    centers, radii = balls[members, :3], balls[members, 3]
-    middle = jnp.mean(centers, axis=1)
-    reach = jnp.sqrt(jnp.sum((centers - middle[:, None]) ** 2, axis=2)) + radii
-    return jnp.concatenate([middle, jnp.max(reach, axis=1, keepdims=True)], axis=1)
 
 
 class _Fields:
     """Parts and leaves of all fields; a field that several contacts ask stands once."""
 
-    def __init__(self, dtype: DTypeLike, n_leaves: int, n_coefficients: int):
-        self.dtype = dtype
-        self._first_leaf, self._n_coefficients = n_leaves, n_coefficients
-        self._places: dict[int, tuple[int, int]] = {}
+    def __init__(self, dtype: DTypeLike, n_leaves: int, twins: Sequence[int]):
+        self.dtype, self._first_leaf, self._twins = dtype, n_leaves, twins
+        self._places: dict[tuple[int, int], tuple[int, int]] = {}
         self._kept: list[AbstractField] = []
         self._parts: list[Array] = []
         self._distances: list[Array] = []
         self._n_distances = 0
         self.kinds: list[tuple[int, ...]] = []
-        self.leaves: list[Array] = []
-        self.leaf_kinds: list[tuple[int, ...]] = []
-        self.coefficients: list[Array] = []
+        self.leaves: list[Placed] = []
         self.unions = False
 
-    def place(self, field: AbstractField, support: Support | None) -> tuple[int, int]:
-        """First part of a field, and number of its parts."""
-        if id(field) not in self._places:
-            parts = _parts_of(_still(field, self.dtype), support)
-            self._places[id(field)] = len(self.kinds), len(parts)
+    def place(self, body: int, field: AbstractField, support: Support | None) -> tuple[int, int]:
+        """First part of a body's field, and number of its parts.
+
+        Shapes differ from contact to contact: in the widths of their edges.
+        """
+        twin = self._twins[body] if self._twins else body
+        key = (twin, 0 if isinstance(field, GridField) else id(field))
+        if key not in self._places:
+            parts = _parts_of(Placed.still(field, self.dtype), support)
+            self._places[key] = len(self.kinds), len(parts)
             # As long as it is kept, no other object has its identity.
             self._kept.append(field)
             self.unions = self.unions or len(parts) > 1
             for part in parts:
                 self._add(part)
-        return self._places[id(field)]
+        return self._places[key]
 
     def _add(self, part: _Part) -> None:
         first = [self.leaf(leaf) for leaf in part.leaves][0]
@@ -332,21 +286,9 @@ class _Fields:
         self._n_distances += int(np.prod(nodes))
         self._parts.append(jnp.concatenate([part.edge.astype(self.dtype)[None], map_row]))
 
-    def leaf(self, placed: _Placed) -> int:
+    def leaf(self, placed: Placed) -> int:
         """Index of a new leaf."""
-        number, own = _KINDS[type(placed.field)]
-        zero = {"sizes": jnp.zeros(3), "length": jnp.zeros(()), "spacing": jnp.ones(3)}
-        numbers = {**zero, **own(placed.field)}
-        pose = [placed.factor[None], placed.position, placed.rotation.ravel()]
-        last = [numbers["sizes"], numbers["length"][None], numbers["spacing"]]
-        self.leaves.append(jnp.concatenate([x.astype(self.dtype) for x in (*pose, *last)]))
-        kind = (number, 0, 0, 0, 0, 0)
-        if isinstance(placed.field, SignedDistanceGrid | GridField):
-            coefficients = placed.field.coefficients
-            kind = (number, self._n_coefficients, *coefficients.shape, degree_of(placed.field.interpolation))
-            self.coefficients.append(coefficients)
-            self._n_coefficients += int(np.prod(coefficients.shape))
-        self.leaf_kinds.append(kind)
+        self.leaves.append(placed)
         return self._first_leaf + len(self.leaves) - 1
 
     def rows(self) -> dict[str, Array]:
@@ -360,11 +302,7 @@ class _Fields:
         }
 
 
-def _still(field: AbstractField, dtype: DTypeLike) -> _Placed:
-    return _Placed(field, jnp.ones((), dtype), jnp.zeros(3, dtype), jnp.eye(3, dtype=dtype))
-
-
-def _parts_of(placed: _Placed, support: Support | None) -> list[_Part]:
+def _parts_of(placed: Placed, support: Support | None) -> list[_Part]:
     """The parts of a field, the densest of which counts."""
     field = placed.field
     if isinstance(field, PosedField):
@@ -380,26 +318,8 @@ def _parts_of(placed: _Placed, support: Support | None) -> list[_Part]:
         while isinstance(inner, PosedShape | ScaledShape):
             inner = inner.shape
         edge = placed.factor * field.edge_width.astype(placed.factor.dtype)
-        return [_Part(_leaves_of(placed), edge, not isinstance(inner, _OWN_DIRECTION), None)]
+        return [_Part(leaves_of(placed), edge, not isinstance(inner, _OWN_DIRECTION), None)]
     raise ValueError(
         "field must be a grid of densities or made of shapes, posed, scaled or joined, got "
         f"{type(field).__name__}: dano.bake(field).grid is a grid of it"
     )
-
-
-def _leaves_of(placed: _Placed) -> list[_Placed]:
-    """The shapes that a shape is made of."""
-    shape = placed.field
-    if isinstance(shape, PosedShape):
-        return _leaves_of(placed.inside(shape.shape, pose=shape.pose))
-    if isinstance(shape, ScaledShape):
-        return _leaves_of(placed.inside(shape.shape, factor=shape.factor))
-    if isinstance(shape, UnionShape):
-        return [leaf for each in shape.shapes for leaf in _leaves_of(placed.inside(each))]
-    if type(shape) not in _KINDS:
-        known = ", ".join(kind.__name__ for kind in _KINDS if kind is not GridField)
-        raise ValueError(
-            f"shape must be one that contact knows ({known}, posed, scaled or joined), got "
-            f"{type(shape).__name__}: a SignedDistanceGrid may stand for any other"
-        )
-    return [placed]

@@ -21,6 +21,10 @@ STATE, _PUSH, REPORT, WRENCH = 13, 6, 5, 6
 _POINT = {"first": 1, "second": 1, "contact": 1, "sample": 1, "share": 1, "impact_stiffness": 1}
 _POINT |= {"arm": 3, "normal": 3, "moment": 3, "extra_slip": 3}
 _POINT |= {"depth": 1, "rate": 1, "approach": 1, "area": 1}
+_PATCHES = tuple(
+    f"room.patches.{name}"
+    for name in ("patches", "arms", "duals", "changes", "linear", "wrenches", "jacobians")
+)
 CHUNK = 16
 """Points that `VariationalEngine.capacity` counts as one."""
 
@@ -149,4 +153,7 @@ def room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> di
     room = {f"room.{name}": length for name, length in lengths.items()}
     if "scene.trees.nodes" in tables.whole.arrays:
         room |= tree_lengths(tables.structure)
+    if "scene.patches.contacts" in tables.whole.arrays:
+        room |= {"room.patches.count": 1}
+        room |= dict.fromkeys(_PATCHES, shapes["scene.patches.materials"].rows)
     return room

@@ -2,30 +2,26 @@
 
 from collections.abc import Sequence
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float, Int
 
-from dano.contact import DistributedLaw, Material, materials, SurfaceSet
+from dano.contact import AbstractPatchLaw, DistributedLaw, Material, materials, SurfaceSet
 from dano.engine.joints import structure_of_trees, tree_rows, TreeStructure
 from dano.engine.launching._instances import Features, instance
-from dano.fields import (
-    AbstractShape,
-    Box,
-    Capsule,
-    Cylinder,
-    degree_of,
-    Ellipsoid,
-    HalfSpace,
-    PosedShape,
-    ScaledShape,
-    SignedDistanceGrid,
-    Sphere,
-    UnionShape,
+from dano.engine.launching._leaves import (
+    balls_around_runs,
+    degrees_of,
+    is_known,
+    kinds_of,
+    leaf_tables,
+    leaves_of,
+    Placed,
 )
+from dano.engine.launching._patch_tables import knows_law, patch_pairs, patch_tables, PatchTables
 from dano.scene import Body, pressing_pairs, Scene
 
 # Samples count as near within this share of the smaller body's size, besides the way they go.
@@ -38,16 +34,6 @@ _THIN = 0.25
 _FEW_BLOCKS = 16
 # How samples turn with their body: see `dano.physics.pairs`.
 _TURNING = {"fixed": 0, "axis": 1, "ball": 2}
-# Kinds of `dano.physics.distances`, and what a shape's row holds besides its pose: sizes, length, spacing.
-_KINDS: dict[type, tuple[str, Any]] = {
-    HalfSpace: ("HALF_SPACE", lambda s: {"sizes": s.normal_direction, "length": s.offset}),
-    Sphere: ("SPHERE", lambda s: {"sizes": jnp.stack([s.radius, 0 * s.radius, 0 * s.radius])}),
-    Box: ("BOX", lambda s: {"sizes": s.half_extents, "length": s.rounding}),
-    Capsule: ("CAPSULE", lambda s: {"sizes": jnp.stack([s.radius, s.half_length, 0 * s.radius])}),
-    Cylinder: ("CYLINDER", lambda s: {"sizes": jnp.stack([s.radius, s.half_length, 0 * s.radius])}),
-    Ellipsoid: ("ELLIPSOID", lambda s: {"sizes": s.semi_axes}),
-    SignedDistanceGrid: ("GRID", lambda s: {"sizes": s.origin, "spacing": s.spacing}),
-}
 
 
 class Whole:
@@ -79,93 +65,56 @@ class Tables(eqx.Module):
         return self.whole.arrays["scene.moving"]
 
 
-class _Leaf(NamedTuple):
-    """A part of a solid: a shape that is no union, and its pose, as in `dano.physics.distances.Leaf`."""
-
-    shape: AbstractShape
-    factor: Array
-    position: Float[Array, "3"]
-    rotation: Float[Array, "3 3"]
-
-
-def is_known(solid: AbstractShape) -> bool:
-    """Whether kernels know a solid and all its parts."""
-    if isinstance(solid, UnionShape):
-        return all(is_known(part) for part in solid.shapes)
-    if isinstance(solid, ScaledShape | PosedShape):
-        return is_known(solid.shape)
-    return type(solid) in _KINDS
-
-
-def leaves_of(solid: AbstractShape, dtype: DTypeLike) -> list[_Leaf]:
-    """The parts of a solid.
-
-    Raises:
-        ValueError: If kernels do not know a part.
-    """
-    still = _Leaf(solid, jnp.ones((), dtype), jnp.zeros(3, dtype), jnp.eye(3, dtype=dtype))
-    return _flattened(still)
-
-
-def _flattened(leaf: _Leaf) -> list[_Leaf]:
-    """With x = s R y + p for y in the axes of the leaf's shape, the same for the shapes in it."""
-    shape, factor, position, rotation = leaf
-    if isinstance(shape, ScaledShape):
-        return _flattened(_Leaf(shape.shape, factor * shape.factor.astype(factor.dtype), position, rotation))
-    if isinstance(shape, PosedShape):
-        turn, way = shape.pose.matrix.astype(factor.dtype), shape.pose.position.astype(factor.dtype)
-        moved = position + factor * (rotation @ way)
-        return _flattened(_Leaf(shape.shape, factor, moved, rotation @ turn))
-    if isinstance(shape, UnionShape):
-        return [part for each in shape.shapes for part in _flattened(leaf._replace(shape=each))]
-    if type(shape) not in _KINDS:
-        known = ", ".join(kind.__name__ for kind in _KINDS)
-        raise ValueError(
-            f"solid must be made of shapes that contact knows ({known}, posed, scaled or joined),"
-            f" got {type(shape).__name__}"
-        )
-    return [leaf]
+def knows(scene: Scene) -> bool:
+    """Whether kernels make the steps of a scene: they know its laws, its solids and its densities."""
+    patches = {name for c in scene.contacts if isinstance(c.law, AbstractPatchLaw) for name in (c.a, c.b)}
+    laws = all(type(c.law) is DistributedLaw or knows_law(c.law) for c in scene.contacts)
+    solids = all(body.solid is None or is_known(body.solid) for body in scene.bodies)
+    queried = [body.field for body in scene.bodies if body.name in patches]
+    return laws and solids and all(field is None or is_known(field) for field in queried)
 
 
 # Kinds, ways of turning and degrees that builds know, from the smallest on. Few builds serve all scenes: each
 # takes some seconds to compile, once on a machine.
-_PLANES, _PRIMITIVES, _GRIDS = frozenset({0}), frozenset(range(6)), frozenset({0, 6})
+_PLANES, _PRIMITIVES, _GRIDS, _DENSITIES = (
+    frozenset({0}),
+    frozenset(range(6)),
+    frozenset({0, 6}),
+    frozenset({0, 7}),
+)
+_SOLIDS, _FIELDS = frozenset(range(7)), frozenset(range(8))
 _STILL, _TURNS = frozenset({0}), frozenset({0, 1, 2})
 
 
-def features_of(scene: Scene, pairs: Sequence[tuple[int, int, int]]) -> Features:
-    """The smallest build that knows what the pairs of a scene need."""
-    kinds, degrees, turning, unions = set(), set(), set(), False
-    numbers = {name: number for number, name in enumerate(_kind_names())}
-    for first, second, _ in pairs:
-        solid, surface = scene.bodies[second].solid, scene.bodies[first].surface
-        assert solid is not None and surface is not None
-        parts = leaves_of(solid, scene.timestep.dtype)
-        unions = unions or len(parts) > 1
-        kinds |= {numbers[_KINDS[type(part.shape)][0]] for part in parts}
-        degrees |= {
-            degree_of(part.shape.interpolation)
-            for part in parts
-            if isinstance(part.shape, SignedDistanceGrid)
-        }
+def features_of(
+    scene: Scene, pairs: Sequence[tuple[int, int, int]], leaves: Sequence[Placed], unions: bool, patches: bool
+) -> Features:
+    """The smallest build that knows what a scene needs.
+
+    Args:
+        scene: The scene.
+        pairs: Those with samples that press.
+        leaves: Of all solids and densities.
+        unions: Whether any of these has several.
+        patches: Whether there are contacts with a patch law.
+    """
+    kinds, degrees, turning = kinds_of(leaves), degrees_of(leaves), set()
+    for first, *_ in pairs:
+        surface = scene.bodies[first].surface
+        assert surface is not None
         turning.add(_TURNING[surface.turning])
-    every = _PRIMITIVES | _GRIDS
-    known = next(each for each in (_PLANES, _PRIMITIVES, _GRIDS, every) if kinds <= each)
+    known = next(each for each in _BUILDS if kinds <= each)
     of_grids = frozenset({2}) if degrees <= {2} else frozenset({1, 2, 3})
     return Features(
         KINDS=known,
-        DEGREES=of_grids if 6 in known else frozenset(),
+        DEGREES=of_grids if known & {6, 7} else frozenset(),
         TURNING=_STILL if turning <= _STILL else _TURNS,
         UNIONS=unions,
-        PATCHES=False,
+        POINTS=bool(pairs) or not patches,
+        PATCHES=patches,
         TREES=bool(scene.joints),
         LOOPS=bool(scene.loops),
     )
-
-
-def _kind_names() -> tuple[str, ...]:
-    """Names of the kinds in the order of their numbers."""
-    return ("HALF_SPACE", "SPHERE", "BOX", "CAPSULE", "CYLINDER", "ELLIPSOID", "GRID")
 
 
 def packed(struct: Any, **fields: Array) -> Float[Array, "rows width"]:
@@ -185,17 +134,22 @@ def scene_tables(scene: Scene) -> Tables:
     """A scene's tables.
 
     Raises:
-        ValueError: If a shape is not one that kernels know.
+        ValueError: If a shape, a density or a law is not one that kernels know.
     """
     dtype = scene.timestep.dtype
     pairs = pressing_pairs(scene.bodies, scene.point_pairs)
-    features = features_of(scene, pairs)
-    kernels = instance(features, "dano.engine.kernels.tables")
     used = {i for pair in pairs for i in pair[:2]}
     bodies = [body if i in used else body.unused() for i, body in enumerate(scene.bodies)]
+    solids, solid_index = _solids(scene, {second for _, second, _ in pairs}, dtype)
+    patches = _patches(scene, len(pairs), len(solids))
+    leaves = [*solids, *patches.leaves]
+    unions = patches.unions or any(count > 1 for _, count in solid_index)
+    features = features_of(scene, pairs, leaves, unions, len(patches.pair_index) > 0)
+    kernels = instance(features, "dano.engine.kernels.tables")
     surfaces, surface_index = _surfaces(scene, bodies, dtype)
-    solids, solid_index = _solids(scene, bodies, used, features, dtype)
-    structure = structure_of_trees(scene, used)
+    of_leaves = leaf_tables(leaves, dtype)
+    touching = used | {int(i) for row in patches.pair_index for i in row[:2]}
+    structure = structure_of_trees(scene, touching)
     index = [[row, *surface_index[i], *solid_index[i]] for i, row in enumerate(structure.rows)]
     extents = jnp.stack([_extent(body) for body in bodies]).astype(dtype)
     com = jnp.stack([body.com + body.com_offset for body in bodies]).astype(dtype)
@@ -214,7 +168,8 @@ def scene_tables(scene: Scene) -> Tables:
     arrays = {
         "scene.bodies": body_rows,
         **surfaces,
-        **solids,
+        "scene.solids.leaves": of_leaves.rows,
+        "scene.solids.coefficients": of_leaves.coefficients,
         "scene.pairs": pair_rows,
         "scene.materials": _materials(scene, dtype),
         "scene.gravity": scene.gravity[None].astype(dtype),
@@ -223,9 +178,11 @@ def scene_tables(scene: Scene) -> Tables:
     whole = {
         "scene.body_index": np.array(index, np.int32),
         "scene.moving": structure.moving,
-        "scene.pair_index": pair_index,
-        "scene.solids.kinds": solids_kinds(scene, bodies, used, dtype),
+        "scene.pair_index": np.concatenate([pair_index, patches.pair_index]),
+        "scene.solids.kinds": of_leaves.kinds,
     }
+    if len(patches.pair_index):
+        arrays, whole = {**arrays, **patches.rows}, {**whole, **patches.whole}
     if scene.joints:
         of_trees, whole_of_trees = tree_rows(scene, structure)
         arrays, whole = {**arrays, **of_trees}, {**whole, **whole_of_trees}
@@ -272,10 +229,11 @@ def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
     vectors = jnp.concatenate([s.vectors.T for s in sets]).astype(dtype)
     centers = jnp.concatenate([s.centers for s in sets]).astype(dtype)
     radii = jnp.concatenate([s.radii for s in sets]).astype(dtype)
+    balls = jnp.concatenate([centers, radii[:, None]], axis=1)
     rows = {
         "scene.samples": jnp.concatenate([points_of, vectors], axis=1),
-        "scene.balls": jnp.concatenate([centers, radii[:, None]], axis=1),
-        "scene.runs": _runs(centers, radii),
+        "scene.balls": balls,
+        "scene.runs": balls_around_runs(balls),
         "scene.probes": jnp.concatenate(probes).astype(dtype),
     }
     return rows, index
@@ -286,71 +244,30 @@ def _probes(surface: SurfaceSet) -> Float[Array, "k 3"]:
     return surface.points[:3].T if surface.radii.shape[0] <= _FEW_BLOCKS else surface.centers
 
 
-def _runs(centers: Float[Array, "b 3"], radii: Float[Array, " b"]) -> Float[Array, "b 4"]:
-    """Balls around runs of blocks; a run may include blocks of the next body, and its ball is then larger."""
-    run, n = 4, radii.shape[0]
-    if n == 0:
-        return jnp.zeros((0, 4), radii.dtype)
-    members = np.minimum(np.arange(n)[:, None] + np.arange(run)[None], n - 1)
-    middle = jnp.mean(centers[members], axis=1)
-    reach = jnp.sqrt(jnp.sum((centers[members] - middle[:, None]) ** 2, axis=2)) + radii[members]
-    return jnp.concatenate([middle, jnp.max(reach, axis=1, keepdims=True)], axis=1)
-
-
-def _solid_leaves(scene: Scene, bodies: Sequence[Body], used: set[int], dtype: DTypeLike):
-    """Leaves of each different solid, and for each body where its own begin and how many they are."""
-    twins = scene.twins or tuple(range(len(bodies)))
+def _solids(scene: Scene, used: set[int], dtype: DTypeLike) -> tuple[list[Placed], list[tuple[int, int]]]:
+    """Leaves of each different solid in use, and for each body where its own begin and how many they are."""
+    twins = scene.twins or tuple(range(len(scene.bodies)))
     first: dict[int, tuple[int, int]] = {}
-    leaves: list[_Leaf] = []
+    leaves: list[Placed] = []
     index = []
-    for i, body in enumerate(bodies):
+    for i, body in enumerate(scene.bodies):
         solid = body.solid if i in used else None
         if solid is None:
             index.append((0, 0))
             continue
         if twins[i] not in first:
-            parts = leaves_of(solid, dtype)
+            parts = leaves_of(Placed.still(solid, dtype))
             first[twins[i]] = len(leaves), len(parts)
             leaves += parts
         index.append(first[twins[i]])
     return leaves, index
 
 
-def _solids(scene: Scene, bodies: Sequence[Body], used: set[int], features: Features, dtype: DTypeLike):
-    leaves, index = _solid_leaves(scene, bodies, used, dtype)
-    leaf = instance(features, "dano.physics.distances").Leaf
-    zero = {"sizes": jnp.zeros(3, dtype), "length": jnp.zeros((), dtype), "spacing": jnp.zeros(3, dtype)}
-    own = [{**zero, **_KINDS[type(part.shape)][1](part.shape)} for part in leaves]
-    rows = jnp.zeros((0, 20), dtype)
-    if leaves:
-        rows = packed(
-            leaf,
-            factor=jnp.stack([part.factor for part in leaves]),
-            position=jnp.stack([part.position for part in leaves]),
-            rotation=jnp.stack([part.rotation for part in leaves]),
-            **{name: jnp.stack([each[name].astype(dtype) for each in own]) for name in zero},
-        )
-    grids = [part.shape.coefficients for part in leaves if isinstance(part.shape, SignedDistanceGrid)]
-    flat = [grid.ravel().astype(dtype) for grid in grids] or [jnp.zeros(1, dtype)]
-    arrays = {"scene.solids.leaves": rows, "scene.solids.coefficients": jnp.concatenate(flat)[:, None]}
-    return arrays, index
-
-
-def solids_kinds(
-    scene: Scene, bodies: Sequence[Body], used: set[int], dtype: DTypeLike
-) -> Int[np.ndarray, "k 6"]:
-    """Kind, first coefficient, nodes along each axis and degree of each leaf."""
-    leaves, _ = _solid_leaves(scene, bodies, used, dtype)
-    names, rows, at = _kind_names(), [], 0
-    for part in leaves:
-        code = names.index(_KINDS[type(part.shape)][0])
-        if isinstance(part.shape, SignedDistanceGrid):
-            shape = part.shape.coefficients.shape
-            rows.append((code, at, *shape, degree_of(part.shape.interpolation)))
-            at += int(np.prod(shape))
-        else:
-            rows.append((code, 0, 0, 0, 0, 0))
-    return np.array(rows, np.int32).reshape(-1, 6)
+def _patches(scene: Scene, n_pairs: int, n_leaves: int) -> PatchTables:
+    """Contacts with a patch law, behind pairs and leaves of the others."""
+    twins = scene.twins or tuple(range(len(scene.bodies)))
+    pairs = patch_pairs(scene)
+    return patch_tables(pairs, scene.timestep.dtype, n_pairs=n_pairs, n_leaves=n_leaves, twins=twins)
 
 
 def _pairs(

@@ -1,0 +1,188 @@
+"""Shapes and grids as rows of numbers: leaves of solids and of densities, and balls around blocks of samples.
+
+See `dano.physics.distances` and `dano.physics.overlap`.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, DTypeLike, Float, Int
+
+from dano.fields import (
+    AbstractField,
+    AbstractShape,
+    Box,
+    Capsule,
+    Cylinder,
+    degree_of,
+    Ellipsoid,
+    GridField,
+    HalfSpace,
+    PosedField,
+    PosedShape,
+    ScaledField,
+    ScaledShape,
+    SignedDistanceGrid,
+    Sphere,
+    UnionField,
+    UnionShape,
+)
+from dano.maths import Pose
+
+LEAF_WIDTH = 20
+"""Numbers of a leaf."""
+# Blocks of a run: see `dano.engine.kernels.tables`.
+_RUN = 4
+_KIND_WIDTH = 6
+# Kinds of leaves by their numbers, and what a leaf holds besides its pose: sizes, length, spacing.
+_KINDS: dict[type[AbstractField], tuple[int, Any]] = {
+    HalfSpace: (0, lambda s: {"sizes": s.normal_direction, "length": s.offset}),
+    Sphere: (1, lambda s: {"sizes": jnp.stack([s.radius, 0 * s.radius, 0 * s.radius])}),
+    Box: (2, lambda s: {"sizes": s.half_extents, "length": s.rounding}),
+    Capsule: (3, lambda s: {"sizes": jnp.stack([s.radius, s.half_length, 0 * s.radius])}),
+    Cylinder: (4, lambda s: {"sizes": jnp.stack([s.radius, s.half_length, 0 * s.radius])}),
+    Ellipsoid: (5, lambda s: {"sizes": s.semi_axes}),
+    SignedDistanceGrid: (6, lambda s: {"sizes": s.origin, "spacing": s.spacing}),
+    GridField: (7, lambda s: {"sizes": s.origin, "spacing": s.spacing}),
+}
+
+
+class Placed(NamedTuple):
+    """A field in a frame: x = s R y + p for y in its own."""
+
+    field: AbstractField
+    factor: Float[Array, ""]
+    position: Float[Array, "3"]
+    rotation: Float[Array, "3 3"]
+
+    @classmethod
+    def still(cls, field: AbstractField, dtype: DTypeLike) -> "Placed":
+        """A field in its own frame."""
+        return cls(field, jnp.ones((), dtype), jnp.zeros(3, dtype), jnp.eye(3, dtype=dtype))
+
+    def inside(self, field: AbstractField, pose: Pose | None = None, factor: Array | None = None) -> "Placed":
+        """What the field is made of."""
+        dtype, position, rotation, size = self.factor.dtype, self.position, self.rotation, self.factor
+        if factor is not None:
+            size = size * factor.astype(dtype)
+        if pose is not None:
+            position = position + size * (rotation @ pose.position.astype(dtype))
+            rotation = rotation @ pose.matrix.astype(dtype)
+        return Placed(field, size, position, rotation)
+
+
+class Leaves(NamedTuple):
+    """Leaves as rows.
+
+    Attributes:
+        rows: See `dano.physics.distances.Leaf`.
+        kinds: See `dano.physics.distances.LeafKind`.
+        coefficients: Spline coefficients of all grids, one below the other.
+    """
+
+    rows: Float[Array, "leaves 20"]
+    kinds: Int[np.ndarray, "leaves 6"]
+    coefficients: Float[Array, "coefficients 1"]
+
+
+def is_known(field: AbstractField) -> bool:
+    """Whether kernels know a shape, or a field that is queried for its density, and all its parts."""
+    if isinstance(field, UnionShape | UnionField):
+        return all(is_known(part) for part in _parts(field))
+    if isinstance(field, PosedShape | ScaledShape | PosedField | ScaledField):
+        return is_known(_inner(field))
+    return type(field) in _KINDS
+
+
+def _parts(field: UnionShape | UnionField) -> Sequence[AbstractField]:
+    return field.shapes if isinstance(field, UnionShape) else field.fields
+
+
+def _inner(field: PosedShape | ScaledShape | PosedField | ScaledField) -> AbstractField:
+    return field.shape if isinstance(field, PosedShape | ScaledShape) else field.field
+
+
+def leaves_of(placed: Placed) -> list[Placed]:
+    """The shapes that a shape is made of.
+
+    Raises:
+        ValueError: If kernels do not know one of them.
+    """
+    shape = placed.field
+    if isinstance(shape, PosedShape):
+        return leaves_of(placed.inside(shape.shape, pose=shape.pose))
+    if isinstance(shape, ScaledShape):
+        return leaves_of(placed.inside(shape.shape, factor=shape.factor))
+    if isinstance(shape, UnionShape):
+        return [leaf for each in shape.shapes for leaf in leaves_of(placed.inside(each))]
+    if type(shape) not in _KINDS:
+        known = ", ".join(kind.__name__ for kind in _KINDS if issubclass(kind, AbstractShape))
+        raise ValueError(
+            f"shape must be one that contact knows ({known}, posed, scaled or joined), got "
+            f"{type(shape).__name__}: a SignedDistanceGrid may stand for any other"
+        )
+    return [placed]
+
+
+def kinds_of(leaves: Sequence[Placed]) -> set[int]:
+    """Kinds of leaves."""
+    return {_KINDS[type(leaf.field)][0] for leaf in leaves}
+
+
+def degrees_of(leaves: Sequence[Placed]) -> set[int]:
+    """Degrees of the splines of leaves that are grids."""
+    return {
+        degree_of(leaf.field.interpolation)
+        for leaf in leaves
+        if isinstance(leaf.field, SignedDistanceGrid | GridField)
+    }
+
+
+def leaf_tables(leaves: Sequence[Placed], dtype: DTypeLike) -> Leaves:
+    """Rows of leaves."""
+    if not leaves:
+        return Leaves(jnp.zeros((0, LEAF_WIDTH), dtype), _whole([]), jnp.zeros((0, 1), dtype))
+    zero = {"sizes": jnp.zeros(3), "length": jnp.zeros(()), "spacing": jnp.ones(3)}
+    own = [{**zero, **_KINDS[type(leaf.field)][1](leaf.field)} for leaf in leaves]
+    columns = [
+        jnp.stack([leaf.factor for leaf in leaves]),
+        jnp.stack([leaf.position for leaf in leaves]),
+        jnp.stack([leaf.rotation for leaf in leaves]),
+        *(jnp.stack([numbers[name].astype(dtype) for numbers in own]) for name in zero),
+    ]
+    kinds, coefficients, at = [], [jnp.zeros(0, dtype)], 0
+    for leaf in leaves:
+        kind = (_KINDS[type(leaf.field)][0], 0, 0, 0, 0, 0)
+        if isinstance(leaf.field, SignedDistanceGrid | GridField):
+            grid = leaf.field.coefficients
+            kind = (kind[0], at, *grid.shape, degree_of(leaf.field.interpolation))
+            coefficients.append(grid.ravel().astype(dtype))
+            at += int(np.prod(grid.shape))
+        kinds.append(kind)
+    return Leaves(
+        jnp.concatenate([x.reshape(len(leaves), -1) for x in columns], axis=1),
+        _whole(kinds),
+        jnp.concatenate(coefficients)[:, None],
+    )
+
+
+def _whole(kinds: Sequence[tuple[int, ...]]) -> Int[np.ndarray, "leaves 6"]:
+    return np.array(kinds, np.int32).reshape(-1, _KIND_WIDTH)
+
+
+def balls_around_runs(balls: Float[Array, "b 4"]) -> Float[Array, "b 4"]:
+    """Balls around each block and those after it; a run may include blocks of the next body.
+
+    Args:
+        balls: Centre [m] and radius [m] of a ball around each block.
+    """
+    n = balls.shape[0]
+    if n == 0:
+        return balls
+    members = np.minimum(np.arange(n)[:, None] + np.arange(_RUN)[None], n - 1)
+    centers, radii = balls[members, :3], balls[members, 3]
+    middle = jnp.mean(centers, axis=1)
+    reach = jnp.sqrt(jnp.sum((centers - middle[:, None]) ** 2, axis=2)) + radii
+    return jnp.concatenate([middle, jnp.max(reach, axis=1, keepdims=True)], axis=1)
