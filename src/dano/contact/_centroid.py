@@ -4,17 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dano.contact._laws import (
-    AbstractPatchLaw,
-    ContactParams,
-    HARD,
-    non_negative,
-    positive,
-    Setting,
-    Softening,
-)
-from dano.contact._overlap import Patch
-from dano.maths import Numbers, safe_norm
+from dano.contact._laws import AbstractPatchLaw, ContactParams, non_negative, positive, Setting
+from dano.maths import Numbers
 
 # Of the paper's implementation; its bodies are about 1 m large.
 PAPER = {
@@ -80,11 +71,6 @@ class CentroidLaw(AbstractPatchLaw):
         """See `AbstractContactLaw.reads`."""
         return ("sliding_friction", *PAPER)
 
-    @property
-    def stiction(self) -> bool:
-        """See `AbstractContactLaw.stiction`."""
-        return self.stiction_velocity is not None
-
     def complete(self, params: ContactParams, setting: Setting) -> ContactParams:
         """See `AbstractContactLaw.complete`."""
         if self.stiction_velocity is None:
@@ -101,7 +87,7 @@ class CentroidLaw(AbstractPatchLaw):
         )
 
     def numbers(self, params: ContactParams) -> Float[Array, "11"]:
-        """All numbers of a contact as machine code reads them.
+        """All numbers of a contact as kernels read them.
 
         Two parameters each of the normal force and of sliding, torsional and rolling friction, then those of
         the law; no stiction velocity is 0.
@@ -112,66 +98,3 @@ class CentroidLaw(AbstractPatchLaw):
         read += ("torsional_drag", "rolling_friction", "rolling_drag")
         of_law = (self.smoothing, self.regularizer, stiction)
         return jnp.stack([*(jnp.asarray(getattr(params, name)) for name in read), *map(jnp.asarray, of_law)])
-
-    def wrench(self, patch: Patch, params, twist, timestep, softening: Softening = HARD):
-        """See `AbstractContactLaw.wrench`; parameters that no scene has filled in are the paper's."""
-        params = params.filled(**PAPER)
-        n, psi = patch.normal, patch.overlap
-        nn = n[:, None] * n[None]
-        tangential = jnp.eye(3, dtype=n.dtype) - nn
-        velocity, spin = twist[:3], twist[3:]
-        v_n, w_n = jnp.sum(n * velocity), jnp.sum(n * spin)
-
-        push = params.spring - params.damper * v_n
-        if self.adhesive:
-            magnitude, slope = psi * jnp.abs(push), -psi * params.damper * jnp.sign(push)
-            direction = n * jnp.sign(push)
-        else:
-            pushing = push > 0
-            magnitude = psi * jnp.where(pushing, push, 0)
-            slope = jnp.where(pushing, -psi * params.damper, 0)
-            direction = n
-
-        slide, d_slide = self._resistance(
-            velocity - n * v_n, tangential, params.sliding_friction, params.sliding_drag, softening
-        )
-        drill, d_drill = self._resistance(
-            n * w_n, nn, params.torsional_friction, params.torsional_drag, softening
-        )
-        roll, d_roll = self._resistance(
-            spin - n * w_n, tangential, params.rolling_friction, params.rolling_drag, softening
-        )
-        per_force, per_moment = direction + slide, drill + roll
-        wrench = magnitude * jnp.concatenate([per_force, per_moment])
-        upper = jnp.concatenate(
-            [slope * per_force[:, None] * n[None] + magnitude * d_slide, jnp.zeros((3, 3), n.dtype)], axis=1
-        )
-        lower = jnp.concatenate(
-            [slope * per_moment[:, None] * n[None], magnitude * (d_drill + d_roll)], axis=1
-        )
-        return wrench, jnp.concatenate([upper, lower])
-
-    def _resistance(self, u, projection, friction, drag, softening: Softening):
-        """μ c(u) − drag u for a velocity u = projection @ u_full, and its derivative by u_full."""
-        speed = safe_norm(u)
-        # c = −gain(|u|) u
-        if self.stiction_velocity is None:
-            angle = jnp.arctan(self.smoothing * speed) * (2 / jnp.pi)
-            reach = self.regularizer + speed
-            gain = angle / reach
-            gain_slope = ((2 / jnp.pi) * self.smoothing / (1 + (self.smoothing * speed) ** 2) - gain) / reach
-        else:
-            gain, gain_slope = sticking(speed, self.stiction_velocity, softening)
-        # The second term of the derivative vanishes with u, so any divisor will do there.
-        along = gain_slope / jnp.where(speed > 0, speed, 1)
-        force = -(friction * gain + drag) * u
-        derivative = -(friction * gain + drag) * projection - friction * along * u[:, None] * u[None]
-        return force, derivative
-
-
-def sticking(speed, stiction_velocity, softening: Softening):
-    """1 / max(speed, stiction velocity), softened, and its derivative by the speed."""
-    held = stiction_velocity * softening.held
-    slides = speed > held
-    gain = 1 / jnp.where(slides, jnp.maximum(speed, held), stiction_velocity * softening.scale)
-    return gain, jnp.where(slides, -gain * gain, 0)

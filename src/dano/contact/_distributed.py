@@ -1,6 +1,7 @@
 """The distributed law: pressure and friction at every surface sample."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,14 +17,49 @@ from dano.contact._laws import (
     Setting,
     STANDARD_GRAVITY,
 )
-from dano.contact._pressure import Material
 from dano.maths import is_traced, Numbers
 
+CHUNK = 16
+"""Points that `VariationalEngine.capacity` counts as one."""
 # Share of its size by which a body sinks under the heaviest load of the scene in a typical orientation, at
 # default stiffness.
 SINKING = 0.005
 # Velocities within which restitution ends at default: so many times √(g · depth of the heaviest load).
 _SLOW = 0.2
+
+
+class Material(NamedTuple):
+    """What the traction at a point depends on besides geometry and velocity; arrays over contacts.
+
+    Attributes:
+        stiffness: k [Pa/m].
+        restitution: e [1].
+        restitution_velocity: v_e [m/s].
+        hysteresis: σ [1].
+        friction: μ [1].
+        friction_fading: φ [1].
+        friction_pressure: p₀ [Pa].
+        stiction: v_s [m/s].
+        ahead: θ h, how far ahead the depth is taken [s].
+        timestep: h [s].
+        instant: 1 where impacts end within the step, 0 where they are left to the spring.
+        bounce: Slowest rebound of an impact [m/s].
+        uplift: An overlap of depth d separates at most at √(uplift · d), if that exceeds v_e [m/s²].
+    """
+
+    stiffness: Float[Array, " *n"]
+    restitution: Float[Array, " *n"]
+    restitution_velocity: Float[Array, " *n"]
+    hysteresis: Float[Array, " *n"]
+    friction: Float[Array, " *n"]
+    friction_fading: Float[Array, " *n"]
+    friction_pressure: Float[Array, " *n"]
+    stiction: Float[Array, " *n"]
+    ahead: Float[Array, " *n"]
+    timestep: Float[Array, " *n"]
+    instant: Float[Array, " *n"]
+    bounce: Float[Array, " *n"]
+    uplift: Float[Array, " *n"]
 
 
 class DistributedLaw(AbstractContactLaw):

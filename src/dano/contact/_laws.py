@@ -1,7 +1,7 @@
 """Contact laws: from the geometry of a contact and the relative motion of two bodies to a wrench.
 
-A law is a class (what is fixed), its parameters are `ContactParams` (what can be identified). Velocities are
-the unknown end-of-step ones, so a law also returns its Jacobian, in closed form, for the step's Newton solve.
+A law is a class (what is fixed), its parameters are `ContactParams` (what can be identified). Its formulas
+are those of `dano.physics`, which kernels evaluate.
 """
 
 import abc
@@ -12,8 +12,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.contact._colliders import Collider
-from dano.contact._overlap import overlap, Patch
 from dano.maths import checked_floating, is_traced, Numbers
 
 # A scalar, or None until a scene fills it in; written so that type checkers let users read it from a scene.
@@ -138,22 +136,6 @@ class Setting(NamedTuple):
     stiffness: Callable[[float], Float[Array, ""]]
 
 
-class Softening(NamedTuple):
-    """How much larger than a law's own the stiction velocity is taken while a solver closes in on a root.
-
-    Attributes:
-        held: What is slower than this many stiction velocities counts as sticking …
-        scale: … and is resisted as if the stiction velocity were so many times as large.
-    """
-
-    held: Float[Array, ""] | float = 1.0
-    scale: Float[Array, ""] | float = 1.0
-
-
-HARD = Softening()
-"""Friction as it is."""
-
-
 class AbstractContactLaw(eqx.Module):
     """How the contact of two bodies becomes force: at a patch (`AbstractPatchLaw`) or at points."""
 
@@ -179,11 +161,6 @@ class AbstractContactLaw(eqx.Module):
         """Whether the law needs surface samples and solids rather than shared mass."""
         return False
 
-    @property
-    def stiction(self) -> bool:
-        """Whether `AbstractPatchLaw.wrench` has a stiction velocity, which it softens when asked to."""
-        return False
-
     def complete(self, params: ContactParams, setting: Setting) -> ContactParams:
         """Parameters with this law's defaults in place of None."""
         return params
@@ -191,34 +168,6 @@ class AbstractContactLaw(eqx.Module):
 
 class AbstractPatchLaw(AbstractContactLaw):
     """One wrench for all of the overlap of two bodies."""
-
-    def patch(self, a: Collider, b: Collider) -> Patch:
-        """Geometry of a contact at the current configuration, constant within a step."""
-        return overlap(a, b)
-
-    @abc.abstractmethod
-    def wrench(
-        self,
-        patch: Patch,
-        params: ContactParams,
-        twist: Float[Array, "6"],
-        timestep: Float[Array, ""],
-        softening: Softening = HARD,
-    ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
-        """Wrench on the first body and its derivative with respect to the relative twist.
-
-        Args:
-            patch: Geometry of the contact, from `patch`.
-            params: Parameters of this contact.
-            twist: Velocity [m/s] of the first body relative to the second at `patch.point`, then relative
-                spin [rad/s]; both in W.
-            timestep: h [s].
-            softening: For laws with stiction.
-
-        Returns:
-            (force [N], torque about `patch.point` [N m]) on the first body [W], shape (6,), and
-            ∂wrench/∂twist.
-        """
 
 
 def non_negative(name: str, value: Numbers) -> Float[Array, ""]:

@@ -17,7 +17,6 @@ from jaxtyping import Array, Bool, Float
 
 from dano.checks import checked_kind
 from dano.contact._colliders import BLOCK, Collider, SampleSet, Support, SYMMETRIC
-from dano.contact._derivatives import by_autodiff, keep
 from dano.fields import AbstractField, AbstractShape, GridField, HalfSpace, PosedField, PosedShape, Sphere
 from dano.maths import contract, einsum, matmul, matvec, product, safe_normalize
 
@@ -168,11 +167,11 @@ def _planar_jvp(primals, tangents):
     plane, samples = primals
     d_plane, d_samples = tangents
     if jax.tree.leaves(d_samples):
-        return by_autodiff(_planar_moments, primals, tangents)
+        return _by_autodiff(_planar_moments, primals, tangents)
     # dS = M dplane with the symmetric 4×4 moment matrix of the samples in the smoothing band.
     t = _depth(plane, samples)
     slope = -6 * t * (1 - t)
-    moments, matrix = keep(_moments(t, samples), _symmetric(samples.weights * slope, samples.products))
+    moments, matrix = _moments(t, samples), _symmetric(samples.weights * slope, samples.products)
     return moments, matvec(matrix, d_plane)
 
 
@@ -204,9 +203,9 @@ def _dense(to_field, field, samples):
 def _dense_jvp(primals, tangents):
     to_field, field, samples = primals
     if jax.tree.leaves(tangents[1:]):
-        return by_autodiff(_dense_sums, primals, tangents)
+        return _by_autodiff(_dense_sums, primals, tangents)
     value, jacobian = _features_and_jacobian(field, product(to_field, samples.points))
-    sums, derivative = keep(*_accumulate(value, jacobian, samples.points, samples.products, samples.weights))
+    sums, derivative = _accumulate(value, jacobian, samples.points, samples.products, samples.weights)
     return sums, einsum("kab,ab->k", derivative, tangents[0])
 
 
@@ -246,8 +245,8 @@ def _culled(to_field, field, samples, support):
 def _culled_jvp(primals, tangents):
     if jax.tree.leaves(tangents[1:]):
         # The map of the support only says what may be skipped: without it the sums are the same.
-        return by_autodiff(_dense_sums, primals[:3], tangents[:3])
-    sums, derivative = keep(*_culled_sums(*primals, derivative=True))
+        return _by_autodiff(_dense_sums, primals[:3], tangents[:3])
+    sums, derivative = _culled_sums(*primals, derivative=True)
     return sums, einsum("kab,ab->k", derivative, tangents[0])
 
 
@@ -337,3 +336,10 @@ def _cap(ball: Collider, plane: Collider) -> Patch:
         jnp.where(touching, ball.origin - offset * normal, 0),
         jnp.where(touching, normal, 0),
     )
+
+
+def _by_autodiff(function, primals, tangents):
+    """Plain forward derivative, for arguments that few ever perturb (a grid's values, samples, a radius)."""
+    perturbed = jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
+    dynamic, static = eqx.partition(primals, perturbed)
+    return jax.jvp(lambda d: function(*eqx.combine(d, static)), (dynamic,), (tangents,))

@@ -7,7 +7,7 @@ from dano.engine._history import (
     contact_wrenches as contact_wrenches,
     ContactHistory as ContactHistory,
 )
-from dano.engine._newton import Report as Report
+from dano.engine._reports import Report as Report
 from dano.engine._rollout import (
     AbstractEngine as AbstractEngine,
     checked_engine as checked_engine,

@@ -14,11 +14,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.checks import checked_count, checked_kind, checked_number
-from dano.contact import KEPT, Patch
-from dano.engine import _problem, _variational
+from dano.contact import Patch
+from dano.engine import _touching, _variational
 from dano.engine._compiling import compiled
-from dano.engine._newton import Report, SolverOptions
-from dano.engine._rigid import too_fast
+from dano.engine._reports import Report, SolverOptions
 from dano.maths import is_traced, quat_conjugate, quat_exp, quat_multiply
 from dano.scene import Control, RESOLVED, Scene, State, Trajectory
 
@@ -97,9 +96,9 @@ class VariationalEngine(AbstractEngine):
         if self.capacity is not None:
             checked_count("capacity", self.capacity)
 
-    def prepare(self, scene: Scene) -> _problem.Prepared:
+    def prepare(self, scene: Scene) -> _variational.Prepared:
         """See `AbstractEngine.prepare`."""
-        return _problem.prepare(scene, self.capacity)
+        return _variational.prepare(scene, self.capacity)
 
     def enlarged(self, scene: Scene, factor: int) -> "VariationalEngine | None":
         """See `AbstractEngine.enlarged`."""
@@ -119,17 +118,17 @@ class VariationalEngine(AbstractEngine):
     ) -> tuple[State, Report] | None:
         """See `AbstractEngine.rollout`."""
         options = SolverOptions(self.tolerance, self.max_iterations)
-        return _variational.rollout(prepared, state, controls, n_steps, options)
+        return _variational.rollout(scene, prepared, state, controls, n_steps, options)
 
     def touch(self, scene: Scene, prepared: Any, state: State) -> Patch:
         """See `AbstractEngine.touch`."""
-        return _variational.touch(scene, prepared, state)
+        return _touching.touch(scene, prepared.tables, prepared.capacity, state)
 
     def wrenches(
         self, scene: Scene, prepared: Any, before: State, after: State, about: Float[Array, "contacts 3"]
     ) -> Float[Array, "contacts 6"]:
         """See `AbstractEngine.wrenches`."""
-        return _variational.wrenches(scene, prepared, before, after, about)
+        return _touching.wrenches(scene, prepared.tables, prepared.capacity, before, after, about)
 
 
 def check_state(scene: Scene, state: State) -> None:
@@ -286,14 +285,8 @@ def _jitted_rollout(engine, scene, state, controls, n_steps, segment):
         following, report = engine.step(scene, prepared, state, control)
         return following, (following, report)
 
-    # Reverse mode keeps the few numbers that are dear and computes the rest of a step again: storing every
-    # intermediate of every step costs more time than computing it, and ten times the memory.
-    step = jax.checkpoint(
-        advance, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(KEPT)
-    )
-
     def scan(state, inputs):
-        return jax.lax.scan(step, state, inputs)
+        return jax.lax.scan(advance, state, inputs)
 
     steps = jnp.arange(n_steps, dtype=scene.timestep.dtype), None if callable(controls) else controls
     if segment is None or segment >= n_steps:
@@ -436,7 +429,8 @@ def _say(scene: Scene, following: State, report: Report) -> None:
             stacklevel=3,
         )
     omega = following.omega.reshape(-1, len(scene.bodies), 3)
-    fast = np.asarray(too_fast(omega, scene.timestep))
+    # Turns of more than 60° in a step.
+    fast = np.asarray(jnp.sum(omega * omega, axis=-1) * scene.timestep**2 > 4 * RESOLVED**2)
     if fast.any():
         spins = np.linalg.norm(np.asarray(omega), axis=2)
         names = ", ".join(repr(scene.names[i]) for i in np.flatnonzero(fast.any(axis=0)))

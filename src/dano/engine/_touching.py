@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dano.contact import Patch
-from dano.engine.launching import overlaps, Tables
-from dano.engine.launching import wrenches as launched_wrenches
+from dano.engine.launching import overlaps, Tables, wrenches as launched_wrenches
 from dano.maths import safe_normalize
 from dano.scene import Scene, State
 
@@ -64,7 +63,7 @@ def wrenches(
 def _places(
     scene: Scene, tables: Tables
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Of each row of what kernels see: its place in `scene.pairs`, whether its first body is that pair's, it."""
+    """Of each row of what kernels see: place in `scene.pairs`, 1 if its first body is that pair's, else −1, it."""
     presses = np.array([c.law.presses for c in scene.contacts], bool)
     listed = np.arange(len(scene.contacts))
     of_points = [*listed[presses], *range(len(scene.contacts), len(scene.pairs))]

@@ -14,7 +14,7 @@ form.
 
 import warp as wp
 
-from dano.physics.friction import Friction, friction, friction_with_dual, following_friction
+from dano.physics.friction import following_friction, Friction, friction, friction_with_dual
 from dano.physics.real import ONE, real, vec3, ZERO
 from dano.physics.samples import Point
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.checks import checked_optional, checked_text
-from dano.contact import Collider, ContactParams, Part, SampleSet, Support, SurfaceSet
+from dano.contact import Collider, ContactParams, SampleSet, Support, SurfaceSet
 from dano.fields import AbstractField, AbstractShape, Ellipsoid, HalfSpace, SignedDistanceGrid, Sphere
 from dano.maths import checked_array, floating, Numbers, quat_rotate
 from dano.objects import checked_inertia, MassProperties, NeuralObject
@@ -32,8 +32,8 @@ class Body(eqx.Module):
         support: Culling map of the object's grid.
         surface: Surface samples with vector areas, for distributed contact; None until a scene needs those of
             a shape.
-        extent: Middle [m, F], radius, size and thickness [m] of the body as contact sees it, see `Part`; None
-            until a scene needs it.
+        extent: Centre of a ball around the body [m, F], its radius [m] (infinite for a half-space), the
+            body's largest extent and its largest depth below the surface [m]; None until a scene needs it.
         density_scale: Makes the object's density dimensionless in neural–neural contacts: one over the mean
             density of its samples.
         mass: [kg].
@@ -215,11 +215,6 @@ class Body(eqx.Module):
         """This body without what distributed contact asks of it."""
         nothing = (None, jnp.zeros(6, self.com.dtype))
         return eqx.tree_at(lambda b: (b.surface, b.extent), self, nothing, is_leaf=lambda x: x is None)
-
-    def part(self, twin: int) -> Part:
-        """The body as distributed contact sees it; `twin` is the first body with the same geometry."""
-        assert self.extent is not None
-        return Part(self.surface, self.scale, self.solid, self.extent, twin)
 
     def collider(self, position: Float[Array, "3"], rotation: Float[Array, "3 3"]) -> Collider:
         """The body as a contact of shared mass sees it.

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.maths import einsum, product, quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
-from dano.scene._filling import fill, fills_natively
 from dano.scene._joint_laws import joint_laws, JointLaws
 from dano.scene._joints import Joint, Layout
 from dano.scene._states import State
@@ -296,8 +295,6 @@ def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:
     if not layout.children:
         return state
     assert state.q is not None and state.v is not None
-    if fills_natively():
-        return fill(chains.table, chains.com, layout, state, h, RESOLVED)
     rows = np.array(layout.children)
     now = place_links(chains, state.position, state.orientation, state.q)
     # Where the roots were a step before.

@@ -11,7 +11,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int
 
 from dano.engine._compiling import compiled
-from dano.engine._newton import Report
+from dano.engine._reports import Report
 from dano.engine._rollout import AbstractEngine
 from dano.engine.batches._devices import map_rows
 from dano.scene import Control, Scene, State

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dano.engine.joints._structure import tree_structure, TreeStructure
-from dano.engine.joints._tables import law_rows
-from dano.scene import Scene
+from dano.scene import JointLaws, Scene
 
 _SIX = 6
 
@@ -38,7 +37,7 @@ def tree_rows(
         loops = jnp.concatenate([closing.position, closing.anchor, closing.orientation], axis=1)
     rows = {
         "scene.trees.joints": scene.chains.table.astype(dtype),
-        "scene.trees.laws": law_rows(scene.chains.laws, dtype),
+        "scene.trees.laws": _law_rows(scene.chains.laws, dtype),
         "scene.trees.loops": loops.astype(dtype),
     }
     whole = {
@@ -71,3 +70,23 @@ def tree_lengths(structure: TreeStructure) -> dict[str, int]:
         "sizes": 4,
     }
     return {f"room.trees.{name}": length for name, length in lengths.items()}
+
+
+def _law_rows(laws: JointLaws, dtype) -> Float[Array, "c 12"]:
+    """What acts on each joint coordinate, see `JointLaws`.
+
+    Damping, armature, stiffness, rest, friction, two limits and five numbers of a motor. What no joint has is
+    0, or endless.
+    """
+    none = jnp.zeros_like(laws.damping)
+
+    def column(values: Array | None) -> Array:
+        return (none if values is None else values)[:, None]
+
+    endless = np.broadcast_to(np.array([-np.inf, np.inf]), (none.size, 2))
+    limits = jnp.asarray(endless, dtype) if laws.limits is None else laws.limits
+    motor = laws.motor
+    if motor is None:
+        motor = jnp.concatenate([jnp.zeros((none.size, 3), dtype), jnp.asarray(endless, dtype)], axis=1)
+    single = (laws.damping, laws.armature, laws.stiffness, laws.rest, laws.friction)
+    return jnp.concatenate([*(column(x) for x in single), limits, motor], axis=1)

@@ -3,9 +3,9 @@
 import warp as wp
 
 from dano.engine.kernels.lanes import wait
-from dano.engine.kernels.rollout import begin_body, Launch
+from dano.engine.kernels.rollout import begin_first_step, Launch
 from dano.engine.kernels.search import find_contacts
-from dano.engine.kernels.tables import Push, Room, Scene
+from dano.engine.kernels.tables import Room, Scene
 from dano.physics.features import LANES
 from dano.physics.real import real, vec3
 
@@ -62,10 +62,7 @@ def listing(scene: Scene, room: Room, launch: Launch, listing: Listing):
     """The points that may press within a step from `launch.state`."""
     block, lane = wp.tid()
     world = launch.first_world + block
-    for i in range(scene.body_index.shape[0]):
-        push = Push()
-        begin_body(scene, room, world, i, launch.state[world, i], push)
-    wait()
+    begin_first_step(scene, room, world, lane, launch)
     n_found, overflow = find_contacts(scene, room, world, lane)
     if lane == 0:
         listing.overflow[world, 0] = wp.where(overflow, real(1.0), real(0.0))

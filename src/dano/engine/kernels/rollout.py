@@ -244,6 +244,20 @@ def begin_step_of_trees(scene: Scene, room: Room, world: int, launch: Launch, t:
 
 
 @wp.func
+def begin_first_step(scene: Scene, room: Room, world: int, lane: int, launch: Launch):
+    """What is known at `launch.state`, without controls."""
+    for i in range(scene.body_index.shape[0]):
+        push = Push()
+        begin_body(scene, room, world, i, launch.state[world, i], push)
+    wait()
+    if wp.static(TREES):
+        if lane == 0:
+            begin_coordinates(scene, room, world, launch, 0)
+            begin_step_of_trees(scene, room, world, launch, 0)
+        wait()
+
+
+@wp.func
 def advance_body(scene: Scene, room: Room, world: int, i: int, row: StateRow) -> StateRow:
     """A body at the end of a step: x⁺ = x + h v⁺, q⁺ = q ⊗ turn."""
     h = scene.timestep[world, 0]

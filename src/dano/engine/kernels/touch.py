@@ -4,12 +4,14 @@ import warp as wp
 
 from dano.engine.kernels.derivatives.equations import settle
 from dano.engine.kernels.lanes import total, total3, wait
-from dano.engine.kernels.rollout import begin_body, begin_coordinates, begin_step_of_trees, Launch, REBOUNDS
+from dano.engine.kernels.patches import contact_of, find_patches
+from dano.engine.kernels.rollout import begin_first_step, Launch, REBOUNDS
 from dano.engine.kernels.search import find_contacts
 from dano.engine.kernels.solve import newton_step
-from dano.engine.kernels.tables import Push, Room, Scene
+from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.kinematics import unknown_of
-from dano.physics.features import LANES, TREES
+from dano.physics.features import LANES, PATCHES, POINTS, TREES
+from dano.physics.overlap import Patch
 from dano.physics.real import INFINITY, ONE, real, vec3, vec6, ZERO
 from dano.physics.twists import angular_part, linear_part
 
@@ -65,23 +67,37 @@ def overlap_of(room: Room, world: int, first: int, end: int, place: vec3) -> Ove
     return found
 
 
+@wp.func
+def overlap_of_patch(patch: Patch) -> Overlap:
+    """The same of a patch, whose shared mass ψ [kg] stands for the volume."""
+    found = Overlap()
+    found.volume = patch.overlap
+    found.moment = patch.overlap * patch.centroid
+    found.direction = patch.overlap * patch.normal
+    return found
+
+
+@wp.func
+def wrench_of(impulse: vec6, h: real) -> Wrench:
+    """Of an impulse in a step of length h."""
+    wrench = Wrench()
+    wrench.force = linear_part(impulse) / h
+    wrench.torque = angular_part(impulse) / h
+    return wrench
+
+
 @wp.kernel(enable_backward=False)
 def touch(scene: Scene, room: Room, launch: Launch, seen: Seen):
     """Overlaps at `launch.state`, in which nothing moves."""
     block, lane = wp.tid()
     world = launch.first_world + block
-    for i in range(scene.body_index.shape[0]):
-        push = Push()
-        begin_body(scene, room, world, i, launch.state[world, i], push)
+    begin_first_step(scene, room, world, lane, launch)
     for p in range(lane, seen.overlaps.shape[1], _LANES):
         seen.overlaps[world, p] = Overlap()
     wait()
-    if wp.static(TREES):
-        if lane == 0:
-            begin_coordinates(scene, room, world, launch, 0)
-            begin_step_of_trees(scene, room, world, launch, 0)
-        wait()
-    n_found, _overflow = find_contacts(scene, room, world, lane)
+    n_found = int(0)
+    if wp.static(POINTS):
+        n_found, _overflow = find_contacts(scene, room, world, lane)
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
         place = room.bodies[world, scene.pair_index[found.pair].first].position
@@ -91,6 +107,14 @@ def touch(scene: Scene, room: Room, launch: Launch, seen: Seen):
         own.direction = total3(own.direction)
         if lane == 0:
             seen.overlaps[world, found.pair] = own
+    if wp.static(PATCHES):
+        find_patches(scene, room, world, lane, n_found)
+        wait()
+        for p in range(room.patches.count[world, 0]):
+            touching = room.found[world, (n_found + p) * _LANES]
+            if lane == 0:
+                patch = room.patches.patches[world, contact_of(scene, touching)]
+                seen.overlaps[world, touching.pair] = overlap_of_patch(patch)
 
 
 @wp.func
@@ -158,7 +182,9 @@ def press(scene: Scene, room: Room, launch: Launch, seen: Seen):
     n_found = settle_with(scene, room, launch, world, lane, chosen)
     if lane == 0:
         for f in range(n_found):
-            row = Wrench()
-            row.force = linear_part(room.wrenches[world, f]) / h
-            row.torque = angular_part(room.wrenches[world, f]) / h
-            seen.wrenches[world, room.found[world, f * _LANES].pair] = row
+            seen.wrenches[world, room.found[world, f * _LANES].pair] = wrench_of(room.wrenches[world, f], h)
+        if wp.static(PATCHES):
+            for p in range(room.patches.count[world, 0]):
+                touching = room.found[world, (n_found + p) * _LANES]
+                impulse = room.patches.wrenches[world, contact_of(scene, touching)]
+                seen.wrenches[world, touching.pair] = wrench_of(impulse, h)

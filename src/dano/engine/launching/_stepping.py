@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dano.engine._newton import Report, SolverOptions
+from dano.contact import CHUNK
+from dano.engine._reports import Report, SolverOptions
 from dano.engine.joints import tree_lengths
 from dano.engine.launching import _derivatives  # noqa: F401  rules for derivatives of launches
 from dano.engine.launching._launch import launch, Plan, plan, Shape
@@ -25,8 +26,6 @@ _PATCHES = tuple(
     f"room.patches.{name}"
     for name in ("patches", "arms", "duals", "changes", "linear", "wrenches", "jacobians")
 )
-CHUNK = 16
-"""Points that `VariationalEngine.capacity` counts as one."""
 
 
 def rollout(

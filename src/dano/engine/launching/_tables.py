@@ -83,6 +83,7 @@ _PLANES, _PRIMITIVES, _GRIDS, _DENSITIES = (
     frozenset({0, 7}),
 )
 _SOLIDS, _FIELDS = frozenset(range(7)), frozenset(range(8))
+_BUILDS = (_PLANES, _PRIMITIVES, _GRIDS, _DENSITIES, _SOLIDS, _FIELDS)
 _STILL, _TURNS = frozenset({0}), frozenset({0, 1, 2})
 
 

@@ -1,10 +1,10 @@
 """Where bodies touch, and how hard they press, as launches of kernels."""
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dano.contact import CHUNK
 from dano.engine.launching._launch import launch, plan, Shape
-from dano.engine.launching._stepping import CHUNK, given, REPORT, room_of, WRENCH
+from dano.engine.launching._stepping import given, REPORT, room_of, WRENCH
 from dano.engine.launching._tables import Tables
 from dano.scene import State
 

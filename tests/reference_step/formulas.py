@@ -1,0 +1,87 @@
+"""Formulas of `dano.physics`, each as a function of NumPy arrays."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from dano.engine.launching import Features, instance
+
+_BUILD = Features(LANES=1)
+momentum: Any = instance(_BUILD, "dano.physics.momentum")
+point_law: Any = instance(_BUILD, "dano.physics.point_law")
+rotations: Any = instance(_BUILD, "dano.physics.rotations")
+friction: Any = instance(_BUILD, "dano.physics.friction")
+vec3, vec4, mat33 = momentum.vec3, rotations.vec4, momentum.mat33
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def press(
+    materials: wp.array(dtype=point_law.Material),
+    points: wp.array(dtype=point_law.Point),
+    impacts: wp.array(dtype=wp.float64),
+    rates: wp.array(dtype=wp.float64),
+    slips: wp.array(dtype=vec3),
+    pressures: wp.array(dtype=wp.float64),
+    frictions: wp.array(dtype=vec3),
+):
+    """Pressure and friction at points that separate and slip."""
+    i = wp.tid()
+    law = point_law.point_law(materials[i], points[i], impacts[i])
+    p = point_law.pressure(law, rates[i], wp.float64(0.0), law.stiction).value
+    pressures[i] = p
+    frictions[i] = friction.friction(slips[i], point_law.friction_bound(law, p).value, law.stiction)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def spin(
+    omega: vec3,
+    inertia: mat33,
+    orientation: vec4,
+    h: wp.float64,
+    sign: wp.float64,
+    momenta: wp.array(dtype=vec3),
+    turned: wp.array(dtype=vec4),
+):
+    """Angular momentum of a step, and the orientation at its end."""
+    momenta[0] = momentum.angular_momentum(omega, inertia, h, sign)
+    turned[0] = rotations.to_wxyz(rotations.turned(rotations.from_wxyz(orientation), omega, h))
+
+
+def traction(material: dict[str, float], points, rate, slip):
+    """Pressure [Pa] and friction [Pa] of points, see `reference_step.collision.Points`."""
+    n = len(rate)
+    rows = np.zeros(n, point_law.Point.numpy_dtype())
+    for name in ("arm", "normal", "moment", "depth", "rate", "area"):
+        rows[name] = getattr(points, name)
+    rows["approach"] = points.rate - np.sum(points.drift * points.normal, axis=1)
+    of_material = np.zeros(n, point_law.Material.numpy_dtype())
+    for name, value in material.items():
+        of_material[name] = value
+    pressures, frictions = wp.zeros(n, wp.float64, device="cpu"), wp.zeros(n, vec3, device="cpu")
+    given = [
+        wp.array(of_material, dtype=point_law.Material, device="cpu"),
+        wp.array(rows, dtype=point_law.Point, device="cpu"),
+        wp.array(points.impact, dtype=wp.float64, device="cpu"),
+        wp.array(rate, dtype=wp.float64, device="cpu"),
+        wp.array(slip, dtype=vec3, device="cpu"),
+    ]
+    wp.launch(press, n, [*given, pressures, frictions], device="cpu")
+    return pressures.numpy(), frictions.numpy()
+
+
+def _spun(omega, inertia, orientation, h, sign):
+    momenta, turned = wp.zeros(1, vec3, device="cpu"), wp.zeros(1, vec4, device="cpu")
+    given = [vec3(*omega), mat33(*np.ravel(inertia)), vec4(*orientation), float(h), float(sign)]
+    wp.launch(spin, 1, [*given, momenta, turned], device="cpu")
+    return momenta.numpy()[0], turned.numpy()[0]
+
+
+def angular_momentum(omega, inertia, h, sign):
+    """P(ω) or P⁻(ω), by the sign."""
+    return _spun(omega, inertia, (1.0, 0.0, 0.0, 0.0), h, sign)[0]
+
+
+def orientation_after(q, omega, h):
+    """Orientation at the end of a step."""
+    return _spun(omega, np.eye(3), q, h, 1.0)[1]
