@@ -52,8 +52,9 @@ def every_solid():
     contacts = [dano.Contact("ball", body.name) for body in bodies]
     scene = dano.Scene.create([ball, *bodies], contacts, timestep=H)
     tables = scene_tables(scene)
-    distances = instance(tables.features, "dano.physics.distances")
-    vec3, vec4, real = distances.vec3, distances.vec4, distances.real
+    distances = instance(tables.features, "dano.physics.solids.distances")
+    reals = instance(tables.features, "dano.physics.real")
+    vec3, vec4, real = reals.vec3, reals.vec4, reals.real
     solid_distance, solid_clearance, solid_of = (
         distances.solid_distance,
         distances.solid_clearance,

@@ -63,7 +63,10 @@ def wrenches(
 def _places(
     scene: Scene, tables: Tables
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Of each row of what kernels see: place in `scene.pairs`, 1 if its first body is that pair's, else −1, it."""
+    """Of each row of what kernels see: its place in `scene.pairs`, its sign, and its first body.
+
+    The sign is 1 where the first body is that of the pair, else −1.
+    """
     presses = np.array([c.law.presses for c in scene.contacts], bool)
     listed = np.arange(len(scene.contacts))
     of_points = [*listed[presses], *range(len(scene.contacts), len(scene.pairs))]

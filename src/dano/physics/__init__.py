@@ -1,8 +1,8 @@
 """The formulas of a step, once, as functions of NVIDIA Warp that run on CPU cores and GPUs.
 
-They are named and ordered as docs/theory: `rotations` and `momentum` (the integrator), `distances` (solids),
-`pairs` and `samples` (finding contact), `point_law` (the distributed law), `twists`, `joints`, `joint_laws`,
-`composites` and `loops` (trees). Kernels in `dano.engine` are loops around them and own no formula. A
+They are named and ordered as docs/theory: `rotations` and `momentum` (the integrator), `solids`, `pairs`
+and `samples` (finding contact), `point_law` (the distributed law), `overlap`, `patch_law` and `friction` (the
+centroid law), `twists`, `trees` (joints and loops). Kernels in `dano.engine` are loops around them and own no formula. A
 structure says its units in its docstring; rows of numbers from JAX are read as such structures, in the order
 of their fields.
 

@@ -9,24 +9,21 @@ with a smooth edge between, or a grid of densities: a leaf of kind `DENSITY`.
 
 import warp as wp
 
-from dano.physics.distances import (
+from dano.physics.features import KINDS, UNIONS
+from dano.physics.real import HALF, mat33, ONE, real, TWO, vec3, vec4, ZERO
+from dano.physics.solids.distances import Solid, solid_clearance, solid_distance, solid_of
+from dano.physics.solids.grids import grid_spline
+from dano.physics.solids.leaves import (
     CAPSULE,
     Distance,
     ELLIPSOID,
     GRID,
-    grid_spline,
     HALF_SPACE,
     Leaf,
     LeafKind,
-    Solid,
-    solid_clearance,
-    solid_distance,
-    solid_of,
     Solids,
     SPHERE,
 )
-from dano.physics.features import KINDS, UNIONS
-from dano.physics.real import HALF, mat33, ONE, real, TWO, vec3, vec4, ZERO
 
 DENSITY = 7
 """Kind of a leaf that is a grid of densities."""

@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from dano.physics.distances import Distance
 from dano.physics.features import TURNING
 from dano.physics.pairs import AXIS, BALL, FIXED, PairPose
 from dano.physics.real import HALF, real, vec3, ZERO
+from dano.physics.solids.leaves import Distance
 
 _FIXED = wp.constant(FIXED)
 _AXIS = wp.constant(AXIS)

@@ -11,7 +11,6 @@ from dano.engine.kernels.assembly import add_contact, Fit, pair_twist, Trial
 from dano.engine.kernels.lanes import total, total3, wait
 from dano.engine.kernels.patch_tables import PatchSideIndex
 from dano.engine.kernels.tables import BLOCK, FoundPair, Room, RUN, Scene, StateRow
-from dano.physics.distances import HALF_SPACE, SPHERE
 from dano.physics.features import KINDS, LANES
 from dano.physics.overlap import (
     added,
@@ -46,6 +45,7 @@ from dano.physics.patch_law import (
 )
 from dano.physics.real import mat66, ONE, real, vec3, vec4, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix
+from dano.physics.solids.leaves import HALF_SPACE, SPHERE
 from dano.physics.twists import joined, joined_blocks, Twist
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)

@@ -19,11 +19,11 @@ from dano.engine.kernels.trees.kinematics import (
 )
 from dano.engine.kernels.trees.loops import begin_loops, forces_of
 from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
-from dano.physics.joints import ROOT
 from dano.physics.momentum import angular_momentum, turned_inertia
 from dano.physics.pairs import BodyState
 from dano.physics.real import ONE, real, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
+from dano.physics.trees.joints import ROOT
 from dano.physics.twists import angular_part, joined, linear_part
 
 _LANES, _ROOT = wp.constant(LANES), wp.constant(ROOT)

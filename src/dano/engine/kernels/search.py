@@ -17,7 +17,6 @@ from dano.engine.kernels.tables import (
     SamplePair,
     Scene,
 )
-from dano.physics.distances import HALF_SPACE, Solid, solid_clearance, solid_distance, solid_of
 from dano.physics.features import LANES
 from dano.physics.pairs import (
     approach,
@@ -37,6 +36,8 @@ from dano.physics.samples import (
     position_in_solid,
     solid_normal,
 )
+from dano.physics.solids.distances import Solid, solid_clearance, solid_distance, solid_of
+from dano.physics.solids.leaves import HALF_SPACE
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
 _HALF_SPACE = wp.constant(HALF_SPACE)

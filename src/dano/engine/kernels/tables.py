@@ -8,14 +8,14 @@ import warp as wp
 
 from dano.engine.kernels.patch_tables import PatchRoom, PatchTables
 from dano.engine.kernels.trees.tables import TreeRoom, Trees
-from dano.physics.distances import Leaf, Solids
-from dano.physics.joint_laws import JointLaw
-from dano.physics.joints import Joint
-from dano.physics.loops import Loop
 from dano.physics.pairs import BodyState
 from dano.physics.point_law import Duals, Linear, Material, PointLaw
 from dano.physics.real import mat33, mat66, real, vec3, vec4, vec6
 from dano.physics.samples import Point, Sample
+from dano.physics.solids.leaves import Leaf, Solids
+from dano.physics.trees.joint_laws import JointLaw
+from dano.physics.trees.joints import Joint
+from dano.physics.trees.loops import Loop
 
 BLOCK = 16
 """Samples of a block."""

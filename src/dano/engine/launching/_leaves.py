@@ -1,6 +1,6 @@
 """Shapes and grids as rows of numbers: leaves of solids and of densities, and balls around blocks of samples.
 
-See `dano.physics.distances` and `dano.physics.overlap`.
+See `dano.physics.solids.distances` and `dano.physics.overlap`.
 """
 
 from collections.abc import Sequence
@@ -77,8 +77,8 @@ class Leaves(NamedTuple):
     """Leaves as rows.
 
     Attributes:
-        rows: See `dano.physics.distances.Leaf`.
-        kinds: See `dano.physics.distances.LeafKind`.
+        rows: See `dano.physics.solids.distances.Leaf`.
+        kinds: See `dano.physics.solids.distances.LeafKind`.
         coefficients: Spline coefficients of all grids, one below the other.
     """
 

@@ -12,7 +12,6 @@ from typing import Any
 import warp as wp
 
 from dano.engine.kernels.tables import Body, Push, StateRow
-from dano.physics.distances import Distance, leaf_distance, Solid, Solids
 from dano.physics.momentum import angular_momentum, turned_inertia
 from dano.physics.pairs import (
     BodyState,
@@ -28,6 +27,8 @@ from dano.physics.point_law import friction_bound, Material, point_law, point_mo
 from dano.physics.real import ONE, real, vec3, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
 from dano.physics.samples import point_contact, position_in_solid, Sample
+from dano.physics.solids.distances import leaf_distance, Solid
+from dano.physics.solids.leaves import Distance, Solids
 from dano.physics.twists import joined, linear_part, relative_twist
 
 

@@ -6,9 +6,9 @@ from dano.engine.kernels.derivatives.adjoint import advance_work, momentum_work,
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Changes, Push, Room, Scene, StateRow
 from dano.physics.features import TREES
-from dano.physics.joints import ROOT
 from dano.physics.pairs import BodyState
 from dano.physics.real import vec6, ZERO
+from dano.physics.trees.joints import ROOT
 
 _ROOT = wp.constant(ROOT)
 

@@ -13,12 +13,12 @@ from dano.engine.kernels.derivatives.adjoint import (
 from dano.engine.kernels.lanes import total, total3, total6, total33
 from dano.engine.kernels.search import posed, solid_of_body
 from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
-from dano.physics.distances import leaf_distance, nearest_leaf, Solid
 from dano.physics.features import LANES, TREES, TURNING, UNIONS
 from dano.physics.pairs import BALL, BodyState, first_touch, PairPose, position_after, rotation_after
 from dano.physics.point_law import Material
 from dano.physics.real import mat33, ONE, real, vec3, ZERO
 from dano.physics.samples import position_in_solid
+from dano.physics.solids.distances import leaf_distance, nearest_leaf, Solid
 
 _BALL = wp.constant(BALL)
 

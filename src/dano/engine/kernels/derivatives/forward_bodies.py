@@ -26,11 +26,11 @@ from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Body, Changes, FoundPair, Push, Room, SamplePair, Scene, StateRow
-from dano.physics.distances import Leaf
 from dano.physics.features import LANES
 from dano.physics.point_law import Material
 from dano.physics.real import real, vec3, vec6, ZERO
 from dano.physics.samples import Sample
+from dano.physics.solids.leaves import Leaf
 from dano.physics.twists import angular_part, joined, linear_part
 
 _LANES = wp.constant(LANES)

@@ -28,14 +28,14 @@ from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Body, Changes, Push, Room, SamplePair, Scene, StateRow
 from dano.engine.kernels.trees.balance import eliminate_joint_duals, solve_trees
-from dano.physics.distances import Leaf
 from dano.physics.features import LANES
-from dano.physics.joint_laws import JointLaw
-from dano.physics.joints import Joint
-from dano.physics.loops import Loop
 from dano.physics.point_law import Material
 from dano.physics.real import ONE, real, vec3, vec6, ZERO
 from dano.physics.samples import Sample
+from dano.physics.solids.leaves import Leaf
+from dano.physics.trees.joint_laws import JointLaw
+from dano.physics.trees.joints import Joint
+from dano.physics.trees.loops import Loop
 
 _LANES = wp.constant(LANES)
 

@@ -4,13 +4,13 @@ import warp as wp
 
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Body, Changes, Push, StateRow
-from dano.physics.distances import Leaf
-from dano.physics.joint_laws import JointLaw
-from dano.physics.joints import Joint
-from dano.physics.loops import Loop
 from dano.physics.point_law import Material
 from dano.physics.real import ONE, real, vec6
 from dano.physics.samples import Sample
+from dano.physics.solids.leaves import Leaf
+from dano.physics.trees.joint_laws import JointLaw
+from dano.physics.trees.joints import Joint
+from dano.physics.trees.loops import Loop
 
 
 @wp.func

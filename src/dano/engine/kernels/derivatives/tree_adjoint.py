@@ -10,8 +10,10 @@ import warp as wp
 from dano.engine.kernels.derivatives.adjoint import momentum_work, need_adjoints
 from dano.engine.kernels.tables import Body, Push, StateRow
 from dano.engine.kernels.trees.tables import Chain, HangingBar
-from dano.physics.joint_laws import joint_momentum, joint_ramps, JointDrive, JointLaw, ramps_force
-from dano.physics.joints import (
+from dano.physics.real import real, vec3, vec4, vec6
+from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turn_of_step
+from dano.physics.trees.joint_laws import joint_momentum, joint_ramps, JointDrive, JointLaw, ramps_force
+from dano.physics.trees.joints import (
     ball_after,
     Carrier,
     Displacement,
@@ -25,9 +27,7 @@ from dano.physics.joints import (
     motion_twist,
     orientation_after,
 )
-from dano.physics.loops import gap_by_twist, Loop, loop_gap, LoopEnd
-from dano.physics.real import real, vec3, vec4, vec6
-from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turn_of_step
+from dano.physics.trees.loops import gap_by_twist, Loop, loop_gap, LoopEnd
 from dano.physics.twists import angular_part, joined, linear_part, twist_at
 
 

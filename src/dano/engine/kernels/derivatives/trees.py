@@ -20,11 +20,11 @@ from dano.engine.kernels.tables import Changes, Push, Room, Scene, StateRow
 from dano.engine.kernels.trees.kinematics import unknown_of, velocities_of
 from dano.engine.kernels.trees.loops import forces_of
 from dano.engine.kernels.trees.tables import Chain, HangingBar, Node
-from dano.physics.joint_laws import JointLaw
-from dano.physics.joints import BALL, Carrier, Joint, ROOT
 from dano.physics.pairs import BodyState
 from dano.physics.real import ONE, quat, real, vec3, vec6, ZERO
 from dano.physics.rotations import from_wxyz, to_wxyz
+from dano.physics.trees.joint_laws import JointLaw
+from dano.physics.trees.joints import BALL, Carrier, Joint, ROOT
 
 _BALL, _ROOT = wp.constant(BALL), wp.constant(ROOT)
 # Efforts that bound nothing [N m or N]: zero times them is zero, as zero times infinity is not.

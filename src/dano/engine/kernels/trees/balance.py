@@ -27,14 +27,16 @@ from dano.engine.kernels.trees.kinematics import (
     unknown_of,
 )
 from dano.engine.kernels.trees.tables import Node
-from dano.physics.composites import (
+from dano.physics.momentum import angular_momentum
+from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
+from dano.physics.trees.composites import (
     by_end_motion,
     by_start_motion,
     composite,
     spin_momentum_by_end,
     summed,
 )
-from dano.physics.joint_laws import (
+from dano.physics.trees.joint_laws import (
     dual_change,
     dual_rounding,
     joint_momentum,
@@ -44,8 +46,6 @@ from dano.physics.joint_laws import (
     ramps_force,
     resolved,
 )
-from dano.physics.momentum import angular_momentum
-from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
 from dano.physics.twists import angular_part, joined, linear_part, wrench_at
 
 # What springs and dampers make of the Jacobian, over the mass, up to which that alone serves for a first

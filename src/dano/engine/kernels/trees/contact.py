@@ -5,8 +5,8 @@ import warp as wp
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.factor import add_to_block
 from dano.engine.kernels.trees.kinematics import chain_twist
-from dano.physics.joints import ROOT
 from dano.physics.real import mat66, real, vec3, vec6
+from dano.physics.trees.joints import ROOT
 from dano.physics.twists import shift
 
 _ROOT = wp.constant(ROOT)

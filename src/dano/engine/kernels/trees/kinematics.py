@@ -4,7 +4,9 @@ import warp as wp
 
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.tables import Node
-from dano.physics.joints import (
+from dano.physics.real import ONE, quat, real, vec3, vec6, ZERO
+from dano.physics.rotations import turn_of_step
+from dano.physics.trees.joints import (
     BALL,
     ball_after,
     Carrier,
@@ -24,8 +26,6 @@ from dano.physics.joints import (
     ROOT,
     turned_by,
 )
-from dano.physics.real import ONE, quat, real, vec3, vec6, ZERO
-from dano.physics.rotations import turn_of_step
 from dano.physics.twists import angular_part, linear_part, twist_at
 
 _BALL, _ROOT = wp.constant(BALL), wp.constant(ROOT)

@@ -6,8 +6,8 @@ from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.factor import add_to_block
 from dano.engine.kernels.trees.kinematics import displacement_of, end_motions, unknown_of
 from dano.physics.features import WIDE
-from dano.physics.loops import gap_by_twist, loop_compliance, loop_gap, LoopEnd
 from dano.physics.real import ONE, quat, real, vec6, ZERO
+from dano.physics.trees.loops import gap_by_twist, loop_compliance, loop_gap, LoopEnd
 from dano.physics.twists import twist_at
 
 _EPSILON = 2.0**-52 if WIDE else 2.0**-23

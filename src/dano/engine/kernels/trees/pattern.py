@@ -3,7 +3,7 @@
 import warp as wp
 
 from dano.engine.kernels.tables import Room, Scene
-from dano.physics.joints import ROOT
+from dano.physics.trees.joints import ROOT
 
 _ROOT = wp.constant(ROOT)
 

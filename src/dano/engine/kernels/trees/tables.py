@@ -2,12 +2,12 @@
 
 import warp as wp
 
-from dano.physics.composites import Composite
-from dano.physics.joint_laws import JointDrive, JointLaw, Ramps, Resolved
-from dano.physics.joints import Displacement, Joint, JointFrame
-from dano.physics.loops import Loop
 from dano.physics.pairs import BodyState
 from dano.physics.real import quat, real, vec3, vec6
+from dano.physics.trees.composites import Composite
+from dano.physics.trees.joint_laws import JointDrive, JointLaw, Ramps, Resolved
+from dano.physics.trees.joints import Displacement, Joint, JointFrame
+from dano.physics.trees.loops import Loop
 
 
 @wp.struct
@@ -18,7 +18,7 @@ class Node:
         body: The body.
         parent: Node on which it hangs, or −1.
         carrier: Body on which it hangs, −1 for the world.
-        kind: See `dano.physics.joints`.
+        kind: See `dano.physics.trees.joints`.
         joint: Row of its joint, or −1.
         coordinate: Place of its first coordinate among q; 0 where it has none.
         place: Of its first velocity among the unknowns: 6 · block + row.

@@ -1,0 +1,159 @@
+"""Signed distances of solids, with gradients (docs/theory/contact.md, "Which side is sampled").
+
+A solid is a run of *leaves*: one for a shape, several for a union, whose distance is the least of theirs.
+Each leaf has a kind, a size s, and a pose: x = s R y + p for y in the axes of its own.
+
+To add a kind: a number in `leaves`, its function from y to a `Distance` in `shapes`, two lines in
+`leaf_distance`, and a row in the table of `dano.engine.launching._leaves`, which says which class of
+`dano.fields` it is.
+"""
+
+import warp as wp
+
+from dano.physics.features import KINDS, UNIONS
+from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
+from dano.physics.solids.grids import beyond_range, grid_distance
+from dano.physics.solids.leaves import (
+    BOX,
+    CAPSULE,
+    CYLINDER,
+    Distance,
+    ELLIPSOID,
+    GRID,
+    HALF_SPACE,
+    Leaf,
+    LeafKind,
+    Solids,
+    SPHERE,
+)
+from dano.physics.solids.shapes import (
+    ball_distance,
+    box_distance,
+    capsule_distance,
+    cylinder_distance,
+    ellipsoid_distance,
+    half_space_distance,
+)
+
+_HALF_SPACE = wp.constant(HALF_SPACE)
+_SPHERE = wp.constant(SPHERE)
+_BOX = wp.constant(BOX)
+_CAPSULE = wp.constant(CAPSULE)
+_CYLINDER = wp.constant(CYLINDER)
+_ELLIPSOID = wp.constant(ELLIPSOID)
+_GRID = wp.constant(GRID)
+
+
+@wp.struct
+class Solid:
+    """A solid: a run of leaves, and the first of them.
+
+    Attributes:
+        first: Index of the first leaf.
+        count: Number of leaves.
+        leaf: The first leaf.
+        kind: Its whole numbers.
+    """
+
+    first: int
+    count: int
+    leaf: Leaf
+    kind: LeafKind
+
+
+@wp.func
+def leaf_distance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: vec3) -> Distance:
+    """Of one leaf, at a point [m, F]."""
+    y = (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position))
+    d = Distance()
+    if wp.static(GRID in KINDS):
+        if kind.kind == _GRID:
+            d = grid_distance(solids, world, kind, leaf, y)
+    if wp.static(HALF_SPACE in KINDS):
+        if kind.kind == _HALF_SPACE:
+            d = half_space_distance(leaf, y)
+    if wp.static(BOX in KINDS):
+        if kind.kind == _BOX:
+            d = box_distance(leaf, y)
+    if wp.static(CAPSULE in KINDS):
+        if kind.kind == _CAPSULE:
+            d = capsule_distance(leaf, y)
+    if wp.static(CYLINDER in KINDS):
+        if kind.kind == _CYLINDER:
+            d = cylinder_distance(leaf, y)
+    if wp.static(ELLIPSOID in KINDS):
+        if kind.kind == _ELLIPSOID:
+            d = ellipsoid_distance(leaf, y)
+    if wp.static(SPHERE in KINDS):
+        if kind.kind == _SPHERE:
+            d = ball_distance(leaf.sizes[0], y)
+    d.value = leaf.factor * d.value
+    d.gradient = leaf.rotation * d.gradient
+    return d
+
+
+@wp.func
+def leaf_clearance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: vec3) -> real:
+    """A lower bound on the distance to one leaf.
+
+    Beyond a grid's border its distance d adds the way b to the border, which is more than the true distance:
+    the solid lies in the grid, so √(d² + b²) bounds that from below.
+    """
+    d = leaf_distance(solids, world, kind, leaf, x).value
+    if wp.static(GRID in KINDS):
+        if kind.kind == _GRID:
+            border = kind.degree + 1
+            y = (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position)) - leaf.sizes
+            away = vec3(
+                beyond_range(y[0], real(kind.nodes_x - 2 * border - 1) * leaf.spacing[0]),
+                beyond_range(y[1], real(kind.nodes_y - 2 * border - 1) * leaf.spacing[1]),
+                beyond_range(y[2], real(kind.nodes_z - 2 * border - 1) * leaf.spacing[2]),
+            )
+            squared = wp.dot(away, away)
+            if squared > ZERO:
+                inner = d - leaf.factor * wp.sqrt(squared)
+                d = wp.sqrt(inner * inner + leaf.factor * leaf.factor * squared)
+    return d
+
+
+@wp.func
+def solid_of(solids: Solids, world: int, first: int, count: int) -> Solid:
+    """A solid by its leaves."""
+    solid = Solid()
+    solid.first = first
+    solid.count = count
+    solid.leaf = solids.leaves[world, first]
+    solid.kind = solids.kinds[first]
+    return solid
+
+
+@wp.func
+def nearest_leaf(solids: Solids, world: int, solid: Solid, x: vec3) -> Solid:
+    """The leaf with the least distance, as a solid of its own."""
+    nearest = solid.first
+    least = real(INFINITY)
+    for i in range(solid.first, solid.first + solid.count):
+        d = leaf_distance(solids, world, solids.kinds[i], solids.leaves[world, i], x)
+        if d.value < least:
+            least = d.value
+            nearest = i
+    return solid_of(solids, world, nearest, 1)
+
+
+@wp.func
+def solid_clearance(solids: Solids, world: int, solid: Solid, x: vec3) -> real:
+    """Lower bound on the distance [m] from a point [m, F] to a solid."""
+    least = leaf_clearance(solids, world, solid.kind, solid.leaf, x)
+    if wp.static(UNIONS):
+        for i in range(solid.first + 1, solid.first + solid.count):
+            other = leaf_clearance(solids, world, solids.kinds[i], solids.leaves[world, i], x)
+            least = wp.min(least, other)
+    return least
+
+
+@wp.func
+def solid_distance(solids: Solids, world: int, solid: Solid, x: vec3) -> Distance:
+    """Signed distance of a solid and its gradient at a point [m, F]; of a union, of its nearest leaf."""
+    if wp.static(UNIONS):
+        solid = nearest_leaf(solids, world, solid, x)
+    return leaf_distance(solids, world, solid.kind, solid.leaf, x)

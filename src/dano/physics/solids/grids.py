@@ -1,0 +1,185 @@
+"""Sampled signed distances: splines of degree 1 to 3, and beyond their border the way to it besides."""
+
+from typing import Any
+
+import warp as wp
+
+from dano.physics.features import DEGREES
+from dano.physics.real import HALF, ONE, real, TWO, vec3, vec4, ZERO
+from dano.physics.solids.leaves import Distance, inverse_or_zero, Leaf, LeafKind, Solids
+
+vec2 = wp.types.vector(length=2, dtype=real)
+# Worked out here: quotients of literals in a kernel have 32 bits.
+_TWO_THIRDS = wp.constant(real(2.0 / 3.0))
+
+
+@wp.func
+def linear_weights(f: real) -> vec2:
+    """Weights of the nodes on both sides of a place f in [0, 1]."""
+    return vec2(ONE - f, f)
+
+
+@wp.func
+def linear_slopes(f: real) -> vec2:
+    """Derivatives of `linear_weights`."""
+    return vec2(-ONE, ONE)
+
+
+@wp.func
+def quadratic_weights(f: real) -> vec3:
+    """Weights of three nodes for a place f in [−½, ½] from the middle one (B-spline of degree 2)."""
+    return vec3(HALF * (HALF - f) * (HALF - f), real(0.75) - f * f, HALF * (HALF + f) * (HALF + f))
+
+
+@wp.func
+def quadratic_slopes(f: real) -> vec3:
+    """Derivatives of `quadratic_weights`."""
+    return vec3(f - HALF, -TWO * f, f + HALF)
+
+
+@wp.func
+def cubic_weights(f: real) -> vec4:
+    """Weights of four nodes for a place f in [0, 1] from the second one (B-spline of degree 3)."""
+    g = ONE - f
+    return vec4(
+        g * g * g / real(6.0),
+        _TWO_THIRDS - f * f * (ONE - HALF * f),
+        _TWO_THIRDS - g * g * (ONE - HALF * g),
+        f * f * f / real(6.0),
+    )
+
+
+@wp.func
+def cubic_slopes(f: real) -> vec4:
+    """Derivatives of `cubic_weights`."""
+    g = ONE - f
+    return vec4(-HALF * g * g, f * (real(1.5) * f - TWO), g * (TWO - real(1.5) * g), HALF * f * f)
+
+
+@wp.func
+def tensor_product(
+    coefficients: wp.array2d(dtype=real),
+    world: int,
+    base: int,
+    stride_x: int,
+    stride_y: int,
+    wx: Any,
+    wy: Any,
+    wz: Any,
+    dx: Any,
+    dy: Any,
+    dz: Any,
+) -> Distance:
+    """Σ c_ijk w_i w_j w_k and its gradient per cell."""
+    d = Distance()
+    for i in range(len(wx)):
+        for j in range(len(wx)):
+            at = base + i * stride_x + j * stride_y
+            line = ZERO
+            line_z = ZERO
+            for k in range(len(wx)):
+                c = coefficients[world, at + k]
+                line += c * wz[k]
+                line_z += c * dz[k]
+            d.value += wx[i] * wy[j] * line
+            d.gradient += vec3(dx[i] * wy[j] * line, wx[i] * dy[j] * line, wx[i] * wy[j] * line_z)
+    return d
+
+
+@wp.func
+def first_node(u: real, nodes: int, degree: int) -> int:
+    """First node of the stencil of a place in index units, counted from the border's first node."""
+    shift = wp.where(degree == 1, 0, 1)
+    node = wp.floor(u)
+    if degree == 2:
+        node = wp.floor(u + HALF)
+    highest = nodes - 2 * (degree + 1) + shift  # last node inside the border whose stencil ends there
+    inner = int(wp.min(node, real(highest)))
+    return inner + degree + 1 - shift
+
+
+@wp.func
+def grid_spline(solids: Solids, world: int, kind: LeafKind, place: vec3) -> Distance:
+    """The spline of a grid and its gradient per cell, at a place in cells from the first node in its border.
+
+    The place is no further beyond the outermost nodes than these reach.
+    """
+    degree = kind.degree
+    border = degree + 1
+    first_x = first_node(place[0], kind.nodes_x, degree)
+    first_y = first_node(place[1], kind.nodes_y, degree)
+    first_z = first_node(place[2], kind.nodes_z, degree)
+    stride_y = kind.nodes_z
+    stride_x = kind.nodes_y * stride_y
+    base = kind.first + first_x * stride_x + first_y * stride_y + first_z
+    # The node from which a place in the stencil is measured: the first, or the second of more than two.
+    origin = wp.where(degree == 1, 0, 1) - border
+    f = vec3(
+        place[0] - real(first_x + origin),
+        place[1] - real(first_y + origin),
+        place[2] - real(first_z + origin),
+    )
+    d = Distance()
+    if wp.static(1 in DEGREES):
+        if degree == 1:
+            d = tensor_product(
+                solids.coefficients, world, base, stride_x, stride_y,
+                linear_weights(f[0]), linear_weights(f[1]), linear_weights(f[2]),
+                linear_slopes(f[0]), linear_slopes(f[1]), linear_slopes(f[2]),
+            )  # fmt: skip
+    if wp.static(2 in DEGREES):
+        if degree == 2:
+            d = tensor_product(
+                solids.coefficients, world, base, stride_x, stride_y,
+                quadratic_weights(f[0]), quadratic_weights(f[1]), quadratic_weights(f[2]),
+                quadratic_slopes(f[0]), quadratic_slopes(f[1]), quadratic_slopes(f[2]),
+            )  # fmt: skip
+    if wp.static(3 in DEGREES):
+        if degree == 3:
+            d = tensor_product(
+                solids.coefficients, world, base, stride_x, stride_y,
+                cubic_weights(f[0]), cubic_weights(f[1]), cubic_weights(f[2]),
+                cubic_slopes(f[0]), cubic_slopes(f[1]), cubic_slopes(f[2]),
+            )  # fmt: skip
+    return d
+
+
+@wp.func
+def grid_distance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec3) -> Distance:
+    """The spline of a grid, and beyond its border the way to it besides."""
+    degree = kind.degree
+    border = degree + 1
+    u = vec3(
+        (y[0] - leaf.sizes[0]) / leaf.spacing[0],
+        (y[1] - leaf.sizes[1]) / leaf.spacing[1],
+        (y[2] - leaf.sizes[2]) / leaf.spacing[2],
+    )
+    last = vec3(
+        real(kind.nodes_x - 2 * border - 1),
+        real(kind.nodes_y - 2 * border - 1),
+        real(kind.nodes_z - 2 * border - 1),
+    )
+    closest = vec3(
+        wp.min(wp.max(u[0], ZERO), last[0]),
+        wp.min(wp.max(u[1], ZERO), last[1]),
+        wp.min(wp.max(u[2], ZERO), last[2]),
+    )
+    away = wp.cw_mul(u - closest, leaf.spacing)
+    d = grid_spline(solids, world, kind, closest)
+    # Moving along an axis on which the point lies outside leaves the closest point where it is.
+    beyond = wp.sqrt(wp.dot(away, away))
+    inverse = inverse_or_zero(beyond)
+    g = d.gradient
+    d.gradient = vec3(
+        wp.where(closest[0] == u[0], g[0] / leaf.spacing[0], ZERO) + away[0] * inverse,
+        wp.where(closest[1] == u[1], g[1] / leaf.spacing[1], ZERO) + away[1] * inverse,
+        wp.where(closest[2] == u[2], g[2] / leaf.spacing[2], ZERO) + away[2] * inverse,
+    )
+    d.value += beyond
+    return d
+
+
+@wp.func
+def beyond_range(x: real, last: real) -> real:
+    """By how much x lies beyond [0, last]."""
+    return x - wp.min(wp.max(x, ZERO), last)

@@ -1,0 +1,83 @@
+"""What solids are made of: leaves, each with a kind, a size s and a pose.
+
+In the axes of a leaf, y stands for x = s R y + p.
+"""
+
+import warp as wp
+
+from dano.physics.real import mat33, ONE, real, vec3, ZERO
+
+HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER, ELLIPSOID, GRID = range(7)
+"""Kinds of leaves."""
+
+
+@wp.struct
+class Leaf:
+    """One part of a solid.
+
+    Attributes:
+        factor: Size s [1].
+        position: p [m, F].
+        rotation: R, leaf → F.
+        sizes: Unit normal of a half-space; half extents of a box; radius and half length of a capsule or
+            cylinder; radius of a sphere; semi-axes of an ellipsoid; first node of a grid [m].
+        length: Offset of a half-space's plane; rounding of a box [m].
+        spacing: Between nodes of a grid [m].
+    """
+
+    factor: real
+    position: vec3
+    rotation: mat33
+    sizes: vec3
+    length: real
+    spacing: vec3
+
+
+@wp.struct
+class LeafKind:
+    """Whole numbers of a leaf.
+
+    Attributes:
+        kind: Which of the kinds above.
+        first: Place of a grid's first spline coefficient.
+        nodes_x: Number of coefficients along x, border included.
+        nodes_y: Along y.
+        nodes_z: Along z.
+        degree: Of the spline.
+    """
+
+    kind: wp.int32
+    first: wp.int32
+    nodes_x: wp.int32
+    nodes_y: wp.int32
+    nodes_z: wp.int32
+    degree: wp.int32
+
+
+@wp.struct
+class Solids:
+    """All solids of a scene.
+
+    Attributes:
+        leaves: Shape (worlds, leaves).
+        kinds: Shape (leaves,).
+        coefficients: Spline coefficients of all grids [m], shape (worlds, coefficients).
+    """
+
+    leaves: wp.array2d(dtype=Leaf)
+    kinds: wp.array(dtype=LeafKind)
+    coefficients: wp.array2d(dtype=real)
+
+
+@wp.struct
+class Distance:
+    """Signed distance [m], negative inside, and its gradient [1]."""
+
+    value: real
+    gradient: vec3
+
+
+@wp.func
+def inverse_or_zero(x: real) -> real:
+    """1 / x, or 0 at 0."""
+    return wp.where(x > ZERO, ONE / wp.where(x > ZERO, x, ONE), ZERO)
