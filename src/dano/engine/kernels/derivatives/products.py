@@ -8,6 +8,8 @@ from dano.physics.distances import Leaf
 from dano.physics.joint_laws import JointLaw
 from dano.physics.joints import Joint
 from dano.physics.loops import Loop
+from dano.physics.overlap import WeightedSample
+from dano.physics.patch_law import PatchMaterial
 from dano.physics.point_law import Material
 from dano.physics.real import ONE, real, vec6
 from dano.physics.samples import Sample
@@ -60,6 +62,30 @@ def material_product(a: Material, b: Material) -> real:
         + a.bounce * b.bounce
         + a.uplift * b.uplift
     )
+
+
+@wp.func
+def patch_material_product(a: PatchMaterial, b: PatchMaterial) -> real:
+    """⟨a, b⟩ of numbers of contacts with a patch law."""
+    return (
+        a.spring * b.spring
+        + a.damper * b.damper
+        + a.sliding_friction * b.sliding_friction
+        + a.sliding_drag * b.sliding_drag
+        + a.torsional_friction * b.torsional_friction
+        + a.torsional_drag * b.torsional_drag
+        + a.rolling_friction * b.rolling_friction
+        + a.rolling_drag * b.rolling_drag
+        + a.smoothing * b.smoothing
+        + a.regularizer * b.regularizer
+        + a.stiction * b.stiction
+    )
+
+
+@wp.func
+def weighted_product(a: WeightedSample, b: WeightedSample) -> real:
+    """⟨a, b⟩ of weighted samples."""
+    return wp.dot(a.point, b.point) + a.weight * b.weight
 
 
 @wp.func
