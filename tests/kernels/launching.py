@@ -85,7 +85,7 @@ class Arguments:
         lengths = {"bodies": n, "found": len(pairs), **dict.fromkeys(of_moving, m)}
         give_room(self.room, {**lengths, **dict.fromkeys(("blocks", "spare", "used", "later"), m * m)})
         of_contacts = dict.fromkeys(self.room.patches._cls.vars, len(pairs))
-        give_room(self.room.patches, {**of_contacts, "count": 1})
+        give_room(self.room.patches, {**of_contacts, "count": 1, "sums": 0})
 
     @classmethod
     def of_scene(cls, scene):

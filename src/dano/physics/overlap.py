@@ -11,7 +11,7 @@ import warp as wp
 
 from dano.physics.features import KINDS, UNIONS
 from dano.physics.real import HALF, mat33, ONE, real, TWO, vec3, vec4, ZERO
-from dano.physics.solids.distances import Solid, solid_clearance, solid_distance, solid_of
+from dano.physics.solids.distances import nearest_leaf, Solid, solid_clearance, solid_distance, solid_of
 from dano.physics.solids.grids import grid_spline
 from dano.physics.solids.leaves import (
     CAPSULE,
@@ -264,6 +264,18 @@ def map_distance(fields: Fields, world: int, part: Part, kind: PartKind, y: vec3
 
 
 @wp.func(inline=True)
+def shell_density(part: Part, kind: PartKind, solid: Solid, x: vec3, d: Distance) -> Density:
+    """Density of a solid from its distance, at a point [m, F]."""
+    found = Density()
+    found.value = occupancy(d.value, part.edge)
+    found.direction = d.gradient
+    if wp.static(SPHERE in KINDS or CAPSULE in KINDS or ELLIPSOID in KINDS):
+        if kind.by_gradient == 0:
+            found.direction = outward(solid.kind, solid.leaf, x, d)
+    return found
+
+
+@wp.func(inline=True)
 def part_density(
     solids: Solids, fields: Fields, world: int, part: Part, kind: PartKind, solid: Solid, x: vec3
 ) -> Density:
@@ -278,12 +290,7 @@ def part_density(
             if map_distance(fields, world, part, kind, y) <= ZERO:
                 found = grid_density(solids, world, solid.kind, solid.leaf, y)
     if not is_grid:
-        d = solid_distance(solids, world, solid, x)
-        found.value = occupancy(d.value, part.edge)
-        found.direction = d.gradient
-        if wp.static(SPHERE in KINDS or CAPSULE in KINDS or ELLIPSOID in KINDS):
-            if kind.by_gradient == 0:
-                found.direction = outward(solid.kind, solid.leaf, x, d)
+        found = shell_density(part, kind, solid, x, solid_distance(solids, world, solid, x))
     return found
 
 
@@ -317,6 +324,28 @@ def density(solids: Solids, fields: Fields, world: int, field: Field, x: vec3) -
             if other.value > found.value:
                 found = other
     return found
+
+
+@wp.func
+def densest(solids: Solids, fields: Fields, world: int, field: Field, x: vec3) -> Field:
+    """The part of a field that counts at a point [m, F], its nearest leaf alone."""
+    leading = field
+    if wp.static(UNIONS):
+        most = part_density(solids, fields, world, field.part, field.kind, field.solid, x).value
+        for i in range(field.first + 1, field.first + field.count):
+            kind = fields.kinds[i]
+            solid = part_solid(solids, world, kind)
+            value = part_density(solids, fields, world, fields.parts[world, i], kind, solid, x).value
+            if value > most:
+                most = value
+                leading.first = i
+                leading.part = fields.parts[world, i]
+                leading.kind = kind
+                leading.solid = solid
+        leading.count = 1
+        if leading.solid.count > 1:
+            leading.solid = nearest_leaf(solids, world, leading.solid, x)
+    return leading
 
 
 @wp.func(inline=True)
@@ -376,16 +405,23 @@ def plane_distance(view: View, point: vec3) -> real:
 
 
 @wp.func(inline=True)
+def plane_density(view: View, edge: real, point: vec3) -> Density:
+    """Density of a half-space at a point in the samples' frame; the direction is in the field's."""
+    found = Density()
+    found.value = occupancy(plane_distance(view, point), edge)
+    found.direction = view.normal
+    return found
+
+
+@wp.func(inline=True)
 def seen_density(
     solids: Solids, fields: Fields, world: int, field: Field, view: View, point: vec3
 ) -> Density:
     """Density of a field at a point in the samples' frame; the direction is in the field's."""
     found = Density()
     if view.is_plane:
-        height = plane_distance(view, point)
-        if height <= view.reach:
-            found.value = occupancy(height, field.part.edge)
-            found.direction = view.normal
+        if plane_distance(view, point) <= view.reach:
+            found = plane_density(view, field.part.edge, point)
     else:
         found = density(solids, fields, world, field, view.rotation * point + view.origin)
     return found
@@ -454,27 +490,30 @@ def patch_of(sums: Sums, mass: real) -> Patch:
 
 
 @wp.func
-def cap_patch(center: vec3, radius: real, mass: real, normal: vec3, height: real) -> Patch:
+def cap_patch(ball: Leaf, plane: Leaf, sampled: Frame, queried: Frame, mass: real) -> Patch:
     """A homogeneous ball with a half-space, in closed form: the spherical cap below the plane.
 
     With depth h of the lowest point, V = π h² (3 r − h)/3, and the cap's centroid lies
-    3 (2 r − h)²/(4 (3 r − h)) from the ball's centre. Exact and smooth where
-    sampling would make a ball rattle as it rolls.
+    3 (2 r − h)²/(4 (3 r − h)) from the ball's centre. Exact and smooth where sampling would make a ball rattle
+    as it rolls.
 
     Args:
-        center: Of the ball [m, W].
-        radius: r [m].
+        ball: The ball, about the origin of its body's frame.
+        plane: The half-space.
+        sampled: Frame of the ball's body.
+        queried: Of the other.
         mass: Of the ball [kg].
-        normal: Of the plane [W].
-        height: Of the centre above the plane [m].
     """
     patch = Patch()
+    radius = ball.sizes[0]
+    normal = queried.rotation * plane.sizes
+    height = wp.dot(normal, sampled.origin - queried.origin) - plane.length
     depth = wp.clamp(radius - height, ZERO, TWO * radius)
     share = depth * depth * (real(3.0) * radius - depth) / (real(4.0) * radius * radius * radius)
     if share > _NEGLIGIBLE:
         across = TWO * radius - depth
         offset = real(3.0) * across * across / (real(4.0) * (real(3.0) * radius - depth))
         patch.overlap = mass * share
-        patch.centroid = center - offset * normal
+        patch.centroid = sampled.origin - offset * normal
         patch.normal = normal
     return patch

@@ -8,7 +8,8 @@ import warp as wp
 from dano.physics.features import TURNING
 from dano.physics.real import mat33, ONE, quat, real, vec3, ZERO
 from dano.physics.rotations import direction, interpolated, matrix, rotation_from_z
-from dano.physics.solids.distances import Distance, Solid, solid_distance, Solids
+from dano.physics.solids.distances import Solid, solid_distance
+from dano.physics.solids.leaves import Distance, Solids
 
 FIXED, AXIS, BALL = 0, 1, 2
 """How samples turn with their body: with it; about its z axis they keep facing the other body; altogether."""

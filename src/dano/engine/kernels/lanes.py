@@ -7,7 +7,7 @@ would write over each other.
 import warp as wp
 
 from dano.physics.features import LANES
-from dano.physics.real import mat33, mat66, real, vec3, vec6
+from dano.physics.real import mat33, mat66, real, vec3, vec4, vec6
 
 
 @wp.func
@@ -20,6 +20,14 @@ def total(x: real) -> real:
 
 @wp.func
 def total3(x: vec3) -> vec3:
+    """Sum over the lanes of a world."""
+    if wp.static(LANES > 1):
+        x = wp.tile_sum(wp.tile(x, preserve_type=True))[0]
+    return x
+
+
+@wp.func
+def total4(x: vec4) -> vec4:
     """Sum over the lanes of a world."""
     if wp.static(LANES > 1):
         x = wp.tile_sum(wp.tile(x, preserve_type=True))[0]

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.physics.overlap import Fields, Patch, WeightedSample
+from dano.physics.overlap import Fields, Patch, Sums, WeightedSample
 from dano.physics.patch_law import PatchDuals, PatchLinear, PatchMaterial
 from dano.physics.real import mat66, real, vec3, vec4, vec6
 
@@ -105,6 +105,7 @@ class PatchRoom:
         linear: The law as it was linearised last.
         wrenches: In the step, about the first body's centre of mass [N s; N m s, W].
         jacobians: Their derivatives by the relative twist there.
+        sums: Over the samples of each side, shape (worlds, sides); only for derivatives.
     """
 
     count: wp.array2d(dtype=wp.int32)
@@ -115,3 +116,4 @@ class PatchRoom:
     linear: wp.array2d(dtype=PatchLinear)
     wrenches: wp.array2d(dtype=vec6)
     jacobians: wp.array2d(dtype=mat66)
+    sums: wp.array2d(dtype=Sums)

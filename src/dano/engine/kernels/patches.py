@@ -9,9 +9,9 @@ import warp as wp
 
 from dano.engine.kernels.assembly import add_contact, Fit, pair_twist, Trial
 from dano.engine.kernels.lanes import total, total3, wait
-from dano.engine.kernels.patch_tables import PatchSideIndex
+from dano.engine.kernels.patch_tables import PatchSide, PatchSideIndex
 from dano.engine.kernels.tables import BLOCK, FoundPair, Room, RUN, Scene, StateRow
-from dano.physics.features import KINDS, LANES
+from dano.physics.features import KINDS, LANES, PATCHES
 from dano.physics.overlap import (
     added,
     cap_patch,
@@ -67,46 +67,79 @@ def reaches(scene: Scene, world: int, field: Field, view: View, ball: vec4) -> b
     return seen_clearance(scene.solids, scene.patches.fields, world, field, view, middle) <= ball[3]
 
 
+@wp.func
+def next_block(scene: Scene, world: int, index: PatchSideIndex, field: Field, view: View, i: int) -> int:
+    """The first block of a side, from the i-th of a lane on, that may reach; their number where none does."""
+    k = int(i)
+    searches = bool(True)
+    while searches and k < index.blocks:
+        b = index.first_block + k
+        skipped = bool(False)
+        if wp.static(LANES == 1):
+            # Where a run of blocks is out of reach, all of them are.
+            skipped = k % _RUN == 0 and not reaches(scene, world, field, view, scene.patches.runs[world, b])
+        if skipped:
+            k += _RUN
+        elif reaches(scene, world, field, view, scene.patches.balls[world, b]):
+            searches = False
+        else:
+            k += _LANES
+    return k
+
+
 @wp.func(inline=True)
 def sums_of_samples(
     scene: Scene, world: int, lane: int, index: PatchSideIndex, field: Field, view: View
 ) -> Sums:
     """Sums over the samples of a side, those of a lane only."""
     sums = Sums()
-    beyond = int(0)
-    for i in range(lane, index.blocks, _LANES):
+    i = next_block(scene, world, index, field, view, lane)
+    while i < index.blocks:
         b = index.first_block + i
-        listed = True
-        if wp.static(LANES == 1):
-            # Where a run of blocks is out of reach, all of them are.
-            if i >= beyond and i % _RUN == 0:
-                if not reaches(scene, world, field, view, scene.patches.runs[world, b]):
-                    beyond = i + _RUN
-            listed = i >= beyond
-        if listed:
-            listed = reaches(scene, world, field, view, scene.patches.balls[world, b])
-        if listed:
-            for s in range(_BLOCK * b, _BLOCK * b + _BLOCK):
-                sample = scene.patches.samples[world, s]
-                found = seen_density(scene.solids, scene.patches.fields, world, field, view, sample.point)
-                if found.value > ZERO:
-                    one = sample_sums(sample, found)
-                    sums.share += one.share
-                    sums.moment += one.moment
-                    sums.direction += one.direction
+        for s in range(_BLOCK * b, _BLOCK * b + _BLOCK):
+            sample = scene.patches.samples[world, s]
+            found = seen_density(scene.solids, scene.patches.fields, world, field, view, sample.point)
+            if found.value > ZERO:
+                one = sample_sums(sample, found)
+                sums.share += one.share
+                sums.moment += one.moment
+                sums.direction += one.direction
+        i = next_block(scene, world, index, field, view, i + _LANES)
     return sums
 
 
 @wp.func
-def cap_of(
-    scene: Scene, world: int, ball: int, field: Field, sampled: Frame, queried: Frame, mass: real
-) -> Patch:
-    """Overlap of a ball with a half-space."""
-    radius = scene.solids.leaves[world, ball].sizes[0]
-    leaf = field.solid.leaf
-    normal = queried.rotation * leaf.sizes
-    height = wp.dot(normal, sampled.origin - queried.origin) - leaf.length
-    return cap_patch(sampled.origin, radius, mass, normal, height)
+def side_field(scene: Scene, world: int, index: PatchSideIndex) -> Field:
+    """The field that the samples of a side query."""
+    return field_of(scene.solids, scene.patches.fields, world, index.first_part, index.parts)
+
+
+@wp.func(inline=True)
+def reached_sums(
+    scene: Scene,
+    world: int,
+    lane: int,
+    side: PatchSide,
+    index: PatchSideIndex,
+    field: Field,
+    sampled: Frame,
+    queried: Frame,
+) -> Sums:
+    """Sums over all samples of a side, zero where the body is out of reach; all lanes know them."""
+    own = Sums()
+    view = view_of(field, sampled, queried)
+    if reaches(scene, world, field, view, vec4(side.middle[0], side.middle[1], side.middle[2], side.radius)):
+        own = sums_of_samples(scene, world, lane, index, field, view)
+        own.share = total(own.share)
+        own.moment = total3(own.moment)
+        own.direction = total3(own.direction)
+    return own
+
+
+@wp.func
+def side_sign(scene: Scene, c: int, index: PatchSideIndex) -> real:
+    """1 where the sampled body is the first of a contact, else −1."""
+    return wp.where(index.sampled == scene.patches.contacts[c].first, ONE, -ONE)
 
 
 @wp.func
@@ -119,25 +152,22 @@ def contact_patch(scene: Scene, room: Room, world: int, lane: int, c: int) -> Pa
     for s in range(contact.first_side, contact.first_side + contact.sides):
         side = scene.patches.sides[world, s]
         index = scene.patches.side_index[s]
-        field = field_of(scene.solids, scene.patches.fields, world, index.first_part, index.parts)
+        field = side_field(scene, world, index)
         sampled = frame_of(room.bodies[world, index.sampled])
         queried = frame_of(room.bodies[world, index.queried])
         mass = scene.bodies[world, index.sampled].mass
-        sign = wp.where(index.sampled == contact.first, ONE, -ONE)
+        sign = side_sign(scene, c, index)
         weighed += mass
         if index.ball >= 0:
             if wp.static(SPHERE in KINDS and HALF_SPACE in KINDS):
-                patch = cap_of(scene, world, index.ball, field, sampled, queried, mass)
+                ball = scene.solids.leaves[world, index.ball]
+                patch = cap_patch(ball, field.solid.leaf, sampled, queried, mass)
                 patch.normal = sign * patch.normal
         else:
-            view = view_of(field, sampled, queried)
-            if reaches(
-                scene, world, field, view, vec4(side.middle[0], side.middle[1], side.middle[2], side.radius)
-            ):
-                own = sums_of_samples(scene, world, lane, index, field, view)
-                own.share = total(own.share)
-                own.moment = total3(own.moment)
-                own.direction = total3(own.direction)
+            own = reached_sums(scene, world, lane, side, index, field, sampled, queried)
+            if lane == 0 and room.patches.sums.shape[1] > 0:
+                room.patches.sums[world, s] = own
+            if own.share > ZERO:
                 sums = added(sums, sums_in_world(own, sampled, queried, mass * side.density_scale, sign))
     if sums.share > ZERO:
         patch = patch_of(sums, weighed)
@@ -173,6 +203,15 @@ def find_patches(scene: Scene, room: Room, world: int, lane: int, n_found: int) 
     if lane == 0:
         room.patches.count[world, 0] = n_near - n_found
     return n_near
+
+
+@wp.func
+def n_patches(room: Room, world: int) -> int:
+    """How many patches touch."""
+    n = int(0)
+    if wp.static(PATCHES):
+        n = room.patches.count[world, 0]
+    return n
 
 
 @wp.func
@@ -310,15 +349,10 @@ def add_patches(scene: Scene, room: Room, world: int, lane: int, n_found: int, t
         for k in range(n):
             found = room.found[world, (n_found + k) * _LANES]
             c = contact_of(scene, found)
-            add_contact(
-                scene,
-                room,
-                world,
-                found,
-                m,
-                room.patches.wrenches[world, c],
-                room.patches.jacobians[world, c],
-            )
+            wrench = room.patches.wrenches[world, c]
+            if room.wrenches.shape[1] > 0:
+                room.wrenches[world, n_found + k] = wrench
+            add_contact(scene, room, world, found, m, wrench, room.patches.jacobians[world, c])
     fit.unfit += total(unfit)
     fit.push += total(push)
     fit.renewed += total(renewed)

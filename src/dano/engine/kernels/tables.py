@@ -6,9 +6,11 @@ whose fields stand in the order of the row; whole numbers are the same for all w
 
 import warp as wp
 
-from dano.engine.kernels.patch_tables import PatchRoom, PatchTables
+from dano.engine.kernels.patch_tables import PatchRoom, PatchSide, PatchTables
 from dano.engine.kernels.trees.tables import TreeRoom, Trees
+from dano.physics.overlap import Part, WeightedSample
 from dano.physics.pairs import BodyState
+from dano.physics.patch_law import PatchMaterial
 from dano.physics.point_law import Duals, Linear, Material, PointLaw
 from dano.physics.real import mat33, mat66, real, vec3, vec4, vec6
 from dano.physics.samples import Point, Sample
@@ -244,6 +246,7 @@ class Room:
         after_bar: By those at its end.
         wrenches: Impulse of each pair that is near, at the first body's centre of mass [N s, N m s, W].
         missing: Changes of the equations of a step, shape (worlds, directions · m).
+        splines: Changes of an equation by changes of coefficients, shape (worlds, directions · lanes).
     """
 
     bodies: wp.array2d(dtype=BodyState)
@@ -276,6 +279,7 @@ class Room:
     after_bar: wp.array2d(dtype=StateRow)
     wrenches: wp.array2d(dtype=vec6)
     missing: wp.array2d(dtype=vec6)
+    splines: wp.array2d(dtype=real)
 
 
 @wp.struct
@@ -285,7 +289,8 @@ class Changes:
     Arrays without columns are not asked for, or do not change. Those of changes hold one direction after the
     other.
 
-    Attributes: those of `Scene`, `Trees` and `Launch` with the same names; `coefficients` are those of `Solids`.
+    Attributes: those of `Scene`, `Trees` and `Launch` with the same names; `coefficients` are those of `Solids`,
+    `patch_materials`, `sides`, `weighted` (samples) and `parts` (of fields) those of `PatchTables`.
     """
 
     bodies: wp.array2d(dtype=Body)
@@ -308,3 +313,7 @@ class Changes:
     states: wp.array2d(dtype=StateRow)
     qs: wp.array2d(dtype=real)
     vs: wp.array2d(dtype=real)
+    patch_materials: wp.array2d(dtype=PatchMaterial)
+    sides: wp.array2d(dtype=PatchSide)
+    weighted: wp.array2d(dtype=WeightedSample)
+    parts: wp.array2d(dtype=Part)

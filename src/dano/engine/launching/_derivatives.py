@@ -32,8 +32,14 @@ CHANGING = {
     "launch.v": "v",
     "launch.efforts": "efforts",
     "launch.commands": "commands",
+    "scene.patches.materials": "patch_materials",
+    "scene.patches.sides": "sides",
+    "scene.patches.samples": "weighted",
+    "scene.patches.fields.parts": "parts",
 }
 """Inputs by which derivatives are taken, and their names in `dano.engine.kernels.tables.Changes`."""
+
+_COEFFICIENTS = "scene.solids.coefficients"
 
 CHANGED = {"launch.states": "states", "launch.qs": "qs", "launch.vs": "vs"}
 """Outputs that change, and their names there."""
@@ -71,7 +77,8 @@ def _jvp(primals, tangents, *, plan: Plan, batched, n_worlds):
     )  # fmt: skip
     changed = dict(zip(_changed(plan), moved, strict=True))
     return found, [
-        changed[name][:, 0] if name in changed else zero for name, zero in zip(plan.outputs, zeros, strict=True)
+        changed[name][:, 0] if name in changed else zero
+        for name, zero in zip(plan.outputs, zeros, strict=True)
     ]
 
 
@@ -120,6 +127,8 @@ def _pullback_plan(forward: Plan, which: tuple[int, ...]) -> Plan:
 def _pulling_room(forward: Plan) -> dict[str, int]:
     """Lengths of what a world needs besides for derivatives of a step's equations."""
     room = dict.fromkeys(("room.state_bar", "room.after_bar"), forward.room["room.bodies"])
+    if "scene.patches.sides" in forward.inputs:
+        room["room.patches.sums"] = forward.inputs["scene.patches.sides"].rows
     if "room.trees.joints" in forward.room:
         names = ("chains", "chain_bars", "hanging_bars", "asked")
         room |= {f"room.trees.{name}": forward.room["room.trees.frames"] for name in names}
@@ -205,7 +214,7 @@ def _spread(change, axis, size: int):
 def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) -> Plan:
     names = list(forward.inputs)
     chosen = {names[i]: forward.inputs[names[i]] for i in which}
-    changes = {f"changes.{CHANGING[k]}": Shape(n_directions * x.rows, x.width) for k, x in chosen.items()}
+    changes = {_place_of_change(k): Shape(n_directions * x.rows, x.width) for k, x in chosen.items()}
     ends = {
         f"changes.{CHANGED[name]}": Shape(n_directions * shape.rows, shape.width)
         for name, shape in _changed(forward).items()
@@ -222,12 +231,19 @@ def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) 
     )
 
 
+def _place_of_change(place: str) -> str:
+    """Where changes of an input stand; those of coefficients are read as coefficients."""
+    return "scene.solids.changes" if place == _COEFFICIENTS else f"changes.{CHANGING[place]}"
+
+
 def _pushforward_room(forward: Plan, which: tuple[int, ...], n_directions: int) -> dict[str, int]:
-    names = list(forward.inputs)
-    rows = {f"bars.{CHANGING[names[i]]}": forward.inputs[names[i]].rows for i in which}
+    names = [list(forward.inputs)[i] for i in which]
+    rows = {f"bars.{CHANGING[k]}": forward.inputs[k].rows for k in names if k != _COEFFICIENTS}
+    splines = {"room.splines": n_directions} if _COEFFICIENTS in names else {}
     return {
         **_pulling_room(forward),
         **rows,
+        **splines,
         "room.missing": n_directions * forward.room["room.velocity"],
         "room.wrenches": forward.room["room.found"],
     }

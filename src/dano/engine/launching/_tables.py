@@ -76,14 +76,7 @@ def knows(scene: Scene) -> bool:
 
 # Kinds, ways of turning and degrees that builds know, from the smallest on. Few builds serve all scenes: each
 # takes some seconds to compile, once on a machine.
-_PLANES, _PRIMITIVES, _GRIDS, _DENSITIES = (
-    frozenset({0}),
-    frozenset(range(6)),
-    frozenset({0, 6}),
-    frozenset({0, 7}),
-)
-_SOLIDS, _FIELDS = frozenset(range(7)), frozenset(range(8))
-_BUILDS = (_PLANES, _PRIMITIVES, _GRIDS, _DENSITIES, _SOLIDS, _FIELDS)
+_BUILDS = tuple(map(frozenset, ({0}, range(6), {0, 6}, {0, 7}, range(7), range(8))))
 _STILL, _TURNS = frozenset({0}), frozenset({0, 1, 2})
 
 
@@ -138,6 +131,12 @@ def scene_tables(scene: Scene) -> Tables:
         ValueError: If a shape, a density or a law is not one that kernels know.
     """
     dtype = scene.timestep.dtype
+    for contact in scene.contacts:
+        if type(contact.law) is not DistributedLaw and not isinstance(contact.law, AbstractPatchLaw):
+            raise ValueError(
+                f"law of contact ({contact.a!r}, {contact.b!r}) must be DistributedLaw or CentroidLaw, which "
+                f"kernels know, got {type(contact.law).__name__}"
+            )
     pairs = pressing_pairs(scene.bodies, scene.point_pairs)
     used = {i for pair in pairs for i in pair[:2]}
     bodies = [body if i in used else body.unused() for i, body in enumerate(scene.bodies)]

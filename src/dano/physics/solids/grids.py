@@ -145,37 +145,83 @@ def grid_spline(solids: Solids, world: int, kind: LeafKind, place: vec3) -> Dist
 
 
 @wp.func
-def grid_distance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec3) -> Distance:
-    """The spline of a grid, and beyond its border the way to it besides."""
-    degree = kind.degree
-    border = degree + 1
-    u = vec3(
+def place_in_grid(leaf: Leaf, y: vec3) -> vec3:
+    """A point in axes of a grid, in cells from the first node inside its border."""
+    return vec3(
         (y[0] - leaf.sizes[0]) / leaf.spacing[0],
         (y[1] - leaf.sizes[1]) / leaf.spacing[1],
         (y[2] - leaf.sizes[2]) / leaf.spacing[2],
     )
-    last = vec3(
-        real(kind.nodes_x - 2 * border - 1),
-        real(kind.nodes_y - 2 * border - 1),
-        real(kind.nodes_z - 2 * border - 1),
-    )
-    closest = vec3(
+
+
+@wp.func
+def closest_in_grid(kind: LeafKind, u: vec3) -> vec3:
+    """The place between a grid's outermost nodes that is closest to a place."""
+    ends = 2 * kind.degree + 3
+    last = vec3(real(kind.nodes_x - ends), real(kind.nodes_y - ends), real(kind.nodes_z - ends))
+    return vec3(
         wp.min(wp.max(u[0], ZERO), last[0]),
         wp.min(wp.max(u[1], ZERO), last[1]),
         wp.min(wp.max(u[2], ZERO), last[2]),
     )
-    away = wp.cw_mul(u - closest, leaf.spacing)
-    d = grid_spline(solids, world, kind, closest)
+
+
+@wp.func
+def spline_distance(
+    solids: Solids, world: int, kind: LeafKind, leaf: Leaf, u: vec3, closest: vec3
+) -> Distance:
+    """The spline of a grid at the place closest to u, and its gradient by u: linear in the coefficients."""
+    d = Distance()
+    found = grid_spline(solids, world, kind, closest)
+    g = found.gradient
+    d.value = found.value
     # Moving along an axis on which the point lies outside leaves the closest point where it is.
-    beyond = wp.sqrt(wp.dot(away, away))
-    inverse = inverse_or_zero(beyond)
-    g = d.gradient
     d.gradient = vec3(
-        wp.where(closest[0] == u[0], g[0] / leaf.spacing[0], ZERO) + away[0] * inverse,
-        wp.where(closest[1] == u[1], g[1] / leaf.spacing[1], ZERO) + away[1] * inverse,
-        wp.where(closest[2] == u[2], g[2] / leaf.spacing[2], ZERO) + away[2] * inverse,
+        wp.where(closest[0] == u[0], g[0] / leaf.spacing[0], ZERO),
+        wp.where(closest[1] == u[1], g[1] / leaf.spacing[1], ZERO),
+        wp.where(closest[2] == u[2], g[2] / leaf.spacing[2], ZERO),
     )
+    return d
+
+
+@wp.func
+def grid_distance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec3) -> Distance:
+    """The spline of a grid, and beyond its border the way to it besides."""
+    u = place_in_grid(leaf, y)
+    closest = closest_in_grid(kind, u)
+    away = wp.cw_mul(u - closest, leaf.spacing)
+    beyond = wp.sqrt(wp.dot(away, away))
+    d = spline_distance(solids, world, kind, leaf, u, closest)
+    d.gradient = d.gradient + inverse_or_zero(beyond) * away
     d.value += beyond
+    return d
+
+
+@wp.func
+def moved_kind(solids: Solids, kind: LeafKind, direction: int) -> LeafKind:
+    """A grid whose coefficients are their changes in a direction, among those of `moved_solids`."""
+    kind.first = kind.first + direction * solids.coefficients.shape[1]
+    return kind
+
+
+@wp.func
+def moved_solids(solids: Solids) -> Solids:
+    """Solids whose coefficients are the changes of these."""
+    moved = solids
+    moved.coefficients = solids.changes
+    return moved
+
+
+@wp.func
+def distance_change(
+    solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: vec3, direction: int
+) -> Distance:
+    """Change of a sampled distance with its coefficients, at a point [m, F]."""
+    u = place_in_grid(leaf, (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position)))
+    moved = moved_kind(solids, kind, direction)
+    d = spline_distance(moved_solids(solids), world, moved, leaf, u, closest_in_grid(kind, u))
+    d.value = leaf.factor * d.value
+    d.gradient = leaf.rotation * d.gradient
     return d
 
 

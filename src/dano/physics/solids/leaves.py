@@ -62,11 +62,13 @@ class Solids:
         leaves: Shape (worlds, leaves).
         kinds: Shape (leaves,).
         coefficients: Spline coefficients of all grids [m], shape (worlds, coefficients).
+        changes: Of the coefficients, one direction after the other; only for forward derivatives.
     """
 
     leaves: wp.array2d(dtype=Leaf)
     kinds: wp.array(dtype=LeafKind)
     coefficients: wp.array2d(dtype=real)
+    changes: wp.array2d(dtype=real)
 
 
 @wp.struct

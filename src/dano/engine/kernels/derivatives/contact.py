@@ -10,6 +10,7 @@ from dano.engine.kernels.derivatives.adjoint import (
     probe_distance,
     Virtual,
 )
+from dano.engine.kernels.derivatives.pair_changes import add_distance_changes
 from dano.engine.kernels.lanes import total, total3, total6, total33
 from dano.engine.kernels.search import posed, solid_of_body
 from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
@@ -195,6 +196,7 @@ def pull_points(
             )  # fmt: skip
             _f, _g, by_solid, by_x, _h = wp.grad(distance_work)(scene.solids, world, solid, x, by_distance)
             add_leaf(bars, world, solid, by_solid)
+            add_distance_changes(scene, room, world, lane, solid, x, by_distance)
             # x = points · sample + origin
             by_pose.points += wp.outer(by_x, sample.point)
             by_pose.origin += by_x

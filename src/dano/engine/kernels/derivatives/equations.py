@@ -13,6 +13,7 @@ from dano.engine.kernels.derivatives.bodies import (
     row_before,
 )
 from dano.engine.kernels.derivatives.contact import PairBar, pull_pair
+from dano.engine.kernels.derivatives.patches import pull_patch
 from dano.engine.kernels.derivatives.trees import (
     add_hanging,
     add_timestep,
@@ -28,6 +29,7 @@ from dano.engine.kernels.derivatives.trees import (
 )
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import copy_transposed_blocks, find_pattern, solve_blocks
+from dano.engine.kernels.patches import add_patches, find_patches, fit_patch_duals
 from dano.engine.kernels.rollout import begin_body, begin_coordinates, begin_step_of_trees, Launch
 from dano.engine.kernels.search import find_contacts, fix_laws
 from dano.engine.kernels.tables import Changes, FoundPair, Push, Room, Scene
@@ -39,7 +41,7 @@ from dano.engine.kernels.trees.balance import (
     solve_trees,
 )
 from dano.engine.kernels.trees.contact import body_twist
-from dano.physics.features import LANES, LOOPS, TREES
+from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
 from dano.physics.real import ONE, real, vec6, ZERO
 from dano.physics.rotations import matrix
 from dano.physics.twists import joined
@@ -49,7 +51,7 @@ _LANES = wp.constant(LANES)
 
 @wp.func
 def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: int) -> int:
-    """A step at its solution: points, laws and the Jacobian; returns the number of pairs that are near."""
+    """A step at its solution: contacts, laws and the Jacobian; returns the number of pairs with points."""
     n = scene.body_index.shape[0]
     for i in range(n):
         push = Push()
@@ -60,10 +62,15 @@ def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: i
             begin_coordinates(scene, room, world, launch, t)
             begin_step_of_trees(scene, room, world, launch, t)
         wait()
-    n_found, _overflow = find_contacts(scene, room, world, lane)
+    n_found = int(0)
+    if wp.static(POINTS):
+        n_found, _overflow = find_contacts(scene, room, world, lane)
+    n_near = n_found
+    if wp.static(PATCHES):
+        n_near = find_patches(scene, room, world, lane, n_found)
     wait()
     if lane == 0:
-        find_pattern(scene, room, world, n_found)
+        find_pattern(scene, room, world, n_near)
         for i in range(n):
             m = scene.body_index[i].row
             if m >= 0 and not hangs(scene, m):
@@ -76,12 +83,17 @@ def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: i
         for b in range(scene.n_blocks):
             room.tried[world, b] = room.velocity[world, b]
     wait()
-    fix_laws(scene, room, world, lane, n_found, launch.reports[world, t].rebound)
-    fit_duals(scene, room, world, lane, n_found)
+    if wp.static(POINTS):
+        fix_laws(scene, room, world, lane, n_found, launch.reports[world, t].rebound)
+        fit_duals(scene, room, world, lane, n_found)
+    if wp.static(PATCHES):
+        fit_patch_duals(scene, room, world, lane, n_found)
     wait()
     trial = Trial()
     trial.softness = ONE
-    assemble(scene, room, world, lane, n_found, trial)
+    fit = assemble(scene, room, world, lane, n_found, trial)
+    if wp.static(PATCHES):
+        add_patches(scene, room, world, lane, n_found, trial, fit)
     wait()
     if wp.static(TREES):
         if lane == 0:
@@ -106,7 +118,9 @@ def solve_transposed(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def twist_of(scene: Scene, room: Room, world: int, row: int, values: wp.array2d(dtype=vec6), offset: real) -> vec6:
+def twist_of(
+    scene: Scene, room: Room, world: int, row: int, values: wp.array2d(dtype=vec6), offset: real
+) -> vec6:
     """How contact sees a body move, by its row, with values of the unknowns; see `body_twist`."""
     if wp.static(TREES):
         return body_twist(scene, room, world, row, values, offset)
@@ -153,7 +167,8 @@ def pull_touching(
     if bars.bodies.shape[1] > 0:
         bars.bodies[world, index.first].scale += bar.scale
     add_timestep(bars, world, bar.timestep)
-    if bars.pairs.shape[1] > 0:
+    # Pairs with a patch stand behind those with points, and have no depth of their own.
+    if found.pair < bars.pairs.shape[1]:
         bars.pairs[world, found.pair].sink += bar.sink
 
 
@@ -177,6 +192,26 @@ def pull_end(scene: Scene, room: Room, bars: Changes, launch: Launch, world: int
         pull_chains(scene, room, bars, launch, world, t)
 
 
+@wp.func
+def twists_of_pair(scene: Scene, room: Room, world: int, found: FoundPair) -> Virtual:
+    """How contact sees the bodies of a pair move at the end of the step, and with virtual velocities."""
+    index = scene.pair_index[found.pair]
+    first = scene.body_index[index.first].row
+    second = scene.body_index[index.second].row
+    twists = Virtual()
+    twists.first = twist_of(scene, room, world, first, room.velocity, ONE)
+    twists.second = twist_of(scene, room, world, second, room.velocity, ONE)
+    twists.first_virtual = twist_of(scene, room, world, first, room.step, ZERO)
+    twists.second_virtual = twist_of(scene, room, world, second, room.step, ZERO)
+    return twists
+
+
+@wp.func
+def is_moved_pair(twists: Virtual) -> bool:
+    """Whether virtual velocities of a pair are not zero; what is not a number is not."""
+    return not (wp.length_sq(twists.first_virtual) + wp.length_sq(twists.second_virtual) == ZERO)
+
+
 @after_adjoints
 @wp.func
 def pull_equations(
@@ -189,21 +224,23 @@ def pull_equations(
             if row >= 0 and not hangs(scene, row) and is_moved(room.step, world, block_of(scene, row)):
                 pull_momentum(scene, room, bars, launch, world, t, i, row_before(scene, launch, world, t, i))
     wait()
-    for f in range(n_found):
-        found = room.found[world, f * _LANES + lane]
-        index = scene.pair_index[found.pair]
-        first = scene.body_index[index.first].row
-        second = scene.body_index[index.second].row
-        twists = Virtual()
-        twists.first = twist_of(scene, room, world, first, room.velocity, ONE)
-        twists.second = twist_of(scene, room, world, second, room.velocity, ONE)
-        twists.first_virtual = twist_of(scene, room, world, first, room.step, ZERO)
-        twists.second_virtual = twist_of(scene, room, world, second, room.step, ZERO)
-        moved = wp.length_sq(twists.first_virtual) + wp.length_sq(twists.second_virtual)
-        if not (moved == ZERO):
-            bar = pull_pair(scene, room, bars, world, lane, found, launch.reports[world, t].rebound, twists)
-            if lane == 0:
-                pull_touching(scene, room, bars, launch, world, t, found, bar)
+    if wp.static(POINTS):
+        for f in range(n_found):
+            found = room.found[world, f * _LANES + lane]
+            twists = twists_of_pair(scene, room, world, found)
+            if is_moved_pair(twists):
+                rebound = launch.reports[world, t].rebound
+                bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists)
+                if lane == 0:
+                    pull_touching(scene, room, bars, launch, world, t, found, bar)
+    if wp.static(PATCHES):
+        for p in range(room.patches.count[world, 0]):
+            touching = room.found[world, (n_found + p) * _LANES + lane]
+            twists_there = twists_of_pair(scene, room, world, touching)
+            if is_moved_pair(twists_there):
+                patch_bar = pull_patch(scene, room, bars, world, lane, touching, twists_there)
+                if lane == 0:
+                    pull_touching(scene, room, bars, launch, world, t, touching, patch_bar)
     wait()
     if wp.static(TREES):
         if lane == 0:

@@ -9,35 +9,47 @@ import warp as wp
 from dano.engine.kernels.assembly import row_of
 from dano.engine.kernels.derivatives.adjoint import advance_work, after_adjoints, momentum_work, Virtual
 from dano.engine.kernels.derivatives.bodies import row_before
-from dano.engine.kernels.derivatives.contact import pull_pair
+from dano.engine.kernels.derivatives.contact import PairBar, pull_pair
 from dano.engine.kernels.derivatives.equations import pull_touching
+from dano.engine.kernels.derivatives.pair_changes import (
+    change_by_leaves,
+    change_by_patch,
+    change_by_samples,
+    change_by_splines,
+    change_by_weighted,
+    clear_leaves,
+    clear_patch,
+    clear_samples,
+    clear_splines,
+    clear_weighted,
+)
+from dano.engine.kernels.derivatives.patches import pull_patch
 from dano.engine.kernels.derivatives.products import (
     body_product,
-    leaf_product,
     material_product,
     push_product,
     row_change,
     row_product,
-    sample_product,
     unit_row,
     unit_vector,
 )
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
+from dano.engine.kernels.patches import n_patches
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Body, Changes, FoundPair, Push, Room, SamplePair, Scene, StateRow
-from dano.physics.features import LANES
+from dano.physics.features import LANES, PATCHES, POINTS
 from dano.physics.point_law import Material
 from dano.physics.real import real, vec3, vec6, ZERO
-from dano.physics.samples import Sample
-from dano.physics.solids.leaves import Leaf
 from dano.physics.twists import angular_part, joined, linear_part
 
 _LANES = wp.constant(LANES)
 
 
 @wp.func
-def clear_pair(scene: Scene, room: Room, bars: Changes, world: int, lane: int, found: FoundPair):
+def clear_pair(
+    scene: Scene, room: Room, bars: Changes, world: int, lane: int, found: FoundPair, has_points: bool
+):
     """Zero the derivatives that a pair adds to."""
     index = scene.pair_index[found.pair]
     if lane == 0:
@@ -46,19 +58,40 @@ def clear_pair(scene: Scene, room: Room, bars: Changes, world: int, lane: int, f
         if bars.bodies.shape[1] > 0:
             bars.bodies[world, index.first] = Body()
             bars.bodies[world, index.second] = Body()
-        if bars.materials.shape[1] > 0:
-            bars.materials[world, index.contact] = Material()
-        if bars.pairs.shape[1] > 0:
-            bars.pairs[world, found.pair] = SamplePair()
         if bars.timestep.shape[1] > 0:
             bars.timestep[world, 0] = ZERO
-        if bars.leaves.shape[1] > 0:
+        if has_points:
+            if bars.materials.shape[1] > 0:
+                bars.materials[world, index.contact] = Material()
+            if bars.pairs.shape[1] > 0:
+                bars.pairs[world, found.pair] = SamplePair()
             solid = scene.body_index[index.second]
-            for k in range(solid.first_leaf, solid.first_leaf + solid.leaves):
-                bars.leaves[world, k] = Leaf()
-    if bars.samples.shape[1] > 0:
-        for k in range(found.first, found.end):
-            bars.samples[world, room.where[world, k].sample] = Sample()
+            clear_leaves(bars, world, solid.first_leaf, solid.leaves)
+    clear_splines(room, world, lane)
+    clear_samples(room, bars, world, found)
+    if wp.static(PATCHES):
+        if not has_points:
+            if lane == 0:
+                clear_patch(scene, bars, world, found)
+            clear_weighted(scene, bars, world, lane, found)
+
+
+@wp.func
+def change_of_points(
+    scene: Scene, changes: Changes, bars: Changes, world: int, found: FoundPair, direction: int
+) -> real:
+    """Change of an equation of a pair by the law of its points and the solid that they press on."""
+    index = scene.pair_index[found.pair]
+    change = real(0.0)
+    if changes.materials.shape[1] > 0:
+        at = direction * scene.materials.shape[1] + index.contact
+        change += material_product(bars.materials[world, index.contact], changes.materials[world, at])
+    if changes.pairs.shape[1] > 0:
+        at = direction * scene.pairs.shape[1] + found.pair
+        change += bars.pairs[world, found.pair].share * changes.pairs[world, at].share
+        change += bars.pairs[world, found.pair].sink * changes.pairs[world, at].sink
+    solid = scene.body_index[index.second]
+    return change + change_by_leaves(changes, bars, world, solid.first_leaf, solid.leaves, direction)
 
 
 @wp.func
@@ -72,6 +105,7 @@ def change_of_pair(
     lane: int,
     t: int,
     found: FoundPair,
+    has_points: bool,
     direction: int,
 ) -> real:
     """Change of an equation of a pair in a direction, from its derivatives."""
@@ -92,28 +126,18 @@ def change_of_pair(
         change += body_product(
             bars.bodies[world, index.second], changes.bodies[world, direction * n + index.second]
         )
-    if changes.materials.shape[1] > 0:
-        at = direction * scene.materials.shape[1] + index.contact
-        change += material_product(bars.materials[world, index.contact], changes.materials[world, at])
-    if changes.pairs.shape[1] > 0:
-        at = direction * scene.pairs.shape[1] + found.pair
-        change += bars.pairs[world, found.pair].share * changes.pairs[world, at].share
-        change += bars.pairs[world, found.pair].sink * changes.pairs[world, at].sink
     if changes.timestep.shape[1] > 0:
         change += bars.timestep[world, 0] * changes.timestep[world, direction]
-    if changes.leaves.shape[1] > 0:
-        solid = scene.body_index[index.second]
-        for k in range(solid.first_leaf, solid.first_leaf + solid.leaves):
-            at = direction * scene.solids.leaves.shape[1] + k
-            change += leaf_product(bars.leaves[world, k], changes.leaves[world, at])
-    if changes.samples.shape[1] > 0:
-        of_samples = real(0.0)
-        for k in range(found.first, found.end):
-            s = room.where[world, k].sample
-            moved = changes.samples[world, direction * scene.samples.shape[1] + s]
-            of_samples += sample_product(bars.samples[world, s], moved)
-        change += total(of_samples)
-    return change
+    of_samples = change_by_splines(room, world, lane, direction)
+    if wp.static(POINTS):
+        if has_points:
+            change += change_of_points(scene, changes, bars, world, found, direction)
+            of_samples += change_by_samples(room, changes, bars, world, found, direction)
+    if wp.static(PATCHES):
+        if not has_points:
+            change += change_by_patch(scene, changes, bars, world, found, direction)
+            of_samples += change_by_weighted(scene, changes, bars, world, lane, found, direction)
+    return change + total(of_samples)
 
 
 @wp.func
@@ -212,6 +236,53 @@ def push_advance(
 
 @after_adjoints
 @wp.func
+def push_pair(
+    scene: Scene,
+    room: Room,
+    launch: Launch,
+    changes: Changes,
+    bars: Changes,
+    world: int,
+    lane: int,
+    t: int,
+    f: int,
+    has_points: bool,
+):
+    """Add what the changes make of the six equations of a pair, in all directions."""
+    found = room.found[world, f * _LANES + lane]
+    index = scene.pair_index[found.pair]
+    twists = Virtual()
+    twists.first = row_of(room.velocity, world, scene.body_index[index.first].row)
+    twists.second = row_of(room.velocity, world, scene.body_index[index.second].row)
+    k = int(0)
+    while k < 6:
+        clear_pair(scene, room, bars, world, lane, found, has_points)
+        wait()
+        # The first body's virtual velocity is measured from the second's: only it moves.
+        twists.first_virtual = unit_vector(k)
+        bar = PairBar()
+        if wp.static(POINTS):
+            if has_points:
+                rebound = launch.reports[world, t].rebound
+                bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists)
+        if wp.static(PATCHES):
+            if not has_points:
+                bar = pull_patch(scene, room, bars, world, lane, found, twists)
+        if lane == 0:
+            pull_touching(scene, room, bars, launch, world, t, found, bar)
+        wait()
+        for d in range(launch.n_directions):
+            change = change_of_pair(scene, room, launch, changes, bars, world, lane, t, found, has_points, d)
+            if lane == 0:
+                add_change(scene, room, world, found, d, change, k)
+        k += 1
+    if lane == 0:
+        for d in range(launch.n_directions):
+            add_shift(scene, room, launch, changes, world, t, f, d)
+
+
+@after_adjoints
+@wp.func
 def push_step_of_bodies(
     scene: Scene,
     room: Room,
@@ -232,30 +303,8 @@ def push_step_of_bodies(
         for k in range(m):
             push_momentum(scene, room, launch, changes, world, t, scene.moving[k])
     wait()
-    for f in range(n_found):
-        found = room.found[world, f * _LANES + lane]
-        index = scene.pair_index[found.pair]
-        twists = Virtual()
-        twists.first = row_of(room.velocity, world, scene.body_index[index.first].row)
-        twists.second = row_of(room.velocity, world, scene.body_index[index.second].row)
-        k = int(0)
-        while k < 6:
-            clear_pair(scene, room, bars, world, lane, found)
-            wait()
-            # The first body's virtual velocity is measured from the second's: only it moves.
-            twists.first_virtual = unit_vector(k)
-            bar = pull_pair(scene, room, bars, world, lane, found, launch.reports[world, t].rebound, twists)
-            if lane == 0:
-                pull_touching(scene, room, bars, launch, world, t, found, bar)
-            wait()
-            for d in range(launch.n_directions):
-                change = change_of_pair(scene, room, launch, changes, bars, world, lane, t, found, d)
-                if lane == 0:
-                    add_change(scene, room, world, found, d, change, k)
-            k += 1
-        if lane == 0:
-            for d in range(launch.n_directions):
-                add_shift(scene, room, launch, changes, world, t, f, d)
+    for f in range(n_found + n_patches(room, world)):
+        push_pair(scene, room, launch, changes, bars, world, lane, t, f, f < n_found)
     wait()
     if lane == 0:
         for d in range(launch.n_directions):

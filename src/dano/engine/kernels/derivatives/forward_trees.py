@@ -8,6 +8,14 @@ import warp as wp
 
 from dano.engine.kernels.derivatives.adjoint import after_adjoints
 from dano.engine.kernels.derivatives.equations import pull_end, pull_equations
+from dano.engine.kernels.derivatives.pair_changes import (
+    change_by_samples,
+    change_by_splines,
+    change_by_weighted,
+    clear_samples,
+    clear_splines,
+    clear_weighted,
+)
 from dano.engine.kernels.derivatives.products import (
     body_product,
     joint_product,
@@ -15,23 +23,26 @@ from dano.engine.kernels.derivatives.products import (
     leaf_product,
     loop_product,
     material_product,
+    patch_material_product,
     push_product,
     row_change,
     row_product,
-    sample_product,
     unit_row,
     unit_vector,
 )
 from dano.engine.kernels.derivatives.trees import follow_chains
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
+from dano.engine.kernels.patch_tables import PatchSide
+from dano.engine.kernels.patches import n_patches
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Body, Changes, Push, Room, SamplePair, Scene, StateRow
 from dano.engine.kernels.trees.balance import eliminate_joint_duals, solve_trees
-from dano.physics.features import LANES
+from dano.physics.features import LANES, PATCHES
+from dano.physics.overlap import Part
+from dano.physics.patch_law import PatchMaterial
 from dano.physics.point_law import Material
 from dano.physics.real import ONE, real, vec3, vec6, ZERO
-from dano.physics.samples import Sample
 from dano.physics.solids.leaves import Leaf
 from dano.physics.trees.joint_laws import JointLaw
 from dano.physics.trees.joints import Joint
@@ -70,6 +81,12 @@ def clear_bars(scene: Scene, room: Room, bars: Changes, world: int, t: int):
         bars.materials[world, i] = Material()
     for i in range(bars.pairs.shape[1]):
         bars.pairs[world, i] = SamplePair()
+    for i in range(bars.patch_materials.shape[1]):
+        bars.patch_materials[world, i] = PatchMaterial()
+    for i in range(bars.sides.shape[1]):
+        bars.sides[world, i] = PatchSide()
+    for i in range(bars.parts.shape[1]):
+        bars.parts[world, i] = Part()
     if bars.gravity.shape[1] > 0:
         bars.gravity[world, 0] = vec3()
     if bars.timestep.shape[1] > 0:
@@ -150,6 +167,16 @@ def change_of_scene(changes: Changes, bars: Changes, world: int, d: int) -> real
     for i in range(bars.pairs.shape[1]):
         moved_pair = changes.pairs[world, d * bars.pairs.shape[1] + i]
         change += bars.pairs[world, i].share * moved_pair.share + bars.pairs[world, i].sink * moved_pair.sink
+    for i in range(bars.patch_materials.shape[1]):
+        change += patch_material_product(
+            bars.patch_materials[world, i],
+            changes.patch_materials[world, d * bars.patch_materials.shape[1] + i],
+        )
+    for i in range(bars.sides.shape[1]):
+        moved_side = changes.sides[world, d * bars.sides.shape[1] + i]
+        change += bars.sides[world, i].density_scale * moved_side.density_scale
+    for i in range(bars.parts.shape[1]):
+        change += bars.parts[world, i].edge * changes.parts[world, d * bars.parts.shape[1] + i].edge
     if bars.gravity.shape[1] > 0:
         change += wp.dot(bars.gravity[world, 0], changes.gravity[world, d])
     if bars.timestep.shape[1] > 0:
@@ -182,22 +209,30 @@ def take_samples(
     block: int,
     k: int,
 ):
-    """Add what changes of samples make of an equation; derivatives by them are used up."""
-    if bars.samples.shape[1] > 0:
-        for f in range(n_found):
+    """Add what changes of samples and of splines make of an equation; derivatives by them are used up."""
+    if room.splines.shape[1] > 0:
+        for d in range(launch.n_directions):
+            of_splines = total(change_by_splines(room, world, lane, d))
+            if lane == 0:
+                room.missing[world, d * scene.n_blocks + block] += of_splines * unit_vector(k)
+        clear_splines(room, world, lane)
+    if bars.samples.shape[1] > 0 or bars.weighted.shape[1] > 0:
+        # A sample that touches several bodies counts with the first of them.
+        for f in range(n_found + n_patches(room, world)):
             found = room.found[world, f * _LANES + lane]
             for d in range(launch.n_directions):
-                change = real(0.0)
-                for p in range(found.first, found.end):
-                    s = room.where[world, p].sample
-                    moved = changes.samples[world, d * bars.samples.shape[1] + s]
-                    change += sample_product(bars.samples[world, s], moved)
+                change = change_by_samples(room, changes, bars, world, found, d)
+                if wp.static(PATCHES):
+                    if f >= n_found:
+                        change = change_by_weighted(scene, changes, bars, world, lane, found, d)
                 change = total(change)
                 if lane == 0:
                     room.missing[world, d * scene.n_blocks + block] += change * unit_vector(k)
-            for p in range(found.first, found.end):
-                bars.samples[world, room.where[world, p].sample] = Sample()
-        wait()
+            clear_samples(room, bars, world, found)
+            if wp.static(PATCHES):
+                if f >= n_found:
+                    clear_weighted(scene, bars, world, lane, found)
+            wait()
 
 
 @wp.func
@@ -290,6 +325,7 @@ def push_step_of_trees(
     if lane == 0:
         for i in range(launch.n_directions * m):
             room.missing[world, i] = vec6()
+    clear_splines(room, world, lane)
     block = int(0)
     k = int(0)
     while block < m:

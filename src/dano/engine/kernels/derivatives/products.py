@@ -4,6 +4,8 @@ import warp as wp
 
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Body, Changes, Push, StateRow
+from dano.physics.overlap import WeightedSample
+from dano.physics.patch_law import PatchMaterial
 from dano.physics.point_law import Material
 from dano.physics.real import ONE, real, vec6
 from dano.physics.samples import Sample
@@ -63,6 +65,30 @@ def material_product(a: Material, b: Material) -> real:
 
 
 @wp.func
+def patch_material_product(a: PatchMaterial, b: PatchMaterial) -> real:
+    """⟨a, b⟩ of numbers of contacts with a patch law."""
+    return (
+        a.spring * b.spring
+        + a.damper * b.damper
+        + a.sliding_friction * b.sliding_friction
+        + a.sliding_drag * b.sliding_drag
+        + a.torsional_friction * b.torsional_friction
+        + a.torsional_drag * b.torsional_drag
+        + a.rolling_friction * b.rolling_friction
+        + a.rolling_drag * b.rolling_drag
+        + a.smoothing * b.smoothing
+        + a.regularizer * b.regularizer
+        + a.stiction * b.stiction
+    )
+
+
+@wp.func
+def weighted_product(a: WeightedSample, b: WeightedSample) -> real:
+    """⟨a, b⟩ of weighted samples."""
+    return wp.dot(a.point, b.point) + a.weight * b.weight
+
+
+@wp.func
 def sample_product(a: Sample, b: Sample) -> real:
     """⟨a, b⟩ of samples."""
     return wp.dot(a.point, b.point) + wp.dot(a.area, b.area)
@@ -109,9 +135,7 @@ def law_product(a: JointLaw, b: JointLaw) -> real:
 @wp.func
 def loop_product(a: Loop, b: Loop) -> real:
     """⟨a, b⟩ of loops."""
-    return (
-        wp.dot(a.position, b.position) + wp.dot(a.anchor, b.anchor) + wp.dot(a.orientation, b.orientation)
-    )
+    return wp.dot(a.position, b.position) + wp.dot(a.anchor, b.anchor) + wp.dot(a.orientation, b.orientation)
 
 
 @wp.func
