@@ -39,7 +39,7 @@ def structure(layout):
 
 
 def test_unknowns_fill_blocks(layout, structure):
-    """Every velocity has a place of its own: roots begin a block, coordinates follow them, loops come last."""
+    """Every velocity has its own place: roots begin a block, coordinates follow, loops come last."""
     taken = []
     for node in structure.nodes:
         if node[KIND] == ROOT:

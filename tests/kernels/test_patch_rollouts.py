@@ -1,4 +1,4 @@
-"""Rollouts with contacts of the centroid law in kernels, and their derivatives, beside those of the engine."""
+"""Rollouts with contacts of the centroid law in kernels, and their derivatives."""
 
 import functools
 

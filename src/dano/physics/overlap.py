@@ -494,8 +494,8 @@ def cap_patch(ball: Leaf, plane: Leaf, sampled: Frame, queried: Frame, mass: rea
     """A homogeneous ball with a half-space, in closed form: the spherical cap below the plane.
 
     With depth h of the lowest point, V = π h² (3 r − h)/3, and the cap's centroid lies
-    3 (2 r − h)²/(4 (3 r − h)) from the ball's centre. Exact and smooth where sampling would make a ball rattle
-    as it rolls.
+    3 (2 r − h)²/(4 (3 r − h)) from the ball's centre. Exact and smooth where sampling would make a ball
+    rattle as it rolls.
 
     Args:
         ball: The ball, about the origin of its body's frame.

@@ -218,8 +218,8 @@ class Room:
         bodies: State of each body at the start of the step.
         momentum: That each moving body has before contact [kg m/s; kg m²/s, W].
         inertia: Of each moving body [kg m², W].
-        found: Pairs that are near, then those whose patches touch, shape (worlds, pairs · lanes) for all rows of
-            `Scene.pair_index`.
+        found: Pairs that are near, then those whose patches touch, shape (worlds, pairs · lanes) for all rows
+            of `Scene.pair_index`.
         where: Of each point where it was found, shape (worlds, capacity).
         points: The points.
         laws: Their constants.
@@ -289,8 +289,8 @@ class Changes:
     Arrays without columns are not asked for, or do not change. Those of changes hold one direction after the
     other.
 
-    Attributes: those of `Scene`, `Trees` and `Launch` with the same names; `coefficients` are those of `Solids`,
-    `patch_materials`, `sides`, `weighted` (samples) and `parts` (of fields) those of `PatchTables`.
+    Attributes: those of `Scene`, `Trees` and `Launch` with the same names; `coefficients` are those of
+    `Solids`, `patch_materials`, `sides`, `weighted` (samples) and `parts` (of fields) those of `PatchTables`.
     """
 
     bodies: wp.array2d(dtype=Body)

@@ -189,10 +189,11 @@ def pull_points(
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
             (
-                by_pose, by_sample, by_distance, _a, _b, by_share_of, by_share, by_h, by_material, _c, _d, by_twists,
+                by_pose, by_sample, by_distance, _a, _b, by_share_of, by_share, by_h, by_material, _c, _d,
+                by_twists,
             ) = wp.grad(point_work)(
-                pose, sample, d, turning, where.presses_back > 0, pair.share, found.share, h, material, rebound,
-                found.impact_stiffness, twists,
+                pose, sample, d, turning, where.presses_back > 0, pair.share, found.share, h, material,
+                rebound, found.impact_stiffness, twists,
             )  # fmt: skip
             _f, _g, by_solid, by_x, _h = wp.grad(distance_work)(scene.solids, world, solid, x, by_distance)
             add_leaf(bars, world, solid, by_solid)

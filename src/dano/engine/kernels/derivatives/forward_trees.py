@@ -1,7 +1,7 @@
 """Forward mode of bodies on joints: an equation, or a number of a step's end, after the other.
 
-The derivative of each by everything that it depends on is that of reverse mode with a unit virtual velocity, or
-with one number of the end asked for, and serves all directions.
+The derivative of each by everything that it depends on is that of reverse mode with a unit virtual velocity,
+or with one number of the end asked for, and serves all directions.
 """
 
 import warp as wp

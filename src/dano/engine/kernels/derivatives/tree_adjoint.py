@@ -1,8 +1,8 @@
 """What the equations of bodies on joints depend on, as numbers whose gradients are derivatives.
 
 See `dano.engine.kernels.derivatives.adjoint`. A body on a joint stands and moves as the body that carries it
-says: each joint is a function from one `Chain` to the next, and derivatives go through it from the tips to the
-roots.
+says: each joint is a function from one `Chain` to the next, and derivatives go through it from the tips to
+the roots.
 """
 
 import warp as wp

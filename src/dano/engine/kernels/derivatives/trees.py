@@ -286,7 +286,7 @@ def carrier_after(scene: Scene, launch: Launch, world: int, t: int, body: int) -
 
 @wp.func
 def pull_places(scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, t: int):
-    """Add derivatives through the poses of bodies on joints at the end of a step, to `after_bar` and `q_after`."""
+    """Add derivatives through poses of bodies on joints at a step's end, to `after_bar` and `q_after`."""
     m = scene.trees.nodes.shape[0]
     for k in range(m):
         n = m - 1 - k
