@@ -1,5 +1,7 @@
 """Settings and data shared by all tests."""
 
+import contextlib
+import ctypes
 import gc
 import os
 from importlib.metadata import version
@@ -12,6 +14,7 @@ if tuple(int(n) for n in version("jaxlib").split(".")[:2]) < (0, 11):
     FAST_COMPILING = "--xla_cpu_use_fusion_emitters=false"
     os.environ["XLA_FLAGS"] = f"{FAST_COMPILING} {os.environ.get('XLA_FLAGS', '')}".strip()
 
+import equinox as eqx
 import jax
 import pytest
 from jaxtyping import install_import_hook
@@ -23,6 +26,8 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # A program that XLA compiles stays mapped while JAX keeps it, and Linux allows 65,530 maps a process.
 MANY_MAPS = 15_000
+MUCH_MEMORY = 1.2e9
+"""Bytes of a process from which compiled programs are forgotten: two run beside each other in 8 GB."""
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -30,9 +35,8 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 # photographs that are rendered and trained on would then take twice as long.
 COMPILES_LONG = ("engine/test_gradients.py",)
 
-# Shapes and types are checked while tracing; kernels are compiled by Numba and Warp, which take plain
-# functions only.
-COMPILED = ("native", "physics")
+# Shapes and types are checked while tracing; kernels are compiled by Warp, which takes plain functions only.
+COMPILED = ("physics",)
 CHECKED = [path.stem for path in (REPOSITORY / "src" / "dano").iterdir() if path.stem not in COMPILED]
 install_import_hook([f"dano.{name}" for name in CHECKED], "beartype.beartype")
 
@@ -41,10 +45,17 @@ install_import_hook([f"dano.{name}" for name in CHECKED], "beartype.beartype")
 def few_programs():
     """Forget compiled programs between modules once there are many; a process that runs out of maps dies."""
     yield
-    maps = Path("/proc/self/maps")
-    if maps.is_file() and maps.read_bytes().count(b"\n") > MANY_MAPS:
+    maps, pages = Path("/proc/self/maps"), Path("/proc/self/statm")
+    if not maps.is_file():
+        return
+    used = int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    if used > MUCH_MEMORY or maps.read_bytes().count(b"\n") > MANY_MAPS:
         jax.clear_caches()
+        eqx.clear_caches()
         gc.collect()
+        # The C library keeps what was freed, unless it is asked to give it back.
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(scope="module", autouse=True)
