@@ -1,4 +1,4 @@
-"""Rollouts with contacts of the centroid law in kernels, and their derivatives, beside those of the engine."""
+"""Rollouts with contacts of the centroid law in kernels, and their derivatives, beside the engine's."""
 
 import functools
 
@@ -13,6 +13,8 @@ from dano.contact import CentroidLaw
 from dano.engine._newton import SolverOptions
 from dano.engine.launching import knows, rollout, scene_tables
 
+# Code that runs three times slower and compiles in three quarters of the time.
+QUICKLY = {"xla_backend_optimization_level": 0}
 H = 0.004
 STEPS = 3
 CAPACITY = 100
@@ -83,7 +85,7 @@ def reaching():
         dano.Contact("b", "a", law=STICKS),
     ]
     joints = [
-        dano.Joint("base", "arm", axis=(0, 1, 0.1), anchor=(-0.1, 0, 0), position=(0.06, 0, 0), damping=0.05),
+        dano.Joint("base", "arm", axis=(0, 1, 0.1), anchor=(-0.1, 0, 0), position=(0.06, 0, 0)),
         dano.Joint("arm", "a", axis=(0, 1, 0.2), position=(0.14, 0, 0), stiffness=0.3),
     ]
     scene = dano.Scene.create(bodies, contacts, joints=joints, timestep=H)
@@ -125,10 +127,13 @@ def test_both_laws():
     assert bool(solved.all()) and bool(jnp.all(converged))
     same_states(found, expected, 1e-8)
     speeds = jnp.array([0.0, 0.1, 0.3])
-    moved = jax.vmap(lambda speed: run(scene, eqx.tree_at(lambda s: s.velocity, state, state.velocity + speed)))
-    many, solved = jax.jit(moved)(speeds)
+
+    def faster(speed):
+        return run(scene, eqx.tree_at(lambda s: s.velocity, state, state.velocity + speed))
+
+    many, solved = jax.jit(jax.vmap(faster))(speeds)
     assert bool(solved.all())
-    alone = run(scene, eqx.tree_at(lambda s: s.velocity, state, state.velocity + 0.3))[0]
+    alone, _ = jax.jit(faster)(speeds[2])
     np.testing.assert_array_equal(many.position[2], alone.position)
 
 
@@ -180,7 +185,9 @@ def changed(scene, state, by):
             leaves += [body.samples.weights, body.samples.points, body.density_scale]
             leaves += [body.object.grid.coefficients]
             points = jnp.concatenate([by["points"], jnp.zeros_like(by["points"][:1])])
-            changes += [by["weights"], points, by["scale"], by["grid"]]
+            # Where there is no density, samples are not looked at.
+            inner = by["grid"] * (body.object.grid.coefficients > 0)
+            changes += [by["weights"], points, by["scale"], inner]
         if isinstance(body.shape, dano.HalfSpace):
             leaves += [body.shape.normal_direction, body.shape.offset]
             changes += [by["plane"][:3], by["plane"][3]]
@@ -211,7 +218,8 @@ def end_of(roll, scene, state, by):
 def check_derivatives(scene, state):
     """Reverse mode against the engine's, and forward mode against it."""
     zero = changes_of(scene, state)
-    expected = jax.jit(jax.grad(functools.partial(end_of, simulated, scene, state)))(zero)
+    slow = functools.partial(end_of, simulated, scene, state)
+    expected = jax.jit(jax.grad(slow), compiler_options=QUICKLY)(zero)
     by_kernels = functools.partial(end_of, run, scene, state)
     found = jax.jit(jax.grad(by_kernels))(zero)
     leaves = jax.tree_util.tree_leaves_with_path(expected)
@@ -227,9 +235,11 @@ def check_derivatives(scene, state):
         jnp.stack([jnp.asarray((k == i) * random.normal(size=x.shape)) for i in range(len(flat))])
         for k, x in enumerate(flat)
     ]
-    forward = jax.jit(
-        jax.vmap(lambda direction: jax.jvp(by_kernels, (zero,), (jax.tree.unflatten(tree, direction),))[1])
-    )(moved)
+
+    def along(direction):
+        return jax.jvp(by_kernels, (zero,), (jax.tree.unflatten(tree, direction),))[1]
+
+    forward = jax.jit(jax.vmap(along))(moved)
     reverse = jnp.stack(
         [jnp.vdot(own, x[i]) for i, (own, x) in enumerate(zip(jax.tree.leaves(found), moved, strict=True))]
     )
