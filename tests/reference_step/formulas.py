@@ -42,10 +42,13 @@ def spin(
     sign: wp.float64,
     momenta: wp.array(dtype=vec3),
     turned: wp.array(dtype=vec4),
+    slopes: wp.array(dtype=mat33),
 ):
-    """Angular momentum of a step, and the orientation at its end."""
+    """Angular momentum of a step, and the orientation at its end; derivatives of both: see below."""
     momenta[0] = momentum.angular_momentum(omega, inertia, h, sign)
     turned[0] = rotations.to_wxyz(rotations.turned(rotations.from_wxyz(orientation), omega, h))
+    slopes[0] = momentum.angular_momentum_jacobian(omega, inertia, h)
+    slopes[1] = rotations.spin_by_end(omega, h)
 
 
 def traction(material: dict[str, float], points, rate, slip):
@@ -71,17 +74,22 @@ def traction(material: dict[str, float], points, rate, slip):
 
 
 def _spun(omega, inertia, orientation, h, sign):
-    momenta, turned = wp.zeros(1, vec3, device="cpu"), wp.zeros(1, vec4, device="cpu")
+    found = [wp.zeros(n, kind, device="cpu") for n, kind in ((1, vec3), (1, vec4), (2, mat33))]
     given = [vec3(*omega), mat33(*np.ravel(inertia)), vec4(*orientation), float(h), float(sign)]
-    wp.launch(spin, 1, [*given, momenta, turned], device="cpu")
-    return momenta.numpy()[0], turned.numpy()[0]
+    wp.launch(spin, 1, [*given, *found], device="cpu")
+    return [x.numpy() for x in found]
 
 
 def angular_momentum(omega, inertia, h, sign):
     """P(ω) or P⁻(ω), by the sign."""
-    return _spun(omega, inertia, (1.0, 0.0, 0.0, 0.0), h, sign)[0]
+    return _spun(omega, inertia, (1.0, 0.0, 0.0, 0.0), h, sign)[0][0]
 
 
 def orientation_after(q, omega, h):
     """Orientation at the end of a step."""
-    return _spun(omega, np.eye(3), q, h, 1.0)[1]
+    return _spun(omega, np.eye(3), q, h, 1.0)[1][0]
+
+
+def spin_slopes(omega, inertia, h):
+    """∂P/∂ω, and how the spin of a step changes where its end turns by a small angle, seen from the start."""
+    return _spun(omega, inertia, (1.0, 0.0, 0.0, 0.0), h, 1.0)[2]

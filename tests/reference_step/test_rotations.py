@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from reference_step import rotations
+from reference_step import formulas, rotations
 from reference_step.rotations import momentum, spin_between, turn
 
 H = 1e-3
@@ -23,6 +23,27 @@ def test_turns_and_momenta(engine, spin):
             momentum(omega, INERTIA, H, sign),
             atol=1e-13 * (1 + spin),
         )
+
+
+@pytest.mark.parametrize("size", [0.2, 0.9, 0.999, 1.001, 1.3, 3.0])
+def test_derivatives_of_momentum_and_turn(size):
+    """Closed forms of kernels against differences of the reference, on both sides of 60° a step."""
+    h, omega = 0.01, size / 0.01 * np.array([0.48, -0.6, 0.64])
+    by_omega, by_end = formulas.spin_slopes(omega, INERTIA, h)
+    for k, unit in enumerate(np.eye(3)):
+        step = 1e-4 * unit
+        change = momentum(omega + step, INERTIA, h, 1) - momentum(omega - step, INERTIA, h, 1)
+        np.testing.assert_allclose(by_omega[:, k], change / 2e-4, rtol=1e-6, atol=1e-6)
+    start = np.array([0.5, -0.5, 0.5, 0.5])
+    end = rotations.multiply(start, turn(omega, h))
+    for k, small in enumerate(1e-6 * np.eye(3)):
+        # Turned at the end by a small angle seen from the start.
+        turned = rotations.multiply(
+            start, rotations.multiply(rotations.exponential(small), rotations.conjugate(start))
+        )
+        ends = [rotations.multiply(x, end) for x in (turned, rotations.conjugate(turned))]
+        change = (spin_between(start, ends[0], h) - spin_between(start, ends[1], h)) / 2e-6
+        np.testing.assert_allclose(by_end[:, k], change, atol=1e-3 * (1 + size / 0.01))
 
 
 def test_slow_spins_conserve_momentum():

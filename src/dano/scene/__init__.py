@@ -16,10 +16,8 @@ from dano.scene._frames import (
     plane_axes as plane_axes,
     Poses as Poses,
     RESOLVED as RESOLVED,
-    step_turn as step_turn,
     step_twists as step_twists,
     triples as triples,
-    turn_shape as turn_shape,
 )
 from dano.scene._joint_laws import JointLaws as JointLaws
 from dano.scene._joints import joined as joined, Joint as Joint, JOINT_KINDS as JOINT_KINDS, Layout as Layout

@@ -301,12 +301,12 @@ def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:
     moves = np.zeros((layout.bodies, 1))
     moves[list(layout.free)] = 1
     moves = jnp.asarray(moves, h.dtype)
-    back = step_turn(-moves * state.omega, h)
+    back = _step_turn(-moves * state.omega, h)
     q = state.q - h * state.v
     _, first = joints_of(layout, "ball")
     if first.size:
         places = triples(first)
-        turned = quat_multiply(quat_exp(state.q[places]), step_turn(-state.v[places], h))
+        turned = quat_multiply(quat_exp(state.q[places]), _step_turn(-state.v[places], h))
         q = q.at[places].set(quat_log(turned))
     earlier = place_links(
         chains,
@@ -324,25 +324,18 @@ def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:
     )
 
 
-def turn_shape(
-    omega: Float[Array, "*n 3"], h: Float[Array, ""]
-) -> tuple[Float[Array, "*n 1"], Float[Array, "*n 1"]]:
-    """Cos a and sin a / x of the turn of a step with a spin, x = h |ω|/2.
+def _step_turn(omega: Float[Array, "*n 3"], h: Float[Array, ""]) -> Float[Array, "*n 4"]:
+    """The turn [cos a, sin a ω/|ω|] of a step with a spin, in the frame of the spin.
 
-    Sin a is x up to `RESOLVED`; from there a grows like x.
+    Sin a is x = h |ω|/2 up to `RESOLVED`; from there a grows like x.
     """
     squared = 0.25 * h**2 * jnp.sum(omega * omega, axis=-1, keepdims=True)
     fast = squared > RESOLVED**2
     root = jnp.sqrt(1 - jnp.where(fast, RESOLVED**2, squared))
     x = jnp.sqrt(jnp.where(fast, squared, 1))
     angle = x + (float(np.arcsin(RESOLVED)) - RESOLVED)
-    return jnp.where(fast, jnp.cos(angle), root), jnp.where(fast, jnp.sin(angle) / x, 1)
-
-
-def step_turn(omega: Float[Array, "*n 3"], h: Float[Array, ""]) -> Float[Array, "*n 4"]:
-    """The turn [cos a, sin a ω/|ω|] of a step with a spin, in the frame of the spin."""
-    cosine, sine = turn_shape(omega, h)
-    return jnp.concatenate([cosine, sine * (0.5 * h * omega)], axis=-1)
+    cosine, share = jnp.where(fast, jnp.cos(angle), root), jnp.where(fast, jnp.sin(angle) / x, 1)
+    return jnp.concatenate([cosine, share * (0.5 * h * omega)], axis=-1)
 
 
 def joint_values(chains: Chains, state: State) -> tuple[Float[Array, " k"], Float[Array, " k"]]:

@@ -29,7 +29,7 @@ from dano.fields import (
     UnionField,
     UnionShape,
 )
-from dano.maths import Pose
+from dano.maths import matmul, matvec, Pose
 
 LEAF_WIDTH = 20
 """Numbers of a leaf."""
@@ -68,8 +68,8 @@ class Placed(NamedTuple):
         if factor is not None:
             size = size * factor.astype(dtype)
         if pose is not None:
-            position = position + size * (rotation @ pose.position.astype(dtype))
-            rotation = rotation @ pose.matrix.astype(dtype)
+            position = position + size * matvec(rotation, pose.position.astype(dtype))
+            rotation = matmul(rotation, pose.matrix.astype(dtype))
         return Placed(field, size, position, rotation)
 
 
