@@ -92,7 +92,7 @@ def reaching():
         base={"position": (-0.3, 0, 0.031)},
         arm={"q": 0.01, "v": 0.4},
         a={"q": 0.1, "v": -1.0},
-        b={"position": (0.012, 0.005, 0.07), "velocity": (0, 0.1, -0.3), "orientation": (1, 0.2, 0.1, 0)},
+        b={"position": (-0.088, 0.005, 0.08), "velocity": (0, 0.1, -0.3), "orientation": (1, 0.2, 0.1, 0)},
         box={"position": (1, 0, 0.0299), "velocity": (0.3, 0.1, -0.1), "omega": (1, 0, 1)},
     )
     return scene, state
@@ -236,7 +236,8 @@ def check_derivatives(scene, state):
     own = zip(jax.tree.leaves(found), moved, strict=True)
     reverse = np.array([float(jnp.vdot(bar, x[i])) for i, (bar, x) in enumerate(own)])
     assert np.all(reverse != 0)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-11 * np.abs(reverse).max())
+    # Stiction makes the systems of a step stiff: numbers of both modes part at their rounding.
+    np.testing.assert_allclose(forward, reverse, rtol=1e-7, atol=1e-9 * np.abs(reverse).max())
     ends = jax.jit(jax.vmap(lambda at: end(jax.tree.unflatten(tree, at))))
     after, before = (ends([sign * 1e-6 * x for x in moved]) for sign in (1, -1))
     differences = (after - before) / 2e-6
