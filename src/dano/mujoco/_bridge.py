@@ -168,20 +168,17 @@ class Bridge:
         # Derivatives by differences go through here more than once at one pose.
         if data.ncon and int(data.contact[data.ncon - 1].geom[1]) in table.geoms:
             return 0
-        batches = table.find(model, data)
-        if not batches:
+        n, search = table.find(model, data)
+        if n == 0:
             return 0
-        if not hasattr(self._local, "writer"):
-            self._local.writer = Writer(mujoco)
-        writer, n = self._local.writer, 0
-        for batch in batches:
-            writer.begin(batch.settings, batch.first, batch.second)
-            rows = zip(batch.distances.tolist(), batch.positions, batch.frames, strict=True)
-            n += sum(writer.add(model, data, *row) for row in rows)
+        writer = getattr(self._local, "writer", None)
+        if writer is None:
+            writer = self._local.writer = Writer(mujoco)
+        added = sum(writer.add(model, data, *line) for line in search.lines[:n])
         mujoco.mj_makeConstraint(model, data)
         mujoco.mj_island(model, data)
         mujoco.mj_projectConstraint(model, data)
-        return n
+        return added
 
     def _passive(self, model: Any, data: Any) -> None:
         if self._before is not None:

@@ -3,3 +3,4 @@
 from dano.engine.launching._instances import Features as Features, instance as instance
 from dano.engine.launching._stepping import listed_points as listed_points, rollout as rollout
 from dano.engine.launching._tables import is_known as is_known, scene_tables as scene_tables, Tables as Tables
+from dano.engine.launching._warp import compiled_kernel as compiled_kernel
