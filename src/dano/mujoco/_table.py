@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
+from dano.mujoco._model import standin_name
 from dano.mujoco._search import Known, Part, part_of_geom, part_of_thing, Search
 from dano.mujoco._settings import overriding, Settings
 from dano.mujoco._solids import geom_of
@@ -62,6 +63,10 @@ class Table:
             for name, body in bodies.items()
         ]
         self.geoms = frozenset(carrier.geom for carrier in self.carriers)
+        self._hulls = {
+            geom: things[name].bits for name in things if (geom := _standin(model, name)) is not None
+        }
+        self._collide = True
         self._known = self._look(model)
         self._searches: dict[int, tuple[Any, Known, Search]] = {}
 
@@ -81,6 +86,15 @@ class Table:
                 if _may_meet(self._mujoco, model, carrier.body, other.body):
                     pairs.append((i, j))
         return Known(parts, np.array(pairs, np.int32).reshape(-1, 2), model.geom_size)
+
+    def stand_in(self, model: Any, collides: bool) -> bool:
+        """Let the hulls that stand in for objects collide, or not; whether that changed."""
+        if collides == self._collide or not self._hulls:
+            return False
+        self._collide = collides
+        for geom, bits in self._hulls.items():
+            model.geom_contype[geom], model.geom_conaffinity[geom] = bits if collides else (0, 0)
+        return True
 
     def find(self, model: Any, data: Any) -> tuple[int, Search]:
         """All contacts of the objects at the present pose: how many, and where they are.
@@ -117,6 +131,14 @@ class Table:
             made = Search(self._mujoco, model, data, known, self._most)
             self._searches[key] = found = gone, known, made
         return found[2]
+
+
+def _standin(model: Any, name: str) -> int | None:
+    # Not by MuJoCo's functions, see `body_index`.
+    try:
+        return model.geom(standin_name(name)).id
+    except KeyError:
+        return None
 
 
 def _unknown(model: Any, known: Known, geom: int) -> str:

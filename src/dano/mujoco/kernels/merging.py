@@ -57,7 +57,7 @@ def tangents(n: vec3) -> vec9:
 
 @wp.func
 def cell_touch(touches: wp.array(dtype=Touch), begin: int, end: int) -> Touch:
-    """One touch for several."""
+    """One touch for several: its weight times its normal is their force."""
     weight = ZERO
     force = vec3()
     moment = vec3()
@@ -82,9 +82,9 @@ def cell_touch(touches: wp.array(dtype=Touch), begin: int, end: int) -> Touch:
     if squared > HALF * HALF * weight * weight and end - begin > 1:
         place = place / weight
         moment -= wp.cross(place, force)
-        merged.weight = weight
+        merged.weight = wp.sqrt(squared)
         merged.position = place + wp.cross(force, moment) / squared
-        merged.normal = force / wp.sqrt(squared)
+        merged.normal = force / merged.weight
         merged.gap = gap / weight
         merged.nearing = nearing / weight
     return merged
