@@ -8,7 +8,7 @@ its samples, but for the part along the force.
 
 import warp as wp
 
-from dano.mujoco.kernels.mixing import softened
+from dano.mujoco.kernels.mixing import in_parallel, softened
 from dano.mujoco.kernels.tables import ContactIndex, ContactRow, PartIndex, Settings, Touch, vec9, Work
 from dano.physics.real import HALF, ONE, real, vec3, ZERO
 
@@ -156,6 +156,7 @@ def merge(
             if work.touches[i].presses == 1:
                 presses = True
             i += 1
-        write(work, at, cell_touch(work.touches, first, i), presses, settings, a, b, sink, h)
+        stiff = in_parallel(settings, i - first)
+        write(work, at, cell_touch(work.touches, first, i), presses, stiff, a, b, sink, h)
         at += 1
     return at

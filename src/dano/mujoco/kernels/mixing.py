@@ -14,6 +14,8 @@ _LEAST_WEIGHT = wp.constant(real(1e-15))
 # Base of the natural logarithm: a critically damped spring with time constant T lets what hits it at v sink
 # in by v T / e.
 _E = wp.constant(real(2.718281828459045))
+# Samples for which a contact counts at most: MuJoCo's solver slows down where compliances differ too much.
+_MOST_SAMPLES = wp.constant(real(6.0))
 # Impedance of contacts that are to end an approach within the step.
 _HARD = wp.constant(real(0.99))
 
@@ -81,6 +83,22 @@ def pair_settings(
                 found.solref = given[0].solref
                 found.solimp = given[0].solimp
                 found.margin = given[0].margin
+    return found
+
+
+@wp.func
+def stiffened(impedance: real, samples: real) -> real:
+    """Impedance of one contact that is as compliant as several in parallel: (1 − d)/d over their number."""
+    return samples * impedance / (ONE + (samples - ONE) * impedance)
+
+
+@wp.func
+def in_parallel(settings: Settings, samples: int) -> Settings:
+    """Parameters of a contact that stands for so many samples."""
+    found = settings
+    n = wp.min(real(samples), _MOST_SAMPLES)
+    imp = settings.solimp
+    found.solimp = vec5(stiffened(imp[0], n), stiffened(imp[1], n), imp[2], imp[3], imp[4])
     return found
 
 
