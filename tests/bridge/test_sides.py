@@ -104,10 +104,7 @@ def test_merged_contacts_have_the_wrench_of_all():
     touches = room.numpy()
     touches = touches[touches["weight"] > 0]
     assert len(touches) > 50
-    # The finest level of the tree with at most eight cells.
-    level = next(k for k in range(24) if len(np.unique(touches["code"] >> k)) <= 8)
-    cells = touches["code"] >> level
-    ends = np.flatnonzero(np.diff(cells, prepend=-1, append=-1)).astype(np.int32)
+    ends = _cells(touches, 8)
     assert n == len(ends) - 1
     assert n >= 5
     few = merged(room, ends)
@@ -119,6 +116,20 @@ def test_merged_contacts_have_the_wrench_of_all():
         own, single = _wrench(touches[first:end]), _wrench(one[None])
         left = own[1] - single[1]
         assert np.linalg.norm(np.cross(left, one["normal"])) < 1e-12 * np.linalg.norm(own[0])
+
+
+def _cells(touches, most):
+    """Where the samples of contacts end: heavy cells at the finest level before there are too many."""
+    light = 0.02 * touches["weight"].sum()
+
+    def heavy(level):
+        _, first, cell = np.unique(touches["code"] >> level, return_index=True, return_inverse=True)
+        return first[np.bincount(cell.ravel(), touches["weight"]) >= light]
+
+    level = 24
+    while level > 0 and len(heavy(level - 1)) <= most:
+        level -= 1
+    return np.array([0, *heavy(level)[1:], len(touches)], np.int32)
 
 
 def _wrench(touches):

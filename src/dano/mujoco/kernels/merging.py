@@ -1,7 +1,7 @@
 """A few contacts in the place of many samples: with the same wrench, and the same from step to step.
 
 Samples lie in a tree of halves of their surface. The finest level of the tree at which few enough of its
-cells touch says which samples go together. So it depends on which samples touch, and on nothing else.
+heavy cells touch says which samples go together; light cells go with others. So it stays from step to step.
 Pressures are as depths: a cell has the force Σ w n with w = area · depth, where its moment is that of
 its samples, but for the part along the force.
 """
@@ -16,31 +16,49 @@ BITS = 24
 """Depth of the tree."""
 
 _BITS = wp.constant(BITS)
-levels = wp.types.vector(length=BITS + 1, dtype=wp.int32)
+# Share of the load below which a cell goes with the one before it. What just begins to touch then changes
+# little, and not which samples go together.
+_LIGHT = wp.constant(real(0.02))
 
 
 @wp.func
-def highest_bit(x: int) -> int:
-    """Place of the highest bit of a number > 0, from 1."""
-    place = int(0)
-    while x > 0:
-        x = x >> 1
-        place += 1
-    return place
+def cell_end(touches: wp.array(dtype=Touch), begin: int, end: int, level: int) -> tuple[int, real]:
+    """The end of the cell that begins at a touch, and its weight [m³]; `level`: low bits of codes left out."""
+    cell = touches[begin].code >> level
+    weight = ZERO
+    i = int(begin)
+    inside = bool(True)
+    while inside:
+        weight += touches[i].weight
+        i += 1
+        inside = i < end
+        if inside:
+            inside = touches[i].code >> level == cell
+    return i, weight
 
 
 @wp.func
-def level_of(touches: wp.array(dtype=Touch), begin: int, end: int, most: int) -> int:
-    """Low bits to leave out of codes such that at most so many different ones are left; codes ascend."""
-    parted = levels()
-    for i in range(begin + 1, end):
-        place = highest_bit(touches[i - 1].code ^ touches[i].code)
-        parted[place] = parted[place] + 1
-    cells = int(1)
+def heavy_cells(touches: wp.array(dtype=Touch), begin: int, end: int, level: int, least: real) -> int:
+    """How many cells of a level weigh at least so much [m³]."""
+    cells = int(0)
+    i = int(begin)
+    while i < end:
+        i, weight = cell_end(touches, i, end, level)
+        if weight >= least:
+            cells += 1
+    return cells
+
+
+@wp.func
+def level_of(touches: wp.array(dtype=Touch), begin: int, end: int, most: int, least: real) -> int:
+    """The finest level before there are more heavy cells than so many."""
     level = int(_BITS)
-    while level > 0 and cells + parted[level] <= most:
-        cells += parted[level]
-        level -= 1
+    searching = bool(True)
+    while searching and level > 0:
+        if heavy_cells(touches, begin, end, level - 1, least) > most:
+            searching = False
+        else:
+            level -= 1
     return level
 
 
@@ -133,6 +151,32 @@ def write(
 
 
 @wp.func
+def write_cell(
+    work: Work,
+    at: int,
+    begin: int,
+    end: int,
+    settings: Settings,
+    a: PartIndex,
+    b: PartIndex,
+    sink: real,
+    h: real,
+):
+    """Touches as one contact of MuJoCo, as compliant as all of them: their number is (Σw)²/Σw²."""
+    presses = bool(False)
+    weight = ZERO
+    squared = ZERO
+    for i in range(begin, end):
+        w = work.touches[i].weight
+        weight += w
+        squared += w * w
+        if work.touches[i].presses == 1:
+            presses = True
+    stiff = in_parallel(settings, weight * weight / squared)
+    write(work, at, cell_touch(work.touches, begin, end), presses, stiff, a, b, sink, h)
+
+
+@wp.func
 def merge(
     work: Work,
     at: int,
@@ -146,17 +190,22 @@ def merge(
     h: real,
 ) -> int:
     """Write the touches of one surface as contacts, from a row on; the row beyond the last."""
-    level = level_of(work.touches, begin, end, most)
+    total = ZERO
+    for k in range(begin, end):
+        total += work.touches[k].weight
+    least = _LIGHT * total
+    level = level_of(work.touches, begin, end, most, least)
+    first = int(begin)
+    heavy = bool(False)
     i = int(begin)
     while i < end:
-        cell = work.touches[i].code >> level
-        first = int(i)
-        presses = bool(False)
-        while i < end and work.touches[i].code >> level == cell:
-            if work.touches[i].presses == 1:
-                presses = True
-            i += 1
-        stiff = in_parallel(settings, i - first)
-        write(work, at, cell_touch(work.touches, first, i), presses, stiff, a, b, sink, h)
-        at += 1
-    return at
+        following, weight = cell_end(work.touches, i, end, level)
+        if weight >= least:
+            if heavy:
+                write_cell(work, at, first, i, settings, a, b, sink, h)
+                at += 1
+                first = i
+            heavy = True
+        i = following
+    write_cell(work, at, first, end, settings, a, b, sink, h)
+    return at + 1

@@ -93,10 +93,10 @@ def stiffened(impedance: real, samples: real) -> real:
 
 
 @wp.func
-def in_parallel(settings: Settings, samples: int) -> Settings:
+def in_parallel(settings: Settings, samples: real) -> Settings:
     """Parameters of a contact that stands for so many samples."""
     found = settings
-    n = wp.min(real(samples), _MOST_SAMPLES)
+    n = wp.min(samples, _MOST_SAMPLES)
     imp = settings.solimp
     found.solimp = vec5(stiffened(imp[0], n), stiffened(imp[1], n), imp[2], imp[3], imp[4])
     return found
