@@ -18,12 +18,12 @@ BITS = 24
 _BITS = wp.constant(BITS)
 # Share of the load below which a cell goes with the one before it. What just begins to touch then changes
 # little, and not which samples go together.
-_LIGHT = wp.constant(real(0.02))
+_LIGHT = wp.constant(real(0.05))
 
 
 @wp.func
 def cell_end(touches: wp.array(dtype=Touch), begin: int, end: int, level: int) -> tuple[int, real]:
-    """The end of the cell that begins at a touch, and its weight [m³]; `level`: low bits of codes left out."""
+    """The end of the cell that begins at a touch, and its weight [m³]; `level`: bits of codes left out."""
     cell = touches[begin].code >> level
     weight = ZERO
     i = int(begin)

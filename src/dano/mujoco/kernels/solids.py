@@ -3,14 +3,14 @@
 import warp as wp
 
 from dano.mujoco.kernels.tables import Known, Model, PartIndex
-from dano.physics.distances import Distance, leaf_clearance, leaf_distance
+from dano.physics.distances import Distance, ELLIPSOID, leaf_clearance, leaf_distance
 from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
 
 HULL, HEIGHTS, NONE, UNKNOWN = 100, 101, -1, -2
 """Kinds of solids besides those of `dano.physics.distances`: convex hulls of meshes; height fields; none;
 those of geoms that may not touch an object."""
 
-_HULL, _HEIGHTS = wp.constant(HULL), wp.constant(HEIGHTS)
+_HULL, _HEIGHTS, _ELLIPSOID = wp.constant(HULL), wp.constant(HEIGHTS), wp.constant(ELLIPSOID)
 
 
 @wp.func(inline=True)
@@ -89,6 +89,11 @@ def part_clearance(known: Known, model: Model, part: PartIndex, x: vec3) -> real
     elif part.solid == _HEIGHTS:
         # Heights are at most 1 of their scale.
         bound = x[2] - model.hfield_size[part.at][2]
+    elif part.solid == _ELLIPSOID:
+        # |y / a| grows by no more than 1 / min a along any way, and no root has to be found for it.
+        leaf = known.solids.leaves[0, part.at]
+        a = leaf.sizes
+        bound = wp.min(a[0], wp.min(a[1], a[2])) * (wp.length(wp.cw_div(x, a)) - ONE)
     else:
         bound = leaf_clearance(
             known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x
