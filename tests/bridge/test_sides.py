@@ -120,7 +120,7 @@ def test_merged_contacts_have_the_wrench_of_all():
 
 def _cells(touches, most):
     """Where the samples of contacts end: heavy cells at the finest level before there are too many."""
-    light = 0.05 * touches["weight"].sum()
+    light = 0.16 * touches["weight"].sum() / most
 
     def heavy(level):
         _, first, cell = np.unique(touches["code"] >> level, return_index=True, return_inverse=True)

@@ -16,9 +16,9 @@ BITS = 24
 """Depth of the tree."""
 
 _BITS = wp.constant(BITS)
-# Share of the load below which a cell goes with the one before it. What just begins to touch then changes
-# little, and not which samples go together.
-_LIGHT = wp.constant(real(0.05))
+# Share of the mean load of a contact below which a cell goes with the one before it. What just begins to
+# touch then changes little, and not which samples go together.
+_LIGHT = wp.constant(real(0.16))
 
 
 @wp.func
@@ -193,7 +193,7 @@ def merge(
     total = ZERO
     for k in range(begin, end):
         total += work.touches[k].weight
-    least = _LIGHT * total
+    least = _LIGHT * total / real(most)
     level = level_of(work.touches, begin, end, most, least)
     first = int(begin)
     heavy = bool(False)
