@@ -1,6 +1,7 @@
 """Contact from both sides and in time: what is small or fast does not pass; few contacts do what many do."""
 
 import threading
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -99,7 +100,9 @@ def test_merged_contacts_have_the_wrench_of_all():
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     mujoco.mj_comVel(model, data)
-    n, search = bridge._table(model).find(model, data)
+    table = bridge._table(model)
+    assert table is not None
+    n, search = table.find(model, data)
     room = search.arguments[-1].touches
     touches = room.numpy()
     touches = touches[touches["weight"] > 0]
@@ -107,11 +110,11 @@ def test_merged_contacts_have_the_wrench_of_all():
     ends = _cells(touches, 8)
     assert n == len(ends) - 1
     assert n >= 5
-    few = merged(room, ends)
+    few: Any = merged(room, ends)
     np.testing.assert_allclose(few["position"], search.rows[:n, 1:4], atol=1e-12)
     every, some = (_wrench(each) for each in (touches, few))
     np.testing.assert_allclose(some[0], every[0], rtol=1e-12, atol=1e-18)
-    np.testing.assert_allclose(some[1], every[1], atol=1e-4 * np.linalg.norm(every[0]))
+    np.testing.assert_allclose(some[1], every[1], atol=1e-4 * float(np.linalg.norm(every[0])))
     for first, end, one in zip(ends, ends[1:], few, strict=False):
         own, single = _wrench(touches[first:end]), _wrench(one[None])
         left = own[1] - single[1]
@@ -153,7 +156,7 @@ def test_few_contacts_carry_what_many_do():
         ends.append((begin, data.qpos.copy(), data.ncon))
     (_, few, n_few), (begin, many, n_many) = ends
     assert n_few <= 8 < n_many
-    way, turn = np.linalg.norm(many[:3] - begin[:3]), np.linalg.norm(many[3:] - begin[3:])
+    way, turn = (float(np.linalg.norm((many - begin)[part])) for part in (slice(0, 3), slice(3, 7)))
     assert way > 0.01
     assert turn > 0.05
     np.testing.assert_allclose(few[:3], many[:3], atol=0.05 * way)

@@ -64,6 +64,7 @@ def test_the_hull_of_a_boxs_corners_is_the_box():
     spec.add_mesh(name="block", uservert=corners.ravel().tolist())
     model = model_with(spec=spec, type=TYPES.mjGEOM_MESH, meshname="block")
     part = geom_part(model)
+    assert part.surface is not None
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, model.geom_quat[0])
     inside = np.random.default_rng(1).uniform(-1, 1, (200, 3)) * HALF
