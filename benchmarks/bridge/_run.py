@@ -11,6 +11,7 @@ import numpy as np
 
 from benchmarks._measure import load_average, parse_arguments, report, Row
 from benchmarks.bridge._agreement import agreement_row, HOLLOW, hollow, HOLLOW_NODES, with_article
+from benchmarks.bridge._grip import held_rows
 from dano.exchange import solid_triangles
 from dano.mujoco import Bridge
 from dano.scene_file import build_asset
@@ -18,6 +19,8 @@ from dano.scene_file import build_asset
 SETTLE, WATCH = 4.0, 1.0
 MOST_CREEP = 1e-4
 """Speed at rest that is asked for [m/s]."""
+MOST_TIME = 60.0
+"""CPU time of a step that is asked for [µs]."""
 LONG_RUN = 600.0
 LONG_TIMESTEP = 0.01
 TIMESTEP = 0.002
@@ -51,6 +54,7 @@ def run() -> None:
         rows += [
             agreement_row(name, support, *_model(name, support, TIMESTEP, False)) for support in supports
         ]
+    rows += held_rows("trained_bunny", arguments.quick)
     rows.append(_memory_row(10.0 if arguments.quick else LONG_RUN))
     settings = {
         "date": datetime.datetime.now().isoformat(timespec="minutes"),
@@ -65,13 +69,12 @@ def run() -> None:
 def _rest_rows(name: str, support: str, timestep: float) -> list[Row]:
     group = f"{name} on {with_article(support)}, {1000 * timestep:g} ms"
     ours, theirs = (_rest(name, support, timestep, own) for own in (False, True))
-    budget = 1e6 * timestep
     return [
         Row(group, "largest speed at rest", ours.speed, "m/s", MOST_CREEP, note=f"{ours.contacts} contacts"),
         Row(group, "speed of MuJoCo's hull", theirs.speed, "m/s", note=f"{theirs.contacts} contacts"),
         Row(group, "creep", ours.creep, "m/s", max(theirs.creep, 1e-9), note=f"{ours.warnings} warnings"),
         Row(group, "creep of MuJoCo's hull", theirs.creep, "m/s"),
-        Row(group, "time of a step", ours.microseconds, "µs", budget, note="target: real time"),
+        Row(group, "time of a step", ours.microseconds, "µs", MOST_TIME),
         Row(group, "time of MuJoCo's hull", theirs.microseconds, "µs"),
     ]
 

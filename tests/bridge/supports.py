@@ -7,7 +7,7 @@ import jax
 import mujoco
 import numpy as np
 
-from dano import load_field, NeuralObject, Sphere
+from dano import Box, load_field, NeuralObject, Sphere
 from dano.scene_file import build_asset
 
 TYPES = mujoco.mjtGeom
@@ -56,6 +56,8 @@ SUPPORTS = {
 @functools.cache
 def thing(name: str) -> NeuralObject:
     """A shipped object, or a ball of samples."""
+    if name == "bar":
+        return NeuralObject.from_field(Box((0.05, 0.02, 0.02)), mass=0.2, n_samples=500, resolution=32)
     if name == "ball":
         return NeuralObject.from_field(Sphere(0.05), n_samples=2000, mass=0.5, key=jax.random.key(1))
     if name == "bunny":
@@ -76,4 +78,21 @@ def world(support: str | None, timestep: float = 0.002):
     if support is not None:
         spec.worldbody.add_geom(name="support", **SUPPORTS[support](spec))
     spec.worldbody.add_body(name="toy", pos=[0, 0, 0.07]).add_freejoint()
+    return spec
+
+
+def gripper(timestep: float, speed: float, *, damping: float = 0.0, half: float = 0.005):
+    """Two fingers that meet at the toy from both sides, at this speed if undamped; the toy hangs in the air.
+
+    The fingers are boxes of 100 g, pushed by a constant force; `half` of their thickness [m].
+    """
+    spec = world(None, timestep)
+    spec.option.gravity = [0, 0, 0]
+    way = 0.05
+    for name, side in (("left", -1), ("right", 1)):
+        finger = spec.worldbody.add_body(name=name, pos=[0, side * (0.045 + way + half), 0.05])
+        finger.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, -side, 0], damping=damping)
+        finger.add_geom(type=TYPES.mjGEOM_BOX, size=[0.03, half, 0.03], mass=0.1)
+        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.gainprm[0] = 0.1 * speed**2 / (2 * way)
     return spec

@@ -6,10 +6,10 @@ import resource
 import mujoco
 import numpy as np
 import pytest
+from bridge.kernels import mixed
 from bridge.supports import SUPPORTS, thing, TYPES, world
 
 from dano.mujoco import Bridge
-from dano.mujoco._settings import mixed
 
 GRAVITY = 9.81
 
@@ -92,10 +92,10 @@ def test_parameters_are_mixed_as_by_mujoco():
         model = spec.compile()
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        contact, ours = data.contact[0], mixed(model, 0, 1, False)
-        assert ours.dim == contact.dim
+        contact, ours = data.contact[0], mixed(model)
+        assert ours["dim"] == contact.dim
         for name in ("friction", "solref", "solimp"):
-            np.testing.assert_allclose(getattr(ours, name), getattr(contact, name), rtol=1e-12)
+            np.testing.assert_allclose(ours[name], getattr(contact, name), rtol=1e-12)
 
 
 def test_two_objects_collide_and_keep_their_momentum():

@@ -4,83 +4,109 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from bridge.supports import SUPPORTS
+from bridge.kernels import distances, geom_part
+from bridge.supports import SUPPORTS, TYPES
 
 from dano import Box, Capsule, Cylinder, Sphere
 from dano.fields import Ellipsoid
-from dano.mujoco import _solids as solids
+from dano.mujoco._surfaces import surface_of
 
 HALF = np.array([0.3, 0.2, 0.1])
 CASES = {
-    "sphere": (solids.sphere(0.2), Sphere(0.2)),
-    "capsule": (solids.capsule(0.1, 0.2), Capsule(0.1, 0.2)),
-    "cylinder": (solids.cylinder(0.2, 0.1), Cylinder(0.2, 0.1)),
-    "box": (solids.box(HALF), Box(HALF)),
-    "ellipsoid": (solids.ellipsoid(HALF), Ellipsoid(HALF)),
+    "sphere": (TYPES.mjGEOM_SPHERE, [0.2, 0, 0], Sphere(0.2)),
+    "capsule": (TYPES.mjGEOM_CAPSULE, [0.1, 0.2, 0], Capsule(0.1, 0.2)),
+    "cylinder": (TYPES.mjGEOM_CYLINDER, [0.2, 0.1, 0], Cylinder(0.2, 0.1)),
+    "box": (TYPES.mjGEOM_BOX, HALF, Box(HALF)),
+    "ellipsoid": (TYPES.mjGEOM_ELLIPSOID, HALF, Ellipsoid(HALF)),
 }
 POINTS = np.random.default_rng(3).uniform(-0.5, 0.5, (400, 3))
 
 
+def model_with(**geom):
+    spec = geom.pop("spec", None) or mujoco.MjSpec()
+    spec.worldbody.add_geom(**geom)
+    return spec.compile()
+
+
+def asked(name: str, points):
+    kind, size, _ = CASES[name]
+    model = model_with(type=kind, size=size)
+    return distances(model, geom_part(model), points)
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_distances_and_normals_are_those_of_our_shapes(name: str):
-    solid, shape = CASES[name]
-    distances, normals = solid.jet(POINTS)
+    shape = CASES[name][2]
+    found, normals, bounds = asked(name, POINTS)
     expected = np.asarray(jax.vmap(shape.sdf)(POINTS))
     # Our ellipsoid is exact near its surface only.
     near = np.abs(expected) < 0.02 if name == "ellipsoid" else np.ones(len(POINTS), bool)
-    np.testing.assert_allclose(distances[near], expected[near], atol=1e-4 if name == "ellipsoid" else 1e-12)
-    outside = distances > 0
-    assert np.all(solid.bound(POINTS)[outside] <= distances[outside] + 1e-12)
-    assert np.all(solid.bound(POINTS)[~outside] <= 0)
+    np.testing.assert_allclose(found[near], expected[near], atol=1e-4 if name == "ellipsoid" else 1e-12)
+    outside = found > 0
+    assert np.all(bounds[outside] <= found[outside] + 1e-12)
+    assert np.all(bounds[~outside] <= 0)
     # A step of 10 µm along the normal changes the distance by as much.
-    further = solid.jet(POINTS + 1e-5 * normals)[0]
-    np.testing.assert_allclose(further - distances, 1e-5, rtol=1e-6, atol=1e-9)
+    further = asked(name, POINTS + 1e-5 * normals)[0]
+    np.testing.assert_allclose(further - found, 1e-5, rtol=1e-6, atol=1e-9)
 
 
 def test_an_ellipsoids_closest_point_is_closest():
-    distances, _ = CASES["ellipsoid"][0].jet(POINTS)
+    found, _, _ = asked("ellipsoid", POINTS)
     directions = np.random.default_rng(0).normal(size=(40000, 3))
     surface = HALF * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     brute = [np.linalg.norm(surface - x, axis=1).min() for x in POINTS[:40]]
-    np.testing.assert_allclose(np.abs(distances[:40]), brute, atol=1e-3)
+    np.testing.assert_allclose(np.abs(found[:40]), brute, atol=1e-3)
 
 
 def test_the_hull_of_a_boxs_corners_is_the_box():
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * HALF
+    spec = mujoco.MjSpec()
+    spec.add_mesh(name="block", uservert=corners.ravel().tolist())
+    model = model_with(spec=spec, type=TYPES.mjGEOM_MESH, meshname="block")
+    part = geom_part(model)
+    assert part.surface is not None
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, model.geom_quat[0])
     inside = np.random.default_rng(1).uniform(-1, 1, (200, 3)) * HALF
-    np.testing.assert_allclose(
-        solids.hull(corners).jet(inside)[0], CASES["box"][0].jet(inside)[0], atol=1e-12
-    )
-    with pytest.raises(ValueError, match="lie in a plane"):
-        solids.hull(corners * [1, 1, 0])
+    own = (inside - model.geom_pos[0]) @ turn.reshape(3, 3)
+    np.testing.assert_allclose(distances(model, part, own)[0], asked("box", inside)[0], atol=1e-7)
+    # Its samples carry the areas of its faces, and lie on them.
+    areas = np.abs(part.surface.vectors @ turn.reshape(3, 3).T).sum(axis=0)
+    np.testing.assert_allclose(areas, 8 * HALF[[1, 2, 0]] * HALF[[2, 0, 1]], rtol=1e-5)
+    np.testing.assert_allclose(distances(model, part, part.surface.points)[0], 0, atol=1e-7)
+    np.testing.assert_allclose(part.solid.thickness, HALF.min(), rtol=1e-6)
 
 
 def test_heights_are_where_mujocos_rays_meet_the_field():
     spec = mujoco.MjSpec()
-    spec.worldbody.add_geom(**SUPPORTS["height field"](spec))
-    model = spec.compile()
+    model = model_with(spec=spec, **SUPPORTS["height field"](spec))
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    solid = solids.geom_solid(mujoco, model, 0)
-    geom = np.zeros(1, np.int32)
+    part, geom = geom_part(model), np.zeros(1, np.int32)
     for x, y in np.random.default_rng(2).uniform(-0.25, 0.25, (50, 2)):
         start = np.array([x, y, 1.0])
         height = 1.0 - mujoco.mj_ray(model, data, start, np.array([0, 0, -1.0]), None, 1, -1, geom)
-        distance, normal = solid.jet(np.array([[x, y, height], [x, y, height - 0.01]]))
+        found, normal, _ = distances(model, part, np.array([[x, y, height], [x, y, height - 0.01]]))
         # Rays cut the cells along the other diagonal than contact does.
-        assert abs(distance[0]) < 3e-4
-        assert distance[1] == pytest.approx(-0.01 * normal[1, 2], abs=3e-4)
-    assert np.isinf(solid.jet(np.array([[0.4, 0.0, 0.0]]))[0])
+        assert abs(found[0]) < 3e-4
+        assert found[1] == pytest.approx(-0.01 * normal[1, 2], abs=3e-4)
+    assert distances(model, part, np.array([[0.4, 0.0, 0.0]]))[0][0] > 1e100
 
 
-def test_a_grid_is_trilinear_and_ends():
-    x = np.linspace(-1, 1, 11)
-    plane = 0.3 * x[:, None, None] - 0.5 * x[None, :, None] + 0.2 * x[None, None] + np.zeros((11, 11, 11))
-    solid = solids.grid(plane, np.full(3, -1.0), np.full(3, 0.2))
-    distances, normals = solid.jet(2 * POINTS)
-    slope = np.array([0.3, -0.5, 0.2])
-    np.testing.assert_allclose(distances, 2 * POINTS @ slope, atol=1e-12)
-    np.testing.assert_allclose(
-        normals, np.broadcast_to(slope / np.linalg.norm(slope), normals.shape), atol=1e-12
-    )
-    assert np.isinf(solid.jet(np.array([[1.1, 0, 0]]))[0][0])
+def test_codes_are_those_of_a_tree_of_halves():
+    points = np.random.default_rng(5).normal(size=(1000, 3))
+    surface = surface_of(points, points)
+    assert np.all(np.diff(surface.codes) > 0)
+    # Cells of a level share the samples evenly, and are compact.
+    for bits in (1, 2, 3, 4):
+        _, cell, count = np.unique(surface.codes >> (24 - bits), return_inverse=True, return_counts=True)
+        assert len(count) == 2**bits
+        assert count.max() <= 2 * count.min()
+        spread = sum(np.var(surface.points[cell == k], axis=0).sum() * n for k, n in enumerate(count))
+        assert spread < 0.9**bits * 1000 * np.var(surface.points, axis=0).sum()
+    for k, (x, y, z, radius) in enumerate(surface.balls):
+        own = surface.points[16 * k : 16 * k + 16]
+        assert np.linalg.norm(own - [x, y, z], axis=1).max() <= radius + 1e-12
+    for k, (x, y, z, radius) in enumerate(surface.runs):
+        own = surface.points[128 * k : 128 * k + 128]
+        assert np.linalg.norm(own - [x, y, z], axis=1).max() <= radius + 1e-12

@@ -6,16 +6,18 @@ its own solver, implicit and coupled with everything else in the model.
 """
 
 import math
+import os
 import threading
 import weakref
 from typing import Any
 
 import numpy as np
 
+from dano.checks import checked_count
 from dano.maths import checked_array, Numbers
 from dano.mujoco._model import carry, carry_compiled, concerns, library, names_of, without_callback
 from dano.mujoco._settings import Writer
-from dano.mujoco._table import body_index, Chooser, Table
+from dano.mujoco._table import body_index, Chooser, MOST, Table
 from dano.mujoco._things import Thing, thing_of
 from dano.names import did_you_mean
 from dano.objects import NeuralObject
@@ -36,23 +38,27 @@ class Bridge:
         mujoco.mj_step(model, data)          # or the viewer, or whatever calls it
     ```
 
-    Within `with`, every model that has all the bodies with objects gets their contacts. MuJoCo's passive
-    callback is one for the process; another one that is set when the block begins is called, too.
+    Within `with`, every model that has all the bodies with objects gets their contacts. Outside of it the
+    objects collide as their convex hulls. MuJoCo's passive callback is one for the process; another one that
+    is set when the block begins is called, too.
 
     Models are compiled outside of the block, or by `compile`: MuJoCo's compiler cannot call Python.
     """
 
-    def __init__(self, target: Any, *, choose: Chooser | None = None):
+    def __init__(self, target: Any, *, choose: Chooser | None = None, most: int = MOST):
         """A bridge without objects.
 
         Args:
             target: An `mujoco.MjSpec` or `mujoco.MjModel`. It is changed by `attach`.
             choose: From a model and two geoms (the second stands for an object) to the parameters of their
-                contacts, None for no contact; default: as MuJoCo mixes those of two geoms.
+                contacts, None for no contact; default: as MuJoCo mixes those of two geoms. It is called for
+                every pair that may touch, in every step.
+            most: Contacts of an object with a geom or another object, from 2 on. Where more samples touch,
+                contacts stand for several of them.
 
         Raises:
             ImportError: If mujoco is missing.
-            ValueError: If the target is neither.
+            ValueError: If the target is neither, or `most` no such number.
         """
         self._mujoco = mujoco = library()
         if not isinstance(target, (mujoco.MjSpec, mujoco.MjModel)):
@@ -60,6 +66,7 @@ class Bridge:
                 f"target must be an mujoco.MjSpec or mujoco.MjModel, got {type(target).__name__}"
             )
         self.target = target
+        self._most = checked_count("most", most, least=2)
         self._choose = choose
         self._things: dict[str, Thing] = {}
         self._tables: dict[int, tuple[Any, Table | None]] = {}
@@ -70,7 +77,7 @@ class Bridge:
     def attach(
         self,
         body: str,
-        obj: NeuralObject,
+        obj: NeuralObject | str | os.PathLike[str],
         *,
         position: Numbers = (0.0, 0.0, 0.0),
         orientation: Numbers = (1.0, 0.0, 0.0, 0.0),
@@ -86,7 +93,7 @@ class Bridge:
 
         Args:
             body: Name of a body.
-            obj: The object.
+            obj: The object, or the path of its file (`.dano`).
             position: Origin of the object's field frame in the body frame [m].
             orientation: Its axes, wxyz, field → body.
             contype: Bits that say with what it collides, as MuJoCo's of a geom.
@@ -106,8 +113,10 @@ class Bridge:
             raise ValueError(f"body must be one of {valid}, got {body!r}{did_you_mean(body, valid)}")
         if body in self._things:
             raise ValueError(f"body must not have an object yet, got {body!r} twice; use another body")
+        if isinstance(obj, str | os.PathLike):
+            obj = NeuralObject.load(obj)
         if not isinstance(obj, NeuralObject):
-            raise ValueError(f"obj must be a NeuralObject, got {type(obj).__name__}")
+            raise ValueError(f"obj must be a NeuralObject or the path of one, got {type(obj).__name__}")
         place = np.asarray(checked_array("position", position, (3,)), np.float64)
         turn = np.asarray(checked_array("orientation", orientation, (4,)), np.float64)
         if not np.linalg.norm(turn) > 0:
@@ -139,6 +148,7 @@ class Bridge:
         if self._depth == 0:
             self._before = self._mujoco.get_mjcb_passive()
             self._mujoco.set_mjcb_passive(self._passive)
+            self._stand_in(False)
         self._depth += 1
         return self
 
@@ -147,6 +157,14 @@ class Bridge:
         if self._depth == 0:
             self._mujoco.set_mjcb_passive(self._before)
             self._before = None
+            self._stand_in(True)
+
+    def _stand_in(self, collides: bool) -> None:
+        """Let the hulls of objects collide, in models that are known, or not."""
+        for reference, table in list(self._tables.values()):
+            model = reference()
+            if model is not None and table is not None:
+                table.stand_in(model, collides)
 
     def contacts(self, model: Any, data: Any) -> int:
         """Append the contacts of the objects at the pose of `data`, and make MuJoCo's constraints again.
@@ -160,33 +178,39 @@ class Bridge:
         Raises:
             ValueError: If the model has some of the bodies but not all, or its timestep is too long.
         """
+        # Velocities of bodies are found after positions; in the callback they are there.
+        self._mujoco.mj_comVel(model, data)
+        return self._append(model, data)
+
+    def _append(self, model: Any, data: Any) -> int:
         mujoco, table = self._mujoco, self._table(model)
         flags = mujoco.mjtDisableBit
         if table is None or model.opt.disableflags & (flags.mjDSBL_CONTACT | flags.mjDSBL_CONSTRAINT):
             return 0
         self._check_timestep(model)
+        stood_in = table.stand_in(model, False)
+        if stood_in:
+            # The first step of a model that the bridge did not compile: hulls have collided in it.
+            mujoco.mj_collision(model, data)
         # Derivatives by differences go through here more than once at one pose.
         if data.ncon and int(data.contact[data.ncon - 1].geom[1]) in table.geoms:
             return 0
-        batches = table.find(model, data)
-        if not batches:
+        n, search = table.find(model, data)
+        if n == 0 and not stood_in:
             return 0
-        if not hasattr(self._local, "writer"):
-            self._local.writer = Writer(mujoco)
-        writer, n = self._local.writer, 0
-        for batch in batches:
-            writer.begin(batch.settings, batch.first, batch.second)
-            rows = zip(batch.distances.tolist(), batch.positions, batch.frames, strict=True)
-            n += sum(writer.add(model, data, *row) for row in rows)
+        writer = getattr(self._local, "writer", None)
+        if writer is None:
+            writer = self._local.writer = Writer(mujoco)
+        added = sum(writer.add(model, data, *line) for line in search.lines[:n])
         mujoco.mj_makeConstraint(model, data)
         mujoco.mj_island(model, data)
         mujoco.mj_projectConstraint(model, data)
-        return n
+        return added
 
     def _passive(self, model: Any, data: Any) -> None:
         if self._before is not None:
             self._before(model, data)
-        self.contacts(model, data)
+        self._append(model, data)
 
     def _table(self, model: Any) -> Table | None:
         """What is known of a model; None if it is none of ours."""
@@ -215,7 +239,7 @@ class Bridge:
                 "model.opt.disableflags must not switch off springs and dampers: MuJoCo then skips the "
                 "callback by which objects get their contacts"
             )
-        return Table(mujoco, model, self._things, self._choose)
+        return Table(mujoco, model, self._things, self._choose, self._most)
 
     def _check_timestep(self, model: Any) -> None:
         h, g = model.opt.timestep, model.opt.gravity

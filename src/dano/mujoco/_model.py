@@ -7,6 +7,7 @@ import numpy as np
 
 from dano.exchange import solid_triangles
 from dano.extras import optional
+from dano.fields import convex_hull
 from dano.mujoco._things import Thing
 from dano.objects import NeuralObject
 
@@ -16,6 +17,10 @@ _LOOK_GROUP = 2
 """MuJoCo's custom: what is only seen."""
 _LOOK_NODES = 48
 """Along the longest side of the mesh that is drawn (chosen: fine enough to be looked at)."""
+_HULL_GROUP = 3
+"""MuJoCo's custom: what only collides."""
+_HULL_CORNERS = 64
+"""Most corners of the hull that stands in for an object (chosen: its edges look round)."""
 _PLAIN = (0.85, 0.73, 0.61, 1.0)
 """Colour of objects without a look (chosen by eye)."""
 
@@ -37,9 +42,9 @@ def names_of(target: Any, spec: bool) -> list[str]:
 
 
 def carry(mujoco: Any, spec: Any, name: str, thing: Thing, look: NeuralObject | None) -> None:
-    """Give a body of a spec an object's mass, take its geoms out of contact, and show the object."""
+    """Give a body of a spec an object's mass and a stand-in, take its geoms out of contact, show it."""
     body = next(body for body in spec.bodies if body.name == name)
-    mesh = None
+    mesh, hull = None, convex_hull(thing.surface.points)[0]
     if look is not None and look.solid is not None:
         mesh, _ = solid_triangles(look.solid, _LOOK_NODES)
     for geom in body.geoms:
@@ -61,10 +66,16 @@ def carry(mujoco: Any, spec: Any, name: str, thing: Thing, look: NeuralObject | 
             inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
         )
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"{_MARK}{name}", **seen)
-    elif not body.geoms:
-        # Something has to stand for the object in the list of contacts.
-        small = [0.01 * thing.size, 0, 0]
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=small, pos=thing.com, **seen)
+    # Collides where the bridge does not.
+    spec.add_mesh(name=standin_name(name), uservert=hull.ravel().tolist(), maxhullvert=_HULL_CORNERS)
+    contype, conaffinity = thing.bits
+    seen |= {"contype": contype, "conaffinity": conaffinity, "group": _HULL_GROUP, "name": standin_name(name)}
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=standin_name(name), **seen)
+
+
+def standin_name(body: str) -> str:
+    """Name of the geom that collides for the object on a body where the bridge does not: its convex hull."""
+    return f"{_MARK}{body}:hull"
 
 
 def carry_compiled(mujoco: Any, model: Any, body: int, name: str, thing: Thing) -> None:

@@ -5,3 +5,4 @@ from dano.engine.launching._leaves import is_known as is_known
 from dano.engine.launching._stepping import listed_points as listed_points, rollout as rollout
 from dano.engine.launching._tables import knows as knows, scene_tables as scene_tables, Tables as Tables
 from dano.engine.launching._touch import overlaps as overlaps, wrenches as wrenches
+from dano.engine.launching._warp import compiled_kernel as compiled_kernel

@@ -15,7 +15,7 @@ from typing import Any
 from dano.engine.launching._warp import begin
 
 _FEATURES = "dano.physics.features"
-_PACKAGES = ("dano.physics", "dano.engine.kernels")
+_PACKAGES = ("dano.physics", "dano.engine.kernels", "dano.mujoco.kernels")
 
 
 class Features:
@@ -43,7 +43,7 @@ class Features:
 
 @functools.cache
 def instance(features: Features, module: str) -> ModuleType:
-    """A module of `dano.physics` or `dano.engine.kernels`, run with some features.
+    """A module of `dano.physics` or of kernels, run with some features.
 
     Args:
         features: The features.

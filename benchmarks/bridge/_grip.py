@@ -1,0 +1,90 @@
+"""Two fast fingers close on an object and hold it, and small balls fall on few samples."""
+
+import time
+
+import mujoco
+import numpy as np
+
+import dano
+from benchmarks._measure import Row
+from dano.mujoco import Bridge
+from dano.scene_file import build_asset
+
+TYPES = mujoco.mjtGeom
+SPEED, MASS, WAY, HALF = 7.7, 0.1, 0.05, 0.005
+"""Of a finger: speed at which it arrives undamped [m/s], mass [kg], way [m], half of its thickness [m]."""
+MOST_TIME = 60.0
+"""CPU time of a step that is asked for [µs]."""
+FALL, SECONDS = 0.05, 0.6
+
+
+def held_rows(name: str, quick: bool) -> list[Row]:
+    """What fingers and balls do at steps of 1, 2 and 5 ms."""
+    rows = []
+    for timestep in (0.002,) if quick else (0.001, 0.002, 0.005):
+        rows += _fingers(name, timestep)
+        rows += [_balls(radius, timestep) for radius in (0.001, 0.002, 0.004)]
+    return rows
+
+
+def _fingers(name: str, timestep: float) -> list[Row]:
+    obj, spec = build_asset(name), mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = timestep, [0, 0, 0]
+    spec.worldbody.add_body(name="toy").add_freejoint()
+    points = np.asarray(obj.surface.points)
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    middle, reach = 0.5 * (lower + upper), 0.5 * (upper - lower)[1]
+    for finger, side in (("left", -1), ("right", 1)):
+        body = spec.worldbody.add_body(name=finger, pos=middle + [0, side * (reach + WAY + HALF), 0])
+        body.add_joint(name=finger, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, -side, 0])
+        body.add_geom(type=TYPES.mjGEOM_BOX, size=[0.03, HALF, 0.03], mass=MASS)
+        motor = spec.add_actuator(name=finger, target=finger, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.gainprm[0] = MASS * SPEED**2 / (2 * WAY)
+    bridge = Bridge(spec)
+    bridge.attach("toy", obj, look=False)
+    model = bridge.compile()
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 1.0
+    fastest, least = 0.0, np.inf
+    with bridge:
+        for _ in range(round(0.5 / timestep)):
+            mujoco.mj_step(model, data)
+            fastest = max(fastest, float(np.abs(data.qvel[-2:]).max()))
+            least = min(least, data.body("right").xpos[1] - data.body("left").xpos[1] - 2 * HALF)
+        n = round(0.5 / timestep)
+        begin = time.process_time()
+        mujoco.mj_step(model, data, n)
+        taken = (time.process_time() - begin) / n
+    speed = float(np.abs(data.qvel).max())
+    group = f"{name} between fingers of {2000 * HALF:g} mm, {1000 * timestep:g} ms"
+    return [
+        Row(group, "speed at which they close", fastest, "m/s"),
+        Row(group, "least distance between them", 1000 * least, "mm", note=f"{data.ncon} contacts"),
+        Row(group, "speed at rest", speed, "m/s", 0.05),
+        Row(group, "time of a step", 1e6 * taken, "µs", MOST_TIME),
+    ]
+
+
+def _balls(radius: float, timestep: float) -> Row:
+    """How deep balls sink into a bar of 500 samples."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = timestep
+    spec.worldbody.add_geom(type=TYPES.mjGEOM_PLANE, size=[1, 1, 0.1])
+    spec.worldbody.add_body(name="bar", pos=[0, 0, 0.02]).add_freejoint()
+    places = [(x, y) for x in (-0.03, 0.001, 0.029) for y in (-0.011, 0.003)]
+    for k, (x, y) in enumerate(places):
+        ball = spec.worldbody.add_body(name=f"ball {k}", pos=[x, y, 0.04 + FALL])
+        ball.add_freejoint()
+        ball.add_geom(type=TYPES.mjGEOM_SPHERE, size=[radius, 0, 0], density=2000)
+    bridge = Bridge(spec)
+    bar = dano.NeuralObject.from_field(dano.Box((0.05, 0.02, 0.02)), mass=0.2, n_samples=500, resolution=32)
+    bridge.attach("bar", bar, look=False)
+    model = bridge.compile()
+    data, deepest = mujoco.MjData(model), 0.0
+    with bridge:
+        for _ in range(round(SECONDS / timestep)):
+            mujoco.mj_step(model, data)
+            heights = [data.body(f"ball {k}").xpos[2] - 0.04 for k in range(len(places))]
+            deepest = max(deepest, radius - min(heights))
+    group = f"Balls on a bar of 500 samples, {1000 * timestep:g} ms"
+    return Row(group, f"{1000 * radius:g} mm, sunk in", 100 * deepest / radius, "% of radius", 100.0)

@@ -1,0 +1,221 @@
+"""The search for contacts as a launch of a kernel: tables of a model, and MuJoCo's arrays where they are."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dano.engine.launching import compiled_kernel, Features, instance
+from dano.mujoco._settings import Settings
+from dano.mujoco._solids import Geom, object_solid, Solid
+from dano.mujoco._surfaces import Surface
+from dano.mujoco._things import Thing
+
+_TABLES, _FINDING = "dano.mujoco.kernels.tables", "dano.mujoco.kernels.finding"
+_SOLIDS, _LEAVES = "dano.mujoco.kernels.solids", "dano.physics.solids.leaves"
+_BLOCK = 16
+"""Samples of a block, as kernels have it."""
+_REALS, _WHOLES = 28, 13
+"""Real and whole numbers of a contact, see `dano.mujoco.kernels.tables`."""
+
+
+class Part(NamedTuple):
+    """A geom or an object.
+
+    Attributes:
+        body: Body that it moves with.
+        geom: Geom that it is, or that stands for the object.
+        solid: Its solid.
+        surface: Samples that press on others; None for none.
+        scale: Factors of samples on the unit ball [m].
+        thing: The object, None for a geom.
+    """
+
+    body: int
+    geom: int
+    solid: Solid
+    surface: Surface | None
+    scale: Float[np.ndarray, "3"]
+    thing: Thing | None
+
+
+def part_of_geom(body: int, geom: int, found: Geom) -> Part:
+    """A geom of a model."""
+    return Part(body, geom, found.solid, found.surface, found.scale, None)
+
+
+def part_of_thing(body: int, geom: int, thing: Thing) -> Part:
+    """An object."""
+    return Part(body, geom, object_solid(thing.obj), thing.surface, np.ones(3), thing)
+
+
+class Known:
+    """Arrays of `dano.mujoco.kernels.tables.Known` of a model, and what their kernels must know."""
+
+    def __init__(self, parts: Sequence[Part], pairs: Int[np.ndarray, "k 2"], sizes: Float[np.ndarray, "g 3"]):
+        """See `dano.mujoco.kernels.tables.Known`; `sizes` are those of the model's geoms."""
+        degrees = {part.solid.degree for part in parts if part.solid.kind == "GRID"}
+        self.features = Features(
+            KINDS=frozenset(range(7)),
+            DEGREES=frozenset({2}) if degrees <= {2} else frozenset({1, 2, 3}),
+            UNIONS=False,
+        )
+        self.parts, self.pairs = parts, pairs
+        self.kernel: Any = compiled_kernel(lambda: instance(self.features, _FINDING).find)
+        self.tables = tables = instance(self.features, _TABLES)
+        structs = instance(self.features, _LEAVES)
+        sampled = [part.surface for part in parts if part.surface is not None]
+        planes = [part.solid.planes for part in parts if part.solid.planes is not None]
+        leaves, kinds, coefficients, at = _solids(structs, parts)
+        numbers, index = _parts(self.features, parts, at)
+        samples = _rows(tables.Sample, sum(len(each.points) for each in sampled))
+        if sampled:
+            samples["point"] = np.concatenate([each.points for each in sampled])
+            samples["area"] = np.concatenate([each.vectors for each in sampled])
+        codes = np.concatenate([np.zeros(0, np.int64), *(each.codes for each in sampled)])
+        balls = np.concatenate([np.zeros((0, 4)), *(each.balls for each in sampled)])
+        solids = structs.Solids()
+        solids.leaves = _array(leaves[None], structs.Leaf)
+        solids.kinds = _array(kinds, structs.LeafKind)
+        solids.coefficients = _array(coefficients[None], structs.real)
+        self.known = known = tables.Known()
+        known.parts, known.index = _array(numbers, tables.Part), _array(index, tables.PartIndex)
+        touching = _rows(tables.TouchPair, len(pairs))
+        touching["first"], touching["second"] = pairs.T
+        known.pairs = _array(touching, tables.TouchPair)
+        known.samples, known.codes = _array(samples, tables.Sample), _array(codes.astype(np.int32), None)
+        known.balls = _array(balls, tables.vec4)
+        runs = np.concatenate([np.zeros((0, 4)), *(each.runs for each in sampled)])
+        known.runs = _array(runs, tables.vec4)
+        known.solids = solids
+        known.planes = _array(np.concatenate([np.zeros((0, 4)), *planes]), tables.vec4)
+        known.sizes = _array(np.array(sizes, np.float64), tables.vec3)
+        most = [sum(_count(parts[i]) for i in pair) for pair in pairs]
+        self.room = max(most, default=0)
+
+
+def _count(part: Part) -> int:
+    return 0 if part.surface is None else len(part.surface.points)
+
+
+def _number(features: Features, kind: str) -> int:
+    """Of a kind of solid by its name."""
+    modules = (instance(features, name) for name in (_SOLIDS, _LEAVES))
+    return next(getattr(module, kind) for module in modules if hasattr(module, kind))
+
+
+def _rows(struct: Any, n: int) -> np.ndarray:
+    """Rows of a structure, by the names of its fields."""
+    return np.zeros(n, dtype=struct.numpy_dtype())
+
+
+def _array(values: np.ndarray, dtype: Any) -> Any:
+    import warp as wp
+
+    return wp.array(np.ascontiguousarray(values), dtype=wp.int32 if dtype is None else dtype, device="cpu")
+
+
+def _solids(structs: Any, parts: Sequence[Part]):
+    """Leaves, their kinds, spline coefficients, and for each part where its solid stands."""
+    own = [part for part in parts if hasattr(structs, part.solid.kind)]
+    leaves, kinds = _rows(structs.Leaf, len(own)), _rows(structs.LeafKind, len(own))
+    grids: dict[int, int] = {}
+    flat, first = [np.zeros(1)], 1
+    for row, kind, part in zip(leaves, kinds, own, strict=True):
+        solid, thing = part.solid, part.thing
+        row["factor"], row["sizes"], row["spacing"] = 1.0, solid.sizes, solid.spacing
+        row["rotation"] = np.eye(3) if thing is None else thing.rotation
+        row["position"] = 0.0 if thing is None else thing.origin
+        kind["kind"] = getattr(structs, solid.kind)
+        if solid.coefficients is not None and thing is not None:
+            # Bodies with the same object share its grid.
+            if id(thing.obj) not in grids:
+                grids[id(thing.obj)] = first
+                flat.append(solid.coefficients.ravel())
+                first += solid.coefficients.size
+            kind["first"] = grids[id(thing.obj)]
+            kind["nodes_x"], kind["nodes_y"], kind["nodes_z"] = solid.coefficients.shape
+            kind["degree"] = solid.degree
+    at, leaf, plane = [], 0, 0
+    for part in parts:
+        if part.solid.planes is not None:
+            at.append(plane)
+            plane += len(part.solid.planes)
+        elif part.solid.kind == "HEIGHTS":
+            at.append(part.solid.field)
+        else:
+            at.append(leaf)
+            leaf += hasattr(structs, part.solid.kind)
+    return leaves, kinds, np.concatenate(flat), at
+
+
+def _parts(features: Features, parts: Sequence[Part], at: Sequence[int]):
+    tables = instance(features, _TABLES)
+    numbers, index = _rows(tables.Part, len(parts)), _rows(tables.PartIndex, len(parts))
+    block, run = 0, 0
+    for row, whole, part, place in zip(numbers, index, parts, at, strict=True):
+        thing = part.thing
+        row["scale"], row["thickness"] = part.scale, part.solid.thickness
+        whole["body"], whole["geom"], whole["is_object"] = part.body, part.geom, thing is not None
+        whole["solid"], whole["at"] = _number(features, part.solid.kind), place
+        whole["count"] = 0 if part.solid.planes is None else len(part.solid.planes)
+        if thing is not None:
+            row["middle"], row["radius"], row["thickness"] = thing.middle, thing.radius, thing.thickness
+            whole["contype"], whole["conaffinity"] = thing.bits
+        whole["first_block"], whole["blocks"] = block, _count(part) // _BLOCK
+        whole["turning"] = 0 if part.surface is None else part.surface.turning
+        whole["first_run"] = run
+        block += _count(part) // _BLOCK
+        run += 0 if part.surface is None else len(part.surface.runs)
+    return numbers, index
+
+
+class Search:
+    """The search in some data of a model: a launch with its arrays, and what it found."""
+
+    def __init__(self, mujoco: Any, model: Any, data: Any, known: Known, most: int):
+        """`most`: contacts of a pair."""
+        import warp as wp
+
+        tables, n = known.tables, len(known.pairs)
+        self.rows, self.wholes = np.zeros((most * n, _REALS)), np.zeros((most * n, _WHOLES), np.int32)
+        self.options, self.settings = np.zeros(4), np.zeros((n, 15))
+        self.options[1] = most
+        self.found = np.zeros(1, np.int32)
+        work = tables.Work()
+        work.options = _seen(self.options, tables.Options, 1)
+        work.settings = _seen(self.settings, tables.Settings, n)
+        work.touches = wp.zeros(max(known.room, 1), dtype=tables.Touch, device="cpu")
+        work.rows = _seen(self.rows, tables.ContactRow, most * n)
+        work.index = _seen(self.wholes, tables.ContactIndex, most * n)
+        work.found = _seen(self.found, wp.int32, 1)
+        self.arguments = [known.known, _views(tables.Model, model), _views(tables.Data, data), work]
+        self._command: Any = wp.launch(known.kernel, 1, self.arguments, device="cpu", record_cmd=True)
+        self.launch: Callable[[], None] = self._command.launch
+        self.lines = list(zip(self.rows, self.wholes, strict=True))
+
+    def give(self, pair: int, settings: Settings | None) -> None:
+        """Say what the parameters of a pair are."""
+        row = self.settings[pair]
+        row[:] = 0
+        if settings is not None:
+            row[0], row[1] = settings.margin, settings.gap
+            row[2:7], row[7:9], row[9:14] = settings.friction, settings.solref, settings.solimp
+            row[14] = settings.dim
+
+
+def _seen(array: np.ndarray, dtype: Any, n: int) -> Any:
+    """An array of NumPy's as kernels see it, in the same memory; it must outlive what is seen."""
+    import warp as wp
+
+    return wp.array(ptr=array.ctypes.data, dtype=dtype, shape=(n,), device="cpu", copy=False)
+
+
+def _views(struct: Any, owner: Any) -> Any:
+    """A structure of arrays whose fields are those of `mjModel` or `mjData` with their names."""
+    views = struct()
+    for name, variable in struct.vars.items():
+        array = getattr(owner, name)
+        setattr(views, name, _seen(array, variable.type.dtype, len(array)))
+    return views

@@ -1,0 +1,376 @@
+"""The contacts of the objects of a model, in one launch (docs/mujoco.md).
+
+The samples of each of two parts are asked for their distance to the other's solid. Where bodies approach so
+fast that they would sink too deep into each other within the step, geometry is taken when the first sample
+has sunk so deep, and what would by the end of the step is listed before it touches.
+"""
+
+import warp as wp
+
+from dano.mujoco.kernels.merging import merge
+from dano.mujoco.kernels.mixing import pair_settings
+from dano.mujoco.kernels.solids import part_clearance, part_distance, UNKNOWN
+from dano.mujoco.kernels.tables import BLOCK, Data, Known, Model, Part, PartIndex, RUN, Touch, Work
+from dano.physics.pairs import approach, BodyState, facing_direction, pair_pose, PairPose, rotation_after
+from dano.physics.real import HALF, INFINITY, mat33, ONE, real, vec3, vec4, ZERO
+from dano.physics.rotations import turned
+from dano.physics.samples import facing_area, position_in_solid, solid_normal
+from dano.physics.solids.distances import solid_of
+from dano.physics.solids.leaves import Distance, GRID, HALF_SPACE
+
+_BLOCK, _GRID, _HALF_SPACE = wp.constant(BLOCK), wp.constant(GRID), wp.constant(HALF_SPACE)
+_RUN, _UNKNOWN = wp.constant(RUN), wp.constant(UNKNOWN)
+# Share of the thinner body's half thickness by which bodies may sink into each other: normals still point
+# out of the side that was hit.
+_SINK = wp.constant(real(0.25))
+# Sampled distances may grow faster than true ones, see `dano.engine.kernels.search`.
+_STEEPEST = wp.constant(real(1.5))
+# Most steps of the search for the moment when bodies meet, and the share of the step that ends it.
+_ADVANCES = wp.constant(40)
+_MET = wp.constant(real(1e-9))
+
+
+@wp.struct
+class Side:
+    """One of two parts whose samples are asked, and the other that they are asked against.
+
+    Attributes:
+        part: Of the samples.
+        index: Of the samples.
+        other: Of the solid.
+        a: State of the samples' part.
+        b: State of the solid's.
+        sign: 1 if normals out of the solid point from the pair's first part to its second, else −1.
+    """
+
+    part: Part
+    index: PartIndex
+    other: PartIndex
+    a: BodyState
+    b: BodyState
+    sign: real
+
+
+@wp.func
+def part_state(model: Model, data: Data, index: PartIndex, h: real) -> BodyState:
+    """Where the frame of a part is, and how it moves. Its centre of mass is that of its body."""
+    state = BodyState()
+    rotation = data.geom_xmat[index.geom]
+    origin = data.geom_xpos[index.geom]
+    if index.is_object == 1:
+        rotation = data.xmat[index.body]
+        origin = data.xpos[index.body]
+    state.position = data.xipos[index.body]
+    state.com = wp.transpose(rotation) * (state.position - origin)
+    state.orientation = wp.quat_from_matrix(rotation)
+    # MuJoCo's velocities are those of the point of the body at the centre of mass of its tree.
+    twist = data.cvel[index.body]
+    state.spin = vec3(twist[0], twist[1], twist[2])
+    arm = state.position - data.subtree_com[model.body_rootid[index.body]]
+    state.velocity = vec3(twist[3], twist[4], twist[5]) + wp.cross(state.spin, arm)
+    state.ahead = turned(state.orientation, wp.transpose(rotation) * state.spin, h)
+    return state
+
+
+@wp.func
+def middle_of(part: Part, state: BodyState) -> vec3:
+    """Centre of the ball around a part [m, W]."""
+    return state.position + rotation_after(state, ZERO) * (part.middle - state.com)
+
+
+@wp.func
+def way_of(a: BodyState, b: BodyState, middle: vec3, radius: real, h: real) -> real:
+    """Most that a point of a ball moves relative to another part within the step [m]."""
+    turns = wp.length(a.spin) * (wp.length(middle - a.position) + radius)
+    turns += wp.length(b.spin) * (wp.length(middle - b.position) + radius)
+    return h * (wp.length(a.velocity - b.velocity) + turns)
+
+
+@wp.func
+def side_pose(known: Known, side: Side, share: real, h: real) -> PairPose:
+    """Pose of the two parts after a share of the step, samples turned to the other part."""
+    toward = vec3(ONE, ZERO, ZERO)
+    # Only objects, whose solids are grids, are asked by samples that turn.
+    if side.index.turning != 0:
+        solid = solid_of(known.solids, 0, side.other.at, 1)
+        toward = facing_direction(
+            known.solids, 0, solid, side.a, side.b, share, h, side.index.turning, side.part.scale
+        )
+    return pair_pose(side.a, side.b, share, h, toward, side.index.turning, side.part.scale, ZERO)
+
+
+@wp.func(inline=True)
+def stretch_of(side: Side) -> real:
+    """Largest factor by which sample coordinates are enlarged."""
+    stretch = ONE
+    if side.index.turning == 2:
+        stretch = wp.max(side.part.scale[0], wp.max(side.part.scale[1], side.part.scale[2]))
+    return stretch
+
+
+@wp.func(inline=True)
+def is_ball_near(
+    known: Known,
+    model: Model,
+    other: PartIndex,
+    turn: mat33,
+    origin: vec3,
+    ball: vec4,
+    stretch: real,
+    reach: real,
+) -> bool:
+    """Whether samples in a ball may be nearer to the solid of a part than `reach` [m].
+
+    Args:
+        known: What is known of the model.
+        model: The model.
+        other: The part with the solid.
+        turn: Sample coordinates → solid frame, without the origin.
+        origin: Where that is [m].
+        ball: Centre and radius in sample coordinates.
+        stretch: Largest factor by which sample coordinates are enlarged.
+        reach: The distance.
+    """
+    steepest = ONE
+    if other.solid == _GRID:
+        steepest = _STEEPEST
+    x = turn * vec3(ball[0], ball[1], ball[2]) + origin
+    return part_clearance(known, model, other, x) - steepest * stretch * ball[3] <= reach
+
+
+@wp.func(inline=True)
+def next_near_block(
+    known: Known,
+    model: Model,
+    side: Side,
+    turn: mat33,
+    origin: vec3,
+    stretch: real,
+    reach: real,
+    block: int,
+    end: int,
+) -> int:
+    """The first block from one on whose samples may be near, see `is_ball_near`; `end` if there is none."""
+    found = block
+    searching = bool(True)
+    while searching and found < end:
+        place = found - side.index.first_block
+        run = side.index.first_run + place // _RUN
+        if place % _RUN == 0 and not is_ball_near(
+            known, model, side.other, turn, origin, known.runs[run], stretch, reach
+        ):
+            found += _RUN
+        elif is_ball_near(known, model, side.other, turn, origin, known.balls[found], stretch, reach):
+            searching = False
+        else:
+            found += 1
+    return found
+
+
+@wp.func
+def meeting(known: Known, model: Model, side: Side, sink: real, way: real, h: real) -> real:
+    """Share of the step after which the first sample has sunk in by `sink`; 1 if none does within the step.
+
+    The root of the depth of the deepest sample, by Newton's method, from the start of the step on.
+    """
+    share = real(0.0)
+    stretch = stretch_of(side)
+    k = int(0)
+    while k < _ADVANCES:
+        pose = side_pose(known, side, share, h)
+        further = real(INFINITY)
+        reach = (ONE - share) * way - sink
+        block = int(side.index.first_block)
+        end = block + side.index.blocks
+        while block < end:
+            block = next_near_block(known, model, side, pose.points, pose.origin, stretch, reach, block, end)
+            if block < end:
+                for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
+                    x = position_in_solid(pose, known.samples[s].point)
+                    d = part_distance(known, model, side.other, x)
+                    if d.value <= reach:
+                        normal = solid_normal(d.gradient)
+                        near = h * approach(pose, side.index.turning, x, normal)
+                        left = d.value + sink
+                        # What begins deeper is no matter of this step.
+                        if near > ZERO and (share > ZERO or left > ZERO):
+                            if facing_area(pose, known.samples[s], normal) > ZERO:
+                                further = wp.min(further, wp.max(left, ZERO) / near)
+                block += 1
+        share += further
+        k += 1
+        if share >= ONE:
+            share = ONE
+            k = _ADVANCES
+        elif further <= _MET:
+            k = _ADVANCES
+    return share
+
+
+@wp.func(inline=True)
+def side_touch(
+    side: Side, pose: PairPose, share: real, h: real, x: vec3, normal: vec3, distance: real
+) -> Touch:
+    """A sample at x of the solid's frame after a share of the step, as both bodies see it at the start."""
+    touch = Touch()
+    before = rotation_after(side.b, ZERO)
+    origin = side.b.position - before * side.b.com
+    below = origin + before * (x - distance * normal)
+    above = origin + before * x
+    if share > ZERO:
+        # The same point of the samples' body, where that is at the start.
+        after = side.b.position + (share * h) * side.b.velocity
+        place = after + rotation_after(side.b, share) * (x - side.b.com)
+        arm = place - side.a.position - (share * h) * side.a.velocity
+        still = wp.transpose(rotation_after(side.a, share)) * arm
+        above = side.a.position + rotation_after(side.a, ZERO) * still
+    n = before * normal
+    touch.position = HALF * (above + below)
+    touch.gap = wp.dot(n, above - below)
+    touch.normal = side.sign * n
+    touch.nearing = approach(pose, side.index.turning, x, normal)
+    return touch
+
+
+@wp.func
+def list_side(
+    known: Known,
+    model: Model,
+    work: Work,
+    side: Side,
+    margin: real,
+    gap: real,
+    sink: real,
+    way: real,
+    h: real,
+    begin: int,
+) -> int:
+    """List the samples of a side that touch, from a place on; the place beyond the last."""
+    share = ZERO
+    fast = way > sink
+    if fast:
+        share = meeting(known, model, side, sink, way, h)
+        # Nothing sinks too deep.
+        if share >= ONE:
+            share = ZERO
+            fast = False
+    pose = side_pose(known, side, share, h)
+    stretch = stretch_of(side)
+    reach = margin
+    if fast:
+        reach = margin + way
+    points = pose.points
+    origin = pose.origin
+    # MuJoCo's planes are normal to their z axis.
+    flat = side.other.solid == _HALF_SPACE
+    at = int(begin)
+    block = int(side.index.first_block)
+    last = block + side.index.blocks
+    while block < last:
+        block = next_near_block(known, model, side, points, origin, stretch, reach, block, last)
+        if block < last:
+            for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
+                sample = known.samples[s]
+                x = points * sample.point + origin
+                # What lies over a plane, as most samples near one do, is passed without a call.
+                d = Distance()
+                d.value = x[2]
+                if not flat or x[2] <= reach:
+                    d = part_distance(known, model, side.other, x)
+                if d.value <= reach:
+                    normal = solid_normal(d.gradient)
+                    area = facing_area(pose, sample, normal)
+                    # Samples on the far side of a thin body do not press.
+                    if area > ZERO:
+                        touch = side_touch(side, pose, share, h, x, normal, d.value)
+                        over = touch.gap - margin + gap
+                        end = over - h * touch.nearing
+                        early = fast and end < -sink
+                        depth = margin - touch.gap
+                        if early:
+                            depth = wp.max(depth, -end)
+                        if depth > ZERO:
+                            touch.weight = area * depth
+                            touch.code = known.codes[s]
+                            touch.presses = wp.where(early or over < ZERO, 1, 0)
+                            work.touches[at] = touch
+                            at += 1
+            block += 1
+    return at
+
+
+@wp.func
+def list_pair(known: Known, model: Model, data: Data, work: Work, pair: int, begin: int) -> int:
+    """Contacts of a pair, from a row on; the row beyond the last, or −2 less the geom that may not touch."""
+    options = work.options[0]
+    h = options.timestep
+    first = known.pairs[pair].first
+    second = known.pairs[pair].second
+    side = Side()
+    side.index = known.index[second]
+    side.other = known.index[first]
+    settings = pair_settings(known, model, options, work.settings, pair)
+    if settings.dim == ZERO:
+        return begin
+    side.part = known.parts[second]
+    part = known.parts[first]
+    side.a = part_state(model, data, side.index, h)
+    side.b = part_state(model, data, side.other, h)
+    middle = middle_of(side.part, side.a)
+    way = way_of(side.a, side.b, middle, side.part.radius, h)
+    reach = side.part.radius + settings.margin + way
+    if side.other.solid == _HALF_SPACE:
+        axis = wp.transpose(data.geom_xmat[side.other.geom])[2]
+        if wp.dot(axis, middle - data.geom_xpos[side.other.geom]) > reach:
+            return begin
+    else:
+        around = part.radius
+        if side.other.is_object == 0:
+            around = model.geom_rbound[side.other.geom]
+        apart = middle - middle_of(part, side.b)
+        if wp.dot(apart, apart) > (reach + around) * (reach + around):
+            return begin
+    if side.other.solid == _UNKNOWN:
+        return -2 - side.other.geom
+    sink = _SINK * wp.min(part.thickness, side.part.thickness)
+    n = int(0)
+    if side.other.solid >= 0:
+        side.sign = ONE
+        n = list_side(known, model, work, side, settings.margin, settings.gap, sink, way, h, 0)
+    both = int(n)
+    if side.other.blocks > 0 and side.index.solid >= 0:
+        flipped = Side()
+        flipped.part = part
+        flipped.index = side.other
+        flipped.other = side.index
+        flipped.a = side.b
+        flipped.b = side.a
+        flipped.sign = -ONE
+        both = list_side(known, model, work, flipped, settings.margin, settings.gap, sink, way, h, n)
+    most = int(options.most)
+    # Each side has half of the contacts, or what the other leaves.
+    of_second = wp.min(both - n, wp.max(most // 2, most - n))
+    at = begin
+    if n > 0:
+        at = merge(work, at, 0, n, most - of_second, settings, side.other, side.index, sink, h)
+    if both > n:
+        at = merge(work, at, n, both, of_second, settings, side.other, side.index, sink, h)
+    return at
+
+
+@wp.kernel(enable_backward=False)
+def find(known: Known, model: Model, data: Data, work: Work):
+    """All contacts of the objects at the pose of `data`."""
+    stale = bool(False)
+    for i in range(known.sizes.shape[0]):
+        change = known.sizes[i] - model.geom_size[i]
+        if wp.dot(change, change) > ZERO:
+            stale = True
+    at = int(0)
+    if stale:
+        at = -1
+    else:
+        for pair in range(known.pairs.shape[0]):
+            if at >= 0:
+                at = list_pair(known, model, data, work, pair, at)
+    work.found[0] = at

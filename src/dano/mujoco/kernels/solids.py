@@ -1,0 +1,102 @@
+"""Solids of MuJoCo's geoms: those of `dano.physics.solids.distances`, and the two that only MuJoCo has."""
+
+import warp as wp
+
+from dano.mujoco.kernels.tables import Known, Model, PartIndex
+from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
+from dano.physics.solids.distances import leaf_clearance, leaf_distance
+from dano.physics.solids.leaves import Distance, ELLIPSOID
+
+HULL, HEIGHTS, NONE, UNKNOWN = 100, 101, -1, -2
+"""Kinds of solids besides those of `dano.physics.solids.leaves`: convex hulls of meshes; height fields; none;
+those of geoms that may not touch an object."""
+
+_HULL, _HEIGHTS, _ELLIPSOID = wp.constant(HULL), wp.constant(HEIGHTS), wp.constant(ELLIPSOID)
+
+
+@wp.func(inline=True)
+def hull_distance(known: Known, part: PartIndex, x: vec3) -> Distance:
+    """Of the farthest face's plane: outside a lower bound on the distance."""
+    d = Distance()
+    farthest = int(part.at)
+    height = real(-INFINITY)
+    for i in range(part.at, part.at + part.count):
+        p = known.planes[i]
+        h = p[0] * x[0] + p[1] * x[1] + p[2] * x[2] + p[3]
+        if h > height:
+            height = h
+            farthest = i
+    p = known.planes[farthest]
+    d.value = height
+    d.gradient = vec3(p[0], p[1], p[2])
+    return d
+
+
+@wp.func(inline=True)
+def height_distance(model: Model, field: int, x: vec3) -> Distance:
+    """Height above a height field along its normal; two triangles in each cell, infinite beside it.
+
+    The diagonal of a cell goes from (+x, −y) to (−x, +y); rows begin at −y.
+    """
+    d = Distance()
+    size = model.hfield_size[field]
+    columns = model.hfield_ncol[field]
+    dx = real(2.0) * size[0] / real(columns - 1)
+    dy = real(2.0) * size[1] / real(model.hfield_nrow[field] - 1)
+    u = (x[0] + size[0]) / dx
+    v = (x[1] + size[1]) / dy
+    i = wp.clamp(int(u), 0, columns - 2)
+    j = wp.clamp(int(v), 0, model.hfield_nrow[field] - 2)
+    u = u - real(i)
+    v = v - real(j)
+    at = model.hfield_adr[field] + j * columns + i
+    z00 = real(model.hfield_data[at])
+    z10 = real(model.hfield_data[at + 1])
+    z01 = real(model.hfield_data[at + columns])
+    z11 = real(model.hfield_data[at + columns + 1])
+    along_x = z11 - z01
+    along_y = z11 - z10
+    start = z01 + z10 - z11
+    if u + v <= ONE:
+        along_x = z10 - z00
+        along_y = z01 - z00
+        start = z00
+    d.gradient = wp.normalize(vec3(-size[2] * along_x / dx, -size[2] * along_y / dy, ONE))
+    d.value = real(INFINITY)
+    if wp.abs(x[0]) <= size[0] and wp.abs(x[1]) <= size[1]:
+        d.value = (x[2] - size[2] * (start + along_x * u + along_y * v)) * d.gradient[2]
+    return d
+
+
+@wp.func(inline=True)
+def part_distance(known: Known, model: Model, part: PartIndex, x: vec3) -> Distance:
+    """Signed distance of a part's solid, and its gradient, at a point of its frame [m]."""
+    d = Distance()
+    if part.solid == _HULL:
+        d = hull_distance(known, part, x)
+    elif part.solid == _HEIGHTS:
+        d = height_distance(model, part.at, x)
+    else:
+        d = leaf_distance(known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x)
+    return d
+
+
+@wp.func(inline=True)
+def part_clearance(known: Known, model: Model, part: PartIndex, x: vec3) -> real:
+    """A lower bound on the distance of a part's solid [m]."""
+    bound = ZERO
+    if part.solid == _HULL:
+        bound = hull_distance(known, part, x).value
+    elif part.solid == _HEIGHTS:
+        # Heights are at most 1 of their scale.
+        bound = x[2] - model.hfield_size[part.at][2]
+    elif part.solid == _ELLIPSOID:
+        # |y / a| grows by no more than 1 / min a along any way, and no root has to be found for it.
+        leaf = known.solids.leaves[0, part.at]
+        a = leaf.sizes
+        bound = wp.min(a[0], wp.min(a[1], a[2])) * (wp.length(wp.cw_div(x, a)) - ONE)
+    else:
+        bound = leaf_clearance(
+            known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x
+        )
+    return bound

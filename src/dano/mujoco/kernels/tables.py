@@ -1,0 +1,260 @@
+"""What the search for contacts reads and writes: tables of a model, MuJoCo's own arrays, rows of contacts.
+
+Whatever may touch is a *part*: a geom of the model, in the geom's frame, or an object, in the frame of its
+body. MuJoCo's arrays are read where they are.
+"""
+
+import warp as wp
+
+from dano.physics.real import mat33, real, vec3, vec4, vec6
+from dano.physics.samples import Sample
+from dano.physics.solids.leaves import Solids
+
+BLOCK = 16
+"""Samples of a block."""
+RUN = 8
+"""Blocks that the search looks at together first."""
+
+vec2 = wp.types.vector(length=2, dtype=real)
+vec5 = wp.types.vector(length=5, dtype=real)
+vec9 = wp.types.vector(length=9, dtype=real)
+
+
+@wp.struct
+class Part:
+    """A geom or an object.
+
+    Attributes:
+        middle: Centre of a ball around an object [m]; geoms have it at their origin.
+        scale: Semi-axes of a ball or an ellipsoid, ones for others [m].
+        radius: Of the ball around an object [m]; unused for geoms.
+        thickness: Half of what is to be gone through at the thickest place [m].
+    """
+
+    middle: vec3
+    scale: vec3
+    radius: real
+    thickness: real
+
+
+@wp.struct
+class PartIndex:
+    """Whole numbers of a part.
+
+    Attributes:
+        body: Body that it moves with.
+        geom: Geom that it is, or that stands for the object.
+        is_object: 1 for an object.
+        first_block: Of its samples.
+        blocks: How many it has; none where its samples are not asked.
+        first_run: Of runs of its blocks.
+        turning: How its samples turn.
+        solid: Kind of its solid, see `dano.mujoco.kernels.solids`; −1 for none.
+        at: Leaf of a solid of `dano.physics`, first plane of a hull, height field.
+        count: Planes of a hull.
+        contype: Of an object, as of MuJoCo's geoms.
+        conaffinity: The same.
+    """
+
+    body: wp.int32
+    geom: wp.int32
+    is_object: wp.int32
+    first_block: wp.int32
+    blocks: wp.int32
+    first_run: wp.int32
+    turning: wp.int32
+    solid: wp.int32
+    at: wp.int32
+    count: wp.int32
+    contype: wp.int32
+    conaffinity: wp.int32
+
+
+@wp.struct
+class TouchPair:
+    """Two parts that may touch; the second is an object."""
+
+    first: wp.int32
+    second: wp.int32
+
+
+@wp.struct
+class Known:
+    """What is known of a model.
+
+    Attributes:
+        parts: Shape (p,).
+        index: Shape (p,).
+        pairs: Shape (k,).
+        samples: Of all parts, in blocks.
+        codes: Where each sample lies in a tree of halves: samples with the same leading bits lie together.
+        balls: Centre and radius [m] of a ball around each block.
+        runs: The same around each run of blocks.
+        solids: Sampled distances and shapes.
+        planes: Unit outward normal and offset [m] of the faces of hulls.
+        sizes: Of the geoms when this was made [m], shape (geoms,).
+    """
+
+    parts: wp.array(dtype=Part)
+    index: wp.array(dtype=PartIndex)
+    pairs: wp.array(dtype=TouchPair)
+    samples: wp.array(dtype=Sample)
+    codes: wp.array(dtype=wp.int32)
+    balls: wp.array(dtype=vec4)
+    runs: wp.array(dtype=vec4)
+    solids: Solids
+    planes: wp.array(dtype=vec4)
+    sizes: wp.array(dtype=vec3)
+
+
+@wp.struct
+class Model:
+    """Arrays of `mjModel`, with its names."""
+
+    body_rootid: wp.array(dtype=wp.int32)
+    geom_size: wp.array(dtype=vec3)
+    geom_rbound: wp.array(dtype=real)
+    geom_margin: wp.array(dtype=real)
+    geom_gap: wp.array(dtype=real)
+    geom_friction: wp.array(dtype=vec3)
+    geom_solref: wp.array(dtype=vec2)
+    geom_solimp: wp.array(dtype=vec5)
+    geom_solmix: wp.array(dtype=real)
+    geom_priority: wp.array(dtype=wp.int32)
+    geom_condim: wp.array(dtype=wp.int32)
+    geom_contype: wp.array(dtype=wp.int32)
+    geom_conaffinity: wp.array(dtype=wp.int32)
+    hfield_size: wp.array(dtype=vec4)
+    hfield_nrow: wp.array(dtype=wp.int32)
+    hfield_ncol: wp.array(dtype=wp.int32)
+    hfield_adr: wp.array(dtype=wp.int32)
+    hfield_data: wp.array(dtype=wp.float32)
+
+
+@wp.struct
+class Data:
+    """Arrays of `mjData`, with its names."""
+
+    xpos: wp.array(dtype=vec3)
+    xmat: wp.array(dtype=mat33)
+    xipos: wp.array(dtype=vec3)
+    geom_xpos: wp.array(dtype=vec3)
+    geom_xmat: wp.array(dtype=mat33)
+    cvel: wp.array(dtype=vec6)
+    subtree_com: wp.array(dtype=vec3)
+
+
+@wp.struct
+class Settings:
+    """Parameters of the contacts of a pair, see `dano.mujoco.Settings`.
+
+    Attributes:
+        margin: [m].
+        gap: [m].
+        friction: Shape (5,).
+        solref: …
+        solimp: …
+        dim: Directions of force; 0: the two do not touch.
+    """
+
+    margin: real
+    gap: real
+    friction: vec5
+    solref: vec2
+    solimp: vec5
+    dim: real
+
+
+@wp.struct
+class Options:
+    """What a step is told besides.
+
+    Attributes:
+        timestep: h [s].
+        most: Contacts of a pair.
+        given: 1 where `settings` has those of each pair, 0 where they are mixed of those of two geoms.
+        overridden: 1 where the model's global contact parameters replace those of geoms: those of the first
+            row of `settings`.
+    """
+
+    timestep: real
+    most: real
+    given: real
+    overridden: real
+
+
+@wp.struct
+class Touch:
+    """A sample that touches, or will within the step.
+
+    Attributes:
+        weight: Its area times its depth at the end of the step, or now if that is more [m³].
+        position: Between the two surfaces [m, W].
+        normal: From the first part to the second [W].
+        gap: Between the surfaces, negative where they overlap [m].
+        nearing: Speed at which the gap closes [m/s].
+        code: See `Known.codes`.
+        presses: 0 where it only counts as near.
+    """
+
+    weight: real
+    position: vec3
+    normal: vec3
+    gap: real
+    nearing: real
+    code: wp.int32
+    presses: wp.int32
+
+
+@wp.struct
+class ContactRow:
+    """The part of MuJoCo's `mjContact` that has real numbers, in its order, with its names."""
+
+    dist: real
+    pos: vec3
+    frame: vec9
+    includemargin: real
+    friction: vec5
+    solref: vec2
+    solreffriction: vec2
+    solimp: vec5
+
+
+@wp.struct
+class ContactIndex:
+    """What is whole in MuJoCo's `mjContact`, in its order, with its names."""
+
+    dim: wp.int32
+    geom1: wp.int32
+    geom2: wp.int32
+    first: wp.int32
+    second: wp.int32
+    flex1: wp.int32
+    flex2: wp.int32
+    elem1: wp.int32
+    elem2: wp.int32
+    vert1: wp.int32
+    vert2: wp.int32
+    exclude: wp.int32
+    efc_address: wp.int32
+
+
+@wp.struct
+class Work:
+    """What a search is told, works in, and finds.
+
+    Attributes:
+        options: Shape (1,).
+        settings: Shape (k,), see `Options`.
+        touches: Room for the samples of a pair that touch.
+        rows: The contacts.
+        index: The same.
+        found: Number of contacts, or −1 where sizes of geoms differ from those that are known; shape (1,).
+    """
+
+    options: wp.array(dtype=Options)
+    settings: wp.array(dtype=Settings)
+    touches: wp.array(dtype=Touch)
+    rows: wp.array(dtype=ContactRow)
+    index: wp.array(dtype=ContactIndex)
+    found: wp.array(dtype=wp.int32)

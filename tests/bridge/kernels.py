@@ -1,0 +1,96 @@
+"""The functions of the bridge's kernels, one at a time."""
+
+import functools
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from dano.engine.launching import Features, instance
+from dano.mujoco._search import _views, Known, part_of_geom
+from dano.mujoco._solids import geom_of
+
+FEATURES = Features(KINDS=frozenset(range(7)), DEGREES=frozenset({2}), UNIONS=False)
+
+
+@functools.cache
+def _kernels():
+    tables = instance(FEATURES, "dano.mujoco.kernels.tables")
+    solids = instance(FEATURES, "dano.mujoco.kernels.solids")
+    mixing = instance(FEATURES, "dano.mujoco.kernels.mixing")
+    part_distance, part_clearance, of_two = solids.part_distance, solids.part_clearance, mixing.mixed
+    vec3, vec4, real = tables.vec3, tables.vec4, tables.real
+    known_type, model_type, settings_type = tables.Known, tables.Model, tables.Settings
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def ask(
+        known: known_type,
+        model: model_type,
+        points: wp.array(dtype=vec3),
+        found: wp.array(dtype=vec4),
+        bounds: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        d = part_distance(known, model, known.index[0], points[i])
+        found[i] = vec4(d.gradient[0], d.gradient[1], d.gradient[2], d.value)
+        bounds[i] = part_clearance(known, model, known.index[0], points[i])
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def mix(model: model_type, found: wp.array(dtype=settings_type)):
+        found[0] = of_two(model, 0, 1)
+
+    return tables, ask, mix
+
+
+@functools.cache
+def _merging():
+    tables = instance(FEATURES, "dano.mujoco.kernels.tables")
+    cell_touch = instance(FEATURES, "dano.mujoco.kernels.merging").cell_touch
+    touch_type = tables.Touch
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def merge(
+        touches: wp.array(dtype=touch_type),
+        ends: wp.array(dtype=wp.int32),
+        found: wp.array(dtype=touch_type),
+    ):
+        i = wp.tid()
+        found[i] = cell_touch(touches, ends[i], ends[i + 1])
+
+    return tables, merge
+
+
+def merged(touches, ends):
+    """One touch for those from each end to the next, of an array of a search's."""
+    tables, merge = _merging()
+    found = wp.zeros(len(ends) - 1, dtype=tables.Touch, device="cpu")
+    wp.launch(
+        merge, len(ends) - 1, [touches, wp.array(ends, dtype=wp.int32, device="cpu"), found], device="cpu"
+    )
+    return found.numpy()
+
+
+def mixed(model) -> dict[str, np.ndarray]:
+    """Parameters of contacts of the first two geoms."""
+    tables, _, mix = _kernels()
+    found = wp.zeros(1, dtype=tables.Settings, device="cpu")
+    wp.launch(mix, 1, [_views(tables.Model, model), found], device="cpu")
+    row = found.numpy()[0]
+    return {name: row[name] for name in row.dtype.names}
+
+
+def distances(model, part, points):
+    """Signed distances [m] of a part, their gradients, and lower bounds, at points of its frame (n, 3)."""
+    known = Known([part], np.zeros((0, 2), np.int32), model.geom_size)
+    tables, ask, _ = _kernels()
+    x = wp.array(np.ascontiguousarray(points, np.float64), dtype=tables.vec3, device="cpu")
+    found = wp.zeros(len(points), dtype=tables.vec4, device="cpu")
+    bounds = wp.zeros(len(points), dtype=tables.real, device="cpu")
+    wp.launch(ask, len(points), [known.known, _views(tables.Model, model), x, found, bounds], device="cpu")
+    rows = found.numpy()
+    return rows[:, 3], rows[:, :3], bounds.numpy()
+
+
+def geom_part(model, geom: int = 0):
+    """A geom as the search has it."""
+    return part_of_geom(0, geom, geom_of(mujoco, model, geom))
