@@ -93,7 +93,7 @@ def reaching():
         base={"position": (-0.3, 0, 0.031)},
         arm={"q": 0.01, "v": 0.4},
         a={"q": 0.1, "v": -1.0},
-        b={"position": (0.012, 0.005, 0.08), "velocity": (0, 0.1, -0.3), "orientation": (1, 0.2, 0.1, 0)},
+        b={"position": (0.012, 0.005, 0.074), "velocity": (0, 0.1, -0.3), "orientation": (1, 0.2, 0.1, 0)},
         box={"position": (1, 0, 0.0299), "velocity": (0.3, 0.1, -0.1), "omega": (1, 0, 1)},
     )
     return scene, state
@@ -186,7 +186,7 @@ def changed(scene, state, by):
             leaves += [body.object.grid.coefficients]
             points = jnp.concatenate([by["points"], jnp.zeros_like(by["points"][:1])])
             # Where there is no density, samples are not looked at.
-            inner = by["grid"] * (body.object.grid.coefficients > 0)
+            inner = jnp.where(body.object.grid.coefficients > 0, by["grid"], 0)
             changes += [by["weights"], points, by["scale"], inner]
         if isinstance(body.shape, dano.HalfSpace):
             leaves += [body.shape.normal_direction, body.shape.offset]
@@ -202,7 +202,7 @@ def changed(scene, state, by):
         state.omega + omega,
         *((state.q + by["q"], state.v + by["v"]) if "q" in by else ()),
     )
-    return scene, state
+    return scene, scene.filled(state)
 
 
 def end_of(roll, scene, state, by):
