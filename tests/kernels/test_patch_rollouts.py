@@ -274,7 +274,7 @@ def test_laws_that_kernels_do_not_know():
     class OwnLaw(CentroidLaw):
         """A law of one's own."""
 
-    own = eqx.tree_at(lambda s: s.contacts[0].law, scene, OwnLaw(smoothing=12.0))
+    own = eqx.tree_at(lambda s: s.contacts[0].law, scene, OwnLaw())  # pyright: ignore[reportCallIssue]
     assert not knows(own)
     with pytest.raises(ValueError, match="got OwnLaw"):
         scene_tables(own)
