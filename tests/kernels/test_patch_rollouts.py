@@ -93,7 +93,7 @@ def reaching():
         base={"position": (-0.3, 0, 0.031)},
         arm={"q": 0.01, "v": 0.4},
         a={"q": 0.1, "v": -1.0},
-        b={"position": (0.012, 0.005, 0.074), "velocity": (0, 0.1, -0.3), "orientation": (1, 0.2, 0.1, 0)},
+        b={"position": (-0.088, 0.005, 0.079), "velocity": (0, 0.1, -0.3), "orientation": (1, 0.2, 0.1, 0)},
         box={"position": (1, 0, 0.0299), "velocity": (0.3, 0.1, -0.1), "omega": (1, 0, 1)},
     )
     return scene, state
