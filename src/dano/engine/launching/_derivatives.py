@@ -126,9 +126,10 @@ def _pullback_plan(forward: Plan, which: tuple[int, ...]) -> Plan:
 
 def _pulling_room(forward: Plan) -> dict[str, int]:
     """Lengths of what a world needs besides for derivatives of a step's equations."""
-    room = dict.fromkeys(("room.state_bar", "room.after_bar"), forward.room["room.bodies"])
+    n = forward.room["room.bodies"]
+    room: dict[str, int] = {"room.state_bar": n, "room.after_bar": n}
     if "scene.patches.sides" in forward.inputs:
-        room["room.patches.sums"] = forward.inputs["scene.patches.sides"].rows
+        room |= {"room.patches.sums": forward.inputs["scene.patches.sides"].rows}
     if "room.trees.joints" in forward.room:
         names = ("chains", "chain_bars", "hanging_bars", "asked")
         room |= {f"room.trees.{name}": forward.room["room.trees.frames"] for name in names}
