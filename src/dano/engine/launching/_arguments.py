@@ -58,7 +58,7 @@ class Arguments:
         setattr(owner, field, array)
 
     def point_all(self, batched: Sequence[bool], n_worlds: int) -> None:
-        """Have arrays for all that a launch reads and writes; inputs that are `batched` differ between worlds."""
+        """Have arrays for what a launch reads and writes; inputs that are `batched` differ between worlds."""
         plan, size = self._plan, 8 if self._build.wide else 4
         differ = [*batched, *(True for _ in plan.outputs)]
         for place, differs in zip(self.places, differ, strict=True):

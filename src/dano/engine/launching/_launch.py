@@ -48,17 +48,17 @@ def _(*inputs, **parameters):
     return jax.jit(lambda *given: launch_p.bind(*given, **parameters))(*inputs)
 
 
-def _lowered_for(call):
+def _lowered_for(platform):
     """How a launch becomes part of a program for a platform."""
 
     def lowered(*inputs, plan, batched, n_worlds):
-        return call(plan, batched, n_worlds, inputs)
+        return platform.call(plan, batched, n_worlds, inputs)
 
     return mlir.lower_fun(lowered, multiple_results=True)
 
 
-mlir.register_lowering(launch_p, _lowered_for(_cpu.call), platform="cpu")
-mlir.register_lowering(launch_p, _lowered_for(_cuda.call), platform="cuda")
+mlir.register_lowering(launch_p, _lowered_for(_cpu), platform="cpu")
+mlir.register_lowering(launch_p, _lowered_for(_cuda), platform="cuda")
 
 
 def _batched(inputs, axes, *, plan, batched, n_worlds):
