@@ -1,4 +1,4 @@
-"""`python -m benchmarks.gpu [--compile NAME] [--worlds N] [--steps N] [--json FILE] [--quick]`; see gpu.sh."""
+"""`python -m benchmarks.gpu [--compile NAME] [--worlds N] [--steps N] [--json FILE]`; see gpu.sh."""
 
 import os
 

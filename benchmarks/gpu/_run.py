@@ -55,7 +55,9 @@ def run() -> None:
 
 def _options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--compile", metavar="NAME", choices=tuple(cases()), help="only compile one case")
-    parser.add_argument("--worlds", type=int, metavar="N", help="rollouts at once, instead of each case's own")
+    parser.add_argument(
+        "--worlds", type=int, metavar="N", help="rollouts at once, instead of each case's own"
+    )
     parser.add_argument("--steps", type=int, metavar="N", default=N_STEPS, help="steps of a rollout")
 
 
@@ -91,7 +93,8 @@ def _beside_cpu(case: Case, gpu: jax.Device, worlds: int) -> Row:
         position, solved = jax.jit(case.program(COMPARED))(*jax.device_put(case.inputs(worlds), device))
         ends.append((np.asarray(position), np.asarray(solved)))
     (one, solved), (other, solved_there) = ends
-    note = f"{COMPARED} steps of {worlds} worlds; solved {solved.mean():.1%}, on the CPU {solved_there.mean():.1%}"
+    note = f"{COMPARED} steps of {worlds} worlds; solved {solved.mean():.1%}"
+    note += f", on the CPU {solved_there.mean():.1%}"
     target = APART_NARROW if case.narrow else APART
     return Row(case.name, "beside the CPU", float(np.abs(one - other).max()), "m", target, note=note)
 
