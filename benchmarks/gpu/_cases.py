@@ -46,7 +46,7 @@ class Case:
     room: int = _BUNNY_ROOM
 
     def inputs(self, worlds: int) -> tuple[dano.Scene, dano.State, jax.Array]:
-        """What a program is given: arrays of the scene, the state, each world's velocity of the first body."""
+        """What a program is given: arrays of the scene, the state, velocities of each world's first body."""
         arrays = eqx.filter(self.scene, eqx.is_array)
         shaken = jnp.linspace(0.8, 1.2, worlds)[:, None] * self.state.velocity[0]
         given = arrays, self.state, shaken

@@ -56,6 +56,11 @@ def in_lanes(monkeypatch):
     return run
 
 
+def narrowed(tree, dtype):
+    """Real numbers of another type."""
+    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, tree)
+
+
 def rolled(scene, velocity, state):
     """Positions, and whether all steps were solved."""
     begun = eqx.tree_at(lambda s: s.velocity, state, velocity)
@@ -88,7 +93,7 @@ def test_lanes_list_the_same_points(stack, in_lanes):
 def test_lanes_take_the_same_steps(stack, in_lanes):
     """A rollout of worlds that differ."""
     scene, state = stack
-    velocities = state.velocity * jnp.linspace(0.9, 1.1, 3)[:, None, None]
+    velocities = state.velocity[None] * jnp.linspace(0.9, 1.1, 3)[:, None, None]
 
     def worlds():
         return jax.vmap(lambda v: rolled(scene, v, state))(velocities)
@@ -96,6 +101,15 @@ def test_lanes_take_the_same_steps(stack, in_lanes):
     (one, solved), (many, solved_in_lanes) = worlds(), in_lanes(worlds)
     assert np.all(solved) and np.all(solved_in_lanes)
     np.testing.assert_allclose(many, one, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_lanes_take_steps_in_32_bits(stack, in_lanes):
+    """Numbers of 32 bits in the kernel itself: the same motion, to what they can tell."""
+    scene, state = narrowed(stack, jnp.float32)
+    position, solved = in_lanes(rolled, scene, state.velocity, state)
+    assert position.dtype == jnp.float32 and np.all(solved)
+    np.testing.assert_allclose(position, rolled(stack[0], stack[1].velocity, stack[1])[0], atol=1e-4)
 
 
 @pytest.mark.slow
@@ -112,9 +126,7 @@ def test_lanes_find_the_same_derivatives(mode, stack, in_lanes):
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_programs_for_a_gpu(dtype, stack):
     """A program for a GPU is made where there is none; launches have room, and reverse mode adds in place."""
-    scene, state = jax.tree.map(
-        lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, stack, is_leaf=eqx.is_array
-    )
+    scene, state = narrowed(stack, dtype)
     program = jax.jit(jax.grad(lambda v: height(v, scene, state)))
     text = program.trace(state.velocity).lower(lowering_platforms=("cuda",)).as_text()
     calls = [line for line in text.splitlines() if "custom_call @dano_" in line]

@@ -163,7 +163,8 @@ def _has_kernels(scene: Scene) -> bool:
     """Whether kernels make the whole step of a scene: free bodies of known shapes, with the default law."""
     alone = all(isinstance(contact.law, DistributedLaw) for contact in scene.contacts)
     known = all(body.solid is None or is_known(body.solid) for body in scene.bodies)
-    return jax.default_backend() == "cpu" and alone and known and not scene.joints and not scene.loops
+    machine = jax.default_backend() in ("cpu", "gpu")
+    return machine and alone and known and not scene.joints and not scene.loops
 
 
 def check_laws(scene: Scene) -> None:
