@@ -1,5 +1,6 @@
 """Launches on GPUs, as far as a CPU can tell: lanes that take turns, programs, and compiling for a GPU."""
 
+import ctypes
 from pathlib import Path
 
 import equinox as eqx
@@ -41,12 +42,18 @@ def stack():
 
 @pytest.fixture
 def in_lanes(monkeypatch):
-    """Runs a function with the launches of a GPU, whose lanes take turns on a CPU."""
+    """Runs a function with the launches of a GPU, whose lanes take turns on a CPU, in a room full of NaN."""
+    launch = _cuda._Blocks.launch
+
+    def launched(blocks, inputs, outputs, stream):
+        ctypes.memset(outputs[-1], 0xFF, blocks.room_bytes)
+        launch(blocks, inputs, outputs, stream)
 
     def run(function, *args):
         begin()
         with monkeypatch.context() as patch:
             patch.setattr(wp.config, "enable_cpu_blocks", True)
+            patch.setattr(_cuda._Blocks, "launch", launched)
             patch.setattr(_cpu, "call", lambda *given: _cuda.call(*given, platform="cpu"))
             jax.clear_caches()
             found = jax.block_until_ready(function(*args))

@@ -319,9 +319,10 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
             wrench = total6(wrench)
             jacobian = total66(whole_jacobian(quarters))
             if lane == 0:
-                if room.wrenches.shape[1] > 0:
-                    room.wrenches[world, f] = wrench
                 add_contact(scene, room, world, found, m, wrench, jacobian)
+        if lane == 0 and room.wrenches.shape[1] > 0:
+            # Zero where nothing presses.
+            room.wrenches[world, f] = wrench
     fit.unfit = total(fit.unfit)
     fit.push = total(fit.push)
     fit.renewed = total(fit.renewed)

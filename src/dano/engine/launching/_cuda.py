@@ -134,7 +134,11 @@ def _stream(device: str, address: int) -> Any:
 
 
 class _Blocks:
-    """Parameters of a launch of all worlds on a device."""
+    """Parameters of a launch of all worlds on a device.
+
+    Attributes:
+        room_bytes: Size of the room of all worlds, which holds anything when a launch begins.
+    """
 
     def __init__(self, plan: Plan, batched: tuple[bool, ...], n_worlds: int, build: Build, device: str):
         arguments = Arguments(plan, build, device)
@@ -149,6 +153,7 @@ class _Blocks:
         self._whole = [arguments.descriptor(place) for place in plan.whole]
         self._room = [(arguments.descriptor(place), at) for place, (at, _, _) in places.items()]
         self._kept = arguments
+        self.room_bytes = n_worlds * size
         self._n_inputs = len(plan.inputs)
 
     def launch(self, inputs: Sequence[int], outputs: Sequence[int], stream: Any) -> None:
