@@ -22,5 +22,5 @@ ZERO = wp.constant(real(0.0))
 HALF = wp.constant(real(0.5))
 ONE = wp.constant(real(1.0))
 TWO = wp.constant(real(2.0))
-INFINITY = wp.constant(real(1e300))
+INFINITY = wp.constant(real(1e300 if WIDE else 1e30))
 """Larger than any length, time or speed that occurs."""

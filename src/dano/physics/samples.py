@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.physics.features import TURNING
+from dano.physics.features import TURNING, WIDE
 from dano.physics.pairs import AXIS, BALL, FIXED, PairPose
 from dano.physics.real import HALF, real, vec3, ZERO
 from dano.physics.solids.leaves import Distance
@@ -12,6 +12,8 @@ _AXIS = wp.constant(AXIS)
 _BALL = wp.constant(BALL)
 # A sample faces the other way if its normal and that of the solid differ by less than 60°: the cosine.
 _TURNED = wp.constant(real(0.5))
+# A number whose inverse is finite.
+_TINY = wp.constant(real(1e-300 if WIDE else 1e-36))
 
 
 @wp.struct
@@ -98,7 +100,7 @@ def drift(pose: PairPose, ahead: vec3, arm: vec3, normal: vec3) -> vec3:
     squared = wp.dot(across, across)
     most = wp.dot(slip, slip)
     if squared > most:
-        across = wp.where(most > ZERO, wp.sqrt(wp.max(most, real(1e-300)) / squared), ZERO) * across
+        across = wp.where(most > ZERO, wp.sqrt(wp.max(most, _TINY) / squared), ZERO) * across
     return nearing + across
 
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.lanes import total, total6, total66
+from dano.engine.kernels.lanes import total, total6, total66, wait
 from dano.engine.kernels.tables import FoundPair, Room, Scene
 from dano.engine.kernels.trees.balance import add_tree_momentum
 from dano.engine.kernels.trees.contact import add_pulled, body_twist, free_block
@@ -214,18 +214,17 @@ def whole_jacobian(sums: Quarters) -> mat66:
 
 
 @wp.func
-def clear_blocks(room: Room, world: int, m: int):
-    """Zero the blocks in use."""
-    for i in range(m):
-        for j in range(m):
-            if room.used[world, i * m + j] > 0:
-                room.blocks[world, i * m + j] = mat66()
+def clear_blocks(room: Room, world: int, lane: int, m: int):
+    """Zero the blocks in use, each lane a part."""
+    for k in range(lane, m * m, _LANES):
+        if room.used[world, k] > 0:
+            room.blocks[world, k] = mat66()
 
 
 @wp.func
-def add_momentum(scene: Scene, room: Room, world: int, m: int, h: real):
+def add_momentum(scene: Scene, room: Room, world: int, lane: int, m: int, h: real):
     """What each body's momentum gains in the step beyond what it comes with, and the derivative."""
-    for i in range(scene.moving.shape[0]):
+    for i in range(lane, scene.moving.shape[0], _LANES):
         b = i
         if wp.static(TREES):
             b = free_block(scene, i)
@@ -273,9 +272,11 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
     h = scene.timestep[world, 0]
     m = scene.n_blocks
     fit = Fit()
+    clear_blocks(room, world, lane, m)
+    wait()
+    add_momentum(scene, room, world, lane, m, h)
+    wait()
     if lane == 0:
-        clear_blocks(room, world, m)
-        add_momentum(scene, room, world, m, h)
         if wp.static(TREES):
             add_tree_momentum(scene, room, world, trial.length)
         if wp.static(LOOPS):
@@ -320,9 +321,10 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
             wrench = total6(wrench)
             jacobian = total66(whole_jacobian(quarters))
             if lane == 0:
-                if room.wrenches.shape[1] > 0:
-                    room.wrenches[world, f] = wrench
                 add_contact(scene, room, world, found, m, wrench, jacobian)
+        if lane == 0 and room.wrenches.shape[1] > 0:
+            # Zero where nothing presses.
+            room.wrenches[world, f] = wrench
     fit.unfit = total(fit.unfit)
     fit.push = total(fit.push)
     fit.renewed = total(fit.renewed)

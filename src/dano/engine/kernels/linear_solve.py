@@ -7,6 +7,7 @@ pivots stay away from singular.
 
 import warp as wp
 
+from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.pattern import couple, couple_pair, couple_trees, mark_tree, mark_trees
 from dano.physics.features import LANES, TREES
@@ -95,43 +96,52 @@ def inverse(m: mat66) -> mat66:
 
 
 @wp.func
-def solve_blocks(room: Room, world: int, m: int):
-    """Solve `spare` x = x in place, x in `room.step`; `spare` is used up."""
+def solve_blocks(room: Room, world: int, lane: int, m: int):
+    """Solve `spare` x = x in place, x in `room.step`; `spare` is used up.
+
+    Both have to be known to all lanes; the solution is known to the first.
+    """
     for s in range(m):
         k = room.order[world, s]
         if k >= 0:
-            pivot = inverse(room.spare[world, k * m + k])
-            room.spare[world, k * m + k] = pivot
             n = room.counts[world, k]
-            for a in range(n):
+            if lane == 0:
+                room.spare[world, k * m + k] = inverse(room.spare[world, k * m + k])
+            wait()
+            for a in range(lane, n, _LANES):
                 i = room.later[world, k * m + a]
-                below = room.spare[world, i * m + k] * pivot
-                room.step[world, i] -= below * room.step[world, k]
-                for b in range(n):
-                    j = room.later[world, k * m + b]
-                    room.spare[world, i * m + j] -= below * room.spare[world, k * m + j]
-    for t in range(m):
-        k = room.order[world, m - 1 - t]
-        if k >= 0:
-            x = room.step[world, k]
-            for a in range(room.counts[world, k]):
-                i = room.later[world, k * m + a]
-                x -= room.spare[world, k * m + i] * room.step[world, i]
-            room.step[world, k] = room.spare[world, k * m + k] * x
+                below = room.spare[world, i * m + k] * room.spare[world, k * m + k]
+                room.spare[world, i * m + k] = below
+                room.step[world, i] = room.step[world, i] - below * room.step[world, k]
+            wait()
+            for e in range(lane, n * n, _LANES):
+                i = room.later[world, k * m + e // n]
+                j = room.later[world, k * m + e % n]
+                taken = room.spare[world, i * m + k] * room.spare[world, k * m + j]
+                room.spare[world, i * m + j] = room.spare[world, i * m + j] - taken
+            wait()
+    if lane == 0:
+        for t in range(m):
+            k = room.order[world, m - 1 - t]
+            if k >= 0:
+                x = room.step[world, k]
+                for a in range(room.counts[world, k]):
+                    i = room.later[world, k * m + a]
+                    x -= room.spare[world, k * m + i] * room.step[world, i]
+                room.step[world, k] = room.spare[world, k * m + k] * x
 
 
 @wp.func
-def copy_blocks(room: Room, world: int, m: int):
-    """Copy the Jacobian into `spare`."""
-    for k in range(m * m):
+def copy_blocks(room: Room, world: int, lane: int, m: int):
+    """Copy the Jacobian into `spare`, each lane a part."""
+    for k in range(lane, m * m, _LANES):
         if room.used[world, k] > 0:
             room.spare[world, k] = room.blocks[world, k]
 
 
 @wp.func
-def copy_transposed_blocks(room: Room, world: int, m: int):
-    """Copy the transpose of the Jacobian into `spare`."""
-    for i in range(m):
-        for j in range(m):
-            if room.used[world, i * m + j] > 0:
-                room.spare[world, j * m + i] = wp.transpose(room.blocks[world, i * m + j])
+def copy_transposed_blocks(room: Room, world: int, lane: int, m: int):
+    """Copy the transpose of the Jacobian into `spare`, each lane a part."""
+    for k in range(lane, m * m, _LANES):
+        if room.used[world, k] > 0:
+            room.spare[world, (k % m) * m + k // m] = wp.transpose(room.blocks[world, k])

@@ -64,6 +64,18 @@ def listing(scene: Scene, room: Room, launch: Launch, listing: Listing):
     world = launch.first_world + block
     begin_first_step(scene, room, world, lane, launch)
     n_found, overflow = find_contacts(scene, room, world, lane)
+    wait()
+    # Lists of lanes stand one after the other in the room, and without gaps among the rows.
+    per_lane = room.points.shape[1] // _LANES
+    shift = int(0)
+    count = int(0)
+    if n_found > 0:
+        for l in range(_LANES):
+            used = room.found[world, (n_found - 1) * _LANES + l].end - l * per_lane
+            count += used
+            if l < lane:
+                shift += used
+    overflow = overflow or count > listing.points.shape[1]
     if lane == 0:
         listing.overflow[world, 0] = wp.where(overflow, real(1.0), real(0.0))
     for k in range(lane, listing.points.shape[1], _LANES):
@@ -89,4 +101,6 @@ def listing(scene: Scene, room: Room, launch: Launch, listing: Listing):
             row.rate = point.rate
             row.approach = point.approach
             row.area = point.area
-            listing.points[world, k] = row
+            at = shift + k - lane * per_lane
+            if at < listing.points.shape[1]:
+                listing.points[world, at] = row

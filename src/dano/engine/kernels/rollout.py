@@ -340,6 +340,7 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                     if lane == 0:
                         restart(scene, room, world)
                     wait()
+        wait()
         if lane == 0:
             report = StepReport()
             report.residual = solved.residual

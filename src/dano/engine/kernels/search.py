@@ -6,7 +6,7 @@ is listed if the old velocities take it into the other body by the end of the st
 
 import warp as wp
 
-from dano.engine.kernels.lanes import least, total, total3
+from dano.engine.kernels.lanes import first_of, lanes_where, least, total, total3
 from dano.engine.kernels.tables import (
     BLOCK,
     Body,
@@ -17,7 +17,7 @@ from dano.engine.kernels.tables import (
     SamplePair,
     Scene,
 )
-from dano.physics.features import LANES
+from dano.physics.features import LANES, WIDE
 from dano.physics.pairs import (
     approach,
     BodyState,
@@ -46,7 +46,7 @@ _HALF_SPACE = wp.constant(HALF_SPACE)
 _STEEPEST = wp.constant(real(1.5))
 # Most steps of the search for the moment when bodies meet, and the share of the step that ends it.
 _ADVANCES = wp.constant(40)
-_MET = wp.constant(real(1e-12))
+_MET = wp.constant(real(1e-12 if WIDE else 1e-6))
 # An impact that is to end within the step presses as if a spring pushed the bodies' common mass apart with
 # this many times the stiffness that would turn its motion round in a step.
 _IMPACT = wp.constant(real(1e3))
@@ -250,6 +250,7 @@ def meeting(
         closest = least(further)
         if closest < further:
             critical = -1
+        critical = first_of(critical)
         before = share
         share = wp.max(share + closest, ZERO)
         k += 1
@@ -272,6 +273,53 @@ def list_point(room: Room, world: int, at: int, point: Point, sample: int, entry
     where.pair = entry
     where.presses_back = wp.where(presses_back, 1, 0)
     room.where[world, at] = where
+
+
+@wp.struct
+class BlockShare:
+    """What a lane takes of the blocks that are listed in a round.
+
+    Attributes:
+        block: Number of a block in the round.
+        begin: First of its samples that the lane takes.
+        count: How many.
+        rest: Bits of the blocks that are left.
+    """
+
+    block: int
+    begin: int
+    count: int
+    rest: wp.uint32
+
+
+@wp.func
+def lowest(bits: wp.uint32) -> int:
+    """Place of the lowest bit that is set."""
+    place = int(0)
+    left = wp.uint32(bits)
+    while (left & wp.uint32(1)) == wp.uint32(0):
+        left = left >> wp.uint32(1)
+        place += 1
+    return place
+
+
+@wp.func
+def block_share(lane: int, bits: wp.uint32) -> BlockShare:
+    """A lane's share of blocks that are listed: the one block, or of the next two one sample."""
+    share = BlockShare()
+    share.count = _BLOCK
+    if wp.static(LANES > 1):
+        share.count = 1
+        share.begin = lane % _BLOCK
+        share.block = lowest(bits)
+        share.rest = bits & (bits - wp.uint32(1))
+        if lane >= _BLOCK:
+            if share.rest == wp.uint32(0):
+                share.count = 0
+            else:
+                share.block = lowest(share.rest)
+        share.rest = share.rest & (share.rest - wp.uint32(1))
+    return share
 
 
 @wp.func
@@ -307,9 +355,10 @@ def find_points(
     layer = wp.where(share < ONE, pair.sink, ZERO)
     at = begin
     beyond = int(0)
-    for i in range(lane, index.blocks, _LANES):
+    # All lanes go through as many rounds: samples of the blocks that are listed in one are shared.
+    for i in range(lane, (index.blocks + _LANES - 1) // _LANES * _LANES, _LANES):
         b = index.first_block + i
-        listed = True
+        listed = i < index.blocks
         if wp.static(LANES == 1):
             if i < beyond:
                 listed = False
@@ -326,8 +375,12 @@ def find_points(
             x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
             clearance = solid_clearance(scene.solids, world, solid, x)
             listed = clearance - ball[3] * stretch <= reach
-        if listed:
-            for s in range(_BLOCK * b, _BLOCK * b + _BLOCK):
+        rest = lanes_where(lane, listed)
+        while rest != wp.uint32(0):
+            share_of = block_share(lane, rest)
+            rest = share_of.rest
+            first_sample = _BLOCK * (b - lane + share_of.block) + share_of.begin
+            for s in range(first_sample, first_sample + share_of.count):
                 sample = scene.samples[world, s]
                 x = position_in_solid(pose, sample.point)
                 d = solid_distance(scene.solids, world, solid, x)
@@ -423,7 +476,7 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
             sums.normal = total3(sums.normal)
             sums.turned_load = total(sums.turned_load)
             # What faces the other way presses where its load is the larger one.
-            if sums.turned_load > sums.load and at <= end:
+            if sums.turned_load > sums.load:
                 at, sums = find_points(
                     scene, room, world, lane, pose, pair, index.first, index.second, n_found, met.share, h,
                     reach, True, at, end, sums,

@@ -19,7 +19,7 @@ converge ends where its residual was smallest.
 import warp as wp
 
 from dano.engine.kernels.assembly import assemble, fit_duals, follow_duals, Trial
-from dano.engine.kernels.lanes import wait
+from dano.engine.kernels.lanes import greatest, total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
 from dano.engine.kernels.patches import add_patches, any_sticks, fit_patch_duals, follow_patch_duals
 from dano.engine.kernels.tables import Room, Scene
@@ -34,12 +34,12 @@ from dano.engine.kernels.trees.balance import (
     same_mode,
     solve_trees,
 )
-from dano.physics.features import LOOPS, PATCHES, POINTS, TREES
+from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
 from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec6, ZERO
 
 LEVELS = 11
 """Number of levels of a solve."""
-_LEVELS = wp.constant(LEVELS)
+_LEVELS, _LANES = wp.constant(LEVELS), wp.constant(LANES)
 # In the first level steps are whole for so many passes, then shares that grow and shrink by these factors and
 # are no less than the last: on recorded piles of 8 to 64 bodies half the passes of fixed shares, or as many.
 _WHOLE = wp.constant(4)
@@ -212,16 +212,17 @@ def narrowed(search: Search, work: real) -> Search:
 
 
 @wp.func
-def measure(scene: Scene, room: Room, world: int) -> Measured:
+def measure(scene: Scene, room: Room, world: int, lane: int) -> Measured:
     """Of the residual and Jacobian at the velocities that were tried."""
     m = scene.n_blocks
     found = Measured()
     if wp.static(TREES):
-        of_joints = measure_joints(scene, room, world)
-        found.work = of_joints.work
-        found.error = of_joints.error
-        found.size = wp.max(of_joints.size, room.trees.sizes[world, 1])
-    for i in range(m):
+        if lane == 0:
+            of_joints = measure_joints(scene, room, world)
+            found.work = of_joints.work
+            found.error = of_joints.error
+            found.size = wp.max(of_joints.size, room.trees.sizes[world, 1])
+    for i in range(lane, m, _LANES):
         residual = room.residual[world, i]
         scale = room.scale[world, i]
         found.work += wp.dot(room.step[world, i], residual)
@@ -234,6 +235,9 @@ def measure(scene: Scene, room: Room, world: int) -> Measured:
             if not (missed <= found.error):
                 found.error = missed
             found.size = wp.max(found.size, scale[k] * size[k])
+    found.work = total(found.work)
+    found.error = greatest(found.error)
+    found.size = greatest(found.size)
     return found
 
 
@@ -252,27 +256,32 @@ def largest_error(scene: Scene, room: Room, world: int) -> real:
 
 
 @wp.func(inline=True)
-def newton_step(scene: Scene, room: Room, world: int, share: real, keeps: bool):
+def newton_step(scene: Scene, room: Room, world: int, lane: int, share: real, keeps: bool):
     """A share of Newton's step from what was tried, in `room.step`.
 
     Args:
         scene: The scene.
         room: Room.
         world: Which world.
+        lane: Which lane of it.
         share: The share.
         keeps: Whether trees have the derivative of the step before.
     """
     m = scene.n_blocks
-    copy_blocks(room, world, m)
-    for i in range(m):
+    copy_blocks(room, world, lane, m)
+    for i in range(lane, m, _LANES):
         room.step[world, i] = -room.residual[world, i]
+    wait()
     if wp.static(TREES):
-        eliminate_joint_duals(scene, room, world, keeps)
-    solve_blocks(room, world, m)
-    if wp.static(TREES):
-        solve_trees(scene, room, world, keeps)
-    for i in range(m):
-        room.step[world, i] = share * room.step[world, i]
+        if lane == 0:
+            eliminate_joint_duals(scene, room, world, keeps)
+        wait()
+    solve_blocks(room, world, lane, m)
+    if lane == 0:
+        if wp.static(TREES):
+            solve_trees(scene, room, world, keeps)
+        for i in range(m):
+            room.step[world, i] = share * room.step[world, i]
 
 
 @wp.func
@@ -340,6 +349,7 @@ def solve(
     needs = bool(True)
     wait()
     while not found.converged and found.passes < options.max_passes and number < _LEVELS:
+        wait()
         if lane == 0:
             for i in range(m):
                 room.tried[world, i] = room.velocity[world, i] + search.length * room.step[world, i]
@@ -370,7 +380,7 @@ def solve(
             if lane == 0 and needs:
                 add_tree_slopes(scene, room, world)
             wait()
-        seen = measure(scene, room, world)
+        seen = measure(scene, room, world, lane)
         tolerance = wp.max(options.tolerance * (ONE + size), real(16.0) * options.rounding * seen.size)
         hard = level.softness == ONE
         enough = tolerance
@@ -422,9 +432,9 @@ def solve(
                     keeps = not needs
                     part = ONE
             if finishes or not found.converged:
-                if lane == 0:
-                    newton_step(scene, room, world, part, keeps)
-                    if wp.static(TREES):
+                newton_step(scene, room, world, lane, part, keeps)
+                if wp.static(TREES):
+                    if lane == 0:
                         follow_joint_duals(scene, room, world, search.length, part)
                 wait()
                 if wp.static(POINTS):

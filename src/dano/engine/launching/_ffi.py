@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 
 import jax
 
-Handler = Callable[[Sequence[int], Sequence[int], Callable[[], int]], None]
-"""From the addresses of the inputs and outputs; the third gives the stream of a GPU."""
+Handler = Callable[[Sequence[int], Sequence[int], "Call"], None]
+"""From the addresses of the inputs and outputs."""
 
 _WORD = ctypes.c_size_t
 _SIGNATURE = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
@@ -25,10 +25,12 @@ _COUNT, _BUFFERS = 2, 4
 # Word of a buffer that points to its data.
 _DATA = 3
 # Words of the extension by which XLA asks for the version: size, type, next, metadata. In the metadata the
-# version stands behind its own size and the header of a version.
-_METADATA_TYPE, _METADATA, _VERSION_OFFSET = 1, 3, 24
+# version stands behind its own size and the header of a version, and then what the handler promises.
+_METADATA_TYPE, _METADATA, _VERSION_OFFSET, _TRAITS_OFFSET = 1, 3, 24, 32
+# The promise that each call launches the same on a stream, so that XLA may record and replay it.
+_RECORDABLE = 1
 # Words of the API: size, extension, version (three words), internals, then the functions.
-_ERROR_CREATE, _STREAM_GET = 6, 10
+_ERROR_CREATE, _STREAM_GET, _DEVICE_GET = 6, 10, 23
 _UNKNOWN = 2
 _kept: list[object] = []
 
@@ -51,8 +53,40 @@ class _StreamArguments(ctypes.Structure):
     )
 
 
+class _DeviceArguments(ctypes.Structure):
+    _fields_ = (
+        ("size", _WORD),
+        ("extension", ctypes.c_void_p),
+        ("context", ctypes.c_void_p),
+        ("device", ctypes.c_int32),
+    )
+
+
+class Call:
+    """A call of a handler: where it is to run."""
+
+    def __init__(self, frame: ctypes.Array):
+        """Of a call frame."""
+        self._frame = frame
+
+    def stream(self) -> int:
+        """Stream of the GPU that the call is to be part of."""
+        given = _StreamArguments(ctypes.sizeof(_StreamArguments), None, self._frame[_CONTEXT], None)
+        _function(self._frame, _STREAM_GET, _StreamArguments)(given)
+        return given.stream or 0
+
+    def device(self) -> int:
+        """Number of the device among those of its kind in this process."""
+        given = _DeviceArguments(ctypes.sizeof(_DeviceArguments), None, self._frame[_CONTEXT], 0)
+        _function(self._frame, _DEVICE_GET, _DeviceArguments)(given)
+        return given.device
+
+
 def register(name: str, handler: Handler, platform: str) -> None:
     """Make a handler known to XLA.
+
+    On a GPU a handler has to launch the same whenever it gets the same addresses, and only on the stream of
+    the call: XLA may record what it launches, and replay that without a call.
 
     Args:
         name: For `jax.ffi.ffi_call`.
@@ -63,10 +97,10 @@ def register(name: str, handler: Handler, platform: str) -> None:
 
     def call(address: int) -> int | None:
         frame = frame_type.from_address(address)
-        if frame[_EXTENSION] and _tells_version(frame[_EXTENSION]):
+        if frame[_EXTENSION] and _tells_version(frame[_EXTENSION], platform):
             return None
         try:
-            handler(_data(frame, _INPUTS), _data(frame, _OUTPUTS), lambda: _stream(frame))
+            handler(_data(frame, _INPUTS), _data(frame, _OUTPUTS), Call(frame))
         except Exception as error:  # nothing may pass through XLA's C++ code
             traceback.print_exc()
             return _error(frame, f"{type(error).__name__}: {error}")
@@ -85,13 +119,15 @@ def _data(frame, at: int) -> list[int]:
     return [_WORD.from_address(buffer + 8 * _DATA).value for buffer in buffers]
 
 
-def _tells_version(extension: int) -> bool:
-    """Whether XLA only asks for the version of the interface, which is then told."""
+def _tells_version(extension: int, platform: str) -> bool:
+    """Whether XLA only asks for the version of the interface and for promises, which are then told."""
     words = (_WORD * 4).from_address(extension)
     if words[1] & 0xFFFFFFFF != _METADATA_TYPE:
         return False
     version = (ctypes.c_int * 2).from_address(words[_METADATA] + _VERSION_OFFSET)
     version[0], version[1] = _API_VERSION
+    if platform != "cpu":
+        ctypes.c_uint32.from_address(words[_METADATA] + _TRAITS_OFFSET).value = _RECORDABLE
     return True
 
 
@@ -103,10 +139,3 @@ def _function(frame, place: int, arguments: type[ctypes.Structure]):
 def _error(frame, message: str) -> int | None:
     given = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message.encode(), _UNKNOWN)
     return _function(frame, _ERROR_CREATE, _ErrorArguments)(given)
-
-
-def _stream(frame) -> int:
-    """Stream of the GPU that the call is to be part of."""
-    given = _StreamArguments(ctypes.sizeof(_StreamArguments), None, frame[_CONTEXT], None)
-    _function(frame, _STREAM_GET, _StreamArguments)(given)
-    return given.stream or 0

@@ -17,11 +17,13 @@ _WORTH_A_WORD = 2.0
 """Seconds after which compiling is said."""
 
 
-def compiled_kernel(made: Callable[[], Any]) -> Any:
-    """A kernel, compiled for this processor, or loaded where it was compiled before.
+def compiled_kernel(made: Callable[[], Any], device: str = "cpu", lanes: int = 1) -> Any:
+    """A kernel, compiled for a device, or loaded where it was compiled before.
 
     Args:
         made: Gives the kernel; called when Warp is ready.
+        device: Its name in Warp.
+        lanes: Threads of a block.
     """
     import warp as wp
 
@@ -29,7 +31,7 @@ def compiled_kernel(made: Callable[[], Any]) -> Any:
     with _quietly(), _said("compiling the simulator for this machine, once …"):
         kernel = made()
         try:
-            wp.load_module(kernel.module, device="cpu")
+            wp.load_module(kernel.module, device=device, block_dim=lanes)
         except OSError as error:
             folder = wp.config.kernel_cache_dir
             raise OSError(

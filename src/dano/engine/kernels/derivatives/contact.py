@@ -3,6 +3,7 @@
 import warp as wp
 
 from dano.engine.kernels.derivatives.adjoint import (
+    after_adjoints,
     distance_work,
     facing_work,
     pair_work,
@@ -309,30 +310,42 @@ def pull_facing(
 
 
 @wp.func
-def pull_pair(
+def scaled_body(s: real, a: BodyState) -> BodyState:
+    """A derivative by the state of a body, times a number."""
+    a.position *= s
+    a.orientation = a.orientation * s
+    a.ahead = a.ahead * s
+    a.velocity *= s
+    a.spin *= s
+    a.com *= s
+    return a
+
+
+@wp.func
+def pull_pose(
     scene: Scene,
-    room: Room,
     bars: Changes,
     world: int,
     lane: int,
     found: FoundPair,
-    rebound: real,
-    twists: Virtual,
+    a: BodyState,
+    b: BodyState,
+    pose: PairPose,
+    pose_bar: PairPose,
+    points_share_bar: real,
+    points_h_bar: real,
 ) -> PairBar:
-    """Derivatives by the states of a pair's bodies; adds those by samples, solids and materials."""
+    """Derivatives by the states of a pair's bodies from those by its pose, τ and h.
+
+    One lane alone comes here: Warp itself adds those by coefficients.
+    """
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
     turning = scene.body_index[index.first].turning
     scale = scene.bodies[world, index.first].scale
     h = scene.timestep[world, 0]
-    a = room.bodies[world, index.first]
-    b = room.bodies[world, index.second]
-    pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
-    pose_bar, share_bar, h_bar, twists_bar = pull_points(
-        scene, room, bars, world, lane, found, pose, rebound, twists
-    )
+    share_bar = points_share_bar
     bar = PairBar()
-    bar.twists = twists_bar
     toward = found.toward
     by_first, by_second, by_share, by_h, by_toward, _a, by_scale, _b, _c = wp.grad(pair_work)(
         a, b, found.share, h, toward, turning, scale, pair.follows, pose_bar
@@ -340,7 +353,7 @@ def pull_pair(
     bar.first = by_first
     bar.second = by_second
     bar.scale = by_scale
-    bar.timestep = h_bar + by_h
+    bar.timestep = points_h_bar + by_h
     share_bar += by_share
     toward_bar = by_toward
     if found.critical >= 0:
@@ -383,13 +396,30 @@ def pull_pair(
     return bar
 
 
+@after_adjoints
 @wp.func
-def scaled_body(s: real, a: BodyState) -> BodyState:
-    """A derivative by the state of a body, times a number."""
-    a.position *= s
-    a.orientation = a.orientation * s
-    a.ahead = a.ahead * s
-    a.velocity *= s
-    a.spin *= s
-    a.com *= s
-    return a
+def pull_pair(
+    scene: Scene,
+    room: Room,
+    bars: Changes,
+    world: int,
+    lane: int,
+    found: FoundPair,
+    rebound: real,
+    twists: Virtual,
+) -> PairBar:
+    """Derivatives by the states of a pair's bodies, for the first lane; adds those by all else."""
+    index = scene.pair_index[found.pair]
+    pair = scene.pairs[world, found.pair]
+    h = scene.timestep[world, 0]
+    a = room.bodies[world, index.first]
+    b = room.bodies[world, index.second]
+    pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
+    pose_bar, share_bar, h_bar, twists_bar = pull_points(
+        scene, room, bars, world, lane, found, pose, rebound, twists
+    )
+    bar = PairBar()
+    if lane == 0:
+        bar = pull_pose(scene, bars, world, lane, found, a, b, pose, pose_bar, share_bar, h_bar)
+    bar.twists = twists_bar
+    return bar

@@ -103,18 +103,22 @@ def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: i
 
 
 @wp.func
-def solve_transposed(scene: Scene, room: Room, world: int):
+def solve_transposed(scene: Scene, room: Room, world: int, lane: int):
     """Virtual velocities λ of a settled step, (∂R/∂V)ᵀ λ = V̄, in `room.step`, from V̄ in `room.residual`."""
     m = scene.n_blocks
-    copy_transposed_blocks(room, world, m)
-    for b in range(m):
-        room.step[world, b] = room.residual[world, b]
+    copy_transposed_blocks(room, world, lane, m)
+    wait()
+    if lane == 0:
+        for b in range(m):
+            room.step[world, b] = room.residual[world, b]
+        if wp.static(TREES):
+            transpose_entries(scene, room, world)
+            eliminate_joint_duals(scene, room, world, False)
+    wait()
+    solve_blocks(room, world, lane, m)
     if wp.static(TREES):
-        transpose_entries(scene, room, world)
-        eliminate_joint_duals(scene, room, world, False)
-    solve_blocks(room, world, m)
-    if wp.static(TREES):
-        solve_trees(scene, room, world, False)
+        if lane == 0:
+            solve_trees(scene, room, world, False)
 
 
 @wp.func

@@ -306,12 +306,14 @@ def push_step_of_bodies(
     for f in range(n_found + n_patches(room, world)):
         push_pair(scene, room, launch, changes, bars, world, lane, t, f, f < n_found)
     wait()
-    if lane == 0:
-        for d in range(launch.n_directions):
+    for d in range(launch.n_directions):
+        if lane == 0:
             for k in range(m):
                 room.step[world, k] = room.missing[world, d * m + k]
-            copy_blocks(room, world, m)
-            solve_blocks(room, world, m)
-            for i in range(n):
-                push_advance(scene, room, launch, changes, world, t, i, d)
-    wait()
+        copy_blocks(room, world, lane, m)
+        wait()
+        solve_blocks(room, world, lane, m)
+        wait()
+        for i in range(lane, n, _LANES):
+            push_advance(scene, room, launch, changes, world, t, i, d)
+        wait()

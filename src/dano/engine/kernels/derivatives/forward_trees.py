@@ -236,19 +236,24 @@ def take_samples(
 
 
 @wp.func
-def solve_directions(scene: Scene, room: Room, launch: Launch, world: int):
+def solve_directions(scene: Scene, room: Room, launch: Launch, world: int, lane: int):
     """Changes of the velocities, in place of those of the equations, in `room.missing`."""
     m = scene.n_blocks
     for d in range(launch.n_directions):
-        for b in range(m):
-            room.step[world, b] = room.missing[world, d * m + b]
-        copy_blocks(room, world, m)
-        # Matrices of trees that touch nothing are factored once.
-        eliminate_joint_duals(scene, room, world, d > 0)
-        solve_blocks(room, world, m)
-        solve_trees(scene, room, world, d > 0)
-        for b in range(m):
-            room.missing[world, d * m + b] = room.step[world, b]
+        copy_blocks(room, world, lane, m)
+        wait()
+        if lane == 0:
+            for b in range(m):
+                room.step[world, b] = room.missing[world, d * m + b]
+            # Matrices of trees that touch nothing are factored once.
+            eliminate_joint_duals(scene, room, world, d > 0)
+        wait()
+        solve_blocks(room, world, lane, m)
+        if lane == 0:
+            solve_trees(scene, room, world, d > 0)
+            for b in range(m):
+                room.missing[world, d * m + b] = room.step[world, b]
+        wait()
 
 
 @wp.func
@@ -346,7 +351,7 @@ def push_step_of_trees(
         if k >= scene.trees.blocks[block].used:
             block += 1
             k = 0
+    solve_directions(scene, room, launch, world, lane)
     if lane == 0:
-        solve_directions(scene, room, launch, world)
         push_end(scene, room, launch, changes, bars, world, t)
     wait()

@@ -61,7 +61,8 @@ def pullback(scene: Scene, room: Room, launch: Launch, bars: Changes):
                 clear_trees(scene, world, room.step)
                 follow_chains(scene, room, launch, world, t)
             pull_end(scene, room, bars, launch, world, t)
-            solve_transposed(scene, room, world)
+        wait()
+        solve_transposed(scene, room, world, lane)
         wait()
         pull_equations(scene, room, bars, launch, world, lane, t, n_found)
         if lane == 0:

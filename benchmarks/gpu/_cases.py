@@ -1,0 +1,145 @@
+"""Scenes whose rollouts a launch of a kernel makes, and the programs that are timed."""
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import dano
+from benchmarks._subjects import shipped_bunny
+from benchmarks.robots.push._case import BEHIND, BUNNY, DOWN, HEIGHT, RADIUS, READY
+from benchmarks.speed._crowds import crowds
+from benchmarks.speed._dano import FRICTION, sliding
+from dano.engine import SolverOptions
+from dano.engine.launching import rollout, scene_tables
+
+# Chunks of points that a world has room for: more than ever touch in these scenes.
+_BUNNY_ROOM, _BOXES_ROOM = 16, 32
+
+
+@dataclass(frozen=True)
+class Case:
+    """Rollouts of a scene that differ in a velocity.
+
+    Attributes:
+        name: For the table.
+        scene: The scene.
+        state: Where all begin.
+        worlds: How many at once.
+        narrow: Whether numbers have 32 bits.
+        backward: Whether reverse mode is timed, too.
+        room: Chunks of points.
+    """
+
+    name: str
+    scene: dano.Scene
+    state: dano.State
+    worlds: int
+    narrow: bool = False
+    backward: bool = False
+    room: int = _BUNNY_ROOM
+
+    def inputs(self, worlds: int) -> tuple[dano.Scene, dano.State, jax.Array]:
+        """What a program is given: arrays of the scene, the state, velocities of each world's first body."""
+        arrays = eqx.filter(self.scene, eqx.is_array)
+        shaken = jnp.linspace(0.8, 1.2, worlds)[:, None] * self.state.velocity[0]
+        given = arrays, self.state, shaken
+        if self.narrow:
+            given = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, given)
+        return given
+
+    def program(self, n_steps: int) -> Callable[..., tuple[jax.Array, jax.Array]]:
+        """Positions at the ends of all steps, and which steps were solved, of all worlds."""
+        static = eqx.filter(self.scene, eqx.is_array, inverse=True)
+
+        def rolled(arrays: dano.Scene, state: dano.State, shaken: jax.Array) -> tuple[jax.Array, jax.Array]:
+            tables = scene_tables(eqx.combine(arrays, static))
+
+            def one(first: jax.Array) -> tuple[jax.Array, jax.Array]:
+                begun = eqx.tree_at(lambda s: s.velocity, state, state.velocity.at[0].set(first))
+                states, report = rollout(tables, begun, None, n_steps, self.room, SolverOptions())
+                return states.position, report.converged
+
+            return jax.vmap(one)(shaken)
+
+        return rolled
+
+    def gradient(self, n_steps: int) -> Callable[..., jax.Array]:
+        """Derivatives of where the first bodies end, by their first velocities."""
+        rolled = self.program(n_steps)
+
+        def ends(shaken: jax.Array, arrays: dano.Scene, state: dano.State) -> jax.Array:
+            return jnp.sum(rolled(arrays, state, shaken)[0][:, -1, 0] ** 2)
+
+        return lambda arrays, state, shaken: jax.grad(ends)(shaken, arrays, state)
+
+
+def cases() -> dict[str, Callable[[], Case]]:
+    """All cases by a short name; made when asked for."""
+    return {
+        "bunny": lambda: _bunny("bunny slides, float64", backward=True),
+        "bunny32": lambda: _bunny("bunny slides, float32", narrow=True),
+        "boxes": _boxes,
+        "panda": _panda,
+    }
+
+
+def _bunny(name: str, **settings: Any) -> Case:
+    subject = shipped_bunny()
+    bodies = [dano.Body("bunny", subject.bunny), dano.Body("floor", dano.HalfSpace(), fixed=True)]
+    contact = dano.Contact("bunny", "floor", dano.ContactParams(sliding_friction=FRICTION))
+    scene = dano.Scene.create(bodies, [contact], timestep=subject.timestep)
+    return Case(name, scene, sliding(subject, subject.settled(scene)), 4096, **settings)
+
+
+def _boxes() -> Case:
+    crowd = next(each for each in crowds() if each.name == "8 boxes")
+    bodies = [dano.Body(f"b{i}", dano.Box((0.05,) * 3), mass=1.0) for i in range(len(crowd.members))]
+    floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
+    scene = dano.Scene.create(
+        [*bodies, floor], others=dano.ContactParams(sliding_friction=FRICTION), timestep=0.005
+    )
+    starts: dict[str, dict[str, Any]] = {
+        f"b{i}": {"position": one.position, "orientation": one.orientation, "velocity": (0, 0, -0.5)}
+        for i, one in enumerate(crowd.members)
+    }
+    return Case("8 boxes fall", scene, scene.initial_state(**starts), 1024, room=_BOXES_ROOM)
+
+
+def _panda() -> Case:
+    """The arm with a ball for a tool moves through the bunny's place; its joints have been set in motion."""
+    spec = importlib.util.find_spec("frax")
+    if spec is None or spec.origin is None:
+        raise FileNotFoundError("the Panda is not there: pip install frax")
+    path = next(Path(spec.origin).parent.rglob("panda*.urdf"))
+    robot, subject = dano.load_urdf(path, collision=False), shipped_bunny()
+    tool = dano.Body("tool", dano.Sphere(RADIUS), mass=0.2)
+    weld = dano.Joint(robot.bodies[-1].name, "tool", "weld", position=(0, 0, 0.2))
+    floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
+    params = dano.ContactParams(sliding_friction=FRICTION)
+    scene = dano.Scene.create(
+        [dano.Body("bunny", subject.bunny), *robot.bodies, tool, floor],
+        [dano.Contact("bunny", "floor", params), dano.Contact("tool", "bunny", params)],
+        joints=[*robot.joints, weld],
+        timestep=0.002,
+    )
+    names = [body.name for body in robot.bodies]
+    place = np.append(BUNNY, 0.06)
+    first = scene.initial_state(
+        bunny={"position": place, "velocity": (0.01, 0, 0)},
+        **{name: {"q": q} for name, q in zip(names, READY, strict=True)},
+    )
+    hand = np.array([place[0] - BEHIND, place[1], HEIGHT + 0.2])
+    target = dano.Target(names[-1], position=hand, orientation=DOWN)
+    found = dano.inverse_kinematics(robot, scene, first, [target])
+    assert found.reached, found.reason
+    assert found.state.v is not None
+    moving = found.state.v.at[3].set(0.5)
+    state = eqx.tree_at(lambda s: s.v, found.state, moving)
+    return Case("Panda pushes the bunny", scene, state, 4096, room=_BUNNY_ROOM)

@@ -1,0 +1,141 @@
+"""Launches on a CPU: a world is one lane, and each core has a share of the worlds."""
+
+import concurrent.futures
+import ctypes
+import functools
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from dano.engine.launching._arguments import Arguments
+from dano.engine.launching._ffi import Call, register
+from dano.engine.launching._plans import Build, Plan, Shape
+
+_BUILD = Build()
+_DEVICE = "cpu"
+_numbers = iter(range(10**12))
+
+
+def call(
+    plan: Plan, batched: tuple[bool, ...], n_worlds: int, inputs: Sequence[jax.Array]
+) -> list[jax.Array]:
+    """Outputs of a launch, as part of a program for a CPU."""
+    dtype = inputs[0].dtype
+    shapes = [jax.ShapeDtypeStruct((n_worlds, *shape), dtype) for shape in plan.outputs.values()]
+    return jax.ffi.ffi_call(_target(plan, batched, n_worlds, np.dtype(dtype)), shapes)(*inputs)
+
+
+@functools.cache
+def _target(plan: Plan, batched: tuple[bool, ...], n_worlds: int, dtype: np.dtype) -> str:
+    """Name for `jax.ffi.ffi_call` of launches of so many worlds with numbers of a type."""
+    name = f"dano_{plan.kernel}_{next(_numbers)}"
+    plan.compile(_BUILD, _DEVICE)
+    launcher = _Launcher(plan, batched, n_worlds)
+    register(name, launcher if dtype == np.float64 else _Widened(launcher), "cpu")
+    return name
+
+
+class _Launcher:
+    """Handler of launches.
+
+    Each share has parameters of its own, which a call takes, points to its buffers, and puts back: so calls
+    from several threads do not meet.
+    """
+
+    def __init__(self, plan: Plan, batched: tuple[bool, ...], n_worlds: int):
+        self.plan, self.batched, self.n_worlds = plan, batched, n_worlds
+        self._free: list[list[_Share]] = []
+
+    def __call__(self, inputs: Sequence[int], outputs: Sequence[int], call: Call) -> None:
+        """Launch."""
+        try:
+            shares = self._free.pop()
+        except IndexError:
+            shares = self._shares()
+        pointers = [*inputs, *outputs]
+        if self.plan.adds:
+            for pointer, shape in zip(outputs, self.plan.outputs.values(), strict=True):
+                ctypes.memset(pointer, 0, 8 * self.n_worlds * shape.rows * shape.width)
+        for share in shares:
+            for array, pointer in zip(share.arrays, pointers, strict=True):
+                array.data = pointer
+            for array, k in share.gradients:
+                array.grad = pointers[k]
+        if len(shares) == 1:
+            shares[0].command.launch()
+        else:
+            others = [_workers().submit(share.command.launch) for share in shares[1:]]
+            shares[0].command.launch()
+            for other in others:
+                other.result()
+        self._free.append(shares)
+
+    def _shares(self) -> list["_Share"]:
+        n = min(self.n_worlds, n_cores())
+        ends = [self.n_worlds * (k + 1) // n for k in range(n)]
+        begins = [0, *ends[:-1]]
+        return [
+            _Share(self.plan, self.batched, self.n_worlds, b, e - b)
+            for b, e in zip(begins, ends, strict=True)
+        ]
+
+
+class _Widened:
+    """Handler for numbers of 32 bits: kernels on a CPU read and write 64."""
+
+    def __init__(self, launcher: _Launcher):
+        self.launcher = launcher
+
+    def __call__(self, inputs: Sequence[int], outputs: Sequence[int], call: Call) -> None:
+        """Launch."""
+        plan, n = self.launcher.plan, self.launcher.n_worlds
+        given = zip(inputs, plan.inputs.values(), self.launcher.batched, strict=True)
+        wide = [_narrow(p, shape, n if b else 1).astype(np.float64) for p, shape, b in given]
+        found = [np.zeros((n, *shape)) for shape in plan.outputs.values()]
+        self.launcher([x.ctypes.data for x in wide], [x.ctypes.data for x in found], call)
+        for x, pointer, shape in zip(found, outputs, plan.outputs.values(), strict=True):
+            _narrow(pointer, shape, n)[...] = x
+
+
+def _narrow(pointer: int, shape: Shape, n: int) -> np.ndarray:
+    """Numbers of 32 bits at an address."""
+    size = n * shape.rows * shape.width
+    if size == 0:
+        return np.zeros((n, *shape), np.float32)
+    return np.ctypeslib.as_array((ctypes.c_float * size).from_address(pointer)).reshape(n, *shape)
+
+
+class _Share:
+    """Parameters of a launch of some worlds."""
+
+    def __init__(self, plan: Plan, batched: tuple[bool, ...], n_worlds: int, first: int, count: int):
+        import warp as wp
+
+        arguments = Arguments(plan, _BUILD, _DEVICE)
+        arguments.point_all(batched, n_worlds)
+        self._kept: list[Any] = [arguments]
+        for place, values in plan.whole.items():
+            arguments.point(place, (values.shape[0],), (values.strides[0],), values.ctypes.data)
+            self._kept.append(values)
+        for place, length in plan.room.items():
+            size = arguments.item(place)
+            memory: Any = wp.zeros(max(length, 1) * size, dtype=wp.uint8, device=_DEVICE)
+            # One world after the other works in the same room.
+            arguments.point(place, (n_worlds, length), (0, size), memory.ptr)
+            self._kept.append(memory)
+        self.command = arguments.recorded(first, count)
+        self.arrays, self.gradients = arguments.pointers()
+
+
+@functools.cache
+def n_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@functools.cache
+def _workers() -> concurrent.futures.ThreadPoolExecutor:
+    return concurrent.futures.ThreadPoolExecutor(max(1, n_cores() - 1), thread_name_prefix="dano")

@@ -1,0 +1,171 @@
+"""Launches on NVIDIA GPUs: a world is a block of lanes, and works in memory that XLA lends the launch.
+
+What a launch needs besides real numbers are further buffers of the call: whole numbers are constants of the
+program, the room is an output that nothing reads. So XLA keeps all memory, on every device; launches on
+several streams do not share a room; and a call launches the same kernel whenever it gets the same addresses,
+so that XLA may record it (command buffers).
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dano.engine.launching._arguments import Arguments
+from dano.engine.launching._ffi import Call, register
+from dano.engine.launching._plans import Build, Plan
+
+LANES = 32
+"""Lanes of a world: those of a warp."""
+PLATFORM = "CUDA"
+# Arrays in the room that have a part for each lane, of the length that one lane needs; and lists of points,
+# of which each lane has a part that is that much longer than its share: lanes do not find equally many.
+_OF_EACH_LANE = ("room.found", "room.near")
+_OF_POINTS = tuple(f"room.{name}" for name in ("where", "points", "laws", "duals", "changes", "linear"))
+_MORE_POINTS = 16
+# Boundary of each array in the room [bytes].
+_ALIGNED = 16
+_numbers = iter(range(10**12))
+
+
+def call(
+    plan: Plan,
+    batched: tuple[bool, ...],
+    n_worlds: int,
+    inputs: Sequence[jax.Array],
+    platform: str = PLATFORM,
+) -> list[jax.Array]:
+    """Outputs of a launch, as part of a program for a GPU.
+
+    Args:
+        plan: The plan.
+        batched: Whether each input differs between worlds.
+        n_worlds: Number of worlds.
+        inputs: The inputs.
+        platform: "cpu" runs the same on a CPU, whose lanes take turns (`warp.config.enable_cpu_blocks`).
+    """
+    dtype = inputs[0].dtype
+    build = Build(LANES, dtype == np.float64)
+    places, size = _layout(plan, build)
+    whole = [np.ascontiguousarray(values, np.int32).reshape(-1) for values in plan.whole.values()]
+    shapes = [jax.ShapeDtypeStruct((n_worlds, *shape), dtype) for shape in plan.outputs.values()]
+    # Outputs to which a kernel adds are given as zeros, in place.
+    zeros = [jnp.zeros(x.shape, x.dtype) for x in shapes] if plan.adds else []
+    first = len(inputs) + len(whole)
+    found = jax.ffi.ffi_call(
+        _target(plan, batched, n_worlds, build, platform),
+        [*shapes, jax.ShapeDtypeStruct((n_worlds, size), np.uint8)],
+        input_output_aliases={first + k: k for k in range(len(zeros))},
+    )(*inputs, *whole, *zeros)
+    return found[:-1]
+
+
+def _layout(plan: Plan, build: Build) -> tuple[dict[str, tuple[int, int, int]], int]:
+    """Where in a world's room each array begins [bytes], its length and item [bytes]; and the room's size."""
+    arguments = Arguments(plan, build, "cpu")
+    places, at = {}, 0
+    for place, length in plan.room.items():
+        if place in _OF_EACH_LANE:
+            length *= build.lanes
+        if place in _OF_POINTS and length > 0:
+            length = build.lanes * (-(-length // build.lanes) + _MORE_POINTS)
+        size = arguments.item(place)
+        places[place] = at, length, size
+        at += -(-length * size // _ALIGNED) * _ALIGNED
+    return places, max(at, _ALIGNED)
+
+
+@functools.cache
+def _target(plan: Plan, batched: tuple[bool, ...], n_worlds: int, build: Build, platform: str) -> str:
+    """Name for `jax.ffi.ffi_call` of launches of so many worlds."""
+    name = f"dano_{plan.kernel}_{platform}_{next(_numbers)}"
+    for device in _devices(platform):
+        # Within a call it would be too late: XLA may be recording.
+        plan.compile(build, device)
+    register(name, _Launcher(plan, batched, n_worlds, build, platform), platform)
+    return name
+
+
+def _devices(platform: str) -> list[str]:
+    """Names in Warp of the devices that programs may run on here; none where one is built for elsewhere."""
+    import warp as wp
+
+    if platform != PLATFORM:
+        return [platform]
+    if wp.get_cuda_device_count() == 0:
+        return []
+    return [f"cuda:{device.local_hardware_id}" for device in jax.local_devices(backend="cuda")]
+
+
+class _Launcher:
+    """Handler of launches.
+
+    Each call takes parameters, points them to its buffers, launches and puts them back: a launch has copied
+    them by then.
+    """
+
+    def __init__(self, plan: Plan, batched: tuple[bool, ...], n_worlds: int, build: Build, platform: str):
+        self._made = functools.partial(_Blocks, plan, batched, n_worlds, build)
+        self._platform = platform
+        self._free: dict[str, list[_Blocks]] = {}
+
+    def __call__(self, inputs: Sequence[int], outputs: Sequence[int], call: Call) -> None:
+        """Launch."""
+        on_gpu = self._platform == PLATFORM
+        device = f"cuda:{call.device()}" if on_gpu else self._platform
+        free = self._free.setdefault(device, [])
+        try:
+            blocks = free.pop()
+        except IndexError:
+            blocks = self._made(device)
+        blocks.launch(inputs, outputs, _stream(device, call.stream()) if on_gpu else None)
+        free.append(blocks)
+
+
+@functools.cache
+def _stream(device: str, address: int) -> Any:
+    """A stream of XLA's as one of Warp's; XLA has few of them, and keeps them."""
+    import warp as wp
+
+    return wp.Stream(device, cuda_stream=address)
+
+
+class _Blocks:
+    """Parameters of a launch of all worlds on a device.
+
+    Attributes:
+        room_bytes: Size of the room of all worlds, which holds anything when a launch begins.
+    """
+
+    def __init__(self, plan: Plan, batched: tuple[bool, ...], n_worlds: int, build: Build, device: str):
+        arguments = Arguments(plan, build, device)
+        arguments.point_all(batched, n_worlds)
+        for place, values in plan.whole.items():
+            arguments.point(place, (values.shape[0],), (arguments.item(place),))
+        places, size = _layout(plan, build)
+        for place, (_, length, item) in places.items():
+            arguments.point(place, (n_worlds, length), (size, item))
+        self._command = arguments.recorded(0, n_worlds)
+        self._arrays, self._gradients = arguments.pointers()
+        self._whole = [arguments.descriptor(place) for place in plan.whole]
+        self._room = [(arguments.descriptor(place), at) for place, (at, _, _) in places.items()]
+        self._kept = arguments
+        self.room_bytes = n_worlds * size
+        self._n_inputs = len(plan.inputs)
+
+    def launch(self, inputs: Sequence[int], outputs: Sequence[int], stream: Any) -> None:
+        """Launch on a stream."""
+        *outputs, room = outputs
+        pointers = [*inputs[: self._n_inputs], *outputs]
+        for array, pointer in zip(self._arrays, pointers, strict=True):
+            array.data = pointer
+        for array, k in self._gradients:
+            array.grad = pointers[k]
+        for array, pointer in zip(self._whole, inputs[self._n_inputs :], strict=False):
+            array.data = pointer
+        for array, at in self._room:
+            array.data = room + at
+        self._command.launch(stream)

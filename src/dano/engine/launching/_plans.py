@@ -1,0 +1,114 @@
+"""Launches but for their real numbers: which kernel, what it reads and writes, and where."""
+
+import threading
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dano.engine.launching._instances import Features, instance
+from dano.engine.launching._warp import compiled_kernel
+
+
+class Shape(NamedTuple):
+    """Rows and numbers a row of an array of real numbers, without the axis of worlds."""
+
+    rows: int
+    width: int
+
+
+class Build(NamedTuple):
+    """What a kernel is built for.
+
+    Attributes:
+        lanes: Lanes of a world.
+        wide: Whether numbers have 64 bits.
+    """
+
+    lanes: int = 1
+    wide: bool = True
+
+
+class Plan:
+    """A launch but for its real numbers.
+
+    Attributes:
+        module: Module of `dano.engine.kernels` that has the kernel.
+        kernel: Its name.
+        features: What it must know.
+        inputs: Place of each input in the kernel's parameters, such as "scene.bodies", and its shape.
+        outputs: The same of the outputs.
+        whole: Arrays of whole numbers, the same for all worlds, by place.
+        room: Lengths of the arrays that a world of one lane works in, by place.
+        numbers: Other fields of the parameters, by place.
+    """
+
+    def __init__(
+        self,
+        module: str,
+        kernel: str,
+        features: Features,
+        inputs: dict[str, Shape],
+        outputs: dict[str, Shape],
+        whole: dict[str, np.ndarray],
+        room: dict[str, int],
+        numbers: dict[str, Any],
+    ):
+        """See the class."""
+        self.module, self.kernel, self.features = module, kernel, features
+        self.inputs, self.outputs, self.whole, self.room, self.numbers = inputs, outputs, whole, room, numbers
+        self._compiled: set[tuple[Build, str]] = set()
+
+    @property
+    def gradients(self) -> dict[str, str]:
+        """Inputs to whose derivatives Warp itself adds, and the outputs that these are."""
+        return {"scene.solids.coefficients": "bars.coefficients"} if self.adds else {}
+
+    @property
+    def adds(self) -> bool:
+        """Whether the kernel adds to its outputs, which have to be zero before."""
+        return self.kernel == "pullback"
+
+    def kernel_of(self, build: Build) -> Any:
+        """The kernel, not compiled."""
+        features = self.features
+        if build != Build():
+            features = Features(**{**dict(features.values), "LANES": build.lanes, "WIDE": build.wide})
+        return getattr(instance(features, self.module), self.kernel)
+
+    def compile(self, build: Build, device: str) -> None:
+        """Compile the kernel for a device of Warp's, or load it: what goes wrong is said here."""
+        key = build, device
+        if key not in self._compiled:
+            compiled_kernel(lambda: self.kernel_of(build), device, build.lanes)
+            self._compiled.add(key)
+
+
+_plans: dict[Any, Plan] = {}
+_lock = threading.Lock()
+
+
+def plan(
+    module: str,
+    kernel: str,
+    features: Features,
+    inputs: dict[str, Shape],
+    outputs: dict[str, Shape],
+    whole: dict[str, np.ndarray],
+    room: dict[str, int],
+    numbers: dict[str, Any],
+) -> Plan:
+    """A plan; equal ones are the same object, so that compiled programs are found again."""
+    key = (
+        module,
+        kernel,
+        features,
+        tuple(inputs.items()),
+        tuple(outputs.items()),
+        tuple((name, x.shape, x.tobytes()) for name, x in whole.items()),
+        tuple(room.items()),
+        tuple(numbers.items()),
+    )
+    with _lock:
+        if key not in _plans:
+            _plans[key] = Plan(module, kernel, features, inputs, outputs, whole, room, numbers)
+        return _plans[key]
