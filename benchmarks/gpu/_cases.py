@@ -16,8 +16,6 @@ from benchmarks._subjects import shipped_bunny
 from benchmarks.robots.push._case import BEHIND, BUNNY, DOWN, HEIGHT, RADIUS, READY
 from benchmarks.speed._crowds import crowds
 from benchmarks.speed._dano import FRICTION, sliding
-from dano.engine import SolverOptions
-from dano.engine.launching import rollout, scene_tables
 
 # Chunks of points that a world has room for: more than ever touch in these scenes.
 _BUNNY_ROOM, _BOXES_ROOM = 16, 32
@@ -59,11 +57,13 @@ class Case:
         static = eqx.filter(self.scene, eqx.is_array, inverse=True)
 
         def rolled(arrays: dano.Scene, state: dano.State, shaken: jax.Array) -> tuple[jax.Array, jax.Array]:
-            tables = scene_tables(eqx.combine(arrays, static))
+            scene = eqx.combine(arrays, static)
+            engine = dano.VariationalEngine(capacity=self.room)
+            prepared = engine.prepare(scene)
 
             def one(first: jax.Array) -> tuple[jax.Array, jax.Array]:
                 begun = eqx.tree_at(lambda s: s.velocity, state, state.velocity.at[0].set(first))
-                states, report = rollout(tables, begun, None, n_steps, self.room, SolverOptions())
+                states, report = engine.rollout(scene, prepared, scene.filled(begun), None, n_steps)
                 return states.position, report.converged
 
             return jax.vmap(one)(shaken)

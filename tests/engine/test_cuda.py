@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import warp as wp
-from dano.engine._newton import SolverOptions
 
 import dano
+from dano.engine._reports import SolverOptions
 from dano.engine.launching import _cpu, _cuda, Features, instance, listed_points, rollout, scene_tables
 from dano.engine.launching._warp import begin
 

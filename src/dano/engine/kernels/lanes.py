@@ -17,8 +17,8 @@ from dano.physics.real import INFINITY, mat33, mat66, real, vec3, vec4, vec6
 _NONE = wp.constant(2**31 - 1)
 
 
-# Sums of a warp are shuffles, which say nothing of memory; and a tile's place may be written again by the lane
-# that is through first, while others still read.
+# Sums of a warp are shuffles, which say nothing of memory; and a tile's place may be written again by the
+# lane that is through first, while others still read.
 @wp.func_native("WP_TILE_SYNC();")
 def _barrier(): ...
 
@@ -46,6 +46,7 @@ def total4(x: vec4) -> vec4:
     """Sum over the lanes of a world."""
     if wp.static(LANES > 1):
         x = wp.tile_sum(wp.tile(x, preserve_type=True))[0]
+        _barrier()
     return x
 
 

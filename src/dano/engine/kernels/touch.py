@@ -118,9 +118,10 @@ def touch(scene: Scene, room: Room, launch: Launch, seen: Seen):
 
 
 @wp.func
-def misses(scene: Scene, room: Room, world: int) -> real:
+def misses(scene: Scene, room: Room, world: int, lane: int) -> real:
     """How far Newton's step from the velocities at the end would lead, forces in loops aside [m/s, rad/s]."""
-    newton_step(scene, room, world, ONE, False)
+    newton_step(scene, room, world, lane, ONE, False)
+    wait()
     found = real(0.0)
     if wp.static(TREES):
         for u in range(scene.trees.unknowns.shape[0]):
@@ -167,10 +168,7 @@ def press(scene: Scene, room: Room, launch: Launch, seen: Seen):
     while hits and attempt <= _REBOUNDS:
         rebound = ONE - real(attempt) / real(_REBOUNDS)
         n_found = settle_with(scene, room, launch, world, lane, rebound)
-        missed = real(0.0)
-        if lane == 0:
-            missed = misses(scene, room, world)
-        missed = total(missed)
+        missed = misses(scene, room, world, lane)
         if missed < best:
             best = missed
             chosen = rebound
