@@ -63,7 +63,9 @@ class Case:
 
             def one(first: jax.Array) -> tuple[jax.Array, jax.Array]:
                 begun = eqx.tree_at(lambda s: s.velocity, state, state.velocity.at[0].set(first))
-                states, report = engine.rollout(scene, prepared, scene.filled(begun), None, n_steps)
+                found = engine.rollout(scene, prepared, scene.filled(begun), None, n_steps)
+                assert found is not None
+                states, report = found
                 return states.position, report.converged
 
             return jax.vmap(one)(shaken)

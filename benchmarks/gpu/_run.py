@@ -4,6 +4,7 @@ import argparse
 import datetime
 import time
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -61,7 +62,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, metavar="N", default=N_STEPS, help="steps of a rollout")
 
 
-def _gpu() -> jax.Device | None:
+def _gpu() -> Any:
     try:
         return jax.devices("cuda")[0]
     except RuntimeError:
@@ -69,13 +70,13 @@ def _gpu() -> jax.Device | None:
 
 
 def _programs(case: Case, n_steps: int) -> dict[str, Callable]:
-    programs = {"rollout": case.program(n_steps)}
+    programs: dict[str, Callable] = {"rollout": case.program(n_steps)}
     if case.backward:
         programs["reverse mode"] = case.gradient(n_steps)
     return programs
 
 
-def _compiled(case: Case, worlds: int, n_steps: int, device: jax.Device) -> list[Row]:
+def _compiled(case: Case, worlds: int, n_steps: int, device: Any) -> list[Row]:
     """Seconds until each program is compiled, kernels with it; those that compare are not."""
     rows = []
     given = jax.device_put(case.inputs(worlds), device)
@@ -86,7 +87,7 @@ def _compiled(case: Case, worlds: int, n_steps: int, device: jax.Device) -> list
     return rows
 
 
-def _beside_cpu(case: Case, gpu: jax.Device, worlds: int) -> Row:
+def _beside_cpu(case: Case, gpu: Any, worlds: int) -> Row:
     """Largest difference of a position in any step."""
     ends = []
     for device in (gpu, jax.devices("cpu")[0]):
@@ -99,7 +100,7 @@ def _beside_cpu(case: Case, gpu: jax.Device, worlds: int) -> Row:
     return Row(case.name, "beside the CPU", float(np.abs(one - other).max()), "m", target, note=note)
 
 
-def _timed(case: Case, worlds: int, n_steps: int, device: jax.Device) -> list[Row]:
+def _timed(case: Case, worlds: int, n_steps: int, device: Any) -> list[Row]:
     rows, per = [], 1e6 / (worlds * n_steps)
     given = jax.device_put(case.inputs(worlds), device)
     for name, program in _programs(case, n_steps).items():

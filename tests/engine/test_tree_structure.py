@@ -27,7 +27,7 @@ JOINTS = (
 @pytest.fixture(scope="module")
 def layout():
     bodies = [dano.Body(name, dano.Sphere(0.1), mass=1.0, fixed=name == "wall") for name in NAMES]
-    joints = [dano.Joint(*joint, mimics=mimics) for *joint, mimics in JOINTS]
+    joints = [dano.Joint(parent, child, kind, mimics=mimics) for parent, child, kind, mimics in JOINTS]
     return dano.Scene.create(bodies, joints=joints).layout
 
 

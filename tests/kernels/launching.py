@@ -1,6 +1,7 @@
 """Scenes for kernels, without an engine around them: structures filled with arrays of NumPy."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -102,7 +103,7 @@ class Arguments:
     def put(self, place, rows):
         """Fill the array at a place such as "scene.bodies"."""
         *path, field = place.split(".")
-        owner = self
+        owner: Any = self
         for name in path:
             owner = getattr(owner, name)
         kind = owner._cls.vars[field].type

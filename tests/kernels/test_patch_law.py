@@ -1,6 +1,8 @@
+# pyright: reportInvalidTypeForm=false, reportCallIssue=false, reportArgumentType=false
 """The centroid law at a patch: against the reference, limits, and numbers of the authors' implementation."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,7 +52,7 @@ def press(
     jacobians: wp.array2d(dtype=law.PatchJacobian),
 ):
     """Wrenches of each material at each twist: the law's, those of its linearisation, and the derivative."""
-    i, j = wp.tid()
+    i, j = wp.tid()  # pyright: ignore
     material = materials[i]
     pulls = adhesive[i] > 0
     velocity = wp.vec3d(twists[j, 0], twists[j, 1], twists[j, 2])
@@ -82,7 +84,8 @@ def pressed(laws, twists, params=PARAMS, overlap=0.02, normal=NORMAL):
         wp.array(np.asarray(twists, float), dtype=wp.float64, device="cpu"),
     ]
     wp.launch(press, shape, [*given, patch, *found], device="cpu")
-    wrenches, linear, slopes = (x.numpy() for x in found)
+    arrays: Any = [x.numpy() for x in found]
+    wrenches, linear, slopes = arrays
     upper = np.concatenate([slopes["force"], np.zeros_like(slopes["force"])], axis=-1)
     whole = np.concatenate([upper, np.concatenate([slopes["moment"], slopes["turning"]], axis=-1)], axis=-2)
     return (*(np.concatenate([x["force"], x["moment"]], axis=-1) for x in (wrenches, linear)), whole)
@@ -93,7 +96,7 @@ def test_wrench_and_jacobian():
     wrenches, linear, slopes = pressed(LAWS, TWISTS)
     for i, one in enumerate(LAWS):
         for j, twist in enumerate(TWISTS):
-            contact = SimpleNamespace(law=one, params=PARAMS)
+            contact: Any = SimpleNamespace(law=one, params=PARAMS)
             patch = Patch(0, 1, contact, 0.02, np.zeros(3), NORMAL, (np.zeros(3), np.zeros(3)))
             expected, slope = patch_wrench(patch, np.array([twist, np.zeros(6)]))
             np.testing.assert_allclose(wrenches[i, j], expected, rtol=1e-12, atol=1e-12)

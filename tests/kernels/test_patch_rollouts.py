@@ -1,6 +1,7 @@
 """Rollouts with contacts of the centroid law: steps by the reference, derivatives by differences."""
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -272,7 +273,9 @@ def test_laws_that_kernels_do_not_know():
     class OwnLaw(CentroidLaw):
         """A law of one's own."""
 
-    own = eqx.tree_at(lambda s: s.contacts[0].law, scene, OwnLaw(smoothing=12.0))
+    own_law: Any = OwnLaw
+
+    own = eqx.tree_at(lambda s: s.contacts[0].law, scene, own_law(smoothing=12.0))
     assert not knows(own)
     with pytest.raises(ValueError, match="got OwnLaw"):
         scene_tables(own)

@@ -1,5 +1,7 @@
 """Overlaps in kernels against those of `dano.overlap`, and what kernels do not know."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -84,7 +86,9 @@ def test_what_kernels_do_not_know():
     class OwnLaw(CentroidLaw):
         """A law of one's own."""
 
+    own_law: Any = OwnLaw
+
     with pytest.raises(ValueError, match="got OwnLaw"):
-        patch_tables([pair._replace(b=dano.Collider(dano.Sphere(0.1)), law=OwnLaw())], float)
+        patch_tables([pair._replace(b=dano.Collider(dano.Sphere(0.1)), law=own_law())], float)
     bodies = [dano.Body("ball", dano.Sphere(0.1), mass=1.0), dano.Body("floor", dano.HalfSpace(), fixed=True)]
     assert patch_pairs(dano.Scene.create(bodies, [dano.Contact("ball", "floor")], timestep=0.01)) == []

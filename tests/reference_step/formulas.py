@@ -1,3 +1,4 @@
+# pyright: reportInvalidTypeForm=false, reportCallIssue=false, reportArgumentType=false
 """Formulas of `dano.physics`, each as a function of NumPy arrays."""
 
 from typing import Any

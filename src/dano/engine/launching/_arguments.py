@@ -47,7 +47,7 @@ class Arguments:
         owner, field, _ = self._found(place)
         setattr(owner, field, value)
 
-    def point(self, place: str, shape: Sequence[int], strides: Sequence[int], pointer: int = 0) -> None:
+    def point(self, place: str, shape: tuple[int, ...], strides: tuple[int, ...], pointer: int = 0) -> None:
         """Have an array at a place, with strides in bytes, and at an address, which a launch may change."""
         import warp as wp
 

@@ -21,7 +21,7 @@ _numbers = iter(range(10**12))
 
 def call(
     plan: Plan, batched: tuple[bool, ...], n_worlds: int, inputs: Sequence[jax.Array]
-) -> list[jax.Array]:
+) -> Sequence[jax.Array]:
     """Outputs of a launch, as part of a program for a CPU."""
     dtype = inputs[0].dtype
     shapes = [jax.ShapeDtypeStruct((n_worlds, *shape), dtype) for shape in plan.outputs.values()]

@@ -37,7 +37,7 @@ def call(
     n_worlds: int,
     inputs: Sequence[jax.Array],
     platform: str = PLATFORM,
-) -> list[jax.Array]:
+) -> Sequence[jax.Array]:
     """Outputs of a launch, as part of a program for a GPU.
 
     Args:
