@@ -291,7 +291,7 @@ def list_side(
                             depth = wp.max(depth, -end)
                         if depth > ZERO:
                             touch.weight = area * depth
-                            touch.code = known.codes[s]
+                            touch.precedence = known.precedence[s]
                             touch.presses = wp.where(early or over < ZERO, 1, 0)
                             work.touches[at] = touch
                             at += 1
@@ -338,7 +338,7 @@ def list_pair(known: Known, model: Model, data: Data, work: Work, pair: int, beg
         side.sign = ONE
         n = list_side(known, model, work, side, settings.margin, settings.gap, sink, way, h, 0)
     both = int(n)
-    if side.other.blocks > 0 and side.index.solid >= 0:
+    if known.pairs[pair].both == 1 and side.other.blocks > 0 and side.index.solid >= 0:
         flipped = Side()
         flipped.part = part
         flipped.index = side.other
@@ -347,15 +347,9 @@ def list_pair(known: Known, model: Model, data: Data, work: Work, pair: int, beg
         flipped.b = side.a
         flipped.sign = -ONE
         both = list_side(known, model, work, flipped, settings.margin, settings.gap, sink, way, h, n)
-    most = int(options.most)
-    # Each side has half of the contacts, or what the other leaves.
-    of_second = wp.min(both - n, wp.max(most // 2, most - n))
-    at = begin
-    if n > 0:
-        at = merge(work, at, 0, n, most - of_second, settings, side.other, side.index, sink, h)
-    if both > n:
-        at = merge(work, at, n, both, of_second, settings, side.other, side.index, sink, h)
-    return at
+    if both == 0:
+        return begin
+    return merge(work, begin, 0, both, int(options.most), settings, side.other, side.index, sink, h)
 
 
 @wp.kernel(enable_backward=False)
