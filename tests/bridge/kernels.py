@@ -1,3 +1,4 @@
+# pyright: reportInvalidTypeForm=false
 """The functions of the bridge's kernels, one at a time."""
 
 import functools

@@ -9,7 +9,7 @@ import warp as wp
 
 from dano.mujoco.kernels.merging import merge
 from dano.mujoco.kernels.mixing import pair_settings
-from dano.mujoco.kernels.solids import part_clearance, part_distance, UNKNOWN
+from dano.mujoco.kernels.solids import part_clearance, part_distance, quick_clearance, UNKNOWN
 from dano.mujoco.kernels.tables import BLOCK, Data, Known, Model, Part, PartIndex, RUN, Touch, Work
 from dano.physics.pairs import approach, BodyState, facing_direction, pair_pose, PairPose, rotation_after
 from dano.physics.real import HALF, INFINITY, mat33, ONE, real, vec3, vec4, ZERO
@@ -261,8 +261,6 @@ def list_side(
         reach = margin + way
     points = pose.points
     origin = pose.origin
-    # MuJoCo's planes are normal to their z axis.
-    flat = side.other.solid == _HALF_SPACE
     at = int(begin)
     block = int(side.index.first_block)
     last = block + side.index.blocks
@@ -272,10 +270,10 @@ def list_side(
             for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
                 sample = known.samples[s]
                 x = points * sample.point + origin
-                # What lies over a plane, as most samples near one do, is passed without a call.
+                # Most samples of a near block are not near.
                 d = Distance()
-                d.value = x[2]
-                if not flat or x[2] <= reach:
+                d.value = quick_clearance(known, side.other, x)
+                if d.value <= reach:
                     d = part_distance(known, model, side.other, x)
                 if d.value <= reach:
                     normal = solid_normal(d.gradient)
