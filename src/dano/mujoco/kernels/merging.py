@@ -133,7 +133,7 @@ def led_touch(work: Work, head: int, begin: int, end: int, near: real) -> tuple[
         nearing += w * touch.nearing
         merged.presses = wp.max(merged.presses, touch.presses)
     squared = wp.dot(force, force)
-    # Where normals oppose each other, no one contact does what they do.
+    # Where normals oppose each other, no one contact does what they do, and the head stands for itself.
     if squared > HALF * HALF * weight * weight:
         place = place / weight
         moment -= wp.cross(place, force)
