@@ -61,7 +61,7 @@ def _fingers(name: str, timestep: float) -> list[Row]:
         Row(group, "speed at which they close", fastest, "m/s"),
         Row(group, "least distance between them", 1000 * least, "mm", note=f"{data.ncon} contacts"),
         Row(group, "speed at rest", speed, "m/s", 0.05),
-        Row(group, "time of a step", 1e6 * taken, "µs", MOST_TIME),
+        Row(group, "time of a step while they hold", 1e6 * taken, "µs", MOST_TIME),
     ]
 
 

@@ -1,3 +1,4 @@
+# pyright: reportInvalidTypeForm=false
 """The functions of the bridge's kernels, one at a time."""
 
 import functools
@@ -40,34 +41,6 @@ def _kernels():
         found[0] = of_two(model, 0, 1)
 
     return tables, ask, mix
-
-
-@functools.cache
-def _merging():
-    tables = instance(FEATURES, "dano.mujoco.kernels.tables")
-    cell_touch = instance(FEATURES, "dano.mujoco.kernels.merging").cell_touch
-    touch_type = tables.Touch
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def merge(
-        touches: wp.array(dtype=touch_type),
-        ends: wp.array(dtype=wp.int32),
-        found: wp.array(dtype=touch_type),
-    ):
-        i = wp.tid()
-        found[i] = cell_touch(touches, ends[i], ends[i + 1])
-
-    return tables, merge
-
-
-def merged(touches, ends):
-    """One touch for those from each end to the next, of an array of a search's."""
-    tables, merge = _merging()
-    found = wp.zeros(len(ends) - 1, dtype=tables.Touch, device="cpu")
-    wp.launch(
-        merge, len(ends) - 1, [touches, wp.array(ends, dtype=wp.int32, device="cpu"), found], device="cpu"
-    )
-    return found.numpy()
 
 
 def mixed(model) -> dict[str, np.ndarray]:

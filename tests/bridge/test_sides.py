@@ -1,12 +1,10 @@
 """Contact from both sides and in time: what is small or fast does not pass; few contacts do what many do."""
 
 import threading
-from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
-from bridge.kernels import merged
 from bridge.supports import gripper, thing, TYPES, world
 
 from dano.mujoco import Bridge
@@ -93,50 +91,74 @@ def test_small_geoms_of_all_types_rest_on_few_samples(kind: str):
 
 
 def test_merged_contacts_have_the_wrench_of_all():
-    """Forces as areas times depths; of a cell's moment only the part along its force is left out."""
-    spec = world("sphere")
-    bridge, model, data = attached(spec)
-    data.qpos[:] = [0, 0, -0.002, 1, 0.02, 0.01, 0]
+    """Forces as areas times depths; of a share's moment only the part along its force is left out."""
+    rows, touches = _touching(*attached(world("sphere")), [0, 0, -0.002, 1, 0.02, 0.01, 0])
+    assert len(touches) > 50
+    heads, shares = _shares(touches, 8)
+    assert len(rows) == len(heads) == 8
+    np.testing.assert_allclose(shares.sum(axis=0), touches["weight"], rtol=1e-12)
+    for row, share in zip(rows, shares, strict=True):
+        force, moment = _wrench(touches, share)
+        size = float(np.linalg.norm(force))
+        np.testing.assert_allclose(row[4:7], force / size, atol=1e-12)
+        left = moment - np.cross(row[1:4], force)
+        assert np.linalg.norm(np.cross(left, row[4:7])) < 1e-12 * size
+        assert abs(left @ row[4:7]) < 1e-4 * size
+        np.testing.assert_allclose(row[0], share @ touches["gap"] / share.sum(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("support", ["plane", "sphere", "box"])
+def test_merged_contacts_do_not_jump(support: str):
+    """A bunny sinks in: the shorter its way, the less changes what contacts do, stiffness times depth."""
+    bridge, model, data = attached(world(support))
+    top = model.geom_solimp[0, 1]
+    changes = []
+    for steps in (300, 600, 1200):
+        wrenches = []
+        for z in np.linspace(0.0, -0.001, steps + 1):
+            rows, _ = _touching(bridge, model, data, [0, 0, z, 1, 0.02, 0.01, 0])
+            stiff = rows[:, 24] / (1 - rows[:, 24]) * (1 - top) / top
+            forces = (-stiff * rows[:, 0])[:, None] * rows[:, 4:7]
+            moments = np.cross(rows[:, 1:4], forces)
+            wrenches.append([forces.sum(axis=0), moments.sum(axis=0)])
+        changes.append(np.linalg.norm(np.diff(wrenches, axis=0), axis=2).max(axis=0))
+    assert np.all(changes[1] < 0.7 * changes[0])
+    assert np.all(changes[2] < 0.7 * changes[1])
+
+
+def _touching(bridge, model, data, pose):
+    """The contacts at a pose, and the samples that touch."""
+    data.qpos[:] = pose
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     mujoco.mj_comVel(model, data)
-    table = bridge._table(model)
-    assert table is not None
-    n, search = table.find(model, data)
-    room = search.arguments[-1].touches
-    touches = room.numpy()
-    touches = touches[touches["weight"] > 0]
-    assert len(touches) > 50
-    ends = _cells(touches, 8)
-    assert n == len(ends) - 1
-    assert n >= 5
-    few: Any = merged(room, ends)
-    np.testing.assert_allclose(few["position"], search.rows[:n, 1:4], atol=1e-12)
-    every, some = (_wrench(each) for each in (touches, few))
-    np.testing.assert_allclose(some[0], every[0], rtol=1e-12, atol=1e-18)
-    np.testing.assert_allclose(some[1], every[1], atol=1e-4 * float(np.linalg.norm(every[0])))
-    for first, end, one in zip(ends, ends[1:], few, strict=False):
-        own, single = _wrench(touches[first:end]), _wrench(one[None])
-        left = own[1] - single[1]
-        assert np.linalg.norm(np.cross(left, one["normal"])) < 1e-12 * np.linalg.norm(own[0])
+    n, search = bridge._table(model).find(model, data)
+    touches = search.arguments[-1].touches
+    touches.zero_()
+    search.launch()
+    touches = touches.numpy()
+    return search.rows[:n], touches[touches["weight"] > 0]
 
 
-def _cells(touches, most):
-    """Where the samples of contacts end: heavy cells at the finest level before there are too many."""
-    light = 0.16 * touches["weight"].sum() / most
+def _shares(touches, most):
+    """Heads, and the part of the load of each sample that each of them has, by the rule of the docs."""
+    loads, scores = touches["weight"], touches["weight"] * touches["precedence"]
+    if len(scores) <= most:
+        return np.arange(len(scores)), np.diag(loads)
+    kept = np.maximum(0, 1 - np.sort(scores)[-most - 1] / scores)
+    heads = np.flatnonzero(kept)
+    x, n = touches["position"], touches["normal"]
+    arms = x - loads @ x / loads.sum()
+    near = 1.5 * (loads @ (arms**2).sum(axis=1) / loads.sum()) / most
+    squares = ((x[heads][:, None] - x) ** 2).sum(axis=2)
+    drawn = kept[heads][:, None] * (np.maximum(1 + n[heads] @ n.T, 1e-3) / (near + squares)) ** 2
+    shares = (1 - kept) * drawn / drawn.sum(axis=0)
+    shares[np.arange(len(heads)), heads] += kept[heads]
+    return heads, shares * loads
 
-    def heavy(level):
-        _, first, cell = np.unique(touches["code"] >> level, return_index=True, return_inverse=True)
-        return first[np.bincount(cell.ravel(), touches["weight"]) >= light]
 
-    level = 24
-    while level > 0 and len(heavy(level - 1)) <= most:
-        level -= 1
-    return np.array([0, *heavy(level)[1:], len(touches)], np.int32)
-
-
-def _wrench(touches):
-    forces = touches["weight"][:, None] * touches["normal"]
+def _wrench(touches, loads):
+    forces = loads[:, None] * touches["normal"]
     return forces.sum(axis=0), np.cross(touches["position"], forces).sum(axis=0)
 
 

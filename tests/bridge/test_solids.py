@@ -93,17 +93,25 @@ def test_heights_are_where_mujocos_rays_meet_the_field():
     assert distances(model, part, np.array([[0.4, 0.0, 0.0]]))[0][0] > 1e100
 
 
-def test_codes_are_those_of_a_tree_of_halves():
-    points = np.random.default_rng(5).normal(size=(1000, 3))
+def test_samples_are_ordered_compactly_and_preceded_evenly():
+    random = np.random.default_rng(5)
+    points = random.normal(size=(1000, 3))
     surface = surface_of(points, points)
-    assert np.all(np.diff(surface.codes) > 0)
-    # Cells of a level share the samples evenly, and are compact.
-    for bits in (1, 2, 3, 4):
-        _, cell, count = np.unique(surface.codes >> (24 - bits), return_inverse=True, return_counts=True)
-        assert len(count) == 2**bits
-        assert count.max() <= 2 * count.min()
-        spread = sum(np.var(surface.points[cell == k], axis=0).sum() * n for k, n in enumerate(count))
-        assert spread < 0.9**bits * 1000 * np.var(surface.points, axis=0).sum()
+
+    def farthest(chosen):
+        """How far samples are from the nearest that is chosen, on average."""
+        way = np.linalg.norm(surface.points[:, None] - surface.points[chosen], axis=2)
+        return way.min(axis=1).mean()
+
+    order = np.argsort(-surface.precedence)
+    ranks = len(order) / surface.precedence[order] ** 2
+    np.testing.assert_allclose(ranks, 1 + np.arange(len(order)))
+    for n in (8, 16, 32, 64, 128):
+        others = [farthest(random.choice(len(order), n, replace=False)) for _ in range(20)]
+        assert farthest(order[:n]) < np.mean(others)
+    # Runs of samples are compact.
+    parts = [surface.points[k : k + 128] for k in range(0, len(order), 128)]
+    assert np.mean([np.var(part, axis=0).sum() for part in parts]) < 0.5 * np.var(points, axis=0).sum()
     for k, (x, y, z, radius) in enumerate(surface.balls):
         own = surface.points[16 * k : 16 * k + 16]
         assert np.linalg.norm(own - [x, y, z], axis=1).max() <= radius + 1e-12

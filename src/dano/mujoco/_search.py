@@ -18,6 +18,10 @@ _BLOCK = 16
 """Samples of a block, as kernels have it."""
 _REALS, _WHOLES = 28, 13
 """Real and whole numbers of a contact, see `dano.mujoco.kernels.tables`."""
+_FLAT = 10.0
+"""A shape with this radius of curvature, in distances between samples, is as a plane to an object's: they
+miss no more than 1/80 of that distance of its depth. Its own samples, which are few, are not asked then.
+Those of a ball turn to what is nearest; with several feet on it, that is one after the other."""
 
 
 class Part(NamedTuple):
@@ -73,7 +77,7 @@ class Known:
         if sampled:
             samples["point"] = np.concatenate([each.points for each in sampled])
             samples["area"] = np.concatenate([each.vectors for each in sampled])
-        codes = np.concatenate([np.zeros(0, np.int64), *(each.codes for each in sampled)])
+        precedence = np.concatenate([np.zeros(0), *(each.precedence for each in sampled)])
         balls = np.concatenate([np.zeros((0, 4)), *(each.balls for each in sampled)])
         solids = structs.Solids()
         solids.leaves = _array(leaves[None], structs.Leaf)
@@ -83,8 +87,9 @@ class Known:
         known.parts, known.index = _array(numbers, tables.Part), _array(index, tables.PartIndex)
         touching = _rows(tables.TouchPair, len(pairs))
         touching["first"], touching["second"] = pairs.T
+        touching["both"] = [not _is_flat(parts[a], parts[b]) for a, b in pairs]
         known.pairs = _array(touching, tables.TouchPair)
-        known.samples, known.codes = _array(samples, tables.Sample), _array(codes.astype(np.int32), None)
+        known.samples, known.precedence = _array(samples, tables.Sample), _array(precedence, tables.real)
         known.balls = _array(balls, tables.vec4)
         runs = np.concatenate([np.zeros((0, 4)), *(each.runs for each in sampled)])
         known.runs = _array(runs, tables.vec4)
@@ -97,6 +102,14 @@ class Known:
 
 def _count(part: Part) -> int:
     return 0 if part.surface is None else len(part.surface.points)
+
+
+def _is_flat(part: Part, object_part: Part) -> bool:
+    """Whether a part is as a plane to the samples of an object."""
+    if object_part.surface is None:
+        return False
+    areas = np.linalg.norm(object_part.surface.vectors, axis=1)
+    return part.solid.bend >= _FLAT * float(np.sqrt(areas.max()))
 
 
 def _number(features: Features, kind: str) -> int:
@@ -187,6 +200,8 @@ class Search:
         work.options = _seen(self.options, tables.Options, 1)
         work.settings = _seen(self.settings, tables.Settings, n)
         work.touches = wp.zeros(max(known.room, 1), dtype=tables.Touch, device="cpu")
+        work.scores = wp.zeros(most + 1, dtype=tables.real, device="cpu")
+        work.heads = wp.zeros(most, dtype=wp.int32, device="cpu")
         work.rows = _seen(self.rows, tables.ContactRow, most * n)
         work.index = _seen(self.wholes, tables.ContactIndex, most * n)
         work.found = _seen(self.found, wp.int32, 1)

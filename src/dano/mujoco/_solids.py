@@ -26,6 +26,7 @@ class Solid(NamedTuple):
         degree: Of the spline.
         planes: Unit outward normal and offset [m] of the faces of a hull, shape (f, 4).
         field: Of a height field, its number.
+        bend: Least radius of curvature of a shape without edges, 0 for others [m].
         error: Why a geom may not touch an object.
     """
 
@@ -37,6 +38,7 @@ class Solid(NamedTuple):
     degree: int = 0
     planes: Float[np.ndarray, "f 4"] | None = None
     field: int = 0
+    bend: float = 0.0
     error: str = ""
 
 
@@ -98,7 +100,8 @@ def _shape(kind: str, make: type[AbstractShape], *size: Any) -> Geom:
     scale = np.ones(3)
     if surface.turning == 2:
         scale = np.broadcast_to(sizes, (3,)) if kind == "ELLIPSOID" else np.full(3, sizes[0])
-    return Geom(Solid(kind, sizes, thickness), surface, scale)
+    bends = {"SPHERE": flat[0], "CAPSULE": flat[0], "ELLIPSOID": flat.min() ** 2 / flat.max()}
+    return Geom(Solid(kind, sizes, thickness, bend=float(bends.get(kind, 0.0))), surface, scale)
 
 
 def _hull(vertices: Float[np.ndarray, "v 3"]) -> Geom:

@@ -1,4 +1,4 @@
-"""Samples of surfaces in blocks, and where each lies in a tree of halves: what contacts are merged by."""
+"""Samples of surfaces in blocks, and an order of them that is spread evenly: what contacts are merged by."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,10 @@ _RUN = 8
 _IN_BLOCK = 4
 """Levels of the tree within a block."""
 _LEVELS = 24
-"""Of the tree, as kernels have it."""
+"""Of the tree of halves."""
+_WITHIN = 0x555555
+"""Which of two halves comes first, by level: in turn the first and the second, so that the first sample of a
+cell lies within it, not at its corner."""
 _TURNING = {"fixed": 0, "axis": 1, "ball": 2}
 """How samples turn with their body, as in `dano.physics.pairs`."""
 _ALONG = 8
@@ -27,7 +30,7 @@ class Surface(NamedTuple):
     Attributes:
         points: [m], or directions on the unit ball, shape (n, 3).
         vectors: Vector areas [m²], zero where the last block is filled up, shape (n, 3).
-        codes: Where samples lie in the tree, ascending, shape (n,).
+        precedence: Root of their number over the place in an order that begins evenly spread, shape (n,).
         balls: Centre and radius [m] of a ball around each block, shape (n / 16, 4).
         runs: The same around each run of eight blocks.
         turning: How samples turn, a number.
@@ -35,7 +38,7 @@ class Surface(NamedTuple):
 
     points: Float[np.ndarray, "n 3"]
     vectors: Float[np.ndarray, "n 3"]
-    codes: Int[np.ndarray, " n"]
+    precedence: Float[np.ndarray, " n"]
     balls: Float[np.ndarray, "b 4"]
     runs: Float[np.ndarray, "r 4"]
     turning: int = 0
@@ -71,7 +74,15 @@ def surface_of(points, vectors, turning: str = "fixed") -> Surface:
     balls = np.concatenate([centers, np.asarray(blocks.radii, np.float64)[:, None]], axis=1)
     balls = balls[order]
     runs = np.array([_around(balls[k : k + _RUN]) for k in range(0, len(balls), _RUN)])
-    return Surface(x[row], a[row], np.concatenate(codes), balls, runs, _TURNING[turning])
+    return Surface(x[row], a[row], _precedence(np.concatenate(codes)), balls, runs, _TURNING[turning])
+
+
+def _precedence(codes: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """By codes of a tree of halves read backwards: each half has every other place, and so on within it."""
+    codes = codes ^ _WITHIN
+    backwards = sum(((codes >> k) & 1) << (_LEVELS - 1 - k) for k in range(_LEVELS))
+    place = np.argsort(np.argsort(backwards, kind="stable"), kind="stable")
+    return np.sqrt(len(codes) / (1.0 + place))
 
 
 def _around(balls: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "4"]:

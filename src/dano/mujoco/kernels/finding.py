@@ -9,7 +9,7 @@ import warp as wp
 
 from dano.mujoco.kernels.merging import merge
 from dano.mujoco.kernels.mixing import pair_settings
-from dano.mujoco.kernels.solids import part_clearance, part_distance, UNKNOWN
+from dano.mujoco.kernels.solids import part_clearance, part_distance, quick_clearance, UNKNOWN
 from dano.mujoco.kernels.tables import BLOCK, Data, Known, Model, Part, PartIndex, RUN, Touch, Work
 from dano.physics.pairs import approach, BodyState, facing_direction, pair_pose, PairPose, rotation_after
 from dano.physics.real import HALF, INFINITY, mat33, ONE, real, vec3, vec4, ZERO
@@ -261,8 +261,6 @@ def list_side(
         reach = margin + way
     points = pose.points
     origin = pose.origin
-    # MuJoCo's planes are normal to their z axis.
-    flat = side.other.solid == _HALF_SPACE
     at = int(begin)
     block = int(side.index.first_block)
     last = block + side.index.blocks
@@ -272,10 +270,10 @@ def list_side(
             for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
                 sample = known.samples[s]
                 x = points * sample.point + origin
-                # What lies over a plane, as most samples near one do, is passed without a call.
+                # Most samples of a near block are not near.
                 d = Distance()
-                d.value = x[2]
-                if not flat or x[2] <= reach:
+                d.value = quick_clearance(known, side.other, x)
+                if d.value <= reach:
                     d = part_distance(known, model, side.other, x)
                 if d.value <= reach:
                     normal = solid_normal(d.gradient)
@@ -291,7 +289,7 @@ def list_side(
                             depth = wp.max(depth, -end)
                         if depth > ZERO:
                             touch.weight = area * depth
-                            touch.code = known.codes[s]
+                            touch.precedence = known.precedence[s]
                             touch.presses = wp.where(early or over < ZERO, 1, 0)
                             work.touches[at] = touch
                             at += 1
@@ -338,7 +336,7 @@ def list_pair(known: Known, model: Model, data: Data, work: Work, pair: int, beg
         side.sign = ONE
         n = list_side(known, model, work, side, settings.margin, settings.gap, sink, way, h, 0)
     both = int(n)
-    if side.other.blocks > 0 and side.index.solid >= 0:
+    if known.pairs[pair].both == 1 and side.other.blocks > 0 and side.index.solid >= 0:
         flipped = Side()
         flipped.part = part
         flipped.index = side.other
@@ -347,15 +345,9 @@ def list_pair(known: Known, model: Model, data: Data, work: Work, pair: int, beg
         flipped.b = side.a
         flipped.sign = -ONE
         both = list_side(known, model, work, flipped, settings.margin, settings.gap, sink, way, h, n)
-    most = int(options.most)
-    # Each side has half of the contacts, or what the other leaves.
-    of_second = wp.min(both - n, wp.max(most // 2, most - n))
-    at = begin
-    if n > 0:
-        at = merge(work, at, 0, n, most - of_second, settings, side.other, side.index, sink, h)
-    if both > n:
-        at = merge(work, at, n, both, of_second, settings, side.other, side.index, sink, h)
-    return at
+    if both == 0:
+        return begin
+    return merge(work, begin, 0, both, int(options.most), settings, side.other, side.index, sink, h)
 
 
 @wp.kernel(enable_backward=False)

@@ -1,9 +1,16 @@
-"""A few contacts in the place of many samples: with the same wrench, and the same from step to step.
+"""A few contacts in the place of many samples: with the same wrench, and without jumps.
 
-Samples lie in a tree of halves of their surface. The finest level of the tree at which few enough of its
-heavy cells touch says which samples go together; light cells go with others. So it stays from step to step.
-Pressures are as depths: a cell has the force Σ w n with w = area · depth, where its moment is that of
-its samples, but for the part along the force.
+Where more samples touch than there may be contacts, some of them are *heads*, each of one contact. A sample
+scores by its load w = area · depth times its precedence, which spreads heads over the surface. With θ the
+first score that is too low, a sample with score s keeps the share f = max(0, 1 − θ/s) of its load. Heads are
+those with f > 0. What is not kept goes to the heads, in proportion to
+
+    f_k ((1 + n_i · n_k) / (ε² + |x_i − x_k|²))²
+
+with ε about half of the distance between heads. So all that MuJoCo is told is a continuous function of the
+state: loads begin at zero, heads at f = 0, and with as many samples as contacts each keeps all of its load.
+Pressures are as depths: a contact has the force Σ w n of its share, where its moment is that of the share,
+but for the part along the force.
 """
 
 import warp as wp
@@ -12,54 +19,77 @@ from dano.mujoco.kernels.mixing import in_parallel, softened
 from dano.mujoco.kernels.tables import ContactIndex, ContactRow, PartIndex, Settings, Touch, vec9, Work
 from dano.physics.real import HALF, ONE, real, vec3, ZERO
 
-BITS = 24
-"""Depth of the tree."""
-
-_BITS = wp.constant(BITS)
-# Share of the mean load of a contact below which a cell goes with the one before it. What just begins to
-# touch then changes little, and not which samples go together.
-_LIGHT = wp.constant(real(0.16))
+# ε² is so much of the mean square of the distance of loads to their centre, over the number of contacts:
+# heads in a disc are √(2π / most) of its root apart.
+_SPREAD = wp.constant(real(1.5))
+# Least of the factor of normals, so that a sample against which all heads are turned goes somewhere.
+_AGAINST = wp.constant(real(1e-3))
 
 
 @wp.func
-def cell_end(touches: wp.array(dtype=Touch), begin: int, end: int, level: int) -> tuple[int, real]:
-    """The end of the cell that begins at a touch, and its weight [m³]; `level`: bits of codes left out."""
-    cell = touches[begin].code >> level
+def too_low(work: Work, begin: int, end: int, most: int) -> real:
+    """θ, the first score after so many others [m³]."""
+    for k in range(most + 1):
+        work.scores[k] = ZERO
+    for i in range(begin, end):
+        score = work.touches[i].weight * work.touches[i].precedence
+        k = int(most)
+        if score > work.scores[k]:
+            while k > 0 and score > work.scores[wp.max(k - 1, 0)]:
+                work.scores[k] = work.scores[k - 1]
+                k -= 1
+            work.scores[k] = score
+    return work.scores[most]
+
+
+@wp.func
+def spread_of(touches: wp.array(dtype=Touch), begin: int, end: int) -> real:
+    """Mean square of the distance of loads to their centre [m²]."""
     weight = ZERO
-    i = int(begin)
-    inside = bool(True)
-    while inside:
+    first = vec3()
+    for i in range(begin, end):
         weight += touches[i].weight
-        i += 1
-        inside = i < end
-        if inside:
-            inside = touches[i].code >> level == cell
-    return i, weight
+        first += touches[i].weight * touches[i].position
+    centre = first / weight
+    second = ZERO
+    for i in range(begin, end):
+        arm = touches[i].position - centre
+        second += touches[i].weight * wp.dot(arm, arm)
+    return second / weight
+
+
+@wp.func(inline=True)
+def pull(head: Touch, touch: Touch, near: real) -> real:
+    """How much of a sample a head draws, beside others; `near`: ε² [m²]."""
+    arm = touch.position - head.position
+    facing = wp.max(ONE + wp.dot(touch.normal, head.normal), _AGAINST)
+    closeness = facing / (near + wp.dot(arm, arm))
+    return head.kept * closeness * closeness
 
 
 @wp.func
-def heavy_cells(touches: wp.array(dtype=Touch), begin: int, end: int, level: int, least: real) -> int:
-    """How many cells of a level weigh at least so much [m³]."""
-    cells = int(0)
-    i = int(begin)
-    while i < end:
-        i, weight = cell_end(touches, i, end, level)
-        if weight >= least:
-            cells += 1
-    return cells
+def find_heads(work: Work, begin: int, end: int, most: int) -> int:
+    """Say of each sample what it keeps, and list heads; how many."""
+    low = too_low(work, begin, end, most)
+    heads = int(0)
+    for i in range(begin, end):
+        score = work.touches[i].weight * work.touches[i].precedence
+        kept = ZERO
+        if score > low:
+            kept = ONE - low / score
+            work.heads[heads] = i
+            heads += 1
+        work.touches[i].kept = kept
+    return heads
 
 
 @wp.func
-def level_of(touches: wp.array(dtype=Touch), begin: int, end: int, most: int, least: real) -> int:
-    """The finest level before there are more heavy cells than so many."""
-    level = int(_BITS)
-    searching = bool(True)
-    while searching and level > 0:
-        if heavy_cells(touches, begin, end, level - 1, least) > most:
-            searching = False
-        else:
-            level -= 1
-    return level
+def pull_on(work: Work, touch: Touch, heads: int, near: real) -> real:
+    """How much all heads draw a sample."""
+    total = ZERO
+    for k in range(heads):
+        total += pull(work.touches[work.heads[k]], touch, near)
+    return total
 
 
 @wp.func
@@ -74,38 +104,45 @@ def tangents(n: vec3) -> vec9:
 
 
 @wp.func
-def cell_touch(touches: wp.array(dtype=Touch), begin: int, end: int) -> Touch:
-    """One touch for several: its weight times its normal is their force."""
+def led_touch(work: Work, head: int, begin: int, end: int, near: real) -> tuple[Touch, real]:
+    """One touch for the share of a head, and the number of samples that it stands for, (Σw)²/Σw².
+
+    Its weight times its normal is their force. It presses if one of them does.
+    """
+    merged = work.touches[head]
     weight = ZERO
+    squares = ZERO
     force = vec3()
     moment = vec3()
     place = vec3()
     gap = ZERO
     nearing = ZERO
-    heaviest = int(begin)
     for i in range(begin, end):
-        touch = touches[i]
-        w = touch.weight
+        touch = work.touches[i]
+        w = (ONE - touch.kept) * pull(merged, touch, near) / touch.drawn
+        if i == head:
+            w += touch.kept
+        squares += w * touch.weight * touch.weight
+        w = w * touch.weight
+        arm = touch.position - merged.position
         weight += w
         force += w * touch.normal
-        moment += w * wp.cross(touch.position, touch.normal)
-        place += w * touch.position
+        moment += w * wp.cross(arm, touch.normal)
+        place += w * arm
         gap += w * touch.gap
         nearing += w * touch.nearing
-        if w > touches[heaviest].weight:
-            heaviest = i
-    merged = touches[heaviest]
+        merged.presses = wp.max(merged.presses, touch.presses)
     squared = wp.dot(force, force)
-    # Where normals oppose each other, no one contact does what they do.
-    if squared > HALF * HALF * weight * weight and end - begin > 1:
+    # Where normals oppose each other, no one contact does what they do, and the head stands for itself.
+    if squared > HALF * HALF * weight * weight:
         place = place / weight
         moment -= wp.cross(place, force)
         merged.weight = wp.sqrt(squared)
-        merged.position = place + wp.cross(force, moment) / squared
+        merged.position += place + wp.cross(force, moment) / squared
         merged.normal = force / merged.weight
         merged.gap = gap / weight
         merged.nearing = nearing / weight
-    return merged
+    return merged, weight * weight / squares
 
 
 @wp.func
@@ -151,32 +188,6 @@ def write(
 
 
 @wp.func
-def write_cell(
-    work: Work,
-    at: int,
-    begin: int,
-    end: int,
-    settings: Settings,
-    a: PartIndex,
-    b: PartIndex,
-    sink: real,
-    h: real,
-):
-    """Touches as one contact of MuJoCo, as compliant as all of them: their number is (Σw)²/Σw²."""
-    presses = bool(False)
-    weight = ZERO
-    squared = ZERO
-    for i in range(begin, end):
-        w = work.touches[i].weight
-        weight += w
-        squared += w * w
-        if work.touches[i].presses == 1:
-            presses = True
-    stiff = in_parallel(settings, weight * weight / squared)
-    write(work, at, cell_touch(work.touches, begin, end), presses, stiff, a, b, sink, h)
-
-
-@wp.func
 def merge(
     work: Work,
     at: int,
@@ -189,23 +200,19 @@ def merge(
     sink: real,
     h: real,
 ) -> int:
-    """Write the touches of one surface as contacts, from a row on; the row beyond the last."""
-    total = ZERO
-    for k in range(begin, end):
-        total += work.touches[k].weight
-    least = _LIGHT * total / real(most)
-    level = level_of(work.touches, begin, end, most, least)
-    first = int(begin)
-    heavy = bool(False)
-    i = int(begin)
-    while i < end:
-        following, weight = cell_end(work.touches, i, end, level)
-        if weight >= least:
-            if heavy:
-                write_cell(work, at, first, i, settings, a, b, sink, h)
-                at += 1
-                first = i
-            heavy = True
-        i = following
-    write_cell(work, at, first, end, settings, a, b, sink, h)
-    return at + 1
+    """Write touches as contacts, from a row on; the row beyond the last."""
+    if end - begin <= most:
+        for i in range(begin, end):
+            touch = work.touches[i]
+            write(work, at, touch, touch.presses == 1, settings, a, b, sink, h)
+            at += 1
+        return at
+    heads = find_heads(work, begin, end, most)
+    near = _SPREAD * spread_of(work.touches, begin, end) / real(most)
+    for i in range(begin, end):
+        work.touches[i].drawn = pull_on(work, work.touches[i], heads, near)
+    for k in range(heads):
+        touch, samples = led_touch(work, work.heads[k], begin, end, near)
+        write(work, at, touch, touch.presses == 1, in_parallel(settings, samples), a, b, sink, h)
+        at += 1
+    return at

@@ -5,13 +5,14 @@ import warp as wp
 from dano.mujoco.kernels.tables import Known, Model, PartIndex
 from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
 from dano.physics.solids.distances import leaf_clearance, leaf_distance
-from dano.physics.solids.leaves import Distance, ELLIPSOID
+from dano.physics.solids.leaves import Distance, ELLIPSOID, HALF_SPACE
 
 HULL, HEIGHTS, NONE, UNKNOWN = 100, 101, -1, -2
 """Kinds of solids besides those of `dano.physics.solids.leaves`: convex hulls of meshes; height fields; none;
 those of geoms that may not touch an object."""
 
-_HULL, _HEIGHTS, _ELLIPSOID = wp.constant(HULL), wp.constant(HEIGHTS), wp.constant(ELLIPSOID)
+_HULL, _HEIGHTS = wp.constant(HULL), wp.constant(HEIGHTS)
+_ELLIPSOID, _HALF_SPACE = wp.constant(ELLIPSOID), wp.constant(HALF_SPACE)
 
 
 @wp.func(inline=True)
@@ -82,6 +83,20 @@ def part_distance(known: Known, model: Model, part: PartIndex, x: vec3) -> Dista
 
 
 @wp.func(inline=True)
+def quick_clearance(known: Known, part: PartIndex, x: vec3) -> real:
+    """A lower bound on the distance of a part's solid [m] where that takes far less than the distance."""
+    bound = real(-INFINITY)
+    if part.solid == _HALF_SPACE:
+        # MuJoCo's planes are normal to their z axis.
+        bound = x[2]
+    elif part.solid == _ELLIPSOID:
+        # |y / a| grows by no more than 1 / min a along any way, and no root has to be found for it.
+        a = known.solids.leaves[0, part.at].sizes
+        bound = wp.min(a[0], wp.min(a[1], a[2])) * (wp.length(wp.cw_div(x, a)) - ONE)
+    return bound
+
+
+@wp.func(inline=True)
 def part_clearance(known: Known, model: Model, part: PartIndex, x: vec3) -> real:
     """A lower bound on the distance of a part's solid [m]."""
     bound = ZERO
@@ -91,10 +106,7 @@ def part_clearance(known: Known, model: Model, part: PartIndex, x: vec3) -> real
         # Heights are at most 1 of their scale.
         bound = x[2] - model.hfield_size[part.at][2]
     elif part.solid == _ELLIPSOID:
-        # |y / a| grows by no more than 1 / min a along any way, and no root has to be found for it.
-        leaf = known.solids.leaves[0, part.at]
-        a = leaf.sizes
-        bound = wp.min(a[0], wp.min(a[1], a[2])) * (wp.length(wp.cw_div(x, a)) - ONE)
+        bound = quick_clearance(known, part, x)
     else:
         bound = leaf_clearance(
             known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x

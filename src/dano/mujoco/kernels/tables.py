@@ -72,10 +72,17 @@ class PartIndex:
 
 @wp.struct
 class TouchPair:
-    """Two parts that may touch; the second is an object."""
+    """Two parts that may touch; the second is an object.
+
+    Attributes:
+        first: Part.
+        second: Part.
+        both: 1 where samples of the first are asked, too.
+    """
 
     first: wp.int32
     second: wp.int32
+    both: wp.int32
 
 
 @wp.struct
@@ -87,7 +94,7 @@ class Known:
         index: Shape (p,).
         pairs: Shape (k,).
         samples: Of all parts, in blocks.
-        codes: Where each sample lies in a tree of halves: samples with the same leading bits lie together.
+        precedence: Of each sample as a head of others, see `dano.mujoco.kernels.merging`.
         balls: Centre and radius [m] of a ball around each block.
         runs: The same around each run of blocks.
         solids: Sampled distances and shapes.
@@ -99,7 +106,7 @@ class Known:
     index: wp.array(dtype=PartIndex)
     pairs: wp.array(dtype=TouchPair)
     samples: wp.array(dtype=Sample)
-    codes: wp.array(dtype=wp.int32)
+    precedence: wp.array(dtype=real)
     balls: wp.array(dtype=vec4)
     runs: wp.array(dtype=vec4)
     solids: Solids
@@ -193,7 +200,9 @@ class Touch:
         normal: From the first part to the second [W].
         gap: Between the surfaces, negative where they overlap [m].
         nearing: Speed at which the gap closes [m/s].
-        code: See `Known.codes`.
+        precedence: See `Known`.
+        kept: Share of its weight that it keeps.
+        drawn: How much heads draw it; both see `dano.mujoco.kernels.merging`.
         presses: 0 where it only counts as near.
     """
 
@@ -202,7 +211,9 @@ class Touch:
     normal: vec3
     gap: real
     nearing: real
-    code: wp.int32
+    precedence: real
+    kept: real
+    drawn: real
     presses: wp.int32
 
 
@@ -247,6 +258,8 @@ class Work:
         options: Shape (1,).
         settings: Shape (k,), see `Options`.
         touches: Room for the samples of a pair that touch.
+        scores: Room for the highest of them, shape (most + 1,).
+        heads: Room for which of them are heads, shape (most,).
         rows: The contacts.
         index: The same.
         found: Number of contacts, or −1 where sizes of geoms differ from those that are known; shape (1,).
@@ -255,6 +268,8 @@ class Work:
     options: wp.array(dtype=Options)
     settings: wp.array(dtype=Settings)
     touches: wp.array(dtype=Touch)
+    scores: wp.array(dtype=real)
+    heads: wp.array(dtype=wp.int32)
     rows: wp.array(dtype=ContactRow)
     index: wp.array(dtype=ContactIndex)
     found: wp.array(dtype=wp.int32)
