@@ -168,6 +168,25 @@ def test_directions_and_worlds(heap):
     np.testing.assert_allclose(reverse[0], alone, rtol=1e-12, atol=1e-15)
 
 
+def test_derivatives_on_a_grid():
+    """A ball that rolls on a sampled one: forward mode, reverse mode and differences."""
+    bodies = [
+        dano.Body("ball", dano.Sphere(0.02), mass=0.3),
+        dano.Body("grid", grid("quadratic"), fixed=True),
+    ]
+    scene = dano.Scene.create(bodies, [dano.Contact("ball", "grid")], timestep=H)
+    state = scene.initial_state(ball=dict(position=(0.003, 0.002, 0.0598), velocity=(0.1, 0, 0)))
+
+    def end(speed):
+        moved = eqx.tree_at(lambda s: s.velocity, state, state.velocity.at[0].add(speed))
+        return dano.simulate(scene, moved, 3).states.velocity[-1, 0]
+
+    forward, reverse = jax.jit(jax.jacfwd(end))(jnp.zeros(3)), jax.jit(jax.jacrev(end))(jnp.zeros(3))
+    np.testing.assert_allclose(forward, reverse, rtol=1e-8, atol=1e-10)
+    differences = [(end(1e-6 * unit) - end(-1e-6 * unit)) / 2e-6 for unit in jnp.eye(3)]
+    np.testing.assert_allclose(forward, jnp.stack(differences, axis=1), rtol=1e-5, atol=1e-6)
+
+
 def test_second_derivatives_are_refused(heap):
     """By one error that says what to do instead."""
     scene, states = heap

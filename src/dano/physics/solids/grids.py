@@ -190,7 +190,11 @@ def grid_distance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec
     u = place_in_grid(leaf, y)
     closest = closest_in_grid(kind, u)
     away = wp.cw_mul(u - closest, leaf.spacing)
-    beyond = wp.sqrt(wp.dot(away, away))
+    squared = wp.dot(away, away)
+    beyond = ZERO
+    # A root has no derivative at zero.
+    if squared > ZERO:
+        beyond = wp.sqrt(squared)
     d = spline_distance(solids, world, kind, leaf, u, closest)
     d.gradient = d.gradient + inverse_or_zero(beyond) * away
     d.value += beyond
