@@ -35,8 +35,7 @@ class Point:
         arm: From the first body's centre of mass to the point [m].
         normal: Unit normal out of the second body, toward the first.
         moment: Moment of a unit pressure about the first body's centre of mass [m]: arm × normal, without
-        what
-            a body that rolls on a smooth surface would feel of single samples.
+            what a body that rolls on a smooth surface would feel of single samples.
         extra_slip: What is added to the slip [m/s]: the part along the surface of half the change of the
             point's velocity within the step, for samples that keep facing the second body.
         depth: Below the second body's surface at the end of the step if nothing moved in it [m].

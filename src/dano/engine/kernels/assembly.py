@@ -315,8 +315,6 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
                     missed = wp.abs(change[0]) + wp.abs(change[1]) + wp.abs(change[2])
                     fit.unfit += weight * (missed + wp.abs(linear.pressure.change))
                     fit.push += weight * linear.pressure.value
-        if lane == 0 and room.wrenches.shape[1] > 0:
-            room.wrenches[world, f] = vec6()
         if total(presses) > ZERO:
             wrench = total6(wrench)
             jacobian = total66(whole_jacobian(quarters))

@@ -3,11 +3,12 @@
 import warp as wp
 
 from dano.engine.kernels.lanes import wait
-from dano.engine.kernels.rollout import begin_first_step, Launch
+from dano.engine.kernels.rollout import begin_unpushed, Launch
 from dano.engine.kernels.search import find_contacts
 from dano.engine.kernels.tables import Room, Scene
 from dano.physics.features import LANES
-from dano.physics.real import real, vec3
+from dano.physics.real import real
+from dano.physics.samples import Point
 
 _LANES = wp.constant(LANES)
 
@@ -23,14 +24,7 @@ class ListedPoint:
         sample: Index of the sample.
         share: Share of the step after which geometry was taken.
         impact_stiffness: Of an impact [Pa/m].
-        arm: [m, W].
-        normal: [W].
-        moment: [m, W].
-        extra_slip: [m/s, W].
-        depth: [m].
-        rate: [m/s].
-        approach: [m/s].
-        area: [m²].
+        point: The point.
     """
 
     first: real
@@ -39,14 +33,7 @@ class ListedPoint:
     sample: real
     share: real
     impact_stiffness: real
-    arm: vec3
-    normal: vec3
-    moment: vec3
-    extra_slip: vec3
-    depth: real
-    rate: real
-    approach: real
-    area: real
+    point: Point
 
 
 @wp.struct
@@ -62,7 +49,7 @@ def listing(scene: Scene, room: Room, launch: Launch, listing: Listing):
     """The points that may press within a step from `launch.state`."""
     block, lane = wp.tid()
     world = launch.first_world + block
-    begin_first_step(scene, room, world, lane, launch)
+    begin_unpushed(scene, room, world, lane, launch, 0)
     n_found, overflow = find_contacts(scene, room, world, lane)
     wait()
     # Lists of lanes stand one after the other in the room, and without gaps among the rows.
@@ -85,7 +72,6 @@ def listing(scene: Scene, room: Room, launch: Launch, listing: Listing):
         found = room.found[world, f * _LANES + lane]
         index = scene.pair_index[found.pair]
         for k in range(found.first, found.end):
-            point = room.points[world, k]
             row = ListedPoint()
             row.first = real(index.first)
             row.second = real(index.second)
@@ -93,14 +79,7 @@ def listing(scene: Scene, room: Room, launch: Launch, listing: Listing):
             row.sample = real(room.where[world, k].sample)
             row.share = found.share
             row.impact_stiffness = found.impact_stiffness
-            row.arm = point.arm
-            row.normal = point.normal
-            row.moment = point.moment
-            row.extra_slip = point.extra_slip
-            row.depth = point.depth
-            row.rate = point.rate
-            row.approach = point.approach
-            row.area = point.area
+            row.point = room.points[world, k]
             at = shift + k - lane * per_lane
             if at < listing.points.shape[1]:
                 listing.points[world, at] = row

@@ -80,6 +80,24 @@ class Launch:
 
 
 @wp.func
+def row_before(scene: Scene, launch: Launch, world: int, t: int, i: int) -> StateRow:
+    """State of a body at the start of a step."""
+    n = scene.body_index.shape[0]
+    if t == 0:
+        return launch.state[world, i]
+    return launch.states[world, (t - 1) * n + i]
+
+
+@wp.func
+def push_of(scene: Scene, launch: Launch, world: int, t: int, i: int) -> Push:
+    """Control of a body in a step; none where there are no pushes."""
+    push = Push()
+    if launch.pushes.shape[1] > 0:
+        push = launch.pushes[world, t * scene.body_index.shape[0] + i]
+    return push
+
+
+@wp.func
 def begin_body(scene: Scene, room: Room, world: int, i: int, row: StateRow, push: Push) -> real:
     """What is known of a body at the start of a step; returns the size of its velocities."""
     h = scene.timestep[world, 0]
@@ -244,17 +262,45 @@ def begin_step_of_trees(scene: Scene, room: Room, world: int, launch: Launch, t:
 
 
 @wp.func
-def begin_first_step(scene: Scene, room: Room, world: int, lane: int, launch: Launch):
-    """What is known at `launch.state`, without controls."""
+def begin_unpushed(scene: Scene, room: Room, world: int, lane: int, launch: Launch, t: int):
+    """What is known at the start of a step that was not, or need not be, pushed."""
     for i in range(scene.body_index.shape[0]):
         push = Push()
-        begin_body(scene, room, world, i, launch.state[world, i], push)
+        begin_body(scene, room, world, i, row_before(scene, launch, world, t, i), push)
     wait()
     if wp.static(TREES):
         if lane == 0:
-            begin_coordinates(scene, room, world, launch, 0)
-            begin_step_of_trees(scene, room, world, launch, 0)
+            begin_coordinates(scene, room, world, launch, t)
+            begin_step_of_trees(scene, room, world, launch, t)
         wait()
+
+
+@wp.func
+def find_touching(scene: Scene, room: Room, world: int, lane: int) -> tuple[int, int, bool]:
+    """What may press within a step, listed in `room.found`: pairs with points, then patches that touch.
+
+    Returns:
+        Number of pairs with points, of all that are listed, and whether there were more points than there is
+        room for.
+    """
+    n_found = int(0)
+    overflow = bool(False)
+    if wp.static(POINTS):
+        n_found, overflow = find_contacts(scene, room, world, lane)
+    n_near = n_found
+    if wp.static(PATCHES):
+        n_near = find_patches(scene, room, world, lane, n_found)
+    wait()
+    return n_found, n_near, overflow
+
+
+@wp.func
+def any_hits(room: Room, world: int, lane: int, n_found: int) -> bool:
+    """Whether one of the pairs with points has an impact."""
+    hits = bool(False)
+    for f in range(n_found):
+        hits = hits or room.found[world, f * _LANES + lane].impact_stiffness > ZERO
+    return hits
 
 
 @wp.func
@@ -288,12 +334,8 @@ def rollout(scene: Scene, room: Room, launch: Launch):
     for t in range(launch.n_steps):
         size = real(0.0)
         for i in range(n):
-            row = launch.state[world, i]
-            if t > 0:
-                row = launch.states[world, (t - 1) * n + i]
-            push = Push()
-            if launch.pushes.shape[1] > 0:
-                push = launch.pushes[world, t * n + i]
+            row = row_before(scene, launch, world, t, i)
+            push = push_of(scene, launch, world, t, i)
             size = wp.max(size, begin_body(scene, room, world, i, row, push))
         wait()
         if wp.static(TREES):
@@ -303,19 +345,10 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                 begin_step_of_trees(scene, room, world, launch, t)
             wait()
             size = wp.max(size, room.trees.sizes[world, 0])
-        n_found = int(0)
-        overflow = bool(False)
-        if wp.static(POINTS):
-            n_found, overflow = find_contacts(scene, room, world, lane)
-        n_near = n_found
-        if wp.static(PATCHES):
-            n_near = find_patches(scene, room, world, lane, n_found)
-        wait()
+        n_found, n_near, overflow = find_touching(scene, room, world, lane)
         if lane == 0:
             find_pattern(scene, room, world, n_near)
-        hits = bool(False)
-        for f in range(n_found):
-            hits = hits or room.found[world, f * _LANES + lane].impact_stiffness > ZERO
+        hits = any_hits(room, world, lane, n_found)
         # A solve that cycles returns its best velocities: from there, with fitting duals, most converge.
         attempt = int(0)
         restarts = int(0)
@@ -355,9 +388,7 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                     report.solved = ZERO
             launch.reports[world, t] = report
             for i in range(n):
-                row = launch.state[world, i]
-                if t > 0:
-                    row = launch.states[world, (t - 1) * n + i]
+                row = row_before(scene, launch, world, t, i)
                 launch.states[world, t * n + i] = advance_body(scene, room, world, i, row)
             if wp.static(TREES):
                 advance_trees(scene, room, world, launch, t)

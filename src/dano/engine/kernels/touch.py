@@ -4,15 +4,14 @@ import warp as wp
 
 from dano.engine.kernels.derivatives.equations import settle
 from dano.engine.kernels.lanes import total, total3, wait
-from dano.engine.kernels.patches import contact_of, find_patches
-from dano.engine.kernels.rollout import begin_first_step, Launch, REBOUNDS
-from dano.engine.kernels.search import find_contacts
+from dano.engine.kernels.patches import contact_of
+from dano.engine.kernels.rollout import any_hits, begin_unpushed, find_touching, Launch, REBOUNDS
 from dano.engine.kernels.solve import newton_step
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.kinematics import unknown_of
-from dano.physics.features import LANES, PATCHES, POINTS, TREES
+from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.overlap import Patch
-from dano.physics.real import INFINITY, ONE, real, vec3, vec6, ZERO
+from dano.physics.real import ONE, real, vec3, vec6, ZERO
 from dano.physics.twists import angular_part, linear_part
 
 _LANES, _REBOUNDS = wp.constant(LANES), wp.constant(REBOUNDS)
@@ -91,13 +90,11 @@ def touch(scene: Scene, room: Room, launch: Launch, seen: Seen):
     """Overlaps at `launch.state`, in which nothing moves."""
     block, lane = wp.tid()
     world = launch.first_world + block
-    begin_first_step(scene, room, world, lane, launch)
+    begin_unpushed(scene, room, world, lane, launch, 0)
     for p in range(lane, seen.overlaps.shape[1], _LANES):
         seen.overlaps[world, p] = Overlap()
     wait()
-    n_found = int(0)
-    if wp.static(POINTS):
-        n_found, _overflow = find_contacts(scene, room, world, lane)
+    n_found, _n_near, _overflow = find_touching(scene, room, world, lane)
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
         place = room.bodies[world, scene.pair_index[found.pair].first].position
@@ -108,8 +105,6 @@ def touch(scene: Scene, room: Room, launch: Launch, seen: Seen):
         if lane == 0:
             seen.overlaps[world, found.pair] = own
     if wp.static(PATCHES):
-        find_patches(scene, room, world, lane, n_found)
-        wait()
         for p in range(room.patches.count[world, 0]):
             touching = room.found[world, (n_found + p) * _LANES]
             if lane == 0:
@@ -139,8 +134,6 @@ def settle_with(scene: Scene, room: Room, launch: Launch, world: int, lane: int,
     """The step at its end, with a share of the restitution; returns the number of pairs that are near."""
     if lane == 0:
         launch.reports[world, 0].rebound = rebound
-        for k in range(room.wrenches.shape[1]):
-            room.wrenches[world, k] = vec6()
         for k in range(launch.forces.shape[1]):
             launch.forces[world, k] = vec6()
     wait()
@@ -161,23 +154,20 @@ def press(scene: Scene, room: Room, launch: Launch, seen: Seen):
     h = scene.timestep[world, 0]
     for p in range(lane, seen.wrenches.shape[1], _LANES):
         seen.wrenches[world, p] = Wrench()
-    best = real(INFINITY)
-    chosen = real(1.0)
-    hits = bool(True)
-    attempt = int(0)
-    while hits and attempt <= _REBOUNDS:
-        rebound = ONE - real(attempt) / real(_REBOUNDS)
-        n_found = settle_with(scene, room, launch, world, lane, rebound)
-        missed = misses(scene, room, world, lane)
-        if missed < best:
-            best = missed
-            chosen = rebound
-        meets = bool(False)
-        for f in range(n_found):
-            meets = meets or room.found[world, f * _LANES + lane].impact_stiffness > ZERO
-        hits = meets
-        attempt += 1
-    n_found = settle_with(scene, room, launch, world, lane, chosen)
+    n_found = settle_with(scene, room, launch, world, lane, ONE)
+    if any_hits(room, world, lane, n_found):
+        best = misses(scene, room, world, lane)
+        chosen = real(1.0)
+        attempt = int(1)
+        while attempt <= _REBOUNDS:
+            rebound = ONE - real(attempt) / real(_REBOUNDS)
+            settle_with(scene, room, launch, world, lane, rebound)
+            missed = misses(scene, room, world, lane)
+            if missed < best:
+                best = missed
+                chosen = rebound
+            attempt += 1
+        n_found = settle_with(scene, room, launch, world, lane, chosen)
     if lane == 0:
         for f in range(n_found):
             seen.wrenches[world, room.found[world, f * _LANES].pair] = wrench_of(room.wrenches[world, f], h)

@@ -171,7 +171,7 @@ def scene_tables(scene: Scene) -> Tables:
         "scene.solids.leaves": of_leaves.rows,
         "scene.solids.coefficients": of_leaves.coefficients,
         "scene.pairs": pair_rows,
-        "scene.materials": _materials(scene, dtype),
+        "scene.materials": _materials(scene, kernels, dtype),
         "scene.gravity": scene.gravity[None].astype(dtype),
         "scene.timestep": scene.timestep[None, None],
     }
@@ -197,14 +197,14 @@ def _extent(body: Body) -> Float[Array, "6"]:
     return jnp.zeros(6) if body.extent is None else body.extent
 
 
-def _materials(scene: Scene, dtype: DTypeLike) -> Float[Array, "contacts 13"]:
+def _materials(scene: Scene, kernels: ModuleType, dtype: DTypeLike) -> Float[Array, "contacts 13"]:
     groups = [(c.law, c.params) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
     if scene.others is not None:
         groups.append((scene.others.law, scene.others.pair_params))
     if not groups:
         return jnp.zeros((0, len(Material._fields)), dtype)
     gravity = jnp.sqrt(jnp.sum(scene.gravity**2))
-    return jnp.stack(materials(groups, scene.timestep, gravity), axis=1)
+    return packed(kernels.Material, **materials(groups, scene.timestep, gravity)._asdict())
 
 
 def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):

@@ -3,8 +3,8 @@
 import warp as wp
 
 from dano.engine.kernels.derivatives.adjoint import advance_work, momentum_work, state_work
-from dano.engine.kernels.rollout import Launch
-from dano.engine.kernels.tables import Changes, Push, Room, Scene, StateRow
+from dano.engine.kernels.rollout import Launch, push_of
+from dano.engine.kernels.tables import Changes, Room, Scene, StateRow
 from dano.physics.features import TREES
 from dano.physics.pairs import BodyState
 from dano.physics.real import vec6, ZERO
@@ -61,9 +61,7 @@ def pull_momentum(
     n = scene.body_index.shape[0]
     b = block_of(scene, scene.body_index[i].row)
     body = scene.bodies[world, i]
-    push = Push()
-    if launch.pushes.shape[1] > 0:
-        push = launch.pushes[world, t * n + i]
+    push = push_of(scene, launch, world, t, i)
     by_body, by_row, by_push, by_gravity, by_h, _a, _b = wp.grad(momentum_work)(
         body, row, push, scene.gravity[world, 0], h, room.velocity[world, b], room.step[world, b]
     )
@@ -103,12 +101,3 @@ def pull_advance(scene: Scene, room: Room, bars: Changes, world: int, i: int, ro
             bars.timestep[world, 0] += by_h
     else:
         room.state_bar[world, i] = after
-
-
-@wp.func
-def row_before(scene: Scene, launch: Launch, world: int, t: int, i: int) -> StateRow:
-    """State of a body at the start of a step."""
-    n = scene.body_index.shape[0]
-    if t == 0:
-        return launch.state[world, i]
-    return launch.states[world, (t - 1) * n + i]

@@ -10,7 +10,6 @@ from dano.engine.kernels.derivatives.bodies import (
     pull_advance,
     pull_body,
     pull_momentum,
-    row_before,
 )
 from dano.engine.kernels.derivatives.contact import PairBar, pull_pair
 from dano.engine.kernels.derivatives.patches import pull_patch
@@ -29,10 +28,10 @@ from dano.engine.kernels.derivatives.trees import (
 )
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import copy_transposed_blocks, find_pattern, solve_blocks
-from dano.engine.kernels.patches import add_patches, find_patches, fit_patch_duals
-from dano.engine.kernels.rollout import begin_body, begin_coordinates, begin_step_of_trees, Launch
-from dano.engine.kernels.search import find_contacts, fix_laws
-from dano.engine.kernels.tables import Changes, FoundPair, Push, Room, Scene
+from dano.engine.kernels.patches import add_patches, fit_patch_duals
+from dano.engine.kernels.rollout import begin_unpushed, find_touching, Launch, row_before
+from dano.engine.kernels.search import fix_laws
+from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
 from dano.engine.kernels.trees.balance import (
     add_tree_slopes,
     clear_trees,
@@ -53,22 +52,8 @@ _LANES = wp.constant(LANES)
 def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: int) -> int:
     """A step at its solution: contacts, laws and the Jacobian; returns the number of pairs with points."""
     n = scene.body_index.shape[0]
-    for i in range(n):
-        push = Push()
-        begin_body(scene, room, world, i, row_before(scene, launch, world, t, i), push)
-    wait()
-    if wp.static(TREES):
-        if lane == 0:
-            begin_coordinates(scene, room, world, launch, t)
-            begin_step_of_trees(scene, room, world, launch, t)
-        wait()
-    n_found = int(0)
-    if wp.static(POINTS):
-        n_found, _overflow = find_contacts(scene, room, world, lane)
-    n_near = n_found
-    if wp.static(PATCHES):
-        n_near = find_patches(scene, room, world, lane, n_found)
-    wait()
+    begin_unpushed(scene, room, world, lane, launch, t)
+    n_found, n_near, _overflow = find_touching(scene, room, world, lane)
     if lane == 0:
         find_pattern(scene, room, world, n_near)
         for i in range(n):

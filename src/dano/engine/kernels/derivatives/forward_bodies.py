@@ -8,7 +8,6 @@ import warp as wp
 
 from dano.engine.kernels.assembly import row_of
 from dano.engine.kernels.derivatives.adjoint import advance_work, after_adjoints, momentum_work, Virtual
-from dano.engine.kernels.derivatives.bodies import row_before
 from dano.engine.kernels.derivatives.contact import PairBar, pull_pair
 from dano.engine.kernels.derivatives.equations import pull_touching
 from dano.engine.kernels.derivatives.pair_changes import (
@@ -36,8 +35,8 @@ from dano.engine.kernels.derivatives.products import (
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
 from dano.engine.kernels.patches import n_patches
-from dano.engine.kernels.rollout import Launch
-from dano.engine.kernels.tables import Body, Changes, FoundPair, Push, Room, SamplePair, Scene, StateRow
+from dano.engine.kernels.rollout import Launch, push_of, row_before
+from dano.engine.kernels.tables import Body, Changes, FoundPair, Room, SamplePair, Scene, StateRow
 from dano.physics.features import LANES, PATCHES, POINTS
 from dano.physics.point_law import Material
 from dano.physics.real import real, vec3, vec6, ZERO
@@ -180,9 +179,7 @@ def push_momentum(scene: Scene, room: Room, launch: Launch, changes: Changes, wo
     m = scene.moving.shape[0]
     row = scene.body_index[i].row
     h = scene.timestep[world, 0]
-    push = Push()
-    if launch.pushes.shape[1] > 0:
-        push = launch.pushes[world, t * n + i]
+    push = push_of(scene, launch, world, t, i)
     k = int(0)
     while k < 6:
         by_body, by_row, by_push, by_gravity, by_h, _a, _b = wp.grad(momentum_work)(

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.bodies import add_row, row_before
+from dano.engine.kernels.derivatives.bodies import add_row
 from dano.engine.kernels.derivatives.tree_adjoint import (
     ball_work,
     coordinate_work,
@@ -15,8 +15,8 @@ from dano.engine.kernels.derivatives.tree_adjoint import (
     root_chain,
     root_work,
 )
-from dano.engine.kernels.rollout import Launch
-from dano.engine.kernels.tables import Changes, Push, Room, Scene, StateRow
+from dano.engine.kernels.rollout import Launch, push_of, row_before
+from dano.engine.kernels.tables import Changes, Room, Scene, StateRow
 from dano.engine.kernels.trees.kinematics import unknown_of, velocities_of
 from dano.engine.kernels.trees.loops import forces_of
 from dano.engine.kernels.trees.tables import Chain, HangingBar, Node
@@ -192,9 +192,7 @@ def pull_hanging(scene: Scene, room: Room, bars: Changes, launch: Launch, world:
     h = scene.timestep[world, 0]
     node = scene.trees.nodes[n]
     i = node.body
-    push = Push()
-    if launch.pushes.shape[1] > 0:
-        push = launch.pushes[world, t * scene.body_index.shape[0] + i]
+    push = push_of(scene, launch, world, t, i)
     origin = room.bodies[world, node.origin].position
     by_body, by_row, by_push, by_gravity, by_h, by_chain, _a, _b = wp.grad(hanging_body_work)(
         scene.bodies[world, i],
