@@ -15,7 +15,7 @@ form.
 import warp as wp
 
 from dano.physics.friction import following_friction, Friction, friction, friction_with_dual
-from dano.physics.real import ONE, real, vec3, ZERO
+from dano.physics.real import ONE, real, TWO, vec3, ZERO
 from dano.physics.samples import Point
 
 
@@ -70,6 +70,8 @@ class PointLaw:
         friction_pressure: p₀ [Pa].
         stiction: v_s [m/s].
         sharp: 1 where the damping has its full size from v_e on, so that bodies are pushed apart no faster.
+        blow: Pressure of an impact by the speed that is missing to its goal [Pa s/m].
+        goal: Separating speed that an impact aims at [m/s].
     """
 
     stiffness: real
@@ -83,6 +85,8 @@ class PointLaw:
     friction_pressure: real
     stiction: real
     sharp: real
+    blow: real
+    goal: real
 
 
 @wp.struct
@@ -157,8 +161,38 @@ class Linear:
     held: real
 
 
+@wp.struct
+class Impact:
+    """The impact of a pair.
+
+    Attributes:
+        share: β of the contact that is an impact [1].
+        stiffness: κ [Pa s/m].
+        factor: F [1].
+        depth: δ [m].
+    """
+
+    share: real
+    stiffness: real
+    factor: real
+    depth: real
+
+
 @wp.func
-def point_law(material: Material, point: Point, impact_stiffness: real) -> PointLaw:
+def fading_in(x: real) -> real:
+    """Weight of a sample in an impact by its depth over that of the impact."""
+    y = wp.max(x, ZERO)
+    return wp.where(y < ONE, y * y, TWO * y - ONE)
+
+
+@wp.func
+def smooth_step(x: real) -> real:
+    y = wp.clamp(x, ZERO, ONE)
+    return y * y * (real(3.0) - TWO * y)
+
+
+@wp.func
+def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
     """The constants of a point.
 
     In an impact that ends within the step, points are to rebound with e times their approaching speed; if
@@ -174,18 +208,16 @@ def point_law(material: Material, point: Point, impact_stiffness: real) -> Point
     squared = material.restitution * material.restitution
     loss = wp.where(material.instant > ZERO, ONE, (ONE - squared) / (ONE + squared))
     kept = wp.min(material.hysteresis, loss)
-    law.stiffness = material.stiffness
     law.depth = point.depth
     law.ahead = material.ahead
     sunk = wp.max(point.depth, ZERO)
-    if impact_stiffness > ZERO:
+    law.stiffness = (ONE - impact.share) * material.stiffness
+    if impact.stiffness > ZERO:
+        law.blow = impact.stiffness * fading_in(point.sunk / impact.depth)
         rebound = -material.restitution * point.approach
-        law.stiffness = impact_stiffness
-        law.ahead = material.timestep
-        sunk = ZERO
-        law.depth = wp.min(point.depth, ZERO)
-        if rebound > material.bounce:
-            law.depth = material.timestep * rebound
+        if rebound <= material.bounce:
+            rebound = ZERO
+        law.goal = rebound + wp.max(rebound - point.approach, ZERO) / impact.factor
     law.damped = (loss - kept) * sunk
     law.lost = kept * sunk
     law.restitution_velocity = wp.sqrt(
@@ -202,7 +234,8 @@ def point_law(material: Material, point: Point, impact_stiffness: real) -> Point
 @wp.func
 def is_apart(law: PointLaw, rate: real) -> bool:
     """Whether a point that is not sunk in stays out: then d − θ h v_n says all."""
-    return law.depth <= ZERO and law.depth - law.ahead * rate <= ZERO
+    apart = law.depth <= ZERO and law.depth - law.ahead * rate <= ZERO
+    return apart and (law.blow == ZERO or rate >= law.goal)
 
 
 @wp.func
@@ -250,6 +283,9 @@ def pressure(law: PointLaw, rate: real, direction: real, stiction: real) -> Pres
             found.change = -law.stiffness * law.lost * found.direction_change
         else:
             found.damping = law.stiffness * law.ahead
+    if law.blow > ZERO and rate < law.goal:
+        found.value += law.blow * (law.goal - rate)
+        found.damping += law.blow
     return found
 
 

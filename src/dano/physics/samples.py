@@ -39,6 +39,7 @@ class Point:
         extra_slip: What is added to the slip [m/s]: the part along the surface of half the change of the
             point's velocity within the step, for samples that keep facing the second body.
         depth: Below the second body's surface at the end of the step if nothing moved in it [m].
+        sunk: Depth in the predicted configuration [m].
         rate: Separating speed at the old velocities [m/s].
         approach: Separating speed with which the step begins [m/s].
         area: That faces the second body [m²].
@@ -52,6 +53,7 @@ class Point:
     rate: real
     approach: real
     area: real
+    sunk: real
 
 
 @wp.func
@@ -147,6 +149,7 @@ def point_contact(
     point.normal = pose.rotation * normal
     point.moment = pose.rotation * moment
     point.depth = lead * rate - d.value
+    point.sunk = -d.value
     point.rate = rate
     point.approach = rate
     point.area = stiffness_share * area

@@ -78,7 +78,7 @@ def listing(scene: Scene, room: Room, launch: Launch, listing: Listing):
             row.contact = real(index.contact)
             row.sample = real(room.where[world, k].sample)
             row.share = found.share
-            row.impact_stiffness = found.impact_stiffness
+            row.impact_stiffness = found.impact.stiffness
             row.point = room.points[world, k]
             at = shift + k - lane * per_lane
             if at < listing.points.shape[1]:

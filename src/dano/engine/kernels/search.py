@@ -25,7 +25,7 @@ from dano.physics.pairs import (
     pair_pose,
     PairPose,
 )
-from dano.physics.point_law import Material, point_law
+from dano.physics.point_law import fading_in, Impact, Material, point_law, smooth_step
 from dano.physics.real import INFINITY, ONE, real, TWO, vec3, ZERO
 from dano.physics.rotations import matrix
 from dano.physics.samples import (
@@ -49,7 +49,8 @@ _ADVANCES = wp.constant(40)
 _MET = wp.constant(real(1e-12 if WIDE else 1e-6))
 # An impact that is to end within the step presses as if a spring pushed the bodies' common mass apart with
 # this many times the stiffness that would turn its motion round in a step.
-_IMPACT = wp.constant(real(1e3))
+import os
+_IMPACT = wp.constant(real(float(os.environ.get('IMPF','10'))))
 
 
 @wp.struct
@@ -208,6 +209,7 @@ def meeting(
     first: int,
     second: int,
     h: real,
+    least_way: real,
 ) -> Meeting:
     """When the geometry of a pair is taken.
 
@@ -225,7 +227,7 @@ def meeting(
         body.radius + wp.length(a.position - b.position)
     )
     way = h * (wp.length(a.velocity - b.velocity) + turn)
-    if way <= pair.sink:
+    if way <= least_way:
         return met
     share = real(0.0)
     n = int(-1)
@@ -352,7 +354,6 @@ def find_points(
     body = scene.bodies[world, first]
     stretch = stretch_of(body, index.turning)
     # Where geometry is taken early, what is about to touch has sunk in by no more than this, or nearly does.
-    layer = wp.where(share < ONE, pair.sink, ZERO)
     at = begin
     beyond = int(0)
     # All lanes go through as many rounds: samples of the blocks that are listed in one are shared.
@@ -395,9 +396,8 @@ def find_points(
                     if (turned and back) or (not turned and facing > ZERO):
                         point = point_contact(pose, sample, d, index.turning, turned, pair.share, share * h)
                         if point.depth - h * point.rate > -pair.margin:
-                            depth = point.depth - share * h * point.rate + layer
-                            if depth > ZERO and not turned:
-                                weight = point.area * depth
+                            if d.value < ZERO and not turned:
+                                weight = point.area * fading_in(point.sunk / pair.sink)
                                 sums.area += point.area
                                 sums.load += weight
                                 sums.rate += weight * point.approach
@@ -417,26 +417,23 @@ def effective_inverse_mass(state: BodyState, arm: vec3, normal: vec3) -> real:
 
 
 @wp.func
-def impact_stiffness(a: BodyState, b: BodyState, sums: PatchSums, material: Material) -> real:
-    """Stiffness [Pa/m] with which an impact ends within the step; zero if there is none.
-
-    A patch of area A that bodies of common mass m (along the normal, at the middle of the load) hit gets
-    `_IMPACT` m / (h² A): as a spring it is that much stiffer than one that turns m round in a step. A patch
-    is hit where it approaches faster than the contact's speed in the mean over its load: ahead of a rolling
-    contact single samples always do.
-    """
+def impact_of(
+    a: BodyState, b: BodyState, sums: PatchSums, material: Material, depth: real, reached: bool
+) -> Impact:
+    impact = Impact()
+    impact.depth = depth
+    impact.factor = _IMPACT
     if material.instant == ZERO or sums.load <= ZERO:
-        return ZERO
-    if -sums.rate <= material.bounce * sums.load:
-        return ZERO
+        return impact
+    impact.share = smooth_step(-sums.rate / (sums.load * material.bounce) - ONE)
+    if not reached or impact.share == ZERO:
+        return impact
     arm = sums.arm / sums.load
     normal = sums.normal / sums.load
     inverse_mass = effective_inverse_mass(a, arm, normal)
     inverse_mass += effective_inverse_mass(b, arm + a.position - b.position, normal)
-    h = material.timestep
-    stiffness = _IMPACT / (h * h * inverse_mass * sums.area)
-    # To a power of two, so that derivatives may hold it fixed: they are those of what is computed.
-    return wp.pow(TWO, wp.round(wp.log2(stiffness)))
+    impact.stiffness = impact.share * _IMPACT / (material.timestep * inverse_mass * sums.load)
+    return impact
 
 
 @wp.func
@@ -458,7 +455,8 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
         a = room.bodies[world, index.first]
         b = room.bodies[world, index.second]
         if is_near(scene, world, a, b, index.first, index.second, pair.margin, h):
-            met = meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h)
+            bounce = scene.materials[world, index.contact].bounce
+            met = meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, h * bounce)
             pose = posed(scene, world, a, b, index.first, index.second, met.share, h, pair.follows)
             body = scene.bodies[world, index.first]
             speed = wp.length(pose.velocity) + wp.length(pose.spin) * TWO * body.radius
@@ -493,7 +491,7 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
             found.com_difference = pose.com_difference
             found.toward = facing(scene, world, a, b, index.first, index.second, met.share, h)
             material = scene.materials[world, index.contact]
-            found.impact_stiffness = impact_stiffness(a, b, sums, material)
+            found.impact = impact_of(a, b, sums, material, pair.sink, met.share < ONE)
             room.found[world, n_found * _LANES + lane] = found
             n_found += 1
     return n_found, total(wp.where(overflow, ONE, ZERO)) > ZERO
@@ -509,4 +507,4 @@ def fix_laws(scene: Scene, room: Room, world: int, lane: int, n_found: int, rebo
         if material.instant > ZERO:
             material.restitution = rebound * material.restitution
         for k in range(found.first, found.end):
-            room.laws[world, k] = point_law(material, room.points[world, k], found.impact_stiffness)
+            room.laws[world, k] = point_law(material, room.points[world, k], found.impact)

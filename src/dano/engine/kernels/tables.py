@@ -11,7 +11,7 @@ from dano.engine.kernels.trees.tables import TreeRoom, Trees
 from dano.physics.overlap import Part, WeightedSample
 from dano.physics.pairs import BodyState
 from dano.physics.patch_law import PatchMaterial
-from dano.physics.point_law import Duals, Linear, Material, PointLaw
+from dano.physics.point_law import Duals, Impact, Linear, Material, PointLaw
 from dano.physics.real import mat33, mat66, real, vec3, vec4, vec6
 from dano.physics.samples import Point, Sample
 from dano.physics.solids.leaves import Leaf, Solids
@@ -205,7 +205,7 @@ class FoundPair:
     end: wp.int32
     critical: wp.int32
     share: real
-    impact_stiffness: real
+    impact: Impact
     toward: vec3
     com_difference: vec3
 

@@ -21,7 +21,7 @@ STATE, _PUSH, REPORT, WRENCH = 13, 6, 5, 6
 # Numbers of a listed point, see `dano.engine.kernels.listing`, and where each quantity begins.
 _POINT = {"first": 1, "second": 1, "contact": 1, "sample": 1, "share": 1, "impact_stiffness": 1}
 _POINT |= {"arm": 3, "normal": 3, "moment": 3, "extra_slip": 3}
-_POINT |= {"depth": 1, "rate": 1, "approach": 1, "area": 1}
+_POINT |= {"depth": 1, "rate": 1, "approach": 1, "area": 1, "sunk": 1}
 _PATCHES = tuple(
     f"room.patches.{name}"
     for name in ("patches", "arms", "duals", "changes", "linear", "wrenches", "jacobians")

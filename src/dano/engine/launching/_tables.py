@@ -27,7 +27,8 @@ from dano.scene import Body, pressing_pairs, Scene
 # Samples count as near within this share of the smaller body's size, besides the way they go.
 _MARGIN = 0.001
 # Geometry is taken where bodies have sunk into each other by at most this share of the smaller one's size …
-_SINK = 0.01
+import os
+_SINK = float(os.environ.get('IMPD','0.005'))
 # … and by this share of the thinner one's half thickness.
 _THIN = 0.25
 # Up to so many blocks the moment of meeting is found from samples, beyond from the centres of blocks.

@@ -1,0 +1,1 @@
+"""Impacts: what derivatives through them are worth, restitution, energy, and where motion ends as steps shrink."""
