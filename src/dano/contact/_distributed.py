@@ -24,6 +24,8 @@ CHUNK = 16
 # Share of its size by which a body sinks under the heaviest load of the scene in a typical orientation, at
 # default stiffness.
 SINKING = 0.005
+IMPACT_DEPTH = 0.005
+"""Depth of an impact over the size of the smaller body, at default."""
 # Velocities within which restitution ends at default: so many times √(g · depth of the heaviest load).
 _SLOW = 0.2
 
@@ -78,8 +80,9 @@ class DistributedLaw(AbstractContactLaw):
     Torsional and rolling resistance come out of the geometry. Where both bodies have samples, each set
     carries half.
 
-    Impacts, approaches faster than `restitution_velocity` + g h, end within the step, whatever its length:
-    samples leave with e times the speed at which they came. With `compliant=True` they are left to the
+    Impacts, approaches faster than `restitution_velocity` + g h, happen when bodies have sunk in by
+    `impact_depth`, and end within the step, whatever its length: a patch leaves with e times the speed at
+    which it came. With `compliant=True` they are left to the
     spring, which needs some twenty steps an impact: right for a measured stiffness and a small timestep.
 
     Default stiffness: set down on a rigid floor in a typical (the median) orientation, so on a corner, an
@@ -119,6 +122,7 @@ class DistributedLaw(AbstractContactLaw):
             "stiffness",
             "restitution",
             "restitution_velocity",
+            "impact_depth",
             "hysteresis",
             "friction_fading",
             "friction_pressure",
@@ -136,6 +140,7 @@ class DistributedLaw(AbstractContactLaw):
         return params.filled(
             restitution=0.0,
             restitution_velocity=_SLOW * (setting.gravity * SINKING * setting.size) ** 0.5,
+            impact_depth=IMPACT_DEPTH * setting.size,
             hysteresis=0.35,
             friction_fading=0.0,
             friction_pressure=1000.0,
@@ -146,7 +151,7 @@ def combined(a: ContactParams, b: ContactParams) -> ContactParams:
     """Complete parameters of pairs from those of their bodies, arrays over the pairs.
 
     The sliding friction is √(μ_a μ_b). Of restitution, stiffness, hysteresis and fading the larger counts, of
-    `restitution_velocity` and `friction_pressure` the smaller.
+    `restitution_velocity`, `impact_depth` and `friction_pressure` the smaller.
     """
 
     def of(name: str) -> Array:
@@ -155,7 +160,8 @@ def combined(a: ContactParams, b: ContactParams) -> ContactParams:
             product = x * y
             slips = product > 0
             return jnp.where(slips, jnp.sqrt(jnp.where(slips, product, 1)), 0)
-        return (jnp.minimum if name in ("restitution_velocity", "friction_pressure") else jnp.maximum)(x, y)
+        smaller = name in ("restitution_velocity", "impact_depth", "friction_pressure")
+        return (jnp.minimum if smaller else jnp.maximum)(x, y)
 
     names = [name for name in a.__dataclass_fields__ if getattr(a, name) is not None]
     return eqx.tree_at(lambda p: [getattr(p, name) for name in names], a, [of(name) for name in names])

@@ -32,6 +32,8 @@ class ContactParams(eqx.Module):
         restitution: Distributed law: separating over approaching speed in an impact e ≤ 1 [1].
         restitution_velocity: Distributed law: speed [m/s] below which impacts lose more than `restitution`
             says, until at rest the contact is a damped spring.
+        impact_depth: Distributed law: depth δ [m] that bodies sink in by until an impact happens, whose samples
+            share it by their depths.
         hysteresis: Distributed law: share σ of the pressure that is lost between going in and coming out
             however slowly (at most what `restitution` leaves): rolling and rocking come to rest [1].
         friction_fading: Distributed law: share φ ≤ 1 of the friction coefficient that is lost under high
@@ -50,6 +52,7 @@ class ContactParams(eqx.Module):
     stiffness: Filled
     restitution: Filled
     restitution_velocity: Filled
+    impact_depth: Filled
     hysteresis: Filled
     friction_fading: Filled
     friction_pressure: Filled
@@ -68,6 +71,7 @@ class ContactParams(eqx.Module):
         stiffness: Numbers | None = None,
         restitution: Numbers | None = None,
         restitution_velocity: Numbers | None = None,
+        impact_depth: Numbers | None = None,
         hysteresis: Numbers | None = None,
         friction_fading: Numbers | None = None,
         friction_pressure: Numbers | None = None,
@@ -112,7 +116,7 @@ def checked_parameter(name: str, value: Numbers) -> Float[Array, ""]:
         return array
     if name in ("restitution", "hysteresis", "friction_fading") and float(array) > 1:
         raise ValueError(f"{name} must lie in [0, 1], got {float(array)}")
-    if name in ("stiffness", "restitution_velocity", "friction_pressure") and float(array) == 0:
+    if name in ("stiffness", "restitution_velocity", "impact_depth", "friction_pressure") and float(array) == 0:
         raise ValueError(f"{name} must be > 0, got {float(array)}")
     return array
 

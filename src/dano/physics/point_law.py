@@ -1,6 +1,6 @@
 """The distributed law at a point (docs/theory/contact.md, "Pressure and friction at a sample").
 
-    F = A p (n − b(p)/p u / max(|u|, v_s)),   p = k max(0, d − D),   b(p) = μ (1 − φ p/(p + p₀)) p
+    F = A p (n − b(p)/p u / max(|u|, v_s)),   p = (1 − β) k max(0, d − D) + κ w max(0, v* − v_n),   b(p) = μ (1 − φ p/(p + p₀)) p
 
 Friction and hysteresis are set-valued maps u/max(|u|, v_s) of a tiny v_s. A solver that knows them by their
 values only has to search for where bodies stick. So the law is also written without a quotient, with the
@@ -15,7 +15,8 @@ form.
 import warp as wp
 
 from dano.physics.friction import following_friction, Friction, friction, friction_with_dual
-from dano.physics.real import ONE, real, TWO, vec3, ZERO
+from dano.physics.impacts import fading_in, Impact, impact_goal
+from dano.physics.real import ONE, real, vec3, ZERO
 from dano.physics.samples import Point
 
 
@@ -70,8 +71,8 @@ class PointLaw:
         friction_pressure: p₀ [Pa].
         stiction: v_s [m/s].
         sharp: 1 where the damping has its full size from v_e on, so that bodies are pushed apart no faster.
-        blow: Pressure of an impact by the speed that is missing to its goal [Pa s/m].
-        goal: Separating speed that an impact aims at [m/s].
+        blow: κ w, pressure of an impact by the speed that is missing to its goal [Pa s/m].
+        goal: v*, separating speed that an impact aims at [m/s].
     """
 
     stiffness: real
@@ -161,63 +162,27 @@ class Linear:
     held: real
 
 
-@wp.struct
-class Impact:
-    """The impact of a pair.
-
-    Attributes:
-        share: β of the contact that is an impact [1].
-        stiffness: κ [Pa s/m].
-        factor: F [1].
-        depth: δ [m].
-    """
-
-    share: real
-    stiffness: real
-    factor: real
-    depth: real
-
-
-@wp.func
-def fading_in(x: real) -> real:
-    """Weight of a sample in an impact by its depth over that of the impact."""
-    y = wp.max(x, ZERO)
-    return wp.where(y < ONE, y * y, TWO * y - ONE)
-
-
-@wp.func
-def smooth_step(x: real) -> real:
-    y = wp.clamp(x, ZERO, ONE)
-    return y * y * (real(3.0) - TWO * y)
-
-
 @wp.func
 def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
     """The constants of a point.
 
-    In an impact that ends within the step, points are to rebound with e times their approaching speed; if
-    that is too slow to matter, to touch the surface without going deeper, whatever is left of their way.
-
     Args:
         material: Of the contact.
         point: The point.
-        impact_stiffness: Of an impact [Pa/m]; zero if there is none.
+        impact: Of the pair.
     """
     law = PointLaw()
     # Impacts that end within the step have had their restitution: what presses on gives nothing back.
     squared = material.restitution * material.restitution
     loss = wp.where(material.instant > ZERO, ONE, (ONE - squared) / (ONE + squared))
     kept = wp.min(material.hysteresis, loss)
+    law.stiffness = (ONE - impact.share) * material.stiffness
     law.depth = point.depth
     law.ahead = material.ahead
     sunk = wp.max(point.depth, ZERO)
-    law.stiffness = (ONE - impact.share) * material.stiffness
     if impact.stiffness > ZERO:
-        law.blow = impact.stiffness * fading_in(point.sunk / impact.depth)
-        rebound = -material.restitution * point.approach
-        if rebound <= material.bounce:
-            rebound = ZERO
-        law.goal = rebound + wp.max(rebound - point.approach, ZERO) / impact.factor
+        law.blow = impact.part * impact.stiffness * fading_in(point.sunk / impact.depth)
+        law.goal = impact_goal(impact, material.restitution, material.bounce, point.approach)
     law.damped = (loss - kept) * sunk
     law.lost = kept * sunk
     law.restitution_velocity = wp.sqrt(
@@ -233,14 +198,15 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
 
 @wp.func
 def is_apart(law: PointLaw, rate: real) -> bool:
-    """Whether a point that is not sunk in stays out: then d − θ h v_n says all."""
-    apart = law.depth <= ZERO and law.depth - law.ahead * rate <= ZERO
-    return apart and (law.blow == ZERO or rate >= law.goal)
+    """Whether a point that is not sunk in stays out, and has no impact: then d − θ h v_n says all."""
+    return law.depth <= ZERO and law.depth - law.ahead * rate <= ZERO and law.blow == ZERO
 
 
 @wp.func
 def pressure(law: PointLaw, rate: real, direction: real, stiction: real) -> Pressure:
-    """Pressure p = k max(0, d − D) at a separating speed v_n.
+    """Pressure p = (1 − β) k max(0, d − D) + κ w max(0, v* − v_n) at a separating speed v_n.
+
+    The second part is that of an impact, see `dano.physics.impacts`.
 
     D is what the separating speed takes off the depth d, the larger of
 

@@ -39,10 +39,10 @@ class Point:
         extra_slip: What is added to the slip [m/s]: the part along the surface of half the change of the
             point's velocity within the step, for samples that keep facing the second body.
         depth: Below the second body's surface at the end of the step if nothing moved in it [m].
-        sunk: Depth in the predicted configuration [m].
         rate: Separating speed at the old velocities [m/s].
         approach: Separating speed with which the step begins [m/s].
         area: That faces the second body [m²].
+        sunk: Depth below the second body's surface in the predicted configuration [m].
     """
 
     arm: vec3

@@ -38,7 +38,7 @@ class Others(eqx.Module):
         """Parameters of each pair, arrays of shape (k,).
 
         √(μ_a μ_b) of the sliding frictions; of restitution, stiffness, hysteresis and fading the larger; of
-        `restitution_velocity` and `friction_pressure` the smaller.
+        `restitution_velocity`, `impact_depth` and `friction_pressure` the smaller.
         """
         first, second = np.array(self.pairs, int).reshape(-1, 2).T
         a, b = (jax.tree.map(lambda x, rows=rows: x[rows], self.params) for rows in (first, second))

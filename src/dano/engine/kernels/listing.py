@@ -23,7 +23,8 @@ class ListedPoint:
         contact: Index of the contact.
         sample: Index of the sample.
         share: Share of the step after which geometry was taken.
-        impact_stiffness: Of an impact [Pa/m].
+        impact_share: β of an impact.
+        impact_stiffness: κ of an impact, what the pair carries of it [Pa s/m].
         point: The point.
     """
 
@@ -32,6 +33,7 @@ class ListedPoint:
     contact: real
     sample: real
     share: real
+    impact_share: real
     impact_stiffness: real
     point: Point
 
@@ -78,7 +80,8 @@ def listing(scene: Scene, room: Room, launch: Launch, listing: Listing):
             row.contact = real(index.contact)
             row.sample = real(room.where[world, k].sample)
             row.share = found.share
-            row.impact_stiffness = found.impact.stiffness
+            row.impact_share = found.impact.share
+            row.impact_stiffness = found.impact.part * found.impact.stiffness
             row.point = room.points[world, k]
             at = shift + k - lane * per_lane
             if at < listing.points.shape[1]:

@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from dano.engine.kernels.lanes import total6, wait
+from dano.engine.kernels.impacts import find_moved
+from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import find_pattern
 from dano.engine.kernels.patches import find_patches
 from dano.engine.kernels.search import find_contacts, fix_laws
@@ -304,49 +305,8 @@ def any_hits(room: Room, world: int, lane: int, n_found: int) -> bool:
 
 
 @wp.func
-def delay(scene: Scene, room: Room, world: int, lane: int, n_found: int):
-    h = scene.timestep[world, 0]
-    if lane == 0:
-        for b in range(scene.n_blocks):
-            room.step[world, b] = vec6()
-    wait()
-    for f in range(n_found):
-        found = room.found[world, f * _LANES + lane]
-        if found.impact.stiffness > ZERO:
-            wrench = vec6()
-            for k in range(found.first, found.end):
-                linear = room.linear[world, k]
-                if linear.pressure.value > ZERO:
-                    point = room.points[world, k]
-                    weight = h * point.area
-                    friction = linear.friction + linear.friction_change
-                    force = weight * (linear.pressure.value * point.normal + friction)
-                    moment = weight * (linear.pressure.value * point.moment + wp.cross(point.arm, friction))
-                    wrench += joined(force, moment)
-            wrench = total6(wrench)
-            if lane == 0:
-                index = scene.pair_index[found.pair]
-                a = scene.body_index[index.first].row
-                b = scene.body_index[index.second].row
-                s = found.share
-                if a >= 0:
-                    state = room.bodies[world, index.first]
-                    room.step[world, a] += s * joined(
-                        state.inverse_mass * linear_part(wrench), state.inverse_inertia * angular_part(wrench)
-                    )
-                if b >= 0:
-                    other = room.bodies[world, index.second]
-                    force = linear_part(wrench)
-                    turn = angular_part(wrench) + wp.cross(found.com_difference, force)
-                    room.step[world, b] -= s * joined(
-                        other.inverse_mass * force, other.inverse_inertia * turn
-                    )
-    wait()
-
-
-@wp.func
 def advance_body(scene: Scene, room: Room, world: int, i: int, row: StateRow) -> StateRow:
-    """A body at the end of a step: x⁺ = x + h v⁺, q⁺ = q ⊗ turn."""
+    """A body at the end of a step: x⁺ = x + h v, q⁺ = q ⊗ turn, with v and turn of `Room.moved`."""
     h = scene.timestep[world, 0]
     m = scene.body_index[i].row
     after = row
@@ -358,15 +318,12 @@ def advance_body(scene: Scene, room: Room, world: int, i: int, row: StateRow) ->
             m = node.place // 6
         v = room.velocity[world, m]
         state = room.bodies[world, i]
-        omega = wp.transpose(matrix(state.orientation)) * angular_part(v)
+        moved = room.moved[world, m]
+        back = wp.transpose(matrix(state.orientation))
         after.velocity = linear_part(v)
-        after.omega = omega
-        moved = v
-        if wp.static(not TREES):
-            moved = v - room.step[world, m]
-        omega = wp.transpose(matrix(state.orientation)) * angular_part(moved)
+        after.omega = back * angular_part(v)
         after.position = row.position + h * linear_part(moved)
-        after.orientation = to_wxyz(turned(state.orientation, omega, h))
+        after.orientation = to_wxyz(turned(state.orientation, back * angular_part(moved), h))
     return after
 
 
@@ -419,8 +376,7 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                         restart(scene, room, world)
                     wait()
         wait()
-        if wp.static(not TREES):
-            delay(scene, room, world, lane, n_found)
+        find_moved(scene, room, world, lane, n_found)
         wait()
         if lane == 0:
             report = StepReport()

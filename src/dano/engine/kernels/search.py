@@ -17,7 +17,8 @@ from dano.engine.kernels.tables import (
     SamplePair,
     Scene,
 )
-from dano.physics.features import LANES, WIDE
+from dano.physics.features import LANES, TREES, WIDE
+from dano.physics.impacts import Impact, Patch, share_of_impact, stiffness_of_impact, with_sample
 from dano.physics.pairs import (
     approach,
     BodyState,
@@ -25,8 +26,8 @@ from dano.physics.pairs import (
     pair_pose,
     PairPose,
 )
-from dano.physics.point_law import fading_in, Impact, Material, point_law, smooth_step
-from dano.physics.real import INFINITY, ONE, real, TWO, vec3, ZERO
+from dano.physics.point_law import Material, point_law
+from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec3, ZERO
 from dano.physics.rotations import matrix
 from dano.physics.samples import (
     facing_area,
@@ -47,10 +48,6 @@ _STEEPEST = wp.constant(real(1.5))
 # Most steps of the search for the moment when bodies meet, and the share of the step that ends it.
 _ADVANCES = wp.constant(40)
 _MET = wp.constant(real(1e-12 if WIDE else 1e-6))
-# An impact that is to end within the step presses as if a spring pushed the bodies' common mass apart with
-# this many times the stiffness that would turn its motion round in a step.
-import os
-_IMPACT = wp.constant(real(float(os.environ.get('IMPF','10'))))
 
 
 @wp.struct
@@ -64,27 +61,6 @@ class Meeting:
 
     share: real
     critical: int
-
-
-@wp.struct
-class PatchSums:
-    """Sums over the samples of a pair that sink in.
-
-    Attributes:
-        area: [m²].
-        load: Area times depth [m³].
-        rate: Approaching speed, weighted by the load [m⁴/s].
-        arm: [m⁴, W].
-        normal: [m³, W].
-        turned_load: Load of samples that lie in the solid and face the other way [m³].
-    """
-
-    area: real
-    load: real
-    rate: real
-    arm: vec3
-    normal: vec3
-    turned_load: real
 
 
 @wp.func
@@ -214,8 +190,9 @@ def meeting(
     """When the geometry of a pair is taken.
 
     At the end of the step, unless a body would be driven deeper into the other than `SamplePair.sink` by
-    then: on the far side of a thin wall, normals push the wrong way. Then when it has sunk that far: the
-    root of the depth of the deepest probe, by Newton's method, which begins as far as none can go deeper.
+    then: on the far side of a thin wall, normals push the wrong way. Then when it has sunk that far, which is
+    when bodies have an impact: the root of the depth of the deepest probe, by Newton's method, which begins
+    as far as none can go deeper. Bodies that move by less than `least_way` [m] are looked at at the end.
     """
     met = Meeting()
     met.critical = -1
@@ -341,19 +318,20 @@ def find_points(
     turned: bool,
     begin: int,
     end: int,
-    sums: PatchSums,
-) -> tuple[int, PatchSums]:
+    patch: Patch,
+) -> tuple[int, Patch, real, real]:
     """List the samples of a body that may press; with `turned` those that face the other way.
 
     Returns:
-        Place of the next point in the list, which may lie beyond its end, and the sums over samples that sink
-        in.
+        Place of the next point in the list, which may lie beyond its end, the patch with the samples that
+        have sunk in, their load, and that of samples that lie in the solid and face the other way [m³].
     """
+    load = real(0.0)
+    turned_load = real(0.0)
     index = scene.body_index[first]
     solid = solid_of_body(scene, world, second)
     body = scene.bodies[world, first]
     stretch = stretch_of(body, index.turning)
-    # Where geometry is taken early, what is about to touch has sunk in by no more than this, or nearly does.
     at = begin
     beyond = int(0)
     # All lanes go through as many rounds: samples of the blocks that are listed in one are shared.
@@ -392,48 +370,63 @@ def find_points(
                     if d.value < ZERO and facing < ZERO:
                         back = is_turned(pose, sample, d, facing)
                         if back and not turned:
-                            sums.turned_load -= d.value * pair.share * wp.length(pose.vectors * sample.area)
+                            turned_load -= d.value * pair.share * wp.length(pose.vectors * sample.area)
                     if (turned and back) or (not turned and facing > ZERO):
                         point = point_contact(pose, sample, d, index.turning, turned, pair.share, share * h)
                         if point.depth - h * point.rate > -pair.margin:
-                            if d.value < ZERO and not turned:
-                                weight = point.area * fading_in(point.sunk / pair.sink)
-                                sums.area += point.area
-                                sums.load += weight
-                                sums.rate += weight * point.approach
-                                sums.arm += weight * point.arm
-                                sums.normal += weight * point.normal
+                            if point.sunk > ZERO and not turned:
+                                load += point.area * point.sunk
+                                patch = with_sample(
+                                    patch, point.area, point.sunk, pair.sink, point.approach, point.arm,
+                                    point.normal,
+                                )  # fmt: skip
                             if at < end:
                                 list_point(room, world, at, point, s, entry, turned)
                             at += 1
-    return at, sums
-
-
-@wp.func
-def effective_inverse_mass(state: BodyState, arm: vec3, normal: vec3) -> real:
-    """1/m + (r × n) · J⁻¹ (r × n): how fast a unit impulse along n makes a body's point at r [1/kg]."""
-    moment = wp.cross(arm, normal)
-    return state.inverse_mass + wp.dot(moment, state.inverse_inertia * moment)
+    return at, patch, load, turned_load
 
 
 @wp.func
 def impact_of(
-    a: BodyState, b: BodyState, sums: PatchSums, material: Material, depth: real, reached: bool
+    a: BodyState, b: BodyState, patch: Patch, material: Material, depth: real, share: real
 ) -> Impact:
+    """The impact of a pair; there is none where it approaches slowly, or where its law leaves it to the spring.
+
+    Args:
+        a: First body.
+        b: Second body.
+        patch: Samples that have sunk in.
+        material: Of the contact.
+        depth: δ [m].
+        share: τ, below one where bodies are as deep within the step.
+    """
     impact = Impact()
     impact.depth = depth
-    impact.factor = _IMPACT
-    if material.instant == ZERO or sums.load <= ZERO:
+    impact.part = ONE
+    if material.instant == ZERO or patch.load <= ZERO:
         return impact
-    impact.share = smooth_step(-sums.rate / (sums.load * material.bounce) - ONE)
-    if not reached or impact.share == ZERO:
-        return impact
-    arm = sums.arm / sums.load
-    normal = sums.normal / sums.load
-    inverse_mass = effective_inverse_mass(a, arm, normal)
-    inverse_mass += effective_inverse_mass(b, arm + a.position - b.position, normal)
-    impact.stiffness = impact.share * _IMPACT / (material.timestep * inverse_mass * sums.load)
+    impact.share = share_of_impact(patch, material.bounce)
+    if impact.share > ZERO and share < ONE:
+        impact.stiffness = stiffness_of_impact(a, b, patch, material.bounce, material.timestep)
+        impact.delays = ONE
+        if wp.static(TREES):
+            impact.delays = ZERO
+            impact.way = share
     return impact
+
+
+@wp.func
+def share_impacts(scene: Scene, room: Room, world: int, lane: int, n_found: int):
+    """Halve impacts that samples of both bodies have part in."""
+    for f in range(1, n_found):
+        one = f * _LANES + lane
+        other = one - _LANES
+        mine = scene.pair_index[room.found[world, one].pair]
+        theirs = scene.pair_index[room.found[world, other].pair]
+        if mine.first == theirs.second and mine.second == theirs.first:
+            if room.found[world, one].impact.stiffness > ZERO and room.found[world, other].impact.stiffness > ZERO:
+                room.found[world, one].impact.part = HALF
+                room.found[world, other].impact.part = HALF
 
 
 @wp.func
@@ -455,29 +448,29 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
         a = room.bodies[world, index.first]
         b = room.bodies[world, index.second]
         if is_near(scene, world, a, b, index.first, index.second, pair.margin, h):
-            bounce = scene.materials[world, index.contact].bounce
-            met = meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, h * bounce)
+            material = scene.materials[world, index.contact]
+            # Slower than this nothing has an impact.
+            least_way = wp.where(material.instant > ZERO, h * material.bounce, pair.sink)
+            met = meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, least_way)
             pose = posed(scene, world, a, b, index.first, index.second, met.share, h, pair.follows)
             body = scene.bodies[world, index.first]
             speed = wp.length(pose.velocity) + wp.length(pose.spin) * TWO * body.radius
             reach = pair.margin + (ONE - met.share) * h * speed
-            sums = PatchSums()
+            patch = Patch()
             begin = at
-            at, sums = find_points(
+            at, patch, load, turned_load = find_points(
                 scene, room, world, lane, pose, pair, index.first, index.second, n_found, met.share, h, reach,
-                False, at, end, sums,
+                False, at, end, patch,
             )  # fmt: skip
-            sums.area = total(sums.area)
-            sums.load = total(sums.load)
-            sums.rate = total(sums.rate)
-            sums.arm = total3(sums.arm)
-            sums.normal = total3(sums.normal)
-            sums.turned_load = total(sums.turned_load)
+            patch.load = total(patch.load)
+            patch.rate = total(patch.rate)
+            patch.arm = total3(patch.arm)
+            patch.normal = total3(patch.normal)
             # What faces the other way presses where its load is the larger one.
-            if sums.turned_load > sums.load:
-                at, sums = find_points(
+            if total(turned_load) > total(load):
+                at, patch, _load, _turned = find_points(
                     scene, room, world, lane, pose, pair, index.first, index.second, n_found, met.share, h,
-                    reach, True, at, end, sums,
+                    reach, True, at, end, patch,
                 )  # fmt: skip
             if at > end:
                 overflow = True
@@ -490,10 +483,11 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
             found.share = met.share
             found.com_difference = pose.com_difference
             found.toward = facing(scene, world, a, b, index.first, index.second, met.share, h)
-            material = scene.materials[world, index.contact]
-            found.impact = impact_of(a, b, sums, material, pair.sink, met.share < ONE)
+            found.patch = patch
+            found.impact = impact_of(a, b, patch, material, pair.sink, met.share)
             room.found[world, n_found * _LANES + lane] = found
             n_found += 1
+    share_impacts(scene, room, world, lane, n_found)
     return n_found, total(wp.where(overflow, ONE, ZERO)) > ZERO
 
 

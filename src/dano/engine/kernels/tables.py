@@ -8,10 +8,11 @@ import warp as wp
 
 from dano.engine.kernels.patch_tables import PatchRoom, PatchSide, PatchTables
 from dano.engine.kernels.trees.tables import TreeRoom, Trees
+from dano.physics.impacts import Impact, Patch
 from dano.physics.overlap import Part, WeightedSample
 from dano.physics.pairs import BodyState
 from dano.physics.patch_law import PatchMaterial
-from dano.physics.point_law import Duals, Impact, Linear, Material, PointLaw
+from dano.physics.point_law import Duals, Linear, Material, PointLaw
 from dano.physics.real import mat33, mat66, real, vec3, vec4, vec6
 from dano.physics.samples import Point, Sample
 from dano.physics.solids.leaves import Leaf, Solids
@@ -78,7 +79,7 @@ class SamplePair:
     Attributes:
         share: Share of the contact's stiffness that this pair carries [1].
         follows: 1 where points follow the second body, which rolls on the first, else 0.
-        sink: Depth up to which predicted geometry is taken [m].
+        sink: Depth of an impact, up to which predicted geometry is taken [m].
         margin: Distance within which samples count as near [m].
     """
 
@@ -195,7 +196,8 @@ class FoundPair:
         end: Beyond its last.
         critical: Probe that says when the bodies meet, −1 where they do not within the step.
         share: τ.
-        impact_stiffness: Of an impact [Pa/m], zero if there is none.
+        impact: Of the pair.
+        patch: Its samples that have sunk in.
         toward: Direction that samples which turn face [F].
         com_difference: From the second body's centre of mass to the first's [m, W].
     """
@@ -206,6 +208,7 @@ class FoundPair:
     critical: wp.int32
     share: real
     impact: Impact
+    patch: Patch
     toward: vec3
     com_difference: vec3
 
@@ -237,6 +240,8 @@ class Room:
         old: Those of the step before; only with joints.
         tried: …
         best: Where the residual was smallest.
+        moved: By which positions change within a step.
+        late: Virtual velocities of impulses that take effect within a step.
         step: Of Newton's method.
         residual: What each block misses [kg m/s; kg m²/s, W].
         scale: Turns momenta into velocities [1/kg; 1/(kg m²)].
@@ -246,6 +251,7 @@ class Room:
         after_bar: By those at its end.
         wrenches: Impulse of each pair that is near, at the first body's centre of mass [N s, N m s, W].
         missing: Changes of the equations of a step, shape (worlds, directions · m).
+        delayed: … and of impulses times the share of the step after which they take effect.
         splines: Changes of an equation by changes of coefficients, shape (worlds, directions · lanes).
     """
 
@@ -270,6 +276,8 @@ class Room:
     old: wp.array2d(dtype=vec6)
     tried: wp.array2d(dtype=vec6)
     best: wp.array2d(dtype=vec6)
+    moved: wp.array2d(dtype=vec6)
+    late: wp.array2d(dtype=vec6)
     step: wp.array2d(dtype=vec6)
     residual: wp.array2d(dtype=vec6)
     scale: wp.array2d(dtype=vec6)
@@ -279,6 +287,7 @@ class Room:
     after_bar: wp.array2d(dtype=StateRow)
     wrenches: wp.array2d(dtype=vec6)
     missing: wp.array2d(dtype=vec6)
+    delayed: wp.array2d(dtype=vec6)
     splines: wp.array2d(dtype=real)
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float, Int
 
-from dano.contact import AbstractPatchLaw, DistributedLaw, Material, materials, SurfaceSet
+from dano.contact import AbstractPatchLaw, ContactParams, DistributedLaw, Material, materials, SurfaceSet
 from dano.engine.joints import structure_of_trees, tree_rows, TreeStructure
 from dano.engine.launching._instances import Features, instance
 from dano.engine.launching._leaves import (
@@ -26,10 +26,7 @@ from dano.scene import Body, pressing_pairs, Scene
 
 # Samples count as near within this share of the smaller body's size, besides the way they go.
 _MARGIN = 0.001
-# Geometry is taken where bodies have sunk into each other by at most this share of the smaller one's size …
-import os
-_SINK = float(os.environ.get('IMPD','0.005'))
-# … and by this share of the thinner one's half thickness.
+# Impacts are at most as deep as this share of the thinner body's half thickness.
 _THIN = 0.25
 # Up to so many blocks the moment of meeting is found from samples, beyond from the centres of blocks.
 _FEW_BLOCKS = 16
@@ -198,10 +195,26 @@ def _extent(body: Body) -> Float[Array, "6"]:
     return jnp.zeros(6) if body.extent is None else body.extent
 
 
-def _materials(scene: Scene, kernels: ModuleType, dtype: DTypeLike) -> Float[Array, "contacts 13"]:
+def _point_laws(scene: Scene) -> list[tuple[DistributedLaw, ContactParams]]:
+    """Point laws and complete parameters, of one contact or arrays over several."""
     groups = [(c.law, c.params) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
     if scene.others is not None:
         groups.append((scene.others.law, scene.others.pair_params))
+    return groups
+
+
+def _impact_depths(scene: Scene, dtype: DTypeLike) -> Float[Array, " contacts"]:
+    """δ of each contact with a point law [m]."""
+    return jnp.concatenate(
+        [
+            jnp.broadcast_to(params.impact_depth, params.sliding_friction.shape).reshape(-1).astype(dtype)
+            for _, params in _point_laws(scene)
+        ]
+    )
+
+
+def _materials(scene: Scene, kernels: ModuleType, dtype: DTypeLike) -> Float[Array, "contacts 13"]:
+    groups = _point_laws(scene)
     if not groups:
         return jnp.zeros((0, len(Material._fields)), dtype)
     gravity = jnp.sqrt(jnp.sum(scene.gravity**2))
@@ -283,7 +296,7 @@ def _pairs(
     if not pairs:
         return jnp.zeros((0, 4), dtype), np.zeros((0, 3), np.int32)
     both = {(first, second) for first, second, _ in pairs}
-    first, second, _ = (np.array(x) for x in zip(*pairs, strict=True))
+    first, second, contact = (np.array(x) for x in zip(*pairs, strict=True))
     size, thickness = jnp.minimum(extents[first, 4:], extents[second, 4:]).T
     smooth = [body.surface is not None and body.surface.turning != "fixed" for body in bodies]
     gravity_step = jnp.sqrt(jnp.sum(scene.gravity**2)) * h * h
@@ -291,7 +304,7 @@ def _pairs(
         kernels.SamplePair,
         share=jnp.asarray([0.5 if (j, i) in both else 1.0 for i, j, _ in pairs], dtype),
         follows=jnp.asarray([float(smooth[j] and not smooth[i]) for i, j, _ in pairs], dtype),
-        sink=jnp.minimum(_SINK * size, _THIN * thickness),
+        sink=jnp.minimum(_impact_depths(scene, dtype)[contact], _THIN * thickness),
         margin=_MARGIN * size + 2 * gravity_step.astype(dtype),
     )
     return rows, np.array(pairs, np.int32)

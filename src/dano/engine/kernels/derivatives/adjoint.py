@@ -23,7 +23,7 @@ from dano.physics.pairs import (
     seen_from,
     shrunk,
 )
-from dano.physics.point_law import friction_bound, Impact, Material, point_law, point_motion, pressure
+from dano.physics.point_law import friction_bound, Material, point_law, point_motion, pressure
 from dano.physics.real import ONE, real, vec3, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
 from dano.physics.samples import point_contact, position_in_solid, Sample
@@ -54,14 +54,14 @@ def point_work(
     h: real,
     material: Material,
     rebound: real,
-    impact: Impact,
+    impact_stiffness: real,
     twists: Virtual,
 ) -> real:
     """Work of a point's impulse along the virtual velocities of its bodies."""
     point = point_contact(pose, sample, d, turning, presses_back, stiffness_share, share * h)
     if material.instant > ZERO:
         material.restitution = rebound * material.restitution
-    law = point_law(material, point, impact)
+    law = point_law(material, point, impact_stiffness)
     twist = relative_twist(twists.first, twists.second, pose.com_difference)
     virtual = relative_twist(twists.first_virtual, twists.second_virtual, pose.com_difference)
     motion = point_motion(point, twist.velocity, twist.spin)

@@ -194,7 +194,7 @@ def pull_points(
                 by_twists,
             ) = wp.grad(point_work)(
                 pose, sample, d, turning, where.presses_back > 0, pair.share, found.share, h, material,
-                rebound, found.impact, twists,
+                rebound, found.impact_stiffness, twists,
             )  # fmt: skip
             _f, _g, by_solid, by_x, _h = wp.grad(distance_work)(scene.solids, world, solid, x, by_distance)
             add_leaf(bars, world, solid, by_solid)

@@ -1,0 +1,134 @@
+"""Impacts of bodies with point contacts (docs/theory/contact.md, "Impacts").
+
+An impact happens when a body has sunk into another by a stated depth δ. The samples that have sunk in are its
+patch; they count with weights w(d/δ) that fade in with depth. A damper between what they do and their goals
+brings them there within a step,
+
+    p = κ w (v* − v_n)⁺,    κ = β F m_eff / (h Σ A w).
+
+Nothing of this depends on where in a step the bodies meet, on the number of samples, or, but for h κ, on h.
+"""
+
+import warp as wp
+
+from dano.physics.pairs import BodyState
+from dano.physics.real import ONE, real, TWO, vec3, ZERO
+
+# F: momentum that the damper passes on, by that of the common mass, for each speed that is missing. The softer,
+# the more samples share an impact; goals make up for it.
+_FACTOR = wp.constant(real(10.0))
+
+
+@wp.struct
+class Patch:
+    """Sums over the samples of a pair that have sunk in, where its geometry is taken.
+
+    Attributes:
+        load: Σ A w [m²].
+        rate: Separating speed, weighted by the load [m³/s].
+        arm: [m³, W].
+        normal: [m², W].
+    """
+
+    load: real
+    rate: real
+    arm: vec3
+    normal: vec3
+
+
+@wp.struct
+class Impact:
+    """The impact of a pair.
+
+    Attributes:
+        share: β, share of the contact that is an impact and no lasting contact [1].
+        stiffness: κ [Pa s/m], zero where bodies have not sunk in far enough.
+        depth: δ [m].
+        part: Share of the impact that the pair carries, ½ where samples of both bodies do [1].
+        delays: 1 where impulses take effect when bodies meet, 0 where they do so at the start of the step.
+        way: Share of the step in which bodies go on as before, τ where impulses take effect at its start.
+    """
+
+    share: real
+    stiffness: real
+    depth: real
+    part: real
+    delays: real
+    way: real
+
+
+@wp.func
+def smooth_step(x: real) -> real:
+    """From 0 at x = 0 to 1 at x = 1, with slopes of zero there."""
+    y = wp.clamp(x, ZERO, ONE)
+    return y * y * (real(3.0) - TWO * y)
+
+
+@wp.func
+def fading_in(x: real) -> real:
+    """w: how much a sample counts at x times the depth of the impact. Its slope has no jumps."""
+    y = wp.max(x, ZERO)
+    return wp.where(y < ONE, y * y, TWO * y - ONE)
+
+
+@wp.func
+def with_sample(
+    patch: Patch, area: real, sunk: real, depth: real, approach: real, arm: vec3, normal: vec3
+) -> Patch:
+    """A patch with one more sample.
+
+    Args:
+        patch: The patch.
+        area: Of the sample [m²].
+        sunk: Its depth where geometry is taken [m].
+        depth: δ [m].
+        approach: Its separating speed with which the step begins [m/s].
+        arm: From the first body's centre of mass [m, W].
+        normal: Unit normal [W].
+    """
+    found = patch
+    weight = area * fading_in(sunk / depth)
+    found.load += weight
+    found.rate += weight * approach
+    found.arm += weight * arm
+    found.normal += weight * normal
+    return found
+
+
+@wp.func
+def effective_inverse_mass(state: BodyState, arm: vec3, normal: vec3) -> real:
+    """1/m + (r × n) · J⁻¹ (r × n): how fast a unit impulse along n makes a body's point at r [1/kg]."""
+    moment = wp.cross(arm, normal)
+    return state.inverse_mass + wp.dot(moment, state.inverse_inertia * moment)
+
+
+@wp.func
+def share_of_impact(patch: Patch, bounce: real) -> real:
+    """β: from 0 at an approach as fast as `bounce` [m/s] to 1 at twice that speed.
+
+    A patch approaches at the mean over its load: ahead of a rolling contact single samples always do.
+    """
+    return smooth_step(-patch.rate / (patch.load * bounce) - ONE)
+
+
+@wp.func
+def stiffness_of_impact(first: BodyState, second: BodyState, patch: Patch, bounce: real, h: real) -> real:
+    """κ [Pa s/m] of a patch whose bodies have met."""
+    arm = patch.arm / patch.load
+    normal = patch.normal / patch.load
+    inverse_mass = effective_inverse_mass(first, arm, normal)
+    inverse_mass += effective_inverse_mass(second, arm + first.position - second.position, normal)
+    return share_of_impact(patch, bounce) * _FACTOR / (h * inverse_mass * patch.load)
+
+
+@wp.func
+def impact_goal(impact: Impact, restitution: real, bounce: real, approach: real) -> real:
+    """v*: separating speed that a sample aims at [m/s], so high that the damper leaves it at Newton's e |v⁻|.
+
+    Rebounds slower than `bounce` fade out. Where impulses take effect at the start of the step, what does not
+    rebound goes on for the rest of its way.
+    """
+    rebound = -restitution * approach
+    rebounds = smooth_step(TWO * rebound / bounce - ONE)
+    after = rebounds * rebound + (ONE - rebounds) * impact.way * wp.min(approach, ZERO)
+    return after + wp.max(after - approach, ZERO) / _FACTOR
