@@ -12,6 +12,8 @@ from typing import Any
 import warp as wp
 
 from dano.engine.kernels.tables import Body, Push, StateRow
+from dano.physics.features import TREES
+from dano.physics.impacts import Impact
 from dano.physics.momentum import angular_momentum, turned_inertia
 from dano.physics.pairs import (
     BodyState,
@@ -29,17 +31,22 @@ from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
 from dano.physics.samples import point_contact, position_in_solid, Sample
 from dano.physics.solids.distances import leaf_distance, Solid
 from dano.physics.solids.leaves import Distance, Solids
-from dano.physics.twists import joined, linear_part, relative_twist
+from dano.physics.twists import angular_part, joined, linear_part, relative_twist
 
 
 @wp.struct
 class Virtual:
-    """Twists of the bodies of a pair [W]: at the end of the step, and virtual ones."""
+    """Twists of the bodies of a pair [W]: at the end of the step, and virtual ones.
+
+    The last two are those of impulses that take effect after the share τ of the step: τ times them is taken off.
+    """
 
     first: vec6
     second: vec6
     first_virtual: vec6
     second_virtual: vec6
+    first_late: vec6
+    second_late: vec6
 
 
 @wp.func
@@ -54,22 +61,25 @@ def point_work(
     h: real,
     material: Material,
     rebound: real,
-    impact_stiffness: real,
+    impact: Impact,
     twists: Virtual,
 ) -> real:
     """Work of a point's impulse along the virtual velocities of its bodies."""
     point = point_contact(pose, sample, d, turning, presses_back, stiffness_share, share * h)
     if material.instant > ZERO:
         material.restitution = rebound * material.restitution
-    law = point_law(material, point, impact_stiffness)
+    law = point_law(material, point, impact)
     twist = relative_twist(twists.first, twists.second, pose.com_difference)
     virtual = relative_twist(twists.first_virtual, twists.second_virtual, pose.com_difference)
+    late = relative_twist(twists.first_late, twists.second_late, pose.com_difference)
+    along = virtual.velocity - (impact.delays * share) * late.velocity
+    turn = virtual.spin - (impact.delays * share) * late.spin
     motion = point_motion(point, twist.velocity, twist.spin)
     slip = motion.slip + point.extra_slip
     p = pressure(law, motion.rate, ZERO, law.stiction).value
     friction = (-friction_bound(law, p).value / wp.max(wp.length(slip), law.stiction)) * slip
-    by_pressure = wp.dot(point.normal, virtual.velocity) + wp.dot(point.moment, virtual.spin)
-    by_friction = wp.dot(friction, virtual.velocity + wp.cross(virtual.spin, point.arm))
+    by_pressure = wp.dot(point.normal, along) + wp.dot(point.moment, turn)
+    by_friction = wp.dot(friction, along + wp.cross(turn, point.arm))
     return h * point.area * (p * by_pressure + by_friction)
 
 
@@ -179,18 +189,22 @@ def state_work(body: Body, row: StateRow, h: real, moves: bool, bar: BodyState) 
     if moves:
         ahead = turned(q, row.omega, h)
         total += wp.dot(bar.velocity, row.velocity) + wp.dot(bar.spin, matrix(q) * row.omega)
+        if wp.static(not TREES):
+            inertia = turned_inertia(matrix(q), body.inertia)
+            total += bar.inverse_mass / body.mass + wp.ddot(bar.inverse_inertia, wp.inverse(inertia))
     return total + wp.dot(bar.ahead, ahead)
 
 
 @wp.func
-def advance_work(row: StateRow, velocity: vec6, h: real, bar: StateRow) -> real:
-    """⟨bar, state of a body at the end of a step⟩."""
+def advance_work(row: StateRow, velocity: vec6, moved: vec6, h: real, bar: StateRow) -> real:
+    """⟨bar, state of a body at the end of a step⟩; `moved` is the twist by which its pose changes."""
     q = from_wxyz(row.orientation)
     v = linear_part(velocity)
-    omega = wp.transpose(matrix(q)) * vec3(velocity[3], velocity[4], velocity[5])
+    back = wp.transpose(matrix(q))
+    omega = back * angular_part(velocity)
     return (
-        wp.dot(bar.position, row.position + h * v)
-        + wp.dot(bar.orientation, to_wxyz(turned(q, omega, h)))
+        wp.dot(bar.position, row.position + h * linear_part(moved))
+        + wp.dot(bar.orientation, to_wxyz(turned(q, back * angular_part(moved), h)))
         + wp.dot(bar.velocity, v)
         + wp.dot(bar.omega, omega)
     )

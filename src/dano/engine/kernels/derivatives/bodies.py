@@ -2,14 +2,19 @@
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.adjoint import advance_work, momentum_work, state_work
-from dano.engine.kernels.rollout import Launch, push_of
+from dano.engine.kernels.derivatives.adjoint import advance_work, after_adjoints, momentum_work, state_work
+from dano.engine.kernels.derivatives.impact_work import late_work
+from dano.engine.kernels.impacts import freed, pair_slope
+from dano.engine.kernels.lanes import wait
+from dano.engine.kernels.rollout import Launch, push_of, row_before
 from dano.engine.kernels.tables import Changes, Room, Scene, StateRow
-from dano.physics.features import TREES
+from dano.physics.features import LANES, TREES
 from dano.physics.pairs import BodyState
 from dano.physics.real import vec6, ZERO
 from dano.physics.trees.joints import ROOT
+from dano.physics.twists import shift
 
+_LANES = wp.constant(LANES)
 _ROOT = wp.constant(ROOT)
 
 
@@ -48,6 +53,8 @@ def pull_body(scene: Scene, room: Room, bars: Changes, world: int, i: int, row: 
     add_row(room.state_bar, world, i, by_row)
     if bars.bodies.shape[1] > 0:
         bars.bodies[world, i].com += by_body.com
+        bars.bodies[world, i].mass += by_body.mass
+        bars.bodies[world, i].inertia += by_body.inertia
     if bars.timestep.shape[1] > 0:
         bars.timestep[world, 0] += by_h
 
@@ -92,12 +99,63 @@ def pull_advance(scene: Scene, room: Room, bars: Changes, world: int, i: int, ro
     if m >= 0 and is_zero(after):
         room.state_bar[world, i] = StateRow()
         room.residual[world, block_of(scene, m)] = vec6()
+        room.late[world, block_of(scene, m)] = vec6()
     elif m >= 0:
         b = block_of(scene, m)
-        by_row, by_velocity, by_h, _a = wp.grad(advance_work)(row, room.velocity[world, b], h, after)
+        by_row, by_velocity, by_moved, by_h, _a = wp.grad(advance_work)(
+            row, room.velocity[world, b], room.moved[world, b], h, after
+        )
         room.state_bar[world, i] = by_row
-        room.residual[world, b] = by_velocity
+        room.residual[world, b] = by_velocity + by_moved
+        room.late[world, b] = freed(room.bodies[world, i], by_moved)
         if bars.timestep.shape[1] > 0:
             bars.timestep[world, 0] += by_h
     else:
         room.state_bar[world, i] = after
+
+
+@wp.func
+def subtract_slope(scene: Scene, room: Room, world: int, lane: int, f: int):
+    """Take what the delayed impulse of a pair makes of positions by its velocities off their derivatives."""
+    found = room.found[world, f * _LANES + lane]
+    slope = pair_slope(scene, room, world, found)
+    if lane == 0:
+        index = scene.pair_index[found.pair]
+        a = scene.body_index[index.first].row
+        b = scene.body_index[index.second].row
+        t = shift(found.com_difference)
+        late = vec6()
+        if a >= 0:
+            late = room.late[world, a]
+        if b >= 0:
+            late = late - t * room.late[world, b]
+        by_twist = found.share * (wp.transpose(slope) * late)
+        if a >= 0:
+            room.residual[world, a] -= by_twist
+        if b >= 0:
+            room.residual[world, b] += wp.transpose(t) * by_twist
+
+
+@after_adjoints
+@wp.func
+def pull_delays(
+    scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, lane: int, t: int, n_found: int
+):
+    """Derivatives by velocities and by masses through impulses that take effect within the step."""
+    for f in range(n_found):
+        if room.found[world, f * _LANES + lane].impact.delays > ZERO:
+            subtract_slope(scene, room, world, lane, f)
+    wait()
+    if lane == 0:
+        for b in range(scene.n_blocks):
+            i = scene.moving[b]
+            delayed = room.velocity[world, b] - room.moved[world, b]
+            if wp.length_sq(delayed) > ZERO:
+                row = row_before(scene, launch, world, t, i)
+                by_body, by_row, _a, _b = wp.grad(late_work)(
+                    scene.bodies[world, i], row, delayed, room.late[world, b]
+                )
+                add_row(room.state_bar, world, i, by_row)
+                if bars.bodies.shape[1] > 0:
+                    bars.bodies[world, i].mass += by_body.mass
+                    bars.bodies[world, i].inertia += by_body.inertia

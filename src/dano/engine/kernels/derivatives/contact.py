@@ -11,16 +11,19 @@ from dano.engine.kernels.derivatives.adjoint import (
     probe_distance,
     Virtual,
 )
+from dano.engine.kernels.derivatives.impact_work import impact_work, patch_work
 from dano.engine.kernels.derivatives.pair_changes import add_distance_changes
 from dano.engine.kernels.lanes import total, total3, total6, total33
 from dano.engine.kernels.search import posed, solid_of_body
 from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
 from dano.physics.features import LANES, TREES, TURNING, UNIONS
+from dano.physics.impacts import Impact, Patch
 from dano.physics.pairs import BALL, BodyState, first_touch, PairPose, position_after, rotation_after
 from dano.physics.point_law import Material
 from dano.physics.real import mat33, ONE, real, vec3, ZERO
-from dano.physics.samples import position_in_solid
+from dano.physics.samples import position_in_solid, Sample
 from dano.physics.solids.distances import leaf_distance, nearest_leaf, Solid
+from dano.physics.solids.leaves import Distance
 
 _BALL = wp.constant(BALL)
 
@@ -151,7 +154,80 @@ def summed_body(a: BodyState, b: BodyState) -> BodyState:
     a.velocity += b.velocity
     a.spin += b.spin
     a.com += b.com
+    a.inverse_mass += b.inverse_mass
+    a.inverse_inertia += b.inverse_inertia
     return a
+
+
+@wp.func
+def pull_sample(
+    scene: Scene,
+    room: Room,
+    bars: Changes,
+    world: int,
+    lane: int,
+    s: int,
+    pose: PairPose,
+    solid: Solid,
+    x: vec3,
+    by_pose: PairPose,
+    by_sample: Sample,
+    by_distance: Distance,
+) -> PairPose:
+    """Add derivatives by a sample and the solid that it meets at x; returns those by the pose."""
+    _f, _g, by_solid, by_x, _h = wp.grad(distance_work)(scene.solids, world, solid, x, by_distance)
+    add_leaf(bars, world, solid, by_solid)
+    add_distance_changes(scene, room, world, lane, solid, x, by_distance)
+    # x = points · sample + origin
+    by_pose.points += wp.outer(by_x, scene.samples[world, s].point)
+    by_pose.origin += by_x
+    if bars.samples.shape[1] > 0:
+        bars.samples[world, s].point += by_sample.point + wp.transpose(pose.points) * by_x
+        bars.samples[world, s].area += by_sample.area
+    return by_pose
+
+
+@wp.func
+def pull_patch_of_impact(
+    scene: Scene,
+    room: Room,
+    bars: Changes,
+    world: int,
+    lane: int,
+    found: FoundPair,
+    pose: PairPose,
+    patch_bar: Patch,
+) -> tuple[PairPose, real, real, real]:
+    """Derivatives by the pose of a pair, τ, h and δ from the patch of its impact; each lane's part."""
+    index = scene.pair_index[found.pair]
+    pair = scene.pairs[world, found.pair]
+    turning = scene.body_index[index.first].turning
+    h = scene.timestep[world, 0]
+    pose_bar = PairPose()
+    lead_bar = real(0.0)
+    depth_bar = real(0.0)
+    share_of_bar = real(0.0)
+    for k in range(found.first, found.end):
+        where = room.where[world, k]
+        if room.points[world, k].sunk > ZERO and where.presses_back == 0:
+            sample = scene.samples[world, where.sample]
+            x = position_in_solid(pose, sample.point)
+            solid = leaf_at(scene, world, index.second, x)
+            d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
+            by_pose, by_sample, by_distance, _a, by_share_of, by_lead, by_depth, _b = wp.grad(patch_work)(
+                pose, sample, d, turning, pair.share, found.share * h, pair.sink, patch_bar
+            )
+            by_pose = pull_sample(
+                scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance
+            )
+            pose_bar = summed_pose(pose_bar, by_pose)
+            lead_bar += by_lead
+            depth_bar += by_depth
+            share_of_bar += by_share_of
+    share_of_bar = total(share_of_bar)
+    if lane == 0 and bars.pairs.shape[1] > 0:
+        bars.pairs[world, found.pair].share += share_of_bar
+    return pose_bar, h * lead_bar, found.share * lead_bar, depth_bar
 
 
 @wp.func
@@ -165,8 +241,8 @@ def pull_points(
     pose: PairPose,
     rebound: real,
     twists: Virtual,
-) -> tuple[PairPose, real, real, Virtual]:
-    """Derivatives by the pose of a pair, τ, h and twists from its points.
+) -> tuple[PairPose, real, real, Impact, Virtual]:
+    """Derivatives by the pose of a pair, τ, h, its impact and twists from its points; each lane's part.
 
     Adds those by samples, solids and materials.
     """
@@ -180,6 +256,7 @@ def pull_points(
     h_bar = real(0.0)
     material_bar = Material()
     stiffness_share_bar = real(0.0)
+    impact_bar = Impact()
     twists_bar = Virtual()
     for k in range(found.first, found.end):
         linear = room.linear[world, k]
@@ -190,22 +267,20 @@ def pull_points(
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
             (
-                by_pose, by_sample, by_distance, _a, _b, by_share_of, by_share, by_h, by_material, _c, _d,
-                by_twists,
+                by_pose, by_sample, by_distance, _a, _b, by_share_of, by_share, by_h, by_material, _c,
+                by_impact, by_twists,
             ) = wp.grad(point_work)(
                 pose, sample, d, turning, where.presses_back > 0, pair.share, found.share, h, material,
-                rebound, found.impact_stiffness, twists,
+                rebound, found.impact, twists,
             )  # fmt: skip
-            _f, _g, by_solid, by_x, _h = wp.grad(distance_work)(scene.solids, world, solid, x, by_distance)
-            add_leaf(bars, world, solid, by_solid)
-            add_distance_changes(scene, room, world, lane, solid, x, by_distance)
-            # x = points · sample + origin
-            by_pose.points += wp.outer(by_x, sample.point)
-            by_pose.origin += by_x
-            if bars.samples.shape[1] > 0:
-                bars.samples[world, where.sample].point += by_sample.point + wp.transpose(pose.points) * by_x
-                bars.samples[world, where.sample].area += by_sample.area
+            by_pose = pull_sample(
+                scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance
+            )
             pose_bar = summed_pose(pose_bar, by_pose)
+            impact_bar.share += by_impact.share
+            impact_bar.stiffness += by_impact.stiffness
+            impact_bar.depth += by_impact.depth
+            impact_bar.way += by_impact.way
             material_bar = summed_material(material_bar, by_material)
             share_bar += by_share
             h_bar += by_h
@@ -228,7 +303,7 @@ def pull_points(
         twists_bar.second = total6(twists_bar.second)
         twists_bar.first_virtual = total6(twists_bar.first_virtual)
         twists_bar.second_virtual = total6(twists_bar.second_virtual)
-    return total_pose(pose_bar), total(share_bar), total(h_bar), twists_bar
+    return pose_bar, share_bar, h_bar, impact_bar, twists_bar
 
 
 @wp.func
@@ -318,6 +393,8 @@ def scaled_body(s: real, a: BodyState) -> BodyState:
     a.velocity *= s
     a.spin *= s
     a.com *= s
+    a.inverse_mass *= s
+    a.inverse_inertia *= s
     return a
 
 
@@ -378,7 +455,7 @@ def pull_pose(
             bar.second = summed_body(bar.second, scaled_body(share, of_second))
             bar.scale += share * of_scale
             bar.timestep += share * of_h
-            bar.sink = share
+            bar.sink += share
             toward_bar += share * of_toward
             if lane == 0:
                 of_solid.leaf.factor *= share
@@ -415,11 +492,40 @@ def pull_pair(
     a = room.bodies[world, index.first]
     b = room.bodies[world, index.second]
     pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
-    pose_bar, share_bar, h_bar, twists_bar = pull_points(
+    pose_bar, share_bar, h_bar, impact_bar, twists_bar = pull_points(
         scene, room, bars, world, lane, found, pose, rebound, twists
     )
+    by_first = BodyState()
+    by_second = BodyState()
+    impact_bar.depth = total(impact_bar.depth)
+    if found.impact.share > ZERO:
+        impact_bar.share = total(impact_bar.share)
+        impact_bar.stiffness = total(impact_bar.stiffness)
+        share_bar += impact_bar.way
+        hits = found.impact.stiffness > ZERO
+        bounce = scene.materials[world, index.contact].bounce
+        by_first, by_second, patch_bar, by_bounce, by_h, _a, _b = wp.grad(impact_work)(
+            a, b, found.patch, bounce, h, hits, impact_bar
+        )
+        by_pose, by_share, by_lead, by_depth = pull_patch_of_impact(
+            scene, room, bars, world, lane, found, pose, patch_bar
+        )
+        pose_bar = summed_pose(pose_bar, by_pose)
+        share_bar += by_share
+        h_bar += by_lead
+        impact_bar.depth += total(by_depth)
+        if lane == 0:
+            h_bar += by_h
+            if bars.materials.shape[1] > 0:
+                bars.materials[world, index.contact].bounce += by_bounce
+    pose_bar = total_pose(pose_bar)
+    share_bar = total(share_bar)
+    h_bar = total(h_bar)
     bar = PairBar()
     if lane == 0:
         bar = pull_pose(scene, bars, world, lane, found, a, b, pose, pose_bar, share_bar, h_bar)
+        bar.first = summed_body(bar.first, by_first)
+        bar.second = summed_body(bar.second, by_second)
+        bar.sink += impact_bar.depth
     bar.twists = twists_bar
     return bar

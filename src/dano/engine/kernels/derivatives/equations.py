@@ -26,6 +26,7 @@ from dano.engine.kernels.derivatives.trees import (
     settle_trees,
     transpose_entries,
 )
+from dano.engine.kernels.impacts import find_moved
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import copy_transposed_blocks, find_pattern, solve_blocks
 from dano.engine.kernels.patches import add_patches, fit_patch_duals
@@ -84,6 +85,8 @@ def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: i
         if lane == 0:
             add_tree_slopes(scene, room, world)
         wait()
+    find_moved(scene, room, world, lane, n_found)
+    wait()
     return n_found
 
 
@@ -192,13 +195,18 @@ def twists_of_pair(scene: Scene, room: Room, world: int, found: FoundPair) -> Vi
     twists.second = twist_of(scene, room, world, second, room.velocity, ONE)
     twists.first_virtual = twist_of(scene, room, world, first, room.step, ZERO)
     twists.second_virtual = twist_of(scene, room, world, second, room.step, ZERO)
+    if wp.static(not TREES):
+        if found.impact.delays > ZERO:
+            twists.first_late = row_of(room.late, world, first)
+            twists.second_late = row_of(room.late, world, second)
     return twists
 
 
 @wp.func
 def is_moved_pair(twists: Virtual) -> bool:
     """Whether virtual velocities of a pair are not zero; what is not a number is not."""
-    return not (wp.length_sq(twists.first_virtual) + wp.length_sq(twists.second_virtual) == ZERO)
+    size = wp.length_sq(twists.first_virtual) + wp.length_sq(twists.second_virtual)
+    return not (size + wp.length_sq(twists.first_late) + wp.length_sq(twists.second_late) == ZERO)
 
 
 @after_adjoints

@@ -10,6 +10,7 @@ from dano.engine.kernels.assembly import row_of
 from dano.engine.kernels.derivatives.adjoint import advance_work, after_adjoints, momentum_work, Virtual
 from dano.engine.kernels.derivatives.contact import PairBar, pull_pair
 from dano.engine.kernels.derivatives.equations import pull_touching
+from dano.engine.kernels.derivatives.impact_work import late_work
 from dano.engine.kernels.derivatives.pair_changes import (
     change_by_leaves,
     change_by_patch,
@@ -32,6 +33,7 @@ from dano.engine.kernels.derivatives.products import (
     unit_row,
     unit_vector,
 )
+from dano.engine.kernels.impacts import freed, pair_slope
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
 from dano.engine.kernels.patches import n_patches
@@ -40,7 +42,7 @@ from dano.engine.kernels.tables import Body, Changes, FoundPair, Room, SamplePai
 from dano.physics.features import LANES, PATCHES, POINTS
 from dano.physics.point_law import Material
 from dano.physics.real import real, vec3, vec6, ZERO
-from dano.physics.twists import angular_part, joined, linear_part
+from dano.physics.twists import angular_part, joined, linear_part, shift
 
 _LANES = wp.constant(LANES)
 
@@ -140,19 +142,27 @@ def change_of_pair(
 
 
 @wp.func
-def add_change(scene: Scene, room: Room, world: int, found: FoundPair, direction: int, change: real, k: int):
-    """Add the change of an equation of a pair to those of its bodies."""
+def add_change(
+    scene: Scene,
+    to: wp.array2d(dtype=vec6),
+    world: int,
+    found: FoundPair,
+    direction: int,
+    change: real,
+    k: int,
+):
+    """Add the change of an impulse of a pair to those of its bodies."""
     m = scene.moving.shape[0]
     index = scene.pair_index[found.pair]
     a = scene.body_index[index.first].row
     b = scene.body_index[index.second].row
     if a >= 0:
-        room.missing[world, direction * m + a] += change * unit_vector(k)
+        to[world, direction * m + a] += change * unit_vector(k)
     if b >= 0:
         # The second body feels −Tᵀ times the wrench on the first.
         force = linear_part(unit_vector(k))
         moment = angular_part(unit_vector(k)) + wp.cross(found.com_difference, force)
-        room.missing[world, direction * m + b] -= change * joined(force, moment)
+        to[world, direction * m + b] -= change * joined(force, moment)
 
 
 @wp.func
@@ -170,6 +180,8 @@ def add_shift(
         moved = moved - row_change(launch, changes, world, t, index.second, direction, n).position
         moment = wp.cross(moved, linear_part(room.wrenches[world, f]))
         room.missing[world, direction * m + b] -= joined(vec3(), moment)
+        if found.impact.delays > ZERO:
+            room.delayed[world, direction * m + b] -= joined(vec3(), found.share * moment)
 
 
 @wp.func
@@ -202,6 +214,46 @@ def push_momentum(scene: Scene, room: Room, launch: Launch, changes: Changes, wo
 
 
 @wp.func
+def change_of_delay(
+    scene: Scene, room: Room, changes: Changes, world: int, i: int, d: int, row: StateRow, moved: StateRow
+) -> vec6:
+    """Change of what a body's velocities lose to impulses that take effect within the step, D = M⁻¹ τ P."""
+    n = scene.body_index.shape[0]
+    m = scene.moving.shape[0]
+    b = scene.body_index[i].row
+    delayed = room.velocity[world, b] - room.moved[world, b]
+    impulse = room.delayed[world, d * m + b]
+    if wp.length_sq(delayed) > ZERO:
+        k = int(0)
+        while k < 6:
+            by_body, by_row, _a, _b = wp.grad(late_work)(scene.bodies[world, i], row, delayed, unit_vector(k))
+            change = row_product(by_row, moved)
+            if changes.bodies.shape[1] > 0:
+                change += body_product(by_body, changes.bodies[world, d * n + i])
+            impulse -= change * unit_vector(k)
+            k += 1
+    return freed(room.bodies[world, i], impulse)
+
+
+@wp.func
+def add_delayed(scene: Scene, room: Room, world: int, lane: int, f: int, d: int):
+    """Add what changes of velocities, in `room.step`, make of the delayed impulse of a pair."""
+    m = scene.moving.shape[0]
+    found = room.found[world, f * _LANES + lane]
+    slope = pair_slope(scene, room, world, found)
+    if lane == 0:
+        index = scene.pair_index[found.pair]
+        a = scene.body_index[index.first].row
+        b = scene.body_index[index.second].row
+        t = shift(found.com_difference)
+        impulse = found.share * (slope * (row_of(room.step, world, a) - t * row_of(room.step, world, b)))
+        if a >= 0:
+            room.delayed[world, d * m + a] += impulse
+        if b >= 0:
+            room.delayed[world, d * m + b] -= wp.transpose(t) * impulse
+
+
+@wp.func
 def push_advance(
     scene: Scene, room: Room, launch: Launch, changes: Changes, world: int, t: int, i: int, d: int
 ):
@@ -212,13 +264,16 @@ def push_advance(
     moved = row_change(launch, changes, world, t, i, d, n)
     if row >= 0:
         h = scene.timestep[world, 0]
+        before = row_before(scene, launch, world, t, i)
+        late = change_of_delay(scene, room, changes, world, i, d, before, moved)
         end = StateRow()
         k = int(0)
         while k < 13:
-            by_row, by_velocity, by_h, _a = wp.grad(advance_work)(
-                row_before(scene, launch, world, t, i), room.velocity[world, row], h, unit_row(k)
+            by_row, by_velocity, by_moved, by_h, _a = wp.grad(advance_work)(
+                before, room.velocity[world, row], room.moved[world, row], h, unit_row(k)
             )
             change = row_product(by_row, moved) + wp.dot(by_velocity, room.step[world, row])
+            change += wp.dot(by_moved, room.step[world, row] - late)
             if changes.timestep.shape[1] > 0:
                 change += by_h * changes.timestep[world, d]
             unit = unit_row(k)
@@ -251,12 +306,21 @@ def push_pair(
     twists = Virtual()
     twists.first = row_of(room.velocity, world, scene.body_index[index.first].row)
     twists.second = row_of(room.velocity, world, scene.body_index[index.second].row)
+    equations = int(6)
+    if found.impact.delays > ZERO:
+        # Impulses that take effect later are asked for twice: as they are, and times τ.
+        equations = int(12)
     k = int(0)
-    while k < 6:
+    while k < equations:
         clear_pair(scene, room, bars, world, lane, found, has_points)
         wait()
         # The first body's virtual velocity is measured from the second's: only it moves.
-        twists.first_virtual = unit_vector(k)
+        twists.first_virtual = vec6()
+        twists.first_late = vec6()
+        if k < 6:
+            twists.first_virtual = unit_vector(k)
+        else:
+            twists.first_late = -unit_vector(k - 6)
         bar = PairBar()
         if wp.static(POINTS):
             if has_points:
@@ -271,7 +335,10 @@ def push_pair(
         for d in range(launch.n_directions):
             change = change_of_pair(scene, room, launch, changes, bars, world, lane, t, found, has_points, d)
             if lane == 0:
-                add_change(scene, room, world, found, d, change, k)
+                if k < 6:
+                    add_change(scene, room.missing, world, found, d, change, k)
+                else:
+                    add_change(scene, room.delayed, world, found, d, change, k - 6)
         k += 1
     if lane == 0:
         for d in range(launch.n_directions):
@@ -297,6 +364,7 @@ def push_step_of_bodies(
     if lane == 0:
         for k in range(launch.n_directions * m):
             room.missing[world, k] = vec6()
+            room.delayed[world, k] = vec6()
         for k in range(m):
             push_momentum(scene, room, launch, changes, world, t, scene.moving[k])
     wait()
@@ -310,6 +378,10 @@ def push_step_of_bodies(
         copy_blocks(room, world, lane, m)
         wait()
         solve_blocks(room, world, lane, m)
+        wait()
+        for f in range(n_found):
+            if room.found[world, f * _LANES + lane].impact.delays > ZERO:
+                add_delayed(scene, room, world, lane, f, d)
         wait()
         for i in range(lane, n, _LANES):
             push_advance(scene, room, launch, changes, world, t, i, d)
