@@ -501,7 +501,9 @@ def pull_pair(
     if found.impact.share > ZERO:
         impact_bar.share = total(impact_bar.share)
         impact_bar.stiffness = total(impact_bar.stiffness)
-        share_bar += impact_bar.way
+        if wp.static(TREES):
+            # The way that is left is τ.
+            share_bar += impact_bar.way
         hits = found.impact.stiffness > ZERO
         bounce = scene.materials[world, index.contact].bounce
         by_first, by_second, patch_bar, by_bounce, by_h, _a, _b = wp.grad(impact_work)(
