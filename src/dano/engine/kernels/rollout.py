@@ -22,7 +22,7 @@ from dano.engine.kernels.trees.loops import begin_loops, forces_of
 from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
 from dano.physics.momentum import angular_momentum, turned_inertia
 from dano.physics.pairs import BodyState
-from dano.physics.real import ONE, real, vec6, ZERO
+from dano.physics.real import HALF, ONE, real, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
 from dano.physics.trees.joints import ROOT
 from dano.physics.twists import angular_part, joined, linear_part
@@ -163,21 +163,23 @@ def adds_energy(scene: Scene, room: Room, world: int) -> bool:
             v = room.velocity[world, b]
             angular = angular_momentum(angular_part(v), room.inertia[world, i], h, ONE)
             impulse = joined(body.mass * linear_part(v), angular) - room.momentum[world, i]
-            mean = joined(state.velocity, state.spin) + v
+            before = joined(state.velocity, state.spin)
+            after = v
             # In the body's axes, in which components of a spin belong to axes of the body.
             back = wp.transpose(matrix(state.orientation))
             impulse = joined(linear_part(impulse), back * angular_part(impulse))
-            mean = joined(linear_part(mean), back * angular_part(mean))
+            before = joined(linear_part(before), back * angular_part(before))
+            after = joined(linear_part(after), back * angular_part(after))
             for k in range(6):
-                work += real(0.5) * impulse[k] * mean[k]
-                moved += real(0.5) * wp.abs(impulse[k] * mean[k])
+                work += HALF * impulse[k] * (before[k] + after[k])
+                moved += HALF * wp.abs(impulse[k]) * (wp.abs(before[k]) + wp.abs(after[k]))
     if wp.static(TREES):
         for k in range(scene.trees.order.shape[0]):
             u = scene.trees.order[k]
-            half = real(0.5) * (unknown_of(room.old, world, u) + unknown_of(room.tried, world, u))
-            done = room.trees.impulses[world, u] * half
-            work += done
-            moved += wp.abs(done)
+            first = HALF * unknown_of(room.old, world, u)
+            last = HALF * unknown_of(room.tried, world, u)
+            work += room.trees.impulses[world, u] * (first + last)
+            moved += wp.abs(room.trees.impulses[world, u]) * (wp.abs(first) + wp.abs(last))
     return work > _ADDS * moved
 
 

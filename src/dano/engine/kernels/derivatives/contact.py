@@ -449,6 +449,11 @@ def pull_pose(
                     scene, spare, world, lane, index.first, index.second, a, b, found.share, of_toward, none
                 )
                 slope += along
+                # What the points feel of the direction that they face depends on τ, too.
+                _i, turns = pull_facing(
+                    scene, spare, world, lane, index.first, index.second, a, b, found.share, toward_bar, none
+                )
+                share_bar += turns
         if slope < ZERO:
             share = -share_bar / slope
             bar.first = summed_body(bar.first, scaled_body(share, of_first))
@@ -467,7 +472,7 @@ def pull_pose(
                 add_leaf(bars, world, solid, of_solid)
     if wp.static(len(TURNING) > 1):
         if turning > 0:
-            bar, _i = pull_facing(
+            bar, _j = pull_facing(
                 scene, bars, world, lane, index.first, index.second, a, b, found.share, toward_bar, bar
             )
     return bar
