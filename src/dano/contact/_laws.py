@@ -116,7 +116,10 @@ def checked_parameter(name: str, value: Numbers) -> Float[Array, ""]:
         return array
     if name in ("restitution", "hysteresis", "friction_fading") and float(array) > 1:
         raise ValueError(f"{name} must lie in [0, 1], got {float(array)}")
-    if name in ("stiffness", "restitution_velocity", "impact_depth", "friction_pressure") and float(array) == 0:
+    if (
+        name in ("stiffness", "restitution_velocity", "impact_depth", "friction_pressure")
+        and float(array) == 0
+    ):
         raise ValueError(f"{name} must be > 0, got {float(array)}")
     return array
 

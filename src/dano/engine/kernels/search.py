@@ -388,7 +388,7 @@ def find_points(
 
 @wp.func
 def impact_of(
-    a: BodyState, b: BodyState, patch: Patch, material: Material, depth: real, share: real
+    a: BodyState, b: BodyState, patch: Patch, material: Material, depth: real, share: real, alone: bool
 ) -> Impact:
     """The impact of a pair; there is none where it approaches slowly, or where its law leaves it to the spring.
 
@@ -399,6 +399,8 @@ def impact_of(
         material: Of the contact.
         depth: δ [m].
         share: τ, below one where bodies are as deep within the step.
+        alone: Whether one of the bodies is fixed and the other moves freely. Then impulses take effect when they
+            meet; between two that move, this would not conserve angular momentum.
     """
     impact = Impact()
     impact.depth = depth
@@ -408,10 +410,8 @@ def impact_of(
     impact.share = share_of_impact(patch, material.bounce)
     if impact.share > ZERO and share < ONE:
         impact.stiffness = stiffness_of_impact(a, b, patch, material.bounce, material.timestep)
-        impact.delays = ONE
-        if wp.static(TREES):
-            impact.delays = ZERO
-            impact.way = share
+        impact.delays = wp.where(alone, ONE, ZERO)
+        impact.way = wp.where(alone, ZERO, share)
     return impact
 
 
@@ -424,7 +424,10 @@ def share_impacts(scene: Scene, room: Room, world: int, lane: int, n_found: int)
         mine = scene.pair_index[room.found[world, one].pair]
         theirs = scene.pair_index[room.found[world, other].pair]
         if mine.first == theirs.second and mine.second == theirs.first:
-            if room.found[world, one].impact.stiffness > ZERO and room.found[world, other].impact.stiffness > ZERO:
+            if (
+                room.found[world, one].impact.stiffness > ZERO
+                and room.found[world, other].impact.stiffness > ZERO
+            ):
                 room.found[world, one].impact.part = HALF
                 room.found[world, other].impact.part = HALF
 
@@ -484,7 +487,10 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
             found.com_difference = pose.com_difference
             found.toward = facing(scene, world, a, b, index.first, index.second, met.share, h)
             found.patch = patch
-            found.impact = impact_of(a, b, patch, material, pair.sink, met.share)
+            alone = bool(False)
+            if wp.static(not TREES):
+                alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
+            found.impact = impact_of(a, b, patch, material, pair.sink, met.share, alone)
             room.found[world, n_found * _LANES + lane] = found
             n_found += 1
     share_impacts(scene, room, world, lane, n_found)

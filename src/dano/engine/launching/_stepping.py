@@ -19,7 +19,15 @@ _MODULE = "dano.engine.kernels.rollout"
 # Numbers of a body's state, of a push on it, and of what a step reports: see `dano.engine.kernels.tables`.
 STATE, _PUSH, REPORT, WRENCH = 13, 6, 5, 6
 # Numbers of a listed point, see `dano.engine.kernels.listing`, and where each quantity begins.
-_POINT = {"first": 1, "second": 1, "contact": 1, "sample": 1, "share": 1, "impact_share": 1, "impact_stiffness": 1}
+_POINT = {
+    "first": 1,
+    "second": 1,
+    "contact": 1,
+    "sample": 1,
+    "share": 1,
+    "impact_share": 1,
+    "impact_stiffness": 1,
+}
 _POINT |= {"arm": 3, "normal": 3, "moment": 3, "extra_slip": 3}
 _POINT |= {"depth": 1, "rate": 1, "approach": 1, "area": 1, "sunk": 1}
 _PATCHES = tuple(

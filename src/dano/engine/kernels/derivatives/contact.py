@@ -506,7 +506,7 @@ def pull_pair(
     if found.impact.share > ZERO:
         impact_bar.share = total(impact_bar.share)
         impact_bar.stiffness = total(impact_bar.stiffness)
-        if wp.static(TREES):
+        if found.impact.delays == ZERO:
             # The way that is left is τ.
             share_bar += impact_bar.way
         hits = found.impact.stiffness > ZERO

@@ -30,10 +30,7 @@ def patch_work(
     own = Patch()
     own = with_sample(own, point.area, point.sunk, depth, point.approach, point.arm, point.normal)
     return (
-        bar.load * own.load
-        + bar.rate * own.rate
-        + wp.dot(bar.arm, own.arm)
-        + wp.dot(bar.normal, own.normal)
+        bar.load * own.load + bar.rate * own.rate + wp.dot(bar.arm, own.arm) + wp.dot(bar.normal, own.normal)
     )
 
 
