@@ -4,13 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 from reference_step.distances import signed_distance
-from reference_step.law import Law, laws_of
+from reference_step.law import FACTOR, Law, laws_of, smooth_step
 from reference_step.rotations import cross_matrix
 
 import dano
 
-IMPACT = 1000.0
-"""An impact is so many times as stiff as the spring that reverses the motion within a step."""
 POLE = np.array([0.36, -0.48, 0.8])
 FROM_Z = np.array([[0.8, 0.48, -0.36], [0.6, -0.64, 0.48], [0.0, -0.6, -0.8]])
 """A direction in which upright bodies do not press, and a rotation that takes z to its opposite."""
@@ -41,7 +39,9 @@ class Points(NamedTuple):
         rate: v_n⁻ [m/s].
         area: A [m²].
         drift: ½ ω⁻ × (r₁ − r₀), its tangential part limited [m/s], shape (n, 3).
-        impact: k_i [Pa/m], zero where there is no impact, shape (n,).
+        impact: κ w [Pa s/m], zero where there is no impact, shape (n,).
+        beta: Share of the contact that is an impact.
+        delays: Whether impulses take effect after the share τ of the step.
     """
 
     first: int
@@ -57,6 +57,8 @@ class Points(NamedTuple):
     area: np.ndarray
     drift: np.ndarray
     impact: np.ndarray
+    beta: float
+    delays: bool
 
 
 def sides_of(scene):
@@ -188,8 +190,8 @@ def unit(v):
 
 def limit_of(scene, side):
     """Depth [m] up to which geometry is predicted."""
-    (_, size, thickness) = np.minimum(*(np.asarray(scene.bodies[k].extent)[3:] for k in (side.i, side.j)))
-    return min(0.01 * size, 0.25 * thickness)
+    (_, _, thickness) = np.minimum(*(np.asarray(scene.bodies[k].extent)[3:] for k in (side.i, side.j)))
+    return min(side.law.delta, 0.25 * thickness)
 
 
 def meeting(scene, bodies, side):
@@ -199,7 +201,7 @@ def meeting(scene, bodies, side):
     apart = np.linalg.norm(bodies.position[side.i] - bodies.position[side.j])
     spins = np.linalg.norm(bodies.spin[[side.i, side.j]], axis=1)
     way = np.linalg.norm(bodies.velocity[side.i] - bodies.velocity[side.j]) + spins @ [radius, radius + apart]
-    if h * way <= limit:
+    if h * way <= (limit if side.law.compliant else h * side.law.slowest_rebound):
         return 1.0
     turning = scene.bodies[side.i].surface.turning
 
@@ -244,7 +246,7 @@ def find(scene, bodies, shares=None):
         given = (side.i, side.j) in shares
         share = shares[side.i, side.j] if given else meeting(scene, bodies, side)
         found.append(listed(scene, bodies, side, share))
-    return [points for points in found if len(points.area)]
+    return halved([points for points in found if len(points.area)])
 
 
 def listed(scene, bodies, side, share):
@@ -268,13 +270,15 @@ def listed(scene, bodies, side, share):
     margin = 0.001 * smaller + 2 * np.linalg.norm(bodies.gravity) * h * h
     near = (area > 0) & (depth - h * rate > -margin)
     usual = near & ~other
-    # Where τ < 1 what is about to touch is at most so deep: depths count from there.
-    sunk = np.maximum(-distance + (limit_of(scene, side) if share < 1 else 0), 0)
-    inside_out = np.sum((area * -distance)[other]) > np.sum((area * sunk)[usual])
+    sunk = np.maximum(-distance, 0)
+    inside_out = np.sum((area * sunk)[other]) > np.sum((area * sunk)[usual])
     kept = np.concatenate([np.flatnonzero(usual), np.flatnonzero(near & other & inside_out)])
     hit = usual & (sunk > 0)
     approach = rate - np.sum(normal * drift, axis=1)
-    stiffness = impact(bodies, side, arm[hit], normal[hit], area[hit], sunk[hit], approach[hit])
+    x = sunk / limit_of(scene, side)
+    weight = np.where(x < 1, x**2, 2 * x - 1) * hit
+    beta, stiffness = impact(bodies, side, arm, normal, area * weight, approach)
+    free = not scene.joints and not (bodies.moves[i] and bodies.moves[j])
     return Points(
         first=i,
         second=j,
@@ -288,7 +292,9 @@ def listed(scene, bodies, side, share):
         rate=rate[kept],
         area=area[kept],
         drift=drift[kept],
-        impact=np.where(usual, stiffness, 0)[kept],
+        impact=(stiffness * (share < 1) * weight)[kept],
+        beta=beta,
+        delays=free and share < 1 and beta > 0,
     )
 
 
@@ -325,18 +331,24 @@ def drifts(u, w, after, arm, normal):
     return change - excess[:, None] * across(change)
 
 
-def impact(bodies, side, arm, normal, area, sunk, approach):
-    """k_i [Pa/m] of the samples of a side that sink in, or zero; rounded to a power of two."""
-    load = np.sum(area * sunk)
-    if side.law.compliant or load == 0:
-        return 0.0
-    weights = area * sunk / load
-    if -(weights @ approach) <= side.law.slowest_rebound:
-        return 0.0
+def impact(bodies, side, arm, normal, load, approach):
+    """β, and κ [Pa s/m] of the samples of a side, with A w of each as load."""
+    if side.law.compliant or load.sum() == 0:
+        return 0.0, 0.0
+    weights = load / load.sum()
+    beta = float(smooth_step(-(weights @ approach) / side.law.slowest_rebound - 1))
     r, n = weights @ arm, weights @ normal
     mobility = bodies.inverse_mass[side.i] + bodies.inverse_mass[side.j]
     for k, lever in ((side.i, r), (side.j, r + bodies.position[side.i] - bodies.position[side.j])):
         turning = np.cross(lever, n)
         mobility += turning @ bodies.inverse_inertia[k] @ turning
-    exact = IMPACT / (bodies.h**2 * mobility * np.sum(area))
-    return 2.0 ** np.round(np.log2(exact))
+    return beta, beta * FACTOR / (bodies.h * mobility * load.sum())
+
+
+def halved(found):
+    """Sides whose impacts both bodies' samples have part in, with half of it each."""
+    hits = {(points.first, points.second) for points in found if np.any(points.impact > 0)}
+    return [
+        points._replace(impact=points.impact / 2) if (points.second, points.first) in hits else points
+        for points in found
+    ]

@@ -20,7 +20,7 @@ vec3, vec4, mat33 = momentum.vec3, rotations.vec4, momentum.mat33
 def press(
     materials: wp.array(dtype=point_law.Material),
     points: wp.array(dtype=point_law.Point),
-    impacts: wp.array(dtype=wp.float64),
+    impacts: wp.array(dtype=point_law.Impact),
     rates: wp.array(dtype=wp.float64),
     slips: wp.array(dtype=vec3),
     pressures: wp.array(dtype=wp.float64),
@@ -58,6 +58,11 @@ def traction(material: dict[str, float], points, rate, slip):
     rows = np.zeros(n, point_law.Point.numpy_dtype())
     for name in ("arm", "normal", "moment", "depth", "rate", "area"):
         rows[name] = getattr(points, name)
+    # The weights of samples stand in `points.impact`: here all are one.
+    rows["sunk"] = 1.0
+    of_impact = np.zeros(n, point_law.Impact.numpy_dtype())
+    of_impact["share"], of_impact["stiffness"], of_impact["depth"] = points.beta, points.impact, 1.0
+    of_impact["part"], of_impact["way"] = 1.0, 0.0 if points.delays else points.share
     rows["approach"] = points.rate - np.sum(points.drift * points.normal, axis=1)
     of_material = np.zeros(n, point_law.Material.numpy_dtype())
     for name, value in material.items():
@@ -66,7 +71,7 @@ def traction(material: dict[str, float], points, rate, slip):
     given = [
         wp.array(of_material, dtype=point_law.Material, device="cpu"),
         wp.array(rows, dtype=point_law.Point, device="cpu"),
-        wp.array(points.impact, dtype=wp.float64, device="cpu"),
+        wp.array(of_impact, dtype=point_law.Impact, device="cpu"),
         wp.array(rate, dtype=wp.float64, device="cpu"),
         wp.array(slip, dtype=vec3, device="cpu"),
     ]

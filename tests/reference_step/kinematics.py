@@ -205,9 +205,9 @@ class Kinematics:
         steps = (self.gaps(1j * SMALL * e).imag / (SMALL * self.h) for e in np.eye(k))
         return np.array(list(steps)).T.reshape(-1, k)
 
-    def end(self, y):
-        """The state at the end of a step with y, as arrays by name."""
-        poses, twists, rows = self.placed(y), self.twists(y), slice(6 * len(self.free), None)
+    def end(self, y, moved):
+        """The state at the end of a step with y, and poses from `moved`, as arrays by name."""
+        poses, twists, rows = self.placed(moved), self.twists(y), slice(6 * len(self.free), None)
         omega = [matrix(q).T @ V[3:] for (_, q), V in zip(self.now, twists, strict=True)]
         q = (self.q + self.h * y)[rows]
         for joint in self.joints:

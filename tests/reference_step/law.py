@@ -6,6 +6,10 @@ import numpy as np
 from reference_step.rotations import cross_matrix
 
 
+FACTOR = 10.0
+"""Momentum that an impact passes on over that of the common mass, for each speed that is missing."""
+
+
 class Law(NamedTuple):
     """Parameters of a pair of bodies: symbols of docs/theory/contact.md.
 
@@ -21,6 +25,7 @@ class Law(NamedTuple):
         theta: Implicitness.
         compliant: Whether impacts are left to the spring.
         h: Timestep [s].
+        delta: Depth of an impact [m].
         slowest_rebound: v_e + g h [m/s].
         gravity: g for samples that are deep [m/s²].
     """
@@ -36,6 +41,7 @@ class Law(NamedTuple):
     theta: float
     compliant: bool
     h: float
+    delta: float
     slowest_rebound: float
     gravity: float
 
@@ -44,6 +50,7 @@ PARAMETERS = (
     "stiffness",
     "restitution",
     "restitution_velocity",
+    "impact_depth",
     "hysteresis",
     "sliding_friction",
     "friction_fading",
@@ -61,9 +68,10 @@ def laws_of(scene):
     for law, params, count in groups:
         columns = [np.broadcast_to(getattr(params, name), count) for name in PARAMETERS]
         for numbers in np.array(columns).T:
-            k, e, v_e, sigma, mu, phi, p_0 = (float(x) for x in numbers)
+            k, e, v_e, delta, sigma, mu, phi, p_0 = (float(x) for x in numbers)
             rest = float(law.stiction_velocity), float(law.implicitness), law.compliant
-            found.append(Law(k, e, v_e, sigma, mu, phi, p_0, *rest, h, v_e + g * h, g if g > 0 else 9.81))
+            rest = *rest, h, delta, v_e + g * h, g if g > 0 else 9.81
+            found.append(Law(k, e, v_e, sigma, mu, phi, p_0, *rest))
     return found
 
 
@@ -129,11 +137,25 @@ def pressure(law, points, rate, v_s):
     p = law.k * np.maximum(left, 0)
     slope = -law.k * (left > 0) * np.where(implicit, law.theta * law.h, D_slope)
 
-    rebound = -law.e * (points.rate - np.sum(points.normal * points.drift, axis=1))
-    goal = np.where(rebound > law.slowest_rebound, law.h * rebound, np.minimum(points.depth, 0))
-    blow = points.impact * np.maximum(goal - law.h * rate, 0)
-    hit = points.impact > 0
-    return np.where(hit, blow, p), np.where(hit, -points.impact * law.h * (blow > 0), slope)
+    missing = np.maximum(goals(law, points) - rate, 0)
+    lasting = 1 - points.beta
+    return lasting * p + points.impact * missing, lasting * slope - points.impact * (missing > 0)
+
+
+def goals(law, points):
+    """v*: separating speeds that points aim at in an impact [m/s]."""
+    approach = points.rate - np.sum(points.normal * points.drift, axis=1)
+    rebound = -law.e * approach
+    fast = smooth_step(2 * rebound / law.slowest_rebound - 1)
+    way = 0.0 if points.delays else points.share
+    after = fast * rebound + (1 - fast) * way * np.minimum(approach, 0)
+    return after + np.maximum(after - approach, 0) / FACTOR
+
+
+def smooth_step(x):
+    """3 x² − 2 x³ between 0 and 1."""
+    y = np.clip(x, 0, 1)
+    return y * y * (3 - 2 * y)
 
 
 class Wrench(NamedTuple):

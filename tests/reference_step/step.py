@@ -85,12 +85,26 @@ class Step:
             if not points.law.compliant:
                 self.points[n] = points._replace(law=points.law._replace(e=share * points.law.e))
 
+    def moved(self, y):
+        """y by which positions change: impulses of impacts take effect after the share τ of the step."""
+        k, found = self.kinematics, np.array(y)
+        for points in self.points:
+            if points.delays:
+                done = wrench(points, k.seen(y))
+                for i, impulse in ((points.first, done.first), (points.second, done.second)):
+                    if i in k.free:
+                        at = 6 * k.free.index(i)
+                        late = points.share * k.h * impulse
+                        found[at : at + 3] -= k.bodies.inverse_mass[i] * late[:3]
+                        found[at + 3 : at + 6] -= k.bodies.inverse_inertia[i] @ late[3:]
+        return found
+
     def adds_energy(self, y):
         """Whether contact adds more than a thousandth of the energy that it moves between coordinates."""
         k = self.kinematics
         own = np.einsum("iak,ia->k", k.jacobian, k.momenta(y, self.control)) + self.h * self.joints.smooth(y)
         work = 0.5 * own * (k.start + y)
-        return np.sum(work) > 1e-3 * np.sum(np.abs(work))
+        return np.sum(work) > 1e-3 * np.sum(0.5 * np.abs(own) * (np.abs(k.start) + np.abs(y)))
 
 
 def newton(step, start, softness, enough, most=50):
@@ -159,4 +173,4 @@ def step(scene, state, control=None, shares=None):
         tenths -= 1
         equations.take_restitution(tenths / 10)
         y = root(equations)
-    return equations.kinematics.end(y), equations
+    return equations.kinematics.end(y, equations.moved(y)), equations

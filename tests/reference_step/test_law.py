@@ -7,7 +7,7 @@ from reference_step.law import Law, pressure, traction, wrench
 
 HARD = Law(
     k=2e6, e=0.4, v_e=0.05, sigma=0.2, mu=0.5, phi=0.3, p_0=2e3, v_s=1e-7, theta=1.0, compliant=False, h=0.01,
-    slowest_rebound=0.15, gravity=9.81,
+    delta=1e-3, slowest_rebound=0.15, gravity=9.81,
 )  # fmt: skip
 LAWS = {
     "default": HARD,
@@ -27,7 +27,7 @@ def random_points(law, impact):
         first=0,
         second=1,
         law=law,
-        share=1.0,
+        share=0.6,
         com_difference=np.array([0.1, -0.2, 0.3]),
         arm=arm,
         normal=normal,
@@ -37,6 +37,8 @@ def random_points(law, impact):
         area=10 ** rng.uniform(-6, -3, N),
         drift=drift,
         impact=np.full(N, impact),
+        beta=0.7 if impact > 0 else 0.0,
+        delays=False,
     )
 
 
@@ -48,7 +50,7 @@ def random_motion(points, seed=4):
     return rng.normal(size=N) * 10 ** rng.uniform(-9, 0, N), slip
 
 
-@pytest.mark.parametrize("impact", [0.0, 1e7], ids=["spring", "impact"])
+@pytest.mark.parametrize("impact", [0.0, 1e4], ids=["spring", "impact"])
 @pytest.mark.parametrize("name", LAWS)
 def test_pressure_and_friction(engine, name, impact):
     """The engine's are the reference's to rounding."""
@@ -61,7 +63,7 @@ def test_pressure_and_friction(engine, name, impact):
     np.testing.assert_allclose(f, expected.f, rtol=1e-12, atol=1e-13 * expected.p.max())
 
 
-@pytest.mark.parametrize("impact", [0.0, 1e7], ids=["spring", "impact"])
+@pytest.mark.parametrize("impact", [0.0, 1e4], ids=["spring", "impact"])
 @pytest.mark.parametrize("name", LAWS)
 def test_derivatives_are_those_of_differences(name, impact):
     """With a stiction velocity that differences resolve; next to kinks they differ."""

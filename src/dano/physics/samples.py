@@ -42,7 +42,8 @@ class Point:
         rate: Separating speed at the old velocities [m/s].
         approach: Separating speed with which the step begins [m/s].
         area: That faces the second body [m²].
-        sunk: Depth below the second body's surface in the predicted configuration [m].
+        sunk: Depth below the second body's surface in the predicted configuration [m], zero for a sample
+            that faces the other way.
     """
 
     arm: vec3
@@ -149,7 +150,8 @@ def point_contact(
     point.normal = pose.rotation * normal
     point.moment = pose.rotation * moment
     point.depth = lead * rate - d.value
-    point.sunk = -d.value
+    if not presses_back:
+        point.sunk = -d.value
     point.rate = rate
     point.approach = rate
     point.area = stiffness_share * area

@@ -7,6 +7,7 @@ from dano.engine.kernels.rollout import begin_unpushed, Launch
 from dano.engine.kernels.search import find_contacts
 from dano.engine.kernels.tables import Room, Scene
 from dano.physics.features import LANES
+from dano.physics.impacts import fading_in
 from dano.physics.real import real
 from dano.physics.samples import Point
 
@@ -24,7 +25,7 @@ class ListedPoint:
         sample: Index of the sample.
         share: Share of the step after which geometry was taken.
         impact_share: β of an impact.
-        impact_stiffness: κ of an impact, what the pair carries of it [Pa s/m].
+        impact_stiffness: κ w of an impact [Pa s/m].
         point: The point.
     """
 
@@ -81,8 +82,9 @@ def listing(scene: Scene, room: Room, launch: Launch, listing: Listing):
             row.sample = real(room.where[world, k].sample)
             row.share = found.share
             row.impact_share = found.impact.share
-            row.impact_stiffness = found.impact.part * found.impact.stiffness
             row.point = room.points[world, k]
+            weight = fading_in(row.point.sunk / found.impact.depth)
+            row.impact_stiffness = weight * found.impact.part * found.impact.stiffness
             at = shift + k - lane * per_lane
             if at < listing.points.shape[1]:
                 listing.points[world, at] = row
