@@ -40,6 +40,9 @@ class Points(NamedTuple):
         area: A [m²].
         drift: ½ ω⁻ × (r₁ − r₀), its tangential part limited [m/s], shape (n, 3).
         impact: κ w [Pa s/m], zero where there is no impact, shape (n,).
+        kappa: κ [Pa s/m].
+        sunk: Depth where geometry is taken [m], shape (n,).
+        delta: Depth of the impact [m].
         beta: Share of the contact that is an impact.
         delays: Whether impulses take effect after the share τ of the step.
     """
@@ -57,6 +60,9 @@ class Points(NamedTuple):
     area: np.ndarray
     drift: np.ndarray
     impact: np.ndarray
+    kappa: float
+    sunk: np.ndarray
+    delta: float
     beta: float
     delays: bool
 
@@ -293,6 +299,9 @@ def listed(scene, bodies, side, share):
         area=area[kept],
         drift=drift[kept],
         impact=(stiffness * (share < 1) * weight)[kept],
+        kappa=stiffness * (share < 1),
+        sunk=np.where(other, 0, -distance)[kept],
+        delta=limit_of(scene, side),
         beta=beta,
         delays=free and share < 1 and beta > 0,
     )
@@ -349,6 +358,6 @@ def halved(found):
     """Sides whose impacts both bodies' samples have part in, with half of it each."""
     hits = {(points.first, points.second) for points in found if np.any(points.impact > 0)}
     return [
-        points._replace(impact=points.impact / 2) if (points.second, points.first) in hits else points
+        points._replace(impact=points.impact / 2, kappa=points.kappa / 2) if (points.second, points.first) in hits else points
         for points in found
     ]

@@ -58,11 +58,13 @@ def traction(material: dict[str, float], points, rate, slip):
     rows = np.zeros(n, point_law.Point.numpy_dtype())
     for name in ("arm", "normal", "moment", "depth", "rate", "area"):
         rows[name] = getattr(points, name)
-    # The weights of samples stand in `points.impact`: here all are one.
-    rows["sunk"] = 1.0
+    rows["sunk"] = points.sunk
     of_impact = np.zeros(n, point_law.Impact.numpy_dtype())
-    of_impact["share"], of_impact["stiffness"], of_impact["depth"] = points.beta, points.impact, 1.0
+    of_impact["share"], of_impact["stiffness"], of_impact["depth"] = points.beta, points.kappa, points.delta
     of_impact["part"], of_impact["way"] = 1.0, 0.0 if points.delays else points.share
+    of_impact["delays"], of_impact["rest"] = points.delays, material["timestep"]
+    if points.delays:
+        of_impact["rest"] *= 1 - points.share
     rows["approach"] = points.rate - np.sum(points.drift * points.normal, axis=1)
     of_material = np.zeros(n, point_law.Material.numpy_dtype())
     for name, value in material.items():

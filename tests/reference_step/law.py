@@ -138,8 +138,13 @@ def pressure(law, points, rate, v_s):
     slope = -law.k * (left > 0) * np.where(implicit, law.theta * law.h, D_slope)
 
     missing = np.maximum(goals(law, points) - rate, 0)
+    # Samples that are less deep than the impact get no deeper.
+    rest = law.h * (max(1 - points.share, 1e-6) if points.delays else 1)
+    limit = np.minimum((points.sunk if points.delays else points.depth) - points.delta, 0) / rest
+    below = np.maximum(limit - rate, 0)
     lasting = 1 - points.beta
-    return lasting * p + points.impact * missing, lasting * slope - points.impact * (missing > 0)
+    blow = points.impact * missing + points.kappa * below
+    return lasting * p + blow, lasting * slope - points.impact * (missing > 0) - points.kappa * (below > 0)
 
 
 def goals(law, points):

@@ -22,6 +22,7 @@ def random_points(law, impact):
     rng = np.random.default_rng(3)
     normal = rng.normal(size=(N, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    x = rng.normal(size=N)
     arm, drift = rng.normal(size=(2, N, 3)) * [[[0.1]], [[0.02]]]
     return Points(
         first=0,
@@ -36,7 +37,10 @@ def random_points(law, impact):
         rate=rng.normal(size=N),
         area=10 ** rng.uniform(-6, -3, N),
         drift=drift,
-        impact=np.full(N, impact),
+        impact=impact * np.where(x < 1, np.maximum(x, 0) ** 2, 2 * x - 1),
+        kappa=impact,
+        sunk=law.delta * x,
+        delta=law.delta,
         beta=0.7 if impact > 0 else 0.0,
         delays=False,
     )

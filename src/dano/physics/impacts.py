@@ -47,6 +47,7 @@ class Impact:
         part: Share of the impact that the pair carries, ½ where samples of both bodies do [1].
         delays: 1 where impulses take effect when bodies meet, 0 where they do so at the start of the step.
         way: Share of the step in which bodies go on as before, τ where impulses take effect at its start.
+        rest: Time from when impulses take effect to the end of the step [s].
     """
 
     share: real
@@ -55,6 +56,7 @@ class Impact:
     part: real
     delays: real
     way: real
+    rest: real
 
 
 @wp.func
@@ -132,3 +134,16 @@ def impact_goal(impact: Impact, restitution: real, bounce: real, approach: real)
     rebounds = smooth_step(TWO * rebound / bounce - ONE)
     after = rebounds * rebound + (ONE - rebounds) * impact.way * wp.min(approach, ZERO)
     return after + wp.max(after - approach, ZERO) / _FACTOR
+
+
+@wp.func
+def impact_limit(impact: Impact, depth: real, sunk: real) -> real:
+    """Separating speed below which a sample would be deeper than the impact at the end of the step [m/s].
+
+    Args:
+        impact: Of the pair.
+        depth: Of the sample at the end of the step, without what the end-of-step velocity takes off [m].
+        sunk: Where geometry is taken [m].
+    """
+    before = impact.delays * sunk + (ONE - impact.delays) * depth
+    return wp.min(before - impact.depth, ZERO) / impact.rest

@@ -15,7 +15,7 @@ form.
 import warp as wp
 
 from dano.physics.friction import following_friction, Friction, friction, friction_with_dual
-from dano.physics.impacts import fading_in, Impact, impact_goal
+from dano.physics.impacts import fading_in, Impact, impact_goal, impact_limit
 from dano.physics.real import ONE, real, vec3, ZERO
 from dano.physics.samples import Point
 
@@ -73,6 +73,8 @@ class PointLaw:
         sharp: 1 where the damping has its full size from v_e on, so that bodies are pushed apart no faster.
         blow: κ w, pressure of an impact by the speed that is missing to its goal [Pa s/m].
         goal: v*, separating speed that an impact aims at [m/s].
+        guard: κ [Pa s/m].
+        limit: Separating speed below which the point would get deeper than the impact [m/s].
     """
 
     stiffness: real
@@ -88,6 +90,8 @@ class PointLaw:
     sharp: real
     blow: real
     goal: real
+    guard: real
+    limit: real
 
 
 @wp.struct
@@ -182,6 +186,8 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
     sunk = wp.max(point.depth, ZERO)
     if impact.stiffness > ZERO:
         law.blow = impact.part * impact.stiffness * fading_in(point.sunk / impact.depth)
+        law.guard = impact.part * impact.stiffness
+        law.limit = impact_limit(impact, point.depth, point.sunk)
         law.goal = impact_goal(impact, material.restitution, material.bounce, point.approach)
     law.damped = (loss - kept) * sunk
     law.lost = kept * sunk
@@ -199,7 +205,8 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
 @wp.func
 def is_apart(law: PointLaw, rate: real) -> bool:
     """Whether a point that is not sunk in stays out, and has no impact: then d − θ h v_n says all."""
-    return law.depth <= ZERO and law.depth - law.ahead * rate <= ZERO and law.blow == ZERO
+    apart = law.depth <= ZERO and law.depth - law.ahead * rate <= ZERO and law.blow == ZERO
+    return apart and (law.guard == ZERO or rate >= law.limit)
 
 
 @wp.func
@@ -252,6 +259,9 @@ def pressure(law: PointLaw, rate: real, direction: real, stiction: real) -> Pres
     if law.blow > ZERO and rate < law.goal:
         found.value += law.blow * (law.goal - rate)
         found.damping += law.blow
+    if law.guard > ZERO and rate < law.limit:
+        found.value += law.guard * (law.limit - rate)
+        found.damping += law.guard
     return found
 
 

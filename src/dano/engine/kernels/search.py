@@ -45,6 +45,8 @@ _HALF_SPACE = wp.constant(HALF_SPACE)
 # Sampled distances may grow faster than true ones: near the shipped objects a hundredth of the space has
 # gradients above 1.2, a thousandth above 1.45.
 _STEEPEST = wp.constant(real(1.5))
+# Least share of a step after an impact.
+_LATEST = wp.constant(real(1e-6))
 # Most steps of the search for the moment when bodies meet, and the share of the step that ends it.
 _ADVANCES = wp.constant(40)
 _MET = wp.constant(real(1e-12 if WIDE else 1e-6))
@@ -412,6 +414,8 @@ def impact_of(
         impact.stiffness = stiffness_of_impact(a, b, patch, material.bounce, material.timestep)
         impact.delays = wp.where(alone, ONE, ZERO)
         impact.way = wp.where(alone, ZERO, share)
+        later = wp.where(alone, ONE - share, ONE)
+        impact.rest = wp.max(later, _LATEST) * material.timestep
     return impact
 
 

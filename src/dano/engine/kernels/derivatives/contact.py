@@ -281,6 +281,7 @@ def pull_points(
             impact_bar.stiffness += by_impact.stiffness
             impact_bar.depth += by_impact.depth
             impact_bar.way += by_impact.way
+            impact_bar.rest += by_impact.rest
             material_bar = summed_material(material_bar, by_material)
             share_bar += by_share
             h_bar += by_h
@@ -507,8 +508,13 @@ def pull_pair(
         impact_bar.share = total(impact_bar.share)
         impact_bar.stiffness = total(impact_bar.stiffness)
         if found.impact.delays == ZERO:
-            # The way that is left is τ.
+            # The way that is left is τ, and the rest the whole step …
             share_bar += impact_bar.way
+            h_bar += impact_bar.rest
+        else:
+            # … or what follows τ.
+            share_bar -= h * impact_bar.rest
+            h_bar += (ONE - found.share) * impact_bar.rest
         hits = found.impact.stiffness > ZERO
         bounce = scene.materials[world, index.contact].bounce
         by_first, by_second, patch_bar, by_bounce, by_h, _a, _b = wp.grad(impact_work)(
