@@ -358,6 +358,8 @@ def halved(found):
     """Sides whose impacts both bodies' samples have part in, with half of it each."""
     hits = {(points.first, points.second) for points in found if np.any(points.impact > 0)}
     return [
-        points._replace(impact=points.impact / 2, kappa=points.kappa / 2) if (points.second, points.first) in hits else points
+        points._replace(impact=points.impact / 2, kappa=points.kappa / 2)
+        if (points.second, points.first) in hits
+        else points
         for points in found
     ]
