@@ -1,1 +1,1 @@
-"""Impacts: what derivatives through them are worth, restitution, energy, and where motion ends as steps shrink."""
+"""Impacts: what derivatives through them are worth, and where motion ends as steps shrink."""

@@ -219,7 +219,8 @@ def meeting(scene, bodies, side):
         axis = pair.R[:, 2]
         turns = {"fixed": w, "axis": w - (w @ axis) * axis, "ball": 0 * w}[turning]
         velocity = u + np.cross(turns, pair.places - pair.x)
-        deep, goes_in = distance <= -limit, np.sum(normal * velocity, axis=1) < 0
+        slow = 0.0 if side.law.compliant else side.law.slowest_rebound
+        deep, goes_in = distance <= -limit, np.sum(normal * velocity, axis=1) < -slow
         speed = np.maximum(np.linalg.norm(velocity, axis=1), 1e-12)
         safe = np.where(deep, np.inf, (distance + limit) / (1.5 * h * speed))
         return np.any(deep & goes_in), safe.min()

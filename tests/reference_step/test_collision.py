@@ -67,7 +67,7 @@ def test_moment_of_meeting(engine, name, what):
 
 
 def test_meeting_in_closed_form():
-    """A ball that falls on a floor reaches the depth of an impact, .5 % of its size, after (gap + limit)/(h v)."""
+    """A ball that falls on a floor reaches the depth of an impact after (gap + depth)/(h v)."""
     scene = dano.Scene.create(
         [dano.Body("a", dano.Sphere(0.05), mass=1.0), scenes.FLOOR],
         [dano.Contact("a", "floor")],

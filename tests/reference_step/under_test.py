@@ -97,6 +97,6 @@ TODAY = Engine(
     turned=formulas.orientation_after,
     # A root, and of bodies with many samples that of the centres of their blocks.
     meeting_error=1e-6,
-    meeting_samples=256,
+    meeting_samples=1024,
 )
 ENGINES = (TODAY,)

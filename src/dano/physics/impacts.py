@@ -14,8 +14,8 @@ import warp as wp
 from dano.physics.pairs import BodyState
 from dano.physics.real import ONE, real, TWO, vec3, ZERO
 
-# F: momentum that the damper passes on, by that of the common mass, for each speed that is missing. The softer,
-# the more samples share an impact; goals make up for it.
+# F: momentum that the damper passes on, by that of the common mass, for each speed that is missing. The
+# softer, the more samples share an impact; goals make up for it.
 _FACTOR = wp.constant(real(10.0))
 
 

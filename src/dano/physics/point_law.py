@@ -1,6 +1,7 @@
 """The distributed law at a point (docs/theory/contact.md, "Pressure and friction at a sample").
 
-    F = A p (n − b(p)/p u / max(|u|, v_s)),   p = (1 − β) k max(0, d − D) + κ w max(0, v* − v_n),   b(p) = μ (1 − φ p/(p + p₀)) p
+    F = A p (n − b(p)/p u / max(|u|, v_s)),   b(p) = μ (1 − φ p/(p + p₀)) p,
+    p = (1 − β) k max(0, d − D) + κ w max(0, v* − v_n) + κ max(0, v_δ − v_n)
 
 Friction and hysteresis are set-valued maps u/max(|u|, v_s) of a tiny v_s. A solver that knows them by their
 values only has to search for where bodies stick. So the law is also written without a quotient, with the
@@ -211,9 +212,9 @@ def is_apart(law: PointLaw, rate: real) -> bool:
 
 @wp.func
 def pressure(law: PointLaw, rate: real, direction: real, stiction: real) -> Pressure:
-    """Pressure p = (1 − β) k max(0, d − D) + κ w max(0, v* − v_n) at a separating speed v_n.
+    """Pressure p at a separating speed v_n.
 
-    The second part is that of an impact, see `dano.physics.impacts`.
+    Of its three parts the last two are those of an impact, see `dano.physics.impacts`.
 
     D is what the separating speed takes off the depth d, the larger of
 

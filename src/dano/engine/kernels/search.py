@@ -188,13 +188,15 @@ def meeting(
     second: int,
     h: real,
     least_way: real,
+    slow: real,
 ) -> Meeting:
     """When the geometry of a pair is taken.
 
     At the end of the step, unless a body would be driven deeper into the other than `SamplePair.sink` by
     then: on the far side of a thin wall, normals push the wrong way. Then when it has sunk that far, which is
     when bodies have an impact: the root of the depth of the deepest probe, by Newton's method, which begins
-    as far as none can go deeper. Bodies that move by less than `least_way` [m] are looked at at the end.
+    as far as none can go deeper. Bodies that move by less than `least_way` [m] are looked at at
+    the end, and probes that near the other body by no more than `slow` in a step do not count.
     """
     met = Meeting()
     met.critical = -1
@@ -224,7 +226,7 @@ def meeting(
             d = solid_distance(scene.solids, world, solid, x)
             near = h * approach(pose, index.turning, x, solid_normal(d.gradient))
             left = d.value + pair.sink
-            if near > ZERO and left - (ONE - share) * near < ZERO:
+            if near > slow and left - (ONE - share) * near < ZERO:
                 if left / near < further:
                     further = left / near
                     critical = p
@@ -392,7 +394,7 @@ def find_points(
 def impact_of(
     a: BodyState, b: BodyState, patch: Patch, material: Material, depth: real, share: real, alone: bool
 ) -> Impact:
-    """The impact of a pair; there is none where it approaches slowly, or where its law leaves it to the spring.
+    """The impact of a pair; none where it approaches slowly, or where its law leaves it to the spring.
 
     Args:
         a: First body.
@@ -401,8 +403,8 @@ def impact_of(
         material: Of the contact.
         depth: δ [m].
         share: τ, below one where bodies are as deep within the step.
-        alone: Whether one of the bodies is fixed and the other moves freely. Then impulses take effect when they
-            meet; between two that move, this would not conserve angular momentum.
+        alone: Whether one of the bodies is fixed and the other moves freely. Then impulses take effect when
+            they meet; between two that move, this would not conserve angular momentum.
     """
     impact = Impact()
     impact.depth = depth
@@ -458,7 +460,8 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
             material = scene.materials[world, index.contact]
             # Slower than this nothing has an impact.
             least_way = wp.where(material.instant > ZERO, h * material.bounce, pair.sink)
-            met = meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, least_way)
+            slow = wp.where(material.instant > ZERO, least_way, ZERO)
+            met = meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, least_way, slow)
             pose = posed(scene, world, a, b, index.first, index.second, met.share, h, pair.follows)
             body = scene.bodies[world, index.first]
             speed = wp.length(pose.velocity) + wp.length(pose.spin) * TWO * body.radius

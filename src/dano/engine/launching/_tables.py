@@ -29,7 +29,7 @@ _MARGIN = 0.001
 # Impacts are at most as deep as this share of the thinner body's half thickness.
 _THIN = 0.25
 # Up to so many blocks the moment of meeting is found from samples, beyond from the centres of blocks.
-_FEW_BLOCKS = 16
+_FEW_BLOCKS = 64
 # How samples turn with their body: see `dano.physics.pairs`.
 _TURNING = {"fixed": 0, "axis": 1, "ball": 2}
 

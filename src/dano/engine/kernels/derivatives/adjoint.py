@@ -38,7 +38,8 @@ from dano.physics.twists import angular_part, joined, linear_part, relative_twis
 class Virtual:
     """Twists of the bodies of a pair [W]: at the end of the step, and virtual ones.
 
-    The last two are those of impulses that take effect after the share τ of the step: τ times them is taken off.
+    The last two are those of impulses that take effect after the share τ of the step: τ times them is taken
+    off.
     """
 
     first: vec6
