@@ -32,8 +32,8 @@ class ContactParams(eqx.Module):
         restitution: Distributed law: separating over approaching speed in an impact e ≤ 1 [1].
         restitution_velocity: Distributed law: speed [m/s] below which impacts lose more than `restitution`
             says, until at rest the contact is a damped spring.
-        impact_depth: Distributed law: depth δ [m] at which an impact happens, and over which its samples share
-            it.
+        impact_depth: Distributed law: depth δ [m] at which an impact happens, and over which its samples
+            share it.
         hysteresis: Distributed law: share σ of the pressure that is lost between going in and coming out
             however slowly (at most what `restitution` leaves): rolling and rocking come to rest [1].
         friction_fading: Distributed law: share φ ≤ 1 of the friction coefficient that is lost under high

@@ -1,0 +1,87 @@
+"""Impacts: restitution at every step, no dependence on where in a step bodies meet, derivatives through them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dano
+
+BOX = dano.Box((0.05, 0.04, 0.03))
+
+
+def on_floor(shape, h, **params):
+    bodies = [dano.Body("a", shape, mass=0.5), dano.Body("floor", dano.HalfSpace(), fixed=True)]
+    contact = dano.Contact("a", "floor", dano.ContactParams(sliding_friction=0.3, **params))
+    return dano.Scene.create(bodies, [contact], timestep=h)
+
+
+def thrown(scene, height=0.12, speed=0.8):
+    turn = dict(orientation=(0.5, -0.3, 0.7, 0.2), omega=(3.0, 2.0, 1.0))
+    return scene.initial_state(a=dict(position=(0, 0, height), velocity=(speed, 0.3, -1.0), **turn))
+
+
+@pytest.mark.parametrize("h", [1e-3, 5e-3, 1e-2])
+@pytest.mark.parametrize("e", [0.3, 1.0])
+def test_restitution_is_exact(e, h):
+    """A ball leaves with e times the speed at which it came, and gains no energy."""
+    bodies = [dano.Body("a", dano.Sphere(0.05), mass=0.5), dano.Body("floor", dano.HalfSpace(), fixed=True)]
+    contact = dano.Contact("a", "floor", dano.ContactParams(restitution=e, hysteresis=0.0))
+    scene = dano.Scene.create(bodies, [contact], timestep=h, gravity=(0, 0, 0))
+    for phase in (0.1, 0.5, 0.9):
+        start = dict(position=(0, 0, 0.05 + (2 + phase) * 2.0 * h), velocity=(0, 0, -2.0))
+        run = dano.simulate(scene, scene.initial_state(a=start), n_steps=60)
+        speed = float(run.states.velocity[-1, 0, 2])
+        assert speed == pytest.approx(2.0 * e, rel=1e-3)
+        assert speed <= 2.0 * (1 + 1e-9)
+
+
+def test_where_in_a_step_bodies_meet_does_not_matter():
+    """Starts that differ by parts of a step's way end as far apart: no jumps where the meeting changes steps."""
+    h = 5e-3
+    scene = on_floor(dano.Sphere(0.05), h)
+    heights = 0.1 + np.linspace(0, 2 * h, 81)
+
+    def end(height):
+        state = scene.initial_state(
+            a=dict(position=(0, 0, height), velocity=(0.8, 0, -1.0), omega=(0, 9.0, 0))
+        )
+        return dano.simulate(scene, state, n_steps=30).states.position[-1, 0, 0]
+
+    ends = np.asarray(jax.vmap(end)(jnp.asarray(heights)))
+    steps = np.abs(np.diff(ends))
+    assert steps.max() < 0.2 * (ends.max() - ends.min()) + 2e-5
+
+
+@pytest.mark.parametrize("shape", [BOX, dano.Ellipsoid((0.05, 0.04, 0.03))], ids=["box", "ellipsoid"])
+def test_derivatives_after_impacts(shape):
+    """By friction, speed, height and depth, against differences of a tiny step; forward mode is the same."""
+    scene = on_floor(shape, 5e-3, restitution=0.5)
+    depth = float(scene.contact("a", "floor").params.impact_depth)
+
+    def end(x):
+        changed = scene.replace_contact("a", "floor", sliding_friction=x[0], impact_depth=x[3])
+        states = dano.simulate(changed, thrown(changed, x[2], x[1]), n_steps=20).states
+        return states.position[-1, 0, 0] + 0.01 * states.velocity[-1, 0, 1]
+
+    x = jnp.array([0.3, 0.8, 0.12, depth])
+    steps = np.diag([1e-6, 1e-6, 1e-7, 1e-9])
+    many = jax.vmap(end)
+    differences = (np.asarray(many(x + steps)) - np.asarray(many(x - steps))) / (2 * np.diag(steps))
+    found = np.asarray(jax.grad(end)(x))
+    np.testing.assert_allclose(found, differences, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(jax.jacfwd(end)(x)), found, rtol=1e-8, atol=1e-10)
+
+
+def test_derivatives_say_what_visible_changes_do():
+    """After an impact, by friction and speed: a difference of a step of 1e-2 is within some per cent."""
+    scene = on_floor(BOX, 5e-3)
+
+    def end(x):
+        changed = scene.replace_contact("a", "floor", sliding_friction=x[0])
+        return dano.simulate(changed, thrown(changed, speed=x[1]), n_steps=18).states.position[-1, 0, 0]
+
+    x, steps = jnp.array([0.3, 0.8]), 0.5e-2 * np.eye(2)
+    many = jax.vmap(end)
+    slopes = (np.asarray(many(x + steps)) - np.asarray(many(x - steps))) / 1e-2
+    np.testing.assert_allclose(np.asarray(jax.grad(end)(x)), slopes, rtol=0.05)
