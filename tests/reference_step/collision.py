@@ -194,15 +194,37 @@ def unit(v):
     return v / np.linalg.norm(v)
 
 
-def limit_of(scene, side):
-    """Depth [m] up to which geometry is predicted."""
-    (_, _, thickness) = np.minimum(*(np.asarray(scene.bodies[k].extent)[3:] for k in (side.i, side.j)))
-    return min(side.law.delta, 0.25 * thickness)
+def depths_of(scene, side):
+    """Depth of an impact, and up to which geometry of contact that lasts is predicted [m]."""
+    (_, size, thickness) = np.minimum(*(np.asarray(scene.bodies[k].extent)[3:] for k in (side.i, side.j)))
+    delta = min(side.law.delta, 0.25 * thickness)
+    return delta, max(delta, min(0.01 * size, 0.25 * thickness))
 
 
-def meeting(scene, bodies, side):
-    """τ: the share of the step at which the first sample that goes in is as deep as `limit_of`; else 1."""
-    limit, h = limit_of(scene, side), bodies.h
+class Meeting(NamedTuple):
+    """When geometry of a side is taken: a share of the step, and of what depth it tells."""
+
+    share: float
+    hits: bool = False
+    deep: bool = False
+
+
+def meetings(scene, bodies, side):
+    """That of an impact, if it can be one, and that of contact that lasts."""
+    delta, sink = depths_of(scene, side)
+    lasting = meeting(scene, bodies, side, sink, sink, 0.0)
+    if side.law.compliant:
+        return lasting, lasting
+    slow = bodies.h * side.law.slowest_rebound
+    share = meeting(scene, bodies, side, delta, slow, side.law.slowest_rebound)
+    if share == 0:
+        return lasting._replace(deep=True), lasting
+    return Meeting(share.share, hits=share.share < 1), lasting
+
+
+def meeting(scene, bodies, side, limit, least_way, slow):
+    """The share of the step at which the first sample that goes in is as deep as a limit; else 1."""
+    h = bodies.h
     (u, w), radius = bodies.relative(side.i, side.j), float(scene.bodies[side.i].extent[3])
     apart = np.linalg.norm(bodies.position[side.i] - bodies.position[side.j])
     spins = np.linalg.norm(bodies.spin[[side.i, side.j]], axis=1)

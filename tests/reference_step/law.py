@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from reference_step.rotations import cross_matrix
 
-FACTOR = 10.0
+FACTOR = 100.0
 """Momentum that an impact passes on over that of the common mass, for each speed that is missing."""
 
 

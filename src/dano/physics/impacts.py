@@ -16,7 +16,7 @@ from dano.physics.real import ONE, real, TWO, vec3, ZERO
 
 # F: momentum that the damper passes on, by that of the common mass, for each speed that is missing. The
 # softer, the more samples share an impact; goals make up for it.
-_FACTOR = wp.constant(real(10.0))
+_FACTOR = wp.constant(real(100.0))
 
 
 @wp.struct
@@ -28,12 +28,14 @@ class Patch:
         rate: Separating speed, weighted by the load [m³/s].
         arm: [m³, W].
         normal: [m², W].
+        deepest: Largest depth [m].
     """
 
     load: real
     rate: real
     arm: vec3
     normal: vec3
+    deepest: real
 
 
 @wp.struct
@@ -94,6 +96,7 @@ def with_sample(
     found.rate += weight * approach
     found.arm += weight * arm
     found.normal += weight * normal
+    found.deepest = wp.max(found.deepest, sunk)
     return found
 
 

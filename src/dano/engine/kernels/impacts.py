@@ -7,15 +7,15 @@ it. One of an impact that happens after the share τ of the step changes positio
 
 import warp as wp
 
-from dano.engine.kernels.assembly import add_point_jacobian, Quarters, whole_jacobian
+from dano.engine.kernels.assembly import add_point_jacobian, Halves, whole_jacobian
 from dano.engine.kernels.lanes import total6, total66, wait
 from dano.engine.kernels.tables import FoundPair, Room, Scene
-from dano.physics.features import LANES, POINTS, TREES
-from dano.physics.pairs import BodyState
+from dano.physics.features import LANES, POINTS, TREES, TURNING
+from dano.physics.pairs import BodyState, FIXED
 from dano.physics.real import mat66, vec6, ZERO
 from dano.physics.twists import angular_part, joined, linear_part, wrench_at
 
-_LANES = wp.constant(LANES)
+_LANES, _FIXED = wp.constant(LANES), wp.constant(FIXED)
 
 
 @wp.func
@@ -38,13 +38,16 @@ def pair_impulse(scene: Scene, room: Room, world: int, found: FoundPair) -> vec6
 def pair_slope(scene: Scene, room: Room, world: int, found: FoundPair) -> mat66:
     """Its derivative by the twist of the first body relative to the second."""
     h = scene.timestep[world, 0]
-    quarters = Quarters()
+    halves = Halves()
+    rolls = bool(False)
+    if wp.static(len(TURNING) > 1):
+        rolls = scene.body_index[scene.pair_index[found.pair].first].turning != _FIXED
     for k in range(found.first, found.end):
         linear = room.linear[world, k]
         if linear.pressure.value > ZERO or linear.grip > ZERO:
             point = room.points[world, k]
-            quarters = add_point_jacobian(quarters, point, linear, h * point.area)
-    return total66(whole_jacobian(quarters))
+            halves = add_point_jacobian(halves, point, linear, h * point.area, rolls)
+    return total66(whole_jacobian(halves))
 
 
 @wp.func

@@ -6,7 +6,7 @@ is listed if the old velocities take it into the other body by the end of the st
 
 import warp as wp
 
-from dano.engine.kernels.lanes import first_of, lanes_where, least, total, total3
+from dano.engine.kernels.lanes import first_of, greatest, lanes_where, least, total, total3
 from dano.engine.kernels.tables import (
     BLOCK,
     Body,
@@ -58,10 +58,12 @@ class Meeting:
     Attributes:
         share: τ, share of the step after which geometry is taken.
         critical: Probe that has sunk in by then, −1 where none does within the step.
+        deep: Whether one had from the start.
     """
 
     share: real
     critical: int
+    deep: bool
 
 
 @wp.func
@@ -185,16 +187,30 @@ def meeting(
     first: int,
     second: int,
     h: real,
+    sink: real,
     least_way: real,
     slow: real,
 ) -> Meeting:
-    """When the geometry of a pair is taken.
+    """When bodies have sunk into each other by a depth.
 
-    At the end of the step, unless a body would be driven deeper into the other than `SamplePair.sink` by
-    then: on the far side of a thin wall, normals push the wrong way. Then when it has sunk that far, which is
-    when bodies have an impact: the root of the depth of the deepest probe, by Newton's method, which begins
-    as far as none can go deeper. Bodies that move by less than `least_way` [m] are looked at at
-    the end, and probes that near the other body by no more than `slow` in a step do not count.
+    That is the root of the depth of the deepest probe, by Newton's method, which begins as far as none can go
+    deeper; the end of the step where it is not within the step. On the far side of a thin wall, normals would
+    push the wrong way.
+
+    Args:
+        scene: The scene.
+        room: Room.
+        world: Which world.
+        lane: Which lane.
+        a: First body.
+        b: Second body.
+        pair: The pair.
+        first: Number of the first body.
+        second: … of the second.
+        h: Timestep [s].
+        sink: The depth [m].
+        least_way: Bodies that move by less in a step [m] are looked at at its end.
+        slow: Probes that near the other body by no more in a step [m] do not count.
     """
     met = Meeting()
     met.critical = -1
@@ -212,7 +228,7 @@ def meeting(
     while k < _ADVANCES:
         pose = posed(scene, world, a, b, first, second, share, h, pair.follows)
         if n < 0:
-            n = find_near_probes(scene, room, world, lane, pose, first, second, STEEPEST * way - pair.sink)
+            n = find_near_probes(scene, room, world, lane, pose, first, second, STEEPEST * way - sink)
         further = INFINITY
         critical = int(-1)
         for i in range(n):
@@ -220,7 +236,7 @@ def meeting(
             x = position_in_solid(pose, scene.probes[world, p])
             d = solid_distance(scene.solids, world, solid, x)
             near = h * approach(pose, index.turning, x, solid_normal(d.gradient))
-            left = d.value + pair.sink
+            left = d.value + sink
             if near > slow and left - (ONE - share) * near < ZERO:
                 if left / near < further:
                     further = left / near
@@ -231,6 +247,7 @@ def meeting(
         critical = first_of(critical)
         before = share
         share = wp.max(share + closest, ZERO)
+        met.deep = closest < ZERO and before == ZERO
         k += 1
         if share >= ONE:
             met.critical = -1
@@ -376,7 +393,7 @@ def find_points(
                             if point.sunk > ZERO and not turned:
                                 load += point.area * point.sunk
                                 patch = with_sample(
-                                    patch, point.area, point.sunk, pair.sink, point.approach, point.arm,
+                                    patch, point.area, point.sunk, pair.impact_depth, point.approach, point.arm,
                                     point.normal,
                                 )  # fmt: skip
                             if at < end:
@@ -387,7 +404,7 @@ def find_points(
 
 @wp.func
 def impact_of(
-    a: BodyState, b: BodyState, patch: Patch, material: Material, depth: real, share: real, alone: bool
+    a: BodyState, b: BodyState, patch: Patch, material: Material, found: FoundPair, depth: real, alone: bool
 ) -> Impact:
     """The impact of a pair; none where it approaches slowly, or where its law leaves it to the spring.
 
@@ -396,8 +413,8 @@ def impact_of(
         b: Second body.
         patch: Samples that have sunk in.
         material: Of the contact.
+        found: The pair.
         depth: δ [m].
-        share: τ, below one where bodies are as deep within the step.
         alone: Whether one of the bodies is fixed and the other moves freely. Then impulses take effect when
             they meet; between two that move, this would not conserve angular momentum.
     """
@@ -407,12 +424,15 @@ def impact_of(
     if material.instant == ZERO or patch.load <= ZERO:
         return impact
     impact.share = share_of_impact(patch, material.bounce)
-    if impact.share > ZERO and share < ONE:
+    if impact.share > ZERO and (found.hits > 0 or found.deep > 0):
         impact.stiffness = stiffness_of_impact(a, b, patch, material.bounce, material.timestep)
-        impact.delays = wp.where(alone, ONE, ZERO)
-        impact.way = wp.where(alone, ZERO, share)
-        later = wp.where(alone, ONE - share, ONE)
-        impact.rest = wp.max(later, _LATEST) * material.timestep
+        impact.rest = material.timestep
+        if found.deep == 0:
+            if alone:
+                impact.delays = ONE
+                impact.rest = wp.max(ONE - found.share, _LATEST) * material.timestep
+            else:
+                impact.way = found.share
     return impact
 
 
@@ -434,6 +454,91 @@ def share_impacts(scene: Scene, room: Room, world: int, lane: int, n_found: int)
 
 
 @wp.func
+def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: int, at: int, end: int) -> int:
+    """List the points of a pair that is near, and write the pair into `room.found`.
+
+    Geometry of an impact is taken when bodies are as deep as in one. Where they approach slowly, or are that
+    deep from the start, it is that of contact that lasts.
+
+    Returns:
+        Place of the next point in the list, which may lie beyond its end.
+    """
+    h = scene.timestep[world, 0]
+    pair = scene.pairs[world, p]
+    index = scene.pair_index[p]
+    a = room.bodies[world, index.first]
+    b = room.bodies[world, index.second]
+    material = scene.materials[world, index.contact]
+    body = scene.bodies[world, index.first]
+    alone = bool(False)
+    if wp.static(not TREES):
+        alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
+    found = FoundPair()
+    found.pair = p
+    found.first = at
+    # Slower than this nothing has an impact.
+    slow = h * material.bounce
+    sink = wp.max(pair.sink, pair.impact_depth)
+    lasts = material.instant == ZERO
+    met = Meeting()
+    if not lasts:
+        met = meeting(
+            scene, room, world, lane, a, b, pair, index.first, index.second, h, pair.impact_depth, slow, slow
+        )
+        lasts = met.deep
+        found.deep = wp.where(met.deep, 1, 0)
+    if lasts:
+        met = meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, sink, sink, ZERO)
+    # Middles of blocks lie deeper in their body than its samples.
+    overlooked = sink
+    if scene.body_index[index.first].probes != scene.body_index[index.first].blocks:
+        overlooked = pair.impact_depth
+    after = at
+    again = bool(True)
+    while again:
+        again = False
+        found.hits = wp.where(not lasts and met.share < ONE, 1, 0)
+        found.critical = met.critical
+        found.share = met.share
+        pose = posed(scene, world, a, b, index.first, index.second, met.share, h, pair.follows)
+        speed = wp.length(pose.velocity) + wp.length(pose.spin) * TWO * body.radius
+        reach = pair.margin + (ONE - met.share) * h * speed
+        patch = Patch()
+        after, patch, load, turned_load = find_points(
+            scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h, reach,
+            False, at, end, patch,
+        )  # fmt: skip
+        patch.load = total(patch.load)
+        patch.rate = total(patch.rate)
+        patch.arm = total3(patch.arm)
+        patch.normal = total3(patch.normal)
+        patch.deepest = greatest(patch.deepest)
+        # Probes that come near only after they have sunk in, by turning, are not met.
+        if met.share >= ONE and patch.deepest > overlooked:
+            found.deep = 1
+        # What faces the other way presses where its load is the larger one.
+        if total(turned_load) > total(load):
+            after, patch, _load, _turned = find_points(
+                scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h, reach,
+                True, after, end, patch,
+            )  # fmt: skip
+        found.patch = patch
+        found.com_difference = pose.com_difference
+        found.impact = impact_of(a, b, patch, material, found, pair.impact_depth, alone)
+        if not lasts and found.impact.share == ZERO:
+            lasts = True
+            before = met.share
+            met = meeting(
+                scene, room, world, lane, a, b, pair, index.first, index.second, h, sink, sink, ZERO
+            )
+            again = met.share != before
+    found.toward = facing(scene, world, a, b, index.first, index.second, found.share, h)
+    found.end = wp.min(after, end)
+    room.found[world, entry * _LANES + lane] = found
+    return after
+
+
+@wp.func
 def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int, bool]:
     """All points that may press within a step, in each lane's part of the list.
 
@@ -447,53 +552,15 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
     n_found = int(0)
     overflow = bool(False)
     for p in range(scene.pairs.shape[1]):
-        pair = scene.pairs[world, p]
         index = scene.pair_index[p]
         a = room.bodies[world, index.first]
         b = room.bodies[world, index.second]
-        if is_near(scene, world, a, b, index.first, index.second, pair.margin, h):
-            material = scene.materials[world, index.contact]
-            # Slower than this nothing has an impact.
-            least_way = wp.where(material.instant > ZERO, h * material.bounce, pair.sink)
-            slow = wp.where(material.instant > ZERO, least_way, ZERO)
-            met = meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, least_way, slow)
-            pose = posed(scene, world, a, b, index.first, index.second, met.share, h, pair.follows)
-            body = scene.bodies[world, index.first]
-            speed = wp.length(pose.velocity) + wp.length(pose.spin) * TWO * body.radius
-            reach = pair.margin + (ONE - met.share) * h * speed
-            patch = Patch()
+        if is_near(scene, world, a, b, index.first, index.second, scene.pairs[world, p].margin, h):
             begin = at
-            at, patch, load, turned_load = find_points(
-                scene, room, world, lane, pose, pair, index.first, index.second, n_found, met.share, h, reach,
-                False, at, end, patch,
-            )  # fmt: skip
-            patch.load = total(patch.load)
-            patch.rate = total(patch.rate)
-            patch.arm = total3(patch.arm)
-            patch.normal = total3(patch.normal)
-            # What faces the other way presses where its load is the larger one.
-            if total(turned_load) > total(load):
-                at, patch, _load, _turned = find_points(
-                    scene, room, world, lane, pose, pair, index.first, index.second, n_found, met.share, h,
-                    reach, True, at, end, patch,
-                )  # fmt: skip
+            at = find_pair(scene, room, world, lane, p, n_found, begin, end)
             if at > end:
                 overflow = True
                 at = end
-            found = FoundPair()
-            found.pair = p
-            found.first = begin
-            found.end = at
-            found.critical = met.critical
-            found.share = met.share
-            found.com_difference = pose.com_difference
-            found.toward = facing(scene, world, a, b, index.first, index.second, met.share, h)
-            found.patch = patch
-            alone = bool(False)
-            if wp.static(not TREES):
-                alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
-            found.impact = impact_of(a, b, patch, material, pair.sink, met.share, alone)
-            room.found[world, n_found * _LANES + lane] = found
             # What is near but has no points neither presses nor couples its bodies.
             if total(real(at - begin)) > ZERO:
                 n_found += 1

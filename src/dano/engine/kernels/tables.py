@@ -79,13 +79,15 @@ class SamplePair:
     Attributes:
         share: Share of the contact's stiffness that this pair carries [1].
         follows: 1 where points follow the second body, which rolls on the first, else 0.
-        sink: Depth of an impact, up to which predicted geometry is taken [m].
+        sink: Depth up to which predicted geometry is taken [m].
+        impact_depth: δ, depth of an impact [m].
         margin: Distance within which samples count as near [m].
     """
 
     share: real
     follows: real
     sink: real
+    impact_depth: real
     margin: real
 
 
@@ -196,6 +198,8 @@ class FoundPair:
         end: Beyond its last.
         critical: Probe that says when the bodies meet, −1 where they do not within the step.
         share: τ.
+        hits: 1 where τ is when the bodies are as deep as in an impact.
+        deep: 1 where they are deeper than that from the start.
         impact: Of the pair.
         patch: Its samples that have sunk in.
         toward: Direction that samples which turn face [F].
@@ -207,6 +211,8 @@ class FoundPair:
     end: wp.int32
     critical: wp.int32
     share: real
+    hits: wp.int32
+    deep: wp.int32
     impact: Impact
     patch: Patch
     toward: vec3

@@ -26,7 +26,9 @@ from dano.scene import Body, pressing_pairs, Scene
 
 # Samples count as near within this share of the smaller body's size, besides the way they go.
 _MARGIN = 0.001
-# Impacts are at most as deep as this share of the thinner body's half thickness.
+# Geometry is taken where bodies have sunk into each other by at most this share of the smaller one's size …
+_SINK = 0.01
+# … and by this share of the thinner one's half thickness. Impacts are at most as deep.
 _THIN = 0.25
 # Up to so many blocks the moment of meeting is found from samples, beyond from the centres of blocks.
 _FEW_BLOCKS = 64
@@ -295,7 +297,7 @@ def _pairs(
     """Rows of the pairs whose first body's samples press on the second's solid, and their whole numbers."""
     dtype, h = extents.dtype, scene.timestep
     if not pairs:
-        return jnp.zeros((0, 4), dtype), np.zeros((0, 3), np.int32)
+        return jnp.zeros((0, 5), dtype), np.zeros((0, 3), np.int32)
     both = {(first, second) for first, second, _ in pairs}
     first, second, contact = (np.array(x) for x in zip(*pairs, strict=True))
     size, thickness = jnp.minimum(extents[first, 4:], extents[second, 4:]).T
@@ -305,7 +307,8 @@ def _pairs(
         kernels.SamplePair,
         share=jnp.asarray([0.5 if (j, i) in both else 1.0 for i, j, _ in pairs], dtype),
         follows=jnp.asarray([float(smooth[j] and not smooth[i]) for i, j, _ in pairs], dtype),
-        sink=jnp.minimum(_impact_depths(scene, dtype)[contact], _THIN * thickness),
+        sink=jnp.minimum(_SINK * size, _THIN * thickness),
+        impact_depth=jnp.minimum(_impact_depths(scene, dtype)[contact], _THIN * thickness),
         margin=_MARGIN * size + 2 * gravity_step.astype(dtype),
     )
     return rows, np.array(pairs, np.int32)

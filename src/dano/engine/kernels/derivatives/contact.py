@@ -38,6 +38,7 @@ class PairBar:
         scale: By the semi-axes of the sampled body.
         timestep: By h.
         sink: By the depth up to which predicted geometry is taken.
+        impact_depth: By δ.
         twists: By twists and virtual twists, of bodies on joints.
     """
 
@@ -46,6 +47,7 @@ class PairBar:
     scale: vec3
     timestep: real
     sink: real
+    impact_depth: real
     twists: Virtual
 
 
@@ -215,7 +217,7 @@ def pull_patch_of_impact(
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
             by_pose, by_sample, by_distance, _a, by_share_of, by_lead, by_depth, _b = wp.grad(patch_work)(
-                pose, sample, d, turning, pair.share, found.share * h, pair.sink, patch_bar
+                pose, sample, d, turning, pair.share, found.share * h, pair.impact_depth, patch_bar
             )
             by_pose = pull_sample(
                 scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance
@@ -435,7 +437,7 @@ def pull_pose(
     share_bar += by_share
     toward_bar = by_toward
     if found.critical >= 0:
-        # τ is the root of distance + sink = 0 at the critical probe.
+        # τ is the root of distance + depth = 0 at the critical probe.
         probe = scene.probes[world, found.critical]
         solid = leaf_at(scene, world, index.second, position_in_solid(pose, probe))
         _d, _e, of_solid, of_first, of_second, of_share, of_h, of_toward, _f, of_scale, _g = wp.grad(
@@ -461,7 +463,10 @@ def pull_pose(
             bar.second = summed_body(bar.second, scaled_body(share, of_second))
             bar.scale += share * of_scale
             bar.timestep += share * of_h
-            bar.sink += share
+            if found.hits > 0 or pair.impact_depth > pair.sink:
+                bar.impact_depth += share
+            else:
+                bar.sink += share
             toward_bar += share * of_toward
             if lane == 0:
                 of_solid.leaf.factor *= share
@@ -508,8 +513,9 @@ def pull_pair(
         impact_bar.share = total(impact_bar.share)
         impact_bar.stiffness = total(impact_bar.stiffness)
         if found.impact.delays == ZERO:
-            # The way that is left is τ, and the rest the whole step …
-            share_bar += impact_bar.way
+            # The way that is left is τ, unless bodies are deep, and the rest the whole step …
+            if found.deep == 0:
+                share_bar += impact_bar.way
             h_bar += impact_bar.rest
         else:
             # … or what follows τ.
@@ -539,6 +545,6 @@ def pull_pair(
         bar = pull_pose(scene, bars, world, lane, found, a, b, pose, pose_bar, share_bar, h_bar)
         bar.first = summed_body(bar.first, by_first)
         bar.second = summed_body(bar.second, by_second)
-        bar.sink += impact_bar.depth
+        bar.impact_depth += impact_bar.depth
     bar.twists = twists_bar
     return bar

@@ -162,6 +162,7 @@ def pull_touching(
     # Pairs with a patch stand behind those with points, and have no depth of their own.
     if found.pair < bars.pairs.shape[1]:
         bars.pairs[world, found.pair].sink += bar.sink
+        bars.pairs[world, found.pair].impact_depth += bar.impact_depth
 
 
 @after_adjoints

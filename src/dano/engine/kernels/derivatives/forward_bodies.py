@@ -27,6 +27,7 @@ from dano.engine.kernels.derivatives.patches import pull_patch
 from dano.engine.kernels.derivatives.products import (
     body_product,
     material_product,
+    pair_product,
     push_product,
     row_change,
     row_product,
@@ -89,8 +90,7 @@ def change_of_points(
         change += material_product(bars.materials[world, index.contact], changes.materials[world, at])
     if changes.pairs.shape[1] > 0:
         at = direction * scene.pairs.shape[1] + found.pair
-        change += bars.pairs[world, found.pair].share * changes.pairs[world, at].share
-        change += bars.pairs[world, found.pair].sink * changes.pairs[world, at].sink
+        change += pair_product(bars.pairs[world, found.pair], changes.pairs[world, at])
     solid = scene.body_index[index.second]
     return change + change_by_leaves(changes, bars, world, solid.first_leaf, solid.leaves, direction)
 

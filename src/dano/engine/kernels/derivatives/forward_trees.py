@@ -23,6 +23,7 @@ from dano.engine.kernels.derivatives.products import (
     leaf_product,
     loop_product,
     material_product,
+    pair_product,
     patch_material_product,
     push_product,
     row_change,
@@ -166,7 +167,7 @@ def change_of_scene(changes: Changes, bars: Changes, world: int, d: int) -> real
         change += material_product(bars.materials[world, i], moved)
     for i in range(bars.pairs.shape[1]):
         moved_pair = changes.pairs[world, d * bars.pairs.shape[1] + i]
-        change += bars.pairs[world, i].share * moved_pair.share + bars.pairs[world, i].sink * moved_pair.sink
+        change += pair_product(bars.pairs[world, i], moved_pair)
     for i in range(bars.patch_materials.shape[1]):
         change += patch_material_product(
             bars.patch_materials[world, i],

@@ -3,7 +3,7 @@
 import warp as wp
 
 from dano.engine.kernels.rollout import Launch
-from dano.engine.kernels.tables import Body, Changes, Push, StateRow
+from dano.engine.kernels.tables import Body, Changes, Push, SamplePair, StateRow
 from dano.physics.overlap import WeightedSample
 from dano.physics.patch_law import PatchMaterial
 from dano.physics.point_law import Material
@@ -43,6 +43,12 @@ def leaf_product(a: Leaf, b: Leaf) -> real:
         + a.length * b.length
         + wp.dot(a.spacing, b.spacing)
     )
+
+
+@wp.func
+def pair_product(a: SamplePair, b: SamplePair) -> real:
+    """⟨a, b⟩ of pairs with samples that press, whose other numbers only choose samples."""
+    return a.share * b.share + a.sink * b.sink + a.impact_depth * b.impact_depth
 
 
 @wp.func
