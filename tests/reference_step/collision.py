@@ -9,6 +9,8 @@ from reference_step.rotations import cross_matrix
 
 import dano
 
+MOST = 1024
+"""Samples of a body of which each is a probe."""
 POLE = np.array([0.36, -0.48, 0.8])
 FROM_Z = np.array([[0.8, 0.48, -0.36], [0.6, -0.64, 0.48], [0.0, -0.6, -0.8]])
 """A direction in which upright bodies do not press, and a rotation that takes z to its opposite."""
@@ -45,6 +47,7 @@ class Points(NamedTuple):
         delta: Depth of the impact [m].
         beta: Share of the contact that is an impact.
         delays: Whether impulses take effect after the share τ of the step.
+        way: Share of the step in which bodies go on as before.
     """
 
     first: int
@@ -65,6 +68,7 @@ class Points(NamedTuple):
     delta: float
     beta: float
     delays: bool
+    way: float
 
 
 def sides_of(scene):
@@ -210,26 +214,29 @@ class Meeting(NamedTuple):
 
 
 def meetings(scene, bodies, side):
-    """That of an impact, if it can be one, and that of contact that lasts."""
+    """That of an impact and that of contact that lasts, which is also the first one's where bodies are deep."""
     delta, sink = depths_of(scene, side)
-    lasting = meeting(scene, bodies, side, sink, sink, 0.0)
+    lasting = Meeting(share_at(scene, bodies, side, sink, sink, 0.0))
     if side.law.compliant:
         return lasting, lasting
-    slow = bodies.h * side.law.slowest_rebound
-    share = meeting(scene, bodies, side, delta, slow, side.law.slowest_rebound)
-    if share == 0:
-        return lasting._replace(deep=True), lasting
-    return Meeting(share.share, hits=share.share < 1), lasting
+    slow = side.law.slowest_rebound
+    share = share_at(scene, bodies, side, delta, bodies.h * slow, slow)
+    hitting = Meeting(share, hits=share < 1) if share > 0 else lasting._replace(deep=True)
+    return hitting, lasting
 
 
-def meeting(scene, bodies, side, limit, least_way, slow):
-    """The share of the step at which the first sample that goes in is as deep as a limit; else 1."""
+def share_at(scene, bodies, side, limit, least_way, slow):
+    """τ: share of the step at which the first sample that goes in is as deep as a limit [m]; else 1.
+
+    Bodies that move by less than `least_way` [m] are looked at at the end, and samples no faster than `slow`
+    [m/s] do not count.
+    """
     h = bodies.h
     (u, w), radius = bodies.relative(side.i, side.j), float(scene.bodies[side.i].extent[3])
     apart = np.linalg.norm(bodies.position[side.i] - bodies.position[side.j])
     spins = np.linalg.norm(bodies.spin[[side.i, side.j]], axis=1)
     way = np.linalg.norm(bodies.velocity[side.i] - bodies.velocity[side.j]) + spins @ [radius, radius + apart]
-    if h * way <= (limit if side.law.compliant else h * side.law.slowest_rebound):
+    if h * way <= least_way:
         return 1.0
     turning = scene.bodies[side.i].surface.turning
 
@@ -241,7 +248,6 @@ def meeting(scene, bodies, side, limit, least_way, slow):
         axis = pair.R[:, 2]
         turns = {"fixed": w, "axis": w - (w @ axis) * axis, "ball": 0 * w}[turning]
         velocity = u + np.cross(turns, pair.places - pair.x)
-        slow = 0.0 if side.law.compliant else side.law.slowest_rebound
         deep, goes_in = distance <= -limit, np.sum(normal * velocity, axis=1) < -slow
         speed = np.maximum(np.linalg.norm(velocity, axis=1), 1e-12)
         safe = np.where(deep, np.inf, (distance + limit) / (1.5 * h * speed))
@@ -272,15 +278,18 @@ def find(scene, bodies, shares=None):
     shares = shares or {}
     found = []
     for side in sides_of(scene):
-        given = (side.i, side.j) in shares
-        share = shares[side.i, side.j] if given else meeting(scene, bodies, side)
-        found.append(listed(scene, bodies, side, share))
+        hitting, lasting = meetings(scene, bodies, side)
+        given = shares.get((side.i, side.j))
+        points = listed(scene, bodies, side, hitting if given is None else hitting._replace(share=given))
+        if points.beta == 0:
+            points = listed(scene, bodies, side, lasting if given is None else Meeting(given))
+        found.append(points)
     return halved([points for points in found if len(points.area)])
 
 
-def listed(scene, bodies, side, share):
-    """The listed points of a side whose geometry is taken after a share of the step."""
-    i, j, h = side.i, side.j, bodies.h
+def listed(scene, bodies, side, met):
+    """The listed points of a side whose geometry is taken when its bodies meet."""
+    i, j, h, share = side.i, side.j, bodies.h, met.share
     pair = Pair(scene, bodies, side, share)
     distance, normal = pair.distance(pair.places)
     facing = -np.sum(pair.vectors * normal, axis=1)
@@ -304,7 +313,11 @@ def listed(scene, bodies, side, share):
     kept = np.concatenate([np.flatnonzero(usual), np.flatnonzero(near & other & inside_out)])
     hit = usual & (sunk > 0)
     approach = rate - np.sum(normal * drift, axis=1)
-    x = sunk / limit_of(scene, side)
+    delta, sink = depths_of(scene, side)
+    # Middles of blocks, which stand for many samples, lie deeper in their body.
+    exact = len(sunk) <= MOST
+    deep = met.deep or (share >= 1 and np.max(sunk * hit, initial=0) > (delta if exact else sink))
+    x = sunk / delta
     weight = np.where(x < 1, x**2, 2 * x - 1) * hit
     beta, stiffness = impact(bodies, side, arm, normal, area * weight, approach)
     free = not scene.joints and not (bodies.moves[i] and bodies.moves[j])
@@ -321,12 +334,13 @@ def listed(scene, bodies, side, share):
         rate=rate[kept],
         area=area[kept],
         drift=drift[kept],
-        impact=(stiffness * (share < 1) * weight)[kept],
-        kappa=stiffness * (share < 1),
+        impact=(stiffness * (met.hits or deep) * weight)[kept],
+        kappa=stiffness * (met.hits or deep),
         sunk=np.where(other, 0, -distance)[kept],
-        delta=limit_of(scene, side),
+        delta=delta,
         beta=beta,
-        delays=free and share < 1 and beta > 0,
+        delays=free and met.hits and not deep and beta > 0,
+        way=0.0 if deep or free else share,
     )
 
 

@@ -151,8 +151,7 @@ def goals(law, points):
     approach = points.rate - np.sum(points.normal * points.drift, axis=1)
     rebound = -law.e * approach
     fast = smooth_step(2 * rebound / law.slowest_rebound - 1)
-    way = 0.0 if points.delays else points.share
-    after = fast * rebound + (1 - fast) * way * np.minimum(approach, 0)
+    after = fast * rebound + (1 - fast) * points.way * np.minimum(approach, 0)
     return after + np.maximum(after - approach, 0) / FACTOR
 
 

@@ -43,6 +43,7 @@ def random_points(law, impact):
         delta=law.delta,
         beta=0.7 if impact > 0 else 0.0,
         delays=False,
+        way=0.6,
     )
 
 

@@ -393,8 +393,8 @@ def find_points(
                             if point.sunk > ZERO and not turned:
                                 load += point.area * point.sunk
                                 patch = with_sample(
-                                    patch, point.area, point.sunk, pair.impact_depth, point.approach, point.arm,
-                                    point.normal,
+                                    patch, point.area, point.sunk, pair.impact_depth, point.approach,
+                                    point.arm, point.normal,
                                 )  # fmt: skip
                             if at < end:
                                 list_point(room, world, at, point, s, entry, turned)
