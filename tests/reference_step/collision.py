@@ -214,7 +214,7 @@ class Meeting(NamedTuple):
 
 
 def meetings(scene, bodies, side):
-    """That of an impact and that of contact that lasts, which is also the first one's where bodies are deep."""
+    """That of an impact, and that of contact that lasts; where bodies are deep the second is both."""
     delta, sink = depths_of(scene, side)
     lasting = Meeting(share_at(scene, bodies, side, sink, sink, 0.0))
     if side.law.compliant:
@@ -318,8 +318,9 @@ def listed(scene, bodies, side, met):
     exact = len(sunk) <= MOST
     deep = met.deep or (share >= 1 and np.max(sunk * hit, initial=0) > (delta if exact else sink))
     x = sunk / delta
-    weight = np.where(x < 1, x**2, 2 * x - 1) * hit
-    beta, stiffness = impact(bodies, side, arm, normal, area * weight, approach)
+    weight = fading_in(x) * hit
+    near_load = area * usual * fading_in((delta * (share < 1) - distance) / delta)
+    beta, stiffness = impact(bodies, side, arm, normal, area * weight, near_load, approach)
     free = not scene.joints and not (bodies.moves[i] and bodies.moves[j])
     return Points(
         first=i,
@@ -377,12 +378,19 @@ def drifts(u, w, after, arm, normal):
     return change - excess[:, None] * across(change)
 
 
-def impact(bodies, side, arm, normal, load, approach):
-    """β, and κ [Pa s/m] of the samples of a side, with A w of each as load."""
+def fading_in(x):
+    """w of samples at x times the depth of an impact."""
+    y = np.maximum(x, 0)
+    return np.where(y < 1, y**2, 2 * y - 1)
+
+
+def impact(bodies, side, arm, normal, load, near_load, approach):
+    """β, and κ [Pa s/m] of a side; A w of samples that have sunk in, and of those that nearly have."""
     if side.law.compliant or load.sum() == 0:
         return 0.0, 0.0
     weights = load / load.sum()
-    beta = float(smooth_step(-(weights @ approach) / side.law.slowest_rebound - 1))
+    nearing = -(near_load @ approach) / near_load.sum()
+    beta = float(smooth_step(nearing / side.law.slowest_rebound - 1))
     r, n = weights @ arm, weights @ normal
     mobility = bodies.inverse_mass[side.i] + bodies.inverse_mass[side.j]
     for k, lever in ((side.i, r), (side.j, r + bodies.position[side.i] - bodies.position[side.j])):

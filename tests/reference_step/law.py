@@ -25,7 +25,7 @@ class Law(NamedTuple):
         compliant: Whether impacts are left to the spring.
         h: Timestep [s].
         delta: Depth of an impact [m].
-        slowest_rebound: v_e + g h [m/s].
+        slowest_rebound: v_e + g h or √(g δ), whichever is larger [m/s].
         gravity: g for samples that are deep [m/s²].
     """
 
@@ -69,7 +69,7 @@ def laws_of(scene):
         for numbers in np.array(columns).T:
             k, e, v_e, delta, sigma, mu, phi, p_0 = (float(x) for x in numbers)
             rest = float(law.stiction_velocity), float(law.implicitness), law.compliant
-            rest = *rest, h, delta, v_e + g * h, g if g > 0 else 9.81
+            rest = *rest, h, delta, max(v_e + g * h, (g * delta) ** 0.5), g if g > 0 else 9.81
             found.append(Law(k, e, v_e, sigma, mu, phi, p_0, *rest))
     return found
 

@@ -189,6 +189,8 @@ def materials(
     laws = [law for law, _ in groups]
     n = sum(sizes)
     strength = jnp.where(gravity > 0, gravity, STANDARD_GRAVITY)
+    # Sinking from rest by half the depth of an impact makes no impact.
+    settling = jnp.where(gravity > 0, jnp.sqrt(strength * stacked.impact_depth), 0)
     return Material(
         stacked.stiffness,
         stacked.restitution,
@@ -201,6 +203,6 @@ def materials(
         column([law.implicitness for law in laws]) * timestep,
         jnp.broadcast_to(timestep, (n,)),
         jnp.asarray(np.repeat([0.0 if law.compliant else 1.0 for law in laws], sizes), timestep.dtype),
-        stacked.restitution_velocity + gravity * timestep,
+        jnp.maximum(stacked.restitution_velocity + gravity * timestep, settling),
         jnp.broadcast_to(_SLOW**2 * strength, (n,)).astype(timestep.dtype),
     )

@@ -25,16 +25,18 @@ class Patch:
 
     Attributes:
         load: Σ A w [m²].
-        rate: Separating speed, weighted by the load [m³/s].
         arm: [m³, W].
         normal: [m², W].
+        near_load: Σ A w of samples that have sunk in or nearly have [m²].
+        near_rate: Their separating speed, weighted by that load [m³/s].
         deepest: Largest depth [m].
     """
 
     load: real
-    rate: real
     arm: vec3
     normal: vec3
+    near_load: real
+    near_rate: real
     deepest: real
 
 
@@ -77,7 +79,14 @@ def fading_in(x: real) -> real:
 
 @wp.func
 def with_sample(
-    patch: Patch, area: real, sunk: real, depth: real, approach: real, arm: vec3, normal: vec3
+    patch: Patch,
+    area: real,
+    sunk: real,
+    depth: real,
+    layer: real,
+    approach: real,
+    arm: vec3,
+    normal: vec3,
 ) -> Patch:
     """A patch with one more sample.
 
@@ -86,6 +95,7 @@ def with_sample(
         area: Of the sample [m²].
         sunk: Its depth where geometry is taken [m].
         depth: δ [m].
+        layer: Within so much of the surface samples nearly have sunk in [m].
         approach: Its separating speed with which the step begins [m/s].
         arm: From the first body's centre of mass [m, W].
         normal: Unit normal [W].
@@ -93,9 +103,11 @@ def with_sample(
     found = patch
     weight = area * fading_in(sunk / depth)
     found.load += weight
-    found.rate += weight * approach
     found.arm += weight * arm
     found.normal += weight * normal
+    near = area * fading_in((sunk + layer) / depth)
+    found.near_load += near
+    found.near_rate += near * approach
     found.deepest = wp.max(found.deepest, sunk)
     return found
 
@@ -113,7 +125,7 @@ def share_of_impact(patch: Patch, bounce: real) -> real:
 
     A patch approaches at the mean over its load: ahead of a rolling contact single samples always do.
     """
-    return smooth_step(-patch.rate / (patch.load * bounce) - ONE)
+    return smooth_step(-patch.near_rate / (patch.near_load * bounce) - ONE)
 
 
 @wp.func

@@ -318,6 +318,12 @@ def block_share(lane: int, bits: wp.uint32) -> BlockShare:
 
 
 @wp.func
+def layer_of(pair: SamplePair, share: real) -> real:
+    """Distance [m] within which samples nearly have sunk in: where geometry is taken early, others follow."""
+    return wp.where(share < ONE, pair.impact_depth, ZERO)
+
+
+@wp.func
 def find_points(
     scene: Scene,
     room: Room,
@@ -348,6 +354,7 @@ def find_points(
     solid = solid_of_body(scene, world, second)
     body = scene.bodies[world, first]
     stretch = stretch_of(body, index.turning)
+    layer = layer_of(pair, share)
     at = begin
     beyond = int(0)
     # All lanes go through as many rounds: samples of the blocks that are listed in one are shared.
@@ -390,10 +397,10 @@ def find_points(
                     if (turned and back) or (not turned and facing > ZERO):
                         point = point_contact(pose, sample, d, index.turning, turned, pair.share, share * h)
                         if point.depth - h * point.rate > -pair.margin:
-                            if point.sunk > ZERO and not turned:
-                                load += point.area * point.sunk
+                            if point.sunk > -layer and not turned:
+                                load += point.area * wp.max(point.sunk, ZERO)
                                 patch = with_sample(
-                                    patch, point.area, point.sunk, pair.impact_depth, point.approach,
+                                    patch, point.area, point.sunk, pair.impact_depth, layer, point.approach,
                                     point.arm, point.normal,
                                 )  # fmt: skip
                             if at < end:
@@ -509,7 +516,8 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
             False, at, end, patch,
         )  # fmt: skip
         patch.load = total(patch.load)
-        patch.rate = total(patch.rate)
+        patch.near_load = total(patch.near_load)
+        patch.near_rate = total(patch.near_rate)
         patch.arm = total3(patch.arm)
         patch.normal = total3(patch.normal)
         patch.deepest = greatest(patch.deepest)

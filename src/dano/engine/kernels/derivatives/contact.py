@@ -14,7 +14,7 @@ from dano.engine.kernels.derivatives.adjoint import (
 from dano.engine.kernels.derivatives.impact_work import impact_work, patch_work
 from dano.engine.kernels.derivatives.pair_changes import add_distance_changes
 from dano.engine.kernels.lanes import total, total3, total6, total33
-from dano.engine.kernels.search import posed, solid_of_body
+from dano.engine.kernels.search import layer_of, posed, solid_of_body
 from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
 from dano.physics.features import LANES, TREES, TURNING, UNIONS
 from dano.physics.impacts import Impact, Patch
@@ -205,26 +205,29 @@ def pull_patch_of_impact(
     pair = scene.pairs[world, found.pair]
     turning = scene.body_index[index.first].turning
     h = scene.timestep[world, 0]
+    layer = layer_of(pair, found.share)
     pose_bar = PairPose()
     lead_bar = real(0.0)
     depth_bar = real(0.0)
     share_of_bar = real(0.0)
     for k in range(found.first, found.end):
         where = room.where[world, k]
-        if room.points[world, k].sunk > ZERO and where.presses_back == 0:
+        if room.points[world, k].sunk > -layer and where.presses_back == 0:
             sample = scene.samples[world, where.sample]
             x = position_in_solid(pose, sample.point)
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
-            by_pose, by_sample, by_distance, _a, by_share_of, by_lead, by_depth, _b = wp.grad(patch_work)(
-                pose, sample, d, turning, pair.share, found.share * h, pair.impact_depth, patch_bar
-            )
+            by_pose, by_sample, by_distance, _a, by_share_of, by_lead, by_depth, by_layer, _b = wp.grad(
+                patch_work
+            )(pose, sample, d, turning, pair.share, found.share * h, pair.impact_depth, layer, patch_bar)
             by_pose = pull_sample(
                 scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance
             )
             pose_bar = summed_pose(pose_bar, by_pose)
             lead_bar += by_lead
             depth_bar += by_depth
+            if layer > ZERO:
+                depth_bar += by_layer
             share_of_bar += by_share_of
     share_of_bar = total(share_of_bar)
     if lane == 0 and bars.pairs.shape[1] > 0:

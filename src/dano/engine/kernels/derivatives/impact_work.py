@@ -23,14 +23,19 @@ def patch_work(
     stiffness_share: real,
     lead: real,
     depth: real,
+    layer: real,
     bar: Patch,
 ) -> real:
     """⟨bar, what a sample adds to the patch of an impact⟩."""
     point = point_contact(pose, sample, d, turning, False, stiffness_share, lead)
     own = Patch()
-    own = with_sample(own, point.area, point.sunk, depth, point.approach, point.arm, point.normal)
+    own = with_sample(own, point.area, point.sunk, depth, layer, point.approach, point.arm, point.normal)
     return (
-        bar.load * own.load + bar.rate * own.rate + wp.dot(bar.arm, own.arm) + wp.dot(bar.normal, own.normal)
+        bar.load * own.load
+        + wp.dot(bar.arm, own.arm)
+        + wp.dot(bar.normal, own.normal)
+        + bar.near_load * own.near_load
+        + bar.near_rate * own.near_rate
     )
 
 
