@@ -14,7 +14,8 @@ from dano.engine.kernels.derivatives.adjoint import (
 from dano.engine.kernels.derivatives.impact_work import impact_work, patch_work
 from dano.engine.kernels.derivatives.pair_changes import add_distance_changes
 from dano.engine.kernels.lanes import total, total3, total6, total33
-from dano.engine.kernels.search import layer_of, posed, solid_of_body
+from dano.engine.kernels.meeting import posed, solid_of_body
+from dano.engine.kernels.search import layer_of
 from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
 from dano.physics.features import LANES, TREES, TURNING, UNIONS
 from dano.physics.impacts import Impact, Patch
