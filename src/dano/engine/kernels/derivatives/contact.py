@@ -13,11 +13,19 @@ from dano.engine.kernels.derivatives.adjoint import (
 )
 from dano.engine.kernels.derivatives.impact_work import impact_work, patch_work
 from dano.engine.kernels.derivatives.pair_changes import add_distance_changes
-from dano.engine.kernels.lanes import total, total3, total6, total33
+from dano.engine.kernels.derivatives.products import (
+    scaled_body,
+    summed_body,
+    summed_material,
+    summed_pose,
+    total_material,
+    total_pose,
+)
+from dano.engine.kernels.lanes import total, total6
 from dano.engine.kernels.meeting import posed, solid_of_body
 from dano.engine.kernels.search import layer_of
 from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
-from dano.physics.features import LANES, TREES, TURNING, UNIONS
+from dano.physics.features import TREES, TURNING, UNIONS
 from dano.physics.impacts import Impact, Patch
 from dano.physics.pairs import BALL, BodyState, first_touch, PairPose, position_after, rotation_after
 from dano.physics.point_law import Material
@@ -72,94 +80,6 @@ def add_leaf(bars: Changes, world: int, solid: Solid, bar: Solid):
         bars.leaves[world, i].sizes += bar.leaf.sizes
         bars.leaves[world, i].length += bar.leaf.length
         bars.leaves[world, i].spacing += bar.leaf.spacing
-
-
-@wp.func
-def summed_material(a: Material, b: Material) -> Material:
-    """Sum of two derivatives by a material."""
-    a.stiffness += b.stiffness
-    a.restitution += b.restitution
-    a.restitution_velocity += b.restitution_velocity
-    a.hysteresis += b.hysteresis
-    a.friction += b.friction
-    a.friction_fading += b.friction_fading
-    a.friction_pressure += b.friction_pressure
-    a.stiction += b.stiction
-    a.ahead += b.ahead
-    a.timestep += b.timestep
-    a.bounce += b.bounce
-    a.uplift += b.uplift
-    return a
-
-
-@wp.func
-def total_material(a: Material) -> Material:
-    """Sum over the lanes of a world."""
-    if wp.static(LANES > 1):
-        a.stiffness = total(a.stiffness)
-        a.restitution = total(a.restitution)
-        a.restitution_velocity = total(a.restitution_velocity)
-        a.hysteresis = total(a.hysteresis)
-        a.friction = total(a.friction)
-        a.friction_fading = total(a.friction_fading)
-        a.friction_pressure = total(a.friction_pressure)
-        a.stiction = total(a.stiction)
-        a.ahead = total(a.ahead)
-        a.timestep = total(a.timestep)
-        a.bounce = total(a.bounce)
-        a.uplift = total(a.uplift)
-    return a
-
-
-@wp.func
-def summed_pose(a: PairPose, b: PairPose) -> PairPose:
-    """Sum of two derivatives by a pose."""
-    a.points += b.points
-    a.origin += b.origin
-    a.vectors += b.vectors
-    a.rotation += b.rotation
-    a.com += b.com
-    a.velocity += b.velocity
-    a.spin += b.spin
-    a.com_difference += b.com_difference
-    a.arms += b.arms
-    a.arm_offset += b.arm_offset
-    a.lowest += b.lowest
-    a.axis += b.axis
-    return a
-
-
-@wp.func
-def total_pose(a: PairPose) -> PairPose:
-    """Sum over the lanes of a world."""
-    if wp.static(LANES > 1):
-        a.points = total33(a.points)
-        a.origin = total3(a.origin)
-        a.vectors = total33(a.vectors)
-        a.rotation = total33(a.rotation)
-        a.com = total3(a.com)
-        a.velocity = total3(a.velocity)
-        a.spin = total3(a.spin)
-        a.com_difference = total3(a.com_difference)
-        a.arms = total33(a.arms)
-        a.arm_offset = total3(a.arm_offset)
-        a.lowest = total3(a.lowest)
-        a.axis = total3(a.axis)
-    return a
-
-
-@wp.func
-def summed_body(a: BodyState, b: BodyState) -> BodyState:
-    """Sum of two derivatives by the state of a body."""
-    a.position += b.position
-    a.orientation = a.orientation + b.orientation
-    a.ahead = a.ahead + b.ahead
-    a.velocity += b.velocity
-    a.spin += b.spin
-    a.com += b.com
-    a.inverse_mass += b.inverse_mass
-    a.inverse_inertia += b.inverse_inertia
-    return a
 
 
 @wp.func
@@ -389,20 +309,6 @@ def pull_facing(
     bar.scale += by_scale
     bar.timestep += by_h
     return bar, by_share
-
-
-@wp.func
-def scaled_body(s: real, a: BodyState) -> BodyState:
-    """A derivative by the state of a body, times a number."""
-    a.position *= s
-    a.orientation = a.orientation * s
-    a.ahead = a.ahead * s
-    a.velocity *= s
-    a.spin *= s
-    a.com *= s
-    a.inverse_mass *= s
-    a.inverse_inertia *= s
-    return a
 
 
 @wp.func

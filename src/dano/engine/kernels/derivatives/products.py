@@ -1,10 +1,13 @@
-"""Changes of what a rollout is given, and their products with derivatives by it, number by number."""
+"""Changes of what a rollout is given, and their products with derivatives by it, number by number; sums."""
 
 import warp as wp
 
+from dano.engine.kernels.lanes import total, total3, total33
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Body, Changes, Push, SamplePair, StateRow
+from dano.physics.features import LANES
 from dano.physics.overlap import WeightedSample
+from dano.physics.pairs import BodyState, PairPose
 from dano.physics.patch_law import PatchMaterial
 from dano.physics.point_law import Material
 from dano.physics.real import ONE, real, vec6
@@ -177,3 +180,105 @@ def unit_vector(k: int) -> vec6:
     unit = vec6()
     unit[k] = ONE
     return unit
+
+
+@wp.func
+def summed_material(a: Material, b: Material) -> Material:
+    """Sum of two derivatives by a material."""
+    a.stiffness += b.stiffness
+    a.restitution += b.restitution
+    a.restitution_velocity += b.restitution_velocity
+    a.hysteresis += b.hysteresis
+    a.friction += b.friction
+    a.friction_fading += b.friction_fading
+    a.friction_pressure += b.friction_pressure
+    a.stiction += b.stiction
+    a.ahead += b.ahead
+    a.timestep += b.timestep
+    a.bounce += b.bounce
+    a.uplift += b.uplift
+    return a
+
+
+@wp.func
+def total_material(a: Material) -> Material:
+    """Sum over the lanes of a world."""
+    if wp.static(LANES > 1):
+        a.stiffness = total(a.stiffness)
+        a.restitution = total(a.restitution)
+        a.restitution_velocity = total(a.restitution_velocity)
+        a.hysteresis = total(a.hysteresis)
+        a.friction = total(a.friction)
+        a.friction_fading = total(a.friction_fading)
+        a.friction_pressure = total(a.friction_pressure)
+        a.stiction = total(a.stiction)
+        a.ahead = total(a.ahead)
+        a.timestep = total(a.timestep)
+        a.bounce = total(a.bounce)
+        a.uplift = total(a.uplift)
+    return a
+
+
+@wp.func
+def summed_pose(a: PairPose, b: PairPose) -> PairPose:
+    """Sum of two derivatives by a pose."""
+    a.points += b.points
+    a.origin += b.origin
+    a.vectors += b.vectors
+    a.rotation += b.rotation
+    a.com += b.com
+    a.velocity += b.velocity
+    a.spin += b.spin
+    a.com_difference += b.com_difference
+    a.arms += b.arms
+    a.arm_offset += b.arm_offset
+    a.lowest += b.lowest
+    a.axis += b.axis
+    return a
+
+
+@wp.func
+def total_pose(a: PairPose) -> PairPose:
+    """Sum over the lanes of a world."""
+    if wp.static(LANES > 1):
+        a.points = total33(a.points)
+        a.origin = total3(a.origin)
+        a.vectors = total33(a.vectors)
+        a.rotation = total33(a.rotation)
+        a.com = total3(a.com)
+        a.velocity = total3(a.velocity)
+        a.spin = total3(a.spin)
+        a.com_difference = total3(a.com_difference)
+        a.arms = total33(a.arms)
+        a.arm_offset = total3(a.arm_offset)
+        a.lowest = total3(a.lowest)
+        a.axis = total3(a.axis)
+    return a
+
+
+@wp.func
+def summed_body(a: BodyState, b: BodyState) -> BodyState:
+    """Sum of two derivatives by the state of a body."""
+    a.position += b.position
+    a.orientation = a.orientation + b.orientation
+    a.ahead = a.ahead + b.ahead
+    a.velocity += b.velocity
+    a.spin += b.spin
+    a.com += b.com
+    a.inverse_mass += b.inverse_mass
+    a.inverse_inertia += b.inverse_inertia
+    return a
+
+
+@wp.func
+def scaled_body(s: real, a: BodyState) -> BodyState:
+    """A derivative by the state of a body, times a number."""
+    a.position *= s
+    a.orientation = a.orientation * s
+    a.ahead = a.ahead * s
+    a.velocity *= s
+    a.spin *= s
+    a.com *= s
+    a.inverse_mass *= s
+    a.inverse_inertia *= s
+    return a
