@@ -1,6 +1,5 @@
 """Robots' files of packages, judged by MuJoCo and, where it is installed, by Pinocchio."""
 
-import enum
 import importlib
 import importlib.util
 import re
@@ -14,6 +13,7 @@ import mujoco
 import numpy as np
 
 import dano
+from benchmarks.intake._verdict import Outcome
 from dano.maths import quat_to_matrix
 from dano.robots import Robot
 
@@ -24,15 +24,6 @@ TOLERANCE = 1e-7
 carries others gets a billionth of what it carries."""
 _EXAMPLES = "cmeel.prefix/share/example-robot-data"
 _OPTION = re.compile(r"ignore=(\[[^\]]*\])|(balance_inertia=True)")
-
-
-class Outcome(enum.Enum):
-    """What became of a file."""
-
-    LOADS = "loads"
-    REFUSED_RIGHTLY = "refused rightly"
-    REFUSED_WRONGLY = "refused wrongly"
-    WRONG = "read wrongly"
 
 
 def robot_files(group: str) -> list[Path]:
