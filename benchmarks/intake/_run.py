@@ -23,7 +23,7 @@ _MADE: dict[str, Callable[[], list[Case]]] = {
     "pictures": _pictures.cases,
     "logs": _logs.cases,
 }
-_HELD = 25
+_HELD = 40
 """Robots between which compiled programs are forgotten: each leaves some, of 10 MB and more."""
 
 
