@@ -175,20 +175,21 @@ def _posed(robot: Robot, names: list[str]) -> _Posed:
         limits = scene.joint(robot.joint_names[name]).limits
         bounded = angle if limits is None else np.clip(angle, *np.asarray(limits))
         angles[name] = float(bounded)
-    state = robot.state(scene, angles)
-    mass, position, orientation = _measured(scene, state)
+
+    @eqx.filter_jit
+    def measured(scene: dano.Scene):
+        state = robot.state(scene, angles)
+        frames = scene.frames(state)
+        return dano.mass_matrix(scene, state), frames.position, frames.orientation
+
+    # Operations one after the other would be compiled one by one.
+    mass, position, orientation = measured(scene)
     children = [joint.child for joint in scene.joints]
     base = 6 * len(scene.layout.free)
     order = [base + scene.layout.coordinates[children.index(robot.joint_names[name])] for name in names]
     return _Posed(
         robot, angles, np.asarray(position), np.asarray(orientation), np.asarray(mass)[np.ix_(order, order)]
     )
-
-
-@eqx.filter_jit
-def _measured(scene: dano.Scene, state: dano.State):
-    frames = scene.frames(state)
-    return dano.mass_matrix(scene, state), frames.position, frames.orientation
 
 
 def _single(robot: Robot, name: str) -> bool:
