@@ -22,7 +22,7 @@ from benchmarks._measure import (
     time_in_turn,
     warm_up,
 )
-from benchmarks.robots import _chains, _identify
+from benchmarks.robots import _chains, _identify, _standing
 from benchmarks.robots.push import panda
 from dano.robots import Robot
 
@@ -50,6 +50,7 @@ def run() -> None:
         rows += _chains.rows(KEPT, 200 if arguments.quick else 10_000)
         arm = Path(str(files("dano") / "assets" / "arm.urdf"))
         rows += _identify.rows(FOUND, path, arm, 1 if arguments.quick else 8)
+    rows += _standing.rows(0.2 if arguments.quick else 2.0)
     # Other programs slow down what is timed, most of all what reads much memory.
     settings = {"steps": STEPS, "timestep": TIMESTEP, "shared": load_average() > SHARED}
     report("robots", rows, settings, load, arguments.json)
