@@ -178,6 +178,8 @@ def _in_mujoco(
     with tempfile.TemporaryDirectory() as folder:
         path = dano.export_robot(robot, Path(folder) / "robot.xml")
         spec = mujoco.MjSpec.from_file(str(path))
+    # Some moments exceed the sum of the others by a rounding of the file.
+    spec.compiler.balanceinertia = True
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     floor = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [1, 1, 1], "contype": 2, "conaffinity": 1}
