@@ -1,5 +1,6 @@
 """The Panda: a step, and its mass matrix, beside MuJoCo and frax; energy and motion of free swinging."""
 
+import argparse
 import dataclasses
 import time
 import xml.etree.ElementTree as ET
@@ -37,8 +38,12 @@ FOUND = "Found from logs"
 
 
 def run() -> None:
-    arguments = parse_arguments("Measure a robot beside MuJoCo and frax.")
+    arguments = parse_arguments("Measure a robot beside MuJoCo and frax.", _add)
     load = load_average()
+    if arguments.standing:
+        rows = list(_standing.rows(0.2 if arguments.quick else 2.0))
+        report("robots-standing", rows, {"timestep": _standing.TIMESTEP}, load, arguments.json)
+        return
     path = panda()
     if path is None:
         rows = [skipped(SPEED, "all of it", "the package frax, which ships the Panda, is not installed")]
@@ -50,10 +55,13 @@ def run() -> None:
         rows += _chains.rows(KEPT, 200 if arguments.quick else 10_000)
         arm = Path(str(files("dano") / "assets" / "arm.urdf"))
         rows += _identify.rows(FOUND, path, arm, 1 if arguments.quick else 8)
-    rows += _standing.rows(0.2 if arguments.quick else 2.0)
     # Other programs slow down what is timed, most of all what reads much memory.
     settings = {"steps": STEPS, "timestep": TIMESTEP, "shared": load_average() > SHARED}
     report("robots", rows, settings, load, arguments.json)
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--standing", action="store_true", help="only robots of five families on a floor")
 
 
 def _speed_rows(robot: Robot, path: Path, repeats: int) -> list[Row]:

@@ -15,7 +15,7 @@ import numpy as np
 
 import dano
 from benchmarks._measure import Row, skipped
-from dano.maths import quat_to_matrix
+from dano.maths import Numbers, quat_to_matrix
 from dano.robots import mesh_of, Robot
 
 TIMESTEP = 2e-3
@@ -87,8 +87,11 @@ def _measured(case: _Case, path: Path, seconds: float) -> Iterator[Row]:
     scene = robot.scene(bodies=[floor], contacts=robot.contacts_with(floor), timestep=TIMESTEP)
     pose = _pose(case, robot, scene)
     state, shift = _set_down(case, robot, scene, pose)
-    commands = {name: dict(command=q - shift.get(name, 0.0)) for name, q in pose.items()}
-    once = scene.control(**{robot.joint_names[name]: given for name, given in commands.items()})
+    commands = {name: q - shift.get(name, 0.0) for name, q in pose.items()}
+    told: dict[str, dict[str, Numbers]] = {
+        robot.joint_names[name]: {"command": q} for name, q in commands.items()
+    }
+    once = scene.control(**told)
     steps = round(seconds / TIMESTEP)
     controls = jax.tree.map(lambda x: x[None].repeat(steps, axis=0), once)
     run = jax.block_until_ready(dano.simulate(scene, state, controls=controls))
@@ -143,7 +146,8 @@ def _set_down(
         root = next(body.name for body in robot.bodies if body.name in robot.places)
         height = _ABOVE - float(_lowest(scene, jax.tree.map(lambda x: x[None], state))[0])
         place = np.asarray(state.position[scene.index(root)]) + [0, 0, height]
-        return robot.state(scene, pose, **{root: dict(position=place)}), {}
+        others: dict[str, dict[str, Numbers]] = {root: {"position": place}}
+        return robot.state(scene, pose, **others), {}
     # The shoulder is turned until the hand is there.
     low, high = 0.0, pose["panda_joint2"]
     for _ in range(12):
@@ -172,7 +176,7 @@ def _lowest(scene: dano.Scene, states: dano.State) -> np.ndarray:
 
 
 def _in_mujoco(
-    robot: Robot, scene: dano.Scene, state: dano.State, commands: dict[str, dict[str, float]], steps: int
+    robot: Robot, scene: dano.Scene, state: dano.State, commands: dict[str, float], steps: int
 ) -> tuple[float, float]:
     """Time of a step [µs] and depth of the deepest contact at the end [mm]."""
     with tempfile.TemporaryDirectory() as folder:
@@ -202,10 +206,11 @@ def _in_mujoco(
         made.set_to_position(kp=gain, kv=damping)
     model = spec.compile()
     data = mujoco.MjData(model)
-    for name, given in commands.items():
+    assert state.q is not None
+    for name, command in commands.items():
         j = [joint.child for joint in scene.joints].index(robot.joint_names[name])
         data.joint(name).qpos = float(state.q[scene.layout.coordinates[j]])
-        data.actuator(name).ctrl = given["command"]
+        data.actuator(name).ctrl = command
     for root in roots:
         i = scene.index(root.name)
         arm = np.asarray(quat_to_matrix(state.orientation[i])) @ np.asarray(scene.bodies[i].com)

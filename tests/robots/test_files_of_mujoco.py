@@ -40,11 +40,13 @@ def test_compensated_weight_moves_as_in_mujoco(tmp_path):
     before = 1e-4 * np.linalg.solve(dano.mass_matrix(scene, state), needed)
     start = robot.state(scene, dict(a=0.2, b=-0.4), dict(a=before[0], b=before[1]))
     run = dano.simulate(scene, start, 1000)
+    assert run.states.q is not None
     np.testing.assert_allclose(run.states.q[-1], data.qpos, atol=2e-5)
     # Without it both fall by half a radian and more.
     plain = dano.load_mjcf(path, collision=False, ignore="gravcomp")
-    fallen = dano.simulate(plain.scene(timestep=2e-4), state, 1000).states.q[-1]
-    assert np.abs(np.asarray(fallen) - data.qpos).max() > 0.1
+    fallen = dano.simulate(plain.scene(timestep=2e-4), state, 1000).states.q
+    assert fallen is not None
+    assert np.abs(np.asarray(fallen[-1]) - data.qpos).max() > 0.1
 
 
 def test_compensated_weight_of_a_body_has_derivatives_and_goes_into_files(tmp_path):

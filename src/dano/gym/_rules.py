@@ -119,13 +119,14 @@ class Rules(eqx.Module):
             return jax.tree.map(lambda x: x[-1], states), jnp.all(report.converged), jnp.asarray(full)
 
         def step(state: State, action: Array, count: Array):
-            u = lower + 0.5 * (jnp.clip(action.astype(lower.dtype), -1, 1) + 1) * (upper - lower)
+            share = 0.5 * (jnp.clip(action.astype(lower.dtype), -1, 1) + 1)
+            u = jnp.asarray(lower) + share * jnp.asarray(upper - lower)
             after, solved, full = advanced(scene.filled(state), u)
             count = count + 1
-            rows = [jax.tree.map(lambda x: x[None], x) for x in (state, u, after)]
-            reward, met, lengths = _judged(self, *rows, (count >= self.n_steps)[None])
+            before, held, ended = (jax.tree.map(lambda x: x[None], x) for x in (state, u, after))
+            reward, met, lengths = _judged(self, before, held, ended, (count >= self.n_steps)[None])
             left = jnp.asarray(1 - count / self.n_steps, scene.timestep.dtype)
-            seen = _observations(scene, task, rows[2], left[None])
+            seen = _observations(scene, task, ended, left[None])
             return after, seen[0], reward[0], met[0], lengths[0], solved, full
 
         return jax.jit(step, compiler_options=compiler_options())
