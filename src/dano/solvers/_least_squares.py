@@ -50,7 +50,7 @@ class Stop(enum.Enum):
     LOSS = "converged: predicted decrease below tolerance"
     STEP = "converged: negligible steps"
     PERFECT = "converged: the residuals are zero up to rounding"
-    STUCK = "no step reduces the loss, although its gradient is not zero: the loss is rough here"
+    STUCK = "no step reduces the loss, although its gradient is not zero"
     ITERATIONS = "the limit of iterations was reached"
     INTERRUPTED = "interrupted: this is the best point so far"
 
@@ -109,7 +109,7 @@ _DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-15, 1e12
 # Relative change of x that is none.
 _NEGLIGIBLE = 1e-10
-# If the loss should fall by so many tolerances and does not, it is called rough.
+# If the loss should fall by so many tolerances and does not, the search is stuck.
 _ROUGH = 100
 # Curvature over a parameter's range, as a share of the largest there is, that may be rounding: a parameter
 # with less stays about where it is instead of running off.
