@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import dano
-from dano.maths import quat_from_axis_angle, quat_multiply
+from dano.maths import quat_exp, quat_from_axis_angle, quat_multiply
 from dano.scene_file import build_asset
 
 TIMESTEP, EVERY = 0.005, 2  # s; steps from frame to frame
@@ -94,9 +94,8 @@ def pushes() -> Case:
         way = np.array([np.cos(around), np.sin(around), 0.0])
         ball = standing[0] - 0.11 * way + 0.01 * rng.standard_normal() * np.array([-way[1], way[0], 0])
         ball[2] = BALL_RADIUS
-        turn = quat_from_axis_angle((0.0, 0.0, 1.0), 0.0)
         return true.initial_state(
-            bunny={"position": standing[0], "orientation": quat_multiply(turn, jnp.asarray(standing[1]))},
+            bunny={"position": standing[0], "orientation": standing[1]},
             ball={"position": ball, "velocity": BALL_SPEED * rng.uniform(0.8, 1.5) * way},
         )
 
@@ -154,11 +153,7 @@ def observed(case: Case, seed: int) -> dano.Motion:
     position = np.array(run.states.position)[::EVERY, rows]
     orientation = run.states.orientation[::EVERY, np.array(rows)]
     turn = ROTATION * rng.standard_normal(position.shape)
-    angle = np.linalg.norm(turn, axis=-1)
-    turned = quat_multiply(orientation, quat_from_axis_angle(jnp.asarray(turn), jnp.asarray(angle)))
-    return dano.Motion.create(
-        np.array(run.times)[::EVERY],
-        position + POSITION * rng.standard_normal(position.shape),
-        np.asarray(turned),
-        names=names,
-    )
+    turned = quat_multiply(orientation, quat_exp(jnp.asarray(turn)))
+    seen = position + POSITION * rng.standard_normal(position.shape)
+    times = np.array(run.times)[::EVERY]
+    return dano.Motion.create(times, names, position=seen, orientation=np.asarray(turned))

@@ -1,8 +1,8 @@
 """Residuals of windows, and their normal equations, in one compiled program each.
 
 Where bodies hit each other, residuals are rough: their derivatives are those of ripples, and a search ends in
-one of many small minima. Then unknowns are drawn around the point, in pairs ± d of independent directions, and
-a plane is put through the residuals. Its slopes take the place of derivatives and its middle that of
+one of many small minima. Then unknowns are drawn around the point, in pairs ± d of independent directions,
+and a plane is put through the residuals. Its slopes take the place of derivatives and its middle that of
 residuals; what is left beside it, the ripple, tells how far the answer may be off because of it.
 """
 
