@@ -188,6 +188,7 @@ class _Ended(NamedTuple):
 
     solution: Solution
     smoothing: Smoothing | None
+    roughness: np.ndarray
 
 
 def _searched(
@@ -202,7 +203,7 @@ def _searched(
             tell(f"fitting, loss {loss:.6g}", (k + i / search.max_iterations) / len(points))
 
         solution = problem.search(x, search.max_iterations, search.tolerance, said, kept=kept)
-        ended.append(_Ended(solution, problem.smoothing))
+        ended.append(_Ended(solution, problem.smoothing, problem.roughness))
         if solution.stop is Stop.INTERRUPTED:
             break
     return sorted(ended, key=lambda each: each.solution.normal.loss)
@@ -218,7 +219,7 @@ def _identification(
 ) -> Identification:
     """The result: values, how sure they are, and the motion that they give."""
     best, space, scene, plan = ended[0].solution, setup.space, setup.scene, problem.plan
-    problem.smoothing = ended[0].smoothing
+    problem.smoothing, problem.roughness = ended[0].smoothing, ended[0].roughness
     ripple = ripple_covariance(problem, best.x, best.blocks)
     at_best = problem.simulate(best.x, best.blocks)
     at_start = problem.simulate(space.start, plan.start)
@@ -252,7 +253,7 @@ def _identification(
         held_out_errors=held_errors,
         minima=tuple(
             Minimum(values_at(space.selections, s.x, sure.covariance)[0], s.normal.loss, s.stop)
-            for s, _ in ended
+            for s, *_ in ended
         ),
         scene=with_values(space.selections, "scene", scene, x),
         controls=controls if controls is None else with_values(space.selections, "controls", controls, x),

@@ -58,6 +58,7 @@ class Problem:
         self.lower, self.upper = space.lower, space.upper
         self.smooth = search.smooth
         self.smoothing: Smoothing | None = None
+        self.roughness = np.zeros((0, 0))
         self._last: _Last | None = None
         policy = controls if callable(controls) else None
         self._planned = functools.partial(
@@ -254,7 +255,7 @@ class Problem:
         self.smoothing = None
         if self.jumps is None:
             solution = minimise(x, self.plan.start, tolerance)
-            return self._settled(solution, minimise, tolerance) if free else solution
+            return self._settled(solution, x) if free else solution
         rough = tolerance if len(self.ties) == 1 else max(tolerance, _NEAR)
         self.model = self.model._replace(jumps=self.ties[0] * self.jumps)
         solution = minimise(x, self.plan.start, rough)
@@ -271,13 +272,25 @@ class Problem:
                 break
             self.model = self.model._replace(jumps=tie * self.jumps)
             solution = minimise(solution.x, solution.blocks, tolerance if tie == self.ties[-1] else rough)
-        return self._settled(solution, minimise, tolerance) if free else solution
+        return self._settled(solution, x) if free else solution
 
-    def _settled(self, solution: Solution, minimise: Callable[..., Solution], tolerance: float) -> Solution:
+    def _settled(self, solution: Solution, first: np.ndarray) -> Solution:
         """The solution, or that of the trend where the loss is rough."""
         if not self.smooth or not self.model.scene.pairs or solution.stop is Stop.INTERRUPTED:
             return solution
-        return settled(self, solution, lambda x, blocks: minimise(x, blocks, tolerance))
+        return settled(self, solution, (first, self.plan.start))
+
+    def count(self, share: float) -> None:
+        """Let a share of the frames of each window count, the first ones; all of them by 1."""
+        windows = self.plan.windows
+        seen = {key: np.asarray(weight) for key, weight in windows.weights.items()}
+        frames = np.max(
+            [np.max(np.where(w > 0, 1 + np.arange(w.shape[1])[:, None], 0), (1, 2)) for w in seen.values()], 0
+        )
+        counts = np.arange(next(iter(seen.values())).shape[1])[None] < np.maximum(3, share * frames)[:, None]
+        weights = {key: jnp.asarray(w * counts[:, :, None], w.dtype) for key, w in seen.items()}
+        windows = dataclasses.replace(windows, weights=weights) if share < 1 else windows
+        self.model = self.model._replace(windows=windows)
 
     def _swept(self, solution: Solution, minimise: Callable[..., Solution]) -> Solution:
         """A better minimum for motions with a window that began in the wrong basin.

@@ -22,7 +22,7 @@ from dano.identify._joint_log import joint_table
 from dano.identify._parameters import Selection, with_values
 from dano.identify._starts import Start
 from dano.identify._windows import Windows
-from dano.maths import einsum, quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
+from dano.maths import einsum, product, quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
 from dano.scene import Control, Scene, State
 
 
@@ -64,15 +64,17 @@ class Model(NamedTuple):
 
 
 class Smoothing(NamedTuple):
-    """Where unknowns of a window are drawn.
+    """Where unknowns of windows are drawn: at u ± L d.
 
     Attributes:
-        draws: Rows d, shape (K, u), without their opposites; ΣddT = K 1.
-        scale: What one is of each unknown, shape (u,).
+        draws: Rows d, without their opposites, shape (K, u); Σ d dᵀ = K 1.
+        spread: L of each window, shape (windows, u, u).
+        inverse: L⁻¹.
     """
 
     draws: Float[Array, "k u"]
-    scale: Float[Array, " u"]
+    spread: Float[Array, "w u u"]
+    inverse: Float[Array, "w u u"]
 
 
 class Plane(NamedTuple):
@@ -81,8 +83,7 @@ class Plane(NamedTuple):
     Attributes:
         value: Its middle.
         slope: By the unknowns.
-        ripple: By which residuals at +d miss it in their odd part, so that curvature does not count; times
-            √2, for each is the mean of two.
+        ripple: By which residuals miss it in their odd part, so that curvature does not count.
     """
 
     value: Float[Array, " r"]
@@ -162,6 +163,8 @@ def linearized(
     rows = np.minimum(mine, n - 1)
     windows, start, following = jax.tree.map(lambda leaf: leaf[rows], (model.windows, start, following))
     share = jnp.asarray(np.asarray(wanted)[rows] & (mine < n))
+    if smoothing is not None:
+        smoothing = smoothing._replace(spread=smoothing.spread[rows], inverse=smoothing.inverse[rows])
     found = _linearized(model._replace(windows=windows), x, start, following, share, smoothing)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf[:n]), gather(found))
 
@@ -178,7 +181,7 @@ def _linearized(
     p, draws = x.shape[0], 1 if smoothing is None else smoothing.draws.shape[0]
 
     def one(item):
-        window, state, after, _ = item
+        window, state, after, _, seen_from = item
 
         def residuals(unknowns):
             rows, jump, predicted, unconverged = _residuals(
@@ -192,7 +195,9 @@ def _linearized(
             slope, (rows, jump, predicted, unconverged) = jacobian(residuals, has_aux=True)(at)
             middle, ripple = rows, jnp.zeros((1, slope.shape[0]), slope.dtype)
         else:
-            plane, (rows, jump, predicted, unconverged) = _plane_through(residuals, at, smoothing)
+            plane, (rows, jump, predicted, unconverged) = _plane_through(
+                residuals, at, smoothing.draws, *seen_from
+            )
             slope, ripple = plane.slope, plane.ripple
             middle, jump = plane.value[: rows.size].reshape(rows.shape), plane.value[rows.size :]
         weights, lengths, loss = _robust(model, middle)
@@ -214,35 +219,29 @@ def _linearized(
         )
 
     def one_or_none(item):
-        return jax.lax.cond(item[-1], one, lambda item: _nothing(model, item[1], p, draws), item)
+        return jax.lax.cond(item[3], one, lambda item: _nothing(model, item[1], p, draws), item)
 
-    rows = model.windows, start, following, wanted
+    # A row for every window, also without smoothing.
+    spread = (wanted, wanted) if smoothing is None else smoothing[1:]
+    rows = model.windows, start, following, wanted, spread
     return map_rows(one_or_none, rows, batch_size=model.batch, mesh=model.mesh)
 
 
 def _plane_through(
-    residuals: Callable[[Array], tuple[Array, Any]], at: Float[Array, " u"], smoothing: Smoothing
+    residuals: Callable[[Array], tuple[Array, Any]], at: Float[Array, " u"], draws, spread, inverse
 ) -> tuple[Plane, Any]:
-    """The plane around a point, and what else the residuals at the point say.
-
-    Args:
-        residuals: Residuals in one row, and other values.
-        at: Unknowns.
-        smoothing: Where to draw.
-    """
-    moves = smoothing.draws * smoothing.scale[None]
+    """The plane around a point, and what else the residuals at the point say; see `Smoothing`."""
+    moves = product(draws, spread.T)
     unknowns = at[None] + jnp.concatenate([jnp.zeros_like(moves[:1]), moves, -moves])
     rows, others = jax.vmap(residuals)(unknowns)
     k = moves.shape[0]
     above, below = rows[1 : 1 + k], rows[1 + k :]
     odd = 0.5 * (above - below)
-    by_draw = smoothing.draws.T @ odd / k
-    ripple = jnp.sqrt(2.0).astype(rows.dtype) * (odd - smoothing.draws @ by_draw)
-    # Slopes took as many of the draws as there are unknowns.
-    share = k / max(1, k - at.shape[0])
-    ripple = ripple * jnp.sqrt(jnp.asarray(share, rows.dtype))
-    value = 0.5 * jnp.mean(above + below, axis=0)
-    plane = Plane(value, by_draw.T / smoothing.scale[None], ripple)
+    by_draw = product(draws.T, odd) / k
+    # Each odd part is the mean of two, and slopes took as many draws as there are unknowns.
+    share = 2 * k / max(1, k - at.shape[0])
+    ripple = jnp.sqrt(jnp.asarray(share, rows.dtype)) * (odd - product(draws, by_draw))
+    plane = Plane(0.5 * jnp.mean(above + below, axis=0), product(by_draw.T, inverse), ripple)
     return plane, jax.tree.map(lambda leaf: leaf[0], others)
 
 

@@ -1,11 +1,12 @@
 """Where a search settles if the loss is rough: at the minimum of its trend, whatever the start.
 
-After a search, two planes through draws of the unknowns say how far the answer is from that minimum and how
-far ripples scatter it. Where both are small beside the standard errors, derivatives were worth having and
-nothing happens. Else the search goes on with slopes over visible steps, wide ones first.
+After a search, planes through draws of the unknowns say how far the answer is from that minimum and how far
+ripples scatter it. Where both are small beside the standard errors, derivatives were worth having and nothing
+happens. Else the search begins again, by Gauss–Newton steps with slopes over visible steps: first for the
+beginning of the motions, so that an impact is met about when it happened before what comes after it counts.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
@@ -13,14 +14,24 @@ import numpy as np
 
 from dano.gradients import Check, check
 from dano.identify._residuals import Linearized, Smoothing
-from dano.solvers import eliminated, NormalEquations, Solution, Stop
+from dano.solvers import eliminated, gauss_newton, NormalEquations, Solution, Stop
 
 # Widest draws of a parameter: a share of its range, or of its value without bounds.
 _WIDEST = 0.05
-# Draws as shares of the widest, stage by stage; and, in standard errors, in the last one.
-_STAGES, _LAST = (1.0, 0.25), 0.5
+# Draws, in standard errors, and least as shares of the widest.
+_LAST, _LEAST = 0.5, 1e-3
 # Distance to the minimum of the trend, and scatter by ripples, that do not matter [standard errors].
 _STEADY = 0.5
+# Shares of the frames that count, one after the other, and steps at each.
+_BEGINNINGS, _STEPS = (0.3, 0.45, 0.6, 0.8), 4
+# Steps with all frames: to the minimum, and about it.
+_FIRST_STEPS, _LAST_STEPS = 5, 10
+# Drift of these that is none, in its own standard errors.
+_DRIFT = 3.0
+# Longest step, in widest draws; and by what a loss may grow that is accepted.
+_LONGEST, _WORSE = 4.0, 1.5
+# Halvings of a step.
+_HALVINGS = 4
 # Sets of independent directions: so many pairs of draws for each unknown.
 _BLOCKS = 2
 # Places at which the loss is looked at.
@@ -31,6 +42,7 @@ class Smoothed(Protocol):
     """A least squares problem whose slopes may be those of planes through draws."""
 
     smoothing: Smoothing | None
+    roughness: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
     freedom: int
@@ -52,61 +64,169 @@ class Smoothed(Protocol):
         """Initial states moved by the change of all blocks."""
         ...
 
+    def count(self, share: float, /) -> None:
+        """Let a share of the frames of each window count, the first ones."""
+        ...
+
     def start_widths(self) -> np.ndarray:
         """By how much initial states are uncertain, of their unknowns."""
         ...
 
 
 class _Sight(NamedTuple):
-    """What a plane says of a point.
+    """What planes say of a point.
 
     Attributes:
+        found: The planes.
+        normal: Normal equations.
         errors: Standard errors of the parameters, ripples not counted; ∞ where they are flat.
         away: Distance to the minimum of the trend, in standard errors, largest of all parameters.
         scatter: By which ripples move the answer, in the same way.
-        start_errors: Standard errors of the unknowns of initial states, largest of all windows.
     """
 
+    found: Linearized
+    normal: NormalEquations
     errors: np.ndarray
     away: float
     scatter: float
-    start_errors: np.ndarray
 
 
-def settled(problem: Smoothed, solution: Solution, minimise: Callable[..., Solution]) -> Solution:
+class _Point(NamedTuple):
+    """Parameters and initial states."""
+
+    x: np.ndarray
+    blocks: Any
+
+
+def settled(problem: Smoothed, solution: Solution, first: tuple[np.ndarray, Any]) -> Solution:
     """The solution, or that of the trend if the loss is rough there; `problem.smoothing` says which.
 
     Args:
         problem: The problem; its `smoothing` is that of the answer afterwards, or None.
         solution: Where a search by derivatives ended.
-        minimise: Searches from parameters and initial states.
+        first: Parameters and initial states at which it began.
     """
     widest = np.concatenate([_ranges(problem, solution.x), problem.start_widths()])
     rows = _directions(len(widest), problem.seed)
-    problem.smoothing = _drawn(rows, widest)
-    widths = _finer(_seen(problem, solution), widest)
-    problem.smoothing = _drawn(rows, widths)
-    sight = _seen(problem, solution)
+    here = _Point(solution.x, solution.blocks)
+    problem.smoothing = _evenly(rows, widest, here)
+    problem.smoothing = _drawn(rows, widest, _seen(problem, here), problem)
+    sight = _seen(problem, here)
     if solution.stop.converged and sight.away <= _STEADY and sight.scatter <= _STEADY:
         problem.smoothing = None
         return solution
-    for share in (*_STAGES, None):
-        problem.smoothing = _drawn(rows, widths if share is None else share * widest)
-        solution = minimise(solution.x, solution.blocks)
-        if solution.stop is Stop.INTERRUPTED:
-            break
-        widths = _finer(_seen(problem, solution), widest)
-    return solution
+    try:
+        grown = _grown(problem, _Point(*first), widest)
+        begin = grown if _loss(problem, grown) < _loss(problem, here) else here
+        end = _averaged(problem, begin, widest)
+    except KeyboardInterrupt:
+        problem.count(1.0)
+        problem.smoothing = None
+        return solution._replace(stop=Stop.INTERRUPTED)
+    problem.roughness = end.scatter
+    losses = np.array([*solution.losses, end.sight.normal.loss])
+    stop = Stop.LOSS if end.steady else Stop.STUCK
+    return Solution(*end.point, end.sight.normal, stop, losses, solution.evaluations)
+
+
+def _loss(problem: Smoothed, point: _Point) -> float:
+    return _seen(problem, point).normal.loss
+
+
+def _grown(problem: Smoothed, point: _Point, widest: np.ndarray) -> _Point:
+    """A point from which the beginning of motions is right, and more and more of them."""
+    for share in _BEGINNINGS:
+        problem.count(share)
+        walk = _walk(problem, point, widest)
+        for _ in range(_STEPS):
+            point, _ = next(walk)
+    problem.count(1.0)
+    return point
+
+
+class _End(NamedTuple):
+    """Where a walk ended: the mean of its last points.
+
+    Attributes:
+        point: The mean, with initial states for it.
+        sight: What is seen there.
+        scatter: Covariance of the points, shape (p, p).
+        steady: Whether the walk had come to rest but for that scatter.
+    """
+
+    point: _Point
+    sight: _Sight
+    scatter: np.ndarray
+    steady: bool
+
+
+def _averaged(problem: Smoothed, point: _Point, widest: np.ndarray) -> _End:
+    """Walk to the minimum of the trend and about it, and take the middle."""
+    walk, rows = _walk(problem, point, widest), []
+    for _ in range(_FIRST_STEPS + _LAST_STEPS):
+        point, _ = next(walk)
+        rows.append(point.x)
+    last = np.array(rows[_FIRST_STEPS:])
+    middle, scatter = last.mean(axis=0), np.atleast_2d(np.cov(last.T))
+    held = _Point(middle, point.blocks)
+    sight = _seen(problem, held)
+    for _ in range(2):
+        _, change = gauss_newton(sight.normal, np.zeros_like(middle), np.zeros_like(middle))
+        other = _Point(middle, problem.retract(held.blocks, change))
+        seen = _seen(problem, other)
+        if seen.normal.loss < sight.normal.loss:
+            held, sight = other, seen
+    half = len(last) // 2
+    drift = np.abs(last[:half].mean(axis=0) - last[half:].mean(axis=0))
+    unsure = np.sqrt(np.diag(scatter) * 4 / len(last))
+    steady = bool(np.all(drift <= _DRIFT * unsure + _STEADY * sight.errors))
+    return _End(held, sight, scatter, steady)
+
+
+def _walk(problem: Smoothed, point: _Point, widest: np.ndarray) -> Iterator[tuple[_Point, _Sight]]:
+    """Points of Gauss–Newton steps by slopes over visible steps, each with draws of its own."""
+    seed = problem.seed
+    problem.smoothing = _evenly(_directions(len(widest), seed), widest, point)
+    sight = _seen(problem, point)
+    while True:
+        seed += 1
+        problem.smoothing = _drawn(_directions(len(widest), seed), widest, sight, problem)
+        for following in _shorter(problem, point, sight.normal, widest):
+            after = _seen(problem, following)
+            if after.normal.loss <= _WORSE * sight.normal.loss:
+                point, sight = following, after
+                break
+        else:
+            # The step came from draws that mislead: others may not.
+            sight = _seen(problem, point)
+        yield point, sight
+
+
+def _shorter(
+    problem: Smoothed, point: _Point, normal: NormalEquations, widest: np.ndarray
+) -> Iterator[_Point]:
+    """Where the step to the minimum of the model leads, then halves of it."""
+    longest = _LONGEST * widest[: len(point.x)]
+    lower = np.maximum(problem.lower - point.x, -longest)
+    upper = np.minimum(problem.upper - point.x, longest)
+    change, block_change = gauss_newton(normal, lower, upper)
+    for halving in range(_HALVINGS):
+        share = 0.5**halving
+        x = np.clip(point.x + share * change, problem.lower, problem.upper)
+        yield _Point(x, problem.retract(point.blocks, share * block_change))
 
 
 def ripple_covariance(problem: Smoothed, x: np.ndarray, blocks: Any) -> np.ndarray:
-    """Covariance that ripples of the residuals give the parameters, shape (p, p); zero without smoothing."""
+    """Covariance that ripples of the residuals give the parameters, shape (p, p); zero without smoothing.
+
+    What was observed has ripples of its own: it is as uncertain as where a walk about the minimum is.
+    """
     p = len(x)
     if problem.smoothing is None:
         return np.zeros((p, p))
     found = problem.simulate(x, blocks)
     moves = _displacements(problem, found)
-    return moves.T @ moves / len(moves)
+    return moves.T @ moves / len(moves) + problem.roughness
 
 
 def worth_of(problem: Smoothed, solution: Solution) -> Check:
@@ -116,7 +236,11 @@ def worth_of(problem: Smoothed, solution: Solution) -> Check:
     standard error of the parameter that moves most and a tenth of it.
     """
     smoothing = problem.smoothing
-    errors = _seen(problem, solution).errors
+    if smoothing is None:
+        widest = np.concatenate([_ranges(problem, solution.x), problem.start_widths()])
+        point = _Point(solution.x, solution.blocks)
+        problem.smoothing = _evenly(_directions(len(widest), problem.seed), widest, point)
+    errors = _seen(problem, _Point(solution.x, solution.blocks)).errors
     problem.smoothing = None
     normal = problem.linearize(solution.x, solution.blocks)
     gradient, hessian = eliminated(normal)
@@ -152,41 +276,53 @@ def _displacements(problem: Smoothed, found: Linearized) -> np.ndarray:
     return np.array(moves)
 
 
-def _seen(problem: Smoothed, solution: Solution) -> _Sight:
-    found = problem.simulate(solution.x, solution.blocks)
+def _seen(problem: Smoothed, point: _Point) -> _Sight:
+    found = problem.simulate(point.x, point.blocks)
     normal = problem.assembled(found)
     gradient, hessian = eliminated(normal)
-    variance = 2 * normal.loss / max(problem.freedom, 1)
     inverse = np.linalg.pinv(hessian, rcond=1e-10, hermitian=True)
-    errors = np.sqrt(np.maximum(np.diag(inverse) * variance, 0))
+    errors = np.sqrt(np.maximum(np.diag(inverse) * _variance(problem, normal), 0))
     errors = np.where(errors > 0, errors, np.inf)
-    to = np.clip(solution.x - inverse @ gradient, problem.lower, problem.upper)
+    to = np.clip(point.x - inverse @ gradient, problem.lower, problem.upper)
     scatter = np.sqrt(np.mean(_displacements(problem, found) ** 2, axis=0))
-    start = np.zeros(0)
-    if normal.block_hessian.size:
-        k = len(problem.start_widths())
-        each = np.asarray(found.hessian)[:, -k:, -k:]
-        start = np.sqrt(np.max([np.diag(np.linalg.pinv(b, rcond=1e-10)) for b in each], axis=0) * variance)
-    return _Sight(
-        errors,
-        float(np.max(np.abs(to - solution.x) / errors, initial=0)),
-        float(np.max(scatter / errors, initial=0)),
-        np.where(start > 0, start, np.inf),
-    )
+    away = float(np.max(np.abs(to - point.x) / errors, initial=0))
+    return _Sight(found, normal, errors, away, float(np.max(scatter / errors, initial=0)))
 
 
-def _finer(sight: _Sight, widest: np.ndarray) -> np.ndarray:
-    """Widths of the last draws."""
-    return np.minimum(widest, _LAST * np.concatenate([sight.errors, sight.start_errors]))
+def _variance(problem: Smoothed, normal: NormalEquations) -> float:
+    return 2 * normal.loss / max(problem.freedom, 1)
+
+
+def _evenly(rows: np.ndarray, widest: np.ndarray, point: _Point) -> Smoothing:
+    """The widest draws."""
+    windows = len(point.blocks.position)
+    return _smoothing(rows, np.tile(np.diag(widest), (windows, 1, 1)))
+
+
+def _drawn(rows: np.ndarray, widest: np.ndarray, sight: _Sight, problem: Smoothed) -> Smoothing:
+    """Draws as likely as the data say, of parameters and a window's initial state together."""
+    hessian, p = np.asarray(sight.found.hessian, float), len(sight.errors)
+    own = hessian[:, :p, :p]
+    if hessian.shape[1] > p:
+        inverse = np.linalg.pinv(hessian[:, p:, p:], rcond=1e-10, hermitian=True)
+        own = own - np.einsum("wxi,wij,wjy->wxy", hessian[:, :p, p:], inverse, hessian[:, p:, :p])
+    variance = _variance(problem, sight.normal)
+    # What other windows say of the parameters, and no wider than the widest.
+    whole = hessian.copy()
+    whole[:, :p, :p] += np.sum(own, axis=0) - own
+    whole += variance * np.diag(1 / widest**2)
+    unit = whole * widest[:, None] * widest[None]
+    covariance = _LAST**2 * variance * np.linalg.inv(unit) + _LEAST**2 * np.eye(len(widest))
+    return _smoothing(rows, widest[None, :, None] * np.linalg.cholesky(covariance))
+
+
+def _smoothing(rows: np.ndarray, spread: np.ndarray) -> Smoothing:
+    return Smoothing(*(jnp.asarray(part) for part in (rows, spread, np.linalg.inv(spread))))
 
 
 def _ranges(problem: Smoothed, x: np.ndarray) -> np.ndarray:
     width = problem.upper - problem.lower
     return _WIDEST * np.where(np.isfinite(width), width, np.maximum(np.abs(x), 1e-3))
-
-
-def _drawn(rows: np.ndarray, scale: np.ndarray) -> Smoothing:
-    return Smoothing(jnp.asarray(rows), jnp.asarray(scale))
 
 
 def _directions(unknowns: int, seed: int) -> np.ndarray:

@@ -352,6 +352,15 @@ def eliminated(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
     return gradient, hessian
 
 
+def gauss_newton(
+    normal: NormalEquations, lower: np.ndarray, upper: np.ndarray, damping: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Changes of x and of the blocks to the minimum of the model, with lower ≤ dx ≤ upper."""
+    scales = _scales(normal)
+    floor = _FLAT * np.max(scales[0], initial=0) * np.ones(len(lower))
+    return _step(normal, damping, floor, scales, lower, upper)[:2]
+
+
 def _eliminate(normal: NormalEquations, damping: float, spread: tuple[np.ndarray, np.ndarray]):
     hessian = normal.hessian + damping * np.diag(spread[0])
     if normal.block_gradient.size == 0:
