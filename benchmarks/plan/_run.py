@@ -1,4 +1,4 @@
-"""Textbook optima beside CasADi with IPOPT, the paper's push-and-slide, a drawer, and goals with nothing set."""
+"""Textbook optima beside CasADi with IPOPT, the paper's push-and-slide, a drawer, goals with nothing set."""
 
 import argparse
 import datetime

@@ -149,9 +149,9 @@ def check(
     """Say what the derivatives of a function are worth at a point.
 
     The function is evaluated at `points` places along each direction, between plus and minus the largest
-    step, and at the other steps. The derivative is compared with the slopes; what is left of the values beside a
-    cubic is how rough the function is. Many places are evaluated by one call under `jax.vmap` where the
-    function allows that, else one by one.
+    step, and at the other steps. The derivative is compared with the slopes; what is left of the values
+    beside a cubic is how rough the function is. Many places are evaluated by one call under `jax.vmap` where
+    the function allows that, else one by one.
 
     Args:
         function: From something like `x` to one number.

@@ -22,16 +22,18 @@ _WIDEST = 0.05
 _LAST, _LEAST = 0.5, 1e-3
 # Distance to the minimum of the trend, and scatter by ripples, that do not matter [standard errors].
 _STEADY = 0.5
-# Shares of the frames that count, one after the other, and steps at each.
-_BEGINNINGS, _STEPS = (0.3, 0.45, 0.6, 0.8), 4
-# Steps with all frames: to the minimum, and about it.
-_FIRST_STEPS, _LAST_STEPS = 5, 10
+# Shares of the frames that count, one after the other, and most steps at each.
+_BEGINNINGS, _STEPS = (0.25, 0.4, 0.55, 0.7, 0.85), 12
+# So many steps in a row that leave more than this share of the loss end them.
+_SLOW, _BETTER = 2, 0.9
+# Steps about the minimum.
+_LAST_STEPS = 8
 # Drift of these that is none, in its own standard errors.
 _DRIFT = 3.0
 # Longest step, in widest draws; and by what a loss may grow that is accepted.
 _LONGEST, _WORSE = 4.0, 1.5
 # Halvings of a step.
-_HALVINGS = 4
+_HALVINGS = 3
 # Sets of independent directions: so many pairs of draws for each unknown.
 _BLOCKS = 2
 # Places at which the loss is looked at.
@@ -137,10 +139,21 @@ def _grown(problem: Smoothed, point: _Point, widest: np.ndarray) -> _Point:
     """A point from which the beginning of motions is right, and more and more of them."""
     for share in _BEGINNINGS:
         problem.count(share)
-        walk = _walk(problem, point, widest)
-        for _ in range(_STEPS):
-            point, _ = next(walk)
+        point = _descended(_walk(problem, point, widest), point)
     problem.count(1.0)
+    return point
+
+
+def _descended(walk: Iterator[tuple[_Point, _Sight]], point: _Point) -> _Point:
+    """The best point of a walk that goes on while it finds better ones."""
+    least, slow = np.inf, 0
+    for _ in range(_STEPS):
+        here, sight = next(walk)
+        slow = slow + 1 if sight.normal.loss > _BETTER * least else 0
+        if sight.normal.loss < least:
+            point, least = here, sight.normal.loss
+        if slow == _SLOW:
+            break
     return point
 
 
@@ -162,11 +175,12 @@ class _End(NamedTuple):
 
 def _averaged(problem: Smoothed, point: _Point, widest: np.ndarray) -> _End:
     """Walk to the minimum of the trend and about it, and take the middle."""
+    point = _descended(_walk(problem, point, widest), point)
     walk, rows = _walk(problem, point, widest), []
-    for _ in range(_FIRST_STEPS + _LAST_STEPS):
+    for _ in range(_LAST_STEPS):
         point, _ = next(walk)
         rows.append(point.x)
-    last = np.array(rows[_FIRST_STEPS:])
+    last = np.array(rows)
     middle, scatter = last.mean(axis=0), np.atleast_2d(np.cov(last.T))
     held = _Point(middle, point.blocks)
     sight = _seen(problem, held)

@@ -24,10 +24,11 @@ from dano.checks import (
     checked_optional,
 )
 from dano.engine import AbstractEngine, checked_engine, compiler_options, simulate
+from dano.gradients import Check, check
 from dano.maths import checked_array
 from dano.plan._exploring import explored, to_touch
 from dano.plan._problem import problem_of, Scales, VIOLATION
-from dano.plan._sampling import rated, sampled, SamplingOptions
+from dano.plan._sampling import costs, rated, sampled, SamplingOptions
 from dano.plan._softening import softened
 from dano.plan._task import Limit, Task
 from dano.scene import Control, Scene, State, state_arrays, Trajectory
@@ -266,7 +267,7 @@ def plan(
     solution = solution or given.optimised(guess)
     message = solution.stop.value
     if solution.stop is TrajectoryStop.INFEASIBLE:
-        message += _what_is_missed(solution)
+        message += f"{_what_is_missed(solution)}; {_worth(given, problem, solution).summary}"
     made = _plan(scene, state, task, scales, engine, solution.controls, solution, message, method, began)
     return dataclasses.replace(made, explored=why)
 
@@ -347,6 +348,24 @@ def _explored(
         if _violation(best) <= VIOLATION or solution.stop in _ENDED:
             break
     return f"{why}: paths that lead to contact were looked for first", best
+
+
+def _worth(given: _Given, problem: TrajectoryProblem, solution: TrajectorySolution) -> Check:
+    """What derivatives of the priced cost are worth at the end, each control moved at all times alike."""
+    w, rate = jnp.asarray(solution.controls), 0.5 * solution.penalty
+
+    def priced(shift: Array) -> Array:
+        cost, violation = costs(problem, given.state, w[None] + shift[None, None])
+        return cost[0] + rate * violation[0]
+
+    labels = [
+        f"the {each.kind} of {each.body}{f' along {axis}' if each.axes else ''}"
+        for each in given.task.actuators
+        for axis in each.axes or "q"
+    ]
+    return check(
+        priced, jnp.zeros(w.shape[1], w.dtype), mode="forward", labels=labels, directions=len(labels)
+    )
 
 
 def _dear(problem: TrajectoryProblem, state: State, guess: Array, found: Array) -> float:

@@ -181,7 +181,7 @@ def _moved(knots: Array, priced: Array, mean: Array, method: str, options: Sampl
 
 def rated(problem: TrajectoryProblem, start: Any, sequences: Array, compiler_options: Any) -> Any:
     """J and the sum of squares of violations of every sequence, as one compiled program."""
-    return program_of(_costs, tuple((compiler_options or {}).items()))(problem, start, sequences)
+    return program_of(costs, tuple((compiler_options or {}).items()))(problem, start, sequences)
 
 
 @functools.cache
@@ -198,7 +198,7 @@ def drawn_around(knots: Array, priced: Array, best: float, least: Any) -> tuple[
     return jnp.mean(elite, axis=0), jnp.maximum(jnp.std(elite, axis=0), least)
 
 
-def _costs(problem: TrajectoryProblem, start: Any, sequences: Float[Array, "s T m"]):
+def costs(problem: TrajectoryProblem, start: Any, sequences: Float[Array, "s T m"]):
     """J and the sum of squares of violations of every sequence, one after the other."""
 
     def one(w):
