@@ -7,7 +7,7 @@ beginning of the motions, so that an impact is met about when it happened before
 """
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +30,8 @@ _SLOW, _BETTER = 2, 0.9
 _LAST_STEPS = 8
 # Drift of these that is none, in its own standard errors.
 _DRIFT = 3.0
+# Least variance of residuals, as a share of what the stated noise has.
+_QUIET = 1e-2
 # Longest step, in widest draws; and by what a loss may grow that is accepted.
 _LONGEST, _WORSE = 4.0, 1.5
 # Halvings of a step.
@@ -40,6 +42,7 @@ _BLOCKS = 2
 _PLACES = 11
 
 
+@runtime_checkable
 class Smoothed(Protocol):
     """A least squares problem whose slopes may be those of planes through draws."""
 
@@ -108,6 +111,8 @@ def settled(problem: Smoothed, solution: Solution, first: tuple[np.ndarray, Any]
         solution: Where a search by derivatives ended.
         first: Parameters and initial states at which it began.
     """
+    if solution.stop is Stop.PERFECT:
+        return solution
     widest = np.concatenate([_ranges(problem, solution.x), problem.start_widths()])
     rows = _directions(len(widest), problem.seed)
     here = _Point(solution.x, solution.blocks)
@@ -304,7 +309,8 @@ def _seen(problem: Smoothed, point: _Point) -> _Sight:
 
 
 def _variance(problem: Smoothed, normal: NormalEquations) -> float:
-    return 2 * normal.loss / max(problem.freedom, 1)
+    """Of the residuals; what is far below the noise that was stated makes no difference."""
+    return max(2 * normal.loss / max(problem.freedom, 1), _QUIET)
 
 
 def _evenly(rows: np.ndarray, widest: np.ndarray, point: _Point) -> Smoothing:
