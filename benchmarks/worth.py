@@ -77,8 +77,14 @@ def way(panel: Panel):
     pose = {"position": last.position[-1, 0], "orientation": last.orientation[-1, 0]}
     if panel.thrown:
         pose = {"position": (0, 0, 0.12), "orientation": (1, 0.3, 0.2, 0), "omega": (3.0, 1.0, 2.0)}
-    state = scene(FRICTION).initial_state(bunny={**pose, "velocity": (0.8, 0, 0)})
-    return lambda friction: dano.simulate(scene(friction), state, N_STEPS).states.position[-1, 0, 0]
+    state = scene(FRICTION).initial_state(bunny={**pose, "velocity": (0.8 if panel.thrown else 0.4, 0, 0)})
+    base = scene(FRICTION)
+
+    def gone(friction):
+        slid = base.replace_contact("bunny", "floor", sliding_friction=friction)
+        return dano.simulate(slid, state, N_STEPS).states.position[-1, 0, 0]
+
+    return gone
 
 
 if __name__ == "__main__":

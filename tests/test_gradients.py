@@ -77,6 +77,12 @@ def test_functions_that_look_at_values_are_called_one_by_one():
     assert check(looked, np.array([2.0]), gradient=np.array([-4.0])).verdict is Verdict.WRONG
 
 
+def test_functions_that_look_at_what_they_hold_are_not_compiled():
+    weights = jnp.array([1.0, 2.0])
+    found = check(lambda x: float(jnp.sum(weights)) * x**2, 2.0)
+    assert found.trusted and found.lines[0].derivative == pytest.approx(12.0)
+
+
 def test_forward_mode_and_single_precision():
     forward = check(lambda x: jnp.sum(x**3), jnp.array([1.0, 2.0]), mode="forward")
     np.testing.assert_allclose([line.derivative for line in forward.lines], [3, 12])

@@ -22,6 +22,8 @@ MODES = ("reverse", "forward")
 """How derivatives are computed."""
 # Share of the function's range over the largest step that a ripple may have.
 _RIPPLE = 0.01
+# Share from which a derivative is no longer called true, even if it equals the slope: next to it it will not.
+_RAGGED = 0.05
 # Within this factor a derivative with the right sign has the right size, roughly.
 _FACTOR = 2.0
 # One-sided slopes that differ by more than this share of the larger one make a kink.
@@ -36,7 +38,7 @@ class Verdict(enum.Enum):
     TRUE = "true: the slope that one sees"
     CURVED = "true at the point, but the function bends within the largest step: take shorter ones"
     FLAT = "zero, and nothing changes: no derivative leads away from here"
-    COARSE = "has the right sign, but not the right size"
+    COARSE = "of the right sign, but its size is not sure: the function is rough"
     KINK = "that of one side of a kink"
     ROUGH = "that of a ripple or beside a jump: over steps that one sees the function goes elsewhere"
     WRONG = "not that of the function, which is smooth: look for a derivative rule that is wrong or stopped"
@@ -276,12 +278,26 @@ def _evaluated(call: Callable[[Array], Any], start: Array, moves: np.ndarray, at
             raise ValueError(f"function must return one number, got shape {value.shape}")
         return value
 
-    try:
-        values = np.asarray(jax.jit(jax.vmap(number))(rows), float)
-    except (TypeError, IndexError, NotImplementedError, ValueError):
-        # Functions that look at values, or are not of JAX. One that is wrong says so here.
-        values = np.array([float(number(row)) for row in rows])
+    def one_by_one(rows: Array) -> Any:
+        return jnp.stack([number(row) for row in rows])
+
+    values = np.asarray(
+        _first_that_works([jax.jit(jax.vmap(number)), jax.vmap(number), one_by_one], rows), float
+    )
     return values.reshape(len(moves), len(at))
+
+
+def _first_that_works(ways: Sequence[Callable[[Array], Any]], at: Array) -> Any:
+    """What the first of some functions gives that does not look at values which are not known yet.
+
+    Functions that are not of JAX, or build a scene, do so. The last one's errors are those of the function.
+    """
+    for way in ways[:-1]:
+        try:
+            return way(at)
+        except (TypeError, IndexError, NotImplementedError, ValueError):
+            continue
+    return ways[-1](at)
 
 
 def _derivatives(flat: _Flat, moves: np.ndarray, mode: str, gradient: Any) -> np.ndarray:
@@ -294,9 +310,14 @@ def _derivatives(flat: _Flat, moves: np.ndarray, mode: str, gradient: Any) -> np
             )
         return moves @ np.asarray(ravel_pytree(jax.tree.map(jnp.asarray, gradient))[0], float)
     if mode == "reverse":
-        return moves @ np.asarray(jax.jit(jax.grad(flat.call))(flat.start), float)
-    forward = jax.jit(lambda way: jax.jvp(flat.call, (flat.start,), (way,))[1])
-    return np.array([float(forward(jnp.asarray(move, flat.start.dtype))) for move in moves])
+        slope = jax.grad(flat.call)
+        return moves @ np.asarray(_first_that_works([jax.jit(slope), slope], flat.start), float)
+
+    def along(way: Array) -> Array:
+        return jax.jvp(flat.call, (flat.start,), (way,))[1]
+
+    ways, rows = [jax.jit(along), along], jnp.asarray(moves, flat.start.dtype)
+    return np.array([float(_first_that_works(ways, row)) for row in rows])
 
 
 def _line(
@@ -336,7 +357,8 @@ def _verdict(at, values, derivative, slopes, steps, roughness, spread, tolerance
         return Verdict.FLAT
     missed = abs(derivative - slopes[0])
     if missed <= tolerance * steepest + noise / largest:
-        return Verdict.TRUE
+        ragged = roughness > _RAGGED * spread + noise and derivative * slopes[0] > 0
+        return Verdict.COARSE if ragged else Verdict.TRUE
     near = np.abs(at) <= least * (1 + 1e-9)
     inside = float(np.ptp(values[near])) / (2 * least)
     smooth = roughness <= _RIPPLE * spread + noise
