@@ -88,7 +88,8 @@ def test_a_throw_is_found_from_far_away_starts():
             assert fit.standard_errors[name] < 0.1
             apart = abs(fit.values[name] - fits[0].values[name])
             assert apart < 3 * fit.standard_errors[name] + 0.01
-        assert fit.errors.rms < 1.5
+        # Where the minimum of the trend is, ripples add about as much as the noise.
+        assert fit.errors.rms < 2
     rough = [fit for fit in fits if fit.smoothed]
     for fit in rough:
         assert fit.worth is not None and fit.to_dict()["worth"] == fit.worth.summary

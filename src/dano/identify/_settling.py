@@ -26,7 +26,8 @@ _STEADY = 0.5
 _BEGINNINGS, _STEPS = (0.25, 0.4, 0.55, 0.7, 0.85), 12
 # So many steps in a row that leave more than this share of the loss end them.
 _SLOW, _BETTER = 2, 0.9
-# Steps about the minimum.
+# Steps about the minimum, of which those count whose loss is no more than so many times the least.
+_LIKE = 2.0
 _LAST_STEPS = 8
 # Drift of these that is none, in its own standard errors.
 _DRIFT = 3.0
@@ -179,24 +180,28 @@ class _End(NamedTuple):
 
 
 def _averaged(problem: Smoothed, point: _Point, widest: np.ndarray) -> _End:
-    """Walk to the minimum of the trend and about it, and take the middle."""
+    """Walk to the minimum of the trend and about it, and take the middle of the points that fit."""
     point = _descended(_walk(problem, point, widest), point)
-    walk, rows = _walk(problem, point, widest), []
-    for _ in range(_LAST_STEPS):
-        point, _ = next(walk)
-        rows.append(point.x)
-    last = np.array(rows)
-    middle, scatter = last.mean(axis=0), np.atleast_2d(np.cov(last.T))
-    held = _Point(middle, point.blocks)
+    walk = _walk(problem, point, widest)
+    seen = [next(walk) for _ in range(_LAST_STEPS)]
+    losses = np.array([sight.normal.loss for _, sight in seen])
+    fits = losses <= _LIKE * losses.min()
+    last = np.array([here.x for here, _ in seen])[fits]
+    middle = last.mean(axis=0)
+    scatter = np.atleast_2d(np.cov(last.T)) if len(last) > 1 else np.zeros((len(middle), len(middle)))
+    held = _Point(middle, seen[int(np.argmin(losses))][0].blocks)
     sight = _seen(problem, held)
-    for _ in range(2):
-        _, change = gauss_newton(sight.normal, np.zeros_like(middle), np.zeros_like(middle))
-        other = _Point(middle, problem.retract(held.blocks, change))
-        seen = _seen(problem, other)
-        if seen.normal.loss < sight.normal.loss:
-            held, sight = other, seen
+    for _ in range(_SLOW):
+        still = np.zeros_like(middle)
+        _, change = gauss_newton(sight.normal, still, still)
+        for halving in range(_HALVINGS):
+            other = _Point(middle, problem.retract(held.blocks, 0.5**halving * change))
+            after = _seen(problem, other)
+            if after.normal.loss < sight.normal.loss:
+                held, sight = other, after
+                break
     half = len(last) // 2
-    drift = np.abs(last[:half].mean(axis=0) - last[half:].mean(axis=0))
+    drift = np.abs(last[:half].mean(axis=0) - last[half:].mean(axis=0)) if half else np.zeros(len(middle))
     unsure = np.sqrt(np.diag(scatter) * 4 / len(last))
     steady = bool(np.all(drift <= _DRIFT * unsure + _STEADY * sight.errors))
     return _End(held, sight, scatter, steady)
