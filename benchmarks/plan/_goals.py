@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import dano
+from dano.maths import Numbers
 from dano.plan import Actuator, Goal, Plan, Task
 from dano.scene_file import build_asset
 
@@ -57,9 +58,8 @@ def case(planned: dano.Scene, name: str, rest: np.ndarray, seed: int) -> tuple[d
     away, moved = rng.uniform(*AWAY), rng.uniform(*MOVED)
     ball = (*(rest[:2] + away * np.array([np.cos(around), np.sin(around)])), RADIUS)
     goal = (*(rest[:2] + moved * np.array([np.cos(way), np.sin(way)])), rest[2])
-    state = planned.initial_state(
-        **{name: {"position": rest[:3], "orientation": rest[3:]}}, ball={"position": ball}
-    )
+    resting: dict[str, Numbers] = {"position": rest[:3], "orientation": rest[3:]}
+    state = planned.initial_state(**{name: resting}, ball={"position": ball})
     task = Task(
         N_STEPS,
         [Actuator("ball", "force", limit=FORCE, axes="xy", cost=1e-3)],
