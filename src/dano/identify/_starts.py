@@ -77,3 +77,14 @@ class Start(NamedTuple):
         q = [orientation if turns else position for turns in self.turning]
         v = [omega if turns else velocity for turns in self.turning]
         return np.concatenate([of_bodies, q, v])
+
+    def deviations(self, usual: Sequence[float]) -> np.ndarray:
+        """Standard deviations of the unknowns from those of the four quantities."""
+        position, orientation, velocity, omega = usual
+        each = dict(zip(QUANTITIES, usual, strict=True))
+        of_bodies = np.tile(
+            np.repeat([each[key] for key in QUANTITIES if key in self.initial], 3), len(self.free)
+        )
+        q = [orientation if turns else position for turns in self.turning if self.poses]
+        v = [omega if turns else velocity for turns in self.turning if self.speeds]
+        return np.concatenate([of_bodies, q, v])
