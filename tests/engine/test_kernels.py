@@ -44,6 +44,10 @@ SOLIDS = {
 }
 
 
+ENOUGH = 0.02
+"""Distance [m] beyond which only that is asked."""
+
+
 @pytest.fixture(scope="module")
 def every_solid():
     """A scene of all solids, its tables, and a kernel that asks their distances."""
@@ -54,7 +58,7 @@ def every_solid():
     tables = scene_tables(scene)
     distances = instance(tables.features, "dano.physics.solids.distances")
     reals = instance(tables.features, "dano.physics.real")
-    vec3, vec4, real = reals.vec3, reals.vec4, reals.real
+    vec3, vec4, real, INFINITY = reals.vec3, reals.vec4, reals.real, reals.INFINITY
     solid_distance, solid_clearance, solid_of = (
         distances.solid_distance,
         distances.solid_clearance,
@@ -69,19 +73,23 @@ def every_solid():
         points: wp.array(dtype=vec3),
         found: wp.array(dtype=vec4),
         least: wp.array(dtype=real),
+        quick: wp.array(dtype=real),
     ):
         i = wp.tid()
         solid = solid_of(solids, 0, first, count)
         d = solid_distance(solids, 0, solid, points[i])
         found[i] = vec4(d.value, d.gradient[0], d.gradient[1], d.gradient[2])
-        least[i] = solid_clearance(solids, 0, solid, points[i])
+        least[i] = solid_clearance(solids, 0, solid, points[i], INFINITY)
+        quick[i] = solid_clearance(solids, 0, solid, points[i], real(ENOUGH))
 
     solids = distances.Solids()
-    rows = {name: np.asarray(tables.rows[f"scene.solids.{name}"]) for name in ("leaves", "coefficients")}
+    names = ("leaves", "coefficients", "bounds")
+    rows = {name: np.asarray(tables.rows[f"scene.solids.{name}"]) for name in names}
     solids.leaves = wp.array(
         rows["leaves"].view(distances.Leaf.numpy_dtype()), dtype=distances.Leaf, device="cpu"
     ).reshape((1, -1))
     solids.coefficients = wp.array(rows["coefficients"].reshape(1, -1), dtype=real, device="cpu")
+    solids.bounds = wp.array(rows["bounds"].reshape(1, -1), dtype=real, device="cpu")
     kinds = tables.whole.arrays["scene.solids.kinds"]
     solids.kinds = wp.array(
         kinds.view(distances.LeafKind.numpy_dtype()).ravel(), dtype=distances.LeafKind, device="cpu"
@@ -90,15 +98,16 @@ def every_solid():
 
     def distance(name, points):
         k = 1 + list(SOLIDS).index(name)
-        found, least = wp.zeros(len(points), vec4, device="cpu"), wp.zeros(len(points), real, device="cpu")
+        found = wp.zeros(len(points), vec4, device="cpu")
+        least, quick = (wp.zeros(len(points), real, device="cpu") for _ in range(2))
         given = wp.array(points, dtype=vec3, device="cpu")
         wp.launch(
             asked,
             len(points),
-            [solids, int(index[k, 6]), int(index[k, 7]), given, found, least],
+            [solids, int(index[k, 6]), int(index[k, 7]), given, found, least, quick],
             device="cpu",
         )
-        return found.numpy(), least.numpy()
+        return found.numpy(), least.numpy(), quick.numpy()
 
     return distance
 
@@ -108,7 +117,10 @@ def test_distances_are_those_of_shapes(name, every_solid):
     """Distance and gradient at random points, inside and far outside; and a lower bound on the distance."""
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (400, 3))
     value, gradient = SOLIDS[name].sdf_jet(jnp.asarray(points.T), 1)
-    found, least = every_solid(name, points)
+    found, least, quick = every_solid(name, points)
+    # Where it matters the quick bound is the bound; elsewhere it says as well that the solid is not near.
+    assert np.array_equal(quick[least <= ENOUGH], least[least <= ENOUGH])
+    assert np.all(quick[least > ENOUGH] > ENOUGH)
     np.testing.assert_allclose(found[:, 0], value, atol=1e-14)
     np.testing.assert_allclose(found[:, 1:], np.asarray(gradient).T, atol=1e-10)
     if "grid" in name:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dano.engine.launching import compiled_kernel, Features, instance
+from dano.engine.launching import compiled_kernel, Features, instance, lower_bounds
 from dano.mujoco._settings import Settings
 from dano.mujoco._solids import Geom, object_solid, Solid
 from dano.mujoco._surfaces import Surface
@@ -71,7 +71,7 @@ class Known:
         structs = instance(self.features, _LEAVES)
         sampled = [part.surface for part in parts if part.surface is not None]
         planes = [part.solid.planes for part in parts if part.solid.planes is not None]
-        leaves, kinds, coefficients, at = _solids(structs, parts)
+        leaves, kinds, coefficients, bounds, at = _solids(structs, parts)
         numbers, index = _parts(self.features, parts, at)
         samples = _rows(tables.Sample, sum(len(each.points) for each in sampled))
         if sampled:
@@ -83,6 +83,7 @@ class Known:
         solids.leaves = _array(leaves[None], structs.Leaf)
         solids.kinds = _array(kinds, structs.LeafKind)
         solids.coefficients = _array(coefficients[None], structs.real)
+        solids.bounds = _array(bounds[None], structs.real)
         self.known = known = tables.Known()
         known.parts, known.index = _array(numbers, tables.Part), _array(index, tables.PartIndex)
         touching = _rows(tables.TouchPair, len(pairs))
@@ -130,11 +131,12 @@ def _array(values: np.ndarray, dtype: Any) -> Any:
 
 
 def _solids(structs: Any, parts: Sequence[Part]):
-    """Leaves, their kinds, spline coefficients, and for each part where its solid stands."""
+    """Leaves, their kinds, spline coefficients and lower bounds, and for each part where its solid stands."""
     own = [part for part in parts if hasattr(structs, part.solid.kind)]
     leaves, kinds = _rows(structs.Leaf, len(own)), _rows(structs.LeafKind, len(own))
-    grids: dict[int, int] = {}
+    grids: dict[int, tuple[int, int]] = {}
     flat, first = [np.zeros(1)], 1
+    bounds, first_bound = [np.zeros(1)], 1
     for row, kind, part in zip(leaves, kinds, own, strict=True):
         solid, thing = part.solid, part.thing
         row["factor"], row["sizes"], row["spacing"] = 1.0, solid.sizes, solid.spacing
@@ -144,10 +146,12 @@ def _solids(structs: Any, parts: Sequence[Part]):
         if solid.coefficients is not None and thing is not None:
             # Bodies with the same object share its grid.
             if id(thing.obj) not in grids:
-                grids[id(thing.obj)] = first
+                grids[id(thing.obj)] = first, first_bound
                 flat.append(solid.coefficients.ravel())
                 first += solid.coefficients.size
-            kind["first"] = grids[id(thing.obj)]
+                bounds.append(np.asarray(lower_bounds(solid.coefficients, solid.degree), float).ravel())
+                first_bound += bounds[-1].size
+            kind["first"], kind["first_bound"] = grids[id(thing.obj)]
             kind["nodes_x"], kind["nodes_y"], kind["nodes_z"] = solid.coefficients.shape
             kind["degree"] = solid.degree
     at, leaf, plane = [], 0, 0
@@ -160,7 +164,7 @@ def _solids(structs: Any, parts: Sequence[Part]):
         else:
             at.append(leaf)
             leaf += hasattr(structs, part.solid.kind)
-    return leaves, kinds, np.concatenate(flat), at
+    return leaves, kinds, np.concatenate(flat), np.concatenate(bounds), at
 
 
 def _parts(features: Features, parts: Sequence[Part], at: Sequence[int]):

@@ -10,9 +10,9 @@ with a smooth edge between, or a grid of densities: a leaf of kind `DENSITY`.
 import warp as wp
 
 from dano.physics.features import KINDS, UNIONS
-from dano.physics.real import HALF, mat33, ONE, real, TWO, vec3, vec4, ZERO
+from dano.physics.real import HALF, INFINITY, mat33, ONE, real, TWO, vec3, vec4, ZERO
 from dano.physics.solids.distances import nearest_leaf, Solid, solid_clearance, solid_distance, solid_of
-from dano.physics.solids.grids import grid_spline
+from dano.physics.solids.grids import grid_spline, STEEPEST
 from dano.physics.solids.leaves import (
     CAPSULE,
     Distance,
@@ -30,8 +30,6 @@ DENSITY = 7
 
 _DENSITY, _HALF_SPACE, _GRID = wp.constant(DENSITY), wp.constant(HALF_SPACE), wp.constant(GRID)
 _SPHERE, _CAPSULE, _ELLIPSOID = wp.constant(SPHERE), wp.constant(CAPSULE), wp.constant(ELLIPSOID)
-# Sampled distances may grow faster than true ones: see the search for point contacts.
-_STEEPEST = wp.constant(real(1.5))
 # Below this share of a body's mass an overlap counts as none: ψ² must not underflow in derivatives of χ.
 _NEGLIGIBLE = wp.constant(real(1e-12))
 
@@ -360,9 +358,9 @@ def part_clearance(
         if is_grid:
             clearance = solid.leaf.factor * map_distance(fields, world, part, kind, in_leaf(solid.leaf, x))
     if not is_grid:
-        clearance = solid_clearance(solids, world, solid, x) - HALF * part.edge
+        clearance = solid_clearance(solids, world, solid, x, INFINITY) - HALF * part.edge
         if wp.static(GRID in KINDS):
-            clearance = clearance / _STEEPEST
+            clearance = clearance / STEEPEST
     return clearance
 
 

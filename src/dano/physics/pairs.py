@@ -6,7 +6,7 @@ Geometry is taken where the old velocities take the bodies by a share τ of the 
 import warp as wp
 
 from dano.physics.features import TURNING
-from dano.physics.real import mat33, ONE, quat, real, vec3, ZERO
+from dano.physics.real import HALF, mat33, ONE, quat, real, vec3, ZERO
 from dano.physics.rotations import direction, interpolated, matrix, rotation_from_z
 from dano.physics.solids.distances import Solid, solid_distance
 from dano.physics.solids.leaves import Distance, Solids
@@ -144,6 +144,26 @@ def rotation_after(body: BodyState, share: real) -> mat33:
 def position_after(body: BodyState, share: real, h: real) -> vec3:
     """Centre of mass after a share of the step [m, W]."""
     return body.position + (share * h) * body.velocity
+
+
+@wp.func
+def way_of(a: BodyState, b: BodyState, middle: vec3, radius: real, h: real) -> real:
+    """Most that a point of a ball moves relative to another body within the step [m].
+
+    Seen from b, a point at r from the first body's centre of mass, which is at d from b's, has the speed
+    |(v_a − v_b − ω_b × d) + (ω_a − ω_b) × r|, and d grows by t (v_a − v_b).
+
+    Args:
+        a: The body that the ball turns with.
+        b: The other body.
+        middle: Centre of the ball at the start of the step [m, W].
+        radius: Of the ball [m].
+        h: Timestep [s].
+    """
+    moves = a.velocity - b.velocity
+    speed = wp.length(moves - wp.cross(b.spin, a.position - b.position))
+    speed += HALF * h * wp.length(b.spin) * wp.length(moves)
+    return h * (speed + wp.length(a.spin - b.spin) * (wp.length(middle - a.position) + radius))
 
 
 @wp.func

@@ -14,6 +14,7 @@ vec3 = wp.types.vector(length=3, dtype=real)
 vec4 = wp.types.vector(length=4, dtype=real)
 vec6 = wp.types.vector(length=6, dtype=real)
 mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
+mat36 = wp.types.matrix(shape=(3, 6), dtype=real)
 mat66 = wp.types.matrix(shape=(6, 6), dtype=real)
 quat = wp.types.quaternion(dtype=real)
 

@@ -6,7 +6,7 @@ about a point [N, N m]. Sums of momenta are wrenches, too [kg m/s, kg m²/s]. Th
 
 import warp as wp
 
-from dano.physics.real import mat33, mat66, real, vec3, vec6
+from dano.physics.real import mat33, mat36, mat66, real, vec3, vec6
 
 
 @wp.struct
@@ -46,6 +46,16 @@ def joined_blocks(a: mat33, b: mat33, c: mat33, d: mat33) -> mat66:
         c[1, 0], c[1, 1], c[1, 2], d[1, 0], d[1, 1], d[1, 2],
         c[2, 0], c[2, 1], c[2, 2], d[2, 0], d[2, 1], d[2, 2],
     )  # fmt: skip
+
+
+@wp.func
+def stacked(top: mat36, bottom: mat36) -> mat66:
+    """The matrix of an upper and a lower half."""
+    a = mat66()
+    for i in range(3):
+        a[i] = top[i]
+        a[i + 3] = bottom[i]
+    return a
 
 
 @wp.func

@@ -3,12 +3,14 @@
 import warp as wp
 
 from dano.engine.kernels.lanes import total, total6, total66, wait
+from dano.engine.kernels.linear_solve import n_listed
 from dano.engine.kernels.tables import FoundPair, Room, Scene
 from dano.engine.kernels.trees.balance import add_tree_momentum
 from dano.engine.kernels.trees.contact import add_pulled, body_twist, free_block
 from dano.engine.kernels.trees.loops import add_loops
-from dano.physics.features import LANES, LOOPS, TREES
+from dano.physics.features import LANES, LOOPS, TREES, TURNING
 from dano.physics.momentum import angular_momentum, angular_momentum_jacobian
+from dano.physics.pairs import FIXED
 from dano.physics.point_law import (
     Duals,
     fitting_duals,
@@ -19,7 +21,7 @@ from dano.physics.point_law import (
     Motion,
     point_motion,
 )
-from dano.physics.real import mat33, mat66, ONE, real, vec3, vec6, ZERO
+from dano.physics.real import mat33, mat36, mat66, ONE, real, vec3, vec6, ZERO
 from dano.physics.samples import Point
 from dano.physics.twists import (
     angular_part,
@@ -28,10 +30,11 @@ from dano.physics.twists import (
     linear_part,
     relative_twist,
     shift,
+    stacked,
     Twist,
 )
 
-_LANES = wp.constant(LANES)
+_LANES, _FIXED = wp.constant(LANES), wp.constant(FIXED)
 
 
 @wp.struct
@@ -50,23 +53,19 @@ class Fit:
 
 
 @wp.struct
-class Quarters:
-    """A derivative of wrenches by twists, by its quarters, and sums of grip, which belong to all of them.
+class Halves:
+    """A derivative of wrenches by twists, by its halves, and sums of grip, which belong to both of them.
 
     Attributes:
-        vv: Force by velocity.
-        vw: Force by spin.
-        wv: Moment by velocity.
-        ww: Moment by spin.
+        force: Derivative of the force by the twist.
+        moment: Of the moment.
         grip: Σ g.
         grip_arm: Σ g r.
         grip_square: Σ g r rᵀ.
     """
 
-    vv: mat33
-    vw: mat33
-    wv: mat33
-    ww: mat33
+    force: mat36
+    moment: mat36
     grip: real
     grip_arm: vec3
     grip_square: mat33
@@ -168,36 +167,41 @@ def follow_duals(scene: Scene, room: Room, world: int, lane: int, n_found: int, 
 
 
 @wp.func
-def add_point_jacobian(sums: Quarters, point: Point, linear: Linear, weight: real) -> Quarters:
+def add_point_jacobian(sums: Halves, point: Point, linear: Linear, weight: real, rolls: bool) -> Halves:
     """Add the derivative of a point's impulse by the twist at the first body's centre of mass.
 
-    With a6 = (a, r × a), n6 = (n, moment), h times its area w, and X v = r × v that is
+    With a6 = (a, r × a), n6 = (n, moment), x6 = (n, r × n), h times its area w, and X v = r × v that is
 
-        w (c6 n6ᵀ − f n6 n6ᵀ − l6 û6ᵀ − g (E − (n, r × n) (n, r × n)ᵀ)),    E = Σ_k e6_k e6_kᵀ = [[1, −X],
-        [X, −X²]].
+        w (c6 n6ᵀ − f n6 n6ᵀ − l6 û6ᵀ − g (E − x6 x6ᵀ)),    E = Σ_k e6_k e6_kᵀ = [[1, −X], [X, −X²]].
+
+    Where samples turn with their body, n6 = x6 and three of the terms are one product.
+
+    Args:
+        sums: To add to.
+        point: The point.
+        linear: Its law.
+        weight: w.
+        rolls: Whether samples keep facing the second body.
     """
     r = point.arm
     n = point.normal
     grip = weight * linear.grip
-    lean = weight * linear.by_pressure
-    damping = weight * linear.pressure.damping
-    a = lean - damping * n
-    a_moment = wp.cross(r, lean) - damping * point.moment
-    across = wp.cross(r, n)
-    g = grip * n
-    g_moment = grip * across
-    sums.vv += wp.outer(a, n) + wp.outer(g, n)
-    sums.vw += wp.outer(a, point.moment) + wp.outer(g, across)
-    sums.wv += wp.outer(a_moment, n) + wp.outer(g_moment, n)
-    sums.ww += wp.outer(a_moment, point.moment) + wp.outer(g_moment, across)
-    if wp.length_sq(linear.turning) > ZERO:
-        l = weight * linear.turning
-        l_moment = wp.cross(r, l)
-        along = wp.cross(r, linear.slip_direction)
-        sums.vv -= wp.outer(l, linear.slip_direction)
-        sums.vw -= wp.outer(l, along)
-        sums.wv -= wp.outer(l_moment, linear.slip_direction)
-        sums.ww -= wp.outer(l_moment, along)
+    push = weight * linear.by_pressure + (grip - weight * linear.pressure.damping) * n
+    push_moment = wp.cross(r, push)
+    along = joined(n, point.moment)
+    if wp.static(len(TURNING) > 1):
+        if rolls:
+            across = wp.cross(r, n)
+            facing = joined(n, across)
+            sums.force += wp.outer(grip * n, facing)
+            sums.moment += wp.outer(grip * across, facing)
+            push = push - grip * n
+            push_moment = wp.cross(r, weight * linear.by_pressure)
+            push_moment = push_moment - weight * linear.pressure.damping * point.moment
+    slip = joined(linear.slip_direction, wp.cross(r, linear.slip_direction))
+    turning = weight * linear.turning
+    sums.force += wp.outer(push, along) - wp.outer(turning, slip)
+    sums.moment += wp.outer(push_moment, along) - wp.outer(wp.cross(r, turning), slip)
     sums.grip += grip
     sums.grip_arm += grip * r
     sums.grip_square += wp.outer(grip * r, r)
@@ -205,20 +209,19 @@ def add_point_jacobian(sums: Quarters, point: Point, linear: Linear, weight: rea
 
 
 @wp.func
-def whole_jacobian(sums: Quarters) -> mat66:
-    """The derivative that is summed by its quarters; − g E is added for all points at once."""
+def whole_jacobian(sums: Halves) -> mat66:
+    """The derivative that is summed by its halves; − g E is added for all points at once."""
     eye = wp.identity(n=3, dtype=real)
     x = wp.skew(sums.grip_arm)
     square = wp.trace(sums.grip_square) * eye - sums.grip_square  # −Σ g X²
-    return joined_blocks(sums.vv - sums.grip * eye, sums.vw + x, sums.wv - x, sums.ww - square)
+    return stacked(sums.force, sums.moment) + joined_blocks(-sums.grip * eye, x, -x, -square)
 
 
 @wp.func
 def clear_blocks(room: Room, world: int, lane: int, m: int):
     """Zero the blocks in use, each lane a part."""
-    for k in range(lane, m * m, _LANES):
-        if room.used[world, k] > 0:
-            room.blocks[world, k] = mat66()
+    for e in range(lane, n_listed(room, world, m), _LANES):
+        room.blocks[world, room.listed[world, e]] = mat66()
 
 
 @wp.func
@@ -285,7 +288,10 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
         found = room.found[world, f * _LANES + lane]
         twist = pair_twist(scene, room, world, found, room.tried, ONE)
         wrench = vec6()
-        quarters = Quarters()
+        halves = Halves()
+        rolls = bool(False)
+        if wp.static(len(TURNING) > 1):
+            rolls = scene.body_index[scene.pair_index[found.pair].first].turning != _FIXED
         presses = ZERO
         for k in range(found.first, found.end):
             point = room.points[world, k]
@@ -310,14 +316,14 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
                     force = weight * (linear.pressure.value * point.normal + friction)
                     moment = weight * (linear.pressure.value * point.moment + wp.cross(point.arm, friction))
                     wrench += joined(force, moment)
-                    quarters = add_point_jacobian(quarters, point, linear, weight)
+                    halves = add_point_jacobian(halves, point, linear, weight, rolls)
                     change = linear.friction_change
                     missed = wp.abs(change[0]) + wp.abs(change[1]) + wp.abs(change[2])
                     fit.unfit += weight * (missed + wp.abs(linear.pressure.change))
                     fit.push += weight * linear.pressure.value
         if total(presses) > ZERO:
             wrench = total6(wrench)
-            jacobian = total66(whole_jacobian(quarters))
+            jacobian = total66(whole_jacobian(halves))
             if lane == 0:
                 add_contact(scene, room, world, found, m, wrench, jacobian)
         if lane == 0 and room.wrenches.shape[1] > 0:

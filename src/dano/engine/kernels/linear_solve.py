@@ -45,32 +45,72 @@ def find_pattern(scene: Scene, room: Room, world: int, n_found: int):
         room.order[world, i] = -1
     if wp.static(TREES):
         couple_trees(scene, room, world)
+    begin_degrees(scene, room, world, m)
     for step in range(m):
         best = int(-1)
         fewest = 2 * m + 1
         for i in range(m):
-            if room.counts[world, i] < 0:
-                degree = int(0)
-                if wp.static(TREES):
-                    # Forces in loops have nothing on the diagonal before all that they push is eliminated.
-                    degree = m * scene.trees.blocks[i].is_loop
-                for j in range(m):
-                    if room.counts[world, j] < 0 and j != i:
-                        degree += room.used[world, i * m + j]
-                if degree < fewest:
-                    fewest = degree
-                    best = i
+            if room.counts[world, i] < 0 and room.degrees[world, i] < fewest:
+                fewest = room.degrees[world, i]
+                best = i
         if best >= 0:
             room.order[world, step] = best
-            n = int(0)
-            for j in range(m):
-                if j != best and room.counts[world, j] < 0 and room.used[world, best * m + j] > 0:
-                    room.later[world, best * m + n] = j
-                    n += 1
-            room.counts[world, best] = n
-            for a in range(n):
-                for b in range(a + 1, n):
-                    couple(room, world, m, room.later[world, best * m + a], room.later[world, best * m + b])
+            eliminate(room, world, m, best)
+    list_blocks(room, world, m)
+
+
+@wp.func
+def begin_degrees(scene: Scene, room: Room, world: int, m: int):
+    """With how many others that are to be eliminated each block is coupled."""
+    for i in range(m):
+        degree = int(0)
+        if wp.static(TREES):
+            # Forces in loops have nothing on the diagonal before all that they push is eliminated.
+            degree = m * scene.trees.blocks[i].is_loop
+        for j in range(m):
+            if room.counts[world, j] < 0 and j != i:
+                degree += room.used[world, i * m + j]
+        room.degrees[world, i] = degree
+
+
+@wp.func
+def eliminate(room: Room, world: int, m: int, best: int):
+    """List the later neighbours of a block, which its elimination couples with each other."""
+    n = int(0)
+    for j in range(m):
+        if j != best and room.counts[world, j] < 0 and room.used[world, best * m + j] > 0:
+            room.later[world, best * m + n] = j
+            room.degrees[world, j] = room.degrees[world, j] - 1
+            n += 1
+    room.counts[world, best] = n
+    for a in range(n):
+        i = room.later[world, best * m + a]
+        for b in range(a + 1, n):
+            j = room.later[world, best * m + b]
+            if room.used[world, i * m + j] == 0:
+                couple(room, world, m, i, j)
+                room.degrees[world, i] = room.degrees[world, i] + 1
+                room.degrees[world, j] = room.degrees[world, j] + 1
+
+
+@wp.func
+def list_blocks(room: Room, world: int, m: int):
+    """List the blocks in use, row by row."""
+    n = int(0)
+    for i in range(m):
+        for j in range(m):
+            if room.used[world, i * m + j] > 0:
+                room.listed[world, n] = i * m + j
+                n += 1
+        room.ends[world, i] = n
+
+
+@wp.func
+def n_listed(room: Room, world: int, row: int) -> int:
+    """Number of blocks in use in the rows before one: where those of a row begin in the list."""
+    if row == 0:
+        return 0
+    return room.ends[world, row - 1]
 
 
 @wp.func
@@ -134,14 +174,14 @@ def solve_blocks(room: Room, world: int, lane: int, m: int):
 @wp.func
 def copy_blocks(room: Room, world: int, lane: int, m: int):
     """Copy the Jacobian into `spare`, each lane a part."""
-    for k in range(lane, m * m, _LANES):
-        if room.used[world, k] > 0:
-            room.spare[world, k] = room.blocks[world, k]
+    for e in range(lane, n_listed(room, world, m), _LANES):
+        k = room.listed[world, e]
+        room.spare[world, k] = room.blocks[world, k]
 
 
 @wp.func
 def copy_transposed_blocks(room: Room, world: int, lane: int, m: int):
     """Copy the transpose of the Jacobian into `spare`, each lane a part."""
-    for k in range(lane, m * m, _LANES):
-        if room.used[world, k] > 0:
-            room.spare[world, (k % m) * m + k // m] = wp.transpose(room.blocks[world, k])
+    for e in range(lane, n_listed(room, world, m), _LANES):
+        k = room.listed[world, e]
+        room.spare[world, (k % m) * m + k // m] = wp.transpose(room.blocks[world, k])

@@ -24,6 +24,7 @@ from dano.physics.pairs import (
     facing_direction,
     pair_pose,
     PairPose,
+    way_of,
 )
 from dano.physics.point_law import Material, point_law
 from dano.physics.real import INFINITY, ONE, real, TWO, vec3, ZERO
@@ -37,13 +38,11 @@ from dano.physics.samples import (
     solid_normal,
 )
 from dano.physics.solids.distances import Solid, solid_clearance, solid_distance, solid_of
+from dano.physics.solids.grids import STEEPEST
 from dano.physics.solids.leaves import HALF_SPACE
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
 _HALF_SPACE = wp.constant(HALF_SPACE)
-# Sampled distances may grow faster than true ones: near the shipped objects a hundredth of the space has
-# gradients above 1.2, a thousandth above 1.45.
-_STEEPEST = wp.constant(real(1.5))
 # Most steps of the search for the moment when bodies meet, and the share of the step that ends it.
 _ADVANCES = wp.constant(40)
 _MET = wp.constant(real(1e-12 if WIDE else 1e-6))
@@ -123,8 +122,7 @@ def is_near(
     solid = solid_of_body(scene, world, second)
     if solid.kind.kind == _HALF_SPACE:
         in_solid = wp.transpose(matrix(b.orientation)) * (x - b.position) + b.com
-        d = solid_clearance(scene.solids, world, solid, in_solid)
-        return d <= reach
+        return solid_clearance(scene.solids, world, solid, in_solid, reach) <= reach
     reach += other.radius + h * wp.length(b.spin) * wp.length(other.middle - other.com)
     apart = x - middle_of(other, b)
     return wp.dot(apart, apart) <= reach * reach
@@ -183,13 +181,13 @@ def find_near_probes(
                 elif of_blocks and i % _RUN == 0:
                     run = scene.runs[world, index.first_block + i]
                     x = pose.points * vec3(run[0], run[1], run[2]) + pose.origin
-                    d = solid_clearance(scene.solids, world, solid, x)
-                    if d - _STEEPEST * run[3] > way:
+                    far = way + STEEPEST * run[3]
+                    if solid_clearance(scene.solids, world, solid, x, far) > far:
                         beyond = i + _RUN
                         listed = False
             if listed:
                 x = position_in_solid(pose, scene.probes[world, index.first_probe + i])
-                listed = solid_clearance(scene.solids, world, solid, x) <= way
+                listed = solid_clearance(scene.solids, world, solid, x, way) <= way
         if listed:
             room.near[world, at + found] = index.first_probe + i
             found += 1
@@ -221,10 +219,7 @@ def meeting(
     index = scene.body_index[first]
     solid = solid_of_body(scene, world, second)
     body = scene.bodies[world, first]
-    turn = wp.length(a.spin) * body.radius + wp.length(b.spin) * (
-        body.radius + wp.length(a.position - b.position)
-    )
-    way = h * (wp.length(a.velocity - b.velocity) + turn)
+    way = way_of(a, b, middle_of(body, a), body.radius, h)
     if way <= pair.sink:
         return met
     share = real(0.0)
@@ -234,7 +229,7 @@ def meeting(
     while k < _ADVANCES:
         pose = posed(scene, world, a, b, first, second, share, h, pair.follows)
         if n < 0:
-            n = find_near_probes(scene, room, world, lane, pose, first, second, way - pair.sink)
+            n = find_near_probes(scene, room, world, lane, pose, first, second, STEEPEST * way - pair.sink)
         further = INFINITY
         critical = int(-1)
         for i in range(n):
@@ -366,15 +361,15 @@ def find_points(
                 # Where a run of blocks is out of reach, all of them are.
                 run = scene.runs[world, b]
                 x = pose.points * vec3(run[0], run[1], run[2]) + pose.origin
-                clearance = solid_clearance(scene.solids, world, solid, x)
-                if clearance - _STEEPEST * run[3] * stretch > reach:
+                far = reach + STEEPEST * run[3] * stretch
+                if solid_clearance(scene.solids, world, solid, x, far) > far:
                     beyond = i + _RUN
                     listed = False
         if listed:
             ball = scene.balls[world, b]
             x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
-            clearance = solid_clearance(scene.solids, world, solid, x)
-            listed = clearance - ball[3] * stretch <= reach
+            near = reach + ball[3] * stretch
+            listed = solid_clearance(scene.solids, world, solid, x, near) <= near
         rest = lanes_where(lane, listed)
         while rest != wp.uint32(0):
             share_of = block_share(lane, rest)
@@ -495,7 +490,9 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
             material = scene.materials[world, index.contact]
             found.impact_stiffness = impact_stiffness(a, b, sums, material)
             room.found[world, n_found * _LANES + lane] = found
-            n_found += 1
+            # What is near but has no points neither presses nor couples its bodies.
+            if total(real(at - begin)) > ZERO:
+                n_found += 1
     return n_found, total(wp.where(overflow, ONE, ZERO)) > ZERO
 
 

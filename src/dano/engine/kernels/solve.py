@@ -20,7 +20,7 @@ import warp as wp
 
 from dano.engine.kernels.assembly import assemble, fit_duals, follow_duals, Trial
 from dano.engine.kernels.lanes import greatest, total, wait
-from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
+from dano.engine.kernels.linear_solve import copy_blocks, n_listed, solve_blocks
 from dano.engine.kernels.patches import add_patches, any_sticks, fit_patch_duals, follow_patch_duals
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.balance import (
@@ -227,14 +227,14 @@ def measure(scene: Scene, room: Room, world: int, lane: int) -> Measured:
         scale = room.scale[world, i]
         found.work += wp.dot(room.step[world, i], residual)
         size = vec6()
-        for j in range(m):
-            if room.used[world, i * m + j] > 0:
-                size += absolute_product(room, world, i * m + j, room.tried[world, j])
-        for k in range(6):
-            missed = wp.abs(scale[k] * residual[k])
+        for e in range(n_listed(room, world, i), room.ends[world, i]):
+            k = room.listed[world, e]
+            size += absolute_product(room, world, k, room.tried[world, k % m])
+        for c in range(6):
+            missed = wp.abs(scale[c] * residual[c])
             if not (missed <= found.error):
                 found.error = missed
-            found.size = wp.max(found.size, scale[k] * size[k])
+            found.size = wp.max(found.size, scale[c] * size[c])
     found.work = total(found.work)
     found.error = greatest(found.error)
     found.size = greatest(found.size)

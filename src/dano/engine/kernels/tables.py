@@ -233,6 +233,9 @@ class Room:
         order: Of elimination; later neighbours; their numbers.
         later: …
         counts: …
+        degrees: With how many others a block is coupled.
+        listed: The blocks that are not zero, row by row.
+        ends: Where those of each row end in this list.
         velocity: Accepted, of each free body [m/s; rad/s, W], or six coordinates of joints; (worlds, blocks).
         old: Those of the step before; only with joints.
         tried: …
@@ -266,6 +269,9 @@ class Room:
     order: wp.array2d(dtype=wp.int32)
     later: wp.array2d(dtype=wp.int32)
     counts: wp.array2d(dtype=wp.int32)
+    degrees: wp.array2d(dtype=wp.int32)
+    listed: wp.array2d(dtype=wp.int32)
+    ends: wp.array2d(dtype=wp.int32)
     velocity: wp.array2d(dtype=vec6)
     old: wp.array2d(dtype=vec6)
     tried: wp.array2d(dtype=vec6)

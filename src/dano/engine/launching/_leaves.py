@@ -3,9 +3,11 @@
 See `dano.physics.solids.distances` and `dano.physics.overlap`.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float, Int
@@ -35,7 +37,9 @@ LEAF_WIDTH = 20
 """Numbers of a leaf."""
 # Blocks of a run: see `dano.engine.kernels.tables`.
 _RUN = 4
-_KIND_WIDTH = 6
+_KIND_WIDTH = 7
+# Cells of a grid along an axis that have one lower bound: see `dano.physics.solids.leaves`.
+_CELL = 4
 # Kinds of leaves by their numbers, and what a leaf holds besides its pose: sizes, length, spacing.
 _KINDS: dict[type[AbstractField], tuple[int, Any]] = {
     HalfSpace: (0, lambda s: {"sizes": s.normal_direction, "length": s.offset}),
@@ -80,11 +84,13 @@ class Leaves(NamedTuple):
         rows: See `dano.physics.solids.distances.Leaf`.
         kinds: See `dano.physics.solids.distances.LeafKind`.
         coefficients: Spline coefficients of all grids, one below the other.
+        bounds: Lower bounds on splines, see `lower_bounds`, one below the other.
     """
 
     rows: Float[Array, "leaves 20"]
-    kinds: Int[np.ndarray, "leaves 6"]
+    kinds: Int[np.ndarray, "leaves 7"]
     coefficients: Float[Array, "coefficients 1"]
+    bounds: Float[Array, "bounds 1"]
 
 
 def is_known(field: AbstractField) -> bool:
@@ -143,7 +149,8 @@ def degrees_of(leaves: Sequence[Placed]) -> set[int]:
 def leaf_tables(leaves: Sequence[Placed], dtype: DTypeLike) -> Leaves:
     """Rows of leaves."""
     if not leaves:
-        return Leaves(jnp.zeros((0, LEAF_WIDTH), dtype), _whole([]), jnp.zeros((0, 1), dtype))
+        none = jnp.zeros((0, 1), dtype)
+        return Leaves(jnp.zeros((0, LEAF_WIDTH), dtype), _whole([]), none, none)
     zero = {"sizes": jnp.zeros(3), "length": jnp.zeros(()), "spacing": jnp.ones(3)}
     own = [{**zero, **_KINDS[type(leaf.field)][1](leaf.field)} for leaf in leaves]
     columns = [
@@ -152,23 +159,46 @@ def leaf_tables(leaves: Sequence[Placed], dtype: DTypeLike) -> Leaves:
         jnp.stack([leaf.rotation for leaf in leaves]),
         *(jnp.stack([numbers[name].astype(dtype) for numbers in own]) for name in zero),
     ]
-    kinds, coefficients, at = [], [jnp.zeros(0, dtype)], 0
+    kinds, coefficients, bounds, at, first_bound = [], [jnp.zeros(0, dtype)], [jnp.zeros(0, dtype)], 0, 0
     for leaf in leaves:
-        kind = (_KINDS[type(leaf.field)][0], 0, 0, 0, 0, 0)
+        kind = (_KINDS[type(leaf.field)][0], 0, 0, 0, 0, 0, 0)
         if isinstance(leaf.field, SignedDistanceGrid | GridField):
             grid = leaf.field.coefficients
-            kind = (kind[0], at, *grid.shape, degree_of(leaf.field.interpolation))
+            degree = degree_of(leaf.field.interpolation)
+            kind = (kind[0], at, *grid.shape, degree, first_bound)
             coefficients.append(grid.ravel().astype(dtype))
             at += int(np.prod(grid.shape))
+            if isinstance(leaf.field, SignedDistanceGrid):
+                bounds.append(lower_bounds(grid, degree).ravel().astype(dtype))
+                first_bound += bounds[-1].shape[0]
         kinds.append(kind)
     return Leaves(
         jnp.concatenate([x.reshape(len(leaves), -1) for x in columns], axis=1),
         _whole(kinds),
         jnp.concatenate(coefficients)[:, None],
+        jnp.concatenate(bounds)[:, None],
     )
 
 
-def _whole(kinds: Sequence[tuple[int, ...]]) -> Int[np.ndarray, "leaves 6"]:
+def lower_bounds(coefficients: Float[Array, "x y z"], degree: int) -> Float[Array, "a b c"]:
+    """Lower bounds on a spline between its outermost nodes, one for each block of cells.
+
+    A spline is a mean of the coefficients around a place.
+
+    Args:
+        coefficients: Of the spline, its border of `degree` + 1 nodes included.
+        degree: Of the spline.
+    """
+    bound = jax.lax.stop_gradient(coefficients)
+    for axis, size in enumerate(coefficients.shape):
+        n = (size - 2 * degree - 3) // _CELL + 1
+        # Those of a block's first cell begin one before its own node, those of the last end two beyond it.
+        begins = np.minimum(degree + np.arange(_CELL + 3)[:, None] + _CELL * np.arange(n), size - 1)
+        bound = functools.reduce(jnp.minimum, (jnp.take(bound, nodes, axis) for nodes in begins))
+    return bound
+
+
+def _whole(kinds: Sequence[tuple[int, ...]]) -> Int[np.ndarray, "leaves 7"]:
     return np.array(kinds, np.int32).reshape(-1, _KIND_WIDTH)
 
 

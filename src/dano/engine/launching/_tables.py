@@ -170,6 +170,7 @@ def scene_tables(scene: Scene) -> Tables:
         **surfaces,
         "scene.solids.leaves": of_leaves.rows,
         "scene.solids.coefficients": of_leaves.coefficients,
+        "scene.solids.bounds": of_leaves.bounds,
         "scene.pairs": pair_rows,
         "scene.materials": _materials(scene, kernels, dtype),
         "scene.gravity": scene.gravity[None].astype(dtype),

@@ -11,11 +11,12 @@ from dano.mujoco.kernels.merging import merge
 from dano.mujoco.kernels.mixing import pair_settings
 from dano.mujoco.kernels.solids import part_clearance, part_distance, quick_clearance, UNKNOWN
 from dano.mujoco.kernels.tables import BLOCK, Data, Known, Model, Part, PartIndex, RUN, Touch, Work
-from dano.physics.pairs import approach, BodyState, facing_direction, pair_pose, PairPose, rotation_after
+from dano.physics.pairs import approach, BodyState, facing_direction, pair_pose, PairPose, rotation_after, way_of
 from dano.physics.real import HALF, INFINITY, mat33, ONE, real, vec3, vec4, ZERO
 from dano.physics.rotations import turned
 from dano.physics.samples import facing_area, position_in_solid, solid_normal
 from dano.physics.solids.distances import solid_of
+from dano.physics.solids.grids import STEEPEST
 from dano.physics.solids.leaves import Distance, GRID, HALF_SPACE
 
 _BLOCK, _GRID, _HALF_SPACE = wp.constant(BLOCK), wp.constant(GRID), wp.constant(HALF_SPACE)
@@ -23,8 +24,6 @@ _RUN, _UNKNOWN = wp.constant(RUN), wp.constant(UNKNOWN)
 # Share of the thinner body's half thickness by which bodies may sink into each other: normals still point
 # out of the side that was hit.
 _SINK = wp.constant(real(0.25))
-# Sampled distances may grow faster than true ones, see `dano.engine.kernels.search`.
-_STEEPEST = wp.constant(real(1.5))
 # Most steps of the search for the moment when bodies meet, and the share of the step that ends it.
 _ADVANCES = wp.constant(40)
 _MET = wp.constant(real(1e-9))
@@ -79,14 +78,6 @@ def middle_of(part: Part, state: BodyState) -> vec3:
 
 
 @wp.func
-def way_of(a: BodyState, b: BodyState, middle: vec3, radius: real, h: real) -> real:
-    """Most that a point of a ball moves relative to another part within the step [m]."""
-    turns = wp.length(a.spin) * (wp.length(middle - a.position) + radius)
-    turns += wp.length(b.spin) * (wp.length(middle - b.position) + radius)
-    return h * (wp.length(a.velocity - b.velocity) + turns)
-
-
-@wp.func
 def side_pose(known: Known, side: Side, share: real, h: real) -> PairPose:
     """Pose of the two parts after a share of the step, samples turned to the other part."""
     toward = vec3(ONE, ZERO, ZERO)
@@ -133,9 +124,10 @@ def is_ball_near(
     """
     steepest = ONE
     if other.solid == _GRID:
-        steepest = _STEEPEST
+        steepest = STEEPEST
     x = turn * vec3(ball[0], ball[1], ball[2]) + origin
-    return part_clearance(known, model, other, x) - steepest * stretch * ball[3] <= reach
+    near = reach + steepest * stretch * ball[3]
+    return part_clearance(known, model, other, x, near) <= near
 
 
 @wp.func(inline=True)

@@ -97,8 +97,8 @@ def quick_clearance(known: Known, part: PartIndex, x: vec3) -> real:
 
 
 @wp.func(inline=True)
-def part_clearance(known: Known, model: Model, part: PartIndex, x: vec3) -> real:
-    """A lower bound on the distance of a part's solid [m]."""
+def part_clearance(known: Known, model: Model, part: PartIndex, x: vec3, enough: real) -> real:
+    """A lower bound on the distance of a part's solid [m]; where it exceeds `enough`, any that does."""
     bound = ZERO
     if part.solid == _HULL:
         bound = hull_distance(known, part, x).value
@@ -109,6 +109,6 @@ def part_clearance(known: Known, model: Model, part: PartIndex, x: vec3) -> real
         bound = quick_clearance(known, part, x)
     else:
         bound = leaf_clearance(
-            known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x
+            known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x, enough
         )
     return bound

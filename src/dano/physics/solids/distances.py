@@ -12,7 +12,7 @@ import warp as wp
 
 from dano.physics.features import KINDS, UNIONS
 from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
-from dano.physics.solids.grids import beyond_range, grid_distance
+from dano.physics.solids.grids import beyond_range, coarse_bound, grid_distance
 from dano.physics.solids.leaves import (
     BOX,
     CAPSULE,
@@ -93,13 +93,13 @@ def leaf_distance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: vec
 
 
 @wp.func
-def leaf_clearance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: vec3) -> real:
-    """A lower bound on the distance to one leaf.
+def leaf_clearance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: vec3, enough: real) -> real:
+    """A lower bound on the distance to one leaf [m]; where it exceeds `enough`, any that does.
 
     Beyond a grid's border its distance d adds the way b to the border, which is more than the true distance:
-    the solid lies in the grid, so √(d² + b²) bounds that from below.
+    the solid lies in the grid, so √(d² + b²) bounds that from below, and so does b.
     """
-    d = leaf_distance(solids, world, kind, leaf, x).value
+    way = ZERO
     if wp.static(GRID in KINDS):
         if kind.kind == _GRID:
             border = kind.degree + 1
@@ -109,10 +109,17 @@ def leaf_clearance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: ve
                 beyond_range(y[1], real(kind.nodes_y - 2 * border - 1) * leaf.spacing[1]),
                 beyond_range(y[2], real(kind.nodes_z - 2 * border - 1) * leaf.spacing[2]),
             )
-            squared = wp.dot(away, away)
-            if squared > ZERO:
-                inner = d - leaf.factor * wp.sqrt(squared)
-                d = wp.sqrt(inner * inner + leaf.factor * leaf.factor * squared)
+            way = leaf.factor * wp.length(away)
+            if way > wp.max(enough, ZERO):
+                return way
+            bound = leaf.factor * coarse_bound(solids, world, kind, leaf, y + leaf.sizes)
+            if way > ZERO:
+                bound = wp.sqrt(wp.max(bound, ZERO) * wp.max(bound, ZERO) + way * way)
+            if bound > enough:
+                return bound
+    d = leaf_distance(solids, world, kind, leaf, x).value
+    if way > ZERO:
+        d = wp.sqrt((d - way) * (d - way) + way * way)
     return d
 
 
@@ -141,12 +148,12 @@ def nearest_leaf(solids: Solids, world: int, solid: Solid, x: vec3) -> Solid:
 
 
 @wp.func
-def solid_clearance(solids: Solids, world: int, solid: Solid, x: vec3) -> real:
-    """Lower bound on the distance [m] from a point [m, F] to a solid."""
-    least = leaf_clearance(solids, world, solid.kind, solid.leaf, x)
+def solid_clearance(solids: Solids, world: int, solid: Solid, x: vec3, enough: real) -> real:
+    """Lower bound on the distance [m] from a point [m, F] to a solid; beyond `enough`, any that is, too."""
+    least = leaf_clearance(solids, world, solid.kind, solid.leaf, x, enough)
     if wp.static(UNIONS):
         for i in range(solid.first + 1, solid.first + solid.count):
-            other = leaf_clearance(solids, world, solids.kinds[i], solids.leaves[world, i], x)
+            other = leaf_clearance(solids, world, solids.kinds[i], solids.leaves[world, i], x, enough)
             least = wp.min(least, other)
     return least
 

@@ -9,6 +9,8 @@ from dano.physics.real import mat33, ONE, real, vec3, ZERO
 
 HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER, ELLIPSOID, GRID = range(7)
 """Kinds of leaves."""
+CELL = 4
+"""Cells of a grid along an axis that have one lower bound."""
 
 
 @wp.struct
@@ -44,6 +46,7 @@ class LeafKind:
         nodes_y: Along y.
         nodes_z: Along z.
         degree: Of the spline.
+        first_bound: Place of the first lower bound on a grid's spline.
     """
 
     kind: wp.int32
@@ -52,6 +55,7 @@ class LeafKind:
     nodes_y: wp.int32
     nodes_z: wp.int32
     degree: wp.int32
+    first_bound: wp.int32
 
 
 @wp.struct
@@ -62,12 +66,14 @@ class Solids:
         leaves: Shape (worlds, leaves).
         kinds: Shape (leaves,).
         coefficients: Spline coefficients of all grids [m], shape (worlds, coefficients).
+        bounds: Lower bounds on the splines of all grids, one for each `CELL`³ cells [m], (worlds, bounds).
         changes: Of the coefficients, one direction after the other; only for forward derivatives.
     """
 
     leaves: wp.array2d(dtype=Leaf)
     kinds: wp.array(dtype=LeafKind)
     coefficients: wp.array2d(dtype=real)
+    bounds: wp.array2d(dtype=real)
     changes: wp.array2d(dtype=real)
 
 
