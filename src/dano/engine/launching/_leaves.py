@@ -180,7 +180,7 @@ def leaf_tables(leaves: Sequence[Placed], dtype: DTypeLike) -> Leaves:
     )
 
 
-def lower_bounds(coefficients: Float[Array, "x y z"], degree: int) -> Float[Array, "a b c"]:
+def lower_bounds(coefficients: Float[Array | np.ndarray, "x y z"], degree: int) -> Float[Array, "a b c"]:
     """Lower bounds on a spline between its outermost nodes, one for each block of cells.
 
     A spline is a mean of the coefficients around a place.

@@ -11,7 +11,15 @@ from dano.mujoco.kernels.merging import merge
 from dano.mujoco.kernels.mixing import pair_settings
 from dano.mujoco.kernels.solids import part_clearance, part_distance, quick_clearance, UNKNOWN
 from dano.mujoco.kernels.tables import BLOCK, Data, Known, Model, Part, PartIndex, RUN, Touch, Work
-from dano.physics.pairs import approach, BodyState, facing_direction, pair_pose, PairPose, rotation_after, way_of
+from dano.physics.pairs import (
+    approach,
+    BodyState,
+    facing_direction,
+    pair_pose,
+    PairPose,
+    rotation_after,
+    way_of,
+)
 from dano.physics.real import HALF, INFINITY, mat33, ONE, real, vec3, vec4, ZERO
 from dano.physics.rotations import turned
 from dano.physics.samples import facing_area, position_in_solid, solid_normal
