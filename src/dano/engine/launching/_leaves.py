@@ -189,7 +189,7 @@ def lower_bounds(coefficients: Float[Array | np.ndarray, "x y z"], degree: int) 
         coefficients: Of the spline, its border of `degree` + 1 nodes included.
         degree: Of the spline.
     """
-    bound = jax.lax.stop_gradient(coefficients)
+    bound = jax.lax.stop_gradient(jnp.asarray(coefficients))
     for axis, size in enumerate(coefficients.shape):
         n = (size - 2 * degree - 3) // _CELL + 1
         # Those of a block's first cell begin one before its own node, those of the last end two beyond it.
