@@ -13,10 +13,9 @@ from jaxtyping import Array
 from dano.engine import device_mesh
 from dano.identify._checkpoint import Checkpoint
 from dano.identify._motion import Motion, QUANTITIES
-from dano.identify._residuals import Linearized, linearized, Model, moved, Smoothing
+from dano.identify._residuals import Linearized, linearized, Model, moved, Smoothing, Start
 from dano.identify._settings import Setup
 from dano.identify._settling import settled
-from dano.identify._starts import Start
 from dano.identify._windows import draw_velocities, plan_windows
 from dano.scene import Control, Scene, State
 from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
