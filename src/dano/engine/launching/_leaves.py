@@ -192,9 +192,9 @@ def lower_bounds(coefficients: Float[Array | np.ndarray, "x y z"], degree: int) 
     bound = jax.lax.stop_gradient(jnp.asarray(coefficients))
     for axis, size in enumerate(coefficients.shape):
         n = (size - 2 * degree - 3) // _CELL + 1
-        # Those of a block's first cell begin one before its own node, those of the last end two beyond it.
-        begins = np.minimum(degree + np.arange(_CELL + 3)[:, None] + _CELL * np.arange(n), size - 1)
-        bound = functools.reduce(jnp.minimum, (jnp.take(bound, nodes, axis) for nodes in begins))
+        # From one before the own node of a block's first cell to two beyond that of its last.
+        nodes = np.minimum(degree + np.arange(_CELL + 3)[:, None] + _CELL * np.arange(n), size - 1)
+        bound = functools.reduce(jnp.minimum, (jnp.take(bound, each, axis) for each in nodes))
     return bound
 
 

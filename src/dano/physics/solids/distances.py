@@ -12,7 +12,7 @@ import warp as wp
 
 from dano.physics.features import KINDS, UNIONS
 from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
-from dano.physics.solids.grids import beyond_range, coarse_bound, grid_distance
+from dano.physics.solids.grids import closest_in_grid, coarse_bound, grid_distance, place_in_grid
 from dano.physics.solids.leaves import (
     BOX,
     CAPSULE,
@@ -102,17 +102,13 @@ def leaf_clearance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: ve
     way = ZERO
     if wp.static(GRID in KINDS):
         if kind.kind == _GRID:
-            border = kind.degree + 1
-            y = (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position)) - leaf.sizes
-            away = vec3(
-                beyond_range(y[0], real(kind.nodes_x - 2 * border - 1) * leaf.spacing[0]),
-                beyond_range(y[1], real(kind.nodes_y - 2 * border - 1) * leaf.spacing[1]),
-                beyond_range(y[2], real(kind.nodes_z - 2 * border - 1) * leaf.spacing[2]),
-            )
-            way = leaf.factor * wp.length(away)
+            y = (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position))
+            u = place_in_grid(leaf, y)
+            closest = closest_in_grid(kind, u)
+            way = leaf.factor * wp.length(wp.cw_mul(u - closest, leaf.spacing))
             if way > wp.max(enough, ZERO):
                 return way
-            bound = leaf.factor * coarse_bound(solids, world, kind, leaf, y + leaf.sizes)
+            bound = leaf.factor * coarse_bound(solids, world, kind, closest)
             if way > ZERO:
                 bound = wp.sqrt(wp.max(bound, ZERO) * wp.max(bound, ZERO) + way * way)
             if bound > enough:
