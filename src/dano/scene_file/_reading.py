@@ -1,6 +1,7 @@
 """Reading scene files. Their keys are described in docs/scenes.md."""
 
 import dataclasses
+import inspect
 import itertools
 import json
 import math
@@ -15,7 +16,7 @@ from dano.archive import checked_input
 from dano.building import BuildOptions, Units
 from dano.checks import checked_choice, checked_count, checked_number, shown
 from dano.contact import AbstractContactLaw, CentroidLaw, ContactParams, DistributedLaw
-from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSpace, load_field, posed, Sphere
+from dano.fields import AbstractShape, load_field, posed, PRIMITIVES
 from dano.maths import Pose
 from dano.memory import memory_limit
 from dano.names import did_you_mean
@@ -50,17 +51,6 @@ from dano.scene_file._table import located, Table
 if TYPE_CHECKING:
     from dano.vision import LearnedField
 
-SHAPES: dict[str, tuple[type[AbstractShape], dict[str, int]]] = {
-    "half_space": (HalfSpace, {"normal": 3, "offset": 1}),
-    "sphere": (Sphere, {"radius": 1}),
-    "box": (Box, {"half_extents": 3, "rounding": 1}),
-    "capsule": (Capsule, {"radius": 1, "half_length": 1}),
-    "cylinder": (Cylinder, {"radius": 1, "half_length": 1}),
-    "ellipsoid": (Ellipsoid, {"semi_axes": 3}),
-}
-"""Shapes by name, with the count of numbers that each of their parameters takes."""
-
-_REQUIRED = {"radius", "half_extents", "half_length", "semi_axes"}
 _STATE = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 _GEOMETRY = ("object", "field", "asset", "shape")
 _BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE, *JOINT_QUANTITIES)
@@ -316,17 +306,18 @@ def _body(row: Table, folder: Path, built: dict[object, NeuralObject], progress:
 
 
 def _shape_keys() -> list[str]:
-    return sorted({key for _, parameters in SHAPES.values() for key in parameters})
+    return sorted({key for shape in PRIMITIVES.values() for key in shape.takes})
 
 
 def _shape(row: Table) -> AbstractShape:
-    kind = row.word("shape", list(SHAPES))
-    make, parameters = SHAPES[kind]
-    row.only((*_BODY, *parameters, "edge", "pose"))
-    if missing := [key for key in parameters if key in _REQUIRED and key not in row]:
+    kind = row.word("shape", list(PRIMITIVES))
+    make: Any = PRIMITIVES[kind]
+    row.only((*_BODY, *make.takes, "edge", "pose"))
+    usual = {key: each.default for key, each in inspect.signature(make).parameters.items()}
+    if missing := [key for key in make.takes if usual[key] is inspect.Parameter.empty and key not in row]:
         raise ValueError(f"a {kind} needs {', '.join(missing)} [m]")
     given: dict[str, Any] = {
-        key: row.number(key) if n == 1 else row.vector(key, n) for key, n in parameters.items() if key in row
+        key: row.number(key) if n == 1 else row.vector(key, n) for key, n in make.takes.items() if key in row
     }
     if "edge" in row:
         given["edge"] = row.number("edge")
