@@ -1,6 +1,7 @@
 """Reading scene files. Their keys are described in docs/scenes.md."""
 
 import dataclasses
+import functools
 import inspect
 import itertools
 import json
@@ -60,37 +61,12 @@ _LOOP = {"position": 3, "anchor": 3, "orientation": 4}
 _JOINT_NUMBERS = ("damping", "friction", "armature", "stiffness", "rest", "ratio", "shift")
 # The mass of a body is a key of the body.
 _BUILD = tuple(field.name for field in dataclasses.fields(BuildOptions) if field.name != "mass")
-_PARAMS = tuple(ContactParams.__dataclass_fields__)
-_OF_CENTROIDS = (
-    "spring",
-    "damper",
-    "sliding_drag",
-    "torsional_friction",
-    "torsional_drag",
-    "rolling_friction",
-    "rolling_drag",
-)
-_LAWS: dict[str, tuple[type[AbstractContactLaw], tuple[str, ...]]] = {
-    "centroid": (
-        CentroidLaw,
-        ("sliding_friction", *_OF_CENTROIDS, "smoothing", "regularizer", "stiction_velocity", "adhesive"),
-    ),
-    "distributed": (
-        DistributedLaw,
-        (
-            *(key for key in _PARAMS if key not in _OF_CENTROIDS),
-            "stiction_velocity",
-            "implicitness",
-            "compliant",
-        ),
-    ),
-}
-"""Laws by name, with the keys that belong to them."""
+_LAWS: dict[str, type[AbstractContactLaw]] = {"centroid": CentroidLaw, "distributed": DistributedLaw}
+"""Laws by name."""
 DEFAULT_LAW = "distributed"
 """Law of contacts that name none."""
 _FLAGS = ("adhesive", "compliant")
 """Those of them that are true or false; the others are numbers."""
-_CONTACT = ("law", "edge", *dict.fromkeys(key for _, keys in _LAWS.values() for key in keys))
 _BYTES_PER_STEP = 500
 """Of a body in memory: state, joined pieces, and contact forces."""
 _TOP = (
@@ -106,6 +82,17 @@ _TOP = (
     "default_contact",
     "controls",
 )
+
+
+@functools.cache
+def _law_keys(law: str) -> tuple[str, ...]:
+    """The keys that belong to a law: the parameters it reads, and what it is made from."""
+    return (*_LAWS[law]().reads, *inspect.signature(_LAWS[law]).parameters)
+
+
+@functools.cache
+def _contact_keys() -> tuple[str, ...]:
+    return ("law", "edge", *dict.fromkeys(key for law in _LAWS for key in _law_keys(law)))
 
 
 @dataclass(frozen=True)
@@ -429,7 +416,7 @@ def _contacts(
     default_law: str,
     robots: Sequence[Robot],
 ) -> list[Contact]:
-    default = top.table("default_contact", _CONTACT)
+    default = top.table("default_contact", _contact_keys())
     default.where = f"{top.where}: [default_contact]"
     usual = _law_name(default, default_law)
     if top.data.get("contacts", "all") == "all":
@@ -441,13 +428,13 @@ def _contacts(
             if a.name != b.name
             and not apart(a.name, b.name)
             and _may_meet(a.name, b.name, robots)
-            and _can_touch(a, b, presses=_LAWS[usual][0]().presses)
+            and _can_touch(a, b, presses=_LAWS[usual]().presses)
         ]
     if isinstance(top.data["contacts"], str):
         raise top.wrong("contacts", "'all' or written as [[contacts]] tables")
     names, contacts = [body.name for body in bodies], []
     for i, row in enumerate(top.tables("contacts")):
-        table = Table(f"{top.where}: [[contacts]] {i + 1}", row, ("a", "b", *_CONTACT))
+        table = Table(f"{top.where}: [[contacts]] {i + 1}", row, ("a", "b", *_contact_keys()))
         a, b = table.word("a"), table.word("b")
         table.where += f" ({a!r}, {b!r})"
         for name in (a, b):
@@ -458,7 +445,7 @@ def _contacts(
                 )
         law = _law_name(table, usual)
         # What the default says for another law does not concern this contact.
-        inherited = {key: value for key, value in default.data.items() if key in ("edge", *_LAWS[law][1])}
+        inherited = {key: value for key, value in default.data.items() if key in ("edge", *_law_keys(law))}
         table.data = {**inherited, **row}
         contacts.append(_contact(table, law, a, b))
     return contacts
@@ -478,12 +465,12 @@ def _law_name(table: Table, default: str) -> str:
     """The law that a table chooses, whose other keys must belong to it."""
     law = table.word("law", tuple(_LAWS), default)
     for key in table.data:
-        owners = [name for name, (_, keys) in _LAWS.items() if key in keys]
+        owners = [name for name in _LAWS if key in _law_keys(name)]
         if owners and law not in owners:
             hint = "" if "law" in table else f"; for the other law write law = {owners[0]!r}"
             raise ValueError(
                 f"{table.where}: {key} belongs to law = {owners[0]!r}, and this is {law!r}, whose keys are "
-                f"{', '.join(_LAWS[law][1])}{hint}"
+                f"{', '.join(_law_keys(law))}{hint}"
             )
     return law
 
@@ -499,11 +486,15 @@ def _can_touch(a: Body, b: Body, *, presses: bool) -> bool:
 
 
 def _contact(table: Table, law: str, a: str, b: str) -> Contact:
-    make, keys = _LAWS[law]
+    make, keys = _LAWS[law], _law_keys(law)
     numbers = {key: table.number(key) for key in keys if key in table and key not in _FLAGS}
-    options: dict[str, Any] = {key: value for key, value in numbers.items() if key not in _PARAMS}
+    options: dict[str, Any] = {
+        key: value for key, value in numbers.items() if key not in ContactParams.__dataclass_fields__
+    }
     options |= {key: table.boolean(key, False) for key in keys if key in table and key in _FLAGS}
     edge = table.number("edge") if "edge" in table else None
     with located(table.where):
-        params = ContactParams(**{key: value for key, value in numbers.items() if key in _PARAMS})
+        params = ContactParams(
+            **{key: value for key, value in numbers.items() if key in ContactParams.__dataclass_fields__}
+        )
         return Contact(a, b, params, make(**options), edge=edge)

@@ -210,7 +210,7 @@ def _extent(body: Body) -> Float[Array, "6"]:
     return jnp.zeros(6) if body.extent is None else body.extent
 
 
-def _materials(scene: Scene, kernels: ModuleType, dtype: DTypeLike) -> Float[Array, "contacts 13"]:
+def _materials(scene: Scene, kernels: ModuleType, dtype: DTypeLike) -> Float[Array, "contacts width"]:
     groups = [(c.law, c.params) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
     if scene.others is not None:
         groups.append((scene.others.law, scene.others.pair_params))
