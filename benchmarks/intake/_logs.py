@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 import dano
-from benchmarks.intake._verdict import Case, verdict
+from benchmarks.intake._verdict import Case, Outcome, verdict
 from dano.maths import quat_from_axis_angle
 
 _EPOCH = 1_700_000_000
@@ -87,7 +87,7 @@ def _text(header: str, columns: Sequence[np.ndarray], separator: str) -> list[st
     return ([header] if header else []) + rows
 
 
-def _tried(lines: Sequence[str], is_right: Callable[[Any], bool] | None, **options: Any) -> str:
+def _tried(lines: Sequence[str], is_right: Callable[[Any], bool] | None, **options: Any) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.csv"
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -104,7 +104,7 @@ def _is_right(motion: Any, *, turns: bool = True) -> bool:
     return bool(close)
 
 
-def _read(header: str, columns: Sequence[np.ndarray], separator: str, *, turns: bool = True) -> str:
+def _read(header: str, columns: Sequence[np.ndarray], separator: str, *, turns: bool = True) -> Outcome:
     return _tried(_text(header, columns, separator), lambda motion: _is_right(motion, turns=turns))
 
 
@@ -112,7 +112,7 @@ def _signs() -> np.ndarray:
     return np.where(np.arange(len(_TIMES)) % 5 < 2, 1.0, -1.0)[:, None] * _TURNS
 
 
-def _dirty() -> str:
+def _dirty() -> Outcome:
     lines = _text(f"time,{_PLAIN}", [_TIMES, _PLACES, _TURNS], ",")
     lines[10], lines[11] = lines[11], lines[10]
     lines.insert(31, lines[30])
@@ -120,23 +120,23 @@ def _dirty() -> str:
     return _tried(lines, _is_right)
 
 
-def _twice() -> str:
+def _twice() -> Outcome:
     lines = _text(f"time,{_PLAIN}", [_TIMES, _PLACES, _TURNS], ",")
     return _tried([*lines, *lines[1:]], None)
 
 
-def _refused(text: str) -> str:
+def _refused(text: str) -> Outcome:
     return _tried(text.splitlines(), None)
 
 
-def _arrays(**options: Any) -> str:
+def _arrays(**options: Any) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.npz"
         np.savez(path, times=_TIMES, position=_PLACES, quat=_XYZW)
         return verdict(lambda: dano.load_motion(path, names="soap", **options), _is_right)
 
 
-def _wrapped(low: float) -> str:
+def _wrapped(low: float) -> Outcome:
     base = dano.Body("base", dano.Box((0.1, 0.1, 0.1)), fixed=True)
     arm = dano.Body("arm", dano.Box((0.1, 0.1, 0.4)), mass=1.0)
     joint = dano.Joint("base", "arm", "hinge", axis=(0, 1, 0))

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 import dano
-from benchmarks.intake._verdict import Case, verdict
+from benchmarks.intake._verdict import Case, Outcome, verdict
 
 _NODES = 64
 _TOLERANCE = 0.01
@@ -43,7 +43,7 @@ def cases() -> list[Case]:
     return found
 
 
-def _tried(mesh: Any, intact: Any, parts: list[Any] | None = None) -> str:
+def _tried(mesh: Any, intact: Any, parts: list[Any] | None = None) -> Outcome:
     """A damaged mesh, against the moments of the intact one, or of parts that do not overlap."""
     whole = parts or [intact]
     volume = sum(part.volume for part in whole)
@@ -152,7 +152,7 @@ _DAMAGES: dict[str, Callable[[Any, np.random.Generator], Any]] = {
 _KINDS = ("stl", "stl_ascii", "obj", "ply", "off", "glb", "3mf", "dae")
 
 
-def _from_file(kind: str, shape: str) -> str:
+def _from_file(kind: str, shape: str) -> Outcome:
     intact = _SHAPES[shape]()
     mesh = intact.copy()
     if kind == "3mf":
@@ -164,14 +164,14 @@ def _from_file(kind: str, shape: str) -> str:
         return _loaded(path, intact)
 
 
-def _loaded(path: Path, intact: Any, **options: Any) -> str:
+def _loaded(path: Path, intact: Any, **options: Any) -> Outcome:
     def is_right(field: Any) -> bool:
         return bool(abs(float(field.solid_moments().volume) / intact.volume - 1) < _TOLERANCE)
 
     return verdict(lambda: dano.load_field(path, resolution=_NODES, **options), is_right)
 
 
-def _with_unit(unit: str | None, size: float) -> str:
+def _with_unit(unit: str | None, size: float) -> Outcome:
     intact = trimesh.creation.box((0.1, 0.07, 0.05))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "m.stl"
@@ -215,7 +215,7 @@ _BROKEN = {
 }
 
 
-def _broken(name: str, data: bytes) -> str:
+def _broken(name: str, data: bytes) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         path.write_bytes(data)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from benchmarks.intake._verdict import Case, verdict
+from benchmarks.intake._verdict import Case, Outcome, verdict
 from dano.vision import load_capture
 from dano.vision.capture import read_mask, read_picture
 
@@ -56,7 +56,7 @@ def _capture(folder: Path, file: str, frame: dict[str, Any] | None = None, **key
     return load_capture(folder).views[0]
 
 
-def _in_folder(work: Callable[[Path], str]) -> str:
+def _in_folder(work: Callable[[Path], Outcome]) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         return work(Path(folder))
 
@@ -65,8 +65,8 @@ def _picture() -> np.ndarray:
     return np.rint(255 * np.where(_DISC[..., None], _COLOUR, 0.1)).astype(np.uint8)
 
 
-def _as_file(kind: str) -> str:
-    def work(folder: Path) -> str:
+def _as_file(kind: str) -> Outcome:
+    def work(folder: Path) -> Outcome:
         if kind == "heic":
             import pillow_heif
 
@@ -94,8 +94,8 @@ _MODES: dict[str, Callable[[], Any]] = {
 }
 
 
-def _with_mode(make: Callable[[], Any]) -> str:
-    def work(folder: Path) -> str:
+def _with_mode(make: Callable[[], Any]) -> Outcome:
+    def work(folder: Path) -> Outcome:
         picture = make()
         picture.save(folder / "a.png")
         if picture.mode.startswith("I;16"):
@@ -134,8 +134,8 @@ _MASKS: dict[str, Callable[[], Any]] = {
 }
 
 
-def _masked(make: Callable[[], Any]) -> str:
-    def work(folder: Path) -> str:
+def _masked(make: Callable[[], Any]) -> Outcome:
+    def work(folder: Path) -> Outcome:
         Image.fromarray(_picture()).save(folder / "a.png")
         make().save(folder / "m.png")
 
@@ -147,16 +147,16 @@ def _masked(make: Callable[[], Any]) -> str:
     return _in_folder(work)
 
 
-def _mask_refused(labels: np.ndarray) -> str:
-    def work(folder: Path) -> str:
+def _mask_refused(labels: np.ndarray) -> Outcome:
+    def work(folder: Path) -> Outcome:
         Image.fromarray(labels).save(folder / "m.png")
         return verdict(lambda: read_mask(folder / "m.png"), None)
 
     return _in_folder(work)
 
 
-def _with_alpha(colour: np.ndarray, kind: str) -> str:
-    def work(folder: Path) -> str:
+def _with_alpha(colour: np.ndarray, kind: str) -> Outcome:
+    def work(folder: Path) -> Outcome:
         alone = colour * _ALPHA[..., None]
         stored = alone if kind == "premultiplied" else np.broadcast_to(colour, (*_SIZE, 3))
         rgba = np.concatenate([stored, _ALPHA[..., None]], axis=2)
@@ -170,10 +170,10 @@ def _with_alpha(colour: np.ndarray, kind: str) -> str:
     return _in_folder(work)
 
 
-def _turned(tag: int, whose: str) -> str:
+def _turned(tag: int, whose: str) -> Outcome:
     """A camera of stored or of upright pixels; where w and h cannot tell, it must be refused."""
 
-    def work(folder: Path) -> str:
+    def work(folder: Path) -> Outcome:
         exif = Image.Exif()
         exif[_TAG] = tag
         stored = _picture()
@@ -202,8 +202,8 @@ _FLAGS = {
 }
 
 
-def _flagged(keys: dict[str, Any]) -> str:
-    def work(folder: Path) -> str:
+def _flagged(keys: dict[str, Any]) -> Outcome:
+    def work(folder: Path) -> Outcome:
         Image.fromarray(_picture()).save(folder / "a.png")
         return verdict(lambda: _capture(folder, "a.png", **keys), None)
 

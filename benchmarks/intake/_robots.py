@@ -1,6 +1,5 @@
 """Robots' files of packages, judged by MuJoCo and, where it is installed, by Pinocchio."""
 
-import enum
 import importlib
 import importlib.util
 import re
@@ -8,13 +7,16 @@ import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 import dano
-from dano.maths import quat_to_matrix
+from benchmarks.intake._verdict import Outcome
+from dano.maths import quat_multiply, quat_rotate, quat_to_matrix
 from dano.robots import Robot
 
 GROUPS = ("frax", "gymnasium", "mujoco", "pybullet_data", "example-robot-data", "dm_control")
@@ -24,15 +26,6 @@ TOLERANCE = 1e-7
 carries others gets a billionth of what it carries."""
 _EXAMPLES = "cmeel.prefix/share/example-robot-data"
 _OPTION = re.compile(r"ignore=(\[[^\]]*\])|(balance_inertia=True)")
-
-
-class Outcome(enum.Enum):
-    """What became of a file."""
-
-    LOADS = "loads"
-    REFUSED_RIGHTLY = "refused rightly"
-    REFUSED_WRONGLY = "refused wrongly"
-    WRONG = "read wrongly"
 
 
 def robot_files(group: str) -> list[Path]:
@@ -142,15 +135,61 @@ def _bare(path: Path) -> str:
     return ET.tostring(root).decode()
 
 
-def _posed(robot: Robot, names: list[str]) -> tuple[dano.Scene, dano.State, dict[str, float]]:
-    """A scene, a state within the limits, and the coordinates of those joints that have one."""
+class _Posed(NamedTuple):
+    """A robot within its limits.
+
+    Attributes:
+        robot: The robot.
+        angles: Coordinates of those joints that have one.
+        position: Of the centres of mass of all bodies [m, W].
+        orientation: Theirs, wxyz.
+        mass: Generalised mass of those joints.
+    """
+
+    robot: Robot
+    angles: dict[str, float]
+    position: np.ndarray
+    orientation: np.ndarray
+    mass: np.ndarray
+
+    def apart(self, link: str, position: np.ndarray, turn: np.ndarray) -> float:
+        """By how much a link's frame differs."""
+        body, own, orientation = self.robot.frames[link]
+        if body is not None:
+            names = [each.name for each in self.robot.bodies]
+            i = names.index(body)
+            arm = quat_rotate(self.orientation[i], own - np.asarray(self.robot.bodies[i].com))
+            own, orientation = self.position[i] + arm, quat_multiply(self.orientation[i], orientation)
+        differences = np.asarray(own) - position, np.asarray(quat_to_matrix(jnp.asarray(orientation))) - turn
+        return float(max(np.abs(each).max() for each in differences))
+
+    def masses_apart(self, expected: np.ndarray) -> float:
+        """By how much the mass matrix differs, as a share of its largest entry."""
+        return float(np.abs(self.mass - expected).max() / np.abs(expected).max())
+
+
+def _posed(robot: Robot, names: list[str]) -> _Posed:
     scene = robot.scene()
     angles: dict[str, float] = {}
     for name, angle in zip(names, np.linspace(-0.4, 0.5, len(names)), strict=True):
         limits = scene.joint(robot.joint_names[name]).limits
         bounded = angle if limits is None else np.clip(angle, *np.asarray(limits))
         angles[name] = float(bounded)
-    return scene, robot.state(scene, angles), angles
+
+    @eqx.filter_jit
+    def measured(scene: dano.Scene):
+        state = robot.state(scene, angles)
+        frames = scene.frames(state)
+        return dano.mass_matrix(scene, state), frames.position, frames.orientation
+
+    # Operations one after the other would be compiled one by one.
+    mass, position, orientation = measured(scene)
+    children = [joint.child for joint in scene.joints]
+    base = 6 * len(scene.layout.free)
+    order = [base + scene.layout.coordinates[children.index(robot.joint_names[name])] for name in names]
+    return _Posed(
+        robot, angles, np.asarray(position), np.asarray(orientation), np.asarray(mass)[np.ix_(order, order)]
+    )
 
 
 def _single(robot: Robot, name: str) -> bool:
@@ -164,7 +203,8 @@ def _from_mujoco(robot: Robot, model: mujoco.MjModel) -> float:
     names = [name for name in every if name and _single(robot, name)]
     if not names or not robot.bodies:
         return 0.0
-    scene, state, angles = _posed(robot, names)
+    posed = _posed(robot, names)
+    angles = posed.angles
     data = mujoco.MjData(model)
     for name, angle in angles.items():
         data.joint(name).qpos = angle
@@ -178,14 +218,14 @@ def _from_mujoco(robot: Robot, model: mujoco.MjModel) -> float:
     for link in robot.frames:
         if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, link) > 0:
             place = data.body(link).xpos, data.body(link).xmat.reshape(3, 3)
-            worst = max(worst, _apart(robot, scene, state, link, *place))
+            worst = max(worst, posed.apart(link, *place))
     if followers or model.neq:
         return worst
     mass = np.zeros((model.nv, model.nv))
     for row, unit in zip(mass, np.eye(model.nv), strict=True):
         mujoco.mj_mulM(model, data, row, unit)
     rows = [int(model.joint(name).dofadr[0]) for name in names]
-    return max(worst, _masses_apart(robot, scene, state, names, mass[np.ix_(rows, rows)]))
+    return max(worst, posed.masses_apart(mass[np.ix_(rows, rows)]))
 
 
 def _from_pinocchio(robot: Robot, model: Any) -> float:
@@ -194,7 +234,8 @@ def _from_pinocchio(robot: Robot, model: Any) -> float:
     names = [name for name in list(model.names)[1:] if _single(robot, name)]
     if not names:
         return 0.0
-    scene, state, angles = _posed(robot, names)
+    posed = _posed(robot, names)
+    angles = posed.angles
     q = pinocchio.neutral(model)
     for name, angle in angles.items():
         k = model.getJointId(name)
@@ -206,28 +247,11 @@ def _from_pinocchio(robot: Robot, model: Any) -> float:
     mass = np.triu(mass) + np.triu(mass, 1).T
     worst = 0.0
     for link in robot.frames:
-        if model.existFrame(link):
-            place = data.oMf[model.getFrameId(link)]
-            worst = max(worst, _apart(robot, scene, state, link, place.translation, place.rotation))
+        # A joint may have the name of a link.
+        if model.existFrame(link, pinocchio.FrameType.BODY):
+            place = data.oMf[model.getFrameId(link, pinocchio.FrameType.BODY)]
+            worst = max(worst, posed.apart(link, place.translation, place.rotation))
     if any(joint.mimics for joint in robot.description.joints):
         return worst
     rows = [model.idx_vs[model.getJointId(name)] for name in names]
-    return max(worst, _masses_apart(robot, scene, state, names, mass[np.ix_(rows, rows)]))
-
-
-def _apart(
-    robot: Robot, scene: dano.Scene, state: dano.State, link: str, position: np.ndarray, turn: np.ndarray
-) -> float:
-    own, orientation, _ = robot.place(scene, state, link)
-    differences = np.asarray(own) - position, np.asarray(quat_to_matrix(orientation)) - turn
-    return float(max(np.abs(each).max() for each in differences))
-
-
-def _masses_apart(
-    robot: Robot, scene: dano.Scene, state: dano.State, names: list[str], expected: np.ndarray
-) -> float:
-    children = [joint.child for joint in scene.joints]
-    base = 6 * len(scene.layout.free)
-    order = [base + scene.layout.coordinates[children.index(robot.joint_names[name])] for name in names]
-    found = np.asarray(dano.mass_matrix(scene, state))[np.ix_(order, order)]
-    return float(np.abs(found - expected).max() / np.abs(expected).max())
+    return max(worst, posed.masses_apart(mass[np.ix_(rows, rows)]))

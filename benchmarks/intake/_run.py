@@ -1,47 +1,76 @@
-"""All files of packages that are installed, by what became of them."""
+"""Files by what became of them: robots of packages that are installed, and what is made in every variant."""
 
 import argparse
 import datetime
+import gc
 import sys
 from collections import Counter
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
+
+import jax
 
 from benchmarks._measure import load_average, parse_arguments, report, Row
-from benchmarks.intake._robots import GROUPS, judged, Outcome, robot_files
+from benchmarks.intake import _logs, _meshes, _pictures
+from benchmarks.intake._robots import GROUPS, judged, robot_files
+from benchmarks.intake._verdict import Case, Outcome
 
 QUICK = 4
-"""Files of each package in a quick run."""
+"""Files of each package, and cases of each kind, in a quick run."""
 MOST_REFUSED = 2.0
 """Share of files that may be refused wrongly [%]."""
+_MADE: dict[str, Callable[[], list[Case]]] = {
+    "meshes": _meshes.cases,
+    "pictures": _pictures.cases,
+    "logs": _logs.cases,
+}
+_HELD = 40
+"""Robots between which compiled programs are forgotten: each leaves some, of 10 MB and more."""
 
 
 def run() -> None:
-    arguments = parse_arguments("Read the robots' files that installed packages ship.", _add)
+    arguments = parse_arguments("Read files as people have them.", _add)
     load = load_average()
     rows: list[Row] = []
     every: Counter[Outcome] = Counter()
-    for group in GROUPS:
-        files = [path for path in robot_files(group) if _wanted(path, arguments.only)]
+    most = QUICK if arguments.quick else None
+    for kind, cases in _MADE.items():
+        chosen = [case for case in cases() if _wanted(f"{kind} {case[0]}", arguments.only)]
         counts: Counter[Outcome] = Counter()
-        for path in files[:QUICK] if arguments.quick else files:
+        for name, try_it in chosen[:most]:
+            _count(counts, try_it(), f"{kind}: {name}", "")
+        every += counts
+        rows += _rows(kind, counts)
+    for group in GROUPS:
+        files = [path for path in robot_files(group) if _wanted(str(path), arguments.only)]
+        counts = Counter()
+        for i, path in enumerate(files[:most]):
             outcome, why = judged(path)
-            counts[outcome] += 1
-            if outcome is not Outcome.LOADS:
-                print(f"{outcome.value}: {path}: {why}", file=sys.stderr, flush=True)
+            _count(counts, outcome, str(path), why)
+            if i % _HELD == _HELD - 1:
+                jax.clear_caches()
+                gc.collect()
         every += counts
         rows += _rows(f"robots of {group}", counts)
-    rows += _rows("all robots", every)
+    rows += _rows("all", every)
     settings = {"date": datetime.datetime.now().isoformat(timespec="minutes"), "quick": arguments.quick}
     report("intake", rows, settings, load, arguments.json)
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--only", nargs="+", default=[], metavar="WORD", help="files whose path has a word")
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="WORD", help="files and cases whose path or name has a word"
+    )
 
 
-def _wanted(path: Path, words: list[str]) -> bool:
-    return not words or any(word in str(path) for word in words)
+def _wanted(name: str, words: list[str]) -> bool:
+    return not words or any(word in name for word in words)
+
+
+def _count(counts: Counter[Outcome], outcome: Outcome, name: str, why: str) -> None:
+    """Count an outcome, and say those that somebody may want to look at."""
+    counts[outcome] += 1
+    if outcome in (Outcome.WRONG, Outcome.REFUSED_WRONGLY) or (why and outcome is not Outcome.LOADS):
+        print(f"{outcome.value}: {name}: {why}", file=sys.stderr, flush=True)
 
 
 def _rows(group: str, counts: Counter[Outcome]) -> Iterator[Row]:

@@ -1,19 +1,25 @@
 """What becomes of a file: one of four words."""
 
+import enum
 import warnings
 from collections.abc import Callable
 from typing import Any
 
-LOADS = "loads"
-REFUSED_RIGHTLY = "refused rightly"
-REFUSED_WRONGLY = "refused wrongly"
-READ_WRONGLY = "read wrongly"
 
-Case = tuple[str, Callable[[], str]]
+class Outcome(enum.Enum):
+    """What became of a file."""
+
+    LOADS = "loads"
+    REFUSED_RIGHTLY = "refused rightly"
+    REFUSED_WRONGLY = "refused wrongly"
+    WRONG = "read wrongly"
+
+
+Case = tuple[str, Callable[[], Outcome]]
 """Name of a case, and what tries it and says the verdict."""
 
 
-def verdict(read: Callable[[], Any], is_right: Callable[[Any], bool] | None) -> str:
+def verdict(read: Callable[[], Any], is_right: Callable[[Any], bool] | None) -> Outcome:
     """Try to read something.
 
     Args:
@@ -28,7 +34,7 @@ def verdict(read: Callable[[], Any], is_right: Callable[[Any], bool] | None) -> 
         try:
             found = read()
         except (ValueError, ImportError):
-            return REFUSED_RIGHTLY if is_right is None else REFUSED_WRONGLY
+            return Outcome.REFUSED_RIGHTLY if is_right is None else Outcome.REFUSED_WRONGLY
         except Exception:  # a traceback is no answer
-            return READ_WRONGLY
-    return LOADS if is_right is not None and is_right(found) else READ_WRONGLY
+            return Outcome.WRONG
+    return Outcome.LOADS if is_right is not None and is_right(found) else Outcome.WRONG

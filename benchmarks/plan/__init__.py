@@ -1,1 +1,1 @@
-"""Plans: textbook optima, push-and-slide, a drawer."""
+"""Plans: textbook optima, push-and-slide, a drawer, random goals with nothing set."""

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.plan [--json FILE] [--quick] [--cases N] [--baseline] [--reference]`."""
+"""`python -m benchmarks.plan [--json FILE] [--quick] [--cases N] [--goals N] [--only-goals] [--baseline]`."""
 
 from benchmarks import _environment
 

@@ -1,4 +1,4 @@
-"""Textbook optima beside CasADi with IPOPT, the paper's push-and-slide, and a drawer."""
+"""Textbook optima beside CasADi with IPOPT, the paper's push-and-slide, a drawer, goals with nothing set."""
 
 import argparse
 import datetime
@@ -9,13 +9,14 @@ import numpy as np
 
 from benchmarks import _subjects
 from benchmarks._measure import load_average, NO_DATA, parse_arguments, report, Row, skipped
-from benchmarks.plan import _drawer, _push, _textbook
+from benchmarks.plan import _drawer, _goals, _push, _textbook
 from dano.archive import replacing
 
 REFERENCE = Path(__file__).parent / "textbook.json"
 TEXTBOOK = "Textbook optima: cost beside IPOPT's"
 PUSH = "Push-and-slide, random starts and goals"
 DRAWER = "Drawer, a neural object on a slide joint"
+GOALS = "Random goals of a push with nothing set: soap, bunny and box"
 GUESSES = 2
 
 
@@ -26,14 +27,20 @@ def references() -> dict[str, float]:
 
 def run() -> None:
     """Measure, print and report."""
-    arguments = parse_arguments("Plans: textbook optima, push-and-slide, a drawer.", _options)
+    arguments = parse_arguments("Plans: textbook optima, push-and-slide, a drawer, random goals.", _options)
     if arguments.reference:
         _write_reference()
         return
     load = load_average()
     n = 2 if arguments.quick else arguments.cases
-    rows = [*_textbook_rows(), *_drawer.rows(DRAWER)]
-    settings: dict[str, object] = {"dtype": "float64", "quick": arguments.quick, "cases": n}
+    n_goals = 3 if arguments.quick else arguments.goals
+    rows = _goal_rows(_goals.outcomes(n_goals, say=lambda x: print(x, flush=True)))
+    if not arguments.only_goals:
+        rows = [*_textbook_rows(), *_drawer.rows(DRAWER), *rows]
+    settings: dict[str, object] = {"dtype": "float64", "quick": arguments.quick, "cases": n, "goals": n_goals}
+    if arguments.only_goals:
+        report("plan", rows, settings, load, arguments.json)
+        return
     if _subjects.authors_bunny() is None:
         rows.append(skipped(PUSH, "all of it", NO_DATA))
     else:
@@ -44,6 +51,8 @@ def run() -> None:
 
 def _options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cases", type=int, default=20, help="random starts and goals")
+    parser.add_argument("--goals", type=int, default=20, help="random goals with nothing set")
+    parser.add_argument("--only-goals", action="store_true", help="these goals alone")
     parser.add_argument("--baseline", action="store_true", help="also plan by CEM, for the same time each")
     parser.add_argument("--reference", action="store_true", help="solve the textbook cases by IPOPT again")
 
@@ -78,6 +87,23 @@ def _textbook_rows() -> list[Row]:
         rows.append(Row(TEXTBOOK, f"{problem.name}: above IPOPT", over, "%", 1.0, note=note))
         worst = found.violations[0]
         rows.append(Row(TEXTBOOK, f"{problem.name}: violation", worst.amount, "", 1e-5, note=worst.name))
+    return rows
+
+
+def _goal_rows(found: list[_goals.Outcome]) -> list[Row]:
+    n = len(found)
+    seconds, errors = np.array([each.seconds for each in found]), np.array([each.error for each in found])
+    rows = [Row(GOALS, "reached", float(sum(each.reached for each in found)), f"of {n}", 0.9 * n, True)]
+    for name in _goals.OBJECTS:
+        mine = [each.reached for each in found if each.name == name]
+        if mine:
+            rows.append(Row(GOALS, f"reached by the {name}", float(sum(mine)), f"of {len(mine)}"))
+    rows += [
+        Row(GOALS, "error, median", 1e3 * float(np.median(errors)), "mm"),
+        Row(GOALS, "error, largest", 1e3 * float(errors.max()), "mm"),
+        Row(GOALS, "time of a plan, median", float(np.median(seconds)), "s"),
+        Row(GOALS, "time of a plan, longest", float(seconds.max()), "s", 60.0, note="with compilation"),
+    ]
     return rows
 
 

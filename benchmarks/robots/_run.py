@@ -1,5 +1,6 @@
 """The Panda: a step, and its mass matrix, beside MuJoCo and frax; energy and motion of free swinging."""
 
+import argparse
 import dataclasses
 import time
 import xml.etree.ElementTree as ET
@@ -22,7 +23,7 @@ from benchmarks._measure import (
     time_in_turn,
     warm_up,
 )
-from benchmarks.robots import _chains, _identify
+from benchmarks.robots import _chains, _identify, _standing
 from benchmarks.robots.push import panda
 from dano.robots import Robot
 
@@ -37,8 +38,12 @@ FOUND = "Found from logs"
 
 
 def run() -> None:
-    arguments = parse_arguments("Measure a robot beside MuJoCo and frax.")
+    arguments = parse_arguments("Measure a robot beside MuJoCo and frax.", _add)
     load = load_average()
+    if arguments.standing:
+        rows = list(_standing.rows(0.2 if arguments.quick else 2.0))
+        report("robots-standing", rows, {"timestep": _standing.TIMESTEP}, load, arguments.json)
+        return
     path = panda()
     if path is None:
         rows = [skipped(SPEED, "all of it", "the package frax, which ships the Panda, is not installed")]
@@ -53,6 +58,10 @@ def run() -> None:
     # Other programs slow down what is timed, most of all what reads much memory.
     settings = {"steps": STEPS, "timestep": TIMESTEP, "shared": load_average() > SHARED}
     report("robots", rows, settings, load, arguments.json)
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--standing", action="store_true", help="only robots of five families on a floor")
 
 
 def _speed_rows(robot: Robot, path: Path, repeats: int) -> list[Row]:

@@ -34,7 +34,7 @@ def _kernels():
         i = wp.tid()
         d = part_distance(known, model, known.index[0], points[i])
         found[i] = vec4(d.gradient[0], d.gradient[1], d.gradient[2], d.value)
-        bounds[i] = part_clearance(known, model, known.index[0], points[i])
+        bounds[i] = part_clearance(known, model, known.index[0], points[i], real(1e9))
 
     @wp.kernel(enable_backward=False, module="unique")
     def mix(model: model_type, found: wp.array(dtype=settings_type)):

@@ -83,11 +83,13 @@ def every_solid():
         quick[i] = solid_clearance(solids, 0, solid, points[i], real(ENOUGH))
 
     solids = distances.Solids()
-    rows = {name: np.asarray(tables.rows[f"scene.solids.{name}"]) for name in ("leaves", "coefficients")}
+    names = ("leaves", "coefficients", "bounds")
+    rows = {name: np.asarray(tables.rows[f"scene.solids.{name}"]) for name in names}
     solids.leaves = wp.array(
         rows["leaves"].view(distances.Leaf.numpy_dtype()), dtype=distances.Leaf, device="cpu"
     ).reshape((1, -1))
     solids.coefficients = wp.array(rows["coefficients"].reshape(1, -1), dtype=real, device="cpu")
+    solids.bounds = wp.array(rows["bounds"].reshape(1, -1), dtype=real, device="cpu")
     kinds = tables.whole.arrays["scene.solids.kinds"]
     solids.kinds = wp.array(
         kinds.view(distances.LeafKind.numpy_dtype()).ravel(), dtype=distances.LeafKind, device="cpu"

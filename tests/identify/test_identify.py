@@ -191,9 +191,13 @@ def test_a_fit_may_go_on_from_an_earlier_one(observed):
     sequence = dano.identify(ball_scene(), motion, [FRICTION], continuity=(3.0, 0.1), **options)
     fit = dano.identify(ball_scene(), motion, [FRICTION], continuity=0.1, after=loose, **options)
     assert fit.loss_history[-1] == pytest.approx(sequence.loss_history[-1], rel=1e-3)
-    # At its own minimum there is nothing left to do.
+    # At its own minimum there is nothing left to do, but to look at how rough the loss is.
     again = dano.identify(ball_scene(), motion, [FRICTION], continuity=0.1, after=fit, **options)
-    assert again.evaluations == 1
+    assert len(again.loss_history) == 1 and not again.smoothed
+    blind = dano.identify(
+        ball_scene(), motion, [FRICTION], continuity=0.1, after=fit, smooth=False, **options
+    )
+    assert blind.evaluations == 1
     assert again.values["mu"] == pytest.approx(fit.values["mu"], abs=1e-12)
     # What was not estimated before begins as measured.
     given = dano.identify(ball_scene(), motion, [FRICTION], initial="given", window=8, noise=NOISE)

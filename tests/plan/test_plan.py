@@ -349,3 +349,30 @@ def test_a_first_pass_may_cover_all_that_bounds_allow(puck):
     assert np.all(np.abs(forces["even"]) <= 20)
     with pytest.raises(ValueError, match="first must be one of normal, even, got 'sobol'"):
         dano.SamplingOptions(first="sobol")
+
+
+def test_contact_is_looked_for_where_the_first_guess_makes_none(pushing):
+    scene, state, task = pushing
+    stages = []
+    made = dano.plan(scene, state, task, callback=lambda stage, *_: stages.append(stage))
+    assert made.reached, made.describe()
+    assert "nothing that is driven touches 'cube'" in made.explored and made.explored in made.describe()
+    assert stages[0] == "exploring" and "optimising" in stages
+    # The hand begins on the wrong side: it must go around the cube.
+    behind = scene.initial_state(hand=dict(position=(0.25, 0.01, 0)))
+    around = dano.plan(scene, behind, task)
+    assert around.reached, around.describe()
+
+
+def test_what_does_not_need_to_be_touched_is_not_explored(pushing, pushed, driven):
+    # A guess that makes contact, a body that is driven itself.
+    assert pushed.explored == "" and driven[1].explored == ""
+    scene, state, task = pushing
+    never = dano.plan(scene, state, task, explore=0)
+    assert never.explored == "" and not never.reached
+    # The derivative is zero; a small force at all times would touch, and the end says what that is worth.
+    assert "the derivative along" in never.message and "the force of hand along x it is 0" in never.message
+    # Where no pair of the scene may touch, there is nothing to look for.
+    apart = dano.Scene.create(list(scene.bodies), timestep=0.02, gravity=(0, 0, 0))
+    made = dano.plan(apart, state, task)
+    assert "no contact of the scene lets it" in made.explored and not made.reached

@@ -50,6 +50,8 @@ def fit(scene: dano.Scene, state: dano.State, motion: Motion) -> Identification:
         stop=next(iter(Stop)),
         loss_history=np.array([10.0, 1.0, 0.5]),
         messages=("this <is> made up",),
+        smoothed=False,
+        worth=None,
         errors=far,
         held_out_errors=None,
         minima=(),

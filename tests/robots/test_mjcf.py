@@ -212,7 +212,6 @@ LACKING = {
         '<option density="1000" viscosity=".1"/>',
         "<option> has density 1000 kg/m³ and viscosity 0.1 Pa s",
     ),
-    "gravcomp": (HINGE.replace("<body", '<body gravcomp="1"'), "", "gravcomp of 'a' is not 0"),
     "tendons": (HINGE, TENDON.format(' stiffness="1"'), "'t': dano has no tendons"),
     "ball limits": (
         body("a", '<joint name="a" type="ball" range="0 1" limited="true"/>'),

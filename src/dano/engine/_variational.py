@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from dano.contact import AbstractPatchLaw, CHUNK, DistributedLaw
 from dano.engine._reports import Report, SolverOptions
 from dano.engine.launching import rollout as launched, scene_tables, Tables
-from dano.scene import Control, Scene, State
+from dano.scene import Control, lifted, Scene, State
 
 
 class Prepared(eqx.Module):
@@ -84,4 +84,5 @@ def rollout(
         none = jnp.zeros(n_steps, state.position.dtype)
         still = jax.tree.map(lambda x: jnp.broadcast_to(x, (n_steps, *x.shape)), state)
         return still, Report(none, none.astype(int), none == 0, none > 0)
+    controls = lifted(scene, controls, n_steps)
     return launched(prepared.tables, state, controls, n_steps, prepared.capacity, options)

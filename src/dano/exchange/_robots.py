@@ -124,6 +124,9 @@ def _urdf(description: Description, target: Path) -> ET.Element:
         warnings.warn(
             f"URDF has no armature and no springs: those of {', '.join(lost)} are left out", stacklevel=3
         )
+    held = [link.name for link in description.links if link.gravcomp]
+    if held:
+        warnings.warn(f"URDF has no gravcomp: that of {', '.join(held)} is left out", stacklevel=3)
     if description.ties:
         first = description.ties[0]
         raise ValueError(
@@ -212,6 +215,8 @@ def _mjcf(description: Description, target: Path) -> ET.Element:
         for each in chain:
             _mjcf_joint(row, (equal, driven), each, homes, target)
         link = description.link(name)
+        if link.gravcomp:
+            row.set("gravcomp", repr(link.gravcomp))
         if link.mass > 0:
             tensor = link.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
             numbers = {"pos": words(link.com), "mass": repr(float(link.mass)), "fullinertia": words(tensor)}

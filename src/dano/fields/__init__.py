@@ -29,16 +29,20 @@ from dano.fields._ellipsoid import Ellipsoid as Ellipsoid
 from dano.fields._grid import DensityMoments as DensityMoments, GridField as GridField
 from dano.fields._hash_grid import HashGrid as HashGrid
 from dano.fields._parts import large_parts as large_parts, largest_part as largest_part
-from dano.fields._redistance import redistanced as redistanced, spread_distances as spread_distances
-from dano.fields._shapes import (
-    AbstractShape as AbstractShape,
+from dano.fields._primitives import (
     Box as Box,
     Capsule as Capsule,
     Cylinder as Cylinder,
     HalfSpace as HalfSpace,
+    PRIMITIVES as PRIMITIVES,
+    Sphere as Sphere,
+)
+from dano.fields._redistance import redistanced as redistanced, spread_distances as spread_distances
+from dano.fields._shapes import (
+    AbstractPrimitive as AbstractPrimitive,
+    AbstractShape as AbstractShape,
     occupancy as occupancy,
     SolidMoments as SolidMoments,
-    Sphere as Sphere,
 )
 from dano.fields._signed_distance import (
     SignedDistanceGrid as SignedDistanceGrid,

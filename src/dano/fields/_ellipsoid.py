@@ -2,6 +2,7 @@
 
 import functools
 import math
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,8 @@ class Ellipsoid(AbstractCentred):
 
     semi_axes: Float[Array, "3"]
     edge: Float[Array, ""] | None
+    kind: ClassVar = "ellipsoid"
+    takes: ClassVar = {"semi_axes": 3}
 
     def __init__(self, semi_axes: Numbers, *, edge: ArrayLike | None = None):
         """Build an ellipsoid centred at the origin.
@@ -50,6 +53,10 @@ class Ellipsoid(AbstractCentred):
     def outward(self, x: Float[Array, "3"]) -> Float[Array, "3"]:
         """Gradient of the quadratic form, x / a² [1/m]."""
         return x / self.semi_axes.astype(x.dtype) ** 2
+
+    def leaf(self) -> dict[str, Array]:
+        """See `AbstractPrimitive.leaf`."""
+        return {"sizes": self.semi_axes}
 
     def solid_moments(self) -> SolidMoments:
         """V = 4/3 π a b c and ∫ x² = V a²/5."""

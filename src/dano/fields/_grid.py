@@ -1,6 +1,6 @@
 """Densities sampled on a regular grid."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -46,6 +46,7 @@ class GridField(AbstractField):
     origin: Float[Array, "3"]
     spacing: Float[Array, "3"]
     interpolation: str = eqx.field(static=True)
+    kind: ClassVar = "density"
 
     def __init__(self, values: Numbers, origin: Numbers, spacing: Numbers, interpolation: str = "quadratic"):
         """Build a grid field; node (i, j, k) lies at origin + spacing · (i, j, k).
@@ -107,6 +108,10 @@ class GridField(AbstractField):
         """Number of nodes along each axis."""
         nx, ny, nz = (size - 2 * self._border for size in self.coefficients.shape)
         return nx, ny, nz
+
+    def leaf(self) -> dict[str, Array]:
+        """See `AbstractPrimitive.leaf`."""
+        return {"sizes": self.origin, "spacing": self.spacing}
 
     @property
     def bounds(self) -> Float[Array, "2 3"]:

@@ -1,5 +1,7 @@
 """Shapes from a sampled signed distance."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -40,6 +42,7 @@ class SignedDistanceGrid(AbstractShape):
     edge: Float[Array, ""] | None
     moments: SolidMoments | None
     interpolation: str = eqx.field(static=True)
+    kind: ClassVar = "grid"
 
     def __init__(
         self,
@@ -90,6 +93,10 @@ class SignedDistanceGrid(AbstractShape):
         nodes = jnp.stack(jnp.meshgrid(*map(jnp.arange, shape), indexing="ij")).reshape(3, -1)
         values = spline_jet(self.coefficients, nodes.astype(self.coefficients.dtype), degree, 0)
         return values[0].reshape(shape)
+
+    def leaf(self) -> dict[str, Array]:
+        """See `AbstractPrimitive.leaf`."""
+        return {"sizes": self.origin, "spacing": self.spacing}
 
     @property
     def bounds(self) -> Float[Array, "2 3"]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
-from dano.gym._rules import Rules, Start
+from dano.gym._rules import Rules, Single, Start
 from dano.scene import State
 
 
@@ -19,6 +19,7 @@ class SceneEnv(gymnasium.Env):
 
     def __init__(self, rules: Rules, state: State, start: Start | None):
         self.rules, self.state = rules, state
+        self._single: Single | None = None
         self._first, self._start, self._step = state, start, 0
         self.observation_space, self.action_space = _spaces(rules)
 
@@ -33,7 +34,22 @@ class SceneEnv(gymnasium.Env):
 
     def step(self, action):
         """See `gymnasium.Env.step`."""
-        rules, before = self.rules, _rows(self.state)
+        rules, before = self.rules, self.state
+        if self._single is None:
+            self._single = rules.single()
+        found = self._single(before, np.asarray(action), self._step)
+        self.state, *numbers = found
+        seen, reward, met, lengths, solved, full = map(np.asarray, numbers)
+        if full:
+            return self._with_room(before, action)
+        self._step += 1
+        info = _info(rules, met, lengths, solved)
+        ends = bool(self._step >= rules.n_steps or not solved)
+        return seen, float(reward), bool(met), ends, info
+
+    def _with_room(self, state: State, action):
+        """A step in which more touches than there is room for, with more."""
+        rules, before = self.rules, _rows(state)
         u = rules.controls(np.asarray(action)[None])
         after, solved = rules.advanced(before, u)
         self._step += 1
@@ -41,8 +57,7 @@ class SceneEnv(gymnasium.Env):
         reward, met, lengths = rules.judged(before, u, after, np.array([over]))
         self.state = jax.tree.map(lambda x: x[0], after)
         info = _info(rules, met[0], lengths[0], solved[0])
-        ends = bool(over or not solved[0])
-        return self._observed(), float(reward[0]), bool(met[0]), ends, info
+        return self._observed(), float(reward[0]), bool(met[0]), bool(over or not solved[0]), info
 
     def _observed(self) -> np.ndarray:
         return self.rules.observed(_rows(self.state), np.array([self._step]))[0]

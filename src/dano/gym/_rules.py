@@ -15,6 +15,13 @@ from dano.scene import Control, Scene, State
 Start = Callable[[np.random.Generator], State]
 """Makes the state in which an episode begins."""
 
+Single = Callable[
+    [State, Float[np.ndarray, " m"], int], tuple[State, Array, Array, Array, Array, Array, Array]
+]
+"""State, action between −1 and 1, steps so far → state after it, observation, reward, whether all goals are
+met, lengths of the goals' errors, whether the steps were solved, whether more touched than there is room
+for."""
+
 
 class Rules(eqx.Module):
     """A scene and a task as an environment, for r episodes at once.
@@ -86,6 +93,43 @@ class Rules(eqx.Module):
         found = _jit(_judged)(self, before, u, after, jnp.asarray(last))
         rewards, met, lengths = (np.asarray(x) for x in found)
         return rewards, met, lengths
+
+    def single(self) -> "Single":
+        """A step of one episode, compiled as one function of its state, its action and its count.
+
+        Many episodes go through `advanced`, which spreads them over the machine; of one that way takes some
+        milliseconds, of which physics are a hundredth.
+        """
+        scene, task, engine, repeat = self.scene, self.task, self.engine, self.repeat
+        prepared = _jit(lambda scene: engine.prepare(scene))(scene)
+        lower, upper = (np.asarray(bound) for bound in task.bounds())
+
+        def advanced(state: State, u: Float[Array, " m"]) -> tuple[State, Array, Array]:
+            held = jax.tree.map(lambda x: jnp.repeat(x[None], repeat, axis=0), task.control(scene, u))
+            found = engine.rollout(scene, prepared, state, held, repeat)
+            if found is None:
+
+                def one(state, control):
+                    following, report = engine.step(scene, prepared, state, control)
+                    return following, (following, report)
+
+                _, found = jax.lax.scan(one, state, held)
+            states, report = found
+            full = False if report.overflow is None else jnp.any(report.overflow)
+            return jax.tree.map(lambda x: x[-1], states), jnp.all(report.converged), jnp.asarray(full)
+
+        def step(state: State, action: Array, count: Array):
+            share = 0.5 * (jnp.clip(action.astype(lower.dtype), -1, 1) + 1)
+            u = jnp.asarray(lower) + share * jnp.asarray(upper - lower)
+            after, solved, full = advanced(scene.filled(state), u)
+            count = count + 1
+            before, held, ended = (jax.tree.map(lambda x: x[None], x) for x in (state, u, after))
+            reward, met, lengths = _judged(self, before, held, ended, (count >= self.n_steps)[None])
+            left = jnp.asarray(1 - count / self.n_steps, scene.timestep.dtype)
+            seen = _observations(scene, task, ended, left[None])
+            return after, seen[0], reward[0], met[0], lengths[0], solved, full
+
+        return jax.jit(step, compiler_options=compiler_options())
 
     def _example(self) -> State:
         return self.scene.initial_state()

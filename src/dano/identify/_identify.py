@@ -6,7 +6,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,10 +19,11 @@ from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._motion_files import load_motion
 from dano.identify._parameters import Parameter, space_of, values_at, with_values
 from dano.identify._problem import Problem
-from dano.identify._residuals import Linearized
+from dano.identify._residuals import Linearized, Smoothing
 from dano.identify._result import Errors, Identification, Minimum
 from dano.identify._scales import check_scales
 from dano.identify._settings import deviations, estimated, Noise, Search, Setup, Windowing
+from dano.identify._settling import ripple_covariance, worth_of
 from dano.identify._uncertainty import uncertainty
 from dano.identify._windows import Plan
 from dano.maths import quat_conjugate, quat_log, quat_multiply
@@ -52,6 +53,7 @@ def identify(
     max_iterations: int = 100,
     tolerance: float = 0.1,
     batch: int | None = None,
+    smooth: bool = True,
     engine: AbstractEngine | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
@@ -85,6 +87,8 @@ def identify(
         jacobian: "forward" costs one rollout per unknown, "reverse" several per observed number, or "auto".
         max_iterations: Steps of each search.
         tolerance: Stop when the predicted move of the parameters is below this, in standard errors.
+        smooth: Whether to go on by slopes over visible steps where the loss is rough: to the minimum of its
+            trend, with standard errors that hold the ripples.
         batch: Windows that a device simulates at once; default one on a CPU, many on a GPU.
         engine: Default `VariationalEngine()`.
         checkpoint: File (.npz) that a long search is kept in while it runs, and when interrupted.
@@ -105,7 +109,7 @@ def identify(
     space = space_of(scene, controls, _started(parameters, after))
     deviation = Noise(deviations(scene, motions, noise), huber)
     windows = Windowing.create(window, continuity, chosen)
-    search = Search(starts, seed, jacobian, max_iterations, tolerance, batch)
+    search = Search(starts, seed, jacobian, max_iterations, tolerance, batch, bool(smooth))
     setup = Setup(space, scene, controls, chosen, deviation, windows, search, checked_engine(engine))
     check_scales(scene, motions, window, state if isinstance(state, State) else None)
     kept = _kept(checkpoint, resume, setup, motions, state, after)
@@ -132,7 +136,7 @@ def _fitted(
         problem.begin_near(after.initial_states, after.initial)
     tell("compiling", 0.0)
     solutions = _searched(problem, setup.search, kept, tell)
-    held_errors = _held_out(setup, held, state, solutions[0])
+    held_errors = _held_out(setup, held, state, solutions[0].solution)
     found = _identification(setup, problem, motions, solutions, held_errors, began)
     tell("done", 1.0)
     return found
@@ -179,44 +183,60 @@ def _held_out(
     return _errors(problem.plan, held, problem.simulate(fixed.x, fixed.blocks))
 
 
+class _Ended(NamedTuple):
+    """Where a search ended, and how residuals were smoothed there; None: not at all."""
+
+    solution: Solution
+    smoothing: Smoothing | None
+    roughness: np.ndarray
+
+
 def _searched(
     problem: Problem, search: Search, kept: Checkpoint, tell: Callable[[str, float], None]
-) -> list[Solution]:
+) -> list[_Ended]:
     """Where the search from each start ended, best first."""
-    solutions = []
+    ended = []
     points = kept.points(lambda: problem.points(search.starts))
     for k, x in enumerate(points):
 
         def said(i: int, loss: float, k: int = k) -> None:
             tell(f"fitting, loss {loss:.6g}", (k + i / search.max_iterations) / len(points))
 
-        solutions.append(problem.search(x, search.max_iterations, search.tolerance, said, kept=kept))
-        if solutions[-1].stop is Stop.INTERRUPTED:
+        solution = problem.search(x, search.max_iterations, search.tolerance, said, kept=kept)
+        ended.append(_Ended(solution, problem.smoothing, problem.roughness))
+        if solution.stop is Stop.INTERRUPTED:
             break
-    return sorted(solutions, key=lambda s: s.normal.loss)
+    return sorted(ended, key=lambda each: each.solution.normal.loss)
 
 
 def _identification(
     setup: Setup,
     problem: Problem,
     motions: tuple[Motion, ...],
-    solutions: list[Solution],
+    ended: list[_Ended],
     held_errors: Errors | None,
     began: float,
 ) -> Identification:
     """The result: values, how sure they are, and the motion that they give."""
-    best, space, scene, plan = solutions[0], setup.space, setup.scene, problem.plan
+    best, space, scene, plan = ended[0].solution, setup.space, setup.scene, problem.plan
+    problem.smoothing, problem.roughness = ended[0].smoothing, ended[0].roughness
+    ripple = ripple_covariance(problem, best.x, best.blocks)
     at_best = problem.simulate(best.x, best.blocks)
     at_start = problem.simulate(space.start, plan.start)
     known = np.asarray(at_best.lengths)
-    sure = uncertainty(space, best.x, best.normal, known[known >= 0], setup.noise.huber, plan.n_data, scene)
+    seen = known[known >= 0]
+    sure = uncertainty(space, best.x, best.normal, seen, setup.noise.huber, plan.n_data, scene, ripple)
     values, errors = values_at(space.selections, best.x, sure.covariance)
     fit_errors = _errors(plan, motions, at_best)
     messages = list(sure.messages)
     if failed := int(np.sum(np.asarray(at_best.unconverged))):
         messages.append(f"{failed} steps did not converge at the values found; try a smaller timestep")
+    worth = None
+    if best.stop is Stop.STUCK or problem.smoothing is not None:
+        worth = worth_of(problem, best)
     if not best.stop.converged:
-        messages.append(f"the search did not end in a minimum: {best.stop.value}")
+        more = f"; {worth.summary}" if worth is not None else ""
+        messages.append(f"the search did not end in a minimum: {best.stop.value}{more}")
     if missed := _missed(scene, motions, fit_errors):
         messages.append(missed)
     x = jnp.asarray(best.x, scene.timestep.dtype)
@@ -233,7 +253,7 @@ def _identification(
         held_out_errors=held_errors,
         minima=tuple(
             Minimum(values_at(space.selections, s.x, sure.covariance)[0], s.normal.loss, s.stop)
-            for s in solutions
+            for s, *_ in ended
         ),
         scene=with_values(space.selections, "scene", scene, x),
         controls=controls if controls is None else with_values(space.selections, "controls", controls, x),
@@ -242,6 +262,8 @@ def _identification(
         motions=motions,
         fitted=_as_motions(plan, motions, at_best, scene),
         guessed=_as_motions(plan, motions, at_start, scene),
+        smoothed=problem.smoothing is not None,
+        worth=worth,
         freedom=sure.freedom,
         evaluations=problem.evaluations,
         seconds=time.perf_counter() - began,

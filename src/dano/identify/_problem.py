@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +13,9 @@ from jaxtyping import Array
 from dano.engine import device_mesh
 from dano.identify._checkpoint import Checkpoint
 from dano.identify._motion import Motion, QUANTITIES
-from dano.identify._residuals import Linearized, linearized, Model, moved
+from dano.identify._residuals import Linearized, linearized, Model, moved, Smoothing, Start
 from dano.identify._settings import Setup
-from dano.identify._starts import Start
+from dano.identify._settling import settled
 from dano.identify._windows import draw_velocities, plan_windows
 from dano.scene import Control, Scene, State
 from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
@@ -34,6 +34,16 @@ _NEAR = 3.0
 _BATCH = 1024
 
 
+class _Last(NamedTuple):
+    """The last simulation, and what it was of."""
+
+    model: Model
+    smoothing: Smoothing | None
+    x: Array
+    states: tuple[State, State]
+    found: Linearized
+
+
 class Problem:
     """The least squares problem of some motions: residuals of windows over parameters and initial states."""
 
@@ -44,7 +54,11 @@ class Problem:
         self.ties = setup.windows.continuity
         self.spacing = float(np.median(np.concatenate([np.diff(motion.times) for motion in motions])))
         self.simulations = 0
-        self._last: tuple[Model, Array, tuple[State, State], Linearized] | None = None
+        self.lower, self.upper = space.lower, space.upper
+        self.smooth = search.smooth
+        self.smoothing: Smoothing | None = None
+        self.roughness = np.zeros((0, 0))
+        self._last: _Last | None = None
         policy = controls if callable(controls) else None
         self._planned = functools.partial(
             plan_windows,
@@ -122,16 +136,19 @@ class Problem:
         at = jnp.asarray(x, self.model.scene.timestep.dtype)
         following = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), start)
         changed = np.ones(len(self.plan.rows), bool)
-        if self._last is not None and self._last[0] is self.model and np.array_equal(at, self._last[1]):
-            changed = _different((start, following), self._last[2])
-        found = linearized(self.model, at, start, following, jnp.asarray(changed))
-        if self._last is not None and not changed.all():
+        last = self._last
+        if last is not None and not (last.model is self.model and last.smoothing is self.smoothing):
+            last = None
+        if last is not None and np.array_equal(at, last.x):
+            changed = _different((start, following), last.states)
+        found = linearized(self.model, at, start, following, jnp.asarray(changed), self.smoothing)
+        if last is not None and not changed.all():
             found = jax.tree.map(
                 lambda new, old: jnp.where(changed.reshape(-1, *[1] * (new.ndim - 1)), new, old),
                 found,
-                self._last[3],
+                last.found,
             )
-        self._last = self.model, at, (start, following), found
+        self._last = _Last(self.model, self.smoothing, at, (start, following), found)
         self.simulations += int(changed.sum())
         return found
 
@@ -145,9 +162,12 @@ class Problem:
 
         A block is a window; or a motion, where windows are to meet.
         """
-        found = self.simulate(x, start)
+        return self.assembled(self.simulate(x, start))
+
+    def assembled(self, found: Linearized) -> NormalEquations:
+        """Normal equations of a simulation of all windows."""
         loss, gradient, hessian, jump, slope = (np.asarray(v, float) for v in found[:5])
-        p, k = len(x), self.private
+        p, k = len(self.space.start), self.private
         if self.model.jumps is not None:
             return _chained(p, k, self.plan.owner, self.model.jumps, loss, gradient, hessian, jump, slope)
         return NormalEquations(
@@ -159,6 +179,11 @@ class Problem:
             hessian[:, p:, :p] if k else np.zeros((0, 0, p)),
             loss if k else np.zeros(0),
         )
+
+    def start_widths(self) -> np.ndarray:
+        """By how much initial states are uncertain, of their unknowns, as the noise says."""
+        span = max(1e-6, float(self.plan.n_steps * self.model.scene.timestep))
+        return self.start.deviations(_usual(self.noise, span))
 
     def retract(self, start: State, change: np.ndarray) -> State:
         """Initial states moved by the change of all blocks."""
@@ -226,8 +251,10 @@ class Problem:
                 return begun()
             return kept.minimised(self, lambda since, keep: begun(since=since, keep=keep))
 
+        self.smoothing = None
         if self.jumps is None:
-            return minimise(x, self.plan.start, tolerance)
+            solution = minimise(x, self.plan.start, tolerance)
+            return self._settled(solution, x) if free else solution
         rough = tolerance if len(self.ties) == 1 else max(tolerance, _NEAR)
         self.model = self.model._replace(jumps=self.ties[0] * self.jumps)
         solution = minimise(x, self.plan.start, rough)
@@ -244,7 +271,25 @@ class Problem:
                 break
             self.model = self.model._replace(jumps=tie * self.jumps)
             solution = minimise(solution.x, solution.blocks, tolerance if tie == self.ties[-1] else rough)
-        return solution
+        return self._settled(solution, x) if free else solution
+
+    def _settled(self, solution: Solution, first: np.ndarray) -> Solution:
+        """The solution, or that of the trend where the loss is rough."""
+        if not self.smooth or not self.model.scene.pairs or solution.stop is Stop.INTERRUPTED:
+            return solution
+        return settled(self, solution, (first, self.plan.start))
+
+    def count(self, share: float) -> None:
+        """Let a share of the frames of each window count, the first ones; all of them by 1."""
+        windows = self.plan.windows
+        seen = {key: np.asarray(weight) for key, weight in windows.weights.items()}
+        frames = np.max(
+            [np.max(np.where(w > 0, 1 + np.arange(w.shape[1])[:, None], 0), (1, 2)) for w in seen.values()], 0
+        )
+        counts = np.arange(next(iter(seen.values())).shape[1])[None] < np.maximum(3, share * frames)[:, None]
+        weights = {key: jnp.asarray(w * counts[:, :, None], w.dtype) for key, w in seen.items()}
+        windows = dataclasses.replace(windows, weights=weights) if share < 1 else windows
+        self.model = self.model._replace(windows=windows)
 
     def _swept(self, solution: Solution, minimise: Callable[..., Solution]) -> Solution:
         """A better minimum for motions with a window that began in the wrong basin.

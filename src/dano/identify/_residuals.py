@@ -1,6 +1,13 @@
-"""Residuals of windows, and their normal equations, in one compiled program each."""
+"""Residuals of windows, and their normal equations, in one compiled program each.
+
+Where bodies hit each other, residuals are rough: their derivatives are those of ripples, and a search ends in
+one of many small minima. Then unknowns are drawn around the point, in pairs ± d of independent directions,
+and a plane is put through the residuals. Its slopes take the place of derivatives and its middle that of
+residuals; what is left beside it, the ripple, tells how far the answer may be off because of it.
+"""
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,13 +17,90 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.engine import AbstractEngine, compiled, gather, map_rows, simulate
+from dano.engine import AbstractEngine, compiled, difference, gather, map_rows, retract, simulate
 from dano.identify._joint_log import joint_table
+from dano.identify._motion import QUANTITIES
 from dano.identify._parameters import Selection, with_values
-from dano.identify._starts import Start
 from dano.identify._windows import Windows
-from dano.maths import einsum, quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
+from dano.maths import einsum, product, quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
 from dano.scene import Control, Scene, State
+
+
+class Start(NamedTuple):
+    """What is estimated of the state in which a window begins (static).
+
+    Unknowns are, body by body, three numbers of each quantity, then coordinates of the joints, then their
+    velocities.
+
+    Attributes:
+        free: Bodies that were observed and move freely.
+        turning: Of each joint coordinate whether it is an angle; none if no body on a joint was observed.
+        initial: Quantities that are estimated. Coordinates of joints are with positions or orientations,
+            their velocities with velocities or spins.
+    """
+
+    free: tuple[int, ...]
+    turning: tuple[bool, ...]
+    initial: tuple[str, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return 3 * len(self.free) * len(self.initial) + len(self.turning) * (self.poses + self.speeds)
+
+    @property
+    def poses(self) -> bool:
+        """Whether coordinates of joints are estimated."""
+        return "position" in self.initial or "orientation" in self.initial
+
+    @property
+    def speeds(self) -> bool:
+        """Whether velocities of joints are estimated."""
+        return "velocity" in self.initial or "omega" in self.initial
+
+    def moved(self, state: State, change: Float[Array, " k"]) -> State:
+        """A state moved by a change of the unknowns."""
+        if not self.size:
+            return state
+        n, joints = 3 * len(self.free) * len(self.initial), len(self.turning)
+        if self.free:
+            given = iter(jnp.split(change[:n].reshape(len(self.free), -1), len(self.initial), axis=1))
+            zero = jnp.zeros((len(self.free), 3), change.dtype)
+            rows = [next(given) if key in self.initial else zero for key in QUANTITIES]
+            state = retract(state, np.array(self.free), jnp.concatenate(rows, axis=1))
+        if state.q is None or state.v is None or not joints:
+            return state
+        none = jnp.zeros(joints, change.dtype)
+        q = change[n : n + joints] if self.poses else none
+        v = change[len(change) - joints :] if self.speeds else none
+        return dataclasses.replace(state, q=state.q + q, v=state.v + v)
+
+    def jump(self, nominal: State, state: State) -> Float[Array, " c"]:
+        """What leads from one state to another, as a change of all that could be estimated."""
+        gone = difference(nominal, state, np.array(self.free, int)).ravel()
+        if not self.turning:
+            return gone
+        assert nominal.q is not None and nominal.v is not None and state.q is not None and state.v is not None
+        return jnp.concatenate([gone, state.q - nominal.q, state.v - nominal.v])
+
+    def widths(self, usual: Sequence[float]) -> np.ndarray:
+        """Standard deviations of the numbers of a jump from those of the four quantities."""
+        position, orientation, velocity, omega = usual
+        of_bodies = np.tile(np.repeat(usual, 3), len(self.free))
+        q = [orientation if turns else position for turns in self.turning]
+        v = [omega if turns else velocity for turns in self.turning]
+        return np.concatenate([of_bodies, q, v])
+
+    def deviations(self, usual: Sequence[float]) -> np.ndarray:
+        """Standard deviations of the unknowns from those of the four quantities."""
+        position, orientation, velocity, omega = usual
+        each = dict(zip(QUANTITIES, usual, strict=True))
+        of_bodies = np.tile(
+            np.repeat([each[key] for key in QUANTITIES if key in self.initial], 3), len(self.free)
+        )
+        q = [orientation if turns else position for turns in self.turning if self.poses]
+        v = [omega if turns else velocity for turns in self.turning if self.speeds]
+        return np.concatenate([of_bodies, q, v])
 
 
 class Model(NamedTuple):
@@ -56,6 +140,34 @@ class Model(NamedTuple):
     mesh: Mesh
 
 
+class Smoothing(NamedTuple):
+    """Where unknowns of windows are drawn: at u ± L d.
+
+    Attributes:
+        draws: Rows d, without their opposites, shape (K, u); Σ d dᵀ = K 1.
+        spread: L of each window, shape (windows, u, u).
+        inverse: L⁻¹.
+    """
+
+    draws: Float[Array, "k u"]
+    spread: Float[Array, "w u u"]
+    inverse: Float[Array, "w u u"]
+
+
+class Plane(NamedTuple):
+    """The plane through the residuals around a point.
+
+    Attributes:
+        value: Its middle.
+        slope: By the unknowns.
+        ripple: By which residuals miss it in their odd part, so that curvature does not count.
+    """
+
+    value: Float[Array, " r"]
+    slope: Float[Array, "r u"]
+    ripple: Float[Array, "k r"]
+
+
 class Linearized(NamedTuple):
     """A simulation of all windows, with derivatives: leaves with a leading axis of windows.
 
@@ -70,6 +182,9 @@ class Linearized(NamedTuple):
         predicted: States at the frames: positions and velocities that correspond to the observed ones.
         lengths: Of the residuals in standard deviations; −1 where nothing was observed.
         unconverged: Steps that did not converge.
+        ripple: Gradients of the loss that ripples of the residuals would have alone, one for each draw of
+            unknowns; one of zeros without smoothing.
+        jump_ripple: Ripples of `jump`.
     """
 
     loss: Float[Array, " w"]
@@ -80,6 +195,8 @@ class Linearized(NamedTuple):
     predicted: State
     lengths: Float[Array, "w f b q"]
     unconverged: Int[Array, " w"]
+    ripple: Float[Array, "w k u"]
+    jump_ripple: Float[Array, "w k c"]
 
 
 class _Late(eqx.Module):
@@ -99,6 +216,7 @@ def linearized(
     start: State,
     following: State,
     wanted: Bool[Array, " w"],
+    smoothing: Smoothing | None = None,
 ) -> Linearized:
     """Simulate windows at coordinates x from their initial states.
 
@@ -108,31 +226,39 @@ def linearized(
         start: Initial states of the windows.
         following: Initial states of the windows that come next in the same motions.
         wanted: Which windows to simulate; rows of the others are zero.
+        smoothing: For a plane through draws of the unknowns instead of derivatives.
 
     Returns:
         All windows, in every process: each process, and each of its devices, simulates a share of them.
     """
     n, processes = len(wanted), jax.process_count()
     if processes * model.mesh.size == 1:
-        return _linearized(model, x, start, following, wanted)
+        return _linearized(model, x, start, following, wanted, smoothing)
     each = -(-n // (processes * model.mesh.size)) * model.mesh.size
     mine = jax.process_index() * each + np.arange(each)
     # Past the end nothing is wanted: the shares have one size.
     rows = np.minimum(mine, n - 1)
     windows, start, following = jax.tree.map(lambda leaf: leaf[rows], (model.windows, start, following))
     share = jnp.asarray(np.asarray(wanted)[rows] & (mine < n))
-    found = _linearized(model._replace(windows=windows), x, start, following, share)
+    if smoothing is not None:
+        smoothing = smoothing._replace(spread=smoothing.spread[rows], inverse=smoothing.inverse[rows])
+    found = _linearized(model._replace(windows=windows), x, start, following, share, smoothing)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf[:n]), gather(found))
 
 
 @compiled
 def _linearized(
-    model: Model, x: Float[Array, " p"], start: State, following: State, wanted: Bool[Array, " w"]
+    model: Model,
+    x: Float[Array, " p"],
+    start: State,
+    following: State,
+    wanted: Bool[Array, " w"],
+    smoothing: Smoothing | None,
 ) -> Linearized:
-    p = x.shape[0]
+    p, draws = x.shape[0], 1 if smoothing is None else smoothing.draws.shape[0]
 
     def one(item):
-        window, state, after, _ = item
+        window, state, after, _, seen_from = item
 
         def residuals(unknowns):
             rows, jump, predicted, unconverged = _residuals(
@@ -141,31 +267,62 @@ def _linearized(
             return jnp.concatenate([rows.ravel(), jump]), (rows, jump, predicted, unconverged)
 
         at = jnp.concatenate([x, _no_change(model)])
-        jacobian = jax.jacrev if model.reverse else jax.jacfwd
-        slope, (rows, jump, predicted, unconverged) = jacobian(residuals, has_aux=True)(at)
-        weights, lengths, loss = _robust(model, rows)
+        if smoothing is None:
+            jacobian = jax.jacrev if model.reverse else jax.jacfwd
+            slope, (rows, jump, predicted, unconverged) = jacobian(residuals, has_aux=True)(at)
+            middle, ripple = rows, jnp.zeros((1, slope.shape[0]), slope.dtype)
+        else:
+            plane, (rows, jump, predicted, unconverged) = _plane_through(
+                residuals, at, smoothing.draws, *seen_from
+            )
+            slope, ripple = plane.slope, plane.ripple
+            middle, jump = plane.value[: rows.size].reshape(rows.shape), plane.value[rows.size :]
+        weights, lengths, loss = _robust(model, middle)
+        lengths = lengths if smoothing is None else jnp.sqrt(jnp.sum(rows * rows, axis=-1))
         seen = jnp.stack([window.weights[key][:, _bodies(model)] for key in model.quantities], axis=-1) > 0
         slope, jump_slope = slope[: rows.size], slope[rows.size :]
         weighted = jnp.broadcast_to(weights[..., None], rows.shape).ravel()[:, None] * slope
         return Linearized(
             loss,
-            weighted.T @ rows.ravel(),
+            weighted.T @ middle.ravel(),
             weighted.T @ slope,
             jump,
             jump_slope,
             predicted,
             jnp.where(seen, lengths, -1),
             unconverged,
+            ripple[:, : rows.size] @ weighted,
+            ripple[:, rows.size :],
         )
 
     def one_or_none(item):
-        return jax.lax.cond(item[-1], one, lambda item: _nothing(model, item[1], p), item)
+        return jax.lax.cond(item[3], one, lambda item: _nothing(model, item[1], p, draws), item)
 
-    rows = model.windows, start, following, wanted
+    # A row for every window, also without smoothing.
+    spread = (wanted, wanted) if smoothing is None else smoothing[1:]
+    rows = model.windows, start, following, wanted, spread
     return map_rows(one_or_none, rows, batch_size=model.batch, mesh=model.mesh)
 
 
-def _nothing(model: Model, state: State, p: int) -> Linearized:
+def _plane_through(
+    residuals: Callable[[Array], tuple[Array, Any]], at: Float[Array, " u"], draws, spread, inverse
+) -> tuple[Plane, Any]:
+    """The plane around a point, and what else the residuals at the point say; see `Smoothing`."""
+    moves = product(draws, spread.T)
+    unknowns = at[None] + jnp.concatenate([jnp.zeros_like(moves[:1]), moves, -moves])
+    rows, others = jax.vmap(residuals)(unknowns)
+    k = moves.shape[0]
+    above, below = rows[1 : 1 + k], rows[1 + k :]
+    odd = 0.5 * (above - below)
+    by_draw = product(draws.T, odd) / k
+    # Each odd part is the mean of two, and slopes took as many draws as there are unknowns.
+    share = 2 * k / max(1, k - at.shape[0])
+    ripple = jnp.sqrt(jnp.asarray(share, rows.dtype)) * (odd - product(draws, by_draw))
+    plane = Plane(0.5 * jnp.mean(above + below, axis=0), product(by_draw.T, inverse), ripple)
+    return plane, jax.tree.map(lambda leaf: leaf[0], others)
+
+
+def _nothing(model: Model, state: State, p: int, draws: int) -> Linearized:
     """Zeros in place of a window."""
     frames, bodies = model.windows.frame[0].shape[1], len(model.bodies)
     unknowns = p + len(_no_change(model))
@@ -183,6 +340,8 @@ def _nothing(model: Model, state: State, p: int) -> Linearized:
         jax.tree.map(lambda leaf: zeros(frames, *leaf.shape), _rows_of(state)),
         zeros(frames, bodies, len(model.quantities)),
         jnp.zeros((), int),
+        zeros(draws, unknowns),
+        zeros(draws, jumps),
     )
 
 

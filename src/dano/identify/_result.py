@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array
 
+from dano.gradients import Check
 from dano.identify._motion import Motion
 from dano.identify._uncertainty import quantile
 from dano.notebook import card, curves, numbers
@@ -63,6 +64,9 @@ class Identification:
         motions: What was observed.
         fitted: What the simulation says at the frames of each motion, with the values found.
         guessed: The same at the start of the search.
+        smoothed: Whether the loss is rough and the values are where its trend is least; standard errors then
+            hold its ripples.
+        worth: What derivatives of the loss are worth there, if it is rough or no step reduces it; else None.
         freedom: Observed numbers less estimated ones.
         evaluations: How often all windows were simulated, with derivatives.
         seconds: Time it took [s], compilation included.
@@ -85,6 +89,8 @@ class Identification:
     motions: tuple[Motion, ...]
     fitted: tuple[Motion, ...]
     guessed: tuple[Motion, ...]
+    smoothed: bool
+    worth: Check | None
     freedom: int
     evaluations: int
     seconds: float
@@ -95,6 +101,7 @@ class Identification:
             (name, f"{numbers(np.ravel(value))} ± {numbers(np.ravel(self.standard_errors[name]))}")
             for name, value in self.values.items()
         ]
+        rows += [("worth of derivatives", self.worth.summary)] if self.worth is not None else []
         rows += [("stopped", str(self.stop)), *(("", message) for message in self.messages)]
         loss = np.log10(np.maximum(np.asarray(self.loss_history, np.float64), 1e-300))
         steps = np.arange(len(loss), dtype=np.float64)
@@ -127,6 +134,8 @@ class Identification:
             "intervals_95": {name: _plain(list(self.interval(name))) for name in self.values},
             "stop": self.stop.value,
             "converged": self.converged,
+            "smoothed": self.smoothed,
+            "worth": None if self.worth is None else self.worth.summary,
             "messages": list(self.messages),
             "errors": _plain(self.errors._asdict()),
             "held_out_errors": None

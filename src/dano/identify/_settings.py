@@ -86,6 +86,7 @@ class Search:
         max_iterations: Steps of each search.
         tolerance: Predicted move of the parameters, in standard errors, below which a search ends.
         batch: Windows that a device simulates at once; None: by the device.
+        smooth: Whether to go on by slopes over visible steps where the loss is rough.
     """
 
     starts: int
@@ -94,6 +95,7 @@ class Search:
     max_iterations: int
     tolerance: float
     batch: int | None
+    smooth: bool = True
 
     def __post_init__(self):
         checked_count("starts", self.starts, most=_MOST_STARTS)

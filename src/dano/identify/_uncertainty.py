@@ -43,6 +43,7 @@ def uncertainty(
     huber: float | None,
     n_data: int,
     scene: Scene,
+    ripple: np.ndarray | None = None,
 ) -> Uncertainty:
     """Covariance s² (JᵀWJ)⁻¹ of the coordinates, initial states eliminated.
 
@@ -57,6 +58,7 @@ def uncertainty(
         huber: Length from which residuals count linearly, or None.
         n_data: How many numbers were observed.
         scene: The scene at the start, for the words.
+        ripple: Covariance of the coordinates that a rough loss adds, shape (p, p); default none.
     """
     p = len(x)
     _, hessian = eliminated(normal)
@@ -79,7 +81,8 @@ def uncertainty(
         for i in np.flatnonzero(on_bound)
     ]
     if len(free):
-        found, more = _inverse(space, x, hessian[np.ix_(free, free)], variance, free, scene, freedom)
+        rough = np.zeros((len(free), len(free))) if ripple is None else ripple[np.ix_(free, free)]
+        found, more = _inverse(space, x, hessian[np.ix_(free, free)], variance, free, scene, freedom, rough)
         covariance[np.ix_(free, free)] = found
         messages += more
     return Uncertainty(covariance, freedom, tuple(messages))
@@ -102,14 +105,14 @@ def _private(normal: NormalEquations) -> int:
     return int(np.sum(values > 1e-9))
 
 
-def _inverse(space: Space, x, hessian, variance: float, free, scene: Scene, freedom: int):
+def _inverse(space: Space, x, hessian, variance: float, free, scene: Scene, freedom: int, rough):
     width = space.upper[free] - space.lower[free]
     span = np.where(np.isfinite(width), width, np.maximum(np.abs(x[free]), 1e-3))
     # In shares of each parameter's range, so that units do not decide what is flat.
     values, vectors = np.linalg.eigh(hessian * span[:, None] * span[None])
     flat = values <= _FLAT * max(float(values[-1]), np.finfo(float).tiny)
     inverse = np.where(flat, 0.0, variance / np.where(flat, 1.0, values))
-    covariance = (vectors * inverse) @ vectors.T
+    covariance = (vectors * inverse) @ vectors.T + rough / (span[:, None] * span[None])
     messages = []
     for k in np.flatnonzero(flat):
         messages.append(_words(space, free, vectors[:, k], scene))

@@ -22,7 +22,7 @@ from dano.mujoco._model import library
 from dano.mujoco._spec import TOUCHES
 from dano.mujoco._twin import Constants, Motion, Twin
 from dano.names import did_you_mean
-from dano.scene import Control, Scene, State
+from dano.scene import Control, lifted, Scene, State
 
 
 class _Place(NamedTuple):
@@ -229,6 +229,7 @@ def _constants(scene: Scene, control: Control | None) -> tuple[Array, ...]:
     def given(value: Array | None, default: Array) -> Array:
         return default if value is None else value
 
+    control = lifted(scene, control)
     pushed = (still, still, None, None)
     if control is not None:
         pushed = control.force, control.torque, control.effort, control.command

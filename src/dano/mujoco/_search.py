@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dano.engine.launching import compiled_kernel, Features, instance, lower_bounds
+from dano.engine.launching import compiled_kernel, Features, instance, kind_numbers, lower_bounds
 from dano.mujoco._settings import Settings
 from dano.mujoco._solids import Geom, object_solid, Solid
 from dano.mujoco._surfaces import Surface
@@ -115,8 +115,7 @@ def _is_flat(part: Part, object_part: Part) -> bool:
 
 def _number(features: Features, kind: str) -> int:
     """Of a kind of solid by its name."""
-    modules = (instance(features, name) for name in (_SOLIDS, _LEAVES))
-    return next(getattr(module, kind) for module in modules if hasattr(module, kind))
+    return getattr(instance(features, _SOLIDS), kind) if kind not in kind_numbers() else kind_numbers()[kind]
 
 
 def _rows(struct: Any, n: int) -> np.ndarray:
@@ -132,7 +131,7 @@ def _array(values: np.ndarray, dtype: Any) -> Any:
 
 def _solids(structs: Any, parts: Sequence[Part]):
     """Leaves, their kinds, spline coefficients and lower bounds, and for each part where its solid stands."""
-    own = [part for part in parts if hasattr(structs, part.solid.kind)]
+    own = [part for part in parts if part.solid.kind in kind_numbers()]
     leaves, kinds = _rows(structs.Leaf, len(own)), _rows(structs.LeafKind, len(own))
     grids: dict[int, tuple[int, int]] = {}
     flat, first = [np.zeros(1)], 1
@@ -142,7 +141,7 @@ def _solids(structs: Any, parts: Sequence[Part]):
         row["factor"], row["sizes"], row["spacing"] = 1.0, solid.sizes, solid.spacing
         row["rotation"] = np.eye(3) if thing is None else thing.rotation
         row["position"] = 0.0 if thing is None else thing.origin
-        kind["kind"] = getattr(structs, solid.kind)
+        kind["kind"] = kind_numbers()[solid.kind]
         if solid.coefficients is not None and thing is not None:
             # Bodies with the same object share its grid.
             if id(thing.obj) not in grids:
@@ -163,7 +162,7 @@ def _solids(structs: Any, parts: Sequence[Part]):
             at.append(part.solid.field)
         else:
             at.append(leaf)
-            leaf += hasattr(structs, part.solid.kind)
+            leaf += part.solid.kind in kind_numbers()
     return leaves, kinds, np.concatenate(flat), np.concatenate(bounds), at
 
 

@@ -4,8 +4,8 @@ These are the values of a build that knows everything. `dano.engine` builds kern
 that it needs (see `dano.engine.launching._instances`), which compiles and runs several times as fast.
 """
 
-KINDS = frozenset(range(8))
-"""Kinds of leaves of solids, see `distances`, and of densities, see `overlap`."""
+KINDS = frozenset(range(32))
+"""Kinds of leaves of solids and of densities, see `leaves` and `shapes`; more than there are."""
 DEGREES = frozenset({1, 2, 3})
 """Degrees of the splines of sampled distances and densities."""
 UNIONS = True

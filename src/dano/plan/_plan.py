@@ -24,13 +24,27 @@ from dano.checks import (
     checked_optional,
 )
 from dano.engine import AbstractEngine, checked_engine, compiler_options, simulate
+from dano.gradients import Check, check
 from dano.maths import checked_array
+from dano.plan._exploring import explored, to_touch
 from dano.plan._problem import problem_of, Scales, VIOLATION
-from dano.plan._sampling import sampled, SamplingOptions
+from dano.plan._sampling import costs, rated, sampled, SamplingOptions
 from dano.plan._softening import softened
 from dano.plan._task import Limit, Task
 from dano.scene import Control, Scene, State, state_arrays, Trajectory
-from dano.solvers import optimal_trajectory, TrajectoryOptions, TrajectorySolution, TrajectoryStop
+from dano.solvers import (
+    optimal_trajectory,
+    TrajectoryOptions,
+    TrajectoryProblem,
+    TrajectorySolution,
+    TrajectoryStop,
+)
+
+# Searches for contact, each with other random numbers, until a plan meets what is required.
+_ATTEMPTS = 3
+# By so much giving up contact is dearer than the controls that make it.
+_DEARER = 10.0
+_ENDED = (TrajectoryStop.STOPPED, TrajectoryStop.TIME)
 
 Method = Literal["ilqr", "cem", "mppi"]
 METHODS = ("ilqr", "cem", "mppi")
@@ -83,6 +97,7 @@ class Plan:
         distances: Length of every goal's error over time [unit of its quantity; rad], by its name, shape
             (T + 1,).
         solution: What the solver says; None from sampling.
+        explored: That and why contact was looked for, in words; empty if it was not.
     """
 
     controls: Control
@@ -98,12 +113,14 @@ class Plan:
     seconds: float
     distances: dict[str, np.ndarray]
     solution: TrajectorySolution | None = None
+    explored: str = ""
 
     def describe(self) -> str:
         """The plan in a few lines."""
         verdict = "reaches all that is required" if self.reached else "does NOT reach all that is required"
         lines = [
             f"the plan {verdict}; cost {self.cost:.4g}, {self.seconds:.1f} s ({self.method})",
+            *([self.explored] if self.explored else []),
             self.message,
         ]
         for goal in self.goals:
@@ -171,7 +188,7 @@ def plan(
     *,
     method: str = "ilqr",
     controls: Float[Array, "T m"] | np.ndarray | None = None,
-    explore: int = 0,
+    explore: int | None = None,
     softening: Sequence[float] = (),
     warm: Plan | None = None,
     options: TrajectoryOptions | None = None,
@@ -192,8 +209,9 @@ def plan(
         task: Goals, limits and actuators.
         method: How to search: "ilqr", "cem" or "mppi".
         controls: First guess [N, N m], shape (T, m); default: zero.
-        explore: Passes of CEM that improve the first guess. Where bodies do not touch yet, derivatives do not
-            lead to contact.
+        explore: Passes of CEM that improve the first guess; 0 for none. Default: where with the first guess
+            no driven body touches one that misses its goal, paths that lead to contact are looked for,
+            because derivatives do not lead there. The plan then says so (`Plan.explored`).
         softening: Factors < 1 of the contacts' stiffness to plan with first; each plan starts from the one
             before.
         warm: Plan of a similar problem: its controls and multipliers are the first guess.
@@ -242,43 +260,125 @@ def plan(
         if method != "ilqr":
             why = "interrupted" if found.interrupted else f"all {search.passes} passes of sampling were made"
             return _plan(scene, state, task, scales, engine, guess, None, why, method, began)
-    solution = _optimised(scene, state, task, engine, guess, softening, warm, options or OPTIONS, tell)
+    given = _Given(scene, state, task, engine, softening, warm, options or OPTIONS, tell)
+    why, solution = "", None
+    if explore is None:
+        why, solution = _explored(given, problem, guess, scales, seed)
+    solution = solution or given.optimised(guess)
     message = solution.stop.value
     if solution.stop is TrajectoryStop.INFEASIBLE:
-        message += _what_is_missed(solution)
-    return _plan(scene, state, task, scales, engine, solution.controls, solution, message, method, began)
+        message += f"{_what_is_missed(solution)}; {_worth(given, problem, solution).summary}"
+    made = _plan(scene, state, task, scales, engine, solution.controls, solution, message, method, began)
+    return dataclasses.replace(made, explored=why)
 
 
-def _check_search(method: str, explore: int, softening: Sequence[float]) -> None:
+def _check_search(method: str, explore: int | None, softening: Sequence[float]) -> None:
     checked_choice("method", method, METHODS)
-    checked_count("explore", explore, least=0)
+    if explore is not None:
+        checked_count("explore", explore, least=0)
     for factor in checked_items("softening", softening, float, int):
         if not 0 < factor < 1:
             raise ValueError(f"softening must hold factors between 0 and 1, got {factor}")
 
 
-def _optimised(scene, state, task, engine, guess, softening, warm, options, tell) -> TrajectorySolution:
-    multipliers = None if warm is None or warm.solution is None else warm.solution.multipliers
-    began = time.perf_counter()
-    stages = [(f"optimising with {f:g} of the stiffness", softened(scene, f)) for f in softening]
-    solution = None
-    for name, stage in (*stages, ("optimising", scene)):
-        limit = options.max_seconds
-        left = None if limit is None else max(0.0, limit - (time.perf_counter() - began))
-        solution = optimal_trajectory(
-            problem_of(stage, task, engine),
-            state,
-            guess,
-            multipliers=multipliers,
-            options=options._replace(max_seconds=left),
-            callback=lambda p, name=name: tell(name, p.iteration, p.cost),
-            compiler_options=compiler_options(),
-        )
-        guess, multipliers = solution.controls, solution.multipliers
-        if solution.stop is TrajectoryStop.STOPPED:
+class _Given(NamedTuple):
+    """What every optimisation of a call of `plan` has in common."""
+
+    scene: Scene
+    state: State
+    task: Task
+    engine: AbstractEngine
+    softening: Sequence[float]
+    warm: Plan | None
+    options: TrajectoryOptions
+    tell: Callable[[str, int, float], object]
+
+    def optimised(self, guess: Array, penalty: float = 0.0) -> TrajectorySolution:
+        """The best trajectory near that of a guess; `penalty` is the least one to begin with."""
+        multipliers = None
+        if self.warm is not None and self.warm.solution is not None:
+            multipliers = self.warm.solution.multipliers
+        began = time.perf_counter()
+        stages = [
+            (f"optimising with {f:g} of the stiffness", softened(self.scene, f)) for f in self.softening
+        ]
+        solution = None
+        for name, stage in (*stages, ("optimising", self.scene)):
+            limit = self.options.max_seconds
+            left = None if limit is None else max(0.0, limit - (time.perf_counter() - began))
+            solution = optimal_trajectory(
+                problem_of(stage, self.task, self.engine),
+                self.state,
+                guess,
+                multipliers=multipliers,
+                options=self.options._replace(max_seconds=left, penalty=max(penalty, self.options.penalty)),
+                callback=lambda p, name=name: self.tell(name, p.iteration, p.cost),
+                compiler_options=compiler_options(),
+            )
+            guess, multipliers = solution.controls, solution.multipliers
+            if solution.stop is TrajectoryStop.STOPPED:
+                break
+        assert solution is not None
+        return solution
+
+
+def _explored(
+    given: _Given, problem: TrajectoryProblem, guess: Array, scales: Scales, seed: int
+) -> tuple[str, TrajectorySolution | None]:
+    """Why contact was looked for and the trajectory that came of it; nothing if the guess makes contact."""
+    scene, task = given.scene, given.task
+    values = scales.physical(guess)
+    states = _rolled(scene, given.state, task, given.engine, values)[1].states
+    reaches = to_touch(scene, task, states, given.engine)
+    if not reaches:
+        return "", None
+    names = " and ".join(repr(scene.names[reach.body]) for reach in reaches)
+    why = f"with the first guess nothing that is driven touches {names}"
+    if all(reach.hand < 0 for reach in reaches):
+        return f"{why}, and no contact of the scene lets it", None
+    best = None
+    for attempt in range(_ATTEMPTS):
+        key = jax.random.key(seed + attempt)
+        found = explored(problem, scene, task, states, reaches, key, given.tell, compiler_options())
+        if found is None:
+            return f"{why}, and no control leads it there", None
+        solution = given.optimised(found, _dear(problem, given.state, guess, found))
+        if best is None or _violation(solution) < _violation(best):
+            best = solution
+        if _violation(best) <= VIOLATION or solution.stop in _ENDED:
             break
-    assert solution is not None
-    return solution
+    return f"{why}: paths that lead to contact were looked for first", best
+
+
+def _worth(given: _Given, problem: TrajectoryProblem, solution: TrajectorySolution) -> Check:
+    """What derivatives of the priced cost are worth at the end, each control moved at all times alike."""
+    w, rate = jnp.asarray(solution.controls), 0.5 * solution.penalty
+
+    def priced(shift: Array) -> Array:
+        cost, violation = costs(problem, given.state, w[None] + shift[None, None])
+        return cost[0] + rate * violation[0]
+
+    labels = [
+        f"the {each.kind} of {each.body}{f' along {axis}' if each.axes else ''}"
+        for each in given.task.actuators
+        for axis in each.axes or "q"
+    ]
+    return check(
+        priced, jnp.zeros(w.shape[1], w.dtype), mode="forward", labels=labels, directions=len(labels)
+    )
+
+
+def _dear(problem: TrajectoryProblem, state: State, guess: Array, found: Array) -> float:
+    """Penalty with which giving up what was found for the first guess costs more than all its controls.
+
+    With less, iLQR first saves controls: contact is lost, and nothing leads back to it.
+    """
+    (cost, _), (_, violation) = (rated(problem, state, w[None], compiler_options()) for w in (found, guess))
+    return _DEARER * float(cost[0]) / (0.5 * max(float(violation[0]), VIOLATION**2))
+
+
+def _violation(solution: TrajectorySolution) -> float:
+    return max((violation.amount for violation in solution.violations), default=0.0)
 
 
 def _first_guess(task: Task, controls: Any, warm: Plan | None) -> Array:
@@ -299,11 +399,7 @@ def _plan(scene, state, task, scales, engine, w, solution, message, method, bega
     lower, upper = task.bounds()
     # The last digit of a scaled bound may lie beyond it.
     values = jnp.clip(values, *(jnp.broadcast_to(bound, values.shape) for bound in (lower, upper)))
-    controls = eqx.filter_jit(task.controls)(scene, values)
-    with warnings.catch_warnings():
-        # Steps that were not solved are in the trajectory, and the plan says so.
-        warnings.simplefilter("ignore", RuntimeWarning)
-        trajectory = simulate(scene, state, controls=controls, engine=engine)
+    controls, trajectory = _rolled(scene, state, task, engine, values)
     n = 12 * len(scene.layout.free) + 2 * scene.layout.n_joints
     gains = (
         jnp.zeros((*values.shape, n)) if solution is None else solution.gains * scales.width[None, :, None]
@@ -332,6 +428,15 @@ def _plan(scene, state, task, scales, engine, w, solution, message, method, bega
         distances,
         solution,
     )
+
+
+def _rolled(scene: Scene, state: State, task: Task, engine: AbstractEngine, values: Array):
+    """Controls for `simulate`, and what comes of them."""
+    controls = eqx.filter_jit(task.controls)(scene, values)
+    with warnings.catch_warnings():
+        # Steps that were not solved are in the trajectory, and the plan says so.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return controls, simulate(scene, state, controls=controls, engine=engine)
 
 
 @eqx.filter_jit

@@ -7,6 +7,7 @@ priced: the cost is J + ½ p Σ violation², with a price p that grows from pass
 """
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -116,14 +117,12 @@ def sampled(
     """
     began = time.perf_counter()
     n_steps, m = controls.shape
-    lift = _lines(n_steps, min(options.knots, n_steps))
+    lift = straight_lines(n_steps, min(options.knots, n_steps))
     assert problem.lower is not None and problem.upper is not None
     least, most = problem.lower, problem.upper
     mean = jnp.zeros((lift.shape[1], m), controls.dtype)
     spread = jnp.full_like(mean, options.deviation)
     prices = np.geomspace(options.price, options.last_price, options.passes)
-    jit: Any = eqx.filter_jit
-    rate = jit(_costs, compiler_options=compiler_options) if compiler_options else jit(_costs)
     best, best_terms, history, interrupted = controls, None, [], False
     try:
         for turn, price in enumerate(prices):
@@ -137,7 +136,7 @@ def sampled(
             sequences = controls[None] + jnp.einsum("tk,skm->stm", jnp.asarray(lift), knots)
             sequences = jnp.clip(sequences, *(jnp.broadcast_to(b, sequences.shape) for b in (least, most)))
             sequences = sequences.at[1].set(best)
-            cost, violation = (np.asarray(x) for x in rate(problem, start, sequences))
+            cost, violation = (np.asarray(x) for x in rated(problem, start, sequences, compiler_options))
             priced = np.nan_to_num(cost + 0.5 * price * violation, nan=np.inf)
             top = int(np.argmin(priced))
             best, best_terms = sequences[top], (float(cost[top]), float(violation[top]))
@@ -170,9 +169,7 @@ def _even(controls: Array, least: Array, most: Array, samples: int, knots: int, 
 def _moved(knots: Array, priced: Array, mean: Array, method: str, options: SamplingOptions):
     """The next mean and deviation."""
     if method == "cem":
-        n = max(2, round(options.best * options.samples))
-        elite = knots[jnp.argsort(priced)[:n]]
-        return jnp.mean(elite, axis=0), jnp.maximum(jnp.std(elite, axis=0), options.least)
+        return drawn_around(knots, priced, options.best, options.least)
     finite = jnp.isfinite(priced)
     low = jnp.min(priced)
     scale = jnp.median(jnp.where(finite, priced, low)) - low
@@ -182,7 +179,26 @@ def _moved(knots: Array, priced: Array, mean: Array, method: str, options: Sampl
     return mean, jnp.full_like(mean, max(options.least, 0.5 * options.deviation))
 
 
-def _costs(problem: TrajectoryProblem, start: Any, sequences: Float[Array, "s T m"]):
+def rated(problem: TrajectoryProblem, start: Any, sequences: Array, compiler_options: Any) -> Any:
+    """J and the sum of squares of violations of every sequence, as one compiled program."""
+    return program_of(costs, tuple((compiler_options or {}).items()))(problem, start, sequences)
+
+
+@functools.cache
+def program_of(function: Callable[..., Any], options: tuple[tuple[str, bool], ...]) -> Callable[..., Any]:
+    """A function compiled with some options, once."""
+    jit: Any = eqx.filter_jit  # whose signature does not list the options that it hands on
+    return jit(function, compiler_options=dict(options)) if options else jit(function)
+
+
+def drawn_around(knots: Array, priced: Array, best: float, least: Any) -> tuple[Array, Array]:
+    """Mean and deviation of the best share of samples, the deviation at least `least`."""
+    n = max(2, round(best * len(priced)))
+    elite = knots[jnp.argsort(priced)[:n]]
+    return jnp.mean(elite, axis=0), jnp.maximum(jnp.std(elite, axis=0), least)
+
+
+def costs(problem: TrajectoryProblem, start: Any, sequences: Float[Array, "s T m"]):
     """J and the sum of squares of violations of every sequence, one after the other."""
 
     def one(w):
@@ -210,7 +226,7 @@ def _squared(constraint, value: Array) -> Array:
     return jnp.sum((value if constraint.equality else jnp.maximum(value, 0)) ** 2)
 
 
-def _lines(n_steps: int, knots: int) -> Float[np.ndarray, "T k"]:
+def straight_lines(n_steps: int, knots: int) -> Float[np.ndarray, "T k"]:
     """Straight lines between knots at every step."""
     at = np.linspace(0, knots - 1, n_steps) if knots > 1 else np.zeros(n_steps)
     left = np.minimum(at.astype(int), max(knots - 2, 0))

@@ -11,6 +11,7 @@ from dano.robots._dynamics import (
     joint_reactions as joint_reactions,
     mass_matrix as mass_matrix,
 )
+from dano.robots._geometry import mesh_of as mesh_of
 from dano.robots._inspect import robot_doubts as robot_doubts, robot_tree as robot_tree
 from dano.robots._inverse import (
     inverse_kinematics as inverse_kinematics,

@@ -129,9 +129,11 @@ def _bodies(
     if planes:
         raise ValueError(f"{where}: a plane must stand still, got one on a link that moves")
     mass, com, inertia = inertial
+    # Those that differ are refused before; links without mass have no weight.
+    held = next((link.gravcomp for link, _ in links if link.mass > 0 and link.gravcomp), None)
     geometry = Sphere(_MARK) if shape is None else shape
     try:
-        body = Body(name, geometry, mass=mass, com=com, inertia=inertia)
+        body = Body(name, geometry, mass=mass, com=com, inertia=inertia, gravcomp=held)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
     return [(body, shape is not None)]

@@ -22,7 +22,7 @@ from dano.maths import (
     quat_multiply,
     quat_rotate,
 )
-from dano.scene import Control, joints_of, place_links, Scene, State, triples
+from dano.scene import Control, joints_of, place_links, pulls, Scene, State, triples
 
 
 def mass_matrix(scene: Scene, state: State) -> Float[Array, "k k"]:
@@ -55,7 +55,7 @@ def gravity_forces(scene: Scene, state: State) -> Float[Array, " k"]:
     """
     mass, _, rows = _masses(scene)
     jacobian = scene.frames(state).jacobian[rows]
-    force = -mass[:, None] * scene.gravity[None]
+    force = -mass[:, None] * pulls(scene)[rows]
     return _pulled(jacobian, force, jnp.zeros_like(force))
 
 
@@ -184,7 +184,7 @@ def _needed(scene: Scene, state: State, acceleration: Float[Array, " k"]):
 
     zero, one = jnp.zeros((), scene.timestep.dtype), jnp.ones((), scene.timestep.dtype)
     (_, omega), (gained, turning), jacobian = jax.jvp(twists, (zero,), (one,), has_aux=True)
-    force = mass[:, None] * (gained[rows] - scene.gravity[None])
+    force = mass[:, None] * (gained[rows] - pulls(scene)[rows])
     spin = einsum("mab,mb->ma", inertia, omega[rows])
     torque = einsum("mab,mb->ma", inertia, turning[rows]) + jnp.cross(omega[rows], spin)
     return force, torque, jacobian, rows

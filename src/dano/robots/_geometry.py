@@ -123,7 +123,7 @@ def _of_mesh(solid: Solid, kind: str, where: str) -> AbstractShape:
         kept = _cache_file(solid, kind)
         if kept is not None and kept.is_file() and isinstance(found := load_field(kept), SignedDistanceGrid):
             return found
-        mesh = _scaled(_read(solid), solid.numbers)
+        mesh = mesh_of(solid)
         made = _distance(mesh) if kind == "distance" else hull_field(mesh[0], _HULL_RESOLUTION)
     except ValueError as error:
         raise ValueError(
@@ -139,7 +139,7 @@ def _pieces(solid: Solid) -> list[np.ndarray]:
     if kept is not None and kept.is_file():
         with np.load(kept) as found:
             return [found[key] for key in found.files]
-    pieces = [points for points, _ in convex_pieces(_scaled(_read(solid), solid.numbers), _CONCAVITY)]
+    pieces = [points for points, _ in convex_pieces(mesh_of(solid), _CONCAVITY)]
     _keep(kept, lambda path: np.savez(path, *pieces))
     return pieces
 
@@ -153,6 +153,16 @@ def _keep(path: Path | None, write: Callable[[Path], None]) -> None:
     except OSError:
         # A full disk, or no home: the mesh is read again the next time.
         pass
+
+
+def mesh_of(solid: Solid) -> Triangles:
+    """Vertices [m, frame of the solid] and faces of a mesh, scaled as the file says; no point is of no face.
+
+    Raises:
+        ImportError: If a package that reads it is missing.
+        ValueError: If it cannot be read.
+    """
+    return _scaled(_read(solid), solid.numbers)
 
 
 def _read(solid: Solid) -> Triangles:

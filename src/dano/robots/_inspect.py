@@ -18,6 +18,7 @@ def robot_doubts(description: Description) -> list[str]:
     """
     doubts = [f"{each.text}: ignore=[{each.feature!r}] leaves it out" for each in description.lacking]
     doubts += description.notes
+    doubts += [f"not read: {line}" for line in description.silent]
     groups = grouped_links(description)
     own = own_inertials(description, groups)
     doubts += [

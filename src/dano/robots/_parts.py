@@ -82,6 +82,9 @@ def without_lacking(description: Description, ignored: Sequence[str]) -> Descrip
         left = [each for each in left if each.feature != "other actuators"]
         joints = tuple(dataclasses.replace(joint, drive=None) for joint in description.joints)
         description = dataclasses.replace(description, joints=joints)
+    if GRAVCOMP in ignored:
+        links = tuple(dataclasses.replace(link, gravcomp=0.0) for link in description.links)
+        description = dataclasses.replace(description, links=links)
     # What hangs on tendons is gone with them.
     if "tendons" in ignored:
         left = [each for each in left if "tendon" not in each.text]

@@ -1,5 +1,6 @@
 """Robots: bodies and joints for a scene, and where every link of the file is on them."""
 
+import itertools
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ from dano.checks import checked_items, checked_kind
 from dano.contact import ContactParams
 from dano.maths import checked_array, checked_floating, is_traced, Numbers, quat_multiply, quat_rotate
 from dano.names import did_you_mean
-from dano.robots.formats import Description, Drive
+from dano.robots.formats import Description, Drive, Keyframe
 from dano.scene import Body, Contact, Control, Joint, Loop, Scene, State
 
 
@@ -57,6 +58,11 @@ class Robot:
     gravity: tuple[float, float, float] | None = None
     drives: dict[str, tuple[str, Drive]] = field(default_factory=dict)
     surroundings: tuple[str, ...] = ()
+
+    @property
+    def keyframes(self) -> tuple[str, ...]:
+        """Names of the states that the file has."""
+        return tuple(self.description.keyframes)
 
     def scene(
         self,
@@ -111,28 +117,74 @@ class Robot:
 
         Args:
             *others: Names of bodies, or bodies.
-            params: Parameters of all these contacts.
+            params: Parameters of all these contacts. Default: between two bodies of the file the friction
+                that it says, and else those of `Contact`.
+
+        Warns:
+            UserWarning: If shapes of one body have several frictions.
         """
         fixed = {body.name for body in self.bodies if body.fixed}
+        known = {body.name for body in self.bodies}
         pairs: list[tuple[str, str]] = []
         for other in others:
             moves = isinstance(other, Body) and not other.fixed
             name = other.name if isinstance(other, Body) else other
             pairs += [(body, name) for body in self.touching if body != name and (moves or body not in fixed)]
-        return [Contact(a, b) if params is None else Contact(a, b, params) for a, b in pairs]
+        if params is not None:
+            return [Contact(a, b, params) for a, b in pairs]
+        return [self._contact(a, b) if b in known else Contact(a, b) for a, b in pairs]
+
+    def _contact(self, a: str, b: str) -> Contact:
+        """A contact of two bodies of the file, with the friction that the file gives it."""
+        sides = [
+            [
+                each
+                for link, (body, *_) in self.frames.items()
+                if body == name
+                for each in self.description.frictions.get(link, ())
+            ]
+            for name in (a, b)
+        ]
+        if not all(sides):
+            return Contact(a, b)
+        # As MuJoCo: that of the higher priority, of equal ones the larger.
+        found = {
+            x[0] if x[1] > y[1] else y[0] if y[1] > x[1] else max(x[0], y[0])
+            for x, y in itertools.product(*sides)
+        }
+        if len(found) > 1:
+            warnings.warn(
+                f"{self.description.source}: shapes of {a!r} and {b!r} have frictions {sorted(found)}: their"
+                f" contact has the largest",
+                UserWarning,
+                stacklevel=4,
+            )
+        return Contact(a, b, ContactParams(sliding_friction=max(found)))
 
     def start(
-        self, q: Mapping[str, Numbers] | None = None, v: Mapping[str, Numbers] | None = None
+        self, q: Mapping[str, Numbers] | str | None = None, v: Mapping[str, Numbers] | None = None
     ) -> dict[str, dict[str, Numbers]]:
         """Arguments of `Scene.initial_state`: joints by their names in the file; by default the file's pose.
 
         Args:
-            q: Coordinates [rad or m].
-            v: Their velocities.
+            q: Coordinates [rad or m], or the name of a key frame of the file.
+            v: Their velocities. Default: those of the key frame, else none.
 
         Raises:
-            ValueError: If a joint is unknown, or a number is not finite.
+            ValueError: If a joint or a key frame is unknown, or a number is not finite.
         """
+        frame = Keyframe({}, {}, {}, {})
+        if isinstance(q, str):
+            frames = self.description.keyframes
+            if q not in frames:
+                raise ValueError(
+                    f"key frame must be one of {list(frames)}, got {q!r}{did_you_mean(q, frames)}"
+                )
+            frame = frames[q]
+            # Joints that follow others have no coordinates of their own.
+            q = {name: x for name, x in frame.q.items() if name in self.joint_names}
+            v = {name: x for name, x in frame.v.items() if name in self.joint_names} if v is None else v
+        shown = {body: link for link in frame.places if (body := self.frames[link][0]) is not None}
         given: dict[str, dict[str, Numbers]] = {
             self.joint_names[name]: {"q": value} for name, value in self.home.items() if value
         }
@@ -141,19 +193,26 @@ class Robot:
                 given.setdefault(body, {})[key] = numbers
         bodies = {body.name: body for body in self.bodies}
         for name, place in self.places.items():
+            place = frame.places[shown[name]] if name in shown else place
             position, orientation = (jnp.asarray(x) for x in place)
-            com = position + quat_rotate(orientation, bodies[name].com.astype(position.dtype))
-            given[name] = dict(position=com, orientation=orientation)
+            arm = quat_rotate(orientation, bodies[name].com.astype(position.dtype))
+            given[name] = dict(position=position + arm, orientation=orientation)
+            if name in shown:
+                velocity, omega = (jnp.asarray(x) for x in frame.speeds[shown[name]])
+                spin = quat_rotate(orientation, omega)
+                given[name] |= dict(velocity=velocity + jnp.cross(spin, arm), omega=omega)
         return given
 
     def state(
         self,
         scene: Scene,
-        q: Mapping[str, Numbers] | None = None,
+        q: Mapping[str, Numbers] | str | None = None,
         v: Mapping[str, Numbers] | None = None,
         **others: dict[str, Numbers],
     ) -> State:
         """A state of a scene with the robot: joints by name, and other bodies as in `Scene.initial_state`.
+
+        `q` may be the name of a key frame of the file (`robot.keyframes`).
 
         Raises:
             ValueError: If a joint is unknown, or as `Scene.initial_state`.

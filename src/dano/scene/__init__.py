@@ -33,3 +33,4 @@ from dano.scene._states import (
     STATE_SIZES as STATE_SIZES,
     Trajectory as Trajectory,
 )
+from dano.scene._weights import lifted as lifted, pulls as pulls

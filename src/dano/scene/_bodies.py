@@ -42,6 +42,7 @@ class Body(eqx.Module):
         mass_scale: Multiplies mass and inertia [1].
         com_offset: Moves the centre of mass [m, F].
         material: Contact parameters for pairs that no contact of a scene names; None: the scene's.
+        gravcomp: Share of the weight that is held, as by a spring balance [1]; None: none.
         fixed: Whether the body never moves.
     """
 
@@ -59,6 +60,7 @@ class Body(eqx.Module):
     mass_scale: Float[Array, ""]
     com_offset: Float[Array, "3"]
     material: ContactParams | None
+    gravcomp: Float[Array, ""] | None
     fixed: bool = eqx.field(static=True)
 
     def __init__(
@@ -72,6 +74,7 @@ class Body(eqx.Module):
         mass_scale: Numbers = 1.0,
         com_offset: Numbers = (0.0, 0.0, 0.0),
         material: ContactParams | None = None,
+        gravcomp: Numbers | None = None,
         fixed: bool = False,
     ):
         """A body from a neural object (which brings its mass) or a shape (homogeneous, of the given mass).
@@ -86,6 +89,8 @@ class Body(eqx.Module):
             mass_scale: Multiplies mass and inertia.
             com_offset: Moves the centre of mass [m, F].
             material: Contact parameters of this body in a scene with `others`, instead of the scene's own.
+            gravcomp: Share of the weight that is held: 1 and gravity does not pull at the body, more and it
+                rises. As MuJoCo's.
             fixed: Whether the body never moves; then it needs no mass.
 
         Raises:
@@ -126,6 +131,9 @@ class Body(eqx.Module):
         self.com = properties.com if com is None else checked_array(f"com of body {name!r}", com, (3,))
         self.mass_scale = checked_array(f"mass_scale of body {name!r}", mass_scale, (), above=0.0)
         self.com_offset = checked_array(f"com_offset of body {name!r}", com_offset, (3,))
+        self.gravcomp = None
+        if gravcomp is not None:
+            self.gravcomp = checked_array(f"gravcomp of body {name!r}", gravcomp, ())
 
     @property
     def size(self) -> float:

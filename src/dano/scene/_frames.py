@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,6 +17,9 @@ from dano.scene._states import State
 
 RESOLVED = 0.5
 """h |ω|/2 up to which a step resolves how a body spins: a turn of 60°."""
+# Trees of so many joints are placed by a loop over their levels, which compiles several times faster than
+# levels one after the other, and runs a little slower.
+_MANY_JOINTS = 16
 
 
 class Frames(eqx.Module):
@@ -173,10 +177,35 @@ def place_links(
     # The world is the last row.
     origin = jnp.concatenate([position - quat_rotate(orientation, chains.com), jnp.zeros((1, 3), q.dtype)])
     turned = jnp.concatenate([orientation, jnp.array([[1.0, 0.0, 0.0, 0.0]], q.dtype)])
-    axis, pivot = jnp.zeros_like(chains.axis), jnp.zeros_like(chains.axis)
-    for level in layout.levels:
-        rows = np.array(level)
-        parents, children = np.array(layout.parents)[rows], np.array(layout.children)[rows]
+    spots = jnp.zeros_like(chains.axis), jnp.zeros_like(chains.axis)
+    origin, turned, axis, pivot = _descended(chains, origin, turned, turn, path, *spots)
+    turned = turned[:-1]
+    placed = origin[:-1] + quat_rotate(turned, chains.com)
+    # Bodies that hang on nothing stay where they are to the last digit.
+    roots = np.array([i not in layout.children for i in range(layout.bodies)])[:, None]
+    return Poses(jnp.where(roots, position, placed), turned, axis, pivot)
+
+
+def _descended(
+    chains: Chains, origin: Array, turned: Array, turn: Array, path: Array, axis: Array, pivot: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Places of bodies, and axes and pivots of joints, level by level from the roots on.
+
+    Args:
+        chains: The trees.
+        origin: Of the field frames of all bodies and of the world [m, W], shape (n + 1, 3); roots count.
+        turned: Their orientations.
+        turn: Rotation vector of each joint [rad], shape (j, 3).
+        path: Its way [m].
+        axis: Filled with the axes of the joints [W].
+        pivot: Filled with points on them [m, W].
+    """
+    layout = chains.layout
+    parents, children = np.array(layout.parents), np.array(layout.children)
+
+    def level(carry, given):
+        origin, turned, axis, pivot = carry
+        rows, parents, joints, bodies = given
         parent = turned[parents]
         rest = quat_multiply(parent, chains.orientation[rows])
         along = quat_rotate(rest, chains.axis[rows])
@@ -187,14 +216,25 @@ def place_links(
             + quat_rotate(rest, chains.anchor[rows])
             + quat_rotate(rest, path[rows])
         )
-        turned = turned.at[children].set(child)
-        origin = origin.at[children].set(point - quat_rotate(child, chains.anchor[rows]))
-        axis, pivot = axis.at[rows].set(along), pivot.at[rows].set(point)
-    turned = turned[:-1]
-    placed = origin[:-1] + quat_rotate(turned, chains.com)
-    # Bodies that hang on nothing stay where they are to the last digit.
-    roots = np.array([i not in layout.children for i in range(layout.bodies)])[:, None]
-    return Poses(jnp.where(roots, position, placed), turned, axis, pivot)
+        base = point - quat_rotate(child, chains.anchor[rows])
+        put = {"mode": "drop", "unique_indices": True}
+        origin, turned = origin.at[bodies].set(base, **put), turned.at[bodies].set(child, **put)
+        return (origin, turned, axis.at[joints].set(along, **put), pivot.at[joints].set(point, **put)), None
+
+    carry = origin, turned, axis, pivot
+    levels = [np.array(rows) for rows in layout.levels]
+    if len(children) < _MANY_JOINTS:
+        for rows in levels:
+            carry, _ = level(carry, (rows, parents[rows], rows, children[rows]))
+        return carry
+    # Narrow levels do their first joint several times, and drop it: nothing has such rows.
+    widest = max(len(rows) for rows in levels)
+    spare = [np.arange(widest - len(rows)) for rows in levels]
+    pairs = list(zip(levels, spare, strict=True))
+    even = np.stack([np.concatenate([rows, rows[0] + 0 * k]) for rows, k in pairs])
+    joints = np.stack([np.concatenate([rows, len(children) + k]) for rows, k in pairs])
+    bodies = np.stack([np.concatenate([children[rows], len(origin) + k]) for rows, k in pairs])
+    return jax.lax.scan(level, carry, (even, parents[even], joints, bodies))[0]
 
 
 def link_jacobian(chains: Chains, poses: Poses) -> Float[Array, "n 6 k"]:

@@ -1,6 +1,8 @@
 """Reading scene files. Their keys are described in docs/scenes.md."""
 
 import dataclasses
+import functools
+import inspect
 import itertools
 import json
 import math
@@ -15,7 +17,7 @@ from dano.archive import checked_input
 from dano.building import BuildOptions, Units
 from dano.checks import checked_choice, checked_count, checked_number, shown
 from dano.contact import AbstractContactLaw, CentroidLaw, ContactParams, DistributedLaw
-from dano.fields import AbstractShape, Box, Capsule, Cylinder, Ellipsoid, HalfSpace, load_field, posed, Sphere
+from dano.fields import AbstractShape, load_field, posed, PRIMITIVES
 from dano.maths import Pose
 from dano.memory import memory_limit
 from dano.names import did_you_mean
@@ -50,17 +52,6 @@ from dano.scene_file._table import located, Table
 if TYPE_CHECKING:
     from dano.vision import LearnedField
 
-SHAPES: dict[str, tuple[type[AbstractShape], dict[str, int]]] = {
-    "half_space": (HalfSpace, {"normal": 3, "offset": 1}),
-    "sphere": (Sphere, {"radius": 1}),
-    "box": (Box, {"half_extents": 3, "rounding": 1}),
-    "capsule": (Capsule, {"radius": 1, "half_length": 1}),
-    "cylinder": (Cylinder, {"radius": 1, "half_length": 1}),
-    "ellipsoid": (Ellipsoid, {"semi_axes": 3}),
-}
-"""Shapes by name, with the count of numbers that each of their parameters takes."""
-
-_REQUIRED = {"radius", "half_extents", "half_length", "semi_axes"}
 _STATE = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
 _GEOMETRY = ("object", "field", "asset", "shape")
 _BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE, *JOINT_QUANTITIES)
@@ -70,37 +61,12 @@ _LOOP = {"position": 3, "anchor": 3, "orientation": 4}
 _JOINT_NUMBERS = ("damping", "friction", "armature", "stiffness", "rest", "ratio", "shift")
 # The mass of a body is a key of the body.
 _BUILD = tuple(field.name for field in dataclasses.fields(BuildOptions) if field.name != "mass")
-_PARAMS = tuple(ContactParams.__dataclass_fields__)
-_OF_CENTROIDS = (
-    "spring",
-    "damper",
-    "sliding_drag",
-    "torsional_friction",
-    "torsional_drag",
-    "rolling_friction",
-    "rolling_drag",
-)
-_LAWS: dict[str, tuple[type[AbstractContactLaw], tuple[str, ...]]] = {
-    "centroid": (
-        CentroidLaw,
-        ("sliding_friction", *_OF_CENTROIDS, "smoothing", "regularizer", "stiction_velocity", "adhesive"),
-    ),
-    "distributed": (
-        DistributedLaw,
-        (
-            *(key for key in _PARAMS if key not in _OF_CENTROIDS),
-            "stiction_velocity",
-            "implicitness",
-            "compliant",
-        ),
-    ),
-}
-"""Laws by name, with the keys that belong to them."""
+_LAWS: dict[str, type[AbstractContactLaw]] = {"centroid": CentroidLaw, "distributed": DistributedLaw}
+"""Laws by name."""
 DEFAULT_LAW = "distributed"
 """Law of contacts that name none."""
 _FLAGS = ("adhesive", "compliant")
 """Those of them that are true or false; the others are numbers."""
-_CONTACT = ("law", "edge", *dict.fromkeys(key for _, keys in _LAWS.values() for key in keys))
 _BYTES_PER_STEP = 500
 """Of a body in memory: state, joined pieces, and contact forces."""
 _TOP = (
@@ -116,6 +82,17 @@ _TOP = (
     "default_contact",
     "controls",
 )
+
+
+@functools.cache
+def _law_keys(law: str) -> tuple[str, ...]:
+    """The keys that belong to a law: the parameters it reads, and what it is made from."""
+    return (*_LAWS[law]().reads, *inspect.signature(_LAWS[law]).parameters)
+
+
+@functools.cache
+def _contact_keys() -> tuple[str, ...]:
+    return ("law", "edge", *dict.fromkeys(key for law in _LAWS for key in _law_keys(law)))
 
 
 @dataclass(frozen=True)
@@ -316,17 +293,18 @@ def _body(row: Table, folder: Path, built: dict[object, NeuralObject], progress:
 
 
 def _shape_keys() -> list[str]:
-    return sorted({key for _, parameters in SHAPES.values() for key in parameters})
+    return sorted({key for shape in PRIMITIVES.values() for key in shape.takes})
 
 
 def _shape(row: Table) -> AbstractShape:
-    kind = row.word("shape", list(SHAPES))
-    make, parameters = SHAPES[kind]
-    row.only((*_BODY, *parameters, "edge", "pose"))
-    if missing := [key for key in parameters if key in _REQUIRED and key not in row]:
+    kind = row.word("shape", list(PRIMITIVES))
+    make: Any = PRIMITIVES[kind]
+    row.only((*_BODY, *make.takes, "edge", "pose"))
+    usual = {key: each.default for key, each in inspect.signature(make).parameters.items()}
+    if missing := [key for key in make.takes if usual[key] is inspect.Parameter.empty and key not in row]:
         raise ValueError(f"a {kind} needs {', '.join(missing)} [m]")
     given: dict[str, Any] = {
-        key: row.number(key) if n == 1 else row.vector(key, n) for key, n in parameters.items() if key in row
+        key: row.number(key) if n == 1 else row.vector(key, n) for key, n in make.takes.items() if key in row
     }
     if "edge" in row:
         given["edge"] = row.number("edge")
@@ -438,7 +416,7 @@ def _contacts(
     default_law: str,
     robots: Sequence[Robot],
 ) -> list[Contact]:
-    default = top.table("default_contact", _CONTACT)
+    default = top.table("default_contact", _contact_keys())
     default.where = f"{top.where}: [default_contact]"
     usual = _law_name(default, default_law)
     if top.data.get("contacts", "all") == "all":
@@ -450,13 +428,13 @@ def _contacts(
             if a.name != b.name
             and not apart(a.name, b.name)
             and _may_meet(a.name, b.name, robots)
-            and _can_touch(a, b, presses=_LAWS[usual][0]().presses)
+            and _can_touch(a, b, presses=_LAWS[usual]().presses)
         ]
     if isinstance(top.data["contacts"], str):
         raise top.wrong("contacts", "'all' or written as [[contacts]] tables")
     names, contacts = [body.name for body in bodies], []
     for i, row in enumerate(top.tables("contacts")):
-        table = Table(f"{top.where}: [[contacts]] {i + 1}", row, ("a", "b", *_CONTACT))
+        table = Table(f"{top.where}: [[contacts]] {i + 1}", row, ("a", "b", *_contact_keys()))
         a, b = table.word("a"), table.word("b")
         table.where += f" ({a!r}, {b!r})"
         for name in (a, b):
@@ -467,7 +445,7 @@ def _contacts(
                 )
         law = _law_name(table, usual)
         # What the default says for another law does not concern this contact.
-        inherited = {key: value for key, value in default.data.items() if key in ("edge", *_LAWS[law][1])}
+        inherited = {key: value for key, value in default.data.items() if key in ("edge", *_law_keys(law))}
         table.data = {**inherited, **row}
         contacts.append(_contact(table, law, a, b))
     return contacts
@@ -487,12 +465,12 @@ def _law_name(table: Table, default: str) -> str:
     """The law that a table chooses, whose other keys must belong to it."""
     law = table.word("law", tuple(_LAWS), default)
     for key in table.data:
-        owners = [name for name, (_, keys) in _LAWS.items() if key in keys]
+        owners = [name for name in _LAWS if key in _law_keys(name)]
         if owners and law not in owners:
             hint = "" if "law" in table else f"; for the other law write law = {owners[0]!r}"
             raise ValueError(
                 f"{table.where}: {key} belongs to law = {owners[0]!r}, and this is {law!r}, whose keys are "
-                f"{', '.join(_LAWS[law][1])}{hint}"
+                f"{', '.join(_law_keys(law))}{hint}"
             )
     return law
 
@@ -508,11 +486,15 @@ def _can_touch(a: Body, b: Body, *, presses: bool) -> bool:
 
 
 def _contact(table: Table, law: str, a: str, b: str) -> Contact:
-    make, keys = _LAWS[law]
+    make, keys = _LAWS[law], _law_keys(law)
     numbers = {key: table.number(key) for key in keys if key in table and key not in _FLAGS}
-    options: dict[str, Any] = {key: value for key, value in numbers.items() if key not in _PARAMS}
+    options: dict[str, Any] = {
+        key: value for key, value in numbers.items() if key not in ContactParams.__dataclass_fields__
+    }
     options |= {key: table.boolean(key, False) for key in keys if key in table and key in _FLAGS}
     edge = table.number("edge") if "edge" in table else None
     with located(table.where):
-        params = ContactParams(**{key: value for key, value in numbers.items() if key in _PARAMS})
+        params = ContactParams(
+            **{key: value for key, value in numbers.items() if key in ContactParams.__dataclass_fields__}
+        )
         return Contact(a, b, params, make(**options), edge=edge)

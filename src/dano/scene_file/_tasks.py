@@ -43,7 +43,7 @@ class Search:
     """
 
     method: Method
-    explore: int
+    explore: int | None
     softening: tuple[float, ...]
     seed: int
     max_seconds: float | None
@@ -210,8 +210,8 @@ def _search(top: Table) -> Search:
         least = 4 if key == "samples" else 1
         if key in table and cast(int, counts[key]) < least:
             raise table.wrong(key, f"≥ {least}")
-    explore = table.integer("explore", 0)
-    if explore < 0:
+    explore = table.integer("explore", 0) if "explore" in table else None
+    if explore is not None and explore < 0:
         raise table.wrong("explore", "≥ 0")
     softening = _numbers(table, "softening") if "softening" in table else ()
     softening = softening if isinstance(softening, tuple) else (softening,)

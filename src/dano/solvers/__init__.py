@@ -5,6 +5,7 @@ from dano.solvers._box import box_minimum as box_minimum, BoxMinimum as BoxMinim
 from dano.solvers._least_squares import (
     bounded_least_squares as bounded_least_squares,
     eliminated as eliminated,
+    gauss_newton as gauss_newton,
     Iterate as Iterate,
     NormalEquations as NormalEquations,
     Solution as Solution,

@@ -50,7 +50,7 @@ class Stop(enum.Enum):
     LOSS = "converged: predicted decrease below tolerance"
     STEP = "converged: negligible steps"
     PERFECT = "converged: the residuals are zero up to rounding"
-    STUCK = "no step reduces the loss, although its gradient is not zero: the loss is rough here"
+    STUCK = "no step reduces the loss, although its gradient is not zero"
     ITERATIONS = "the limit of iterations was reached"
     INTERRUPTED = "interrupted: this is the best point so far"
 
@@ -109,7 +109,7 @@ _DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-15, 1e12
 # Relative change of x that is none.
 _NEGLIGIBLE = 1e-10
-# If the loss should fall by so many tolerances and does not, it is called rough.
+# If the loss should fall by so many tolerances and does not, the search is stuck.
 _ROUGH = 100
 # Curvature over a parameter's range, as a share of the largest there is, that may be rounding: a parameter
 # with less stays about where it is instead of running off.
@@ -350,6 +350,15 @@ def eliminated(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
     """Gradient (p,) and Hessian (p, p) of the loss in x alone, minimised over the blocks."""
     gradient, hessian, _, _ = _eliminate(normal, 0.0, _scales(normal))
     return gradient, hessian
+
+
+def gauss_newton(
+    normal: NormalEquations, lower: np.ndarray, upper: np.ndarray, damping: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Changes of x and of the blocks to the minimum of the model, with lower ≤ dx ≤ upper."""
+    scales = _scales(normal)
+    floor = _FLAT * np.max(scales[0], initial=0) * np.ones(len(lower))
+    return _step(normal, damping, floor, scales, lower, upper)[:2]
 
 
 def _eliminate(normal: NormalEquations, damping: float, spread: tuple[np.ndarray, np.ndarray]):

@@ -5,29 +5,25 @@ See `dano.physics.solids.distances` and `dano.physics.overlap`.
 
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float, Int
 
+from dano.engine.launching._instances import Features, instance
 from dano.fields import (
     AbstractField,
-    AbstractShape,
-    Box,
-    Capsule,
-    Cylinder,
+    AbstractPrimitive,
     degree_of,
-    Ellipsoid,
     GridField,
-    HalfSpace,
     PosedField,
     PosedShape,
+    PRIMITIVES,
     ScaledField,
     ScaledShape,
     SignedDistanceGrid,
-    Sphere,
     UnionField,
     UnionShape,
 )
@@ -40,17 +36,28 @@ _RUN = 4
 _KIND_WIDTH = 7
 # Cells of a grid along an axis that have one lower bound: see `dano.physics.solids.leaves`.
 _CELL = 4
-# Kinds of leaves by their numbers, and what a leaf holds besides its pose: sizes, length, spacing.
-_KINDS: dict[type[AbstractField], tuple[int, Any]] = {
-    HalfSpace: (0, lambda s: {"sizes": s.normal_direction, "length": s.offset}),
-    Sphere: (1, lambda s: {"sizes": jnp.stack([s.radius, 0 * s.radius, 0 * s.radius])}),
-    Box: (2, lambda s: {"sizes": s.half_extents, "length": s.rounding}),
-    Capsule: (3, lambda s: {"sizes": jnp.stack([s.radius, s.half_length, 0 * s.radius])}),
-    Cylinder: (4, lambda s: {"sizes": jnp.stack([s.radius, s.half_length, 0 * s.radius])}),
-    Ellipsoid: (5, lambda s: {"sizes": s.semi_axes}),
-    SignedDistanceGrid: (6, lambda s: {"sizes": s.origin, "spacing": s.spacing}),
-    GridField: (7, lambda s: {"sizes": s.origin, "spacing": s.spacing}),
-}
+_NUMBERS = "dano.physics.solids.leaves", "dano.physics.solids.shapes"
+Known = AbstractPrimitive | SignedDistanceGrid | GridField
+"""Fields that kernels know."""
+
+
+@functools.cache
+def kind_numbers() -> dict[str, int]:
+    """Numbers of all kinds of leaves in kernels, by their names in capitals."""
+    modules = [instance(Features(KINDS=frozenset()), name) for name in _NUMBERS]
+    known = {name: value for module in modules for name, value in vars(module).items()}
+    kinds = (*PRIMITIVES, SignedDistanceGrid.kind, GridField.kind)
+    return {kind.upper(): known[kind.upper()] for kind in kinds}
+
+
+def kind_number(kind: str) -> int:
+    """Number of a kind of leaves."""
+    return kind_numbers()[kind.upper()]
+
+
+def shape_kinds() -> set[int]:
+    """Numbers of the kinds of shapes with a name."""
+    return set(map(kind_number, PRIMITIVES))
 
 
 class Placed(NamedTuple):
@@ -65,6 +72,12 @@ class Placed(NamedTuple):
     def still(cls, field: AbstractField, dtype: DTypeLike) -> "Placed":
         """A field in its own frame."""
         return cls(field, jnp.ones((), dtype), jnp.zeros(3, dtype), jnp.eye(3, dtype=dtype))
+
+    @property
+    def leaf(self) -> Known:
+        """The field, which is a leaf."""
+        assert isinstance(self.field, Known)
+        return self.field
 
     def inside(self, field: AbstractField, pose: Pose | None = None, factor: Array | None = None) -> "Placed":
         """What the field is made of."""
@@ -99,7 +112,7 @@ def is_known(field: AbstractField) -> bool:
         return all(is_known(part) for part in _parts(field))
     if isinstance(field, PosedShape | ScaledShape | PosedField | ScaledField):
         return is_known(_inner(field))
-    return type(field) in _KINDS
+    return isinstance(field, Known)
 
 
 def _parts(field: UnionShape | UnionField) -> Sequence[AbstractField]:
@@ -123,8 +136,8 @@ def leaves_of(placed: Placed) -> list[Placed]:
         return leaves_of(placed.inside(shape.shape, factor=shape.factor))
     if isinstance(shape, UnionShape):
         return [leaf for each in shape.shapes for leaf in leaves_of(placed.inside(each))]
-    if type(shape) not in _KINDS:
-        known = ", ".join(kind.__name__ for kind in _KINDS if issubclass(kind, AbstractShape))
+    if not isinstance(shape, Known):
+        known = ", ".join(kind.__name__ for kind in (*PRIMITIVES.values(), SignedDistanceGrid))
         raise ValueError(
             f"shape must be one that contact knows ({known}, posed, scaled or joined), got "
             f"{type(shape).__name__}: a SignedDistanceGrid may stand for any other"
@@ -134,7 +147,7 @@ def leaves_of(placed: Placed) -> list[Placed]:
 
 def kinds_of(leaves: Sequence[Placed]) -> set[int]:
     """Kinds of leaves."""
-    return {_KINDS[type(leaf.field)][0] for leaf in leaves}
+    return {kind_number(each.leaf.kind) for each in leaves}
 
 
 def degrees_of(leaves: Sequence[Placed]) -> set[int]:
@@ -152,7 +165,7 @@ def leaf_tables(leaves: Sequence[Placed], dtype: DTypeLike) -> Leaves:
         none = jnp.zeros((0, 1), dtype)
         return Leaves(jnp.zeros((0, LEAF_WIDTH), dtype), _whole([]), none, none)
     zero = {"sizes": jnp.zeros(3), "length": jnp.zeros(()), "spacing": jnp.ones(3)}
-    own = [{**zero, **_KINDS[type(leaf.field)][1](leaf.field)} for leaf in leaves]
+    own = [{**zero, **each.leaf.leaf()} for each in leaves]
     columns = [
         jnp.stack([leaf.factor for leaf in leaves]),
         jnp.stack([leaf.position for leaf in leaves]),
@@ -161,7 +174,7 @@ def leaf_tables(leaves: Sequence[Placed], dtype: DTypeLike) -> Leaves:
     ]
     kinds, coefficients, bounds, at, first_bound = [], [jnp.zeros(0, dtype)], [jnp.zeros(0, dtype)], 0, 0
     for leaf in leaves:
-        kind = (_KINDS[type(leaf.field)][0], 0, 0, 0, 0, 0, 0)
+        kind = (kind_number(leaf.leaf.kind), 0, 0, 0, 0, 0, 0)
         if isinstance(leaf.field, SignedDistanceGrid | GridField):
             grid = leaf.field.coefficients
             degree = degree_of(leaf.field.interpolation)
@@ -180,7 +193,7 @@ def leaf_tables(leaves: Sequence[Placed], dtype: DTypeLike) -> Leaves:
     )
 
 
-def lower_bounds(coefficients: Float[Array, "x y z"], degree: int) -> Float[Array, "a b c"]:
+def lower_bounds(coefficients: Float[Array | np.ndarray, "x y z"], degree: int) -> Float[Array, "a b c"]:
     """Lower bounds on a spline between its outermost nodes, one for each block of cells.
 
     A spline is a mean of the coefficients around a place.
@@ -189,12 +202,12 @@ def lower_bounds(coefficients: Float[Array, "x y z"], degree: int) -> Float[Arra
         coefficients: Of the spline, its border of `degree` + 1 nodes included.
         degree: Of the spline.
     """
-    bound = jax.lax.stop_gradient(coefficients)
+    bound = jax.lax.stop_gradient(jnp.asarray(coefficients))
     for axis, size in enumerate(coefficients.shape):
         n = (size - 2 * degree - 3) // _CELL + 1
-        # Those of a block's first cell begin one before its own node, those of the last end two beyond it.
-        begins = np.minimum(degree + np.arange(_CELL + 3)[:, None] + _CELL * np.arange(n), size - 1)
-        bound = functools.reduce(jnp.minimum, (jnp.take(bound, nodes, axis) for nodes in begins))
+        # From one before the own node of a block's first cell to two beyond that of its last.
+        nodes = np.minimum(degree + np.arange(_CELL + 3)[:, None] + _CELL * np.arange(n), size - 1)
+        bound = functools.reduce(jnp.minimum, (jnp.take(bound, each, axis) for each in nodes))
     return bound
 
 

@@ -1,5 +1,6 @@
 """A scene as rows of numbers, as kernels read them (`dano.engine.kernels.tables`)."""
 
+import functools
 from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
@@ -16,10 +17,12 @@ from dano.engine.launching._leaves import (
     balls_around_runs,
     degrees_of,
     is_known,
+    kind_number,
     kinds_of,
     leaf_tables,
     leaves_of,
     Placed,
+    shape_kinds,
 )
 from dano.engine.launching._patch_tables import knows_law, patch_pairs, patch_tables, PatchTables
 from dano.scene import Body, pressing_pairs, Scene
@@ -74,10 +77,19 @@ def knows(scene: Scene) -> bool:
     return laws and solids and all(field is None or is_known(field) for field in queried)
 
 
-# Kinds, ways of turning and degrees that builds know, from the smallest on. Few builds serve all scenes: each
-# takes some seconds to compile, once on a machine.
-_BUILDS = tuple(map(frozenset, ({0}, range(6), {0, 6}, {0, 7}, range(7), range(8))))
 _STILL, _TURNS = frozenset({0}), frozenset({0, 1, 2})
+
+
+@functools.cache
+def _builds() -> list[frozenset[int]]:
+    """Kinds of leaves that builds know, from the smallest on.
+
+    Few builds serve all scenes: each takes some seconds to compile, once on a machine.
+    """
+    plane, grid, density = map(kind_number, ("half_space", "grid", "density"))
+    shapes = shape_kinds()
+    builds = {plane}, shapes, {plane, grid}, {plane, density}, {*shapes, grid}, {*shapes, grid, density}
+    return [frozenset(each) for each in builds]
 
 
 def features_of(
@@ -97,11 +109,11 @@ def features_of(
         surface = scene.bodies[first].surface
         assert surface is not None
         turning.add(_TURNING[surface.turning])
-    known = next(each for each in _BUILDS if kinds <= each)
+    known = next(each for each in _builds() if kinds <= each)
     of_grids = frozenset({2}) if degrees <= {2} else frozenset({1, 2, 3})
     return Features(
         KINDS=known,
-        DEGREES=of_grids if known & {6, 7} else frozenset(),
+        DEGREES=of_grids if known - shape_kinds() else frozenset(),
         TURNING=_STILL if turning <= _STILL else _TURNS,
         UNIONS=unions,
         POINTS=bool(pairs) or not patches,
@@ -216,7 +228,7 @@ def _impact_depths(scene: Scene, dtype: DTypeLike) -> Float[Array, " contacts"]:
     )
 
 
-def _materials(scene: Scene, kernels: ModuleType, dtype: DTypeLike) -> Float[Array, "contacts 13"]:
+def _materials(scene: Scene, kernels: ModuleType, dtype: DTypeLike) -> Float[Array, "contacts width"]:
     groups = _point_laws(scene)
     if not groups:
         return jnp.zeros((0, len(Material._fields)), dtype)

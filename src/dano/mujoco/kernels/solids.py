@@ -5,10 +5,11 @@ import warp as wp
 from dano.mujoco.kernels.tables import Known, Model, PartIndex
 from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
 from dano.physics.solids.distances import leaf_clearance, leaf_distance
-from dano.physics.solids.leaves import Distance, ELLIPSOID, HALF_SPACE
+from dano.physics.solids.leaves import Distance, HALF_SPACE
+from dano.physics.solids.shapes import ELLIPSOID
 
 HULL, HEIGHTS, NONE, UNKNOWN = 100, 101, -1, -2
-"""Kinds of solids besides those of `dano.physics.solids.leaves`: convex hulls of meshes; height fields; none;
+"""Kinds of solids besides those of `dano.physics.solids`: convex hulls of meshes; height fields; none;
 those of geoms that may not touch an object."""
 
 _HULL, _HEIGHTS = wp.constant(HULL), wp.constant(HEIGHTS)

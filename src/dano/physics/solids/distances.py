@@ -2,45 +2,16 @@
 
 A solid is a run of *leaves*: one for a shape, several for a union, whose distance is the least of theirs.
 Each leaf has a kind, a size s, and a pose: x = s R y + p for y in the axes of its own.
-
-To add a kind: a number in `leaves`, its function from y to a `Distance` in `shapes`, two lines in
-`leaf_distance`, and a row in the table of `dano.engine.launching._leaves`, which says which class of
-`dano.fields` it is.
 """
 
 import warp as wp
 
 from dano.physics.features import KINDS, UNIONS
 from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
-from dano.physics.solids.grids import beyond_range, coarse_bound, grid_distance
-from dano.physics.solids.leaves import (
-    BOX,
-    CAPSULE,
-    CYLINDER,
-    Distance,
-    ELLIPSOID,
-    GRID,
-    HALF_SPACE,
-    Leaf,
-    LeafKind,
-    Solids,
-    SPHERE,
-)
-from dano.physics.solids.shapes import (
-    ball_distance,
-    box_distance,
-    capsule_distance,
-    cylinder_distance,
-    ellipsoid_distance,
-    half_space_distance,
-)
+from dano.physics.solids.grids import closest_in_grid, coarse_bound, grid_distance, place_in_grid
+from dano.physics.solids.leaves import Distance, GRID, Leaf, LeafKind, Solids
+from dano.physics.solids.shapes import shape_distance
 
-_HALF_SPACE = wp.constant(HALF_SPACE)
-_SPHERE = wp.constant(SPHERE)
-_BOX = wp.constant(BOX)
-_CAPSULE = wp.constant(CAPSULE)
-_CYLINDER = wp.constant(CYLINDER)
-_ELLIPSOID = wp.constant(ELLIPSOID)
 _GRID = wp.constant(GRID)
 
 
@@ -65,28 +36,10 @@ class Solid:
 def leaf_distance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: vec3) -> Distance:
     """Of one leaf, at a point [m, F]."""
     y = (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position))
-    d = Distance()
+    d = shape_distance(kind.kind, leaf, y)
     if wp.static(GRID in KINDS):
         if kind.kind == _GRID:
             d = grid_distance(solids, world, kind, leaf, y)
-    if wp.static(HALF_SPACE in KINDS):
-        if kind.kind == _HALF_SPACE:
-            d = half_space_distance(leaf, y)
-    if wp.static(BOX in KINDS):
-        if kind.kind == _BOX:
-            d = box_distance(leaf, y)
-    if wp.static(CAPSULE in KINDS):
-        if kind.kind == _CAPSULE:
-            d = capsule_distance(leaf, y)
-    if wp.static(CYLINDER in KINDS):
-        if kind.kind == _CYLINDER:
-            d = cylinder_distance(leaf, y)
-    if wp.static(ELLIPSOID in KINDS):
-        if kind.kind == _ELLIPSOID:
-            d = ellipsoid_distance(leaf, y)
-    if wp.static(SPHERE in KINDS):
-        if kind.kind == _SPHERE:
-            d = ball_distance(leaf.sizes[0], y)
     d.value = leaf.factor * d.value
     d.gradient = leaf.rotation * d.gradient
     return d
@@ -102,17 +55,13 @@ def leaf_clearance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: ve
     way = ZERO
     if wp.static(GRID in KINDS):
         if kind.kind == _GRID:
-            border = kind.degree + 1
-            y = (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position)) - leaf.sizes
-            away = vec3(
-                beyond_range(y[0], real(kind.nodes_x - 2 * border - 1) * leaf.spacing[0]),
-                beyond_range(y[1], real(kind.nodes_y - 2 * border - 1) * leaf.spacing[1]),
-                beyond_range(y[2], real(kind.nodes_z - 2 * border - 1) * leaf.spacing[2]),
-            )
-            way = leaf.factor * wp.length(away)
+            y = (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position))
+            u = place_in_grid(leaf, y)
+            closest = closest_in_grid(kind, u)
+            way = leaf.factor * wp.length(wp.cw_mul(u - closest, leaf.spacing))
             if way > wp.max(enough, ZERO):
                 return way
-            bound = leaf.factor * coarse_bound(solids, world, kind, leaf, y + leaf.sizes)
+            bound = leaf.factor * coarse_bound(solids, world, kind, closest)
             if way > ZERO:
                 bound = wp.sqrt(wp.max(bound, ZERO) * wp.max(bound, ZERO) + way * way)
             if bound > enough:

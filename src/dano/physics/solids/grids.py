@@ -171,9 +171,8 @@ def closest_in_grid(kind: LeafKind, u: vec3) -> vec3:
 
 
 @wp.func
-def coarse_bound(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, y: vec3) -> real:
-    """A lower bound on the spline at the place in a grid closest to a point in its axes [m]: of few cells."""
-    u = closest_in_grid(kind, place_in_grid(leaf, y))
+def coarse_bound(solids: Solids, world: int, kind: LeafKind, u: vec3) -> real:
+    """A lower bound on the spline at a place between a grid's outermost nodes [m]: that of a few cells."""
     inner = 2 * kind.degree + 3
     along_y = (kind.nodes_y - inner) // _CELL + 1
     along_z = (kind.nodes_z - inner) // _CELL + 1
@@ -242,9 +241,3 @@ def distance_change(
     d.value = leaf.factor * d.value
     d.gradient = leaf.rotation * d.gradient
     return d
-
-
-@wp.func
-def beyond_range(x: real, last: real) -> real:
-    """By how much x lies beyond [0, last]."""
-    return x - wp.min(wp.max(x, ZERO), last)

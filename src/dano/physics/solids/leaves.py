@@ -7,8 +7,8 @@ import warp as wp
 
 from dano.physics.real import mat33, ONE, real, vec3, ZERO
 
-HALF_SPACE, SPHERE, BOX, CAPSULE, CYLINDER, ELLIPSOID, GRID = range(7)
-"""Kinds of leaves."""
+HALF_SPACE, GRID, DENSITY = 0, 6, 7
+"""Kinds of leaves: planes, grids of distances and grids of densities; the others stand in `shapes`."""
 CELL = 4
 """Cells of a grid along an axis that have one lower bound."""
 
@@ -40,7 +40,7 @@ class LeafKind:
     """Whole numbers of a leaf.
 
     Attributes:
-        kind: Which of the kinds above.
+        kind: Its number, see above.
         first: Place of a grid's first spline coefficient.
         nodes_x: Number of coefficients along x, border included.
         nodes_y: Along y.

@@ -1,10 +1,20 @@
-"""Signed distances of shapes, with gradients, each in its own axes."""
+"""Signed distances of shapes, with gradients, each in its own axes.
+
+To add a shape: a number, a function from y to a `Distance`, and two lines in `shape_distance`. The number is
+named as the `kind` of its class in `dano.fields`.
+"""
 
 import warp as wp
 
+from dano.physics.features import KINDS
 from dano.physics.real import ONE, real, TWO, vec3, ZERO
-from dano.physics.solids.leaves import Distance, inverse_or_zero, Leaf
+from dano.physics.solids.leaves import Distance, HALF_SPACE, inverse_or_zero, Leaf
 
+SPHERE, BOX, CAPSULE, CYLINDER, ELLIPSOID = range(1, 6)
+"""Kinds of leaves that are shapes; the next would be 8."""
+
+_HALF_SPACE, _SPHERE, _BOX = wp.constant(HALF_SPACE), wp.constant(SPHERE), wp.constant(BOX)
+_CAPSULE, _CYLINDER, _ELLIPSOID = wp.constant(CAPSULE), wp.constant(CYLINDER), wp.constant(ELLIPSOID)
 # Of the search for the closest point of an ellipsoid: halvings of its bracket, then steps of Newton's method.
 _BISECTIONS, _STEPS = wp.constant(5), wp.constant(7)
 # Points closer to a symmetry plane than this share of a semi-axis count as there: 4 times the rounding.
@@ -176,4 +186,29 @@ def ellipsoid_distance(leaf: Leaf, y: vec3) -> Distance:
     length = wp.sqrt(wp.dot(r, r))
     d.value = (s - least * least) * length
     d.gradient = wp.cw_mul(vec3(sign(y[0]), sign(y[1]), sign(y[2])), r) / length
+    return d
+
+
+@wp.func
+def shape_distance(kind: int, leaf: Leaf, y: vec3) -> Distance:
+    """Of a shape of some kind, at a point in its axes [m]."""
+    d = Distance()
+    if wp.static(HALF_SPACE in KINDS):
+        if kind == _HALF_SPACE:
+            d = half_space_distance(leaf, y)
+    if wp.static(BOX in KINDS):
+        if kind == _BOX:
+            d = box_distance(leaf, y)
+    if wp.static(CAPSULE in KINDS):
+        if kind == _CAPSULE:
+            d = capsule_distance(leaf, y)
+    if wp.static(CYLINDER in KINDS):
+        if kind == _CYLINDER:
+            d = cylinder_distance(leaf, y)
+    if wp.static(ELLIPSOID in KINDS):
+        if kind == _ELLIPSOID:
+            d = ellipsoid_distance(leaf, y)
+    if wp.static(SPHERE in KINDS):
+        if kind == _SPHERE:
+            d = ball_distance(leaf.sizes[0], y)
     return d

@@ -48,6 +48,31 @@ class Joint:
     shift: real
 
 
+@wp.func
+def summed_joint(a: Joint, b: Joint) -> Joint:
+    """Sum of two derivatives by a joint."""
+    a.axis += b.axis
+    a.anchor += b.anchor
+    a.position += b.position
+    a.orientation += b.orientation
+    a.ratio += b.ratio
+    a.shift += b.shift
+    return a
+
+
+@wp.func
+def joint_product(a: Joint, b: Joint) -> real:
+    """⟨a, b⟩ of joints."""
+    return (
+        wp.dot(a.axis, b.axis)
+        + wp.dot(a.anchor, b.anchor)
+        + wp.dot(a.position, b.position)
+        + wp.dot(a.orientation, b.orientation)
+        + a.ratio * b.ratio
+        + a.shift * b.shift
+    )
+
+
 @wp.struct
 class JointFrame:
     """Where a joint is at the start of a step [W].
@@ -219,9 +244,9 @@ def motion_share(kind: int, joint: Joint) -> real:
 
 
 @wp.func
-def motion_twist(turning: bool, along: vec3, lever: vec3) -> vec6:
+def motion_twist(kind: int, joint: Joint, part: int, along: vec3, lever: vec3) -> vec6:
     """Twist of a motion at the origin of its tree, from which a lever leads to the pivot [m]."""
-    if turning:
+    if is_turn(kind, part):
         return joined(wp.cross(lever, along), along)
     return joined(along, vec3())
 
@@ -234,14 +259,14 @@ def joint_spin(frame: JointFrame, y: vec3) -> vec3:
 
 @wp.func
 def hanging_move(
-    kind: int, share: real, frame: JointFrame, parent: Displacement, arm: vec3, lever: vec3, y: vec3, h: real
+    kind: int, joint: Joint, frame: JointFrame, parent: Displacement, arm: vec3, lever: vec3, y: vec3, h: real
 ) -> JointMove:
     """How a body on a joint moves in a step.
 
     Args:
         kind: Of the joint.
-        share: See `motion_share`.
-        frame: The joint at the start of the step.
+        joint: The joint.
+        frame: Where it is at the start of the step.
         parent: How the body that carries it moves.
         arm: From that body's centre of mass to the pivot [m, W].
         lever: From the pivot to the centre of mass of the body that hangs on it [m, W].
@@ -249,6 +274,7 @@ def hanging_move(
         h: Timestep [s].
     """
     found = JointMove()
+    share = motion_share(kind, joint)
     before = parent.turn
     moved = parent.shift + change_by_turn(before, arm)
     own = quat(ZERO, ZERO, ZERO, ONE)

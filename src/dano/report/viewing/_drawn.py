@@ -11,7 +11,7 @@ from dano.maths import Pose, quat_from_matrix, quat_to_matrix
 from dano.report._resample import poses_at
 from dano.report._stage import Touches, touches
 from dano.report.viewing._meshes import add_coloured, body_mesh
-from dano.scene import Body, Scene, Trajectory
+from dano.scene import Body, pulls, Scene, Trajectory
 from dano.vision import Camera, checked_colour, Item, LearnedField, PALETTE
 
 _GHOST = 0.35
@@ -182,14 +182,14 @@ def _energy(scene: Scene, trajectory: Trajectory) -> Float[np.ndarray, " T"]:
     states = trajectory.states
     rows = [i for i, body in enumerate(scene.bodies) if not body.fixed]
     total = np.zeros(len(trajectory.times))
-    gravity = np.asarray(scene.gravity, np.float64)
+    gravity = np.asarray(pulls(scene), np.float64)
     for i in rows:
         body = scene.bodies[i]
         scale = float(body.mass_scale)
         mass, inertia = scale * float(body.mass), scale * np.asarray(body.inertia, np.float64)
         speed, spin = (np.asarray(x[:, i], np.float64) for x in (states.velocity, states.omega))
         total += 0.5 * mass * np.sum(speed**2, axis=1) + 0.5 * np.einsum("ti,ij,tj->t", spin, inertia, spin)
-        total -= mass * np.asarray(states.position[:, i], np.float64) @ gravity
+        total -= mass * np.asarray(states.position[:, i], np.float64) @ gravity[i]
     return total - total.min()
 
 

@@ -8,16 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dano.exchange import solid_triangles
-from dano.fields import (
-    AbstractShape,
-    Box,
-    Capsule,
-    Cylinder,
-    Ellipsoid,
-    PosedShape,
-    SignedDistanceGrid,
-    Sphere,
-)
+from dano.fields import AbstractShape, HalfSpace, PosedShape, PRIMITIVES, SignedDistanceGrid, Sphere
 from dano.scene import Body
 from dano.vision import LearnedField, placement
 
@@ -28,7 +19,7 @@ _FINE = 128
 """Most nodes of a shape that is shown alone."""
 
 
-_CONVEX = Sphere | Ellipsoid | Capsule | Cylinder | Box
+_CONVEX = tuple(shape for shape in PRIMITIVES.values() if shape is not HalfSpace)
 """Shapes whose surface rays from the middle find exactly, however thin they are."""
 
 
@@ -125,7 +116,7 @@ def surface_mesh(shape: AbstractShape, n: int = 48) -> tuple[np.ndarray, np.ndar
     directions, faces = _cube_sphere(n if isinstance(shape, _CONVEX) else 2 * n)
     bounds = np.asarray(shape.bounds, dtype=np.float64)
     centre, half = bounds.mean(axis=0), 0.5 * (bounds[1] - bounds[0])
-    if isinstance(shape, Ellipsoid | Capsule | Cylinder | Box):
+    if isinstance(shape, _CONVEX) and not isinstance(shape, Sphere):
         # In proportion to the extent, so that flat shapes get vertices along their long sides.
         directions = directions * half
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -7,6 +7,7 @@ from dano.robots.formats._description import (
     Description as Description,
     Drive as Drive,
     held_at as held_at,
+    Keyframe as Keyframe,
     Lacking as Lacking,
     Link as Link,
     Placed as Placed,

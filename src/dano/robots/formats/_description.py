@@ -49,6 +49,7 @@ class Link:
         inertia: About it [kg m², axes of the link], shape (3, 3).
         solids: What it touches with.
         visuals: What it looks like.
+        gravcomp: Share of its weight that is held [1].
     """
 
     name: str
@@ -57,6 +58,7 @@ class Link:
     inertia: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     solids: tuple[Solid, ...] = ()
     visuals: tuple[Solid, ...] = ()
+    gravcomp: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,23 @@ class Connection:
 
 
 @dataclass(frozen=True)
+class Keyframe:
+    """A state that a file names.
+
+    Attributes:
+        q: Coordinates of joints by name [rad or m]; of a ball its rotation vector.
+        v: Their velocities.
+        places: Of links that move freely, by name: position [m, W] and orientation wxyz of the link's frame.
+        speeds: Theirs: velocity of the frame's origin [m/s, W] and omega [rad/s, link].
+    """
+
+    q: dict[str, np.ndarray]
+    v: dict[str, np.ndarray]
+    places: dict[str, tuple[np.ndarray, np.ndarray]]
+    speeds: dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True)
 class Tie:
     """What closes a loop of a robot: see `dano.Loop`, with links for bodies.
 
@@ -173,6 +192,10 @@ class Description:
         gravity: [m/s²]; None if the format has none.
         lacking: What must be left out by name.
         notes: What was read in another way than it is written, one line each.
+        keyframes: States that the file names.
+        frictions: Sliding friction and priority of each shape that a link touches with, by the link's name;
+            links of which nothing is said have none.
+        silent: What is not read and changes how it is simulated, one line each.
     """
 
     name: str
@@ -184,6 +207,9 @@ class Description:
     gravity: tuple[float, float, float] | None = None
     lacking: tuple[Lacking, ...] = ()
     notes: tuple[str, ...] = ()
+    keyframes: dict[str, Keyframe] = field(default_factory=dict)
+    frictions: dict[str, tuple[tuple[float, int], ...]] = field(default_factory=dict)
+    silent: tuple[str, ...] = ()
 
     def link(self, name: str) -> Link:
         """A link by name."""

@@ -60,15 +60,37 @@ def lacking_of(model: Any, mujoco: Any) -> list[Lacking]:
             "fluid",
             f"<option> has density {density:g} kg/m³ and viscosity {viscosity:g} Pa s: dano has no drag",
         )
-    names = [model.body(i).name or f"body {i}" for i in np.flatnonzero(model.body_gravcomp)]
-    if names:
-        say(GRAVCOMP, f"gravcomp of {_listed(names)} is not 0: dano lets gravity act on all bodies alike")
+    for head in np.unique(model.body_weldid)[1:]:
+        welded = np.flatnonzero((model.body_weldid == head) & (model.body_mass > 0))
+        if np.ptp(model.body_gravcomp[welded]) > 0 if welded.size else False:
+            names = _listed([model.body(i).name or f"body {i}" for i in welded])
+            say(GRAVCOMP, f"gravcomp of {names} differs: to dano what is welded together is one body")
     acting = [name for t in range(model.ntendon) if (name := _acting_tendon(model, t))]
     if acting:
         say("tendons", f"{_listed(acting)}: dano has no tendons")
     if model.nflex:
         say("soft bodies", f"{model.nflex} flexes: dano has rigid bodies only")
     found += _of_joints(model, mujoco) + _of_geoms(model, mujoco)
+    return found
+
+
+def silent_of(model: Any, mujoco: Any) -> list[str]:
+    """What is not read although it changes how MuJoCo simulates, one line each."""
+    soft = np.array([0.02, 1.0]), np.array([0.9, 0.95, 0.001, 0.5, 2.0])
+    geoms = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
+    told = [
+        g
+        for g in geoms
+        if not (np.allclose(model.geom_solref[g], soft[0]) and np.allclose(model.geom_solimp[g], soft[1]))
+    ]
+    found = []
+    if told:
+        names = _listed([model.geom(g).name or f"geom {g}" for g in told])
+        found.append(f"solref or solimp of {names}: contacts are as soft as dano.ContactParams says")
+    rolling = [g for g in geoms if model.geom_condim[g] > 3]
+    if rolling:
+        names = _listed([model.geom(g).name or f"geom {g}" for g in rolling])
+        found.append(f"torsional and rolling friction of {names}: in dano they come out of the geometry")
     return found
 
 

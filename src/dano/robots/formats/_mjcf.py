@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from dano.robots.formats._description import (
     Tie,
     without_followers,
 )
-from dano.robots.formats._lacking import EQUALITIES, lacking_of
+from dano.robots.formats._keyframes import keyframes_of
+from dano.robots.formats._lacking import EQUALITIES, lacking_of, silent_of
 
 _WORLD = "world"
 
@@ -64,6 +66,7 @@ class _Reader:
         self.bodies = self.unique([model.body(i).name or f"body {i}" for i in range(1, model.nbody)])
         self.joints = self.unique([self.joint_name(j) for j in range(model.njnt)])
         self.lacking = [*lacking_of(model, mujoco), *self.undriven]
+        self.frictions: dict[str, tuple[tuple[float, int], ...]] = {}
 
     def description(self) -> Description:
         model = self.model
@@ -79,11 +82,14 @@ class _Reader:
                 name += " geom"
             taken.add(name)
             links.append(self.shaped(Link(name), [(solid, touches)]))
+            self.frictions |= self.friction(name, [g]) if touches else {}
             joints.append(Connection(f"{name} (fixed)", "weld", _WORLD, name))
         for i in range(1, model.nbody):
             chain = self.chain(i)
             links += [Link(joint.child) for joint in chain[:-1]]
             links.append(self.link(i))
+            first = int(model.body_geomadr[i])
+            self.frictions |= self.friction(self.name(i), range(first, first + int(model.body_geomnum[i])))
             joints += chain
         joints = self.followed(joints)
         x, y, z = (0.0, 0.0, 0.0) if self.off("GRAVITY") else map(float, model.opt.gravity)
@@ -97,6 +103,9 @@ class _Reader:
             world=_WORLD,
             gravity=(x, y, z),
             lacking=tuple(self.lacking),
+            keyframes=keyframes_of(model, self.mujoco, self.joints, self.bodies),
+            frictions=self.frictions,
+            silent=tuple(silent_of(model, self.mujoco)),
         ).checked()
 
     def off(self, flag: str) -> bool:
@@ -127,7 +136,16 @@ class _Reader:
         first = model.body_geomadr[i]
         found = [self.solid(g) for g in range(first, first + model.body_geomnum[i])]
         mass = float(model.body_mass[i])
-        return self.shaped(Link(self.name(i), mass, model.body_ipos[i].copy(), inertia), found)
+        held = 0.0 if self.off("GRAVITY") else float(model.body_gravcomp[i])
+        link = Link(self.name(i), mass, model.body_ipos[i].copy(), inertia, gravcomp=held)
+        return self.shaped(link, found)
+
+    def friction(self, name: str, geoms: Iterable[int]) -> dict[str, tuple[tuple[float, int], ...]]:
+        """Sliding friction and priority of those geoms that touch."""
+        model = self.model
+        rows = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
+        found = tuple((float(model.geom_friction[g, 0]), int(model.geom_priority[g])) for g in rows)
+        return {name: found} if found else {}
 
     @staticmethod
     def shaped(link: Link, found: list[tuple[Solid | None, bool]]) -> Link:

@@ -41,7 +41,8 @@ from dano.physics.pairs import BodyState
 from dano.physics.patch_law import PatchMaterial
 from dano.physics.real import real, vec3, ZERO
 from dano.physics.solids.distances import leaf_distance, Solid
-from dano.physics.solids.leaves import HALF_SPACE, SPHERE
+from dano.physics.solids.leaves import HALF_SPACE
+from dano.physics.solids.shapes import SPHERE
 
 _LANES, _BLOCK, _DENSITY = wp.constant(LANES), wp.constant(BLOCK), wp.constant(DENSITY)
 

@@ -14,7 +14,6 @@ from dano.physics.real import ONE, real, vec6
 from dano.physics.samples import Sample
 from dano.physics.solids.leaves import Leaf
 from dano.physics.trees.joint_laws import JointLaw
-from dano.physics.trees.joints import Joint
 from dano.physics.trees.loops import Loop
 
 
@@ -107,19 +106,6 @@ def sample_product(a: Sample, b: Sample) -> real:
 def push_product(a: Push, b: Push) -> real:
     """⟨a, b⟩ of controls of bodies."""
     return wp.dot(a.force, b.force) + wp.dot(a.torque, b.torque)
-
-
-@wp.func
-def joint_product(a: Joint, b: Joint) -> real:
-    """⟨a, b⟩ of joints."""
-    return (
-        wp.dot(a.axis, b.axis)
-        + wp.dot(a.anchor, b.anchor)
-        + wp.dot(a.position, b.position)
-        + wp.dot(a.orientation, b.orientation)
-        + a.ratio * b.ratio
-        + a.shift * b.shift
-    )
 
 
 @wp.func

@@ -20,7 +20,6 @@ from dano.physics.trees.joints import (
     displacement_twist,
     hanging_move,
     hanging_pose,
-    is_turn,
     Joint,
     motion_direction,
     motion_share,
@@ -93,8 +92,8 @@ def hanging_chain(
     share = motion_share(kind, joint)
     arm = frame.pivot - parent.position
     lever = pose.position - frame.pivot
-    before = hanging_move(kind, share, frame, parent.before, arm, lever, speeds.before, h)
-    after = hanging_move(kind, share, frame, parent.after, arm, lever, speeds.after, h)
+    before = hanging_move(kind, joint, frame, parent.before, arm, lever, speeds.before, h)
+    after = hanging_move(kind, joint, frame, parent.after, arm, lever, speeds.after, h)
     found.position = pose.position
     found.orientation = pose.orientation
     found.before = before.displacement
@@ -103,7 +102,7 @@ def hanging_chain(
     found.work = parent.work
     for part in range(3):
         along = share * motion_direction(kind, frame, part)
-        motion = motion_twist(is_turn(kind, part), along, frame.pivot - origin)
+        motion = motion_twist(kind, joint, part, along, frame.pivot - origin)
         found.change += (speeds.after[part] - speeds.before[part]) * motion
         found.work += speeds.work[part] * motion
     return found

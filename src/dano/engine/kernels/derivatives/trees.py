@@ -24,7 +24,7 @@ from dano.physics.pairs import BodyState
 from dano.physics.real import ONE, quat, real, vec3, vec6, ZERO
 from dano.physics.rotations import from_wxyz, to_wxyz
 from dano.physics.trees.joint_laws import JointLaw
-from dano.physics.trees.joints import BALL, Carrier, Joint, ROOT
+from dano.physics.trees.joints import BALL, Carrier, Joint, ROOT, summed_joint
 
 _BALL, _ROOT = wp.constant(BALL), wp.constant(ROOT)
 # Efforts that bound nothing [N m or N]: zero times them is zero, as zero times infinity is not.
@@ -132,12 +132,7 @@ def add_chain(scene: Scene, room: Room, world: int, node: int, body: int, bar: C
 def add_joint(bars: Changes, world: int, row: int, bar: Joint):
     """Add a derivative by a joint."""
     if bars.joints.shape[1] > 0:
-        bars.joints[world, row].axis += bar.axis
-        bars.joints[world, row].anchor += bar.anchor
-        bars.joints[world, row].position += bar.position
-        bars.joints[world, row].orientation += bar.orientation
-        bars.joints[world, row].ratio += bar.ratio
-        bars.joints[world, row].shift += bar.shift
+        bars.joints[world, row] = summed_joint(bars.joints[world, row], bar)
 
 
 @wp.func

@@ -15,7 +15,7 @@ from dano.physics.trees.joints import (
     end_by_spin,
     hanging_move,
     hanging_pose,
-    is_turn,
+    Joint,
     joint_spin,
     JointFrame,
     largest_turn,
@@ -89,16 +89,18 @@ def start_motions(scene: Scene, room: Room, world: int):
         node = scene.trees.nodes[n]
         if node.alone == 0:
             frame = JointFrame()
+            joint = Joint()
             lever = vec3()
             share = ONE
             if node.kind != _ROOT:
                 frame = room.trees.frames[world, n]
                 lever = frame.pivot - room.bodies[world, node.origin].position
-                share = motion_share(node.kind, scene.trees.joints[world, node.joint])
+                joint = scene.trees.joints[world, node.joint]
+                share = motion_share(node.kind, joint)
             for part in range(node.width):
                 along = share * motion_direction(node.kind, frame, part)
                 room.trees.start[world, node.motion + part] = motion_twist(
-                    is_turn(node.kind, part), along, lever
+                    node.kind, joint, part, along, lever
                 )
 
 
@@ -119,14 +121,14 @@ def move_hanging(
 ):
     """How a body on a joint moves."""
     frame = room.trees.frames[world, n]
-    share = motion_share(node.kind, scene.trees.joints[world, node.joint])
+    joint = scene.trees.joints[world, node.joint]
     arm = vec3()
     if node.parent >= 0:
         arm = frame.pivot - room.bodies[world, node.carrier].position
     position = room.bodies[world, node.body].position
     y = velocities_of(velocities, world, node)
     parent = displacement_of(room, world, node.parent)
-    move = hanging_move(node.kind, share, frame, parent, arm, position - frame.pivot, y, h)
+    move = hanging_move(node.kind, joint, frame, parent, arm, position - frame.pivot, y, h)
     moved = move.displacement
     room.trees.displacements[world, n] = moved
     room.trees.pivots[world, n] = move.pivot
@@ -158,6 +160,7 @@ def end_motions(scene: Scene, room: Room, world: int, velocities: wp.array2d(dty
         node = scene.trees.nodes[n]
         if node.alone == 0:
             frame = JointFrame()
+            joint = Joint()
             share = ONE
             before = quat(ZERO, ZERO, ZERO, ONE)
             lever = vec3()
@@ -165,7 +168,8 @@ def end_motions(scene: Scene, room: Room, world: int, velocities: wp.array2d(dty
                 lever = room.trees.displacements[world, n].shift
             else:
                 frame = room.trees.frames[world, n]
-                share = motion_share(node.kind, scene.trees.joints[world, node.joint])
+                joint = scene.trees.joints[world, node.joint]
+                share = motion_share(node.kind, joint)
                 before = displacement_of(room, world, node.parent).turn
                 lever = frame.pivot + room.trees.pivots[world, n]
                 lever = lever - room.bodies[world, node.origin].position
@@ -179,9 +183,7 @@ def end_motions(scene: Scene, room: Room, world: int, velocities: wp.array2d(dty
                 if node.kind == _BALL or (node.kind == _ROOT and part >= 3):
                     along = turning * along
                 along = turned_by(before, along)
-                room.trees.end[world, node.motion + part] = motion_twist(
-                    is_turn(node.kind, part), along, lever
-                )
+                room.trees.end[world, node.motion + part] = motion_twist(node.kind, joint, part, along, lever)
 
 
 @wp.func

@@ -1,0 +1,1 @@
+"""Fits through impacts: whether they end, where from ten starts, and what their intervals hold."""

@@ -1,0 +1,357 @@
+"""Where a search settles if the loss is rough: at the minimum of its trend, whatever the start.
+
+After a search, planes through draws of the unknowns say how far the answer is from that minimum and how far
+ripples scatter it. Where both are small beside the standard errors, derivatives were worth having and nothing
+happens. Else the search begins again, by Gauss–Newton steps with slopes over visible steps: first for the
+beginning of the motions, so that an impact is met about when it happened before what comes after it counts.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax.numpy as jnp
+import numpy as np
+
+from dano.gradients import Check, check
+from dano.identify._residuals import Linearized, Smoothing
+from dano.solvers import eliminated, gauss_newton, NormalEquations, Solution, Stop
+
+# Widest draws of a parameter: a share of its range, or of its value without bounds.
+_WIDEST = 0.05
+# Draws, in standard errors, and least as shares of the widest.
+_LAST, _LEAST = 0.5, 1e-3
+# Distance to the minimum of the trend, and scatter by ripples, that do not matter [standard errors].
+_STEADY = 0.5
+# Shares of the frames that count, one after the other, and most steps at each.
+_BEGINNINGS, _STEPS = (0.25, 0.4, 0.55, 0.7, 0.85), 12
+# So many steps in a row that leave more than this share of the loss end them.
+_SLOW, _BETTER = 2, 0.9
+# Steps about the minimum, of which those count whose loss is no more than so many times the least.
+_LIKE = 2.0
+_LAST_STEPS = 8
+# Drift of these that is none, in its own standard errors.
+_DRIFT = 3.0
+# Least variance of residuals, as a share of what the stated noise has.
+_QUIET = 1e-2
+# Longest step, in widest draws; and by what a loss may grow that is accepted.
+_LONGEST, _WORSE = 4.0, 1.5
+# Halvings of a step.
+_HALVINGS = 3
+# Sets of independent directions: so many pairs of draws for each unknown.
+_BLOCKS = 2
+# Places at which the loss is looked at.
+_PLACES = 11
+
+
+@runtime_checkable
+class Smoothed(Protocol):
+    """A least squares problem whose slopes may be those of planes through draws."""
+
+    smoothing: Smoothing | None
+    roughness: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    freedom: int
+    seed: int
+
+    def linearize(self, x: np.ndarray, start: Any, /) -> NormalEquations:
+        """The model at coordinates and initial states."""
+        ...
+
+    def simulate(self, x: np.ndarray, start: Any, /) -> Linearized:
+        """All windows at coordinates and initial states."""
+        ...
+
+    def assembled(self, found: Linearized, /) -> NormalEquations:
+        """Normal equations of all windows."""
+        ...
+
+    def retract(self, start: Any, change: np.ndarray, /) -> Any:
+        """Initial states moved by the change of all blocks."""
+        ...
+
+    def count(self, share: float, /) -> None:
+        """Let a share of the frames of each window count, the first ones."""
+        ...
+
+    def start_widths(self) -> np.ndarray:
+        """By how much initial states are uncertain, of their unknowns."""
+        ...
+
+
+class _Sight(NamedTuple):
+    """What planes say of a point.
+
+    Attributes:
+        found: The planes.
+        normal: Normal equations.
+        errors: Standard errors of the parameters, ripples not counted; ∞ where they are flat.
+        away: Distance to the minimum of the trend, in standard errors, largest of all parameters.
+        scatter: By which ripples move the answer, in the same way.
+    """
+
+    found: Linearized
+    normal: NormalEquations
+    errors: np.ndarray
+    away: float
+    scatter: float
+
+
+class _Point(NamedTuple):
+    """Parameters and initial states."""
+
+    x: np.ndarray
+    blocks: Any
+
+
+def settled(problem: Smoothed, solution: Solution, first: tuple[np.ndarray, Any]) -> Solution:
+    """The solution, or that of the trend if the loss is rough there; `problem.smoothing` says which.
+
+    Args:
+        problem: The problem; its `smoothing` is that of the answer afterwards, or None.
+        solution: Where a search by derivatives ended.
+        first: Parameters and initial states at which it began.
+    """
+    if solution.stop is Stop.PERFECT:
+        return solution
+    widest = np.concatenate([_ranges(problem, solution.x), problem.start_widths()])
+    rows = _directions(len(widest), problem.seed)
+    here = _Point(solution.x, solution.blocks)
+    problem.smoothing = _evenly(rows, widest, here)
+    problem.smoothing = _drawn(rows, widest, _seen(problem, here), problem)
+    sight = _seen(problem, here)
+    if solution.stop.converged and sight.away <= _STEADY and sight.scatter <= _STEADY:
+        problem.smoothing = None
+        return solution
+    try:
+        grown = _grown(problem, _Point(*first), widest)
+        begin = grown if _loss(problem, grown) < _loss(problem, here) else here
+        end = _averaged(problem, begin, widest)
+    except KeyboardInterrupt:
+        problem.count(1.0)
+        problem.smoothing = None
+        return solution._replace(stop=Stop.INTERRUPTED)
+    problem.roughness = end.scatter
+    losses = np.array([*solution.losses, end.sight.normal.loss])
+    stop = Stop.LOSS if end.steady else Stop.STUCK
+    return Solution(*end.point, end.sight.normal, stop, losses, solution.evaluations)
+
+
+def _loss(problem: Smoothed, point: _Point) -> float:
+    return _seen(problem, point).normal.loss
+
+
+def _grown(problem: Smoothed, point: _Point, widest: np.ndarray) -> _Point:
+    """A point from which the beginning of motions is right, and more and more of them."""
+    for share in _BEGINNINGS:
+        problem.count(share)
+        point = _descended(_walk(problem, point, widest), point)
+    problem.count(1.0)
+    return point
+
+
+def _descended(walk: Iterator[tuple[_Point, _Sight]], point: _Point) -> _Point:
+    """The best point of a walk that goes on while it finds better ones."""
+    least, slow = np.inf, 0
+    for _ in range(_STEPS):
+        here, sight = next(walk)
+        slow = slow + 1 if sight.normal.loss > _BETTER * least else 0
+        if sight.normal.loss < least:
+            point, least = here, sight.normal.loss
+        if slow == _SLOW:
+            break
+    return point
+
+
+class _End(NamedTuple):
+    """Where a walk ended: the mean of its last points.
+
+    Attributes:
+        point: The mean, with initial states for it.
+        sight: What is seen there.
+        scatter: Covariance of the points, shape (p, p).
+        steady: Whether the walk had come to rest but for that scatter.
+    """
+
+    point: _Point
+    sight: _Sight
+    scatter: np.ndarray
+    steady: bool
+
+
+def _averaged(problem: Smoothed, point: _Point, widest: np.ndarray) -> _End:
+    """Walk to the minimum of the trend and about it, and take the middle of the points that fit."""
+    point = _descended(_walk(problem, point, widest), point)
+    walk = _walk(problem, point, widest)
+    seen = [next(walk) for _ in range(_LAST_STEPS)]
+    losses = np.array([sight.normal.loss for _, sight in seen])
+    fits = losses <= _LIKE * losses.min()
+    last = np.array([here.x for here, _ in seen])[fits]
+    middle = last.mean(axis=0)
+    scatter = np.atleast_2d(np.cov(last.T)) if len(last) > 1 else np.zeros((len(middle), len(middle)))
+    held = _Point(middle, seen[int(np.argmin(losses))][0].blocks)
+    sight = _seen(problem, held)
+    for _ in range(_SLOW):
+        still = np.zeros_like(middle)
+        _, change = gauss_newton(sight.normal, still, still)
+        for halving in range(_HALVINGS):
+            other = _Point(middle, problem.retract(held.blocks, 0.5**halving * change))
+            after = _seen(problem, other)
+            if after.normal.loss < sight.normal.loss:
+                held, sight = other, after
+                break
+    half = len(last) // 2
+    drift = np.abs(last[:half].mean(axis=0) - last[half:].mean(axis=0)) if half else np.zeros(len(middle))
+    unsure = np.sqrt(np.diag(scatter) * 4 / len(last))
+    steady = bool(np.all(drift <= _DRIFT * unsure + _STEADY * sight.errors))
+    return _End(held, sight, scatter, steady)
+
+
+def _walk(problem: Smoothed, point: _Point, widest: np.ndarray) -> Iterator[tuple[_Point, _Sight]]:
+    """Points of Gauss–Newton steps by slopes over visible steps, each with draws of its own."""
+    seed = problem.seed
+    problem.smoothing = _evenly(_directions(len(widest), seed), widest, point)
+    sight = _seen(problem, point)
+    while True:
+        seed += 1
+        problem.smoothing = _drawn(_directions(len(widest), seed), widest, sight, problem)
+        for following in _shorter(problem, point, sight.normal, widest):
+            after = _seen(problem, following)
+            if after.normal.loss <= _WORSE * sight.normal.loss:
+                point, sight = following, after
+                break
+        else:
+            # The step came from draws that mislead: others may not.
+            sight = _seen(problem, point)
+        yield point, sight
+
+
+def _shorter(
+    problem: Smoothed, point: _Point, normal: NormalEquations, widest: np.ndarray
+) -> Iterator[_Point]:
+    """Where the step to the minimum of the model leads, then halves of it."""
+    longest = _LONGEST * widest[: len(point.x)]
+    lower = np.maximum(problem.lower - point.x, -longest)
+    upper = np.minimum(problem.upper - point.x, longest)
+    change, block_change = gauss_newton(normal, lower, upper)
+    for halving in range(_HALVINGS):
+        share = 0.5**halving
+        x = np.clip(point.x + share * change, problem.lower, problem.upper)
+        yield _Point(x, problem.retract(point.blocks, share * block_change))
+
+
+def ripple_covariance(problem: Smoothed, x: np.ndarray, blocks: Any) -> np.ndarray:
+    """Covariance that ripples of the residuals give the parameters, shape (p, p); zero without smoothing.
+
+    What was observed has ripples of its own: it is as uncertain as where a walk about the minimum is.
+    """
+    p = len(x)
+    if problem.smoothing is None:
+        return np.zeros((p, p))
+    found = problem.simulate(x, blocks)
+    moves = _displacements(problem, found)
+    return moves.T @ moves / len(moves) + problem.roughness
+
+
+def worth_of(problem: Smoothed, solution: Solution) -> Check:
+    """What derivatives of the loss are worth where a search ended.
+
+    Looked at is the way to the minimum of the model that derivatives make, initial states included, over one
+    standard error of the parameter that moves most and a tenth of it.
+    """
+    smoothing = problem.smoothing
+    if smoothing is None:
+        widest = np.concatenate([_ranges(problem, solution.x), problem.start_widths()])
+        point = _Point(solution.x, solution.blocks)
+        problem.smoothing = _evenly(_directions(len(widest), problem.seed), widest, point)
+    errors = _seen(problem, _Point(solution.x, solution.blocks)).errors
+    problem.smoothing = None
+    normal = problem.linearize(solution.x, solution.blocks)
+    gradient, hessian = eliminated(normal)
+    step = -np.linalg.pinv(hessian, rcond=1e-10, hermitian=True) @ gradient
+    longest = float(np.max(np.abs(step) / errors, initial=0))
+    step = step / longest if longest > 0 else step
+    follow, slope = np.zeros_like(normal.block_gradient), float(normal.gradient @ step)
+    if follow.size:
+        pull = normal.block_gradient / max(longest, 1e-300) + normal.coupling @ step
+        inverse = np.linalg.pinv(normal.block_hessian, rcond=1e-10, hermitian=True)
+        follow = -np.einsum("mij,mj->mi", inverse, pull)
+        slope += float(np.sum(normal.block_gradient * follow))
+
+    def loss(share: Any) -> float:
+        x = np.clip(solution.x + float(share) * step, problem.lower, problem.upper)
+        return problem.linearize(x, problem.retract(solution.blocks, float(share) * follow)).loss
+
+    found = check(
+        loss, 0.0, gradient=slope, scale=1.0, steps=(1.0, 0.1), points=_PLACES, labels=["the next step"]
+    )
+    problem.smoothing = smoothing
+    return found
+
+
+def _displacements(problem: Smoothed, found: Linearized) -> np.ndarray:
+    """By how much each ripple alone moves the parameters, initial states following, shape (draws, p)."""
+    _, hessian = eliminated(problem.assembled(found))
+    inverse = np.linalg.pinv(hessian, rcond=1e-10, hermitian=True)
+    moves = []
+    for k in range(found.ripple.shape[1]):
+        alone = found._replace(gradient=found.ripple[:, k], jump=found.jump_ripple[:, k])
+        moves.append(-inverse @ eliminated(problem.assembled(alone))[0])
+    return np.array(moves)
+
+
+def _seen(problem: Smoothed, point: _Point) -> _Sight:
+    found = problem.simulate(point.x, point.blocks)
+    normal = problem.assembled(found)
+    gradient, hessian = eliminated(normal)
+    inverse = np.linalg.pinv(hessian, rcond=1e-10, hermitian=True)
+    errors = np.sqrt(np.maximum(np.diag(inverse) * _variance(problem, normal), 0))
+    errors = np.where(errors > 0, errors, np.inf)
+    to = np.clip(point.x - inverse @ gradient, problem.lower, problem.upper)
+    scatter = np.sqrt(np.mean(_displacements(problem, found) ** 2, axis=0))
+    away = float(np.max(np.abs(to - point.x) / errors, initial=0))
+    return _Sight(found, normal, errors, away, float(np.max(scatter / errors, initial=0)))
+
+
+def _variance(problem: Smoothed, normal: NormalEquations) -> float:
+    """Of the residuals; what is far below the noise that was stated makes no difference."""
+    return max(2 * normal.loss / max(problem.freedom, 1), _QUIET)
+
+
+def _evenly(rows: np.ndarray, widest: np.ndarray, point: _Point) -> Smoothing:
+    """The widest draws."""
+    windows = len(point.blocks.position)
+    return _smoothing(rows, np.tile(np.diag(widest), (windows, 1, 1)))
+
+
+def _drawn(rows: np.ndarray, widest: np.ndarray, sight: _Sight, problem: Smoothed) -> Smoothing:
+    """Draws as likely as the data say, of parameters and a window's initial state together."""
+    hessian, p = np.asarray(sight.found.hessian, float), len(sight.errors)
+    own = hessian[:, :p, :p]
+    if hessian.shape[1] > p:
+        inverse = np.linalg.pinv(hessian[:, p:, p:], rcond=1e-10, hermitian=True)
+        own = own - np.einsum("wxi,wij,wjy->wxy", hessian[:, :p, p:], inverse, hessian[:, p:, :p])
+    variance = _variance(problem, sight.normal)
+    # What other windows say of the parameters, and no wider than the widest.
+    whole = hessian.copy()
+    whole[:, :p, :p] += np.sum(own, axis=0) - own
+    whole += variance * np.diag(1 / widest**2)
+    unit = whole * widest[:, None] * widest[None]
+    covariance = _LAST**2 * variance * np.linalg.inv(unit) + _LEAST**2 * np.eye(len(widest))
+    return _smoothing(rows, widest[None, :, None] * np.linalg.cholesky(covariance))
+
+
+def _smoothing(rows: np.ndarray, spread: np.ndarray) -> Smoothing:
+    return Smoothing(*(jnp.asarray(part) for part in (rows, spread, np.linalg.inv(spread))))
+
+
+def _ranges(problem: Smoothed, x: np.ndarray) -> np.ndarray:
+    width = problem.upper - problem.lower
+    return _WIDEST * np.where(np.isfinite(width), width, np.maximum(np.abs(x), 1e-3))
+
+
+def _directions(unknowns: int, seed: int) -> np.ndarray:
+    """Draws of `Smoothing`: rows of random orthogonal matrices, as long as normal ones are."""
+    random = np.random.default_rng(seed)
+    blocks = [np.linalg.qr(random.standard_normal((unknowns, unknowns)))[0] for _ in range(_BLOCKS)]
+    return np.sqrt(unknowns) * np.concatenate(blocks)

@@ -1,0 +1,35 @@
+"""What gravity does to each body: all of it, or what a body's `gravcomp` leaves."""
+
+import dataclasses
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dano.scene._scene import Scene
+from dano.scene._states import Control
+
+
+def pulls(scene: Scene) -> Float[Array, "n 3"]:
+    """With how much gravity pulls at each body [m/s²]."""
+    dtype = scene.timestep.dtype
+    shares = [1.0 if body.gravcomp is None else 1 - body.gravcomp.astype(dtype) for body in scene.bodies]
+    return jnp.stack([jnp.asarray(share, dtype) for share in shares])[:, None] * scene.gravity[None]
+
+
+def lifted(scene: Scene, control: Control | None, *leading: int) -> Control | None:
+    """A control with the forces that compensate weights; the same where none is compensated.
+
+    Args:
+        scene: The scene.
+        control: None for none.
+        *leading: Axes before those of the bodies.
+    """
+    if all(body.gravcomp is None for body in scene.bodies):
+        return control
+    dtype = scene.timestep.dtype
+    mass = jnp.stack([body.mass * body.mass_scale for body in scene.bodies]).astype(dtype)
+    lift = mass[:, None] * (pulls(scene) - scene.gravity[None])
+    if control is None:
+        still = jnp.zeros((*leading, *lift.shape), dtype)
+        control = Control(still, still)
+    return dataclasses.replace(control, force=control.force + jnp.broadcast_to(lift, control.force.shape))

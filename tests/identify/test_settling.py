@@ -1,0 +1,95 @@
+"""Fits where the loss is rough: planes through draws, and a throw whose derivatives lead nowhere."""
+
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dano
+from dano.identify._residuals import _plane_through
+from dano.identify._settling import _directions
+from dano.maths import quat_exp, quat_multiply
+
+N = 4
+
+
+def plane(residuals, at, scale):
+    spread = np.diag(scale)
+    rows = jnp.asarray(_directions(N, 3))
+    return _plane_through(
+        lambda u: (residuals(u), u), at, rows, jnp.asarray(spread), jnp.asarray(np.linalg.inv(spread))
+    )
+
+
+def test_a_plane_through_a_parabola_has_its_slope_and_no_ripple():
+    rng = np.random.default_rng(0)
+    slope, bend = rng.standard_normal((6, N)), rng.standard_normal((6, N))
+    at, scale = jnp.asarray(rng.standard_normal(N)), np.array([0.1, 0.2, 0.01, 1.0])
+
+    def residuals(u):
+        return jnp.asarray(slope) @ (u - at) + 0.5 * jnp.asarray(bend) @ (u - at) ** 2 + 7.0
+
+    found, middle = plane(residuals, at, scale)
+    np.testing.assert_allclose(found.slope, slope, atol=1e-9)
+    np.testing.assert_allclose(found.ripple, 0, atol=1e-12)
+    np.testing.assert_allclose(middle, at)
+    # Draws have variance one along each unknown.
+    np.testing.assert_allclose(found.value, 7 + 0.5 * bend @ scale**2, rtol=1e-9)
+
+
+def test_a_ripple_is_measured_and_does_not_make_the_slope():
+    slope = np.arange(1.0, 1.0 + N)
+
+    def residuals(u):
+        ripple = 1e-2 * jnp.sin(1e5 * (u @ jnp.array([1.0, 0.7, 0.3, 0.9])))
+        return jnp.stack([jnp.asarray(slope) @ u + ripple])
+
+    found, _ = plane(residuals, jnp.zeros(N), np.ones(N))
+    # The derivative at the point is 1000 times as large.
+    np.testing.assert_allclose(found.slope[0], slope, atol=0.02)
+    assert float(jnp.sqrt(jnp.mean(found.ripple**2))) == pytest.approx(1e-2, rel=0.6)
+
+
+def thrown(friction, restitution):
+    box = dano.Body("box", dano.Box((0.05, 0.04, 0.03)), mass=1.0)
+    params = dano.ContactParams(sliding_friction=friction, restitution=restitution)
+    floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
+    return dano.Scene.create([box, floor], [dano.Contact("box", "floor", params)], timestep=0.005)
+
+
+def test_a_throw_is_found_from_far_away_starts():
+    scene, rng = thrown(0.3, 0.3), np.random.default_rng(2)
+    start = scene.initial_state(
+        box=dict(position=(0, 0, 0.1), orientation=(1, 0.3, 0.2, 0.1), velocity=(0.8, 0, 0), omega=(2, 4, 1))
+    )
+    run = dano.simulate(scene, start, 60)
+    seen = np.array(run.states.position)[::2, :1]
+    turn = quat_exp(jnp.asarray(1e-2 * rng.standard_normal(seen.shape)))
+    motion = dano.Motion.create(
+        np.array(run.times)[::2],
+        "box",
+        position=seen + 1e-3 * rng.standard_normal(seen.shape),
+        orientation=np.asarray(quat_multiply(run.states.orientation[::2, :1], turn)),
+    )
+    parameters = [
+        dano.Parameter("friction", lambda s: s.contact("box", "floor").sliding_friction, 0.05, 0.8),
+        dano.Parameter("restitution", lambda s: s.contact("box", "floor").restitution, 0.0, 0.8),
+    ]
+    noise = {"position": 1e-3, "orientation": 1e-2}
+    fits = []
+    for guess in ((0.6, 0.6), (0.1, 0.1)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            fits.append(dano.identify(thrown(*guess), motion, parameters, initial="states", noise=noise))
+    for fit in fits:
+        for name in ("friction", "restitution"):
+            assert abs(fit.values[name] - 0.3) < max(4 * fit.standard_errors[name], 0.01)
+            assert fit.standard_errors[name] < 0.1
+            apart = abs(fit.values[name] - fits[0].values[name])
+            assert apart < 3 * fit.standard_errors[name] + 0.01
+        # Where the minimum of the trend is, ripples add about as much as the noise.
+        assert fit.errors.rms < 2
+    rough = [fit for fit in fits if fit.smoothed]
+    for fit in rough:
+        assert fit.worth is not None and fit.to_dict()["worth"] == fit.worth.summary
