@@ -312,10 +312,27 @@ def facing_direction(
 
 
 @wp.func
+def spin_of_samples(spin: vec3, axis: vec3, turning: int) -> vec3:
+    """What of a body's spin its samples follow: those that keep facing the other body do not turn with it.
+
+    Args:
+        spin: Of the body.
+        axis: The body's z axis, about which samples of a cylinder do not turn.
+        turning: How samples turn.
+    """
+    follows = spin
+    if wp.static(AXIS in TURNING):
+        if turning == _AXIS:
+            follows = spin - wp.dot(spin, axis) * axis
+    if wp.static(BALL in TURNING):
+        if turning == _BALL:
+            follows = vec3()
+    return follows
+
+
+@wp.func
 def approach(pose: PairPose, turning: int, x: vec3, normal: vec3) -> real:
     """Speed at which a point x [F] of the first body nears the solid at old velocities [m/s]."""
-    u = pose.velocity
-    if turning == _FIXED:
-        # Samples that keep facing the other body do not turn with theirs.
-        u = u + wp.cross(pose.spin, x - pose.com)
-    return -wp.dot(normal, u)
+    axis = vec3(pose.points[0, 2], pose.points[1, 2], pose.points[2, 2])
+    spin = spin_of_samples(pose.spin, axis, turning)
+    return -wp.dot(normal, pose.velocity + wp.cross(spin, x - pose.com))

@@ -5,8 +5,16 @@ import warp as wp
 from dano.engine.kernels.lanes import first_of, least
 from dano.engine.kernels.tables import Body, Room, RUN, SamplePair, Scene
 from dano.physics.features import LANES, WIDE
-from dano.physics.pairs import approach, BodyState, facing_direction, pair_pose, PairPose, way_of
-from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
+from dano.physics.pairs import (
+    approach,
+    BodyState,
+    facing_direction,
+    pair_pose,
+    PairPose,
+    spin_of_samples,
+    way_of,
+)
+from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec3, ZERO
 from dano.physics.rotations import matrix
 from dano.physics.samples import position_in_solid, solid_normal
 from dano.physics.solids.distances import Solid, solid_clearance, solid_distance, solid_of
@@ -15,9 +23,12 @@ from dano.physics.solids.leaves import HALF_SPACE
 
 _LANES, _RUN = wp.constant(LANES), wp.constant(RUN)
 _HALF_SPACE = wp.constant(HALF_SPACE)
-# Most steps of the search for the moment when bodies meet, and the share of the step that ends it.
-_ADVANCES = wp.constant(40)
+# Most steps of the search for the moment when bodies meet, the share of the step that ends it, and by how
+# much it goes on at least past probes that are slow.
+_ADVANCES = wp.constant(200)
 _MET = wp.constant(real(1e-12 if WIDE else 1e-6))
+_ONWARD = wp.constant(real(1.0 / 32.0))
+_FLAT = wp.constant(real(1e-9))
 
 
 @wp.struct
@@ -162,9 +173,11 @@ def meeting(
 ) -> Meeting:
     """When bodies have sunk into each other by a depth.
 
-    That is the root of the depth of the deepest probe, by Newton's method, which begins as far as none can go
-    deeper; the end of the step where it is not within the step. On the far side of a thin wall, normals would
-    push the wrong way.
+    That is the root of the depth of the deepest probe, the end of the step where it is not within the step.
+    On the far side of a thin wall, normals would push the wrong way. It is found from the start of the step
+    on, by steps within which none can get there: l = v t + b t²/2 with l what is left of its way, v its speed
+    and b a bound on how fast that grows, by turning. Along a line, distance to a convex solid grows no slower
+    than its tangent; where nothing turns, this is Newton's method.
 
     Args:
         scene: The scene.
@@ -190,6 +203,10 @@ def meeting(
     way = way_of(a, b, middle_of(body, a), body.radius, h)
     if way <= least_way:
         return met
+    # Seen from the second body, velocities turn with both bodies.
+    axis = matrix(a.orientation) * vec3(ZERO, ZERO, ONE)
+    turns = spin_of_samples(a.spin - b.spin, axis, index.turning)
+    bend = way * h * (wp.length(turns) + TWO * wp.length(b.spin))
     share = real(0.0)
     n = int(-1)
     k = int(0)
@@ -206,9 +223,19 @@ def meeting(
             d = solid_distance(scene.solids, world, solid, x)
             near = h * approach(pose, index.turning, x, solid_normal(d.gradient))
             left = d.value + sink
-            if near > slow and left - (ONE - share) * near < ZERO:
-                if left / near < further:
-                    further = left / near
+            rest = ONE - share
+            if near + bend * rest > slow and left - rest * (near + HALF * bend * rest) < ZERO:
+                ahead = INFINITY
+                if left > ZERO:
+                    ahead = TWO * left / (near + wp.sqrt(near * near + TWO * bend * left))
+                    if near <= slow:
+                        ahead = wp.max(ahead, _ONWARD)
+                elif near > slow:
+                    ahead = wp.max(left, -near * (near - slow) / wp.max(bend, _FLAT * near)) / near
+                else:
+                    ahead = wp.max((slow - near) / bend, _ONWARD)
+                if ahead < further:
+                    further = ahead
                     critical = p
         closest = least(further)
         if closest < further:
