@@ -175,7 +175,8 @@ def test_directions_and_worlds(heap):
     frictions = jnp.array([0.3, 0.4, 0.5])
     reverse = jax.jit(jax.vmap(jax.grad(end, (0, 1)), (0, None)))(frictions, 0.01)
     forward = jax.jit(jax.vmap(jax.jacfwd(end, (0, 1)), (0, None)))(frictions, 0.01)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-8, atol=1e-12)
+    # Where points stick, the equations of a step are some 1e8 times as stiff as inertia.
+    np.testing.assert_allclose(forward, reverse, rtol=1e-7, atol=1e-12)
     alone = jnp.stack([jax.grad(end)(friction, 0.01) for friction in frictions])
     np.testing.assert_allclose(reverse[0], alone, rtol=1e-12, atol=1e-15)
 

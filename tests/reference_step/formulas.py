@@ -29,9 +29,9 @@ def press(
     """Pressure and friction at points that separate and slip."""
     i = wp.tid()
     law = point_law.point_law(materials[i], points[i], impacts[i])
-    p = point_law.pressure(law, rates[i], wp.float64(0.0), law.stiction).value
-    pressures[i] = p
-    frictions[i] = friction.friction(slips[i], point_law.friction_bound(law, p).value, law.stiction)
+    found = point_law.traction(law, rates[i], slips[i])
+    pressures[i] = found.pressure
+    frictions[i] = found.friction
 
 
 @wp.kernel(enable_backward=False, module="unique")

@@ -115,6 +115,14 @@ class Pressure:
 
 
 @wp.struct
+class Traction:
+    """Pressure along the normal, and friction [Pa]."""
+
+    pressure: real
+    friction: vec3
+
+
+@wp.struct
 class Bound:
     """Largest friction b(p) [Pa] and its derivative by p."""
 
@@ -287,13 +295,12 @@ def point_motion(point: Point, velocity: vec3, spin: vec3) -> Motion:
 
 
 @wp.func
-def traction(law: PointLaw, point: Point, velocity: vec3, spin: vec3) -> vec3:
-    """The law: pressure and friction [Pa] at a point that moves relative to the second body."""
-    motion = point_motion(point, velocity, spin)
-    slip = motion.slip + point.extra_slip
-    p = pressure(law, motion.rate, ZERO, law.stiction).value
-    bound = friction_bound(law, p)
-    return p * point.normal + friction(slip, bound.value, law.stiction)
+def traction(law: PointLaw, rate: real, slip: vec3) -> Traction:
+    """The law: what presses at a separating speed v_n and a slip u [m/s]."""
+    found = Traction()
+    found.pressure = pressure(law, rate, ZERO, law.stiction).value
+    found.friction = friction(slip, friction_bound(law, found.pressure).value, law.stiction)
+    return found
 
 
 @wp.func
@@ -301,9 +308,7 @@ def fitting_duals(law: PointLaw, motion: Motion) -> Duals:
     """Duals that fit given velocities."""
     duals = Duals()
     duals.direction = motion.rate / wp.max(wp.abs(motion.rate), law.stiction)
-    p = pressure(law, motion.rate, duals.direction, law.stiction).value
-    bound = friction_bound(law, p)
-    duals.friction = friction(motion.slip, bound.value, law.stiction)
+    duals.friction = traction(law, motion.rate, motion.slip).friction
     return duals
 
 

@@ -8,10 +8,13 @@ What a lane writes others may read only after `wait`, and what others may still 
 Numbers that lanes sum up are the same in all of them, so that they go the same way.
 """
 
+from typing import Any
+
 import warp as wp
 
 from dano.physics.features import LANES
 from dano.physics.real import INFINITY, mat33, mat66, real, vec3, vec4, vec6
+from dano.physics.structures import plain_fields, written
 
 # Beyond all indices.
 _NONE = wp.constant(2**31 - 1)
@@ -75,6 +78,18 @@ def total66(x: mat66) -> mat66:
         x = wp.tile_sum(wp.tile(x, preserve_type=True))[0]
         _barrier()
     return x
+
+
+_TOTALS = {real: "total", vec3: "total3", vec4: "total4", mat33: "total33", vec6: "total6", mat66: "total66"}
+
+
+def total_of(structure: Any) -> Any:
+    """Sum of a structure over the lanes of a world."""
+    lines = ["def whole(a: S) -> S:"]
+    if LANES > 1:
+        lines += [f"    a.{name} = {_TOTALS[kind]}(a.{name})" for name, kind in plain_fields(structure)]
+    sums = {name: globals()[name] for name in _TOTALS.values()}
+    return written(structure, "whole", [*lines, "    return a"], sums)
 
 
 @wp.func

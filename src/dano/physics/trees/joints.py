@@ -60,19 +60,6 @@ def summed_joint(a: Joint, b: Joint) -> Joint:
     return a
 
 
-@wp.func
-def joint_product(a: Joint, b: Joint) -> real:
-    """⟨a, b⟩ of joints."""
-    return (
-        wp.dot(a.axis, b.axis)
-        + wp.dot(a.anchor, b.anchor)
-        + wp.dot(a.position, b.position)
-        + wp.dot(a.orientation, b.orientation)
-        + a.ratio * b.ratio
-        + a.shift * b.shift
-    )
-
-
 @wp.struct
 class JointFrame:
     """Where a joint is at the start of a step [W].

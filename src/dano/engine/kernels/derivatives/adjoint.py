@@ -25,12 +25,13 @@ from dano.physics.pairs import (
     seen_from,
     shrunk,
 )
-from dano.physics.point_law import friction_bound, Material, point_law, point_motion, pressure
+from dano.physics.point_law import Material, point_law, point_motion, traction
 from dano.physics.real import ONE, real, vec3, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
 from dano.physics.samples import point_contact, position_in_solid, Sample
 from dano.physics.solids.distances import leaf_distance, Solid
 from dano.physics.solids.leaves import Distance, Solids
+from dano.physics.structures import product_of
 from dano.physics.twists import angular_part, joined, linear_part, relative_twist
 
 
@@ -76,12 +77,10 @@ def point_work(
     along = virtual.velocity - (impact.delays * share) * late.velocity
     turn = virtual.spin - (impact.delays * share) * late.spin
     motion = point_motion(point, twist.velocity, twist.spin)
-    slip = motion.slip + point.extra_slip
-    p = pressure(law, motion.rate, ZERO, law.stiction).value
-    friction = (-friction_bound(law, p).value / wp.max(wp.length(slip), law.stiction)) * slip
+    found = traction(law, motion.rate, motion.slip + point.extra_slip)
     by_pressure = wp.dot(point.normal, along) + wp.dot(point.moment, turn)
-    by_friction = wp.dot(friction, along + wp.cross(turn, point.arm))
-    return h * point.area * (p * by_pressure + by_friction)
+    by_friction = wp.dot(found.friction, along + wp.cross(turn, point.arm))
+    return h * point.area * (found.pressure * by_pressure + by_friction)
 
 
 @wp.func
@@ -110,6 +109,9 @@ def probe_distance(
     return leaf_distance(solids, world, solid.kind, solid.leaf, position_in_solid(pose, probe)).value
 
 
+pose_product = product_of(PairPose)
+
+
 @wp.func
 def pair_work(
     first: BodyState,
@@ -123,21 +125,7 @@ def pair_work(
     bar: PairPose,
 ) -> real:
     """⟨bar, pose of a pair⟩."""
-    pose = pair_pose(first, second, share, h, toward, turning, scale, follows)
-    return (
-        wp.ddot(bar.points, pose.points)
-        + wp.dot(bar.origin, pose.origin)
-        + wp.ddot(bar.vectors, pose.vectors)
-        + wp.ddot(bar.rotation, pose.rotation)
-        + wp.dot(bar.com, pose.com)
-        + wp.dot(bar.velocity, pose.velocity)
-        + wp.dot(bar.spin, pose.spin)
-        + wp.dot(bar.com_difference, pose.com_difference)
-        + wp.ddot(bar.arms, pose.arms)
-        + wp.dot(bar.arm_offset, pose.arm_offset)
-        + wp.dot(bar.lowest, pose.lowest)
-        + wp.dot(bar.axis, pose.axis)
-    )
+    return pose_product(bar, pair_pose(first, second, share, h, toward, turning, scale, follows))
 
 
 @wp.func

@@ -14,7 +14,9 @@ from dano.engine.kernels.derivatives.adjoint import (
 from dano.engine.kernels.derivatives.impact_work import impact_work, patch_work
 from dano.engine.kernels.derivatives.pair_changes import add_distance_changes
 from dano.engine.kernels.derivatives.products import (
+    add_to_leaf,
     scaled_body,
+    scaled_leaf,
     summed_body,
     summed_material,
     summed_pose,
@@ -70,19 +72,6 @@ def leaf_at(scene: Scene, world: int, body: int, x: vec3) -> Solid:
 
 
 @wp.func
-def add_leaf(bars: Changes, world: int, solid: Solid, bar: Solid):
-    """Add a derivative by a leaf."""
-    if bars.leaves.shape[1] > 0:
-        i = solid.first
-        bars.leaves[world, i].factor += bar.leaf.factor
-        bars.leaves[world, i].position += bar.leaf.position
-        bars.leaves[world, i].rotation += bar.leaf.rotation
-        bars.leaves[world, i].sizes += bar.leaf.sizes
-        bars.leaves[world, i].length += bar.leaf.length
-        bars.leaves[world, i].spacing += bar.leaf.spacing
-
-
-@wp.func
 def pull_sample(
     scene: Scene,
     room: Room,
@@ -99,7 +88,7 @@ def pull_sample(
 ) -> PairPose:
     """Add derivatives by a sample and the solid that it meets at x; returns those by the pose."""
     _f, _g, by_solid, by_x, _h = wp.grad(distance_work)(scene.solids, world, solid, x, by_distance)
-    add_leaf(bars, world, solid, by_solid)
+    add_to_leaf(bars.leaves, world, solid.first, by_solid.leaf)
     add_distance_changes(scene, room, world, lane, solid, x, by_distance)
     # x = points · sample + origin
     by_pose.points += wp.outer(by_x, scene.samples[world, s].point)
@@ -303,7 +292,7 @@ def pull_facing(
         scene.solids, world, solid, a, b, share, h, turning, scale, point, toward_bar, touched_bar
     )
     if lane == 0:
-        add_leaf(bars, world, solid, by_solid)
+        add_to_leaf(bars.leaves, world, solid.first, by_solid.leaf)
     bar.first = summed_body(bar.first, by_first)
     bar.second = summed_body(bar.second, by_second)
     bar.scale += by_scale
@@ -379,13 +368,7 @@ def pull_pose(
                 bar.sink += share
             toward_bar += share * of_toward
             if lane == 0:
-                of_solid.leaf.factor *= share
-                of_solid.leaf.position *= share
-                of_solid.leaf.rotation *= share
-                of_solid.leaf.sizes *= share
-                of_solid.leaf.length *= share
-                of_solid.leaf.spacing *= share
-                add_leaf(bars, world, solid, of_solid)
+                add_to_leaf(bars.leaves, world, solid.first, scaled_leaf(share, of_solid.leaf))
     if wp.static(len(TURNING) > 1):
         if turning > 0:
             bar, _j = pull_facing(

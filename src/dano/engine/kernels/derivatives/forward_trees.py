@@ -18,6 +18,7 @@ from dano.engine.kernels.derivatives.pair_changes import (
 )
 from dano.engine.kernels.derivatives.products import (
     body_product,
+    joint_product,
     law_product,
     leaf_product,
     loop_product,
@@ -45,7 +46,7 @@ from dano.physics.point_law import Material
 from dano.physics.real import ONE, real, vec3, vec6, ZERO
 from dano.physics.solids.leaves import Leaf
 from dano.physics.trees.joint_laws import JointLaw
-from dano.physics.trees.joints import Joint, joint_product
+from dano.physics.trees.joints import Joint
 from dano.physics.trees.loops import Loop
 
 _LANES = wp.constant(LANES)

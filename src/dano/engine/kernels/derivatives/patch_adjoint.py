@@ -32,6 +32,7 @@ from dano.physics.patch_law import patch_law, PatchMaterial
 from dano.physics.real import real, vec3
 from dano.physics.solids.distances import Solid
 from dano.physics.solids.leaves import Distance, Leaf, Solids
+from dano.physics.structures import product_of
 from dano.physics.twists import relative_twist
 
 
@@ -58,16 +59,7 @@ def patch_work(
     return h * (wp.dot(found.force, moved) + wp.dot(found.moment, virtual.spin))
 
 
-@wp.func
-def patch_product(a: Patch, b: Patch) -> real:
-    """⟨a, b⟩ of patches."""
-    return a.overlap * b.overlap + wp.dot(a.centroid, b.centroid) + wp.dot(a.normal, b.normal)
-
-
-@wp.func
-def sums_product(a: Sums, b: Sums) -> real:
-    """⟨a, b⟩ of sums."""
-    return a.share * b.share + wp.dot(a.moment, b.moment) + wp.dot(a.direction, b.direction)
+patch_product, sums_product = product_of(Patch), product_of(Sums)
 
 
 @wp.func

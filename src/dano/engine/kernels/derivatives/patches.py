@@ -6,7 +6,7 @@ What only skips work, balls around samples and maps of where a density is positi
 import warp as wp
 
 from dano.engine.kernels.derivatives.adjoint import distance_work, Virtual
-from dano.engine.kernels.derivatives.contact import add_leaf, PairBar, summed_body
+from dano.engine.kernels.derivatives.contact import PairBar, summed_body
 from dano.engine.kernels.derivatives.pair_changes import add_density_changes, add_distance_changes
 from dano.engine.kernels.derivatives.patch_adjoint import (
     cap_work,
@@ -19,7 +19,8 @@ from dano.engine.kernels.derivatives.patch_adjoint import (
     side_work,
     view_work,
 )
-from dano.engine.kernels.lanes import total3, total4, total33, wait
+from dano.engine.kernels.derivatives.products import add_patch_material, add_to_leaf
+from dano.engine.kernels.lanes import total_of, wait
 from dano.engine.kernels.patch_tables import PatchSideIndex
 from dano.engine.kernels.patches import contact_of, frame_of, next_block, side_field, side_sign
 from dano.engine.kernels.tables import BLOCK, Changes, FoundPair, Room, Scene
@@ -38,51 +39,15 @@ from dano.physics.overlap import (
     view_of,
 )
 from dano.physics.pairs import BodyState
-from dano.physics.patch_law import PatchMaterial
 from dano.physics.real import real, vec3, ZERO
-from dano.physics.solids.distances import leaf_distance, Solid
+from dano.physics.solids.distances import leaf_distance
 from dano.physics.solids.leaves import HALF_SPACE
 from dano.physics.solids.shapes import SPHERE
+from dano.physics.structures import sum_of
 
 _LANES, _BLOCK, _DENSITY = wp.constant(LANES), wp.constant(BLOCK), wp.constant(DENSITY)
 
-
-@wp.func
-def summed_view(a: View, b: View) -> View:
-    """Sum of two derivatives by a view."""
-    a.rotation += b.rotation
-    a.origin += b.origin
-    a.plane += b.plane
-    a.normal += b.normal
-    return a
-
-
-@wp.func
-def total_view(a: View) -> View:
-    """Sum over the lanes of a world."""
-    if wp.static(LANES > 1):
-        a.rotation = total33(a.rotation)
-        a.origin = total3(a.origin)
-        a.plane = total4(a.plane)
-        a.normal = total3(a.normal)
-    return a
-
-
-@wp.func
-def add_patch_material(bars: Changes, world: int, c: int, bar: PatchMaterial):
-    """Add a derivative by the numbers of a contact."""
-    if bars.patch_materials.shape[1] > 0:
-        bars.patch_materials[world, c].spring += bar.spring
-        bars.patch_materials[world, c].damper += bar.damper
-        bars.patch_materials[world, c].sliding_friction += bar.sliding_friction
-        bars.patch_materials[world, c].sliding_drag += bar.sliding_drag
-        bars.patch_materials[world, c].torsional_friction += bar.torsional_friction
-        bars.patch_materials[world, c].torsional_drag += bar.torsional_drag
-        bars.patch_materials[world, c].rolling_friction += bar.rolling_friction
-        bars.patch_materials[world, c].rolling_drag += bar.rolling_drag
-        bars.patch_materials[world, c].smoothing += bar.smoothing
-        bars.patch_materials[world, c].regularizer += bar.regularizer
-        bars.patch_materials[world, c].stiction += bar.stiction
+summed_view, total_view = sum_of(View), total_of(View)
 
 
 @wp.func
@@ -112,7 +77,7 @@ def pull_place(
         is_grid = solid.kind.kind == _DENSITY
         if is_grid:
             _a, _b, by_grid, by_place, _c = wp.grad(grid_work)(scene.solids, world, solid, x, bar)
-            add_leaf(bars, world, solid, by_grid)
+            add_to_leaf(bars.leaves, world, solid.first, by_grid.leaf)
             add_density_changes(scene, room, world, lane, solid, x, bar)
             found = by_place
     if not is_grid:
@@ -122,8 +87,8 @@ def pull_place(
         )
         _f, _g, by_leaf, of_x, _h = wp.grad(distance_work)(scene.solids, world, solid, x, by_d)
         add_edge(bars, world, leading.first, by_part.edge)
-        add_leaf(bars, world, solid, by_solid)
-        add_leaf(bars, world, solid, by_leaf)
+        add_to_leaf(bars.leaves, world, solid.first, by_solid.leaf)
+        add_to_leaf(bars.leaves, world, solid.first, by_leaf.leaf)
         add_distance_changes(scene, room, world, lane, solid, x, by_d)
         found = by_x + of_x
     return found
@@ -201,11 +166,8 @@ def pull_cap(
     index = scene.patches.side_index[s]
     plane = side_field(scene, world, index).solid
     sign = side_sign(scene, c, index)
-    ball = Solid()
-    ball.first = index.ball
-    ball.leaf = scene.solids.leaves[world, index.ball]
     by_ball, by_plane, by_sampled, by_queried, by_mass, _a, _b = wp.grad(cap_work)(
-        ball.leaf,
+        scene.solids.leaves[world, index.ball],
         plane.leaf,
         room.bodies[world, index.sampled],
         room.bodies[world, index.queried],
@@ -214,11 +176,8 @@ def pull_cap(
         patch_bar,
     )
     if lane == 0:
-        ball.leaf = by_ball
-        add_leaf(bars, world, ball, ball)
-        of_plane = plane
-        of_plane.leaf = by_plane
-        add_leaf(bars, world, plane, of_plane)
+        add_to_leaf(bars.leaves, world, index.ball, by_ball)
+        add_to_leaf(bars.leaves, world, plane.first, by_plane)
         add_mass(bars, world, index.sampled, by_mass)
     return add_side(bar, sign > ZERO, by_sampled, by_queried)
 
@@ -250,7 +209,7 @@ def pull_side(
     by_view = pull_samples(scene, room, bars, world, lane, index, field, view, by_own)
     by_field, of_sampled, of_queried, _c = wp.grad(view_work)(field, a, b, by_view)
     if lane == 0:
-        add_leaf(bars, world, field.solid, by_field.solid)
+        add_to_leaf(bars.leaves, world, field.solid.first, by_field.solid.leaf)
         add_mass(bars, world, index.sampled, by_mass)
         if bars.sides.shape[1] > 0:
             bars.sides[world, s].density_scale += by_scale
@@ -299,7 +258,7 @@ def pull_patch(
         twists,
     )
     if lane == 0:
-        add_patch_material(bars, world, c, by_material)
+        add_patch_material(bars.patch_materials, world, c, by_material)
     bar = PairBar()
     bar.first.position = by_first
     bar.second.position = by_second

@@ -12,11 +12,11 @@ from dano.engine.kernels.tables import Body, Push, StateRow
 from dano.engine.kernels.trees.tables import Chain, HangingBar
 from dano.physics.real import real, vec3, vec4, vec6
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turn_of_step
+from dano.physics.structures import product_of
 from dano.physics.trees.joint_laws import joint_momentum, joint_ramps, JointDrive, JointLaw, ramps_force
 from dano.physics.trees.joints import (
     ball_after,
     Carrier,
-    Displacement,
     displacement_twist,
     hanging_move,
     hanging_pose,
@@ -108,23 +108,7 @@ def hanging_chain(
     return found
 
 
-@wp.func
-def displacement_product(a: Displacement, b: Displacement) -> real:
-    """⟨a, b⟩."""
-    return wp.dot(a.turn, b.turn) + wp.dot(a.shift, b.shift)
-
-
-@wp.func
-def chain_product(a: Chain, b: Chain) -> real:
-    """⟨a, b⟩."""
-    return (
-        wp.dot(a.position, b.position)
-        + wp.dot(a.orientation, b.orientation)
-        + displacement_product(a.before, b.before)
-        + displacement_product(a.after, b.after)
-        + wp.dot(a.change, b.change)
-        + wp.dot(a.work, b.work)
-    )
+chain_product = product_of(Chain)
 
 
 @wp.func

@@ -3,6 +3,7 @@
 import warp as wp
 
 from dano.engine.kernels.derivatives.bodies import add_row
+from dano.engine.kernels.derivatives.products import add_law, add_loop
 from dano.engine.kernels.derivatives.tree_adjoint import (
     ball_work,
     coordinate_work,
@@ -23,7 +24,6 @@ from dano.engine.kernels.trees.tables import Chain, HangingBar, Node
 from dano.physics.pairs import BodyState
 from dano.physics.real import ONE, quat, real, vec3, vec6, ZERO
 from dano.physics.rotations import from_wxyz, to_wxyz
-from dano.physics.trees.joint_laws import JointLaw
 from dano.physics.trees.joints import BALL, Carrier, Joint, ROOT, summed_joint
 
 _BALL, _ROOT = wp.constant(BALL), wp.constant(ROOT)
@@ -379,25 +379,7 @@ def pull_laws(scene: Scene, room: Room, bars: Changes, world: int, t: int):
             bars.efforts[world, t * k + c] = by_drive.effort
         if bars.commands.shape[1] > 0:
             bars.commands[world, t * k + c] = by_drive.command
-        if bars.laws.shape[1] > 0:
-            add_law(bars, world, c, by_law)
-
-
-@wp.func
-def add_law(bars: Changes, world: int, c: int, bar: JointLaw):
-    """Add a derivative by what acts on a coordinate."""
-    bars.laws[world, c].damping += bar.damping
-    bars.laws[world, c].armature += bar.armature
-    bars.laws[world, c].stiffness += bar.stiffness
-    bars.laws[world, c].rest += bar.rest
-    bars.laws[world, c].friction += bar.friction
-    bars.laws[world, c].least += bar.least
-    bars.laws[world, c].most += bar.most
-    bars.laws[world, c].gear += bar.gear
-    bars.laws[world, c].motor_stiffness += bar.motor_stiffness
-    bars.laws[world, c].motor_damping += bar.motor_damping
-    bars.laws[world, c].least_effort += bar.least_effort
-    bars.laws[world, c].most_effort += bar.most_effort
+        add_law(bars.laws, world, c, by_law)
 
 
 @wp.func
@@ -427,10 +409,7 @@ def pull_loops(scene: Scene, room: Room, bars: Changes, world: int):
         add_chain(scene, room, world, index.first, index.first_body, by_first)
         add_chain(scene, room, world, index.second, index.second_body, by_second)
         add_timestep(bars, world, by_h)
-        if bars.loops.shape[1] > 0:
-            bars.loops[world, row].position += by_loop.position
-            bars.loops[world, row].anchor += by_loop.anchor
-            bars.loops[world, row].orientation += by_loop.orientation
+        add_loop(bars.loops, world, row, by_loop)
 
 
 @wp.func
