@@ -1,0 +1,1 @@
+"""What derivatives through impacts are worth: `python -m benchmarks.gradients`."""
