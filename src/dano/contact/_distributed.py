@@ -1,5 +1,6 @@
 """The distributed law: pressure and friction at every surface sample."""
 
+import os
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from dano.contact._laws import (
     Setting,
     STANDARD_GRAVITY,
 )
-from dano.maths import is_traced, Numbers
+from dano.maths import checked_array, is_traced, Numbers
 
 CHUNK = 16
 """Points that `VariationalEngine.capacity` counts as one."""
@@ -94,25 +95,41 @@ class DistributedLaw(AbstractContactLaw):
         stiction_velocity: v_s, slip up to which friction counts as sticking [m/s].
         implicitness: θ from 1/2 to 1: where in a step the depth is taken. 1, its end, is quietest.
         compliant: Whether impacts are left to the spring (static).
+        functions: A file of functions that stand in place of some of those of a point, see
+            `docs/theory/contact.md`; none for this law as it is (static).
+        numbers: Three numbers for them.
     """
 
     stiction_velocity: Float[Array, ""]
     implicitness: Float[Array, ""]
     compliant: bool = eqx.field(static=True)
+    functions: str | None = eqx.field(static=True)
+    numbers: Float[Array, "3"]
 
     def __init__(
-        self, *, stiction_velocity: Numbers = 1e-7, implicitness: Numbers = 1.0, compliant: bool = False
+        self,
+        *,
+        stiction_velocity: Numbers = 1e-7,
+        implicitness: Numbers = 1.0,
+        compliant: bool = False,
+        functions: str | os.PathLike[str] | None = None,
+        numbers: Numbers = (0.0, 0.0, 0.0),
     ):
         """See the class.
 
         Raises:
-            ValueError: If `stiction_velocity` is not a positive number or `implicitness` not in [1/2, 1].
+            ValueError: If `stiction_velocity` is not a positive number, `implicitness` not in [1/2, 1],
+                `functions` no file, or `numbers` not three.
         """
         self.stiction_velocity = positive("stiction_velocity", stiction_velocity)
         self.implicitness = non_negative("implicitness", implicitness)
         if not is_traced(self.implicitness) and not 0.5 <= float(self.implicitness) <= 1:
             raise ValueError(f"implicitness must lie in [1/2, 1], got {float(self.implicitness)}")
         self.compliant = bool(compliant)
+        self.functions = None if functions is None else os.path.abspath(functions)
+        if self.functions is not None and not os.path.isfile(self.functions):
+            raise ValueError(f"functions must be a file, got {os.fspath(functions or '')!r}")
+        self.numbers = checked_array("numbers", numbers, (3,))
 
     @property
     def reads(self) -> tuple[str, ...]:

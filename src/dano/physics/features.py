@@ -12,6 +12,8 @@ UNIONS = True
 """Whether a solid has several leaves, or a density several parts."""
 POINTS = True
 """Whether there are contacts with a point law."""
+LAW = ""
+"""A file whose functions stand in place of those of `point_law`; none if empty."""
 PATCHES = True
 """Whether there are contacts with a patch law."""
 TURNING = frozenset({0, 1, 2})

@@ -11,10 +11,13 @@ friction λ and the direction s of the hysteresis as unknowns of their own, the 
 
 (Chan, Golub, Mulet 1999; Andersen et al. 2000, for sums of norms). `linearized` is the derivative of this
 form.
+
+A file of functions may stand in place of some of these: see `DistributedLaw.functions`.
 """
 
 import warp as wp
 
+from dano.physics.features import LAW
 from dano.physics.friction import following_friction, Friction, friction, friction_with_dual
 from dano.physics.impacts import fading_in, Impact, impact_goal, impact_limit
 from dano.physics.real import ONE, real, vec3, ZERO
@@ -39,6 +42,7 @@ class Material:
         instant: 1 where impacts end within the step, 0 where they are left to the spring.
         bounce: Slowest rebound of an impact, and slowest approach that is one [m/s].
         uplift: An overlap of depth d separates at most at √(uplift · d), if that exceeds v_e [m/s²].
+        numbers: Of a law of one's own; only where there is one.
     """
 
     stiffness: real
@@ -54,6 +58,8 @@ class Material:
     instant: real
     bounce: real
     uplift: real
+    if LAW:
+        numbers: vec3
 
 
 @wp.struct
@@ -76,6 +82,7 @@ class PointLaw:
         goal: v*, separating speed that an impact aims at [m/s].
         guard: κ [Pa s/m].
         limit: Separating speed below which the point would get deeper than the impact [m/s].
+        numbers: Of a law of one's own; only where there is one.
     """
 
     stiffness: real
@@ -93,6 +100,8 @@ class PointLaw:
     goal: real
     guard: real
     limit: real
+    if LAW:
+        numbers: vec3
 
 
 @wp.struct
@@ -208,6 +217,8 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
     law.friction_pressure = material.friction_pressure
     law.stiction = material.stiction
     law.sharp = material.instant
+    if wp.static(len(LAW) > 0):
+        law.numbers = material.numbers
     return law
 
 

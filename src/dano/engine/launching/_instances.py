@@ -7,7 +7,9 @@ features (`dano.physics.features`), under names of their own.
 
 import builtins
 import functools
+import hashlib
 import importlib.util
+import inspect
 import sys
 from types import ModuleType
 from typing import Any
@@ -15,6 +17,7 @@ from typing import Any
 from dano.engine.launching._warp import begin
 
 _FEATURES = "dano.physics.features"
+_LAW = "dano.physics.point_law"
 _PACKAGES = ("dano.physics", "dano.engine.kernels", "dano.mujoco.kernels")
 
 
@@ -36,9 +39,16 @@ class Features:
         """A name for modules, the same in each process."""
         parts = []
         for key, value in self.values:
-            shown = "".join(map(str, sorted(value))) if isinstance(value, frozenset) else str(int(value))
-            parts.append(f"{key.lower()}{shown}")
+            parts.append(f"{key.lower()}{_shown(value)}")
         return "_".join(parts)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, frozenset):
+        return "".join(map(str, sorted(value)))
+    if isinstance(value, str):
+        return hashlib.sha256(value.encode()).hexdigest()[:12] if value else ""
+    return str(int(value))
 
 
 @functools.cache
@@ -53,12 +63,15 @@ def instance(features: Features, module: str) -> ModuleType:
     spec = importlib.util.find_spec(module)
     assert spec is not None and spec.origin is not None and spec.loader is not None
 
+    made = ModuleType(f"{module}.{features.name}")
+
     def imports(name, globals=None, locals=None, fromlist=(), level=0):
+        if name == module and fromlist:
+            return made
         if fromlist and name.startswith(_PACKAGES) and name not in _PACKAGES:
             return instance(features, name)
         return builtins.__import__(name, globals, locals, fromlist, level)
 
-    made = ModuleType(f"{module}.{features.name}")
     made.__file__, made.__loader__ = spec.origin, spec.loader
     made.__dict__["__builtins__"] = {**vars(builtins), "__import__": imports}
     sys.modules[made.__name__] = made
@@ -66,4 +79,43 @@ def instance(features: Features, module: str) -> ModuleType:
         exec(compile(file.read(), spec.origin, "exec"), made.__dict__)
     if module == _FEATURES:
         made.__dict__.update(features.values)
+    law = dict(features.values).get("LAW")
+    if module == _LAW and law:
+        made.__dict__.update(_functions_in(law, made))
     return made
+
+
+def _functions_in(path: str, usual: ModuleType) -> dict[str, Any]:
+    """Functions of a file that have the names of a module's.
+
+    Raises:
+        ValueError: If the file cannot be run, has none, or one that takes other arguments.
+    """
+    own = ModuleType(f"{usual.__name__}.own")
+    own.__file__ = path
+    own.__dict__["__builtins__"] = usual.__dict__["__builtins__"]
+    sys.modules[own.__name__] = own
+    try:
+        with open(path, encoding="utf-8") as file:
+            exec(compile(file.read(), path, "exec"), own.__dict__)
+    except Exception as error:
+        raise ValueError(f"functions must be a file that Python runs, got {path!r}: {error}") from error
+    valid, found = _kernel_functions(usual), _kernel_functions(own)
+    named = {name: x for name, x in found.items() if name in valid}
+    if not named:
+        raise ValueError(
+            f"functions must define at least one of {sorted(valid)}, got {path!r} with {sorted(found)}"
+        )
+    for name, function in named.items():
+        takes, asked = (list(inspect.signature(x.func).parameters) for x in (function, valid[name]))
+        if takes != asked:
+            raise ValueError(f"{name} of {path!r} must take ({', '.join(asked)}), got ({', '.join(takes)})")
+    return named
+
+
+def _kernel_functions(module: ModuleType) -> dict[str, Any]:
+    """Warp functions that a module defines itself."""
+    import warp as wp
+
+    functions = {name: x for name, x in vars(module).items() if isinstance(x, wp.Function)}
+    return {name: x for name, x in functions.items() if x.func.__module__ == module.__name__}

@@ -112,6 +112,7 @@ def features_of(
     known = next(each for each in _builds() if kinds <= each)
     of_grids = frozenset({2}) if degrees <= {2} else frozenset({1, 2, 3})
     return Features(
+        LAW=_own_law(scene),
         KINDS=known,
         DEGREES=of_grids if known - shape_kinds() else frozenset(),
         TURNING=_STILL if turning <= _STILL else _TURNS,
@@ -121,6 +122,15 @@ def features_of(
         TREES=bool(scene.joints),
         LOOPS=bool(scene.loops),
     )
+
+
+def _own_law(scene: Scene) -> str:
+    """The file of functions of the scene's point contacts, empty if they have the usual ones."""
+    files = {law.functions or "" for law, _ in _point_laws(scene)}
+    if len(files) > 1:
+        shown = sorted(name or "the usual ones" for name in files)
+        raise ValueError(f"functions must be the same for all contacts of a scene, got {', '.join(shown)}")
+    return files.pop() if files else ""
 
 
 def packed(struct: Any, **fields: Array) -> Float[Array, "rows width"]:
@@ -233,7 +243,11 @@ def _materials(scene: Scene, kernels: ModuleType, dtype: DTypeLike) -> Float[Arr
     if not groups:
         return jnp.zeros((0, len(Material._fields)), dtype)
     gravity = jnp.sqrt(jnp.sum(scene.gravity**2))
-    return packed(kernels.Material, **materials(groups, scene.timestep, gravity)._asdict())
+    fields = materials(groups, scene.timestep, gravity)._asdict()
+    if "numbers" in kernels.Material.vars:
+        rows = [jnp.broadcast_to(law.numbers, (p.sliding_friction.size, 3)) for law, p in groups]
+        fields["numbers"] = jnp.concatenate(rows).astype(dtype)
+    return packed(kernels.Material, **fields)
 
 
 def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
