@@ -16,7 +16,7 @@ from dano.report.viewing._drawn import Drawn, Shown
 from dano.report.viewing._field import Surface
 from dano.report.viewing._meshes import body_mesh, shape_mesh, surface_mesh
 from dano.report.viewing._serving import serve
-from dano.scene_file import asset_look, build_asset
+from dano.scene_file import asset_look, load_asset
 from dano.vision import Capture, LearnedField, visual_hull
 
 
@@ -108,7 +108,7 @@ def test_meshes_of_objects_have_the_colours_that_were_learned(trained):
 
 @pytest.fixture(scope="module")
 def trained():
-    return dano.Body("soap", build_asset("trained_soap")), asset_look("trained_soap")
+    return dano.Body("soap", load_asset("trained_soap")), asset_look("trained_soap")
 
 
 def test_meshes_of_shapes_lie_on_their_surface():

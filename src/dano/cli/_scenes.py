@@ -278,7 +278,7 @@ def _demo_scene(name: str, folder: Path, artist: "_Artist", tell: Callable[[str]
         if f'asset = "{asset}"' in text:
             # Before the scene is read, so that the first is drawn while the second is built.
             objects[asset] = str(folder / f"{asset}.dano")
-            made = scene_file.build_asset(asset)
+            made = scene_file.load_asset(asset)
             made.save(folder / f"{asset}.dano")
             artist.draw(made, folder / f"{asset}.png")
     loaded = load(path, None, None)

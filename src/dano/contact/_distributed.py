@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from dano.contact._laws import (
     AbstractContactLaw,
@@ -17,6 +17,7 @@ from dano.contact._laws import (
     Setting,
     STANDARD_GRAVITY,
 )
+from dano.hosted import hosted
 from dano.maths import is_traced, Numbers
 
 CHUNK = 16
@@ -135,11 +136,17 @@ class DistributedLaw(AbstractContactLaw):
             params = params.filled(stiffness=setting.stiffness(SINKING))
         return params.filled(
             restitution=0.0,
-            restitution_velocity=_SLOW * (setting.gravity * SINKING * setting.size) ** 0.5,
+            restitution_velocity=_slow(setting.gravity, setting.size),
             hysteresis=0.35,
             friction_fading=0.0,
             friction_pressure=1000.0,
         )
+
+
+@hosted
+def _slow(gravity: Float[Array, ""], size: ArrayLike) -> Float[Array, ""]:
+    """Speed [m/s] of an impact that counts as slow for bodies of a size [m]."""
+    return _SLOW * jnp.sqrt(gravity * SINKING * size)
 
 
 def combined(a: ContactParams, b: ContactParams) -> ContactParams:
