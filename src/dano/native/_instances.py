@@ -12,7 +12,7 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from dano.engine.launching._warp import begin
+from dano.native._warp import begin
 
 _FEATURES = "dano.physics.features"
 _PACKAGES = ("dano.physics", "dano.engine.kernels", "dano.mujoco.kernels")

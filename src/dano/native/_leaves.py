@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float, Int
 
-from dano.engine.launching._instances import Features, instance
 from dano.fields import (
     AbstractField,
     AbstractPrimitive,
@@ -28,6 +27,7 @@ from dano.fields import (
     UnionShape,
 )
 from dano.maths import matmul, matvec, Pose
+from dano.native._instances import Features, instance
 
 LEAF_WIDTH = 20
 """Numbers of a leaf."""
