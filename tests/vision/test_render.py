@@ -7,6 +7,7 @@ import pytest
 from vision.models import Fog, learned
 
 from dano import Box, GridField, HalfSpace, Pose, Sphere
+from dano.fields import AbstractShape
 from dano.vision import Camera, Item, level_surface, PosedCamera, render
 from dano.vision.drawing._rays import CHUNK, Thing, Tracer, transmitted
 from dano.vision.radiance._picture import picture
@@ -188,3 +189,30 @@ def test_learned_media_dim_what_is_behind_them_and_shadow_the_floor():
 def test_bad_pictures_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+class Egg(AbstractShape):
+    """A shape that kernels do not know."""
+
+    edge: None = None
+
+    def sdf(self, x):
+        stretched = x * jnp.array([1.0, 1.0, 0.7], x.dtype)
+        return jnp.linalg.norm(stretched) - 0.4
+
+    @property
+    def bounds(self):
+        reach = jnp.array([0.4, 0.4, 0.4 / 0.7])
+        return jnp.stack([-reach, reach])
+
+    def solid_moments(self):
+        return None
+
+
+def test_shapes_of_users_are_drawn():
+    camera = Camera((0.0, -30.0, 0.0), vertical_fov=0.06, width=120, height=100)
+    empty = render([], camera, floor=False)
+    seen = (render([Item(Egg())], camera, floor=False, antialias=False) != empty).any(axis=2)
+    # From afar an ellipse.
+    area = math.pi * 0.4 * 0.4 / 0.7 / (30 * camera.pixel_angle) ** 2
+    assert seen.sum() == pytest.approx(area, rel=0.02)
