@@ -64,7 +64,7 @@ class GridField(AbstractField):
         """
         degree = degree_of(interpolation)
         values = checked_values(values)
-        self.coefficients = jnp.pad(values, border(degree))
+        self.coefficients = _padded(values, border(degree))
         self.origin = checked_array("origin", origin, (3,))
         self.spacing = checked_spacing(spacing)
         self.interpolation = interpolation
@@ -173,6 +173,11 @@ class GridField(AbstractField):
         )
         cell = jnp.prod(spacing)
         return DensityMoments(cell * total, mean + self.origin.astype(dtype), cell * second)
+
+
+@hosted
+def _padded(values: Float[Array, "nx ny nz"], width: int) -> Float[Array, "px py pz"]:
+    return jnp.pad(values, width)
 
 
 def scaled_jet(rows: Float[Array, "rows n"], spacing: Float[Array, "3"], order: int) -> Jet:

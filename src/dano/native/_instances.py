@@ -9,6 +9,7 @@ import builtins
 import functools
 import importlib.util
 import sys
+import threading
 from types import ModuleType
 from typing import Any
 
@@ -41,7 +42,10 @@ class Features:
         return "_".join(parts)
 
 
-@functools.cache
+# One thread makes instances, the others wait for them.
+_lock = threading.RLock()
+
+
 def instance(features: Features, module: str) -> ModuleType:
     """A module of `dano.physics` or of kernels, run with some features.
 
@@ -50,6 +54,12 @@ def instance(features: Features, module: str) -> ModuleType:
         module: Its usual name.
     """
     begin()
+    with _lock:
+        return _instance(features, module)
+
+
+@functools.cache
+def _instance(features: Features, module: str) -> ModuleType:
     spec = importlib.util.find_spec(module)
     assert spec is not None and spec.origin is not None and spec.loader is not None
 

@@ -71,7 +71,8 @@ class Placed(NamedTuple):
     @classmethod
     def still(cls, field: AbstractField, dtype: DTypeLike) -> "Placed":
         """A field in its own frame."""
-        return cls(field, jnp.ones((), dtype), jnp.zeros(3, dtype), jnp.eye(3, dtype=dtype))
+        still = (np.ones((), dtype), np.zeros(3, dtype), np.eye(3, dtype=dtype))
+        return cls(field, *map(jax.device_put, still))
 
     @property
     def leaf(self) -> Known:

@@ -17,8 +17,8 @@ from dano.report._framing import CAMERAS, cameras_for, Seen, seen_of, together
 from dano.report._overlay import draw_clock, draw_label, draw_touches
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import check_run, Stage, stage, Touches, touches
-from dano.scene import Scene, Trajectory
-from dano.vision import Camera, LearnedField, render
+from dano.scene import Scene, State, Trajectory
+from dano.vision import Camera, LearnedField, prepare, render
 
 MOST_PIXELS = 8192
 """Longest side of a film: what common decoders of H.264 can show."""
@@ -101,6 +101,39 @@ def render_trajectory(
     style, outputs = _checked(style, [(scene, trajectory)], path, strip)
     count = len(frame_times(trajectory, fps, slow_motion))
     _film([_take(scene, trajectory, stage(scene, colours, looks), count, style)], style, outputs)
+
+
+def render_start(
+    scene: Scene,
+    state: State,
+    path: str | os.PathLike[str],
+    *,
+    looks: Mapping[str, LearnedField] | None = None,
+    size: tuple[int, int] = (640, 400),
+) -> None:
+    """Draw a scene at a state, for instance before its simulation.
+
+    Args:
+        scene: The scene.
+        state: Where its bodies are.
+        path: A PNG, written whole or not at all.
+        looks: As in `render_trajectory`.
+        size: Width and height [pixels], even numbers.
+
+    Raises:
+        ValueError: If the size is wrong, or the output path is a directory, lies in none, or has another
+            ending.
+        ImportError: If pillow is missing.
+    """
+    scene.check_state(state)
+    _, output = _outputs(None, path, size, 1)
+    assert output is not None
+    drawn = stage(scene, None, looks)
+    position, orientation = (np.asarray(x, np.float64) for x in (state.position, state.orientation))
+    seen = seen_of(scene, drawn, position[None], orientation[None])
+    camera = cameras_for(seen, 1.0, (size[0], size[1]), "fixed")[0]
+    prepare(drawn.items, camera)
+    write_png(output, render(drawn.posed(position, orientation), camera, floor=False))
 
 
 def render_side_by_side(
@@ -212,7 +245,12 @@ def check_film(
         raise ValueError("path or strip must be given, got None for both")
     for scene, trajectory in runs:
         check_run(scene, trajectory)
-    checked_size(size, len(runs))
+    return _outputs(path, strip, size, len(runs))
+
+
+def _outputs(path: Any, strip: Any, size: Any, count: int) -> tuple[Path | None, Path | None]:
+    """See `check_film`."""
+    checked_size(size, count)
     checked = []
     for name, output, suffix in (("path", path, ".mp4"), ("strip", strip, ".png")):
         if output is not None and checked_path(name, output).suffix.lower() != suffix:
@@ -255,6 +293,8 @@ def _film(takes: Sequence[_Take], style: _Style, outputs: tuple[Path | None, Pat
         cameras = cameras_for(together([take.seen for take in takes]), step, style.size, style.camera)
     else:
         cameras = [style.camera] * count
+    if count > 1:
+        prepare([item for take in takes for item in take.drawn.items], cameras[0])
     sizes = [item.radius for take in takes for item in take.drawn.items if item.plane is None]
     arrow = 0.55 * float(np.median(sizes or [1.0]))
     position = np.concatenate([take.position for take in takes], axis=1)
@@ -373,7 +413,7 @@ def write_png(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
     """Write an image, whole or not at all."""
     picture = require("PIL.Image", "pillow").fromarray(image)
     with replacing(path) as file:
-        picture.save(file, format="PNG", optimize=True)
+        picture.save(file, format="PNG", compress_level=6)
 
 
 def require(module: str, package: str | None = None) -> Any:

@@ -9,7 +9,7 @@ from dano.checks import checked_optional, checked_text
 from dano.contact import Collider, ContactParams, SampleSet, Support, SurfaceSet
 from dano.fields import AbstractField, AbstractShape, Ellipsoid, HalfSpace, SignedDistanceGrid, Sphere
 from dano.hosted import hosted
-from dano.maths import checked_array, floating, Numbers, quat_rotate
+from dano.maths import checked_array, floating, Numbers, quat_rotate, stacked
 from dano.objects import checked_inertia, MassProperties, NeuralObject
 
 # Orientations over which the support of a body is sampled.
@@ -176,7 +176,7 @@ class Body(eqx.Module):
             margin: Distance from which samples are listed because a step may bring them into contact [m].
         """
         assert self.surface is not None
-        points, vectors = np.asarray(self.surface.points[:3]), np.asarray(self.surface.vectors)
+        points, vectors = np.asarray(self.surface.points)[:3], np.asarray(self.surface.vectors)
         n = points.shape[1]
         if self.surface.turning != "fixed":
             return n
@@ -192,7 +192,7 @@ class Body(eqx.Module):
         if self.surface is None or self.surface.turning != "ball":
             return floating(np.ones(3, self.com.dtype))
         if isinstance(self.shape, Sphere):
-            return jnp.broadcast_to(self.shape.radius, (3,))
+            return stacked([self.shape.radius] * 3)
         assert isinstance(self.shape, Ellipsoid)
         return self.shape.semi_axes
 

@@ -4,7 +4,6 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
@@ -20,7 +19,7 @@ from dano.fields import (
     redistanced,
     SignedDistanceGrid,
 )
-from dano.maths import checked_array, Numbers, Pose, quat_to_matrix
+from dano.maths import checked_array, Numbers, on_device, Pose, quat_to_matrix
 from dano.native import is_known
 from dano.vision.radiance import AbstractModel, LearnedField, SurfaceModel
 
@@ -287,4 +286,4 @@ def _single(module: M) -> M:
 
 
 def _as(module: M, dtype: np.dtype) -> M:
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype), module)
+    return jax.tree.map(lambda x: on_device(np.asarray(x, dtype)), module)

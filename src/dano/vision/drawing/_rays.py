@@ -92,7 +92,7 @@ class Tracer:
         """
         import warp as wp
 
-        self._kernel = compiled_kernel(lambda: instance(_FEATURES, _TRACING).trace)
+        self._kernel = _kernel(_TRACING, "trace")
         module = instance(_FEATURES, _TRACING)
         view: Any = module.View()
         tables = _tables([thing.shape for thing in things])
@@ -150,7 +150,7 @@ class Painter:
         """
         import warp as wp
 
-        self._kernel = compiled_kernel(lambda: instance(_FEATURES, _PAINTING).paint)
+        self._kernel = _kernel(_PAINTING, "paint")
         scenery: Any = instance(_FEATURES, _PAINTING).Scenery()
         scenery.albedos = wp.array(np.array(albedos, np.float32).reshape(-1, 3), dtype=wp.vec3f, device="cpu")
         scenery.n_planes = n_planes
@@ -169,6 +169,17 @@ class Painter:
         given = (rays, met.depth, met.which, normals, met.lamp, met.ambient)
         _launch(self._kernel, self._scenery, (*given, colours, picture))
         return np.ascontiguousarray(colours.T), picture
+
+
+def compile_kernels() -> None:
+    """Compile what draws, or load it; so that others may compile something else meanwhile."""
+    _kernel(_PAINTING, "paint")
+    _kernel(_TRACING, "trace")
+
+
+@functools.cache
+def _kernel(module: str, name: str) -> Any:
+    return compiled_kernel(lambda: getattr(instance(_FEATURES, module), name), what="what draws")
 
 
 def _launch(kernel: Any, first: Any, arrays: Sequence[np.ndarray]) -> None:

@@ -6,8 +6,10 @@ kind of edge at a small part of the cost of doing so everywhere.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
@@ -15,10 +17,11 @@ from scipy import ndimage
 
 from dano.checks import checked_items, checked_kind
 from dano.maths import checked_array, Numbers, product
+from dano.native import together
 from dano.vision.capture import AbstractCamera, Camera
 from dano.vision.drawing._composed import part_of, radiance, reached_through, through
 from dano.vision.drawing._item import checked_colour, Item, placement
-from dano.vision.drawing._rays import CHUNK, Met, Painter, Thing, Tracer, transmitted
+from dano.vision.drawing._rays import CHUNK, compile_kernels, Met, Painter, Thing, Tracer, transmitted
 from dano.vision.drawing._shade import GAMMA, lamps_of, Surroundings, to_picture
 from dano.vision.radiance import Sampling, tiles
 
@@ -210,6 +213,22 @@ def _edges(picture, touched, width: int, height: int) -> Int[np.ndarray, " edges
     return (y + window[0].start) * width + x + window[1].start
 
 
+def prepare(items: Sequence[Item], camera: AbstractCamera) -> None:
+    """Compile what a picture of some items needs, on all cores; the first picture would do it on one.
+
+    Args:
+        items: What will be in it.
+        camera: From where.
+    """
+    items = checked_items("items", items, Item)
+    lamps = lamps_of(_surroundings(camera, _focus(camera, items), None, None))
+    learned = [part_of(item, camera) for item in items if item.model is not None and item.shape is not None]
+    points, share = np.zeros((3, CHUNK), np.float32), np.zeros(CHUNK, np.float32)
+    together(
+        [compile_kernels, *(partial(_sent, part, lamps, points, points, share, share) for part in learned)]
+    )
+
+
 def _drawn(view: _View, d: np.ndarray) -> tuple[UInt8[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Picture of rays, and which of them see more than empty surroundings."""
     met = view.tracer(d)
@@ -269,11 +288,12 @@ def _sent(part, lamps, points, view, lamp, ambient):
     if not part.model.appearance.lit:
         sent, _ = part.model.colour(local, towards, jnp.zeros_like(local))
         return jnp.maximum(sent, 0).T ** GAMMA * (0.45 * lamp + 0.55 * ambient)[None]
-    first, *sky = (
-        jnp.maximum(radiance((part,), 0, (light,), points.T, local, towards, None).T, 0) ** GAMMA
-        for light in lamps
+    # A loop: one copy of the network is compiled.
+    sent = jax.lax.map(
+        lambda one: jnp.maximum(radiance((part,), 0, (one,), points.T, local, towards, None).T, 0) ** GAMMA,
+        jax.tree.map(lambda *each: jnp.stack([jnp.asarray(x) for x in each]), *lamps),
     )
-    return first * lamp[None] + sum(sky, jnp.zeros_like(first)) * ambient[None]
+    return sent[0] * lamp[None] + jnp.sum(sent[1:], axis=0) * ambient[None]
 
 
 def _lay_clouds_over(view, d, depth, colour):
