@@ -248,8 +248,8 @@ def test_a_written_page_says_what_a_run_is(fall, tmp_path):
     said = json.loads(re.search(r"const run = (\{.*\});", page).group(1))
     assert said["title"] == "a <fall> </script>"
     energy, force = said["graphs"]
-    # A free fall keeps its energy and touches nothing.
-    np.testing.assert_allclose(energy["values"], energy["values"][0], rtol=0.01)
+    # A free fall keeps its energy, to a share of what moves between its kinds, and touches nothing.
+    assert 0 <= min(energy["values"]) and max(energy["values"]) < 0.05 * 0.3 * 9.81 * 0.05
     assert not any(force["values"]) and len(force["values"]) == len(said["times"])
     bodies, parameters = said["tables"]
     assert [row[:2] for row in bodies] == [["ball", "0.3 kg"], ["floor", "fixed"]]

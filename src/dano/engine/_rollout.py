@@ -251,7 +251,7 @@ def _fast(omega: Float[Array, "steps n 3"], timestep: Float[Array, ""]) -> Bool[
 
 
 @hosted
-def _times(timestep: Float[Array, ""], n_steps: int) -> Float[Array, " n_steps+1"]:
+def _times(timestep: Float[Array, ""], n_steps: int) -> Float[Array, " steps"]:
     return timestep * jnp.arange(n_steps + 1, dtype=timestep.dtype)
 
 
