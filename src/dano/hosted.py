@@ -325,7 +325,7 @@ def _product(eqn: Any) -> Operation:
         order = (*stack, *free, *summed) if summed_last else (*stack, *summed, *free)
         outer, inner = (free, summed) if summed_last else (summed, free)
         sizes = [math.prod(x.shape[axis] for axis in axes) for axes in (outer, inner)]
-        return x.transpose(order).reshape(*(x.shape[axis] for axis in stack), *sizes), [
+        return x.transpose(order).reshape((*(x.shape[axis] for axis in stack), *sizes)), [
             x.shape[axis] for axis in free
         ]
 
@@ -333,7 +333,8 @@ def _product(eqn: Any) -> Operation:
         rows, first = arranged(x, left_stack, left, summed_last=True)
         columns, second = arranged(y, right_stack, right, summed_last=False)
         found = np.matmul(rows, columns)
-        return found.reshape(*found.shape[: len(left_stack)], *first, *second).astype(dtype, copy=False)
+        shape = (*found.shape[: len(left_stack)], *first, *second)
+        return found.reshape(shape).astype(dtype, copy=False)
 
     return product
 
@@ -375,6 +376,26 @@ def _gather(eqn: Any) -> Operation:
     return gather
 
 
+def _scan(eqn: Any) -> Operation:
+    """`lax.scan`, and so `lax.map`: a loop over the first axes of arrays."""
+    once = _steps(eqn.params["jaxpr"])
+    n_consts, n_carried = eqn.params["num_consts"], eqn.params["num_carry"]
+    places = range(eqn.params["length"])
+    if eqn.params["reverse"] or not places:
+        raise _UnknownError
+
+    def scan(*given: Any) -> list[Any]:
+        consts, carried = given[:n_consts], list(given[n_consts : n_consts + n_carried])
+        rows = []
+        for i in places:
+            found = once(*consts, *carried, *[x[i] for x in given[n_consts + n_carried :]])
+            carried = found[:n_carried]
+            rows.append(found[n_carried:])
+        return [*carried, *(np.stack(column) for column in zip(*rows, strict=True))]
+
+    return scan
+
+
 _OPERATIONS: dict[str, Callable[[Any], Operation]] = {
     "argmax": _extreme(np.argmax),
     "argmin": _extreme(np.argmin),
@@ -401,6 +422,7 @@ _OPERATIONS: dict[str, Callable[[Any], Operation]] = {
     "reshape": lambda eqn: lambda x: np.reshape(x, eqn.params["new_sizes"]),
     "rev": lambda eqn: lambda x: np.flip(x, eqn.params["dimensions"]),
     "round": _round,
+    "scan": _scan,
     "slice": _slice,
     "split": _split,
     "stack": lambda eqn: lambda *x: np.stack(x, axis=eqn.params["axis"]),
