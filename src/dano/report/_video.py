@@ -125,13 +125,16 @@ def render_start(
             ending.
         ImportError: If pillow is missing.
     """
-    scene.check_state(state)
-    _, output = _outputs(None, path, size, 1)
-    assert output is not None
+    checked_kind("scene", scene, Scene).check_state(checked_kind("state", state, State))
+    output = checked_output(path)
+    if output.suffix.lower() != ".png":
+        raise ValueError(f"path must end in .png, got {output}")
+    width, height = checked_size(size)
+    require("PIL", "pillow")
     drawn = stage(scene, None, looks)
     position, orientation = (np.asarray(x, np.float64) for x in (state.position, state.orientation))
     seen = seen_of(scene, drawn, position[None], orientation[None])
-    camera = cameras_for(seen, 1.0, (size[0], size[1]), "fixed")[0]
+    camera = cameras_for(seen, 1.0, (width, height), "fixed")[0]
     prepare(drawn.items, camera)
     write_png(output, render(drawn.posed(position, orientation), camera, floor=False))
 
@@ -245,12 +248,7 @@ def check_film(
         raise ValueError("path or strip must be given, got None for both")
     for scene, trajectory in runs:
         check_run(scene, trajectory)
-    return _outputs(path, strip, size, len(runs))
-
-
-def _outputs(path: Any, strip: Any, size: Any, count: int) -> tuple[Path | None, Path | None]:
-    """See `check_film`."""
-    checked_size(size, count)
+    checked_size(size, len(runs))
     checked = []
     for name, output, suffix in (("path", path, ".mp4"), ("strip", strip, ".png")):
         if output is not None and checked_path(name, output).suffix.lower() != suffix:
