@@ -68,7 +68,7 @@ def test_is_what_jax_computes(name):
 
 def test_compiles_nothing_that_it_knows():
     seen = []
-    monitoring.register_event_duration_secs_listener(lambda name, *_, **__: seen.append(name))
+    monitoring.register_event_duration_secs_listener(lambda event, duration_secs, **_: seen.append(event))
     odd = jnp.asarray(np.linspace(0, 1, 3 * 61).reshape(3, 61))
     seen.clear()
     hosted(FUNCTIONS["density"])(odd)

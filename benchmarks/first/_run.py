@@ -110,5 +110,5 @@ def run() -> None:
     for program in _programs_to_run():
         if not arguments.only or any(word in program.name for word in arguments.only):
             rows += _rows(program, twice=not arguments.quick)
-    settings = {"cores": len(os.sched_getaffinity(0))}
+    settings: dict[str, object] = {"cores": len(os.sched_getaffinity(0))}
     report("first", rows, settings, before, arguments.json)

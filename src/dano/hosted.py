@@ -86,7 +86,7 @@ class _Program:
 
     def __init__(self, function: Callable[..., Any], leaves: list[Any], tree: Any):
         given = [leaf for leaf in leaves if _is_array(leaf)]
-        if any(jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.extended) for leaf in given):
+        if any(jnp.issubdtype(leaf.dtype, jax.dtypes.extended) for leaf in given):
             raise _UnknownError
 
         def flat(*arrays: Any) -> Any:
@@ -97,7 +97,8 @@ class _Program:
         traced, shape = jax.make_jaxpr(flat, return_shape=True)(*given)
         self._run = _steps(traced)
         self._tree = jax.tree.structure(shape)
-        self._dtypes = [aval.dtype for aval in traced.out_avals]
+        shapes: list[Any] = traced.out_avals
+        self._dtypes = [shape.dtype for shape in shapes]
 
     def __call__(self, arrays: list[np.ndarray]) -> Any:
         with np.errstate(all="ignore"):
@@ -119,7 +120,8 @@ def _steps(closed: ClosedJaxpr) -> Operation:
 
     def place(var: Any) -> int:
         if isinstance(var, Literal):
-            start.append(np.asarray(var.val, var.aval.dtype))
+            kind: Any = var.aval
+            start.append(np.asarray(var.val, kind.dtype))
             return len(start) - 1
         if var not in places:
             places[var] = len(start)

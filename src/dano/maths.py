@@ -397,7 +397,7 @@ def floating(value: Numbers) -> Array:
     """`value` as a floating JAX array: floating arrays keep their dtype, the rest takes JAX's default."""
     dtype = getattr(value, "dtype", None)
     if dtype is not None and jnp.issubdtype(dtype, jnp.floating):
-        return value if isinstance(value, jax.Array) else on_device(value)
+        return value if isinstance(value, jax.Array) else on_device(np.asarray(value))
     usual = jnp.result_type(float)
     if is_traced(value) or isinstance(value, jax.Array):
         return jnp.asarray(value, usual)

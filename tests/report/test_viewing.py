@@ -245,7 +245,8 @@ def test_a_written_page_says_what_a_run_is(fall, tmp_path):
     write_view(scene, run, tmp_path / "run.html", title="a <fall> </script>")
     page = (tmp_path / "run.html").read_text(encoding="utf-8")
     assert "<title>a &lt;fall&gt; &lt;/script&gt;</title>" in page
-    said = json.loads(re.search(r"const run = (\{.*\});", page).group(1))
+    (text,) = re.findall(r"const run = (\{.*\});", page)
+    said = json.loads(text)
     assert said["title"] == "a <fall> </script>"
     energy, force = said["graphs"]
     # A free fall keeps its energy, to a share of what moves between its kinds, and touches nothing.

@@ -194,7 +194,7 @@ def test_bad_pictures_are_refused(make, message):
 class Egg(AbstractShape):
     """A shape that kernels do not know."""
 
-    edge: None = None
+    edge: None = None  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def sdf(self, x):
         stretched = x * jnp.array([1.0, 1.0, 0.7], x.dtype)

@@ -151,7 +151,7 @@ def _rays_of(camera: AbstractCamera) -> tuple[Int[np.ndarray, " n"], Float[np.nd
     """
     width, height = camera.width, camera.height
     probes = np.array([[0, 0], [width, 0], [0, height], [0.3 * width, 0.4 * height]], float)
-    axes = np.stack(camera.axes)
+    axes = np.asarray(camera.axes)
     kind = np.round(camera.directions(probes) @ axes.T, 9)
     key = np.array([width, height, *kind.ravel()]).tobytes()
     if key not in _kept:
