@@ -7,7 +7,7 @@ import numpy as np
 
 import dano
 from benchmarks._measure import reference_folder
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Subject:
 
 def shipped_bunny() -> Subject:
     """The bunny that dano ships: 12 cm, 1 kg."""
-    return Subject("bunny", build_asset("bunny"), 0.115, 0.002)
+    return Subject("bunny", load_asset("bunny"), 0.115, 0.002)
 
 
 def authors_bunny() -> Subject | None:

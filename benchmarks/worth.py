@@ -62,9 +62,9 @@ def main() -> None:
 def way(panel: Panel):
     """Where the bunny is at the end, as a function of friction."""
     import dano
-    from dano.scene_file import build_asset
+    from dano.scene_file import load_asset
 
-    bodies = [dano.Body("bunny", build_asset("bunny")), dano.Body("floor", dano.HalfSpace(), fixed=True)]
+    bodies = [dano.Body("bunny", load_asset("bunny")), dano.Body("floor", dano.HalfSpace(), fixed=True)]
     law = dano.CentroidLaw() if panel.centroid else dano.DistributedLaw()
 
     def scene(friction) -> dano.Scene:

@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 
 from dano.mujoco import Bridge
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 LEG = """
 <mujoco>
@@ -30,7 +30,7 @@ LEG = """
 def main(quick: bool = False) -> dict[str, float]:
     spec = mujoco.MjSpec.from_string(LEG)
     bridge = Bridge(spec)
-    bridge.attach("bunny", build_asset("trained_bunny"), look=not quick)
+    bridge.attach("bunny", load_asset("trained_bunny"), look=not quick)
     model = bridge.compile()
     model.geom_friction[:, 0] = 0.3
     data = mujoco.MjData(model)

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from dano.mujoco import Bridge
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 PANDA = "assets/franka_panda/bubblify/panda_spherized.urdf"
 STIFFNESS, DAMPING = np.array([400, 400, 400, 400, 100, 100, 50.0]), np.array([40, 40, 40, 40, 10, 10, 5.0])
@@ -30,7 +30,7 @@ def main(quick: bool = False) -> dict[str, float]:
     # The file's spheres of the base and the first link overlap.
     spec.add_exclude(bodyname1="world", bodyname2="panda_link1")
     bridge = Bridge(spec)
-    bridge.attach("bunny", build_asset("trained_bunny"), look=not quick)
+    bridge.attach("bunny", load_asset("trained_bunny"), look=not quick)
     model = bridge.compile()
     data = mujoco.MjData(model)
     data.qpos[:7] = NEAR

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from dano.scene_file import asset_look
+from dano.scene_file import asset_look, build_asset, load_asset
 from dano.vision import load_capture, score
 
 MODEL = Path(__file__).resolve().parents[1] / "assets" / "bunny.obj"
@@ -92,3 +92,19 @@ def test_trained_objects_are_the_solids_and_look_like_the_photographs(name: str,
     quality = score(look, (view,))
     assert quality.psnr > 29 and quality.mask_iou > 0.985
     assert asset_look(name) is None
+
+
+def test_shipped_objects_are_what_is_built_of_their_fields():
+    shipped, built = load_asset("soap"), build_asset("soap")
+    for name in ("mass", "com", "inertia"):
+        np.testing.assert_allclose(
+            getattr(shipped.mass, name), getattr(built.mass, name), rtol=1e-9, atol=1e-15
+        )
+    for name in ("grid", "solid"):
+        mine, theirs = getattr(shipped, name), getattr(built, name)
+        np.testing.assert_allclose(mine.coefficients, theirs.coefficients, rtol=1e-5, atol=1e-6)
+    # Rounding may choose another of two candidates that lie equally far from all others.
+    assert shipped.surface.points.shape == built.surface.points.shape
+    np.testing.assert_allclose(shipped.surface.areas.sum(), built.surface.areas.sum(), rtol=1e-6)
+    same = np.all(np.isclose(shipped.surface.points, built.surface.points, atol=1e-9), axis=1)
+    assert np.mean(same) > 0.5

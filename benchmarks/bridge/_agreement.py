@@ -6,7 +6,7 @@ import numpy as np
 import dano
 from benchmarks._measure import Row
 from dano.fields import SignedDistanceGrid
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 SETTLE, WATCH = 3.0, 1.0
 SPEED, FRICTION = 0.2, 0.3
@@ -41,7 +41,7 @@ def agreement_row(name: str, support: str, model, bridge) -> Row:
     # Without this advice of MuJoCo's its friction gives way on slopes, for its own geoms, too.
     model.opt.cone, model.opt.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0
     model.geom_friction[:, 0] = FRICTION
-    data, obj = mujoco.MjData(model), build_asset(name)
+    data, obj = mujoco.MjData(model), load_asset(name)
     com, n = np.asarray(obj.mass.com), round(WATCH / model.opt.timestep)
     with bridge:
         mujoco.mj_step(model, data, round(SETTLE / model.opt.timestep))

@@ -8,7 +8,7 @@ import numpy as np
 import dano
 from benchmarks._measure import Row
 from dano.mujoco import Bridge
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 TYPES = mujoco.mjtGeom
 SPEED, MASS, WAY, HALF = 7.7, 0.1, 0.05, 0.005
@@ -28,7 +28,7 @@ def held_rows(name: str, quick: bool) -> list[Row]:
 
 
 def _fingers(name: str, timestep: float) -> list[Row]:
-    obj, spec = build_asset(name), mujoco.MjSpec()
+    obj, spec = load_asset(name), mujoco.MjSpec()
     spec.option.timestep, spec.option.gravity = timestep, [0, 0, 0]
     spec.worldbody.add_body(name="toy").add_freejoint()
     points = np.asarray(obj.surface.points)

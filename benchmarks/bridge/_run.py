@@ -14,7 +14,7 @@ from benchmarks.bridge._agreement import agreement_row, HOLLOW, hollow, HOLLOW_N
 from benchmarks.bridge._grip import held_rows
 from dano.exchange import solid_triangles
 from dano.mujoco import Bridge
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 SETTLE, WATCH = 4.0, 1.0
 MOST_CREEP = 1e-4
@@ -99,7 +99,7 @@ def _rest(name: str, support: str, timestep: float, own: bool) -> Rest:
 
 
 def _model(name: str, support: str, timestep: float, own: bool):
-    obj = build_asset(name)
+    obj = load_asset(name)
     spec = mujoco.MjSpec()
     spec.option.timestep = timestep
     spec.worldbody.add_geom(**_support(spec, support))

@@ -25,7 +25,7 @@ from benchmarks.compare._picture import draw, Panel
 from dano.comparison import compare, Comparison, Row as Measured
 from dano.fields import SignedDistanceGrid
 from dano.report import draw_rest, verdict
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 DROPS, QUICK_DROPS = 3, 1
 FLAT = 1.0
@@ -69,7 +69,7 @@ def _trained(name: str) -> Subject:
         assert isinstance(truth, dano.AbstractShape)
     else:
         truth = _true_soap()
-    return Subject(build_asset(name), field, (0.03, 0.7, 0.95), truth)
+    return Subject(load_asset(name), field, (0.03, 0.7, 0.95), truth)
 
 
 def _true_soap() -> dano.AbstractShape:

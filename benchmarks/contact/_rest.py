@@ -6,7 +6,7 @@ import dano
 from benchmarks._measure import Row
 from benchmarks.contact import _mujoco
 from benchmarks.contact._scenes import Geometry, GRAVITY, milliseconds, Motion, on_floor, play
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 SLOPE = "Creep on a slope of 0.9 times the friction angle"
 STILL = "Rest on a level floor"
@@ -23,7 +23,7 @@ STILL_TARGET = 1e-6
 def rows(*, quick: bool) -> list[Row]:
     things: dict[str, tuple[Geometry, float]] = {"box": (dano.Box((0.05, 0.04, 0.03)), 0.03)}
     if not quick:
-        bunny, soap = build_asset("bunny"), build_asset("soap")
+        bunny, soap = load_asset("bunny"), load_asset("soap")
         things["bunny"] = (bunny, _upright(bunny))
         things["soap"] = (soap, _upright(soap))
     steps = TIMESTEPS[1:2] if quick else TIMESTEPS

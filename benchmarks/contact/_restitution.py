@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import dano
 from benchmarks._measure import Row
 from benchmarks.contact._scenes import energy, Geometry, Motion, on_floor, play, STEPS
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 GROUP = "Restitution: rebound over approach speed, without gravity"
 COEFFICIENTS = (0.2, 0.5, 0.8, 1.0)
@@ -65,7 +65,7 @@ def _things(*, quick: bool) -> list[tuple[str, Geometry, np.ndarray, float]]:
         ("box of 10 cm on its face", dano.Box((0.05,) * 3), level, 0.05),
     ]
     if not quick:
-        bunny = build_asset("bunny")
+        bunny = load_asset("bunny")
         things.append(("bunny on its farthest point", bunny, *_on_farthest_point(bunny)))
     return things
 

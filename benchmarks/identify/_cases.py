@@ -8,7 +8,7 @@ import numpy as np
 
 import dano
 from dano.maths import quat_exp, quat_from_axis_angle, quat_multiply
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 TIMESTEP, EVERY = 0.005, 2  # s; steps from frame to frame
 POSITION, ROTATION = 1e-3, 1e-2  # m, rad: noise
@@ -39,7 +39,7 @@ class Case:
 
 def throws() -> Case:
     """The bunny is thrown on a floor and tumbles; friction and restitution are not known."""
-    bunny = dano.Body("bunny", build_asset("bunny"))
+    bunny = dano.Body("bunny", load_asset("bunny"))
 
     def scene(friction: float, restitution: float) -> dano.Scene:
         params = dano.ContactParams(sliding_friction=friction, restitution=restitution)
@@ -69,7 +69,7 @@ def throws() -> Case:
 
 def pushes() -> Case:
     """A ball of known mass runs into the bunny that stands; friction and the bunny's mass are not known."""
-    made = build_asset("bunny")
+    made = load_asset("bunny")
 
     def scene(friction: float, scale: float) -> dano.Scene:
         params = dano.ContactParams(sliding_friction=friction)
@@ -108,7 +108,7 @@ def pushes() -> Case:
 
 def soap() -> Case:
     """The soap is thrown flat, turning; friction is not known."""
-    made = build_asset("soap")
+    made = load_asset("soap")
 
     def scene(friction: float) -> dano.Scene:
         params = dano.ContactParams(sliding_friction=friction)

@@ -3,7 +3,7 @@
 import dano
 from benchmarks._measure import Row
 from dano.plan import Actuator, Goal, Limit, Plan, Task
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 TRAVEL = 0.2  # m
 N_STEPS, TIMESTEP = 50, 0.02
@@ -12,7 +12,7 @@ FORCE = 4.0  # N
 
 def scene() -> dano.Scene:
     """The shipped soap on a slide along x, with damping."""
-    drawer = dano.Body("drawer", build_asset("soap"))
+    drawer = dano.Body("drawer", load_asset("soap"))
     slide = dano.Joint(None, "drawer", "slide", axis=(1, 0, 0), position=(0, 0, 0.1), damping=2.0)
     return dano.Scene.create([drawer], joints=[slide], timestep=TIMESTEP)
 

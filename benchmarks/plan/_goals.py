@@ -12,7 +12,7 @@ import numpy as np
 import dano
 from dano.maths import Numbers
 from dano.plan import Actuator, Goal, Plan, Task
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 TIMESTEP, N_STEPS = 0.02, 60
 RADIUS, MASS = 0.03, 0.5  # m, kg: of the ball
@@ -28,7 +28,7 @@ OBJECTS = "soap", "bunny", "box"
 
 def scene(name: str) -> dano.Scene:
     """An object, a ball and a floor."""
-    thing = dano.Body(name, BOX, mass=1.0) if name == "box" else dano.Body(name, build_asset(name))
+    thing = dano.Body(name, BOX, mass=1.0) if name == "box" else dano.Body(name, load_asset(name))
     bodies = [
         thing,
         dano.Body("ball", dano.Sphere(RADIUS), mass=MASS),

@@ -10,7 +10,7 @@ import numpy as np
 
 import dano
 from benchmarks.robust._draw import OBJECTS, Piece, ROUNDING
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 CHUNK = 8192
 """Points whose distance is found by one compiled call."""
@@ -54,7 +54,7 @@ def geometry(piece: Piece) -> dano.NeuralObject | dano.AbstractShape:
             return dano.Cylinder(*lengths)
         case "ellipsoid":
             return dano.Ellipsoid(lengths)
-    return build_asset(piece.kind)
+    return load_asset(piece.kind)
 
 
 def probe(piece: Piece) -> Probe:

@@ -12,7 +12,7 @@ import dano
 from benchmarks._measure import compiled
 from benchmarks.speed._cases import Case
 from benchmarks.speed._dano import FRICTION
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 TIMESTEP = 0.005  # [s]
 REPEATS = 3
@@ -107,7 +107,7 @@ def demo_case() -> Case:
 
 def _geometry(kind: str) -> dano.NeuralObject | dano.AbstractShape:
     if kind == "bunny":
-        return build_asset("trained_bunny")
+        return load_asset("trained_bunny")
     return dano.Box((HALF,) * 3) if kind == "box" else dano.Sphere(HALF)
 
 

@@ -9,7 +9,7 @@ from benchmarks._measure import REPOSITORY
 from benchmarks.speed._cases import Case
 from benchmarks.speed._crowds import Crowd, DEMO, HALF, MASS, Member, REPEATS, TIMESTEP
 from benchmarks.speed._dano import FRICTION
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 BUNNY_SIZE = 0.12  # [m]
 SOAP_HALF_EXTENTS = (0.045, 0.03, 0.015)  # [m], as assets/solids.py has it
@@ -43,7 +43,7 @@ def mujoco_demo_case() -> Case:
 
 def _bunny_center() -> np.ndarray:
     """Centre of mass of dano's bunny in the frame of the mesh [m]."""
-    bunny = build_asset("trained_bunny")
+    bunny = load_asset("trained_bunny")
     assert isinstance(bunny, dano.NeuralObject)
     return np.asarray(bunny.mass.com)
 

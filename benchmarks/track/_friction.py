@@ -8,7 +8,7 @@ import numpy as np
 import dano
 from dano.identify import identify, Motion
 from dano.pixels import FilmFit, identify_in_film
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 from dano.vision import Film, LearnedField, PosedCamera, Tracked, TrackOptions
 
 SLIDES = ("soap_slide", "bunny_slide", "soap_hard", "bunny_hard")
@@ -27,7 +27,7 @@ def fit_film(
     """Friction of a slide, from poses and from pixels."""
     scene = dano.Scene.create(
         bodies=[
-            dano.Body(name, build_asset(f"trained_{name}")),
+            dano.Body(name, load_asset(f"trained_{name}")),
             dano.Body("table", dano.HalfSpace(), fixed=True),
         ],
         contacts=[dano.Contact(name, "table", dano.ContactParams(sliding_friction=0.5))],
@@ -54,7 +54,7 @@ def fit_centre_of_mass(name: str, found: Tracked, frames: int) -> np.ndarray:
 
     State and inertia are unknown, too: what moves the centre of mass changes how the object turns.
     """
-    built = build_asset(f"trained_{name}")
+    built = load_asset(f"trained_{name}")
     scene = dano.Scene.create(bodies=[dano.Body(name, built)], timestep=1 / 240)
     motion = Motion.from_tracked(found, name)
     away = dano.Parameter("away", lambda s: s.body(name).com_offset, -0.03, 0.03)

@@ -18,6 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from dano.checks import shown
+from dano.hosted import hosted
 
 Numbers = ArrayLike | Sequence[Any]
 """What constructors take for an array: an array, a number, or (nested) lists and tuples of numbers."""
@@ -34,6 +35,13 @@ def _library(*arrays: Array | np.ndarray) -> ModuleType:
     return np if all(isinstance(array, np.ndarray) for array in arrays) else jnp
 
 
+@hosted
+def stacked(rows: Sequence[Float[Array, "*shape"]]) -> Float[Array, "n *shape"]:
+    """Arrays as the rows of one."""
+    return jnp.stack(list(rows))
+
+
+@hosted
 def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
     """Euclidean norm whose derivative at zero is zero instead of NaN."""
     squared = jnp.sum(x * x, axis=axis)
@@ -53,6 +61,7 @@ def column_norm(x: Float[Array, "k *batch"]) -> Float[Array, "*batch"]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
 
 
+@hosted
 def safe_normalize(x: Float[Array, "*shape"], axis: int = -1) -> Float[Array, "*shape"]:
     """Unit vector along `x`; the zero vector where `x` is zero."""
     norm = jnp.expand_dims(safe_norm(x, axis), axis)
@@ -388,8 +397,16 @@ def floating(value: Numbers) -> Array:
     """`value` as a floating JAX array: floating arrays keep their dtype, the rest takes JAX's default."""
     dtype = getattr(value, "dtype", None)
     if dtype is not None and jnp.issubdtype(dtype, jnp.floating):
-        return jnp.asarray(value)
-    return jnp.asarray(value, dtype=jnp.result_type(float))
+        return value if isinstance(value, jax.Array) else on_device(np.asarray(value))
+    usual = jnp.result_type(float)
+    if is_traced(value) or isinstance(value, jax.Array):
+        return jnp.asarray(value, usual)
+    return on_device(np.asarray(value, usual))
+
+
+def on_device(value: np.ndarray | np.generic) -> Array:
+    """`jnp.asarray` of an array of NumPy, for which that would compile a program."""
+    return jax.device_put(np.array(value, jax.dtypes.canonicalize_dtype(value.dtype)))
 
 
 def checked_numbers(name: str, value: Numbers) -> np.ndarray:

@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from dano.engine.launching import Features, instance
 from dano.mujoco._search import _views, Known, part_of_geom
 from dano.mujoco._solids import geom_of
+from dano.native import Features, instance
 
 FEATURES = Features(KINDS=frozenset(range(7)), DEGREES=frozenset({2}), UNIONS=False)
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from dano import Box, load_field, NeuralObject, Sphere
-from dano.scene_file import build_asset
+from dano.scene_file import load_asset
 
 TYPES = mujoco.mjtGeom
 LYING = (0.7071067811865476, 0.0, 0.7071067811865476, 0.0)
@@ -64,7 +64,7 @@ def thing(name: str) -> NeuralObject:
         # Coarser than the shipped one is built, to be quick.
         field = load_field(str(importlib.resources.files("dano") / "assets" / "bunny.npz"))
         return NeuralObject.from_field(field, n_samples=2500, mass=1.0, resolution=48)
-    return build_asset(name)
+    return load_asset(name)
 
 
 def world(support: str | None, timestep: float = 0.002):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import dano
-from dano.scene_file import build_asset, load_run, load_scene, parse_scene, save_run
+from dano.scene_file import load_asset, load_run, load_scene, parse_scene, save_run
 
 
 def test_defaults_and_all_pairs(scene):
@@ -231,8 +231,8 @@ def _velocities(run):
 
 
 def test_assets_are_real():
-    soap = build_asset("soap")
-    assert build_asset("soap") is soap
+    soap = load_asset("soap")
+    assert load_asset("soap") is soap
     assert dano.load_object("soap") is soap
     np.testing.assert_allclose(np.ptp(soap.samples.points, axis=0), (0.09, 0.06, 0.03), atol=0.003)
     # A bar of uniform density weighs m/12 (b² + c²) about its long axis; rounded edges take 5 %.

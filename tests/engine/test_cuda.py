@@ -12,8 +12,8 @@ import warp as wp
 
 import dano
 from dano.engine._reports import SolverOptions
-from dano.engine.launching import _cpu, _cuda, Features, instance, listed_points, rollout, scene_tables
-from dano.engine.launching._warp import begin
+from dano.engine.launching import _cpu, _cuda, listed_points, rollout, scene_tables
+from dano.native import begin, Features, instance
 
 N_STEPS, ROOM = 4, 16
 KERNELS = {

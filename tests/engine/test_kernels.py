@@ -12,9 +12,10 @@ import warp as wp
 
 import dano
 from dano.contact import AbstractContactLaw
-from dano.engine.launching import instance, scene_tables
+from dano.engine.launching import scene_tables
 from dano.fields import SignedDistanceGrid
 from dano.maths import Pose
+from dano.native import instance
 
 H = 0.005
 

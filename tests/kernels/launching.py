@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from dano.engine.launching import Features, instance
-from dano.engine.launching._leaves import leaf_tables
 from dano.engine.launching._patch_tables import patch_pairs, patch_tables
+from dano.native import Features, instance, leaf_tables
 
 # What the tests need, so that each module is compiled once for all of them.
 FEATURES = Features(

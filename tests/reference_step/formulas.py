@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from dano.engine.launching import Features, instance
+from dano.native import Features, instance
 
 _BUILD = Features(LANES=1)
 momentum: Any = instance(_BUILD, "dano.physics.momentum")

@@ -6,7 +6,15 @@ import pytest
 from vision.models import learned
 
 import dano
-from dano.report import _framing, _video, CAMERAS, draw_object, render_side_by_side, render_trajectory
+from dano.report import (
+    _framing,
+    _video,
+    CAMERAS,
+    draw_object,
+    render_side_by_side,
+    render_start,
+    render_trajectory,
+)
 from dano.report._object import with_error
 from dano.report._overlay import draw_label
 from dano.report._resample import frame_times, poses_at
@@ -325,3 +333,24 @@ def test_the_bar_is_as_long_as_what_it_stands_for():
     bar = np.flatnonzero((row < 100).all(axis=1) & (np.arange(640) > 320))
     ends = camera.project(np.array([[0, 0, 0], [0.2, 0, 0]]))[:, 0]
     assert len(bar) == pytest.approx(ends[1] - ends[0], abs=2)
+
+
+def test_a_picture_of_the_start_shows_where_bodies_are(tmp_path):
+    bodies = [
+        dano.Body("left", dano.Sphere(0.1), mass=1.0),
+        dano.Body("right", dano.Box((0.1, 0.1, 0.1)), mass=1.0),
+        dano.Body("floor", dano.HalfSpace(), fixed=True),
+    ]
+    scene = dano.Scene.create(bodies, [], timestep=0.01)
+    state = scene.initial_state(left=dict(position=(-0.3, 0, 0.1)), right=dict(position=(0.3, 0, 0.1)))
+    render_start(scene, state, tmp_path / "start.png", size=(160, 100))
+    with Image.open(tmp_path / "start.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    assert pixels.shape == (100, 160, 3)
+    # Orange and blue, as everywhere: the first colours of the palette.
+    orange = np.argwhere(pixels[..., 0] > pixels[..., 2] + 40)
+    blue = np.argwhere(pixels[..., 2] > pixels[..., 0] + 40)
+    assert len(orange) > 100 and len(blue) > 100
+    assert abs(orange[:, 1].mean() - blue[:, 1].mean()) > 30
+    with pytest.raises(ValueError, match="png"):
+        render_start(scene, state, tmp_path / "start.gif")

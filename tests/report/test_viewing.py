@@ -1,5 +1,7 @@
 """Pages in the browser: what they show, against closed forms. Whether they open: tests/test_browser.py."""
 
+import json
+import re
 import socket
 import urllib.request
 
@@ -10,13 +12,13 @@ from vision.models import learned
 from vision.photographs import capture, CENTRE, SEMI_AXES
 
 import dano
-from dano.report import view, view_capture, view_field, write_capture_view, write_field_view
+from dano.report import view, view_capture, view_field, write_capture_view, write_field_view, write_view
 from dano.report.viewing._capture import _camera_length
 from dano.report.viewing._drawn import Drawn, Shown
 from dano.report.viewing._field import Surface
-from dano.report.viewing._meshes import body_mesh, shape_mesh, surface_mesh
+from dano.report.viewing._meshes import add_coloured, body_mesh, BodyMesh, shape_mesh, surface_mesh
 from dano.report.viewing._serving import serve
-from dano.scene_file import asset_look, build_asset
+from dano.scene_file import asset_look, load_asset
 from dano.vision import Capture, LearnedField, visual_hull
 
 
@@ -108,7 +110,7 @@ def test_meshes_of_objects_have_the_colours_that_were_learned(trained):
 
 @pytest.fixture(scope="module")
 def trained():
-    return dano.Body("soap", build_asset("trained_soap")), asset_look("trained_soap")
+    return dano.Body("soap", load_asset("trained_soap")), asset_look("trained_soap")
 
 
 def test_meshes_of_shapes_lie_on_their_surface():
@@ -236,3 +238,35 @@ def test_what_cannot_be_shown_is_refused(tmp_path):
         with pytest.raises(ValueError, match=message):
             write_field_view(field, path, **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_written_page_says_what_a_run_is(fall, tmp_path):
+    scene, run = fall
+    write_view(scene, run, tmp_path / "run.html", title="a <fall> </script>")
+    page = (tmp_path / "run.html").read_text(encoding="utf-8")
+    assert "<title>a &lt;fall&gt; &lt;/script&gt;</title>" in page
+    (text,) = re.findall(r"const run = (\{.*\});", page)
+    said = json.loads(text)
+    assert said["title"] == "a <fall> </script>"
+    energy, force = said["graphs"]
+    # A free fall keeps its energy, to a share of what moves between its kinds, and touches nothing.
+    assert 0 <= min(energy["values"]) and max(energy["values"]) < 0.05 * 0.3 * 9.81 * 0.05
+    assert not any(force["values"]) and len(force["values"]) == len(said["times"])
+    bodies, parameters = said["tables"]
+    assert [row[:2] for row in bodies] == [["ball", "0.3 kg"], ["floor", "fixed"]]
+    assert ["friction, ball – floor", "0.2", None] in parameters
+    assert said["frame"] == pytest.approx(0.1 / 3, rel=0.01)
+    assert set(said["cameras"]) == {"front", "side", "top"}
+
+
+def test_learned_colours_are_linear_in_meshes():
+    served = []
+
+    class Scene:
+        def add_mesh_trimesh(self, name, solid):
+            served.append(solid)
+
+    mesh = BodyMesh(np.eye(3), np.array([[0, 1, 2]]), np.array([[255, 186, 0]] * 3, np.uint8))
+    add_coloured(Scene(), "a", mesh)
+    # Half of the light is 186 of 255 in a picture.
+    np.testing.assert_allclose(served[0].visual.vertex_colors[0, :3], (255, 127.5, 0), atol=1)

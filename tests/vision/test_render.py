@@ -7,9 +7,9 @@ import pytest
 from vision.models import Fog, learned
 
 from dano import Box, GridField, HalfSpace, Pose, Sphere
+from dano.fields import AbstractShape
 from dano.vision import Camera, Item, level_surface, PosedCamera, render
-from dano.vision.drawing._rays import CHUNK, Placed, transmitted
-from dano.vision.drawing._render import _first_hits
+from dano.vision.drawing._rays import CHUNK, Thing, Tracer, transmitted
 from dano.vision.radiance._picture import picture
 
 EYE = np.eye(3, dtype=np.float32)
@@ -47,13 +47,19 @@ def test_rays_meet_a_box_where_the_slabs_do():
     near, far = np.sort(np.stack([(-half - o) / local, (half - o) / local]), axis=0)
     enter, leave = near.max(axis=1), far.min(axis=1)
     assert item.shape is not None
-    placed = Placed(
-        item.shape, jnp.asarray(rotation, jnp.float32), jnp.array([0.1, 0.2, 0.3], dtype=jnp.float32)
-    )
-    everywhere, index = np.full(3000, np.inf, dtype=np.float32), np.arange(3000)
-    hit, t = _first_hits(
-        placed, origin.astype(np.float32), d.T.astype(np.float32), everywhere, index, np.float32(1e-4)
-    )
+    thing = Thing(item.shape, rotation, np.array([0.1, 0.2, 0.3]), *item.placed_ball, False)
+    numbers = {
+        "light": (0.0, 0.0, 1.0),
+        "focus": ZERO,
+        "spread": 0.1,
+        "pixel": 1e-4,
+        "far": 1.0,
+        "floor_reach": 1.0,
+    }
+    met = Tracer([thing], [], origin, **numbers)(d.T.astype(np.float32))
+    hit = np.flatnonzero(met.which == 0)
+    t = met.depth[hit]
+    assert np.all(np.isinf(met.depth[met.which < 0]))
     assert set(hit) == set(np.flatnonzero(enter < leave - 2e-3)) | (
         set(hit) & set(np.flatnonzero(enter < leave + 1e-3))
     )
@@ -183,3 +189,30 @@ def test_learned_media_dim_what_is_behind_them_and_shadow_the_floor():
 def test_bad_pictures_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+class Egg(AbstractShape):
+    """A shape that kernels do not know."""
+
+    edge: None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def sdf(self, x):
+        stretched = x * jnp.array([1.0, 1.0, 0.7], x.dtype)
+        return jnp.linalg.norm(stretched) - 0.4
+
+    @property
+    def bounds(self):
+        reach = jnp.array([0.4, 0.4, 0.4 / 0.7])
+        return jnp.stack([-reach, reach])
+
+    def solid_moments(self):
+        return None
+
+
+def test_shapes_of_users_are_drawn():
+    camera = Camera((0.0, -30.0, 0.0), vertical_fov=0.06, width=120, height=100)
+    empty = render([], camera, floor=False)
+    seen = (render([Item(Egg())], camera, floor=False, antialias=False) != empty).any(axis=2)
+    # From afar an ellipse.
+    area = math.pi * 0.4 * 0.4 / 0.7 / (30 * camera.pixel_angle) ** 2
+    assert seen.sum() == pytest.approx(area, rel=0.02)

@@ -272,17 +272,17 @@ def _demo_scene(name: str, folder: Path, artist: "_Artist", tell: Callable[[str]
     path = folder / f"{name}.toml"
     with replacing(path) as file:
         file.write((files("dano") / "scenes" / path.name).read_bytes())
-    tell(f"{name}: building objects, {path} written")
+    tell(f"{name}: {path} written")
+    loaded = load(path, None, None)
+    artist.begin(loaded, path.with_suffix(".png"))
+    tell(f"{name}: compiling and simulating {loaded.n_steps} steps")
     objects, text = {}, path.read_text(encoding="utf-8")
     for asset in scene_file.ASSETS:
         if f'asset = "{asset}"' in text:
-            # Before the scene is read, so that the first is drawn while the second is built.
             objects[asset] = str(folder / f"{asset}.dano")
-            made = scene_file.build_asset(asset)
+            made = scene_file.load_asset(asset)
             made.save(folder / f"{asset}.dano")
             artist.draw(made, folder / f"{asset}.png")
-    loaded = load(path, None, None)
-    tell(f"{name}: compiling and simulating {loaded.n_steps} steps")
     rollout, report = _simulated(loaded, path.with_suffix(".npz"), running.Clock())
     tell(f"{name}: simulated, {path.with_suffix('.npz')} written")
     report = {"scene": str(path), "objects": objects, **report}
@@ -307,6 +307,11 @@ class _Artist:
     def __exit__(self, *_: object) -> None:
         self._stopped.set()
         self._thread.shutdown(cancel_futures=True)
+
+    def begin(self, loaded: scene_file.SceneFile, path: Path) -> None:
+        """Order a first picture: the scene before it is simulated."""
+        if self._draws:
+            self._order(self._thread.submit(_draw_start, loaded, path), path)
 
     def draw(self, made: NeuralObject, path: Path) -> None:
         """Order the figure of an object, once."""
@@ -359,6 +364,12 @@ class _Artist:
         # Until then the line on the terminal belongs to the simulation.
         if self._watched.is_set():
             self._progress(description, share)
+
+
+def _draw_start(loaded: scene_file.SceneFile, path: Path) -> None:
+    from dano.report import render_start
+
+    render_start(loaded.scene, loaded.state, path, looks=loaded.looks(), size=DEMO_SIZE)
 
 
 def load(path: Path, steps: int | None, timestep: float | None) -> scene_file.SceneFile:

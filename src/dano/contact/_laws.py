@@ -186,7 +186,7 @@ def non_negative(name: str, value: Numbers) -> Float[Array, ""]:
     array = checked_floating(name, value)
     if array.shape != ():
         raise ValueError(f"{name} must be a scalar, got shape {array.shape}")
-    if not is_traced(array) and not (np.isfinite(array) and array >= 0):
+    if not is_traced(array) and not (np.isfinite(np.asarray(array)) and float(array) >= 0):
         raise ValueError(f"{name} must be finite and ≥ 0, got {float(array)}")
     return array
 

@@ -11,13 +11,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from dano.checks import checked_count, checked_kind, checked_number
 from dano.contact import Patch
 from dano.engine import _touching, _variational
 from dano.engine._compiling import compiled
 from dano.engine._reports import Report, SolverOptions
+from dano.hosted import hosted
 from dano.maths import is_traced, quat_conjugate, quat_exp, quat_multiply
 from dano.scene import Control, RESOLVED, Scene, State, Trajectory
 
@@ -238,9 +239,20 @@ def simulate(
         scene,
         lambda engine: _jitted_rollout(engine, scene, state, controls, n_steps, checkpoint_every),
     )
-    _say(scene, jax.tree.map(lambda x: x[1:], states), report)
-    times = scene.timestep * jnp.arange(n_steps + 1, dtype=scene.timestep.dtype)
+    _say(scene, states, report)
+    times = _times(scene.timestep, n_steps)
     return Trajectory(times, states, report.residual, report.iterations, report.converged, scene.names)
+
+
+@hosted
+def _fast(omega: Float[Array, "steps n 3"], timestep: Float[Array, ""]) -> Bool[Array, "steps n"]:
+    """Whether bodies turn by more than 60° in a step."""
+    return jnp.sum(omega * omega, axis=-1) * timestep**2 > 4 * RESOLVED**2
+
+
+@hosted
+def _times(timestep: Float[Array, ""], n_steps: int) -> Float[Array, " steps"]:
+    return timestep * jnp.arange(n_steps + 1, dtype=timestep.dtype)
 
 
 def linearize(
@@ -378,7 +390,7 @@ def _with_room(
     while True:
         states, report = run(current)
         full = report.overflow
-        if full is None or is_traced(full) or not bool(jnp.any(full)):
+        if full is None or is_traced(full) or not np.any(np.asarray(full)):
             return states, report
         factor *= 2
         larger = chosen.enlarged(scene, factor)
@@ -415,7 +427,10 @@ def _way_out(report: Report, failed: np.ndarray) -> str:
 
 
 def _say(scene: Scene, following: State, report: Report) -> None:
-    """Warn of steps that did not converge, and of bodies that spin faster than a step resolves."""
+    """Warn of steps that did not converge, and of bodies that spin faster than a step resolves.
+
+    States before the first step may stand before those that follow.
+    """
     if is_traced(report.converged, scene.timestep):
         return
     converged = np.atleast_1d(np.asarray(report.converged))
@@ -428,11 +443,10 @@ def _say(scene: Scene, following: State, report: Report) -> None:
             RuntimeWarning,
             stacklevel=3,
         )
-    omega = following.omega.reshape(-1, len(scene.bodies), 3)
-    # Turns of more than 60° in a step.
-    fast = np.asarray(jnp.sum(omega * omega, axis=-1) * scene.timestep**2 > 4 * RESOLVED**2)
+    omega = jax.lax.stop_gradient(following.omega).reshape(-1, len(scene.bodies), 3)
+    fast = np.asarray(_fast(omega, scene.timestep))[-converged.size :]
     if fast.any():
-        spins = np.linalg.norm(np.asarray(omega), axis=2)
+        spins = np.linalg.norm(np.asarray(omega), axis=2)[-converged.size :]
         names = ", ".join(repr(scene.names[i]) for i in np.flatnonzero(fast.any(axis=0)))
         warnings.warn(
             f"{names} turns by more than 60° in a step, first in step {np.flatnonzero(fast.any(axis=1))[0]}: "

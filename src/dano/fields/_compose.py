@@ -12,6 +12,7 @@ from dano.fields._base import AbstractField, check_order, Jet
 from dano.fields._grid import GridField
 from dano.fields._shapes import AbstractShape, checked_edge, scaled_moments, SolidMoments
 from dano.fields._signed_distance import SignedDistanceGrid
+from dano.hosted import hosted
 from dano.maths import checked_array, einsum, Pose, product
 
 
@@ -143,6 +144,7 @@ class PosedField(AbstractField):
     pose: Pose
 
     @property
+    @hosted
     def bounds(self) -> Float[Array, "2 3"]:
         """Axis-aligned box [m] around the moved bounds of the inner field."""
         return posed_bounds(self.field.bounds, self.pose)
@@ -182,11 +184,13 @@ class PosedShape(AbstractShape):
         return self.shape.edge
 
     @property
+    @hosted
     def size(self) -> Float[Array, ""]:
         """Size of the inner shape [m], so that turning a shape does not change its smooth edge."""
         return self.shape.size
 
     @property
+    @hosted
     def bounds(self) -> Float[Array, "2 3"]:
         """Axis-aligned box [m] around the moved bounds of the inner shape."""
         return posed_bounds(self.shape.bounds, self.pose)
@@ -203,6 +207,7 @@ class PosedShape(AbstractShape):
         """See `AbstractShape.sdf_jet`."""
         return _posed_jet(self.shape.sdf_jet, self.pose, x, order)
 
+    @hosted
     def solid_moments(self) -> SolidMoments | None:
         """Moments of the inner shape, moved: V, R c + p, R S Rᵀ."""
         moments = self.shape.solid_moments()
@@ -237,6 +242,7 @@ class ScaledField(AbstractField):
     factor: Float[Array, ""]
 
     @property
+    @hosted
     def bounds(self) -> Float[Array, "2 3"]:
         """Scaled bounds [m] of the inner field."""
         return self.field.bounds * self.factor.astype(self.field.bounds.dtype)
@@ -277,11 +283,13 @@ class ScaledShape(AbstractShape):
         return None if edge is None else edge * self.factor.astype(edge.dtype)
 
     @property
+    @hosted
     def size(self) -> Float[Array, ""]:
         """Scaled size of the inner shape [m]."""
         return self.shape.size * self.factor.astype(self.shape.size.dtype)
 
     @property
+    @hosted
     def bounds(self) -> Float[Array, "2 3"]:
         """Scaled bounds [m] of the inner shape."""
         return self.shape.bounds * self.factor.astype(self.shape.bounds.dtype)
@@ -300,6 +308,7 @@ class ScaledShape(AbstractShape):
         factor = self.factor.astype(x.dtype)
         return jax.tree.map(lambda part: factor * part, _scaled_jet(self.shape.sdf_jet, factor, x, order))
 
+    @hosted
     def solid_moments(self) -> SolidMoments | None:
         """Moments of the inner shape: V s³, c s, S s⁵."""
         moments = self.shape.solid_moments()
@@ -321,6 +330,7 @@ class UnionField(AbstractField):
     fields: tuple[AbstractField, ...]
 
     @property
+    @hosted
     def bounds(self) -> Float[Array, "2 3"]:
         """Box [m] around the bounds of all parts."""
         return _joined_bounds(self.fields)
@@ -361,6 +371,7 @@ class UnionShape(AbstractShape):
     edge: Float[Array, ""] | None
 
     @property
+    @hosted
     def bounds(self) -> Float[Array, "2 3"]:
         """Box [m] around the bounds of all parts."""
         return _joined_bounds(self.shapes)

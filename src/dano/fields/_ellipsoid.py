@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from dano.fields._shapes import AbstractCentred, checked_edge, column, positive, SolidMoments
+from dano.hosted import hosted
 from dano.maths import column_norm, Numbers
 
 
@@ -58,6 +59,7 @@ class Ellipsoid(AbstractCentred):
         """See `AbstractPrimitive.leaf`."""
         return {"sizes": self.semi_axes}
 
+    @hosted
     def solid_moments(self) -> SolidMoments:
         """V = 4/3 π a b c and ∫ x² = V a²/5."""
         volume = 4 / 3 * math.pi * jnp.prod(self.semi_axes)

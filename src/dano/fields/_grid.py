@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from dano.fields._base import AbstractField, check_order, Jet
 from dano.fields._spline import border, degree_of, multi_indices, nonnegative_coefficients, spline_jet
+from dano.hosted import hosted
 from dano.maths import checked_array, checked_floating, is_traced, Numbers, product
 
 
@@ -63,7 +64,7 @@ class GridField(AbstractField):
         """
         degree = degree_of(interpolation)
         values = checked_values(values)
-        self.coefficients = jnp.pad(values, border(degree))
+        self.coefficients = _padded(values, border(degree))
         self.origin = checked_array("origin", origin, (3,))
         self.spacing = checked_spacing(spacing)
         self.interpolation = interpolation
@@ -98,6 +99,7 @@ class GridField(AbstractField):
         return GridField(values, self.origin, self.spacing, self.interpolation)
 
     @property
+    @hosted
     def values(self) -> Float[Array, "nx ny nz"]:
         """Values at the nodes (the spline's coefficients)."""
         inside = slice(self._border, -self._border)
@@ -114,6 +116,7 @@ class GridField(AbstractField):
         return {"sizes": self.origin, "spacing": self.spacing}
 
     @property
+    @hosted
     def bounds(self) -> Float[Array, "2 3"]:
         """Box [m, F] around the nodes and the cells over which the density falls to zero."""
         reach = 0.5 * (self._degree + 1)
@@ -141,6 +144,7 @@ class GridField(AbstractField):
         u = (x - self.origin.astype(x.dtype)[:, None]) / spacing[:, None]
         return scaled_jet(spline_jet(self.coefficients, u, self._degree, order), spacing, order)
 
+    @hosted
     def moments(self) -> DensityMoments:
         """Integral, centroid and second moment of the density over all space, exactly.
 
@@ -169,6 +173,11 @@ class GridField(AbstractField):
         )
         cell = jnp.prod(spacing)
         return DensityMoments(cell * total, mean + self.origin.astype(dtype), cell * second)
+
+
+@hosted
+def _padded(values: Float[Array, "nx ny nz"], width: int) -> Float[Array, "px py pz"]:
+    return jnp.pad(values, width)
 
 
 def scaled_jet(rows: Float[Array, "rows n"], spacing: Float[Array, "3"], order: int) -> Jet:

@@ -17,6 +17,7 @@ from dano.fields._shapes import (
     positive,
     SolidMoments,
 )
+from dano.hosted import hosted
 from dano.maths import checked_array, column_norm, is_traced, Numbers, product, safe_normalize
 
 
@@ -50,6 +51,7 @@ class HalfSpace(AbstractPrimitive):
         self.edge = checked_edge(edge)
 
     @property
+    @hosted
     def bounds(self) -> Float[Array, "2 3"]:
         """Infinite in every direction."""
         reach = jnp.full_like(self.normal_direction, jnp.inf)
@@ -113,6 +115,7 @@ class Sphere(AbstractCentred):
         """See `AbstractPrimitive.leaf`."""
         return {"sizes": jnp.stack([self.radius, 0 * self.radius, 0 * self.radius])}
 
+    @hosted
     def solid_moments(self) -> SolidMoments:
         """V = 4/3 π r³ and ∫ x xᵀ = V r²/5 I."""
         volume = 4 / 3 * math.pi * self.radius**3
@@ -177,6 +180,7 @@ class Box(AbstractCentred):
         """See `AbstractPrimitive.leaf`."""
         return {"sizes": self.half_extents, "length": self.rounding}
 
+    @hosted
     def solid_moments(self) -> SolidMoments:
         """A core box, slabs on its faces, quarter cylinders on edges and octants of a ball on corners."""
         r = self.rounding
@@ -242,6 +246,7 @@ class Capsule(AbstractCentred):
         """See `AbstractPrimitive.leaf`."""
         return {"sizes": jnp.stack([self.radius, self.half_length, 0 * self.radius])}
 
+    @hosted
     def solid_moments(self) -> SolidMoments:
         """A cylinder and two half balls set on its ends."""
         r, h = self.radius, self.half_length
@@ -289,6 +294,7 @@ class Cylinder(AbstractCentred):
         """See `AbstractPrimitive.leaf`."""
         return {"sizes": jnp.stack([self.radius, self.half_length, 0 * self.radius])}
 
+    @hosted
     def solid_moments(self) -> SolidMoments:
         """V = 2π r² h; ∫ x² = V r²/4, ∫ z² = V h²/3."""
         r, h = self.radius, self.half_length

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from dano.fields._base import AbstractField, check_order, Jet, vmapped_jet
+from dano.hosted import hosted
 from dano.maths import checked_array, column_norm, is_traced, Numbers
 
 DEFAULT_EDGE = 0.005
@@ -93,11 +94,13 @@ class AbstractShape(AbstractField):
         """Volume, centroid and second moment of the solid in closed form, or None if there is none."""
 
     @property
+    @hosted
     def size(self) -> Float[Array, ""]:
         """Largest extent of the bounds [m]; infinite for a half-space."""
         return jnp.max(self.bounds[1] - self.bounds[0])
 
     @property
+    @hosted
     def edge_width(self) -> Float[Array, ""]:
         """Width of the smooth edge in force [m]: `edge`, else 0.5 % of `size`, else (infinite size) 0."""
         if self.edge is not None:
@@ -220,11 +223,13 @@ class AbstractCentred(AbstractPrimitive):
         """Half the side lengths [m] of the tightest box around the solid."""
 
     @property
+    @hosted
     def size(self) -> Float[Array, ""]:
         """Largest extent of the solid [m]."""
         return 2 * jnp.max(self._half_extents)
 
     @property
+    @hosted
     def bounds(self) -> Float[Array, "2 3"]:
         """Lower and upper corner [m, F] of the solid and its smooth edge."""
         return symmetric(self._half_extents, self.edge_width)

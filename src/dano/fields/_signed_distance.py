@@ -5,13 +5,14 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from dano.fields._base import check_order, Jet
 from dano.fields._grid import checked_spacing, scaled_jet
 from dano.fields._redistance import spread_distances
 from dano.fields._shapes import AbstractShape, checked_edge, scaled_moments, SolidMoments
 from dano.fields._spline import border, degree_of, interpolating_coefficients, spline_jet
+from dano.hosted import hosted
 from dano.maths import checked_array, checked_floating, column_norm, is_traced, Numbers
 
 _EXTENSION = 16
@@ -82,10 +83,11 @@ class SignedDistanceGrid(AbstractShape):
         self.coefficients = jnp.asarray(interpolating_coefficients(extended, degree)[keep, keep, keep])
         inside = np.argwhere(host <= 0)
         # The surface passes within one cell of a node that is inside.
-        cells = jnp.asarray(np.stack([inside.min(0) - 1, inside.max(0) + 1]), self.spacing.dtype)
-        self.solid_bounds = self.origin.astype(cells.dtype)[None] + cells * self.spacing[None]
+        cells = np.stack([inside.min(0) - 1, inside.max(0) + 1])
+        self.solid_bounds = _corners(self.origin, self.spacing, cells)
 
     @property
+    @hosted
     def distances(self) -> Float[Array, "nx ny nz"]:
         """Signed distances [m] at the nodes."""
         degree = degree_of(self.interpolation)
@@ -99,12 +101,14 @@ class SignedDistanceGrid(AbstractShape):
         return {"sizes": self.origin, "spacing": self.spacing}
 
     @property
+    @hosted
     def bounds(self) -> Float[Array, "2 3"]:
         """Box [m, F] around the solid and its smooth edge."""
         reach = jnp.broadcast_to(0.5 * self.edge_width.astype(self.solid_bounds.dtype), (3,))
         return self.solid_bounds + jnp.stack([-reach, reach])
 
     @property
+    @hosted
     def size(self) -> Float[Array, ""]:
         """Largest extent of the solid [m], to within two cells."""
         return jnp.max(self.solid_bounds[1] - self.solid_bounds[0])
@@ -182,6 +186,14 @@ def extended_distances(distances: np.ndarray, spacing: np.ndarray, width: float)
     closest = spacing * np.argwhere(near) - distances[near][:, None] * slope
     far, _ = spread_distances(near, closest, np.zeros(3), spacing)
     return np.where(np.abs(distances) < (1 - 1e-6) * width, distances, np.copysign(far, distances))
+
+
+@hosted
+def _corners(
+    origin: Float[Array, "3"], spacing: Float[Array, "3"], cells: Int[Array | np.ndarray, "2 3"]
+) -> Float[Array, "2 3"]:
+    """Corners [m] of a grid at some numbers of cells."""
+    return origin.astype(spacing.dtype)[None] + cells.astype(spacing.dtype) * spacing[None]
 
 
 def _checked_distances(distances: Numbers) -> np.ndarray:

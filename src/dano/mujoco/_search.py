@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dano.engine.launching import compiled_kernel, Features, instance, kind_numbers, lower_bounds
 from dano.mujoco._settings import Settings
 from dano.mujoco._solids import Geom, object_solid, Solid
 from dano.mujoco._surfaces import Surface
 from dano.mujoco._things import Thing
+from dano.native import compiled_kernel, Features, instance, kind_numbers, lower_bounds
 
 _TABLES, _FINDING = "dano.mujoco.kernels.tables", "dano.mujoco.kernels.finding"
 _SOLIDS, _LEAVES = "dano.mujoco.kernels.solids", "dano.physics.solids.leaves"

@@ -7,7 +7,6 @@ from typing import get_args, Literal
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -243,7 +242,7 @@ class NeuralObject(eqx.Module):
     @property
     def size(self) -> float:
         """Largest extent of the samples [m]."""
-        return float(jnp.max(jnp.ptp(self.samples.points, axis=0)))
+        return float(np.ptp(np.asarray(self.samples.points), axis=0).max())
 
     def save(self, path: str | os.PathLike[str], *, look: Mapping[str, np.ndarray] | None = None) -> None:
         """Write the object to one file (a zip of arrays, no pickle), replacing another only when complete.

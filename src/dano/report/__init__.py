@@ -27,6 +27,7 @@ from dano.report._training import (
 from dano.report._video import (
     checked_size as checked_size,
     render_side_by_side as render_side_by_side,
+    render_start as render_start,
     render_trajectory as render_trajectory,
 )
 from dano.report.viewing import (

@@ -17,8 +17,8 @@ from dano.report._framing import CAMERAS, cameras_for, Seen, seen_of, together
 from dano.report._overlay import draw_clock, draw_label, draw_touches
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import check_run, Stage, stage, Touches, touches
-from dano.scene import Scene, Trajectory
-from dano.vision import Camera, LearnedField, render
+from dano.scene import Scene, State, Trajectory
+from dano.vision import Camera, LearnedField, prepare, render
 
 MOST_PIXELS = 8192
 """Longest side of a film: what common decoders of H.264 can show."""
@@ -101,6 +101,42 @@ def render_trajectory(
     style, outputs = _checked(style, [(scene, trajectory)], path, strip)
     count = len(frame_times(trajectory, fps, slow_motion))
     _film([_take(scene, trajectory, stage(scene, colours, looks), count, style)], style, outputs)
+
+
+def render_start(
+    scene: Scene,
+    state: State,
+    path: str | os.PathLike[str],
+    *,
+    looks: Mapping[str, LearnedField] | None = None,
+    size: tuple[int, int] = (640, 400),
+) -> None:
+    """Draw a scene at a state, for instance before its simulation.
+
+    Args:
+        scene: The scene.
+        state: Where its bodies are.
+        path: A PNG, written whole or not at all.
+        looks: As in `render_trajectory`.
+        size: Width and height [pixels], even numbers.
+
+    Raises:
+        ValueError: If the size is wrong, or the output path is a directory, lies in none, or has another
+            ending.
+        ImportError: If pillow is missing.
+    """
+    checked_kind("scene", scene, Scene).check_state(checked_kind("state", state, State))
+    output = checked_output(path)
+    if output.suffix.lower() != ".png":
+        raise ValueError(f"path must end in .png, got {output}")
+    width, height = checked_size(size)
+    require("PIL", "pillow")
+    drawn = stage(scene, None, looks)
+    position, orientation = (np.asarray(x, np.float64) for x in (state.position, state.orientation))
+    seen = seen_of(scene, drawn, position[None], orientation[None])
+    camera = cameras_for(seen, 1.0, (width, height), "fixed")[0]
+    prepare(drawn.items, camera)
+    write_png(output, render(drawn.posed(position, orientation), camera, floor=False))
 
 
 def render_side_by_side(
@@ -255,6 +291,8 @@ def _film(takes: Sequence[_Take], style: _Style, outputs: tuple[Path | None, Pat
         cameras = cameras_for(together([take.seen for take in takes]), step, style.size, style.camera)
     else:
         cameras = [style.camera] * count
+    if count > 1:
+        prepare([item for take in takes for item in take.drawn.items], cameras[0])
     sizes = [item.radius for take in takes for item in take.drawn.items if item.plane is None]
     arrow = 0.55 * float(np.median(sizes or [1.0]))
     position = np.concatenate([take.position for take in takes], axis=1)
@@ -373,7 +411,7 @@ def write_png(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
     """Write an image, whole or not at all."""
     picture = require("PIL.Image", "pillow").fromarray(image)
     with replacing(path) as file:
-        picture.save(file, format="PNG", optimize=True)
+        picture.save(file, format="PNG", compress_level=6)
 
 
 def require(module: str, package: str | None = None) -> Any:

@@ -8,7 +8,8 @@ from jaxtyping import Array, Float
 from dano.checks import checked_optional, checked_text
 from dano.contact import Collider, ContactParams, SampleSet, Support, SurfaceSet
 from dano.fields import AbstractField, AbstractShape, Ellipsoid, HalfSpace, SignedDistanceGrid, Sphere
-from dano.maths import checked_array, floating, Numbers, quat_rotate
+from dano.hosted import hosted
+from dano.maths import checked_array, floating, Numbers, quat_rotate, stacked
 from dano.objects import checked_inertia, MassProperties, NeuralObject
 
 # Orientations over which the support of a body is sampled.
@@ -107,7 +108,7 @@ class Body(eqx.Module):
             self.samples = SampleSet.create(geometry.samples.points, geometry.samples.density)
             surface = geometry.surface
             self.surface = SurfaceSet.create(surface.points, surface.vectors)
-            self.density_scale = 1 / jnp.mean(geometry.samples.density)
+            self.density_scale = _over_mean(geometry.samples.density)
             if geometry.grid is not None:
                 self.support = Support.create(geometry.grid)
         elif isinstance(geometry, AbstractShape):
@@ -119,12 +120,9 @@ class Body(eqx.Module):
             )
         mass = None if mass is None else checked_array(f"mass of body {name!r}", mass, (), above=0.0)
         properties = _properties(name, geometry, (mass, com, inertia), self.fixed)
-        share = 1.0
-        if mass is not None:
-            share = mass / properties.mass
         self.mass = properties.mass if mass is None else mass
         self.inertia = (
-            properties.inertia * share
+            _shared(properties.inertia, properties.mass, self.mass)
             if inertia is None
             else checked_inertia(f"inertia of body {name!r}", inertia)
         )
@@ -141,7 +139,7 @@ class Body(eqx.Module):
         if self.object is not None:
             return self.object.size
         assert self.shape is not None
-        extent = np.asarray(self.shape.bounds[1] - self.shape.bounds[0])
+        extent = np.ptp(np.asarray(self.shape.bounds), axis=0)
         return float(extent.max())
 
     @property
@@ -161,7 +159,7 @@ class Body(eqx.Module):
         """
         assert self.surface is not None
         scale = np.asarray(self.scale)[:, None]
-        points = scale * np.asarray(self.surface.points[:3])
+        points = scale * np.asarray(self.surface.points)[:3]
         vectors = scale.prod() / scale * np.asarray(self.surface.vectors)
         turned = self.surface.turning == "ball"
         # The densest samples of a ball lie at its −z, and turn to where it touches.
@@ -178,7 +176,7 @@ class Body(eqx.Module):
             margin: Distance from which samples are listed because a step may bring them into contact [m].
         """
         assert self.surface is not None
-        points, vectors = np.asarray(self.surface.points[:3]), np.asarray(self.surface.vectors)
+        points, vectors = np.asarray(self.surface.points)[:3], np.asarray(self.surface.vectors)
         n = points.shape[1]
         if self.surface.turning != "fixed":
             return n
@@ -192,9 +190,9 @@ class Body(eqx.Module):
     def scale(self) -> Float[Array, "3"]:
         """What directions on the unit ball are multiplied with to lie on the surface [m]; ones if unused."""
         if self.surface is None or self.surface.turning != "ball":
-            return jnp.ones_like(self.com)
+            return floating(np.ones(3, self.com.dtype))
         if isinstance(self.shape, Sphere):
-            return jnp.broadcast_to(self.shape.radius, (3,))
+            return stacked([self.shape.radius] * 3)
         assert isinstance(self.shape, Ellipsoid)
         return self.shape.semi_axes
 
@@ -213,7 +211,7 @@ class Body(eqx.Module):
         if isinstance(solid, SignedDistanceGrid):
             thickness = -float(np.min(np.asarray(solid.coefficients)))
         else:
-            thickness = 0.0 if solid is None else -float(solid.sdf(floating(middle)))
+            thickness = 0.0 if solid is None else -float(_distance(solid, floating(middle)))
         # The middle of a hollow solid is no measure of its walls.
         thickness = thickness if thickness > 0 else 0.5 * float((upper - lower).min())
         radius = 0.5 * float(np.linalg.norm(upper - lower))
@@ -257,6 +255,24 @@ class Body(eqx.Module):
         normal = np.asarray(quat_rotate(orientation, self.shape.normal_direction))
         origin = np.asarray(position - quat_rotate(orientation, self.com))
         return normal, float(self.shape.offset) + float(normal @ origin)
+
+
+@hosted
+def _over_mean(density: Float[Array, " n"]) -> Float[Array, ""]:
+    return 1 / jnp.mean(density)
+
+
+@hosted
+def _shared(
+    inertia: Float[Array, "3 3"], own: Float[Array, ""], mass: Float[Array, ""]
+) -> Float[Array, "3 3"]:
+    """Inertia of a body with another mass than its own."""
+    return inertia * (mass / own)
+
+
+@hosted
+def _distance(shape: AbstractShape, x: Float[Array, "3"]) -> Float[Array, ""]:
+    return shape.sdf(x)
 
 
 def _directions(n: int) -> np.ndarray:

@@ -21,6 +21,7 @@ from dano.contact import (
     SurfaceSet,
 )
 from dano.fields import AbstractShape, HalfSpace, PosedShape, Sphere
+from dano.hosted import hosted
 from dano.maths import floating, Numbers
 from dano.objects import draw_contact_samples, NeuralObject, surface_quadrature
 from dano.scene._bodies import Body
@@ -190,10 +191,19 @@ def _none(x: Any) -> bool:
 
 def heaviest(bodies: Sequence[Body], gravity: Float[Array, "3"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Weight of the heaviest body [N], and the strength of gravity that it is taken with [m/s²]."""
-    masses = [body.mass * body.mass_scale for body in bodies if not body.fixed]
+    return _heaviest([(body.mass, body.mass_scale) for body in bodies if not body.fixed], gravity)
+
+
+@hosted
+def _heaviest(
+    masses: list[tuple[Float[Array, ""], Float[Array, ""]]], gravity: Float[Array, "3"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """See `heaviest`; of masses and what they are multiplied with."""
     strength = jnp.sqrt(jnp.sum(gravity**2))
     strength = jnp.where(strength > 0, strength, STANDARD_GRAVITY)
-    return functools.reduce(jnp.maximum, masses, floating(0.0)) * strength, strength
+    return functools.reduce(
+        jnp.maximum, [mass * scale for mass, scale in masses], floating(0.0)
+    ) * strength, strength
 
 
 def _needs_samples(a: Body, b: Body) -> bool:
@@ -256,7 +266,13 @@ def _stiffness(
     # An object made of samples may meet a body that has none.
     sampled = [x if x.surface is not None else y for x, y in ((a, b), (b, a)) if not x.fixed]
     whose = f"of the contact between {a.name!r} and {b.name!r} must be given, or law=CentroidLaw()"
-    return weight / min(checked_support(body, carried(body.name, sinking), whose) for body in sampled)
+    least = min(checked_support(body, carried(body.name, sinking), whose) for body in sampled)
+    return _quotient(weight, floating(least))
+
+
+@hosted
+def _quotient(x: Float[Array, ""], y: Float[Array, ""]) -> Float[Array, ""]:
+    return x / y.astype(x.dtype)
 
 
 def checked_support(body: Body, support: float, whose: str) -> float:

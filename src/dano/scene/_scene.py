@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_items, checked_kind, checked_optional, shown
 from dano.contact import checked_parameter, ContactParams
-from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
+from dano.maths import checked_array, checked_quaternion, is_traced, Numbers, stacked
 from dano.notebook import card, cloud
 from dano.objects import checked_inertia
 from dano.scene._bodies import Body
@@ -353,7 +353,7 @@ class Scene(eqx.Module):
                 label, value = f"{key} of {name!r}", given[key] if key in given else default[key]
                 check = checked_quaternion(label, value) if size == 4 else checked_array(label, value, (3,))
                 rows[key].append(check.astype(self.timestep.dtype))
-        state = State(*(jnp.stack(rows[key]) for key in STATE_SIZES))
+        state = State(*(stacked(rows[key]) for key in STATE_SIZES))
         if self.joints:
             state = self.filled(dataclasses.replace(state, **self._joint_values(bodies, JOINT_QUANTITIES)))
         self.check_state(state)

@@ -17,6 +17,7 @@ from dano.scene_file._objects import (
     build_asset as build_asset,
     build_object as build_object,
     is_shipped as is_shipped,
+    load_asset as load_asset,
     load_object as load_object,
     object_look as object_look,
     Progress as Progress,

@@ -105,7 +105,7 @@ def load_object(
     """A shipped object by its name, or one from a file.
 
     Args:
-        source: "bunny", "soap", "trained_bunny", "trained_soap" (see `build_asset`), a .dano file, or a mesh
+        source: "bunny", "soap", "trained_bunny", "trained_soap" (see `load_asset`), a .dano file, or a mesh
             or another field that `load_field` reads, of which an object is built. A file of one of these
             names goes before.
         options: How to build it; None: with defaults, which a UserWarning says.
@@ -118,7 +118,7 @@ def load_object(
     """
     path = checked_path("source", source)
     if is_shipped(source):
-        return build_asset(str(source), progress=progress)
+        return load_asset(str(source))
     if not os.path.exists(source) and not Path(source).suffix:
         raise ValueError(
             f"source must be a .dano file or one of {list(ASSETS)}, got {str(source)!r}"
@@ -175,31 +175,46 @@ def object_look(source: str | os.PathLike[str]) -> "LearnedField | None":
     return LearnedField.of_object(Path(source))
 
 
-def build_asset(name: str, *, progress: Progress | None = None) -> NeuralObject:
-    """A shipped object, built from its field on first use in a process (some seconds).
+def load_asset(name: str) -> NeuralObject:
+    """A shipped object, as `build_asset` makes it of its field; it is shipped built.
 
     Args:
         name: "bunny" (12 cm, 1 kg) or "soap" (9 × 6 × 3 cm, 0.15 kg): density grids with the flaws of
             ordinary radiance fields, hollow and with floaters. "trained_bunny" or "trained_soap": what
             `dano train` makes of photographs of the same objects.
+
+    Raises:
+        ValueError: If there is no such object.
+    """
+    _check_asset(name)
+    # Objects follow the precision that JAX is set to, which may change within a process.
+    key = (name, jnp.result_type(float).name)
+    if key not in _built:
+        with as_file(files("dano") / "assets" / f"{name}.dano") as path:
+            _built[key] = NeuralObject.load(path)
+    return _built[key]
+
+
+def build_asset(name: str, *, progress: Progress | None = None) -> NeuralObject:
+    """A shipped object built from its field, in some seconds; `load_asset` has it built.
+
+    Args:
+        name: See `load_asset`.
         progress: Called with a description and the share done.
 
     Raises:
         ValueError: If there is no such object.
     """
+    _check_asset(name)
+    look = asset_look(name)
+    if look is not None:
+        return build_object(look, BuildOptions(mass=ASSETS[name], mass_model="solid"), progress=progress)
+    return build_object(load_field(name), BuildOptions(mass=ASSETS[name]), progress=progress)
+
+
+def _check_asset(name: str) -> None:
     if name not in ASSETS:
         raise ValueError(f"asset must be one of {list(ASSETS)}, got {name!r}{did_you_mean(name, ASSETS)}")
-    # Objects follow the precision that JAX is set to, which may change within a process.
-    key = (name, jnp.result_type(float).name)
-    if key not in _built:
-        look = asset_look(name)
-        if look is not None:
-            options = BuildOptions(mass=ASSETS[name], mass_model="solid")
-            _built[key] = build_object(look, options, progress=progress)
-        else:
-            options = BuildOptions(mass=ASSETS[name])
-            _built[key] = build_object(load_field(name), options, progress=progress)
-    return _built[key]
 
 
 def asset_look(name: str) -> "LearnedField | None":

@@ -38,9 +38,9 @@ from dano.scene import (
     State,
 )
 from dano.scene_file._objects import (
-    build_asset,
     build_object,
     is_shipped,
+    load_asset,
     load_object,
     object_look,
     Progress,
@@ -322,7 +322,7 @@ def _object(
     """The neural object of a body; bodies that say the same share one."""
     name = row.word(kind)
     if kind == "asset":
-        return build_asset(name, progress=progress)
+        return load_asset(name)
     source = _source(folder, name)
     build = row.table("build", _BUILD)
     is_object = kind == "object"

@@ -24,6 +24,7 @@ from dano.vision.drawing import (
     PALETTE as PALETTE,
     Part as Part,
     placement as placement,
+    prepare as prepare,
     render as render,
     through as through,
     usual_level as usual_level,

@@ -363,6 +363,19 @@ def _pictures(w: World) -> Iterator[Call]:
         {"path": "", "strip": "", "scenes": "", "trajectories": "", "looks": ""},
     )
     yield Call(
+        "report.render_start",
+        report.render_start,
+        {"scene": w.scene, "state": w.state, "path": w.folder / "out.png", "size": (32, 32)},
+        {
+            "scene": {**instance(), "another": w.door},
+            "state": instance(),
+            "path": {**kinds.target(w.folder, ".png"), "another ending": w.folder / "out.gif"},
+            "looks": kinds.LOOKS,
+            "size": kinds.SIZE,
+        },
+        {"path": "", "scene": "", "looks": ""},
+    )
+    yield Call(
         "report.draw_object",
         report.draw_object,
         {"obj": w.thing, "path": w.folder / "out.png"},

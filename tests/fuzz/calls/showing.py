@@ -39,7 +39,7 @@ def _pages(w: World) -> Iterator[Call]:
         "report.write_view",
         report.write_view,
         {**run, "path": w.folder / "out.html"},
-        {**bad_run, "path": page},
+        {**bad_run, "path": page, "title": {"number": 3, "empty": "", "list": ["a"]}},
         {**says, "path": ""},
     )
     bad_field = {

@@ -1,9 +1,7 @@
 """Launches on a CPU: a world is one lane, and each core has a share of the worlds."""
 
-import concurrent.futures
 import ctypes
 import functools
-import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,6 +11,7 @@ import numpy as np
 from dano.engine.launching._arguments import Arguments
 from dano.engine.launching._ffi import Call, register
 from dano.engine.launching._plans import Build, Plan, Shape
+from dano.native import n_cores, together
 
 _BUILD = Build()
 _DEVICE = "cpu"
@@ -67,10 +66,7 @@ class _Launcher:
         if len(shares) == 1:
             shares[0].command.launch()
         else:
-            others = [_workers().submit(share.command.launch) for share in shares[1:]]
-            shares[0].command.launch()
-            for other in others:
-                other.result()
+            together([share.command.launch for share in shares])
         self._free.append(shares)
 
     def _shares(self) -> list["_Share"]:
@@ -128,14 +124,3 @@ class _Share:
             self._kept.append(memory)
         self.command = arguments.recorded(first, count)
         self.arrays, self.gradients = arguments.pointers()
-
-
-@functools.cache
-def n_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@functools.cache
-def _workers() -> concurrent.futures.ThreadPoolExecutor:
-    return concurrent.futures.ThreadPoolExecutor(max(1, n_cores() - 1), thread_name_prefix="dano")

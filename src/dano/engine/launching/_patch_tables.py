@@ -19,7 +19,6 @@ from dano.contact import (
     SampleSet,
     Support,
 )
-from dano.engine.launching._leaves import balls_around_runs, leaves_of, Placed
 from dano.fields import (
     AbstractField,
     AbstractShape,
@@ -34,6 +33,7 @@ from dano.fields import (
     Sphere,
     UnionField,
 )
+from dano.native import balls_around_runs, leaves_of, Placed
 from dano.scene import colliders, Scene, State
 
 # Shapes with an outward direction of their own; that of others is the gradient of their distance.

@@ -5,8 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dano.engine.launching._instances import Features, instance
-from dano.engine.launching._warp import compiled_kernel
+from dano.native import compiled_kernel, Features, instance
 
 
 class Shape(NamedTuple):

@@ -12,10 +12,12 @@ from jaxtyping import Array, DTypeLike, Float, Int
 
 from dano.contact import AbstractPatchLaw, ContactParams, DistributedLaw, Material, materials, SurfaceSet
 from dano.engine.joints import structure_of_trees, tree_rows, TreeStructure
-from dano.engine.launching._instances import Features, instance
-from dano.engine.launching._leaves import (
+from dano.engine.launching._patch_tables import knows_law, patch_pairs, patch_tables, PatchTables
+from dano.native import (
     balls_around_runs,
     degrees_of,
+    Features,
+    instance,
     is_known,
     kind_number,
     kinds_of,
@@ -24,7 +26,6 @@ from dano.engine.launching._leaves import (
     Placed,
     shape_kinds,
 )
-from dano.engine.launching._patch_tables import knows_law, patch_pairs, patch_tables, PatchTables
 from dano.scene import Body, pressing_pairs, Scene
 
 # Samples count as near within this share of the smaller body's size, besides the way they go.

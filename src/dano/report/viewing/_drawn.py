@@ -48,6 +48,8 @@ class Drawn:
 
     Attributes:
         numbers: Energy and contact force over the run.
+        colours: "#rrggbb" of bodies that have one colour, by their index.
+        camera: Where the page opens from, and what it looks at [m, W].
         touched: Contact forces; None without contacts.
     """
 
@@ -62,6 +64,8 @@ class Drawn:
         self._scene, self._server = server.scene, server
         self._runs = [trajectory] if beside is None else [trajectory, beside]
         self._handles: list[list[Any]] = []
+        self.colours: dict[int, str] = {}
+        self.camera = np.array([1.0, -1.0, 1.0]), np.zeros(3)
         sizes = [body.size for body in scene.bodies if np.isfinite(body.size)]
         self._length = 0.3 * float(np.median(sizes)) if sizes else 1.0
         self._scene.set_up_direction("+z")
@@ -92,6 +96,8 @@ class Drawn:
                         _add_floor(self._scene, name, plane, 40 * self._length)
                     handles.append(None)
                     continue
+                if body.name not in looks:
+                    self.colours[i] = PALETTE[used % len(PALETTE)]
                 handle = self._scene.add_frame(name, show_axes=False)
                 opacity = None if which == 0 else _GHOST
                 _add_body(
@@ -109,10 +115,11 @@ class Drawn:
         runs = [np.asarray(run.states.position, np.float64)[:, moving].reshape(-1, 3) for run in self._runs]
         places = np.concatenate(runs)
         radii = np.resize([0.5 * scene.bodies[i].size for i in moving], len(places))
-        camera = Camera.framing(places, radii, width=3, height=2, margin=0.15)
+        camera = Camera.framing(places, radii, width=3, height=2, margin=0.05)
         start = self._server.initial_camera
         start.up, start.fov = (0.0, 0.0, 1.0), camera.vertical_fov
         start.position, start.look_at = tuple(camera.position), tuple(camera.look_at)
+        self.camera = camera.position, camera.look_at
 
     def show(self, time: float, shown: Shown) -> None:
         """Move everything to a time [s]."""

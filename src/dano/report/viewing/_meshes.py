@@ -10,7 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from dano.exchange import solid_triangles
 from dano.fields import AbstractShape, HalfSpace, PosedShape, PRIMITIVES, SignedDistanceGrid, Sphere
 from dano.scene import Body
-from dano.vision import LearnedField, placement
+from dano.vision import GAMMA, LearnedField, placement
 
 _RESOLUTION = 64
 """Nodes along the longest side of an object: triangles of a sixtieth of its size."""
@@ -84,7 +84,9 @@ def add_coloured(scene: Any, name: str, mesh: BodyMesh) -> None:
     """Show triangles in the colours of their vertices in a server of viser."""
     import trimesh
 
-    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False)
+    # Colours of vertices are linear there.
+    colours = np.rint(255 * (np.asarray(mesh.colours) / 255) ** GAMMA).astype(np.uint8)
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
     # Asked for once, they are written, too: without them every triangle would be shaded alone.
     _ = solid.vertex_normals
     scene.add_mesh_trimesh(name, solid)

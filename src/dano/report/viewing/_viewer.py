@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from dano.checks import checked_function, checked_kind
+from dano.checks import checked_function, checked_kind, checked_path, checked_text
 from dano.report._stage import check_run
 from dano.report.viewing._drawn import Drawn, Shown
+from dano.report.viewing._panel import with_panel
 from dano.report.viewing._player import Again, Player, TICK
 from dano.report.viewing._serving import serve, Viewer, write_file
 from dano.scene import Scene, Trajectory
@@ -67,8 +68,13 @@ def write_view(
     *,
     looks: Mapping[str, LearnedField] | None = None,
     beside: Trajectory | None = None,
+    title: str | None = None,
 ) -> None:
     """Write a page that plays a trajectory, as one HTML file that needs no server.
+
+    Beside the bodies and contact forces it shows energy and contact force over the time, names and masses,
+    and the parameters of the run. The keys "," and "." go from frame to frame; an address that ends in #t=0.5
+    opens at that moment [s].
 
     Args:
         scene: The scene.
@@ -76,12 +82,14 @@ def write_view(
         path: Where to write, .html.
         looks: As in `view`.
         beside: As in `view`.
+        title: Of the page; default: the name of the file.
 
     Raises:
-        ValueError: As in `view`.
+        ValueError: As in `view`, or if the title is empty.
         ImportError: If viser or libigl is missing.
     """
     kept = _checked(scene, trajectory, looks, beside)
+    title = checked_path("path", path).stem if title is None else checked_text("title", title)
 
     def fill(server: Any) -> str:
         drawn = Drawn(server, scene, trajectory, kept, beside)
@@ -91,7 +99,7 @@ def write_view(
         for now in np.linspace(times[0], times[-1], count):
             drawn.show(float(now), Shown())
             film.insert_sleep(float(times[-1] - times[0]) / count)
-        return film.as_html()
+        return with_panel(film.as_html(), scene, drawn, title, float(times[-1] - times[0]) / count)
 
     write_file(path, fill)
 

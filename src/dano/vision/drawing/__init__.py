@@ -9,5 +9,5 @@ from dano.vision.drawing._item import (
     placement as placement,
     usual_level as usual_level,
 )
-from dano.vision.drawing._render import render as render
+from dano.vision.drawing._render import prepare as prepare, render as render
 from dano.vision.drawing._shade import GAMMA as GAMMA

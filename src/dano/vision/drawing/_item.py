@@ -4,7 +4,6 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
@@ -20,7 +19,8 @@ from dano.fields import (
     redistanced,
     SignedDistanceGrid,
 )
-from dano.maths import checked_array, Numbers, Pose, quat_to_matrix
+from dano.maths import checked_array, Numbers, on_device, Pose, quat_to_matrix
+from dano.native import is_known
 from dano.vision.radiance import AbstractModel, LearnedField, SurfaceModel
 
 PALETTE = ("#e07a3f", "#3d7ea6", "#5f9e6e", "#c9a227", "#8d6cab", "#c8553d", "#4aa3a2", "#7a8450")
@@ -124,7 +124,7 @@ class Item(eqx.Module):
         elif solid is not None and level is None:
             self.shape = drawn = _single(solid)
         elif isinstance(field, AbstractShape):
-            self.shape = drawn = _single(_without_moments(field))
+            self.shape = drawn = _single(_without_moments(_traceable(field)))
         else:
             self.shape = drawn = _single(level_surface(_grid(field), level))
         lower, upper = np.asarray(drawn.bounds, dtype=np.float64)
@@ -262,6 +262,19 @@ def _grid(field: AbstractField) -> GridField:
     return bake(field, _BAKE_NODES).grid
 
 
+def _traceable(shape: AbstractShape) -> AbstractShape:
+    """The shape, or its distances on a grid where kernels do not know it."""
+    if is_known(shape) or not np.all(np.isfinite(np.asarray(shape.bounds))):
+        return shape
+    lower, upper = np.asarray(shape.bounds, np.float64)
+    spacing = float((upper - lower).max()) / (_MOST_NODES - 1)
+    lower = lower - 2 * spacing
+    counts = np.ceil((upper - lower) / spacing).astype(int) + 3
+    nodes = lower[:, None] + spacing * np.indices(counts).reshape(3, -1)
+    distances = np.asarray(jax.jit(lambda x: shape.sdf_jet(x, 0))(nodes)).reshape(counts)
+    return SignedDistanceGrid(distances, lower, spacing, edge=0.0)
+
+
 def _without_moments(shape: AbstractShape) -> AbstractShape:
     if isinstance(shape, SignedDistanceGrid) and shape.moments is not None:
         return eqx.tree_at(lambda s: s.moments, shape, None)
@@ -273,4 +286,4 @@ def _single(module: M) -> M:
 
 
 def _as(module: M, dtype: np.dtype) -> M:
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype), module)
+    return jax.tree.map(lambda x: on_device(np.asarray(x, dtype)), module)

@@ -1,195 +1,279 @@
-"""Compiled kernels: where rays meet a solid, what a medium lets through, what light a point receives.
-
-All of them take one field, where it is, and a fixed number of rays in structure-of-arrays layout (one a
-column), in float32. They are compiled once per type of field and serve every picture, pose and image size
-after that.
-"""
+"""Where rays meet solids and what light arrives there, by kernels; what a medium lets through, by JAX."""
 
 import functools
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int, UInt8
 
 from dano.fields import AbstractShape, GridField
+from dano.hosted import hosted
 from dano.maths import product
+from dano.native import (
+    compiled_kernel,
+    Features,
+    instance,
+    leaf_tables,
+    Leaves,
+    leaves_of,
+    n_cores,
+    Placed,
+    together,
+)
 from dano.vision.capture import box_interval
 
 CHUNK = 2048
-"""Rays per call: few enough that one slow ray does not hold many up, enough to make a call worth while."""
-
-MISSED, HIT, ON_ITS_WAY = np.int32(0), np.int32(1), np.int32(2)
-"""What has become of a ray."""
+"""Rays per call of what JAX compiles: enough to make a call worth while."""
 
 _MEDIUM_STEPS = 128
 """Steps along a ray through a medium: a cell of the shipped grids each, nearly."""
 
-# Heights above a point, as shares of the reach, at which its surroundings are probed, and their weights.
-_HEIGHTS = (0.12, 0.3, 0.6, 1.0)
-_WEIGHTS = (0.4, 0.3, 0.2, 0.1)
-
-# Share of the distance to the surface that a ray advances; interpolated distances are not quite 1-Lipschitz.
-_CAUTION = 0.95
-
-
-def _local(rotation: Array, position: Array, origins: Array, directions: Array) -> tuple[Array, Array]:
-    return product(rotation.T, origins - position[:, None]), product(rotation.T, directions)
+_TRACING, _PAINTING = "dano.vision.drawing.kernels.tracing", "dano.vision.drawing.kernels.painting"
+# Kernels for all scenes: they are compiled once.
+_FEATURES = Features(WIDE=False)
+# So few rays are not worth a second core, else each has some shares of them.
+_FEW, _SHARES = 512, 4
 
 
-def _unit(vectors: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-    return vectors * jax.lax.rsqrt(jnp.maximum(jnp.sum(vectors * vectors, axis=0), 1e-24))[None]
-
-
-class Placed(NamedTuple):
-    """A shape somewhere.
+class Thing(NamedTuple):
+    """A solid somewhere (host only).
 
     Attributes:
-        shape: Signed distance, bounded, in float32.
-        rotation: Field frame → world (3, 3).
+        shape: Its signed distance, bounded.
+        rotation: F → W (3, 3).
         position: Of the field frame [m, W] (3,).
+        centre: Of a ball around it [m, W] (3,).
+        radius: Of that ball [m].
+        own_shadows: Whether it already shows the light that it takes from itself.
     """
 
     shape: AbstractShape
-    rotation: Float[Array, "3 3"]
-    position: Float[Array, "3"]
+    rotation: Float[np.ndarray, "3 3"]
+    position: Float[np.ndarray, "3"]
+    centre: Float[np.ndarray, "3"]
+    radius: float
+    own_shadows: bool
 
 
-@jax.jit
-def march(
-    placed: Placed,
-    origins: Float[Array, "3 n"],
-    directions: Float[Array, "3 n"],
-    limit: Float[Array, " n"],
-    start: Float[Array, " n"],
-    pixel: Float[Array, ""],
-    n_steps: Int[Array, ""],
-) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
-    """Some steps of sphere tracing.
+class Met(NamedTuple):
+    """What rays meet.
 
-    Args:
-        placed: What may be hit.
-        origins: Starts of the rays [m, W].
-        directions: Their unit directions [W].
-        limit: Length [m] beyond which a ray is not followed; 0 for rays that only fill the chunk.
-        start: How far each ray has come before [m].
-        pixel: Angle between neighbouring rays [rad].
-        n_steps: Most steps to take.
-
-    Returns:
-        How far each ray has come [m], and whether it missed (0), hit (1) or is on its way (2).
+    Attributes:
+        depth: Distance [m] (n,), infinite where nothing is met.
+        which: Number of the plane, or of the thing after all planes; −1 for none; (n,).
+        normals: Unit normals [W] (3, n).
+        lamp: Shares of the lamp's light that arrive (n,).
+        ambient: Shares of the light from all around (n,).
     """
-    shape, rotation, position = placed
-    o, d = _local(rotation, position, origins, directions)
-    bounds = shape.bounds
-    size = jnp.max(bounds[1] - bounds[0])
-    enter, leave = box_interval(bounds[0][:, None], bounds[1][:, None], o, d)
-    leave = jnp.minimum(leave, limit)
 
-    def unfinished(carry: tuple[Array, Array, Array]) -> Bool[Array, ""]:
-        _, state, i = carry
-        return jnp.any(state == ON_ITS_WAY) & (i < n_steps)
-
-    def advance(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        t, state, i = carry
-        s = shape.sdf_jet(o + t[None] * d, 0)
-        live = state == ON_ITS_WAY
-        # A tenth of a pixel, by which silhouettes grow, but not below what float32 resolves.
-        near = s < jnp.maximum(0.1 * pixel * t, 1e-5 * size)
-        t = jnp.where(live, t + _CAUTION * s, t)
-        state = jnp.where(live & near, HIT, jnp.where(live & (t >= leave), MISSED, state))
-        return t, state, i + 1
-
-    t = jnp.maximum(enter, start)
-    state = jnp.where(t < leave, ON_ITS_WAY, MISSED)
-    t, state, _ = jax.lax.while_loop(unfinished, advance, (t, state, jnp.int32(0)))
-    return t, state
+    depth: Float[np.ndarray, " n"]
+    which: Int[np.ndarray, " n"]
+    normals: Float[np.ndarray, "3 n"]
+    lamp: Float[np.ndarray, " n"]
+    ambient: Float[np.ndarray, " n"]
 
 
-@jax.jit
-def normals_at(placed: Placed, points: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-    """Unit normals [W] of a shape at points [m, W] of its surface."""
-    shape, rotation, position = placed
-    _, gradient = shape.sdf_jet(product(rotation.T, points - position[:, None]), 1)
-    return product(rotation, _unit(gradient))
+class Tracer:
+    """Finds what rays from one point meet."""
+
+    def __init__(
+        self, things: Sequence[Thing], planes: Sequence[np.ndarray], origin: np.ndarray, **numbers: Any
+    ):
+        """Make a view of things.
+
+        Args:
+            things: Solids.
+            planes: Unit normal and offset [m] of half-spaces.
+            origin: Of rays [m, W].
+            numbers: Other fields of `tracing.View`.
+        """
+        import warp as wp
+
+        self._kernel = _kernel(_TRACING, "trace")
+        module = instance(_FEATURES, _TRACING)
+        view: Any = module.View()
+        tables = _tables([thing.shape for thing in things])
+        # What Warp points to has to be kept.
+        self._kept: list[Any] = [tables]
+        view.solids = tables.solids
+        rows = [self._row(module, thing, *part) for thing, part in zip(things, tables.parts, strict=True)]
+        view.things = wp.array(rows, dtype=module.Thing, device="cpu")
+        view.planes = wp.array(np.array(planes, np.float32).reshape(-1, 4), dtype=wp.vec4f, device="cpu")
+        for name, value in {"origin": origin, **numbers}.items():
+            setattr(view, name, wp.vec3f(*map(float, value)) if np.ndim(value) else float(value))
+        self._view = view
+
+    @staticmethod
+    def _row(module: Any, thing: Thing, first: int, count: int, bounds: np.ndarray) -> Any:
+        import warp as wp
+
+        row = module.Thing()
+        row.first, row.count, row.own_shadows = first, count, int(thing.own_shadows)
+        row.rotation = wp.mat33f(*np.asarray(thing.rotation, float).ravel())
+        for name, value in (
+            ("position", thing.position),
+            ("centre", thing.centre),
+            ("low", bounds[0]),
+            ("high", bounds[1]),
+        ):
+            setattr(row, name, wp.vec3f(*map(float, value)))
+        row.radius = float(thing.radius)
+        return row
+
+    def __call__(self, directions: Float[np.ndarray, "3 n"]) -> Met:
+        """What rays of some unit directions [W] meet."""
+        n = directions.shape[1]
+        rays = np.ascontiguousarray(directions.T, np.float32)
+        depth, which = np.empty(n, np.float32), np.empty(n, np.int32)
+        normals, lamp, ambient = (
+            np.empty((n, 3), np.float32),
+            np.empty(n, np.float32),
+            np.empty(n, np.float32),
+        )
+        _launch(self._kernel, self._view, (rays, depth, which, normals, lamp, ambient))
+        return Met(depth, which, np.ascontiguousarray(normals.T), lamp, ambient)
 
 
-@jax.jit
-def ambient_light(
-    placed: Placed, points: Float[Array, "3 n"], normals: Float[Array, "3 n"], reach: Float[Array, ""]
-) -> Float[Array, " n"]:
-    """Share in [0, 1] of the light from all around that a shape leaves to points.
+class Painter:
+    """Gives colours to what rays meet."""
 
-    Args:
-        placed: What stands in the way.
-        points: [m, W].
-        normals: Unit normals of the surfaces that the points lie on [W].
-        reach: How far around a point the shape darkens it [m].
+    def __init__(self, albedos: Sequence[np.ndarray], n_planes: int, **numbers: Any):
+        """Make it.
+
+        Args:
+            albedos: Linear, of planes, of things, and of whatever else is painted.
+            n_planes: Number of planes.
+            numbers: Other fields of `painting.Scenery`.
+        """
+        import warp as wp
+
+        self._kernel = _kernel(_PAINTING, "paint")
+        scenery: Any = instance(_FEATURES, _PAINTING).Scenery()
+        scenery.albedos = wp.array(np.array(albedos, np.float32).reshape(-1, 3), dtype=wp.vec3f, device="cpu")
+        scenery.n_planes = n_planes
+        for name, value in numbers.items():
+            setattr(scenery, name, wp.vec3f(*map(float, value)) if np.ndim(value) else float(value))
+        self._scenery = scenery
+
+    def __call__(
+        self, directions: Float[np.ndarray, "3 n"], met: Met
+    ) -> tuple[Float[np.ndarray, "3 n"], UInt8[np.ndarray, "n 3"]]:
+        """Linear colours and values of a picture, of rays of some unit directions [W]."""
+        n = directions.shape[1]
+        colours, picture = np.empty((n, 3), np.float32), np.empty((n, 3), np.uint8)
+        rays = np.ascontiguousarray(directions.T, np.float32)
+        normals = np.ascontiguousarray(met.normals.T, np.float32)
+        given = (rays, met.depth, met.which, normals, met.lamp, met.ambient)
+        _launch(self._kernel, self._scenery, (*given, colours, picture))
+        return np.ascontiguousarray(colours.T), picture
+
+
+def compile_kernels() -> None:
+    """Compile what draws, or load it; so that others may compile something else meanwhile."""
+    _kernel(_PAINTING, "paint")
+    _kernel(_TRACING, "trace")
+
+
+@functools.cache
+def _kernel(module: str, name: str) -> Any:
+    return compiled_kernel(lambda: getattr(instance(_FEATURES, module), name), what="what draws")
+
+
+def _launch(kernel: Any, first: Any, arrays: Sequence[np.ndarray]) -> None:
+    """Launch a kernel of a ray a thread on all cores."""
+    n = len(arrays[0])
+    # Neighbouring shares cost different times: several for each core make all end together.
+    count = min(max(n // _FEW, 1), 1 if n_cores() == 1 else _SHARES * n_cores())
+    ends = [n * (k + 1) // count for k in range(count)]
+    works = [_work(kernel, first, arrays, b, e) for b, e in zip([0, *ends[:-1]], ends, strict=True) if e > b]
+    if works:
+        together([functools.partial(_each, works[k :: n_cores()]) for k in range(min(n_cores(), len(works)))])
+
+
+def _work(kernel: Any, first: Any, arrays: Sequence[np.ndarray], begin: int, end: int) -> Any:
+    """A launch for some of the rays."""
+    import warp as wp
+
+    threes = {np.dtype(np.float32): wp.vec3f, np.dtype(np.uint8): wp.types.vector(3, wp.uint8)}
+    given: list[Any] = [
+        wp.array(
+            ptr=x[begin:end].ctypes.data,
+            dtype=threes[x.dtype] if x.ndim == 2 else wp.dtype_from_numpy(x.dtype),
+            shape=(end - begin,),
+            device="cpu",
+            copy=False,
+        )
+        for x in arrays
+    ]
+    return wp.launch(kernel, end - begin, [first, *given], device="cpu", record_cmd=True)
+
+
+def _each(works: Sequence[Any]) -> None:
+    for work in works:
+        work.launch()
+
+
+class _Tables(NamedTuple):
+    """Leaves of some shapes.
+
+    Attributes:
+        solids: As kernels read them.
+        parts: First leaf, number of leaves and bounds [m, F] of each shape.
+        arrays: What `solids` points to.
     """
-    shape, rotation, position = placed
-    o, n = _local(rotation, position, points, normals)
-    # All heights in one call: each call is compiled anew.
-    heights = reach * jnp.asarray(_HEIGHTS, jnp.float32)
-    probes = o[:, None] + heights[None, :, None] * n[:, None]
-    above = shape.sdf_jet(probes.reshape(3, -1), 0).reshape(len(_HEIGHTS), -1)
-    covered = jnp.clip(1 - above / heights[:, None], 0, 1.3)
-    return jnp.clip(1 - jnp.asarray(_WEIGHTS, jnp.float32) @ covered, 0.12, 1)
+
+    solids: Any
+    parts: list[tuple[int, int, np.ndarray]]
+    arrays: list[np.ndarray]
 
 
-@jax.jit
-def march_to_lamp(
-    placed: Placed,
-    points: Float[Array, "3 n"],
-    start: Float[Array, " n"],
-    seen: Float[Array, " n"],
-    light: Float[Array, "3"],
-    spread: Float[Array, ""],
-    bias: Float[Array, ""],
-    n_steps: Int[Array, ""],
-) -> tuple[Float[Array, " n"], Float[Array, " n"], Int[Array, " n"]]:
-    """Some steps from points towards a lamp of some width.
+_known: dict[tuple[int, ...], tuple[list[Any], _Tables]] = {}
 
-    At distance t the disc of the lamp has the radius spread · t, and the ray is at the height s above the
-    shape. The least s / (spread · t), between −1 (dark) and 1 (clear), says how much of the disc is seen.
 
-    Args:
-        placed: What stands in the way.
-        points: [m, W], a little above the surface they belong to.
-        start: How far the way has been followed before [m].
-        seen: Least height ratio until there.
-        light: Unit direction towards the lamp [W].
-        spread: Half the lamp's angular width [rad].
-        bias: Least step [m].
-        n_steps: Most steps to take.
+def _tables(shapes: Sequence[AbstractShape]) -> _Tables:
+    """Leaves of shapes, kept from the last call if these are the same: pictures come in series."""
+    numbers = jax.tree.leaves(list(shapes))
+    key = tuple(map(id, numbers))
+    if key not in _known:
+        made = _made(shapes)
+        _known.clear()
+        # With the arrays themselves, so that no other can have their place in memory.
+        _known[key] = numbers, made
+    return _known[key][1]
 
-    Returns:
-        How far each way has been followed [m], least height ratio, and state (0 done, 2 on its way).
-    """
-    shape, rotation, position = placed
-    o, d = _local(rotation, position, points, jnp.broadcast_to(light[:, None], points.shape))
-    bounds = shape.bounds
-    ahead = jnp.maximum(jnp.sum((0.5 * (bounds[0] + bounds[1])[:, None] - o) * d, axis=0), 0)
-    # Grown by what the cone's width reaches beyond the box.
-    grow = (spread * ahead + 2 * bias)[None]
-    enter, leave = box_interval(bounds[0][:, None] - grow, bounds[1][:, None] + grow, o, d)
 
-    def unfinished(carry: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
-        _, _, state, i = carry
-        return jnp.any(state == ON_ITS_WAY) & (i < n_steps)
+def _made(shapes: Sequence[AbstractShape]) -> _Tables:
+    import warp as wp
 
-    def advance(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        t, seen, state, i = carry
-        s = shape.sdf_jet(o + t[None] * d, 0)
-        live = state == ON_ITS_WAY
-        seen = jnp.where(live, jnp.minimum(seen, s / (spread * t)), seen)
-        t = jnp.where(live, t + jnp.maximum(0.7 * jnp.abs(s), bias + 0.1 * spread * t), t)
-        return t, seen, jnp.where(live & ((t >= leave) | (seen <= -1)), MISSED, state), i + 1
+    module = instance(_FEATURES, "dano.physics.solids.leaves")
+    leaves = [leaves_of(Placed.still(shape, np.float32)) for shape in shapes]
+    counts = [len(each) for each in leaves]
+    bounds = [np.asarray(shape.bounds, float) for shape in shapes]
+    parts = list(zip(np.cumsum([0, *counts])[:-1].tolist(), counts, bounds, strict=True))
+    found = _leaf_tables([leaf for each in leaves for leaf in each])
+    arrays = [np.ascontiguousarray(x) for x in (found.rows, found.kinds, found.coefficients, found.bounds)]
+    solids: Any = module.Solids()
+    for name, values, dtype in zip(
+        ("leaves", "kinds", "coefficients", "bounds"),
+        arrays,
+        (module.Leaf, module.LeafKind, wp.float32, wp.float32),
+        strict=True,
+    ):
+        shape = (len(values),) if name == "kinds" else (1, len(values))
+        setattr(
+            solids,
+            name,
+            wp.array(ptr=values.ctypes.data, dtype=dtype, shape=shape, device="cpu", copy=False),
+        )
+    return _Tables(solids, parts, arrays)
 
-    t = jnp.maximum(jnp.maximum(enter, bias), start)
-    state = jnp.where((t < leave) & (seen > -1), ON_ITS_WAY, MISSED)
-    t, seen, state, _ = jax.lax.while_loop(unfinished, advance, (t, seen, state, jnp.int32(0)))
-    return t, seen, state
+
+@hosted
+def _leaf_tables(leaves: list[Placed]) -> Leaves:
+    return leaf_tables(leaves, jnp.float32)
 
 
 @functools.partial(jax.jit, static_argnames="n_steps")
@@ -224,3 +308,11 @@ def transmitted(
     clear, depth, normal = jax.lax.fori_loop(jnp.int32(0), jnp.int32(n_steps), advance, start)
     opacity = 1 - clear
     return opacity, depth / jnp.maximum(opacity, 1e-6), product(rotation, _unit(normal))
+
+
+def _local(rotation: Array, position: Array, origins: Array, directions: Array) -> tuple[Array, Array]:
+    return product(rotation.T, origins - position[:, None]), product(rotation.T, directions)
+
+
+def _unit(vectors: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    return vectors * jax.lax.rsqrt(jnp.maximum(jnp.sum(vectors * vectors, axis=0), 1e-24))[None]

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from dano.archive import LOOK, OBJECT, read_archive, write_archive
 from dano.fields import AbstractField, check_order, Jet, redistanced, SignedDistanceGrid, vmapped_jet
-from dano.maths import Numbers
+from dano.maths import Numbers, on_device
 from dano.vision.capture import AbstractCamera
 from dano.vision.radiance._appearance import Appearance, Network
 from dano.vision.radiance._models import SurfaceModel
@@ -56,7 +56,7 @@ class LearnedField(AbstractField):
         origin = box.origin - 2 * box.spacing
         wide = redistanced(wide, box.spacing)
         return cls(
-            SignedDistanceGrid(jnp.asarray(wide), origin, box.spacing),
+            SignedDistanceGrid(wide, origin, box.spacing),
             jnp.asarray(_EDGE / box.spacing),
             model,
             jnp.asarray(drawn_sharpness),
@@ -179,20 +179,20 @@ class LearnedField(AbstractField):
         try:
             layers = range(int(data["layers"]))
             network = Network(
-                tuple(jnp.asarray(data[f"weight_{i}"]) for i in layers),
-                tuple(jnp.asarray(data[f"bias_{i}"]) for i in layers),
+                tuple(on_device(data[f"weight_{i}"]) for i in layers),
+                tuple(on_device(data[f"bias_{i}"]) for i in layers),
             )
             appearance = Appearance(
-                jnp.asarray(data["features"].astype(np.float32)),
+                on_device(data["features"].astype(np.float32)),
                 network,
-                jnp.asarray(data["features_origin"]),
-                jnp.asarray(data["features_spacing"]),
+                on_device(data["features_origin"]),
+                on_device(data["features_spacing"]),
                 bool(data["lit"]),
                 bool(data["near_light"]),
             )
             model = SurfaceModel(
                 appearance=appearance,
-                **{name: jnp.asarray(data[name]) for name in ("distance", "origin", "spacing", "scale")},
+                **{name: on_device(data[name]) for name in ("distance", "origin", "spacing", "scale")},
             )
             return cls.from_model(model, float(data["drawn_sharpness"]))
         except (KeyError, ValueError) as error:

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float, Int
 
-from dano.engine.launching._instances import Features, instance
 from dano.fields import (
     AbstractField,
     AbstractPrimitive,
@@ -28,6 +27,7 @@ from dano.fields import (
     UnionShape,
 )
 from dano.maths import matmul, matvec, Pose
+from dano.native._instances import Features, instance
 
 LEAF_WIDTH = 20
 """Numbers of a leaf."""
@@ -71,7 +71,8 @@ class Placed(NamedTuple):
     @classmethod
     def still(cls, field: AbstractField, dtype: DTypeLike) -> "Placed":
         """A field in its own frame."""
-        return cls(field, jnp.ones((), dtype), jnp.zeros(3, dtype), jnp.eye(3, dtype=dtype))
+        still = (np.ones((), dtype), np.zeros(3, dtype), np.eye(3, dtype=dtype))
+        return cls(field, *map(jax.device_put, still))
 
     @property
     def leaf(self) -> Known:

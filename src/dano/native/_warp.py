@@ -17,27 +17,37 @@ _WORTH_A_WORD = 2.0
 """Seconds after which compiling is said."""
 
 
-def compiled_kernel(made: Callable[[], Any], device: str = "cpu", lanes: int = 1) -> Any:
+def compiled_kernel(
+    made: Callable[[], Any], device: str = "cpu", lanes: int = 1, *, what: str = "the simulator"
+) -> Any:
     """A kernel, compiled for a device, or loaded where it was compiled before.
 
     Args:
         made: Gives the kernel; called when Warp is ready.
         device: Its name in Warp.
         lanes: Threads of a block.
+        what: What it is, for who waits.
     """
     import warp as wp
 
     begin()
-    with _quietly(), _said("compiling the simulator for this machine, once …"):
+    with _quietly(), _said(f"compiling {what} for this machine, once …"):
         kernel = made()
         try:
-            wp.load_module(kernel.module, device=device, block_dim=lanes)
+            # Who else wants it waits, instead of compiling it, too.
+            with _lock_of(kernel.module.name, device, lanes):
+                wp.load_module(kernel.module, device=device, block_dim=lanes)
         except OSError as error:
             folder = wp.config.kernel_cache_dir
             raise OSError(
-                f"the simulator cannot be compiled in {folder}: {error}; DANO_CACHE_DIR names another folder"
+                f"{what} cannot be compiled in {folder}: {error}; DANO_CACHE_DIR names another folder"
             ) from error
     return kernel
+
+
+@functools.cache
+def _lock_of(name: str, device: str, lanes: int) -> threading.Lock:
+    return threading.Lock()
 
 
 @functools.cache

@@ -11,10 +11,11 @@ import hashlib
 import importlib.util
 import inspect
 import sys
+import threading
 from types import ModuleType
 from typing import Any
 
-from dano.engine.launching._warp import begin
+from dano.native._warp import begin
 
 _FEATURES = "dano.physics.features"
 _LAW = "dano.physics.point_law"
@@ -51,7 +52,10 @@ def _shown(value: Any) -> str:
     return str(int(value))
 
 
-@functools.cache
+# One thread makes instances, the others wait for them.
+_lock = threading.RLock()
+
+
 def instance(features: Features, module: str) -> ModuleType:
     """A module of `dano.physics` or of kernels, run with some features.
 
@@ -60,12 +64,19 @@ def instance(features: Features, module: str) -> ModuleType:
         module: Its usual name.
     """
     begin()
+    with _lock:
+        return _instance(features, module)
+
+
+@functools.cache
+def _instance(features: Features, module: str) -> ModuleType:
     spec = importlib.util.find_spec(module)
     assert spec is not None and spec.origin is not None and spec.loader is not None
 
     made = ModuleType(f"{module}.{features.name}")
 
     def imports(name, globals=None, locals=None, fromlist=(), level=0):
+        # A file of one's own asks for what stands in the module that it changes.
         if name == module and fromlist:
             return made
         if fromlist and name.startswith(_PACKAGES) and name not in _PACKAGES:

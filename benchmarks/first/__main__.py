@@ -1,0 +1,6 @@
+"""`python -m benchmarks.first [--only WORD …] [--json FILE] [--quick]`."""
+
+from benchmarks.first._run import run
+
+if __name__ == "__main__":
+    run()
