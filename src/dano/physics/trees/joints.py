@@ -48,18 +48,6 @@ class Joint:
     shift: real
 
 
-@wp.func
-def summed_joint(a: Joint, b: Joint) -> Joint:
-    """Sum of two derivatives by a joint."""
-    a.axis += b.axis
-    a.anchor += b.anchor
-    a.position += b.position
-    a.orientation += b.orientation
-    a.ratio += b.ratio
-    a.shift += b.shift
-    return a
-
-
 @wp.struct
 class JointFrame:
     """Where a joint is at the start of a step [W].

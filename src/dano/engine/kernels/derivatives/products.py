@@ -37,6 +37,7 @@ scaled_leaf = scaled_of(Leaf)
 
 add_to_leaf = addition_of(Leaf)
 add_patch_material = addition_of(PatchMaterial)
+add_joint = addition_of(Joint)
 add_law = addition_of(JointLaw)
 add_loop = addition_of(Loop)
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from dano.engine.kernels.derivatives.bodies import add_row
-from dano.engine.kernels.derivatives.products import add_law, add_loop
+from dano.engine.kernels.derivatives.products import add_joint, add_law, add_loop
 from dano.engine.kernels.derivatives.tree_adjoint import (
     ball_work,
     coordinate_work,
@@ -24,7 +24,7 @@ from dano.engine.kernels.trees.tables import Chain, HangingBar, Node
 from dano.physics.pairs import BodyState
 from dano.physics.real import ONE, quat, real, vec3, vec6, ZERO
 from dano.physics.rotations import from_wxyz, to_wxyz
-from dano.physics.trees.joints import BALL, Carrier, Joint, ROOT, summed_joint
+from dano.physics.trees.joints import BALL, Carrier, ROOT
 
 _BALL, _ROOT = wp.constant(BALL), wp.constant(ROOT)
 # Efforts that bound nothing [N m or N]: zero times them is zero, as zero times infinity is not.
@@ -129,13 +129,6 @@ def add_chain(scene: Scene, room: Room, world: int, node: int, body: int, bar: C
 
 
 @wp.func
-def add_joint(bars: Changes, world: int, row: int, bar: Joint):
-    """Add a derivative by a joint."""
-    if bars.joints.shape[1] > 0:
-        bars.joints[world, row] = summed_joint(bars.joints[world, row], bar)
-
-
-@wp.func
 def add_com(bars: Changes, world: int, body: int, bar: vec3):
     """Add a derivative by a centre of mass; −1 for the world."""
     if body >= 0 and bars.bodies.shape[1] > 0:
@@ -220,7 +213,7 @@ def pull_hanging(scene: Scene, room: Room, bars: Changes, launch: Launch, world:
         h,
         room.trees.chain_bars[world, n],
     )
-    add_joint(bars, world, node.joint, by_joint)
+    add_joint(bars.joints, world, node.joint, by_joint)
     add_com(bars, world, node.carrier, by_parent_com)
     add_com(bars, world, i, by_com + by_body.com)
     add_timestep(bars, world, by_h + of_h)
@@ -299,7 +292,7 @@ def pull_places(scene: Scene, room: Room, bars: Changes, launch: Launch, world: 
                 asked.position,
                 asked.orientation,
             )
-            add_joint(bars, world, node.joint, by_joint)
+            add_joint(bars.joints, world, node.joint, by_joint)
             add_place(room.after_bar, world, node.carrier, by_carrier.position, by_carrier.orientation)
             add_com(bars, world, node.carrier, by_carrier.com)
             add_com(bars, world, node.body, by_com)
