@@ -273,21 +273,30 @@ def bisected(true_from, low, high):
     return low
 
 
-def find(scene, bodies, shares=None):
-    """The listed points of every side; `shares` are given τ by (i, j), of those that are not to be exact."""
+def find(scene, bodies, shares=None, gains=None):
+    """The listed points of every side.
+
+    Args:
+        scene: The scene.
+        bodies: Its bodies.
+        shares: τ by (i, j), of those that are not to be exact.
+        gains: By how much velocities and spins of bodies change within the step, if known, shape (n, 6).
+    """
     shares = shares or {}
+    gains = np.zeros((len(scene.bodies), 6)) if gains is None else gains
     found = []
     for side in sides_of(scene):
         hitting, lasting = meetings(scene, bodies, side)
         given = shares.get((side.i, side.j))
-        points = listed(scene, bodies, side, hitting if given is None else hitting._replace(share=given))
+        met = hitting if given is None else hitting._replace(share=given)
+        points = listed(scene, bodies, side, met, gains)
         if points.beta == 0:
-            points = listed(scene, bodies, side, lasting if given is None else Meeting(given))
+            points = listed(scene, bodies, side, lasting if given is None else Meeting(given), gains)
         found.append(points)
     return halved([points for points in found if len(points.area)])
 
 
-def listed(scene, bodies, side, met):
+def listed(scene, bodies, side, met, gains):
     """The listed points of a side whose geometry is taken when its bodies meet."""
     i, j, h, share = side.i, side.j, bodies.h, met.share
     pair = Pair(scene, bodies, side, share)
@@ -306,11 +315,15 @@ def listed(scene, bodies, side, met):
 
     smaller = min(float(scene.bodies[k].extent[4]) for k in (i, j))
     margin = 0.001 * smaller + 2 * np.linalg.norm(bodies.gravity) * h * h
-    near = (area > 0) & (depth - h * rate > -margin)
-    usual = near & ~other
+    apart = bodies.position[i] - bodies.position[j]
+    gained = normal @ (gains[i] - gains[j])[:3] - normal @ np.cross(gains[j, 3:], apart)
+    gained = gained + moment @ (gains[i] - gains[j])[3:]
+    comes = (area > 0) & (depth - h * rate > -margin)
+    near = comes | ((area > 0) & (depth - h * (rate + gained) > -margin))
+    usual = comes & ~other
     sunk = np.maximum(-distance, 0)
     inside_out = np.sum((area * sunk)[other]) > np.sum((area * sunk)[usual])
-    kept = np.concatenate([np.flatnonzero(usual), np.flatnonzero(near & other & inside_out)])
+    kept = np.concatenate([np.flatnonzero(near & ~other), np.flatnonzero(near & other & inside_out)])
     hit = usual & (sunk > 0)
     approach = rate - np.sum(normal * drift, axis=1)
     delta, sink = depths_of(scene, side)
@@ -327,7 +340,7 @@ def listed(scene, bodies, side, met):
         second=j,
         law=side.law,
         share=share,
-        com_difference=bodies.position[i] - bodies.position[j],
+        com_difference=apart,
         arm=arm[kept],
         normal=normal[kept],
         moment=moment[kept],

@@ -27,13 +27,26 @@ class Step:
         self.kinematics = Kinematics(scene, state)
         self.scene, self.control, self.h = self.kinematics.scene, control, self.kinematics.h
         self.joints = JointLaw(self.kinematics, control)
-        self.given = find(self.scene, self.kinematics.bodies, shares)
-        self.points = list(self.given)
+        self.search(shares, None)
         self.patches = patches_of(self.scene, self.kinematics.bodies)
         self.loops = self.kinematics.gap_slopes()
         self.start = np.r_[self.kinematics.start, np.zeros(len(self.loops))]
         self.kept = None, None
         self.scale = 1 / np.r_[np.diag(self.kinematics.mass_matrix), np.full(len(self.loops), self.h)]
+
+    def search(self, shares, gains):
+        """Find point contacts, see `reference_step.collision.find`."""
+        self.given = find(self.scene, self.kinematics.bodies, shares, gains)
+        self.points = list(self.given)
+
+    def gains(self, y):
+        """How velocities and spins of bodies change; and whether one goes beyond what a search looks at."""
+        bodies, h = self.kinematics.bodies, self.h
+        found = self.kinematics.seen(y) - np.c_[bodies.velocity, bodies.spin]
+        reach = np.array([0.0 if body.fixed else float(body.extent[3]) for body in self.scene.bodies])
+        way = h * (np.linalg.norm(found[:, :3], axis=1) + reach * np.linalg.norm(found[:, 3:], axis=1))
+        seen = 1e-3 * reach + h * h * np.linalg.norm(bodies.gravity)
+        return found, bool(np.any((way > seen)[reach > 0]))
 
     def residual(self, unknowns, softness=1.0):
         """R: what the equations miss at y and the forces λ of loops, as velocities [m/s, rad/s]."""
@@ -167,10 +180,20 @@ def step(scene, state, control=None, shares=None):
         ArithmeticError: If no root was found.
     """
     equations = Step(scene, state, control, shares)
+    y = settled(equations)
+    gains, beyond = equations.gains(y)
+    if beyond:
+        equations.search(shares, gains)
+        y = settled(equations)
+    return equations.kinematics.end(y, equations.moved(y)), equations
+
+
+def settled(equations):
+    """The root of a step, with as much of the restitution as adds no energy."""
     hits = any(np.any(points.impact > 0) for points in equations.points)
     y, tenths = root(equations), 10
     while hits and tenths > 0 and equations.adds_energy(y):
         tenths -= 1
         equations.take_restitution(tenths / 10)
         y = root(equations)
-    return equations.kinematics.end(y, equations.moved(y)), equations
+    return y

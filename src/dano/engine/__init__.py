@@ -19,6 +19,7 @@ from dano.engine._rollout import (
     step as step,
     VariationalEngine as VariationalEngine,
 )
+from dano.engine._runs_on import runs_on as runs_on
 from dano.engine.batches import (
     device_mesh as device_mesh,
     gather as gather,

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from dano.contact import AbstractContactLaw, CentroidLaw, CHUNK, ContactParams, DistributedLaw
-from dano.engine import contact_patches
+from dano.engine import contact_patches, runs_on
 from dano.progress import Progress
 from dano.scene import Body, Scene, State
 from dano.scene_file._forecast import bounds, fast_spin, Finding, forecast, starts, too_fast
@@ -81,6 +81,7 @@ class SceneCheck(NamedTuple):
         contacts: Laws and parameters.
         bodies: One line a body.
         findings: What is not resolved, or odd.
+        runs_on: What makes the steps: see `dano.engine.runs_on`.
         cost: What steps cost.
     """
 
@@ -89,6 +90,7 @@ class SceneCheck(NamedTuple):
     contacts: list[ContactLine]
     bodies: list[BodyLine]
     findings: list[Finding]
+    runs_on: str
     cost: Cost
 
     @property
@@ -137,7 +139,7 @@ def check_scene(
         )
         for body, limit in zip(scene.bodies, limits, strict=True)
     ]
-    return SceneCheck(h, loaded.n_steps, _contact_lines(scene), bodies, findings, cost)
+    return SceneCheck(h, loaded.n_steps, _contact_lines(scene), bodies, findings, runs_on(scene), cost)
 
 
 def _touching(scene: Scene, body: Body) -> int | None:

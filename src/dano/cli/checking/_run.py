@@ -42,6 +42,7 @@ def _numbers(found: scene_file.SceneCheck) -> dict:
         "contacts": [line._asdict() for line in found.contacts],
         "bodies": [line._asdict() for line in found.bodies],
         "findings": [finding._asdict() for finding in found.findings],
+        "runs_on": found.runs_on,
         "cost": {**found.cost._asdict(), "total_seconds": mean, "total_seconds_slowest": slowest},
     }
 
@@ -74,6 +75,7 @@ def _print(found: scene_file.SceneCheck) -> None:
     else:
         put("nothing found that the steps would not resolve: impacts, spins, walls, masses, samples")
     put()
+    put(textwrap.fill(found.runs_on, 100, initial_indent="runs on     ", subsequent_indent=_INDENT))
     cost, (mean, slowest) = found.cost, found.total_seconds
     if cost.room is not None:
         put(f"points      room for {cost.room} point contacts in a step; room for more is made when needed")

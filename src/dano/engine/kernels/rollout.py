@@ -309,7 +309,9 @@ def find_gains(scene: Scene, room: Room, world: int) -> bool:
         room.gains[world, index] = gained
         radius = scene.bodies[world, index].radius
         way = h * (wp.length(linear_part(gained)) + radius * wp.length(angular_part(gained)))
-        beyond = beyond or way > _LOOKS * radius + h * h * wp.length(scene.gravity[world, 0])
+        looked = _LOOKS * radius + h * h * wp.length(scene.gravity[world, 0])
+        # What touches nothing has no radius.
+        beyond = beyond or (radius > ZERO and way > looked)
     return beyond
 
 
