@@ -485,13 +485,14 @@ def test_demo(run, tmp_path, monkeypatch, small_scenes):
     drawn = []
     monkeypatch.setattr("dano.report.draw_object", lambda *given, **_: drawn.append(given[1].name))
     monkeypatch.setattr("dano.report.render_trajectory", lambda *given, **_: drawn.append(given[2].name))
+    monkeypatch.setattr("dano.report.render_start", lambda *given, **_: drawn.append(given[2].name))
     folder = tmp_path / "demo"
     answer = run("demo", "all", "-o", folder, "--json")
     assert answer.code == 0
     report = json.loads(answer.out)["scenes"]
     assert list(report) == list(_scenes.SCENES)
-    # An object of both scenes is drawn once.
-    assert drawn == ["bunny.png", "drop.mp4", "collision.mp4"]
+    # First of all how a scene begins; an object of both scenes is drawn once.
+    assert drawn == ["drop.png", "bunny.png", "drop.mp4", "collision.png", "collision.mp4"]
     written = {f"{name}.{suffix}" for name in _scenes.SCENES for suffix in ("toml", "npz", "json")}
     assert {path.name for path in folder.iterdir()} == {*written, "bunny.dano"}
     assert json.loads((folder / "drop.json").read_text(encoding="utf-8")) == report["drop"]

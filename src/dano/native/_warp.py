@@ -50,9 +50,17 @@ def _lock_of(name: str, device: str, lanes: int) -> threading.Lock:
     return threading.Lock()
 
 
-@functools.cache
 def begin() -> None:
     """Start Warp; before any of its functions is made, which would start it with words."""
+    with _starting:
+        _begin()
+
+
+_starting = threading.Lock()
+
+
+@functools.cache
+def _begin() -> None:
     import warp as wp
 
     _find_cache()
@@ -73,17 +81,29 @@ def _find_cache() -> None:
     wp.config.kernel_cache_dir = kept
 
 
+_words = threading.Lock()
+_levels: list[int] = []
+
+
 @contextlib.contextmanager
 def _quietly() -> Iterator[None]:
     """Without Warp's words about devices and compiled modules."""
     import warp as wp
 
-    level = wp.config.log_level
-    wp.config.log_level = wp.LOG_ERROR
+    with _words:
+        if not _levels:
+            _levels.append(wp.config.log_level)
+            wp.config.log_level = wp.LOG_ERROR
+        else:
+            _levels.append(_levels[0])
     try:
         yield
     finally:
-        wp.config.log_level = level
+        # The last of several threads gives Warp its words back.
+        with _words:
+            level = _levels.pop()
+            if not _levels:
+                wp.config.log_level = level
 
 
 @contextlib.contextmanager
