@@ -1,5 +1,6 @@
 """What an environment shows, what it rewards, and when an episode ends: plain functions of many states."""
 
+import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
@@ -21,6 +22,13 @@ Single = Callable[
 """State, action between −1 and 1, steps so far → state after it, observation, reward, whether all goals are
 met, lengths of the goals' errors, whether the steps were solved, whether more touched than there is room
 for."""
+
+Many = Callable[
+    [State, Float[np.ndarray, "r m"], Int[np.ndarray, " r"], Bool[np.ndarray, " r"]],
+    tuple[State, Array, Array, Array, Array, Array, Array],
+]
+"""The same of r episodes, and whether each begins. Those that begin stay where they are, get no reward and
+have met nothing."""
 
 
 class Rules(eqx.Module):
@@ -97,9 +105,38 @@ class Rules(eqx.Module):
     def single(self) -> "Single":
         """A step of one episode, compiled as one function of its state, its action and its count.
 
-        Many episodes go through `advanced`, which spreads them over the machine; of one that way takes some
-        milliseconds, of which physics are a hundredth.
+        By `advanced` a step takes some milliseconds, of which physics are a hundredth.
         """
+        return jax.jit(self._stepping(), compiler_options=compiler_options())
+
+    def many(self) -> "Many":
+        """A step of many episodes, compiled as one function: one launch of the engine for all of them.
+
+        It computes on one device; `advanced` spreads episodes over several.
+        """
+        step = self._stepping()
+
+        def stepped(states: State, actions: Array, counts: Array, begins: Array):
+            after, seen, rewards, met, lengths, solved, full = jax.vmap(step)(states, actions, counts)
+            first = _observations(self.scene, self.task, states, jnp.ones(len(begins), seen.dtype))
+            kept = jax.tree.map(
+                lambda old, new: jnp.where(begins.reshape(-1, *(1,) * (old.ndim - 1)), old, new),
+                states,
+                after,
+            )
+            seen = jnp.where(begins[:, None], first, seen)
+            full, solved = full & ~begins, solved | begins
+            return kept, seen, jnp.where(begins, 0, rewards), met & ~begins, lengths, solved, full
+
+        return jax.jit(stepped, compiler_options=compiler_options())
+
+    def enlarged(self, factor: int) -> "Rules | None":
+        """The same with room for so many times as many contacts; None if the engine's room is fixed."""
+        engine = self.engine.enlarged(self.scene, factor)
+        return None if engine is None else dataclasses.replace(self, engine=engine)
+
+    def _stepping(self) -> Callable:
+        """What `single` compiles."""
         scene, task, engine, repeat = self.scene, self.task, self.engine, self.repeat
         prepared = _jit(lambda scene: engine.prepare(scene))(scene)
         lower, upper = (np.asarray(bound) for bound in task.bounds())
@@ -129,7 +166,7 @@ class Rules(eqx.Module):
             seen = _observations(scene, task, ended, left[None])
             return after, seen[0], reward[0], met[0], lengths[0], solved, full
 
-        return jax.jit(step, compiler_options=compiler_options())
+        return step
 
     def _example(self) -> State:
         return self.scene.initial_state()
