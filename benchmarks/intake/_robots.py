@@ -102,7 +102,8 @@ def _references(path: Path) -> list[Callable[[Robot], float]]:
         model = _compiled(path)
     except (ValueError, ET.ParseError):
         model = None
-    if model is not None:
+    # Of a file with soft bodies only, it reads nothing.
+    if model is not None and model.nbody > 1:
         found.append(lambda robot: _from_mujoco(robot, model))
     if path.suffix == ".urdf" and importlib.util.find_spec("pinocchio") is not None:
         pinocchio = importlib.import_module("pinocchio")

@@ -103,6 +103,15 @@ REFUSED = {
         link("a") + link("b", BODY.replace('ixx="1"', 'ixx="2.1"')) + joint("j", "a", "b"),
         r"5 % too much; balance_inertia=True",
     ),
+    "a soft body alone": (
+        '<deformable name="torus"/>',
+        "must hold a link, got the soft body 'torus' alone: dano has rigid bodies only",
+    ),
+    "a soft body": (link("a") + '<deformable name="d"/>', r"'d' is a soft body.*ignore=\['soft bodies'\]"),
+    "a signed distance": (
+        f'<link name="a">{BODY}<collision><geometry><cdf filename="a.cdf"/></geometry></collision></link>',
+        r"link 'a': <cdf> is a signed distance of Bullet.*ignore=\['height fields'\]",
+    ),
     "negative friction": (
         link("a") + link("b") + joint("j", "a", "b", '<dynamics friction="-1"/>'),
         "joint 'j': friction must be ≥ 0, got -1",
