@@ -47,9 +47,9 @@ class SceneEnv(gymnasium.Env):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"]}
 
     def __init__(self, rules: Rules, state: State, start: Start | None, rendering: Rendering):
-        self.rules, self.state = rules, state
+        self.rules, self.state = rules, rules.begun(state)
         self._roomy = _Roomy(rules, Rules.single)
-        self._first, self._start, self._step = state, start, 0
+        self._first, self._start, self._step = self.state, start, 0
         self.observation_space, self.action_space = _spaces(rules)
         self._rendering, self.render_mode = rendering, rendering.mode
         self.metadata = self.metadata | {"render_fps": rendering.fps}
@@ -58,8 +58,10 @@ class SceneEnv(gymnasium.Env):
         """Begin an episode; `options` may hold the `state` that it begins with."""
         super().reset(seed=seed)
         given = _given(options)
-        self.state = _begun(self.rules, self._first, self._start, self.np_random) if given is None else given
-        self.rules.scene.check_state(self.state)
+        if given is None:
+            self.state = _begun(self.rules, self._first, self._start, self.np_random)
+        else:
+            self.state = self.rules.begun(given)
         self._step = 0
         self._rendering.begin()
         self._follow(self.state)
@@ -106,9 +108,9 @@ class SceneVectorEnv(gymnasium.vector.VectorEnv):
 
     def __init__(self, rules: Rules, state: State, n_envs: int, start: Start | None, rendering: Rendering):
         self.rules, self.num_envs = rules, n_envs
-        self._first, self._start = state, start
+        self._first, self._start = rules.begun(state), start
         self._roomy = _Roomy(rules, Rules.many)
-        self.states = _repeated(state, n_envs)
+        self.states = _repeated(self._first, n_envs)
         self._steps, self._ended = np.zeros(n_envs, int), np.zeros(n_envs, bool)
         self.single_observation_space, self.single_action_space = _spaces(rules)
         self.observation_space = batch_space(self.single_observation_space, n_envs)
@@ -192,16 +194,14 @@ class SceneVectorEnv(gymnasium.vector.VectorEnv):
         """The states that `reset` was given, one for each episode."""
         n = self.num_envs
         if given.position.ndim == 2:
-            self.rules.scene.check_state(given)
-            return _repeated(given, n)
+            return _repeated(self.rules.begun(given), n)
         if given.position.ndim != 3 or len(given.position) != n:
             raise ValueError(
                 f"options['state'] must be a state, or {n} of them along a first axis, got positions of shape"
                 f" {given.position.shape}"
             )
-        for i in range(n):
-            self.rules.scene.check_state(jax.tree.map(lambda x, i=i: x[i], given))
-        return given
+        each = [self.rules.begun(jax.tree.map(lambda x, i=i: x[i], given)) for i in range(n)]
+        return jax.tree.map(lambda *x: jnp.stack(x), *each)
 
 
 def _spaces(rules: Rules) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -223,11 +223,7 @@ def _given(options: Mapping[str, Any] | None) -> State | None:
 
 
 def _begun(rules: Rules, first: State, start: Start | None, random: np.random.Generator) -> State:
-    if start is None:
-        return first
-    state = start(random)
-    rules.scene.check_state(state)
-    return state
+    return first if start is None else rules.begun(start(random))
 
 
 def _repeated(state: State, n: int) -> State:

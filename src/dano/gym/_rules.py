@@ -70,6 +70,17 @@ class Rules(eqx.Module):
         joints = 2 * layout.n_joints
         return 13 * len(layout.free) + joints + sum(e.shape[0] for e in errors) + 1, lower.shape[0]
 
+    def begun(self, state: State) -> State:
+        """A state where an episode may begin: checked, with the poses of bodies on joints as `q` says.
+
+        Steps keep it so, and do not look again.
+
+        Raises:
+            ValueError: If the state does not fit the scene.
+        """
+        self.scene.check_state(state)
+        return _jit(_filled)(self.scene, state)
+
     def controls(self, actions: Float[np.ndarray, "r m"]) -> Float[Array, "r m"]:
         """Controls [N, N m] of actions between −1 and 1; the ends are the actuators' bounds."""
         lower, upper = (np.asarray(bound) for bound in self.task.bounds())
@@ -158,7 +169,7 @@ class Rules(eqx.Module):
         def step(state: State, action: Array, count: Array):
             share = 0.5 * (jnp.clip(action.astype(lower.dtype), -1, 1) + 1)
             u = jnp.asarray(lower) + share * jnp.asarray(upper - lower)
-            after, solved, full = advanced(scene.filled(state), u)
+            after, solved, full = advanced(state, u)
             count = count + 1
             before, held, ended = (jax.tree.map(lambda x: x[None], x) for x in (state, u, after))
             reward, met, lengths = _judged(self, before, held, ended, (count >= self.n_steps)[None])
@@ -175,6 +186,10 @@ class Rules(eqx.Module):
 def _jit(function: Callable) -> Callable:
     jit: Callable = eqx.filter_jit
     return jit(function, compiler_options=compiler_options())
+
+
+def _filled(scene: Scene, state: State) -> State:
+    return scene.filled(state)
 
 
 def _errors(scene: Scene, task: Task, state: State) -> list[Array]:
