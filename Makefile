@@ -67,7 +67,7 @@ $(VENV)/.demo: $(VENV)/.pip $(PACKAGE)
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.pip $(PACKAGE)
-	$(INSTALL) --editable '.[dev,gym,view,mesh,mujoco,import,train,poses,batch,export,usd,pybullet]'
+	$(INSTALL) --editable '.[dev,gym,view,mesh,mujoco,import,train,poses,batch,export,usd,pybullet,step]'
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.pip $(PACKAGE)

@@ -6,6 +6,7 @@ import re
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,8 +25,46 @@ GROUPS = ("frax", "gymnasium", "mujoco", "pybullet_data", "example-robot-data", 
 TOLERANCE = 1e-7
 """Largest difference of a frame [m], or of the mass matrix by its largest entry: a link without mass that
 carries others gets a billionth of what it carries."""
+_HASTY = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 _EXAMPLES = "cmeel.prefix/share/example-robot-data"
 _OPTION = re.compile(r"ignore=(\[[^\]]*\])|(balance_inertia=True)")
+
+
+class _Posed(NamedTuple):
+    """A robot within its limits.
+
+    Attributes:
+        robot: The robot.
+        angles: Coordinates of those joints that have one.
+        position: Of the centres of mass of all bodies [m, W].
+        orientation: Theirs, wxyz.
+        mass: Generalised mass of those joints.
+    """
+
+    robot: Robot
+    angles: dict[str, float]
+    position: np.ndarray
+    orientation: np.ndarray
+    mass: np.ndarray
+
+    def apart(self, link: str, position: np.ndarray, turn: np.ndarray) -> float:
+        """By how much a link's frame differs."""
+        body, own, orientation = self.robot.frames[link]
+        if body is not None:
+            names = [each.name for each in self.robot.bodies]
+            i = names.index(body)
+            arm = quat_rotate(self.orientation[i], own - np.asarray(self.robot.bodies[i].com))
+            own, orientation = self.position[i] + arm, quat_multiply(self.orientation[i], orientation)
+        differences = np.asarray(own) - position, np.asarray(quat_to_matrix(jnp.asarray(orientation))) - turn
+        return float(max(np.abs(each).max() for each in differences))
+
+    def masses_apart(self, expected: np.ndarray) -> float:
+        """By how much the mass matrix differs, as a share of its largest entry."""
+        return float(np.abs(self.mass - expected).max() / np.abs(expected).max())
+
+
+_Posing = Callable[[tuple[str, ...]], _Posed]
+"""A robot with some joints turned."""
 
 
 def robot_files(group: str) -> list[Path]:
@@ -66,7 +105,8 @@ def judged(path: Path) -> tuple[Outcome, str]:
             return (Outcome.REFUSED_WRONGLY if wrongly else Outcome.REFUSED_RIGHTLY), said
         # Others have no balanced inertias to compare with.
         compared = [] if "balance_inertia" in options else references
-        worst = max((reference(robot) for reference in compared), default=0.0)
+        posing = lru_cache(partial(_posed, robot))
+        worst = max((reference(robot, posing) for reference in compared), default=0.0)
         if worst > TOLERANCE:
             return Outcome.WRONG, f"differs by {worst:.2g}"
         return (Outcome.REFUSED_RIGHTLY, first) if options else (Outcome.LOADS, "")
@@ -95,15 +135,16 @@ def _both(old: Any, new: Any) -> Any:
     return tuple(dict.fromkeys((*old, *new))) if isinstance(old, tuple) else new
 
 
-def _references(path: Path) -> list[Callable[[Robot], float]]:
+def _references(path: Path) -> list[Callable[[Robot, _Posing], float]]:
     """By how much a robot differs from what others read; of those that read the file."""
-    found: list[Callable[[Robot], float]] = []
+    found: list[Callable[[Robot, _Posing], float]] = []
     try:
         model = _compiled(path)
     except (ValueError, ET.ParseError):
         model = None
-    if model is not None:
-        found.append(lambda robot: _from_mujoco(robot, model))
+    # Of a file with soft bodies only, it reads nothing.
+    if model is not None and model.nbody > 1:
+        found.append(lambda robot, posed: _from_mujoco(robot, posed, model))
     if path.suffix == ".urdf" and importlib.util.find_spec("pinocchio") is not None:
         pinocchio = importlib.import_module("pinocchio")
         try:
@@ -111,7 +152,7 @@ def _references(path: Path) -> list[Callable[[Robot], float]]:
         except (ValueError, RuntimeError, ET.ParseError):
             return found
         if built.njoints > 1:
-            found.append(lambda robot: _from_pinocchio(robot, built))
+            found.append(lambda robot, posed: _from_pinocchio(robot, posed, built))
     return found
 
 
@@ -135,40 +176,7 @@ def _bare(path: Path) -> str:
     return ET.tostring(root).decode()
 
 
-class _Posed(NamedTuple):
-    """A robot within its limits.
-
-    Attributes:
-        robot: The robot.
-        angles: Coordinates of those joints that have one.
-        position: Of the centres of mass of all bodies [m, W].
-        orientation: Theirs, wxyz.
-        mass: Generalised mass of those joints.
-    """
-
-    robot: Robot
-    angles: dict[str, float]
-    position: np.ndarray
-    orientation: np.ndarray
-    mass: np.ndarray
-
-    def apart(self, link: str, position: np.ndarray, turn: np.ndarray) -> float:
-        """By how much a link's frame differs."""
-        body, own, orientation = self.robot.frames[link]
-        if body is not None:
-            names = [each.name for each in self.robot.bodies]
-            i = names.index(body)
-            arm = quat_rotate(self.orientation[i], own - np.asarray(self.robot.bodies[i].com))
-            own, orientation = self.position[i] + arm, quat_multiply(self.orientation[i], orientation)
-        differences = np.asarray(own) - position, np.asarray(quat_to_matrix(jnp.asarray(orientation))) - turn
-        return float(max(np.abs(each).max() for each in differences))
-
-    def masses_apart(self, expected: np.ndarray) -> float:
-        """By how much the mass matrix differs, as a share of its largest entry."""
-        return float(np.abs(self.mass - expected).max() / np.abs(expected).max())
-
-
-def _posed(robot: Robot, names: list[str]) -> _Posed:
+def _posed(robot: Robot, names: tuple[str, ...]) -> _Posed:
     scene = robot.scene()
     angles: dict[str, float] = {}
     for name, angle in zip(names, np.linspace(-0.4, 0.5, len(names)), strict=True):
@@ -176,14 +184,15 @@ def _posed(robot: Robot, names: list[str]) -> _Posed:
         bounded = angle if limits is None else np.clip(angle, *np.asarray(limits))
         angles[name] = float(bounded)
 
-    @eqx.filter_jit
+    # Run once: what is quick to compile is quick.
     def measured(scene: dano.Scene):
         state = robot.state(scene, angles)
         frames = scene.frames(state)
         return dano.mass_matrix(scene, state), frames.position, frames.orientation
 
     # Operations one after the other would be compiled one by one.
-    mass, position, orientation = measured(scene)
+    hasty: Callable = eqx.filter_jit
+    mass, position, orientation = hasty(measured, compiler_options=_HASTY)(scene)
     children = [joint.child for joint in scene.joints]
     base = 6 * len(scene.layout.free)
     order = [base + scene.layout.coordinates[children.index(robot.joint_names[name])] for name in names]
@@ -198,12 +207,12 @@ def _single(robot: Robot, name: str) -> bool:
     return name in robot.joint_names and kinds[name] in ("hinge", "slide")
 
 
-def _from_mujoco(robot: Robot, model: mujoco.MjModel) -> float:
+def _from_mujoco(robot: Robot, posing: _Posing, model: mujoco.MjModel) -> float:
     every = [model.joint(j).name for j in range(model.njnt)]
-    names = [name for name in every if name and _single(robot, name)]
+    names = tuple(sorted(name for name in every if name and _single(robot, name)))
     if not names or not robot.bodies:
         return 0.0
-    posed = _posed(robot, names)
+    posed = posing(names)
     angles = posed.angles
     data = mujoco.MjData(model)
     for name, angle in angles.items():
@@ -228,13 +237,13 @@ def _from_mujoco(robot: Robot, model: mujoco.MjModel) -> float:
     return max(worst, posed.masses_apart(mass[np.ix_(rows, rows)]))
 
 
-def _from_pinocchio(robot: Robot, model: Any) -> float:
+def _from_pinocchio(robot: Robot, posing: _Posing, model: Any) -> float:
     pinocchio = importlib.import_module("pinocchio")
     data = model.createData()
-    names = [name for name in list(model.names)[1:] if _single(robot, name)]
+    names = tuple(sorted(name for name in list(model.names)[1:] if _single(robot, name)))
     if not names:
         return 0.0
-    posed = _posed(robot, names)
+    posed = posing(names)
     angles = posed.angles
     q = pinocchio.neutral(model)
     for name, angle in angles.items():

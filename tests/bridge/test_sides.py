@@ -232,6 +232,13 @@ def test_outside_of_the_block_the_hull_stands_in(tmp_path):
         assert data.body("toy").xpos[2] == pytest.approx(0.02, abs=1e-3)
 
 
+@pytest.mark.slow
+def test_shipped_objects_go_by_their_names():
+    bridge = Bridge(world("plane"))
+    bridge.attach("toy", "soap", look=False)
+    assert bridge.compile().body("toy").mass[0] == pytest.approx(0.15)
+
+
 def test_a_size_that_changes_is_followed():
     spec = world("box")
     spec.body("toy").pos = [0, 0, 0.021]
@@ -250,3 +257,5 @@ def test_bad_input_is_named():
     bridge = Bridge(world("plane"))
     with pytest.raises((ValueError, FileNotFoundError), match=r"nowhere\.dano"):
         bridge.attach("toy", "nowhere.dano")
+    with pytest.raises(ValueError, match="got 'trained_bunn'; did you mean 'trained_bunny'"):
+        bridge.attach("toy", "trained_bunn")

@@ -65,6 +65,36 @@ def test_limits_stop_without_rebound():
     assert coordinates(falls.states)[0].min() < -0.55
 
 
+@pytest.mark.filterwarnings("ignore:joint 'rod' starts at")
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_start_beyond_a_limit_is_taken_back_at_a_stated_speed(side):
+    """At 1 rad/s whatever pulls and however heavy it is, until it rests at the limit."""
+    h, limit, start = 2e-3, 0.3, 0.5013
+    pulls, damping = 6.0, 2.0
+    limits = sorted([side * limit, -side * np.inf])
+    scene = hinged(h, gravity=(0, 0, 0), limits=tuple(limits), damping=damping)
+    controls = commanded(scene, 200, rod=dict(effort=side * pulls))
+
+    def reached(q, n):
+        begun = scene.initial_state(rod=dict(q=q))
+        return dano.simulate(scene, begun, controls=jax.tree.map(lambda x: x[:n], controls))
+
+    run = reached(side * start, 200)
+    assert bool(run.converged.all())
+    q = side * coordinates(run.states)[0][:, 0]
+    # A limit gives way by 1e-4 of what would accelerate the rod in a step.
+    slower = 1e-4 * h * (pulls + damping) / INERTIA
+    np.testing.assert_allclose(q[1:101], q[1] - (1 - slower) * h * np.arange(100), atol=1e-9)
+    np.testing.assert_allclose(q[1], start - h, atol=3e-4 * h)
+    np.testing.assert_allclose(q[150:], limit, atol=2e-4 * h * h * pulls / INERTIA)
+    # Nothing else decides where it is on its way back.
+    for n, slope in ((80, 1.0), (120, 0.0)):
+        by_q = jax.jit(jax.grad(lambda q, n=n: reached_angle(reached(q, n))))(jnp.asarray(side * start))
+        numeric = [float(reached_angle(reached(side * start + d, n))) for d in (1e-3, -1e-3)]
+        np.testing.assert_allclose(by_q, (numeric[0] - numeric[1]) / 2e-3, atol=1e-4)
+        np.testing.assert_allclose(by_q, slope, atol=1e-4)
+
+
 def test_motors():
     """A stiff position motor within its limits, a velocity motor, and an effort through a gear."""
     position = hinged(motor=dano.Motor("position", stiffness=1e6, damping=1e3, limits=(-20, 20)))

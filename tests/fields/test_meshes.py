@@ -1,7 +1,9 @@
 """Meshes as people have them: damaged by seeds, from CAD, in other units, of every kind of file."""
 
+import importlib.util
 import re
 import warnings
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -17,6 +19,7 @@ pytest.importorskip("igl")
 
 distance_of = eqx.filter_jit(lambda field, x: field.sdf_jet(x, 0))
 BALL = trimesh.creation.icosphere(4, 0.05)
+DATA = Path(__file__).parents[1] / "data" / "imports"
 BOX = trimesh.creation.box((0.1, 0.1, 0.1))
 
 
@@ -214,3 +217,15 @@ def test_an_object_of_several_groups(tmp_path):
     (tmp_path / "m.obj").write_text("\n".join(lines), encoding="utf-8")
     moments = silent(tmp_path / "m.obj").solid_moments()
     assert moments is not None and float(moments.volume) == pytest.approx(3e-3, rel=1e-9)
+
+
+def test_solids_of_cad_are_in_metres():
+    """A box of 100 × 70 × 50 mm as a STEP file; without its reader one line says what to install."""
+    path = DATA / "box.step"
+    if importlib.util.find_spec("cascadio") is None:
+        with pytest.raises(ImportError, match=r"reading .step needs cascadio: pip install 'dano\[step\]'"):
+            load_field(path)
+        return
+    moments = load_field(path, resolution=32).solid_moments()
+    np.testing.assert_allclose(moments.volume, 3.5e-4, rtol=1e-6)
+    np.testing.assert_allclose(moments.centroid, (0.05, 0.035, 0.025), atol=1e-6)

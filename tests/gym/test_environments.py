@@ -112,9 +112,74 @@ def test_many_episodes_are_single_ones(pushed):
     assert (seen[:, -1] == 1).all() and len(set(seen[:, 0]) | set(first[:, 0])) == 6
 
 
+def test_a_state_to_begin_with_is_taken_by_one_and_by_many(pushed):
+    """One state for all episodes or one for each; other options are no options."""
+    scene, state, task = pushed
+    many = make_vector_env(scene, state, task, 2)
+    here, there = (scene.initial_state(puck=dict(position=(x, 0, 0))) for x in (0.2, 0.4))
+    seen, _ = many.reset(options={"state": there})
+    np.testing.assert_allclose(seen[:, 0], 0.4)
+    each = jax.tree.map(lambda *x: np.stack(x), here, there)
+    seen, _ = many.reset(options={"state": each})
+    np.testing.assert_allclose(seen[:, 0], [0.2, 0.4])
+    # An episode that had ended begins where it is told to.
+    many.step(np.zeros((2, 3), np.float32))
+    for env in (make_env(scene, state, task), many):
+        with pytest.raises(ValueError, match="options must be state, got 'sate'; did you mean 'state'"):
+            env.reset(options={"sate": here})
+        with pytest.raises(ValueError, match=r"options\['state'\] must be a dano.State"):
+            env.reset(options={"state": 0.3})
+    with pytest.raises(ValueError, match="a state, or 2 of them"):
+        many.reset(options={"state": jax.tree.map(lambda x: x[:1], each)})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [1, 2])
+def test_steps_get_the_room_that_they_need(n, monkeypatch):
+    """Where more touches than a launch has room for, a step is made again with more."""
+    a, floor = dano.Body("a", dano.Box((0.1, 0.1, 0.1)), mass=1.0), dano.HalfSpace()
+    bodies = [a, dano.Body("floor", floor, fixed=True)]
+    scene = dano.Scene.create(bodies, contacts=[dano.Contact("a", "floor")], timestep=2e-3)
+    state = scene.initial_state(a=dict(position=(0, 0, 0.1)))
+    task = dano.Task(3, [dano.Actuator("a", limit=1.0)], [dano.Goal("a", position=(1, 0, 0))])
+    roomy, tight = dano.VariationalEngine(capacity=32), dano.VariationalEngine(capacity=1)
+    monkeypatch.setattr(
+        type(tight), "enlarged", lambda self, scene, factor: dano.VariationalEngine(capacity=factor)
+    )
+    found = []
+    for engine in (roomy, tight):
+        made = make_env if n == 1 else lambda *args, **kw: make_vector_env(*args, n, **kw)
+        env = made(scene, state, task, engine=engine)
+        env.reset(seed=0)
+        action = np.full(env.action_space.shape, 0.5, np.float32)
+        *_, (seen, reward, _, _, info) = [env.step(action) for _ in range(3)]
+        assert np.all(info["converged"])
+        found.append((seen, reward))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_episodes_on_several_devices_are_those_on_one(pushed, monkeypatch):
+    """By the way that spreads them over devices, here over one."""
+    scene, state, task = pushed
+    found = []
+    for count in (1, 2):
+        monkeypatch.setattr(jax, "local_device_count", lambda count=count: count)
+        many = make_vector_env(scene, state, task, 2, repeat=7)
+        many.reset(options={"state": state})
+        # The third step is the last, the fourth begins again.
+        found.append([many.step(np.full((2, 3), 0.1 * (k + 1), np.float32))[:4] for k in range(5)])
+    for one, other in zip(*found, strict=True):
+        for x, y in zip(one, other, strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-12)
+    assert found[0][2][3].all() and not found[0][3][1].any()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (dict(render_mode="rgb"), "render_mode must be one of rgb_array, human, got 'rgb'"),
+        (dict(render_mode="rgb_array", size=(31, 40)), "size must be two even numbers"),
         (dict(repeat=0), "repeat must be .* got 0"),
         (dict(shaping=-1.0), "shaping must be finite and ≥ 0, got -1.0"),
     ],
@@ -124,3 +189,5 @@ def test_wrong_options_are_said(pushed, options, message):
         make_env(*pushed, **options)
     with pytest.raises(ValueError, match="n_envs must be"):
         make_vector_env(*pushed, n_envs=0)
+    with pytest.raises(ValueError, match="render_mode must be one of rgb_array, got 'human'"):
+        make_vector_env(*pushed, n_envs=2, render_mode="human")

@@ -10,6 +10,9 @@ STICKING = 1e-7
 STOP = 1e4
 """Stiffness of a limit, times h² and over what the coordinate weighs."""
 
+CLOSING = 1.0
+"""Largest speed at which a limit takes a joint back [rad/s or m/s]."""
+
 
 class Term(NamedTuple):
     """A force clip(slope (y − centre), least, most) on the coordinate in a row of y."""
@@ -79,7 +82,10 @@ def smooth_terms(joint, factor, row, q, old, h):
 
 
 def kinked_terms(joint, factor, row, q, weight, h):
-    """Friction that sticks up to `STICKING`, and limits as springs of `STOP` times weight over h²."""
+    """Friction that sticks up to `STICKING`, and limits as springs of `STOP` times weight over h².
+
+    A limit that was passed is closed at `CLOSING`.
+    """
     terms = []
     if joint.friction is not None:
         most = abs(factor) * float(joint.friction)
@@ -87,9 +93,9 @@ def kinked_terms(joint, factor, row, q, weight, h):
     if joint.limits is not None:
         (least, most), slope = joint.limits, STOP * weight / h
         if np.isfinite(least):
-            terms.append(Term("limit", row, slope, (least - q) / h, most=0.0))
+            terms.append(Term("limit", row, slope, min((least - q) / h, CLOSING), most=0.0))
         if np.isfinite(most):
-            terms.append(Term("limit", row, slope, (most - q) / h, least=0.0))
+            terms.append(Term("limit", row, slope, max((most - q) / h, -CLOSING), least=0.0))
     return terms
 
 

@@ -142,6 +142,15 @@ def test_a_stuck_joint_holds_and_a_limit_stops():
     assert found == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.parametrize("joint", ["arm", "door", "bolt"])
+def test_joints_beyond_their_limits(engine, joint):
+    """They come back at the speed that the reference says, with all that hangs on them."""
+    scene = scenes.tree()
+    with pytest.warns(RuntimeWarning, match=f"joint '{joint}' starts at"):
+        start = scene.initial_state(**{joint: dict(q=0.6)})
+    assert_step(engine, scene, start)
+
+
 @pytest.mark.parametrize("speed", [0.5, 100.0])
 def test_loops(engine, speed):
     """A linkage stays closed and moves as the reference says; it holds more than there is to hold."""

@@ -103,6 +103,15 @@ REFUSED = {
         link("a") + link("b", BODY.replace('ixx="1"', 'ixx="2.1"')) + joint("j", "a", "b"),
         r"5 % too much; balance_inertia=True",
     ),
+    "a soft body alone": (
+        '<deformable name="torus"/>',
+        "must hold a link, got the soft body 'torus' alone: dano has rigid bodies only",
+    ),
+    "a soft body": (link("a") + '<deformable name="d"/>', r"'d' is a soft body.*ignore=\['soft bodies'\]"),
+    "a signed distance": (
+        f'<link name="a">{BODY}<collision><geometry><cdf filename="a.cdf"/></geometry></collision></link>',
+        r"link 'a': <cdf> is a signed distance of Bullet.*ignore=\['height fields'\]",
+    ),
     "negative friction": (
         link("a") + link("b") + joint("j", "a", "b", '<dynamics friction="-1"/>'),
         "joint 'j': friction must be ≥ 0, got -1",
@@ -187,7 +196,7 @@ def test_starts_beyond_limits_and_efforts_are_said(tmp_path):
     robot = dano.load_urdf(path)
     scene = robot.scene(timestep=2e-3)
     with pytest.warns(
-        RuntimeWarning, match=r"joint 'j' starts at 0 rad, beyond its limits 0.5 to 1.* 250 rad/s"
+        RuntimeWarning, match=r"joint 'j' starts at 0 rad, beyond its limits 0.5 to 1.* at 1 rad/s"
     ):
         robot.state(scene)
     with pytest.warns(RuntimeWarning, match="joint 'arm' starts at 2 rad, beyond its limits"):

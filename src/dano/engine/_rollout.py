@@ -451,7 +451,8 @@ def _say(scene: Scene, following: State, report: Report) -> None:
         warnings.warn(
             f"{names} turns by more than 60° in a step, first in step {np.flatnonzero(fast.any(axis=1))[0]}: "
             "the spin is kept, precession is not resolved; "
-            f"use a timestep of {2 * RESOLVED / spins.max():.2g} s or less",
+            f"use a timestep of {2 * RESOLVED / spins.max():.2g} s or less"
+            + (", or smaller gains if a controller of yours drives it" if scene.joints else ""),
             RuntimeWarning,
             stacklevel=3,
         )

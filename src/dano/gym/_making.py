@@ -1,15 +1,25 @@
 """Environments from scenes and tasks."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 
-from dano.checks import checked_count, checked_function, checked_kind, checked_number, checked_optional
+from dano.checks import (
+    checked_choice,
+    checked_count,
+    checked_function,
+    checked_kind,
+    checked_number,
+    checked_optional,
+)
 from dano.engine import AbstractEngine, VariationalEngine
 from dano.extras import optional
+from dano.gym._rendering import MODES, Rendering
 from dano.gym._rules import Rules, Start
 from dano.plan import Task
 from dano.scene import Scene, State
+from dano.vision import Camera
 
 _NEED = "environments need gymnasium"
 
@@ -23,6 +33,9 @@ def make_env(
     repeat: int = 1,
     shaping: float = 1.0,
     engine: AbstractEngine | None = None,
+    render_mode: str | None = None,
+    size: tuple[int, int] = (640, 400),
+    camera: Camera | None = None,
 ) -> Any:
     """A `gymnasium.Env` of a scene and a task.
 
@@ -32,6 +45,9 @@ def make_env(
     `info` has `reached`, `errors` of the goals by name, and `converged`. For observations and rewards see
     `Rules`. The state is `env.unwrapped.state`, and `reset(options={"state": …})` begins with another.
 
+    With `render_mode="rgb_array"`, `render()` gives a picture of the state. With "human" each step is shown
+    in the browser, no faster than it is in life; the page's address is printed.
+
     Args:
         scene: The scene.
         state: Where episodes begin.
@@ -40,15 +56,19 @@ def make_env(
         repeat: Steps of the scene in a step of the environment.
         shaping: Reward for each unit by which the goals' errors fall.
         engine: Default `VariationalEngine()`.
+        render_mode: "rgb_array", "human" (extra `view`), or None.
+        size: Width and height of pictures [pixels], even numbers.
+        camera: From where they are taken, in place of `size`; default: a camera that sees all.
 
     Raises:
-        ImportError: Without the extra `gym`.
+        ImportError: Without the extra `gym`, or for "human" without `view`.
         ValueError: If the state or the task does not fit the scene, or an option is out of range.
     """
     optional("gymnasium", _NEED, "gym")
     from dano.gym._environments import SceneEnv
 
-    return SceneEnv(_checked(scene, state, task, start, repeat, shaping, engine), state, start)
+    rules = _checked(scene, state, task, start, repeat, shaping, engine)
+    return SceneEnv(rules, state, start, _rendering(rules, state, render_mode, MODES, size, camera))
 
 
 def make_vector_env(
@@ -61,10 +81,15 @@ def make_vector_env(
     repeat: int = 1,
     shaping: float = 1.0,
     engine: AbstractEngine | None = None,
+    render_mode: str | None = None,
+    size: tuple[int, int] = (640, 400),
+    camera: Camera | None = None,
 ) -> Any:
-    """A `gymnasium.vector.VectorEnv` of many episodes, whose steps are one call of `dano.rollouts`.
+    """A `gymnasium.vector.VectorEnv` of many episodes, whose steps are one launch of the engine.
 
     Episodes that end begin again in the next step, as `AutoresetMode.NEXT_STEP` says.
+    `reset(options={"state": …})` begins all with another state, or each with its own: then arrays of the
+    state have a first axis of `n_envs`.
 
     Args:
         scene: As in `make_env`, as are the others.
@@ -75,6 +100,9 @@ def make_vector_env(
         repeat: Steps of the scene in a step of the environment.
         shaping: Reward for each unit by which the goals' errors fall.
         engine: Default `VariationalEngine()`.
+        render_mode: "rgb_array", with which `render()` gives a picture of each episode, or None.
+        size: Width and height of pictures [pixels], even numbers.
+        camera: From where they are taken, in place of `size`.
 
     Raises:
         ImportError: Without the extra `gym`.
@@ -84,7 +112,10 @@ def make_vector_env(
     from dano.gym._environments import SceneVectorEnv
 
     n_envs = checked_count("n_envs", n_envs)
-    return SceneVectorEnv(_checked(scene, state, task, start, repeat, shaping, engine), state, n_envs, start)
+    rules = _checked(scene, state, task, start, repeat, shaping, engine)
+    # A page shows one episode.
+    rendering = _rendering(rules, state, render_mode, MODES[:1], size, camera, n_envs)
+    return SceneVectorEnv(rules, state, n_envs, start, rendering)
 
 
 def _checked(
@@ -107,3 +138,18 @@ def _checked(
     repeat = checked_count("repeat", repeat)
     shaping = checked_number("shaping", shaping, least=0)
     return Rules(scene, task, engine or VariationalEngine(), repeat, shaping)
+
+
+def _rendering(
+    rules: Rules,
+    state: State,
+    mode: str | None,
+    modes: Sequence[str],
+    size: tuple[int, int],
+    camera: Camera | None,
+    n_envs: int = 1,
+) -> Rendering:
+    if mode is not None:
+        checked_choice("render_mode", mode, modes)
+    period = rules.repeat * float(rules.scene.timestep)
+    return Rendering(rules.scene, state, mode, period, size, camera, n_envs)

@@ -1,5 +1,6 @@
 """What an environment shows, what it rewards, and when an episode ends: plain functions of many states."""
 
+import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
@@ -21,6 +22,13 @@ Single = Callable[
 """State, action between −1 and 1, steps so far → state after it, observation, reward, whether all goals are
 met, lengths of the goals' errors, whether the steps were solved, whether more touched than there is room
 for."""
+
+Many = Callable[
+    [State, Float[np.ndarray, "r m"], Int[np.ndarray, " r"], Bool[np.ndarray, " r"]],
+    tuple[State, Array, Array, Array, Array, Array, Array],
+]
+"""The same of r episodes, and whether each begins. Those that begin stay where they are, get no reward and
+have met nothing."""
 
 
 class Rules(eqx.Module):
@@ -62,6 +70,17 @@ class Rules(eqx.Module):
         joints = 2 * layout.n_joints
         return 13 * len(layout.free) + joints + sum(e.shape[0] for e in errors) + 1, lower.shape[0]
 
+    def begun(self, state: State) -> State:
+        """A state where an episode may begin: checked, with the poses of bodies on joints as `q` says.
+
+        Steps keep it so, and do not look again.
+
+        Raises:
+            ValueError: If the state does not fit the scene.
+        """
+        self.scene.check_state(state)
+        return _jit(_filled)(self.scene, state)
+
     def controls(self, actions: Float[np.ndarray, "r m"]) -> Float[Array, "r m"]:
         """Controls [N, N m] of actions between −1 and 1; the ends are the actuators' bounds."""
         lower, upper = (np.asarray(bound) for bound in self.task.bounds())
@@ -97,9 +116,38 @@ class Rules(eqx.Module):
     def single(self) -> "Single":
         """A step of one episode, compiled as one function of its state, its action and its count.
 
-        Many episodes go through `advanced`, which spreads them over the machine; of one that way takes some
-        milliseconds, of which physics are a hundredth.
+        By `advanced` a step takes some milliseconds, of which physics are a hundredth.
         """
+        return jax.jit(self._stepping(), compiler_options=compiler_options())
+
+    def many(self) -> "Many":
+        """A step of many episodes, compiled as one function: one launch of the engine for all of them.
+
+        It computes on one device; `advanced` spreads episodes over several.
+        """
+        step = self._stepping()
+
+        def stepped(states: State, actions: Array, counts: Array, begins: Array):
+            after, seen, rewards, met, lengths, solved, full = jax.vmap(step)(states, actions, counts)
+            first = _observations(self.scene, self.task, states, jnp.ones(len(begins), seen.dtype))
+            kept = jax.tree.map(
+                lambda old, new: jnp.where(begins.reshape(-1, *(1,) * (old.ndim - 1)), old, new),
+                states,
+                after,
+            )
+            seen = jnp.where(begins[:, None], first, seen)
+            full, solved = full & ~begins, solved | begins
+            return kept, seen, jnp.where(begins, 0, rewards), met & ~begins, lengths, solved, full
+
+        return jax.jit(stepped, compiler_options=compiler_options())
+
+    def enlarged(self, factor: int) -> "Rules | None":
+        """The same with room for so many times as many contacts; None if the engine's room is fixed."""
+        engine = self.engine.enlarged(self.scene, factor)
+        return None if engine is None else dataclasses.replace(self, engine=engine)
+
+    def _stepping(self) -> Callable:
+        """What `single` compiles."""
         scene, task, engine, repeat = self.scene, self.task, self.engine, self.repeat
         prepared = _jit(lambda scene: engine.prepare(scene))(scene)
         lower, upper = (np.asarray(bound) for bound in task.bounds())
@@ -121,7 +169,7 @@ class Rules(eqx.Module):
         def step(state: State, action: Array, count: Array):
             share = 0.5 * (jnp.clip(action.astype(lower.dtype), -1, 1) + 1)
             u = jnp.asarray(lower) + share * jnp.asarray(upper - lower)
-            after, solved, full = advanced(scene.filled(state), u)
+            after, solved, full = advanced(state, u)
             count = count + 1
             before, held, ended = (jax.tree.map(lambda x: x[None], x) for x in (state, u, after))
             reward, met, lengths = _judged(self, before, held, ended, (count >= self.n_steps)[None])
@@ -129,7 +177,7 @@ class Rules(eqx.Module):
             seen = _observations(scene, task, ended, left[None])
             return after, seen[0], reward[0], met[0], lengths[0], solved, full
 
-        return jax.jit(step, compiler_options=compiler_options())
+        return step
 
     def _example(self) -> State:
         return self.scene.initial_state()
@@ -138,6 +186,10 @@ class Rules(eqx.Module):
 def _jit(function: Callable) -> Callable:
     jit: Callable = eqx.filter_jit
     return jit(function, compiler_options=compiler_options())
+
+
+def _filled(scene: Scene, state: State) -> State:
+    return scene.filled(state)
 
 
 def _errors(scene: Scene, task: Task, state: State) -> list[Array]:

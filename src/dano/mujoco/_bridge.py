@@ -21,6 +21,7 @@ from dano.mujoco._table import body_index, Chooser, MOST, Table
 from dano.mujoco._things import Thing, thing_of
 from dano.names import did_you_mean
 from dano.objects import NeuralObject
+from dano.scene_file import load_object
 
 _LONGEST_FALL = 0.1
 """Way that gravity adds to a body's in a step, as a share of the body's size."""
@@ -93,7 +94,7 @@ class Bridge:
 
         Args:
             body: Name of a body.
-            obj: The object, or the path of its file (`.dano`).
+            obj: The object; or what `dano.load_object` takes: its file, a mesh, the name of a shipped one.
             position: Origin of the object's field frame in the body frame [m].
             orientation: Its axes, wxyz, field → body.
             contype: Bits that say with what it collides, as MuJoCo's of a geom.
@@ -114,7 +115,7 @@ class Bridge:
         if body in self._things:
             raise ValueError(f"body must not have an object yet, got {body!r} twice; use another body")
         if isinstance(obj, str | os.PathLike):
-            obj = NeuralObject.load(obj)
+            obj = load_object(obj)
         if not isinstance(obj, NeuralObject):
             raise ValueError(f"obj must be a NeuralObject or the path of one, got {type(obj).__name__}")
         place = np.asarray(checked_array("position", position, (3,)), np.float64)

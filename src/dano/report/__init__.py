@@ -12,6 +12,7 @@ from dano.report._identification import (
     write_film_report as write_film_report,
     write_identification_report as write_identification_report,
 )
+from dano.report._live import Pictures as Pictures
 from dano.report._object import draw_object as draw_object
 from dano.report._plan import draw_controls as draw_controls, film_plan as film_plan
 from dano.report._resample import frame_count as frame_count
@@ -31,6 +32,7 @@ from dano.report._video import (
     render_trajectory as render_trajectory,
 )
 from dano.report.viewing import (
+    LiveView as LiveView,
     view as view,
     view_capture as view_capture,
     view_field as view_field,

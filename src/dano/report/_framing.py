@@ -108,7 +108,7 @@ def cameras_for(seen: Seen, step: float, size: tuple[int, int], how: str = "auto
         return [fixed] * len(moving)
     if how == "auto" and _least_fill([fixed] * len(moving), moving) >= LEAST:
         return [fixed] * len(moving)
-    direction = _direction(seen)
+    direction = view_direction(seen)
     nearest = _following(moving, direction, 0, size)
     # Bodies far apart cannot fill it: then nearly what can be had.
     wanted = min(LEAST, 0.9 * _least_fill(nearest, moving))
@@ -130,7 +130,7 @@ def _following(
     """
     n = len(moving)
     near = [slice(max(0, i - reach), min(n, i + reach + 1)) for i in range(n)]
-    single = [_framed(moving[part].reshape(-1, 3), direction, *size) for part in near]
+    single = [framed(moving[part].reshape(-1, 3), direction, *size) for part in near]
     places = np.array([camera.position for camera in single])
     ahead = single[0].axes[2]
     cameras = []
@@ -142,15 +142,16 @@ def _following(
     return cameras
 
 
-def _framed(points: Float[np.ndarray, "n 3"], direction: np.ndarray, width: int, height: int) -> Camera:
+def framed(points: Float[np.ndarray, "n 3"], direction: np.ndarray, width: int, height: int) -> Camera:
+    """The nearest camera of a direction that sees all points; some camera where there are none."""
+    if not len(points):
+        return Camera((3.0, -8.0, 4.0), width=width, height=height)
     none = np.zeros(len(points))
     return Camera.framing(points, none, direction=direction, width=width, height=height, margin=_MARGIN)
 
 
 def _fixed(seen: Seen, width: int, height: int) -> Camera:
-    if not len(seen.points):
-        return Camera((3.0, -8.0, 4.0), width=width, height=height)
-    return _framed(seen.points, _direction(seen), width, height)
+    return framed(seen.points, view_direction(seen), width, height)
 
 
 def _least_fill(cameras: Sequence[Camera], moving: Float[np.ndarray, "frames n 3"]) -> float:
@@ -174,8 +175,10 @@ def _outline(body: Body, shape: AbstractShape) -> Float[np.ndarray, "n 3"]:
     return 0.5 * (lower + upper) + 0.5 * (upper - lower) * corners
 
 
-def _direction(seen: Seen) -> np.ndarray:
+def view_direction(seen: Seen) -> np.ndarray:
     """Where cameras look: across the main direction of motion, a little from the side and from above."""
+    if not len(seen.points):
+        return np.array([0.34, 0.94, _DOWN])
     right = _main_direction(seen.points, [path[:, :2] for path in seen.paths])
     # Seen a little from the side, motion along the screen still shows depth.
     ahead = np.array([-right[1], right[0]])

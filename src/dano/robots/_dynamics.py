@@ -126,15 +126,18 @@ def joint_reactions(
     return jnp.concatenate([passed[:, :3], about], axis=1)
 
 
-def joint_control(scene: Scene, effort: Float[Array, " k"]) -> Control:
-    """The control of a step with efforts of all joint coordinates [N m or N].
+def joint_control(
+    scene: Scene, effort: Float[Array, " k"], command: Float[Array, " j"] | None = None
+) -> Control:
+    """The control of a step with efforts of all joint coordinates [N m or N], and commands of their motors.
 
     Args:
         scene: The scene.
         effort: Of the joints alone, or generalised forces, whose last entries are those of the joints.
+        command: What the motors of all joint coordinates are told; what has none takes no notice.
 
     Raises:
-        ValueError: If there are fewer or more efforts, or one is not finite.
+        ValueError: If there are fewer or more efforts or commands, or one is not finite.
     """
     checked_kind("scene", scene, Scene)
     effort = checked_floating("effort", effort)
@@ -145,7 +148,9 @@ def joint_control(scene: Scene, effort: Float[Array, " k"]) -> Control:
         )
     effort = checked_array("effort", effort, effort.shape)
     still = jnp.zeros((len(scene.bodies), 3), scene.timestep.dtype)
-    return Control(still, still, effort[effort.shape[0] - scene.layout.n_joints :])
+    if command is not None:
+        command = checked_array("command", command, (scene.layout.n_joints,))
+    return Control(still, still, effort[effort.shape[0] - scene.layout.n_joints :], command)
 
 
 def generalised_velocities(scene: Scene, state: State) -> Float[Array, " k"]:

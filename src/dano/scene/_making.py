@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from dano.contact import CHUNK, ContactParams
 from dano.maths import is_traced
 from dano.names import did_you_mean
+from dano.physics.trees.sizes import CLOSES
 from dano.scene._bodies import Body
 from dano.scene._contacts import Contact
 from dano.scene._joints import Joint, Layout, layout_of
@@ -121,7 +122,7 @@ def warn_of_limits(
     timestep: Float[Array, ""],
     names: Mapping[str, str],
 ) -> None:
-    """Warn if joints are beyond their limits, from where their first step takes them back.
+    """Warn if joints are beyond their limits, which take them back at a speed of their own.
 
     Args:
         layout: Of the scene.
@@ -149,7 +150,7 @@ def warn_of_limits(
     more = f" (and {len(found) - 1} other joints)" if len(found) > 1 else ""
     warnings.warn(
         f"joint {name!r} starts at {at:.4g} {unit}, beyond its limits {least:.4g} to {most:.4g}{more}:"
-        f" the first step takes it there, at {beyond / float(timestep):.3g} {unit}/s",
+        f" they take it back at {min(beyond / float(timestep), CLOSES):.3g} {unit}/s",
         RuntimeWarning,
         stacklevel=4,
     )

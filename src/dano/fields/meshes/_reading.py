@@ -17,7 +17,7 @@ MESH_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".3mf", ".dae"
 """How the names of files of meshes end."""
 
 _NEEDS = {".dae": "collada", ".3mf": "lxml", ".step": "cascadio", ".stp": "cascadio"}
-_PACKAGES = {"collada": "pycollada", "lxml": "lxml", "cascadio": "cascadio"}
+_EXTRAS = {"cascadio": "step"}
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048, "um": 1e-6}
 """Metres in the units that meshes may have."""
@@ -100,9 +100,8 @@ def _loaded(path: Path) -> Any:
         raise ValueError(f"{path}: no such file; expected a triangle mesh")
     needed = _NEEDS.get(path.suffix.lower())
     if needed is not None and not is_installed(needed):
-        raise ImportError(
-            f"{path}: reading {path.suffix} needs {_PACKAGES[needed]}: pip install {_PACKAGES[needed]}"
-        )
+        extra = _EXTRAS.get(needed, "mesh")
+        raise ImportError(f"{path}: reading {path.suffix} needs {needed}: pip install 'dano[{extra}]'")
     try:
         return trimesh.load_scene(path)
     except Exception as error:  # each of trimesh's readers raises its own kinds

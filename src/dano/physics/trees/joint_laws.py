@@ -15,15 +15,9 @@ one iteration finds the mode (stick, slip, limit) of each joint as if the joints
 import warp as wp
 
 from dano.physics.real import INFINITY, real, ZERO
+from dano.physics.trees.sizes import CLOSES, STICKS, STOPS
 
-STICKS = 1e-7
-"""Speed [rad/s or m/s] at which friction has its full size: joints that stick creep by no more."""
-STOPS = 1e4
-"""How much stiffer a limit is than the effective mass over h².
-
-With an acceleration a, a coordinate ends a h² times the inverse of this beyond its limit.
-"""
-_STICKS, _STOPS = wp.constant(real(STICKS)), wp.constant(real(STOPS))
+_STICKS, _STOPS, _CLOSES = wp.constant(real(STICKS)), wp.constant(real(STOPS)), wp.constant(real(CLOSES))
 
 
 @wp.struct
@@ -143,11 +137,11 @@ def joint_ramps(law: JointLaw, drive: JointDrive, h: real, mass: real) -> Ramps:
     stiff = _STOPS * mass / h
     if wp.abs(law.least) < INFINITY:
         ramps.lower.slope = stiff
-        ramps.lower.centre = (law.least - drive.q) / h
+        ramps.lower.centre = wp.min((law.least - drive.q) / h, _CLOSES)
     ramps.lower.least = -INFINITY
     if wp.abs(law.most) < INFINITY:
         ramps.upper.slope = stiff
-        ramps.upper.centre = (law.most - drive.q) / h
+        ramps.upper.centre = wp.max((law.most - drive.q) / h, -_CLOSES)
     ramps.upper.most = INFINITY
     if not drive.constant:
         ramps.motor = motor_ramp(law, drive, h)

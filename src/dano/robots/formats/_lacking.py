@@ -27,7 +27,7 @@ IGNORABLE = {
     "height fields": "shapes that are height fields or signed distances",
     "mimics of nothing": "joints that mimic one which does not exist",
     "nonlinear springs": "springs and dampers that are not linear",
-    "soft bodies": "flexes",
+    "soft bodies": "flexes and deformable bodies",
     "tendons": "tendons, and what hangs on them",
     WEIGHTLESS: "joints that move nothing with mass: they stay where they are",
 }

@@ -40,6 +40,10 @@ _DEFINITIONS = ("}macro", "}property", "}arg")
 _ABOVE = 6
 
 
+_FIELDS = {"cdf": "a signed distance of Bullet", "heightmap": "a height field"}
+"""Shapes that are files of numbers."""
+
+
 def read_urdf(path: Path) -> Description:
     """Read a URDF file.
 
@@ -56,6 +60,11 @@ def read_urdf(path: Path) -> Description:
         raise ValueError(f"{path} must be a URDF file with a <robot>, got <{root.tag}>")
     _check_macros(path, root)
     reader = _Reader(path)
+    soft = [row.get("name", "") for row in root.findall("deformable")]
+    rigid = "dano has rigid bodies only"
+    if soft and root.find("link") is None:
+        raise ValueError(f"{path} must hold a link, got the soft body {soft[0]!r} alone: {rigid}")
+    reader.lacking += [Lacking("soft bodies", f"{name!r} is a soft body: {rigid}") for name in soft]
     links = tuple(reader.link(row) for row in root.findall("link"))
     joints = [reader.joint(row) for row in root.findall("joint")]
     fixed = {joint.name: 0.0 for joint in joints if joint.kind == "weld"}
@@ -139,7 +148,8 @@ class _Reader:
         name = row.get("name", "")
         self.where = f"{self.path}: link {name!r}"
         solids, visuals = (
-            tuple(self.solid(part) for part in row.findall(role)) for role in ("collision", "visual")
+            tuple(made for part in row.findall(role) if (made := self.solid(part)) is not None)
+            for role in ("collision", "visual")
         )
         inertial = row.find("inertial")
         if inertial is None:
@@ -195,7 +205,7 @@ class _Reader:
             mimics=follows,
         )
 
-    def solid(self, row: ET.Element) -> Solid:
+    def solid(self, row: ET.Element) -> Solid | None:
         geometry, place = self.needed(row, "geometry"), self.place(row)
         shapes = list(geometry)
         if not shapes:
@@ -220,6 +230,10 @@ class _Reader:
             # Of Bullet.
             normal = np.array(self.numbers(shape, "normal", 3, (0.0, 0.0, 1.0)))
             return Solid("plane", (), Placed(place.position, _upright(place, normal)))
+        if shape.tag in _FIELDS:
+            text = f"{self.named} <{shape.tag}> is {_FIELDS[shape.tag]}: dano reads no such file here"
+            self.lacking.append(Lacking("height fields", text))
+            return None
         valid = "box, sphere, cylinder, capsule, plane, mesh"
         raise ValueError(f"{self.where}: geometry must be one of {valid}, got {shape.tag!r}")
 

@@ -1,0 +1,1 @@
+"""Environments: how long their steps take, and Gymnasium's models beside MuJoCo."""
