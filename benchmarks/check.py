@@ -9,7 +9,7 @@ import sys
 from benchmarks._measure import Row
 from benchmarks.figures import RESULTS, stored_row
 
-TIMES = ("ns", "µs", "ms", "s", "s/set", "×", "rays/s")
+TIMES = ("ns", "µs", "ms", "s", "s/set", "×", "rays/s", "1/s")
 
 
 def missed() -> list[tuple[str, Row]]:
