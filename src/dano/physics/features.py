@@ -1,7 +1,7 @@
 """What the kernels of a scene must know: code for anything else is left out when they are built.
 
 These are the values of a build that knows everything. `dano.engine` builds kernels for a scene with those
-that it needs (see `dano.engine.launching._instances`), which compiles and runs several times as fast.
+that it needs (see `dano.native._instances`), which compiles and runs several times as fast.
 """
 
 KINDS = frozenset(range(32))

@@ -1,6 +1,6 @@
 """Arithmetic of structures, number by number. Warp has none: it is written here from a structure's fields.
 
-A field more needs nothing else. Whole numbers take no part.
+A field more needs nothing else. Only real numbers take part.
 """
 
 import linecache
@@ -9,9 +9,9 @@ from typing import Any
 
 import warp as wp
 
-from dano.physics.real import mat33, mat66, quat, real, vec3, vec4, vec6
+from dano.physics.real import mat33, mat66, real
 
-_VECTORS, _MATRICES = (vec3, vec4, vec6, quat), (mat33, mat66)
+_MATRICES, _OTHERS = (mat33, mat66), (int, bool, wp.int32, wp.bool)
 
 
 def product_of(structure: Any) -> Any:
@@ -54,9 +54,9 @@ def addition_of(structure: Any) -> Any:
 
 
 def fields_of(structure: Any) -> list[tuple[str, Any]]:
-    """Names and types of a structure's fields, but whole numbers."""
+    """Names and types of a structure's fields that are real numbers, or made of them."""
     kinds = ((name, var.type) for name, var in structure.vars.items())
-    return [(name, kind) for name, kind in kinds if kind not in (int, wp.int32)]
+    return [(name, kind) for name, kind in kinds if kind not in _OTHERS]
 
 
 def plain_fields(structure: Any) -> list[tuple[str, Any]]:
