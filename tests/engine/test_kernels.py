@@ -232,7 +232,9 @@ def test_single_precision(heap):
     step = dano.step(short(scene), short(states[2]))
     assert step.velocity.dtype == jnp.float32
     np.testing.assert_allclose(step.velocity, exact.velocity, atol=2e-2)
-    np.testing.assert_allclose(step.position, exact.position, atol=1e-4)
+    # Slips are rounded by as much as sticks, so the impulse of an impact that sticks is known coarsely, and
+    # positions change by it from the moment of the impact on.
+    np.testing.assert_allclose(step.position, exact.position, atol=1e-3)
 
 
 def test_unions():

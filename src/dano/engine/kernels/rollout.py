@@ -335,6 +335,16 @@ def find_touching(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
 
 
 @wp.func
+def points_listed(room: Room, world: int, lane: int, n_found: int) -> real:
+    """How many points are listed."""
+    count = int(0)
+    for f in range(n_found):
+        found = room.found[world, f * _LANES + lane]
+        count += found.end - found.first
+    return total(real(count))
+
+
+@wp.func
 def any_hits(room: Room, world: int, lane: int, n_found: int) -> bool:
     """Whether one of the pairs with points has an impact."""
     hits = bool(False)
@@ -429,18 +439,24 @@ def rollout(scene: Scene, room: Room, launch: Launch):
         solved = Solved()
         rebound = real(1.0)
         searches = int(0)
+        listed = real(-1.0)
         while searches < _SEARCHES:
-            n_found, n_near, overflow = find_touching(scene, room, world, lane)
-            if lane == 0:
-                find_pattern(scene, room, world, n_near)
-            solved, rebound = solve_step(scene, room, launch, world, lane, n_found, size)
             searches += 1
-            # What an impact drives into further bodies is found in a second search.
-            beyond = ZERO
-            if lane == 0:
-                beyond = wp.where(find_gains(scene, room, world), ONE, ZERO)
-            if total(beyond) == ZERO:
+            n_found, n_near, overflow = find_touching(scene, room, world, lane)
+            before = listed
+            listed = points_listed(room, world, lane, n_found)
+            if listed == before:
                 searches = _SEARCHES
+            else:
+                if lane == 0:
+                    find_pattern(scene, room, world, n_near)
+                solved, rebound = solve_step(scene, room, launch, world, lane, n_found, size)
+                # What an impact drives into further bodies is found in a second search.
+                beyond = ZERO
+                if lane == 0:
+                    beyond = wp.where(find_gains(scene, room, world), ONE, ZERO)
+                if total(beyond) == ZERO:
+                    searches = _SEARCHES
             wait()
         find_moved(scene, room, world, lane, n_found)
         wait()
