@@ -48,7 +48,7 @@ class Family(NamedTuple):
         start: Puts them into a state.
         draw: A state, numbers of its start and what is one of each.
         n_steps: Of a motion.
-        count: How many motions are looked at.
+        motions: How many motions are looked at.
     """
 
     scene: dano.Scene
@@ -57,7 +57,7 @@ class Family(NamedTuple):
     start: Start
     draw: Callable[[Random], tuple[dano.State, np.ndarray, np.ndarray]]
     n_steps: int
-    count: int
+    motions: int
 
     def end(self, x: Array, state: dano.State, direction: Array) -> Float[Array, ""]:
         """Where the body is at the end, along a direction [m], by friction, restitution, mass and start."""

@@ -83,7 +83,7 @@ def run() -> None:
             if arguments.only and kind not in arguments.only:
                 continue
             began = time.monotonic()
-            found = study(family, 2 if arguments.quick else family.count)
+            found = study(family, 2 if arguments.quick else family.motions)
             every.append(found)
             rows += rows_of(f"{name}: {kind}", found)
             print(f"{name}, {kind}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)

@@ -138,8 +138,8 @@ def _rows_of(law: dano.AbstractContactLaw, h: float, group: str) -> list[Row]:
     return [
         Row(group, "roughness of the end by friction, median", float(np.median(rough)), "mm", note=each),
         Row(group, "roughness over its range, median", float(np.median(shares)), "%", 1.0),
-        Row(group, "slopes between neighbours with the trend's sign", right, "%", note=trends),
-        Row(group, "derivatives with the sign of a visible slope", signs, "%", 95.0, True),
+        Row(group, "slopes between neighbours with the trend's sign", float(right), "%", note=trends),
+        Row(group, "derivatives with the sign of a visible slope", float(signs), "%", 95.0, True),
         Row(group, "derivative less visible slope, median", float(np.median(missed)), "m", note=gradients),
         Row(group, "… relative", float(np.median(relative)), "%", 10.0),
         Row(group, "derivative: largest size", float(np.max(np.abs(derived))), "m"),

@@ -1,5 +1,7 @@
 """Impacts: restitution at every step, meeting anywhere in a step, derivatives through them."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,7 +32,7 @@ def test_restitution_is_exact(e, h):
     contact = dano.Contact("a", "floor", dano.ContactParams(restitution=e, hysteresis=0.0))
     scene = dano.Scene.create(bodies, [contact], timestep=h, gravity=(0, 0, 0))
     for phase in (0.1, 0.5, 0.9):
-        start = dict(position=(0, 0, 0.05 + (2 + phase) * 2.0 * h), velocity=(0, 0, -2.0))
+        start: dict[str, Any] = dict(position=(0, 0, 0.05 + (2 + phase) * 2.0 * h), velocity=(0, 0, -2.0))
         run = dano.simulate(scene, scene.initial_state(a=start), n_steps=60)
         speed = float(run.states.velocity[-1, 0, 2])
         assert speed == pytest.approx(2.0 * e, rel=1e-3)

@@ -226,6 +226,7 @@ def test_solids_of_cad_are_in_metres():
         with pytest.raises(ImportError, match=r"reading .step needs cascadio: pip install 'dano\[step\]'"):
             load_field(path)
         return
-    moments = load_field(path, resolution=32).solid_moments()
+    box: Any = load_field(path, resolution=32)
+    moments = box.solid_moments()
     np.testing.assert_allclose(moments.volume, 3.5e-4, rtol=1e-6)
     np.testing.assert_allclose(moments.centroid, (0.05, 0.035, 0.025), atol=1e-6)

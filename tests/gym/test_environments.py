@@ -1,6 +1,7 @@
 """Environments: Gymnasium's own checkers, rewards from costs, many episodes as single ones."""
 
 import warnings
+from typing import Any
 
 import jax
 import numpy as np
@@ -148,8 +149,11 @@ def test_steps_get_the_room_that_they_need(n, monkeypatch):
     )
     found = []
     for engine in (roomy, tight):
-        made = make_env if n == 1 else lambda *args, **kw: make_vector_env(*args, n, **kw)
-        env = made(scene, state, task, engine=engine)
+        env: Any = (
+            make_env(scene, state, task, engine=engine)
+            if n == 1
+            else make_vector_env(scene, state, task, n, engine=engine)
+        )
         env.reset(seed=0)
         action = np.full(env.action_space.shape, 0.5, np.float32)
         *_, (seen, reward, _, _, info) = [env.step(action) for _ in range(3)]

@@ -1,6 +1,7 @@
 """Bodies on joints: forward kinematics, Jacobians and whole steps, slow and fast, against the reference."""
 
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -147,7 +148,8 @@ def test_joints_beyond_their_limits(engine, joint):
     """They come back at the speed that the reference says, with all that hangs on them."""
     scene = scenes.tree()
     with pytest.warns(RuntimeWarning, match=f"joint '{joint}' starts at"):
-        start = scene.initial_state(**{joint: dict(q=0.6)})
+        beyond: dict[str, Any] = {joint: dict(q=0.6)}
+        start = scene.initial_state(**beyond)
     assert_step(engine, scene, start)
 
 
