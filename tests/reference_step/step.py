@@ -43,7 +43,11 @@ class Step:
         """How velocities and spins of bodies change; and whether one goes beyond what a search looks at."""
         bodies, h = self.kinematics.bodies, self.h
         found = self.kinematics.seen(y) - np.c_[bodies.velocity, bodies.spin]
-        reach = np.array([0.0 if body.fixed else float(body.extent[3]) for body in self.scene.bodies])
+        # What touches nothing has no extent.
+        touches = [not body.fixed and body.extent is not None for body in self.scene.bodies]
+        reach = np.array(
+            [float(b.extent[3]) if t else 0.0 for b, t in zip(self.scene.bodies, touches, strict=True)]
+        )
         way = h * (np.linalg.norm(found[:, :3], axis=1) + reach * np.linalg.norm(found[:, 3:], axis=1))
         seen = 1e-3 * reach + h * h * np.linalg.norm(bodies.gravity)
         return found, bool(np.any((way > seen)[reach > 0]))

@@ -2,8 +2,13 @@
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.adjoint import advance_work, after_adjoints, momentum_work, state_work
-from dano.engine.kernels.derivatives.impact_work import late_work
+from dano.engine.kernels.derivatives.adjoint import (
+    advance_work,
+    after_adjoints,
+    late_work,
+    momentum_work,
+    state_work,
+)
 from dano.engine.kernels.impacts import freed, pair_slope
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.rollout import Launch, push_of, row_before

@@ -6,12 +6,13 @@ from dano.engine.kernels.derivatives.adjoint import (
     after_adjoints,
     distance_work,
     facing_work,
+    impact_patch_work,
+    impact_work,
     pair_work,
     point_work,
     probe_distance,
     Virtual,
 )
-from dano.engine.kernels.derivatives.impact_work import impact_work, patch_work
 from dano.engine.kernels.derivatives.pair_changes import add_distance_changes
 from dano.engine.kernels.derivatives.products import (
     add_to_leaf,
@@ -128,7 +129,7 @@ def pull_patch_of_impact(
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
             by_pose, by_sample, by_distance, _a, by_share_of, by_lead, by_depth, by_layer, _b = wp.grad(
-                patch_work
+                impact_patch_work
             )(pose, sample, d, turning, pair.share, found.share * h, pair.impact_depth, layer, patch_bar)
             by_pose = pull_sample(
                 scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance

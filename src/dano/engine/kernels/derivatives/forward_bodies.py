@@ -7,10 +7,15 @@ velocity, and serves all directions.
 import warp as wp
 
 from dano.engine.kernels.assembly import row_of
-from dano.engine.kernels.derivatives.adjoint import advance_work, after_adjoints, momentum_work, Virtual
+from dano.engine.kernels.derivatives.adjoint import (
+    advance_work,
+    after_adjoints,
+    late_work,
+    momentum_work,
+    Virtual,
+)
 from dano.engine.kernels.derivatives.contact import PairBar, pull_pair
 from dano.engine.kernels.derivatives.equations import pull_touching
-from dano.engine.kernels.derivatives.impact_work import late_work
 from dano.engine.kernels.derivatives.pair_changes import (
     change_by_leaves,
     change_by_patch,
