@@ -273,30 +273,22 @@ def bisected(true_from, low, high):
     return low
 
 
-def find(scene, bodies, shares=None, gains=None):
-    """The listed points of every side.
-
-    Args:
-        scene: The scene.
-        bodies: Its bodies.
-        shares: τ by (i, j), of those that are not to be exact.
-        gains: By how much velocities and spins of bodies change within the step, if known, shape (n, 6).
-    """
+def find(scene, bodies, shares=None):
+    """The listed points of every side; `shares` are given τ by (i, j), of those that are not to be exact."""
     shares = shares or {}
-    gains = np.zeros((len(scene.bodies), 6)) if gains is None else gains
     found = []
     for side in sides_of(scene):
         hitting, lasting = meetings(scene, bodies, side)
         given = shares.get((side.i, side.j))
         met = hitting if given is None else hitting._replace(share=given)
-        points = listed(scene, bodies, side, met, gains)
+        points = listed(scene, bodies, side, met)
         if points.beta == 0:
-            points = listed(scene, bodies, side, lasting if given is None else Meeting(given), gains)
+            points = listed(scene, bodies, side, lasting if given is None else Meeting(given))
         found.append(points)
     return halved([points for points in found if len(points.area)])
 
 
-def listed(scene, bodies, side, met, gains):
+def listed(scene, bodies, side, met):
     """The listed points of a side whose geometry is taken when its bodies meet."""
     i, j, h, share = side.i, side.j, bodies.h, met.share
     pair = Pair(scene, bodies, side, share)
@@ -315,15 +307,11 @@ def listed(scene, bodies, side, met, gains):
 
     smaller = min(float(scene.bodies[k].extent[4]) for k in (i, j))
     margin = 0.001 * smaller + 2 * np.linalg.norm(bodies.gravity) * h * h
-    apart = bodies.position[i] - bodies.position[j]
-    gained = normal @ (gains[i] - gains[j])[:3] - normal @ np.cross(gains[j, 3:], apart)
-    gained = gained + moment @ (gains[i] - gains[j])[3:]
-    comes = (area > 0) & (depth - h * rate > -margin)
-    near = comes | ((area > 0) & (depth - h * (rate + gained) > -margin))
-    usual = comes & ~other
+    near = (area > 0) & (depth - h * rate > -margin)
+    usual = near & ~other
     sunk = np.maximum(-distance, 0)
     inside_out = np.sum((area * sunk)[other]) > np.sum((area * sunk)[usual])
-    kept = np.concatenate([np.flatnonzero(near & ~other), np.flatnonzero(near & other & inside_out)])
+    kept = np.concatenate([np.flatnonzero(usual), np.flatnonzero(near & other & inside_out)])
     hit = usual & (sunk > 0)
     approach = rate - np.sum(normal * drift, axis=1)
     delta, sink = depths_of(scene, side)
@@ -340,7 +328,7 @@ def listed(scene, bodies, side, met, gains):
         second=j,
         law=side.law,
         share=share,
-        com_difference=apart,
+        com_difference=bodies.position[i] - bodies.position[j],
         arm=arm[kept],
         normal=normal[kept],
         moment=moment[kept],

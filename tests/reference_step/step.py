@@ -27,30 +27,13 @@ class Step:
         self.kinematics = Kinematics(scene, state)
         self.scene, self.control, self.h = self.kinematics.scene, control, self.kinematics.h
         self.joints = JointLaw(self.kinematics, control)
-        self.search(shares, None)
+        self.given = find(self.scene, self.kinematics.bodies, shares)
+        self.points = list(self.given)
         self.patches = patches_of(self.scene, self.kinematics.bodies)
         self.loops = self.kinematics.gap_slopes()
         self.start = np.r_[self.kinematics.start, np.zeros(len(self.loops))]
         self.kept = None, None
         self.scale = 1 / np.r_[np.diag(self.kinematics.mass_matrix), np.full(len(self.loops), self.h)]
-
-    def search(self, shares, gains):
-        """Find point contacts, see `reference_step.collision.find`."""
-        self.given = find(self.scene, self.kinematics.bodies, shares, gains)
-        self.points = list(self.given)
-
-    def gains(self, y):
-        """How velocities and spins of bodies change; and whether one goes beyond what a search looks at."""
-        bodies, h = self.kinematics.bodies, self.h
-        found = self.kinematics.seen(y) - np.c_[bodies.velocity, bodies.spin]
-        # What touches nothing has no extent.
-        touches = [not body.fixed and body.extent is not None for body in self.scene.bodies]
-        reach = np.array(
-            [float(b.extent[3]) if t else 0.0 for b, t in zip(self.scene.bodies, touches, strict=True)]
-        )
-        way = h * (np.linalg.norm(found[:, :3], axis=1) + reach * np.linalg.norm(found[:, 3:], axis=1))
-        seen = 1e-3 * reach + h * h * np.linalg.norm(bodies.gravity)
-        return found, bool(np.any((way > seen)[reach > 0]))
 
     def residual(self, unknowns, softness=1.0):
         """R: what the equations miss at y and the forces λ of loops, as velocities [m/s, rad/s]."""
@@ -185,10 +168,6 @@ def step(scene, state, control=None, shares=None):
     """
     equations = Step(scene, state, control, shares)
     y = settled(equations)
-    gains, beyond = equations.gains(y)
-    if beyond:
-        equations.search(shares, gains)
-        y = settled(equations)
     return equations.kinematics.end(y, equations.moved(y)), equations
 
 

@@ -2,9 +2,8 @@
 
 import warp as wp
 
-from dano.engine.kernels.assembly import twist_of
 from dano.engine.kernels.impacts import find_moved
-from dano.engine.kernels.lanes import total, wait
+from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import find_pattern
 from dano.engine.kernels.patches import find_patches
 from dano.engine.kernels.search import find_contacts, fix_laws
@@ -38,10 +37,6 @@ and Applications). Without rebound contact only dissipates.
 _REBOUNDS = wp.constant(REBOUNDS)
 # Energy that contact may add, over what it moves between coordinates: impacts reach their goals to 1e-3.
 _ADDS = wp.constant(real(1e-3))
-# How far a search looks ahead, by the radius of a body, besides what gravity makes of a step.
-_LOOKS = wp.constant(real(1e-3))
-# How often contacts are searched in a step.
-_SEARCHES = wp.constant(2)
 # How often a step's solve may begin again.
 _RESTARTS = wp.constant(2)
 
@@ -270,49 +265,17 @@ def begin_step_of_trees(scene: Scene, room: Room, world: int, launch: Launch, t:
 
 
 @wp.func
-def clear_gains(scene: Scene, room: Room, world: int):
-    """Nothing is known of how velocities change within the step."""
-    for i in range(scene.body_index.shape[0]):
-        room.gains[world, i] = vec6()
-
-
-@wp.func
 def begin_unpushed(scene: Scene, room: Room, world: int, lane: int, launch: Launch, t: int):
     """What is known at the start of a step that was not, or need not be, pushed."""
     for i in range(scene.body_index.shape[0]):
         push = Push()
         begin_body(scene, room, world, i, row_before(scene, launch, world, t, i), push)
-    if lane == 0:
-        clear_gains(scene, room, world)
     wait()
     if wp.static(TREES):
         if lane == 0:
             begin_coordinates(scene, room, world, launch, t)
             begin_step_of_trees(scene, room, world, launch, t)
         wait()
-
-
-@wp.func
-def find_gains(scene: Scene, room: Room, world: int) -> bool:
-    """How velocities of bodies change within a step that is solved, in `room.gains`.
-
-    Returns:
-        Whether a body moves on by more than the search looked ahead.
-    """
-    h = scene.timestep[world, 0]
-    beyond = bool(False)
-    for i in range(scene.moving.shape[0]):
-        index = scene.moving[i]
-        state = room.bodies[world, index]
-        gained = twist_of(scene, room, world, scene.body_index[index].row, room.velocity, ONE)
-        gained = gained - joined(state.velocity, state.spin)
-        room.gains[world, index] = gained
-        radius = scene.bodies[world, index].radius
-        way = h * (wp.length(linear_part(gained)) + radius * wp.length(angular_part(gained)))
-        looked = _LOOKS * radius + h * h * wp.length(scene.gravity[world, 0])
-        # What touches nothing has no radius.
-        beyond = beyond or (radius > ZERO and way > looked)
-    return beyond
 
 
 @wp.func
@@ -332,16 +295,6 @@ def find_touching(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
         n_near = find_patches(scene, room, world, lane, n_found)
     wait()
     return n_found, n_near, overflow
-
-
-@wp.func
-def points_listed(room: Room, world: int, lane: int, n_found: int) -> real:
-    """How many points are listed."""
-    count = int(0)
-    for f in range(n_found):
-        found = room.found[world, f * _LANES + lane]
-        count += found.end - found.first
-    return total(real(count))
 
 
 @wp.func
@@ -376,42 +329,6 @@ def advance_body(scene: Scene, room: Room, world: int, i: int, row: StateRow) ->
     return after
 
 
-@wp.func(inline=True)
-def solve_step(
-    scene: Scene, room: Room, launch: Launch, world: int, lane: int, n_found: int, size: real
-) -> tuple[Solved, real]:
-    """Velocities at the end of a step whose contacts are found, and the share of the restitution it has.
-
-    A solve that cycles returns its best velocities: from there, with fitting duals, most converge.
-    """
-    hits = any_hits(room, world, lane, n_found)
-    attempt = int(0)
-    restarts = int(0)
-    again = bool(True)
-    solved = Solved()
-    rebound = real(1.0)
-    while again:
-        rebound = ONE - real(attempt) / real(_REBOUNDS)
-        if wp.static(POINTS):
-            fix_laws(scene, room, world, lane, n_found, rebound)
-        wait()
-        solved = solve(scene, room, world, lane, n_found, size, launch.options)
-        again = False
-        if not solved.converged and restarts < _RESTARTS:
-            restarts += 1
-            again = True
-        elif hits and attempt < _REBOUNDS:
-            if adds_energy(scene, room, world):
-                attempt += 1
-                again = True
-                wait()
-                if lane == 0:
-                    restart(scene, room, world)
-                wait()
-    wait()
-    return solved, rebound
-
-
 @wp.kernel(enable_backward=False)
 def rollout(scene: Scene, room: Room, launch: Launch):
     """Steps of all worlds."""
@@ -424,8 +341,6 @@ def rollout(scene: Scene, room: Room, launch: Launch):
             row = row_before(scene, launch, world, t, i)
             push = push_of(scene, launch, world, t, i)
             size = wp.max(size, begin_body(scene, room, world, i, row, push))
-        if lane == 0:
-            clear_gains(scene, room, world)
         wait()
         if wp.static(TREES):
             if lane == 0:
@@ -434,30 +349,35 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                 begin_step_of_trees(scene, room, world, launch, t)
             wait()
             size = wp.max(size, room.trees.sizes[world, 0])
-        n_found = int(0)
-        overflow = bool(False)
+        n_found, n_near, overflow = find_touching(scene, room, world, lane)
+        if lane == 0:
+            find_pattern(scene, room, world, n_near)
+        hits = any_hits(room, world, lane, n_found)
+        # A solve that cycles returns its best velocities: from there, with fitting duals, most converge.
+        attempt = int(0)
+        restarts = int(0)
+        again = bool(True)
         solved = Solved()
         rebound = real(1.0)
-        searches = int(0)
-        listed = real(-1.0)
-        while searches < _SEARCHES:
-            searches += 1
-            n_found, n_near, overflow = find_touching(scene, room, world, lane)
-            before = listed
-            listed = points_listed(room, world, lane, n_found)
-            if listed == before:
-                searches = _SEARCHES
-            else:
-                if lane == 0:
-                    find_pattern(scene, room, world, n_near)
-                solved, rebound = solve_step(scene, room, launch, world, lane, n_found, size)
-                # What an impact drives into further bodies is found in a second search.
-                beyond = ZERO
-                if lane == 0:
-                    beyond = wp.where(find_gains(scene, room, world), ONE, ZERO)
-                if total(beyond) == ZERO:
-                    searches = _SEARCHES
+        while again:
+            rebound = ONE - real(attempt) / real(_REBOUNDS)
+            if wp.static(POINTS):
+                fix_laws(scene, room, world, lane, n_found, rebound)
             wait()
+            solved = solve(scene, room, world, lane, n_found, size, launch.options)
+            again = False
+            if not solved.converged and restarts < _RESTARTS:
+                restarts += 1
+                again = True
+            elif hits and attempt < _REBOUNDS:
+                if adds_energy(scene, room, world):
+                    attempt += 1
+                    again = True
+                    wait()
+                    if lane == 0:
+                        restart(scene, room, world)
+                    wait()
+        wait()
         find_moved(scene, room, world, lane, n_found)
         wait()
         if lane == 0:

@@ -31,7 +31,7 @@ from dano.physics.pairs import (
     BodyState,
     PairPose,
 )
-from dano.physics.point_law import Material, point_law, point_motion
+from dano.physics.point_law import Material, point_law
 from dano.physics.real import HALF, ONE, real, TWO, vec3, ZERO
 from dano.physics.samples import (
     facing_area,
@@ -43,7 +43,6 @@ from dano.physics.samples import (
 )
 from dano.physics.solids.distances import solid_clearance, solid_distance
 from dano.physics.solids.grids import STEEPEST
-from dano.physics.twists import relative_twist, Twist
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
 # Least share of a step after an impact.
@@ -132,11 +131,8 @@ def find_points(
     begin: int,
     end: int,
     patch: Patch,
-    gain: Twist,
 ) -> tuple[int, Patch, real, real]:
     """List the samples of a body that may press; with `turned` those that face the other way.
-
-    Those are the ones that come near at the old velocities or, if they are known, at those of the end.
 
     Returns:
         Place of the next point in the list, which may lie beyond its end, the patch with the samples that
@@ -190,10 +186,8 @@ def find_points(
                             turned_load -= d.value * pair.share * wp.length(pose.vectors * sample.area)
                     if (turned and back) or (not turned and facing > ZERO):
                         point = point_contact(pose, sample, d, index.turning, turned, pair.share, share * h)
-                        gained = point_motion(point, gain.velocity, gain.spin).rate
-                        comes = point.depth - h * point.rate > -pair.margin
-                        if comes or point.depth - h * (point.rate + gained) > -pair.margin:
-                            if comes and point.sunk > -layer and not turned:
+                        if point.depth - h * point.rate > -pair.margin:
+                            if point.sunk > -layer and not turned:
                                 load += point.area * wp.max(point.sunk, ZERO)
                                 patch = with_sample(
                                     patch, point.area, point.sunk, pair.impact_depth, layer, point.approach,
@@ -257,22 +251,7 @@ def share_impacts(scene: Scene, room: Room, world: int, lane: int, n_found: int)
 
 
 @wp.func
-def gain_of(scene: Scene, room: Room, world: int, first: int, second: int) -> Twist:
-    """By how much the twist of a body relative to another changes within the step, as far as it is known."""
-    apart = room.bodies[world, first].position - room.bodies[world, second].position
-    return relative_twist(room.gains[world, first], room.gains[world, second], apart)
-
-
-@wp.func
-def way_gained(scene: Scene, world: int, first: int, gain: Twist, h: real) -> real:
-    """Most that a point of a body moves on by a gain within the step [m]."""
-    return h * (wp.length(gain.velocity) + TWO * scene.bodies[world, first].radius * wp.length(gain.spin))
-
-
-@wp.func
-def find_pair(
-    scene: Scene, room: Room, world: int, lane: int, p: int, entry: int, at: int, end: int, gain: Twist
-) -> int:
+def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: int, at: int, end: int) -> int:
     """List the points of a pair that is near, and write the pair into `room.found`.
 
     Geometry of an impact is taken when bodies are as deep as in one. Where they approach slowly, or are that
@@ -288,7 +267,6 @@ def find_pair(
     b = room.bodies[world, index.second]
     material = scene.materials[world, index.contact]
     body = scene.bodies[world, index.first]
-    further = way_gained(scene, world, index.first, gain, h)
     alone = bool(False)
     if wp.static(not TREES):
         alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
@@ -321,11 +299,11 @@ def find_pair(
         found.share = met.share
         pose = posed(scene, world, a, b, index.first, index.second, met.share, h, pair.follows)
         speed = wp.length(pose.velocity) + wp.length(pose.spin) * TWO * body.radius
-        reach = pair.margin + (ONE - met.share) * h * speed + further
+        reach = pair.margin + (ONE - met.share) * h * speed
         patch = Patch()
         after, patch, load, turned_load = find_points(
             scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h, reach,
-            False, at, end, patch, gain,
+            False, at, end, patch,
         )  # fmt: skip
         patch.load = total(patch.load)
         patch.near_load = total(patch.near_load)
@@ -340,7 +318,7 @@ def find_pair(
         if total(turned_load) > total(load):
             after, patch, _load, _turned = find_points(
                 scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h, reach,
-                True, after, end, patch, gain,
+                True, after, end, patch,
             )  # fmt: skip
         found.patch = patch
         found.com_difference = pose.com_difference
@@ -375,11 +353,9 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
         index = scene.pair_index[p]
         a = room.bodies[world, index.first]
         b = room.bodies[world, index.second]
-        gain = gain_of(scene, room, world, index.first, index.second)
-        margin = scene.pairs[world, p].margin + way_gained(scene, world, index.first, gain, h)
-        if is_near(scene, world, a, b, index.first, index.second, margin, h):
+        if is_near(scene, world, a, b, index.first, index.second, scene.pairs[world, p].margin, h):
             begin = at
-            at = find_pair(scene, room, world, lane, p, n_found, begin, end, gain)
+            at = find_pair(scene, room, world, lane, p, n_found, begin, end)
             if at > end:
                 overflow = True
                 at = end

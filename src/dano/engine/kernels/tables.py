@@ -250,7 +250,6 @@ class Room:
         tried: …
         best: Where the residual was smallest.
         moved: By which positions change within a step.
-        gains: By how much velocities and spins of bodies change within the step, as known before a search.
         late: Virtual velocities of impulses that take effect within a step.
         step: Of Newton's method.
         residual: What each block misses [kg m/s; kg m²/s, W].
@@ -290,7 +289,6 @@ class Room:
     tried: wp.array2d(dtype=vec6)
     best: wp.array2d(dtype=vec6)
     moved: wp.array2d(dtype=vec6)
-    gains: wp.array2d(dtype=vec6)
     late: wp.array2d(dtype=vec6)
     step: wp.array2d(dtype=vec6)
     residual: wp.array2d(dtype=vec6)

@@ -148,7 +148,7 @@ def room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> di
     m, pairs = len(tables.structure.moving), len(tables.whole.arrays["scene.pair_index"])
     blocks = tables.structure.n_blocks
     lengths = {
-        **dict.fromkeys(("bodies", "gains"), n),
+        "bodies": n,
         **dict.fromkeys(("momentum", "inertia"), m),
         **dict.fromkeys(("velocity", "old", "tried", "best", "moved", "step", "residual", "scale"), blocks),
         **dict.fromkeys(("order", "counts", "degrees", "ends"), blocks),

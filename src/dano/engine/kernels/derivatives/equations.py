@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.assembly import assemble, fit_duals, row_of, Trial, twist_of
+from dano.engine.kernels.assembly import assemble, fit_duals, row_of, Trial
 from dano.engine.kernels.derivatives.adjoint import after_adjoints, Virtual
 from dano.engine.kernels.derivatives.bodies import (
     block_of,
@@ -30,7 +30,7 @@ from dano.engine.kernels.impacts import find_moved
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import copy_transposed_blocks, find_pattern, solve_blocks
 from dano.engine.kernels.patches import add_patches, fit_patch_duals
-from dano.engine.kernels.rollout import begin_unpushed, find_gains, find_touching, Launch, row_before
+from dano.engine.kernels.rollout import begin_unpushed, find_touching, Launch, row_before
 from dano.engine.kernels.search import fix_laws
 from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
 from dano.engine.kernels.trees.balance import (
@@ -40,8 +40,9 @@ from dano.engine.kernels.trees.balance import (
     fit_joint_duals,
     solve_trees,
 )
+from dano.engine.kernels.trees.contact import body_twist
 from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
-from dano.physics.real import ONE, vec6, ZERO
+from dano.physics.real import ONE, real, vec6, ZERO
 from dano.physics.rotations import matrix
 from dano.physics.twists import joined
 
@@ -53,7 +54,9 @@ def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: i
     """A step at its solution: contacts, laws and the Jacobian; returns the number of pairs with points."""
     n = scene.body_index.shape[0]
     begin_unpushed(scene, room, world, lane, launch, t)
+    n_found, n_near, _overflow = find_touching(scene, room, world, lane)
     if lane == 0:
+        find_pattern(scene, room, world, n_near)
         for i in range(n):
             m = scene.body_index[i].row
             if m >= 0 and not hangs(scene, m):
@@ -65,12 +68,6 @@ def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: i
             fit_joint_duals(scene, room, world)
         for b in range(scene.n_blocks):
             room.tried[world, b] = room.velocity[world, b]
-        # What presses at the end may not have come near at the old velocities.
-        find_gains(scene, room, world)
-    wait()
-    n_found, n_near, _overflow = find_touching(scene, room, world, lane)
-    if lane == 0:
-        find_pattern(scene, room, world, n_near)
     wait()
     if wp.static(POINTS):
         fix_laws(scene, room, world, lane, n_found, launch.reports[world, t].rebound)
@@ -110,6 +107,16 @@ def solve_transposed(scene: Scene, room: Room, world: int, lane: int):
     if wp.static(TREES):
         if lane == 0:
             solve_trees(scene, room, world, False)
+
+
+@wp.func
+def twist_of(
+    scene: Scene, room: Room, world: int, row: int, values: wp.array2d(dtype=vec6), offset: real
+) -> vec6:
+    """How contact sees a body move, by its row, with values of the unknowns; see `body_twist`."""
+    if wp.static(TREES):
+        return body_twist(scene, room, world, row, values, offset)
+    return row_of(values, world, row)
 
 
 @wp.func
