@@ -6,10 +6,12 @@ import importlib.metadata
 import json
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -73,6 +75,34 @@ def parse_arguments(
     if add is not None:
         add(parser)
     return parser.parse_args()
+
+
+def parts_option(parts: Mapping[str, Any]) -> Callable[[argparse.ArgumentParser], None]:
+    """Adds names of parts to the options, see `rows_of_parts`."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("parts", nargs="*", metavar="NAME", help=f"{', '.join(parts)}; default: all")
+
+    return add
+
+
+def rows_of_parts(
+    parts: Mapping[str, Callable[..., list[Row]]], arguments: argparse.Namespace
+) -> tuple[list[str], list[Row]]:
+    """Names and rows of the parts that the options name, or of all; says how long each took."""
+    names = arguments.parts or list(parts)
+    if unknown := [name for name in names if name not in parts]:
+        raise SystemExit(f"parts must be of {', '.join(parts)}, got {', '.join(unknown)}")
+    rows: list[Row] = []
+    for name in names:
+        began = time.monotonic()
+        try:
+            rows += parts[name](quick=arguments.quick)
+        except ValueError as error:
+            # A simulation that went wrong; what the other parts measure is worth keeping.
+            rows.append(skipped(f"Part {name}", "did not end", str(error)))
+        print(f"{name}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
+    return names, rows
 
 
 def warm_up() -> None:

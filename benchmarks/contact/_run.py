@@ -1,11 +1,8 @@
 """Chooses the parts, runs them and reports."""
 
-import argparse
-import sys
-import time
 from collections.abc import Callable
 
-from benchmarks._measure import load_average, parse_arguments, report, Row, skipped
+from benchmarks._measure import load_average, parse_arguments, parts_option, report, Row, rows_of_parts
 from benchmarks.contact import (
     _depth,
     _dominoes,
@@ -31,23 +28,10 @@ PARTS: dict[str, Callable[..., list[Row]]] = {
 
 
 def run() -> None:
-    arguments = parse_arguments("Compare contact with closed forms and rigid-body equations.", _options)
+    arguments = parse_arguments(
+        "Compare contact with closed forms and rigid-body equations.", parts_option(PARTS)
+    )
     load = load_average()
-    names = arguments.parts or list(PARTS)
-    if unknown := [name for name in names if name not in PARTS]:
-        raise SystemExit(f"parts must be of {', '.join(PARTS)}, got {', '.join(unknown)}")
-    rows = []
-    for name in names:
-        began = time.monotonic()
-        try:
-            rows += PARTS[name](quick=arguments.quick)
-        except ValueError as error:
-            # A simulation that went wrong; what the other parts measure is worth keeping.
-            rows.append(skipped(f"Part {name}", "did not end", str(error)))
-        print(f"{name}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
+    names, rows = rows_of_parts(PARTS, arguments)
     settings: dict[str, object] = {"parts": names, "law": "distributed", "dtype": "float64"}
     report("contact", rows, settings, load, arguments.json)
-
-
-def _options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("parts", nargs="*", metavar="NAME", help=f"{', '.join(PARTS)}; default: all")

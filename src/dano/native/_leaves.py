@@ -34,9 +34,8 @@ LEAF_WIDTH = 20
 # Blocks of a run: see `dano.engine.kernels.tables`.
 _RUN = 4
 _KIND_WIDTH = 7
-# Cells of a grid along an axis that have one lower bound: see `dano.physics.solids.leaves`.
-_CELL = 4
 _NUMBERS = "dano.physics.solids.leaves", "dano.physics.solids.shapes"
+_NO_KINDS = Features(KINDS=frozenset())
 Known = AbstractPrimitive | SignedDistanceGrid | GridField
 """Fields that kernels know."""
 
@@ -44,7 +43,7 @@ Known = AbstractPrimitive | SignedDistanceGrid | GridField
 @functools.cache
 def kind_numbers() -> dict[str, int]:
     """Numbers of all kinds of leaves in kernels, by their names in capitals."""
-    modules = [instance(Features(KINDS=frozenset()), name) for name in _NUMBERS]
+    modules = [instance(_NO_KINDS, name) for name in _NUMBERS]
     known = {name: value for module in modules for name, value in vars(module).items()}
     kinds = (*PRIMITIVES, SignedDistanceGrid.kind, GridField.kind)
     return {kind.upper(): known[kind.upper()] for kind in kinds}
@@ -204,10 +203,11 @@ def lower_bounds(coefficients: Float[Array | np.ndarray, "x y z"], degree: int) 
         degree: Of the spline.
     """
     bound = jax.lax.stop_gradient(jnp.asarray(coefficients))
+    cell = instance(_NO_KINDS, _NUMBERS[0]).CELL
     for axis, size in enumerate(coefficients.shape):
-        n = (size - 2 * degree - 3) // _CELL + 1
+        n = (size - 2 * degree - 3) // cell + 1
         # From one before the own node of a block's first cell to two beyond that of its last.
-        nodes = np.minimum(degree + np.arange(_CELL + 3)[:, None] + _CELL * np.arange(n), size - 1)
+        nodes = np.minimum(degree + np.arange(cell + 3)[:, None] + cell * np.arange(n), size - 1)
         bound = functools.reduce(jnp.minimum, (jnp.take(bound, each, axis) for each in nodes))
     return bound
 

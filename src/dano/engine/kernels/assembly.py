@@ -97,6 +97,16 @@ def row_of(values: wp.array2d(dtype=vec6), world: int, row: int) -> vec6:
 
 
 @wp.func
+def twist_of(
+    scene: Scene, room: Room, world: int, row: int, values: wp.array2d(dtype=vec6), offset: real
+) -> vec6:
+    """How contact sees a body move, by its row, with values of the unknowns; see `body_twist`."""
+    if wp.static(TREES):
+        return body_twist(scene, room, world, row, values, offset)
+    return row_of(values, world, row)
+
+
+@wp.func
 def pair_twist(
     scene: Scene, room: Room, world: int, found: FoundPair, velocities: wp.array2d(dtype=vec6), offset: real
 ) -> Twist:
@@ -113,12 +123,8 @@ def pair_twist(
     index = scene.pair_index[found.pair]
     a = scene.body_index[index.first].row
     b = scene.body_index[index.second].row
-    if wp.static(TREES):
-        moved = body_twist(scene, room, world, a, velocities, offset)
-        other = body_twist(scene, room, world, b, velocities, offset)
-        return relative_twist(moved, other, found.com_difference)
-    first = row_of(velocities, world, a)
-    second = row_of(velocities, world, b)
+    first = twist_of(scene, room, world, a, velocities, offset)
+    second = twist_of(scene, room, world, b, velocities, offset)
     return relative_twist(first, second, found.com_difference)
 
 

@@ -156,6 +156,24 @@ def find_near_probes(
 
 
 @wp.func
+def soonest(left: real, near: real, bend: real, slow: real) -> real:
+    """Share of the step before which a probe cannot have met, or, below zero, since when it may have.
+
+    Args:
+        left: Way that is left [m].
+        near: How far the probe nears the other body in a step [m].
+        bend: By how much that grows in a step at most [m].
+        slow: A probe that nears it by no more does not count [m].
+    """
+    if left > ZERO:
+        ahead = TWO * left / (near + wp.sqrt(near * near + TWO * bend * left))
+        return wp.where(near > slow, ahead, wp.max(ahead, _ONWARD))
+    if near > slow:
+        return wp.max(left, -near * (near - slow) / wp.max(bend, _FLAT * near)) / near
+    return wp.max((slow - near) / bend, _ONWARD)
+
+
+@wp.func
 def meeting(
     scene: Scene,
     room: Room,
@@ -225,15 +243,7 @@ def meeting(
             left = d.value + sink
             rest = ONE - share
             if near + bend * rest > slow and left - rest * (near + HALF * bend * rest) < ZERO:
-                ahead = INFINITY
-                if left > ZERO:
-                    ahead = TWO * left / (near + wp.sqrt(near * near + TWO * bend * left))
-                    if near <= slow:
-                        ahead = wp.max(ahead, _ONWARD)
-                elif near > slow:
-                    ahead = wp.max(left, -near * (near - slow) / wp.max(bend, _FLAT * near)) / near
-                else:
-                    ahead = wp.max((slow - near) / bend, _ONWARD)
+                ahead = soonest(left, near, bend, slow)
                 if ahead < further:
                     further = ahead
                     critical = p

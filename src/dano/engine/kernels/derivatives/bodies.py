@@ -9,6 +9,7 @@ from dano.engine.kernels.derivatives.adjoint import (
     momentum_work,
     state_work,
 )
+from dano.engine.kernels.derivatives.products import add_row
 from dano.engine.kernels.impacts import freed, pair_slope
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.rollout import Launch, push_of, row_before
@@ -21,15 +22,6 @@ from dano.physics.twists import shift
 
 _LANES = wp.constant(LANES)
 _ROOT = wp.constant(ROOT)
-
-
-@wp.func
-def add_row(bars: wp.array2d(dtype=StateRow), world: int, i: int, bar: StateRow):
-    """Add a derivative by a state."""
-    bars[world, i].position += bar.position
-    bars[world, i].orientation += bar.orientation
-    bars[world, i].velocity += bar.velocity
-    bars[world, i].omega += bar.omega
 
 
 @wp.func

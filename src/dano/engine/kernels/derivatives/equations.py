@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.assembly import assemble, fit_duals, row_of, Trial
+from dano.engine.kernels.assembly import assemble, fit_duals, row_of, Trial, twist_of
 from dano.engine.kernels.derivatives.adjoint import after_adjoints, Virtual
 from dano.engine.kernels.derivatives.bodies import (
     block_of,
@@ -40,9 +40,8 @@ from dano.engine.kernels.trees.balance import (
     fit_joint_duals,
     solve_trees,
 )
-from dano.engine.kernels.trees.contact import body_twist
 from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
-from dano.physics.real import ONE, real, vec6, ZERO
+from dano.physics.real import ONE, vec6, ZERO
 from dano.physics.rotations import matrix
 from dano.physics.twists import joined
 
@@ -107,16 +106,6 @@ def solve_transposed(scene: Scene, room: Room, world: int, lane: int):
     if wp.static(TREES):
         if lane == 0:
             solve_trees(scene, room, world, False)
-
-
-@wp.func
-def twist_of(
-    scene: Scene, room: Room, world: int, row: int, values: wp.array2d(dtype=vec6), offset: real
-) -> vec6:
-    """How contact sees a body move, by its row, with values of the unknowns; see `body_twist`."""
-    if wp.static(TREES):
-        return body_twist(scene, room, world, row, values, offset)
-    return row_of(values, world, row)
 
 
 @wp.func

@@ -35,6 +35,7 @@ summed_pose, total_pose = sum_of(PairPose), total_of(PairPose)
 summed_body, scaled_body = sum_of(BodyState), scaled_of(BodyState)
 scaled_leaf = scaled_of(Leaf)
 
+add_row = addition_of(StateRow)
 add_to_leaf = addition_of(Leaf)
 add_patch_material = addition_of(PatchMaterial)
 add_joint = addition_of(Joint)

@@ -2,8 +2,9 @@
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.bodies import add_row, pull_delays
+from dano.engine.kernels.derivatives.bodies import pull_delays
 from dano.engine.kernels.derivatives.equations import pull_end, pull_equations, settle, solve_transposed
+from dano.engine.kernels.derivatives.products import add_row
 from dano.engine.kernels.derivatives.trees import follow_chains
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.rollout import Launch

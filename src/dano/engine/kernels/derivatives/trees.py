@@ -2,8 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.bodies import add_row
-from dano.engine.kernels.derivatives.products import add_joint, add_law, add_loop
+from dano.engine.kernels.derivatives.products import add_joint, add_law, add_loop, add_row
 from dano.engine.kernels.derivatives.tree_adjoint import (
     ball_work,
     coordinate_work,
