@@ -19,6 +19,7 @@ class Bodies(NamedTuple):
         ahead: Orientations at the end of the step at the old spins.
         velocity: [m/s, W], zero for a fixed body.
         spin: [rad/s, W], the same.
+        gain: What gravity adds to the velocity of a body that falls freely [m/s, W], shape (n, 3).
         inverse_mass: 1/m, zero for a fixed body [1/kg].
         inverse_inertia: [1/(kg m²), W], the same.
     """
@@ -34,16 +35,20 @@ class Bodies(NamedTuple):
     ahead: np.ndarray
     velocity: np.ndarray
     spin: np.ndarray
+    gain: np.ndarray
     inverse_mass: np.ndarray
     inverse_inertia: np.ndarray
 
     def pose(self, i, share):
         """Position [m, W] and rotation of a body after a share of the step at the old velocities.
 
-        Centres of mass move on lines; quaternions move on the chord between start and end, normalised.
+        Centres of mass move on lines, or parabolas where they fall, with a velocity that is that of half a
+        step before; quaternions move on the chord between start and end, normalised.
         """
         q = self.orientation[i] + share * (self.ahead[i] - self.orientation[i])
-        return self.position[i] + share * self.h * self.velocity[i], matrix(q / np.linalg.norm(q))
+        start = self.velocity[i] + 0.5 * self.gain[i]
+        way = share * self.h * (start + 0.5 * share * self.gain[i])
+        return self.position[i] + way, matrix(q / np.linalg.norm(q))
 
     def relative(self, i, j):
         """Velocity [m/s] of centre of mass i and spin [rad/s] relative to body j as a rigid frame [W]."""
@@ -76,6 +81,7 @@ def read(scene, state):
         ahead=ahead,
         velocity=velocity,
         spin=np.einsum("nij,nj->ni", rotations, omega),
+        gain=np.where(moves[:, None] & (not scene.joints), h * np.asarray(scene.gravity), 0),
         inverse_mass=np.where(moves, 1 / mass, 0),
         inverse_inertia=np.array(
             [m * R @ np.linalg.inv(J) @ R.T for m, R, J in zip(moves, rotations, inertia, strict=True)]

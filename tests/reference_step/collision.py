@@ -39,6 +39,8 @@ class Points(NamedTuple):
         moment: Of a unit pressure about the first centre of mass [m].
         depth: d of the law [m], shape (n,).
         rate: v_n⁻ [m/s].
+        meets: v_n when bodies meet [m/s].
+        gains: What gravity adds to v_n from then to the middle of the step [m/s].
         area: A [m²].
         drift: ½ ω⁻ × (r₁ − r₀), its tangential part limited [m/s], shape (n, 3).
         impact: κ w [Pa s/m], zero where there is no impact, shape (n,).
@@ -60,6 +62,8 @@ class Points(NamedTuple):
     moment: np.ndarray
     depth: np.ndarray
     rate: np.ndarray
+    meets: np.ndarray
+    gains: np.ndarray
     area: np.ndarray
     drift: np.ndarray
     impact: np.ndarray
@@ -211,18 +215,33 @@ class Meeting(NamedTuple):
     share: float
     hits: bool = False
     deep: bool = False
+    falls: bool = False
 
 
 def meetings(scene, bodies, side):
     """That of an impact, and that of contact that lasts; where bodies are deep the second is both."""
     delta, sink = depths_of(scene, side)
-    lasting = Meeting(share_at(scene, bodies, side, sink, sink, 0.0))
+    lasting = Meeting(share_at(scene, held(bodies), side, sink, sink, 0.0))
     if side.law.compliant:
         return lasting, lasting
     slow = side.law.slowest_rebound
     share = share_at(scene, bodies, side, delta, bodies.h * slow, slow)
-    hitting = Meeting(share, hits=share < 1) if share > 0 else lasting._replace(deep=True)
-    return hitting, lasting
+    if share == 0:
+        return lasting._replace(deep=True), lasting
+    return Meeting(share, hits=share < 1, falls=nears(scene, bodies, side, delta, slow)), lasting
+
+
+def held(bodies):
+    """Bodies to whose velocities gravity adds nothing."""
+    return bodies._replace(gain=np.zeros_like(bodies.gain))
+
+
+def nears(scene, bodies, side, limit, slow):
+    """Whether a sample that may get as deep as a limit [m] goes in faster than `slow` [m/s]."""
+    if fastest(scene, bodies, side) <= slow:
+        return False
+    _, goes_in, near = seen(scene, bodies, side, limit, slow, 0.0)
+    return np.any(goes_in & near)
 
 
 def share_at(scene, bodies, side, limit, least_way, slow):
@@ -231,26 +250,14 @@ def share_at(scene, bodies, side, limit, least_way, slow):
     Bodies that move by less than `least_way` [m] are looked at at the end, and samples no faster than `slow`
     [m/s] do not count.
     """
-    h = bodies.h
-    (u, w), radius = bodies.relative(side.i, side.j), float(scene.bodies[side.i].extent[3])
-    apart = np.linalg.norm(bodies.position[side.i] - bodies.position[side.j])
-    spins = np.linalg.norm(bodies.spin[[side.i, side.j]], axis=1)
-    way = np.linalg.norm(bodies.velocity[side.i] - bodies.velocity[side.j]) + spins @ [radius, radius + apart]
-    if h * way <= least_way:
+    if bodies.h * fastest(scene, bodies, side) <= least_way:
         return 1.0
-    turning = scene.bodies[side.i].surface.turning
 
     def look(share):
         """Whether a sample is too deep and goes in, and the share within which none can get there."""
-        pair = Pair(scene, bodies, side, share)
-        distance, normal = pair.distance(pair.places)
-        # What faces the other body does not turn with its own, a cylinder's samples not about its axis.
-        axis = pair.R[:, 2]
-        turns = {"fixed": w, "axis": w - (w @ axis) * axis, "ball": 0 * w}[turning]
-        velocity = u + np.cross(turns, pair.places - pair.x)
-        deep, goes_in = distance <= -limit, np.sum(normal * velocity, axis=1) < -slow
-        speed = np.maximum(np.linalg.norm(velocity, axis=1), 1e-12)
-        safe = np.where(deep, np.inf, (distance + limit) / (1.5 * h * speed))
+        (distance, speed), goes_in, _ = seen(scene, bodies, side, limit, slow, share)
+        deep = distance <= -limit
+        safe = np.where(deep, np.inf, (distance + limit) / (1.5 * bodies.h * speed))
         return np.any(deep & goes_in), safe.min()
 
     share = 0.0
@@ -263,6 +270,37 @@ def share_at(scene, bodies, side, limit, least_way, slow):
         if too_deep:
             return bisected(lambda s: look(s)[0], before, share)
     return 1.0
+
+
+def fastest(scene, bodies, side):
+    """More than any point of one body moves relative to the other [m/s]."""
+    i, j = side.i, side.j
+    radius = float(scene.bodies[i].extent[3])
+    apart = np.linalg.norm(bodies.position[i] - bodies.position[j])
+    spins = np.linalg.norm(bodies.spin[[i, j]], axis=1)
+    return np.linalg.norm(bodies.velocity[i] - bodies.velocity[j]) + spins @ [radius, radius + apart]
+
+
+def seen(scene, bodies, side, limit, slow, share):
+    """Distances of samples after a share of the step and how fast they move [m/s], and what moves in.
+
+    Returns:
+        Distances and speeds; which go in faster than `slow` [m/s], gravity aside or not; which may get as
+        deep as a limit [m] within a step.
+    """
+    (u, w), h = bodies.relative(side.i, side.j), bodies.h
+    pair = Pair(scene, bodies, side, share)
+    distance, normal = pair.distance(pair.places)
+    # What faces the other body does not turn with its own, a cylinder's samples not about its axis.
+    axis, turning = pair.R[:, 2], scene.bodies[side.i].surface.turning
+    turns = {"fixed": w, "axis": w - (w @ axis) * axis, "ball": 0 * w}[turning]
+    velocity = u + np.cross(turns, pair.places - pair.x)
+    gain = bodies.gain[side.i] - bodies.gain[side.j]
+    rate = np.sum(normal * velocity, axis=1)
+    goes_in = np.maximum(rate, rate + (0.5 + share) * normal @ gain) < -slow
+    speed = np.maximum(np.linalg.norm(velocity, axis=1) + 1.5 * np.linalg.norm(gain), 1e-12)
+    way = 1.5 * h * (fastest(scene, bodies, side) + 1.5 * np.linalg.norm(gain))
+    return (distance, speed), goes_in, (distance <= way - limit) | (turning != "fixed")
 
 
 def bisected(true_from, low, high):
@@ -280,16 +318,15 @@ def find(scene, bodies, shares=None):
     for side in sides_of(scene):
         hitting, lasting = meetings(scene, bodies, side)
         given = shares.get((side.i, side.j))
-        met = hitting if given is None else hitting._replace(share=given)
-        points = listed(scene, bodies, side, met)
-        if points.beta == 0:
-            points = listed(scene, bodies, side, lasting if given is None else Meeting(given))
-        found.append(points)
+        met = hitting if listed(scene, bodies, side, hitting).beta > 0 else lasting
+        found.append(listed(scene, bodies, side, met if given is None else met._replace(share=given)))
     return halved([points for points in found if len(points.area)])
 
 
 def listed(scene, bodies, side, met):
     """The listed points of a side whose geometry is taken when its bodies meet."""
+    if not met.falls:
+        bodies = held(bodies)
     i, j, h, share = side.i, side.j, bodies.h, met.share
     pair = Pair(scene, bodies, side, share)
     distance, normal = pair.distance(pair.places)
@@ -303,7 +340,8 @@ def listed(scene, bodies, side, met):
     after, arm, moment = levers(scene, bodies, side, share, pair, normal)
     rate = normal @ u + moment @ w
     drift = drifts(u, w, after, arm, normal) if pair.turning != "fixed" else np.zeros_like(arm)
-    depth = -distance + share * h * rate
+    gain = normal @ (bodies.gain[i] - bodies.gain[j])
+    depth = -distance + share * h * (rate + 0.5 * (1 + share) * gain)
 
     smaller = min(float(scene.bodies[k].extent[4]) for k in (i, j))
     margin = 0.001 * smaller + 2 * np.linalg.norm(bodies.gravity) * h * h
@@ -334,6 +372,8 @@ def listed(scene, bodies, side, met):
         moment=moment[kept],
         depth=depth[kept],
         rate=rate[kept],
+        meets=(approach + (0.5 + share) * gain)[kept],
+        gains=((0.5 - share) * gain)[kept],
         area=area[kept],
         drift=drift[kept],
         impact=(stiffness * (met.hits or deep) * weight)[kept],

@@ -66,6 +66,7 @@ def traction(material: dict[str, float], points, rate, slip):
     if points.delays:
         of_impact["rest"] *= 1 - points.share
     rows["approach"] = points.rate - np.sum(points.drift * points.normal, axis=1)
+    rows["meets"], rows["gains_after"] = points.meets, points.gains
     of_material = np.zeros(n, point_law.Material.numpy_dtype())
     for name, value in material.items():
         of_material[name] = value

@@ -149,9 +149,9 @@ def pressure(law, points, rate, v_s):
 def goals(law, points):
     """v*: separating speeds that points aim at in an impact [m/s]."""
     approach = points.rate - np.sum(points.normal * points.drift, axis=1)
-    rebound = -law.e * approach
+    rebound = -law.e * points.meets
     fast = smooth_step(2 * rebound / law.slowest_rebound - 1)
-    after = fast * rebound + (1 - fast) * points.way * np.minimum(approach, 0)
+    after = fast * (rebound + points.gains) + (1 - fast) * points.way * np.minimum(approach, 0)
     return after + np.maximum(after - approach, 0) / FACTOR
 
 

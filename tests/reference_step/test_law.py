@@ -35,6 +35,8 @@ def random_points(law, impact):
         moment=np.cross(arm, normal),
         depth=rng.normal(size=N) * 10 ** rng.uniform(-6, -1, N),
         rate=rng.normal(size=N),
+        meets=rng.normal(size=N),
+        gains=0.1 * rng.normal(size=N),
         area=10 ** rng.uniform(-6, -3, N),
         drift=drift,
         impact=impact * np.where(x < 1, np.maximum(x, 0) ** 2, 2 * x - 1),

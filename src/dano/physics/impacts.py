@@ -139,15 +139,25 @@ def stiffness_of_impact(first: BodyState, second: BodyState, patch: Patch, bounc
 
 
 @wp.func
-def impact_goal(impact: Impact, restitution: real, bounce: real, approach: real) -> real:
+def impact_goal(
+    impact: Impact, restitution: real, bounce: real, approach: real, meets: real, gains: real
+) -> real:
     """v*: separating speed that a sample aims at [m/s], so high that the damper leaves it at Newton's e |v⁻|.
 
     Rebounds slower than `bounce` fade out. Where impulses take effect at the start of the step, what does not
     rebound goes on for the rest of its way.
+
+    Args:
+        impact: Of the pair.
+        restitution: e [1].
+        bounce: Slowest rebound [m/s].
+        approach: Separating speed with which the step begins [m/s].
+        meets: v⁻, separating speed when bodies meet [m/s].
+        gains: What gravity adds to it from then on [m/s].
     """
-    rebound = -restitution * approach
+    rebound = -restitution * meets
     rebounds = smooth_step(TWO * rebound / bounce - ONE)
-    after = rebounds * rebound + (ONE - rebounds) * impact.way * wp.min(approach, ZERO)
+    after = rebounds * (rebound + gains) + (ONE - rebounds) * impact.way * wp.min(approach, ZERO)
     return after + wp.max(after - approach, ZERO) / _FACTOR
 
 

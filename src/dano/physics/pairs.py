@@ -37,6 +37,7 @@ class BodyState:
         ahead: Orientation at the end of the step at the old velocities.
         velocity: Of the centre of mass [m/s, W].
         spin: [rad/s, W].
+        gain: What gravity adds to the velocity within the step [m/s, W], zero for a body on a joint.
         com: Centre of mass in the field frame [m, F].
         inverse_mass: Effective inverse mass [1/kg], zero for a fixed body.
         inverse_inertia: Effective inverse inertia [1/(kg m²), W], zero for a fixed body.
@@ -47,6 +48,7 @@ class BodyState:
     ahead: quat
     velocity: vec3
     spin: vec3
+    gain: vec3
     com: vec3
     inverse_mass: real
     inverse_inertia: mat33
@@ -64,6 +66,9 @@ class PairPose:
         com: First body's centre of mass [m].
         velocity: Of the first body's centre of mass relative to the second body [m/s].
         spin: Of the first body relative to the second [rad/s].
+        gained: What gravity has added to the velocity by then [m/s].
+        gained_on_way: The same, in the mean over the way.
+        gains_after: What the velocity of the end of the step gains from then on [m/s].
         com_difference: From the second body's centre of mass to the first's at the start [m, W].
         arms: Sample coordinates → arms from the first body's centre of mass, without their offset. Those of
             samples that keep facing the solid are those of the start of the step.
@@ -80,6 +85,9 @@ class PairPose:
     com: vec3
     velocity: vec3
     spin: vec3
+    gained: vec3
+    gained_on_way: vec3
+    gains_after: vec3
     com_difference: vec3
     arms: mat33
     arm_offset: vec3
@@ -135,6 +143,15 @@ def facing_map(turn: mat33, toward: vec3, turning: int, scale: vec3) -> FacingMa
 
 
 @wp.func
+def falling(body: BodyState, falls: int) -> BodyState:
+    """A body that falls freely, or one that others hold: gravity adds nothing to its velocity."""
+    found = body
+    if falls == 0:
+        found.gain = vec3()
+    return found
+
+
+@wp.func
 def rotation_after(body: BodyState, share: real) -> mat33:
     """Rotation of a body after a share of the step."""
     return matrix(interpolated(body.orientation, body.ahead, share))
@@ -142,8 +159,12 @@ def rotation_after(body: BodyState, share: real) -> mat33:
 
 @wp.func
 def position_after(body: BodyState, share: real, h: real) -> vec3:
-    """Centre of mass after a share of the step [m, W]."""
-    return body.position + (share * h) * body.velocity
+    """Centre of mass after a share of the step [m, W].
+
+    A velocity is that of the middle of the step before: x(τ) = x + τ h (v + (1 + τ)/2 Δ) is the parabola of
+    free fall that goes on to x + h (v + Δ).
+    """
+    return body.position + (share * h) * (body.velocity + (HALF * (ONE + share)) * body.gain)
 
 
 @wp.func
@@ -200,6 +221,10 @@ def pair_pose(
     moves = first.velocity - second.velocity
     pose.velocity = inverse * (moves - wp.cross(second.spin, pose.com_difference))
     pose.spin = inverse * (first.spin - second.spin)
+    gain = inverse * (first.gain - second.gain)
+    pose.gained = (HALF + share) * gain
+    pose.gained_on_way = (HALF * (ONE + share)) * gain
+    pose.gains_after = (HALF - share) * gain
     seen = facing_map(turn, toward, turning, scale)
     pose.points = seen.points
     pose.vectors = seen.vectors
@@ -332,7 +357,7 @@ def spin_of_samples(spin: vec3, axis: vec3, turning: int) -> vec3:
 
 @wp.func
 def approach(pose: PairPose, turning: int, x: vec3, normal: vec3) -> real:
-    """Speed at which a point x [F] of the first body nears the solid at old velocities [m/s]."""
+    """Speed at which a point x [F] of the first body nears the solid at old velocities [m/s], without gains."""
     axis = vec3(pose.points[0, 2], pose.points[1, 2], pose.points[2, 2])
     spin = spin_of_samples(pose.spin, axis, turning)
     return -wp.dot(normal, pose.velocity + wp.cross(spin, x - pose.com))

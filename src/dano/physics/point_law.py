@@ -206,7 +206,9 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
         law.blow = impact.part * impact.stiffness * fading_in(point.sunk / impact.depth)
         law.guard = impact.part * impact.stiffness
         law.limit = impact_limit(impact, point.depth, point.sunk)
-        law.goal = impact_goal(impact, material.restitution, material.bounce, point.approach)
+        law.goal = impact_goal(
+            impact, material.restitution, material.bounce, point.approach, point.meets, point.gains_after
+        )
     law.damped = (loss - kept) * sunk
     law.lost = kept * sunk
     law.restitution_velocity = wp.sqrt(

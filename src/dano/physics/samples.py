@@ -41,6 +41,8 @@ class Point:
         depth: Below the second body's surface at the end of the step if nothing moved in it [m].
         rate: Separating speed at the old velocities [m/s].
         approach: Separating speed with which the step begins [m/s].
+        meets: Separating speed in the predicted configuration [m/s].
+        gains_after: What the separating speed at the end of the step gains from then on [m/s].
         area: That faces the second body [m²].
         sunk: Depth below the second body's surface in the predicted configuration [m], zero for a sample
             that faces the other way.
@@ -53,6 +55,8 @@ class Point:
     depth: real
     rate: real
     approach: real
+    meets: real
+    gains_after: real
     area: real
     sunk: real
 
@@ -149,7 +153,7 @@ def point_contact(
     point.arm = pose.rotation * arm
     point.normal = pose.rotation * normal
     point.moment = pose.rotation * moment
-    point.depth = lead * rate - d.value
+    point.depth = lead * (rate + wp.dot(pose.gained_on_way, normal)) - d.value
     if not presses_back:
         point.sunk = -d.value
     point.rate = rate
@@ -162,4 +166,6 @@ def point_contact(
             nearing = wp.dot(normal, changed)
             point.approach = rate - nearing
             point.extra_slip = pose.rotation * (changed - nearing * normal)
+    point.meets = point.approach + wp.dot(pose.gained, normal)
+    point.gains_after = wp.dot(pose.gains_after, normal)
     return point

@@ -39,11 +39,13 @@ class Meeting:
         share: τ, share of the step after which geometry is taken.
         critical: Probe that has sunk in by then, −1 where none does within the step.
         deep: Whether one had from the start.
+        nears: Whether a probe nears the other body fast enough to count.
     """
 
     share: real
     critical: int
     deep: bool
+    nears: bool
 
 
 @wp.func
@@ -79,6 +81,7 @@ def is_near(
         body.radius
         + margin
         + h * (wp.length(a.velocity - b.velocity) + wp.length(a.spin) * wp.length(body.middle - body.com))
+        + h * wp.length(a.gain - b.gain)
     )
     solid = solid_of_body(scene, world, second)
     if solid.kind.kind == _HALF_SPACE:
@@ -224,8 +227,11 @@ def meeting(
     # Seen from the second body, velocities turn with both bodies.
     axis = matrix(a.orientation) * vec3(ZERO, ZERO, ONE)
     turns = spin_of_samples(a.spin - b.spin, axis, index.turning)
-    bend = way * h * (wp.length(turns) + TWO * wp.length(b.spin))
+    gain = h * wp.length(a.gain - b.gain)
+    way += real(1.5) * gain
+    bend = way * h * (wp.length(turns) + TWO * wp.length(b.spin)) + gain
     share = real(0.0)
+    fastest = real(0.0)
     n = int(-1)
     k = int(0)
     at = lane * scene.probes.shape[1]
@@ -239,11 +245,17 @@ def meeting(
             p = room.near[world, at + i]
             x = position_in_solid(pose, scene.probes[world, p])
             d = solid_distance(scene.solids, world, solid, x)
-            near = h * approach(pose, index.turning, x, solid_normal(d.gradient))
+            normal = solid_normal(d.gradient)
+            at_old = h * approach(pose, index.turning, x, normal)
+            near = at_old - h * wp.dot(pose.gained, normal)
+            if k == 0:
+                fastest = wp.max(fastest, at_old)
+            # Gains alone, of bodies that others hold, are no approach.
+            counts = slow + wp.max(near - at_old, ZERO)
             left = d.value + sink
             rest = ONE - share
-            if near + bend * rest > slow and left - rest * (near + HALF * bend * rest) < ZERO:
-                ahead = soonest(left, near, bend, slow)
+            if near + bend * rest > counts and left - rest * (near + HALF * bend * rest) < ZERO:
+                ahead = soonest(left, near, bend, counts)
                 if ahead < further:
                     further = ahead
                     critical = p
@@ -251,6 +263,8 @@ def meeting(
         if closest < further:
             critical = -1
         critical = first_of(critical)
+        if k == 0:
+            met.nears = least(-fastest) < -slow
         before = share
         share = wp.max(share + closest, ZERO)
         met.deep = closest < ZERO and before == ZERO

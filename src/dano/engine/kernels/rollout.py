@@ -126,6 +126,8 @@ def begin_body(scene: Scene, room: Room, world: int, i: int, row: StateRow, push
             state.ahead = turned(state.orientation, row.omega, h)
             state.velocity = row.velocity
             state.spin = spin
+            if wp.static(not TREES):
+                state.gain = h * scene.gravity[world, 0]
         if is_alone:
             state.inverse_mass = ONE / body.mass
             state.inverse_inertia = wp.inverse(inertia)

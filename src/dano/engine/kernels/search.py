@@ -29,6 +29,7 @@ from dano.physics.features import LANES, TREES
 from dano.physics.impacts import Impact, Patch, share_of_impact, stiffness_of_impact, with_sample
 from dano.physics.pairs import (
     BodyState,
+    falling,
     PairPose,
 )
 from dano.physics.point_law import Material, point_law
@@ -251,6 +252,26 @@ def share_impacts(scene: Scene, room: Room, world: int, lane: int, n_found: int)
 
 
 @wp.func
+def lasting_meeting(
+    scene: Scene,
+    room: Room,
+    world: int,
+    lane: int,
+    a: BodyState,
+    b: BodyState,
+    pair: SamplePair,
+    first: int,
+    second: int,
+    h: real,
+    sink: real,
+) -> Meeting:
+    """When bodies in contact that lasts are as deep as geometry is predicted: what presses holds them."""
+    return meeting(
+        scene, room, world, lane, falling(a, 0), falling(b, 0), pair, first, second, h, sink, sink, ZERO
+    )
+
+
+@wp.func
 def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: int, at: int, end: int) -> int:
     """List the points of a pair that is near, and write the pair into `room.found`.
 
@@ -285,7 +306,7 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
         lasts = met.deep
         found.deep = wp.where(met.deep, 1, 0)
     if lasts:
-        met = meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, sink, sink, ZERO)
+        met = lasting_meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, sink)
     # Middles of blocks lie deeper in their body than its samples.
     overlooked = sink
     if scene.body_index[index.first].probes != scene.body_index[index.first].blocks:
@@ -295,10 +316,14 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
     while again:
         again = False
         found.hits = wp.where(not lasts and met.share < ONE, 1, 0)
+        found.falls = wp.where(not lasts and met.nears, 1, 0)
         found.critical = met.critical
         found.share = met.share
-        pose = posed(scene, world, a, b, index.first, index.second, met.share, h, pair.follows)
+        seen = falling(a, found.falls)
+        other = falling(b, found.falls)
+        pose = posed(scene, world, seen, other, index.first, index.second, met.share, h, pair.follows)
         speed = wp.length(pose.velocity) + wp.length(pose.spin) * TWO * body.radius
+        speed += wp.length(pose.gained_on_way)
         reach = pair.margin + (ONE - met.share) * h * speed
         patch = Patch()
         after, patch, load, turned_load = find_points(
@@ -326,11 +351,11 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
         if not lasts and found.impact.share == ZERO:
             lasts = True
             before = met.share
-            met = meeting(
-                scene, room, world, lane, a, b, pair, index.first, index.second, h, sink, sink, ZERO
-            )
-            again = met.share != before
-    found.toward = facing(scene, world, a, b, index.first, index.second, found.share, h)
+            met = lasting_meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, sink)
+            again = met.share != before or found.falls > 0
+    seen = falling(a, found.falls)
+    other = falling(b, found.falls)
+    found.toward = facing(scene, world, seen, other, index.first, index.second, found.share, h)
     found.end = wp.min(after, end)
     room.found[world, entry * _LANES + lane] = found
     return after

@@ -200,6 +200,7 @@ class FoundPair:
         share: τ.
         hits: 1 where τ is when the bodies are as deep as in an impact.
         deep: 1 where they are deeper than that from the start.
+        falls: 1 where bodies fall freely until they meet: then gravity takes part in their way.
         impact: Of the pair.
         patch: Its samples that have sunk in.
         toward: Direction that samples which turn face [F].
@@ -213,6 +214,7 @@ class FoundPair:
     share: real
     hits: wp.int32
     deep: wp.int32
+    falls: wp.int32
     impact: Impact
     patch: Patch
     toward: vec3

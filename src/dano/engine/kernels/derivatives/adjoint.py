@@ -170,7 +170,7 @@ def momentum_work(
 
 
 @wp.func
-def state_work(body: Body, row: StateRow, h: real, moves: bool, bar: BodyState) -> real:
+def state_work(body: Body, row: StateRow, gravity: vec3, h: real, moves: bool, bar: BodyState) -> real:
     """⟨bar, what contact sees of a body at the start of a step⟩; quaternions as (x, y, z, w)."""
     q = from_wxyz(row.orientation)
     total = wp.dot(bar.position, row.position) + wp.dot(bar.orientation, q) + wp.dot(bar.com, body.com)
@@ -180,6 +180,7 @@ def state_work(body: Body, row: StateRow, h: real, moves: bool, bar: BodyState) 
         total += wp.dot(bar.velocity, row.velocity) + wp.dot(bar.spin, matrix(q) * row.omega)
         if wp.static(not TREES):
             inertia = turned_inertia(matrix(q), body.inertia)
+            total += h * wp.dot(bar.gain, gravity)
             total += bar.inverse_mass / body.mass + wp.ddot(bar.inverse_inertia, wp.inverse(inertia))
     return total + wp.dot(bar.ahead, ahead)
 

@@ -46,12 +46,15 @@ def pull_body(scene: Scene, room: Room, bars: Changes, world: int, i: int, row: 
     h = scene.timestep[world, 0]
     body = scene.bodies[world, i]
     moves = scene.body_index[i].row >= 0
-    by_body, by_row, by_h, _a, _b = wp.grad(state_work)(body, row, h, moves, bar)
+    gravity = scene.gravity[world, 0]
+    by_body, by_row, by_gravity, by_h, _a, _b = wp.grad(state_work)(body, row, gravity, h, moves, bar)
     add_row(room.state_bar, world, i, by_row)
     if bars.bodies.shape[1] > 0:
         bars.bodies[world, i].com += by_body.com
         bars.bodies[world, i].mass += by_body.mass
         bars.bodies[world, i].inertia += by_body.inertia
+    if bars.gravity.shape[1] > 0:
+        bars.gravity[world, 0] += by_gravity
     if bars.timestep.shape[1] > 0:
         bars.timestep[world, 0] += by_h
 

@@ -30,7 +30,7 @@ from dano.engine.kernels.search import layer_of
 from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
 from dano.physics.features import TREES, TURNING, UNIONS
 from dano.physics.impacts import Impact, Patch
-from dano.physics.pairs import BALL, BodyState, first_touch, PairPose, position_after, rotation_after
+from dano.physics.pairs import BALL, BodyState, falling, first_touch, PairPose, position_after, rotation_after
 from dano.physics.point_law import Material
 from dano.physics.real import mat33, ONE, real, vec3, ZERO
 from dano.physics.samples import position_in_solid, Sample
@@ -394,8 +394,8 @@ def pull_pair(
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
     h = scene.timestep[world, 0]
-    a = room.bodies[world, index.first]
-    b = room.bodies[world, index.second]
+    a = falling(room.bodies[world, index.first], found.falls)
+    b = falling(room.bodies[world, index.second], found.falls)
     pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
     pose_bar, share_bar, h_bar, impact_bar, twists_bar = pull_points(
         scene, room, bars, world, lane, found, pose, rebound, twists
@@ -440,5 +440,7 @@ def pull_pair(
         bar.first = summed_body(bar.first, by_first)
         bar.second = summed_body(bar.second, by_second)
         bar.impact_depth += impact_bar.depth
+        bar.first = falling(bar.first, found.falls)
+        bar.second = falling(bar.second, found.falls)
     bar.twists = twists_bar
     return bar

@@ -67,6 +67,8 @@ def clear_pair(
             bars.bodies[world, index.second] = Body()
         if bars.timestep.shape[1] > 0:
             bars.timestep[world, 0] = ZERO
+        if bars.gravity.shape[1] > 0:
+            bars.gravity[world, 0] = vec3()
         if has_points:
             if bars.materials.shape[1] > 0:
                 bars.materials[world, index.contact] = Material()
@@ -134,6 +136,8 @@ def change_of_pair(
         )
     if changes.timestep.shape[1] > 0:
         change += bars.timestep[world, 0] * changes.timestep[world, direction]
+    if changes.gravity.shape[1] > 0:
+        change += wp.dot(bars.gravity[world, 0], changes.gravity[world, direction])
     of_samples = change_by_splines(room, world, lane, direction)
     if wp.static(POINTS):
         if has_points:
