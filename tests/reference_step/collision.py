@@ -9,8 +9,6 @@ from reference_step.rotations import cross_matrix
 
 import dano
 
-MOST = 1024
-"""Samples of a body of which each is a probe."""
 POLE = np.array([0.36, -0.48, 0.8])
 FROM_Z = np.array([[0.8, 0.48, -0.36], [0.6, -0.64, 0.48], [0.0, -0.6, -0.8]])
 """A direction in which upright bodies do not press, and a rotation that takes z to its opposite."""
@@ -238,7 +236,7 @@ def held(bodies):
 
 def nears(scene, bodies, side, limit, slow):
     """Whether a sample that may get as deep as a limit [m] goes in faster than `slow` [m/s]."""
-    if fastest(scene, bodies, side) <= slow:
+    if nearing(scene, bodies, side) <= slow:
         return False
     _, goes_in, near = seen(scene, bodies, side, limit, slow, 0.0)
     return np.any(goes_in & near)
@@ -247,10 +245,10 @@ def nears(scene, bodies, side, limit, slow):
 def share_at(scene, bodies, side, limit, least_way, slow):
     """τ: share of the step at which the first sample that goes in is as deep as a limit [m]; else 1.
 
-    Bodies that move by less than `least_way` [m] are looked at at the end, and samples no faster than `slow`
+    Bodies that near each other by less than `least_way` [m] are looked at at the end, and samples no faster than `slow`
     [m/s] do not count.
     """
-    if bodies.h * fastest(scene, bodies, side) <= least_way:
+    if bodies.h * nearing(scene, bodies, side) <= least_way:
         return 1.0
 
     def look(share):
@@ -279,6 +277,18 @@ def fastest(scene, bodies, side):
     apart = np.linalg.norm(bodies.position[i] - bodies.position[j])
     spins = np.linalg.norm(bodies.spin[[i, j]], axis=1)
     return np.linalg.norm(bodies.velocity[i] - bodies.velocity[j]) + spins @ [radius, radius + apart]
+
+
+def nearing(scene, bodies, side):
+    """More than any point of one body nears the other [m/s]: a plane at rest only along its normal."""
+    j = side.j
+    still = not (np.any(bodies.velocity[j]) or np.any(bodies.spin[j]))
+    most = fastest(scene, bodies, side)
+    if still and isinstance(scene.bodies[j].shape, dano.HalfSpace):
+        normal, radius = bodies.pose(j, 0)[1][:, 2], float(scene.bodies[side.i].extent[3])
+        speed = np.abs(normal @ bodies.velocity[side.i])
+        most = min(most, speed + np.linalg.norm(bodies.spin[side.i]) * radius)
+    return most
 
 
 def seen(scene, bodies, side, limit, slow, share):
@@ -352,10 +362,8 @@ def listed(scene, bodies, side, met):
     kept = np.concatenate([np.flatnonzero(usual), np.flatnonzero(near & other & inside_out)])
     hit = usual & (sunk > 0)
     approach = rate - np.sum(normal * drift, axis=1)
-    delta, sink = depths_of(scene, side)
-    # Middles of blocks, which stand for many samples, lie deeper in their body.
-    exact = len(sunk) <= MOST
-    deep = met.deep or (share >= 1 and np.max(sunk * hit, initial=0) > (delta if exact else sink))
+    delta, _ = depths_of(scene, side)
+    deep = met.deep or (share >= 1 and np.max(sunk * hit, initial=0) > delta)
     x = sunk / delta
     weight = fading_in(x) * hit
     near_load = area * usual * fading_in((delta * (share < 1) - distance) / delta)

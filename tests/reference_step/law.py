@@ -141,7 +141,8 @@ def pressure(law, points, rate, v_s):
     rest = law.h * (max(1 - points.share, 1e-6) if points.delays else 1)
     limit = np.minimum((points.sunk if points.delays else points.depth) - points.delta, 0) / rest
     below = np.maximum(limit - rate, 0)
-    lasting = 1 - points.beta
+    approach = points.rate - np.sum(points.normal * points.drift, axis=1)
+    lasting = 1 - points.beta * smooth_step(-approach / law.slowest_rebound - 1)
     blow = points.impact * missing + points.kappa * below
     return lasting * p + blow, lasting * slope - points.impact * (missing > 0) - points.kappa * (below > 0)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from reference_step import scenes
-from reference_step.collision import find, first_touch, meetings, Pair, samples_of, sides_of
+from reference_step.collision import find, first_touch, meetings, Pair, sides_of
 from reference_step.kinematics import Kinematics
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
@@ -60,8 +60,7 @@ def test_moment_of_meeting(engine, name, what):
     scene, state = scenes.pair(name), scenes.states(name)[what]
     kinematics, found = Kinematics(scene, state), engine.find(scene, state)
     for points in find(kinematics.scene, kinematics.bodies):
-        coarse = len(samples_of(scene.bodies[points.first])[0]) > engine.meeting_samples
-        if (points.first, points.second) in found and not coarse:
+        if (points.first, points.second) in found:
             share = found[points.first, points.second]["share"]
             assert points.share - engine.meeting_error <= share <= points.share + 1e-6
 

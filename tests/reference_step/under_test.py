@@ -25,7 +25,6 @@ class Engine(NamedTuple):
         momentum: From ω, J, h and a sign to P(ω) (+1) or P⁻(ω) (−1).
         turned: From q, ω and h to the orientation at the end of the step.
         meeting_error: By how much of a step τ may be too early.
-        meeting_samples: Up to how many samples of a body count for τ; of more, only some do.
     """
 
     name: str
@@ -36,7 +35,6 @@ class Engine(NamedTuple):
     momentum: Callable[..., np.ndarray]
     turned: Callable[..., np.ndarray]
     meeting_error: float
-    meeting_samples: float
 
 
 def _traction(law, points, rate, slip):
@@ -95,8 +93,7 @@ TODAY = Engine(
     distance=_distance,
     momentum=formulas.angular_momentum,
     turned=formulas.orientation_after,
-    # A root, and of bodies with many samples that of the centres of their blocks.
+    # A root.
     meeting_error=1e-6,
-    meeting_samples=1024,
 )
 ENGINES = (TODAY,)

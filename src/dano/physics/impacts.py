@@ -120,12 +120,18 @@ def effective_inverse_mass(state: BodyState, arm: vec3, normal: vec3) -> real:
 
 
 @wp.func
+def is_impact(approach: real, bounce: real) -> real:
+    """From 0 at a separating speed of −`bounce` [m/s] to 1 at twice that speed."""
+    return smooth_step(-approach / bounce - ONE)
+
+
+@wp.func
 def share_of_impact(patch: Patch, bounce: real) -> real:
-    """β: from 0 at an approach as fast as `bounce` [m/s] to 1 at twice that speed.
+    """β: share of a patch's contact that is an impact.
 
     A patch approaches at the mean over its load: ahead of a rolling contact single samples always do.
     """
-    return smooth_step(-patch.near_rate / (patch.near_load * bounce) - ONE)
+    return is_impact(patch.near_rate / patch.near_load, bounce)
 
 
 @wp.func

@@ -357,7 +357,7 @@ def spin_of_samples(spin: vec3, axis: vec3, turning: int) -> vec3:
 
 @wp.func
 def approach(pose: PairPose, turning: int, x: vec3, normal: vec3) -> real:
-    """Speed at which a point x [F] of the first body nears the solid at old velocities [m/s], without gains."""
+    """Speed at which a point x [F] of the first body nears the solid at old velocities [m/s]."""
     axis = vec3(pose.points[0, 2], pose.points[1, 2], pose.points[2, 2])
     spin = spin_of_samples(pose.spin, axis, turning)
     return -wp.dot(normal, pose.velocity + wp.cross(spin, x - pose.com))

@@ -3,7 +3,7 @@
 import warp as wp
 
 from dano.engine.kernels.lanes import first_of, least
-from dano.engine.kernels.tables import Body, Room, RUN, SamplePair, Scene
+from dano.engine.kernels.tables import BLOCK, Body, Room, RUN, SamplePair, Scene
 from dano.physics.features import LANES, WIDE
 from dano.physics.pairs import (
     approach,
@@ -19,12 +19,12 @@ from dano.physics.rotations import matrix
 from dano.physics.samples import position_in_solid, solid_normal
 from dano.physics.solids.distances import Solid, solid_clearance, solid_distance, solid_of
 from dano.physics.solids.grids import STEEPEST
-from dano.physics.solids.leaves import HALF_SPACE
+from dano.physics.solids.leaves import Distance, HALF_SPACE
 
-_LANES, _RUN = wp.constant(LANES), wp.constant(RUN)
+_LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
 _HALF_SPACE = wp.constant(HALF_SPACE)
 # Most steps of the search for the moment when bodies meet, the share of the step that ends it, and by how
-# much it goes on at least past probes that are slow.
+# much it goes on at least past samples that are slow.
 _ADVANCES = wp.constant(200)
 _MET = wp.constant(real(1e-12 if WIDE else 1e-6))
 _ONWARD = wp.constant(real(1.0 / 32.0))
@@ -37,15 +37,17 @@ class Meeting:
 
     Attributes:
         share: τ, share of the step after which geometry is taken.
-        critical: Probe that has sunk in by then, −1 where none does within the step.
+        critical: Sample that has sunk in by then, −1 where none does within the step.
         deep: Whether one had from the start.
-        nears: Whether a probe nears the other body fast enough to count.
+        nears: Whether a sample nears the other body fast enough to count.
+        least: No sample gets closer to the other body than that [m].
     """
 
     share: real
     critical: int
     deep: bool
     nears: bool
+    least: real
 
 
 @wp.func
@@ -122,58 +124,128 @@ def posed(
 
 
 @wp.func
-def find_near_probes(
+def find_near_blocks(
     scene: Scene, room: Room, world: int, lane: int, pose: PairPose, first: int, second: int, way: real
-) -> int:
-    """Probes no further from the solid than anything moves in a step, into `room.near`; their number.
+) -> tuple[int, int]:
+    """Blocks with samples no further from the solid than anything moves in a step, into `room.near`.
 
     Samples that keep facing the solid do not move with their body: then it is all of them.
+
+    Returns:
+        Number of blocks, and the one that comes closest, −1 where there is none.
     """
     index = scene.body_index[first]
     solid = solid_of_body(scene, world, second)
-    # Where there are as many probes as blocks, they are the centres of blocks, which have runs.
-    of_blocks = index.probes == index.blocks
+    closest = INFINITY
+    lowest = int(-1)
     found = int(0)
     beyond = int(0)
-    at = lane * scene.probes.shape[1]
-    for i in range(lane, index.probes, _LANES):
+    at = lane * (room.near.shape[1] // _LANES)
+    for i in range(lane, index.blocks, _LANES):
+        b = index.first_block + i
         listed = True
         if index.turning == 0:
             if wp.static(LANES == 1):
                 if i < beyond:
                     listed = False
-                elif of_blocks and i % _RUN == 0:
-                    run = scene.runs[world, index.first_block + i]
+                elif i % _RUN == 0:
+                    run = scene.runs[world, b]
                     x = pose.points * vec3(run[0], run[1], run[2]) + pose.origin
                     far = way + STEEPEST * run[3]
                     if solid_clearance(scene.solids, world, solid, x, far) > far:
                         beyond = i + _RUN
                         listed = False
             if listed:
-                x = position_in_solid(pose, scene.probes[world, index.first_probe + i])
-                listed = solid_clearance(scene.solids, world, solid, x, way) <= way
+                ball = scene.balls[world, b]
+                x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
+                reach = way + ball[3]
+                clear = solid_clearance(scene.solids, world, solid, x, reach)
+                listed = clear <= reach
+                if clear - ball[3] < closest:
+                    closest = clear - ball[3]
+                    lowest = b
         if listed:
-            room.near[world, at + found] = index.first_probe + i
+            room.near[world, at + found] = b
             found += 1
+    return found, lowest
+
+
+@wp.struct
+class Nearing:
+    """How a point nears a solid within a step.
+
+    Attributes:
+        left: Way that is left to the depth at which bodies meet [m].
+        near: How far it nears the solid in a step, at the moment [m].
+        counts: By more than so much in a step where it counts [m].
+        at_old: How far it would near it without gravity [m].
+    """
+
+    left: real
+    near: real
+    counts: real
+    at_old: real
+
+
+@wp.func
+def nearing(pose: PairPose, turning: int, x: vec3, d: Distance, sink: real, h: real, slow: real) -> Nearing:
+    """How a point x [F] at a distance nears a solid; what is slower than `slow` [m] in a step does not count."""
+    found = Nearing()
+    normal = solid_normal(d.gradient)
+    found.left = d.value + sink
+    found.at_old = h * approach(pose, turning, x, normal)
+    found.near = found.at_old - h * wp.dot(pose.gained, normal)
+    # Gravity alone, of bodies that others hold, is no approach.
+    found.counts = slow + wp.max(found.near - found.at_old, ZERO)
     return found
 
 
 @wp.func
+def may_meet(left: real, near: real, bend: real, rest: real) -> bool:
+    """Whether a point may have gone the way that is left by the end of the step."""
+    return left - rest * (near + HALF * bend * rest) < ZERO
+
+
+@wp.func
+def ahead_of(left: real, near: real, bend: real) -> real:
+    """Share of the step before which a point cannot have gone a way l: t with n t + b t²/2 = l."""
+    return TWO * left / (near + wp.sqrt(near * near + TWO * bend * left))
+
+
+@wp.func
 def soonest(left: real, near: real, bend: real, slow: real) -> real:
-    """Share of the step before which a probe cannot have met, or, below zero, since when it may have.
+    """Share of the step before which a sample cannot have met, or, below zero, since when it may have.
 
     Args:
         left: Way that is left [m].
         near: How far the probe nears the other body in a step [m].
         bend: By how much that grows in a step at most [m].
-        slow: A probe that nears it by no more does not count [m].
+        slow: A sample that nears it by no more does not count [m].
     """
     if left > ZERO:
-        ahead = TWO * left / (near + wp.sqrt(near * near + TWO * bend * left))
+        ahead = ahead_of(left, near, bend)
         return wp.where(near > slow, ahead, wp.max(ahead, _ONWARD))
     if near > slow:
         return wp.max(left, -near * (near - slow) / wp.max(bend, _FLAT * near)) / near
     return wp.max((slow - near) / bend, _ONWARD)
+
+
+@wp.func
+def most_nearing(
+    scene: Scene, world: int, solid: Solid, body: Body, a: BodyState, b: BodyState, way: real, h: real
+) -> real:
+    """Most by which a point of a body nears a solid within the step [m].
+
+    A half-space has one normal: along it nothing nears it. Others are neared by no more than bodies move.
+    """
+    most = way
+    if solid.kind.kind == _HALF_SPACE and solid.count == 1:
+        if wp.length_sq(b.velocity) + wp.length_sq(b.spin) == ZERO:
+            rotation = matrix(b.orientation)
+            normal = rotation * solid_normal(solid_distance(scene.solids, world, solid, b.com).gradient)
+            lever = wp.length(middle_of(body, a) - a.position) + body.radius
+            most = wp.min(most, h * (wp.abs(wp.dot(normal, a.velocity)) + wp.length(a.spin) * lever))
+    return most
 
 
 @wp.func
@@ -194,7 +266,7 @@ def meeting(
 ) -> Meeting:
     """When bodies have sunk into each other by a depth.
 
-    That is the root of the depth of the deepest probe, the end of the step where it is not within the step.
+    That is the root of the depth of the deepest sample, the end of the step where it is not within the step.
     On the far side of a thin wall, normals would push the wrong way. It is found from the start of the step
     on, by steps within which none can get there: l = v t + b t²/2 with l what is left of its way, v its speed
     and b a bound on how fast that grows, by turning. Along a line, distance to a convex solid grows no slower
@@ -212,59 +284,88 @@ def meeting(
         second: … of the second.
         h: Timestep [s].
         sink: The depth [m].
-        least_way: Bodies that move by less in a step [m] are looked at at its end.
-        slow: Probes that near the other body by no more in a step [m] do not count.
+        least_way: Bodies that near each other by less in a step [m] are looked at at its end.
+        slow: Samples that near the other body by no more in a step [m] do not count.
     """
     met = Meeting()
     met.critical = -1
     met.share = ONE
+    met.least = -INFINITY
     index = scene.body_index[first]
     solid = solid_of_body(scene, world, second)
     body = scene.bodies[world, first]
     way = way_of(a, b, middle_of(body, a), body.radius, h)
-    if way <= least_way:
+    most = most_nearing(scene, world, solid, body, a, b, way, h)
+    if most <= least_way:
         return met
     # Seen from the second body, velocities turn with both bodies.
     axis = matrix(a.orientation) * vec3(ZERO, ZERO, ONE)
     turns = spin_of_samples(a.spin - b.spin, axis, index.turning)
     gain = h * wp.length(a.gain - b.gain)
     way += real(1.5) * gain
+    most += real(1.5) * gain
     bend = way * h * (wp.length(turns) + TWO * wp.length(b.spin)) + gain
     share = real(0.0)
     fastest = real(0.0)
+    closest_of_all = real(0.0)
     n = int(-1)
+    likely = int(-1)
     k = int(0)
-    at = lane * scene.probes.shape[1]
+    at = lane * (room.near.shape[1] // _LANES)
+    stretch = stretch_of(body, index.turning)
     while k < _ADVANCES:
         pose = posed(scene, world, a, b, first, second, share, h, pair.follows)
         if n < 0:
-            n = find_near_probes(scene, room, world, lane, pose, first, second, STEEPEST * way - sink)
+            n, likely = find_near_blocks(scene, room, world, lane, pose, first, second, STEEPEST * way - sink)
         further = INFINITY
         critical = int(-1)
-        for i in range(n):
-            p = room.near[world, at + i]
-            x = position_in_solid(pose, scene.probes[world, p])
+        rest = ONE - share
+        # What is soonest most likely comes first: it rules others out.
+        begin = likely
+        for i in range(-1, n):
+            block = begin
+            if i >= 0:
+                block = room.near[world, at + i]
+            if (i >= 0) == (block == begin) or block < 0:
+                continue
+            ball = scene.balls[world, block]
+            x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
             d = solid_distance(scene.solids, world, solid, x)
-            normal = solid_normal(d.gradient)
-            at_old = h * approach(pose, index.turning, x, normal)
-            near = at_old - h * wp.dot(pose.gained, normal)
-            if k == 0:
-                fastest = wp.max(fastest, at_old)
-            # Gains alone, of bodies that others hold, are no approach.
-            counts = slow + wp.max(near - at_old, ZERO)
-            left = d.value + sink
-            rest = ONE - share
-            if near + bend * rest > counts and left - rest * (near + HALF * bend * rest) < ZERO:
-                ahead = soonest(left, near, bend, counts)
-                if ahead < further:
-                    further = ahead
-                    critical = p
+            radius = ball[3] * stretch
+            # Samples of a block are no nearer than its middle, less its radius.
+            asked = index.turning != 0
+            if d.value - radius <= rest * most:
+                middle = nearing(pose, index.turning, x, d, sink, h, slow)
+                if k == 0:
+                    fastest = wp.max(fastest, middle.at_old)
+                asked = asked or middle.left <= radius
+                if not asked:
+                    if may_meet(middle.left - radius, middle.near, bend, rest):
+                        asked = ahead_of(middle.left - radius, middle.near, bend) < further
+            if asked:
+                for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
+                    x = position_in_solid(pose, scene.samples[world, s].point)
+                    d = solid_distance(scene.solids, world, solid, x)
+                    if d.value <= rest * most:
+                        own = nearing(pose, index.turning, x, d, sink, h, slow)
+                        if k == 0:
+                            fastest = wp.max(fastest, own.at_old)
+                            close = d.value - wp.max(own.near + HALF * bend, ZERO)
+                            closest_of_all = wp.min(closest_of_all, close)
+                        if own.near + bend * rest > own.counts and may_meet(own.left, own.near, bend, rest):
+                            ahead = soonest(own.left, own.near, bend, own.counts)
+                            if ahead < further:
+                                further = ahead
+                                critical = s
+                                likely = block
         closest = least(further)
         if closest < further:
             critical = -1
         critical = first_of(critical)
         if k == 0:
             met.nears = least(-fastest) < -slow
+            # Samples that were not asked do not sink in that far.
+            met.least = wp.min(least(closest_of_all), -sink)
         before = share
         share = wp.max(share + closest, ZERO)
         met.deep = closest < ZERO and before == ZERO

@@ -307,10 +307,6 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
         found.deep = wp.where(met.deep, 1, 0)
     if lasts:
         met = lasting_meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, sink)
-    # Middles of blocks lie deeper in their body than its samples.
-    overlooked = sink
-    if scene.body_index[index.first].probes != scene.body_index[index.first].blocks:
-        overlooked = pair.impact_depth
     after = at
     again = bool(True)
     while again:
@@ -336,8 +332,8 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
         patch.arm = total3(patch.arm)
         patch.normal = total3(patch.normal)
         patch.deepest = greatest(patch.deepest)
-        # Probes that come near only after they have sunk in, by turning, are not met.
-        if met.share >= ONE and patch.deepest > overlooked:
+        # Samples that come near only after they have sunk in, by turning, are not met.
+        if met.share >= ONE and patch.deepest > pair.impact_depth:
             found.deep = 1
         # What faces the other way presses where its load is the larger one.
         if total(turned_load) > total(load):
@@ -351,7 +347,10 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
         if not lasts and found.impact.share == ZERO:
             lasts = True
             before = met.share
-            met = lasting_meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, sink)
+            if before < ONE or met.least < -sink:
+                met = lasting_meeting(
+                    scene, room, world, lane, a, b, pair, index.first, index.second, h, sink
+                )
             again = met.share != before or found.falls > 0
     seen = falling(a, found.falls)
     other = falling(b, found.falls)

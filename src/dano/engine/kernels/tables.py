@@ -55,8 +55,6 @@ class BodyIndex:
         row: Place among the bodies that move, or −1; of bodies on joints their node.
         first_block: Of its samples.
         blocks: How many it has.
-        first_probe: Of the points that say how deep it is, coarsely if there are many samples.
-        probes: How many it has.
         turning: How its samples turn.
         first_leaf: Of its solid.
         leaves: How many its solid has.
@@ -65,8 +63,6 @@ class BodyIndex:
     row: wp.int32
     first_block: wp.int32
     blocks: wp.int32
-    first_probe: wp.int32
-    probes: wp.int32
     turning: wp.int32
     first_leaf: wp.int32
     leaves: wp.int32
@@ -112,7 +108,6 @@ class Scene:
         samples: Of all bodies, in blocks, shape (worlds, samples).
         balls: Centre [m, F] and radius [m] of a ball around each block, shape (worlds, blocks).
         runs: Balls around each block and those after it, `RUN` in all.
-        probes: Points that say how deep a body is [m, F].
         solids: What samples press on.
         pairs: Shape (worlds, pairs).
         pair_index: Shape (pairs + contacts with a patch law,): bodies and contact of each pair with samples
@@ -131,7 +126,6 @@ class Scene:
     samples: wp.array2d(dtype=Sample)
     balls: wp.array2d(dtype=vec4)
     runs: wp.array2d(dtype=vec4)
-    probes: wp.array2d(dtype=vec3)
     solids: Solids
     pairs: wp.array2d(dtype=SamplePair)
     pair_index: wp.array(dtype=PairIndex)
@@ -196,7 +190,7 @@ class FoundPair:
         pair: Index among the pairs.
         first: First of its points in a lane's list.
         end: Beyond its last.
-        critical: Probe that says when the bodies meet, −1 where they do not within the step.
+        critical: Sample that says when the bodies meet, −1 where they do not within the step.
         share: τ.
         hits: 1 where τ is when the bodies are as deep as in an impact.
         deep: 1 where they are deeper than that from the start.
@@ -237,7 +231,7 @@ class Room:
         duals: At the accepted velocities.
         changes: Of the duals by the whole step.
         linear: The law as it was linearised last.
-        near: Probes that may meet a solid within the step.
+        near: Blocks whose samples may meet a solid within the step, of each lane a part.
         blocks: Of the Jacobian, shape (worlds, blocks · blocks).
         spare: The same, used up by the solve.
         used: Whether a block is not zero.

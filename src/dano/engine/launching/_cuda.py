@@ -23,8 +23,10 @@ LANES = 32
 PLATFORM = "CUDA"
 # Arrays in the room that have a part for each lane, of the length that one lane needs; and lists of points,
 # of which each lane has a part that is that much longer than its share: lanes do not find equally many.
-_OF_EACH_LANE = ("room.found", "room.near")
-_OF_POINTS = tuple(f"room.{name}" for name in ("where", "points", "laws", "duals", "changes", "linear"))
+_OF_EACH_LANE = ("room.found",)
+_OF_POINTS = tuple(
+    f"room.{name}" for name in ("near", "where", "points", "laws", "duals", "changes", "linear")
+)
 _MORE_POINTS = 16
 # Boundary of each array in the room [bytes].
 _ALIGNED = 16

@@ -155,7 +155,7 @@ def room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> di
         **dict.fromkeys(("blocks", "spare", "used", "later", "listed"), blocks * blocks),
         **dict.fromkeys(("where", "points", "laws", "duals", "changes", "linear"), points),
         "found": pairs,
-        "near": shapes["scene.probes"].rows,
+        "near": int(max(tables.whole.arrays["scene.body_index"][:, 2], default=0)),
     }
     room = {f"room.{name}": length for name, length in lengths.items()}
     if "scene.trees.nodes" in tables.whole.arrays:

@@ -34,8 +34,6 @@ _MARGIN = 0.001
 _SINK = 0.01
 # … and by this share of the thinner one's half thickness. Impacts are at most as deep.
 _THIN = 0.25
-# Up to so many blocks the moment of meeting is found from samples, beyond from the centres of blocks.
-_FEW_BLOCKS = 64
 # How samples turn with their body: see `dano.physics.pairs`.
 _TURNING = {"fixed": 0, "axis": 1, "ball": 2}
 
@@ -252,22 +250,19 @@ def _materials(scene: Scene, kernels: ModuleType, dtype: DTypeLike) -> Float[Arr
 
 
 def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
-    """Samples, balls around blocks and runs of them, and probes of all bodies; where each body's stand."""
+    """Samples, and balls around blocks and runs of them, of all bodies; where each body's stand."""
     twins = scene.twins or tuple(range(len(bodies)))
     empty = SurfaceSet.none(dtype)
-    first: dict[int, tuple[int, int, int, int]] = {}
+    first: dict[int, tuple[int, int]] = {}
     sets: list[SurfaceSet] = []
-    probes, index, blocks, points = [], [], 0, 0
+    index, blocks = [], 0
     for i, body in enumerate(bodies):
         surface = empty if body.surface is None else body.surface
         key = twins[i] if body.surface is not None else -1 - i
         if key not in first:
-            probe = _probes(surface)
-            n_blocks, n_probes = surface.radii.shape[0], probe.shape[0]
-            first[key] = blocks, n_blocks, points, n_probes
+            first[key] = blocks, surface.radii.shape[0]
             sets.append(surface)
-            probes.append(probe)
-            blocks, points = blocks + n_blocks, points + n_probes
+            blocks += surface.radii.shape[0]
         index.append((*first[key], _TURNING[surface.turning]))
     points_of = jnp.concatenate([s.points[:3].T for s in sets]).astype(dtype)
     vectors = jnp.concatenate([s.vectors.T for s in sets]).astype(dtype)
@@ -278,14 +273,8 @@ def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
         "scene.samples": jnp.concatenate([points_of, vectors], axis=1),
         "scene.balls": balls,
         "scene.runs": balls_around_runs(balls),
-        "scene.probes": jnp.concatenate(probes).astype(dtype),
     }
     return rows, index
-
-
-def _probes(surface: SurfaceSet) -> Float[Array, "k 3"]:
-    """Points that say how deep a surface is: its samples, or if they are many the centres of blocks."""
-    return surface.points[:3].T if surface.radii.shape[0] <= _FEW_BLOCKS else surface.centers
 
 
 def _solids(scene: Scene, used: set[int], dtype: DTypeLike) -> tuple[list[Placed], list[tuple[int, int]]]:

@@ -91,7 +91,7 @@ def distance_work(solids: Solids, world: int, solid: Solid, x: vec3, bar: Distan
 
 
 @wp.func
-def probe_distance(
+def sample_distance(
     solids: Solids,
     world: int,
     solid: Solid,
@@ -102,11 +102,11 @@ def probe_distance(
     toward: vec3,
     turning: int,
     scale: vec3,
-    probe: vec3,
+    sample: vec3,
 ) -> real:
-    """Distance of a probe from a leaf after a share of the step: −sink at the moment when bodies meet."""
+    """Distance of a sample from a leaf after a share of the step: −sink at the moment when bodies meet."""
     pose = pair_pose(first, second, share, h, toward, turning, scale, ZERO)
-    return leaf_distance(solids, world, solid.kind, solid.leaf, position_in_solid(pose, probe)).value
+    return leaf_distance(solids, world, solid.kind, solid.leaf, position_in_solid(pose, sample)).value
 
 
 pose_product = product_of(PairPose)
@@ -273,7 +273,7 @@ def _names_in(code: CodeType) -> set[str]:
 
 
 for _function in (
-    point_work, distance_work, probe_distance, pair_work, facing_work, momentum_work, state_work,
+    point_work, distance_work, sample_distance, pair_work, facing_work, momentum_work, state_work,
     advance_work, impact_patch_work, impact_work, late_work,
 ):  # fmt: skip
     need_adjoints(_function)

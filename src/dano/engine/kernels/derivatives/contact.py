@@ -10,7 +10,7 @@ from dano.engine.kernels.derivatives.adjoint import (
     impact_work,
     pair_work,
     point_work,
-    probe_distance,
+    sample_distance,
     Virtual,
 )
 from dano.engine.kernels.derivatives.pair_changes import add_distance_changes
@@ -337,12 +337,12 @@ def pull_pose(
     share_bar += by_share
     toward_bar = by_toward
     if found.critical >= 0:
-        # τ is the root of distance + depth = 0 at the critical probe.
-        probe = scene.probes[world, found.critical]
-        solid = leaf_at(scene, world, index.second, position_in_solid(pose, probe))
-        _d, _e, of_solid, of_first, of_second, of_share, of_h, of_toward, _f, of_scale, _g = wp.grad(
-            probe_distance
-        )(scene.solids, world, solid, a, b, found.share, h, toward, turning, scale, probe)
+        # τ is the root of distance + depth = 0 at the critical sample.
+        critical = scene.samples[world, found.critical].point
+        solid = leaf_at(scene, world, index.second, position_in_solid(pose, critical))
+        _d, _e, of_solid, of_first, of_second, of_share, of_h, of_toward, _f, of_scale, of_sample = wp.grad(
+            sample_distance
+        )(scene.solids, world, solid, a, b, found.share, h, toward, turning, scale, critical)
         slope = of_share
         if wp.static(len(TURNING) > 1):
             if turning > 0:
@@ -370,6 +370,8 @@ def pull_pose(
             toward_bar += share * of_toward
             if lane == 0:
                 add_to_leaf(bars.leaves, world, solid.first, scaled_leaf(share, of_solid.leaf))
+                if bars.samples.shape[1] > 0:
+                    bars.samples[world, found.critical].point += share * of_sample
     if wp.static(len(TURNING) > 1):
         if turning > 0:
             bar, _j = pull_facing(
