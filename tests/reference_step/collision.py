@@ -245,8 +245,8 @@ def nears(scene, bodies, side, limit, slow):
 def share_at(scene, bodies, side, limit, least_way, slow):
     """τ: share of the step at which the first sample that goes in is as deep as a limit [m]; else 1.
 
-    Bodies that near each other by less than `least_way` [m] are looked at at the end, and samples no faster than `slow`
-    [m/s] do not count.
+    Bodies that near each other by less than `least_way` [m] are looked at at the end, and samples no faster
+    than `slow` [m/s] do not count.
     """
     if bodies.h * nearing(scene, bodies, side) <= least_way:
         return 1.0
@@ -330,7 +330,7 @@ def find(scene, bodies, shares=None):
         given = shares.get((side.i, side.j))
         met = hitting if listed(scene, bodies, side, hitting).beta > 0 else lasting
         found.append(listed(scene, bodies, side, met if given is None else met._replace(share=given)))
-    return halved([points for points in found if len(points.area)])
+    return together(bodies, halved([points for points in found if len(points.area)]))
 
 
 def listed(scene, bodies, side, met):
@@ -454,6 +454,17 @@ def halved(found):
     return [
         points._replace(impact=points.impact / 2, kappa=points.kappa / 2)
         if (points.second, points.first) in hits
+        else points
+        for points in found
+    ]
+
+
+def together(bodies, found):
+    """Sides of bodies that touch others that move, too: their impulses do not wait for the impact."""
+    crowded = {k for points in found for k in points[:2] if all(bodies.moves[list(points[:2])])}
+    return [
+        points._replace(delays=False, way=points.share)
+        if points.delays and crowded & set(points[:2])
         else points
         for points in found
     ]

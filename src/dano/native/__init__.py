@@ -16,5 +16,6 @@ from dano.native._leaves import (
     lower_bounds as lower_bounds,
     Placed as Placed,
     shape_kinds as shape_kinds,
+    slabs_of_blocks as slabs_of_blocks,
 )
 from dano.native._warp import begin as begin, compiled_kernel as compiled_kernel

@@ -230,3 +230,23 @@ def balls_around_runs(balls: Float[Array, "b 4"]) -> Float[Array, "b 4"]:
     middle = jnp.mean(centers, axis=1)
     reach = jnp.sqrt(jnp.sum((centers - middle[:, None]) ** 2, axis=2)) + radii
     return jnp.concatenate([middle, jnp.max(reach, axis=1, keepdims=True)], axis=1)
+
+
+def slabs_of_blocks(
+    points: Float[Array, "n 3"], vectors: Float[Array, "n 3"], centers: Float[Array, "b 3"]
+) -> Float[Array, "b 4"]:
+    """Slabs around blocks of samples: unit normals, and how far samples are along them from a centre at most.
+
+    Args:
+        points: Samples [m].
+        vectors: Vector areas [m²].
+        centers: Of the blocks [m].
+    """
+    b = centers.shape[0]
+    if b == 0:
+        return jnp.zeros((0, 4), points.dtype)
+    whole = jnp.sum(vectors.reshape(b, -1, 3), axis=1)
+    size = jnp.sqrt(jnp.sum(whole**2, axis=1, keepdims=True))
+    normals = jnp.where(size > 0, whole / jnp.where(size > 0, size, 1), 0)
+    along = jnp.sum((points.reshape(b, -1, 3) - centers[:, None]) * normals[:, None], axis=2)
+    return jnp.concatenate([normals, jnp.max(jnp.abs(along), axis=1, keepdims=True)], axis=1)

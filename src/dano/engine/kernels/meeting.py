@@ -58,6 +58,44 @@ def stretch_of(body: Body, turning: int) -> real:
     return ONE
 
 
+@wp.struct
+class Plane:
+    """What a body nears, if it is a plane.
+
+    Attributes:
+        is_one: Whether it is one, and samples are fixed to the body.
+        normal: Unit normal in the axes of the solid.
+    """
+
+    is_one: bool
+    normal: vec3
+
+
+@wp.func
+def plane_of(scene: Scene, world: int, solid: Solid, turning: int, x: vec3) -> Plane:
+    """The plane that samples near, from any point x of the solid's frame."""
+    plane = Plane()
+    plane.is_one = solid.kind.kind == _HALF_SPACE and solid.count == 1 and turning == 0
+    if plane.is_one:
+        plane.normal = solid_normal(solid_distance(scene.solids, world, solid, x).gradient)
+    return plane
+
+
+@wp.func
+def reach_of_block(scene: Scene, world: int, pose: PairPose, plane: Plane, block: int, stretch: real) -> real:
+    """By how much samples of a block are nearer to a solid than its middle at most [m].
+
+    A plane sees how thick a block is, where it sees it from above.
+    """
+    radius = scene.balls[world, block][3] * stretch
+    if plane.is_one:
+        slab = scene.slabs[world, block]
+        along = wp.dot(plane.normal, pose.points * vec3(slab[0], slab[1], slab[2]))
+        across = wp.sqrt(wp.max(ONE - along * along, ZERO))
+        return wp.min(radius, slab[3] * wp.abs(along) + radius * across)
+    return radius
+
+
 @wp.func
 def middle_of(body: Body, state: BodyState) -> vec3:
     """Centre of the ball around a body at the start of the step [m, W]."""
@@ -189,7 +227,7 @@ class Nearing:
 
 @wp.func
 def nearing(pose: PairPose, turning: int, x: vec3, d: Distance, sink: real, h: real, slow: real) -> Nearing:
-    """How a point x [F] at a distance nears a solid; what is slower than `slow` [m] in a step does not count."""
+    """How a point x [F] nears a solid; what is slower than `slow` [m] in a step does not count."""
     found = Nearing()
     normal = solid_normal(d.gradient)
     found.left = d.value + sink
@@ -313,6 +351,7 @@ def meeting(
     k = int(0)
     at = lane * (room.near.shape[1] // _LANES)
     stretch = stretch_of(body, index.turning)
+    plane = plane_of(scene, world, solid, index.turning, b.com)
     while k < _ADVANCES:
         pose = posed(scene, world, a, b, first, second, share, h, pair.follows)
         if n < 0:
@@ -331,7 +370,7 @@ def meeting(
             ball = scene.balls[world, block]
             x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
             d = solid_distance(scene.solids, world, solid, x)
-            radius = ball[3] * stretch
+            radius = reach_of_block(scene, world, pose, plane, block, stretch)
             # Samples of a block are no nearer than its middle, less its radius.
             asked = index.turning != 0
             if d.value - radius <= rest * most:

@@ -12,7 +12,9 @@ from dano.engine.kernels.meeting import (
     is_near,
     Meeting,
     meeting,
+    plane_of,
     posed,
+    reach_of_block,
     solid_of_body,
     stretch_of,
 )
@@ -146,6 +148,7 @@ def find_points(
     body = scene.bodies[world, first]
     stretch = stretch_of(body, index.turning)
     layer = layer_of(pair, share)
+    plane = plane_of(scene, world, solid, index.turning, pose.origin)
     at = begin
     beyond = int(0)
     # All lanes go through as many rounds: samples of the blocks that are listed in one are shared.
@@ -166,7 +169,7 @@ def find_points(
         if listed:
             ball = scene.balls[world, b]
             x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
-            near = reach + ball[3] * stretch
+            near = reach + reach_of_block(scene, world, pose, plane, b, stretch)
             listed = solid_clearance(scene.solids, world, solid, x, near) <= near
         rest = lanes_where(lane, listed)
         while rest != wp.uint32(0):
@@ -269,6 +272,37 @@ def lasting_meeting(
     return meeting(
         scene, room, world, lane, falling(a, 0), falling(b, 0), pair, first, second, h, sink, sink, ZERO
     )
+
+
+@wp.func
+def touches_others(scene: Scene, room: Room, world: int, lane: int, n_found: int, f: int) -> bool:
+    """Whether the body that moves in a pair is near others that move, too."""
+    index = scene.pair_index[room.found[world, f * _LANES + lane].pair]
+    moves = index.first
+    if scene.body_index[index.first].row < 0:
+        moves = index.second
+    found = bool(False)
+    for g in range(n_found):
+        other = scene.pair_index[room.found[world, g * _LANES + lane].pair]
+        if other.first == moves or other.second == moves:
+            both = scene.body_index[other.first].row >= 0 and scene.body_index[other.second].row >= 0
+            found = found or both
+    return found
+
+
+@wp.func
+def keep_together(scene: Scene, room: Room, world: int, lane: int, n_found: int):
+    """Have impulses on bodies that touch others, too, take effect all at once: at the start of the step.
+
+    What is pressed from both sides would else go on by what one of them does until the other begins.
+    """
+    for f in range(n_found):
+        k = f * _LANES + lane
+        if room.found[world, k].impact.delays > ZERO:
+            if touches_others(scene, room, world, lane, n_found, f):
+                room.found[world, k].impact.delays = ZERO
+                room.found[world, k].impact.way = room.found[world, k].share
+                room.found[world, k].impact.rest = scene.timestep[world, 0]
 
 
 @wp.func
@@ -387,6 +421,8 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
             if total(real(at - begin)) > ZERO:
                 n_found += 1
     share_impacts(scene, room, world, lane, n_found)
+    if wp.static(not TREES):
+        keep_together(scene, room, world, lane, n_found)
     return n_found, total(wp.where(overflow, ONE, ZERO)) > ZERO
 
 

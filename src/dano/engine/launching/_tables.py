@@ -25,6 +25,7 @@ from dano.native import (
     leaves_of,
     Placed,
     shape_kinds,
+    slabs_of_blocks,
 )
 from dano.scene import Body, pressing_pairs, Scene
 
@@ -272,6 +273,7 @@ def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
     rows = {
         "scene.samples": jnp.concatenate([points_of, vectors], axis=1),
         "scene.balls": balls,
+        "scene.slabs": slabs_of_blocks(points_of, vectors, centers),
         "scene.runs": balls_around_runs(balls),
     }
     return rows, index
