@@ -107,7 +107,7 @@ class Scene:
         moving: Bodies that move, shape (m,); with joints in the order of nodes.
         samples: Of all bodies, in blocks, shape (worlds, samples).
         balls: Centre [m, F] and radius [m] of a ball around each block, shape (worlds, blocks).
-        slabs: Mean unit normal [F] of each block, and how far samples are along it from the ball's centre [m].
+        slabs: Mean unit normal [F] of each block, and how far along it samples are from its centre [m].
         runs: Balls around each block and those after it, `RUN` in all.
         solids: What samples press on.
         pairs: Shape (worlds, pairs).
