@@ -105,7 +105,7 @@ def every_solid():
         wp.launch(
             asked,
             len(points),
-            [solids, int(index[k, 6]), int(index[k, 7]), given, found, least, quick],
+            [solids, int(index[k, 4]), int(index[k, 5]), given, found, least, quick],
             device="cpu",
         )
         return found.numpy(), least.numpy(), quick.numpy()
@@ -273,16 +273,21 @@ def test_laws_that_no_step_would_ask():
 
 @pytest.mark.parametrize("height", [0.2, 0.55, 1.2])
 def test_fast_small_bodies_rebound(height):
-    """A ball of 1 cm that falls through several of its radii a step leaves with e times its speed."""
+    """A ball of 1 cm that falls through several of its radii a step rises to e² of the height it fell from."""
     scene = dano.Scene.create(
         [dano.Body("ball", dano.Sphere(0.01), mass=0.01), dano.Body("floor", dano.HalfSpace(), fixed=True)],
         [dano.Contact("ball", "floor", dano.ContactParams(restitution=0.8))],
         timestep=0.01,
     )
     run = dano.simulate(scene, scene.initial_state(ball=dict(position=(0, 0, 0.01 + height))), 60)
-    speed = np.asarray(run.states.velocity[:, 0, 2])
+    z, speed = (np.asarray(x[:, 0, 2]) for x in (run.states.position, run.states.velocity))
+    # A velocity is that of half a step before: of the parabola through these places the vertex is at …
+    h, g = 0.01, 9.81
+    vertex = z + (speed - 0.5 * h * g) ** 2 / (2 * g)
     before = speed.argmin()
-    np.testing.assert_allclose(speed[before : before + 5].max(), -0.8 * speed[before], rtol=5e-3)
+    # The impact happens where the ball has sunk in by .5 % of its size, and half of its edge.
+    met = 0.01 - 0.005 * 0.02 * 1.005
+    np.testing.assert_allclose(vertex[before + 2] - met, 0.8**2 * (vertex[before] - met), rtol=5e-3)
 
 
 @pytest.mark.parametrize("height", [0.3, 0.45, 0.7])

@@ -376,3 +376,19 @@ def test_what_does_not_need_to_be_touched_is_not_explored(pushing, pushed, drive
     apart = dano.Scene.create(list(scene.bodies), timestep=0.02, gravity=(0, 0, 0))
     made = dano.plan(apart, state, task)
     assert "no contact of the scene lets it" in made.explored and not made.reached
+
+
+def test_a_body_that_sticks_is_pushed():
+    """With no force it is held, and derivatives say that a little force moves nothing."""
+    box = dano.Body("box", dano.Box((0.05, 0.05, 0.05)), mass=1.0)
+    floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
+    params = dano.ContactParams(sliding_friction=0.5)
+    scene = dano.Scene.create([box, floor], [dano.Contact("box", "floor", params)], timestep=0.02)
+    goals = [
+        dano.Goal("box", position=(0.1, 0, 0.05), within=2e-3),
+        dano.Goal("box", velocity=(0, 0, 0), within=1e-2),
+    ]
+    task = dano.Task(16, [dano.Actuator("box", limit=15.0)], goals)
+    made = dano.plan(scene, scene.initial_state(box=dict(position=(0, 0, 0.0499))), task)
+    assert made.reached, made.describe()
+    assert np.abs(made.values[:, 0]).max() > 0.5 * 9.81

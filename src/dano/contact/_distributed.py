@@ -49,6 +49,7 @@ class Material(NamedTuple):
         instant: 1 where impacts end within the step, 0 where they are left to the spring.
         bounce: Slowest rebound of an impact [m/s].
         uplift: An overlap of depth d separates at most at √(uplift · d), if that exceeds v_e [m/s²].
+        gradual: v_g [m/s].
     """
 
     stiffness: Float[Array, " *n"]
@@ -64,6 +65,7 @@ class Material(NamedTuple):
     instant: Float[Array, " *n"]
     bounce: Float[Array, " *n"]
     uplift: Float[Array, " *n"]
+    gradual: Float[Array, " *n"]
 
 
 class DistributedLaw(AbstractContactLaw):
@@ -96,6 +98,9 @@ class DistributedLaw(AbstractContactLaw):
         stiction_velocity: v_s, slip up to which friction counts as sticking [m/s].
         implicitness: θ from 1/2 to 1: where in a step the depth is taken. 1, its end, is quietest.
         compliant: Whether impacts are left to the spring (static).
+        gradual_stiction: v_g, slip up to which friction grows with it in derivatives, −b/v_g du [m/s]; 0 for
+            that of Coulomb friction, in which what sticks does not move however one pushes. The motion is
+            the same.
         functions: A file of functions that stand in place of some of those of a point, see
             `docs/theory/contact.md`; none for this law as it is (static).
         numbers: Three numbers for them.
@@ -103,6 +108,7 @@ class DistributedLaw(AbstractContactLaw):
 
     stiction_velocity: Float[Array, ""]
     implicitness: Float[Array, ""]
+    gradual_stiction: Float[Array, ""]
     compliant: bool = eqx.field(static=True)
     functions: str | None = eqx.field(static=True)
     numbers: Float[Array, "3"]
@@ -112,6 +118,7 @@ class DistributedLaw(AbstractContactLaw):
         *,
         stiction_velocity: Numbers = 1e-7,
         implicitness: Numbers = 1.0,
+        gradual_stiction: Numbers = 0.0,
         compliant: bool = False,
         functions: str | os.PathLike[str] | None = None,
         numbers: Numbers = (0.0, 0.0, 0.0),
@@ -120,12 +127,13 @@ class DistributedLaw(AbstractContactLaw):
 
         Raises:
             ValueError: If `stiction_velocity` is not a positive number, `implicitness` not in [1/2, 1],
-                `functions` no file, or `numbers` not three.
+                `gradual_stiction` negative, `functions` no file, or `numbers` not three.
         """
         self.stiction_velocity = positive("stiction_velocity", stiction_velocity)
         self.implicitness = non_negative("implicitness", implicitness)
         if not is_traced(self.implicitness) and not 0.5 <= float(self.implicitness) <= 1:
             raise ValueError(f"implicitness must lie in [1/2, 1], got {float(self.implicitness)}")
+        self.gradual_stiction = non_negative("gradual_stiction", gradual_stiction)
         self.compliant = bool(compliant)
         self.functions = None if functions is None else os.path.abspath(functions)
         if self.functions is not None and not os.path.isfile(self.functions):
@@ -235,4 +243,5 @@ def materials(
         jnp.asarray(np.repeat([0.0 if law.compliant else 1.0 for law in laws], sizes), timestep.dtype),
         jnp.maximum(stacked.restitution_velocity + gravity * timestep, settling),
         jnp.broadcast_to(_SLOW**2 * strength, (n,)).astype(timestep.dtype),
+        column([law.gradual_stiction for law in laws]),
     )

@@ -39,7 +39,9 @@ class Friction:
 
 
 @wp.func
-def friction_with_dual(u: vec3, dual: vec3, bound: real, bound_damping: real, stiction: real) -> Friction:
+def friction_with_dual(
+    u: vec3, dual: vec3, bound: real, bound_damping: real, stiction: real, gradual: real
+) -> Friction:
     """Friction at a velocity, from its dual.
 
     Args:
@@ -48,6 +50,7 @@ def friction_with_dual(u: vec3, dual: vec3, bound: real, bound_damping: real, st
         bound: b.
         bound_damping: −∂b/∂v_n.
         stiction: v_s, softened or not.
+        gradual: v_g: below it the derivative by the velocity is that of a damper −b/v_g.
     """
     found = Friction()
     speed = wp.length(u)
@@ -58,12 +61,35 @@ def friction_with_dual(u: vec3, dual: vec3, bound: real, bound_damping: real, st
         found.value = (bound / size) * dual
     gain = inverse_slow * u
     found.change = -found.value - bound * gain
-    found.grip = bound * inverse_slow
-    if speed > stiction:
+    found.grip = bound / wp.max(wp.max(speed, stiction), gradual)
+    if speed > wp.max(stiction, gradual):
         found.turning = inverse_slow * found.value
         found.direction = gain
     found.by_rate = bound_damping * gain
     return found
+
+
+@wp.struct
+class Slip:
+    """A slip, and friction there as a derivative takes it.
+
+    Attributes:
+        slip: u₀ [m/s].
+        direction: Of the friction, −u₀/max(|u₀|, v_s).
+        grip: b/v_g [Pa s/m].
+        is_gradual: Whether friction is −b/v_g (u − u₀) more for other slips.
+    """
+
+    slip: vec3
+    direction: vec3
+    grip: real
+    is_gradual: bool
+
+
+@wp.func
+def friction_near(u: vec3, bound: real, at: Slip) -> vec3:
+    """Friction near a slip, whose derivative is that of `friction_with_dual` with v_g."""
+    return bound * at.direction - at.grip * (u - at.slip)
 
 
 @wp.func

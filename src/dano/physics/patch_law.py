@@ -213,7 +213,7 @@ def resistance(
     """Friction of at most b against a velocity u, of whichever kind the material has."""
     found = Friction()
     if material.stiction > ZERO:
-        found = friction_with_dual(u, dual, bound, bound_damping, softness * material.stiction)
+        found = friction_with_dual(u, dual, bound, bound_damping, softness * material.stiction, ZERO)
     else:
         found = smooth_friction(material, u, bound, bound_damping)
     return found

@@ -18,7 +18,7 @@ A file of functions may stand in place of some of these: see `DistributedLaw.fun
 import warp as wp
 
 from dano.physics.features import LAW
-from dano.physics.friction import following_friction, Friction, friction, friction_with_dual
+from dano.physics.friction import following_friction, Friction, friction, friction_with_dual, Slip
 from dano.physics.impacts import fading_in, Impact, impact_goal, impact_limit, is_impact
 from dano.physics.real import ONE, real, vec3, ZERO
 from dano.physics.samples import Point
@@ -42,6 +42,7 @@ class Material:
         instant: 1 where impacts end within the step, 0 where they are left to the spring.
         bounce: Slowest rebound of an impact, and slowest approach that is one [m/s].
         uplift: An overlap of depth d separates at most at √(uplift · d), if that exceeds v_e [m/s²].
+        gradual: v_g, slip below which friction grows with it in derivatives [m/s]; 0: as it is.
         numbers: Of a law of one's own; only where there is one.
     """
 
@@ -58,6 +59,7 @@ class Material:
     instant: real
     bounce: real
     uplift: real
+    gradual: real
     if LAW:
         numbers: vec3
 
@@ -77,6 +79,7 @@ class PointLaw:
         fading: φ [1].
         friction_pressure: p₀ [Pa].
         stiction: v_s [m/s].
+        gradual: v_g [m/s], zero where motion is looked for and no derivative.
         sharp: 1 where the damping has its full size from v_e on, so that bodies are pushed apart no faster.
         blow: κ w, pressure of an impact by the speed that is missing to its goal [Pa s/m].
         goal: v*, separating speed that an impact aims at [m/s].
@@ -95,6 +98,7 @@ class PointLaw:
     fading: real
     friction_pressure: real
     stiction: real
+    gradual: real
     sharp: real
     blow: real
     goal: real
@@ -220,6 +224,7 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
     law.fading = material.friction_fading
     law.friction_pressure = material.friction_pressure
     law.stiction = material.stiction
+    law.gradual = material.gradual
     law.sharp = material.instant
     if wp.static(len(LAW) > 0):
         law.numbers = material.numbers
@@ -319,6 +324,18 @@ def traction(law: PointLaw, rate: real, slip: vec3) -> Traction:
 
 
 @wp.func
+def slip_at(law: PointLaw, slip: vec3, grip: real) -> Slip:
+    """A slip as derivatives take it, with the grip that `linearized` has there."""
+    at = Slip()
+    speed = wp.length(slip)
+    at.slip = slip
+    at.direction = (-ONE / wp.max(speed, law.stiction)) * slip
+    at.grip = grip
+    at.is_gradual = speed < law.gradual
+    return at
+
+
+@wp.func
 def fitting_duals(law: PointLaw, motion: Motion) -> Duals:
     """Duals that fit given velocities."""
     duals = Duals()
@@ -353,7 +370,8 @@ def linearized(
         found.held = held + mix * (limit - held)
         limit = found.held
         marginal = ZERO
-    own = friction_with_dual(motion.slip, duals.friction, limit, marginal * found.pressure.damping, stiction)
+    damping = marginal * found.pressure.damping
+    own = friction_with_dual(motion.slip, duals.friction, limit, damping, stiction, law.gradual)
     found.friction = own.value
     found.friction_change = own.change
     found.grip = own.grip

@@ -17,7 +17,7 @@ from dano.plan._plan import (
 )
 from dano.plan._problem import problem_of as problem_of
 from dano.plan._sampling import FIRST_DRAWS as FIRST_DRAWS, SamplingOptions as SamplingOptions
-from dano.plan._softening import softened as softened
+from dano.plan._softening import gradual as gradual, softened as softened
 from dano.plan._task import (
     Actuator as Actuator,
     Goal as Goal,

@@ -29,7 +29,7 @@ from dano.maths import checked_array
 from dano.plan._exploring import explored, to_touch
 from dano.plan._problem import problem_of, Scales, VIOLATION
 from dano.plan._sampling import costs, rated, sampled, SamplingOptions
-from dano.plan._softening import softened
+from dano.plan._softening import gradual, softened
 from dano.plan._task import Limit, Task
 from dano.scene import Control, Scene, State, state_arrays, Trajectory
 from dano.solvers import (
@@ -42,6 +42,8 @@ from dano.solvers import (
 
 # Searches for contact, each with other random numbers, until a plan meets what is required.
 _ATTEMPTS = 3
+# Slip below which friction is gradual where without it nothing moves [m/s]: that of a careful push.
+_GRADUAL = 0.02
 # By so much giving up contact is dearer than the controls that make it.
 _DEARER = 10.0
 _ENDED = (TrajectoryStop.STOPPED, TrajectoryStop.TIME)
@@ -200,8 +202,9 @@ def plan(
     """Find controls that do a task.
 
     With `method="ilqr"`: augmented-Lagrangian iLQR with the derivatives of the scene's steps by the implicit
-    function theorem (see docs/plan.md). With "cem" or "mppi": by sampling rollouts, which needs no
-    derivatives and is much less exact.
+    function theorem (see docs/plan.md). Where these lead to no plan that meets the constraints, it goes on
+    with friction that is gradual in derivatives, see `gradual`. With "cem" or "mppi": by sampling rollouts,
+    which needs no derivatives and is much less exact.
 
     Args:
         scene: The scene.
@@ -265,6 +268,8 @@ def plan(
     if explore is None:
         why, solution = _explored(given, problem, guess, scales, seed)
     solution = solution or given.optimised(guess)
+    if solution.stop is TrajectoryStop.INFEASIBLE:
+        solution = _pushed(given, solution)
     message = solution.stop.value
     if solution.stop is TrajectoryStop.INFEASIBLE:
         message += f"{_what_is_missed(solution)}; {_worth(given, problem, solution).summary}"
@@ -320,6 +325,13 @@ class _Given(NamedTuple):
                 break
         assert solution is not None
         return solution
+
+
+def _pushed(given: _Given, solution: TrajectorySolution) -> TrajectorySolution:
+    """The solution, or one that meets the constraints once friction is gradual in derivatives."""
+    scene = gradual(given.scene, _GRADUAL)
+    found = given._replace(scene=scene, warm=None).optimised(solution.controls)
+    return solution if found.stop is TrajectoryStop.INFEASIBLE else found
 
 
 def _explored(

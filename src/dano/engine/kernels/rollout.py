@@ -364,7 +364,7 @@ def rollout(scene: Scene, room: Room, launch: Launch):
         while again:
             rebound = ONE - real(attempt) / real(_REBOUNDS)
             if wp.static(POINTS):
-                fix_laws(scene, room, world, lane, n_found, rebound)
+                fix_laws(scene, room, world, lane, n_found, rebound, False)
             wait()
             solved = solve(scene, room, world, lane, n_found, size, launch.options)
             again = False

@@ -427,13 +427,27 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
 
 
 @wp.func
-def fix_laws(scene: Scene, room: Room, world: int, lane: int, n_found: int, rebound: real):
-    """The constants of the law at every point; `rebound` is the share of the restitution that counts."""
+def fix_laws(
+    scene: Scene, room: Room, world: int, lane: int, n_found: int, rebound: real, differentiates: bool
+):
+    """The constants of the law at every point.
+
+    Args:
+        scene: The scene.
+        room: Room.
+        world: Which world.
+        lane: Which lane.
+        n_found: Number of pairs with points.
+        rebound: Share of the restitution that counts.
+        differentiates: Whether derivatives are asked for, for which friction may be gradual.
+    """
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
         index = scene.pair_index[found.pair]
         material = scene.materials[world, index.contact]
         if material.instant > ZERO:
             material.restitution = rebound * material.restitution
+        if not differentiates:
+            material.gradual = ZERO
         for k in range(found.first, found.end):
             room.laws[world, k] = point_law(material, room.points[world, k], found.impact)

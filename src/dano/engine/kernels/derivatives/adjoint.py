@@ -13,6 +13,7 @@ import warp as wp
 
 from dano.engine.kernels.tables import Body, Push, StateRow
 from dano.physics.features import TREES
+from dano.physics.friction import friction_near, Slip
 from dano.physics.impacts import Impact, Patch, share_of_impact, stiffness_of_impact, with_sample
 from dano.physics.momentum import angular_momentum, turned_inertia
 from dano.physics.pairs import (
@@ -25,7 +26,7 @@ from dano.physics.pairs import (
     seen_from,
     shrunk,
 )
-from dano.physics.point_law import Material, point_law, point_motion, traction
+from dano.physics.point_law import friction_bound, Material, point_law, point_motion, traction
 from dano.physics.real import ONE, real, vec3, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
 from dano.physics.samples import point_contact, position_in_solid, Sample
@@ -65,6 +66,7 @@ def point_work(
     rebound: real,
     impact: Impact,
     twists: Virtual,
+    at: Slip,
 ) -> real:
     """Work of a point's impulse along the virtual velocities of its bodies."""
     point = point_contact(pose, sample, d, turning, presses_back, stiffness_share, share * h)
@@ -78,6 +80,9 @@ def point_work(
     turn = virtual.spin - (impact.delays * share) * late.spin
     motion = point_motion(point, twist.velocity, twist.spin)
     found = traction(law, motion.rate, motion.slip + point.extra_slip)
+    if at.is_gradual:
+        bound = friction_bound(law, found.pressure)
+        found.friction = friction_near(motion.slip + point.extra_slip, bound.value, at)
     by_pressure = wp.dot(point.normal, along) + wp.dot(point.moment, turn)
     by_friction = wp.dot(found.friction, along + wp.cross(turn, point.arm))
     return h * point.area * (found.pressure * by_pressure + by_friction)

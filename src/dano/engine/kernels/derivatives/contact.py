@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from dano.engine.kernels.assembly import slip_of
 from dano.engine.kernels.derivatives.adjoint import (
     after_adjoints,
     distance_work,
@@ -31,11 +32,12 @@ from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
 from dano.physics.features import TREES, TURNING, UNIONS
 from dano.physics.impacts import Impact, Patch
 from dano.physics.pairs import BALL, BodyState, falling, first_touch, PairPose, position_after, rotation_after
-from dano.physics.point_law import Material
+from dano.physics.point_law import Material, point_motion, slip_at
 from dano.physics.real import mat33, ONE, real, vec3, ZERO
 from dano.physics.samples import position_in_solid, Sample
 from dano.physics.solids.distances import leaf_distance, nearest_leaf, Solid
 from dano.physics.solids.leaves import Distance
+from dano.physics.twists import relative_twist
 
 _BALL = wp.constant(BALL)
 
@@ -174,20 +176,24 @@ def pull_points(
     stiffness_share_bar = real(0.0)
     impact_bar = Impact()
     twists_bar = Virtual()
+    twist = relative_twist(twists.first, twists.second, pose.com_difference)
     for k in range(found.first, found.end):
         linear = room.linear[world, k]
         if linear.pressure.value > ZERO:
             where = room.where[world, k]
+            point = room.points[world, k]
+            motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
+            at = slip_at(room.laws[world, k], motion.slip, linear.grip)
             sample = scene.samples[world, where.sample]
             x = position_in_solid(pose, sample.point)
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
             (
                 by_pose, by_sample, by_distance, _a, _b, by_share_of, by_share, by_h, by_material, _c,
-                by_impact, by_twists,
+                by_impact, by_twists, _d,
             ) = wp.grad(point_work)(
                 pose, sample, d, turning, where.presses_back > 0, pair.share, found.share, h, material,
-                rebound, found.impact, twists,
+                rebound, found.impact, twists, at,
             )  # fmt: skip
             by_pose = pull_sample(
                 scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance

@@ -69,7 +69,7 @@ def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: i
             room.tried[world, b] = room.velocity[world, b]
     wait()
     if wp.static(POINTS):
-        fix_laws(scene, room, world, lane, n_found, launch.reports[world, t].rebound)
+        fix_laws(scene, room, world, lane, n_found, launch.reports[world, t].rebound, True)
         fit_duals(scene, room, world, lane, n_found)
     if wp.static(PATCHES):
         fit_patch_duals(scene, room, world, lane, n_found)
