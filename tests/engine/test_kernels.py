@@ -273,7 +273,7 @@ def test_laws_that_no_step_would_ask():
 
 @pytest.mark.parametrize("height", [0.2, 0.55, 1.2])
 def test_fast_small_bodies_rebound(height):
-    """A ball of 1 cm that falls through several of its radii a step rises to e² of the height it fell from."""
+    """A ball of 1 cm that falls by several of its radii in a step rises to e² of its height."""
     scene = dano.Scene.create(
         [dano.Body("ball", dano.Sphere(0.01), mass=0.01), dano.Body("floor", dano.HalfSpace(), fixed=True)],
         [dano.Contact("ball", "floor", dano.ContactParams(restitution=0.8))],

@@ -22,6 +22,8 @@ _WIDEST = 0.05
 _LAST, _LEAST = 0.5, 1e-3
 # Distance to the minimum of the trend, and scatter by ripples, that do not matter [standard errors].
 _STEADY = 0.5
+# Derivatives are blind to a parameter if their curvature is so small a share of that of planes.
+_LITTLE = 1e-2
 # Shares of the frames that count, one after the other, and most steps at each.
 _BEGINNINGS, _STEPS = (0.25, 0.4, 0.55, 0.7, 0.85), 12
 # So many steps in a row that leave more than this share of the loss end them.
@@ -120,7 +122,8 @@ def settled(problem: Smoothed, solution: Solution, first: tuple[np.ndarray, Any]
     problem.smoothing = _evenly(rows, widest, here)
     problem.smoothing = _drawn(rows, widest, _seen(problem, here), problem)
     sight = _seen(problem, here)
-    if solution.stop.converged and sight.away <= _STEADY and sight.scatter <= _STEADY:
+    steady = sight.away <= _STEADY and sight.scatter <= _STEADY
+    if solution.stop.converged and steady and not _blind(solution, sight):
         problem.smoothing = None
         return solution
     try:
@@ -135,6 +138,16 @@ def settled(problem: Smoothed, solution: Solution, first: tuple[np.ndarray, Any]
     losses = np.array([*solution.losses, end.sight.normal.loss])
     stop = Stop.LOSS if end.steady else Stop.STUCK
     return Solution(*end.point, end.sight.normal, stop, losses, solution.evaluations)
+
+
+def _blind(solution: Solution, sight: _Sight) -> bool:
+    """Whether derivatives say far less of a parameter than planes do.
+
+    So it is with a restitution that became too small for any rebound: a little more makes no difference, but
+    what one sees does.
+    """
+    curved, seen = (np.diag(eliminated(normal)[1]) for normal in (solution.normal, sight.normal))
+    return bool(np.any(curved < _LITTLE * seen))
 
 
 def _loss(problem: Smoothed, point: _Point) -> float:

@@ -330,6 +330,8 @@ class _Given(NamedTuple):
 def _pushed(given: _Given, solution: TrajectorySolution) -> TrajectorySolution:
     """The solution, or one that meets the constraints once friction is gradual in derivatives."""
     scene = gradual(given.scene, _GRADUAL)
+    if scene is given.scene:
+        return solution
     found = given._replace(scene=scene, warm=None).optimised(solution.controls)
     return solution if found.stop is TrajectoryStop.INFEASIBLE else found
 

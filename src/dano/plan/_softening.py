@@ -49,4 +49,5 @@ def gradual(scene: Scene, slip: float) -> Scene:
         every += [] if scene.others is None else [scene.others.law]
         return [law.gradual_stiction for law in every if isinstance(law, DistributedLaw)]
 
-    return eqx.tree_at(laws_of, scene, [jnp.full_like(x, slip) for x in laws_of(scene)])
+    found = laws_of(scene)
+    return eqx.tree_at(laws_of, scene, [jnp.full_like(x, slip) for x in found]) if found else scene

@@ -256,7 +256,7 @@ def soonest(left: real, near: real, bend: real, slow: real) -> real:
 
     Args:
         left: Way that is left [m].
-        near: How far the probe nears the other body in a step [m].
+        near: How far the sample nears the other body in a step [m].
         bend: By how much that grows in a step at most [m].
         slow: A sample that nears it by no more does not count [m].
     """
@@ -266,6 +266,86 @@ def soonest(left: real, near: real, bend: real, slow: real) -> real:
     if near > slow:
         return wp.max(left, -near * (near - slow) / wp.max(bend, _FLAT * near)) / near
     return wp.max((slow - near) / bend, _ONWARD)
+
+
+@wp.struct
+class Ask:
+    """What is asked of samples at a moment.
+
+    Attributes:
+        sink: Depth at which bodies meet [m].
+        h: Timestep [s].
+        slow: What nears the solid by no more in a step does not count [m].
+        most: By no more does anything near it in a step [m].
+        bend: By how much that grows in a step at most [m].
+        rest: Share of the step that is left.
+        turning: How samples turn.
+        stretch: Largest factor by which sample coordinates are enlarged.
+        plane: What they near, if it is a plane.
+    """
+
+    sink: real
+    h: real
+    slow: real
+    most: real
+    bend: real
+    rest: real
+    turning: int
+    stretch: real
+    plane: Plane
+
+
+@wp.struct
+class Soonest:
+    """The sample that meets the solid first, and what else samples say that were asked.
+
+    Attributes:
+        further: Share of the step until it may.
+        critical: The sample, −1 where none does within the step.
+        fastest: Most by which one nears the solid in a step [m].
+        close: Least distance that one may have by the end of the step [m].
+    """
+
+    further: real
+    critical: int
+    fastest: real
+    close: real
+
+
+@wp.func
+def look_at_block(
+    scene: Scene, world: int, solid: Solid, pose: PairPose, ask: Ask, block: int, seen: Soonest
+) -> Soonest:
+    """What the samples of a block say besides those seen before; where they cannot be sooner, its middle."""
+    found = seen
+    ball = scene.balls[world, block]
+    x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
+    d = solid_distance(scene.solids, world, solid, x)
+    # Samples of a block are no nearer than its middle, less its radius.
+    radius = reach_of_block(scene, world, pose, ask.plane, block, ask.stretch)
+    asked = ask.turning != 0
+    if d.value - radius <= ask.rest * ask.most:
+        middle = nearing(pose, ask.turning, x, d, ask.sink, ask.h, ask.slow)
+        found.fastest = wp.max(found.fastest, middle.at_old)
+        asked = asked or middle.left <= radius
+        if not asked:
+            if may_meet(middle.left - radius, middle.near, ask.bend, ask.rest):
+                asked = ahead_of(middle.left - radius, middle.near, ask.bend) < found.further
+    if asked:
+        for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
+            x = position_in_solid(pose, scene.samples[world, s].point)
+            d = solid_distance(scene.solids, world, solid, x)
+            if d.value <= ask.rest * ask.most:
+                own = nearing(pose, ask.turning, x, d, ask.sink, ask.h, ask.slow)
+                found.fastest = wp.max(found.fastest, own.at_old)
+                found.close = wp.min(found.close, d.value - wp.max(own.near + HALF * ask.bend, ZERO))
+                counts = own.near + ask.bend * ask.rest > own.counts
+                if counts and may_meet(own.left, own.near, ask.bend, ask.rest):
+                    ahead = soonest(own.left, own.near, ask.bend, own.counts)
+                    if ahead < found.further:
+                        found.further = ahead
+                        found.critical = s
+    return found
 
 
 @wp.func
@@ -341,70 +421,48 @@ def meeting(
     turns = spin_of_samples(a.spin - b.spin, axis, index.turning)
     gain = h * wp.length(a.gain - b.gain)
     way += real(1.5) * gain
-    most += real(1.5) * gain
+    most = STEEPEST * (most + real(1.5) * gain)
     bend = way * h * (wp.length(turns) + TWO * wp.length(b.spin)) + gain
+    ask = Ask()
+    ask.sink = sink
+    ask.h = h
+    ask.slow = slow
+    ask.most = most
+    ask.bend = bend
+    ask.turning = index.turning
+    ask.stretch = stretch_of(body, index.turning)
+    ask.plane = plane_of(scene, world, solid, index.turning, b.com)
     share = real(0.0)
-    fastest = real(0.0)
-    closest_of_all = real(0.0)
-    n = int(-1)
     likely = int(-1)
+    n = int(-1)
     k = int(0)
     at = lane * (room.near.shape[1] // _LANES)
-    stretch = stretch_of(body, index.turning)
-    plane = plane_of(scene, world, solid, index.turning, b.com)
     while k < _ADVANCES:
         pose = posed(scene, world, a, b, first, second, share, h, pair.follows)
         if n < 0:
             n, likely = find_near_blocks(scene, room, world, lane, pose, first, second, STEEPEST * way - sink)
-        further = INFINITY
-        critical = int(-1)
-        rest = ONE - share
+        seen = Soonest()
+        seen.further = INFINITY
+        seen.critical = -1
+        ask.rest = ONE - share
         # What is soonest most likely comes first: it rules others out.
-        begin = likely
-        for i in range(-1, n):
-            block = begin
-            if i >= 0:
-                block = room.near[world, at + i]
-            if (i >= 0) == (block == begin) or block < 0:
-                continue
-            ball = scene.balls[world, block]
-            x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
-            d = solid_distance(scene.solids, world, solid, x)
-            radius = reach_of_block(scene, world, pose, plane, block, stretch)
-            # Samples of a block are no nearer than its middle, less its radius.
-            asked = index.turning != 0
-            if d.value - radius <= rest * most:
-                middle = nearing(pose, index.turning, x, d, sink, h, slow)
-                if k == 0:
-                    fastest = wp.max(fastest, middle.at_old)
-                asked = asked or middle.left <= radius
-                if not asked:
-                    if may_meet(middle.left - radius, middle.near, bend, rest):
-                        asked = ahead_of(middle.left - radius, middle.near, bend) < further
-            if asked:
-                for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
-                    x = position_in_solid(pose, scene.samples[world, s].point)
-                    d = solid_distance(scene.solids, world, solid, x)
-                    if d.value <= rest * most:
-                        own = nearing(pose, index.turning, x, d, sink, h, slow)
-                        if k == 0:
-                            fastest = wp.max(fastest, own.at_old)
-                            close = d.value - wp.max(own.near + HALF * bend, ZERO)
-                            closest_of_all = wp.min(closest_of_all, close)
-                        if own.near + bend * rest > own.counts and may_meet(own.left, own.near, bend, rest):
-                            ahead = soonest(own.left, own.near, bend, own.counts)
-                            if ahead < further:
-                                further = ahead
-                                critical = s
-                                likely = block
-        closest = least(further)
-        if closest < further:
+        if likely >= 0:
+            seen = look_at_block(scene, world, solid, pose, ask, likely, seen)
+        for i in range(n):
+            block = room.near[world, at + i]
+            if block != likely:
+                seen = look_at_block(scene, world, solid, pose, ask, block, seen)
+        closest = least(seen.further)
+        critical = seen.critical
+        if closest < seen.further:
             critical = -1
         critical = first_of(critical)
+        if seen.critical >= 0:
+            likely = seen.critical // _BLOCK
         if k == 0:
-            met.nears = least(-fastest) < -slow
+            met.nears = least(-seen.fastest) < -slow
             # Samples that were not asked do not sink in that far.
-            met.least = wp.min(least(closest_of_all), -sink)
+            met.least = wp.min(least(seen.close), -sink)
         before = share
         share = wp.max(share + closest, ZERO)
         met.deep = closest < ZERO and before == ZERO
