@@ -35,6 +35,6 @@ def verdict(read: Callable[[], Any], is_right: Callable[[Any], bool] | None) -> 
             found = read()
         except (ValueError, ImportError):
             return Outcome.REFUSED_RIGHTLY if is_right is None else Outcome.REFUSED_WRONGLY
-        except Exception:  # a traceback is no answer
+        except Exception:  # a traceback is not an answer
             return Outcome.WRONG
     return Outcome.LOADS if is_right is not None and is_right(found) else Outcome.WRONG

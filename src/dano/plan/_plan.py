@@ -42,7 +42,7 @@ from dano.solvers import (
 
 # Searches for contact, each with other random numbers, until a plan meets what is required.
 _ATTEMPTS = 3
-# By so much giving up contact is dearer than the controls that make it.
+# By so much giving up contact costs more than the controls that make it.
 _DEARER = 10.0
 _ENDED = (TrajectoryStop.STOPPED, TrajectoryStop.TIME)
 

@@ -151,7 +151,7 @@ def _single(faces: np.ndarray) -> tuple[np.ndarray, int]:
             a, b, c = ordered[face].tolist()
             if all(edge in odd for edge in ((a, b), (b, c), (a, c))):
                 keep[face] = True
-    # A wall between two parts is no defect.
+    # A wall between two parts is not a defect.
     walls = 2 * int(np.sum(~keep[pairs]))
     return faces[keep], int(np.sum(~keep)) - walls
 
