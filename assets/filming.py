@@ -21,6 +21,7 @@ MOST_BYTES = 300_000
 
 FPS = 12
 SIZE = (640, 360)
+SKY = (236, 238, 240)
 
 Frames = list[np.ndarray]
 
@@ -87,22 +88,54 @@ def frames_in_mujoco(
         look_at: Point in the middle of the picture [m, W].
         away: Distance [m], azimuth and elevation [degrees] of the camera.
     """
-    model.vis.headlight.ambient[:] = 0.35
-    model.vis.headlight.diffuse[:] = 0.6
-    model.vis.global_.offwidth, model.vis.global_.offheight = SIZE
     data, camera = mujoco.MjData(model), mujoco.MjvCamera()
     camera.lookat[:] = look_at
     camera.distance, camera.azimuth, camera.elevation = away
     every = max(1, round(1 / (FPS * model.opt.timestep)))
     frames = []
-    with mujoco.Renderer(model, SIZE[1], SIZE[0]) as renderer:
-        for qpos in coordinates[::every]:
-            data.qpos[:] = qpos
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_camlight(model, data)
-            renderer.update_scene(data, camera)
-            frames.append(renderer.render().copy())
+    for qpos in coordinates[::every]:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        frames.append(picture_in_mujoco(model, data, camera))
     return frames
+
+
+def picture_in_mujoco(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    camera: mujoco.MjvCamera,
+    size: tuple[int, int] = SIZE,
+    option: mujoco.MjvOption | None = None,
+) -> np.ndarray:
+    """What MuJoCo draws, with a lamp and a bright floor and sky, which plain models do not have."""
+    planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    model.geom_matid[planes] = -1
+    model.geom_rgba[planes] = [0.86, 0.87, 0.88, 1]
+    model.geom_size[planes, :2] = 4.0  # so that no edge is near
+    model.vis.headlight.ambient[:] = 0.35
+    model.vis.headlight.diffuse[:] = 0.25
+    with mujoco.Renderer(model, size[1], size[0]) as renderer:
+        renderer.update_scene(data, camera, option)
+        _add_lamp(renderer.scene, camera.lookat)
+        picture = renderer.render().copy()
+        renderer.enable_depth_rendering()
+        nothing = renderer.render() > 0.95 * model.vis.map.zfar * model.stat.extent
+    picture[nothing] = SKY
+    return picture
+
+
+def _add_lamp(scene: mujoco.MjvScene, where: np.ndarray) -> None:
+    """A lamp above a point, which casts shadows."""
+    lamp = scene.lights[scene.nlight]
+    scene.nlight += 1
+    lamp.type = mujoco.mjtLightType.mjLIGHT_SPOT
+    lamp.cutoff, lamp.exponent = 60, 1
+    lamp.attenuation[:] = 1, 0, 0
+    lamp.pos[:] = where + np.array([-0.6, -0.8, 2.0])
+    lamp.dir[:] = np.array([0.3, 0.4, -1.0]) / np.linalg.norm([0.3, 0.4, -1.0])
+    lamp.ambient[:], lamp.diffuse[:], lamp.specular[:] = 0.0, 0.7, 0.1
+    lamp.headlight, lamp.castshadow = 0, 1
 
 
 def write_webp(path: Path, frames: Sequence[np.ndarray], fps: int = FPS) -> None:

@@ -29,6 +29,7 @@ from filming import (
     Frames,
     frames_in_mujoco,
     frames_of,
+    picture_in_mujoco,
     read_film,
     recorded,
     recorded_in_mujoco,
@@ -78,8 +79,14 @@ def runs_of_guide(page: str) -> list[Run]:
 
 
 def longest(runs: list[Run]) -> Run:
-    """The run of most time."""
-    return max(runs, key=lambda run: float(run[1].times[-1]))
+    """The run of most time; of several, the one in which bodies move farthest."""
+
+    def length(run: Run) -> tuple[float, float]:
+        return float(run[1].times[-1]), float(
+            jnp.abs(run[1].states.position[-1] - run[1].states.position[0]).max()
+        )
+
+    return max(runs, key=length)
 
 
 def runs_of_example(name: str) -> list[Run]:
@@ -155,7 +162,7 @@ def scenes() -> Frames:
 
 def joints() -> Frames:
     """The door of its guide, seen from above its hinge's side."""
-    camera = Camera((1.9, 2.3, 1.9), (0.45, 0.2, 0.55), vertical_fov=0.5, width=SIZE[0], height=SIZE[1])
+    camera = Camera((1.9, 2.3, 1.9), (0.42, 0.2, 0.6), vertical_fov=0.36, width=SIZE[0], height=SIZE[1])
     return frames_of(*runs_of_guide("joints")[0], slow_motion=8, camera=camera)
 
 
@@ -178,7 +185,7 @@ def robots() -> Frames:
     ]
     controls = jax.tree.map(lambda *x: jnp.repeat(jnp.stack(x), 225, axis=0), *told)
     run = dano.simulate(scene, start, controls=controls)
-    camera = Camera((1.7, -1.5, 0.95), (0.15, 0, 0.42), vertical_fov=0.55, width=SIZE[0], height=SIZE[1])
+    camera = Camera((1.7, -1.5, 0.95), (0.2, 0, 0.35), vertical_fov=0.56, width=SIZE[0], height=SIZE[1])
     return frames_of(scene, run, camera=camera, contact_points=False)
 
 
@@ -208,7 +215,7 @@ def identify() -> Frames:
     figure = Figure(figsize=(6.4, 3.6), dpi=110, facecolor="white")
     axes = figure.add_subplot()
     axes.plot(times, slide(guess)[:, 0, 0], "--", color=OTHER, label=f"first guess, friction {guess}")
-    axes.plot(times, slide(found)[:, 0, 0], color=FITTED, label=f"found, {found:.4f} ± {error:.4f}")
+    axes.plot(times, slide(found)[:, 0, 0], color=FITTED, label=f"found, {found:.3f} ± {error:.3f}")
     axes.plot(times[::4], seen[:, 0, 0], "o", ms=4, color=MEASURED, label=f"observed, friction {true}")
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_xlabel("time [s]")
@@ -322,20 +329,19 @@ def beside_its_pieces(model: mujoco.MjModel) -> np.ndarray:
     model.geom_matid[touching] = -1
     option.geomgroup[:] = 1
     panels = []
-    with mujoco.Renderer(model, 360, 480) as renderer:
-        for hidden in (touching, visual):
-            shown = model.geom_rgba[:, 3].copy()
-            model.geom_rgba[touching, 3] = 1
-            model.geom_rgba[hidden, 3] = 0
-            renderer.update_scene(data, camera, option)
-            panels.append(renderer.render().copy())
-            model.geom_rgba[:, 3] = shown
+    for hidden in (touching, visual):
+        model.geom_rgba[touching, 3] = 1
+        model.geom_rgba[visual, 3] = 1
+        model.geom_rgba[hidden, 3] = 0
+        panels.append(picture_in_mujoco(model, data, camera, (480, 360), option))
     return np.concatenate(panels, axis=1)
 
 
-def example(name: str, slow_motion: float = 1.0, **options: Any) -> Callable[[], Frames]:
-    """The longest run of a program of `examples/`."""
-    return lambda: frames_of(*longest(runs_of_example(name)), slow_motion=slow_motion, **options)
+def example(
+    name: str, slow_motion: float = 1.0, most: int | None = None, **options: Any
+) -> Callable[[], Frames]:
+    """The longest run of a program of `examples/`, at most so many frames."""
+    return lambda: frames_of(*longest(runs_of_example(name)), slow_motion=slow_motion, **options)[:most]
 
 
 def mujoco_example(
@@ -368,11 +374,16 @@ PICTURES: dict[str, Callable[[], Frames]] = {
     "examples/02_gradient_of_a_slide": example("02_gradient_of_a_slide", slow_motion=2),
     "examples/03_two_bunnies": example("03_two_bunnies", slow_motion=6),
     "examples/04_own_field": example("04_own_field", slow_motion=2),
-    "examples/06_linearize_and_control": example("06_linearize_and_control", slow_motion=2),
+    "examples/06_linearize_and_control": example(
+        "06_linearize_and_control",
+        slow_motion=4,
+        most=36,
+        camera=Camera((0.4, -0.95, 0.62), (0.09, 0, 0.475), vertical_fov=0.3, width=SIZE[0], height=SIZE[1]),
+    ),
     "examples/07_door": example("07_door", slow_motion=10),
-    "examples/08_mujoco_kick": mujoco_example("08_mujoco_kick", (0.1, 0, 0.15), (1.5, 60, -15)),
-    "examples/09_mujoco_push": mujoco_example("09_mujoco_push", (0, 0, 0.03), (1.1, 60, -30)),
-    "examples/10_mujoco_panda": mujoco_example("10_mujoco_panda", (0.35, 0, 0.2), (1.9, 60, -18)),
+    "examples/08_mujoco_kick": mujoco_example("08_mujoco_kick", (0.1, 0, 0.2), (1.15, 90, -14)),
+    "examples/09_mujoco_push": mujoco_example("09_mujoco_push", (-0.08, 0, 0.03), (0.8, 75, -28)),
+    "examples/10_mujoco_panda": mujoco_example("10_mujoco_panda", (0.35, 0, 0.28), (1.5, 115, -12)),
 }
 """How each picture is made, by its path below the folder of images."""
 
