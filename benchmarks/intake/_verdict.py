@@ -28,7 +28,7 @@ def verdict(read: Callable[[], Any], is_right: Callable[[Any], bool] | None) -> 
         is_right: Whether what was read is what the file means; None if it must be refused.
     """
     with warnings.catch_warnings():
-        # What is mended and guessed is said; here only what comes out counts.
+        # What is corrected and guessed is said; here only what comes out counts.
         warnings.simplefilter("ignore", UserWarning)
         warnings.simplefilter("ignore", RuntimeWarning)
         try:

@@ -1,4 +1,4 @@
-"""What logs get wrong, mended where there is one way to read them; every guess is said."""
+"""What logs get wrong, corrected where there is one way to read them; every guess is reported."""
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def mended_times(
         first: What was taken from them already.
 
     Returns:
-        Times [s]; the rows that stay, in order; what was mended, in words.
+        Times [s]; the rows that stay, in order; what was corrected, in words.
 
     Raises:
         ValueError: If they jump back by more than late rows do.
