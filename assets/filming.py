@@ -108,16 +108,17 @@ def picture_in_mujoco(
     size: tuple[int, int] = SIZE,
     option: mujoco.MjvOption | None = None,
 ) -> np.ndarray:
-    """What MuJoCo draws, with a lamp and a bright floor and sky, which plain models do not have."""
+    """What MuJoCo draws, with a bright floor and sky, and with a lamp if the model has none."""
     planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     model.geom_matid[planes] = -1
     model.geom_rgba[planes] = [0.86, 0.87, 0.88, 1]
-    model.geom_size[planes, :2] = 4.0  # so that no edge is near
+    model.geom_size[planes, :2] = 12.0  # so that no edge is near
     model.vis.headlight.ambient[:] = 0.35
     model.vis.headlight.diffuse[:] = 0.25
     with mujoco.Renderer(model, size[1], size[0]) as renderer:
         renderer.update_scene(data, camera, option)
-        _add_lamp(renderer.scene, camera.lookat)
+        if model.nlight == 0:
+            _add_lamp(renderer.scene, camera.lookat)
         picture = renderer.render().copy()
         renderer.enable_depth_rendering()
         nothing = renderer.render() > 0.95 * model.vis.map.zfar * model.stat.extent

@@ -162,7 +162,7 @@ def scenes() -> Frames:
 
 def joints() -> Frames:
     """The door of its guide, seen from above its hinge's side."""
-    camera = Camera((1.9, 2.3, 1.9), (0.42, 0.2, 0.6), vertical_fov=0.36, width=SIZE[0], height=SIZE[1])
+    camera = Camera((1.9, 2.3, 1.9), (0.42, 0.2, 0.6), vertical_fov=0.45, width=SIZE[0], height=SIZE[1])
     return frames_of(*runs_of_guide("joints")[0], slow_motion=8, camera=camera)
 
 
@@ -303,7 +303,7 @@ def batches() -> Frames:
     )
     look = asset_look("trained_soap")
     assert look is not None
-    camera = Camera((0.45, -0.65, 0.66), (0.45, 0.26, 0.0), vertical_fov=0.6, width=SIZE[0], height=SIZE[1])
+    camera = Camera((0.49, -0.7, 0.7), (0.49, 0.26, 0.0), vertical_fov=0.62, width=SIZE[0], height=SIZE[1])
     return frames_of(shown, run, 2, camera=camera, looks=dict.fromkeys(names, look), contact_points=False)
 
 
