@@ -41,7 +41,7 @@ def test_folders_in_order(monkeypatch, tmp_path: Path):
     [
         ({"DANO_CACHE_DIR": "cache"}, "cache is not an absolute path"),
         ({"XDG_CACHE_HOME": "."}, "dano is not an absolute path"),
-        ({"HOME": "."}, "no absolute path"),
+        ({"HOME": "."}, "not an absolute path"),
         ({"DANO_CACHE_DIR": "{here}"}, "is the working folder"),
         ({"HOME": "/dev/null"}, "/dev/null/.cache/dano cannot be written"),
     ],
