@@ -11,6 +11,7 @@ import av
 import jax
 import mujoco
 import numpy as np
+from jax.core import Tracer
 from PIL import Image
 
 import dano
@@ -34,7 +35,7 @@ def recorded() -> Iterator[list[tuple[dano.Scene, dano.Trajectory]]]:
 
     def recording(scene: dano.Scene, *args: Any, **kwargs: Any) -> dano.Trajectory:
         run = simulate(scene, *args, **kwargs)
-        if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, run))):
+        if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((scene, run))):
             runs.append((scene, run))
         return run
 
