@@ -1,29 +1,27 @@
-"""Makes the film on top of the documentation: photographs, the object learned of them, and what it does.
+"""Makes the film on top of the documentation: what a learned object does, and what it was learned from.
 
-Photographs are those of `assets/images/bunny`, the object is the shipped `trained_bunny`, its motion is
-simulated here. Writes home.webp, an animated WebP, which browsers and GitHub show without a player, and a
-still of each stage for the gallery.
+The pictures that it was learned from are the renders of `assets/images/bunny`, the object is the shipped
+`trained_bunny`, its motion is simulated here. Writes home.webp, an animated WebP, which browsers and GitHub
+show without a player, and a still of each stage for the cards below it.
 
 Usage: python assets/render_home.py docs/images    (two minutes of a processor)
 """
 
 import argparse
-import tempfile
 from pathlib import Path
 
-import av
 import jax
 import numpy as np
+from filming import frames_of, write_webp
 from PIL import Image, ImageDraw, ImageFont
 
 import dano
-from dano.report import render_trajectory
 from dano.scene_file import asset_look, build_asset
 from dano.vision import Camera
 
-PHOTOGRAPHS = Path(__file__).parent / "images" / "bunny"
-WIDTH, HEIGHT, FPS = 720, 404, 12
-QUALITY = 80  # of WebP: 1.5 MB at most
+PICTURES = Path(__file__).parent / "images" / "bunny"
+WIDTH, HEIGHT = 720, 404
+QUALITY = 80  # of the stills
 PAPER, ACCENT = (246, 247, 249), (0, 137, 123)
 REST = 0.042  # [m], height of the bunny's centre of mass when it stands
 
@@ -33,32 +31,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Make the film of the documentation's first page.")
     parser.add_argument("folder", type=Path)
     folder = parser.parse_args().folder
-    output = folder / "home.webp"
     jax.config.update("jax_enable_x64", True)
-    stages = [("1  photographs", photographs()), ("2  a solid object, learned of them", turntable())]
-    stages += [("3  it falls", falls()), ("4  it slides", slides()), ("5  it is pushed", pushed())]
-    frames = [labelled(frame, text) for text, clip in stages for frame in clip]
-    frames[0].save(
-        output,
-        save_all=True,
-        append_images=frames[1:],
-        duration=round(1000 / FPS),
-        loop=0,
-        quality=QUALITY,
-        method=6,
-    )
-    for (text, clip), share in zip(stages, (1.0, 0.0, 0.3, 1.0, 0.55), strict=True):
+    # Label, clip, and of its still the number in the file's name and the moment as a share.
+    stages = [
+        ("it falls", falls(), 3, 0.3),
+        ("it is pushed", pushed(), 5, 0.55),
+        ("it slides", slides(), 4, 1.0),
+        ("it was learned from pictures", pictures(), 1, 1.0),
+        ("as a solid object", turntable(), 2, 0.0),
+    ]
+    frames = [np.asarray(labelled(frame, text)) for text, clip, _, _ in stages for frame in clip]
+    write_webp(folder / "home.webp", frames)
+    for _, clip, number, share in stages:
         still = Image.fromarray(clip[round(share * (len(clip) - 1))])
         still.resize((480, 270), Image.Resampling.LANCZOS).save(
-            folder / f"stage_{text[0]}.webp", quality=QUALITY, method=6
+            folder / f"stage_{number}.webp", quality=QUALITY, method=6
         )
-    print(f"{output}: {len(frames)} frames, {output.stat().st_size / 1e6:.2f} MB")
 
 
-def photographs() -> list[np.ndarray]:
-    """Photographs laid out one after another."""
+def pictures() -> list[np.ndarray]:
+    """Pictures laid out one after another."""
     columns, rows, side = 7, 3, 92
-    names = sorted(PHOTOGRAPHS.glob("train_*.png"))[: columns * rows]
+    names = sorted(PICTURES.glob("train_*.png"))[: columns * rows]
     page = Image.new("RGB", (WIDTH, HEIGHT), PAPER)
     frames = []
     for k, name in enumerate(names):
@@ -126,21 +120,9 @@ def film(scene: dano.Scene, trajectory: dano.Trajectory, slow_motion: int) -> li
     camera = Camera((0.1, -0.62, 0.24), (0, 0, 0.07), vertical_fov=0.4, width=WIDTH, height=HEIGHT)
     look = asset_look("trained_bunny")
     assert look is not None
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "film.mp4"
-        render_trajectory(
-            scene,
-            trajectory,
-            path,
-            fps=FPS,
-            slow_motion=slow_motion,
-            camera=camera,
-            contact_points=False,
-            clock=False,
-            looks={"bunny": look},
-        )
-        with av.open(str(path)) as container:
-            return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    return frames_of(
+        scene, trajectory, slow_motion, camera=camera, contact_points=False, looks={"bunny": look}
+    )
 
 
 def labelled(frame: np.ndarray, text: str) -> Image.Image:

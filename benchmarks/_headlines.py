@@ -74,7 +74,7 @@ HEADLINES = (
         Cell("closed form"),
     ),
     Headline(
-        "learning a bunny from 80 photographs: held-out views, inertia, time",
+        "learning a bunny from 80 renders: held-out views, inertia, time",
         Cell(
             "{:.1f} dB, {:.1f} % off, {:.0f} s",
             "learn-cpu",

@@ -39,9 +39,9 @@ def test_folders_in_order(monkeypatch, tmp_path: Path):
 @pytest.mark.parametrize(
     ("variables", "said"),
     [
-        ({"DANO_CACHE_DIR": "cache"}, "cache is no absolute path"),
-        ({"XDG_CACHE_HOME": "."}, "dano is no absolute path"),
-        ({"HOME": "."}, "no absolute path"),
+        ({"DANO_CACHE_DIR": "cache"}, "cache is not an absolute path"),
+        ({"XDG_CACHE_HOME": "."}, "dano is not an absolute path"),
+        ({"HOME": "."}, "not an absolute path"),
         ({"DANO_CACHE_DIR": "{here}"}, "is the working folder"),
         ({"HOME": "/dev/null"}, "/dev/null/.cache/dano cannot be written"),
     ],

@@ -45,18 +45,18 @@ def test_python_blocks_run(page: str, tmp_path: Path):
         assert float(printed[1]) == pytest.approx(float(difference), rel=0.05)
 
 
+def public(file: Path) -> set[str]:
+    """The names that a package gives to its users."""
+    body = ast.parse(file.read_text(encoding="utf-8")).body
+    imports = [statement for statement in body if isinstance(statement, ast.ImportFrom)]
+    return {alias.name for one in imports for alias in one.names if alias.asname == alias.name}
+
+
 @pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.parent.name)
 def test_every_public_name_is_documented(package: Path):
-    exported = {
-        alias.name
-        for statement in ast.parse(package.read_text(encoding="utf-8")).body
-        if isinstance(statement, ast.ImportFrom)
-        for alias in statement.names
-        if alias.asname == alias.name
-    }
     page = REPOSITORY / "docs" / "api" / f"{package.parent.name}.md"
     documented = set(re.findall(r"^ {8}- (\w+)$", page.read_text(encoding="utf-8"), re.MULTILINE))
-    assert documented == exported
+    assert documented == public(package)
 
 
 @pytest.mark.parametrize("page", [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))])
@@ -72,5 +72,68 @@ def test_no_code_block_scrolls_sideways(page: Path):
 
 def test_the_index_leads_to_every_page():
     docs = REPOSITORY / "docs"
-    linked = set(re.findall(r"\]\(([\w/]+\.md)", (docs / "index.md").read_text(encoding="utf-8")))
-    assert linked == {str(page.relative_to(docs)) for page in docs.rglob("*.md")} - {"index.md"}
+
+    def linked(page: str) -> set[str]:
+        return set(re.findall(r"\]\(([\w/]+\.md)", (docs / page).read_text(encoding="utf-8")))
+
+    # Parts of the benchmarks are listed on their own first page.
+    parts = {name for name in linked("benchmarks.md") if name.startswith("benchmarks/")}
+    assert linked("index.md") | parts == {str(p.relative_to(docs)) for p in docs.rglob("*.md")} - {"index.md"}
+
+
+MENU = (REPOSITORY / "mkdocs.yml").read_text(encoding="utf-8")
+GUIDES = re.findall(r": (\w+\.md)$", MENU.split("- Guides:\n")[1].split("\n  - ")[0], re.MULTILINE)
+WITHOUT_PICTURE = {"cli.md", "conventions.md"}  # tables
+HEAVIEST = 300_000
+"""Bytes of a picture."""
+
+
+@pytest.mark.parametrize("page", sorted(set(GUIDES) - WITHOUT_PICTURE))
+def test_a_guide_begins_with_a_picture(page: str):
+    text = (REPOSITORY / "docs" / page).read_text(encoding="utf-8")
+    first = text.split("\n\n")[1]
+    assert re.fullmatch(r"!\[[^]]{20,}\]\(images/[\w/]+\.(webp|png)\)", first), first
+
+
+@pytest.mark.parametrize("page", [*sorted((REPOSITORY / "docs").rglob("*.md"))], ids=lambda page: page.stem)
+def test_pictures_are_there_and_light(page: Path):
+    for name in re.findall(r"!\[[^]]*\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
+        assert (page.parent / name).stat().st_size <= HEAVIEST, name
+
+
+def test_the_gallery_shows_every_example():
+    shown = re.findall(r"\*\*`(\w+\.py)`\*\*", (REPOSITORY / "docs" / "gallery.md").read_text("utf-8"))
+    assert shown == sorted(file.name for file in (REPOSITORY / "examples").glob("*.py"))
+
+
+def imported_by_dano(package: str) -> set[str]:
+    """The names of a package that `import dano` gives."""
+    body = ast.parse((REPOSITORY / "src" / "dano" / "__init__.py").read_text(encoding="utf-8")).body
+    imports = [one for one in body if isinstance(one, ast.ImportFrom) and one.module == f"dano.{package}"]
+    return {alias.name for one in imports for alias in one.names}
+
+
+@pytest.mark.parametrize(
+    "page", sorted((REPOSITORY / "docs" / "api").glob("*.md")), ids=lambda page: page.stem
+)
+def test_a_page_of_the_api_begins_with_what_users_import(page: Path):
+    names = re.findall(r"^ {8}- (\w+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    users = [name in imported_by_dano(page.stem) for name in names]
+    constants = [re.fullmatch(r"[A-Z][A-Z_]{3,}", name) is not None for name in names]
+    assert constants == sorted(constants), "constants are last"
+    # Pages of packages that `import dano` takes nothing from have no order to keep.
+    assert users == sorted(users, reverse=True), "names of `import dano` are first"
+
+
+USERS_FIRST = (
+    "contact",
+    "engine",
+    "exchange",
+    "fields",
+    "identify",
+    "objects",
+    "plan",
+    "robots",
+    "scene",
+    "scene_file",
+)

@@ -100,7 +100,7 @@ def test_derivatives_of_pixels_are_differences_at_a_visible_step(pictures):
         # All pixels together, weighted by how far to the right they are, say where the light has gone.
         slope, change = (np.einsum("fpc,p->f", x, across)[-1] for x in (forward[..., k], difference))
         together.append(abs(slope / change - 1))
-    # Where an edge passes a sample of a ray, a difference of that size is no derivative.
+    # Where an edge passes a sample of a ray, a difference of that size is not a derivative.
     assert max(apart) < 0.35, apart
     assert max(together) < 0.2, together
 

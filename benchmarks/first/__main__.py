@@ -1,4 +1,4 @@
-"""`python -m benchmarks.first [--only WORD …] [--json FILE] [--quick]`."""
+"""`python -m benchmarks.first [--examples] [--only WORD …] [--json FILE] [--quick]`."""
 
 from benchmarks.first._run import run
 

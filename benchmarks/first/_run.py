@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks._measure import load_average, parse_arguments, report, Row
+from benchmarks._measure import load_average, parse_arguments, report, REPOSITORY, Row
 from benchmarks.first import _programs
 
 # How often a file is looked for [s].
@@ -23,14 +23,14 @@ class Program(NamedTuple):
     Attributes:
         name: For the table.
         words: Of the command line, in an empty folder.
-        goal: Seconds from empty caches, on two cores.
+        goal: Seconds from empty caches, on two cores; None for none.
         before: Words of a command that is run before, and not measured.
         marks: Files by name, with the seconds in which each should be there.
     """
 
     name: str
     words: list[str]
-    goal: float
+    goal: float | None
     before: list[str] | None = None
     marks: dict[str, tuple[str, float]] = {}
 
@@ -55,6 +55,12 @@ def _programs_to_run() -> list[Program]:
         Program("page of a run", [*dano, "view", "run.npz", "--page", "run.html"], 5.0, before=small),
         Program("film of a run, 120 frames of 720 p", [sys.executable, "-c", _programs.FILM], 15.0, small),
     ]
+
+
+def _examples() -> list[Program]:
+    """Each program of `examples/`, without a goal."""
+    files = sorted((REPOSITORY / "examples").glob("*.py"))
+    return [Program(file.name, [sys.executable, str(file)], None) for file in files]
 
 
 def _taken(words: list[str], home: Path, folder: Path, marks: dict[str, tuple[str, float]]) -> Taken:
@@ -104,11 +110,12 @@ def run() -> None:
 
     def add(parser: argparse.ArgumentParser) -> None:
         parser.add_argument("--only", nargs="*", default=[], help="programs whose names hold one of these")
+        parser.add_argument("--examples", action="store_true", help="the programs of examples/ instead")
 
     arguments = parse_arguments("How long the first programs take.", add)
     before, rows = load_average(), []
-    for program in _programs_to_run():
+    for program in _examples() if arguments.examples else _programs_to_run():
         if not arguments.only or any(word in program.name for word in arguments.only):
             rows += _rows(program, twice=not arguments.quick)
     settings: dict[str, object] = {"cores": len(os.sched_getaffinity(0))}
-    report("first", rows, settings, before, arguments.json)
+    report("first-examples" if arguments.examples else "first", rows, settings, before, arguments.json)

@@ -207,7 +207,7 @@ _WITHOUT_INSIDE: dict[str, Callable[[], Any]] = {
 }
 _BROKEN = {
     "empty.stl": b"",
-    "words.obj": b"this is no mesh\n",
+    "words.obj": b"this is not a mesh\n",
     "points.ply": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
     b"property float z\nend_header\n0 0 0\n",
     "cut.stl": b"\0" * 80 + (1000).to_bytes(4, "little") + b"\0" * 500,

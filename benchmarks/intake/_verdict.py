@@ -28,13 +28,13 @@ def verdict(read: Callable[[], Any], is_right: Callable[[Any], bool] | None) -> 
         is_right: Whether what was read is what the file means; None if it must be refused.
     """
     with warnings.catch_warnings():
-        # What is mended and guessed is said; here only what comes out counts.
+        # What is corrected and guessed is said; here only what comes out counts.
         warnings.simplefilter("ignore", UserWarning)
         warnings.simplefilter("ignore", RuntimeWarning)
         try:
             found = read()
         except (ValueError, ImportError):
             return Outcome.REFUSED_RIGHTLY if is_right is None else Outcome.REFUSED_WRONGLY
-        except Exception:  # a traceback is no answer
+        except Exception:  # a traceback is not an answer
             return Outcome.WRONG
     return Outcome.LOADS if is_right is not None and is_right(found) else Outcome.WRONG

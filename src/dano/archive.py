@@ -185,7 +185,7 @@ class Arrays:
             file: Open for reading bytes; must stay open.
 
         Raises:
-            ValueError: If it is no zip.
+            ValueError: If it is not a zip.
         """
         if not zipfile.is_zipfile(file):
             file.seek(0)
@@ -195,7 +195,7 @@ class Arrays:
             # How every pickle of the last twenty years begins.
             if start[:1] == b"\x80":
                 raise ValueError(_PICKLED)
-            raise ValueError("it is no archive of arrays, or cut off")
+            raise ValueError("it is not an archive of arrays, or cut off")
         file.seek(0)
         try:
             self._zip = zipfile.ZipFile(file)

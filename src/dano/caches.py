@@ -26,7 +26,7 @@ def cache_folder() -> Path | None:
     except RuntimeError:
         return _none("there is no home folder")
     if not folder.is_absolute():
-        return _none(f"{folder} is no absolute path")
+        return _none(f"{folder} is not an absolute path")
     if folder == Path.cwd():
         return _none(f"{folder} is the working folder")
     try:

@@ -53,7 +53,7 @@ def checked_items(name: str, value: object, *kinds: type[T]) -> tuple[T, ...]:
     """A list of instances of some classes, as a tuple.
 
     Raises:
-        ValueError: If it is no list, or something else is among it.
+        ValueError: If it is not a list, or something else is among it.
     """
     valid = " or ".join(_known_as(kind) for kind in kinds)
     if not isinstance(value, Iterable) or isinstance(value, (str, bytes)):
@@ -88,7 +88,7 @@ def checked_number(
         unit: Of the number, for the error.
 
     Raises:
-        ValueError: If it is no number, not finite, or out of range.
+        ValueError: If it is not a number, not finite, or out of range.
     """
     number = None
     if value is not None and not isinstance(value, (str, bytes, complex)):
@@ -112,7 +112,7 @@ def checked_count(name: str, value: object, least: int = 1, most: int | None = N
     """`value` as a whole number.
 
     Raises:
-        ValueError: If it is none, such as 300.0, or out of range.
+        ValueError: If it is not an integer (300.0 is not), or out of range.
     """
     try:
         count = operator.index(value)  # pyright: ignore[reportArgumentType]
@@ -163,7 +163,7 @@ def checked_path(name: str, value: object) -> Path:
     """`value` as a path, there or not.
 
     Raises:
-        ValueError: If it is no path, such as a number, or holds a null character.
+        ValueError: If it is not a path, such as a number, or holds a null character.
     """
     if not isinstance(value, (str, os.PathLike)):
         raise ValueError(f"{name} must be a path, got {shown(value)}")

@@ -157,7 +157,7 @@ def check(
 
     Args:
         function: From something like `x` to one number.
-        x: The point: a number, an array, or a tree of arrays; what is no real array stays as it is.
+        x: The point: a number, an array, or a tree of arrays; what is not a real array stays as it is.
         steps: Visible steps, as multiples of `scale`.
         scale: What is one of each coordinate, of the structure of `x` or one number; default: the largest
             magnitude in its array, or 1 for an array of zeros.
@@ -167,7 +167,7 @@ def check(
             looked at along so many random directions, in which each moves by plus or minus its scale.
         tolerance: Relative difference to the slope that counts as none.
         mode: "reverse" (`jax.grad`) or "forward" (`jax.jvp`).
-        gradient: The derivative, of the structure of `x`, where `function` is none of JAX.
+        gradient: The derivative, of the structure of `x`, where `function` is not one of JAX.
         seed: Of random directions.
 
     Raises:

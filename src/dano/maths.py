@@ -350,7 +350,7 @@ def checked_array(
         above: What every entry must exceed.
 
     Raises:
-        ValueError: If the shape differs, or an entry is no number, not finite or out of range.
+        ValueError: If the shape differs, or an entry is not a number, not finite or out of range.
     """
     array = checked_floating(name, value)
     if array.shape != shape:
@@ -444,7 +444,7 @@ def checked_key(key: PRNGKeyArray | None) -> PRNGKeyArray:
     """A random key; None stands for `jax.random.key(0)`.
 
     Raises:
-        ValueError: If it is no single key of JAX.
+        ValueError: If it is not a single key of JAX.
     """
     if key is None:
         return jax.random.key(0)

@@ -120,7 +120,7 @@ def corrupt(path, kind):
     {
         "truncated": "expected a grid: values",
         "damaged": "expected a grid: values",
-        "text": "expected a grid: values .* it is no archive of arrays",
+        "text": "expected a grid: values .* it is not an archive of arrays",
         "text member": r"values must hold numbers, got text of shape \(4, 4, 4\)",
         "empty": "expected a grid: values",
         "pickle": "pickled objects, which are never loaded",

@@ -156,7 +156,7 @@ def test_meshes_that_enclose_nothing_are_refused(trimesh, tmp_path):
     with pytest.raises(ValueError, match="the mesh must enclose a volume, got sheets"):
         mesh_field(sheet)
     garbage = tmp_path / "garbage.obj"
-    garbage.write_text("this is no mesh\n")
+    garbage.write_text("this is not a mesh\n")
     with pytest.raises(ValueError, match="garbage.obj"):
         mesh_field(garbage)
     with pytest.raises(ValueError, match="none.obj: no such file"):

@@ -1,4 +1,4 @@
-"""Command lines that are wrong: files that are none, numbers that are none, outputs that cannot be."""
+"""Command lines that are wrong: files of another kind, words in place of numbers, outputs that cannot be."""
 
 import contextlib
 import io

@@ -51,7 +51,7 @@ def _drawn(call: Call, argument: str) -> list[Outcome]:
         case = f"{call.name}({argument}={value!r})"
         arguments = {**call.good, argument: value}
         outcome = judge(case, call.function, arguments, "")
-        # What is taken is no fault: a number drawn by chance may be one that is valid.
+        # What is taken is not a fault: a number drawn by chance may be one that is valid.
         found.append(outcome._replace(verdict="clear") if outcome.verdict == "silently wrong" else outcome)
 
     draw()

@@ -72,7 +72,7 @@ def _left(folder: Path) -> list[str]:
 
 
 def _one_line(err: str, says: str) -> bool:
-    """Whether an error is one line that names what it is about; lines of progress are none."""
+    """Whether an error is one line that names what it is about; lines of progress do not count."""
     lines = [line for line in err.splitlines() if not line.endswith(" %") and " s left" not in line]
     return len(lines) == 1 and lines[0].startswith("dano: error: ") and says in lines[0]
 

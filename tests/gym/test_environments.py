@@ -114,7 +114,7 @@ def test_many_episodes_are_single_ones(pushed):
 
 
 def test_a_state_to_begin_with_is_taken_by_one_and_by_many(pushed):
-    """One state for all episodes or one for each; other options are no options."""
+    """One state for all episodes or one for each; other options are not options."""
     scene, state, task = pushed
     many = make_vector_env(scene, state, task, 2)
     here, there = (scene.initial_state(puck=dict(position=(x, 0, 0))) for x in (0.2, 0.4))

@@ -145,7 +145,7 @@ def test_bad_motions(options, match):
         ("time,x,y\n0,1,2\n", r"\['z'\] are missing"),
         ("time,x,x\n0,1,2\n", "different columns"),
         ("time,x,y,z\n0,1,2\n", "must hold 4 cells"),
-        ("time,x,y,z\n0,1,two,3\n", "'two' is no number"),
+        ("time,x,y,z\n0,1,two,3\n", "'two' is not a number"),
         ("x,y,z\n0,1,2\n", "no times"),
         ("time,height\n0,1\n", "must have columns"),
     ],

@@ -171,5 +171,5 @@ def test_what_is_left_out_of_a_folder_is_said(tmp_path: Path):
     (tmp_path / "notes.txt").write_text("x", encoding="utf-8")
     assert [file.name for file in picture_files(tmp_path)] == ["a.png", "b.JPG"]
     (tmp_path / "c.dng").write_bytes(b"raw")
-    with pytest.warns(RuntimeWarning, match=r"left out 1 files that are no pictures .*c\.dng"):
+    with pytest.warns(RuntimeWarning, match=r"left out 1 files that are not pictures .*c\.dng"):
         assert len(picture_files(tmp_path)) == 2

@@ -320,7 +320,7 @@ def test_the_edge_of_a_mask_is_found_in_the_picture_and_moved_there(change):
     # Sideways a unit of the ellipse is 1.4 pixels.
     assert offset == pytest.approx(1.2 * change, abs=0.35)
     assert overlap(moved_edge(mask, -offset), truth) > 0.975
-    # A plain picture shows no edge, and what differs from frame to frame is no common offset.
+    # A plain picture shows no edge, and what differs from frame to frame is not a common offset.
     assert np.isnan(edge_offset(mask, np.full_like(image, 0.5), seen))
     assert np.isnan(edge_offset(np.zeros_like(mask), image, seen))
     assert common_offset([offset] * 5) == (pytest.approx(offset) if change else 0)

@@ -239,9 +239,9 @@ def data_folder() -> Path | None:
 def _members(path: Path) -> dict[str, np.ndarray]:
     wanted = (*_COLUMNS, "offsets")
     try:
-        # NumPy takes what is no archive for a pickle, and says so.
+        # NumPy takes what is not an archive for a pickle, and says so.
         if path.exists() and not zipfile.is_zipfile(path):
-            raise zipfile.BadZipFile("it is no zip file")
+            raise zipfile.BadZipFile("it is not a zip file")
         with np.load(path) as archive:
             missing = [name for name in wanted if name not in archive.files]
             if not missing:

@@ -12,13 +12,13 @@ from dano.cli._interrupt import interrupted
 BAR = 24
 """Characters of a progress bar (convention)."""
 QUIET = 10.0
-"""Seconds between two lines of progress where stderr is no terminal (convention)."""
+"""Seconds between two lines of progress where stderr is not a terminal (convention)."""
 
 
 class Progress:
     """A line on stderr that says what is being done, how far it is, and how long it still takes.
 
-    Where stderr is no terminal, such as a file, it says so in a line every ten seconds. An interrupt
+    Where stderr is not a terminal, such as a file, it says so in a line every ten seconds. An interrupt
     that was lost is raised again here, unless what runs returns its best so far instead.
     """
 

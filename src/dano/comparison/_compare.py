@@ -49,7 +49,7 @@ class Row(NamedTuple):
         preparation: Time for surface, pieces and loading [s].
         triangles: Of the surface.
         pieces: Convex pieces that touch; 0 where contact is not with pieces.
-        parts: Parts of the surface that hang together.
+        parts: Connected parts of the surface.
         open_edges: Edges without two faces; 0: watertight.
         volume_error: Relative.
         com_error: Distance over the size.

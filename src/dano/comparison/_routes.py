@@ -69,12 +69,12 @@ class Mesh(NamedTuple):
 
     @property
     def parts(self) -> int:
-        """Number of pieces that hang together."""
+        """Number of connected parts."""
         return len(np.unique(components(self.triangles)))
 
 
 def components(mesh: Triangles) -> Int[np.ndarray, " f"]:
-    """Which of the parts that hang together each face belongs to, counted from 0."""
+    """Which of the connected parts each face belongs to, counted from 0."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -128,7 +128,7 @@ def clean(grid: Grid, level: float) -> Grid:
 def best_level(grid: Grid, volume: float) -> float:
     """The level whose cleaned surface encloses a volume: what hindsight would choose.
 
-    Nobody who has only the density knows it. It gives the mesh its best chance.
+    It cannot be determined from the density alone. It gives the mesh its best chance.
 
     Args:
         grid: The density.

@@ -44,7 +44,7 @@ class AbstractEngine(eqx.Module):
         """One timestep; the report says whether the step's equations were solved."""
 
     def enlarged(self, scene: Scene, factor: int) -> "AbstractEngine | None":
-        """The engine with `factor` times the room for contacts that it chose; None if it did not choose."""
+        """The engine with `factor` times the contact capacity that it chose; None if it was given."""
         return None
 
     def rollout(
@@ -136,7 +136,7 @@ def check_state(scene: Scene, state: State) -> None:
     """`Scene.check_state`, after the scene itself; and whether loops are closed.
 
     Raises:
-        ValueError: If the scene is none, the state does not fit it, or loops are open.
+        ValueError: If the scene is not a `Scene`, the state does not fit it, or loops are open.
     """
     checked_kind("scene", scene, Scene)
     scene.check_state(state)
@@ -159,7 +159,7 @@ def checked_engine(engine: AbstractEngine | None) -> AbstractEngine:
     """An engine; None stands for `VariationalEngine()`.
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If it is not an engine.
     """
     return VariationalEngine() if engine is None else checked_kind("engine", engine, AbstractEngine)
 

@@ -16,8 +16,8 @@ def chosen_collision(collision: str) -> Literal["coacd", "hull"]:
     """What is made for `collision`: "auto" is CoACD where it is installed.
 
     Raises:
-        ValueError: If it is none of the three.
-        ImportError: If CoACD is asked for and missing.
+        ValueError: If it is not one of the three.
+        ImportError: If CoACD is requested and missing.
     """
     if collision not in get_args(Collision):
         raise ValueError(f"collision must be one of {list(get_args(Collision))}, got {collision!r}")

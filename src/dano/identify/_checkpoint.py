@@ -56,7 +56,7 @@ class Checkpoint:
         """Take what an earlier search has left, if there is something.
 
         Raises:
-            ValueError: If the file is no checkpoint, or one of another search.
+            ValueError: If the file is not a checkpoint, or one of another search.
         """
         if self._path is None or not self._path.exists():
             return

@@ -76,7 +76,8 @@ def identify(
         initial: What to estimate of the state in which each window begins: "given" (nothing), "velocities"
             (with spins), "states" (all), or a list of quantities. Default: what the motion does not hold.
         noise: Standard deviations of the quantities that count: position [m], orientation [rad], velocity
-            [m/s], omega [rad/s], q [rad or m]. Default: poses. A covariance of the motion goes before.
+            [m/s], omega [rad/s], q [rad or m]. Default: poses. If the motion has covariances, they replace
+            `noise`.
         huber: Length of a residual, in standard deviations, from which it counts linearly.
         window: Frames of the windows that motions are cut into (multiple shooting); default: no cuts.
         continuity: Allowed gap between windows, as multiple of `noise`, or a falling sequence of it, searched
@@ -217,7 +218,7 @@ def _identification(
     held_errors: Errors | None,
     began: float,
 ) -> Identification:
-    """The result: values, how sure they are, and the motion that they give."""
+    """The result: values, their uncertainty, and the motion that they give."""
     best, space, scene, plan = ended[0].solution, setup.space, setup.scene, problem.plan
     problem.smoothing, problem.roughness = ended[0].smoothing, ended[0].roughness
     ripple = ripple_covariance(problem, best.x, best.blocks)

@@ -43,7 +43,7 @@ def motion_of_joints(scene: Scene, times: Numbers, q: Numbers, *, state: State |
     """The motion of a log of joint coordinates.
 
     What `identify` compares are the coordinates. Poses of the bodies that hang on the joints follow from
-    them: each noisy coordinate moves all bodies after its joint, so these are no observations of their own.
+    them: each noisy coordinate moves all bodies after its joint, so these are not observations of their own.
     Positions are those of the field frames, so that they say nothing of centres of mass, which may be
     unknown.
 
@@ -100,7 +100,7 @@ def _whole_turns(scene: Scene, rows: np.ndarray) -> np.ndarray:
         if joint.kind != "hinge":
             continue
         if joint.limits is not None and float(np.ptp(np.asarray(joint.limits))) < 2 * np.pi - 0.1:
-            # It cannot turn all the way round: what jumps is no angle that was wrapped.
+            # It cannot turn all the way round: what jumps is not an angle that was wrapped.
             continue
         rows[:, place], jumps = unwrapped(rows[:, place])
         if jumps:

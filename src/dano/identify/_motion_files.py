@@ -90,7 +90,7 @@ def load_motion(
     (`x [mm]`, `time_ms`). An empty cell is an unknown number. Units as in `Motion`.
 
     Rows that repeat a time or come a little late are left out or sorted. Units and orders that nobody stated
-    are guessed where SI units or wxyz cannot be meant. One UserWarning says what was mended and guessed.
+    are guessed where SI units or wxyz cannot be meant. One UserWarning says what was corrected and guessed.
 
     Args:
         path: The file.

@@ -22,7 +22,7 @@ class Parameter:
         name: What results call it.
         where: From the scene to a leaf, or to a list of leaves that share the value, e.g.
             ``lambda s: s.contact("bunny", "floor").sliding_friction``.
-            For what is no leaf see `apply`.
+            For what is not a leaf see `apply`.
         lower: Smallest value (a number, or an array of the leaf's shape).
         upper: Largest value.
         start: Where to begin; default the scene's own value, moved into the bounds.
@@ -31,8 +31,9 @@ class Parameter:
             matrix Σ = ½ tr(J) I − J of second moments, so that every value is the inertia tensor of some
             mass distribution. Default: "inertia" for leaves of shape (3, 3), "value" for others.
         of: "scene", or "controls" for leaves of the controls given to `identify`.
-        apply: Instead of `where`, from the scene and the value to the scene that has it, for what is no leaf
-            itself, e.g. the half side of a box whose corners follow; needs `start`, which gives the shape.
+        apply: Instead of `where`, from the scene and the value to the scene that has it, for what is not a
+            leaf itself, e.g. the half side of a box whose corners follow; needs `start`, which gives the
+            shape.
     """
 
     name: str
@@ -48,8 +49,8 @@ class Parameter:
         """Check what can be checked without a scene.
 
         Raises:
-            ValueError: If the name is empty, both or none of `where` and `apply` are given, a number is none,
-                bounds cross, or a word is unknown.
+            ValueError: If the name is empty, both or none of `where` and `apply` are given, a number is not
+                one, bounds cross, or a word is unknown.
         """
         what = f"of parameter {checked_text('name', self.name)!r}"
         if (self.where is None) == (self.apply is None):

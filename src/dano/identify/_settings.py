@@ -133,7 +133,7 @@ def estimated(initial: str | Sequence[str] | None, motions: Sequence[Motion]) ->
     """Quantities of the initial states that are estimated, by the argument `initial` of `identify`.
 
     Raises:
-        ValueError: If it is none of the known words, or lists something else than quantities.
+        ValueError: If it is not one of the known words, or lists something else than quantities.
     """
     if initial is None and any(m.q is not None for m in motions):
         initial = "states"

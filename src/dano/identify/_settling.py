@@ -31,7 +31,7 @@ _SLOW, _BETTER = 2, 0.9
 # Steps about the minimum, of which those count whose loss is no more than so many times the least.
 _LIKE = 2.0
 _LAST_STEPS = 8
-# Drift of these that is none, in its own standard errors.
+# Drift of these that counts as no drift, in its own standard errors.
 _DRIFT = 3.0
 # Least variance of residuals, as a share of what the stated noise has.
 _QUIET = 1e-2

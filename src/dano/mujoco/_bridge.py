@@ -214,7 +214,7 @@ class Bridge:
         self._append(model, data)
 
     def _table(self, model: Any) -> Table | None:
-        """What is known of a model; None if it is none of ours."""
+        """What is known of a model; None if it was not made by a bridge."""
         found = self._tables.get(id(model))
         if found is None or found[0]() is not model:
             # Models come and go; what is known of those that went is dropped.
@@ -230,7 +230,8 @@ class Bridge:
         mujoco = self._mujoco
         if model.opt.enableflags & int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)):
             raise ValueError(
-                "model.opt.enableflags must not have mjENBL_SLEEP: contacts of objects wake nobody"
+                "model.opt.enableflags must not have mjENBL_SLEEP:"
+                " contacts added by the bridge do not wake sleeping bodies"
             )
         both = int(getattr(mujoco.mjtDisableBit, "mjDSBL_PASSIVE", 0))
         if not both:

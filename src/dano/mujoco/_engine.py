@@ -87,8 +87,8 @@ class MuJoCoEngine(AbstractEngine):
 
         Raises:
             ImportError: If mujoco is missing.
-            ValueError: If nothing in the scene moves, a shape is no geom of MuJoCo's, an object has no solid
-                for a mesh, or an option is out of range.
+            ValueError: If nothing in the scene moves, a shape is not a geom of MuJoCo's, an object has no
+                solid for a mesh, or an option is out of range.
         """
         checked_kind("scene", scene, Scene)
         difference = checked_number("difference", difference, above=0)

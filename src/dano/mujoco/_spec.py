@@ -28,7 +28,7 @@ def spec_of(mujoco: Any, scene: Scene) -> Any:
     Body frames are ours: axes of the field frame at the centre of mass.
 
     Raises:
-        ValueError: If a shape is no geom of MuJoCo's.
+        ValueError: If a shape is not a geom of MuJoCo's.
     """
     spec = mujoco.MjSpec()
     # With the default integrator bodies that tumble gain energy without limit.

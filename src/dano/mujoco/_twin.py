@@ -138,7 +138,7 @@ class Twin:
 
         Raises:
             ImportError: If mujoco is missing.
-            ValueError: If a shape is no geom of MuJoCo's, or an object has no solid to make a mesh of.
+            ValueError: If a shape is not a geom of MuJoCo's, or an object has no solid to make a mesh of.
         """
         self._mujoco = mujoco = library()
         self._lock = threading.Lock()

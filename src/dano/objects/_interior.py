@@ -112,8 +112,8 @@ def examine(lattice: Lattice) -> tuple[Interior, Bool[np.ndarray, "nx ny nz"]]:
     """Find the solid that a density stands for, and what its inside looks like.
 
     The level of the surface is half the plateau density. For an occupancy this is the natural level, for
-    other fields the middle of the wall. Another level is taken if the part above it is no watertight solid.
-    It is not if
+    other fields the middle of the wall. Another level is taken if the part above it is not a watertight
+    solid. It is not if
 
     - closing its pores by one more cell enlarges it by more than 6 %, or
     - a lower level finds a hollow of more than 5 % of its volume, bordered by its dense part, that it does

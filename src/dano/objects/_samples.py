@@ -285,7 +285,7 @@ def draw_contact_samples(shape: AbstractShape, n: int, key: PRNGKeyArray | None 
         key: Random key; default `jax.random.key(0)`.
 
     Raises:
-        ValueError: If the shape is none or unbounded, or n is no whole number ≥ 1.
+        ValueError: If the shape is not a shape or is unbounded, or n is not an integer ≥ 1.
     """
     checked_kind("shape", shape, AbstractShape)
     n = checked_count("n", n)

@@ -142,7 +142,7 @@ def _shell(
     inside = (height > 0) & (height < 2 * skin)
     drawn, height, gradient = drawn[inside], height[inside], gradient[inside]
     slope = np.linalg.norm(gradient, axis=1)
-    # ∫ f(s) |∇s| dx is an integral over level sets even where s is no exact distance.
+    # ∫ f(s) |∇s| dx is an integral over level sets even where s is not an exact distance.
     areas = (1 - np.cos(math.pi * height / skin)) / (2 * skin) * slope * side**3
     normals = gradient / np.maximum(slope, _LEAST_SLOPE)[:, None]
     points = _projected(drawn, height, gradient)

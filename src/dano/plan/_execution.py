@@ -211,7 +211,7 @@ def _substeps(name: str, scene: Scene, plan: Plan) -> int:
     """Steps of a scene in a step of a plan.
 
     Raises:
-        ValueError: If it is no whole number.
+        ValueError: If it is not an integer.
     """
     planned, given = float(plan.trajectory.times[1] - plan.trajectory.times[0]), float(scene.timestep)
     n = max(1, round(planned / given))

@@ -54,7 +54,7 @@ class Reach(NamedTuple):
 def to_touch(scene: Scene, task: Task, states: State, engine: AbstractEngine) -> tuple[Reach, ...]:
     """Bodies that do not come to their goal, and that nothing driven touches along a trajectory.
 
-    A body is driven that an actuator drives, or that hangs together with such a one by joints. Touch may go
+    A body is driven that an actuator drives, or that joints connect with such a one. Touch may go
     through others: a stick that is driven touches what lies on the tray that it pushes.
     """
     groups = _groups(scene)
@@ -80,7 +80,7 @@ def to_touch(scene: Scene, task: Task, states: State, engine: AbstractEngine) ->
 
 
 def _groups(scene: Scene) -> list[int]:
-    """Of each body the first one of those that hang together by joints; what stands still ties nothing."""
+    """Of each body the first one of its kinematic tree; fixed bodies connect nothing."""
     groups = list(range(len(scene.bodies)))
     layout = scene.layout
     for parent, child in zip(layout.parents, layout.children, strict=True):

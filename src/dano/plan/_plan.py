@@ -44,7 +44,7 @@ from dano.solvers import (
 _ATTEMPTS = 3
 # Slip below which friction is gradual where without it nothing moves [m/s]: that of a careful push.
 _GRADUAL = 0.02
-# By so much giving up contact is dearer than the controls that make it.
+# By so much giving up contact costs more than the controls that make it.
 _DEARER = 10.0
 _ENDED = (TrajectoryStop.STOPPED, TrajectoryStop.TIME)
 

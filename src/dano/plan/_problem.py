@@ -41,7 +41,8 @@ class Chart(eqx.Module):
 class Retract(Chart):
     """The state that a change leads to.
 
-    Rows of bodies on joints stay: what reads them fills them in itself, which is dear to compile.
+    Rows of bodies on joints stay: readers run forward kinematics themselves, because doing it here compiles
+    slowly.
     """
 
     def __call__(self, state: State, change: Float[Array, " n"]) -> State:

@@ -245,7 +245,7 @@ class Limit(eqx.Module):
         """How far beyond each finite bound a state is; negative inside."""
         n = QUANTITIES[self.quantity]
         value = _difference(scene, state, self.body, self.quantity, jnp.zeros(n, self.lower.dtype), self.axes)
-        # An infinite bound is no condition; a finite number keeps derivatives finite.
+        # An infinite bound is not a condition; a finite number keeps derivatives finite.
         over = jnp.where(jnp.isfinite(self.upper), value - self.upper, -1.0)
         under = jnp.where(jnp.isfinite(self.lower), self.lower - value, -1.0)
         return jnp.concatenate([over, under])

@@ -30,7 +30,7 @@ _FLAT, _FLOATS = 1.0, 0.01
 
 _COLUMNS = (
     ("triangles", "of the surface"),
-    ("parts", "of the surface that hang together; floaters and cavities count"),
+    ("parts", "connected parts of the surface; floaters and cavities count"),
     ("open", "edges that have no two faces: 0 is watertight"),
     ("pieces", "convex solids that touch"),
     ("prepared", "time for the surface, the pieces, loading or compiling"),
@@ -75,8 +75,10 @@ def write_comparison_report(
     intro = (
         f"One object, {100 * comparison.size:.3g} cm long, in dano as it is, in other simulators as meshes."
         f" Surfaces at densities φ = {levels}; the best one is φ = {comparison.best:.3g}, whose surface"
-        f" encloses the volume of {comparison.reference}: who has only the density does not know it. Each"
-        f" falls {comparison.drops} times on a plane from the same orientations. Errors are measured against"
+        f" encloses the volume of {comparison.reference}:"
+        " this level cannot be determined from the density alone."
+        f" Each falls {comparison.drops} times on a plane from the same orientations."
+        " Errors are measured against"
         f" {comparison.reference}."
     )
     parts = [

@@ -163,7 +163,7 @@ def draw_simulated(
         background: Picture of the place without the object; default: the object is drawn over the frames.
 
     Raises:
-        ValueError: If an argument is of another kind, or the background is no picture or of another size
+        ValueError: If an argument is of another kind, or the background is not a picture or of another size
             than the frames.
         ImportError: If pillow is missing.
     """

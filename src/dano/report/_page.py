@@ -27,7 +27,7 @@ def write_page(path: str | os.PathLike[str], title: str, parts: Sequence[str]) -
     """Write a page with a heading and parts in HTML, whole or not at all.
 
     Raises:
-        ValueError: If `path` is a directory or lies in none, or the title is no text.
+        ValueError: If `path` is a directory or lies in none, or the title is not text.
     """
     heading = html.escape(checked_text("title", title))
     page = (
@@ -42,7 +42,7 @@ def check_page(path: str | os.PathLike[str], title: str) -> None:
     """Check where a page goes, and its title, before what is on it is drawn.
 
     Raises:
-        ValueError: If `path` is a directory or lies in none, or the title is no text.
+        ValueError: If `path` is a directory or lies in none, or the title is not text.
     """
     checked_output(path)
     checked_text("title", title)

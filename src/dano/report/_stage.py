@@ -75,7 +75,7 @@ def stage(
     """Make the bodies of a scene ready for drawing; bodies without a field or shape are left out.
 
     Raises:
-        ValueError: If a colour is none, a colour or look names no body, or nothing can be drawn.
+        ValueError: If a colour is not "#rrggbb", a colour or look names no body, or nothing can be drawn.
     """
     colours = checked_kind("colours", {} if colours is None else colours, Mapping)
     looks = checked_kind("looks", {} if looks is None else looks, Mapping)

@@ -1,4 +1,4 @@
-"""The report of a tracked film: silhouettes over frames, how they fit, how sure the poses are."""
+"""The report of a tracked film: silhouettes over frames, how they fit, the uncertainty of the poses."""
 
 import io
 import os

@@ -224,7 +224,7 @@ def checked_size(size: Sequence[int], count: int = 1) -> tuple[int, int]:
         count: Runs that are side by side.
 
     Raises:
-        ValueError: If they are no even numbers in range.
+        ValueError: If they are not even numbers in range.
     """
     size, most = checked_items("size", size, int), MOST_PIXELS if count == 1 else _MOST_OF_HALF
     if len(size) != 2 or not all(16 <= n <= most and n % 2 == 0 for n in size):

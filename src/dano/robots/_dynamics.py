@@ -1,7 +1,7 @@
 """Mass, bias and gravity of trees in their own coordinates, and torques that follow from them.
 
 With generalised velocities v (see `Frames`): M(q) v̇ + b(q, v) = τ, where b holds Coriolis, centrifugal and
-gravity terms. Springs, friction, damping, limits, motors and loops of joints are no part of b.
+gravity terms. Springs, friction, damping, limits, motors and loops of joints are not part of b.
 """
 
 import dataclasses

@@ -11,7 +11,7 @@ from dano.robots.formats import at_home, Connection, Description, Link, Placed, 
 # Mass and inertia of a link that has none but carries some, as a share of what it carries: a body must have
 # some, and a billionth is far below what any file knows of the mass that it adds to.
 VIRTUAL = 1e-9
-# Of the scaled mass matrix: a smallest eigenvalue below is none.
+# Of the scaled mass matrix: a smallest eigenvalue below counts as zero.
 _SINGULAR = 1e-11
 # By how much the largest moment may exceed the sum of the others in numbers that were rounded.
 ROUNDED = 1e-3
@@ -210,7 +210,7 @@ def completed(name: str, own: Inertial, carried: Inertial, total: Inertial) -> I
     """
     mass, com, inertia = own
     moments = np.linalg.eigvalsh(inertia)
-    # A moment of a body no larger than a micrometre is none.
+    # A moment of a body no larger than a micrometre counts as zero.
     rounding = ROUNDED * max(moments[2], 0.0) + 1e-12 * mass
     if moments[0] < -rounding:
         raise ValueError(

@@ -39,7 +39,7 @@ def load_urdf(
     Raises:
         ImportError: If a mesh needs packages that are missing.
         ValueError: If the file is missing or broken, its joints make no tree, a joint moves nothing with
-            mass, an inertia is impossible, a mesh is missing, or an argument is none of those above.
+            mass, an inertia is impossible, a mesh is missing, or an argument is not one of those above.
     """
     source = checked_input(path)
     return build_robot(

@@ -95,7 +95,7 @@ class Body(eqx.Module):
             fixed: Whether the body never moves; then it needs no mass.
 
         Raises:
-            ValueError: If the name is empty, the geometry is no shape or object, or a mass property is
+            ValueError: If the name is empty, the geometry is not a shape or object, or a mass property is
                 missing or out of range.
         """
         self.name = checked_text("name", name)
@@ -212,7 +212,7 @@ class Body(eqx.Module):
             thickness = -float(np.min(np.asarray(solid.coefficients)))
         else:
             thickness = 0.0 if solid is None else -float(_distance(solid, floating(middle)))
-        # The middle of a hollow solid is no measure of its walls.
+        # The middle of a hollow solid is not a measure of its walls.
         thickness = thickness if thickness > 0 else 0.5 * float((upper - lower).min())
         radius = 0.5 * float(np.linalg.norm(upper - lower))
         return floating([*middle, radius, size, thickness])
@@ -244,7 +244,7 @@ class Body(eqx.Module):
     def half_space_at(
         self, position: Float[Array, "3"], orientation: Float[Array, "4"]
     ) -> tuple[Float[np.ndarray, "3"], float] | None:
-        """Unit normal [W] and distance from the origin [m] of its plane; None if it is no half-space.
+        """Unit normal [W] and distance from the origin [m] of its plane; None if it is not a half-space.
 
         Args:
             position: Of its centre of mass [m, W].

@@ -50,8 +50,8 @@ class Chains(eqx.Module):
         anchor: Points on the axes.
         position: Origins at q = 0.
         orientation: At q = 0.
-        ratio: Of joints that mimic others; one of the others. Shape (j,).
-        shift: The same; zero of the others.
+        ratio: Of joints that mimic others; 1 for all other joints. Shape (j,).
+        shift: The same; 0 for all other joints.
         laws: What acts on the coordinates.
         com: Centres of mass of all bodies [m, F].
     """

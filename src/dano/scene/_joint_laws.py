@@ -20,7 +20,7 @@ class JointLaws(eqx.Module):
         damping: [N m s/rad or N s/m], shape (k,).
         armature: [kg m² or kg].
         stiffness: Of springs [N m/rad or N/m].
-        rest: Where they are slack [rad or m].
+        rest: Where they exert no force [rad or m].
         friction: [N m or N].
         limits: Least and largest q [rad or m], shape (k, 2).
         motor: Gear, stiffness and damping of motors, and their least and largest effort, see `Motor`;

@@ -44,7 +44,7 @@ class Joint(eqx.Module):
         friction: Torque [N m] or force [N] up to which the joint sticks, and with which it slips.
         armature: Inertia [kg m²] or mass [kg] of what turns with the joint, such as rotors through gears.
         stiffness: Of a spring [N m/rad or N/m], which pulls to `rest`.
-        rest: q at which the spring is slack [rad or m].
+        rest: q at which the spring exerts no force [rad or m].
         mimics: Child of the joint whose coordinate moves this one, too: q = ratio · q of that + shift.
         ratio: See `mimics`.
         shift: See `mimics` [rad or m].

@@ -377,7 +377,7 @@ class Scene(eqx.Module):
         Angles are between −π and π; what the joints do not allow is left out.
 
         Raises:
-            ValueError: If the state is none, or not one of this scene's bodies.
+            ValueError: If the state is not a `State`, or not one of this scene's bodies.
         """
         self._check_bodies(state)
         return joint_values(self.chains, state)
@@ -415,8 +415,8 @@ class Scene(eqx.Module):
         """Check a concrete state against the scene; traced values pass.
 
         Raises:
-            ValueError: If it is no state, a shape or dtype is wrong, a number is not finite, or a quaternion
-                is not of unit length.
+            ValueError: If it is not a state, a shape or dtype is wrong, a number is not finite, or a
+                quaternion is not of unit length.
         """
         self._check_bodies(state)
         for key in JOINT_QUANTITIES:

@@ -10,7 +10,7 @@ from dano.scene._states import Control
 
 
 def pulls(scene: Scene) -> Float[Array, "n 3"]:
-    """With how much gravity pulls at each body [m/s²]."""
+    """Gravitational acceleration of each body [m/s²]."""
     dtype = scene.timestep.dtype
     shares = [1.0 if body.gravcomp is None else 1 - body.gravcomp.astype(dtype) for body in scene.bodies]
     return jnp.stack([jnp.asarray(share, dtype) for share in shares])[:, None] * scene.gravity[None]

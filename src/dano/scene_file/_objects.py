@@ -107,7 +107,7 @@ def load_object(
     Args:
         source: "bunny", "soap", "trained_bunny", "trained_soap" (see `load_asset`), a .dano file, or a mesh
             or another field that `load_field` reads, of which an object is built. A file of one of these
-            names goes before.
+            names takes precedence.
         options: How to build it; None: with defaults, which a UserWarning says.
         weighed: Whether the mass of what is built is stated elsewhere.
         progress: Called with a description and the share done while an object is built.

@@ -123,7 +123,7 @@ class Table:
 
 
 def is_number(value: object) -> bool:
-    """Whether a value of a TOML file is a finite number; true and false are none."""
+    """Whether a value of a TOML file is a finite number; true and false are not numbers."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 

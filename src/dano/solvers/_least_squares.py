@@ -107,14 +107,14 @@ class Iterate(NamedTuple):
 # At the start, and its limits: shares of the diagonal of the normal equations, from rounding to "no step".
 _DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-15, 1e12
-# Relative change of x that is none.
+# Relative change of x that counts as no change.
 _NEGLIGIBLE = 1e-10
 # If the loss should fall by so many tolerances and does not, the search is stuck.
 _ROUGH = 100
 # Curvature over a parameter's range, as a share of the largest there is, that may be rounding: a parameter
 # with less stays about where it is instead of running off.
 _FLAT = 1e-10
-# Share of the largest curvature of an unknown among blocks that counts as the least: a tenth of the scale.
+# Lower bound on a block's curvature scaling, as a share of the largest: a tenth of the scale.
 _ALIKE = 1e-2
 # A step is accepted if it reduces the loss by at least this share of the model's prediction.
 _SUFFICIENT = 1e-4

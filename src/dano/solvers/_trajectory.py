@@ -94,7 +94,7 @@ class TrajectoryProblem(eqx.Module):
         retract: x ⊞ δ.
         difference: difference(x, y) = y ⊟ x, shape (n,).
         stage_residuals: r(x, u, t) of costs that are ℓ = ½ r·r; their Hessians are then taken as Gauss and
-            Newton do, from first derivatives. None where costs are none of this kind.
+            Newton do, from first derivatives. None where costs are not of this kind.
         final_residuals: The same of ℓ_T.
         convex: Whether the Hessians of the costs are known to have no negative eigenvalue; otherwise negative
             ones are set to zero (static).

@@ -21,7 +21,7 @@ class Checkpoint:
     """Pieces of a run on disk.
 
     Attributes:
-        path: The file; None where the output is no file, and nothing is kept.
+        path: The file; None where the output is not a file, and nothing is kept.
     """
 
     def __init__(self, output: Path, loaded: SceneFile):
@@ -36,7 +36,7 @@ class Checkpoint:
         """The pieces that an earlier run has left; none if there is no file.
 
         Raises:
-            ValueError: If the file is no checkpoint, or one of another run.
+            ValueError: If the file is not a checkpoint, or one of another run.
         """
         if self.path is None or not self.path.exists():
             return []

@@ -71,7 +71,7 @@ def camera_of(filming: Filming, film: Film) -> PosedCamera:
     """The camera that took a film.
 
     Raises:
-        ValueError: If the focal length is more than two numbers, or the file is none of a camera.
+        ValueError: If the focal length is more than two numbers, or the file is not one of a camera.
     """
     width, height = (n * film.shrunk for n in film.size)
     if filming.camera is not None:

@@ -51,7 +51,7 @@ def demo_soap(folder: Path, tell: Callable[[str], None], began: float, *, as_jso
         as_json: Whether to print one JSON object instead of text.
     """
     page, result = folder / "soap_story.html", folder / "soap_friction.json"
-    # What the stages print is no part of the object.
+    # What the stages print is not part of the object.
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         _make(folder, page, result, tell)
     found = json.loads(result.read_text(encoding="utf-8"))

@@ -31,7 +31,7 @@ class Program(NamedTuple):
     """The static part of a simulation; it decides the compiled program.
 
     Attributes:
-        static: What is no array of scene, parameters, state, controls and engine.
+        static: What is not an array of scene, parameters, state, controls and engine.
         n_steps: Number of steps.
         every: Steps between kept states; `n_steps` to keep the last alone.
         first: Whether the initial state is kept.

@@ -1,4 +1,4 @@
-"""How bodies on joints hang together, as tables for kernels."""
+"""Kinematic trees as tables for kernels."""
 
 from dano.engine.joints._rows import (
     structure_of_trees as structure_of_trees,

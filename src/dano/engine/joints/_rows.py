@@ -13,7 +13,7 @@ _SIX = 6
 
 
 def structure_of_trees(scene: Scene, touching: Iterable[int]) -> TreeStructure:
-    """How the bodies of a scene hang together.
+    """Kinematic trees and loops of a scene.
 
     Args:
         scene: The scene.

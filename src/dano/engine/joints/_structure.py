@@ -1,4 +1,4 @@
-"""How the bodies of a scene hang together, in whole numbers for kernels: nodes, unknowns, blocks, loops.
+"""Kinematic trees and loops of a scene, in integers for kernels: nodes, unknowns, blocks, loops.
 
 The unknowns of a step stand in blocks of six. A body that moves freely has a block. The joint coordinates of
 its tree follow in blocks of their own, parents before children; places that are left over are padding. Last

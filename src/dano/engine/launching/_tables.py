@@ -54,7 +54,7 @@ class Tables(eqx.Module):
         rows: Real numbers by place in a kernel's parameters, arrays of rows.
         whole: Whole numbers (static).
         features: What kernels must know of the scene (static).
-        structure: How bodies hang together (static).
+        structure: Kinematic trees and loops (static).
     """
 
     rows: dict[str, Float[Array, "rows width"]]

@@ -1,4 +1,4 @@
-"""Shapes from triangle meshes: files of many kinds, what is mended of them, and distances on a grid."""
+"""Shapes from triangle meshes: files of many kinds, how they are repaired, and distances on a grid."""
 
 from dano.fields.meshes._field import mesh_field as mesh_field, mesh_moments as mesh_moments
 from dano.fields.meshes._reading import (

@@ -77,7 +77,7 @@ def mesh_field(
     cavity.
 
     Holes are closed by flat fans of faces, flipped faces turned like their neighbours, doubled ones left out.
-    A UserWarning says in numbers what was mended, and the share of the surface that was added.
+    A UserWarning says in numbers what was repaired, and the share of the surface that was added.
 
     Where parts overlap, the distance inside is that to the surface of the part in which a point lies deepest.
     Distances within three cells of the surface are exact at the nodes; those further away are distances to
@@ -139,7 +139,7 @@ def mesh_field(
             f" {thin or 'the mesh is too thin'}"
         )
     if notes:
-        warnings.warn(f"{name}: mended: {'; '.join(notes)}", UserWarning, stacklevel=2)
+        warnings.warn(f"{name}: repaired: {'; '.join(notes)}", UserWarning, stacklevel=2)
     if thin:
         warnings.warn(f"{name}: {thin}", stacklevel=2)
     moments = None if overlap else mesh_moments(solid.whole)

@@ -31,7 +31,7 @@ class Repaired(NamedTuple):
         faces: Shape (f, 3).
         labels: Shell of each face, shape (f,): each is closed on its own.
         doubt: Share of the area that was added to close holes.
-        notes: What was mended, in words.
+        notes: What was repaired, in words.
         is_crossed: Faces may lie within the solid: walls between parts that touch, or what was added.
         is_smooth: Two faces meet at each edge, and all have normals: these tell which side is inside.
     """
@@ -151,7 +151,7 @@ def _single(faces: np.ndarray) -> tuple[np.ndarray, int]:
             a, b, c = ordered[face].tolist()
             if all(edge in odd for edge in ((a, b), (b, c), (a, c))):
                 keep[face] = True
-    # A wall between two parts is no defect.
+    # A wall between two parts is not a defect.
     walls = 2 * int(np.sum(~keep[pairs]))
     return faces[keep], int(np.sum(~keep)) - walls
 

@@ -58,7 +58,7 @@ def read_weights(path: Path) -> dict[str, np.ndarray]:
     try:
         if not zipfile.is_zipfile(path):
             raise ValueError(
-                "it is no zip, or cut off (files of torch before 1.6 must be saved again with a newer one)"
+                "it is not a zip, or cut off (files of torch before 1.6 must be saved again with a newer one)"
             )
         with zipfile.ZipFile(path) as archive:
             if (size := sum(info.file_size for info in archive.infolist())) > memory_limit():

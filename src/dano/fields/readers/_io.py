@@ -167,7 +167,7 @@ def _is_mesh(path: str | Path) -> bool:
 
 
 def _of_unit(path: str | Path, crop: np.ndarray | None, options: dict[str, Any]) -> AbstractField:
-    """What a file that is no mesh holds, in its own unit."""
+    """What a file that is not a mesh holds, in its own unit."""
     if (
         isinstance(path, str)
         and re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", path)
@@ -244,7 +244,7 @@ def save_field(field: GridField | SignedDistanceGrid, path: str | Path) -> None:
         path: File name ending in .npz, in an existing folder.
 
     Raises:
-        ValueError: If `field` is no grid, or `path` does not end in .npz, is a folder, or lies in none.
+        ValueError: If `field` is not a grid, or `path` does not end in .npz, is a folder, or lies in none.
     """
     path = checked_path("path", path)
     if not isinstance(field, (GridField, SignedDistanceGrid)):

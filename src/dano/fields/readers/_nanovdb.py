@@ -18,7 +18,7 @@ def read_nanovdb(data: bytes) -> Rows:
     """The grids of a NanoVDB file.
 
     Raises:
-        ValueError: If the bytes are none, are damaged, or are of a version that is not read.
+        ValueError: If the bytes are not NanoVDB, are damaged, or are of a version that is not read.
         EOFError: If the file ends too early.
     """
     rows = []

@@ -131,7 +131,7 @@ def load_checkpoint(
             `features_per_level`, `num_levels`, `log2_hashmap_size`, `disable_scene_contraction`.
 
     Raises:
-        ValueError: If it is no checkpoint of these methods or a number does not fit its weights.
+        ValueError: If it is not a checkpoint of these methods or a number does not fit its weights.
     """
     weights = read_weights(path)
     if gaussians := _under(weights, "gauss_params"):
@@ -286,7 +286,7 @@ def _undone(field: AbstractField, transforms: Path) -> AbstractField:
         scale = float(content["scale"])
         rotation = matrix[:, :3]
         if not (scale > 0 and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)):
-            raise ValueError("its transform is no rotation, or its scale not positive")
+            raise ValueError("its transform is not a rotation, or its scale not positive")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"{transforms}: expected transform (3, 4) and scale, or undo_transform=False; {error}"

@@ -25,7 +25,7 @@ def read_openvdb(data: bytes) -> Rows:
     """The grids of an OpenVDB file.
 
     Raises:
-        ValueError: If the bytes are none, are damaged, or are of a version that is not read.
+        ValueError: If the bytes are not OpenVDB, are damaged, or are of a version that is not read.
         EOFError: If the file ends too early.
     """
     stream = Stream(data)

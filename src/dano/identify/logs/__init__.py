@@ -1,4 +1,4 @@
-"""Logs as they are recorded: tables of text, what their columns mean, and what of them has to be mended."""
+"""Logs as they are recorded: tables of text, what their columns mean, and what has to be corrected."""
 
 from dano.identify.logs._columns import Columns as Columns, understood as understood
 from dano.identify.logs._mending import (

@@ -1,4 +1,4 @@
-"""What logs get wrong, mended where there is one way to read them; every guess is said."""
+"""What logs get wrong, corrected where there is one way to read them; every guess is reported."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LENGTH_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 _SLOWEST, _UNSURE = 5.0, 1.0
-"""Median step between rows [s] above which times are no seconds, and above which they may be none."""
+"""Median step between rows [s] above which times are not seconds, and above which they may be none."""
 
 _STEPS = {"ms": 2e3, "us": 2e5, "ns": np.inf}
 """Largest usual steps of 30 to 1000 frames a second or so, in each unit."""
@@ -18,7 +18,7 @@ _JITTER = 10
 """Steps by which a row may be late to be sorted back; more is another log."""
 
 _FAST, _FAR = 30.0, 20.0
-"""Speed [m/s] of a tenth of the frames from which positions are no metres; span [m] that is doubted."""
+"""Speed [m/s] of a tenth of the frames from which positions are not metres; span [m] that is doubted."""
 
 _IDENTITY = 0.05
 """Largest of the first two parts of quaternions that turn about the last axis, if these are x and y."""
@@ -35,7 +35,7 @@ def mended_times(
         first: What was taken from them already.
 
     Returns:
-        Times [s]; the rows that stay, in order; what was mended, in words.
+        Times [s]; the rows that stay, in order; what was corrected, in words.
 
     Raises:
         ValueError: If they jump back by more than late rows do.

@@ -34,7 +34,7 @@ class Table(NamedTuple):
         """A column as numbers, NaN where cells are empty.
 
         Raises:
-            ValueError: If a cell is no number.
+            ValueError: If a cell is not a number.
         """
         found = np.full(len(self.rows), np.nan)
         for i, row in enumerate(self.rows):
@@ -46,7 +46,7 @@ class Table(NamedTuple):
             except ValueError as error:
                 raise ValueError(
                     f"{self.source}: row {i + 1} (line {self.lines[i]}), column {self.header[column]!r}:"
-                    f" {cell!r} is no number"
+                    f" {cell!r} is not a number"
                 ) from error
         return found
 
@@ -69,11 +69,11 @@ def read_table(source: Path) -> Table:
     """Read a table of text.
 
     Cells are separated by commas, semicolons (then numbers may have decimal commas), tabs or blanks. The
-    first line that is no comment names the columns, or a comment with as many words does, as EuRoC has it.
+    first line that is not a comment names the columns, or a comment with as many words does, as EuRoC has it.
     Eight columns of numbers without names are a trajectory of TUM: time, x, y, z, and a quaternion xyzw.
 
     Raises:
-        ValueError: If the file is no text, has no header, or rows have different numbers of cells.
+        ValueError: If the file is not text, has no header, or rows have different numbers of cells.
     """
     try:
         text = source.read_text("utf-8-sig")

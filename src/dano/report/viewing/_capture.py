@@ -59,7 +59,7 @@ def view_capture(
         The viewer, stopped if `block`.
 
     Raises:
-        ValueError: If an argument is of another kind, or the port or host is none.
+        ValueError: If an argument is of another kind, or the port or host is not one.
         ImportError: If viser is missing, or pillow, or libigl for a hull.
     """
     _check(capture, unit)

@@ -20,7 +20,7 @@ from dano.report.viewing._serving import serve, Viewer, write_file
 from dano.vision import checked_colour, LearnedField, PALETTE, usual_level
 
 _NODES = 96
-"""Nodes along the longest side of a field that is no grid."""
+"""Nodes along the longest side of a field that is not a grid."""
 
 _MOST_NODES = 128
 """Nodes along the longest side of what is drawn: a page of some megabytes."""
@@ -53,7 +53,7 @@ def view_field(
 
     Raises:
         ValueError: If the field is unbounded or empty, a level is given for a solid or is not reached, or the
-            port or host is none.
+            port or host is not one.
         ImportError: If viser or libigl is missing.
     """
     _check(field, level)

@@ -32,7 +32,7 @@ class LiveView:
             host: Address to listen at; "0.0.0.0" lets other machines look.
 
         Raises:
-            ValueError: If the state does not fit the scene, or the port or host is none.
+            ValueError: If the state does not fit the scene, or the port or host is not one.
             ImportError: If viser or libigl is missing.
         """
         checked_kind("scene", scene, Scene).check_state(state)

@@ -57,7 +57,7 @@ def checked_address(port: int, host: str) -> None:
     """Check where to listen.
 
     Raises:
-        ValueError: If the port is none, or the host is no text.
+        ValueError: If the port is not one, or the host is not text.
     """
     checked_count("port", port, most=65535)
     checked_text("host", host)
@@ -73,7 +73,7 @@ def serve(fill: Callable[[Any], Callable[[], None] | None], *, port: int, host: 
         block: Whether to serve until interrupted.
 
     Raises:
-        ValueError: If the port is none, or the host is no text.
+        ValueError: If the port is not one, or the host is not text.
         ImportError: If viser is missing.
     """
     checked_address(port, host)

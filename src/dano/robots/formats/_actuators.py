@@ -44,7 +44,7 @@ def _disabled(model: Any, mujoco: Any, flag: str) -> bool:
 
 
 def _unlike(model: Any, mujoco: Any, i: int) -> str | None:
-    """Why an actuator is no motor of one joint; None if it is."""
+    """Why an actuator is not a motor of one joint; None if it is."""
     joints = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
     if int(model.actuator_trntype[i]) not in map(int, joints):
         return "acts on no joint, but on a tendon, a site or a body"

@@ -17,7 +17,7 @@ def read_collada(path: Path) -> Triangles:
     The unit of the file counts, the direction that it calls up does not: so do the readers of ROS.
 
     Raises:
-        ValueError: If it is no Collada file, something in it is missing, or it has no triangles.
+        ValueError: If it is not a Collada file, something in it is missing, or it has no triangles.
     """
     try:
         root = ET.fromstring(path.read_bytes().lstrip())
@@ -105,7 +105,7 @@ class _Reader:
             faces = [(each[0], each[k], each[k + 1]) for each in lists for k in range(1, len(each) - 1)]
         if not len(faces):
             return None
-        # Several geometries may share points: those of others are no part of this one.
+        # Several geometries may share points: those of others are not part of this one.
         used, faces = np.unique(np.array(faces), return_inverse=True)
         return self.points(self.at(positions))[used], faces.reshape(-1, 3)
 

@@ -102,7 +102,7 @@ class Connection:
         friction: [N m or N].
         armature: [kg m² or kg].
         stiffness: Of a spring [N m/rad or N/m].
-        rest: Where it is slack.
+        rest: Where it exerts no force.
         home: q in the pose that the file shows [rad or m].
         mimics: Name of the joint that it follows, ratio, shift; None if it does not.
         drive: Its actuator.

@@ -48,8 +48,8 @@ def read_urdf(path: Path) -> Description:
     """Read a URDF file.
 
     Raises:
-        ValueError: If it is no URDF, xacro was not expanded, or something in it is missing, unknown or no
-            number.
+        ValueError: If it is not a URDF, xacro was not expanded, or something in it is missing, unknown or
+            not a number.
     """
     text, notes = _expanded(path)
     try:

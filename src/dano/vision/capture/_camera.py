@@ -221,8 +221,8 @@ class PosedCamera(AbstractCamera):
             distortion: k₁, k₂, k₃, p₁, p₂.
 
         Raises:
-            ValueError: If the pose is no rotation and translation, a focal length is not positive, the image
-                is empty, or the distortion folds the image over itself.
+            ValueError: If the pose is not a rotation and translation, a focal length is not positive, the
+                image is empty, or the distortion folds the image over itself.
         """
         pose = checked_numbers("camera_to_world", camera_to_world)
         if pose.shape not in ((4, 4), (3, 4)) or not np.all(np.isfinite(pose)):

@@ -69,8 +69,8 @@ def load_capture(path: str | Path, *, hold_out: int | None = None, downscale: in
         The capture.
 
     Raises:
-        ValueError: If a file is missing or cannot be read, a pose is no rotation, or an image does not have
-            the size that its camera states; the message names the file.
+        ValueError: If a file is missing or cannot be read, a pose is not a rotation, or an image does not
+            have the size that its camera states; the message names the file.
         ImportError: If pillow is missing.
     """
     path = checked_path("path", path)

@@ -160,6 +160,6 @@ def hull_distance(views: Sequence[View], box: NodeGrid, lost: float = LOST) -> F
     inside = value > 0
     if not inside.any():
         raise ValueError("the silhouettes leave nothing of the box: the object is thinner than a cell")
-    # Crumbs of few views' silhouettes are no objects; parts of some size stay.
+    # Crumbs of few views' silhouettes are not objects; parts of some size stay.
     crumbs = inside & ~large_parts(inside, 0.02)
     return redistanced(np.where(crumbs, 1e-3, -value), box.spacing)

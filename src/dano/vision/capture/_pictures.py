@@ -186,7 +186,7 @@ def picture_files(folder: Path) -> list[Path]:
     others = [f.name for f in files if f not in found and f.suffix.lower() not in _BESIDE]
     if others:
         warnings.warn(
-            f"{folder}: left out {len(others)} files that are no pictures that dano reads:"
+            f"{folder}: left out {len(others)} files that are not pictures that dano reads:"
             f" {', '.join(others[:4])}{', …' if len(others) > 4 else ''}",
             RuntimeWarning,
             stacklevel=3,
@@ -195,7 +195,7 @@ def picture_files(folder: Path) -> list[Path]:
 
 
 _BESIDE = (".json", ".txt", ".csv", ".toml", ".md", ".npz", ".dano", ".aae", ".xmp", ".ini", ".db", ".yml")
-"""Endings of what lies beside pictures and is none."""
+"""Endings of files that lie beside pictures and are not pictures."""
 
 
 def _opened(file: Path) -> Any:

@@ -81,7 +81,7 @@ class Item(eqx.Module):
                 half-space.
             level: Density at which the surface of a solid lies; default: half the median of what the field
                 holds.
-            density_scale: If given, the field is no solid but a medium with extinction density_scale · φ
+            density_scale: If given, the field is not a solid but a medium with extinction density_scale · φ
                 [1/m].
             sharpness: Of the surface of a `SurfaceModel` [1/m]; default: its opacity rises over half a cell.
 

@@ -120,7 +120,7 @@ def render(
         sRGB image, shape (height, width, 3).
 
     Raises:
-        ValueError: If an item is not an `Item`, the light is zero, or a colour is none.
+        ValueError: If an item is not an `Item`, the light is zero, or a colour is not "#rrggbb".
     """
     items = checked_items("items", items, Item)
     checked_kind("camera", camera, AbstractCamera)

@@ -90,7 +90,7 @@ class Appearance(eqx.Module):
         n_inputs = n_features + 6 + (7 if lit else 0)
         network = Network.create((n_inputs, width, width, 3), second)
         # What depends on the view starts at nothing: where it is left out at first, it would else come in as
-        # noise, and push the surface about before it is learned.
+        # noise, and distort the surface before they are learned.
         seen = np.arange(n_features + 3, n_features + 6)
         seen = np.append(seen, (n_inputs - 2, n_inputs - 1)) if lit else seen
         first_layer = network.weights[0].at[seen].set(0)

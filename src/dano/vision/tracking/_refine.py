@@ -391,7 +391,7 @@ def _refined(
 
 
 def _covariance(rows: _Rows, hessian: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """H⁻¹ (Σ gₜ gₜᵀ) H⁻¹ over tiles of pixels t, whose errors hang together (Huber's sandwich, clustered)."""
+    """H⁻¹ (Σ gₜ gₜᵀ) H⁻¹ over tiles of pixels t with correlated errors (Huber's sandwich, clustered)."""
     tiles = index // _TILE
     _, tile = np.unique(tiles[:, 0] * 100003 + tiles[:, 1], return_inverse=True)
     each = np.einsum("nki,nk->ni", rows.weight[..., None] * rows.slope, rows.residual)

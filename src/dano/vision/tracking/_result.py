@@ -1,4 +1,4 @@
-"""What tracking finds: poses of an object in the frames of a film, and how sure they are."""
+"""What tracking finds: poses of an object in the frames of a film, and their uncertainty."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -138,8 +138,8 @@ def _messages(film: Film, status: Sequence[str], moved: np.ndarray, ambiguity: f
     if moved.any():
         names = [film.names[i] for i in np.flatnonzero(moved)]
         texts.append(
-            f"{len(names)} frames show so little of the object that their poses lean on the frames around"
-            f" them: {_first_of(names)}"
+            f"{len(names)} frames show so little of the object that their poses are smoothed with the frames"
+            f" around them: {_first_of(names)}"
         )
     if ambiguity < _CLEAR:
         texts.append(

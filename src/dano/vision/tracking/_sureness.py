@@ -1,4 +1,4 @@
-"""How sure poses are: covariances, directions that a film does not show, and frames that show too little."""
+"""Uncertainty of poses: covariances, directions that a film does not show, frames that show too little."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -21,7 +21,7 @@ _TURN_DOUBT = 3e-3
 """By which it is turned [rad]."""
 
 _INFLATED = 1.5
-"""By which variances by tiles are too small: the light's errors hang together over larger areas."""
+"""Factor by which variances by tiles are too small: lighting errors are correlated beyond one tile."""
 
 _OPEN = 0.1
 """Standard deviation, in radii or radians, from which a direction is not observed."""
@@ -30,7 +30,7 @@ _FREE_TURN = np.pi / np.sqrt(3)
 """Standard deviation of an angle of which nothing is known [rad]."""
 
 _UNSURE = 4.0
-"""How many times less sure than usual a pose must be to lean on those around it."""
+"""Poses whose standard deviation exceeds the median by this factor are smoothed with their neighbours."""
 
 _STEADY = 0.003
 """Least standard deviation of a third difference: in sizes, and [rad]."""

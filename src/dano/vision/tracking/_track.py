@@ -51,13 +51,14 @@ _ALIKE = 0.02
 """By which overlaps of starts may differ for colours to decide."""
 
 _UNLIKE = 0.1
-"""Usual difference of colours [sRGB] from which a thing is another one: a blurred, noisy object has 0.055."""
+"""Usual difference of colours [sRGB] above which a segment is rejected as a different object: a blurred,
+noisy object has 0.055."""
 
 _TWIN = 1.5
 """Ratio of the scores of two things in a frame up to which both look like the object."""
 
 _OTHER = np.radians(12)
-"""Angle from which a start is another one."""
+"""Angle above which two starts are different ones."""
 
 _WORSE = 0.03
 """By how much less than usually a silhouette must overlap for other poses to be tried."""
@@ -103,8 +104,8 @@ def track(
         progress: Told how far it is.
 
     Raises:
-        ValueError: If the camera does not fit the film, the start is no pose, there is no mask to be had, or
-            the object is in no frame.
+        ValueError: If the camera does not fit the film, the start is not a pose, there is no mask to be had,
+            or the object is in no frame.
     """
     chosen = options or TrackOptions()
     film.check_size(camera)
@@ -254,7 +255,7 @@ class _Walk:
         return better
 
     def _taken_up(self, i: int, expected: Placement) -> bool:
-        """Track a frame once more from an expected pose; returns whether the answer is another one.
+        """Track a frame once more from an expected pose; returns whether the answer differs.
 
         Of poses that fit alike the one nearer to where it was expected is likelier.
         """
@@ -391,7 +392,7 @@ class _Walk:
         return bool(found.overlap >= self._options.lost) and not self._is_another(found)
 
     def _is_another(self, found: Refined) -> bool:
-        """Whether colours say that a thing of the right shape is another one."""
+        """Whether colours say that a segment of the right shape is a different object."""
         return self._options.loss == "photometric" and found.colour_error > _UNLIKE
 
     def _refined(self, i: int, before: Placement, light: LightFit) -> Refined | None:

@@ -51,7 +51,7 @@ _MASK_WEIGHT, _CLEAR_WEIGHT, _EVEN_WEIGHT = 0.01, 0.01, 0.005
 """Weights of mask, clear and even fog beside the error of colours (chosen; no benchmark varies them)."""
 
 _BALL = 2.5
-"""Radius in cells of the ball that must fit into a cavity: a pore in a wall is none."""
+"""Radius in cells of the ball that must fit into a cavity: a pore in a wall does not count."""
 
 _WITNESSES, _SEEN = 2, 0.3
 """Cameras that must look at a place for it to be empty, and the share of its light that must reach them."""

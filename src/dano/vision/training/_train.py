@@ -39,8 +39,8 @@ _TRIAL = 80
 """Steps that tell whether a surface without cavities explains more."""
 
 _STILL, _COHERENT, _SHARP = 0.125, 0.6, 0.7
-"""Shares of the steps until which the surface stays where it is, so that looks do not push it about which are
-not learned yet (but cameras and surface are learned together); until its nodes move each on its own; and
+"""Shares of the steps until which the surface stays where it is, so that the untrained appearance does not
+distort the surface (but cameras and surface are learned together); until its nodes move each on its own; and
 until it is sharp."""
 
 _PER_DECIBEL = 0.002
@@ -144,7 +144,7 @@ def train(
 
     Raises:
         ValueError: If the capture cannot be learned from (see `survey`), or the checkpoint is of another
-            training, or `previews` is no folder.
+            training, or `previews` is not a folder.
         ImportError: If pillow is missing for previews.
         KeyboardInterrupt: When interrupted, after the state has been saved to `checkpoint`.
     """
