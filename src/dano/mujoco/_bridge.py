@@ -16,9 +16,10 @@ import numpy as np
 from dano.checks import checked_count
 from dano.maths import checked_array, Numbers
 from dano.mujoco._model import carry, carry_compiled, concerns, library, names_of, without_callback
-from dano.mujoco._settings import Writer
+from dano.mujoco._settings import is_gap_beyond, Writer
 from dano.mujoco._table import body_index, Chooser, MOST, Table
 from dano.mujoco._things import Thing, thing_of
+from dano.mujoco._worlds import warp_device, warp_library
 from dano.names import did_you_mean
 from dano.objects import NeuralObject
 from dano.scene_file import load_object
@@ -67,6 +68,8 @@ class Bridge:
                 f"target must be an mujoco.MjSpec or mujoco.MjModel, got {type(target).__name__}"
             )
         self.target = target
+        with without_callback(mujoco):
+            is_gap_beyond(mujoco)
         self._most = checked_count("most", most, least=2)
         self._choose = choose
         self._things: dict[str, Thing] = {}
@@ -166,6 +169,45 @@ class Bridge:
             model = reference()
             if model is not None and table is not None:
                 table.stand_in(model, collides)
+
+    def put_model(self, model: Any, **options: Any) -> Any:
+        """The model in MuJoCo Warp, whose steps find the contacts of the objects in all worlds.
+
+        ```
+        m = bridge.put_model(model)                     # instead of mujoco_warp.put_model(model)
+        d = mujoco_warp.make_data(model, nworld=4096)
+        mujoco_warp.step(m, d)                          # no `with`; the second may be captured in a graph
+        ```
+
+        The objects are found by a kernel on Warp's device of the moment. It is what `callback.contactfilter`
+        of the model calls; one that is set later must call this one, too. Contacts that are to touch within
+        the step are listed as touching. Sizes of geoms are those that the model has now, in all worlds.
+
+        Args:
+            model: Compiled, with all bodies that have objects.
+            **options: Of `mujoco_warp.put_model`.
+
+        Raises:
+            ImportError: If mujoco_warp is missing.
+            ValueError: If the model lacks a body, asks for what objects cannot do, or a geom that an object
+                may touch cannot touch it.
+        """
+        mujoco_warp, table = warp_library(), self._checked(model)
+        self._check_timestep(model)
+        if model.nflex:
+            raise ValueError(f"model must have no flexes in worlds with objects, got {model.nflex}")
+        if np.any(getattr(model, "geom_surfacevel", 0)):
+            raise ValueError("model.geom_surfacevel must be zero in worlds with objects: contacts lack it")
+        worlds = table.in_worlds(model, str(warp_device()))
+        # Hulls that stand in would be among the pairs that MuJoCo Warp collects here.
+        changed = table.stand_in(model, False)
+        try:
+            made = mujoco_warp.put_model(model, **options)
+        finally:
+            if changed:
+                table.stand_in(model, True)
+        made.callback.contactfilter = worlds
+        return made
 
     def contacts(self, model: Any, data: Any) -> int:
         """Append the contacts of the objects at the pose of `data`, and make MuJoCo's constraints again.
