@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from bridge.supports import thing, TYPES, world
+from bridge.supports import gripper, thing, TYPES, world
 
 from dano.mujoco import Bridge
 
@@ -68,6 +68,30 @@ def test_what_comes_fast_is_stopped_as_in_mujoco(speed: float, cone: str):
             expected = played(bridge, model, start, fall, 10)
             np.testing.assert_allclose(d.qpos.numpy()[:, :3], expected[:, :3], atol=0.01 * obj.size)
     assert lowest > -0.1 * obj.size
+
+
+@pytest.mark.parametrize("timestep", [0.001, 0.005])
+def test_fast_fingers_hold_the_bunny(timestep: float):
+    speed = 7.7
+    spec = gripper(timestep, speed)
+    spec.body("toy").pos = [0, 0, 0.0]
+    bridge = Bridge(spec)
+    bridge.attach("toy", thing("bunny"), look=False)
+    model = bridge.compile()
+    # One world begins a little later than the other.
+    start = np.repeat(model.qpos0[None], 2, axis=0)
+    start[1, -2:] -= 0.003
+    m, d = made(bridge, model, start, np.tile([0, 0, 0, 0, 0, 0, speed, speed], (2, 1)))
+    d.ctrl.fill_(1.0)
+    apart, left, right = [], model.body("left").id, model.body("right").id
+    for _ in range(round(0.5 / timestep)):
+        mjw.step(m, d)
+        at = d.xpos.numpy()[:, :, 1]
+        apart.append(at[:, right] - at[:, left] - 0.01)
+    points = np.asarray(thing("bunny").surface.points)
+    near = (np.abs(points[:, 2] - 0.05) < 0.03) & (np.abs(points[:, 0]) < 0.03)
+    assert np.min(apart) > 0.5 * np.ptp(points[near, 1])
+    assert np.abs(d.qvel.numpy()).max() < 0.05
 
 
 def test_two_objects_collide_as_in_mujoco():

@@ -14,15 +14,14 @@ from typing import Any
 import numpy as np
 
 from dano.checks import checked_count
-from dano.maths import checked_array, Numbers
+from dano.maths import Numbers
 from dano.mujoco._model import carry, carry_compiled, concerns, library, names_of, without_callback
 from dano.mujoco._settings import is_gap_beyond, Writer
 from dano.mujoco._table import body_index, Chooser, MOST, Table
-from dano.mujoco._things import Thing, thing_of
+from dano.mujoco._things import checked_thing, Thing
 from dano.mujoco._worlds import warp_device, warp_library
 from dano.names import did_you_mean
 from dano.objects import NeuralObject
-from dano.scene_file import load_object
 
 _LONGEST_FALL = 0.1
 """Way that gravity adds to a body's in a step, as a share of the body's size."""
@@ -117,17 +116,9 @@ class Bridge:
             raise ValueError(f"body must be one of {valid}, got {body!r}{did_you_mean(body, valid)}")
         if body in self._things:
             raise ValueError(f"body must not have an object yet, got {body!r} twice; use another body")
-        if isinstance(obj, str | os.PathLike):
-            obj = load_object(obj)
-        if not isinstance(obj, NeuralObject):
-            raise ValueError(f"obj must be a NeuralObject or the path of one, got {type(obj).__name__}")
-        place = np.asarray(checked_array("position", position, (3,)), np.float64)
-        turn = np.asarray(checked_array("orientation", orientation, (4,)), np.float64)
-        if not np.linalg.norm(turn) > 0:
-            raise ValueError(f"orientation must not be zero, got {turn.tolist()}")
-        thing = thing_of(obj, place, turn / np.linalg.norm(turn), (contype, conaffinity))
+        thing = checked_thing(obj, position, orientation, (contype, conaffinity))
         if spec:
-            carry(mujoco, self.target, body, thing, obj if look else None)
+            carry(mujoco, self.target, body, thing, thing.obj if look else None)
         else:
             carry_compiled(mujoco, self.target, body_index(self.target, body), body, thing)
         self._things[body] = thing

@@ -4,7 +4,7 @@ MuJoCo Warp calls `model.callback.contactfilter` after it has found contacts and
 """
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -61,24 +61,35 @@ class Worlds:
         self._options = tables.Options()
         self._options.most, self._options.given = float(most), float(given is not None)
         self._options.beyond = self._options.within = 1.0
-        self._launches: dict[int, tuple[Any, tuple[int, ...], Any]] = {}
+        self._hidden: Any = None
+        self._launches: dict[int, tuple[Any, tuple[int, ...], list[Any]]] = {}
+
+    def hide(self, geoms: Sequence[int], n_geoms: int) -> None:
+        """Leave out what MuJoCo Warp has found for geoms that only stand for objects."""
+        import warp as wp
+
+        hidden, whole = np.zeros(n_geoms, np.int32), wp.int32
+        hidden[list(geoms)] = 1
+        self._hidden = wp.array(hidden, dtype=whole, device=self._known.device)
+        self._launches.clear()
 
     def __call__(self, model: Any, data: Any) -> None:
         """Append the contacts of the objects in all worlds."""
         # Velocities of bodies are found after contacts; here they are needed before.
         warp_library().com_vel(model, data)
-        self._launch(model, data)()
+        for command in self._commands(model, data):
+            command.launch()
 
-    def _launch(self, model: Any, data: Any) -> Callable[[], None]:
-        """The launch for some data, with the arrays that it and the model have now."""
+    def _commands(self, model: Any, data: Any) -> list[Any]:
+        """The launches for some data, with the arrays that it and the model have now."""
         key, places = id(data), _places(self._kernels, model, data)
         found = self._launches.get(key)
         if found is None or found[0]() is not data or found[1] != places:
             gone = weakref.ref(data, lambda _: self._launches.pop(key, None))
             self._launches[key] = found = gone, places, self._made(model, data)
-        return found[2].launch
+        return found[2]
 
-    def _made(self, model: Any, data: Any) -> Any:
+    def _made(self, model: Any, data: Any) -> list[Any]:
         import warp as wp
 
         known, kernels, tables = self._known, self._kernels, self._known.tables
@@ -109,14 +120,10 @@ class Worlds:
             contacts,
             data.nacon,
         ]
-        return wp.launch(
-            known.kernel,
-            (data.nworld, n),
-            arguments,
-            device=device,
-            record_cmd=True,
-            block_dim=known.lanes,
-        )
+        launches: list[Any] = [(known.kernel, (data.nworld, n), arguments)]
+        if self._hidden is not None:
+            launches.insert(0, (kernels.leave_out, data.naconmax, [self._hidden, contacts, data.nacon]))
+        return [wp.launch(*each, device=device, record_cmd=True, block_dim=known.lanes) for each in launches]
 
 
 def _places(kernels: Any, model: Any, data: Any) -> tuple[int, ...]:

@@ -32,6 +32,8 @@ _RUN, _UNKNOWN = wp.constant(RUN), wp.constant(UNKNOWN)
 # Share of the thinner body's half thickness by which bodies may sink into each other: normals still point
 # out of the side that was hit.
 _SINK = wp.constant(real(0.25))
+# Share of its depth with which a sample counts that is near, but does not press.
+_NEAR = wp.constant(real(1e-6))
 # Most steps of the search for the moment when bodies meet, and the share of the step that ends it.
 _ADVANCES = wp.constant(40)
 _MET = wp.constant(real(1e-9))
@@ -285,6 +287,9 @@ def list_side(
                         end = over - h * touch.nearing
                         early = fast and end < -sink
                         depth = margin - touch.gap
+                        # What is only near must not lead what presses.
+                        if gap > ZERO:
+                            depth = wp.max(-over, _NEAR * depth)
                         if early:
                             depth = wp.max(depth, -end)
                         if depth > ZERO:
@@ -311,6 +316,10 @@ def list_pair(
     settings = pair_settings(known, model, options, work.settings, world, pair)
     if settings.dim == ZERO:
         return begin
+    if options.within > ZERO:
+        # Such a solver does not hear of what is only near.
+        settings.margin = settings.margin - settings.gap
+        settings.gap = ZERO
     side.part = known.parts[second]
     part = known.parts[first]
     side.a = part_state(model, data, world, side.index, h)

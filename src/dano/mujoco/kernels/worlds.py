@@ -105,6 +105,17 @@ def append(contacts: Contacts, at: int, world: int, number: int, row: ContactRow
 
 
 @wp.kernel(enable_backward=False)
+def leave_out(hidden: wp.array(dtype=wp.int32), contacts: Contacts, count: wp.array(dtype=wp.int32)):
+    """Take the contacts of geoms that only stand for objects from the solver; `hidden`: 1 for such a geom."""
+    at = wp.tid()
+    if at < count[0]:
+        geoms = contacts.geom[at]
+        if geoms[0] >= 0 and geoms[1] >= 0:
+            if hidden[geoms[0]] + hidden[geoms[1]] > 0:
+                contacts.type[at] = 0
+
+
+@wp.kernel(enable_backward=False)
 def find_in_worlds(
     known: Known,
     model: Model,
