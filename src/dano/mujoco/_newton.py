@@ -45,11 +45,12 @@ def add_newton_body(
     """
     if isinstance(obj, str | os.PathLike):
         obj = load_object(obj)
-    mass, com, inertia = (np.asarray(x, float) for x in (obj.mass.mass, obj.mass.com, obj.mass.inertia))
+    numbers = obj.mass.mass, obj.mass.com, obj.mass.inertia
+    mass, com, inertia = (np.asarray(x, float).tolist() for x in numbers)
     body = builder.add_body(
-        mass=float(mass),
-        com=com.tolist(),
-        inertia=inertia.tolist(),
+        mass=mass,
+        com=com,
+        inertia=inertia,
         label=label,
         xform=xform,
         lock_inertia=True,
