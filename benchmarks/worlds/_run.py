@@ -55,6 +55,14 @@ def run() -> None:
     report("worlds", rows, settings, load, arguments.json)
 
 
+def _worlds(n: int) -> str:
+    return f"{n} world{'s' if n > 1 else ''}"
+
+
+def _group(n: int) -> str:
+    return f"Time of a step in {_worlds(n)}"
+
+
 def _version(package: str) -> str:
     try:
         return importlib.metadata.version(package)
@@ -126,7 +134,14 @@ def _apart_rows() -> list[Row]:
         way = np.linalg.norm(expected[:, :3] - starts[:, :3], axis=1).max()
         note = f"{1000 * way:.0f} mm way, {steps * TIMESTEP:g} s, 4 worlds"
         rows.append(
-            Row("Beside MuJoCo", f"{case}, apart", 100 * apart / size, "% of size", MOST_APART, note=note)
+            Row(
+                "Beside MuJoCo",
+                f"{case} in MuJoCo Warp, apart",
+                100 * apart / size,
+                "% of size",
+                MOST_APART,
+                note=note,
+            )
         )
     return rows
 
@@ -160,7 +175,7 @@ def _warp_time_rows(n: int) -> list[Row]:
             model = bridge.compile()
             m = bridge.put_model(model) if kind == "object" else mjw.put_model(model)
         except (NotImplementedError, ValueError) as error:
-            rows.append(skipped(f"Time of a step, {n} worlds", name, str(error)))
+            rows.append(skipped(_group(n), name, str(error)))
             continue
         d = mjw.make_data(model, nworld=n)
         for _ in range(SETTLE // 2):
@@ -178,7 +193,7 @@ def _timed(n: int, name: str, step, count) -> Row:
         fastest = min(fastest, _clock() - begin)
     taken = 1e6 * fastest / (TIMED // BATCHES) / n
     note = f"{int(count.numpy()[0]) // n} contacts"
-    return Row(f"Time of a step, {n} worlds", name, taken, "µs a world", note=note)
+    return Row(_group(n), name, taken, "µs a world", note=note)
 
 
 def _newton_rows(n: int) -> list[Row]:
@@ -220,7 +235,7 @@ def _newton_rows(n: int) -> list[Row]:
             rows.append(
                 Row(
                     "Beside MuJoCo",
-                    f"dropped in Newton, {n} worlds, apart",
+                    f"dropped in {_worlds(n)} of Newton, apart",
                     100 * apart / obj.size,
                     "% of size",
                     MOST_APART,
