@@ -29,7 +29,8 @@ def main(quick: bool = False) -> dict[str, np.ndarray]:
     m.geom_friction = wp.array(slides, dtype=wp.vec3)
     for _ in range(250):
         mujoco_warp.step(m, d)
-    start = d.qpos.numpy()[:, 0]
+    # A copy: on a CPU NumPy looks into the memory of the worlds.
+    start = d.qpos.numpy()[:, 0].copy()
     d.qvel.assign(np.tile(np.array([SPEED, 0, 0, 0, 0, 0], np.float32), (len(frictions), 1)))
     for _ in range(250):
         mujoco_warp.step(m, d)

@@ -131,6 +131,15 @@ def test_each_world_has_its_own_friction():
     np.testing.assert_allclose(way, 0.6**2 / (2 * 9.81 * np.array([0.3, 0.6])), rtol=0.03)
 
 
+def test_an_object_alone_falls():
+    bridge = Bridge(world(None))
+    bridge.attach("toy", thing("soap"), look=False)
+    m, d = made(bridge, bridge.compile(), np.tile([0, 0, 1.0, 1, 0, 0, 0], (2, 1)))
+    for _ in range(10):
+        mjw.step(m, d)
+    np.testing.assert_allclose(d.qpos.numpy()[:, 2], 1 - 9.81 * 0.002**2 * 55, rtol=1e-5)
+
+
 def test_bad_input_is_named():
     spec = world("plane")
     bridge = Bridge(spec)

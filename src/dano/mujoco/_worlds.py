@@ -120,7 +120,8 @@ class Worlds:
             contacts,
             data.nacon,
         ]
-        launches: list[Any] = [(known.kernel, (data.nworld, n), arguments)]
+        # An object without anything to touch has no pair.
+        launches: list[Any] = [(known.kernel, (data.nworld, n), arguments)] if n else []
         if self._hidden is not None:
             launches.insert(0, (kernels.leave_out, data.naconmax, [self._hidden, contacts, data.nacon]))
         return [wp.launch(*each, device=device, record_cmd=True, block_dim=known.lanes) for each in launches]
