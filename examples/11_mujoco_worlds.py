@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false
 """Bunnies slide in 16 worlds of MuJoCo Warp at once, each with a friction of its own."""
 
 import jax

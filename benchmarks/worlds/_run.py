@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false
 """The trained bunny in worlds of MuJoCo Warp and Newton, beside MuJoCo with the bridge and beside hulls."""
 
 import contextlib
@@ -46,7 +47,7 @@ def run() -> None:
             rows += _newton_rows(n)
     else:
         rows.append(skipped("Newton", "all", "newton is not installed"))
-    settings = {
+    settings: dict[str, object] = {
         "date": datetime.datetime.now().isoformat(timespec="minutes"),
         **{name: _version(name) for name in ("mujoco", "mujoco-warp", "newton", "warp-lang")},
         "device": device,
