@@ -112,3 +112,11 @@ def test_mujoco_panda():
     assert abs(answer["aside"]) < 0.02
     assert answer["hand_contacts"] > 3
     assert answer["joint_error"] < 0.02
+
+
+@pytest.mark.skipif(find_spec("mujoco_warp") is None, reason="worlds of MuJoCo Warp need mujoco-warp")
+def test_mujoco_worlds():
+    answer = run("11_mujoco_worlds")
+    # As Coulomb says of a point, which does not rock.
+    expected = 0.3**2 / (2 * 9.81 * answer["friction"])
+    assert answer["way"] == pytest.approx(expected, rel=0.15)

@@ -22,6 +22,7 @@ def _kernels():
     part_distance, part_clearance, of_two = solids.part_distance, solids.part_clearance, mixing.mixed
     vec3, vec4, real = tables.vec3, tables.vec4, tables.real
     known_type, model_type, settings_type = tables.Known, tables.Model, tables.Settings
+    options_type = tables.Options
 
     @wp.kernel(enable_backward=False, module="unique")
     def ask(
@@ -37,8 +38,8 @@ def _kernels():
         bounds[i] = part_clearance(known, model, known.index[0], points[i], real(1e9))
 
     @wp.kernel(enable_backward=False, module="unique")
-    def mix(model: model_type, found: wp.array(dtype=settings_type)):
-        found[0] = of_two(model, 0, 1)
+    def mix(model: model_type, options: options_type, found: wp.array(dtype=settings_type)):
+        found[0] = of_two(model, options, 0, 0, 1)
 
     return tables, ask, mix
 
@@ -47,7 +48,7 @@ def mixed(model) -> dict[str, np.ndarray]:
     """Parameters of contacts of the first two geoms."""
     tables, _, mix = _kernels()
     found = wp.zeros(1, dtype=tables.Settings, device="cpu")
-    wp.launch(mix, 1, [_views(tables.Model, model), found], device="cpu")
+    wp.launch(mix, 1, [_views(tables.Model, model), tables.Options(), found], device="cpu")
     row = found.numpy()[0]
     return {name: row[name] for name in row.dtype.names}
 

@@ -98,6 +98,35 @@ def test_parameters_are_mixed_as_by_mujoco():
             np.testing.assert_allclose(ours[name], getattr(contact, name), rtol=1e-12)
 
 
+def test_margins_and_gaps_are_those_of_mujocos_own_contacts():
+    spec = world("plane")
+    spec.geom("support").margin, spec.geom("support").gap = 0.01, 0.004
+    toy = next(body for body in spec.bodies if body.name == "toy")
+    toy.add_geom(type=TYPES.mjGEOM_SPHERE, size=[0.05, 0, 0], margin=0.002, gap=0.001, mass=0)
+    own = spec.worldbody.add_body(name="own", pos=[1, 0, 0])
+    own.add_freejoint()
+    own.add_geom(type=TYPES.mjGEOM_SPHERE, size=[0.05, 0, 0], margin=0.002, gap=0.001)
+    bridge = Bridge(spec)
+    bridge.attach("toy", thing("ball"), look=False)
+    model = bridge.compile()
+    data = mujoco.MjData(model)
+    seen = set()
+    for height in (0.005, 0.009, 0.011, 0.0135, 0.016):
+        data.qpos[2] = data.qpos[9] = 0.05 + height
+        data.qpos[7], data.qvel[:] = 1.0, 0
+        with bridge:
+            mujoco.mj_forward(model, data)
+        listed = [contact for contact in data.contact if contact.geom[1] == model.body("own").geomadr[0]]
+        ours = [contact for contact in data.contact if contact.geom[1] == model.body("toy").geomadr[0]]
+        assert bool(listed) == bool(ours)
+        for contact in listed:
+            nearest = min(ours, key=lambda each: each.dist)
+            assert nearest.includemargin == pytest.approx(contact.includemargin)
+            assert nearest.exclude == contact.exclude
+        seen.add(listed[0].exclude if listed else None)
+    assert {0, 1} <= seen
+
+
 def test_two_objects_collide_and_keep_their_momentum():
     spec = world(None)
     spec.option.gravity = [0, 0, 0]

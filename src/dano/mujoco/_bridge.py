@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from dano.checks import checked_count
-from dano.maths import checked_array, Numbers
+from dano.maths import Numbers
 from dano.mujoco._model import carry, carry_compiled, concerns, library, names_of, without_callback
-from dano.mujoco._settings import Writer
+from dano.mujoco._settings import is_gap_beyond, Writer
 from dano.mujoco._table import body_index, Chooser, MOST, Table
-from dano.mujoco._things import Thing, thing_of
+from dano.mujoco._things import checked_thing, Thing
+from dano.mujoco._worlds import warp_device, warp_library
 from dano.names import did_you_mean
 from dano.objects import NeuralObject
-from dano.scene_file import load_object
 
 _LONGEST_FALL = 0.1
 """Way that gravity adds to a body's in a step, as a share of the body's size."""
@@ -67,6 +67,8 @@ class Bridge:
                 f"target must be an mujoco.MjSpec or mujoco.MjModel, got {type(target).__name__}"
             )
         self.target = target
+        with without_callback(mujoco):
+            is_gap_beyond(mujoco)
         self._most = checked_count("most", most, least=2)
         self._choose = choose
         self._things: dict[str, Thing] = {}
@@ -114,17 +116,9 @@ class Bridge:
             raise ValueError(f"body must be one of {valid}, got {body!r}{did_you_mean(body, valid)}")
         if body in self._things:
             raise ValueError(f"body must not have an object yet, got {body!r} twice; use another body")
-        if isinstance(obj, str | os.PathLike):
-            obj = load_object(obj)
-        if not isinstance(obj, NeuralObject):
-            raise ValueError(f"obj must be a NeuralObject or the path of one, got {type(obj).__name__}")
-        place = np.asarray(checked_array("position", position, (3,)), np.float64)
-        turn = np.asarray(checked_array("orientation", orientation, (4,)), np.float64)
-        if not np.linalg.norm(turn) > 0:
-            raise ValueError(f"orientation must not be zero, got {turn.tolist()}")
-        thing = thing_of(obj, place, turn / np.linalg.norm(turn), (contype, conaffinity))
+        thing = checked_thing(obj, position, orientation, (contype, conaffinity))
         if spec:
-            carry(mujoco, self.target, body, thing, obj if look else None)
+            carry(mujoco, self.target, body, thing, thing.obj if look else None)
         else:
             carry_compiled(mujoco, self.target, body_index(self.target, body), body, thing)
         self._things[body] = thing
@@ -166,6 +160,45 @@ class Bridge:
             model = reference()
             if model is not None and table is not None:
                 table.stand_in(model, collides)
+
+    def put_model(self, model: Any, **options: Any) -> Any:
+        """The model in MuJoCo Warp, whose steps find the contacts of the objects in all worlds.
+
+        ```
+        m = bridge.put_model(model)                     # instead of mujoco_warp.put_model(model)
+        d = mujoco_warp.make_data(model, nworld=4096)
+        mujoco_warp.step(m, d)                          # no `with`; the second may be captured in a graph
+        ```
+
+        The objects are found by a kernel on Warp's device of the moment. It is what `callback.contactfilter`
+        of the model calls; one that is set later must call this one, too. Contacts that are to touch within
+        the step are listed as touching. Sizes of geoms are those that the model has now, in all worlds.
+
+        Args:
+            model: Compiled, with all bodies that have objects.
+            **options: Of `mujoco_warp.put_model`.
+
+        Raises:
+            ImportError: If mujoco_warp is missing.
+            ValueError: If the model lacks a body, asks for what objects cannot do, or a geom that an object
+                may touch cannot touch it.
+        """
+        mujoco_warp, table = warp_library(), self._checked(model)
+        self._check_timestep(model)
+        if model.nflex:
+            raise ValueError(f"model must have no flexes in worlds with objects, got {model.nflex}")
+        if np.any(getattr(model, "geom_surfacevel", 0)):
+            raise ValueError("model.geom_surfacevel must be zero in worlds with objects: contacts lack it")
+        worlds = table.in_worlds(model, str(warp_device()))
+        # Hulls that stand in would be among the pairs that MuJoCo Warp collects here.
+        changed = table.stand_in(model, False)
+        try:
+            made = mujoco_warp.put_model(model, **options)
+        finally:
+            if changed:
+                table.stand_in(model, True)
+        made.callback.contactfilter = worlds
+        return made
 
     def contacts(self, model: Any, data: Any) -> int:
         """Append the contacts of the objects at the pose of `data`, and make MuJoCo's constraints again.

@@ -1,23 +1,29 @@
 """The search for contacts as a launch of a kernel: tables of a model, and MuJoCo's arrays where they are."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from dano.mujoco._settings import Settings
+from dano.mujoco._settings import is_gap_beyond, Settings
 from dano.mujoco._solids import Geom, object_solid, Solid
 from dano.mujoco._surfaces import Surface
 from dano.mujoco._things import Thing
 from dano.native import compiled_kernel, Features, instance, kind_numbers, lower_bounds
 
 _TABLES, _FINDING = "dano.mujoco.kernels.tables", "dano.mujoco.kernels.finding"
+_WORLDS = "dano.mujoco.kernels.worlds"
 _SOLIDS, _LEAVES = "dano.mujoco.kernels.solids", "dano.physics.solids.leaves"
 _BLOCK = 16
 """Samples of a block, as kernels have it."""
+_TOLD = 6
+"""Numbers of `dano.mujoco.kernels.tables.Options`."""
 _REALS, _WHOLES = 28, 13
 """Real and whole numbers of a contact, see `dano.mujoco.kernels.tables`."""
+_LANES = 64
+"""Threads of a block on a GPU: each needs many registers."""
 _FLAT = 10.0
 """A shape with this radius of curvature, in distances between samples, is as a plane to an object's: they
 miss no more than 1/80 of that distance of its depth. Its own samples, which are few, are not asked then.
@@ -57,16 +63,33 @@ def part_of_thing(body: int, geom: int, thing: Thing) -> Part:
 class Known:
     """Arrays of `dano.mujoco.kernels.tables.Known` of a model, and what their kernels must know."""
 
-    def __init__(self, parts: Sequence[Part], pairs: Int[np.ndarray, "k 2"], sizes: Float[np.ndarray, "g 3"]):
-        """See `dano.mujoco.kernels.tables.Known`; `sizes` are those of the model's geoms."""
+    def __init__(
+        self,
+        parts: Sequence[Part],
+        pairs: Int[np.ndarray, "k 2"],
+        sizes: Float[np.ndarray, "g 3"],
+        device: str | None = None,
+    ):
+        """See `dano.mujoco.kernels.tables.Known`.
+
+        Args:
+            parts: Parts.
+            pairs: Those that may touch.
+            sizes: Of the model's geoms [m].
+            device: Where MuJoCo Warp has its worlds, with numbers of 32 bits; None for MuJoCo itself.
+        """
         degrees = {part.solid.degree for part in parts if part.solid.kind == "GRID"}
         self.features = Features(
             KINDS=frozenset(range(7)),
             DEGREES=frozenset({2}) if degrees <= {2} else frozenset({1, 2, 3}),
             UNIONS=False,
+            **({} if device is None else {"WIDE": False}),
         )
+        self.device = device or "cpu"
+        self.lanes = 1 if self.device == "cpu" else _LANES
+        _array = functools.partial(_placed, device=self.device)
         self.parts, self.pairs = parts, pairs
-        self.kernel: Any = compiled_kernel(lambda: instance(self.features, _FINDING).find)
+        self.kernel: Any = compiled_kernel(lambda: self._kernel(device is not None), self.device, self.lanes)
         self.tables = tables = instance(self.features, _TABLES)
         structs = instance(self.features, _LEAVES)
         sampled = [part.surface for part in parts if part.surface is not None]
@@ -100,6 +123,13 @@ class Known:
         most = [sum(_count(parts[i]) for i in pair) for pair in pairs]
         self.room = max(most, default=0)
 
+    def _kernel(self, in_worlds: bool) -> Any:
+        return (
+            instance(self.features, _WORLDS).find_in_worlds
+            if in_worlds
+            else instance(self.features, _FINDING).find
+        )
+
 
 def _count(part: Part) -> int:
     return 0 if part.surface is None else len(part.surface.points)
@@ -123,10 +153,10 @@ def _rows(struct: Any, n: int) -> np.ndarray:
     return np.zeros(n, dtype=struct.numpy_dtype())
 
 
-def _array(values: np.ndarray, dtype: Any) -> Any:
+def _placed(values: np.ndarray, dtype: Any, device: str) -> Any:
     import warp as wp
 
-    return wp.array(np.ascontiguousarray(values), dtype=wp.int32 if dtype is None else dtype, device="cpu")
+    return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
 
 def _solids(structs: Any, parts: Sequence[Part]):
@@ -196,8 +226,8 @@ class Search:
 
         tables, n = known.tables, len(known.pairs)
         self.rows, self.wholes = np.zeros((most * n, _REALS)), np.zeros((most * n, _WHOLES), np.int32)
-        self.options, self.settings = np.zeros(4), np.zeros((n, 15))
-        self.options[1] = most
+        self.options, self.settings = np.zeros(_TOLD), np.zeros((n, 15))
+        self.options[1], self.options[4] = most, is_gap_beyond(mujoco)
         self.found = np.zeros(1, np.int32)
         work = tables.Work()
         work.options = _seen(self.options, tables.Options, 1)
@@ -215,12 +245,7 @@ class Search:
 
     def give(self, pair: int, settings: Settings | None) -> None:
         """Say what the parameters of a pair are."""
-        row = self.settings[pair]
-        row[:] = 0
-        if settings is not None:
-            row[0], row[1] = settings.margin, settings.gap
-            row[2:7], row[7:9], row[9:14] = settings.friction, settings.solref, settings.solimp
-            row[14] = settings.dim
+        self.settings[pair] = 0.0 if settings is None else settings.numbers()
 
 
 def _seen(array: np.ndarray, dtype: Any, n: int) -> Any:
@@ -231,9 +256,10 @@ def _seen(array: np.ndarray, dtype: Any, n: int) -> Any:
 
 
 def _views(struct: Any, owner: Any) -> Any:
-    """A structure of arrays whose fields are those of `mjModel` or `mjData` with their names."""
+    """A structure of arrays of `mjModel` or `mjData` with their names, as of one world."""
     views = struct()
     for name, variable in struct.vars.items():
         array = getattr(owner, name)
-        setattr(views, name, _seen(array, variable.type.dtype, len(array)))
+        seen = _seen(array, variable.type.dtype, len(array))
+        setattr(views, name, seen if variable.type.ndim == 1 else seen.reshape((1, len(array))))
     return views

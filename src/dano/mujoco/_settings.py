@@ -1,6 +1,7 @@
 """What MuJoCo's solver is told about a contact besides where it is."""
 
 import ctypes
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ class Settings(NamedTuple):
         solref: Time constant [s] and damping ratio, or, negative, stiffness and damping.
         solimp: Impedance, shape (5,).
         margin: Distance from which contacts are listed [m].
-        gap: By how much more than that at which they press [m].
+        gap: By how much nearer they are when they begin to press [m].
     """
 
     dim: int
@@ -29,11 +30,30 @@ class Settings(NamedTuple):
     margin: float = 0.0
     gap: float = 0.0
 
+    def numbers(self) -> Float[np.ndarray, "15"]:
+        """As `dano.mujoco.kernels.tables.Settings` has them."""
+        parts = [self.margin, self.gap], self.friction, self.solref, self.solimp, [self.dim]
+        return np.concatenate([np.asarray(part, np.float64) for part in parts])
+
 
 def overriding(model: Any) -> Settings:
     """The model's global contact parameters; of its directions and gap nothing is said."""
     option = model.opt
     return Settings(0, option.o_friction, option.o_solref, option.o_solimp, float(option.o_margin))
+
+
+@functools.cache
+def is_gap_beyond(mujoco: Any) -> bool:
+    """Whether contacts are listed from margin plus gap on, as newer versions of MuJoCo have it.
+
+    In others they are listed from the margin on, and press a gap later. Not to be asked in a callback.
+    """
+    geom = '<geom size="0.1" margin="0.01" gap="0.004"/>'
+    body = f'<body pos="0 0 0.1"><freejoint/>{geom}</body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geom}{body}</worldbody></mujoco>")
+    data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)
+    return bool(data.contact[0].includemargin > 0.018)
 
 
 class Writer:

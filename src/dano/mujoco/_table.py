@@ -12,6 +12,7 @@ from dano.mujoco._search import Known, Part, part_of_geom, part_of_thing, Search
 from dano.mujoco._settings import overriding, Settings
 from dano.mujoco._solids import geom_of
 from dano.mujoco._things import Thing
+from dano.mujoco._worlds import Worlds
 
 MOST = 8
 """Contacts of a pair, unless said otherwise."""
@@ -70,8 +71,8 @@ class Table:
         self._known = self._look(model)
         self._searches: dict[int, tuple[Any, Known, Search]] = {}
 
-    def _look(self, model: Any) -> Known:
-        """The parts of the model, and which of them may touch."""
+    def _look(self, model: Any, device: str | None = None) -> Known:
+        """The parts of the model, and which of them may touch; `device` as `Known` has it."""
         parts: list[Part] = [part_of_thing(each.body, each.geom, each.thing) for each in self.carriers]
         at: dict[int, int] = {}
         pairs = []
@@ -85,7 +86,7 @@ class Table:
             for j, other in enumerate(self.carriers[i + 1 :], i + 1):
                 if _may_meet(self._mujoco, model, carrier.body, other.body):
                     pairs.append((i, j))
-        return Known(parts, np.array(pairs, np.int32).reshape(-1, 2), model.geom_size)
+        return Known(parts, np.array(pairs, np.int32).reshape(-1, 2), model.geom_size, device)
 
     def stand_in(self, model: Any, collides: bool) -> bool:
         """Let the hulls that stand in for objects collide, or not; whether that changed."""
@@ -95,6 +96,23 @@ class Table:
         for geom, bits in self._hulls.items():
             model.geom_contype[geom], model.geom_conaffinity[geom] = bits if collides else (0, 0)
         return True
+
+    def in_worlds(self, model: Any, device: str) -> Worlds:
+        """What finds the contacts in worlds of MuJoCo Warp on a device.
+
+        Raises:
+            ValueError: If a geom that an object may touch cannot touch it.
+        """
+        known = self._look(model, device)
+        for a, b in known.pairs.tolist():
+            geom, carrier = known.parts[a], known.parts[b]
+            if geom.solid.error and _do_touch(model, geom, carrier):
+                raise ValueError(_unknown(model, known, geom.geom))
+        given = None
+        if self._choose is not None:
+            ends = [(known.parts[a].geom, known.parts[b].geom) for a, b in known.pairs.tolist()]
+            given = [self._choose(model, a, b) for a, b in ends]
+        return Worlds(known, self._most, given)
 
     def find(self, model: Any, data: Any) -> tuple[int, Search]:
         """All contacts of the objects at the present pose: how many, and where they are.
@@ -131,6 +149,13 @@ class Table:
             made = Search(self._mujoco, model, data, known, self._most)
             self._searches[key] = found = gone, known, made
         return found[2]
+
+
+def _do_touch(model: Any, geom: Part, carrier: Part) -> bool:
+    assert carrier.thing is not None
+    contype, conaffinity = carrier.thing.bits
+    own = int(model.geom_contype[geom.geom]), int(model.geom_conaffinity[geom.geom])
+    return bool(own[0] & conaffinity or contype & own[1])
 
 
 def _standin(model: Any, name: str) -> int | None:

@@ -1,13 +1,15 @@
 """A neural object as the search for contacts wants it: arrays in the frame of its MuJoCo body."""
 
+import os
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from dano.maths import quat_to_matrix
+from dano.maths import checked_array, Numbers, quat_to_matrix
 from dano.mujoco._surfaces import Surface, surface_of
 from dano.objects import NeuralObject
+from dano.scene_file import load_object
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,28 @@ class Thing:
     com: Float[np.ndarray, "3"]
     inertia: Float[np.ndarray, "3 3"]
     bits: tuple[int, int]
+
+
+def checked_thing(
+    obj: NeuralObject | str | os.PathLike[str],
+    position: Numbers,
+    orientation: Numbers,
+    bits: tuple[int, int],
+) -> Thing:
+    """What `thing_of` makes of the arguments of an `attach`.
+
+    Raises:
+        ValueError: If they are no object or no pose.
+    """
+    if isinstance(obj, str | os.PathLike):
+        obj = load_object(obj)
+    if not isinstance(obj, NeuralObject):
+        raise ValueError(f"obj must be a NeuralObject or the path of one, got {type(obj).__name__}")
+    place = np.asarray(checked_array("position", position, (3,)), np.float64)
+    turn = np.asarray(checked_array("orientation", orientation, (4,)), np.float64)
+    if not np.linalg.norm(turn) > 0:
+        raise ValueError(f"orientation must not be zero, got {turn.tolist()}")
+    return thing_of(obj, place, turn / np.linalg.norm(turn), bits)
 
 
 def thing_of(

@@ -10,7 +10,7 @@ import warp as wp
 from dano.mujoco.kernels.merging import merge
 from dano.mujoco.kernels.mixing import pair_settings
 from dano.mujoco.kernels.solids import part_clearance, part_distance, quick_clearance, UNKNOWN
-from dano.mujoco.kernels.tables import BLOCK, Data, Known, Model, Part, PartIndex, RUN, Touch, Work
+from dano.mujoco.kernels.tables import BLOCK, Data, Known, Model, Options, Part, PartIndex, RUN, Touch, Work
 from dano.physics.pairs import (
     approach,
     BodyState,
@@ -32,6 +32,8 @@ _RUN, _UNKNOWN = wp.constant(RUN), wp.constant(UNKNOWN)
 # Share of the thinner body's half thickness by which bodies may sink into each other: normals still point
 # out of the side that was hit.
 _SINK = wp.constant(real(0.25))
+# Share of its depth with which a sample counts that is near, but does not press.
+_NEAR = wp.constant(real(1e-6))
 # Most steps of the search for the moment when bodies meet, and the share of the step that ends it.
 _ADVANCES = wp.constant(40)
 _MET = wp.constant(real(1e-9))
@@ -59,21 +61,21 @@ class Side:
 
 
 @wp.func
-def part_state(model: Model, data: Data, index: PartIndex, h: real) -> BodyState:
+def part_state(model: Model, data: Data, world: int, index: PartIndex, h: real) -> BodyState:
     """Where the frame of a part is, and how it moves. Its centre of mass is that of its body."""
     state = BodyState()
-    rotation = data.geom_xmat[index.geom]
-    origin = data.geom_xpos[index.geom]
+    rotation = data.geom_xmat[world, index.geom]
+    origin = data.geom_xpos[world, index.geom]
     if index.is_object == 1:
-        rotation = data.xmat[index.body]
-        origin = data.xpos[index.body]
-    state.position = data.xipos[index.body]
+        rotation = data.xmat[world, index.body]
+        origin = data.xpos[world, index.body]
+    state.position = data.xipos[world, index.body]
     state.com = wp.transpose(rotation) * (state.position - origin)
     state.orientation = wp.quat_from_matrix(rotation)
     # MuJoCo's velocities are those of the point of the body at the centre of mass of its tree.
-    twist = data.cvel[index.body]
+    twist = data.cvel[world, index.body]
     state.spin = vec3(twist[0], twist[1], twist[2])
-    arm = state.position - data.subtree_com[model.body_rootid[index.body]]
+    arm = state.position - data.subtree_com[world, model.body_rootid[index.body]]
     state.velocity = vec3(twist[3], twist[4], twist[5]) + wp.cross(state.spin, arm)
     state.ahead = turned(state.orientation, wp.transpose(rotation) * state.spin, h)
     return state
@@ -285,6 +287,9 @@ def list_side(
                         end = over - h * touch.nearing
                         early = fast and end < -sink
                         depth = margin - touch.gap
+                        # What is only near must not lead what presses.
+                        if gap > ZERO:
+                            depth = wp.max(-over, _NEAR * depth)
                         if early:
                             depth = wp.max(depth, -end)
                         if depth > ZERO:
@@ -298,33 +303,38 @@ def list_side(
 
 
 @wp.func
-def list_pair(known: Known, model: Model, data: Data, work: Work, pair: int, begin: int) -> int:
+def list_pair(
+    known: Known, model: Model, data: Data, work: Work, options: Options, world: int, pair: int, begin: int
+) -> int:
     """Contacts of a pair, from a row on; the row beyond the last, or −2 less the geom that may not touch."""
-    options = work.options[0]
     h = options.timestep
     first = known.pairs[pair].first
     second = known.pairs[pair].second
     side = Side()
     side.index = known.index[second]
     side.other = known.index[first]
-    settings = pair_settings(known, model, options, work.settings, pair)
+    settings = pair_settings(known, model, options, work.settings, world, pair)
     if settings.dim == ZERO:
         return begin
+    if options.within > ZERO:
+        # Such a solver does not hear of what is only near.
+        settings.margin = settings.margin - settings.gap
+        settings.gap = ZERO
     side.part = known.parts[second]
     part = known.parts[first]
-    side.a = part_state(model, data, side.index, h)
-    side.b = part_state(model, data, side.other, h)
+    side.a = part_state(model, data, world, side.index, h)
+    side.b = part_state(model, data, world, side.other, h)
     middle = middle_of(side.part, side.a)
     way = way_of(side.a, side.b, middle, side.part.radius, h)
     reach = side.part.radius + settings.margin + way
     if side.other.solid == _HALF_SPACE:
-        axis = wp.transpose(data.geom_xmat[side.other.geom])[2]
-        if wp.dot(axis, middle - data.geom_xpos[side.other.geom]) > reach:
+        axis = wp.transpose(data.geom_xmat[world, side.other.geom])[2]
+        if wp.dot(axis, middle - data.geom_xpos[world, side.other.geom]) > reach:
             return begin
     else:
         around = part.radius
         if side.other.is_object == 0:
-            around = model.geom_rbound[side.other.geom]
+            around = model.geom_rbound[world, side.other.geom]
         apart = middle - middle_of(part, side.b)
         if wp.dot(apart, apart) > (reach + around) * (reach + around):
             return begin
@@ -347,7 +357,7 @@ def list_pair(known: Known, model: Model, data: Data, work: Work, pair: int, beg
         both = list_side(known, model, work, flipped, settings.margin, settings.gap, sink, way, h, n)
     if both == 0:
         return begin
-    return merge(work, begin, 0, both, int(options.most), settings, side.other, side.index, sink, h)
+    return merge(work, begin, 0, both, options, settings, side.other, side.index, sink)
 
 
 @wp.kernel(enable_backward=False)
@@ -355,7 +365,7 @@ def find(known: Known, model: Model, data: Data, work: Work):
     """All contacts of the objects at the pose of `data`."""
     stale = bool(False)
     for i in range(known.sizes.shape[0]):
-        change = known.sizes[i] - model.geom_size[i]
+        change = known.sizes[i] - model.geom_size[0, i]
         if wp.dot(change, change) > ZERO:
             stale = True
     at = int(0)
@@ -364,5 +374,5 @@ def find(known: Known, model: Model, data: Data, work: Work):
     else:
         for pair in range(known.pairs.shape[0]):
             if at >= 0:
-                at = list_pair(known, model, data, work, pair, at)
+                at = list_pair(known, model, data, work, work.options[0], 0, pair, at)
     work.found[0] = at

@@ -15,8 +15,17 @@ but for the part along the force.
 
 import warp as wp
 
-from dano.mujoco.kernels.mixing import in_parallel, softened
-from dano.mujoco.kernels.tables import ContactIndex, ContactRow, PartIndex, Settings, Touch, vec9, Work
+from dano.mujoco.kernels.mixing import held_back, in_parallel, softened
+from dano.mujoco.kernels.tables import (
+    ContactIndex,
+    ContactRow,
+    Options,
+    PartIndex,
+    Settings,
+    Touch,
+    vec9,
+    Work,
+)
 from dano.physics.real import HALF, ONE, real, vec3, ZERO
 
 # ε² is so much of the mean square of the distance of loads to their centre, over the number of contacts:
@@ -155,7 +164,7 @@ def write(
     a: PartIndex,
     b: PartIndex,
     sink: real,
-    h: real,
+    options: Options,
 ):
     """A touch as a contact of MuJoCo."""
     row = ContactRow()
@@ -165,10 +174,12 @@ def write(
     row.includemargin = settings.margin - settings.gap
     fitted = settings
     if presses:
-        fitted = softened(settings, touch.gap - row.includemargin, touch.nearing, sink, h)
+        fitted = softened(settings, touch.gap - row.includemargin, touch.nearing, sink, options.timestep)
     row.friction = fitted.friction
     row.solref = fitted.solref
     row.solimp = fitted.solimp
+    if presses and options.within > ZERO and row.dist >= row.includemargin:
+        row = held_back(row, touch.nearing, options.timestep)
     work.rows[at] = row
     index = ContactIndex()
     index.dim = int(settings.dim)
@@ -193,18 +204,18 @@ def merge(
     at: int,
     begin: int,
     end: int,
-    most: int,
+    options: Options,
     settings: Settings,
     a: PartIndex,
     b: PartIndex,
     sink: real,
-    h: real,
 ) -> int:
     """Write touches as contacts, from a row on; the row beyond the last."""
+    most = int(options.most)
     if end - begin <= most:
         for i in range(begin, end):
             touch = work.touches[i]
-            write(work, at, touch, touch.presses == 1, settings, a, b, sink, h)
+            write(work, at, touch, touch.presses == 1, settings, a, b, sink, options)
             at += 1
         return at
     heads = find_heads(work, begin, end, most)
@@ -213,6 +224,6 @@ def merge(
         work.touches[i].drawn = pull_on(work, work.touches[i], heads, near)
     for k in range(heads):
         touch, samples = led_touch(work, work.heads[k], begin, end, near)
-        write(work, at, touch, touch.presses == 1, in_parallel(settings, samples), a, b, sink, h)
+        write(work, at, touch, touch.presses == 1, in_parallel(settings, samples), a, b, sink, options)
         at += 1
     return at

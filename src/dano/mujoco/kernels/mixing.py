@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.mujoco.kernels.tables import Known, Model, Options, PartIndex, Settings, vec2, vec5
+from dano.mujoco.kernels.tables import ContactRow, Known, Model, Options, PartIndex, Settings, vec2, vec5
 from dano.physics.real import ONE, real, TWO, ZERO
 
 LEAST_FRICTION = 1e-5
@@ -16,6 +16,8 @@ _LEAST_WEIGHT = wp.constant(real(1e-15))
 _E = wp.constant(real(2.718281828459045))
 # Samples for which a contact counts at most: MuJoCo's solver slows down where compliances differ too much.
 _MOST_SAMPLES = wp.constant(real(6.0))
+# Share of the way of a step by which contacts that come into being early lie within their margin.
+_INSIDE = wp.constant(real(1e-3))
 # Impedance of contacts that are to end an approach within the step.
 _HARD = wp.constant(real(0.99))
 
@@ -32,17 +34,17 @@ def do_touch(model: Model, a: PartIndex, b: PartIndex) -> bool:
 
 
 @wp.func
-def mixed(model: Model, a: int, b: int) -> Settings:
+def mixed(model: Model, options: Options, world: int, a: int, b: int) -> Settings:
     """What MuJoCo takes for two of its geoms, by priority, solmix and size. Margins and gaps add up."""
     found = Settings()
-    found.margin = model.geom_margin[a] + model.geom_margin[b]
-    found.gap = model.geom_gap[a] + model.geom_gap[b]
+    found.gap = model.geom_gap[world, a] + model.geom_gap[world, b]
+    found.margin = model.geom_margin[world, a] + model.geom_margin[world, b] + options.beyond * found.gap
     dim = wp.max(model.geom_condim[a], model.geom_condim[b])
-    weight = model.geom_solmix[a] + model.geom_solmix[b]
+    weight = model.geom_solmix[world, a] + model.geom_solmix[world, b]
     share = real(0.5)
     if weight > _LEAST_WEIGHT:
-        share = model.geom_solmix[a] / weight
-    friction = wp.max(model.geom_friction[a], model.geom_friction[b])
+        share = model.geom_solmix[world, a] / weight
+    friction = wp.max(model.geom_friction[world, a], model.geom_friction[world, b])
     same = model.geom_priority[a] == model.geom_priority[b]
     if not same:
         leader = a
@@ -51,13 +53,13 @@ def mixed(model: Model, a: int, b: int) -> Settings:
             leader = b
             share = ZERO
         dim = model.geom_condim[leader]
-        friction = model.geom_friction[leader]
-    first = model.geom_solref[a]
-    second = model.geom_solref[b]
+        friction = model.geom_friction[world, leader]
+    first = model.geom_solref[world, a]
+    second = model.geom_solref[world, b]
     found.solref = share * first + (ONE - share) * second
     if same and (first[0] <= ZERO or second[0] <= ZERO):
         found.solref = wp.min(first, second)
-    found.solimp = share * model.geom_solimp[a] + (ONE - share) * model.geom_solimp[b]
+    found.solimp = share * model.geom_solimp[world, a] + (ONE - share) * model.geom_solimp[world, b]
     sliding = wp.max(friction[0], _LEAST_FRICTION)
     rolling = wp.max(friction[2], _LEAST_FRICTION)
     found.friction = vec5(sliding, sliding, wp.max(friction[1], _LEAST_FRICTION), rolling, rolling)
@@ -67,7 +69,7 @@ def mixed(model: Model, a: int, b: int) -> Settings:
 
 @wp.func
 def pair_settings(
-    known: Known, model: Model, options: Options, given: wp.array(dtype=Settings), pair: int
+    known: Known, model: Model, options: Options, given: wp.array(dtype=Settings), world: int, pair: int
 ) -> Settings:
     """Parameters of a pair, of no direction where its parts do not touch."""
     found = Settings()
@@ -77,12 +79,12 @@ def pair_settings(
         a = known.index[known.pairs[pair].first]
         b = known.index[known.pairs[pair].second]
         if do_touch(model, a, b):
-            found = mixed(model, a.geom, b.geom)
+            found = mixed(model, options, world, a.geom, b.geom)
             if options.overridden > ZERO:
                 found.friction = given[0].friction
                 found.solref = given[0].solref
                 found.solimp = given[0].solimp
-                found.margin = given[0].margin
+                found.margin = given[0].margin + options.beyond * found.gap
     return found
 
 
@@ -99,6 +101,28 @@ def in_parallel(settings: Settings, samples: real) -> Settings:
     n = wp.min(samples, _MOST_SAMPLES)
     imp = settings.solimp
     found.solimp = vec5(stiffened(imp[0], n), stiffened(imp[1], n), imp[2], imp[3], imp[4])
+    return found
+
+
+@wp.func
+def held_back(row: ContactRow, nearing: real, h: real) -> ContactRow:
+    """A contact that is to touch by the end of the step, for a solver that takes none beyond its margin.
+
+    It lies just within the margin, without a spring. Its damper alone leads to v⁺ = −gap/h, as the spring of
+    `softened` does: −b v with b = (1 − gap/(h v))/h. Friction keeps that one's damping.
+
+    Args:
+        row: As `softened` has it.
+        nearing: v, the speed at which the gap closes [m/s].
+        h: Timestep [s].
+    """
+    found = row
+    gap = row.dist - row.includemargin
+    # What does not touch by then stays beyond the margin, and unheard.
+    if h * nearing > gap:
+        found.dist = row.includemargin - _INSIDE * h * nearing
+        found.solreffriction = row.solref
+        found.solref = vec2(ZERO, row.solref[1] * (ONE - gap / (h * nearing)))
     return found
 
 

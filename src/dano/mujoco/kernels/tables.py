@@ -116,17 +116,17 @@ class Known:
 
 @wp.struct
 class Model:
-    """Arrays of `mjModel`, with its names."""
+    """Arrays of `mjModel`, with its names. Those with two axes may differ between worlds, the first."""
 
     body_rootid: wp.array(dtype=wp.int32)
-    geom_size: wp.array(dtype=vec3)
-    geom_rbound: wp.array(dtype=real)
-    geom_margin: wp.array(dtype=real)
-    geom_gap: wp.array(dtype=real)
-    geom_friction: wp.array(dtype=vec3)
-    geom_solref: wp.array(dtype=vec2)
-    geom_solimp: wp.array(dtype=vec5)
-    geom_solmix: wp.array(dtype=real)
+    geom_size: wp.array2d(dtype=vec3)
+    geom_rbound: wp.array2d(dtype=real)
+    geom_margin: wp.array2d(dtype=real)
+    geom_gap: wp.array2d(dtype=real)
+    geom_friction: wp.array2d(dtype=vec3)
+    geom_solref: wp.array2d(dtype=vec2)
+    geom_solimp: wp.array2d(dtype=vec5)
+    geom_solmix: wp.array2d(dtype=real)
     geom_priority: wp.array(dtype=wp.int32)
     geom_condim: wp.array(dtype=wp.int32)
     geom_contype: wp.array(dtype=wp.int32)
@@ -140,15 +140,15 @@ class Model:
 
 @wp.struct
 class Data:
-    """Arrays of `mjData`, with its names."""
+    """Arrays of `mjData`, with its names, for one world or more."""
 
-    xpos: wp.array(dtype=vec3)
-    xmat: wp.array(dtype=mat33)
-    xipos: wp.array(dtype=vec3)
-    geom_xpos: wp.array(dtype=vec3)
-    geom_xmat: wp.array(dtype=mat33)
-    cvel: wp.array(dtype=vec6)
-    subtree_com: wp.array(dtype=vec3)
+    xpos: wp.array2d(dtype=vec3)
+    xmat: wp.array2d(dtype=mat33)
+    xipos: wp.array2d(dtype=vec3)
+    geom_xpos: wp.array2d(dtype=vec3)
+    geom_xmat: wp.array2d(dtype=mat33)
+    cvel: wp.array2d(dtype=vec6)
+    subtree_com: wp.array2d(dtype=vec3)
 
 
 @wp.struct
@@ -182,12 +182,17 @@ class Options:
         given: 1 where `settings` has those of each pair, 0 where they are mixed of those of two geoms.
         overridden: 1 where the model's global contact parameters replace those of geoms: those of the first
             row of `settings`.
+        beyond: 1 where contacts are listed from margin and gap on and press from the margin on, as MuJoCo has
+            it since some version; 0 where they are listed from the margin on and press a gap later.
+        within: 1 where the solver takes no contact beyond its margin, see `mixing.held_back`.
     """
 
     timestep: real
     most: real
     given: real
     overridden: real
+    beyond: real
+    within: real
 
 
 @wp.struct
