@@ -2,7 +2,7 @@
 
 Guides show what their own programs do, run as they stand on the page; the gallery shows the runs of the
 programs in `examples/`. Each picture is a WebP of at most 300 kB. Needs the extras `all`, `mktestdocs`,
-`frax`, and `MUJOCO_GL=egl` where there is no screen.
+`frax`, and `MUJOCO_GL=egl` where there is no screen; `guides/worlds` the extra `mjwarp`.
 
 Usage: python assets/render_guides.py docs/images [NAME …]    (a quarter of an hour on two cores)
 """
@@ -315,6 +315,22 @@ def export() -> Frames:
     return [beside_its_pieces(model)]
 
 
+def worlds() -> Frames:
+    """How far the bunnies of worlds of MuJoCo Warp slide, beside v²/(2 μ g)."""
+    program = runpy.run_path(str(REPOSITORY / "examples" / "11_mujoco_worlds.py"))
+    found = program["main"]()
+    figure = Figure((6.4, 3.2), dpi=100, layout="constrained")
+    axes = figure.add_subplot()
+    mu = np.linspace(0.09, 0.62, 100)
+    axes.plot(mu, 100 * program["SPEED"] ** 2 / (2 * mu * 9.81), color=OTHER, label="v²/(2 μ g)")
+    axes.plot(found["friction"], 100 * found["way"], "o", color=FITTED, label="bunny, one world each")
+    axes.set(xlabel="friction", ylabel="way of the slide [cm]")
+    axes.legend(frameon=False)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return [np.asarray(canvas.buffer_rgba())[..., :3]]
+
+
 def beside_its_pieces(model: mujoco.MjModel) -> np.ndarray:
     """Two pictures of a model: its visual geoms, and those that touch in colours of their own."""
     data = mujoco.MjData(model)
@@ -370,6 +386,7 @@ PICTURES: dict[str, Callable[[], Frames]] = {
     "guides/poses": poses,
     "guides/batches": batches,
     "guides/export": export,
+    "guides/worlds": worlds,
     "examples/01_drop": example("01_drop", slow_motion=2),
     "examples/02_gradient_of_a_slide": example("02_gradient_of_a_slide", slow_motion=2),
     "examples/03_two_bunnies": example("03_two_bunnies", slow_motion=6),

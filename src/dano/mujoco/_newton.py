@@ -117,7 +117,7 @@ class NewtonBridge:
 
         Raises:
             ValueError: If there is no such body, it has an object or no shape, a shape that the object may
-                touch is of no type that can, or the pose is none.
+                touch is of no type that can, or the pose is invalid.
         """
         model = self._solver.mj_model
         names = [name for i in range(1, model.nbody) if (name := model.body(i).name)]
