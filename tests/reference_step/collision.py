@@ -226,7 +226,7 @@ def meetings(scene, bodies, side):
     share = share_at(scene, bodies, side, delta, bodies.h * slow, slow)
     if share == 0:
         return lasting._replace(deep=True), lasting
-    return Meeting(share, hits=share < 1, falls=nears(scene, bodies, side, delta, slow)), lasting
+    return Meeting(share, hits=bool(share < 1), falls=nears(scene, bodies, side, delta, slow)), lasting
 
 
 def held(bodies):
@@ -239,7 +239,7 @@ def nears(scene, bodies, side, limit, slow):
     if nearing(scene, bodies, side) <= slow:
         return False
     _, goes_in, near = seen(scene, bodies, side, limit, slow, 0.0)
-    return np.any(goes_in & near)
+    return bool(np.any(goes_in & near))
 
 
 def share_at(scene, bodies, side, limit, least_way, slow):
