@@ -47,4 +47,6 @@ def test_the_extra_all_holds_every_extra_for_users():
     extras = tomllib.loads(project.read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     (requirement,) = extras["all"]
     named = requirement.removeprefix("dano[").removesuffix("]").split(",")
-    assert sorted(named) == sorted(set(extras) - {"all", "dev", "docs"})
+    # Newton asks for an older MuJoCo than others do.
+    apart = {"mjwarp", "newton"}
+    assert sorted(named) == sorted(set(extras) - {"all", "dev", "docs"} - apart)
