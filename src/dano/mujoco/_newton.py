@@ -81,7 +81,7 @@ class NewtonBridge:
 
         Raises:
             ImportError: If mujoco is missing.
-            ValueError: If the solver is no such one.
+            ValueError: If the solver is not a `SolverMuJoCo`, or finds no contacts itself.
         """
         model = getattr(solver, "mjw_model", None)
         if model is None:

@@ -15,8 +15,6 @@ from dano.mujoco._settings import Settings
 from dano.native import begin, instance
 
 _WORLDS = "dano.mujoco.kernels.worlds"
-_SETTINGS_WIDTH = 15
-"""Numbers of `dano.mujoco.kernels.tables.Settings`."""
 
 
 def warp_library() -> Any:
@@ -51,13 +49,13 @@ class Worlds:
 
         self._known, self._most = known, most
         self._kernels = instance(known.features, _WORLDS)
-        rows = np.zeros((len(known.pairs), _SETTINGS_WIDTH), np.float32)
+        tables = known.tables
+        kind = np.dtype(tables.Settings.numpy_dtype())
+        rows = np.zeros((len(known.pairs), kind.itemsize // np.float32().itemsize), np.float32)
         for row, settings in zip(rows, given or (), strict=False):
             if settings is not None:
                 row[:] = settings.numbers()
-        tables = known.tables
-        rows = rows.view(tables.Settings.numpy_dtype()).ravel()
-        self._settings = wp.array(rows, dtype=tables.Settings, device=known.device)
+        self._settings = wp.array(rows.view(kind).ravel(), dtype=tables.Settings, device=known.device)
         self._options = tables.Options()
         self._options.most, self._options.given = float(most), float(given is not None)
         self._options.beyond = self._options.within = 1.0
