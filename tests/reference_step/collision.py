@@ -46,7 +46,7 @@ class Points(NamedTuple):
         sunk: Depth where geometry is taken [m], shape (n,).
         delta: Depth of the impact [m].
         beta: Share of the contact that is an impact.
-        delays: Whether impulses take effect after the share τ of the step.
+        delays: Impulses take effect after this share of τ.
         way: Share of the step in which bodies go on as before.
     """
 
@@ -69,7 +69,7 @@ class Points(NamedTuple):
     sunk: np.ndarray
     delta: float
     beta: float
-    delays: bool
+    delays: float
     way: float
 
 
@@ -212,20 +212,18 @@ class Meeting(NamedTuple):
 
     share: float
     hits: bool = False
-    deep: bool = False
+    lasts: bool = False
     falls: bool = False
 
 
 def meetings(scene, bodies, side):
-    """That of an impact, and that of contact that lasts; where bodies are deep the second is both."""
+    """That of an impact, and that of contact that lasts."""
     delta, sink = depths_of(scene, side)
-    lasting = Meeting(share_at(scene, held(bodies), side, sink, sink, 0.0))
+    lasting = Meeting(share_at(scene, held(bodies), side, sink, sink, 0.0), lasts=True)
     if side.law.compliant:
         return lasting, lasting
     slow = side.law.slowest_rebound
     share = share_at(scene, bodies, side, delta, bodies.h * slow, slow)
-    if share == 0:
-        return lasting._replace(deep=True), lasting
     return Meeting(share, hits=bool(share < 1), falls=nears(scene, bodies, side, delta, slow)), lasting
 
 
@@ -363,12 +361,14 @@ def listed(scene, bodies, side, met):
     hit = usual & (sunk > 0)
     approach = rate - np.sum(normal * drift, axis=1)
     delta, _ = depths_of(scene, side)
-    deep = met.deep or (share >= 1 and np.max(sunk * hit, initial=0) > delta)
     x = sunk / delta
     weight = fading_in(x) * hit
-    near_load = area * usual * fading_in((delta * (share < 1) - distance) / delta)
-    beta, stiffness = impact(bodies, side, arm, normal, area * weight, near_load, approach)
+    near_load = area * usual * fading_in((delta * smooth_step(4 * (1 - share)) - distance) / delta)
+    beta, stiffness = 0.0, 0.0
+    if not met.lasts:
+        beta, stiffness = impact(bodies, side, arm, normal, area * weight, near_load, approach)
     free = not scene.joints and not (bodies.moves[i] and bodies.moves[j])
+    delays = beta * (free and met.hits)
     return Points(
         first=i,
         second=j,
@@ -384,13 +384,13 @@ def listed(scene, bodies, side, met):
         gains=((0.5 - share) * gain)[kept],
         area=area[kept],
         drift=drift[kept],
-        impact=(stiffness * (met.hits or deep) * weight)[kept],
-        kappa=stiffness * (met.hits or deep),
+        impact=(stiffness * met.hits * weight)[kept],
+        kappa=stiffness * met.hits,
         sunk=np.where(other, 0, -distance)[kept],
         delta=delta,
         beta=beta,
-        delays=free and met.hits and not deep and beta > 0,
-        way=0.0 if deep or free else share,
+        delays=delays,
+        way=(1 - delays) * share * met.hits,
     )
 
 
@@ -445,7 +445,8 @@ def impact(bodies, side, arm, normal, load, near_load, approach):
     for k, lever in ((side.i, r), (side.j, r + bodies.position[side.i] - bodies.position[side.j])):
         turning = np.cross(lever, n)
         mobility += turning @ bodies.inverse_inertia[k] @ turning
-    return beta, beta * FACTOR / (bodies.h * mobility * load.sum())
+    factor = beta * FACTOR / (1 + (1 - beta) * FACTOR)
+    return beta, factor / (bodies.h * mobility * load.sum())
 
 
 def halved(found):
@@ -463,7 +464,7 @@ def together(bodies, found):
     """Sides of bodies that touch others that move, too: their impulses do not wait for the impact."""
     crowded = {k for points in found for k in points[:2] if all(bodies.moves[list(points[:2])])}
     return [
-        points._replace(delays=False, way=points.share)
+        points._replace(delays=0.0, way=points.share)
         if points.delays and crowded & set(points[:2])
         else points
         for points in found

@@ -41,7 +41,7 @@ class Kinematics:
         self.scene, self.bodies, self.h = scene, read(scene, state), float(scene.timestep)
         self.names, self.joints, self.closing = list(scene.names), scene.joints, scene.loops
         self.hangs = {self.names.index(joint.child): joint for joint in self.joints}
-        moves = self.bodies.moves
+        moves, self.met = self.bodies.moves, np.zeros(len(self.names))
         self.free = [i for i in range(len(self.names)) if moves[i] and i not in self.hangs]
         self.joint_rows, size = {}, 6 * len(self.free)
         for joint in self.joints:
@@ -176,11 +176,27 @@ class Kinematics:
             if not bodies.moves[i]:
                 continue
             R, J = matrix(bodies.orientation[i]), bodies.inertia[i]
-            spin = momentum(R.T @ v[3:], J, h, 1) - momentum(R.T @ before[3:], J, h, -1)
-            gained[i] = np.r_[bodies.mass[i] * (v[:3] - before[:3] - h * bodies.gravity), R @ spin]
+            R_met, lead = self.rotation_met(i), 1 - 2 * self.met[i]
+            spin = R_met @ momentum(R_met.T @ v[3:], J, h, lead) - R @ momentum(R.T @ before[3:], J, h, -1)
+            gained[i] = np.r_[bodies.mass[i] * (v[:3] - before[:3] - h * bodies.gravity), spin]
             if control is not None:
                 gained[i] -= h * np.r_[np.asarray(control.force)[i], np.asarray(control.torque)[i]]
         return gained
+
+    def balance_when_met(self, found):
+        """Take when bodies meet fixed ones, the mean of several moments, from the listed points of sides."""
+        for i in self.free:
+            moments = [p.delays * p.share for p in found if p.delays > 0 and i in (p.first, p.second)]
+            self.met[i] = np.mean(moments) if moments else 0.0
+
+    def rotation_met(self, i):
+        """Rotation of a body when its angular momentum is balanced."""
+        return self.bodies.pose(i, self.met[i])[1] if self.met[i] > 0 else matrix(self.bodies.orientation[i])
+
+    def inertia_met(self, i):
+        """Its inertia then [kg m², W]."""
+        R = self.rotation_met(i)
+        return R @ self.bodies.inertia[i] @ R.T
 
     def gaps(self, y):
         """φ: how far loops are open after a step; distances [m, W], then turns of welds [rad]."""
@@ -208,7 +224,7 @@ class Kinematics:
     def end(self, y, moved):
         """The state at the end of a step with y, and poses from `moved`, as arrays by name."""
         poses, twists, rows = self.placed(moved), self.twists(y), slice(6 * len(self.free), None)
-        omega = [matrix(q).T @ V[3:] for (_, q), V in zip(self.now, twists, strict=True)]
+        omega = [self.rotation_met(i).T @ V[3:] for i, V in enumerate(twists)]
         q = (self.q + self.h * y)[rows]
         for joint in self.joints:
             if joint.kind == "ball":

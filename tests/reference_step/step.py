@@ -29,6 +29,7 @@ class Step:
         self.joints = JointLaw(self.kinematics, control)
         self.given = find(self.scene, self.kinematics.bodies, shares)
         self.points = list(self.given)
+        self.kinematics.balance_when_met(self.given)
         self.patches = patches_of(self.scene, self.kinematics.bodies)
         self.loops = self.kinematics.gap_slopes()
         self.start = np.r_[self.kinematics.start, np.zeros(len(self.loops))]
@@ -94,9 +95,9 @@ class Step:
                 for i, impulse in ((points.first, done.first), (points.second, done.second)):
                     if i in k.free:
                         at = 6 * k.free.index(i)
-                        late = points.share * k.h * impulse
+                        late = points.delays * points.share * k.h * impulse
                         found[at : at + 3] -= k.bodies.inverse_mass[i] * late[:3]
-                        found[at + 3 : at + 6] -= k.bodies.inverse_inertia[i] @ late[3:]
+                        found[at + 3 : at + 6] -= np.linalg.solve(k.inertia_met(i), late[3:])
         return found
 
     def adds_energy(self, y):

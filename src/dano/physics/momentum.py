@@ -60,20 +60,28 @@ def momentum_shares(omega: vec3, h: real) -> MomentumShares:
 
 
 @wp.func
-def angular_momentum(omega: vec3, inertia: mat33, h: real, sign: real) -> vec3:
-    """Moment m J ω ± g (h/2) ω × Jω: after a step (sign +1), or before it (−1)."""
+def angular_momentum(omega: vec3, inertia: mat33, h: real, lead: real) -> vec3:
+    """Moment m J ω + g lead (h/2) ω × Jω, as seen from an orientation within a step.
+
+    Args:
+        omega: Spin [rad/s].
+        inertia: In the same axes [kg m²].
+        h: Timestep [s].
+        lead: How long after that orientation the middle of the spin's step is, in half steps: 1 at the start
+            of the step that is made with the spin, −1 at its end.
+    """
     shares = momentum_shares(omega, h)
     spin = inertia * omega
-    return shares.share * spin + (HALF * sign * h * shares.gyroscopic) * wp.cross(omega, spin)
+    return shares.share * spin + (HALF * lead * h * shares.gyroscopic) * wp.cross(omega, spin)
 
 
 @wp.func
-def angular_momentum_jacobian(omega: vec3, inertia: mat33, h: real) -> mat33:
-    """Derivative of the angular momentum after a step by ω."""
+def angular_momentum_jacobian(omega: vec3, inertia: mat33, h: real, lead: real) -> mat33:
+    """Derivative of the angular momentum by ω."""
     shares = momentum_shares(omega, h)
     spin = inertia * omega
-    along = shares.share_slope * spin + (HALF * h * shares.gyroscopic_slope) * wp.cross(omega, spin)
-    turning = (HALF * h * shares.gyroscopic) * (skew(omega) * inertia - skew(spin))
+    along = shares.share_slope * spin + (HALF * lead * h * shares.gyroscopic_slope) * wp.cross(omega, spin)
+    turning = (HALF * lead * h * shares.gyroscopic) * (skew(omega) * inertia - skew(spin))
     return shares.share * inertia + turning + (real(0.25) * h * h) * wp.outer(along, omega)
 
 

@@ -41,6 +41,8 @@ class BodyState:
         com: Centre of mass in the field frame [m, F].
         inverse_mass: Effective inverse mass [1/kg], zero for a fixed body.
         inverse_inertia: Effective inverse inertia [1/(kg m²), W], zero for a fixed body.
+        met: Share of the step after which the body meets a fixed one in an impact; 0 where it does not. Its
+            angular momentum is balanced then.
     """
 
     position: vec3
@@ -52,6 +54,7 @@ class BodyState:
     com: vec3
     inverse_mass: real
     inverse_inertia: mat33
+    met: real
 
 
 @wp.struct
@@ -155,6 +158,14 @@ def falling(body: BodyState, falls: int) -> BodyState:
 def rotation_after(body: BodyState, share: real) -> mat33:
     """Rotation of a body after a share of the step."""
     return matrix(interpolated(body.orientation, body.ahead, share))
+
+
+@wp.func
+def rotation_met(body: BodyState) -> mat33:
+    """Rotation of a body when its angular momentum is balanced: its spin at the end is seen from there."""
+    if body.met > ZERO:
+        return rotation_after(body, body.met)
+    return matrix(body.orientation)
 
 
 @wp.func

@@ -38,14 +38,12 @@ class Meeting:
     Attributes:
         share: τ, share of the step after which geometry is taken.
         critical: Sample that has sunk in by then, −1 where none does within the step.
-        deep: Whether one had from the start.
         nears: Whether a sample nears the other body fast enough to count.
         least: No sample gets closer to the other body than that [m].
     """
 
     share: real
     critical: int
-    deep: bool
     nears: bool
     least: real
 
@@ -465,7 +463,6 @@ def meeting(
             met.least = wp.min(least(seen.close), -sink)
         before = share
         share = wp.max(share + closest, ZERO)
-        met.deep = closest < ZERO and before == ZERO
         k += 1
         if share >= ONE:
             met.critical = -1

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.impacts import find_moved
+from dano.engine.kernels.impacts import balance_when_met, find_moved
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import find_pattern
 from dano.engine.kernels.patches import find_patches
@@ -21,8 +21,8 @@ from dano.engine.kernels.trees.kinematics import (
 from dano.engine.kernels.trees.loops import begin_loops, forces_of
 from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
 from dano.physics.momentum import angular_momentum, turned_inertia
-from dano.physics.pairs import BodyState
-from dano.physics.real import HALF, ONE, real, vec6, ZERO
+from dano.physics.pairs import BodyState, rotation_met
+from dano.physics.real import HALF, ONE, real, TWO, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
 from dano.physics.trees.joints import ROOT
 from dano.physics.twists import angular_part, joined, linear_part
@@ -163,7 +163,8 @@ def adds_energy(scene: Scene, room: Room, world: int) -> bool:
             body = scene.bodies[world, scene.moving[i]]
             state = room.bodies[world, scene.moving[i]]
             v = room.velocity[world, b]
-            angular = angular_momentum(angular_part(v), room.inertia[world, i], h, ONE)
+            lead = ONE - TWO * state.met
+            angular = angular_momentum(angular_part(v), room.inertia[world, i], h, lead)
             impulse = joined(body.mass * linear_part(v), angular) - room.momentum[world, i]
             before = joined(state.velocity, state.spin)
             after = v
@@ -292,6 +293,10 @@ def find_touching(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
     overflow = bool(False)
     if wp.static(POINTS):
         n_found, overflow = find_contacts(scene, room, world, lane)
+        if wp.static(not TREES):
+            wait()
+            if lane == 0:
+                balance_when_met(scene, room, world, n_found)
     n_near = n_found
     if wp.static(PATCHES):
         n_near = find_patches(scene, room, world, lane, n_found)
@@ -325,7 +330,7 @@ def advance_body(scene: Scene, room: Room, world: int, i: int, row: StateRow) ->
         moved = room.moved[world, m]
         back = wp.transpose(matrix(state.orientation))
         after.velocity = linear_part(v)
-        after.omega = back * angular_part(v)
+        after.omega = wp.transpose(rotation_met(state)) * angular_part(v)
         after.position = row.position + h * linear_part(moved)
         after.orientation = to_wxyz(turned(state.orientation, back * angular_part(moved), h))
     return after

@@ -14,7 +14,7 @@ import warp as wp
 from dano.engine.kernels.tables import Body, Push, StateRow
 from dano.physics.features import TREES
 from dano.physics.friction import friction_near, Slip
-from dano.physics.impacts import Impact, Patch, share_of_impact, stiffness_of_impact, with_sample
+from dano.physics.impacts import Impact, layer_of, Patch, share_of_impact, stiffness_of_impact, with_sample
 from dano.physics.momentum import angular_momentum, turned_inertia
 from dano.physics.pairs import (
     BodyState,
@@ -27,8 +27,8 @@ from dano.physics.pairs import (
     shrunk,
 )
 from dano.physics.point_law import friction_bound, Material, point_law, point_motion, traction
-from dano.physics.real import ONE, real, vec3, vec6, ZERO
-from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
+from dano.physics.real import mat33, ONE, real, TWO, vec3, vec6, ZERO
+from dano.physics.rotations import from_wxyz, interpolated, matrix, to_wxyz, turned
 from dano.physics.samples import point_contact, position_in_solid, Sample
 from dano.physics.solids.distances import leaf_distance, Solid
 from dano.physics.solids.leaves import Distance, Solids
@@ -162,16 +162,26 @@ def facing_work(
 
 
 @wp.func
+def rotation_of(row: StateRow, met: real, h: real) -> mat33:
+    """`rotation_met` of a body's row at the start of a step."""
+    q = from_wxyz(row.orientation)
+    if met > ZERO:
+        return matrix(interpolated(q, turned(q, row.omega, h), met))
+    return matrix(q)
+
+
+@wp.func
 def momentum_work(
-    body: Body, row: StateRow, push: Push, gravity: vec3, h: real, velocity: vec6, virtual: vec6
+    body: Body, row: StateRow, push: Push, gravity: vec3, h: real, met: real, velocity: vec6, virtual: vec6
 ) -> real:
     """Work of what a body's momentum gains beyond gravity and control, along minus its virtual velocity."""
     rotation = matrix(from_wxyz(row.orientation))
-    inertia = turned_inertia(rotation, body.inertia)
-    spin = vec3(velocity[3], velocity[4], velocity[5])
     linear = body.mass * (row.velocity + h * gravity - linear_part(velocity)) + h * push.force
+    inertia = turned_inertia(rotation, body.inertia)
     before = angular_momentum(rotation * row.omega, inertia, h, -ONE) + h * push.torque
-    return wp.dot(joined(linear, before - angular_momentum(spin, inertia, h, ONE)), virtual)
+    inertia_met = turned_inertia(rotation_of(row, met, h), body.inertia)
+    after = angular_momentum(angular_part(velocity), inertia_met, h, ONE - TWO * met)
+    return wp.dot(joined(linear, before - after), virtual)
 
 
 @wp.func
@@ -191,12 +201,12 @@ def state_work(body: Body, row: StateRow, gravity: vec3, h: real, moves: bool, b
 
 
 @wp.func
-def advance_work(row: StateRow, velocity: vec6, moved: vec6, h: real, bar: StateRow) -> real:
+def advance_work(row: StateRow, velocity: vec6, moved: vec6, h: real, met: real, bar: StateRow) -> real:
     """⟨bar, state of a body at the end of a step⟩; `moved` is the twist by which its pose changes."""
     q = from_wxyz(row.orientation)
     v = linear_part(velocity)
     back = wp.transpose(matrix(q))
-    omega = back * angular_part(velocity)
+    omega = wp.transpose(rotation_of(row, met, h)) * angular_part(velocity)
     return (
         wp.dot(bar.position, row.position + h * linear_part(moved))
         + wp.dot(bar.orientation, to_wxyz(turned(q, back * angular_part(moved), h)))
@@ -212,13 +222,14 @@ def impact_patch_work(
     d: Distance,
     turning: int,
     stiffness_share: real,
-    lead: real,
+    share: real,
+    h: real,
     depth: real,
-    layer: real,
     bar: Patch,
 ) -> real:
     """⟨bar, what a sample adds to the patch of an impact⟩."""
-    point = point_contact(pose, sample, d, turning, False, stiffness_share, lead)
+    point = point_contact(pose, sample, d, turning, False, stiffness_share, share * h)
+    layer = layer_of(depth, share)
     own = Patch()
     own = with_sample(own, point.area, point.sunk, depth, layer, point.approach, point.arm, point.normal)
     return (
@@ -242,9 +253,9 @@ def impact_work(
 
 
 @wp.func
-def late_work(body: Body, row: StateRow, delayed: vec6, late: vec6) -> real:
+def late_work(body: Body, row: StateRow, h: real, met: real, delayed: vec6, late: vec6) -> real:
     """Work of the momentum of a twist along another: μᵀ M D."""
-    inertia = turned_inertia(matrix(from_wxyz(row.orientation)), body.inertia)
+    inertia = turned_inertia(rotation_of(row, met, h), body.inertia)
     along = wp.dot(linear_part(late), linear_part(delayed))
     return body.mass * along + wp.dot(angular_part(late), inertia * angular_part(delayed))
 

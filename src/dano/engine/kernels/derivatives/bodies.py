@@ -69,10 +69,12 @@ def pull_momentum(
     b = block_of(scene, scene.body_index[i].row)
     body = scene.bodies[world, i]
     push = push_of(scene, launch, world, t, i)
-    by_body, by_row, by_push, by_gravity, by_h, _a, _b = wp.grad(momentum_work)(
-        body, row, push, scene.gravity[world, 0], h, room.velocity[world, b], room.step[world, b]
+    met = room.bodies[world, i].met
+    by_body, by_row, by_push, by_gravity, by_h, by_met, _a, _b = wp.grad(momentum_work)(
+        body, row, push, scene.gravity[world, 0], h, met, room.velocity[world, b], room.step[world, b]
     )
     add_row(room.state_bar, world, i, by_row)
+    room.met_bar[world, b] = room.met_bar[world, b] + by_met
     if bars.bodies.shape[1] > 0:
         bars.bodies[world, i].mass += by_body.mass
         bars.bodies[world, i].inertia += by_body.inertia
@@ -100,14 +102,17 @@ def pull_advance(scene: Scene, room: Room, bars: Changes, world: int, i: int, ro
         room.state_bar[world, i] = StateRow()
         room.residual[world, block_of(scene, m)] = vec6()
         room.late[world, block_of(scene, m)] = vec6()
+        room.met_bar[world, block_of(scene, m)] = ZERO
     elif m >= 0:
         b = block_of(scene, m)
-        by_row, by_velocity, by_moved, by_h, _a = wp.grad(advance_work)(
-            row, room.velocity[world, b], room.moved[world, b], h, after
+        by_row, by_velocity, by_moved, by_h, by_met, _a = wp.grad(advance_work)(
+            row, room.velocity[world, b], room.moved[world, b], h, room.bodies[world, i].met, after
         )
         room.state_bar[world, i] = by_row
         room.residual[world, b] = by_velocity + by_moved
-        room.late[world, b] = freed(room.bodies[world, i], by_moved)
+        room.met_bar[world, b] = by_met
+        if wp.static(not TREES):
+            room.late[world, b] = freed(room, world, i, m, by_moved)
         if bars.timestep.shape[1] > 0:
             bars.timestep[world, 0] += by_h
     else:
@@ -129,7 +134,7 @@ def subtract_slope(scene: Scene, room: Room, world: int, lane: int, f: int):
             late = room.late[world, a]
         if b >= 0:
             late = late - t * room.late[world, b]
-        by_twist = found.share * (wp.transpose(slope) * late)
+        by_twist = (found.impact.delays * found.share) * (wp.transpose(slope) * late)
         if a >= 0:
             room.residual[world, a] -= by_twist
         if b >= 0:
@@ -152,10 +157,14 @@ def pull_delays(
             delayed = room.velocity[world, b] - room.moved[world, b]
             if wp.length_sq(delayed) > ZERO:
                 row = row_before(scene, launch, world, t, i)
-                by_body, by_row, _a, _b = wp.grad(late_work)(
-                    scene.bodies[world, i], row, delayed, room.late[world, b]
+                h = scene.timestep[world, 0]
+                by_body, by_row, by_h, by_met, _a, _b = wp.grad(late_work)(
+                    scene.bodies[world, i], row, h, room.bodies[world, i].met, delayed, room.late[world, b]
                 )
                 add_row(room.state_bar, world, i, by_row)
+                room.met_bar[world, b] = room.met_bar[world, b] + by_met
+                if bars.timestep.shape[1] > 0:
+                    bars.timestep[world, 0] += by_h
                 if bars.bodies.shape[1] > 0:
                     bars.bodies[world, i].mass += by_body.mass
                     bars.bodies[world, i].inertia += by_body.inertia

@@ -26,7 +26,7 @@ from dano.engine.kernels.derivatives.trees import (
     settle_trees,
     transpose_entries,
 )
-from dano.engine.kernels.impacts import find_moved
+from dano.engine.kernels.impacts import find_moved, meetings_of, moving_of
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import copy_transposed_blocks, find_pattern, solve_blocks
 from dano.engine.kernels.patches import add_patches, fit_patch_duals
@@ -41,8 +41,8 @@ from dano.engine.kernels.trees.balance import (
     solve_trees,
 )
 from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
-from dano.physics.real import ONE, vec6, ZERO
-from dano.physics.rotations import matrix
+from dano.physics.pairs import rotation_met
+from dano.physics.real import ONE, real, vec6, ZERO
 from dano.physics.twists import joined
 
 _LANES = wp.constant(LANES)
@@ -60,7 +60,7 @@ def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: i
             m = scene.body_index[i].row
             if m >= 0 and not hangs(scene, m):
                 row = launch.states[world, t * n + i]
-                spin = matrix(room.bodies[world, i].orientation) * row.omega
+                spin = rotation_met(room.bodies[world, i]) * row.omega
                 room.velocity[world, block_of(scene, m)] = joined(row.velocity, spin)
         if wp.static(TREES):
             settle_trees(scene, room, launch, world, t)
@@ -199,6 +199,18 @@ def is_moved_pair(twists: Virtual) -> bool:
     return not (size + wp.length_sq(twists.first_late) + wp.length_sq(twists.second_late) == ZERO)
 
 
+@wp.func
+def met_bar_of(scene: Scene, room: Room, world: int, n_found: int, found: FoundPair) -> real:
+    """Derivative by when the bodies of a pair meet, from the balance of the one that moves."""
+    bar = ZERO
+    if wp.static(not TREES):
+        if found.impact.delays > ZERO:
+            body = moving_of(scene, found)
+            count, _shares = meetings_of(scene, room, world, n_found, body)
+            bar = room.met_bar[world, scene.body_index[body].row] / count
+    return bar
+
+
 @after_adjoints
 @wp.func
 def pull_equations(
@@ -215,9 +227,10 @@ def pull_equations(
         for f in range(n_found):
             found = room.found[world, f * _LANES + lane]
             twists = twists_of_pair(scene, room, world, found)
-            if is_moved_pair(twists):
+            met_bar = met_bar_of(scene, room, world, n_found, found)
+            if is_moved_pair(twists) or met_bar != ZERO:
                 rebound = launch.reports[world, t].rebound
-                bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists)
+                bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, met_bar)
                 if lane == 0:
                     pull_touching(scene, room, bars, launch, world, t, found, bar)
     if wp.static(PATCHES):

@@ -165,7 +165,7 @@ def hanging_body_work(
     stands.orientation = to_wxyz(chain.orientation)
     stands.velocity = row.velocity
     stands.omega = row.omega
-    total = momentum_work(body, stands, push, gravity, h, twist, virtual)
+    total = momentum_work(body, stands, push, gravity, h, ZERO, twist, virtual)
     ahead = orientation_after(chain.before, chain.orientation)
     total += wp.dot(bar.state.position, chain.position) + wp.dot(bar.state.orientation, chain.orientation)
     total += wp.dot(bar.state.ahead, ahead) + wp.dot(bar.state.com, body.com)
