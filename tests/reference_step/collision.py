@@ -219,17 +219,13 @@ class Meeting(NamedTuple):
 def meetings(scene, bodies, side):
     """That of an impact, and that of contact that lasts."""
     delta, sink = depths_of(scene, side)
-    lasting = Meeting(share_at(scene, held(bodies), side, sink, sink, 0.0), lasts=True)
+    lasting = Meeting(share_at(scene, bodies.held(), side, sink, sink, 0.0), lasts=True)
     if side.law.compliant:
         return lasting, lasting
     slow = side.law.slowest_rebound
+    bodies = bodies.falling()
     share = share_at(scene, bodies, side, delta, bodies.h * slow, slow)
     return Meeting(share, hits=bool(share < 1), falls=nears(scene, bodies, side, delta, slow)), lasting
-
-
-def held(bodies):
-    """Bodies to whose velocities gravity adds nothing."""
-    return bodies._replace(gain=np.zeros_like(bodies.gain))
 
 
 def nears(scene, bodies, side, limit, slow):
@@ -303,11 +299,13 @@ def seen(scene, bodies, side, limit, slow, share):
     axis, turning = pair.R[:, 2], scene.bodies[side.i].surface.turning
     turns = {"fixed": w, "axis": w - (w @ axis) * axis, "ball": 0 * w}[turning]
     velocity = u + np.cross(turns, pair.places - pair.x)
-    gain = bodies.gain[side.i] - bodies.gain[side.j]
+    gain, spin_gain = bodies.gains(side.i, side.j)
+    gain = gain + np.cross(spin_gain * (turning == "fixed"), pair.places - pair.x)
     rate = np.sum(normal * velocity, axis=1)
-    goes_in = np.maximum(rate, rate + (0.5 + share) * normal @ gain) < -slow
-    speed = np.maximum(np.linalg.norm(velocity, axis=1) + 1.5 * np.linalg.norm(gain), 1e-12)
-    way = 1.5 * h * (fastest(scene, bodies, side) + 1.5 * np.linalg.norm(gain))
+    goes_in = np.maximum(rate, rate + (0.5 + share) * np.sum(normal * gain, axis=1)) < -slow
+    most = 1.5 * np.linalg.norm(gain, axis=1)
+    speed = np.maximum(np.linalg.norm(velocity, axis=1) + most, 1e-12)
+    way = 1.5 * h * (fastest(scene, bodies, side) + most.max())
     return (distance, speed), goes_in, (distance <= way - limit) | (turning != "fixed")
 
 
@@ -333,8 +331,7 @@ def find(scene, bodies, shares=None):
 
 def listed(scene, bodies, side, met):
     """The listed points of a side whose geometry is taken when its bodies meet."""
-    if not met.falls:
-        bodies = held(bodies)
+    bodies = bodies.falling() if met.falls else bodies.held()
     i, j, h, share = side.i, side.j, bodies.h, met.share
     pair = Pair(scene, bodies, side, share)
     distance, normal = pair.distance(pair.places)
@@ -348,8 +345,9 @@ def listed(scene, bodies, side, met):
     after, arm, moment = levers(scene, bodies, side, share, pair, normal)
     rate = normal @ u + moment @ w
     drift = drifts(u, w, after, arm, normal) if pair.turning != "fixed" else np.zeros_like(arm)
-    gain = normal @ (bodies.gain[i] - bodies.gain[j])
-    depth = -distance + share * h * (rate + 0.5 * (1 + share) * gain)
+    gains, spin_gains = bodies.gains(i, j)
+    gain, spin_gain = normal @ gains, moment @ spin_gains
+    depth = -distance + share * h * (rate + 0.5 * (1 + share) * gain + spin_gain)
 
     smaller = min(float(scene.bodies[k].extent[4]) for k in (i, j))
     margin = 0.001 * smaller + 2 * np.linalg.norm(bodies.gravity) * h * h
@@ -380,7 +378,7 @@ def listed(scene, bodies, side, met):
         moment=moment[kept],
         depth=depth[kept],
         rate=rate[kept],
-        meets=(approach + (0.5 + share) * gain)[kept],
+        meets=(approach + (0.5 + share) * (gain + spin_gain))[kept],
         gains=((0.5 - share) * gain)[kept],
         area=area[kept],
         drift=drift[kept],

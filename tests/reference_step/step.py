@@ -104,8 +104,12 @@ class Step:
         """Whether contact adds more than a thousandth of the energy that it moves between coordinates."""
         k = self.kinematics
         own = np.einsum("iak,ia->k", k.jacobian, k.momenta(y, self.control)) + self.h * self.joints.smooth(y)
-        work = 0.5 * own * (k.start + y)
-        return np.sum(work) > 1e-3 * np.sum(0.5 * np.abs(own) * (np.abs(k.start) + np.abs(y)))
+        start = np.array(k.start)
+        for r, i in enumerate(k.free):
+            # An impact begins with the spin of its moment.
+            start[6 * r + 3 : 6 * r + 6] += (1 - k.lead[i]) * (0.5 + k.met[i]) * k.bodies.spin_gain[i]
+        work = 0.5 * own * (start + y)
+        return np.sum(work) > 1e-3 * np.sum(0.5 * np.abs(own) * (np.abs(start) + np.abs(y)))
 
 
 def newton(step, start, softness, enough, most=50):

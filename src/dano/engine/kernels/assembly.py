@@ -21,7 +21,7 @@ from dano.physics.point_law import (
     Motion,
     point_motion,
 )
-from dano.physics.real import mat33, mat36, mat66, ONE, real, TWO, vec3, vec6, ZERO
+from dano.physics.real import mat33, mat36, mat66, ONE, real, vec3, vec6, ZERO
 from dano.physics.samples import Point
 from dano.physics.twists import (
     angular_part,
@@ -242,7 +242,7 @@ def add_momentum(scene: Scene, room: Room, world: int, lane: int, m: int, h: rea
             v = room.tried[world, b]
             spin = angular_part(v)
             inertia = room.inertia[world, i]
-            lead = ONE - TWO * room.bodies[world, scene.moving[i]].met
+            lead = room.bodies[world, scene.moving[i]].lead
             linear = body.mass * linear_part(v)
             angular = angular_momentum(spin, inertia, h, lead)
             room.residual[world, b] = joined(linear, angular) - room.momentum[world, i]

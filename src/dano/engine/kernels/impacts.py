@@ -59,16 +59,18 @@ def moving_of(scene: Scene, found: FoundPair) -> int:
 
 
 @wp.func
-def meetings_of(scene: Scene, room: Room, world: int, n_found: int, body: int) -> tuple[real, real]:
-    """How many impulses on a body take effect when it meets another, and the sum of these moments τ."""
+def meetings_of(scene: Scene, room: Room, world: int, n_found: int, body: int) -> tuple[real, real, real]:
+    """How many impulses on a body wait for when it meets another, by how much, and the sum of moments τ_β."""
     count = real(0.0)
+    waits = real(0.0)
     shares = real(0.0)
     for f in range(n_found):
         found = room.found[world, f * _LANES]
         if found.impact.delays > ZERO and moving_of(scene, found) == body:
             count += ONE
+            waits += found.impact.delays
             shares += found.impact.delays * found.share
-    return count, shares
+    return count, waits, shares
 
 
 @wp.func
@@ -80,9 +82,10 @@ def balance_when_met(scene: Scene, room: Room, world: int, n_found: int):
     """
     for i in range(scene.moving.shape[0]):
         body = scene.moving[i]
-        count, shares = meetings_of(scene, room, world, n_found, body)
-        if shares > ZERO:
+        count, waits, shares = meetings_of(scene, room, world, n_found, body)
+        if count > ZERO:
             room.bodies[world, body].met = shares / count
+            room.bodies[world, body].lead = ONE - waits / count
             rotation = rotation_met(room.bodies[world, body])
             room.inertia[world, i] = turned_inertia(rotation, scene.bodies[world, body].inertia)
 

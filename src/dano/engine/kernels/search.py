@@ -329,8 +329,9 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
     met = Meeting()
     if not lasts:
         met = meeting(
-            scene, room, world, lane, a, b, pair, index.first, index.second, h, pair.impact_depth, slow, slow
-        )
+            scene, room, world, lane, falling(a, 1), falling(b, 1), pair, index.first, index.second, h,
+            pair.impact_depth, slow, slow,
+        )  # fmt: skip
     if lasts:
         met = lasting_meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, sink)
     after = at
@@ -345,7 +346,7 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
         other = falling(b, found.falls)
         pose = posed(scene, world, seen, other, index.first, index.second, met.share, h, pair.follows)
         speed = wp.length(pose.velocity) + wp.length(pose.spin) * TWO * body.radius
-        speed += wp.length(pose.gained_on_way)
+        speed += wp.length(pose.gained_on_way) + wp.length(pose.spin_gained_on_way) * TWO * body.radius
         reach = pair.margin + (ONE - met.share) * h * speed
         patch = Patch()
         after, patch, load, turned_load = find_points(

@@ -216,6 +216,14 @@ class FoundPair:
 
 
 @wp.struct
+class Moment:
+    """When the angular momentum of a body is balanced, see `BodyState`."""
+
+    met: real
+    lead: real
+
+
+@wp.struct
 class Room:
     """Where a world works: arrays that nothing outside reads.
 
@@ -247,7 +255,7 @@ class Room:
         best: Where the residual was smallest.
         moved: By which positions change within a step.
         late: Virtual velocities of impulses that take effect within a step.
-        met_bar: Derivatives by when bodies meet, see `BodyState.met`.
+        moment_bar: Derivatives by when the angular momentum of bodies is balanced.
         step: Of Newton's method.
         residual: What each block misses [kg m/s; kg m²/s, W].
         scale: Turns momenta into velocities [1/kg; 1/(kg m²)].
@@ -258,7 +266,7 @@ class Room:
         wrenches: Impulse of each pair that is near, at the first body's centre of mass [N s, N m s, W].
         missing: Changes of the equations of a step, shape (worlds, directions · m).
         delayed: … and of impulses times the share of the step after which they take effect.
-        met: … and of when bodies meet.
+        moments: … and of when angular momentum is balanced.
         splines: Changes of an equation by changes of coefficients, shape (worlds, directions · lanes).
     """
 
@@ -288,7 +296,7 @@ class Room:
     best: wp.array2d(dtype=vec6)
     moved: wp.array2d(dtype=vec6)
     late: wp.array2d(dtype=vec6)
-    met_bar: wp.array2d(dtype=real)
+    moment_bar: wp.array2d(dtype=Moment)
     step: wp.array2d(dtype=vec6)
     residual: wp.array2d(dtype=vec6)
     scale: wp.array2d(dtype=vec6)
@@ -299,7 +307,7 @@ class Room:
     wrenches: wp.array2d(dtype=vec6)
     missing: wp.array2d(dtype=vec6)
     delayed: wp.array2d(dtype=vec6)
-    met: wp.array2d(dtype=real)
+    moments: wp.array2d(dtype=Moment)
     splines: wp.array2d(dtype=real)
 
 

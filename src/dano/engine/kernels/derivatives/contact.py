@@ -27,10 +27,19 @@ from dano.engine.kernels.derivatives.products import (
 )
 from dano.engine.kernels.lanes import total, total6
 from dano.engine.kernels.meeting import posed, solid_of_body
-from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
+from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
 from dano.physics.features import TREES, TURNING, UNIONS
 from dano.physics.impacts import Impact, layer_of, Patch
-from dano.physics.pairs import BALL, BodyState, falling, first_touch, PairPose, position_after, rotation_after
+from dano.physics.pairs import (
+    BALL,
+    BodyState,
+    falling,
+    falling_bar,
+    first_touch,
+    PairPose,
+    position_after,
+    rotation_after,
+)
 from dano.physics.point_law import Material, point_motion, slip_at
 from dano.physics.real import mat33, ONE, real, vec3, ZERO
 from dano.physics.samples import position_in_solid, Sample
@@ -397,7 +406,7 @@ def pull_pair(
     found: FoundPair,
     rebound: real,
     twists: Virtual,
-    met_bar: real,
+    moment_bar: Moment,
 ) -> PairBar:
     """Derivatives by the states of a pair's bodies, for the first lane; adds those by all else.
 
@@ -410,7 +419,7 @@ def pull_pair(
         found: The pair.
         rebound: Share of the restitution that counts.
         twists: Of its bodies.
-        met_bar: Derivative by τ of what else depends on it.
+        moment_bar: Derivatives by when the angular momentum of its bodies is balanced.
     """
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
@@ -429,12 +438,12 @@ def pull_pair(
         impact_bar.stiffness = total(impact_bar.stiffness)
         hits = found.impact.stiffness > ZERO
         if hits:
-            # What `delayed` says, with β as `delays` where that is not zero; and of the balance, `met_bar`.
+            # What `delayed` says, with β as `delays` where that is not zero; and of the balance, `moment_bar`.
             delays = found.impact.delays
             share_bar += (ONE - delays) * impact_bar.way - delays * h * impact_bar.rest
             h_bar += (ONE - delays * found.share) * impact_bar.rest
             by_delays = impact_bar.delays - found.share * (impact_bar.way + h * impact_bar.rest)
-            by_delays = total(by_delays) + found.share * met_bar
+            by_delays = total(by_delays) + found.share * moment_bar.met - moment_bar.lead
             if delays > ZERO:
                 impact_bar.share += by_delays
         else:
@@ -455,7 +464,7 @@ def pull_pair(
             if bars.materials.shape[1] > 0:
                 bars.materials[world, index.contact].bounce += by_bounce
     pose_bar = total_pose(pose_bar)
-    share_bar = total(share_bar) + found.impact.delays * met_bar
+    share_bar = total(share_bar) + found.impact.delays * moment_bar.met
     h_bar = total(h_bar)
     bar = PairBar()
     if lane == 0:
@@ -463,7 +472,7 @@ def pull_pair(
         bar.first = summed_body(bar.first, by_first)
         bar.second = summed_body(bar.second, by_second)
         bar.impact_depth += impact_bar.depth
-        bar.first = falling(bar.first, found.falls)
-        bar.second = falling(bar.second, found.falls)
+        bar.first = falling_bar(bar.first, found.falls)
+        bar.second = falling_bar(bar.second, found.falls)
     bar.twists = twists_bar
     return bar
