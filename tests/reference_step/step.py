@@ -139,12 +139,14 @@ def missed(R, slope, x):
 
 
 def root(step):
-    """y of a step: the root near the old velocities, or followed from large stiction velocities to its own.
+    """y of a step: the root near the old velocities, or from rest, or followed from large stiction velocities.
 
     Raises:
         ArithmeticError: If none is found.
     """
     x, error = newton(step, step.start, 1.0, SOLVED, 12)
+    if error > GOOD:
+        x, error = newton(step, 0 * step.start, 1.0, SOLVED, 12)
     for factor in (4.0, 1.5):
         if error > GOOD:
             x, error = followed(step, factor)
