@@ -139,7 +139,7 @@ def missed(R, slope, x):
 
 
 def root(step):
-    """y of a step: the root near the old velocities, or from rest, or followed from large stiction velocities.
+    """y of a step: the root near the old velocities, or from rest, or from large stiction velocities on.
 
     Raises:
         ArithmeticError: If none is found.

@@ -438,7 +438,7 @@ def pull_pair(
         impact_bar.stiffness = total(impact_bar.stiffness)
         hits = found.impact.stiffness > ZERO
         if hits:
-            # What `delayed` says, with β as `delays` where that is not zero; and of the balance, `moment_bar`.
+            # What `delayed` says, with β for `delays` where that is not zero; and of the balance.
             delays = found.impact.delays
             share_bar += (ONE - delays) * impact_bar.way - delays * h * impact_bar.rest
             h_bar += (ONE - delays * found.share) * impact_bar.rest
