@@ -9,7 +9,7 @@ lights of the training views; "relight", other views under lights that no traini
 The soap is no surface but a scattering medium inside a boundary that does not refract, because light from far
 away cannot be connected through a refracting one.
 
-Usage: python assets/render_images.py [bunny soap mug] [--out assets/images] [--quick]
+Usage: python assets/render_images.py [bunny soap mug block] [--out assets/images] [--quick]
 """
 
 import argparse
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from solids import bunny_mesh, mug_mesh, soap_mesh
+from solids import block_mesh, bunny_mesh, mug_mesh, soap_mesh
 
 SEED = 7
 FIELD_OF_VIEW = 30.0  # [degrees]
@@ -57,6 +57,7 @@ SUBJECTS = {
     "bunny": Subject(bunny_mesh, 128, 64, 128),
     "soap": Subject(soap_mesh, 96, 96, 384, n_train=64, medium=True),
     "mug": Subject(mug_mesh, 128, 64, 128, faceted=True),
+    "block": Subject(block_mesh, 128, 64, 128, faceted=True),
 }
 
 
