@@ -25,13 +25,12 @@ Poses = tuple[np.ndarray, np.ndarray]
 
 
 class Motion(Protocol):
-    """How the object moves.
+    """How the object moves."""
 
-    Attributes:
-        known: What else is known about it, for the truth.
-    """
-
-    known: dict
+    @property
+    def known(self) -> dict:
+        """What else is known about it, for the truth."""
+        ...
 
     def at(self, times: np.ndarray) -> Poses:
         """Positions [m], shape (n, 3), and orientations, shape (n, 4), of the object's frame at times [s]."""

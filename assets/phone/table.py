@@ -129,4 +129,6 @@ def hand() -> trimesh.Trimesh:
     ]
     thumb = limb((-0.03, -0.02, 0.0), (-0.072, 0.03, -0.012), 0.011)
     arm = limb((0.0, -0.04, 0.004), (0.04, -0.36, 0.05), 0.026)
-    return trimesh.util.concatenate([palm, *fingers, thumb, arm])
+    whole = trimesh.util.concatenate([palm, *fingers, thumb, arm])
+    assert isinstance(whole, trimesh.Trimesh)
+    return whole

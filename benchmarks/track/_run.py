@@ -43,7 +43,7 @@ def run() -> None:
     arguments = parse_arguments("Track objects in rendered films and compare with the truth.", _options)
     load, rows = load_average(), []
     cases = []
-    for name in FILMS:
+    for name in FILMS if arguments.films is not None or arguments.phone is None else ():
         if arguments.films is None or not (arguments.films / name / "truth.json").is_file():
             rows.append(
                 skipped(name, "poses", "no films: python assets/render_videos.py DIR, then --films DIR")
