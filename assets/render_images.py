@@ -151,12 +151,17 @@ def camera_to_world(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 def painted_file(vertices: np.ndarray, faces: np.ndarray, path: Path) -> Path:
     """Write vertices, their paint and faces as a binary PLY file, the form in which Mitsuba takes colours."""
     corners = np.zeros(len(vertices), [(name, "<f4") for name in ("x", "y", "z", "r", "g", "b")])
-    for name, column in zip(corners.dtype.names or (), np.hstack([vertices, paint(vertices)]).T, strict=True):
+    return write_ply(corners, np.hstack([vertices, paint(vertices)]), faces, path)
+
+
+def write_ply(corners: np.ndarray, columns: np.ndarray, faces: np.ndarray, path: Path) -> Path:
+    """Write a binary PLY file: corners, an array of records that the columns fill, and faces."""
+    for name, column in zip(corners.dtype.names or (), columns.T, strict=True):
         corners[name] = column
     triangles = np.zeros(len(faces), [("n", "u1"), ("corners", "<i4", 3)])
     triangles["n"], triangles["corners"] = 3, faces
     header = [
-        *("ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"),
+        *("ply", "format binary_little_endian 1.0", f"element vertex {len(corners)}"),
         *(f"property float {name}" for name in corners.dtype.names or ()),
         *(f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""),
     ]

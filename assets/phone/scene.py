@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from render_images import camera_to_world, paint, painted_file
+from render_images import camera_to_world, paint, write_ply
 from render_videos import matrix, scattering
 from solids import Mesh
 
@@ -37,20 +37,21 @@ class Place:
         self.motion = film.motion(film)
         mesh = mesh_of(film.object)
         own = _own(film.object, mesh)
-        self._files = {"object": painted_file(*mesh, folder / "object.ply"), "hand": folder / "hand.ply"}
+        self._files = {"object": folder / "object.ply", "hand": folder / "hand.ply"}
+        colours = faceted_file(*mesh, self._files["object"])
         hand().export(self._files["hand"])
         for k, (thing, _) in enumerate(things(own, film.seed)):
             self._files[f"thing{k}"] = folder / f"thing{k}.ply"
             thing.export(self._files[f"thing{k}"])
-        colours = [colour for _, colour in things(own, film.seed)]
+        tints = [tint for _, tint in things(own, film.seed)]
         self.hull = trimesh.Trimesh(*mesh, process=False).convex_hull.vertices
         self._palm = hand().vertices
         top = tabletop(film.seed, own, papers=film.papers, patches=film.patches)
         # The first row of a bitmap lies at v = 0, the lowest y.
         bitmap = mi.Bitmap((255 * top[::-1] + 0.5).astype(np.uint8))
         self._still = {
-            False: self._at_rest({"type": "bitmap", "bitmap": bitmap, "wrap_mode": "clamp"}, colours),
-            True: self._at_rest(_rgb([0.0, 0.0, 0.0]), len(colours) * [[0.0, 0.0, 0.0]]),
+            False: self._at_rest({"type": "bitmap", "bitmap": bitmap, "wrap_mode": "clamp"}, tints),
+            True: self._at_rest(_rgb([0.0, 0.0, 0.0]), len(tints) * [[0.0, 0.0, 0.0]]),
         }
         skin = {"bsdf": _diffuse([0.62, 0.40, 0.30])}
         self._groups = {
@@ -58,8 +59,8 @@ class Place:
             ("hand", True): self._group("hand", {"bsdf": _diffuse([0.0, 1.0, 0.0])}),
             ("hand", False): self._group("hand", skin),
         }
-        if film.object == "soap":
-            self._groups["object", False] = self._group("object", scattering())
+        surface = scattering() if film.object == "soap" else _painted(mi.Bitmap(colours))
+        self._groups["object", False] = self._group("object", surface)
 
     def _at_rest(self, paint: dict, colours: list[list[float]]) -> dict:
         """The table and the things on it, with this paint and these colours."""
@@ -122,21 +123,12 @@ class Place:
             }
             content |= self._lights()
         for name, pose in (("object", object_pose), ("hand", hand_pose)):
-            if pose is None:
-                continue
-            to_world = self.mi.ScalarTransform4f(pose)
-            group = self._groups.get((name, cover))
-            if group is not None:
+            if pose is not None:
+                group = self._groups[name, cover]
+                placed_so = self.mi.ScalarTransform4f(pose)
                 content |= {
                     f"{name}s": group,
-                    name: {"type": "instance", "to_world": to_world, "body": group},
-                }
-            else:
-                # Instances know nothing of the colours of vertices.
-                file = str(self._files[name])
-                content[name] = {
-                    **{"type": "ply", "filename": file, "face_normals": True, "to_world": to_world},
-                    **_painted(),
+                    name: {"type": "instance", "to_world": placed_so, "body": group},
                 }
         return self.mi.load_dict(content)
 
@@ -194,11 +186,28 @@ def _diffuse(colour: list[float]) -> dict:
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _rgb(colour)}}
 
 
-def _painted() -> dict:
-    """As in the photographs of `render_images`."""
-    colour = {"type": "mesh_attribute", "name": "vertex_color"}
-    bsdf = {"type": "principled", "base_color": colour, "roughness": 0.5, "specular": 0.4}
-    return {"bsdf": {"type": "twosided", "bsdf": bsdf}}
+def _painted(colours) -> dict:
+    """As in the photographs of `render_images`, the colours of faces in a bitmap."""
+    bitmap = {"type": "bitmap", "bitmap": colours, "raw": True, "filter_type": "nearest"}
+    bsdf = {"type": "principled", "base_color": bitmap, "roughness": 0.5, "specular": 0.4}
+    return {"face_normals": True, "bsdf": {"type": "twosided", "bsdf": bsdf}}
+
+
+def faceted_file(vertices: np.ndarray, faces: np.ndarray, path: Path) -> np.ndarray:
+    """Write a PLY file whose faces each point to a texel, because instances know no colours of vertices.
+
+    Returns:
+        Linear colours of the texels, shape (side, side, 3), first row at v = 0.
+    """
+    side = int(np.ceil(np.sqrt(len(faces))))
+    colours = np.zeros((side * side, 3), np.float32)
+    colours[: len(faces)] = paint(vertices)[faces].mean(axis=1)
+    row, column = np.divmod(np.arange(len(faces)), side)
+    corners = np.zeros(3 * len(faces), [(name, "<f4") for name in ("x", "y", "z", "u", "v")])
+    texel = np.repeat(np.stack([column + 0.5, row + 0.5], axis=1) / side, 3, axis=0)
+    columns = np.hstack([vertices[faces].reshape(-1, 3), texel])
+    write_ply(corners, columns, np.arange(3 * len(faces)).reshape(-1, 3), path)
+    return colours.reshape(side, side, 3)
 
 
 def _own(name: str, mesh: Mesh) -> np.ndarray:
