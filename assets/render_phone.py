@@ -116,7 +116,9 @@ def _exposed(
     moments, weights = film.exposure.moments(time, (top, bottom), count)
     # A row sees in so many of the moments.
     seen = max(count * film.exposure.shutter / (end - start), 1.0) if moves else 0.5
-    paths = -(-place.paths // round(seen)) if seen >= 1 else round(place.paths / seen)
+    # A hand covers half of the picture, which takes long enough with half of the paths.
+    wanted = place.paths // 2 if hands else place.paths
+    paths = -(-wanted // round(seen)) if seen >= 1 else round(wanted / seen)
     light, cover = empty.copy(), np.zeros_like(empty)
     fresh, covered = np.zeros((2, bottom - top, right - left, 3))
     for k, (moment, weight) in enumerate(zip(moments, weights, strict=True)):

@@ -18,6 +18,7 @@ GRAVITY = 9.81  # [m/s²]
 BEFORE = 0.06  # by which motions begin before the first frame, whose exposure does [s]
 STEP = 0.0002  # of MuJoCo [s]
 SPHERES, CORNERS, RADIUS = 400, 300, 0.001  # on faces, outermost in so many directions, their radius [m]
+LEVEL = 5e-5  # by which spheres may reach out of the solid [m]
 DENSITY = 800.0  # [kg/m³]
 STILL = 2e-5, 2e-4  # by which what lies still may differ from where it ends [m], [rad]
 
@@ -132,7 +133,7 @@ def _body(mesh: Mesh, friction: float) -> str:
     away = directions(CORNERS, -1.0, np.random.default_rng(3))
     outermost = solid.vertices[np.unique(np.argmax(away @ solid.vertices.T, axis=1))]
     inwards = RADIUS * away[np.argmax(outermost @ away.T - (solid.vertices @ away.T).max(axis=0), axis=1)]
-    points = np.concatenate([on_faces, outermost - inwards])
+    points = _within(solid.convex_hull, np.concatenate([on_faces, outermost - inwards]))
     spheres = "\n".join(
         f'<geom type="sphere" size="{RADIUS}" pos="{x:.6f} {y:.6f} {z:.6f}" contype="2" conaffinity="1"/>'
         for x, y, z in points
@@ -147,3 +148,16 @@ def _body(mesh: Mesh, friction: float) -> str:
 
 {spheres}
 </body></worldbody></mujoco>"""
+
+
+def _within(hull: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """Middles of spheres moved inwards until none reaches out of the hull: at sharp edges they would."""
+    normals = hull.face_normals
+    limits = np.sum(normals * hull.triangles[:, 0], axis=1) - RADIUS
+    for _ in range(40):
+        out = points @ normals.T - limits
+        worst = np.argmax(out, axis=1)
+        depth = out[np.arange(len(points)), worst]
+        depth = np.where(depth > LEVEL, depth, 0.0)
+        points = points - depth[:, None] * normals[worst]
+    return points
