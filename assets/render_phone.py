@@ -34,10 +34,12 @@ from phone.scene import camera, LAMPS, Place, placed, project, SUN
 from phone.table import tag_centre, TAG_SIDE
 from render_images import camera_to_world
 from render_table import write
+from scipy import ndimage
 
 STEP = 1.5  # way of the object between two moments of a frame [pixels]; a hand may go four times as far
 MOST = 24  # moments of a frame
 FEATHER = 12  # pixels over which what is rendered anew fades into what is not
+SOFT = 1.2  # pixels over which shadows are averaged
 WALK, LARGER = 24, 1.5  # photographs, and how much larger they are than frames
 
 
@@ -128,9 +130,21 @@ def _exposed(
         covered += rows * place.look(place.scene(pose, palm, cover=True), box, max(paths // 2, 3), seed)
     fade = _fade(box)[..., None]
     part = (slice(top, bottom), slice(left, right))
-    light[part] = fade * fresh + (1 - fade) * empty[part]
+    light[part] = fade * _smooth(fresh, empty[part], covered) + (1 - fade) * empty[part]
     cover[part] = covered
     return light, cover
+
+
+def _smooth(fresh: np.ndarray, empty: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """Light in which the noise of few paths is less where only shadows fall.
+
+    There the picture is that of the empty place times the share of the light that is left, which is smooth.
+    """
+    free = (covered.sum(axis=2, keepdims=True) < 0.01).astype(float)
+    spread = (SOFT, SOFT, 0.0)
+    left = ndimage.gaussian_filter(free * fresh / np.maximum(empty, 1e-3), spread)
+    left /= np.maximum(ndimage.gaussian_filter(free, spread), 1e-3)
+    return np.where(free > 0, left * empty, fresh)
 
 
 def _moments(place: Place, start: float, end: float) -> int:

@@ -99,7 +99,7 @@ class Place:
             return None
         pose = np.eye(4)
         pose[:3, :3] = matrix(np.array([np.cos(0.15), 0.0, 0.0, np.sin(0.15)]))
-        pose[:3, 3] = -0.34 + 0.68 * share, -0.13 + 0.05 * np.sin(np.pi * share), 0.11
+        pose[:3, 3] = -0.46 + 0.92 * share, -0.13 + 0.05 * np.sin(np.pi * share), 0.11
         return pose
 
     def scene(
