@@ -11,7 +11,7 @@ Each film gets a folder with `frames/` (before H.264), `masks/` (true silhouette
 `occluders/` (the hand, where there is one), `film.mp4`, `empty.png` (the place without the object, a picture
 of its own with another exposure) and `truth.json`: as `render_videos` writes it, and the `object`, `kind` of
 motion, `readout` [s], height of the `table` [m], and the frame from which on the object lies still, `rest`.
-With `--walk` there is `walk/`: `images/` with photographs from around the object where it came to rest, a
+`--walk` adds `walk/` to a film that is there: `images/` with photographs from around the object where it came to rest, a
 printed marker (`tag_side` of `walk/truth.json`) and the film's last frame, which has the film's camera;
 `masks/`; and `truth.json` with all cameras.
 
@@ -49,7 +49,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("films", nargs="*", default=list(FILMS))
     parser.add_argument("--paths", type=int, default=24, help="paths per pixel")
-    parser.add_argument("--walk", action="store_true", help="photographs from around the object, too")
+    parser.add_argument("--walk", action="store_true", help="photographs for a film that is there")
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
     import drjit as dr  # pyright: ignore[reportMissingImports]
@@ -61,9 +61,10 @@ def main() -> None:
         folder = arguments.folder / name
         folder.mkdir(parents=True, exist_ok=True)
         place = Place(mi, FILMS[name], folder, arguments.paths)
-        render(place, folder)
         if arguments.walk:
             walk(place, folder / "walk")
+        else:
+            render(place, folder)
         place.close()
 
 
