@@ -3,17 +3,17 @@
 Path tracing by Mitsuba 3 (`pip install mitsuba mujoco trimesh libigl opencv-python-headless pillow av
 scipy`). A soap, a painted block and a mug slide, spin or are thrown on a table with newspaper, patches and
 things in the object's own colours, and lie still at the end. Motions are closed forms or MuJoCo's
-(`phone_motion`). Pictures have blur, a rolling shutter, noise, an exposure that follows what it sees, and
-H.264 (`phone_camera`). In some a hand passes, or the object begins beyond the picture's edge. Four films are
+(`phone.motion`). Pictures have blur, a rolling shutter, noise, an exposure that follows what it sees, and
+H.264 (`phone.camera`). In some a hand passes, or the object begins beyond the picture's edge. Four films are
 named `held_…`: who improves tracking looks at them at the end only.
 
 Each film gets a folder with `frames/` (before H.264), `masks/` (true silhouettes, blur included),
 `occluders/` (the hand, where there is one), `film.mp4`, `empty.png` (the place without the object, a picture
 of its own with another exposure) and `truth.json`: as `render_videos` writes it, and the `object`, `kind` of
 motion, `readout` [s], height of the `table` [m], and the frame from which on the object lies still, `rest`.
-`--walk` adds `walk/` to a film that is there: `images/` with photographs from around the object where it came to rest, a
-printed marker (`tag_side` of `walk/truth.json`) and the film's last frame, which has the film's camera;
-`masks/`; and `truth.json` with all cameras.
+`--walk` adds `walk/` to a film that is there: `images/` with photographs from around the object where it came
+to rest, a printed marker (`tag_side` of `walk/truth.json`) and the film's last frame, which has the film's
+camera; `masks/`; and `truth.json` with all cameras.
 
 The soap's look is shipped (`trained_soap`). The others are learned from photographs:
 `python assets/render_images.py block mug --out FOLDER/photographs`, then
