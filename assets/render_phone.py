@@ -117,8 +117,8 @@ def _exposed(
     start, end = film.exposure.span(time, (top, bottom))
     count = min(_moments(place, start, end), MOST) if moves else 1
     moments, weights = film.exposure.moments(time, (top, bottom), count)
-    # A row sees in so many of the moments.
-    seen = max(count * film.exposure.shutter / (end - start), 1.0) if moves else 0.5
+    # A row sees in so many of the moments; what lies still is rendered once for all frames, so with care.
+    seen = max(count * film.exposure.shutter / (end - start), 1.0) if moves else 0.125
     # A hand covers half of the picture, which takes long enough with half of the paths.
     wanted = place.paths // 2 if hands else place.paths
     paths = -(-wanted // round(seen)) if seen >= 1 else round(wanted / seen)
