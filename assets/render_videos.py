@@ -304,7 +304,7 @@ def scene(mi, mesh: Path | None, medium: bool, pose: np.ndarray, *, table: bool)
             "type": "ply",
             "filename": str(mesh),
             "to_world": mi.ScalarTransform4f(pose),
-            **(_scattering() if medium else _painted()),
+            **(scattering() if medium else _painted()),
         }
     if table:
         # The first row of a bitmap lies at v = 0, the lowest y.
@@ -326,7 +326,7 @@ def _painted() -> dict:
     return {"bsdf": {"type": "principled", "base_color": colour, "roughness": 0.5, "specular": 0.4}}
 
 
-def _scattering() -> dict:
+def scattering() -> dict:
     """As in the photographs of `render_images`."""
     return {
         "bsdf": {"type": "null"},
