@@ -72,6 +72,8 @@ class Kinematics:
         self.bodies = bodies = bodies._replace(
             position=position, orientation=orientation, ahead=np.array([q for _, q in ahead])
         )
+        if self.joints:
+            self.bodies = bodies = bodies._replace(ahead_falling=bodies.ahead)
         self.before = np.concatenate([bodies.velocity, bodies.spin], axis=1)
         for i in self.hangs:
             omega = spin_between(earlier[i][1], orientation[i], h)

@@ -5,7 +5,7 @@ Geometry is taken where the old velocities take the bodies by a share τ of the 
 
 import warp as wp
 
-from dano.physics.features import TURNING
+from dano.physics.features import TREES, TURNING
 from dano.physics.real import HALF, mat33, ONE, quat, real, vec3, ZERO
 from dano.physics.rotations import direction, interpolated, matrix, rotation_from_z
 from dano.physics.solids.distances import Solid, solid_distance
@@ -39,7 +39,7 @@ class BodyState:
         spin: [rad/s, W].
         gain: What gravity adds to the velocity within the step [m/s, W], zero for a body on a joint.
         spin_gain: What gyroscopic torque adds to the spin within the step [rad/s, W]; the same.
-        ahead_falling: Orientation at the end of the step with that gain.
+        ahead_falling: Orientation at the end of the step with that gain; unused where there are joints.
         com: Centre of mass in the field frame [m, F].
         inverse_mass: Effective inverse mass [1/kg], zero for a fixed body.
         inverse_inertia: Effective inverse inertia [1/(kg m²), W], zero for a fixed body.
@@ -163,7 +163,7 @@ def falling(body: BodyState, falls: int) -> BodyState:
     if falls == 0:
         found.gain = vec3()
         found.spin_gain = vec3()
-    else:
+    elif wp.static(not TREES):
         found.ahead = body.ahead_falling
     return found
 
@@ -175,7 +175,7 @@ def falling_bar(bar: BodyState, falls: int) -> BodyState:
     if falls == 0:
         found.gain = vec3()
         found.spin_gain = vec3()
-    else:
+    elif wp.static(not TREES):
         found.ahead_falling = bar.ahead_falling + bar.ahead
         found.ahead = quat()
     return found
