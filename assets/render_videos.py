@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from render_images import camera_to_world, painted_file, srgb
-from render_table import TABLE_SIDE, tabletop, write
+from render_table import pinhole, TABLE_SIDE, tabletop, write
 from solids import bunny_mesh, Mesh, soap_mesh
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 420.0  # [pixels]
@@ -183,7 +183,8 @@ def render(mi, film: Film, folder: Path, paths: int) -> None:
     (positions, orientations), known = film.moved(film, times)
     mesh, ball = painted_file(*film.mesh(), folder / "mesh.ply"), folder / "ball.ply"
     trimesh.creation.icosphere(3).export(ball)
-    sensor, random = camera(mi), np.random.default_rng(5)
+    sensor = pinhole(mi, EYE, TARGET, WIDTH / FOCAL, width=WIDTH, height=HEIGHT, pixel_format="rgba")
+    random = np.random.default_rng(5)
     empty = mi.load_dict(scene(mi, None, film.medium, np.eye(4), table=True))
     write(folder / "empty.png", srgb(np.array(mi.render(empty, sensor=sensor, spp=4 * paths))[..., :3]))
     for i, time in enumerate(times):
@@ -264,21 +265,6 @@ def matrix(quaternion: np.ndarray) -> np.ndarray:
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
-    )
-
-
-def camera(mi):
-    """The camera, which stands still."""
-    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
-    return mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": float(np.degrees(2 * np.arctan(0.5 * WIDTH / FOCAL))),
-            "fov_axis": "x",
-            "to_world": mi.ScalarTransform4f().look_at(list(EYE), list(TARGET), [0, 0, 1]),
-            "near_clip": 0.01,
-            "film": film | {"pixel_format": "rgba"},
-        }
     )
 
 

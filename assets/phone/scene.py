@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from render_images import camera_to_world, paint, write_ply
+from render_table import pinhole
 from render_videos import matrix, scattering
 from solids import Mesh
 
@@ -221,20 +222,9 @@ def camera(mi, eye, target, scale: float, box: tuple[int, int, int, int] | None 
     """The phone's lens; pictures of `scale` times the size of a frame, or a part of one."""
     width, height = round(scale * WIDTH), round(scale * HEIGHT)
     left, top, right, bottom = box or (0, 0, width, height)
-    return mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": float(np.degrees(2 * np.arctan(0.5 * WIDTH / FOCAL))),
-            "fov_axis": "x",
-            "to_world": mi.ScalarTransform4f().look_at(list(eye), list(target), [0, 0, 1]),
-            "near_clip": 0.01,
-            "film": {
-                **{"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
-                **{"crop_offset_x": int(left), "crop_offset_y": int(top)},
-                **{"crop_width": int(right - left), "crop_height": int(bottom - top)},
-            },
-        }
-    )
+    part = {"crop_offset_x": int(left), "crop_offset_y": int(top)}
+    part |= {"crop_width": int(right - left), "crop_height": int(bottom - top)}
+    return pinhole(mi, eye, target, WIDTH / FOCAL, width=width, height=height, **part)
 
 
 def project(film: Film, points: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
 from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate
 from dano.scene_file import asset_look
@@ -117,3 +118,8 @@ def errors(case: Case, found: Tracked) -> tuple[np.ndarray, np.ndarray, np.ndarr
     for i in np.flatnonzero(np.isfinite(both).all(axis=1)):
         distance[i] = both[i] @ np.linalg.solve(found.covariance[i], both[i])
     return np.linalg.norm(shift + arms, axis=1) / case.size, np.linalg.norm(turns, axis=1), distance
+
+
+def in_region(distance: np.ndarray) -> np.ndarray:
+    """Whether the truth lies in the stated 95 % regions of poses, by its Mahalanobis²."""
+    return distance < chi2.ppf(0.95, 6)

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
 import dano
 from benchmarks._measure import Row
-from benchmarks.track._cases import Case, errors, read_case
+from benchmarks.track._cases import Case, errors, in_region, read_case
 from benchmarks.track._friction import fit_film
 from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate
 from dano.scene_file import load_object
@@ -100,7 +99,7 @@ def _of_poses(group: str, filmed: PhoneFilm, found: Tracked) -> list[Row]:
     case = filmed.case
     place, turn, distance = errors(case, found)
     known = np.isfinite(place)
-    held = 100 * float((distance[known] < chi2.ppf(0.95, 6)).mean())
+    held = 100 * float(in_region(distance[known]).mean())
     angle = np.degrees(turn)
     farthest, turned = int(np.nanargmax(place)), int(np.nanargmax(angle))
     stated = 100 * np.sqrt(np.trace(found.covariance[known, :3, :3], axis1=1, axis2=2)) / case.size

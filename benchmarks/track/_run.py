@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
-from scipy.stats import chi2
 
 from benchmarks._measure import load_average, parse_arguments, report, Row, skipped
-from benchmarks.track._cases import Case, errors, read_case
+from benchmarks.track._cases import Case, errors, in_region, read_case
 from benchmarks.track._friction import fit_centre_of_mass, fit_film, SLIDES
 from benchmarks.track._phone import phone_rows, read_phone_films, without_masks
 from dano.maths import quat_multiply
@@ -93,7 +92,7 @@ def _tracked(case: Case, source: str) -> list[Row]:
     processor = (time.process_time() - began) / len(film.times)
     place, turn, distance = errors(case, found)
     known = np.isfinite(place)
-    held = distance[known] < chi2.ppf(0.95, 6)
+    held = in_region(distance[known])
     last = len(film.times)
     rows = [
         Row(group, "frames tracked", found.n_tracked, "", last, at_least=True, note=f"of {last}"),
