@@ -124,18 +124,18 @@ def begin_body(scene: Scene, room: Room, world: int, i: int, row: StateRow, push
         rotation = matrix(state.orientation)
         inertia = turned_inertia(rotation, body.inertia)
         spin = rotation * row.omega
+        if is_alone:
+            state.inverse_mass = ONE / body.mass
+            state.inverse_inertia = wp.inverse(inertia)
         if not hangs:
             state.ahead = turned(state.orientation, row.omega, h)
             state.velocity = row.velocity
             state.spin = spin
             if wp.static(not TREES):
                 state.gain = h * scene.gravity[world, 0]
-                state.spin_gain = gyroscopic_gain(spin, inertia, wp.inverse(inertia), h)
+                state.spin_gain = gyroscopic_gain(spin, inertia, state.inverse_inertia, h)
                 falls = row.omega + wp.transpose(rotation) * state.spin_gain
                 state.ahead_falling = turned(state.orientation, falls, h)
-        if is_alone:
-            state.inverse_mass = ONE / body.mass
-            state.inverse_inertia = wp.inverse(inertia)
         linear = body.mass * (row.velocity + h * scene.gravity[world, 0]) + h * push.force
         angular = angular_momentum(spin, inertia, h, -ONE) + h * push.torque
         room.momentum[world, m] = joined(linear, angular)
