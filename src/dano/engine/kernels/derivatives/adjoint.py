@@ -196,6 +196,7 @@ def state_work(body: Body, row: StateRow, gravity: vec3, h: real, moves: bool, b
     q = from_wxyz(row.orientation)
     total = wp.dot(bar.position, row.position) + wp.dot(bar.orientation, q) + wp.dot(bar.com, body.com)
     ahead = q
+    ahead_falling = q
     if moves:
         ahead = turned(q, row.omega, h)
         total += wp.dot(bar.velocity, row.velocity) + wp.dot(bar.spin, matrix(q) * row.omega)
@@ -204,9 +205,8 @@ def state_work(body: Body, row: StateRow, gravity: vec3, h: real, moves: bool, b
             gain = gain_of_row(body, row, h)
             ahead_falling = turned(q, row.omega + gain, h)
             total += h * wp.dot(bar.gain, gravity) + wp.dot(bar.spin_gain, matrix(q) * gain)
-            total += wp.dot(bar.ahead_falling, ahead_falling)
             total += bar.inverse_mass / body.mass + wp.ddot(bar.inverse_inertia, wp.inverse(inertia))
-    return total + wp.dot(bar.ahead, ahead)
+    return total + wp.dot(bar.ahead, ahead) + wp.dot(bar.ahead_falling, ahead_falling)
 
 
 @wp.func
