@@ -45,6 +45,7 @@ class Points(NamedTuple):
         kappa: κ [Pa s/m].
         sunk: Depth where geometry is taken [m], shape (n,).
         delta: Depth of the impact [m].
+        deepest: Depth that another part of the body may have, whose impact is left to the next step [m].
         beta: Share of the contact that is an impact.
         delays: Impulses take effect after this share of τ.
         way: Share of the step in which bodies go on as before.
@@ -68,6 +69,7 @@ class Points(NamedTuple):
     kappa: float
     sunk: np.ndarray
     delta: float
+    deepest: float
     beta: float
     delays: float
     way: float
@@ -201,10 +203,10 @@ def unit(v):
 
 
 def depths_of(scene, side):
-    """Depth of an impact, and up to which geometry of contact that lasts is predicted [m]."""
+    """Depths [m]: of an impact; predicted in contact that lasts; of parts whose impact is the next step's."""
     (_, size, thickness) = np.minimum(*(np.asarray(scene.bodies[k].extent)[3:] for k in (side.i, side.j)))
     delta = min(side.law.delta, 0.25 * thickness)
-    return delta, max(delta, min(0.01 * size, 0.25 * thickness))
+    return delta, max(delta, min(0.01 * size, 0.25 * thickness)), 0.25 * thickness
 
 
 class Meeting(NamedTuple):
@@ -218,14 +220,20 @@ class Meeting(NamedTuple):
 
 def meetings(scene, bodies, side):
     """That of an impact, and that of contact that lasts."""
-    delta, sink = depths_of(scene, side)
+    delta, sink, _ = depths_of(scene, side)
     lasting = Meeting(share_at(scene, bodies.held(), side, sink, sink, 0.0), lasts=True)
     if side.law.compliant:
         return lasting, lasting
     slow = side.law.slowest_rebound
     bodies = bodies.falling()
-    share = share_at(scene, bodies, side, delta, bodies.h * slow, slow)
+    since = -1.0 if is_alone(scene, bodies, side) else 0.0
+    share = share_at(scene, bodies, side, delta, bodies.h * slow, slow, since)
     return Meeting(share, hits=bool(share < 1), falls=nears(scene, bodies, side, delta, slow)), lasting
+
+
+def is_alone(scene, bodies, side):
+    """Whether one of the bodies is fixed, and the other moves freely."""
+    return not scene.joints and not (bodies.moves[side.i] and bodies.moves[side.j])
 
 
 def nears(scene, bodies, side, limit, slow):
@@ -236,11 +244,11 @@ def nears(scene, bodies, side, limit, slow):
     return bool(np.any(goes_in & near))
 
 
-def share_at(scene, bodies, side, limit, least_way, slow):
+def share_at(scene, bodies, side, limit, least_way, slow, since=0.0):
     """τ: share of the step at which the first sample that goes in is as deep as a limit [m]; else 1.
 
     Bodies that near each other by less than `least_way` [m] are looked at at the end, and samples no faster
-    than `slow` [m/s] do not count.
+    than `slow` [m/s] do not count. Where one is deeper at the start, bodies are followed back until `since`.
     """
     if bodies.h * nearing(scene, bodies, side) <= least_way:
         return 1.0
@@ -255,7 +263,9 @@ def share_at(scene, bodies, side, limit, least_way, slow):
     share = 0.0
     too_deep, safe = look(share)
     if too_deep:
-        return share
+        earlier = np.linspace(0.0, since, 201)[1:]
+        free = next((s for s in earlier if not look(s)[0]), None)
+        return since if free is None else bisected(lambda s: look(s)[0], free, free - since / 200)
     while share < 1:
         before, share = share, min(share + max(safe, 1e-4), 1.0)
         too_deep, safe = look(share)
@@ -351,22 +361,24 @@ def listed(scene, bodies, side, met):
 
     smaller = min(float(scene.bodies[k].extent[4]) for k in (i, j))
     margin = 0.001 * smaller + 2 * np.linalg.norm(bodies.gravity) * h * h
-    near = (area > 0) & (depth - h * rate > -margin)
+    delta, _, deepest = depths_of(scene, side)
+    # What has separated since a moment before the step was not deeper then.
+    before = np.minimum(-distance, depth) if share < 0 else -distance
+    in_patch = ~other & (before > -delta) & (share < 1)
+    near = (area > 0) & ((depth - h * rate > -margin) | in_patch)
     usual = near & ~other
-    sunk = np.maximum(-distance, 0)
+    sunk = np.maximum(before, 0)
     inside_out = np.sum((area * sunk)[other]) > np.sum((area * sunk)[usual])
     kept = np.concatenate([np.flatnonzero(usual), np.flatnonzero(near & other & inside_out)])
     hit = usual & (sunk > 0)
     approach = rate - np.sum(normal * drift, axis=1)
-    delta, _ = depths_of(scene, side)
     x = sunk / delta
     weight = fading_in(x) * hit
-    near_load = area * usual * fading_in((delta * smooth_step(4 * (1 - share)) - distance) / delta)
+    near_load = area * usual * fading_in(1 + before / delta)
     beta, stiffness = 0.0, 0.0
     if not met.lasts:
         beta, stiffness = impact(bodies, side, arm, normal, area * weight, near_load, approach)
-    free = not scene.joints and not (bodies.moves[i] and bodies.moves[j])
-    delays = beta * (free and met.hits)
+    delays = beta * (is_alone(scene, bodies, side) and met.hits)
     return Points(
         first=i,
         second=j,
@@ -384,11 +396,12 @@ def listed(scene, bodies, side, met):
         drift=drift[kept],
         impact=(stiffness * met.hits * weight)[kept],
         kappa=stiffness * met.hits,
-        sunk=np.where(other, 0, -distance)[kept],
+        sunk=np.where(other, 0, before)[kept],
         delta=delta,
+        deepest=deepest,
         beta=beta,
         delays=delays,
-        way=(1 - delays) * share * met.hits,
+        way=(1 - delays) * max(share, 0) * met.hits,
     )
 
 
@@ -462,7 +475,7 @@ def together(bodies, found):
     """Sides of bodies that touch others that move, too: their impulses do not wait for the impact."""
     crowded = {k for points in found for k in points[:2] if all(bodies.moves[list(points[:2])])}
     return [
-        points._replace(delays=0.0, way=points.share)
+        points._replace(delays=0.0, way=max(points.share, 0.0))
         if points.delays and crowded & set(points[:2])
         else points
         for points in found

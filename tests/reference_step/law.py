@@ -137,13 +137,17 @@ def pressure(law, points, rate, v_s):
     slope = -law.k * (left > 0) * np.where(implicit, law.theta * law.h, D_slope)
 
     missing = np.maximum(goals(law, points) - rate, 0)
-    # Samples that are less deep than the impact get no deeper.
+    # Samples that are less deep than the impact get no deeper, or, where bodies wait until they meet, by so
+    # much that there is a next impact.
     rest = law.h * max(1 - points.delays * points.share, 1e-6)
     before = points.delays * points.sunk + (1 - points.delays) * points.depth
-    limit = np.minimum(before - points.delta, 0) / rest
+    most = points.delta + points.delays * (points.deepest - points.delta)
+    limit = np.minimum(before - most, 0) / rest
     below = np.maximum(limit - rate, 0)
     approach = points.rate - np.sum(points.normal * points.drift, axis=1)
-    lasting = 1 - points.beta * smooth_step(-approach / law.slowest_rebound - 1)
+    rested = 1 - points.delays * (1 - smooth_step(1 + points.sunk / points.delta))
+    rests = (1 - smooth_step(-approach / law.slowest_rebound - 1)) * rested
+    lasting = 1 - points.beta * (1 - rests)
     blow = points.impact * missing + points.kappa * below
     return lasting * p + blow, lasting * slope - points.impact * (missing > 0) - points.kappa * (below > 0)
 

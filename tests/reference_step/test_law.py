@@ -43,9 +43,10 @@ def random_points(law, impact):
         kappa=impact,
         sunk=law.delta * x,
         delta=law.delta,
+        deepest=5 * law.delta,
         beta=0.7 if impact > 0 else 0.0,
-        delays=0.0,
-        way=0.6,
+        delays=0.4 if impact > 0 else 0.0,
+        way=0.36 if impact > 0 else 0.6,
     )
 
 

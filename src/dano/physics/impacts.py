@@ -29,7 +29,7 @@ class Patch:
         load: Σ A w [m²].
         arm: [m³, W].
         normal: [m², W].
-        near_load: Σ A w of samples that have sunk in or nearly have [m²].
+        near_load: Σ A w of samples that have sunk in or are nearer than δ [m²].
         near_rate: Their separating speed, weighted by that load [m³/s].
     """
 
@@ -48,6 +48,8 @@ class Impact:
         share: β, share of the contact that is an impact and no lasting contact [1].
         stiffness: κ [Pa s/m], zero where bodies have not sunk in far enough.
         depth: δ [m].
+        deepest: Depth that another part of the body may have at the end of the step, where its impact is left
+            to the next one [m].
         part: Share of the impact that the pair carries, ½ where samples of both bodies do [1].
         delays: Impulses take effect after this share of τ: β where they wait for when bodies meet, 0 where
             they act from the start of the step.
@@ -58,6 +60,7 @@ class Impact:
     share: real
     stiffness: real
     depth: real
+    deepest: real
     part: real
     delays: real
     way: real
@@ -79,21 +82,11 @@ def fading_in(x: real) -> real:
 
 
 @wp.func
-def layer_of(depth: real, share: real) -> real:
-    """Distance [m] within which samples nearly have sunk in: where geometry is taken early, others follow.
-
-    Args:
-        depth: δ [m].
-        share: τ. Towards the end of the step the layer fades out.
-    """
-    return depth * smooth_step(real(4.0) * (ONE - share))
-
-
-@wp.func
-def no_impact(depth: real, h: real) -> Impact:
+def no_impact(depth: real, deepest: real, h: real) -> Impact:
     """That of contact that lasts: nothing happens within the step of length h."""
     impact = Impact()
     impact.depth = depth
+    impact.deepest = deepest
     impact.part = ONE
     impact.rest = h
     return impact
@@ -101,10 +94,13 @@ def no_impact(depth: real, h: real) -> Impact:
 
 @wp.func
 def delayed(impact: Impact, delays: real, share: real, h: real) -> Impact:
-    """The impact with impulses that take effect after so much of the share τ of a step of length h."""
+    """The impact with impulses that take effect after so much of the share τ of a step of length h.
+
+    With τ < 0 that is before its start.
+    """
     found = impact
     found.delays = delays
-    found.way = (ONE - delays) * share
+    found.way = (ONE - delays) * wp.max(share, ZERO)
     found.rest = wp.max(ONE - delays * share, _LATEST) * h
     return found
 
@@ -115,7 +111,6 @@ def with_sample(
     area: real,
     sunk: real,
     depth: real,
-    layer: real,
     approach: real,
     arm: vec3,
     normal: vec3,
@@ -127,7 +122,6 @@ def with_sample(
         area: Of the sample [m²].
         sunk: Its depth where geometry is taken [m].
         depth: δ [m].
-        layer: Within so much of the surface samples nearly have sunk in [m].
         approach: Its separating speed with which the step begins [m/s].
         arm: From the first body's centre of mass [m, W].
         normal: Unit normal [W].
@@ -137,7 +131,7 @@ def with_sample(
     found.load += weight
     found.arm += weight * arm
     found.normal += weight * normal
-    near = area * fading_in((sunk + layer) / depth)
+    near = area * fading_in(sunk / depth + ONE)
     found.near_load += near
     found.near_rate += near * approach
     return found
@@ -177,6 +171,15 @@ def stiffness_of_impact(first: BodyState, second: BodyState, patch: Patch, bounc
 
 
 @wp.func
+def may_rest(impact: Impact, sunk: real) -> real:
+    """From 0 for a sample at a distance of δ to 1 for one that has sunk in: others have not rested before.
+
+    What gets in only after the impact of another part has its own in the next step.
+    """
+    return ONE - impact.delays * (ONE - smooth_step(ONE + sunk / impact.depth))
+
+
+@wp.func
 def impact_goal(
     impact: Impact, restitution: real, bounce: real, approach: real, meets: real, gains: real
 ) -> real:
@@ -201,7 +204,10 @@ def impact_goal(
 
 @wp.func
 def impact_limit(impact: Impact, depth: real, sunk: real) -> real:
-    """Separating speed below which a sample would be deeper than the impact at the end of the step [m/s].
+    """Separating speed below which a sample would be too deep at the end of the step [m/s].
+
+    Deeper than δ where impulses act from the start of the step. Where bodies wait until they meet, another
+    part may get deeper: its impact is the next step's, at the moment at which it met.
 
     Args:
         impact: Of the pair.
@@ -209,4 +215,5 @@ def impact_limit(impact: Impact, depth: real, sunk: real) -> real:
         sunk: Where geometry is taken [m].
     """
     before = impact.delays * sunk + (ONE - impact.delays) * depth
-    return wp.min(before - impact.depth, ZERO) / impact.rest
+    most = impact.depth + impact.delays * (impact.deepest - impact.depth)
+    return wp.min(before - most, ZERO) / impact.rest

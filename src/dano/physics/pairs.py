@@ -190,7 +190,7 @@ def rotation_after(body: BodyState, share: real) -> mat33:
 @wp.func
 def rotation_met(body: BodyState) -> mat33:
     """Rotation of a body when its angular momentum is balanced: its spin at the end is seen from there."""
-    if body.met > ZERO:
+    if body.met != ZERO:
         return matrix(interpolated(body.orientation, body.ahead_falling, body.met))
     return matrix(body.orientation)
 

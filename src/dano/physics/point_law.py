@@ -19,7 +19,7 @@ import warp as wp
 
 from dano.physics.features import LAW
 from dano.physics.friction import following_friction, Friction, friction, friction_with_dual, Slip
-from dano.physics.impacts import fading_in, Impact, impact_goal, impact_limit, is_impact
+from dano.physics.impacts import fading_in, Impact, impact_goal, impact_limit, is_impact, may_rest
 from dano.physics.real import ONE, real, vec3, ZERO
 from dano.physics.samples import Point
 
@@ -203,7 +203,8 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
     loss = wp.where(material.instant > ZERO, ONE, (ONE - squared) / (ONE + squared))
     kept = wp.min(material.hysteresis, loss)
     # What rests on goes on to press where another part of the patch has an impact.
-    hits = impact.share * is_impact(point.approach, material.bounce)
+    rests = (ONE - is_impact(point.approach, material.bounce)) * may_rest(impact, point.sunk)
+    hits = impact.share * (ONE - rests)
     law.stiffness = (ONE - hits) * material.stiffness
     law.depth = point.depth
     law.ahead = material.ahead

@@ -157,6 +157,9 @@ def point_contact(
     point.depth = lead * (rate + gained_on_way) - d.value
     if not presses_back:
         point.sunk = -d.value
+        if lead < ZERO:
+            # What has separated since then was not deeper: it had its impact only after that.
+            point.sunk = wp.min(point.sunk, point.depth)
     point.rate = rate
     point.approach = rate
     point.area = stiffness_share * area

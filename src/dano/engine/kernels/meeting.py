@@ -396,6 +396,7 @@ def meeting(
     sink: real,
     least_way: real,
     slow: real,
+    since: real,
 ) -> Meeting:
     """When bodies have sunk into each other by a depth.
 
@@ -419,6 +420,8 @@ def meeting(
         sink: The depth [m].
         least_way: Bodies that near each other by less in a step [m] are looked at at its end.
         slow: Samples that near the other body by no more in a step [m] do not count.
+        since: Least τ, 0 or less: bodies that are deeper at the start of the step may have met in the one
+            before, which their velocities tell.
     """
     met = Meeting()
     met.critical = -1
@@ -479,12 +482,12 @@ def meeting(
             # Samples that were not asked do not sink in that far.
             met.least = wp.min(least(seen.close), -sink)
         before = share
-        share = wp.max(share + closest, ZERO)
+        share = wp.max(share + closest, since)
         k += 1
         if share >= ONE:
             met.critical = -1
             return met
-        met.critical = wp.where(share > ZERO, critical, -1)
+        met.critical = wp.where(share > since, critical, -1)
         if wp.abs(share - before) <= _MET:
             k = _ADVANCES
     met.share = share

@@ -31,7 +31,6 @@ from dano.physics.features import LANES, TREES
 from dano.physics.impacts import (
     delayed,
     Impact,
-    layer_of,
     no_impact,
     Patch,
     share_of_impact,
@@ -148,7 +147,6 @@ def find_points(
     solid = solid_of_body(scene, world, second)
     body = scene.bodies[world, first]
     stretch = stretch_of(body, index.turning)
-    layer = layer_of(pair.impact_depth, share)
     plane = plane_of(scene, world, solid, index.turning, pose.origin)
     at = begin
     beyond = int(0)
@@ -191,11 +189,12 @@ def find_points(
                             turned_load -= d.value * pair.share * wp.length(pose.vectors * sample.area)
                     if (turned and back) or (not turned and facing > ZERO):
                         point = point_contact(pose, sample, d, index.turning, turned, pair.share, share * h)
-                        if point.depth - h * point.rate > -pair.margin:
-                            if point.sunk > -layer and not turned:
+                        in_patch = not turned and point.sunk > -pair.impact_depth
+                        if point.depth - h * point.rate > -pair.margin or (share < ONE and in_patch):
+                            if in_patch:
                                 load += point.area * wp.max(point.sunk, ZERO)
                                 patch = with_sample(
-                                    patch, point.area, point.sunk, pair.impact_depth, layer, point.approach,
+                                    patch, point.area, point.sunk, pair.impact_depth, point.approach,
                                     point.arm, point.normal,
                                 )  # fmt: skip
                             if at < end:
@@ -206,7 +205,13 @@ def find_points(
 
 @wp.func
 def impact_of(
-    a: BodyState, b: BodyState, patch: Patch, material: Material, found: FoundPair, depth: real, alone: bool
+    a: BodyState,
+    b: BodyState,
+    patch: Patch,
+    material: Material,
+    found: FoundPair,
+    pair: SamplePair,
+    alone: bool,
 ) -> Impact:
     """The impact of a pair; none where it approaches slowly.
 
@@ -215,12 +220,12 @@ def impact_of(
         b: Second body.
         patch: Samples that have sunk in.
         material: Of the contact.
-        found: The pair.
-        depth: δ [m].
+        found: What is found of the pair.
+        pair: The pair.
         alone: Whether one of the bodies is fixed and the other moves freely. Then impulses take effect when
             they meet; between two that move, this would not conserve angular momentum.
     """
-    impact = no_impact(depth, material.timestep)
+    impact = no_impact(pair.impact_depth, pair.deepest, material.timestep)
     if patch.load > ZERO:
         impact.share = share_of_impact(patch, material.bounce)
         if impact.share > ZERO and found.hits > 0:
@@ -263,7 +268,7 @@ def lasting_meeting(
 ) -> Meeting:
     """When bodies in contact that lasts are as deep as geometry is predicted: what presses holds them."""
     return meeting(
-        scene, room, world, lane, falling(a, 0), falling(b, 0), pair, first, second, h, sink, sink, ZERO
+        scene, room, world, lane, falling(a, 0), falling(b, 0), pair, first, second, h, sink, sink, ZERO, ZERO
     )
 
 
@@ -303,7 +308,7 @@ def keep_together(scene: Scene, room: Room, world: int, lane: int, n_found: int)
 def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: int, at: int, end: int) -> int:
     """List the points of a pair that is near, and write the pair into `room.found`.
 
-    Geometry of an impact is taken when bodies are as deep as in one, or at the start where they are deeper.
+    Geometry of an impact is taken when bodies are as deep as in one: in the step before if they are deeper.
     Where they approach slowly, it is that of contact that lasts.
 
     Returns:
@@ -330,7 +335,7 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
     if not lasts:
         met = meeting(
             scene, room, world, lane, falling(a, 1), falling(b, 1), pair, index.first, index.second, h,
-            pair.impact_depth, slow, slow,
+            pair.impact_depth, slow, slow, wp.where(alone, -ONE, ZERO),
         )  # fmt: skip
     if lasts:
         met = lasting_meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, sink)
@@ -348,6 +353,8 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
         speed = wp.length(pose.velocity) + wp.length(pose.spin) * TWO * body.radius
         speed += wp.length(pose.gained_on_way) + wp.length(pose.spin_gained_on_way) * TWO * body.radius
         reach = pair.margin + (ONE - met.share) * h * speed
+        if met.share < ONE:
+            reach = wp.max(reach, pair.impact_depth)
         patch = Patch()
         after, patch, load, turned_load = find_points(
             scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h, reach,
@@ -366,9 +373,9 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
             )  # fmt: skip
         found.patch = patch
         found.com_difference = pose.com_difference
-        found.impact = no_impact(pair.impact_depth, h)
+        found.impact = no_impact(pair.impact_depth, pair.deepest, h)
         if not lasts:
-            found.impact = impact_of(a, b, patch, material, found, pair.impact_depth, alone)
+            found.impact = impact_of(a, b, patch, material, found, pair, alone)
         if not lasts and found.impact.share == ZERO:
             lasts = True
             before = met.share

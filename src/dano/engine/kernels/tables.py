@@ -77,6 +77,7 @@ class SamplePair:
         follows: 1 where points follow the second body, which rolls on the first, else 0.
         sink: Depth up to which predicted geometry is taken [m].
         impact_depth: δ, depth of an impact [m].
+        deepest: Depth that no part gets beyond within a step with an impact of another part [m].
         margin: Distance within which samples count as near [m].
     """
 
@@ -84,6 +85,7 @@ class SamplePair:
     follows: real
     sink: real
     impact_depth: real
+    deepest: real
     margin: real
 
 

@@ -315,7 +315,7 @@ def _pairs(
     """Rows of the pairs whose first body's samples press on the second's solid, and their whole numbers."""
     dtype, h = extents.dtype, scene.timestep
     if not pairs:
-        return jnp.zeros((0, 5), dtype), np.zeros((0, 3), np.int32)
+        return jnp.zeros((0, 6), dtype), np.zeros((0, 3), np.int32)
     both = {(first, second) for first, second, _ in pairs}
     first, second, contact = (np.array(x) for x in zip(*pairs, strict=True))
     size, thickness = jnp.minimum(extents[first, 4:], extents[second, 4:]).T
@@ -327,6 +327,7 @@ def _pairs(
         follows=jnp.asarray([float(smooth[j] and not smooth[i]) for i, j, _ in pairs], dtype),
         sink=jnp.minimum(_SINK * size, _THIN * thickness),
         impact_depth=jnp.minimum(_impact_depths(scene, dtype)[contact], _THIN * thickness),
+        deepest=_THIN * thickness,
         margin=_MARGIN * size + 2 * gravity_step.astype(dtype),
     )
     return rows, np.array(pairs, np.int32)

@@ -14,7 +14,7 @@ import warp as wp
 from dano.engine.kernels.tables import Body, Moment, Push, StateRow
 from dano.physics.features import TREES
 from dano.physics.friction import friction_near, Slip
-from dano.physics.impacts import Impact, layer_of, Patch, share_of_impact, stiffness_of_impact, with_sample
+from dano.physics.impacts import Impact, Patch, share_of_impact, stiffness_of_impact, with_sample
 from dano.physics.momentum import angular_momentum, end_of_impact, gyroscopic_gain, turned_inertia
 from dano.physics.pairs import (
     BodyState,
@@ -171,7 +171,7 @@ def gain_of_row(body: Body, row: StateRow, h: real) -> vec3:
 def rotation_of(body: Body, row: StateRow, met: real, h: real) -> mat33:
     """`rotation_met` of a body's row at the start of a step."""
     q = from_wxyz(row.orientation)
-    if met > ZERO:
+    if met != ZERO:
         return matrix(interpolated(q, turned(q, row.omega + gain_of_row(body, row, h), h), met))
     return matrix(q)
 
@@ -247,9 +247,8 @@ def impact_patch_work(
 ) -> real:
     """⟨bar, what a sample adds to the patch of an impact⟩."""
     point = point_contact(pose, sample, d, turning, False, stiffness_share, share * h)
-    layer = layer_of(depth, share)
     own = Patch()
-    own = with_sample(own, point.area, point.sunk, depth, layer, point.approach, point.arm, point.normal)
+    own = with_sample(own, point.area, point.sunk, depth, point.approach, point.arm, point.normal)
     return (
         bar.load * own.load
         + wp.dot(bar.arm, own.arm)

@@ -29,7 +29,7 @@ from dano.engine.kernels.lanes import total, total6
 from dano.engine.kernels.meeting import posed, solid_of_body
 from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
 from dano.physics.features import TREES, TURNING, UNIONS
-from dano.physics.impacts import Impact, layer_of, Patch
+from dano.physics.impacts import Impact, Patch
 from dano.physics.pairs import (
     BALL,
     BodyState,
@@ -61,6 +61,7 @@ class PairBar:
         timestep: By h.
         sink: By the depth up to which predicted geometry is taken.
         impact_depth: By δ.
+        deepest: By the depth that another part may have.
         twists: By twists and virtual twists, of bodies on joints.
     """
 
@@ -70,6 +71,7 @@ class PairBar:
     timestep: real
     sink: real
     impact_depth: real
+    deepest: real
     twists: Virtual
 
 
@@ -126,7 +128,6 @@ def pull_patch_of_impact(
     pair = scene.pairs[world, found.pair]
     turning = scene.body_index[index.first].turning
     h = scene.timestep[world, 0]
-    layer = layer_of(pair.impact_depth, found.share)
     pose_bar = PairPose()
     share_bar = real(0.0)
     h_bar = real(0.0)
@@ -134,7 +135,7 @@ def pull_patch_of_impact(
     share_of_bar = real(0.0)
     for k in range(found.first, found.end):
         where = room.where[world, k]
-        if room.points[world, k].sunk > -layer and where.presses_back == 0:
+        if room.points[world, k].sunk > -pair.impact_depth and where.presses_back == 0:
             sample = scene.samples[world, where.sample]
             x = position_in_solid(pose, sample.point)
             solid = leaf_at(scene, world, index.second, x)
@@ -210,6 +211,7 @@ def pull_points(
             impact_bar.share += by_impact.share
             impact_bar.stiffness += by_impact.stiffness
             impact_bar.depth += by_impact.depth
+            impact_bar.deepest += by_impact.deepest
             impact_bar.delays += by_impact.delays
             impact_bar.way += by_impact.way
             impact_bar.rest += by_impact.rest
@@ -433,6 +435,7 @@ def pull_pair(
     by_first = BodyState()
     by_second = BodyState()
     impact_bar.depth = total(impact_bar.depth)
+    impact_bar.deepest = total(impact_bar.deepest)
     if found.impact.share > ZERO:
         impact_bar.share = total(impact_bar.share)
         impact_bar.stiffness = total(impact_bar.stiffness)
@@ -440,9 +443,12 @@ def pull_pair(
         if hits:
             # What `delayed` says, with β for `delays` where that is not zero; and of the balance.
             delays = found.impact.delays
-            share_bar += (ONE - delays) * impact_bar.way - delays * h * impact_bar.rest
+            if found.share > ZERO:
+                share_bar += (ONE - delays) * impact_bar.way
+            share_bar -= delays * h * impact_bar.rest
             h_bar += (ONE - delays * found.share) * impact_bar.rest
-            by_delays = impact_bar.delays - found.share * (impact_bar.way + h * impact_bar.rest)
+            by_delays = impact_bar.delays - wp.max(found.share, ZERO) * impact_bar.way
+            by_delays -= found.share * h * impact_bar.rest
             by_delays = total(by_delays) + found.share * moment_bar.met - moment_bar.lead
             if delays > ZERO:
                 impact_bar.share += by_delays
@@ -472,6 +478,7 @@ def pull_pair(
         bar.first = summed_body(bar.first, by_first)
         bar.second = summed_body(bar.second, by_second)
         bar.impact_depth += impact_bar.depth
+        bar.deepest += impact_bar.deepest
         bar.first = falling_bar(bar.first, found.falls)
         bar.second = falling_bar(bar.second, found.falls)
     bar.twists = twists_bar
