@@ -17,7 +17,7 @@ from dano.vision.tracking._placement import Drift, Placement
 CHUNK = 512
 """Rays at once: one size, one compilation."""
 
-SAMPLING = Sampling(48, 12, 2)
+SAMPLING = Sampling(48, 12, 2, grazes=True)
 """Coarser than for pictures to look at: a pixel of a film has noise of its own."""
 
 _SOFT = 3.0
