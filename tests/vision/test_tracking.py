@@ -15,11 +15,10 @@ from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_r
 from dano.scene_file import asset_look
 from dano.vision import adjust_poses, Camera, compose, Film, Item, Light, PosedCamera, track, TrackOptions
 from dano.vision.drawing import GAMMA
-from dano.vision.tracking._edges import common_offset, edge_offset, moved_edge
 from dano.vision.tracking._light import LightFit, ShadowFit
 from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.tracking._refine import Refined
-from dano.vision.tracking._segments import overlap
+from dano.vision.tracking._segments import common_offset, edge_offset, moved_edge, overlap
 from dano.vision.tracking._subject import Subject
 from dano.vision.tracking._sureness import covariance_of, unobservable
 

@@ -114,7 +114,7 @@ class AbstractModel(eqx.Module):
         return edges
 
     def closest(self, rays: Rays, edges: Float[Array, "rays edges"]) -> Float[Array, "rays 1"]:
-        """Where along rays the least gets through, from edges of coarse sections; their middle if anywhere."""
+        """Where along rays the least gets through, from edges of coarse sections."""
         del rays
         return 0.5 * (edges[:, :1] + edges[:, -1:])
 

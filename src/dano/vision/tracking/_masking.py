@@ -9,15 +9,17 @@ from scipy import ndimage
 
 from dano.vision.capture import background_mask, Light, PosedCamera, View
 from dano.vision.drawing import GAMMA
-from dano.vision.tracking._edges import common_offset, edge_offset, moved_edge
 from dano.vision.tracking._film import Film
 from dano.vision.tracking._light import LightFit
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
-from dano.vision.tracking._refine import silhouette, Target, window_of
+from dano.vision.tracking._refine import MASK_NOISE, OWN_MASK_NOISE, silhouette, Target, window_of
 from dano.vision.tracking._segments import (
     bare_brightness,
+    common_offset,
+    edge_offset,
     like_object,
+    moved_edge,
     Palette,
     Place,
     uncommon,
@@ -221,7 +223,8 @@ class Masking:
             target = _near(target, window_of(subject, place, camera, 1.0))
             if self._place is None:
                 return target
-            return target._replace(behind=self._place.seen_in(target.image, target.mask < 0.05))
+            behind = self._place.seen_in(target.image, target.mask < 0.05)
+            return target._replace(behind=behind, mask_noise=MASK_NOISE)
         window = window_of(subject, place, camera, 1.5)
         if window is None:
             return None
@@ -239,8 +242,8 @@ class Masking:
             free[window] &= ~ndimage.binary_dilation(expected > 0.02, iterations=int(np.ceil(blur)))
             behind = self._place.seen_in(image, free & (mask < 0.05))
         # Beside something else it is not known where the object ends.
-        sure = not found.other.any()
-        return Target(camera, image.astype(np.float64), mask, seen, behind, sure)
+        noise = None if found.other.any() else OWN_MASK_NOISE
+        return Target(camera, image.astype(np.float64), mask, seen, behind, noise)
 
     def learn(self, target: Target, window: tuple[slice, slice], shape: np.ndarray) -> None:
         """Take the object's colours in a frame into account, where it surely is."""

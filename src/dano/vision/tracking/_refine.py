@@ -17,10 +17,10 @@ from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._segments import overlap
 from dano.vision.tracking._subject import Seen, Subject
 
-_MASK_NOISE = 0.12
-"""Standard deviation of a mask at the edge, least."""
+MASK_NOISE = 0.12
+"""Standard deviation of a given mask at its edge."""
 
-_OWN_MASK_NOISE = 0.25
+OWN_MASK_NOISE = 0.25
 """Standard deviation of a mask that was made of colours, where it counts beside them: with 0.12 a
 soap that slides is nearer to the truth, with 0.3 one that tumbles."""
 
@@ -46,6 +46,9 @@ _COLOURED_EDGE = 6.0
 """By which variances grow where colours alone say where the object ends: light passes its rim, and its shadow
 lies beside it (measured in rendered films, with their true poses)."""
 
+_FURTHEST = 0.1
+"""Change of a pose [radii, rad] up to which one step says where a picture wants it."""
+
 _SMALL = 0.02
 """Predicted move [pixels] that ends the search."""
 
@@ -59,7 +62,7 @@ class Target(NamedTuple):
         mask: Where the object is, 0 to 1.
         seen: Where nothing else stands in front of it.
         behind: What would be seen there without the object, in this frame's light; None if it is not known.
-        sure: Whether the mask counts beside what is behind.
+        mask_noise: Standard deviation of the mask at its edge; None: it does not count beside what is behind.
     """
 
     camera: PosedCamera
@@ -67,7 +70,7 @@ class Target(NamedTuple):
     mask: Float[np.ndarray, "height width"]
     seen: Bool[np.ndarray, "height width"]
     behind: Float[np.ndarray, "height width 3"] | None = None
-    sure: bool = False
+    mask_noise: float | None = None
 
     def reduced(self, factor: int) -> "Target":
         """The same with so many pixels a side averaged into one."""
@@ -84,7 +87,7 @@ class Target(NamedTuple):
         )
         behind = None if self.behind is None else mean(self.behind)
         seen = mean(self.seen.astype(float)) > 0.99
-        return Target(camera, mean(self.image), mean(self.mask), seen, behind, self.sure)
+        return Target(camera, mean(self.image), mean(self.mask), seen, behind, self.mask_noise)
 
 
 class Refined(NamedTuple):
@@ -227,6 +230,37 @@ def refine(
     return _refined(subject, target, lamps, *best, index)
 
 
+def linearized(
+    subject: Subject,
+    target: Target,
+    place: Placement,
+    lamps: tuple[Light, ...],
+    *,
+    loss: str,
+    rays: int,
+    random: np.random.Generator,
+) -> Refined | None:
+    """What a picture says of a pose near a given one: one step of Gauss and Newton from there.
+
+    Arguments and result are those of `refine`. Its cost, overlap and silhouette are those of the given pose.
+    """
+    window = window_of(subject, place, target.camera)
+    if window is None:
+        return None
+    opacity, _ = silhouette(subject, place, lamps, target.camera, window)
+    index = _chosen(opacity, target, window, rays, random)
+    if len(index) < 24:
+        return None
+    rows = _rows(subject, target, place, lamps, index, loss)
+    found = _refined(subject, target, lamps, place, rows, index)
+    if found is None:
+        return None
+    gradient, hessian = _normal(rows)
+    change = -np.linalg.solve(hessian + 1e-6 * np.trace(hessian) * np.eye(6), gradient)
+    change *= min(1.0, _FURTHEST / max(float(np.abs(change).max()), 1e-9))
+    return found._replace(place=place.moved(change, subject.radius))
+
+
 def _chosen(opacity, target: Target, window, rays: int, random: np.random.Generator) -> np.ndarray:
     """Rows and columns of the pixels that take part: edges first, of the inside as many as fit."""
     mask, seen = target.mask[window], target.seen[window]
@@ -255,7 +289,7 @@ def _rows(subject: Subject, target: Target, place: Placement, lamps, index: np.n
         return _paper_rows(target, seen, index)
     if loss == "photometric" and target.behind is not None:
         return _composed_rows(target, seen, index)
-    sigma = _MASK_NOISE
+    sigma = MASK_NOISE
     residual = ((seen.opacity - target.mask[y, x]) / sigma)[:, None]
     slope = (seen.opacity_slope / sigma)[:, None]
     weight, cost = _robust(np.abs(residual[:, 0]))
@@ -287,10 +321,10 @@ def _composed_rows(target: Target, seen: Seen, index: np.ndarray) -> _Rows:
     # How bright the place is, in the object's shadow above all, is known roughly.
     doubt = _SHADE_DOUBT * (1 - alpha) * behind
     rows = _colour_rows(away, change, inside, np.ones(len(index), bool), doubt)
-    if not target.sure:
+    if target.mask_noise is None:
         return rows
-    residual = (seen.opacity - target.mask[y, x]) / _OWN_MASK_NOISE
-    slope = seen.opacity_slope / _OWN_MASK_NOISE
+    residual = (seen.opacity - target.mask[y, x]) / target.mask_noise
+    slope = seen.opacity_slope / target.mask_noise
     weight, cost = _robust(np.abs(residual))
     return _Rows(
         np.concatenate([rows.residual, residual[:, None]], axis=1),
@@ -358,9 +392,9 @@ def _paper_rows(target: Target, seen: Seen, index: np.ndarray) -> _Rows:
         return ndimage.gaussian_filter(grid, _BLUR, mode="constant")[y, x]
 
     away = seen.opacity - target.mask[index[:, 0], index[:, 1]]
-    residual = np.stack([away, blurred(away)], axis=1) / _MASK_NOISE
+    residual = np.stack([away, blurred(away)], axis=1) / MASK_NOISE
     slopes = np.stack([blurred(column) for column in seen.opacity_slope.T], axis=1)
-    slope = np.stack([seen.opacity_slope, slopes], axis=1) / _MASK_NOISE
+    slope = np.stack([seen.opacity_slope, slopes], axis=1) / MASK_NOISE
     cost = float(0.5 * np.mean(np.sum(residual**2, axis=1)))
     return _Rows(residual, slope, np.ones_like(residual), cost, float("nan"))
 

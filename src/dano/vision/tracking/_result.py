@@ -10,10 +10,17 @@ from dano.vision.capture import Light
 from dano.vision.tracking._film import Film
 from dano.vision.tracking._refine import Refined
 from dano.vision.tracking._subject import Subject
-from dano.vision.tracking._sureness import covariance_of, Poses, steadied, unobservable
+from dano.vision.tracking._sureness import covariance_of, shared_covariance, unobservable
+from dano.vision.trajectory import Smoothed
 
 _CLEAR = 1.05
 """Ratio of how starts fit up to which a message says so."""
+
+_BELIEVED = 0.3
+"""Share of what a frame says below which its pose is one of the others."""
+
+_UNTRUSTED = 6.0
+"""How many times larger than pixels say errors may be for their sizes to be trusted."""
 
 TRACKED, LOST, OUTSIDE, HIDDEN = "tracked", "lost", "outside", "hidden"
 """What became of a frame."""
@@ -82,6 +89,7 @@ def tracked(
     notes: Sequence[str] = (),
     ambiguity: float = np.inf,
     seconds: Sequence[float] = (),
+    motion: Smoothed | None = None,
 ) -> Tracked:
     """Poses of a film put together.
 
@@ -95,6 +103,7 @@ def tracked(
         notes: Sentences about masks.
         ambiguity: As in `Tracked`.
         seconds: Time of each frame [s].
+        motion: Of all frames together; None: each frame has its own pose.
     """
     n = len(found)
     position, orientation = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
@@ -105,14 +114,21 @@ def tracked(
         if one is not None:
             position[i], orientation[i] = one.place.position, one.place.orientation
             covariance[i] = covariance_of(one, subject, eye)
+            if motion is not None:
+                position[i], orientation[i] = motion.poses.position[i], motion.poses.orientation[i]
+                shared = shared_covariance(subject.middle(one.place), subject, eye)
+                covariance[i] = motion.poses.covariance[i] + shared
             quality[i], colour[i] = one.overlap, one.colour_error
             overlays[i] = Overlay(one.window, one.silhouette)
     known = [one for one in found if one is not None]
-    poses, moved = steadied(film.times, Poses(position, orientation, covariance), subject.size)
-    texts = [*film.notes, *notes, *unobservable(known, subject), *_messages(film, status, moved, ambiguity)]
+    texts = [*film.notes, *notes, *unobservable(known, subject), *_messages(film, status, ambiguity)]
+    if motion is not None:
+        texts += _of_motion(film, motion)
     return Tracked(
         film.times,
-        *poses,
+        position,
+        orientation,
+        covariance,
         tuple(status),
         quality,
         colour,
@@ -124,8 +140,8 @@ def tracked(
     )
 
 
-def _messages(film: Film, status: Sequence[str], moved: np.ndarray, ambiguity: float) -> list[str]:
-    """What a user should know of frames without a pose, or with one that was moved, and of the start."""
+def _messages(film: Film, status: Sequence[str], ambiguity: float) -> list[str]:
+    """What a user should know of frames without a pose, and of the start."""
     texts = []
     for kind, words in (
         (LOST, "the object was lost (its mask does not fit the silhouette)"),
@@ -135,16 +151,28 @@ def _messages(film: Film, status: Sequence[str], moved: np.ndarray, ambiguity: f
         names = [n for n, s in zip(film.names, status, strict=True) if s == kind]
         if names:
             texts.append(f"{words} in {len(names)} frames: {_first_of(names)}")
-    if moved.any():
-        names = [film.names[i] for i in np.flatnonzero(moved)]
-        texts.append(
-            f"{len(names)} frames show so little of the object that their poses are smoothed with the frames"
-            f" around them: {_first_of(names)}"
-        )
     if ambiguity < _CLEAR:
         texts.append(
             "another orientation explains the first frame nearly as well: the object may be turned by a"
             " symmetry of its shape; give start if it is"
+        )
+    return texts
+
+
+def _of_motion(film: Film, motion: Smoothed) -> list[str]:
+    """What a user should know of frames that are not believed, and of how far errors can be trusted."""
+    texts = []
+    leaning = np.flatnonzero(motion.weight < _BELIEVED)
+    if len(leaning):
+        names = [film.names[i] for i in leaning]
+        texts.append(
+            f"{len(names)} frames disagree with the motion of the others, on which their poses lean:"
+            f" {_first_of(names)}"
+        )
+    if motion.inflation > _UNTRUSTED**2:
+        texts.append(
+            f"errors are not trustworthy: frames disagree by {np.sqrt(motion.inflation):.0f} times what their"
+            " pixels say; masks, camera or look are wrong by more than noise"
         )
     return texts
 

@@ -1,5 +1,6 @@
 """What is tracked, as the renderer sees it, and how what is seen changes with its pose."""
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from dano.vision.capture import AbstractCamera, Light
 from dano.vision.drawing import Part, through
 from dano.vision.radiance import LearnedField, Sampling, SurfaceModel
 from dano.vision.tracking._placement import Drift, Placement
+from dano.vision.trajectory import Solid, solid_of
 
 CHUNK = 512
 """Rays at once: one size, one compilation."""
@@ -63,7 +65,19 @@ class Subject:
         self.size = float((upper - lower).max())
         self.lit = bool(field.model.appearance.lit)
         self._model = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), field.model)
+        self._field = field
         self._drawn = float(field.drawn_sharpness)
+
+    @functools.cached_property
+    def solid(self) -> Solid:
+        """What lies and slides: its hull, and its centre of mass if it is equally dense."""
+        values, box = np.asarray(self._field.model.distances), self._field.model.box
+        inside = np.argwhere(values < 0)
+        slope = np.stack(np.gradient(values, box.spacing), axis=-1)
+        skin = np.abs(values) < box.spacing
+        slope = slope[skin] / np.maximum(np.sum(slope[skin] ** 2, axis=1, keepdims=True), 1e-9)
+        points = box.origin + box.spacing * np.argwhere(skin) - values[skin][:, None] * slope
+        return solid_of(points, box.origin + box.spacing * inside.mean(axis=0))
 
     def middle(self, place: Placement) -> Float[np.ndarray, "3"]:
         """The ball's centre [m, W]."""

@@ -37,6 +37,7 @@ from dano.vision.tracking._search import (
     unlikeness,
 )
 from dano.vision.tracking._subject import CHUNK, Subject
+from dano.vision.tracking._whole import Whole
 
 _COARSE = 24
 """Size of the object [pixels] at the coarsest level of the pyramid."""
@@ -474,14 +475,19 @@ class _Walk:
                 f"video: the object was found in none of {len(self._found)} frames: it must be in the"
                 " picture, of the size that camera and object say, and masks must show it (see docs/track.md)"
             )
+        began = time.perf_counter()
+        whole = Whole(self._film, self._subject, self._camera, self._options, self._found)
+        self._light = whole.look(self._masking, self._light, self._random)
+        share = (time.perf_counter() - began) / len(self._found)
         return tracked(
             self._film,
             self._subject,
             self._camera.position,
-            self._found,
+            whole.found,
             self._status,
             self._light.lamps,
             notes=self._masking.notes,
             ambiguity=self._ambiguity,
-            seconds=self._seconds,
+            seconds=[share + one for one in self._seconds],
+            motion=whole.motion,
         )

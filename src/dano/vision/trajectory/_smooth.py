@@ -51,6 +51,15 @@ _PASSES = 16
 _ENDED = 1e-6
 """Largest change [sizes, rad] that ends them."""
 
+_CALIBRATIONS = 4
+"""Motions that are found, each with covariances of frames as the one before tells them."""
+
+_LEAST_FREE = 1.0
+"""Least number of six that a frame is free in from its own motion (convention)."""
+
+_MEDIAN = 0.8914
+"""Of χ² with six degrees of freedom, over six."""
+
 _EPSILON = 1e-6
 """Step of differences [sizes, rad]."""
 
@@ -63,12 +72,14 @@ class Smoothed(NamedTuple):
         weight: How much of what the frame says was believed, 0 to 1, shape (T,); NaN where there is no pose.
         supported: Frames in which the object lies or slides on a face, shape (T,).
         away: What frames by themselves say less the motion: in sizes [W] and [rad, F], shape (T, 6).
+        inflation: Factor by which variances of frames were too small.
     """
 
     poses: Poses
     weight: Float[np.ndarray, " T"]
     supported: Bool[np.ndarray, " T"]
     away: Float[np.ndarray, "T 6"]
+    inflation: float
 
 
 class Scenery(NamedTuple):
@@ -96,15 +107,22 @@ def smoothed(times: Float[np.ndarray, " T"], poses: Poses, scenery: Scenery) -> 
     n, rows = len(times), np.flatnonzero(poses.known)
     weight, supported, away = np.full(n, np.nan), np.zeros(n, bool), np.full((n, 6), np.nan)
     if not len(rows):
-        return Smoothed(poses, weight, supported, away)
+        return Smoothed(poses, weight, supported, away, 1.0)
     resting = _at_rest(scenery.still, rows)
-    problem = _Problem(times[rows], poses.taken(rows), scenery.solid, resting)
-    found = problem.solved([])
+    seen = poses.taken(rows)
+    # Frames of a thing that lies still are one picture with much the same errors: together they say as much.
+    together = _together(resting, len(rows))
+    seen = seen._replace(covariance=seen.covariance * together[:, None, None])
     runs: list[_Run] = []
-    if scenery.table is not None:
-        # Which face it lies on is seen better once frames agree on a motion.
-        runs = _runs(found, scenery.solid, scenery.table)
-        found = problem.solved(runs, scenery.table)
+    inflation = 1.0
+    for k in range(_CALIBRATIONS):
+        more = seen._replace(covariance=inflation * seen.covariance)
+        problem = _Problem(times[rows], more, scenery.solid, resting)
+        found = problem.solved([] if k == 0 else runs, scenery.table or 0.0)
+        if k == 0 and scenery.table is not None:
+            # Which face it lies on is seen better once frames agree on a motion.
+            runs = _runs(found, scenery.solid, scenery.table)
+        inflation = max(1.0, inflation * _disagreement(more, found, together))
     result = Poses(*(x.copy() for x in poses))
     for whole, part in zip(result, found, strict=True):
         whole[rows] = part
@@ -112,8 +130,27 @@ def smoothed(times: Float[np.ndarray, " T"], poses: Poses, scenery: Scenery) -> 
     for run in runs:
         supported[rows[run.rows]] = True
     unit = np.repeat([scenery.solid.size, 1.0], 3)
-    away[rows] = difference(found, poses.taken(rows)) / unit
-    return Smoothed(result, weight, supported, away)
+    away[rows] = difference(found, seen) / unit
+    return Smoothed(result, weight, supported, away, inflation)
+
+
+def _together(resting: np.ndarray, n: int) -> Float[np.ndarray, " n"]:
+    """How many frames each one lies still with, itself included."""
+    number = np.cumsum(~np.isin(np.arange(n), resting[:, 1]))
+    return np.bincount(number)[number].astype(float)
+
+
+def _disagreement(seen: Poses, found: Poses, together: np.ndarray) -> float:
+    """Variance of what frames are off by from their motion, over what their covariances say."""
+    away = difference(found, seen)
+    inverse = np.linalg.inv(seen.covariance)
+    square = np.einsum("ni,nij,nj->n", away, inverse, away)
+    # What a frame itself contributed to the motion does not show.
+    free = 6 - np.einsum("nij,nji->n", inverse, found.covariance)
+    ratio = square / np.maximum(free, _LEAST_FREE)
+    order = np.argsort(ratio)
+    share = np.cumsum((1 / together)[order])
+    return float(ratio[order][np.searchsorted(share, 0.5 * share[-1])] / _MEDIAN)
 
 
 def difference(first: Poses, second: Poses) -> Float[np.ndarray, "n 6"]:
