@@ -26,7 +26,7 @@ _UNEVEN = 0.2
 _FLOW_BLUR = 1.0
 """Standard deviation of the filter of pictures whose displacement is measured [pixels]."""
 
-_UNMOVED = 0.1
+_UNMOVED = 0.15
 """Displacement up to which a thing lies still [pixels]: a film of it is exact to a few hundredths."""
 
 

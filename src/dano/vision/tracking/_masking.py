@@ -17,6 +17,7 @@ from dano.vision.tracking._refine import MASK_NOISE, OWN_MASK_NOISE, silhouette,
 from dano.vision.tracking._segments import (
     bare_brightness,
     common_offset,
+    differs,
     edge_offset,
     like_object,
     moved_edge,
@@ -243,7 +244,11 @@ class Masking:
             behind = self._place.seen_in(image, free & (mask < 0.05))
         # Beside something else it is not known where the object ends.
         noise = None if found.other.any() else OWN_MASK_NOISE
-        return Target(camera, image.astype(np.float64), mask, seen, behind, noise)
+        telling = None
+        if behind is not None:
+            telling = np.zeros(mask.shape, bool)
+            telling[window] = differs(expected, colour, behind[window])
+        return Target(camera, image.astype(np.float64), mask, seen, behind, noise, telling)
 
     def learn(self, target: Target, window: tuple[slice, slice], shape: np.ndarray) -> None:
         """Take the object's colours in a frame into account, where it surely is."""

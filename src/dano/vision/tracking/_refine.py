@@ -27,8 +27,11 @@ soap that slides is nearer to the truth, with 0.3 one that tumbles."""
 _COLOUR_NOISE = 0.025
 """Standard deviation of a colour, in sRGB, least: a learned look is not better."""
 
-_SHADE_DOUBT = 0.3
+_SHADE_DOUBT = 0.5
 """Standard deviation of how bright a place is that the object's shadow may reach, as a share."""
+
+_LOOK_DOUBT = 0.1
+"""Standard deviation of how bright a part of the object is, as a share: its light is known roughly."""
 
 _OUTLIER = 3.0
 """Standard deviations from which residuals lose weight (Geman and McClure)."""
@@ -63,6 +66,7 @@ class Target(NamedTuple):
         seen: Where nothing else stands in front of it.
         behind: What would be seen there without the object, in this frame's light; None if it is not known.
         mask_noise: Standard deviation of the mask at its edge; None: it does not count beside what is behind.
+        telling: Where it counts then: the object is not alike to what is behind it; None: everywhere.
     """
 
     camera: PosedCamera
@@ -71,6 +75,7 @@ class Target(NamedTuple):
     seen: Bool[np.ndarray, "height width"]
     behind: Float[np.ndarray, "height width 3"] | None = None
     mask_noise: float | None = None
+    telling: Bool[np.ndarray, "height width"] | None = None
 
     def reduced(self, factor: int) -> "Target":
         """The same with so many pixels a side averaged into one."""
@@ -87,7 +92,8 @@ class Target(NamedTuple):
         )
         behind = None if self.behind is None else mean(self.behind)
         seen = mean(self.seen.astype(float)) > 0.99
-        return Target(camera, mean(self.image), mean(self.mask), seen, behind, self.mask_noise)
+        telling = None if self.telling is None else mean(self.telling.astype(float)) > 0.5
+        return Target(camera, mean(self.image), mean(self.mask), seen, behind, self.mask_noise, telling)
 
 
 class Refined(NamedTuple):
@@ -318,13 +324,15 @@ def _composed_rows(target: Target, seen: Seen, index: np.ndarray) -> _Rows:
     away = seen.colour + (1 - alpha) * behind - target.image[y, x]
     change = seen.colour_slope - behind[..., None] * seen.opacity_slope[:, None]
     inside = (seen.opacity > 0.9) & (target.mask[y, x] > 0.5)
-    # How bright the place is, in the object's shadow above all, is known roughly.
-    doubt = _SHADE_DOUBT * (1 - alpha) * behind
-    rows = _colour_rows(away, change, inside, np.ones(len(index), bool), doubt)
+    common = np.stack([_SHADE_DOUBT * (1 - alpha) * behind, _LOOK_DOUBT * seen.colour], axis=2)
+    rows = _colour_rows(*_without_common(away, change, common, index), inside, np.ones(len(index), bool))
     if target.mask_noise is None:
         return rows
     residual = (seen.opacity - target.mask[y, x]) / target.mask_noise
     slope = seen.opacity_slope / target.mask_noise
+    if target.telling is not None:
+        told = target.telling[y, x]
+        residual, slope = np.where(told, residual, 0), np.where(told[:, None], slope, 0)
     weight, cost = _robust(np.abs(residual))
     return _Rows(
         np.concatenate([rows.residual, residual[:, None]], axis=1),
@@ -335,12 +343,49 @@ def _composed_rows(target: Target, seen: Seen, index: np.ndarray) -> _Rows:
     )
 
 
+def _without_common(
+    away: np.ndarray, change: np.ndarray, common: np.ndarray, index: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Differences of colours and their derivatives without what neighbouring pixels share.
+
+    A shadow beside the object, or a shade on it, is wrong for a whole tile of pixels, by a share that is not
+    known. The likeliest shares are subtracted, which is least squares with two more unknowns for each tile.
+    Otherwise many pixels that are wrong together would pull like as many that are right.
+
+    Args:
+        away: Differences in sRGB (n, 3).
+        change: Their derivatives (n, 3, 6).
+        common: Differences that are expected in a tile with variance one (n, 3, m).
+        index: Rows and columns of the pixels (n, 2).
+    """
+    tile = _tiles(index)
+    both = np.concatenate([away[..., None], change], axis=2)
+    noise = _COLOUR_NOISE
+    rest = both
+    for _ in range(2):
+        weight, _ = _robust(np.sqrt(np.mean(rest[..., 0] ** 2, axis=1)) / noise)
+        weight = weight / (3 * noise**2)
+        square = np.zeros((tile.max() + 1, common.shape[2], common.shape[2])) + np.eye(common.shape[2])
+        mixed = np.zeros((tile.max() + 1, common.shape[2], both.shape[2]))
+        np.add.at(square, tile, np.einsum("n,nci,ncj->nij", weight, common, common))
+        np.add.at(mixed, tile, np.einsum("n,nci,ncj->nij", weight, common, both))
+        rest = both - np.einsum("nci,nij->ncj", common, np.linalg.solve(square, mixed)[tile])
+        usual = float(np.median(np.sqrt(np.mean(rest[..., 0] ** 2, axis=1))))
+        noise = max(1.2 * usual, _COLOUR_NOISE)
+    return rest[..., 0], rest[..., 1:]
+
+
+def _tiles(index: np.ndarray) -> np.ndarray:
+    """Number of the tile of each pixel."""
+    tiles = index // _TILE
+    return np.unique(tiles[:, 0] * 100003 + tiles[:, 1], return_inverse=True)[1]
+
+
 def _colour_rows(
     away: np.ndarray,
     change: np.ndarray,
     inside: np.ndarray,
     counted: np.ndarray,
-    doubt: np.ndarray | None = None,
 ) -> _Rows:
     """Rows of differences of colours over their noise, which pixels inside the object tell.
 
@@ -349,18 +394,10 @@ def _colour_rows(
         change: Their derivatives (n, 3, 6).
         inside: Pixels that show the object and nothing else.
         counted: Pixels that count.
-        doubt: Differences (n, 3) that are expected with variance one beside the noise, e.g. of brightness.
     """
     lengths = np.sqrt(np.mean(away**2, axis=1))
     error = float(np.median(lengths[inside])) if inside.any() else float("nan")
     noise = max(1.2 * error, _COLOUR_NOISE) if inside.any() else 1.0
-    if doubt is not None:
-        # (σ² I + d dᵀ)^(−1/2) σ: what lies along d counts less.
-        square = np.sum(doubt**2, axis=1)
-        less = (1 - 1 / np.sqrt(1 + square / noise**2)) / np.maximum(square, 1e-12)
-        away = away - (less * np.sum(doubt * away, axis=1))[:, None] * doubt
-        change = change - (less[:, None] * np.einsum("nc,nck->nk", doubt, change))[:, None] * doubt[..., None]
-        lengths = np.sqrt(np.mean(away**2, axis=1))
     weight, cost = _robust(np.where(counted, lengths / noise, 0))
     # Costs of different noise can be compared only with what the noise itself costs.
     total = float(np.mean(np.where(counted, cost + np.log(noise / _COLOUR_NOISE), 0)))
@@ -426,8 +463,7 @@ def _refined(
 
 def _covariance(rows: _Rows, hessian: np.ndarray, index: np.ndarray) -> np.ndarray:
     """H⁻¹ (Σ gₜ gₜᵀ) H⁻¹ over tiles of pixels t with correlated errors (Huber's sandwich, clustered)."""
-    tiles = index // _TILE
-    _, tile = np.unique(tiles[:, 0] * 100003 + tiles[:, 1], return_inverse=True)
+    tile = _tiles(index)
     each = np.einsum("nki,nk->ni", rows.weight[..., None] * rows.slope, rows.residual)
     sums = np.zeros((tile.max() + 1, 6))
     np.add.at(sums, tile, each)

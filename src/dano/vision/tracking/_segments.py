@@ -59,6 +59,12 @@ of the bunny itself more than 1 in 5 % of its pixels."""
 _LOOK_NOISE = 0.07
 """Standard deviation of a pixel of the object from how it is rendered, in sRGB: `_UNLIKE` is more."""
 
+_LOOK_REACH = 2.0
+"""Standard deviation of the filter that carries colours of an object beyond its edge [pixels]."""
+
+_UNALIKE = 0.1
+"""Difference of colours [sRGB] from which a mask that is made of them is believed: some 1.5 `_LOOK_NOISE`."""
+
 _PIECE = 0.1
 """Share of the largest part's area from which another one belongs to an object that something cuts."""
 
@@ -279,6 +285,26 @@ def like_object(
     if not other.any():
         return Segments(_main(ratio), other)
     return Segments(_main(np.where(other, -12, ratio), _PIECE), other)
+
+
+def differs(
+    expected: Float[np.ndarray, "height width"],
+    colour: Float[np.ndarray, "height width 3"],
+    behind: Float[np.ndarray, "height width 3"],
+) -> Bool[np.ndarray, "height width"]:
+    """Where an object differs from the place behind it, lit or in a shadow: there masks are right.
+
+    Where they are alike a mask has a bite. Bites are on one side only, and many: an object seems smaller.
+
+    Args:
+        expected: Rendered silhouette.
+        colour: Rendered over black.
+        behind: The place.
+    """
+    share = ndimage.gaussian_filter(expected, _LOOK_REACH) + 1e-3
+    look = ndimage.gaussian_filter(colour, (_LOOK_REACH, _LOOK_REACH, 0)) / share[..., None]
+    apart = [np.sqrt(np.mean((look - shade * behind) ** 2, axis=2)) for shade in _SHADES]
+    return np.min(apart, axis=0) > _UNALIKE
 
 
 def _as_rendered(
