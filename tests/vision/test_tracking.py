@@ -287,6 +287,25 @@ def test_a_film_is_tracked_and_its_end_lies_outside(bunny, camera, filmed):
     assert overlap(masks[2][outline.window], outline.opacity) > 0.93
 
 
+def test_frames_in_which_it_lies_still_share_one_pose(bunny, camera, filmed):
+    rng = np.random.default_rng(7)
+    position, orientation, frames, masks = filmed
+    rows = [0, 1, 2, 2, 2, 2]
+    noisy = [
+        np.rint(np.clip(frames[i] + 4 * rng.normal(size=frames[i].shape), 0, 255)).astype(np.uint8)
+        for i in rows
+    ]
+    # Masks that are wrong in another place in each frame.
+    given = [np.roll(masks[i], k % 2, axis=k // 2 % 2) for k, i in enumerate(rows)]
+    start = position[0], orientation[0]
+    found = track(film_of(noisy, given), bunny, camera, ROUGH, start=start)
+    assert np.ptp(found.position[2:], axis=0).max() < 2e-3 * 0.12
+    for q in found.orientation[3:]:
+        assert np.linalg.norm(turn_of(found.orientation[2], q)) < 2e-3
+    shift, _ = errors(found, position[rows], orientation[rows], slice(None))
+    assert np.median(shift) < 0.02
+
+
 def turn_of(p, q):
     return quat_log(quat_multiply(quat_conjugate(p), q))
 

@@ -39,7 +39,7 @@ class Overlay(NamedTuple):
 
 
 class Tracked(NamedTuple):
-    """Poses of an object in the frames of a film. What was not seen is NaN.
+    """Poses of an object in the frames of a film, as one motion. What was not seen is NaN.
 
     Attributes:
         times: Of the frames [s], shape (T,).
