@@ -141,8 +141,10 @@ def fine_frame(field, camera, position, orientation, back, finer=4):
 @pytest.mark.parametrize("name", ["trained_bunny", "trained_soap"])
 def test_silhouettes_are_as_large_as_the_object(camera, name):
     field = asset_look(name)
+    assert field is not None
     subject, place = Subject(field), Placement(np.zeros(3), quat_exp(np.array([0.3, -0.2, 0.8])))
     window = window_of(subject, place, camera)
+    assert window is not None
     shape, _ = silhouette(subject, place, unlit(), camera, window)
     _, mask = fine_frame(field, camera, place.position, place.orientation, np.zeros((*SIZE[::-1], 3)), 6)
     # Rays that graze came out too clear by 0.1 to 0.2 pixels, which is 0.5 to 1.5 % of the area here.
@@ -170,6 +172,7 @@ def test_losses_agree_on_the_size(bunny, camera):
         one = refine(
             subject, target, begin, lamps, loss=loss, steps=12, rays=4000, random=np.random.default_rng(0)
         )
+        assert one is not None
         found[label] = float((subject.middle(one.place) - subject.middle(true)) @ ray) / subject.size
     assert max(found.values()) - min(found.values()) < 3e-3, found
     assert max(map(abs, found.values())) < 4e-3, found

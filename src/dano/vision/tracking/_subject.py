@@ -73,7 +73,7 @@ class Subject:
         """What lies and slides: its hull, and its centre of mass if it is equally dense."""
         values, box = np.asarray(self._field.model.distances), self._field.model.box
         inside = np.argwhere(values < 0)
-        slope = np.stack(np.gradient(values, box.spacing), axis=-1)
+        slope = np.stack([np.gradient(values, box.spacing, axis=k) for k in range(3)], axis=-1)
         skin = np.abs(values) < box.spacing
         slope = slope[skin] / np.maximum(np.sum(slope[skin] ** 2, axis=1, keepdims=True), 1e-9)
         points = box.origin + box.spacing * np.argwhere(skin) - values[skin][:, None] * slope
