@@ -51,7 +51,7 @@ _PASSES = 16
 _ENDED = 1e-6
 """Largest change [sizes, rad] that ends them."""
 
-_CALIBRATIONS = 4
+_CALIBRATIONS = 3
 """Motions that are found, each with covariances of frames as the one before tells them."""
 
 _LEAST_FREE = 1.0
@@ -113,16 +113,15 @@ def smoothed(times: Float[np.ndarray, " T"], poses: Poses, scenery: Scenery) -> 
     # Frames of a thing that lies still are one picture with much the same errors: together they say as much.
     together = _together(resting, len(rows))
     seen = seen._replace(covariance=seen.covariance * together[:, None, None])
-    runs: list[_Run] = []
+    problem = _Problem(times[rows], seen, scenery.solid, resting)
+    found = problem.solved(seen, [])
+    # Which face it lies on is seen better once frames agree on a motion.
+    runs = [] if scenery.table is None else _runs(found, scenery.solid, scenery.table)
     inflation = 1.0
-    for k in range(_CALIBRATIONS):
+    for _ in range(_CALIBRATIONS):
+        inflation = max(1.0, inflation * _disagreement(seen, found, together, inflation))
         more = seen._replace(covariance=inflation * seen.covariance)
-        problem = _Problem(times[rows], more, scenery.solid, resting)
-        found = problem.solved([] if k == 0 else runs, scenery.table or 0.0)
-        if k == 0 and scenery.table is not None:
-            # Which face it lies on is seen better once frames agree on a motion.
-            runs = _runs(found, scenery.solid, scenery.table)
-        inflation = max(1.0, inflation * _disagreement(more, found, together))
+        found = problem.solved(more, runs, scenery.table or 0.0)
     result = Poses(*(x.copy() for x in poses))
     for whole, part in zip(result, found, strict=True):
         whole[rows] = part
@@ -140,10 +139,10 @@ def _together(resting: np.ndarray, n: int) -> Float[np.ndarray, " n"]:
     return np.bincount(number)[number].astype(float)
 
 
-def _disagreement(seen: Poses, found: Poses, together: np.ndarray) -> float:
-    """Variance of what frames are off by from their motion, over what their covariances say."""
+def _disagreement(seen: Poses, found: Poses, together: np.ndarray, inflation: float) -> float:
+    """Variance of what frames are off by from their motion, over what their inflated covariances say."""
     away = difference(found, seen)
-    inverse = np.linalg.inv(seen.covariance)
+    inverse = np.linalg.inv(inflation * seen.covariance)
     square = np.einsum("ni,nij,nj->n", away, inverse, away)
     # What a frame itself contributed to the motion does not show.
     free = 6 - np.einsum("nij,nji->n", inverse, found.covariance)
@@ -185,16 +184,20 @@ def _at_rest(still: np.ndarray, rows: np.ndarray) -> Int[np.ndarray, "m 2"]:
 def _runs(poses: Poses, solid: Solid, table: float) -> list[_Run]:
     """Where an object lies on a face, by its height above the table and its tilt."""
     n, runs = len(poses.position), []
+    if not solid.faces:
+        return []
     scaled = poses.covariance / np.outer(*[np.repeat([solid.size, 1.0], 3)] * 2)
     high = _ABOVE + 2 * np.sqrt(scaled[:, 2, 2])
     tilted = _TILTED + 2 * np.sqrt(np.linalg.eigvalsh(scaled[:, 3:, 3:])[:, -1])
+    tilts = []
     for face in solid.faces:
         turned = quat_rotate(poses.orientation, np.broadcast_to(face.down, (n, 3)))
-        height = (
-            poses.position[:, 2] + quat_rotate(poses.orientation, np.broadcast_to(face.point, (n, 3)))[:, 2]
-        )
-        tilt = np.arccos(np.clip(-turned[:, 2], -1, 1))
-        lies = (np.abs(height - table) < high * solid.size) & (tilt < tilted)
+        tilts.append(np.arccos(np.clip(-turned[:, 2], -1, 1)))
+    nearest = np.argmin(tilts, axis=0)
+    for k, face in enumerate(solid.faces):
+        point = quat_rotate(poses.orientation, np.broadcast_to(face.point, (n, 3)))
+        height = (poses.position + point)[:, 2]
+        lies = (np.abs(height - table) < high * solid.size) & (tilts[k] < tilted) & (nearest == k)
         edges = np.flatnonzero(np.diff(np.concatenate([[False], lies, [False]]).astype(int)))
         runs += [_Run(face, np.arange(a, b)) for a, b in edges.reshape(-1, 2) if b - a >= _SHORTEST]
     return runs
@@ -205,9 +208,8 @@ class _Problem:
 
     def __init__(self, times: np.ndarray, poses: Poses, solid: Solid, resting: np.ndarray):
         self._poses, self._solid, self._resting = poses, solid, resting
-        unit = np.repeat([solid.size, 1.0], 3)
-        self._roots = np.linalg.inv(np.linalg.cholesky(poses.covariance / np.outer(unit, unit)))
-        self._unit = unit
+        self._unit = np.repeat([solid.size, 1.0], 3)
+        self._roots = np.zeros((len(times), 6, 6))
         n = len(times)
         self._fours = np.arange(max(n - 3, 0))[:, None] + np.arange(4)
         self._rates = _third_differences(times[self._fours])
@@ -216,13 +218,14 @@ class _Problem:
         self._runs: list[_Run] = []
         self._table = 0.0
 
-    def solved(self, runs: list[_Run], table: float = 0.0) -> Poses:
-        """Poses at the minimum, with their covariance, given runs of frames on a table.
+    def solved(self, poses: Poses, runs: list[_Run], table: float = 0.0) -> Poses:
+        """Poses at the minimum, with their covariance, given those of frames and runs of frames on a table.
 
         Single wrong frames and blows both break a steady motion. At first differences keep their weight,
         which finds the wrong frames. Then each stretch that is not believed is tried as its frames have it.
         """
-        self._runs, self._table = runs, table
+        self._poses, self._runs, self._table = poses, runs, table
+        self._roots = np.linalg.inv(np.linalg.cholesky(poses.covariance / np.outer(self._unit, self._unit)))
         best = self._descended(self._poses, np.zeros((len(runs), 3)), _TOLERANT)
         doubted = np.flatnonzero(np.diff(np.concatenate([[0], best.weight < _DOUBTED, [0]]).astype(int)))
         for first, last in doubted.reshape(-1, 2):
@@ -239,18 +242,17 @@ class _Problem:
 
     def _descended(self, poses: Poses, shared: np.ndarray, tolerance: float) -> "_Minimum":
         """Gauss and Newton's steps from poses; `tolerance` is where differences lose weight at first."""
-        n = len(poses.position)
-        for k in range(_PASSES):
-            self._tolerance = max(tolerance / 2**k, 1.0)
+        n, k = len(poses.position), 0
+        while True:
+            self._tolerance, k = max(tolerance / 2**k, 1.0), k + 1
             jacobian, residual = self._system(poses, shared)
             inverse = splu((jacobian.T @ jacobian).tocsc())
             found = _Minimum(poses, shared, self._weight, self._cost, inverse)
             step = -inverse.solve(jacobian.T @ residual)
             poses = poses.moved(step[: 6 * n].reshape(n, 6), self._solid.size)
             shared = shared + step[6 * n :].reshape(-1, 3)
-            if self._tolerance == 1 and np.abs(step).max() < _ENDED:
-                break
-        return found
+            if k == _PASSES or (self._tolerance == 1 and np.abs(step).max() < _ENDED):
+                return found
 
     def _system(self, poses: Poses, shared: np.ndarray):
         """Jacobian (sparse) and residuals at poses, both weighted; notes cost and weights of frames."""
@@ -264,8 +266,6 @@ class _Problem:
         rows = [_spread(*part, width) for part in parts]
         for k, run in enumerate(self._runs):
             rows.append(self._lying(poses, run, shared[k], 6 * n + 3 * k, width))
-        for _, residual in rows[1 + bool(len(self._fours)) :]:
-            self._cost += 0.5 * float(residual @ residual)
         matrices, residuals = zip(*rows, strict=True)
         return sparse.vstack(matrices).tocsr(), np.concatenate(residuals)
 
@@ -310,6 +310,7 @@ class _Problem:
         def change(moved: Poses) -> np.ndarray:
             return difference(moved.taken(first), moved.taken(second)) / self._unit / _STILL
 
+        self._cost += 0.5 * float(np.sum(change(poses) ** 2))
         return self._linear(change, poses, self._resting, np.ones((len(first), 6)))
 
     def _linear(self, function, poses: Poses, frames: Int[np.ndarray, "m k"], root: np.ndarray):
@@ -343,21 +344,19 @@ class _Problem:
             tilt = quat_rotate(turn, np.broadcast_to(down, (m, 3)))[:, :2]
             return np.concatenate([((height / size - base[0]) / _LEVEL)[:, None], tilt / _FLAT], axis=1)
 
-        _, slopes, value = self._linear(
-            lambda moved: off(moved, shared), poses, rows[:, None], np.ones((len(rows), 3))
-        )
-        matrix, residual = _spread(rows[:, None], slopes, value, width)
-        common = np.stack(
-            [(off(poses, shared + _EPSILON * e) - value).ravel() / _EPSILON for e in np.eye(3)], axis=1
-        )
-        matrix = matrix + sparse.csr_matrix(
-            (
-                common.ravel(),
-                (np.repeat(np.arange(len(common)), 3), np.tile(column + np.arange(3), len(common))),
-            ),
-            shape=matrix.shape,
-        )
+        # What rocks, or has left the table for a moment, does not lie there.
+        plain = off(poses, shared)
+        square = np.sum(plain**2, axis=1)
+        root = np.sqrt(4 / (1 + square / self._tolerance**2))[:, None]
+        self._cost += 2 * float(np.sum(np.log1p(square)))
+        part = self._linear(lambda moved: off(moved, shared), poses, rows[:, None], root)
+        matrix, residual = _spread(*part, width)
+        slopes = [(off(poses, shared + _EPSILON * e) - plain) / _EPSILON for e in np.eye(3)]
+        common = np.stack([(root * slope).ravel() for slope in slopes], axis=1)
+        place = np.repeat(np.arange(len(common)), 3), np.tile(column + np.arange(3), len(common))
+        matrix = matrix + sparse.csr_matrix((common.ravel(), place), shape=matrix.shape)
         known = 1 / np.array([_BASE, _LEAN, _LEAN])
+        self._cost += 0.5 * float(np.sum((known * shared) ** 2))
         prior = sparse.csr_matrix((known, (np.arange(3), column + np.arange(3))), shape=(3, width))
         return sparse.vstack([matrix, prior]), np.concatenate([residual, known * shared])
 
