@@ -9,7 +9,7 @@ lights of the training views; "relight", other views under lights that no traini
 The soap is no surface but a scattering medium inside a boundary that does not refract, because light from far
 away cannot be connected through a refracting one.
 
-Usage: python assets/render_images.py [bunny soap mug] [--out assets/images] [--quick]
+Usage: python assets/render_images.py [bunny soap mug block] [--out assets/images] [--quick]
 """
 
 import argparse
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from solids import bunny_mesh, mug_mesh, soap_mesh
+from solids import block_mesh, bunny_mesh, mug_mesh, soap_mesh
 
 SEED = 7
 FIELD_OF_VIEW = 30.0  # [degrees]
@@ -57,6 +57,7 @@ SUBJECTS = {
     "bunny": Subject(bunny_mesh, 128, 64, 128),
     "soap": Subject(soap_mesh, 96, 96, 384, n_train=64, medium=True),
     "mug": Subject(mug_mesh, 128, 64, 128, faceted=True),
+    "block": Subject(block_mesh, 128, 64, 128, faceted=True),
 }
 
 
@@ -150,12 +151,17 @@ def camera_to_world(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 def painted_file(vertices: np.ndarray, faces: np.ndarray, path: Path) -> Path:
     """Write vertices, their paint and faces as a binary PLY file, the form in which Mitsuba takes colours."""
     corners = np.zeros(len(vertices), [(name, "<f4") for name in ("x", "y", "z", "r", "g", "b")])
-    for name, column in zip(corners.dtype.names or (), np.hstack([vertices, paint(vertices)]).T, strict=True):
+    return write_ply(corners, np.hstack([vertices, paint(vertices)]), faces, path)
+
+
+def write_ply(corners: np.ndarray, columns: np.ndarray, faces: np.ndarray, path: Path) -> Path:
+    """Write a binary PLY file: corners, an array of records that the columns fill, and faces."""
+    for name, column in zip(corners.dtype.names or (), columns.T, strict=True):
         corners[name] = column
     triangles = np.zeros(len(faces), [("n", "u1"), ("corners", "<i4", 3)])
     triangles["n"], triangles["corners"] = 3, faces
     header = [
-        *("ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"),
+        *("ply", "format binary_little_endian 1.0", f"element vertex {len(corners)}"),
         *(f"property float {name}" for name in corners.dtype.names or ()),
         *(f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""),
     ]

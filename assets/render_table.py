@@ -46,7 +46,7 @@ def photograph(mi, folder: Path, count: int, paths: int) -> None:
     frames = []
     for i, (eye, target) in enumerate(stations(count)):
         name = f"{i:03d}.png"
-        sensor = camera(mi, eye, target)
+        sensor = pinhole(mi, eye, target, WIDTH / FOCAL, width=WIDTH, height=HEIGHT, pixel_format="rgba")
         colours = np.array(mi.render(whole, sensor=sensor, spp=paths, seed=i))[..., :3]
         cover = np.array(mi.render(alone, sensor=sensor, spp=16, seed=i))[..., 3]
         write(folder / "images" / name, srgb(colours))
@@ -78,17 +78,24 @@ def stations(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
     return result
 
 
-def camera(mi, eye: np.ndarray, target: np.ndarray):
-    """A pinhole camera."""
-    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
+def pinhole(mi, eye, target, across: float, **film):
+    """A pinhole camera without a filter between pixels.
+
+    Args:
+        mi: Mitsuba.
+        eye: Where it is [m].
+        target: What it looks at [m].
+        across: Width of its picture over its focal length.
+        film: Width, height and more of Mitsuba's `hdrfilm`.
+    """
     return mi.load_dict(
         {
             "type": "perspective",
-            "fov": float(np.degrees(2 * np.arctan(0.5 * WIDTH / FOCAL))),
+            "fov": float(np.degrees(2 * np.arctan(0.5 * across))),
             "fov_axis": "x",
             "to_world": mi.ScalarTransform4f().look_at(list(eye), list(target), [0, 0, 1]),
             "near_clip": 0.01,
-            "film": film | {"pixel_format": "rgba"},
+            "film": {"type": "hdrfilm", "rfilter": {"type": "box"}, **film},
         }
     )
 

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from render_images import camera_to_world, painted_file, srgb
-from render_table import TABLE_SIDE, tabletop, write
+from render_table import pinhole, TABLE_SIDE, tabletop, write
 from solids import bunny_mesh, Mesh, soap_mesh
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 420.0  # [pixels]
@@ -183,7 +183,8 @@ def render(mi, film: Film, folder: Path, paths: int) -> None:
     (positions, orientations), known = film.moved(film, times)
     mesh, ball = painted_file(*film.mesh(), folder / "mesh.ply"), folder / "ball.ply"
     trimesh.creation.icosphere(3).export(ball)
-    sensor, random = camera(mi), np.random.default_rng(5)
+    sensor = pinhole(mi, EYE, TARGET, WIDTH / FOCAL, width=WIDTH, height=HEIGHT, pixel_format="rgba")
+    random = np.random.default_rng(5)
     empty = mi.load_dict(scene(mi, None, film.medium, np.eye(4), table=True))
     write(folder / "empty.png", srgb(np.array(mi.render(empty, sensor=sensor, spp=4 * paths))[..., :3]))
     for i, time in enumerate(times):
@@ -267,21 +268,6 @@ def matrix(quaternion: np.ndarray) -> np.ndarray:
     )
 
 
-def camera(mi):
-    """The camera, which stands still."""
-    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
-    return mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": float(np.degrees(2 * np.arctan(0.5 * WIDTH / FOCAL))),
-            "fov_axis": "x",
-            "to_world": mi.ScalarTransform4f().look_at(list(EYE), list(TARGET), [0, 0, 1]),
-            "near_clip": 0.01,
-            "film": film | {"pixel_format": "rgba"},
-        }
-    )
-
-
 def scene(mi, mesh: Path | None, medium: bool, pose: np.ndarray, *, table: bool) -> dict:
     """The object under sun and sky, on the table or alone."""
     light = LIGHT / np.linalg.norm(LIGHT)
@@ -304,7 +290,7 @@ def scene(mi, mesh: Path | None, medium: bool, pose: np.ndarray, *, table: bool)
             "type": "ply",
             "filename": str(mesh),
             "to_world": mi.ScalarTransform4f(pose),
-            **(_scattering() if medium else _painted()),
+            **(scattering() if medium else _painted()),
         }
     if table:
         # The first row of a bitmap lies at v = 0, the lowest y.
@@ -326,7 +312,7 @@ def _painted() -> dict:
     return {"bsdf": {"type": "principled", "base_color": colour, "roughness": 0.5, "specular": 0.4}}
 
 
-def _scattering() -> dict:
+def scattering() -> dict:
     """As in the photographs of `render_images`."""
     return {
         "bsdf": {"type": "null"},

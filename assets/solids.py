@@ -1,7 +1,7 @@
 """The true solids behind the photographs that dano ships: signed distances and triangle meshes, in metres.
 
 `bunny` is the Stanford bunny 12 cm long, `soap` a bar of 9 × 6 × 3 cm with a word carved into it, `mug` a
-mug of 10 cm with a handle, whose inside no silhouette shows.
+mug of 10 cm with a handle, whose inside no silhouette shows, `block` a cuboid with rounded edges.
 """
 
 from collections.abc import Callable
@@ -15,6 +15,7 @@ SOAP_ROUNDING = 0.008  # [m]
 ENGRAVING_DEPTH = 0.003  # [m]
 ENGRAVING_STROKE = 0.0038  # [m], width of a stroke
 BUNNY_EXTENT = 0.12  # [m], longest side of the bounding box
+BLOCK_HALF_EXTENTS, BLOCK_ROUNDING = np.array([0.040, 0.0275, 0.020]), 0.003  # [m]
 MUG_RADIUS, MUG_HEIGHT, MUG_WALL = 0.04, 0.095, 0.005  # [m]
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -36,6 +37,11 @@ def bunny_mesh() -> Mesh:
 def soap_mesh() -> Mesh:
     """The bar."""
     return surface(soap_distance, 1.05 * np.stack([-SOAP_HALF_EXTENTS, SOAP_HALF_EXTENTS]), 0.0006)
+
+
+def block_mesh() -> Mesh:
+    """The cuboid."""
+    return surface(block_distance, 1.06 * np.stack([-BLOCK_HALF_EXTENTS, BLOCK_HALF_EXTENTS]), 0.001)
 
 
 def mug_mesh() -> Mesh:
@@ -61,10 +67,20 @@ def surface(distance: SignedDistance, box: np.ndarray, spacing: float) -> Mesh:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
+def block_distance(x: np.ndarray) -> np.ndarray:
+    """Signed distance [m] of the cuboid."""
+    return rounded_distance(x, BLOCK_HALF_EXTENTS, BLOCK_ROUNDING)
+
+
+def rounded_distance(x: np.ndarray, half_extents: np.ndarray, rounding: float) -> np.ndarray:
+    """Signed distance [m] of a cuboid whose edges are rounded with a radius [m]."""
+    q = np.abs(x) - (half_extents - rounding)
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0) - rounding
+
+
 def soap_distance(x: np.ndarray) -> np.ndarray:
     """Signed distance [m] of a bar with rounded edges and "dano" carved into its top face."""
-    q = np.abs(x) - (SOAP_HALF_EXTENTS - SOAP_ROUNDING)
-    bar = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0) - SOAP_ROUNDING
+    bar = rounded_distance(x, SOAP_HALF_EXTENTS, SOAP_ROUNDING)
     floor = SOAP_HALF_EXTENTS[2] - ENGRAVING_DEPTH
     groove = np.maximum(letters_distance(x[..., :2]) - ENGRAVING_STROKE / 2, floor - x[..., 2])
     return np.maximum(bar, -groove)

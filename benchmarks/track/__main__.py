@@ -1,4 +1,7 @@
-"""`python -m benchmarks.track --films DIR [--masks given object] [--starts 20] [--json FILE] [--quick]`."""
+"""`python -m benchmarks.track --films DIR [--masks given object] [--starts 20] [--json FILE] [--quick]`.
+
+`--phone DIR [--only FILM …] [--held] [--friction]` measures with films as phones take them.
+"""
 
 from benchmarks import _environment
 

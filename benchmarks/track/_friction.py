@@ -17,6 +17,7 @@ SLIDES = ("soap_slide", "bunny_slide", "soap_hard", "bunny_hard")
 
 def fit_film(
     name: str,
+    body: dano.NeuralObject,
     film: Film,
     look: LearnedField,
     camera: PosedCamera,
@@ -27,7 +28,7 @@ def fit_film(
     """Friction of a slide, from poses and from pixels."""
     scene = dano.Scene.create(
         bodies=[
-            dano.Body(name, load_asset(f"trained_{name}")),
+            dano.Body(name, body),
             dano.Body("table", dano.HalfSpace(), fixed=True),
         ],
         contacts=[dano.Contact(name, "table", dano.ContactParams(sliding_friction=0.5))],

@@ -1,21 +1,20 @@
 """Poses in rendered films against the true ones: errors, regions, starts, time, and friction from them."""
 
 import argparse
-import json
 import os
 import time
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
-from scipy.stats import chi2
 
 from benchmarks._measure import load_average, parse_arguments, report, Row, skipped
+from benchmarks.track._cases import Case, errors, in_region, read_case
 from benchmarks.track._friction import fit_centre_of_mass, fit_film, SLIDES
-from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate
-from dano.scene_file import asset_look
-from dano.vision import Film, LearnedField, load_camera, PosedCamera, read_film, track, Tracked, TrackOptions
+from benchmarks.track._phone import phone_rows, read_phone_films, without_masks
+from dano.maths import quat_multiply
+from dano.scene_file import load_asset
+from dano.vision import Film, track, Tracked, TrackOptions
 
 FILMS = (
     "soap_slide",
@@ -38,59 +37,18 @@ _TURNED = {"soap": np.eye(4)[1:]}
 """Half turns that leave an object as it is but for the word carved into one face."""
 
 
-class Case(NamedTuple):
-    """A film with its truth.
-
-    Attributes:
-        name: Of the film.
-        film: Its frames, with the true masks.
-        camera: Which took it.
-        field: The object.
-        position: True positions of its frame [m], shape (T, 3).
-        orientation: True orientations, shape (T, 4).
-        friction: Of the table.
-        background: Picture of the table alone.
-        shutter: Exposure of a frame [s].
-        sun: Direction towards the sun.
-        com: Centre of mass that the motion was simulated with [m, object's frame]; None if it is not known.
-        airborne: Frames before the object touches anything.
-    """
-
-    name: str
-    film: Film
-    camera: PosedCamera
-    field: LearnedField
-    position: np.ndarray
-    orientation: np.ndarray
-    friction: float
-    background: Path
-    shutter: float
-    sun: np.ndarray
-    com: np.ndarray | None
-    airborne: int
-
-    @property
-    def is_hard(self) -> bool:
-        """Whether the film is blurred, noisy, darker and darker, and something passes in front."""
-        return self.shutter > 0
-
-    def options(self, source: str) -> TrackOptions:
-        """How it is tracked, with masks from a source."""
-        return TrackOptions(masks=source, shutter=self.shutter)
-
-
 def run() -> None:
     """Measure, print and report."""
     arguments = parse_arguments("Track objects in rendered films and compare with the truth.", _options)
     load, rows = load_average(), []
     cases = []
-    for name in FILMS:
+    for name in FILMS if arguments.films is not None or arguments.phone is None else ():
         if arguments.films is None or not (arguments.films / name / "truth.json").is_file():
             rows.append(
                 skipped(name, "poses", "no films: python assets/render_videos.py DIR, then --films DIR")
             )
             continue
-        cases.append(_case(arguments.films / name))
+        cases.append(read_case(arguments.films / name))
     for case in cases[: 1 if arguments.quick else None]:
         for source in arguments.masks:
             # A hand that passes in front is part of the place only in its own masks.
@@ -102,41 +60,28 @@ def run() -> None:
     if not arguments.quick:
         rows += [row for case in cases if case.name == "bunny_slide" for row in _disturbed(case)]
     settings: dict[str, object] = {"quick": arguments.quick, "options": str(TrackOptions())}
+    if arguments.phone is not None:
+        films = read_phone_films(arguments.phone, names=arguments.only, held=arguments.held)
+        for filmed in films[: 1 if arguments.quick else None]:
+            for source in arguments.masks:
+                rows += phone_rows(filmed, source, friction=arguments.friction)
     report("track", rows, settings, load, arguments.json)
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--films", type=Path, metavar="DIR", help="what assets/render_videos.py wrote")
+    parser.add_argument("--phone", type=Path, metavar="DIR", help="what assets/render_phone.py wrote")
+    parser.add_argument("--only", nargs="+", metavar="FILM", help="films of --phone; default: all not held")
+    parser.add_argument("--held", action="store_true", help="films of --phone that are held back, too")
+    parser.add_argument("--friction", action="store_true", help="of slides of --phone, too: minutes a film")
     parser.add_argument("--masks", nargs="+", default=["given", "object"], help="where masks come from")
     parser.add_argument("--starts", type=int, default=20, help="searches without a start; 0: none")
-
-
-def _case(folder: Path) -> Case:
-    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
-    hand = folder / "occluders"
-    film = read_film(folder / "film.mp4", masks=folder / "masks", occluders=hand if hand.is_dir() else None)
-    field = asset_look(f"trained_{folder.name.split('_')[0]}")
-    assert field is not None
-    return Case(
-        folder.name,
-        film,
-        load_camera(folder / "truth.json", *film.size),
-        field,
-        np.array(truth["position"]),
-        np.array(truth["orientation"]),
-        truth["friction"],
-        folder / "empty.png",
-        truth["shutter"],
-        np.array(truth["sun"]),
-        np.array(truth["com"]) if "com" in truth else None,
-        truth.get("airborne", 0),
-    )
 
 
 def _tracked(case: Case, source: str) -> list[Row]:
     """One film, with masks from one source."""
     group = f"{case.name}, masks: {source}"
-    film = case.film if source == "given" else case.film._replace(masks=[None] * len(case.film.masks))
+    film = case.film if source == "given" else without_masks(case.film)
     began = time.process_time()
     background = None if source == "given" else case.background
     try:
@@ -145,9 +90,9 @@ def _tracked(case: Case, source: str) -> list[Row]:
         n = len(film.times)
         return [Row(group, "frames tracked", 0, "", n, at_least=True, note=f"of {n}: {error}"[:60])]
     processor = (time.process_time() - began) / len(film.times)
-    place, turn, distance = _errors(case, found)
+    place, turn, distance = errors(case, found)
     known = np.isfinite(place)
-    held = distance[known] < chi2.ppf(0.95, 6)
+    held = in_region(distance[known])
     last = len(film.times)
     rows = [
         Row(group, "frames tracked", found.n_tracked, "", last, at_least=True, note=f"of {last}"),
@@ -188,7 +133,8 @@ def _friction(
     group: str, case: Case, film: Film, found: Tracked, options: TrackOptions, background: Path | None
 ) -> list[Row]:
     """Friction from the poses, then from the pixels; and where the light comes from."""
-    fit = fit_film(case.name.split("_")[0], film, case.field, case.camera, found, options, background)
+    body = load_asset(f"trained_{case.object}")
+    fit = fit_film(case.object, body, film, case.field, case.camera, found, options, background)
     rows = []
     for name, one, target in (("poses", fit.poses, 5.0), ("pixels", fit.fit, 2.0)):
         value, error = float(one.values["mu"]), float(one.standard_errors["mu"])
@@ -205,9 +151,8 @@ def _friction(
 def _centre_of_mass(group: str, case: Case, found: Tracked) -> Row:
     """Where the centre of mass is, from the poses in the air, with the state unknown."""
     assert case.com is not None
-    off = fit_centre_of_mass(case.name.split("_")[0], found, case.airborne) - case.com
-    lower, upper = np.asarray(case.field.solid.solid_bounds, np.float64)
-    share = 100 * float(np.linalg.norm(off)) / float((upper - lower).max())
+    off = fit_centre_of_mass(case.object, found, case.airborne) - case.com
+    share = 100 * float(np.linalg.norm(off)) / case.size
     note = f"off by {' '.join(f'{1e3 * x:.2f}' for x in off)} mm, {case.airborne} frames in the air"
     return Row(group, "centre of mass, error", share, "% size", 1.0, note=note)
 
@@ -230,7 +175,7 @@ def _disturbed(case: Case) -> list[Row]:
         )
         cut = case._replace(film=part, position=case.position[kept], orientation=case.orientation[kept])
         found = track(part, case.field, case.camera, case.options("given"))
-        place, turn, _ = _errors(cut, found)
+        place, turn, _ = errors(cut, found)
         known = np.isfinite(place)
         group = f"{case.name}, masks {name} by 1 px, 10 % of frames missing"
         largest = f"largest {100 * place[known].max():.2f}"
@@ -248,22 +193,6 @@ def _disturbed(case: Case) -> list[Row]:
             Row(group, "orientation, median error", float(np.degrees(np.median(turn[known]))), "°", 3.0)
         )
     return rows
-
-
-def _errors(case: Case, found: Tracked) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each frame: position as a share of the size, at the object's middle; orientation; Mahalanobis²."""
-    lower, upper = np.asarray(case.field.solid.solid_bounds, np.float64)
-    middle = 0.5 * (lower + upper)
-    turns = quat_log(quat_multiply(quat_conjugate(found.orientation), case.orientation))
-    shift = case.position - found.position
-    arms = quat_rotate(case.orientation, np.broadcast_to(middle, shift.shape))
-    arms = arms - quat_rotate(found.orientation, np.broadcast_to(middle, shift.shape))
-    both = np.concatenate([shift, turns], axis=1)
-    distance = np.full(len(both), np.nan)
-    for i in np.flatnonzero(np.isfinite(both).all(axis=1)):
-        distance[i] = both[i] @ np.linalg.solve(found.covariance[i], both[i])
-    size = float((upper - lower).max())
-    return np.linalg.norm(shift + arms, axis=1) / size, np.linalg.norm(turns, axis=1), distance
 
 
 def _starts(cases: list[Case], count: int) -> Row:
@@ -292,7 +221,7 @@ def _starts(cases: list[Case], count: int) -> Row:
             right += 1
         elif any(
             _is_right(cut._replace(orientation=quat_multiply(cut.orientation, np.tile(turn, (2, 1)))), found)
-            for turn in _TURNED.get(case.name.split("_")[0], ())
+            for turn in _TURNED.get(case.object, ())
         ):
             up_to_symmetry += 1
         else:
@@ -304,5 +233,5 @@ def _starts(cases: list[Case], count: int) -> Row:
 
 
 def _is_right(case: Case, found: Tracked) -> bool:
-    place, turn, _ = _errors(case, found)
+    place, turn, _ = errors(case, found)
     return bool(place[0] < _RIGHT[0] and turn[0] < _RIGHT[1])

@@ -16,6 +16,7 @@ _ELSEWHERE = {
     "sphere": ("ball",),
     "box": ("cube", "cuboid"),
     "half_extents": ("size", "extents", "extent", "dimensions", "half_size"),
+    "radius": ("size", "r", "diameter"),
     "semi_axes": ("size", "radii", "axes"),
     "sliding_friction": ("friction", "mu", "friction_coefficient"),
     "restitution": ("bounce", "bounciness", "elasticity"),

@@ -266,6 +266,7 @@ BAD = {
         "[[bodies]] 1 ('ball'): unknown key 'radus'; valid keys are ",
     ),
     "key nearly right": ("n_steps = 1\n" + BODY + "radus = 1\n", "; did you mean 'radius'?"),
+    "key of other programs": ("n_steps = 1\n" + BODY + "size = 1\n", "; did you mean 'radius'?"),
     "shape nearly right": (
         'n_steps = 1\n[[bodies]]\nname = "x"\nshape = "shpere"\n',
         "got 'shpere'; did you mean 'sphere'?",

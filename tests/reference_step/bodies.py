@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from reference_step.rotations import matrix, multiply, turn
+from reference_step.rotations import gyroscopic_gain, matrix, multiply, turn
 
 
 class Bodies(NamedTuple):
@@ -17,9 +17,11 @@ class Bodies(NamedTuple):
         position: Of the centres of mass [m, W], shape (n, 3).
         orientation: wxyz, shape (n, 4).
         ahead: Orientations at the end of the step at the old spins.
+        ahead_falling: The same with what the spins gain.
         velocity: [m/s, W], zero for a fixed body.
         spin: [rad/s, W], the same.
         gain: What gravity adds to the velocity of a body that falls freely [m/s, W], shape (n, 3).
+        spin_gain: What gyroscopic torques add to its spin [rad/s, W], shape (n, 3).
         inverse_mass: 1/m, zero for a fixed body [1/kg].
         inverse_inertia: [1/(kg m²), W], the same.
     """
@@ -33,9 +35,11 @@ class Bodies(NamedTuple):
     position: np.ndarray
     orientation: np.ndarray
     ahead: np.ndarray
+    ahead_falling: np.ndarray
     velocity: np.ndarray
     spin: np.ndarray
     gain: np.ndarray
+    spin_gain: np.ndarray
     inverse_mass: np.ndarray
     inverse_inertia: np.ndarray
 
@@ -49,6 +53,20 @@ class Bodies(NamedTuple):
         start = self.velocity[i] + 0.5 * self.gain[i]
         way = share * self.h * (start + 0.5 * share * self.gain[i])
         return self.position[i] + way, matrix(q / np.linalg.norm(q))
+
+    def gains(self, i, j):
+        """What `relative` gains within the step."""
+        away = self.position[i] - self.position[j]
+        gain = self.gain[i] - self.gain[j] - np.cross(self.spin_gain[j], away)
+        return gain, self.spin_gain[i] - self.spin_gain[j]
+
+    def falling(self):
+        """Bodies whose spins gain what gyroscopic torques add."""
+        return self._replace(ahead=self.ahead_falling)
+
+    def held(self):
+        """Bodies whose velocities gain nothing."""
+        return self._replace(gain=0 * self.gain, spin_gain=0 * self.spin_gain)
 
     def relative(self, i, j):
         """Velocity [m/s] of centre of mass i and spin [rad/s] relative to body j as a rigid frame [W]."""
@@ -69,6 +87,13 @@ def read(scene, state):
     omega = np.where(moves[:, None], state.omega, 0)
     rotations = np.array([matrix(q) for q in orientation])
     ahead = np.array([multiply(q, turn(w, h)) for q, w in zip(orientation, omega, strict=True)])
+    falls = moves & (not scene.joints)
+    gains = np.array(
+        [gyroscopic_gain(w, J, h) if f else 0 * w for w, J, f in zip(omega, inertia, falls, strict=True)]
+    )
+    ahead_falling = np.array(
+        [multiply(q, turn(w, h)) for q, w in zip(orientation, omega + gains, strict=True)]
+    )
     return Bodies(
         h=h,
         gravity=np.asarray(scene.gravity),
@@ -79,9 +104,11 @@ def read(scene, state):
         position=position,
         orientation=orientation,
         ahead=ahead,
+        ahead_falling=ahead_falling,
         velocity=velocity,
         spin=np.einsum("nij,nj->ni", rotations, omega),
-        gain=np.where(moves[:, None] & (not scene.joints), h * np.asarray(scene.gravity), 0),
+        gain=np.where(falls[:, None], h * np.asarray(scene.gravity), 0),
+        spin_gain=np.einsum("nij,nj->ni", rotations, gains),
         inverse_mass=np.where(moves, 1 / mass, 0),
         inverse_inertia=np.array(
             [m * R @ np.linalg.inv(J) @ R.T for m, R, J in zip(moves, rotations, inertia, strict=True)]

@@ -46,7 +46,7 @@ class Points(NamedTuple):
         sunk: Depth where geometry is taken [m], shape (n,).
         delta: Depth of the impact [m].
         beta: Share of the contact that is an impact.
-        delays: Whether impulses take effect after the share τ of the step.
+        delays: Impulses take effect after this share of τ.
         way: Share of the step in which bodies go on as before.
     """
 
@@ -69,7 +69,7 @@ class Points(NamedTuple):
     sunk: np.ndarray
     delta: float
     beta: float
-    delays: bool
+    delays: float
     way: float
 
 
@@ -212,26 +212,20 @@ class Meeting(NamedTuple):
 
     share: float
     hits: bool = False
-    deep: bool = False
+    lasts: bool = False
     falls: bool = False
 
 
 def meetings(scene, bodies, side):
-    """That of an impact, and that of contact that lasts; where bodies are deep the second is both."""
+    """That of an impact, and that of contact that lasts."""
     delta, sink = depths_of(scene, side)
-    lasting = Meeting(share_at(scene, held(bodies), side, sink, sink, 0.0))
+    lasting = Meeting(share_at(scene, bodies.held(), side, sink, sink, 0.0), lasts=True)
     if side.law.compliant:
         return lasting, lasting
     slow = side.law.slowest_rebound
+    bodies = bodies.falling()
     share = share_at(scene, bodies, side, delta, bodies.h * slow, slow)
-    if share == 0:
-        return lasting._replace(deep=True), lasting
     return Meeting(share, hits=bool(share < 1), falls=nears(scene, bodies, side, delta, slow)), lasting
-
-
-def held(bodies):
-    """Bodies to whose velocities gravity adds nothing."""
-    return bodies._replace(gain=np.zeros_like(bodies.gain))
 
 
 def nears(scene, bodies, side, limit, slow):
@@ -305,11 +299,13 @@ def seen(scene, bodies, side, limit, slow, share):
     axis, turning = pair.R[:, 2], scene.bodies[side.i].surface.turning
     turns = {"fixed": w, "axis": w - (w @ axis) * axis, "ball": 0 * w}[turning]
     velocity = u + np.cross(turns, pair.places - pair.x)
-    gain = bodies.gain[side.i] - bodies.gain[side.j]
+    gain, spin_gain = bodies.gains(side.i, side.j)
+    gain = gain + np.cross(spin_gain * (turning == "fixed"), pair.places - pair.x)
     rate = np.sum(normal * velocity, axis=1)
-    goes_in = np.maximum(rate, rate + (0.5 + share) * normal @ gain) < -slow
-    speed = np.maximum(np.linalg.norm(velocity, axis=1) + 1.5 * np.linalg.norm(gain), 1e-12)
-    way = 1.5 * h * (fastest(scene, bodies, side) + 1.5 * np.linalg.norm(gain))
+    goes_in = np.maximum(rate, rate + (0.5 + share) * np.sum(normal * gain, axis=1)) < -slow
+    most = 1.5 * np.linalg.norm(gain, axis=1)
+    speed = np.maximum(np.linalg.norm(velocity, axis=1) + most, 1e-12)
+    way = 1.5 * h * (fastest(scene, bodies, side) + most.max())
     return (distance, speed), goes_in, (distance <= way - limit) | (turning != "fixed")
 
 
@@ -335,8 +331,7 @@ def find(scene, bodies, shares=None):
 
 def listed(scene, bodies, side, met):
     """The listed points of a side whose geometry is taken when its bodies meet."""
-    if not met.falls:
-        bodies = held(bodies)
+    bodies = bodies.falling() if met.falls else bodies.held()
     i, j, h, share = side.i, side.j, bodies.h, met.share
     pair = Pair(scene, bodies, side, share)
     distance, normal = pair.distance(pair.places)
@@ -350,8 +345,9 @@ def listed(scene, bodies, side, met):
     after, arm, moment = levers(scene, bodies, side, share, pair, normal)
     rate = normal @ u + moment @ w
     drift = drifts(u, w, after, arm, normal) if pair.turning != "fixed" else np.zeros_like(arm)
-    gain = normal @ (bodies.gain[i] - bodies.gain[j])
-    depth = -distance + share * h * (rate + 0.5 * (1 + share) * gain)
+    gains, spin_gains = bodies.gains(i, j)
+    gain, spin_gain = normal @ gains, moment @ spin_gains
+    depth = -distance + share * h * (rate + 0.5 * (1 + share) * gain + spin_gain)
 
     smaller = min(float(scene.bodies[k].extent[4]) for k in (i, j))
     margin = 0.001 * smaller + 2 * np.linalg.norm(bodies.gravity) * h * h
@@ -363,12 +359,14 @@ def listed(scene, bodies, side, met):
     hit = usual & (sunk > 0)
     approach = rate - np.sum(normal * drift, axis=1)
     delta, _ = depths_of(scene, side)
-    deep = met.deep or (share >= 1 and np.max(sunk * hit, initial=0) > delta)
     x = sunk / delta
     weight = fading_in(x) * hit
-    near_load = area * usual * fading_in((delta * (share < 1) - distance) / delta)
-    beta, stiffness = impact(bodies, side, arm, normal, area * weight, near_load, approach)
+    near_load = area * usual * fading_in((delta * smooth_step(4 * (1 - share)) - distance) / delta)
+    beta, stiffness = 0.0, 0.0
+    if not met.lasts:
+        beta, stiffness = impact(bodies, side, arm, normal, area * weight, near_load, approach)
     free = not scene.joints and not (bodies.moves[i] and bodies.moves[j])
+    delays = beta * (free and met.hits)
     return Points(
         first=i,
         second=j,
@@ -380,17 +378,17 @@ def listed(scene, bodies, side, met):
         moment=moment[kept],
         depth=depth[kept],
         rate=rate[kept],
-        meets=(approach + (0.5 + share) * gain)[kept],
+        meets=(approach + (0.5 + share) * (gain + spin_gain))[kept],
         gains=((0.5 - share) * gain)[kept],
         area=area[kept],
         drift=drift[kept],
-        impact=(stiffness * (met.hits or deep) * weight)[kept],
-        kappa=stiffness * (met.hits or deep),
+        impact=(stiffness * met.hits * weight)[kept],
+        kappa=stiffness * met.hits,
         sunk=np.where(other, 0, -distance)[kept],
         delta=delta,
         beta=beta,
-        delays=free and met.hits and not deep and beta > 0,
-        way=0.0 if deep or free else share,
+        delays=delays,
+        way=(1 - delays) * share * met.hits,
     )
 
 
@@ -445,7 +443,8 @@ def impact(bodies, side, arm, normal, load, near_load, approach):
     for k, lever in ((side.i, r), (side.j, r + bodies.position[side.i] - bodies.position[side.j])):
         turning = np.cross(lever, n)
         mobility += turning @ bodies.inverse_inertia[k] @ turning
-    return beta, beta * FACTOR / (bodies.h * mobility * load.sum())
+    factor = beta * FACTOR / (1 + (1 - beta) * FACTOR)
+    return beta, factor / (bodies.h * mobility * load.sum())
 
 
 def halved(found):
@@ -463,7 +462,7 @@ def together(bodies, found):
     """Sides of bodies that touch others that move, too: their impulses do not wait for the impact."""
     crowded = {k for points in found for k in points[:2] if all(bodies.moves[list(points[:2])])}
     return [
-        points._replace(delays=False, way=points.share)
+        points._replace(delays=0.0, way=points.share)
         if points.delays and crowded & set(points[:2])
         else points
         for points in found

@@ -48,7 +48,7 @@ def spin(
     """Angular momentum of a step, and the orientation at its end; derivatives of both: see below."""
     momenta[0] = momentum.angular_momentum(omega, inertia, h, sign)
     turned[0] = rotations.to_wxyz(rotations.turned(rotations.from_wxyz(orientation), omega, h))
-    slopes[0] = momentum.angular_momentum_jacobian(omega, inertia, h)
+    slopes[0] = momentum.angular_momentum_jacobian(omega, inertia, h, sign)
     slopes[1] = rotations.spin_by_end(omega, h)
 
 
@@ -63,8 +63,7 @@ def traction(material: dict[str, float], points, rate, slip):
     of_impact["share"], of_impact["stiffness"], of_impact["depth"] = points.beta, points.kappa, points.delta
     of_impact["part"], of_impact["way"] = 1.0, points.way
     of_impact["delays"], of_impact["rest"] = points.delays, material["timestep"]
-    if points.delays:
-        of_impact["rest"] *= 1 - points.share
+    of_impact["rest"] *= 1 - points.delays * points.share
     rows["approach"] = points.rate - np.sum(points.drift * points.normal, axis=1)
     rows["meets"], rows["gains_after"] = points.meets, points.gains
     of_material = np.zeros(n, point_law.Material.numpy_dtype())

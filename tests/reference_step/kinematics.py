@@ -10,11 +10,13 @@ from reference_step.bodies import read
 from reference_step.rotations import (
     conjugate,
     exponential,
+    gyroscopic_gain,
     logarithm,
     matrix,
     momentum,
     multiply,
     spin_between,
+    spin_with,
     turn,
 )
 
@@ -42,6 +44,7 @@ class Kinematics:
         self.names, self.joints, self.closing = list(scene.names), scene.joints, scene.loops
         self.hangs = {self.names.index(joint.child): joint for joint in self.joints}
         moves = self.bodies.moves
+        self.met, self.lead = np.zeros(len(self.names)), np.ones(len(self.names))
         self.free = [i for i in range(len(self.names)) if moves[i] and i not in self.hangs]
         self.joint_rows, size = {}, 6 * len(self.free)
         for joint in self.joints:
@@ -69,6 +72,8 @@ class Kinematics:
         self.bodies = bodies = bodies._replace(
             position=position, orientation=orientation, ahead=np.array([q for _, q in ahead])
         )
+        if self.joints:
+            self.bodies = bodies = bodies._replace(ahead_falling=bodies.ahead)
         self.before = np.concatenate([bodies.velocity, bodies.spin], axis=1)
         for i in self.hangs:
             omega = spin_between(earlier[i][1], orientation[i], h)
@@ -176,11 +181,38 @@ class Kinematics:
             if not bodies.moves[i]:
                 continue
             R, J = matrix(bodies.orientation[i]), bodies.inertia[i]
-            spin = momentum(R.T @ v[3:], J, h, 1) - momentum(R.T @ before[3:], J, h, -1)
-            gained[i] = np.r_[bodies.mass[i] * (v[:3] - before[:3] - h * bodies.gravity), R @ spin]
+            R_met = self.rotation_met(i)
+            spin = R_met @ momentum(R_met.T @ v[3:], J, h, self.lead[i]) - R @ momentum(
+                R.T @ before[3:], J, h, -1
+            )
+            gained[i] = np.r_[bodies.mass[i] * (v[:3] - before[:3] - h * bodies.gravity), spin]
             if control is not None:
                 gained[i] -= h * np.r_[np.asarray(control.force)[i], np.asarray(control.torque)[i]]
         return gained
+
+    def balance_when_met(self, found):
+        """Take when bodies meet fixed ones, the mean of several moments, from the listed points of sides."""
+        for i in self.free:
+            waiting = [(p.delays * p.share, p.delays) for p in found if p.delays > 0 and i in p[:2]]
+            if waiting:
+                self.met[i], self.lead[i] = np.mean(waiting, axis=0) * [1, -1] + [0, 1]
+
+    def rotation_met(self, i):
+        """Rotation of a body when its angular momentum is balanced."""
+        return self.bodies.falling().pose(i, self.met[i])[1]
+
+    def inertia_met(self, i):
+        """Its inertia then [kg m², W]."""
+        R = self.rotation_met(i)
+        return R @ self.bodies.inertia[i] @ R.T
+
+    def end_of_impact(self, i, w):
+        """Spin at the end of the step [B] and what it turns by besides `w` [W]; w is that of the balance."""
+        R, J, h, met = self.rotation_met(i), self.bodies.inertia[i], self.h, self.met[i]
+        seen = R.T @ w
+        omega = spin_with(momentum(seen, J, h, self.lead[i]), seen, J, h, 1 - 2 * met)
+        gains = R @ gyroscopic_gain(omega, J, h) - self.bodies.spin_gain[i]
+        return omega, R @ (omega - seen) + met**2 / 2 * gains
 
     def gaps(self, y):
         """φ: how far loops are open after a step; distances [m, W], then turns of welds [rad]."""
@@ -207,8 +239,13 @@ class Kinematics:
 
     def end(self, y, moved):
         """The state at the end of a step with y, and poses from `moved`, as arrays by name."""
-        poses, twists, rows = self.placed(moved), self.twists(y), slice(6 * len(self.free), None)
+        twists, rows, moved = self.twists(y), slice(6 * len(self.free), None), np.array(moved)
         omega = [matrix(q).T @ V[3:] for (_, q), V in zip(self.now, twists, strict=True)]
+        for r, i in enumerate(self.free):
+            if self.lead[i] < 1:
+                omega[i], turned = self.end_of_impact(i, twists[i][3:])
+                moved[6 * r + 3 : 6 * r + 6] += turned
+        poses = self.placed(moved)
         q = (self.q + self.h * y)[rows]
         for joint in self.joints:
             if joint.kind == "ball":

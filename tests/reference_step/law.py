@@ -138,8 +138,9 @@ def pressure(law, points, rate, v_s):
 
     missing = np.maximum(goals(law, points) - rate, 0)
     # Samples that are less deep than the impact get no deeper.
-    rest = law.h * (max(1 - points.share, 1e-6) if points.delays else 1)
-    limit = np.minimum((points.sunk if points.delays else points.depth) - points.delta, 0) / rest
+    rest = law.h * max(1 - points.delays * points.share, 1e-6)
+    before = points.delays * points.sunk + (1 - points.delays) * points.depth
+    limit = np.minimum(before - points.delta, 0) / rest
     below = np.maximum(limit - rate, 0)
     approach = points.rate - np.sum(points.normal * points.drift, axis=1)
     lasting = 1 - points.beta * smooth_step(-approach / law.slowest_rebound - 1)

@@ -46,8 +46,8 @@ def logarithm(q):
     return 2 * np.arctan2(sine, q[0]) / sine * q[1:] if sine > 0 else 2 * q[1:]
 
 
-def momentum(omega, inertia, h, sign):
-    """P(ω) (sign +1) or P⁻(ω) (sign −1) = m Jω ± g (h/2) ω × Jω, for ω and J in body axes."""
+def shares(omega, h):
+    """m and g of a spin."""
     x = h * np.linalg.norm(omega) / 2
     m, g = np.sqrt(1 - min(x, RESOLVED) ** 2), 1.0
     if x > RESOLVED:
@@ -55,8 +55,36 @@ def momentum(omega, inertia, h, sign):
         c = RESOLVED * ROOT - RESOLVED
         m = (c + x - (1 - SLOPE) * FADE * (1 - np.exp(-y / FADE))) / x
         g = np.exp(-((y / FADE) ** 2))
+    return m, g
+
+
+def momentum(omega, inertia, h, lead):
+    """P(ω) (lead +1) or P⁻(ω) (lead −1) = m Jω ± g (h/2) ω × Jω, for ω and J in body axes."""
+    m, g = shares(omega, h)
     spin = inertia @ omega
-    return m * spin + sign * g * h / 2 * cross_matrix(omega) @ spin
+    return m * spin + lead * g * h / 2 * cross_matrix(omega) @ spin
+
+
+def gyroscopic_gain(omega, inertia, h):
+    """What a spin gains in a step without torques, by the midpoint rule; ω and J in the same axes."""
+    m, g = shares(omega, h)
+
+    def gained(w):
+        return -h * g / m * np.linalg.solve(inertia, np.cross(w, inertia @ w))
+
+    return gained(omega + gained(omega) / 2)
+
+
+def spin_with(L, start, inertia, h, lead):
+    """ω in body axes whose angular momentum is L as seen with a lead, near a spin."""
+    omega = np.array(start)
+    for _ in range(30):
+        slopes = [
+            (momentum(omega + e, inertia, h, lead) - momentum(omega - e, inertia, h, lead)) / 2e-5
+            for e in 1e-5 * np.eye(3)
+        ]
+        omega = omega - np.linalg.solve(np.transpose(slopes), momentum(omega, inertia, h, lead) - L)
+    return omega
 
 
 def turn(omega, h):

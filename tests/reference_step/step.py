@@ -29,6 +29,7 @@ class Step:
         self.joints = JointLaw(self.kinematics, control)
         self.given = find(self.scene, self.kinematics.bodies, shares)
         self.points = list(self.given)
+        self.kinematics.balance_when_met(self.given)
         self.patches = patches_of(self.scene, self.kinematics.bodies)
         self.loops = self.kinematics.gap_slopes()
         self.start = np.r_[self.kinematics.start, np.zeros(len(self.loops))]
@@ -94,17 +95,21 @@ class Step:
                 for i, impulse in ((points.first, done.first), (points.second, done.second)):
                     if i in k.free:
                         at = 6 * k.free.index(i)
-                        late = points.share * k.h * impulse
+                        late = points.delays * points.share * k.h * impulse
                         found[at : at + 3] -= k.bodies.inverse_mass[i] * late[:3]
-                        found[at + 3 : at + 6] -= k.bodies.inverse_inertia[i] @ late[3:]
+                        found[at + 3 : at + 6] -= np.linalg.solve(k.inertia_met(i), late[3:])
         return found
 
     def adds_energy(self, y):
         """Whether contact adds more than a thousandth of the energy that it moves between coordinates."""
         k = self.kinematics
         own = np.einsum("iak,ia->k", k.jacobian, k.momenta(y, self.control)) + self.h * self.joints.smooth(y)
-        work = 0.5 * own * (k.start + y)
-        return np.sum(work) > 1e-3 * np.sum(0.5 * np.abs(own) * (np.abs(k.start) + np.abs(y)))
+        start = np.array(k.start)
+        for r, i in enumerate(k.free):
+            # An impact begins with the spin of its moment.
+            start[6 * r + 3 : 6 * r + 6] += (1 - k.lead[i]) * (0.5 + k.met[i]) * k.bodies.spin_gain[i]
+        work = 0.5 * own * (start + y)
+        return np.sum(work) > 1e-3 * np.sum(0.5 * np.abs(own) * (np.abs(start) + np.abs(y)))
 
 
 def newton(step, start, softness, enough, most=50):
@@ -134,12 +139,14 @@ def missed(R, slope, x):
 
 
 def root(step):
-    """y of a step: the root near the old velocities, or followed from large stiction velocities to its own.
+    """y of a step: the root near the old velocities, or from rest, or from large stiction velocities on.
 
     Raises:
         ArithmeticError: If none is found.
     """
     x, error = newton(step, step.start, 1.0, SOLVED, 12)
+    if error > GOOD:
+        x, error = newton(step, 0 * step.start, 1.0, SOLVED, 12)
     for factor in (4.0, 1.5):
         if error > GOOD:
             x, error = followed(step, factor)

@@ -44,7 +44,7 @@ def random_points(law, impact):
         sunk=law.delta * x,
         delta=law.delta,
         beta=0.7 if impact > 0 else 0.0,
-        delays=False,
+        delays=0.0,
         way=0.6,
     )
 

@@ -216,9 +216,27 @@ def still(folder: Path) -> None:
     write_pictures(folder, [CAMERAS[0]] * 5)
 
 
+def scratched(seed: int, shape: tuple[int, int]) -> np.ndarray:
+    """What a sensor and a watermark add to every picture [grey levels]."""
+    mark = np.zeros(shape, np.uint8)
+    cv2.putText(mark, "(c)", (shape[1] // 2, shape[0] // 2), cv2.FONT_HERSHEY_SIMPLEX, 0.8, 80, 2)
+    return np.random.default_rng(seed).normal(0, 20, shape) + mark
+
+
+def plain_ball_behind_scratches(folder: Path) -> None:
+    """A ball of one colour that is given masks; all that pictures share is what the sensor adds."""
+    for i, view in enumerate([camera(0.1 * i, 0.5 + 0.1 * i, 0.2) for i in range(6)]):
+        grey, mask = photograph(view, np.full((1024, 1024), 0.02), np.full((1024, 1024), 0.5))
+        shown = np.clip(grey + scratched(0, grey.shape), 0, 255)
+        Image.fromarray(np.rint(np.dstack([shown] * 3 + [255 * mask])).astype(np.uint8), "RGBA").save(
+            folder / f"{i}.png"
+        )
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (plain_ball_behind_scratches, "masks move, but the points that pictures share stand still"),
         (rotation_only, "the camera only turned .* walk around"),
         (blurred, "the pictures are blurred"),
         (plain, "plain .* nothing to recognise"),
@@ -337,3 +355,32 @@ def test_where_points_are_looked_for_follows_from_what_is_around_the_object(tmp_
     assert _features_on(backdrop, "auto") == "object"
     assert _features_on(walk, "everything") == "everything"
     assert _features_on([*walk[:2], walk[2]._replace(mask=None)], "auto") == "everything"
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_what_all_pictures_have_in_the_same_place_is_taken_out(masked: bool):
+    from dano.vision.structure._photographs import Photograph, without_what_stays
+
+    top, skin = table(), pattern(1)
+    true, photographs, counted = [], [], []
+    for view in [camera(0.3 * i, 0.6 + 0.1 * (i % 2), 0.2) for i in range(16)]:
+        grey, mask = photograph(view, top, skin)
+        shown = np.rint(np.clip(grey + scratched(0, grey.shape), 0, 255)).astype(np.uint8)
+        true.append(grey.astype(float))
+        counted.append((mask > 0.5).astype(np.float32) if masked else None)
+        photographs.append(Photograph("", Path(), None, shown, mask, None, 0.0))
+    cleaned = without_what_stays(photographs, counted)
+    inside = [np.ones_like(true[0], bool) if where is None else where > 0.5 for where in counted]
+
+    def spoiled(pictures: list[Photograph]) -> float:
+        """What the pictures have in common and should not, as its root mean square."""
+        added = [np.where(w, p.grey - t, np.nan) for p, t, w in zip(pictures, true, inside, strict=True)]
+        enough = np.sum(inside, axis=0) == len(inside)
+        return float(np.sqrt(np.mean(np.mean(added, axis=0)[enough] ** 2)))
+
+    assert spoiled(photographs) > 15
+    assert spoiled(cleaned) < 0.5 * spoiled(photographs)
+    # Four pictures say nothing of what they have in common; one of another size has none like it.
+    assert without_what_stays(photographs[:4], counted[:4]) == photographs[:4]
+    odd = photographs[0]._replace(grey=photographs[0].grey[:90])
+    assert without_what_stays([*photographs, odd], [*counted, None])[-1] is odd

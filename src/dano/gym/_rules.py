@@ -193,7 +193,8 @@ def _filled(scene: Scene, state: State) -> State:
 
 
 def _errors(scene: Scene, task: Task, state: State) -> list[Array]:
-    return [goal.error(scene, state) for goal in task.goals]
+    """Of states as `Rules.begun` and steps leave them."""
+    return [goal.error(scene, state, placed=True) for goal in task.goals]
 
 
 def _observations(scene: Scene, task: Task, states: State, left: Float[Array, " r"]):
@@ -227,7 +228,9 @@ def _judged(rules: Rules, before: State, u: Float[Array, "r m"], after: State, l
         end = sum(0.5 * goal.final * e * e for goal, e in zip(task.goals, new, strict=True))
         gained = rules.shaping * (sum(old) - sum(new))
         met = [
-            jnp.max(jnp.abs(goal.error(scene, after))) <= goal.within for goal in task.goals if goal.required
+            jnp.max(jnp.abs(error)) <= goal.within
+            for goal, error in zip(task.goals, _errors(scene, task, after), strict=True)
+            if goal.required
         ]
         reached = jnp.all(jnp.stack(met)) if met else jnp.asarray(False)
         return gained - length * price - jnp.where(last, end, 0), reached, jnp.stack(new)

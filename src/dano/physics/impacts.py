@@ -4,7 +4,7 @@ An impact happens when a body has sunk into another by a stated depth δ. The sa
 patch; they count with weights w(d/δ) that fade in with depth. A damper between what they do and their goals
 brings them there within a step,
 
-    p = κ w (v* − v_n)⁺,    κ = β F m_eff / (h Σ A w).
+    p = κ w (v* − v_n)⁺,    κ = β F/(1 + (1 − β) F) m_eff / (h Σ A w).
 
 Nothing of this depends on where in a step the bodies meet, on the number of samples, or, but for h κ, on h.
 """
@@ -17,6 +17,8 @@ from dano.physics.real import ONE, real, TWO, vec3, ZERO
 # F: momentum that the damper passes on, by that of the common mass, for each speed that is missing. The
 # softer, the more samples share an impact; goals make up for it.
 _FACTOR = wp.constant(real(100.0))
+# Least share of a step after an impact.
+_LATEST = wp.constant(real(1e-6))
 
 
 @wp.struct
@@ -29,7 +31,6 @@ class Patch:
         normal: [m², W].
         near_load: Σ A w of samples that have sunk in or nearly have [m²].
         near_rate: Their separating speed, weighted by that load [m³/s].
-        deepest: Largest depth [m].
     """
 
     load: real
@@ -37,7 +38,6 @@ class Patch:
     normal: vec3
     near_load: real
     near_rate: real
-    deepest: real
 
 
 @wp.struct
@@ -49,8 +49,9 @@ class Impact:
         stiffness: κ [Pa s/m], zero where bodies have not sunk in far enough.
         depth: δ [m].
         part: Share of the impact that the pair carries, ½ where samples of both bodies do [1].
-        delays: 1 where impulses take effect when bodies meet, 0 where they do so at the start of the step.
-        way: Share of the step in which bodies go on as before, τ where impulses take effect at its start.
+        delays: Impulses take effect after this share of τ: β where they wait for when bodies meet, 0 where
+            they act from the start of the step.
+        way: Share of the step in which bodies go on as before, all the same.
         rest: Time from when impulses take effect to the end of the step [s].
     """
 
@@ -75,6 +76,37 @@ def fading_in(x: real) -> real:
     """w: how much a sample counts at x times the depth of the impact. Its slope has no jumps."""
     y = wp.max(x, ZERO)
     return wp.where(y < ONE, y * y, TWO * y - ONE)
+
+
+@wp.func
+def layer_of(depth: real, share: real) -> real:
+    """Distance [m] within which samples nearly have sunk in: where geometry is taken early, others follow.
+
+    Args:
+        depth: δ [m].
+        share: τ. Towards the end of the step the layer fades out.
+    """
+    return depth * smooth_step(real(4.0) * (ONE - share))
+
+
+@wp.func
+def no_impact(depth: real, h: real) -> Impact:
+    """That of contact that lasts: nothing happens within the step of length h."""
+    impact = Impact()
+    impact.depth = depth
+    impact.part = ONE
+    impact.rest = h
+    return impact
+
+
+@wp.func
+def delayed(impact: Impact, delays: real, share: real, h: real) -> Impact:
+    """The impact with impulses that take effect after so much of the share τ of a step of length h."""
+    found = impact
+    found.delays = delays
+    found.way = (ONE - delays) * share
+    found.rest = wp.max(ONE - delays * share, _LATEST) * h
+    return found
 
 
 @wp.func
@@ -108,7 +140,6 @@ def with_sample(
     near = area * fading_in((sunk + layer) / depth)
     found.near_load += near
     found.near_rate += near * approach
-    found.deepest = wp.max(found.deepest, sunk)
     return found
 
 
@@ -136,12 +167,13 @@ def share_of_impact(patch: Patch, bounce: real) -> real:
 
 @wp.func
 def stiffness_of_impact(first: BodyState, second: BodyState, patch: Patch, bounce: real, h: real) -> real:
-    """κ [Pa s/m] of a patch whose bodies have met."""
+    """κ [Pa s/m] of a patch whose bodies have met, such that β is its share of how velocities change."""
     arm = patch.arm / patch.load
     normal = patch.normal / patch.load
     inverse_mass = effective_inverse_mass(first, arm, normal)
     inverse_mass += effective_inverse_mass(second, arm + first.position - second.position, normal)
-    return share_of_impact(patch, bounce) * _FACTOR / (h * inverse_mass * patch.load)
+    share = share_of_impact(patch, bounce)
+    return share * _FACTOR / ((ONE + (ONE - share) * _FACTOR) * h * inverse_mass * patch.load)
 
 
 @wp.func

@@ -16,6 +16,8 @@ FADE = 0.15
 """Over how much of x the momentum of fast spins tends to Jω: a tenth of a turn."""
 
 _RESOLVED = wp.constant(real(RESOLVED))
+# Steps of Newton's method between spins that differ by h |ω|² at most; each squares the error.
+_SEEN = wp.constant(4)
 _FADE = wp.constant(real(FADE))
 _ROOT = wp.constant(real(math.sqrt(1 - RESOLVED**2)))
 _SLOPE = wp.constant(real(math.sqrt(1 - RESOLVED**2) - RESOLVED**2 / math.sqrt(1 - RESOLVED**2)))
@@ -60,21 +62,107 @@ def momentum_shares(omega: vec3, h: real) -> MomentumShares:
 
 
 @wp.func
-def angular_momentum(omega: vec3, inertia: mat33, h: real, sign: real) -> vec3:
-    """Moment m J ω ± g (h/2) ω × Jω: after a step (sign +1), or before it (−1)."""
+def angular_momentum(omega: vec3, inertia: mat33, h: real, lead: real) -> vec3:
+    """Moment m J ω + g lead (h/2) ω × Jω, as seen from an orientation within a step.
+
+    Args:
+        omega: Spin [rad/s].
+        inertia: In the same axes [kg m²].
+        h: Timestep [s].
+        lead: How long after that orientation the middle of the spin's step is, in half steps: 1 at the start
+            of the step that is made with the spin, −1 at its end.
+    """
     shares = momentum_shares(omega, h)
     spin = inertia * omega
-    return shares.share * spin + (HALF * sign * h * shares.gyroscopic) * wp.cross(omega, spin)
+    return shares.share * spin + (HALF * lead * h * shares.gyroscopic) * wp.cross(omega, spin)
 
 
 @wp.func
-def angular_momentum_jacobian(omega: vec3, inertia: mat33, h: real) -> mat33:
-    """Derivative of the angular momentum after a step by ω."""
+def angular_momentum_jacobian(omega: vec3, inertia: mat33, h: real, lead: real) -> mat33:
+    """Derivative of the angular momentum by ω."""
     shares = momentum_shares(omega, h)
     spin = inertia * omega
-    along = shares.share_slope * spin + (HALF * h * shares.gyroscopic_slope) * wp.cross(omega, spin)
-    turning = (HALF * h * shares.gyroscopic) * (skew(omega) * inertia - skew(spin))
+    along = shares.share_slope * spin + (HALF * lead * h * shares.gyroscopic_slope) * wp.cross(omega, spin)
+    turning = (HALF * lead * h * shares.gyroscopic) * (skew(omega) * inertia - skew(spin))
     return shares.share * inertia + turning + (real(0.25) * h * h) * wp.outer(along, omega)
+
+
+@wp.func
+def gyroscopic_gain(omega: vec3, inertia: mat33, inverse: mat33, h: real) -> vec3:
+    """What a spin gains in a step without torques [rad/s], by the midpoint rule.
+
+    Args:
+        omega: The spin [rad/s].
+        inertia: In the same axes [kg m²].
+        inverse: Its inverse.
+        h: Timestep [s].
+    """
+    shares = momentum_shares(omega, h)
+    factor = -h * shares.gyroscopic / shares.share
+    middle = omega + (HALF * factor) * (inverse * wp.cross(omega, inertia * omega))
+    return factor * (inverse * wp.cross(middle, inertia * middle))
+
+
+@wp.func
+def spin_seen_from(omega: vec3, inertia: mat33, h: real, lead: real, other: real) -> vec3:
+    """The spin with the same angular momentum, as seen with another lead; by Newton's method.
+
+    Args:
+        omega: The spin [rad/s, B].
+        inertia: [kg m², B].
+        h: Timestep [s].
+        lead: See `angular_momentum`.
+        other: The other lead.
+    """
+    momentum = angular_momentum(omega, inertia, h, lead)
+    found = omega
+    for _k in range(_SEEN):
+        missed = angular_momentum(found, inertia, h, other) - momentum
+        found = found - wp.inverse(angular_momentum_jacobian(found, inertia, h, other)) * missed
+    return found
+
+
+@wp.struct
+class EndOfImpact:
+    """What becomes of a body whose spin was solved for when it met another.
+
+    Attributes:
+        omega: Its spin at the end of the step [rad/s, B].
+        turn: What is added to the spin by which its orientation changes within the step [rad/s, W].
+    """
+
+    omega: vec3
+    turn: vec3
+
+
+@wp.func
+def end_of_impact(
+    spin: vec3, inertia: mat33, rotation: mat33, gain: vec3, h: real, met: real, lead: real
+) -> EndOfImpact:
+    """The end of a step in which angular momentum is balanced after the share τ.
+
+    Before it a spin ω gains γ a step, after it γ⁺. So the mean over the step is
+
+        τ (ω + (½ + τ/2) γ) + (1 − τ) (ω_τ + (1 − τ)/2 γ⁺),
+
+    of which the impulse tells τ (ω + (½ + τ) γ) + (1 − τ) ω_τ.
+
+    Args:
+        spin: The spin that the balance gives [rad/s, W].
+        inertia: [kg m², B].
+        rotation: Of the body when it is balanced.
+        gain: γ [rad/s, W].
+        h: Timestep [s].
+        met: τ.
+        lead: With which the balance sees the spin.
+    """
+    end = EndOfImpact()
+    back = wp.transpose(rotation)
+    seen = back * spin
+    end.omega = spin_seen_from(seen, inertia, h, lead, ONE - TWO * met)
+    gains = rotation * gyroscopic_gain(end.omega, inertia, wp.inverse(inertia), h)
+    end.turn = rotation * (end.omega - seen) + (HALF * met * met) * (gains - gain)
+    return end
 
 
 @wp.func

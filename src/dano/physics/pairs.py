@@ -5,7 +5,7 @@ Geometry is taken where the old velocities take the bodies by a share τ of the 
 
 import warp as wp
 
-from dano.physics.features import TURNING
+from dano.physics.features import TREES, TURNING
 from dano.physics.real import HALF, mat33, ONE, quat, real, vec3, ZERO
 from dano.physics.rotations import direction, interpolated, matrix, rotation_from_z
 from dano.physics.solids.distances import Solid, solid_distance
@@ -38,9 +38,15 @@ class BodyState:
         velocity: Of the centre of mass [m/s, W].
         spin: [rad/s, W].
         gain: What gravity adds to the velocity within the step [m/s, W], zero for a body on a joint.
+        spin_gain: What gyroscopic torque adds to the spin within the step [rad/s, W]; the same.
+        ahead_falling: Orientation at the end of the step with that gain; unused where there are joints.
         com: Centre of mass in the field frame [m, F].
         inverse_mass: Effective inverse mass [1/kg], zero for a fixed body.
         inverse_inertia: Effective inverse inertia [1/(kg m²), W], zero for a fixed body.
+        met: Share of the step after which the body meets a fixed one in an impact; 0 where it does not. Its
+            angular momentum is balanced then.
+        lead: With which the balance sees the spin, see `angular_momentum`: 1 for that of the step, 0 for that
+            at the moment of the balance, in an impact.
     """
 
     position: vec3
@@ -49,9 +55,13 @@ class BodyState:
     velocity: vec3
     spin: vec3
     gain: vec3
+    spin_gain: vec3
+    ahead_falling: quat
     com: vec3
     inverse_mass: real
     inverse_inertia: mat33
+    met: real
+    lead: real
 
 
 @wp.struct
@@ -68,6 +78,8 @@ class PairPose:
         spin: Of the first body relative to the second [rad/s].
         gained: What gravity has added to the velocity by then [m/s].
         gained_on_way: The same, in the mean over the way.
+        spin_gained: What gyroscopic torques have added to the spin [rad/s].
+        spin_gained_on_way: The same, in the mean over the way.
         gains_after: What the velocity of the end of the step gains from then on [m/s].
         com_difference: From the second body's centre of mass to the first's at the start [m, W].
         arms: Sample coordinates → arms from the first body's centre of mass, without their offset. Those of
@@ -87,6 +99,8 @@ class PairPose:
     spin: vec3
     gained: vec3
     gained_on_way: vec3
+    spin_gained: vec3
+    spin_gained_on_way: vec3
     gains_after: vec3
     com_difference: vec3
     arms: mat33
@@ -144,10 +158,26 @@ def facing_map(turn: mat33, toward: vec3, turning: int, scale: vec3) -> FacingMa
 
 @wp.func
 def falling(body: BodyState, falls: int) -> BodyState:
-    """A body that falls freely, or one that others hold: gravity adds nothing to its velocity."""
+    """A body that falls freely, or one that others hold, whose velocities gain nothing."""
     found = body
     if falls == 0:
         found.gain = vec3()
+        found.spin_gain = vec3()
+    elif wp.static(not TREES):
+        found.ahead = body.ahead_falling
+    return found
+
+
+@wp.func
+def falling_bar(bar: BodyState, falls: int) -> BodyState:
+    """Derivatives by a body from those by what `falling` makes of it."""
+    found = bar
+    if falls == 0:
+        found.gain = vec3()
+        found.spin_gain = vec3()
+    elif wp.static(not TREES):
+        found.ahead_falling = bar.ahead_falling + bar.ahead
+        found.ahead = quat()
     return found
 
 
@@ -155,6 +185,14 @@ def falling(body: BodyState, falls: int) -> BodyState:
 def rotation_after(body: BodyState, share: real) -> mat33:
     """Rotation of a body after a share of the step."""
     return matrix(interpolated(body.orientation, body.ahead, share))
+
+
+@wp.func
+def rotation_met(body: BodyState) -> mat33:
+    """Rotation of a body when its angular momentum is balanced: its spin at the end is seen from there."""
+    if body.met > ZERO:
+        return matrix(interpolated(body.orientation, body.ahead_falling, body.met))
+    return matrix(body.orientation)
 
 
 @wp.func
@@ -221,7 +259,10 @@ def pair_pose(
     moves = first.velocity - second.velocity
     pose.velocity = inverse * (moves - wp.cross(second.spin, pose.com_difference))
     pose.spin = inverse * (first.spin - second.spin)
-    gain = inverse * (first.gain - second.gain)
+    gain = inverse * (first.gain - second.gain - wp.cross(second.spin_gain, pose.com_difference))
+    spin_gain = inverse * (first.spin_gain - second.spin_gain)
+    pose.spin_gained = (HALF + share) * spin_gain
+    pose.spin_gained_on_way = spin_gain
     pose.gained = (HALF + share) * gain
     pose.gained_on_way = (HALF * (ONE + share)) * gain
     pose.gains_after = (HALF - share) * gain

@@ -153,7 +153,8 @@ def point_contact(
     point.arm = pose.rotation * arm
     point.normal = pose.rotation * normal
     point.moment = pose.rotation * moment
-    point.depth = lead * (rate + wp.dot(pose.gained_on_way, normal)) - d.value
+    gained_on_way = wp.dot(pose.gained_on_way, normal) + wp.dot(pose.spin_gained_on_way, moment)
+    point.depth = lead * (rate + gained_on_way) - d.value
     if not presses_back:
         point.sunk = -d.value
     point.rate = rate
@@ -166,6 +167,6 @@ def point_contact(
             nearing = wp.dot(normal, changed)
             point.approach = rate - nearing
             point.extra_slip = pose.rotation * (changed - nearing * normal)
-    point.meets = point.approach + wp.dot(pose.gained, normal)
+    point.meets = point.approach + wp.dot(pose.gained, normal) + wp.dot(pose.spin_gained, moment)
     point.gains_after = wp.dot(pose.gains_after, normal)
     return point

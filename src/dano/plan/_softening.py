@@ -23,8 +23,7 @@ def softened(scene: Scene, factor: float) -> Scene:
     checked_number("factor", factor, above=0)
 
     def params_of(scene: Scene) -> list:
-        every = [contact.params for contact in scene.contacts]
-        every += [] if scene.others is None else [scene.others.params]
+        every = [contact.params for contact in _contacts(scene)]
         return [x for params in every for name in _STIFF if (x := getattr(params, name)) is not None]
 
     return eqx.tree_at(params_of, scene, [factor * x for x in params_of(scene)])
@@ -45,9 +44,13 @@ def gradual(scene: Scene, slip: float) -> Scene:
     checked_number("slip", slip, above=0)
 
     def laws_of(scene: Scene) -> list:
-        every = [contact.law for contact in scene.contacts]
-        every += [] if scene.others is None else [scene.others.law]
+        every = [contact.law for contact in _contacts(scene)]
         return [law.gradual_stiction for law in every if isinstance(law, DistributedLaw)]
 
     found = laws_of(scene)
     return eqx.tree_at(laws_of, scene, [jnp.full_like(x, slip) for x in found]) if found else scene
+
+
+def _contacts(scene: Scene) -> list:
+    """All that have parameters and a law: the contacts, and what lets other pairs touch."""
+    return [*scene.contacts, *([] if scene.others is None else [scene.others])]

@@ -182,9 +182,17 @@ class Goal(eqx.Module):
         """What it is called in results."""
         return f"{self.quantity} of {self.body}"
 
-    def error(self, scene: Scene, state: State) -> Float[Array, " p"]:
-        """E at a state, shape (number of axes,)."""
-        return _difference(scene, state, self.body, self.quantity, self.value, self.axes)
+    def error(self, scene: Scene, state: State, *, placed: bool = False) -> Float[Array, " p"]:
+        """E at a state, shape (number of axes,).
+
+        Args:
+            scene: Of the state.
+            state: Where to ask.
+            placed: Whether poses of bodies on joints are known to be those of `state.q`, as they are in
+                states that `Scene.filled` or a step returned. Derivatives by `q` are lost then.
+        """
+        filled = state if placed else _placed(scene, state, self.body, self.quantity)
+        return _difference(scene, filled, self.body, self.quantity, self.value, self.axes)
 
 
 class Limit(eqx.Module):
@@ -244,7 +252,8 @@ class Limit(eqx.Module):
     def excess(self, scene: Scene, state: State) -> Float[Array, " p"]:
         """How far beyond each finite bound a state is; negative inside."""
         n = QUANTITIES[self.quantity]
-        value = _difference(scene, state, self.body, self.quantity, jnp.zeros(n, self.lower.dtype), self.axes)
+        filled, none = _placed(scene, state, self.body, self.quantity), jnp.zeros(n, self.lower.dtype)
+        value = _difference(scene, filled, self.body, self.quantity, none, self.axes)
         # An infinite bound is not a condition; a finite number keeps derivatives finite.
         over = jnp.where(jnp.isfinite(self.upper), value - self.upper, -1.0)
         under = jnp.where(jnp.isfinite(self.lower), self.lower - value, -1.0)
@@ -350,6 +359,12 @@ class Task(eqx.Module):
         return jax.vmap(lambda row: self.control(scene, row))(u)
 
 
+def _placed(scene: Scene, state: State, body: str, quantity: str) -> State:
+    """The state with poses of bodies on joints as its `q` says, where the quantity depends on them."""
+    on_joint = scene.layout.joint_of(scene.index(body)) is not None
+    return scene.filled(state) if on_joint and quantity not in ("q", "v") else state
+
+
 def _difference(scene: Scene, state: State, body: str, quantity: str, value: Array, axes: str) -> Array:
     i, layout = scene.index(body), scene.layout
     if quantity in ("q", "v"):
@@ -358,8 +373,6 @@ def _difference(scene: Scene, state: State, body: str, quantity: str, value: Arr
         assert joint is not None and numbers is not None
         place = layout.coordinates[joint]
         return numbers[place : place + 1] - value
-    if layout.joint_of(i) is not None:
-        state = scene.filled(state)
     if quantity == "orientation":
         error = quat_log(quat_multiply(quat_conjugate(value), state.orientation[i]))
     else:

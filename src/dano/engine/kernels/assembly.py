@@ -242,11 +242,12 @@ def add_momentum(scene: Scene, room: Room, world: int, lane: int, m: int, h: rea
             v = room.tried[world, b]
             spin = angular_part(v)
             inertia = room.inertia[world, i]
+            lead = room.bodies[world, scene.moving[i]].lead
             linear = body.mass * linear_part(v)
-            angular = angular_momentum(spin, inertia, h, ONE)
+            angular = angular_momentum(spin, inertia, h, lead)
             room.residual[world, b] = joined(linear, angular) - room.momentum[world, i]
             eye = wp.identity(n=3, dtype=real)
-            turning = angular_momentum_jacobian(spin, inertia, h)
+            turning = angular_momentum_jacobian(spin, inertia, h, lead)
             room.blocks[world, b * m + b] = joined_blocks(body.mass * eye, mat33(), mat33(), turning)
 
 

@@ -11,8 +11,9 @@ from dano.engine.kernels.assembly import add_point_jacobian, Halves, whole_jacob
 from dano.engine.kernels.lanes import total6, total66, wait
 from dano.engine.kernels.tables import FoundPair, Room, Scene
 from dano.physics.features import LANES, POINTS, TREES, TURNING
-from dano.physics.pairs import BodyState, FIXED
-from dano.physics.real import mat66, vec6, ZERO
+from dano.physics.momentum import turned_inertia
+from dano.physics.pairs import FIXED, rotation_met
+from dano.physics.real import mat66, ONE, real, vec6, ZERO
 from dano.physics.twists import angular_part, joined, linear_part, wrench_at
 
 _LANES, _FIXED = wp.constant(LANES), wp.constant(FIXED)
@@ -51,9 +52,49 @@ def pair_slope(scene: Scene, room: Room, world: int, found: FoundPair) -> mat66:
 
 
 @wp.func
-def freed(state: BodyState, impulse: vec6) -> vec6:
-    """M⁻¹ P: change of a body's velocity and spin by an impulse."""
-    return joined(state.inverse_mass * linear_part(impulse), state.inverse_inertia * angular_part(impulse))
+def moving_of(scene: Scene, found: FoundPair) -> int:
+    """The body that moves of a pair of which the other is fixed."""
+    index = scene.pair_index[found.pair]
+    return wp.where(scene.body_index[index.first].row >= 0, index.first, index.second)
+
+
+@wp.func
+def meetings_of(scene: Scene, room: Room, world: int, n_found: int, body: int) -> tuple[real, real, real]:
+    """How many impulses on a body wait for when it meets another, by how much, and the sum of moments τ_β."""
+    count = real(0.0)
+    waits = real(0.0)
+    shares = real(0.0)
+    for f in range(n_found):
+        found = room.found[world, f * _LANES]
+        if found.impact.delays > ZERO and moving_of(scene, found) == body:
+            count += ONE
+            waits += found.impact.delays
+            shares += found.impact.delays * found.share
+    return count, waits, shares
+
+
+@wp.func
+def balance_when_met(scene: Scene, room: Room, world: int, n_found: int):
+    """Balance angular momenta where bodies meet: with the inertia that they have then.
+
+    Of impulses that take effect at several moments the mean counts. Everything is right to first order in h
+    for any of them.
+    """
+    for i in range(scene.moving.shape[0]):
+        body = scene.moving[i]
+        count, waits, shares = meetings_of(scene, room, world, n_found, body)
+        if count > ZERO:
+            room.bodies[world, body].met = shares / count
+            room.bodies[world, body].lead = ONE - waits / count
+            rotation = rotation_met(room.bodies[world, body])
+            room.inertia[world, i] = turned_inertia(rotation, scene.bodies[world, body].inertia)
+
+
+@wp.func
+def freed(room: Room, world: int, i: int, row: int, impulse: vec6) -> vec6:
+    """M⁻¹ P: change of a body's velocity and spin by an impulse, by its number and its row."""
+    linear = room.bodies[world, i].inverse_mass * linear_part(impulse)
+    return joined(linear, wp.inverse(room.inertia[world, row]) * angular_part(impulse))
 
 
 @wp.func
@@ -67,13 +108,13 @@ def find_moved(scene: Scene, room: Room, world: int, lane: int, n_found: int):
         for f in range(n_found):
             found = room.found[world, f * _LANES + lane]
             if found.impact.delays > ZERO:
-                impulse = found.share * pair_impulse(scene, room, world, found)
+                impulse = (found.impact.delays * found.share) * pair_impulse(scene, room, world, found)
                 if lane == 0:
                     index = scene.pair_index[found.pair]
                     a = scene.body_index[index.first].row
                     b = scene.body_index[index.second].row
                     if a >= 0:
-                        room.moved[world, a] -= freed(room.bodies[world, index.first], impulse)
+                        room.moved[world, a] -= freed(room, world, index.first, a, impulse)
                     if b >= 0:
                         back = wrench_at(impulse, found.com_difference)
-                        room.moved[world, b] += freed(room.bodies[world, index.second], back)
+                        room.moved[world, b] += freed(room, world, index.second, b, back)

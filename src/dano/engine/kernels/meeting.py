@@ -38,14 +38,12 @@ class Meeting:
     Attributes:
         share: τ, share of the step after which geometry is taken.
         critical: Sample that has sunk in by then, −1 where none does within the step.
-        deep: Whether one had from the start.
         nears: Whether a sample nears the other body fast enough to count.
         least: No sample gets closer to the other body than that [m].
     """
 
     share: real
     critical: int
-    deep: bool
     nears: bool
     least: real
 
@@ -110,6 +108,20 @@ def solid_of_body(scene: Scene, world: int, body: int) -> Solid:
 
 
 @wp.func
+def gain_of(a: BodyState, b: BodyState, lever: real) -> real:
+    """Most that a velocity of a point gains relative to another body within a step [m/s].
+
+    Args:
+        a: The body of the point.
+        b: The other body.
+        lever: Largest distance of the point from the first body's centre of mass [m].
+    """
+    of_spins = wp.length(a.spin_gain) * lever
+    of_spins += wp.length(b.spin_gain) * (lever + wp.length(a.position - b.position))
+    return wp.length(a.gain - b.gain) + of_spins
+
+
+@wp.func
 def is_near(
     scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, margin: real, h: real
 ) -> bool:
@@ -121,7 +133,7 @@ def is_near(
         body.radius
         + margin
         + h * (wp.length(a.velocity - b.velocity) + wp.length(a.spin) * wp.length(body.middle - body.com))
-        + h * wp.length(a.gain - b.gain)
+        + h * gain_of(a, b, wp.length(body.middle - body.com))
     )
     solid = solid_of_body(scene, world, second)
     if solid.kind.kind == _HALF_SPACE:
@@ -216,7 +228,7 @@ class Nearing:
         left: Way that is left to the depth at which bodies meet [m].
         near: How far it nears the solid in a step, at the moment [m].
         counts: By more than so much in a step where it counts [m].
-        at_old: How far it would near it without gravity [m].
+        at_old: How far it would near it if its velocity gained nothing [m].
     """
 
     left: real
@@ -232,8 +244,11 @@ def nearing(pose: PairPose, turning: int, x: vec3, d: Distance, sink: real, h: r
     normal = solid_normal(d.gradient)
     found.left = d.value + sink
     found.at_old = h * approach(pose, turning, x, normal)
-    found.near = found.at_old - h * wp.dot(pose.gained, normal)
-    # Gravity alone, of bodies that others hold, is no approach.
+    gained = pose.gained
+    if turning == 0:
+        gained = gained + wp.cross(pose.spin_gained, x - pose.com)
+    found.near = found.at_old - h * wp.dot(gained, normal)
+    # What velocities gain alone, of bodies that others hold, is no approach.
     found.counts = slow + wp.max(found.near - found.at_old, ZERO)
     return found
 
@@ -419,7 +434,7 @@ def meeting(
     # Seen from the second body, velocities turn with both bodies.
     axis = matrix(a.orientation) * vec3(ZERO, ZERO, ONE)
     turns = spin_of_samples(a.spin - b.spin, axis, index.turning)
-    gain = h * wp.length(a.gain - b.gain)
+    gain = h * gain_of(a, b, wp.length(middle_of(body, a) - a.position) + body.radius)
     way += real(1.5) * gain
     most = STEEPEST * (most + real(1.5) * gain)
     bend = way * h * (wp.length(turns) + TWO * wp.length(b.spin)) + gain
@@ -465,7 +480,6 @@ def meeting(
             met.least = wp.min(least(seen.close), -sink)
         before = share
         share = wp.max(share + closest, ZERO)
-        met.deep = closest < ZERO and before == ZERO
         k += 1
         if share >= ONE:
             met.critical = -1

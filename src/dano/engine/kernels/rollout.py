@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.impacts import find_moved
+from dano.engine.kernels.impacts import balance_when_met, find_moved
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import find_pattern
 from dano.engine.kernels.patches import find_patches
@@ -20,8 +20,8 @@ from dano.engine.kernels.trees.kinematics import (
 )
 from dano.engine.kernels.trees.loops import begin_loops, forces_of
 from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
-from dano.physics.momentum import angular_momentum, turned_inertia
-from dano.physics.pairs import BodyState
+from dano.physics.momentum import angular_momentum, end_of_impact, gyroscopic_gain, turned_inertia
+from dano.physics.pairs import BodyState, rotation_met
 from dano.physics.real import HALF, ONE, real, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
 from dano.physics.trees.joints import ROOT
@@ -108,6 +108,8 @@ def begin_body(scene: Scene, room: Room, world: int, i: int, row: StateRow, push
     state.position = row.position
     state.orientation = from_wxyz(row.orientation)
     state.ahead = state.orientation
+    state.ahead_falling = state.orientation
+    state.lead = ONE
     state.com = body.com
     size = ZERO
     if m >= 0:
@@ -122,15 +124,18 @@ def begin_body(scene: Scene, room: Room, world: int, i: int, row: StateRow, push
         rotation = matrix(state.orientation)
         inertia = turned_inertia(rotation, body.inertia)
         spin = rotation * row.omega
+        if is_alone:
+            state.inverse_mass = ONE / body.mass
+            state.inverse_inertia = wp.inverse(inertia)
         if not hangs:
             state.ahead = turned(state.orientation, row.omega, h)
             state.velocity = row.velocity
             state.spin = spin
             if wp.static(not TREES):
                 state.gain = h * scene.gravity[world, 0]
-        if is_alone:
-            state.inverse_mass = ONE / body.mass
-            state.inverse_inertia = wp.inverse(inertia)
+                state.spin_gain = gyroscopic_gain(spin, inertia, state.inverse_inertia, h)
+                falls = row.omega + wp.transpose(rotation) * state.spin_gain
+                state.ahead_falling = turned(state.orientation, falls, h)
         linear = body.mass * (row.velocity + h * scene.gravity[world, 0]) + h * push.force
         angular = angular_momentum(spin, inertia, h, -ONE) + h * push.torque
         room.momentum[world, m] = joined(linear, angular)
@@ -163,9 +168,11 @@ def adds_energy(scene: Scene, room: Room, world: int) -> bool:
             body = scene.bodies[world, scene.moving[i]]
             state = room.bodies[world, scene.moving[i]]
             v = room.velocity[world, b]
-            angular = angular_momentum(angular_part(v), room.inertia[world, i], h, ONE)
+            angular = angular_momentum(angular_part(v), room.inertia[world, i], h, state.lead)
             impulse = joined(body.mass * linear_part(v), angular) - room.momentum[world, i]
-            before = joined(state.velocity, state.spin)
+            # An impact begins with the spin of its moment.
+            waits = (ONE - state.lead) * (HALF + state.met)
+            before = joined(state.velocity, state.spin + waits * state.spin_gain)
             after = v
             # In the body's axes, in which components of a spin belong to axes of the body.
             back = wp.transpose(matrix(state.orientation))
@@ -292,6 +299,10 @@ def find_touching(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
     overflow = bool(False)
     if wp.static(POINTS):
         n_found, overflow = find_contacts(scene, room, world, lane)
+        if wp.static(not TREES):
+            wait()
+            if lane == 0:
+                balance_when_met(scene, room, world, n_found)
     n_near = n_found
     if wp.static(PATCHES):
         n_near = find_patches(scene, room, world, lane, n_found)
@@ -324,10 +335,18 @@ def advance_body(scene: Scene, room: Room, world: int, i: int, row: StateRow) ->
         state = room.bodies[world, i]
         moved = room.moved[world, m]
         back = wp.transpose(matrix(state.orientation))
+        turn = angular_part(moved)
         after.velocity = linear_part(v)
         after.omega = back * angular_part(v)
+        if state.lead < ONE:
+            end = end_of_impact(
+                angular_part(v), scene.bodies[world, i].inertia, rotation_met(state), state.spin_gain, h,
+                state.met, state.lead,
+            )  # fmt: skip
+            after.omega = end.omega
+            turn = turn + end.turn
         after.position = row.position + h * linear_part(moved)
-        after.orientation = to_wxyz(turned(state.orientation, back * angular_part(moved), h))
+        after.orientation = to_wxyz(turned(state.orientation, back * turn, h))
     return after
 
 

@@ -6,7 +6,7 @@ is listed if the old velocities take it into the other body by the end of the st
 
 import warp as wp
 
-from dano.engine.kernels.lanes import greatest, lanes_where, total, total3
+from dano.engine.kernels.lanes import lanes_where, total, total3
 from dano.engine.kernels.meeting import (
     facing,
     is_near,
@@ -28,7 +28,16 @@ from dano.engine.kernels.tables import (
     Scene,
 )
 from dano.physics.features import LANES, TREES
-from dano.physics.impacts import Impact, Patch, share_of_impact, stiffness_of_impact, with_sample
+from dano.physics.impacts import (
+    delayed,
+    Impact,
+    layer_of,
+    no_impact,
+    Patch,
+    share_of_impact,
+    stiffness_of_impact,
+    with_sample,
+)
 from dano.physics.pairs import (
     BodyState,
     falling,
@@ -48,8 +57,6 @@ from dano.physics.solids.distances import solid_clearance, solid_distance
 from dano.physics.solids.grids import STEEPEST
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
-# Least share of a step after an impact.
-_LATEST = wp.constant(real(1e-6))
 
 
 @wp.func
@@ -111,12 +118,6 @@ def block_share(lane: int, bits: wp.uint32) -> BlockShare:
 
 
 @wp.func
-def layer_of(pair: SamplePair, share: real) -> real:
-    """Distance [m] within which samples nearly have sunk in: where geometry is taken early, others follow."""
-    return wp.where(share < ONE, pair.impact_depth, ZERO)
-
-
-@wp.func
 def find_points(
     scene: Scene,
     room: Room,
@@ -147,7 +148,7 @@ def find_points(
     solid = solid_of_body(scene, world, second)
     body = scene.bodies[world, first]
     stretch = stretch_of(body, index.turning)
-    layer = layer_of(pair, share)
+    layer = layer_of(pair.impact_depth, share)
     plane = plane_of(scene, world, solid, index.turning, pose.origin)
     at = begin
     beyond = int(0)
@@ -207,7 +208,7 @@ def find_points(
 def impact_of(
     a: BodyState, b: BodyState, patch: Patch, material: Material, found: FoundPair, depth: real, alone: bool
 ) -> Impact:
-    """The impact of a pair; none where it approaches slowly, or where its law leaves it to the spring.
+    """The impact of a pair; none where it approaches slowly.
 
     Args:
         a: First body.
@@ -219,21 +220,13 @@ def impact_of(
         alone: Whether one of the bodies is fixed and the other moves freely. Then impulses take effect when
             they meet; between two that move, this would not conserve angular momentum.
     """
-    impact = Impact()
-    impact.depth = depth
-    impact.part = ONE
-    if material.instant == ZERO or patch.load <= ZERO:
-        return impact
-    impact.share = share_of_impact(patch, material.bounce)
-    if impact.share > ZERO and (found.hits > 0 or found.deep > 0):
-        impact.stiffness = stiffness_of_impact(a, b, patch, material.bounce, material.timestep)
-        impact.rest = material.timestep
-        if found.deep == 0:
-            if alone:
-                impact.delays = ONE
-                impact.rest = wp.max(ONE - found.share, _LATEST) * material.timestep
-            else:
-                impact.way = found.share
+    impact = no_impact(depth, material.timestep)
+    if patch.load > ZERO:
+        impact.share = share_of_impact(patch, material.bounce)
+        if impact.share > ZERO and found.hits > 0:
+            impact.stiffness = stiffness_of_impact(a, b, patch, material.bounce, material.timestep)
+            delays = wp.where(alone, impact.share, ZERO)
+            impact = delayed(impact, delays, found.share, material.timestep)
     return impact
 
 
@@ -300,17 +293,18 @@ def keep_together(scene: Scene, room: Room, world: int, lane: int, n_found: int)
         k = f * _LANES + lane
         if room.found[world, k].impact.delays > ZERO:
             if touches_others(scene, room, world, lane, n_found, f):
-                room.found[world, k].impact.delays = ZERO
-                room.found[world, k].impact.way = room.found[world, k].share
-                room.found[world, k].impact.rest = scene.timestep[world, 0]
+                found = room.found[world, k]
+                room.found[world, k].impact = delayed(
+                    found.impact, ZERO, found.share, scene.timestep[world, 0]
+                )
 
 
 @wp.func
 def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: int, at: int, end: int) -> int:
     """List the points of a pair that is near, and write the pair into `room.found`.
 
-    Geometry of an impact is taken when bodies are as deep as in one. Where they approach slowly, or are that
-    deep from the start, it is that of contact that lasts.
+    Geometry of an impact is taken when bodies are as deep as in one, or at the start where they are deeper.
+    Where they approach slowly, it is that of contact that lasts.
 
     Returns:
         Place of the next point in the list, which may lie beyond its end.
@@ -335,10 +329,9 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
     met = Meeting()
     if not lasts:
         met = meeting(
-            scene, room, world, lane, a, b, pair, index.first, index.second, h, pair.impact_depth, slow, slow
-        )
-        lasts = met.deep
-        found.deep = wp.where(met.deep, 1, 0)
+            scene, room, world, lane, falling(a, 1), falling(b, 1), pair, index.first, index.second, h,
+            pair.impact_depth, slow, slow,
+        )  # fmt: skip
     if lasts:
         met = lasting_meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, sink)
     after = at
@@ -353,7 +346,7 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
         other = falling(b, found.falls)
         pose = posed(scene, world, seen, other, index.first, index.second, met.share, h, pair.follows)
         speed = wp.length(pose.velocity) + wp.length(pose.spin) * TWO * body.radius
-        speed += wp.length(pose.gained_on_way)
+        speed += wp.length(pose.gained_on_way) + wp.length(pose.spin_gained_on_way) * TWO * body.radius
         reach = pair.margin + (ONE - met.share) * h * speed
         patch = Patch()
         after, patch, load, turned_load = find_points(
@@ -365,10 +358,6 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
         patch.near_rate = total(patch.near_rate)
         patch.arm = total3(patch.arm)
         patch.normal = total3(patch.normal)
-        patch.deepest = greatest(patch.deepest)
-        # Samples that come near only after they have sunk in, by turning, are not met.
-        if met.share >= ONE and patch.deepest > pair.impact_depth:
-            found.deep = 1
         # What faces the other way presses where its load is the larger one.
         if total(turned_load) > total(load):
             after, patch, _load, _turned = find_points(
@@ -377,7 +366,9 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
             )  # fmt: skip
         found.patch = patch
         found.com_difference = pose.com_difference
-        found.impact = impact_of(a, b, patch, material, found, pair.impact_depth, alone)
+        found.impact = no_impact(pair.impact_depth, h)
+        if not lasts:
+            found.impact = impact_of(a, b, patch, material, found, pair.impact_depth, alone)
         if not lasts and found.impact.share == ZERO:
             lasts = True
             before = met.share

@@ -195,7 +195,6 @@ class FoundPair:
         critical: Sample that says when the bodies meet, −1 where they do not within the step.
         share: τ.
         hits: 1 where τ is when the bodies are as deep as in an impact.
-        deep: 1 where they are deeper than that from the start.
         falls: 1 where bodies fall freely until they meet: then gravity takes part in their way.
         impact: Of the pair.
         patch: Its samples that have sunk in.
@@ -209,12 +208,19 @@ class FoundPair:
     critical: wp.int32
     share: real
     hits: wp.int32
-    deep: wp.int32
     falls: wp.int32
     impact: Impact
     patch: Patch
     toward: vec3
     com_difference: vec3
+
+
+@wp.struct
+class Moment:
+    """When the angular momentum of a body is balanced, see `BodyState`."""
+
+    met: real
+    lead: real
 
 
 @wp.struct
@@ -249,6 +255,7 @@ class Room:
         best: Where the residual was smallest.
         moved: By which positions change within a step.
         late: Virtual velocities of impulses that take effect within a step.
+        moment_bar: Derivatives by when the angular momentum of bodies is balanced.
         step: Of Newton's method.
         residual: What each block misses [kg m/s; kg m²/s, W].
         scale: Turns momenta into velocities [1/kg; 1/(kg m²)].
@@ -259,6 +266,7 @@ class Room:
         wrenches: Impulse of each pair that is near, at the first body's centre of mass [N s, N m s, W].
         missing: Changes of the equations of a step, shape (worlds, directions · m).
         delayed: … and of impulses times the share of the step after which they take effect.
+        moments: … and of when angular momentum is balanced.
         splines: Changes of an equation by changes of coefficients, shape (worlds, directions · lanes).
     """
 
@@ -288,6 +296,7 @@ class Room:
     best: wp.array2d(dtype=vec6)
     moved: wp.array2d(dtype=vec6)
     late: wp.array2d(dtype=vec6)
+    moment_bar: wp.array2d(dtype=Moment)
     step: wp.array2d(dtype=vec6)
     residual: wp.array2d(dtype=vec6)
     scale: wp.array2d(dtype=vec6)
@@ -298,6 +307,7 @@ class Room:
     wrenches: wp.array2d(dtype=vec6)
     missing: wp.array2d(dtype=vec6)
     delayed: wp.array2d(dtype=vec6)
+    moments: wp.array2d(dtype=Moment)
     splines: wp.array2d(dtype=real)
 
 

@@ -128,7 +128,7 @@ def _pulling_room(forward: Plan) -> dict[str, int]:
     """Lengths of what a world needs besides for derivatives of a step's equations."""
     n = forward.room["room.bodies"]
     room: dict[str, int] = {"room.state_bar": n, "room.after_bar": n}
-    room["room.late"] = forward.room["room.velocity"]
+    room |= {f"room.{name}": forward.room["room.velocity"] for name in ("late", "moment_bar")}
     if "scene.patches.sides" in forward.inputs:
         room |= {"room.patches.sums": forward.inputs["scene.patches.sides"].rows}
     if "room.trees.joints" in forward.room:
@@ -246,8 +246,10 @@ def _pushforward_room(forward: Plan, which: tuple[int, ...], n_directions: int) 
         **_pulling_room(forward),
         **rows,
         **splines,
-        "room.missing": n_directions * forward.room["room.velocity"],
-        "room.delayed": n_directions * forward.room["room.velocity"],
+        **{
+            f"room.{n}": n_directions * forward.room["room.velocity"]
+            for n in ("missing", "delayed", "moments")
+        },
         "room.wrenches": forward.room["room.found"],
     }
 

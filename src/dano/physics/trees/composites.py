@@ -9,7 +9,7 @@ inertias (Featherstone 2008, Rigid Body Dynamics Algorithms, chapter 6).
 import warp as wp
 
 from dano.physics.momentum import angular_momentum_jacobian
-from dano.physics.real import mat33, real, vec3, vec6
+from dano.physics.real import mat33, ONE, real, vec3, vec6
 from dano.physics.rotations import spin_by_end
 from dano.physics.twists import angular_part, joined, linear_part
 
@@ -54,7 +54,7 @@ def composite(mass: real, lever: vec3, lever_after: vec3, turning: mat33) -> Com
 @wp.func
 def spin_momentum_by_end(omega: vec3, inertia: mat33, h: real) -> mat33:
     """Derivative of the angular momentum after a step by a turn of its end, over h: h ∂P/∂ω A(ω) [kg m²]."""
-    return h * (angular_momentum_jacobian(omega, inertia, h) * spin_by_end(omega, h))
+    return h * (angular_momentum_jacobian(omega, inertia, h, ONE) * spin_by_end(omega, h))
 
 
 @wp.func

@@ -26,23 +26,28 @@ _PLAIN = 4.0
 _TURNED, _TURNED_SHARE = 1.5, 0.08
 """What a rotation may leave of the motion between two pictures to explain it: pixels, and share."""
 
+_SAME_MASK = 0.97
+"""Overlap of two masks (intersection over union) from which on they show an object that stands still."""
+
 _CHECKED_PAIRS = 60
 """Pairs of pictures whose motion is looked at: enough for a median (convention)."""
 
 
-def motion_fault(photographs: Sequence[Photograph], matches: Matches, options: PoseOptions) -> str | None:
+def motion_fault(
+    photographs: Sequence[Photograph], matches: Matches, options: PoseOptions, *, still: float | None = None
+) -> str | None:
     """Why the motion between pictures cannot show depth, in words; None if it can.
 
     Checked before cameras are placed, because a model of pictures from one place looks as good as any.
+
+    Args:
+        photographs: The pictures.
+        matches: What they have in common.
+        options: See there.
+        still: What `stands_still` said of them; None if what they show moves.
     """
-    still = _stands_still(photographs, matches)
-    if still is not None:
-        masks = "" if _all_masked(photographs) else ", or give masks"
-        return (
-            f"nothing moves between the pictures (points move by {still:.1f} pixels): camera and object stood"
-            f" still, or what is seen is a reflection or the background; look at the object from other sides"
-            f"{masks}"
-        )
+    if still is not None and not _moves(photographs, matches):
+        return _why_still(photographs, still)
     pairs = [
         (pair, found)
         for pair, found in zip(matches.pairs, matches.verified, strict=True)
@@ -76,7 +81,7 @@ def motion_fault(photographs: Sequence[Photograph], matches: Matches, options: P
     )
 
 
-def _stands_still(photographs: Sequence[Photograph], matches: Matches) -> float | None:
+def stands_still(photographs: Sequence[Photograph], matches: Matches) -> float | None:
     """How far points move [pixels] if they stand still in most pairs of most pictures; None if they do not.
 
     Judged by all pairs with similar points. A few pairs among many pictures say nothing: what they share may
@@ -87,6 +92,41 @@ def _stands_still(photographs: Sequence[Photograph], matches: Matches) -> float 
         return None
     linked = np.unique(matches.pairs[known & (matches.moved < STILL)])
     return float(np.median(matches.moved[known])) if len(linked) > 0.5 * len(photographs) else None
+
+
+def _moves(photographs: Sequence[Photograph], matches: Matches) -> bool:
+    """Whether points that move link most pictures, whatever else stands still in them."""
+    linked: set[int] = set()
+    for (a, b), found in zip(matches.pairs, matches.verified, strict=True):
+        if len(found) < FEWEST_MATCHES:
+            continue
+        apart = matches.coordinates[a][found[:, 0]] - matches.coordinates[b][found[:, 1]]
+        if np.median(np.linalg.norm(apart, axis=1)) > STILL:
+            linked |= {int(a), int(b)}
+    return len(linked) > 0.5 * len(photographs)
+
+
+def _why_still(photographs: Sequence[Photograph], still: float) -> str:
+    """What to say of pictures in which points stand still; masks may show that the object does not."""
+    shapes = [photograph.mask > 0.5 for photograph in photographs if photograph.mask is not None]
+    overlaps = [
+        float((a & b).sum() / (a | b).sum())
+        for a, b in zip(shapes, shapes[1:], strict=False)
+        if a.shape == b.shape
+    ]
+    if overlaps and np.median(overlaps) < _SAME_MASK:
+        return (
+            f"masks move, but the points that pictures share stand still (they move by {still:.1f} pixels):"
+            " they are noise, dust or a watermark, and the object itself shows too few points: put it on"
+            " something with a pattern that turns with it (a newspaper, a printed marker) and say"
+            " features_on='everything'"
+        )
+    masks = "" if _all_masked(photographs) else ", or give masks"
+    return (
+        f"nothing moves between the pictures (points move by {still:.1f} pixels): camera and object stood"
+        f" still, or what is seen is a reflection or the background; look at the object from other sides"
+        f"{masks}"
+    )
 
 
 def _all_masked(photographs: Sequence[Photograph]) -> bool:

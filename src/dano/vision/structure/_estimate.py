@@ -15,7 +15,14 @@ from dano.checks import checked_items, checked_optional, checked_path
 from dano.progress import Progress
 from dano.vision.capture import PosedCamera
 from dano.vision.structure._colmap import colmap, opencv, quiet
-from dano.vision.structure._diagnosis import doubts, motion_fault, too_few, why_left_out, why_none
+from dano.vision.structure._diagnosis import (
+    doubts,
+    motion_fault,
+    stands_still,
+    too_few,
+    why_left_out,
+    why_none,
+)
 from dano.vision.structure._features import enlargement, find_matches, Matches, where_points_count
 from dano.vision.structure._gauge import (
     cameras_up,
@@ -32,7 +39,13 @@ from dano.vision.structure._gauge import (
 from dano.vision.structure._mapping import find_models, Lens, Model
 from dano.vision.structure._markers import detect_markers, place_markers, PlacedMarker
 from dano.vision.structure._options import FEWEST, PoseOptions
-from dano.vision.structure._photographs import mask_folder, Photograph, picture_files, read_photograph
+from dano.vision.structure._photographs import (
+    mask_folder,
+    Photograph,
+    picture_files,
+    read_photograph,
+    without_what_stays,
+)
 from dano.vision.structure._similarity import Similarity
 from dano.vision.structure._video import is_video, stretch, write_frames
 
@@ -206,7 +219,12 @@ def _from_files(
     counted = [where_points_count(photograph.mask, on) for photograph in photographs]
     with tempfile.TemporaryDirectory(prefix="dano-poses-") as folder, quiet():
         matches = find_matches(photographs, counted, options, Path(folder), ordered=ordered, progress=told)
-        if fault := motion_fault(photographs, matches, options):
+        if (still := stands_still(photographs, matches)) is not None:
+            # It hides what moves: few points of the object are among the strongest of a picture.
+            cleaned, again = without_what_stays(photographs, counted), Path(folder) / "again"
+            again.mkdir()
+            matches = find_matches(cleaned, counted, options, again, ordered=ordered, progress=told)
+        if fault := motion_fault(photographs, matches, options, still=still):
             raise ValueError(f"no cameras: {fault}")
         scales = [enlargement(photograph) for photograph in photographs]
         models = find_models(matches, scales, options, Path(folder), told)

@@ -1,16 +1,28 @@
 """Pictures as they come from a phone: any size, any orientation, some of them broken."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from scipy import ndimage
 
 from dano.vision.capture import picture_files as files_in, PICTURES, read_mask, read_picture
 from dano.vision.structure._sharpness import blur
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+
+_DETAIL, _EDGE = 0.01, 0.008
+"""What counts as detail of a picture, as shares of its longest side: smaller than the standard deviation of a
+Gaussian (letters of a watermark), and so far from where points do not count, where the object ends."""
+
+_FEWEST_ALIKE = 5
+"""Pictures below which what they have in common cannot be told from what one of them shows."""
+
+_BAND = 2**25
+"""Most pixels of all pictures together that are compared at a time."""
 
 
 class Photograph(NamedTuple):
@@ -106,3 +118,67 @@ def _mask_file(folder: Path, file: Path) -> Path | None:
     return next(
         (name for name in names if name.suffix.lower() in PICTURES and name.is_file() and name != file), None
     )
+
+
+def without_what_stays(
+    photographs: Sequence[Photograph], counted: Sequence[np.ndarray | None]
+) -> list[Photograph]:
+    """Pictures less the details that all of one size have in the same place: noise, dust, a watermark.
+
+    Such a detail is the median over the pictures, which an object or a camera that moves leaves small.
+
+    Args:
+        photographs: The pictures.
+        counted: For each, where it counts, 0 or 1; None: everywhere.
+    """
+    cleaned = list(photographs)
+    for size in dict.fromkeys(photograph.size for photograph in photographs):
+        mine = [i for i, photograph in enumerate(photographs) if photograph.size == size]
+        if len(mine) < _FEWEST_ALIKE:
+            continue
+        greys = [np.ascontiguousarray(photographs[i].grey, dtype=np.uint8).copy() for i in mine]
+        width, height = size
+        rows = max(1, _BAND // (len(mine) * width))
+        for first in range(0, height, rows):
+            last = min(first + rows, height)
+            _clean_band([photographs[i].grey for i in mine], [counted[i] for i in mine], greys, first, last)
+        for i, grey in zip(mine, greys, strict=True):
+            cleaned[i] = photographs[i]._replace(grey=grey)
+    return cleaned
+
+
+def _clean_band(
+    pictures: Sequence[np.ndarray],
+    counted: Sequence[np.ndarray | None],
+    cleaned: Sequence[np.ndarray],
+    first: int,
+    last: int,
+) -> None:
+    """Write rows `first` to `last` of `pictures`, less their common detail, to those of `cleaned`."""
+    longest = max(pictures[0].shape)
+    width, edge = _DETAIL * longest, max(1, round(_EDGE * longest))
+    low = max(first - edge - math.ceil(3 * width), 0)
+    high = last + edge + math.ceil(3 * width)
+    details = np.empty((len(pictures), last - first, pictures[0].shape[1]), np.float32)
+    for detail, picture, where in zip(details, pictures, counted, strict=True):
+        part = picture[low:high].astype(np.float32)
+        # The object's outline is the same in many pictures of a turntable: only what lies within it counts.
+        inside = np.ones_like(part) if where is None else _within(where[low:high], edge)
+        coarse = _smooth(part * inside, width) / np.maximum(_smooth(inside, width), 1e-3)
+        detail[:] = np.where(inside > 0.5, part - coarse, np.nan)[first - low : last - low]
+    details.sort(axis=0)
+    count = np.isfinite(details).sum(axis=0)
+    middle = [np.maximum(index, 0)[None] for index in ((count - 1) // 2, np.minimum(count // 2, count - 1))]
+    common = 0.5 * sum(np.take_along_axis(details, index, axis=0)[0] for index in middle)
+    common = np.where(count >= _FEWEST_ALIKE, common, 0.0)
+    for picture, grey in zip(pictures, cleaned, strict=True):
+        grey[first:last] = np.clip(np.rint(picture[first:last] - common), 0, 255)
+
+
+def _within(where: np.ndarray, edge: int) -> Float[np.ndarray, "height width"]:
+    """1 so many pixels within what counts, 0 elsewhere."""
+    return ndimage.minimum_filter((where > 0.5).astype(np.float32), 2 * edge + 1)
+
+
+def _smooth(image: np.ndarray, width: float) -> np.ndarray:
+    return ndimage.gaussian_filter(image, width, truncate=3.0)

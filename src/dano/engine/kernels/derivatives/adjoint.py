@@ -11,11 +11,11 @@ from typing import Any
 
 import warp as wp
 
-from dano.engine.kernels.tables import Body, Push, StateRow
+from dano.engine.kernels.tables import Body, Moment, Push, StateRow
 from dano.physics.features import TREES
 from dano.physics.friction import friction_near, Slip
-from dano.physics.impacts import Impact, Patch, share_of_impact, stiffness_of_impact, with_sample
-from dano.physics.momentum import angular_momentum, turned_inertia
+from dano.physics.impacts import Impact, layer_of, Patch, share_of_impact, stiffness_of_impact, with_sample
+from dano.physics.momentum import angular_momentum, end_of_impact, gyroscopic_gain, turned_inertia
 from dano.physics.pairs import (
     BodyState,
     closer,
@@ -27,8 +27,8 @@ from dano.physics.pairs import (
     shrunk,
 )
 from dano.physics.point_law import friction_bound, Material, point_law, point_motion, traction
-from dano.physics.real import ONE, real, vec3, vec6, ZERO
-from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
+from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
+from dano.physics.rotations import from_wxyz, interpolated, matrix, to_wxyz, turned
 from dano.physics.samples import point_contact, position_in_solid, Sample
 from dano.physics.solids.distances import leaf_distance, Solid
 from dano.physics.solids.leaves import Distance, Solids
@@ -162,16 +162,32 @@ def facing_work(
 
 
 @wp.func
+def gain_of_row(body: Body, row: StateRow, h: real) -> vec3:
+    """`BodyState.spin_gain` of a body's row at the start of a step [rad/s, B]."""
+    return gyroscopic_gain(row.omega, body.inertia, wp.inverse(body.inertia), h)
+
+
+@wp.func
+def rotation_of(body: Body, row: StateRow, met: real, h: real) -> mat33:
+    """`rotation_met` of a body's row at the start of a step."""
+    q = from_wxyz(row.orientation)
+    if met > ZERO:
+        return matrix(interpolated(q, turned(q, row.omega + gain_of_row(body, row, h), h), met))
+    return matrix(q)
+
+
+@wp.func
 def momentum_work(
-    body: Body, row: StateRow, push: Push, gravity: vec3, h: real, velocity: vec6, virtual: vec6
+    body: Body, row: StateRow, push: Push, gravity: vec3, h: real, at: Moment, velocity: vec6, virtual: vec6
 ) -> real:
     """Work of what a body's momentum gains beyond gravity and control, along minus its virtual velocity."""
     rotation = matrix(from_wxyz(row.orientation))
-    inertia = turned_inertia(rotation, body.inertia)
-    spin = vec3(velocity[3], velocity[4], velocity[5])
     linear = body.mass * (row.velocity + h * gravity - linear_part(velocity)) + h * push.force
+    inertia = turned_inertia(rotation, body.inertia)
     before = angular_momentum(rotation * row.omega, inertia, h, -ONE) + h * push.torque
-    return wp.dot(joined(linear, before - angular_momentum(spin, inertia, h, ONE)), virtual)
+    inertia_met = turned_inertia(rotation_of(body, row, at.met, h), body.inertia)
+    after = angular_momentum(angular_part(velocity), inertia_met, h, at.lead)
+    return wp.dot(joined(linear, before - after), virtual)
 
 
 @wp.func
@@ -180,26 +196,38 @@ def state_work(body: Body, row: StateRow, gravity: vec3, h: real, moves: bool, b
     q = from_wxyz(row.orientation)
     total = wp.dot(bar.position, row.position) + wp.dot(bar.orientation, q) + wp.dot(bar.com, body.com)
     ahead = q
+    ahead_falling = q
     if moves:
         ahead = turned(q, row.omega, h)
         total += wp.dot(bar.velocity, row.velocity) + wp.dot(bar.spin, matrix(q) * row.omega)
         if wp.static(not TREES):
             inertia = turned_inertia(matrix(q), body.inertia)
-            total += h * wp.dot(bar.gain, gravity)
+            gain = gain_of_row(body, row, h)
+            ahead_falling = turned(q, row.omega + gain, h)
+            total += h * wp.dot(bar.gain, gravity) + wp.dot(bar.spin_gain, matrix(q) * gain)
             total += bar.inverse_mass / body.mass + wp.ddot(bar.inverse_inertia, wp.inverse(inertia))
-    return total + wp.dot(bar.ahead, ahead)
+    return total + wp.dot(bar.ahead, ahead) + wp.dot(bar.ahead_falling, ahead_falling)
 
 
 @wp.func
-def advance_work(row: StateRow, velocity: vec6, moved: vec6, h: real, bar: StateRow) -> real:
+def advance_work(
+    body: Body, row: StateRow, velocity: vec6, moved: vec6, h: real, at: Moment, bar: StateRow
+) -> real:
     """⟨bar, state of a body at the end of a step⟩; `moved` is the twist by which its pose changes."""
     q = from_wxyz(row.orientation)
     v = linear_part(velocity)
     back = wp.transpose(matrix(q))
+    turn = angular_part(moved)
     omega = back * angular_part(velocity)
+    if at.lead < ONE:
+        gain = matrix(q) * gain_of_row(body, row, h)
+        met = rotation_of(body, row, at.met, h)
+        end = end_of_impact(angular_part(velocity), body.inertia, met, gain, h, at.met, at.lead)
+        omega = end.omega
+        turn = turn + end.turn
     return (
         wp.dot(bar.position, row.position + h * linear_part(moved))
-        + wp.dot(bar.orientation, to_wxyz(turned(q, back * angular_part(moved), h)))
+        + wp.dot(bar.orientation, to_wxyz(turned(q, back * turn, h)))
         + wp.dot(bar.velocity, v)
         + wp.dot(bar.omega, omega)
     )
@@ -212,13 +240,14 @@ def impact_patch_work(
     d: Distance,
     turning: int,
     stiffness_share: real,
-    lead: real,
+    share: real,
+    h: real,
     depth: real,
-    layer: real,
     bar: Patch,
 ) -> real:
     """⟨bar, what a sample adds to the patch of an impact⟩."""
-    point = point_contact(pose, sample, d, turning, False, stiffness_share, lead)
+    point = point_contact(pose, sample, d, turning, False, stiffness_share, share * h)
+    layer = layer_of(depth, share)
     own = Patch()
     own = with_sample(own, point.area, point.sunk, depth, layer, point.approach, point.arm, point.normal)
     return (
@@ -242,9 +271,9 @@ def impact_work(
 
 
 @wp.func
-def late_work(body: Body, row: StateRow, delayed: vec6, late: vec6) -> real:
+def late_work(body: Body, row: StateRow, h: real, at: Moment, delayed: vec6, late: vec6) -> real:
     """Work of the momentum of a twist along another: μᵀ M D."""
-    inertia = turned_inertia(matrix(from_wxyz(row.orientation)), body.inertia)
+    inertia = turned_inertia(rotation_of(body, row, at.met, h), body.inertia)
     along = wp.dot(linear_part(late), linear_part(delayed))
     return body.mass * along + wp.dot(angular_part(late), inertia * angular_part(delayed))
 

@@ -13,7 +13,7 @@ from dano.engine.kernels.derivatives.products import add_row
 from dano.engine.kernels.impacts import freed, pair_slope
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.rollout import Launch, push_of, row_before
-from dano.engine.kernels.tables import Changes, Room, Scene, StateRow
+from dano.engine.kernels.tables import Changes, Moment, Room, Scene, StateRow
 from dano.physics.features import LANES, TREES
 from dano.physics.pairs import BodyState
 from dano.physics.real import vec6, ZERO
@@ -69,10 +69,12 @@ def pull_momentum(
     b = block_of(scene, scene.body_index[i].row)
     body = scene.bodies[world, i]
     push = push_of(scene, launch, world, t, i)
-    by_body, by_row, by_push, by_gravity, by_h, _a, _b = wp.grad(momentum_work)(
-        body, row, push, scene.gravity[world, 0], h, room.velocity[world, b], room.step[world, b]
+    at = moment_of(room, world, i)
+    by_body, by_row, by_push, by_gravity, by_h, by_moment, _a, _b = wp.grad(momentum_work)(
+        body, row, push, scene.gravity[world, 0], h, at, room.velocity[world, b], room.step[world, b]
     )
     add_row(room.state_bar, world, i, by_row)
+    add_moment(room, world, b, by_moment)
     if bars.bodies.shape[1] > 0:
         bars.bodies[world, i].mass += by_body.mass
         bars.bodies[world, i].inertia += by_body.inertia
@@ -82,6 +84,22 @@ def pull_momentum(
         bars.gravity[world, 0] += by_gravity
     if bars.timestep.shape[1] > 0:
         bars.timestep[world, 0] += by_h
+
+
+@wp.func
+def moment_of(room: Room, world: int, i: int) -> Moment:
+    """When the angular momentum of a body is balanced."""
+    moment = Moment()
+    moment.met = room.bodies[world, i].met
+    moment.lead = room.bodies[world, i].lead
+    return moment
+
+
+@wp.func
+def add_moment(room: Room, world: int, b: int, bar: Moment):
+    """Add derivatives by when the angular momentum of a body is balanced."""
+    room.moment_bar[world, b].met += bar.met
+    room.moment_bar[world, b].lead += bar.lead
 
 
 @wp.func
@@ -100,14 +118,20 @@ def pull_advance(scene: Scene, room: Room, bars: Changes, world: int, i: int, ro
         room.state_bar[world, i] = StateRow()
         room.residual[world, block_of(scene, m)] = vec6()
         room.late[world, block_of(scene, m)] = vec6()
+        room.moment_bar[world, block_of(scene, m)] = Moment()
     elif m >= 0:
         b = block_of(scene, m)
-        by_row, by_velocity, by_moved, by_h, _a = wp.grad(advance_work)(
-            row, room.velocity[world, b], room.moved[world, b], h, after
+        body = scene.bodies[world, i]
+        by_body, by_row, by_velocity, by_moved, by_h, by_moment, _a = wp.grad(advance_work)(
+            body, row, room.velocity[world, b], room.moved[world, b], h, moment_of(room, world, i), after
         )
+        if bars.bodies.shape[1] > 0:
+            bars.bodies[world, i].inertia += by_body.inertia
         room.state_bar[world, i] = by_row
         room.residual[world, b] = by_velocity + by_moved
-        room.late[world, b] = freed(room.bodies[world, i], by_moved)
+        room.moment_bar[world, b] = by_moment
+        if wp.static(not TREES):
+            room.late[world, b] = freed(room, world, i, m, by_moved)
         if bars.timestep.shape[1] > 0:
             bars.timestep[world, 0] += by_h
     else:
@@ -129,7 +153,7 @@ def subtract_slope(scene: Scene, room: Room, world: int, lane: int, f: int):
             late = room.late[world, a]
         if b >= 0:
             late = late - t * room.late[world, b]
-        by_twist = found.share * (wp.transpose(slope) * late)
+        by_twist = (found.impact.delays * found.share) * (wp.transpose(slope) * late)
         if a >= 0:
             room.residual[world, a] -= by_twist
         if b >= 0:
@@ -152,10 +176,14 @@ def pull_delays(
             delayed = room.velocity[world, b] - room.moved[world, b]
             if wp.length_sq(delayed) > ZERO:
                 row = row_before(scene, launch, world, t, i)
-                by_body, by_row, _a, _b = wp.grad(late_work)(
-                    scene.bodies[world, i], row, delayed, room.late[world, b]
+                h = scene.timestep[world, 0]
+                by_body, by_row, by_h, by_moment, _a, _b = wp.grad(late_work)(
+                    scene.bodies[world, i], row, h, moment_of(room, world, i), delayed, room.late[world, b]
                 )
                 add_row(room.state_bar, world, i, by_row)
+                add_moment(room, world, b, by_moment)
+                if bars.timestep.shape[1] > 0:
+                    bars.timestep[world, 0] += by_h
                 if bars.bodies.shape[1] > 0:
                     bars.bodies[world, i].mass += by_body.mass
                     bars.bodies[world, i].inertia += by_body.inertia

@@ -27,11 +27,19 @@ from dano.engine.kernels.derivatives.products import (
 )
 from dano.engine.kernels.lanes import total, total6
 from dano.engine.kernels.meeting import posed, solid_of_body
-from dano.engine.kernels.search import layer_of
-from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
+from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
 from dano.physics.features import TREES, TURNING, UNIONS
-from dano.physics.impacts import Impact, Patch
-from dano.physics.pairs import BALL, BodyState, falling, first_touch, PairPose, position_after, rotation_after
+from dano.physics.impacts import Impact, layer_of, Patch
+from dano.physics.pairs import (
+    BALL,
+    BodyState,
+    falling,
+    falling_bar,
+    first_touch,
+    PairPose,
+    position_after,
+    rotation_after,
+)
 from dano.physics.point_law import Material, point_motion, slip_at
 from dano.physics.real import mat33, ONE, real, vec3, ZERO
 from dano.physics.samples import position_in_solid, Sample
@@ -118,9 +126,10 @@ def pull_patch_of_impact(
     pair = scene.pairs[world, found.pair]
     turning = scene.body_index[index.first].turning
     h = scene.timestep[world, 0]
-    layer = layer_of(pair, found.share)
+    layer = layer_of(pair.impact_depth, found.share)
     pose_bar = PairPose()
-    lead_bar = real(0.0)
+    share_bar = real(0.0)
+    h_bar = real(0.0)
     depth_bar = real(0.0)
     share_of_bar = real(0.0)
     for k in range(found.first, found.end):
@@ -130,22 +139,21 @@ def pull_patch_of_impact(
             x = position_in_solid(pose, sample.point)
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
-            by_pose, by_sample, by_distance, _a, by_share_of, by_lead, by_depth, by_layer, _b = wp.grad(
+            by_pose, by_sample, by_distance, _a, by_share_of, by_share, by_h, by_depth, _b = wp.grad(
                 impact_patch_work
-            )(pose, sample, d, turning, pair.share, found.share * h, pair.impact_depth, layer, patch_bar)
+            )(pose, sample, d, turning, pair.share, found.share, h, pair.impact_depth, patch_bar)
             by_pose = pull_sample(
                 scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance
             )
             pose_bar = summed_pose(pose_bar, by_pose)
-            lead_bar += by_lead
+            share_bar += by_share
+            h_bar += by_h
             depth_bar += by_depth
-            if layer > ZERO:
-                depth_bar += by_layer
             share_of_bar += by_share_of
     share_of_bar = total(share_of_bar)
     if lane == 0 and bars.pairs.shape[1] > 0:
         bars.pairs[world, found.pair].share += share_of_bar
-    return pose_bar, h * lead_bar, found.share * lead_bar, depth_bar
+    return pose_bar, share_bar, h_bar, depth_bar
 
 
 @wp.func
@@ -202,6 +210,7 @@ def pull_points(
             impact_bar.share += by_impact.share
             impact_bar.stiffness += by_impact.stiffness
             impact_bar.depth += by_impact.depth
+            impact_bar.delays += by_impact.delays
             impact_bar.way += by_impact.way
             impact_bar.rest += by_impact.rest
             material_bar = summed_material(material_bar, by_material)
@@ -397,8 +406,21 @@ def pull_pair(
     found: FoundPair,
     rebound: real,
     twists: Virtual,
+    moment_bar: Moment,
 ) -> PairBar:
-    """Derivatives by the states of a pair's bodies, for the first lane; adds those by all else."""
+    """Derivatives by the states of a pair's bodies, for the first lane; adds those by all else.
+
+    Args:
+        scene: The scene.
+        room: Room.
+        bars: Added to.
+        world: Which world.
+        lane: Which lane.
+        found: The pair.
+        rebound: Share of the restitution that counts.
+        twists: Of its bodies.
+        moment_bar: Derivatives by when the angular momentum of its bodies is balanced.
+    """
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
     h = scene.timestep[world, 0]
@@ -414,33 +436,35 @@ def pull_pair(
     if found.impact.share > ZERO:
         impact_bar.share = total(impact_bar.share)
         impact_bar.stiffness = total(impact_bar.stiffness)
-        if found.impact.delays == ZERO:
-            # The way that is left is τ, unless bodies are deep, and the rest the whole step …
-            if found.deep == 0:
-                share_bar += impact_bar.way
-            h_bar += impact_bar.rest
-        else:
-            # … or what follows τ.
-            share_bar -= h * impact_bar.rest
-            h_bar += (ONE - found.share) * impact_bar.rest
         hits = found.impact.stiffness > ZERO
+        if hits:
+            # What `delayed` says, with β for `delays` where that is not zero; and of the balance.
+            delays = found.impact.delays
+            share_bar += (ONE - delays) * impact_bar.way - delays * h * impact_bar.rest
+            h_bar += (ONE - delays * found.share) * impact_bar.rest
+            by_delays = impact_bar.delays - found.share * (impact_bar.way + h * impact_bar.rest)
+            by_delays = total(by_delays) + found.share * moment_bar.met - moment_bar.lead
+            if delays > ZERO:
+                impact_bar.share += by_delays
+        else:
+            h_bar += impact_bar.rest
         bounce = scene.materials[world, index.contact].bounce
         by_first, by_second, patch_bar, by_bounce, by_h, _a, _b = wp.grad(impact_work)(
             a, b, found.patch, bounce, h, hits, impact_bar
         )
-        by_pose, by_share, by_lead, by_depth = pull_patch_of_impact(
+        by_pose, by_share, by_h_of_patch, by_depth = pull_patch_of_impact(
             scene, room, bars, world, lane, found, pose, patch_bar
         )
         pose_bar = summed_pose(pose_bar, by_pose)
         share_bar += by_share
-        h_bar += by_lead
+        h_bar += by_h_of_patch
         impact_bar.depth += total(by_depth)
         if lane == 0:
             h_bar += by_h
             if bars.materials.shape[1] > 0:
                 bars.materials[world, index.contact].bounce += by_bounce
     pose_bar = total_pose(pose_bar)
-    share_bar = total(share_bar)
+    share_bar = total(share_bar) + found.impact.delays * moment_bar.met
     h_bar = total(h_bar)
     bar = PairBar()
     if lane == 0:
@@ -448,7 +472,7 @@ def pull_pair(
         bar.first = summed_body(bar.first, by_first)
         bar.second = summed_body(bar.second, by_second)
         bar.impact_depth += impact_bar.depth
-        bar.first = falling(bar.first, found.falls)
-        bar.second = falling(bar.second, found.falls)
+        bar.first = falling_bar(bar.first, found.falls)
+        bar.second = falling_bar(bar.second, found.falls)
     bar.twists = twists_bar
     return bar

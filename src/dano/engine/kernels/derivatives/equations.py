@@ -26,13 +26,13 @@ from dano.engine.kernels.derivatives.trees import (
     settle_trees,
     transpose_entries,
 )
-from dano.engine.kernels.impacts import find_moved
+from dano.engine.kernels.impacts import find_moved, meetings_of, moving_of
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import copy_transposed_blocks, find_pattern, solve_blocks
 from dano.engine.kernels.patches import add_patches, fit_patch_duals
 from dano.engine.kernels.rollout import begin_unpushed, find_touching, Launch, row_before
 from dano.engine.kernels.search import fix_laws
-from dano.engine.kernels.tables import Changes, FoundPair, Room, Scene
+from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
 from dano.engine.kernels.trees.balance import (
     add_tree_slopes,
     clear_trees,
@@ -41,8 +41,9 @@ from dano.engine.kernels.trees.balance import (
     solve_trees,
 )
 from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
-from dano.physics.real import ONE, vec6, ZERO
-from dano.physics.rotations import matrix
+from dano.physics.momentum import spin_seen_from
+from dano.physics.pairs import rotation_met
+from dano.physics.real import ONE, TWO, vec6, ZERO
 from dano.physics.twists import joined
 
 _LANES = wp.constant(LANES)
@@ -60,7 +61,14 @@ def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: i
             m = scene.body_index[i].row
             if m >= 0 and not hangs(scene, m):
                 row = launch.states[world, t * n + i]
-                spin = matrix(room.bodies[world, i].orientation) * row.omega
+                state = room.bodies[world, i]
+                omega = row.omega
+                if state.lead < ONE:
+                    inertia = scene.bodies[world, i].inertia
+                    omega = spin_seen_from(
+                        omega, inertia, scene.timestep[world, 0], ONE - TWO * state.met, state.lead
+                    )
+                spin = rotation_met(state) * omega
                 room.velocity[world, block_of(scene, m)] = joined(row.velocity, spin)
         if wp.static(TREES):
             settle_trees(scene, room, launch, world, t)
@@ -199,6 +207,20 @@ def is_moved_pair(twists: Virtual) -> bool:
     return not (size + wp.length_sq(twists.first_late) + wp.length_sq(twists.second_late) == ZERO)
 
 
+@wp.func
+def moment_bar_of(scene: Scene, room: Room, world: int, n_found: int, found: FoundPair) -> Moment:
+    """A pair's part of derivatives by when the angular momentum of the body that moves is balanced."""
+    bar = Moment()
+    if wp.static(not TREES):
+        if found.impact.delays > ZERO:
+            body = moving_of(scene, found)
+            count, _waits, _shares = meetings_of(scene, room, world, n_found, body)
+            row = scene.body_index[body].row
+            bar.met = room.moment_bar[world, row].met / count
+            bar.lead = room.moment_bar[world, row].lead / count
+    return bar
+
+
 @after_adjoints
 @wp.func
 def pull_equations(
@@ -215,9 +237,10 @@ def pull_equations(
         for f in range(n_found):
             found = room.found[world, f * _LANES + lane]
             twists = twists_of_pair(scene, room, world, found)
-            if is_moved_pair(twists):
+            moment_bar = moment_bar_of(scene, room, world, n_found, found)
+            if is_moved_pair(twists) or moment_bar.met != ZERO or moment_bar.lead != ZERO:
                 rebound = launch.reports[world, t].rebound
-                bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists)
+                bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, moment_bar)
                 if lane == 0:
                     pull_touching(scene, room, bars, launch, world, t, found, bar)
     if wp.static(PATCHES):

@@ -14,6 +14,7 @@ from dano.engine.kernels.derivatives.adjoint import (
     momentum_work,
     Virtual,
 )
+from dano.engine.kernels.derivatives.bodies import moment_of
 from dano.engine.kernels.derivatives.contact import PairBar, pull_pair
 from dano.engine.kernels.derivatives.equations import pull_touching
 from dano.engine.kernels.derivatives.pair_changes import (
@@ -32,6 +33,7 @@ from dano.engine.kernels.derivatives.patches import pull_patch
 from dano.engine.kernels.derivatives.products import (
     body_product,
     material_product,
+    moment_product,
     pair_product,
     push_product,
     row_change,
@@ -39,15 +41,15 @@ from dano.engine.kernels.derivatives.products import (
     unit_row,
     unit_vector,
 )
-from dano.engine.kernels.impacts import freed, pair_slope
+from dano.engine.kernels.impacts import freed, meetings_of, moving_of, pair_slope
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
 from dano.engine.kernels.patches import n_patches
 from dano.engine.kernels.rollout import Launch, push_of, row_before
-from dano.engine.kernels.tables import Body, Changes, FoundPair, Room, SamplePair, Scene, StateRow
+from dano.engine.kernels.tables import Body, Changes, FoundPair, Moment, Room, SamplePair, Scene, StateRow
 from dano.physics.features import LANES, PATCHES, POINTS
 from dano.physics.point_law import Material
-from dano.physics.real import real, vec3, vec6, ZERO
+from dano.physics.real import ONE, real, vec3, vec6, ZERO
 from dano.physics.twists import angular_part, joined, linear_part, shift
 
 _LANES = wp.constant(LANES)
@@ -175,6 +177,27 @@ def add_change(
 
 
 @wp.func
+def add_meeting(
+    scene: Scene,
+    room: Room,
+    world: int,
+    n_found: int,
+    found: FoundPair,
+    direction: int,
+    change: real,
+    of_met: bool,
+):
+    """Add a pair's part of the change of when the angular momentum of the body that moves is balanced."""
+    body = moving_of(scene, found)
+    count, _waits, _shares = meetings_of(scene, room, world, n_found, body)
+    at = direction * scene.moving.shape[0] + scene.body_index[body].row
+    if of_met:
+        room.moments[world, at].met += change / count
+    else:
+        room.moments[world, at].lead += change / count
+
+
+@wp.func
 def add_shift(
     scene: Scene, room: Room, launch: Launch, changes: Changes, world: int, t: int, f: int, direction: int
 ):
@@ -190,7 +213,9 @@ def add_shift(
         moment = wp.cross(moved, linear_part(room.wrenches[world, f]))
         room.missing[world, direction * m + b] -= joined(vec3(), moment)
         if found.impact.delays > ZERO:
-            room.delayed[world, direction * m + b] -= joined(vec3(), found.share * moment)
+            room.delayed[world, direction * m + b] -= joined(
+                vec3(), (found.impact.delays * found.share) * moment
+            )
 
 
 @wp.func
@@ -203,12 +228,13 @@ def push_momentum(scene: Scene, room: Room, launch: Launch, changes: Changes, wo
     push = push_of(scene, launch, world, t, i)
     k = int(0)
     while k < 6:
-        by_body, by_row, by_push, by_gravity, by_h, _a, _b = wp.grad(momentum_work)(
+        by_body, by_row, by_push, by_gravity, by_h, by_moment, _a, _b = wp.grad(momentum_work)(
             scene.bodies[world, i], row_before(scene, launch, world, t, i), push, scene.gravity[world, 0], h,
-            room.velocity[world, row], unit_vector(k),
+            moment_of(room, world, i), room.velocity[world, row], unit_vector(k),
         )  # fmt: skip
         for d in range(launch.n_directions):
             change = row_product(by_row, row_change(launch, changes, world, t, i, d, n))
+            change += moment_product(by_moment, room.moments[world, d * m + row])
             if changes.bodies.shape[1] > 0:
                 change += body_product(by_body, changes.bodies[world, d * n + i])
             if changes.pushes.shape[1] > 0:
@@ -229,19 +255,25 @@ def change_of_delay(
     """Change of what a body's velocities lose to impulses that take effect within the step, D = M⁻¹ τ P."""
     n = scene.body_index.shape[0]
     m = scene.moving.shape[0]
+    h = scene.timestep[world, 0]
     b = scene.body_index[i].row
     delayed = room.velocity[world, b] - room.moved[world, b]
     impulse = room.delayed[world, d * m + b]
     if wp.length_sq(delayed) > ZERO:
         k = int(0)
         while k < 6:
-            by_body, by_row, _a, _b = wp.grad(late_work)(scene.bodies[world, i], row, delayed, unit_vector(k))
+            by_body, by_row, by_h, by_moment, _a, _b = wp.grad(late_work)(
+                scene.bodies[world, i], row, h, moment_of(room, world, i), delayed, unit_vector(k)
+            )
             change = row_product(by_row, moved)
+            change += moment_product(by_moment, room.moments[world, d * m + b])
             if changes.bodies.shape[1] > 0:
                 change += body_product(by_body, changes.bodies[world, d * n + i])
+            if changes.timestep.shape[1] > 0:
+                change += by_h * changes.timestep[world, d]
             impulse -= change * unit_vector(k)
             k += 1
-    return freed(room.bodies[world, i], impulse)
+    return freed(room, world, i, b, impulse)
 
 
 @wp.func
@@ -255,7 +287,8 @@ def add_delayed(scene: Scene, room: Room, world: int, lane: int, f: int, d: int)
         a = scene.body_index[index.first].row
         b = scene.body_index[index.second].row
         t = shift(found.com_difference)
-        impulse = found.share * (slope * (row_of(room.step, world, a) - t * row_of(room.step, world, b)))
+        twist = row_of(room.step, world, a) - t * row_of(room.step, world, b)
+        impulse = (found.impact.delays * found.share) * (slope * twist)
         if a >= 0:
             room.delayed[world, d * m + a] += impulse
         if b >= 0:
@@ -278,10 +311,14 @@ def push_advance(
         end = StateRow()
         k = int(0)
         while k < 13:
-            by_row, by_velocity, by_moved, by_h, _a = wp.grad(advance_work)(
-                before, room.velocity[world, row], room.moved[world, row], h, unit_row(k)
-            )
-            change = row_product(by_row, moved) + wp.dot(by_velocity, room.step[world, row])
+            by_body, by_row, by_velocity, by_moved, by_h, by_moment, _a = wp.grad(advance_work)(
+                scene.bodies[world, i], before, room.velocity[world, row], room.moved[world, row], h,
+                moment_of(room, world, i), unit_row(k),
+            )  # fmt: skip
+            change = moment_product(by_moment, room.moments[world, d * scene.moving.shape[0] + row])
+            if changes.bodies.shape[1] > 0:
+                change += body_product(by_body, changes.bodies[world, d * n + i])
+            change += row_product(by_row, moved) + wp.dot(by_velocity, room.step[world, row])
             change += wp.dot(by_moved, room.step[world, row] - late)
             if changes.timestep.shape[1] > 0:
                 change += by_h * changes.timestep[world, d]
@@ -307,9 +344,10 @@ def push_pair(
     lane: int,
     t: int,
     f: int,
-    has_points: bool,
+    n_found: int,
 ):
     """Add what the changes make of the six equations of a pair, in all directions."""
+    has_points = f < n_found
     found = room.found[world, f * _LANES + lane]
     index = scene.pair_index[found.pair]
     twists = Virtual()
@@ -317,8 +355,8 @@ def push_pair(
     twists.second = row_of(room.velocity, world, scene.body_index[index.second].row)
     equations = int(6)
     if found.impact.delays > ZERO:
-        # Impulses that take effect later are asked for twice: as they are, and times τ.
-        equations = int(12)
+        # Impulses that take effect later are asked for twice, as they are and times τ_β; then what says when.
+        equations = int(14)
     k = int(0)
     while k < equations:
         clear_pair(scene, room, bars, world, lane, found, has_points)
@@ -326,15 +364,20 @@ def push_pair(
         # The first body's virtual velocity is measured from the second's: only it moves.
         twists.first_virtual = vec6()
         twists.first_late = vec6()
+        moment_bar = Moment()
         if k < 6:
             twists.first_virtual = unit_vector(k)
-        else:
+        elif k < 12:
             twists.first_late = -unit_vector(k - 6)
+        elif k == 12:
+            moment_bar.met = ONE
+        else:
+            moment_bar.lead = ONE
         bar = PairBar()
         if wp.static(POINTS):
             if has_points:
                 rebound = launch.reports[world, t].rebound
-                bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists)
+                bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, moment_bar)
         if wp.static(PATCHES):
             if not has_points:
                 bar = pull_patch(scene, room, bars, world, lane, found, twists)
@@ -346,8 +389,10 @@ def push_pair(
             if lane == 0:
                 if k < 6:
                     add_change(scene, room.missing, world, found, d, change, k)
-                else:
+                elif k < 12:
                     add_change(scene, room.delayed, world, found, d, change, k - 6)
+                else:
+                    add_meeting(scene, room, world, n_found, found, d, change, k == 12)
         k += 1
     if lane == 0:
         for d in range(launch.n_directions):
@@ -374,11 +419,14 @@ def push_step_of_bodies(
         for k in range(launch.n_directions * m):
             room.missing[world, k] = vec6()
             room.delayed[world, k] = vec6()
-        for k in range(m):
-            push_momentum(scene, room, launch, changes, world, t, scene.moving[k])
+            room.moments[world, k] = Moment()
     wait()
     for f in range(n_found + n_patches(room, world)):
-        push_pair(scene, room, launch, changes, bars, world, lane, t, f, f < n_found)
+        push_pair(scene, room, launch, changes, bars, world, lane, t, f, n_found)
+    wait()
+    if lane == 0:
+        for k in range(m):
+            push_momentum(scene, room, launch, changes, world, t, scene.moving[k])
     wait()
     for d in range(launch.n_directions):
         if lane == 0:

@@ -4,7 +4,7 @@ import warp as wp
 
 from dano.engine.kernels.lanes import total_of
 from dano.engine.kernels.rollout import Launch
-from dano.engine.kernels.tables import Body, Changes, Push, SamplePair, StateRow
+from dano.engine.kernels.tables import Body, Changes, Moment, Push, SamplePair, StateRow
 from dano.physics.overlap import WeightedSample
 from dano.physics.pairs import BodyState, PairPose
 from dano.physics.patch_law import PatchMaterial
@@ -26,6 +26,7 @@ patch_material_product = product_of(PatchMaterial)
 weighted_product = product_of(WeightedSample)
 sample_product = product_of(Sample)
 push_product = product_of(Push)
+moment_product = product_of(Moment)
 joint_product = product_of(Joint)
 law_product = product_of(JointLaw)
 loop_product = product_of(Loop)

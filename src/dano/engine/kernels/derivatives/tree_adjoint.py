@@ -8,9 +8,9 @@ the roots.
 import warp as wp
 
 from dano.engine.kernels.derivatives.adjoint import momentum_work, need_adjoints
-from dano.engine.kernels.tables import Body, Push, StateRow
+from dano.engine.kernels.tables import Body, Moment, Push, StateRow
 from dano.engine.kernels.trees.tables import Chain, HangingBar
-from dano.physics.real import real, vec3, vec4, vec6
+from dano.physics.real import ONE, real, vec3, vec4, vec6
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turn_of_step
 from dano.physics.structures import product_of
 from dano.physics.trees.joint_laws import joint_momentum, joint_ramps, JointDrive, JointLaw, ramps_force
@@ -165,7 +165,9 @@ def hanging_body_work(
     stands.orientation = to_wxyz(chain.orientation)
     stands.velocity = row.velocity
     stands.omega = row.omega
-    total = momentum_work(body, stands, push, gravity, h, twist, virtual)
+    at = Moment()
+    at.lead = ONE
+    total = momentum_work(body, stands, push, gravity, h, at, twist, virtual)
     ahead = orientation_after(chain.before, chain.orientation)
     total += wp.dot(bar.state.position, chain.position) + wp.dot(bar.state.orientation, chain.orientation)
     total += wp.dot(bar.state.ahead, ahead) + wp.dot(bar.state.com, body.com)

@@ -1,0 +1,1 @@
+"""Films as a phone takes them: motions, place, light and sensor."""
