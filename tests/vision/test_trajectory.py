@@ -137,3 +137,43 @@ def test_errors_along_the_line_of_sight_are_undone_by_rest_and_a_table(box, tabl
     else:
         assert found.supported.all()
         assert np.median(after) < 0.006 * SIDES.max() < 0.5 * np.median(before)
+
+
+@pytest.mark.parametrize("table", [None, 0.2])
+def test_a_wrong_size_is_told_by_a_table_or_doubted(box, table):
+    """A thing known 1 % too large is seen 1 % too far away in all frames, and a table says so."""
+    times = np.arange(FRAMES) / 30
+    position = np.stack([0.3 * times - 0.2 * times**2, 0.1 * times, np.full(FRAMES, 0.2)], axis=1)
+    orientation = Rotation.from_rotvec(np.outer(np.full(FRAMES, 0.4), [0, 0, 1.0]))
+    eye, doubt = np.array([0.2, -0.5, 0.7]), 0.01
+    given = seen(position, orientation, np.tile(np.diag(SURE), (FRAMES, 1, 1)), 5)
+    middle = position + orientation.apply(0.5 * SIDES)
+    sight = (middle - eye) / np.linalg.norm(middle - eye, axis=1)[:, None]
+    given = given._replace(position=given.position + 0.01 * (middle - eye))
+    found = smoothed(times, given, Scenery(box, NOWHERE, table, eye, doubt))
+    away = np.einsum("ni,ni->n", off(found.poses, position, orientation)[:, :3], sight)
+    stated = np.sqrt(np.einsum("ni,nij,nj->n", sight, found.poses.covariance[:, :3, :3], sight))
+    distance = np.linalg.norm(middle - eye, axis=1)
+    if table is None:
+        np.testing.assert_allclose(stated, doubt * distance, rtol=0.1)
+    else:
+        assert stated.max() < 0.2 * doubt * distance.min()
+    assert (np.abs(away) < 2.5 * stated).all()
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, FRAMES])
+def test_frames_that_share_a_pose_say_together_what_one_picture_says(box, frames):
+    """n poses at rest have the covariance S of one frame each; as if independent they must sum to S⁻¹."""
+    spread = np.tile(np.diag(SURE), (frames, 1, 1))
+    place, turn = np.zeros((frames, 3)), Rotation.identity(frames)
+    given = Poses(place, np.roll(turn.as_quat(), 1, axis=1), spread @ spread)
+    found = smoothed(np.arange(frames) / 30, given, Scenery(box, np.ones(frames - 1, bool)))
+    # What lies still may move by a fraction of what a frame is sure of.
+    np.testing.assert_allclose(found.repeats, frames, rtol=0.1)
+    told = np.linalg.inv(found.poses.covariance * found.repeats[:, None, None]).sum(axis=0)
+    # What fits exactly is believed more, by Student's distribution with four degrees of freedom.
+    np.testing.assert_allclose(np.diag(told), (4 + 6) / 4 * SURE**-2, rtol=0.1)
+    # Frames that know nothing of each other are independent.
+    if frames < 4:
+        alone = smoothed(np.arange(frames) / 30, given, Scenery(box, np.zeros(frames - 1, bool)))
+        np.testing.assert_allclose(alone.repeats, 1, rtol=1e-6)

@@ -4,6 +4,7 @@ Shades on the object say roughly where the sun is, as far as the learned look is
 table says it to a degree or two: there the outline of the object is all that counts.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -99,6 +100,14 @@ class LightFit:
         self._sun: np.ndarray | None = None
         self._places = even_directions(_DIRECTIONS)
 
+    def afresh(self, keep: int) -> "LightFit":
+        """Nothing known but where the sun was, to begin there; so many frames will count."""
+        result = LightFit(self._subject, keep, None if self._shadows is None else self._shadows.table)
+        result._sun = self._sun
+        if result._shadows is not None and self._shadows is not None:
+            result._shadows.towards = self._shadows.towards
+        return result
+
     def add(
         self,
         place: Placement,
@@ -177,6 +186,9 @@ class LightFit:
     def _column(self, view: tuple[Placement, AbstractCamera, np.ndarray], towards: np.ndarray) -> np.ndarray:
         """Light that pixels of a frame get from a lamp of power one (n, 3)."""
         place, camera, pixels = view
+        if place.drift is not None:
+            # Lamps are far: what is blurred is lit as it is in the middle of the exposure.
+            place = dataclasses.replace(place, drift=place.drift._replace(shutter=0.0))
         dark = Light((0.0, 0.0, 1.0), intensity=0.0)
         seen = self._subject.picture(place, (Light(towards), *[dark] * (LAMPS - 1)), camera, pixels)
         return np.maximum(seen.colour / np.maximum(seen.opacity, 0.5)[:, None], 0) ** GAMMA
@@ -230,11 +242,16 @@ class _Shadow(NamedTuple):
 
 
 class ShadowFit:
-    """Where the sun is, from the shadow of a known object on a level table (host)."""
+    """Where the sun is, from the shadow of a known object on a level table (host).
+
+    Attributes:
+        table: Height of the table [m, W].
+        towards: Direction towards the sun; None while it is not known.
+    """
 
     def __init__(self, subject: Subject, table: float, keep: int):
-        self._subject, self._table, self._keep = subject, table, keep
-        self._sun: np.ndarray | None = None
+        self._subject, self.table, self._keep = subject, table, keep
+        self.towards: np.ndarray | None = None
         self._lamps = unlit()
         self._frames: list[_Shadow] = []
         self._above = even_directions(_DIRECTIONS, 0.0)
@@ -242,7 +259,7 @@ class ShadowFit:
 
     def add(self, place: Placement, camera: AbstractCamera, image: np.ndarray, bare, free) -> None:
         """See `LightFit.add_shadow`."""
-        height = camera.position[2] - self._table
+        height = camera.position[2] - self.table
         if height <= 0:
             return
         y, x = np.nonzero(free & (bare > _DARK))
@@ -272,11 +289,15 @@ class ShadowFit:
                 return np.inf
             return sum(_unlikely(one, self._hidden(one.place, one.points, towards)) for one in self._frames)
 
-        begin = min(even_directions(_SHADOW_STARTS, _LOWEST), key=unlike) if self._sun is None else self._sun
+        begin = (
+            min(even_directions(_SHADOW_STARTS, _LOWEST), key=unlike)
+            if self.towards is None
+            else self.towards
+        )
         best = _best_direction(unlike, begin, _SHADOW_TURN, _SHADOW_TRIES)
         without = sum(_unlikely(one, np.zeros(len(one.shade))) for one in self._frames)
-        self._sun = best if without - unlike(best) > _SURE else None
-        return self._sun
+        self.towards = best if without - unlike(best) > _SURE else None
+        return self.towards
 
     def _hidden(self, place: Placement, points: np.ndarray, towards: np.ndarray) -> np.ndarray:
         """How much of the light from a direction the object keeps from points, 0 to 1."""

@@ -71,6 +71,7 @@ class Masking:
         self._colours: list[np.ndarray] = []
         self._place: Place | None = None
         self._last: tuple[int, np.ndarray] | None = None
+        self._exposures: dict[int, np.ndarray] = {}
         self.notes: list[str] = []
         given = any(mask is not None for mask in film.masks)
         self.source = options.masks
@@ -120,7 +121,13 @@ class Masking:
         return View(name=self._film.names[i], camera=anywhere, image=self._image(i), mask=None)
 
     def _image(self, i: int) -> Float[np.ndarray, "height width 3"]:
-        return self._film.images[i].astype(np.float32) / 255
+        """A frame, as bright as the place is known."""
+        image = self._film.images[i].astype(np.float32) / 255
+        if self._place is None:
+            return image
+        if i not in self._exposures:
+            self._exposures[i] = self._place.exposure(image)
+        return np.minimum(image / self._exposures[i], 1)
 
     def _seen(self, i: int) -> np.ndarray:
         occluder = self._film.occluders[i]

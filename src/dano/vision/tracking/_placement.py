@@ -74,3 +74,11 @@ class Placement:
         return dataclasses.replace(
             self, position=self.position + radius * change[:3], orientation=turned / np.linalg.norm(turned)
         )
+
+    def led_to(self, later: "Placement", share: float) -> "Placement":
+        """Where a steady motion from here to a later placement leads, a share of that time after it."""
+        turn = quat_log(quat_multiply(quat_conjugate(self.orientation), later.orientation))
+        return Placement(
+            later.position + share * (later.position - self.position),
+            quat_multiply(later.orientation, quat_exp(share * turn)),
+        )

@@ -15,7 +15,7 @@ from scipy import ndimage
 from dano.vision.capture import Light, PosedCamera
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._segments import overlap
-from dano.vision.tracking._subject import Seen, Subject
+from dano.vision.tracking._subject import BAND, Seen, Subject, window_of
 
 MASK_NOISE = 0.12
 """Standard deviation of a given mask at its edge."""
@@ -35,9 +35,6 @@ _LOOK_DOUBT = 0.1
 
 _OUTLIER = 3.0
 """Standard deviations from which residuals lose weight (Geman and McClure)."""
-
-_BAND = 4
-"""Pixels on each side of an edge that take part."""
 
 _TILE = 6
 """Side of the tiles [pixels] within which errors of neighbouring pixels are taken to be one."""
@@ -130,39 +127,12 @@ class _Rows(NamedTuple):
     colour_error: float
 
 
-def window_of(
-    subject: Subject, place: Placement, camera: PosedCamera, margin: float = 1.25
-) -> tuple[slice, slice] | None:
-    """The part of a picture that shows the object's ball; None if it lies outside or behind."""
-    middle = camera.project(subject.middle(place)[None])[0]
-    if not np.isfinite(middle).all() or middle[2] < 1.05 * subject.radius:
-        return None
-    reach = margin * subject.radius / middle[2] * float(camera.focal.mean()) + _BAND
-    low, high = np.floor(middle[:2] - reach).astype(int), np.ceil(middle[:2] + reach).astype(int)
-    low, high = np.maximum(low, 0), np.minimum(high, [camera.width, camera.height])
-    if np.any(high - low < 4):
-        return None
-    return slice(low[1], high[1]), slice(low[0], high[0])
-
-
-def pixels_of(window: tuple[slice, slice]) -> Float[np.ndarray, "n 2"]:
-    """Image coordinates of the middles of the pixels of a window, row by row."""
-    y, x = np.mgrid[window]
-    return np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
-
-
 def silhouette(
     subject: Subject, place: Placement, lamps: tuple[Light, ...], camera: PosedCamera, window
 ) -> tuple[np.ndarray, np.ndarray]:
     """Opacity and colour over black of the pixels of a window."""
-    pixels = pixels_of(window)
-    near = subject.reached(place, camera, pixels)
-    opacity, colour = np.zeros(len(pixels)), np.zeros((len(pixels), 3))
-    if near.any():
-        seen = subject.picture(place, lamps, camera, pixels[near])
-        opacity[near], colour[near] = seen.opacity, seen.colour
-    shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
-    return opacity.reshape(shape), colour.reshape(*shape, 3)
+    opacity, colour = subject.whole(place, lamps, camera)
+    return opacity[window].copy(), colour[window].copy()
 
 
 def aligned(subject: Subject, target: Target, place: Placement, lamps: tuple[Light, ...]) -> Placement:
@@ -217,7 +187,6 @@ def refine(
     if len(index) < 24:
         return None
     damping, best, change = 1e-3, None, np.zeros(6)
-    pixel = target.camera.pixel_angle
     for _ in range(steps + 1):
         moved = place if best is None else best[0].moved(change, subject.radius)
         rows = _rows(subject, target, moved, lamps, index, loss)
@@ -229,8 +198,7 @@ def refine(
         scale = np.diag(np.diagonal(hessian)) + 1e-9 * np.trace(hessian) * np.eye(6)
         change = -np.linalg.solve(hessian + damping * scale, gradient)
         change *= min(1.0, 0.35 / max(float(np.abs(change).max()), 1e-9))
-        away = np.linalg.norm(subject.middle(best[0]) - target.camera.position)
-        if np.abs(change).max() * subject.radius < _SMALL * pixel * away:
+        if np.abs(change).max() * subject.radius < _SMALL * subject.pixel(best[0], target.camera):
             break
     assert best is not None
     return _refined(subject, target, lamps, *best, index)
@@ -273,8 +241,8 @@ def _chosen(opacity, target: Target, window, rays: int, random: np.random.Genera
     solid, given = opacity > 0.5, mask > 0.5
     edge = np.zeros(mask.shape, bool)
     for shape in (solid, given):
-        edge |= ndimage.binary_dilation(shape, iterations=_BAND) & ~ndimage.binary_erosion(
-            shape, iterations=_BAND, border_value=1
+        edge |= ndimage.binary_dilation(shape, iterations=BAND) & ~ndimage.binary_erosion(
+            shape, iterations=BAND, border_value=1
         )
     inner = solid & ~edge
     picked = []

@@ -57,6 +57,7 @@ class Tracked(NamedTuple):
         overlays: Silhouettes at these poses, None where there is none.
         messages: What a user should know, in sentences.
         seconds: Time a frame took [s], the search at the start not included.
+        repeats: In how many poses what one frame shows is found again, shape (T,); see `Smoothed`.
     """
 
     times: Float[np.ndarray, " T"]
@@ -71,6 +72,7 @@ class Tracked(NamedTuple):
     overlays: tuple[Overlay | None, ...]
     messages: tuple[str, ...]
     seconds: float
+    repeats: Float[np.ndarray, " T"]
 
     @property
     def n_tracked(self) -> int:
@@ -116,8 +118,7 @@ def tracked(
             covariance[i] = covariance_of(one, subject, eye)
             if motion is not None:
                 position[i], orientation[i] = motion.poses.position[i], motion.poses.orientation[i]
-                shared = shared_covariance(subject.middle(one.place), subject, eye)
-                covariance[i] = motion.poses.covariance[i] + shared
+                covariance[i] = motion.poses.covariance[i] + shared_covariance(subject)
             quality[i], colour[i] = one.overlap, one.colour_error
             overlays[i] = Overlay(one.window, one.silhouette)
     known = [one for one in found if one is not None]
@@ -137,6 +138,7 @@ def tracked(
         tuple(overlays),
         tuple(texts),
         float(np.mean(seconds)) if len(seconds) else 0.0,
+        np.where(np.isfinite(position[:, 0]), 1.0, np.nan) if motion is None else motion.repeats,
     )
 
 

@@ -1,5 +1,6 @@
 """What is tracked, as the renderer sees it, and how what is seen changes with its pose."""
 
+import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -8,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy import ndimage
 
-from dano.maths import quat_exp, quat_multiply, quat_rotate, quat_to_matrix
-from dano.vision.capture import AbstractCamera, Light
+from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate, quat_to_matrix
+from dano.vision.capture import AbstractCamera, Light, PosedCamera
 from dano.vision.drawing import Part, through
 from dano.vision.radiance import LearnedField, Sampling, SurfaceModel
 from dano.vision.tracking._placement import Drift, Placement
@@ -25,8 +27,17 @@ SAMPLING = Sampling(48, 12, 2, grazes=True)
 _SOFT = 3.0
 """Pixels by which the edge of a silhouette lies outside the box, at most."""
 
+BAND = 4
+"""Pixels on each side of an edge that take part in what pictures say."""
+
+_NEARLY = 0.02, np.radians(2)
+"""Share of the size, and angle, by which a pose may be beside the one that other frames lead to."""
+
 _LOOSE = 0.02
 """Share of its size by which the object's density reaches out of the box of its surface."""
+
+_WIDE = 1.5
+"""Radii around the middle up to which a picture shows the object, by blur and rolling shutter, too."""
 
 _STEEPEST = 4.0
 """Sharpness of a silhouette times the width of a pixel: its edge is as soft as a pixel's average makes it."""
@@ -67,6 +78,7 @@ class Subject:
         self._model = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), field.model)
         self._field = field
         self._drawn = float(field.drawn_sharpness)
+        self._last: tuple[tuple, np.ndarray, np.ndarray] | None = None
 
     @functools.cached_property
     def solid(self) -> Solid:
@@ -87,12 +99,26 @@ class Subject:
         """The placement with an orientation whose ball lies around a point [m, W]."""
         return Placement(middle - quat_to_matrix(orientation) @ self.centre, orientation)
 
+    def pixel(self, place: Placement, camera: AbstractCamera) -> float:
+        """What one pixel of a camera covers at the middle [m]."""
+        away = float(np.linalg.norm(self.middle(place) - camera.position))
+        return max(away, self.radius) * camera.pixel_angle
+
+    def pixels(self, place: Placement, camera: AbstractCamera) -> float:
+        """Size of the object in a picture [pixels]."""
+        return self.size / self.pixel(place, camera)
+
+    def off(self, place: Placement, expected: Placement) -> float:
+        """How far a pose is from an expected one, in units of `_NEARLY`."""
+        moved = self.middle(place) - self.middle(expected)
+        turned = quat_log(quat_multiply(quat_conjugate(expected.orientation), place.orientation))
+        return float(np.linalg.norm(moved) / (_NEARLY[0] * self.size) + np.linalg.norm(turned) / _NEARLY[1])
+
     def reached(
         self, place: Placement, camera: AbstractCamera, pixels: Float[np.ndarray, "n 2"]
     ) -> Bool[np.ndarray, " n"]:
         """Which pixels may show the object: their rays pass the box around it, or by less than its edge."""
-        away = max(float(np.linalg.norm(self.middle(place) - camera.position)), self.radius)
-        margin = _SOFT * camera.pixel_angle * away + _LOOSE * self.size
+        margin = _SOFT * self.pixel(place, camera) + _LOOSE * self.size
         drift = place.drift
         if drift is not None:
             margin += 0.5 * (drift.shutter + drift.readout) * drift.speed(self.radius)
@@ -167,8 +193,8 @@ class Subject:
         drift = place.drift
         if drift is None:
             return self.see(place, lamps, origins, directions, pixel, slopes=slopes)
-        away = max(float(np.linalg.norm(self.middle(place) - camera.position)), self.radius)
-        moments = drift.moments(pixels[:, 1] / camera.height, drift.speed(self.radius) / (pixel * away))
+        speed = drift.speed(self.radius) / self.pixel(place, camera)
+        moments = drift.moments(pixels[:, 1] / camera.height, speed)
         exposures = [
             self.see(
                 place, lamps, *self._meanwhile(place, drift, late, origins, directions), pixel, slopes=slopes
@@ -176,6 +202,56 @@ class Subject:
             for late in moments.T
         ]
         return Seen(*(np.mean(column, axis=0) for column in zip(*exposures, strict=True)))
+
+    def whole(
+        self, place: Placement, lamps: tuple[Light, ...], camera: PosedCamera
+    ) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width 3"]]:
+        """Opacity and colour over black of a whole picture.
+
+        Of a moving object the picture in the middle of the exposure is spread over the others: a mask or an
+        overlap need no more. The last one is kept: a mask is made from it, pixels are chosen by it, and
+        an overlap is measured.
+        """
+        asked = (place, lamps, camera)
+        if self._last is None or any(a is not b for a, b in zip(self._last[0], asked, strict=True)):
+            opacity = np.zeros((camera.height, camera.width))
+            colour = np.zeros((camera.height, camera.width, 3))
+            window = window_of(self, place, camera, _WIDE)
+            pixels = np.zeros((0, 2)) if window is None else pixels_of(window)
+            pixels = pixels[self.reached(place, camera, pixels)]
+            if len(pixels):
+                still = dataclasses.replace(place, drift=None)
+                seen, (x, y) = self.picture(still, lamps, camera, pixels), pixels.astype(int).T
+                opacity[y, x], colour[y, x] = seen.opacity, seen.colour
+                if place.drift is not None:
+                    both = np.concatenate([opacity[..., None], colour], axis=2)
+                    spread = self._spread(place, place.drift, camera, pixels, both)
+                    opacity[y, x], colour[y, x] = spread[:, 0], spread[:, 1:]
+            self._last = asked, opacity, colour
+        return self._last[1:]
+
+    def _spread(
+        self,
+        place: Placement,
+        drift: Drift,
+        camera: PosedCamera,
+        pixels: Float[np.ndarray, "n 2"],
+        sharp: Float[np.ndarray, "height width k"],
+    ) -> Float[np.ndarray, "n k"]:
+        """Mean over the exposure of a picture of the object, as if it were flat and facing the camera."""
+        directions, facing = camera.directions(pixels), camera.axes[2]
+        middle = self.middle(place)
+        ahead = (middle - camera.position) @ facing / (directions @ facing)
+        points = camera.position + ahead[:, None] * directions
+        speed = drift.speed(self.radius) / self.pixel(place, camera)
+        moments = drift.moments(pixels[:, 1] / camera.height, speed)
+        total = np.zeros((len(pixels), sharp.shape[2]))
+        for late in moments.T:
+            here, _ = self._meanwhile(place, drift, late, points, directions)
+            x, y = camera.project(here)[:, :2].T - 0.5
+            for k, channel in enumerate(np.moveaxis(sharp, 2, 0)):
+                total[:, k] += ndimage.map_coordinates(channel, [y, x], order=1, mode="nearest")
+        return total / moments.shape[1]
 
     def _meanwhile(
         self,
@@ -190,6 +266,27 @@ class Subject:
         back = quat_exp(-late[:, None] * drift.spin)
         here = middle + quat_rotate(back, origins - middle - late[:, None] * drift.velocity)
         return here, quat_rotate(back, directions)
+
+
+def window_of(
+    subject: Subject, place: Placement, camera: PosedCamera, margin: float = 1.25
+) -> tuple[slice, slice] | None:
+    """The part of a picture that shows the object's ball; None if it lies outside or behind."""
+    middle = camera.project(subject.middle(place)[None])[0]
+    if not np.isfinite(middle).all() or middle[2] < 1.05 * subject.radius:
+        return None
+    reach = margin * subject.radius / middle[2] * float(camera.focal.mean()) + BAND
+    low, high = np.floor(middle[:2] - reach).astype(int), np.ceil(middle[:2] + reach).astype(int)
+    low, high = np.maximum(low, 0), np.minimum(high, [camera.width, camera.height])
+    if np.any(high - low < 4):
+        return None
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def pixels_of(window: tuple[slice, slice]) -> Float[np.ndarray, "n 2"]:
+    """Image coordinates of the middles of the pixels of a window, row by row."""
+    y, x = np.mgrid[window]
+    return np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
 
 
 def _filled(rows: Float[np.ndarray, "n 3"], last: Float[np.ndarray, "3"]) -> Array:

@@ -11,7 +11,7 @@ from dano.vision.tracking._subject import Subject
 _PLACE_DOUBT = 2.0e-3
 """Share of its size by which a learned object lies beside the true one: no frame shows it, all share it."""
 
-_SCALE_DOUBT = 1.5e-3
+SCALE_DOUBT = 1.5e-3
 """Share by which it is too large or too small: it then seems to be nearer or further by that share."""
 
 _TURN_DOUBT = 3e-3
@@ -51,23 +51,19 @@ def own_covariance(found: Refined, subject: Subject) -> Float[np.ndarray, "6 6"]
     return 0.5 * (result + result.T)
 
 
-def shared_covariance(middle: Float[np.ndarray, "3"], subject: Subject, eye: Float[np.ndarray, "3"]):
-    """Covariance of errors that all frames share and none shows, of an object around a point [m, W].
-
-    Args:
-        middle: Of the object [m, W].
-        subject: The object.
-        eye: Where the camera is [m, W].
-    """
-    away = middle - eye
-    result = np.diag(np.repeat([(_PLACE_DOUBT * subject.size) ** 2, _TURN_DOUBT**2], 3))
-    result[:3, :3] += _SCALE_DOUBT**2 * np.outer(away, away)
-    return result
+def shared_covariance(subject: Subject) -> Float[np.ndarray, "6 6"]:
+    """Covariance of errors of an object's frame that all frames of a film share and none shows."""
+    return np.diag(np.repeat([(_PLACE_DOUBT * subject.size) ** 2, _TURN_DOUBT**2], 3))
 
 
 def covariance_of(found: Refined, subject: Subject, eye: Float[np.ndarray, "3"]) -> Float[np.ndarray, "6 6"]:
     """Covariance of position [m, W] and rotation vector [rad, F], seen from a point [m, W]."""
-    return own_covariance(found, subject) + shared_covariance(subject.middle(found.place), subject, eye)
+    result, away = (
+        own_covariance(found, subject) + shared_covariance(subject),
+        subject.middle(found.place) - eye,
+    )
+    result[:3, :3] += SCALE_DOUBT**2 * np.outer(away, away)
+    return result
 
 
 def unobservable(found: Sequence[Refined], subject: Subject) -> list[str]:

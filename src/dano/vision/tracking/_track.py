@@ -11,10 +11,6 @@ from jaxtyping import Float
 from dano.maths import (
     checked_array,
     checked_quaternion,
-    quat_conjugate,
-    quat_exp,
-    quat_log,
-    quat_multiply,
 )
 from dano.progress import Progress
 from dano.vision.capture import PosedCamera
@@ -28,28 +24,32 @@ from dano.vision.tracking._refine import aligned, refine, Refined, Target, windo
 from dano.vision.tracking._result import HIDDEN, LOST, OUTSIDE, TRACKED, Tracked, tracked
 from dano.vision.tracking._search import (
     colours_of,
-    distinct,
     half_turns,
     learn_light,
+    likeliest,
     score,
     search,
     Start,
-    unlikeness,
+    turned_aside,
 )
+from dano.vision.tracking._segments import overlap
 from dano.vision.tracking._subject import CHUNK, Subject
-from dano.vision.tracking._whole import Whole
+from dano.vision.tracking._whole import region_of, Whole
 
 _COARSE = 24
 """Size of the object [pixels] at the coarsest level of the pyramid."""
+
+_STEPS = 4
+"""Steps of a refinement, most."""
+
+_SHARP = 0.3
+"""Way during an exposure that does not show [pixels]."""
 
 _LIGHT_EVERY = 4
 """Frames after which the light is fitted again; exposure and clouds change slower."""
 
 _FOUND = 0.75
 """Overlap from which a search has found the object."""
-
-_ALIKE = 0.02
-"""By which overlaps of starts may differ for colours to decide."""
 
 _UNLIKE = 0.1
 """Usual difference of colours [sRGB] above which a segment is rejected as a different object: a blurred,
@@ -58,23 +58,17 @@ noisy object has 0.055."""
 _TWIN = 1.5
 """Ratio of the scores of two things in a frame up to which both look like the object."""
 
-_OTHER = np.radians(12)
-"""Angle above which two starts are different ones."""
-
 _WORSE = 0.03
 """By how much less than usually a silhouette must overlap for other poses to be tried."""
 
 _PALER = 1.5
 """How many times larger than usual the difference of colours must be for that."""
 
+_CAUGHT = 0.4
+"""Overlap with a thing from which it may be the object, turned meanwhile."""
+
 _NEAR = 4
 """Frames between two that say where the object is in others near them."""
-
-_ASIDE = np.radians(15)
-"""By how much these are turned."""
-
-_NEARLY = 0.02, np.radians(2)
-"""Share of the size, and angle, by which a pose may be beside the one that other frames lead to."""
 
 _PULL = 0.01
 """What so much costs in a score, which is known to about as much."""
@@ -158,14 +152,16 @@ class _Walk:
         if before is None:
             found, status = self._searched(i), LOST
         else:
-            found, status = self._followed(i, before)
+            found, status = self._unmoved(i), TRACKED
+            if found is None:
+                found, status = self._followed(i, before)
+            if status == LOST:
+                found, status = self._followed(i, self._caught_up(i, before))
             self._seconds.append(time.perf_counter() - began)
             if found is None and status == LOST and self._missed == 0:
                 found, searched = self._searched(i), True
         if found is not None:
-            found = self._exposed(i, found)
-        if found is not None:
-            status = TRACKED
+            found, status = self._exposed(i, found), TRACKED
             self._missed = 0
             count = self._status.count(TRACKED)
             if searched or count < _LIGHT_EVERY or count % _LIGHT_EVERY == 0:
@@ -202,15 +198,20 @@ class _Walk:
             return last
         return dataclasses.replace(self._carried(seen[-2], seen[-1], i), drift=last.drift)
 
+    def _caught_up(self, i: int, last: Placement) -> Placement:
+        """A pose moved to the thing in a frame that it fits best: it may move faster than was expected."""
+        shapes, lamps = [], self._light.lamps
+        for part in self._masking.parts(i, self._camera):
+            moved = aligned(self._subject, part, last, lamps)
+            shape, _ = self._subject.whole(moved, lamps, self._camera)
+            shapes.append((overlap(part.mask, shape, part.seen), moved))
+        best = max(shapes, key=lambda one: one[0], default=(0.0, last))
+        return best[1] if best[0] > _CAUGHT else last
+
     def _carried(self, j: int, k: int, i: int) -> Placement:
         """The pose in frame i at the constant velocity that leads from frame j to k."""
-        times, first, second = self._film.times, self._place(j), self._place(k)
-        share = (times[i] - times[k]) / (times[k] - times[j])
-        turn = quat_log(quat_multiply(quat_conjugate(first.orientation), second.orientation))
-        return Placement(
-            second.position + share * (second.position - first.position),
-            quat_multiply(second.orientation, quat_exp(share * turn)),
-        )
+        times = self._film.times
+        return self._place(j).led_to(self._place(k), (times[i] - times[k]) / (times[k] - times[j]))
 
     def look_again(self) -> None:
         """Begin once more in frames that fit worse than usual, or were lost: where other frames say."""
@@ -250,10 +251,17 @@ class _Walk:
             known, after = self._found[i], self._place(i + 1)
             further = i + 2 < len(self._found) and self._found[i + 2] is not None
             carried = self._carried(i + 2, i + 1, i) if further else after
-            if known is not None and (not further or self._off(known.place, carried) < 1):
+            if known is not None and (not further or self._is_led_to(i, known.place, carried)):
                 continue
             better = self._taken_up(i, dataclasses.replace(carried, drift=after.drift)) or better
         return better
+
+    def _is_led_to(self, i: int, place: Placement, carried: Placement) -> bool:
+        """Whether the frames after one lead to its pose, at constant velocity or as that changed before."""
+        away = self._subject.off(place, carried)
+        if away < 1 or i + 3 >= len(self._found) or self._found[i + 3] is None:
+            return away < 1
+        return away < 1 + self._subject.off(self._place(i + 1), self._carried(i + 3, i + 2, i + 1))
 
     def _taken_up(self, i: int, expected: Placement) -> bool:
         """Track a frame once more from an expected pose; returns whether the answer differs.
@@ -268,19 +276,11 @@ class _Walk:
         poses = [one for one in (self._found[i], found, near) if one is not None]
         if not poses:
             return False
-        best = min(poses, key=lambda one: score(one) + _PULL * self._off(one.place, expected))
+        best = min(poses, key=lambda one: score(one) + _PULL * self._subject.off(one.place, expected))
         if best is self._found[i]:
             return False
         self._found[i], self._status[i] = self._exposed(i, best), TRACKED
         return True
-
-    def _off(self, place: Placement, expected: Placement) -> float:
-        """How far a pose is from an expected one, in units of `_NEARLY`."""
-        moved = self._subject.middle(place) - self._subject.middle(expected)
-        turned = quat_log(quat_multiply(quat_conjugate(expected.orientation), place.orientation))
-        return float(
-            np.linalg.norm(moved) / (_NEARLY[0] * self._subject.size) + np.linalg.norm(turned) / _NEARLY[1]
-        )
 
     def _exposed(self, i: int, found: Refined) -> Refined:
         """The pose once more, with how the object moves while the frame is exposed."""
@@ -293,11 +293,18 @@ class _Walk:
         drift = Drift.between(
             last, found.place, duration, self._subject.middle, options.shutter, options.readout
         )
+        way = drift.speed(self._subject.radius) * (options.shutter + options.readout)
+        if way / self._subject.pixel(found.place, self._camera) < _SHARP:
+            return found
         if last.drift is None:
             # The first frame was taken for one of an object at rest.
             begun = self._fine(seen[-1], dataclasses.replace(last, drift=drift), self._light)
             self._found[seen[-1]] = begun or self._found[seen[-1]]
-        return self._fine(i, dataclasses.replace(found.place, drift=drift), self._light) or found
+        place = dataclasses.replace(found.place, drift=drift)
+        if found.place.drift is not None:
+            # With the motion of the frame before it is nearly right.
+            return found._replace(place=place)
+        return self._fine(i, place, self._light) or found
 
     def _place(self, i: int) -> Placement:
         found = self._found[i]
@@ -344,21 +351,10 @@ class _Walk:
             self._finished(i, place, finer[0].light)
             for place in half_turns(self._subject, finer[0].refined.place)
         ]
-        best, ambiguity = self._likeliest(target, [*finer, *(s for s in turned if s is not None)])
+        best, ambiguity = likeliest(
+            self._subject, target, self._options.loss, [*finer, *(s for s in turned if s is not None)]
+        )
         return None if self._is_another(best.refined) else (best, ambiguity)
-
-    def _likeliest(self, target: Target, starts: list[Start]) -> tuple[Start, float]:
-        """Of starts whose silhouettes fit alike, the one whose colours fit best; and how clearly."""
-        most = max(start.refined.overlap for start in starts)
-        alike = sorted((s for s in starts if s.refined.overlap > most - _ALIKE), key=lambda s: s.score)
-        alike = distinct(alike, lambda start: start.refined.place, _OTHER)
-        if self._options.loss != "photometric":
-            values = [start.score for start in alike]
-        else:
-            found = [(unlikeness(self._subject, target, start), start) for start in alike]
-            found.sort(key=lambda pair: pair[0])
-            values, alike = [value for value, _ in found], [start for _, start in found]
-        return alike[0], min((value / max(values[0], 1e-9) for value in values[1:]), default=np.inf)
 
     def _finished(self, i: int, place: Placement, light: LightFit) -> Start | None:
         """A start at full resolution, under the light that it implies itself."""
@@ -373,6 +369,16 @@ class _Walk:
                 # Without light colours did not count, and costs could not be compared.
                 found = self._fine(i, found.place, own) or found
         return Start(found, own if own.known else light, score(found))
+
+    def _unmoved(self, i: int) -> Refined | None:
+        """The pose of the frame before, if the object lies still between both; None if it moves."""
+        before = self._found[i - 1] if i else None
+        if before is None or self._masking.hidden(i, before.window) > 1 - BLIND:
+            return None
+        if not self._film.is_still(i - 1, i, region_of(before, self._film.images[i].shape[:2])):
+            return None
+        found = self._fine(i, dataclasses.replace(before.place, drift=None), self._light, 1)
+        return found if found is not None and self._is_it(found) else None
 
     def _followed(self, i: int, before: Placement) -> tuple[Refined | None, str]:
         window = window_of(self._subject, before, self._camera)
@@ -401,14 +407,14 @@ class _Walk:
         found = self._from_coarse(i, before, light)
         usual = [other.overlap for other in self._found if other is not None]
         if found is not None and usual and found.overlap < np.median(usual) - _WORSE:
-            around = [self._from_coarse(i, place, light) for place in self._beside(before)]
+            around = [self._from_coarse(i, place, light) for place in turned_aside(self._subject, before)]
             known = [other for other in [found, *around] if other is not None]
             found = min(known, key=score)
         return None if found is None else self._fine(i, found.place, light)
 
     def _from_coarse(self, i: int, before: Placement, light: LightFit) -> Refined | None:
         """By silhouettes first, which are seen from further away; then by colours."""
-        size = self._size(before)
+        size = self._subject.pixels(before, self._camera)
         target = self._masking.near(i, self._subject, before, light.lamps, self._camera, 0.06 * size)
         if target is None:
             return None
@@ -417,43 +423,35 @@ class _Walk:
         last = self._loss(light)
         for loss in ("silhouette", last) if last == "photometric" else (last,):
             found = refine(
-                self._subject, coarse, place, light.lamps, loss=loss, steps=4, rays=CHUNK, random=self._random
+                self._subject,
+                coarse,
+                place,
+                light.lamps,
+                loss=loss,
+                steps=_STEPS,
+                rays=CHUNK,
+                random=self._random,
             )
             if found is None:
                 return None
             place = found.place
         return found
 
-    def _fine(self, i: int, place: Placement, light: LightFit) -> Refined | None:
+    def _fine(self, i: int, place: Placement, light: LightFit, steps: int = _STEPS) -> Refined | None:
         target = self._masking.near(i, self._subject, place, light.lamps, self._camera, 2.0)
         if target is None:
             return None
-        return refine(
-            self._subject,
-            target,
-            place,
-            light.lamps,
-            loss=self._loss(light),
-            steps=4,
-            rays=self._options.rays,
-            random=self._random,
+        # All frames together are looked at with all rays.
+        return self._refine(
+            target, place, light, self._loss(light), steps, max(self._options.rays // 2, CHUNK)
         )
+
+    def _refine(self, target: Target, place: Placement, light: LightFit, loss: str, steps: int, rays: int):
+        subject, random = self._subject, self._random
+        return refine(subject, target, place, light.lamps, loss=loss, steps=steps, rays=rays, random=random)
 
     def _loss(self, light: LightFit) -> str:
         return "silhouette" if self._options.loss == "photometric" and not light.known else self._options.loss
-
-    def _size(self, place: Placement) -> float:
-        """Size of the object in the picture [pixels]."""
-        away = np.linalg.norm(self._subject.middle(place) - self._camera.position)
-        return self._subject.size / float(away) / self._camera.pixel_angle
-
-    def _beside(self, place: Placement) -> list[Placement]:
-        """Other poses to begin at: the object turned both ways about each of its axes."""
-        turns = [_ASIDE * sign * axis for axis in np.eye(3) for sign in (1, -1)]
-        middle = self._subject.middle(place)
-        return [
-            self._subject.around(middle, quat_multiply(place.orientation, quat_exp(turn))) for turn in turns
-        ]
 
     def _learn(self, i: int, found: Refined) -> None:
         if self._options.loss != "photometric":

@@ -16,7 +16,7 @@ from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.tracking._refine import linearized, Refined, silhouette, window_of
 from dano.vision.tracking._search import learn_light
 from dano.vision.tracking._subject import Subject
-from dano.vision.tracking._sureness import own_covariance
+from dano.vision.tracking._sureness import own_covariance, SCALE_DOUBT
 from dano.vision.trajectory import Poses, Scenery, Smoothed, smoothed
 
 _PASSES = 2
@@ -85,7 +85,9 @@ class Whole:
             if one is not None:
                 poses.position[i], poses.orientation[i] = one.place.position, one.place.orientation
                 poses.covariance[i] = own_covariance(one, self._subject)
-        scenery = Scenery(self._subject.solid, self._still, self._options.table)
+        scenery = Scenery(
+            self._subject.solid, self._still, self._options.table, self._camera.position, SCALE_DOUBT
+        )
         return smoothed(self._film.times, poses, scenery)
 
     def _place(self, i: int) -> Placement:
@@ -116,7 +118,7 @@ class Whole:
         known = self._known()
         if self._options.loss != "photometric":
             return light
-        fit = LightFit(self._subject, _LIGHT_FRAMES, self._options.table)
+        fit = light.afresh(_LIGHT_FRAMES)
         for k in np.unique(np.linspace(0, len(known) - 1, min(_LIGHT_FRAMES, len(known))).astype(int)):
             i = known[k]
             place = self._place(i)
@@ -132,14 +134,14 @@ class Whole:
     def _stillness(self) -> Bool[np.ndarray, " T_minus_1"]:
         """Whether the object lies still between a frame and the next one, by their pictures."""
         still = np.zeros(len(self.found) - 1, bool)
-        begun = 0
+        begun, shape = 0, self._film.images[0].shape[:2]
         for i in range(len(still)):
             if not still[i - 1] or i == 0:
                 begun = i
             first, second = self.found[i], self.found[i + 1]
             if first is None or second is None or self._apart(first, second) > _FAR:
                 continue
-            region = self._region(first) | self._region(second)
+            region = region_of(first, shape) | region_of(second, shape)
             # What creeps lies still from one frame to the next, but not from the first one on.
             still[i] = self._film.is_still(i, i + 1, region) and self._film.is_still(begun, i + 1, region)
         return still
@@ -149,7 +151,14 @@ class Whole:
         middles = np.stack([self._subject.middle(one.place) for one in (first, second)])
         return float(np.linalg.norm(np.diff(self._camera.project(middles)[:, :2], axis=0)))
 
-    def _region(self, one: Refined) -> Bool[np.ndarray, "height width"]:
-        region = np.zeros(self._film.images[0].shape[:2], bool)
-        region[one.window] = one.silhouette > 0.5
-        return ndimage.binary_dilation(region, iterations=_RIM)
+
+def region_of(one: Refined, shape: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
+    """Where a picture of some height and width shows the object, and a motion of it.
+
+    Args:
+        one: The object's pose there.
+        shape: Of the picture.
+    """
+    region = np.zeros(shape, bool)
+    region[one.window] = one.silhouette > 0.5
+    return ndimage.binary_dilation(region, iterations=_RIM)

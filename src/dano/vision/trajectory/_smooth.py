@@ -3,7 +3,8 @@
 Least squares over all frames: what the pixels of a frame say of its pose, as a Gaussian (`Poses`); third
 differences of position and rotation, which vanish under constant acceleration and spin; differences between
 frames in which the object lies still; and, above a known table, height and tilt of an object that lies or
-slides on one of its faces. Weights of frames and of differences are those of Student's and Cauchy's
+slides on one of its faces. A wrong size of the object moves it along the line of sight in all frames alike.
+Weights of frames and of differences are those of Student's and Cauchy's
 distributions, found again in every step (iteratively reweighted least squares).
 """
 
@@ -73,6 +74,9 @@ class Smoothed(NamedTuple):
         supported: Frames in which the object lies or slides on a face, shape (T,).
         away: What frames by themselves say less the motion: in sizes [W] and [rad, F], shape (T, 6).
         inflation: Factor by which variances of frames were too small.
+        repeats: In how many poses what one frame says is found again, ≥ 1, shape (T,); NaN where there is
+            none. Poses that frames share have small covariances, but are not independent: with covariances so
+            many times larger they say together, as if they were, what the frames say together.
     """
 
     poses: Poses
@@ -80,6 +84,7 @@ class Smoothed(NamedTuple):
     supported: Bool[np.ndarray, " T"]
     away: Float[np.ndarray, "T 6"]
     inflation: float
+    repeats: Float[np.ndarray, " T"]
 
 
 class Scenery(NamedTuple):
@@ -89,11 +94,16 @@ class Scenery(NamedTuple):
         solid: The object.
         still: Whether it moves between a frame and the next one, shape (T − 1,): True if it does not.
         table: Height of a level table [m, W]; None: none is known.
+        eye: Where the camera is [m, W]; None: what frames say has no distance in common that may be wrong.
+        scale: Standard deviation of the share by which all frames see it too near or too far, because the
+            object is known too small or too large.
     """
 
     solid: Solid
     still: Bool[np.ndarray, " T_minus_1"]
     table: float | None = None
+    eye: Float[np.ndarray, "3"] | None = None
+    scale: float = 0.0
 
 
 def smoothed(times: Float[np.ndarray, " T"], poses: Poses, scenery: Scenery) -> Smoothed:
@@ -107,19 +117,19 @@ def smoothed(times: Float[np.ndarray, " T"], poses: Poses, scenery: Scenery) -> 
     n, rows = len(times), np.flatnonzero(poses.known)
     weight, supported, away = np.full(n, np.nan), np.zeros(n, bool), np.full((n, 6), np.nan)
     if not len(rows):
-        return Smoothed(poses, weight, supported, away, 1.0)
+        return Smoothed(poses, weight, supported, away, 1.0, weight.copy())
     resting = _at_rest(scenery.still, rows)
     seen = poses.taken(rows)
     # Frames of a thing that lies still are one picture with much the same errors: together they say as much.
     together = _together(resting, len(rows))
     seen = seen._replace(covariance=seen.covariance * together[:, None, None])
-    problem = _Problem(times[rows], seen, scenery.solid, resting)
+    problem = _Problem(times[rows], seen, scenery, resting)
     found = problem.solved(seen, [])
     # Which face it lies on is seen better once frames agree on a motion.
     runs = [] if scenery.table is None else _runs(found, scenery.solid, scenery.table)
-    inflation = 1.0
+    inflation, more = 1.0, seen
     for _ in range(_CALIBRATIONS):
-        inflation = max(1.0, inflation * _disagreement(seen, found, together, inflation))
+        inflation = max(1.0, inflation * _disagreement(seen, found, problem.seen(found), together, inflation))
         more = seen._replace(covariance=inflation * seen.covariance)
         found = problem.solved(more, runs, scenery.table or 0.0)
     result = Poses(*(x.copy() for x in poses))
@@ -129,8 +139,12 @@ def smoothed(times: Float[np.ndarray, " T"], poses: Poses, scenery: Scenery) -> 
     for run in runs:
         supported[rows[run.rows]] = True
     unit = np.repeat([scenery.solid.size, 1.0], 3)
-    away[rows] = difference(found, seen) / unit
-    return Smoothed(result, weight, supported, away, inflation)
+    away[rows] = difference(problem.seen(found), seen) / unit
+    # The share of a pose that its own frame decides, of one that all others know nothing of.
+    own = problem.weight * np.einsum("nij,nji->n", np.linalg.inv(more.covariance), found.covariance) / 6
+    repeats = np.full(n, np.nan)
+    repeats[rows] = np.clip(1 / own, 1, len(rows))
+    return Smoothed(result, weight, supported, away, inflation, repeats)
 
 
 def _together(resting: np.ndarray, n: int) -> Float[np.ndarray, " n"]:
@@ -139,9 +153,11 @@ def _together(resting: np.ndarray, n: int) -> Float[np.ndarray, " n"]:
     return np.bincount(number)[number].astype(float)
 
 
-def _disagreement(seen: Poses, found: Poses, together: np.ndarray, inflation: float) -> float:
+def _disagreement(
+    seen: Poses, found: Poses, expected: Poses, together: np.ndarray, inflation: float
+) -> float:
     """Variance of what frames are off by from their motion, over what their inflated covariances say."""
-    away = difference(found, seen)
+    away = difference(expected, seen)
     inverse = np.linalg.inv(inflation * seen.covariance)
     square = np.einsum("ni,nij,nj->n", away, inverse, away)
     # What a frame itself contributed to the motion does not show.
@@ -166,10 +182,15 @@ class _Run(NamedTuple):
 
 
 class _Minimum(NamedTuple):
-    """Where steps ended."""
+    """Where steps ended.
+
+    Attributes:
+        poses: Of the frames.
+        shared: Height and tilts of the face of each run, then the share by which frames see too far.
+    """
 
     poses: Poses
-    shared: Float[np.ndarray, "runs 3"]
+    shared: Float[np.ndarray, " m"]
     weight: Float[np.ndarray, " n"]
     cost: float
     inverse: Any
@@ -206,8 +227,10 @@ def _runs(poses: Poses, solid: Solid, table: float) -> list[_Run]:
 class _Problem:
     """Least squares over the frames that have a pose (host)."""
 
-    def __init__(self, times: np.ndarray, poses: Poses, solid: Solid, resting: np.ndarray):
-        self._poses, self._solid, self._resting = poses, solid, resting
+    def __init__(self, times: np.ndarray, poses: Poses, scenery: Scenery, resting: np.ndarray):
+        self._poses, self._solid, self._resting = poses, scenery.solid, resting
+        solid, self._eye, self._scale = scenery.solid, scenery.eye, max(scenery.scale, _EPSILON)
+        self._further = 0.0
         self._unit = np.repeat([solid.size, 1.0], 3)
         self._roots = np.zeros((len(times), 6, 6))
         n = len(times)
@@ -226,7 +249,7 @@ class _Problem:
         """
         self._poses, self._runs, self._table = poses, runs, table
         self._roots = np.linalg.inv(np.linalg.cholesky(poses.covariance / np.outer(self._unit, self._unit)))
-        best = self._descended(self._poses, np.zeros((len(runs), 3)), _TOLERANT)
+        best = self._descended(self._poses, np.zeros(3 * len(runs) + 1), _TOLERANT)
         doubted = np.flatnonzero(np.diff(np.concatenate([[0], best.weight < _DOUBTED, [0]]).astype(int)))
         for first, last in doubted.reshape(-1, 2):
             rows = slice(first, last)
@@ -235,10 +258,18 @@ class _Problem:
                 whole[rows] = own[rows]
             other = self._descended(begun, best.shared, 1.0)
             best = min(best, other, key=lambda one: one.cost)
-        self.weight = best.weight
+        self.weight, self._further = best.weight, float(best.shared[-1])
         n = len(self._poses.position)
-        blocks = np.stack([_block(best.inverse, k, 6 * n + 3 * len(runs)) for k in range(n)])
+        blocks = np.stack([_block(best.inverse, k, 6 * n + len(best.shared)) for k in range(n)])
         return best.poses._replace(covariance=blocks * np.outer(self._unit, self._unit))
+
+    def seen(self, poses: Poses, further: float | None = None) -> Poses:
+        """What frames are expected to say of poses, all further away by a share; default: as was found."""
+        if self._eye is None:
+            return poses
+        share = self._further if further is None else further
+        arm = quat_rotate(poses.orientation, np.broadcast_to(self._solid.middle, poses.position.shape))
+        return poses._replace(position=poses.position + share * (poses.position + arm - self._eye))
 
     def _descended(self, poses: Poses, shared: np.ndarray, tolerance: float) -> "_Minimum":
         """Gauss and Newton's steps from poses; `tolerance` is where differences lose weight at first."""
@@ -250,36 +281,51 @@ class _Problem:
             found = _Minimum(poses, shared, self._weight, self._cost, inverse)
             step = -inverse.solve(jacobian.T @ residual)
             poses = poses.moved(step[: 6 * n].reshape(n, 6), self._solid.size)
-            shared = shared + step[6 * n :].reshape(-1, 3)
+            shared = shared + step[6 * n :]
             if k == _PASSES or (self._tolerance == 1 and np.abs(step).max() < _ENDED):
                 return found
 
     def _system(self, poses: Poses, shared: np.ndarray):
         """Jacobian (sparse) and residuals at poses, both weighted; notes cost and weights of frames."""
         n, self._cost = len(poses.position), 0.0
-        width = 6 * n + 3 * len(self._runs)
-        parts = [self._seen(poses)]
+        width = 6 * n + len(shared)
+        parts = []
         if len(self._fours):
             parts.append(self._steady(poses))
         if len(self._resting):
             parts.append(self._rest(poses))
-        rows = [_spread(*part, width) for part in parts]
+        rows = [self._said(poses, shared[-1], width), *(_spread(*part, width) for part in parts)]
         for k, run in enumerate(self._runs):
-            rows.append(self._lying(poses, run, shared[k], 6 * n + 3 * k, width))
+            rows.append(self._lying(poses, run, shared[3 * k : 3 * k + 3], 6 * n + 3 * k, width))
+        rows.append(self._prior(shared, width))
         matrices, residuals = zip(*rows, strict=True)
         return sparse.vstack(matrices).tocsr(), np.concatenate(residuals)
 
-    def _seen(self, poses: Poses):
+    def _prior(self, shared: np.ndarray, width: int):
+        """How far a learned object may differ from the true one."""
+        runs = (len(shared) - 1) // 3
+        known = 1 / np.append(np.tile([_BASE, _LEAN, _LEAN], runs), self._scale)
+        self._cost += 0.5 * float(np.sum((known * shared) ** 2))
+        rows = np.arange(len(shared))
+        matrix = sparse.csr_matrix((known, (rows, width - len(shared) + rows)), shape=(len(shared), width))
+        return matrix, known * shared
+
+    def _said(self, poses: Poses, further: float, width: int):
         """What frames say, weighted as by Student's distribution."""
 
-        def away(moved: Poses) -> np.ndarray:
-            return np.einsum("nij,nj->ni", self._roots, difference(self._poses, moved) / self._unit)
+        def away(moved: Poses, share: float = further) -> np.ndarray:
+            apart = difference(self._poses, self.seen(moved, share)) / self._unit
+            return np.einsum("nij,nj->ni", self._roots, apart)
 
         residual = away(poses)
         square = np.sum(residual**2, axis=1)
         self._weight = (_FREEDOM + 6) / (_FREEDOM + square)
         self._cost += 0.5 * (_FREEDOM + 6) * float(np.sum(np.log1p(square / _FREEDOM)))
-        return self._linear(away, poses, np.arange(len(square))[:, None], np.sqrt(self._weight)[:, None])
+        root = np.sqrt(self._weight)[:, None]
+        matrix, residual = _spread(*self._linear(away, poses, np.arange(len(square))[:, None], root), width)
+        slope = (root * (away(poses, further + _EPSILON) - away(poses)) / _EPSILON).ravel()
+        place = np.arange(len(slope)), np.full(len(slope), width - 1)
+        return matrix + sparse.csr_matrix((slope, place), shape=matrix.shape), residual
 
     def _steady(self, poses: Poses):
         """Third differences, weighted as by Cauchy's distribution: a blow is allowed."""
@@ -355,10 +401,7 @@ class _Problem:
         common = np.stack([(root * slope).ravel() for slope in slopes], axis=1)
         place = np.repeat(np.arange(len(common)), 3), np.tile(column + np.arange(3), len(common))
         matrix = matrix + sparse.csr_matrix((common.ravel(), place), shape=matrix.shape)
-        known = 1 / np.array([_BASE, _LEAN, _LEAN])
-        self._cost += 0.5 * float(np.sum((known * shared) ** 2))
-        prior = sparse.csr_matrix((known, (np.arange(3), column + np.arange(3))), shape=(3, width))
-        return sparse.vstack([matrix, prior]), np.concatenate([residual, known * shared])
+        return matrix, residual
 
 
 def _spread(frames: np.ndarray, slopes: np.ndarray, residual: np.ndarray, width: int):
