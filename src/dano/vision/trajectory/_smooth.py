@@ -294,7 +294,8 @@ class _Problem:
             parts.append(self._steady(poses))
         if len(self._resting):
             parts.append(self._rest(poses))
-        rows = [self._said(poses, shared[-1], width), *(_spread(*part, width) for part in parts)]
+        rows = [self._said(poses, shared[-1], width)]
+        rows += [_spread(frames, slopes, residual, width) for frames, slopes, residual in parts]
         for k, run in enumerate(self._runs):
             rows.append(self._lying(poses, run, shared[3 * k : 3 * k + 3], 6 * n + 3 * k, width))
         rows.append(self._prior(shared, width))
