@@ -32,6 +32,21 @@ def test_a_place_is_seen_in_the_frame_s_shadow_and_exposure():
     assert inside.max() < 0.95
 
 
+def test_the_exposure_of_a_frame_is_that_of_most_of_the_place():
+    random = np.random.default_rng(6)
+    colours = random.uniform(0.1, 0.6, (60, 80, 3)).astype(np.float32)
+    gain = np.array([1.4, 1.3, 1.25])
+    image = gain * colours + 0.01 * random.normal(size=colours.shape)
+    image[10:40, 20:60] = 0.05
+    frames = [np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)] * 2
+    place = Place(colours, frames)
+    np.testing.assert_allclose(place.exposure((frames[0] / 255).astype(np.float32)), gain, rtol=0.01)
+    # What is brighter by an exposure is no noise.
+    assert place.noise < 0.02
+    # A black frame can still be brought to some brightness.
+    assert (place.exposure(np.zeros_like(colours)) > 0).all()
+
+
 def test_a_table_is_bright_where_the_object_passes_with_its_shadow():
     bare = np.random.default_rng(4).uniform(0.3, 0.9, (20, 30))
     frames, masks = [], []

@@ -31,6 +31,9 @@ _STILL = 0.05
 _EVERY = 3
 """Rows and columns after which pixels are taken for the exposure (convention)."""
 
+_EXPOSURES = 0.1, 10.0
+"""Least and largest ratio of brightnesses, in sRGB."""
+
 _DARKEST = 0.05
 """Least sRGB of a pixel that tells it."""
 
@@ -74,7 +77,7 @@ _UNALIKE = 0.1
 _PIECE = 0.1
 """Share of the largest part's area from which another one belongs to an object that something cuts."""
 
-_FINER = 3
+_FINER = 5
 """Parts of a pixel, each way, that distances from a mask's edge are measured in; odd."""
 
 _EDGE_REACH = 4
@@ -137,7 +140,9 @@ class Place:
         some = slice(None, None, _EVERY)
         frame, known = image[some, some], self.colours[some, some]
         bright = known.min(axis=2) > _DARKEST
-        return np.median(frame[bright] / known[bright], axis=0) if bright.any() else np.ones(3, frame.dtype)
+        if not bright.any():
+            return np.ones(3, frame.dtype)
+        return np.clip(np.median(frame[bright] / known[bright], axis=0), *_EXPOSURES)
 
     def log_likelihood(self, image: Float[np.ndarray, "*shape 3"], window=()) -> Float[np.ndarray, "*shape"]:
         """Logarithm of the density of colours of the place, lit or in a shadow."""
