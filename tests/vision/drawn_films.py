@@ -73,3 +73,8 @@ def errors(found, position, orientation, rows):
     shift = np.linalg.norm(found.position[rows] - position[rows], axis=1) / 0.12
     turned = quat_log(quat_multiply(quat_conjugate(found.orientation[rows]), orientation[rows]))
     return shift, np.linalg.norm(turned, axis=1)
+
+
+def ramp():
+    values = np.random.default_rng(0).integers(0, 255, (SIZE[1], SIZE[0], 3))
+    return values.astype(np.uint8)

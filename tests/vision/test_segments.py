@@ -4,8 +4,8 @@ import numpy as np
 from scipy import ndimage
 
 from dano.vision.drawing import GAMMA
+from dano.vision.tracking._light import bare_brightness
 from dano.vision.tracking._segments import (
-    bare_brightness,
     like_object,
     overlap,
     Palette,

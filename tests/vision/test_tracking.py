@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy import ndimage
-from vision.drawn_films import above, BACK, drawn, errors, film_of, fine_frame, LIGHT, path, ROUGH, SIZE
+from vision.drawn_films import above, BACK, drawn, errors, film_of, fine_frame, LIGHT, path, ramp, ROUGH, SIZE
 
 from dano.cli import main
 from dano.identify import load_motion
@@ -16,7 +16,7 @@ from dano.scene_file import asset_look
 from dano.vision import adjust_poses, Light, track, TrackOptions
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._segments import moved_edge, overlap
-from dano.vision.tracking._track import _Walk
+from dano.vision.tracking._walk import Walk
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_a_jump_is_caught_up_with_where_masks_need_no_pose(bunny, camera, tmp_pa
     file = tmp_path / "place.png"
     Image.fromarray(np.rint(255 * back).astype(np.uint8)).save(file)
     options = dataclasses.replace(ROUGH, masks="object")
-    walk = _Walk(film_of(frames, [None, None]), bunny, camera, options, file)
+    walk = Walk(film_of(frames, [None, None]), bunny, camera, options, file)
     monkeypatch.setattr(walk, "_searched", lambda i: None)
     walk.begin(Placement(position[0], orientation[0]))
     walk.step(0)

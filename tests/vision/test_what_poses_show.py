@@ -23,9 +23,9 @@ from dano.vision.tracking._refine import (
     Target,
     window_of,
 )
+from dano.vision.tracking._result import covariance_of, unobservable
 from dano.vision.tracking._segments import common_offset, differs, edge_offset, moved_edge, overlap
 from dano.vision.tracking._subject import Subject
-from dano.vision.tracking._sureness import covariance_of, unobservable
 
 
 @pytest.fixture(scope="module")
@@ -269,11 +269,6 @@ def test_the_shadow_on_a_table_says_where_the_sun_is(bunny, sun):
     assert found is not None
     assert np.degrees(np.arccos(found @ towards)) < 2
     assert nothing.sun() is None
-
-
-def ramp():
-    values = np.random.default_rng(0).integers(0, 255, (SIZE[1], SIZE[0], 3))
-    return values.astype(np.uint8)
 
 
 def test_directions_that_are_not_seen_are_said_and_have_large_variances(bunny):

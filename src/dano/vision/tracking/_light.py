@@ -9,12 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import ndimage
 from scipy.optimize import minimize, nnls
 
 from dano.maths import even_directions
 from dano.vision.capture import AbstractCamera, Light
 from dano.vision.drawing import GAMMA
 from dano.vision.tracking._placement import Placement
+from dano.vision.tracking._segments import OFTEN
 from dano.vision.tracking._subject import CHUNK, Subject
 
 LAMPS = 3
@@ -68,8 +70,32 @@ _SHADE_NOISE = 0.01
 _REWEIGHTED = 4
 """Fits of shades by least squares, each weighted by what the one before missed (convention)."""
 
+_BRIGHTER = 0.25
+"""Share of the frames that are brighter than what is taken for the place without a shadow."""
+
 _DARK = 0.01
 """Linear brightness of a table below which it shows no shadow."""
+
+
+def bare_brightness(
+    images: list[np.ndarray], masks: list[np.ndarray | None]
+) -> Float[np.ndarray, "height width"]:
+    """Linear brightness of what the object hides now and then and its shadow passes; NaN where always hidden.
+
+    Shadows darken: of the frames in which a pixel is free, one of the brighter ones tells.
+    """
+    rows = np.linspace(0, len(images) - 1, min(len(images), OFTEN)).astype(int)
+    light = np.stack([np.sum((images[i] / np.float32(255)) ** np.float32(GAMMA), axis=2) for i in rows])
+    for one, i in zip(light, rows, strict=True):
+        mask = masks[i]
+        if mask is None:
+            one[:] = -1
+        else:
+            one[ndimage.binary_dilation(mask > 0.02)] = -1
+    count = np.sum(light >= 0, axis=0)
+    light = np.sort(light, axis=0)
+    at = len(light) - 1 - np.floor(_BRIGHTER * np.maximum(count - 1, 0)).astype(int)
+    return np.where(count > 0, np.take_along_axis(light, at[None], axis=0)[0], np.nan).astype(np.float64)
 
 
 def unlit() -> tuple[Light, ...]:

@@ -10,12 +10,11 @@ from scipy import ndimage
 from dano.vision.capture import background_mask, Light, PosedCamera, View
 from dano.vision.drawing import GAMMA
 from dano.vision.tracking._film import Film
-from dano.vision.tracking._light import LightFit
+from dano.vision.tracking._light import bare_brightness, LightFit
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._refine import MASK_NOISE, OWN_MASK_NOISE, silhouette, Target, window_of
 from dano.vision.tracking._segments import (
-    bare_brightness,
     common_offset,
     differs,
     edge_offset,
@@ -23,6 +22,7 @@ from dano.vision.tracking._segments import (
     moved_edge,
     Palette,
     Place,
+    SHADES,
     uncommon,
     unlike_place,
 )
@@ -71,6 +71,7 @@ class Masking:
         self._colours: list[np.ndarray] = []
         self._place: Place | None = None
         self._last: tuple[int, np.ndarray] | None = None
+        self._own: Palette | None = None
         self._exposures: dict[int, np.ndarray] = {}
         self.notes: list[str] = []
         given = any(mask is not None for mask in film.masks)
@@ -90,6 +91,10 @@ class Masking:
                 "masks: what is behind the object is taken from the median of all frames; a picture of"
                 " the place without it (background) is better"
             )
+
+    def knows(self, colours: Float[np.ndarray, "n 3"]) -> None:
+        """Look for what has an object's colours, whose sRGB from all sides is given, under any light."""
+        self._own, self._last = Palette(np.clip(np.concatenate([k * colours for k in SHADES]), 0, 1)), None
 
     def _offset(self) -> float:
         """By how much given masks are too large [pixels]."""
@@ -201,7 +206,7 @@ class Masking:
                 return None
         else:
             assert self._place is not None
-            mask = unlike_place(self._image(i), self._place)
+            mask = unlike_place(self._image(i), self._place, self._own)
         self._last = i, mask
         return mask
 

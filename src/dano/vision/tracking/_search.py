@@ -32,7 +32,7 @@ _REACH = 1.7
 _SIDES = 24
 """Directions from which the object's colours are collected."""
 
-_ALIKE = 0.02
+_ALIKE = 0.03
 """By which overlaps of starts may differ for colours to decide."""
 
 _OTHER = np.radians(12)

@@ -13,17 +13,23 @@ from dano.vision.drawing import GAMMA
 _BINS = 16
 """Bins of each colour channel of what the object looks like."""
 
-_SHADES = (1.0, 0.85, 0.7, 0.55, 0.4)
-"""By which a cast shadow may darken the place."""
+SHADES = (1.0, 0.85, 0.7, 0.55, 0.4)
+"""By which a cast shadow may darken the place, and the sides of an object that are turned from the sun."""
 
 _SHADOW_PRIOR = 0.4
 """How likely that is beside no shadow."""
 
-_OFTEN = 40
-"""Frames that the median of the place is taken of."""
+_DARKENED_PRIOR = 0.1
+"""The same anywhere in a picture, where objects are seen that have the colours of shadows."""
 
-_BRIGHTER = 0.25
-"""Share of the frames that are brighter than what is taken for the place without a shadow."""
+_ROUGHLY = 0.7
+"""How likely its colours are so; else they may be any."""
+
+_PATCH = 1.5
+"""Standard deviation of the filter that takes neighbouring pixels for one thing [pixels]."""
+
+OFTEN = 40
+"""Frames that the median of the place is taken of."""
 
 _STILL = 0.05
 """Usual change of a pixel over a film, in sRGB, up to which the camera stands still."""
@@ -124,7 +130,7 @@ class Place:
         Raises:
             ValueError: If the camera moves.
         """
-        rows = np.linspace(0, len(images) - 1, min(len(images), _OFTEN)).astype(int)
+        rows = np.linspace(0, len(images) - 1, min(len(images), OFTEN)).astype(int)
         stack = np.stack([images[i] for i in rows])
         middle = np.median(stack, axis=0).astype(np.float32)
         usual = float(np.median(np.abs(stack - middle[None])) / 255)
@@ -144,13 +150,15 @@ class Place:
             return np.ones(3, frame.dtype)
         return np.clip(np.median(frame[bright] / known[bright], axis=0), *_EXPOSURES)
 
-    def log_likelihood(self, image: Float[np.ndarray, "*shape 3"], window=()) -> Float[np.ndarray, "*shape"]:
-        """Logarithm of the density of colours of the place, lit or in a shadow."""
+    def log_likelihood(
+        self, image: Float[np.ndarray, "*shape 3"], window=(), shadow: float = _SHADOW_PRIOR
+    ) -> Float[np.ndarray, "*shape"]:
+        """Logarithm of the density of colours of the place, lit or in a shadow, of some likelihood."""
         colours = self.colours[window]
         best = np.full(image.shape[:2], -np.inf)
-        for shade in _SHADES:
+        for shade in SHADES:
             square = np.sum((image - shade * colours) ** 2, axis=2) / (2 * (1.5 * self.noise) ** 2)
-            best = np.maximum(best, -square + (0 if shade == 1.0 else np.log(_SHADOW_PRIOR)))
+            best = np.maximum(best, -square + (0 if shade == 1.0 else np.log(shadow)))
         return best - 1.5 * np.log(2 * np.pi) - 3 * np.log(1.5 * self.noise)
 
     def seen_in(
@@ -167,27 +175,6 @@ class Place:
         # Far from everything that is free the place is as bright as in the picture of it.
         shade = (sums[0] + _SHADE_PRIOR) / (sums[1] + _SHADE_PRIOR)
         return np.clip(shade, *_SHADE_RANGE)[..., None] * self.colours
-
-
-def bare_brightness(
-    images: list[np.ndarray], masks: list[np.ndarray | None]
-) -> Float[np.ndarray, "height width"]:
-    """Linear brightness of what the object hides now and then and its shadow passes; NaN where always hidden.
-
-    Shadows darken: of the frames in which a pixel is free, one of the brighter ones tells.
-    """
-    rows = np.linspace(0, len(images) - 1, min(len(images), _OFTEN)).astype(int)
-    light = np.stack([np.sum((images[i] / np.float32(255)) ** np.float32(GAMMA), axis=2) for i in rows])
-    for one, i in zip(light, rows, strict=True):
-        mask = masks[i]
-        if mask is None:
-            one[:] = -1
-        else:
-            one[ndimage.binary_dilation(mask > 0.02)] = -1
-    count = np.sum(light >= 0, axis=0)
-    light = np.sort(light, axis=0)
-    at = len(light) - 1 - np.floor(_BRIGHTER * np.maximum(count - 1, 0)).astype(int)
-    return np.where(count > 0, np.take_along_axis(light, at[None], axis=0)[0], np.nan).astype(np.float64)
 
 
 class Palette:
@@ -207,12 +194,21 @@ class Palette:
 
 
 def unlike_place(
-    image: Float[np.ndarray, "height width 3"], place: Place
+    image: Float[np.ndarray, "height width 3"], place: Place, palette: Palette | None = None
 ) -> Float[np.ndarray, "height width"]:
-    """What differs from the place by more than a shadow, its largest part."""
-    # The object may have any colour: density one.
-    ratio = ndimage.gaussian_filter(np.clip(-place.log_likelihood(image), -8, 8), 1.0)
-    return _main(ratio)
+    """What differs from the place by more than a shadow, its largest part.
+
+    Args:
+        image: A frame.
+        place: What is seen where the object is not.
+        palette: Colours of the object, roughly; None: it may have any.
+    """
+    if palette is None:
+        # Density one.
+        return _main(ndimage.gaussian_filter(np.clip(-place.log_likelihood(image), -8, 8), 1.0))
+    own = np.logaddexp(np.log(1 - _ROUGHLY), np.log(_ROUGHLY) + palette.log_likelihood(image))
+    ratio = own - place.log_likelihood(image, shadow=_DARKENED_PRIOR)
+    return _main(ndimage.gaussian_filter(np.clip(ratio, -8, 8), _PATCH))
 
 
 def uncommon(
@@ -325,7 +321,7 @@ def differs(
     """
     share = ndimage.gaussian_filter(expected, _LOOK_REACH) + 1e-3
     look = ndimage.gaussian_filter(colour, (_LOOK_REACH, _LOOK_REACH, 0)) / share[..., None]
-    apart = [np.sqrt(np.mean((look - shade * behind) ** 2, axis=2)) for shade in _SHADES]
+    apart = [np.sqrt(np.mean((look - shade * behind) ** 2, axis=2)) for shade in SHADES]
     return np.min(apart, axis=0) > _UNALIKE
 
 

@@ -14,9 +14,9 @@ from dano.vision.tracking._masking import Masking
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.tracking._refine import linearized, Refined, silhouette, window_of
+from dano.vision.tracking._result import own_covariance, SCALE_DOUBT
 from dano.vision.tracking._search import learn_light
 from dano.vision.tracking._subject import Subject
-from dano.vision.tracking._sureness import own_covariance, SCALE_DOUBT
 from dano.vision.trajectory import Poses, Scenery, Smoothed, smoothed
 
 _PASSES = 2
