@@ -163,3 +163,19 @@ def test_what_lies_still_is_told_from_what_creeps(shift, gain, still):
     region[15:45, 20:60] = True
     assert film.is_still(0, 1, region) == still
     assert not film.is_still(0, 1, np.zeros_like(region))
+
+
+def test_quiet_frames_are_those_in_which_little_moves():
+    rng = np.random.default_rng(0)
+    place, images = rng.integers(60, 200, (40, 60, 3)), []
+    # It moves in frames 0 to 5 and 9 to 11, and lies still from 6 to 8; the exposure changes throughout.
+    for i, x in enumerate([0, 5, 10, 15, 20, 25, 30, 30, 30, 36, 42, 48]):
+        frame = place.copy()
+        frame[10:30, x : x + 10] = 0
+        images.append(np.rint(frame * (1 - 0.02 * i)).astype(np.uint8))
+    nothing = [None] * len(images)
+    film = Film(tuple(map(str, range(12))), 0.1 * np.arange(12), images, nothing, nothing, 1, ())
+    assert film.quiet(1) == [7]
+    first, *others = film.quiet(3)
+    assert first == 7
+    assert sorted(others)[0] < 4 and sorted(others)[1] > 7

@@ -47,6 +47,22 @@ def test_the_exposure_of_a_frame_is_that_of_most_of_the_place():
     assert (place.exposure(np.zeros_like(colours)) > 0).all()
 
 
+def test_what_looks_like_a_shadow_is_the_object_if_it_has_its_colours():
+    rng = np.random.default_rng(8)
+    place = ndimage.gaussian_filter(rng.uniform(0.5, 0.9, (80, 100, 1)), (2, 2, 0)) * np.ones(3)
+    y, x = np.mgrid[:80, :100]
+    truth = (y > 20) & (y < 55) & (x > 30) & (x < 75)
+    # Half of the object is as grey as the place in a shadow; the shadow beside it is no object.
+    grey = np.where((x + y) % 24 < 12, 1, 0)[..., None]
+    look = grey * np.array([0.36, 0.37, 0.40]) + (1 - grey) * np.array([0.8, 0.4, 0.2])
+    image = np.where(((y > 45) & (x > 60) & (x < 90))[..., None], 0.8 * place, place)
+    image = np.where(truth[..., None], look, image) + 0.02 * rng.normal(size=place.shape)
+    known = Place(place, [np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)] * 2)
+    palette = Palette((look + 0.03 * rng.normal(size=look.shape))[truth].clip(0, 1))
+    assert overlap(unlike_place(image, known), truth.astype(float)) < 0.75
+    assert overlap(unlike_place(image, known, palette), truth.astype(float)) > 0.9
+
+
 def test_a_table_is_bright_where_the_object_passes_with_its_shadow():
     bare = np.random.default_rng(4).uniform(0.3, 0.9, (20, 30))
     frames, masks = [], []
