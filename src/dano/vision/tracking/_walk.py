@@ -67,6 +67,9 @@ _CONVINCING = 0.45
 _CAUGHT = 0.4
 """Overlap with a thing from which it may be the object, turned meanwhile."""
 
+_FAR_WORSE = 2.2
+"""How many times larger than usual a score may be: frames of a fast motion have 1.5 times."""
+
 _NEAR = 4
 """Frames between two that say where the object is in others near them."""
 
@@ -380,8 +383,13 @@ class Walk:
         return found, TRACKED
 
     def _is_it(self, found: Refined) -> bool:
-        """Whether shape and colours are the object's."""
-        return bool(found.overlap >= self._options.lost) and not self._is_another(found)
+        """Whether shape and colours are the object's, and fit not much worse than in the other frames."""
+        if found.overlap < self._options.lost or self._is_another(found):
+            return False
+        fits = [score(one) for one in self._found if one is not None]
+        return len(fits) < _LIGHT_EVERY or score(found) < max(
+            _FAR_WORSE * float(np.median(fits)), _CONVINCING
+        )
 
     def _is_another(self, found: Refined) -> bool:
         """Whether colours say that a segment of the right shape is a different object."""

@@ -25,6 +25,10 @@ _PASSES = 2
 _LIGHT_FRAMES = 6
 """Frames, spread over the film, that the light is fitted to at these poses."""
 
+_EDGE_DOUBT = 0.1
+"""By how much colours alone may show the edge beside the true one, in all frames alike [pixels]: a camera
+sharpens, and a video is compressed."""
+
 _RIM = 3
 """Pixels around a silhouette in which a motion shows."""
 
@@ -86,9 +90,17 @@ class Whole:
                 poses.position[i], poses.orientation[i] = one.place.position, one.place.orientation
                 poses.covariance[i] = own_covariance(one, self._subject)
         scenery = Scenery(
-            self._subject.solid, self._still, self._options.table, self._camera.position, SCALE_DOUBT
+            self._subject.solid, self._still, self._options.table, self._camera.position, self._scale()
         )
         return smoothed(self._film.times, poses, scenery)
+
+    def _scale(self) -> float:
+        """Share by which the object may look too large or too small in all frames alike."""
+        masks = self._film.masks
+        if self._options.masks in ("auto", "given") and any(mask is not None for mask in masks):
+            return SCALE_DOUBT
+        sizes = [self._subject.pixels(one.place, self._camera) for one in self.found if one is not None]
+        return float(np.hypot(SCALE_DOUBT, 2 * _EDGE_DOUBT / np.median(sizes))) if sizes else SCALE_DOUBT
 
     def _place(self, i: int) -> Placement:
         """Where the motion has the object in a frame, and how it moves meanwhile."""

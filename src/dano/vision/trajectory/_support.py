@@ -7,8 +7,9 @@ from jaxtyping import Float
 
 from dano.fields import convex_hull
 
-_STEADY = 0.02
-"""Share of the size by which the centre of mass must lie within the foot of a face: less is a balance."""
+_STEADY = 0.05
+"""Share of the size by which the centre of mass must lie within the foot of a face: less is a balance. The
+edges of a learned box are rounded, by 0.02 or so."""
 
 
 class Face(NamedTuple):
