@@ -112,6 +112,19 @@ def test_the_ways_a_box_can_lie(box):
     assert {tuple(np.rint(face.down).astype(int)) for face in loaded.faces} == {(1, 0, 0), (-1, 0, 0)}
 
 
+def test_a_box_does_not_lie_on_its_rounded_edges():
+    """Long edges of a learned box are flat over 6 mm of 80, square to the line from the centre of mass."""
+    sides = 0.5 * np.array([0.08, 0.055, 0.04])
+    way = sides[1:] / np.linalg.norm(sides[1:])
+    depth = way @ sides[1:] - 3e-3
+    low = (depth - way[0] * sides[1]) / way[1], (depth - way[1] * sides[2]) / way[0]
+    quarter = np.array([[sides[0], sides[1], low[0]], [sides[0], low[1], sides[2]]])
+    signs = np.stack(np.meshgrid(*[[-1, 1]] * 3), axis=-1).reshape(-1, 1, 3)
+    faces = solid_of((signs * quarter).reshape(-1, 3), np.zeros(3)).faces
+    assert len(faces) == 6
+    assert all(np.abs(face.down).max() > 0.99 for face in faces)
+
+
 @pytest.mark.parametrize("table", [None, 0.2])
 def test_errors_along_the_line_of_sight_are_undone_by_rest_and_a_table(box, table):
     times = np.arange(FRAMES) / 30
