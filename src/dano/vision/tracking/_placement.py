@@ -41,6 +41,13 @@ class Drift(NamedTuple):
         """Of the fastest point of a ball around the middle, at most [m/s]."""
         return float(np.linalg.norm(self.velocity) + radius * np.linalg.norm(self.spin))
 
+    def apart(self, other: "Drift", radius: float) -> float:
+        """How differently points of that ball move in two motions while a frame is exposed, at most [m]."""
+        speed = np.linalg.norm(self.velocity - other.velocity) + radius * np.linalg.norm(
+            self.spin - other.spin
+        )
+        return float(speed) * (self.shutter + self.readout)
+
     def moments(self, rows: Float[np.ndarray, " n"], speed: float) -> Float[np.ndarray, "n k"]:
         """Times at which pixels see the object, from the middle of the exposure of the middle row [s].
 

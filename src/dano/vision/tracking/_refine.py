@@ -258,7 +258,8 @@ def _chosen(opacity, target: Target, window, rays: int, random: np.random.Genera
 def _rows(subject: Subject, target: Target, place: Placement, lamps, index: np.ndarray, loss: str) -> _Rows:
     y, x = index.T
     pixels = np.stack([x, y], axis=1) + 0.5
-    seen = subject.picture(place, lamps, target.camera, pixels, slopes=True)
+    behind = None if target.behind is None or loss != "photometric" else target.behind[y, x]
+    seen = subject.picture(place, lamps, target.camera, pixels, slopes=True, behind=behind)
     if loss == "paper":
         return _paper_rows(target, seen, index)
     if loss == "photometric" and target.behind is not None:

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate, quat_to_matrix
 from dano.vision.capture import AbstractCamera, Light, PosedCamera
-from dano.vision.drawing import Part, through
+from dano.vision.drawing import GAMMA, Part, through
 from dano.vision.radiance import LearnedField, Sampling, SurfaceModel
 from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.trajectory import Solid, solid_of
@@ -32,6 +32,9 @@ BAND = 4
 
 _NEARLY = 0.02, np.radians(2)
 """Share of the size, and angle, by which a pose may be beside the one that other frames lead to."""
+
+_BLACK = 1e-3
+"""Least sRGB: the curve of a camera is steep at black."""
 
 _LOOSE = 0.02
 """Share of its size by which the object's density reaches out of the box of its surface."""
@@ -183,10 +186,19 @@ class Subject:
         pixels: Float[np.ndarray, "n 2"],
         *,
         slopes: bool = False,
+        behind: Float[np.ndarray, "n 3"] | None = None,
     ) -> Seen:
         """What a camera sees at image coordinates [pixels], in the mean of its exposure.
 
-        Colours are averaged as sRGB: where an object is opaque they differ little within the blur.
+        Args:
+            place: Where the object is, and how it moves.
+            lamps: Light that it is under.
+            camera: From where.
+            pixels: Image coordinates.
+            slopes: Whether derivatives are wanted.
+            behind: SRGB behind the object. An exposure is a mean of light: before what is bright a blurred
+                thing seems narrower. Colours are then such that, laid over what is behind, they are the camera's.
+                None: colours are averaged as sRGB.
         """
         directions, pixel = camera.directions(pixels), camera.pixel_angle
         origins = np.broadcast_to(camera.position, directions.shape)
@@ -201,7 +213,8 @@ class Subject:
             )
             for late in moments.T
         ]
-        return Seen(*(np.mean(column, axis=0) for column in zip(*exposures, strict=True)))
+        mean = Seen(*(np.mean(column, axis=0) for column in zip(*exposures, strict=True)))
+        return mean if behind is None or len(exposures) == 1 else _exposed(exposures, mean, behind)
 
     def whole(
         self, place: Placement, lamps: tuple[Light, ...], camera: PosedCamera
@@ -266,6 +279,21 @@ class Subject:
         back = quat_exp(-late[:, None] * drift.spin)
         here = middle + quat_rotate(back, origins - middle - late[:, None] * drift.velocity)
         return here, quat_rotate(back, directions)
+
+
+def _exposed(exposures: list[Seen], mean: Seen, behind: Float[np.ndarray, "n 3"]) -> Seen:
+    """The mean of exposures as light, as colours that are to be laid over what is behind."""
+    frames = [np.clip(one.colour + (1 - one.opacity[:, None]) * behind, _BLACK, None) for one in exposures]
+    light = np.mean([frame**GAMMA for frame in frames], axis=0)
+    colour = light ** (1 / GAMMA) - (1 - mean.opacity[:, None]) * behind
+    if not len(mean.opacity_slope):
+        return mean._replace(colour=colour)
+    slope = np.zeros_like(mean.colour_slope)
+    for frame, one in zip(frames, exposures, strict=True):
+        change = one.colour_slope - behind[..., None] * one.opacity_slope[:, None]
+        slope += (frame ** (GAMMA - 1))[..., None] * change / len(exposures)
+    slope *= (light ** (1 / GAMMA - 1))[..., None]
+    return mean._replace(colour=colour, colour_slope=slope + behind[..., None] * mean.opacity_slope[:, None])
 
 
 def window_of(

@@ -36,8 +36,8 @@ _COARSE = 24
 _STEPS = 4
 """Steps of a refinement, most."""
 
-_SHARP = 0.3
-"""Way during an exposure that does not show [pixels]."""
+_SHARP = 0.7
+"""Difference of ways during an exposure that hardly shows [pixels]."""
 
 _LIGHT_EVERY = 4
 """Frames after which the light is fitted again; exposure and clouds change slower."""
@@ -274,17 +274,15 @@ class Walk:
         drift = Drift.between(
             last, found.place, duration, self._subject.middle, options.shutter, options.readout
         )
-        way = drift.speed(self._subject.radius) * (options.shutter + options.readout)
-        if way / self._subject.pixel(found.place, self._camera) < _SHARP:
-            return found
+        known = found.place.drift or Drift(np.zeros(3), np.zeros(3), options.shutter, options.readout)
+        away = drift.apart(known, self._subject.radius) / self._subject.pixel(found.place, self._camera)
+        place = dataclasses.replace(found.place, drift=drift)
+        if away < _SHARP:
+            return found._replace(place=place)
         if last.drift is None and len(seen) == 1:
             # The first frame was taken for one of an object at rest.
             begun = self._fine(near, dataclasses.replace(last, drift=drift), self._light)
             self._found[near] = begun or self._found[near]
-        place = dataclasses.replace(found.place, drift=drift)
-        if found.place.drift is not None:
-            # With the motion of the frame before it is nearly right.
-            return found._replace(place=place)
         return self._fine(i, place, self._light) or found
 
     def _place(self, i: int) -> Placement:

@@ -22,6 +22,9 @@ from dano.vision.trajectory import Poses, Scenery, Smoothed, smoothed
 _PASSES = 2
 """Times that frames are looked at again, at the poses of the motion."""
 
+_STEPS = 4
+"""Steps of Gauss and Newton in a frame that is not where the motion has it, most."""
+
 _LIGHT_FRAMES = 6
 """Frames, spread over the film, that the light is fitted to at these poses."""
 
@@ -62,22 +65,32 @@ class Whole:
         for _ in range(_PASSES):
             light = self._relit(masking, light)
             for i in self._known():
-                place = self._place(i)
-                target = masking.near(i, self._subject, place, light.lamps, self._camera, 2.0)
-                if target is None:
-                    continue
-                one = linearized(
-                    self._subject,
-                    target,
-                    place,
-                    light.lamps,
-                    loss=self._options.loss,
-                    rays=self._options.rays,
-                    random=random,
-                )
-                self.found[i] = one or self.found[i]
+                self.found[i] = self._looked_at(i, masking, light, random) or self.found[i]
             self.motion = self._smoothed()
         return light
+
+    def _looked_at(
+        self, i: int, masking: Masking, light: LightFit, random: np.random.Generator
+    ) -> Refined | None:
+        """What a frame says near the motion; of what lies further away, near that."""
+        place, found = self._place(i), None
+        for _ in range(_STEPS):
+            target = masking.near(i, self._subject, place, light.lamps, self._camera, 2.0)
+            if target is None:
+                return found
+            found = linearized(
+                self._subject,
+                target,
+                place,
+                light.lamps,
+                loss=self._options.loss,
+                rays=self._options.rays,
+                random=random,
+            )
+            if found is None or self._subject.off(found.place, place) < 1:
+                return found
+            place = found.place
+        return found
 
     def _known(self) -> list[int]:
         return [i for i, one in enumerate(self.found) if one is not None]
