@@ -25,7 +25,7 @@ from dano.vision.tracking._refine import (
 )
 from dano.vision.tracking._result import covariance_of, unobservable
 from dano.vision.tracking._segments import common_offset, differs, edge_offset, moved_edge, overlap
-from dano.vision.tracking._subject import Subject
+from dano.vision.tracking._subject import _exposed, Seen, Subject
 
 
 @pytest.fixture(scope="module")
@@ -155,6 +155,16 @@ def test_exposures_are_those_of_a_moving_object(bunny, camera):
     assert moments.shape[1] == 5
     mean = np.mean([later(t, everything).opacity for t in moments[0]], axis=0)
     np.testing.assert_allclose(seen.opacity, mean, atol=5e-3)
+    back = np.full((len(pixels), 3), 0.9)
+    seen = subject.picture(blurred, lamps, camera, pixels, behind=back)
+    over = [
+        one.colour + (1 - one.opacity[:, None]) * back for one in (later(t, everything) for t in moments[0])
+    ]
+    light = np.mean([frame**GAMMA for frame in over], axis=0) ** (1 / GAMMA)
+    found = seen.colour + (1 - seen.opacity[:, None]) * back
+    np.testing.assert_allclose(found, light, atol=5e-3)
+    # The mean of sRGB is darker where the object passed.
+    assert (found - np.mean(over, axis=0)).max() > 0.02
     sharp = subject.picture(still, lamps, camera, pixels)
     assert np.abs(sharp.opacity - mean).max() > 0.2
 
@@ -195,6 +205,29 @@ def test_the_edge_of_a_mask_is_found_in_the_picture_and_moved_there(change):
     assert common_offset([offset] * 5) == (pytest.approx(offset) if change else 0)
     assert common_offset([-2.0, 2.0, -1.5, 1.5]) == 0
     assert common_offset([offset, np.nan, np.nan]) == 0
+
+
+def test_derivatives_of_exposures_are_those_of_means_of_light():
+    rng = np.random.default_rng(9)
+    back, way, step = rng.uniform(0.2, 0.9, (5, 3)), rng.normal(size=6), 1e-6
+    plain = []
+    for _ in range(4):
+        slopes = rng.normal(size=(5, 6)), rng.normal(size=(5, 3, 6))
+        plain.append(Seen(rng.uniform(0.2, 0.8, 5), rng.uniform(0, 0.5, (5, 3)), *slopes))
+
+    def blurred(far: float) -> Seen:
+        ones = [
+            one._replace(
+                opacity=one.opacity + far * one.opacity_slope @ way,
+                colour=one.colour + far * one.colour_slope @ way,
+            )
+            for one in plain
+        ]
+        mean = Seen(*(np.mean(column, axis=0) for column in zip(*ones, strict=True)))
+        return _exposed(ones, mean, back)
+
+    change = (blurred(step).colour - blurred(-step).colour) / (2 * step)
+    np.testing.assert_allclose(blurred(0.0).colour_slope @ way, change, rtol=1e-6)
 
 
 @pytest.mark.parametrize("angle", [0, 20, 45, 70])

@@ -197,8 +197,8 @@ class Subject:
             pixels: Image coordinates.
             slopes: Whether derivatives are wanted.
             behind: SRGB behind the object. An exposure is a mean of light: before what is bright a blurred
-                thing seems narrower. Colours are then such that, laid over what is behind, they are the camera's.
-                None: colours are averaged as sRGB.
+                thing seems narrower. Colours are then such that, laid over what is behind, they are the
+                camera's. None: colours are averaged as sRGB.
         """
         directions, pixel = camera.directions(pixels), camera.pixel_angle
         origins = np.broadcast_to(camera.position, directions.shape)
