@@ -1,8 +1,10 @@
 """Every Python block of the README and of the guides runs as written, in a process of its own."""
 
 import ast
+import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -47,6 +49,20 @@ def test_python_blocks_run(page: str, tmp_path: Path):
         printed = answer.stdout.split()
         assert [float(number) for number in printed] == pytest.approx([float(t) for t in told], rel=5e-3)
         assert float(printed[1]) == pytest.approx(float(difference), rel=0.05)
+
+
+def test_notebooks_say_what_their_pages_say():
+    """Whose blocks run above; `python assets/write_notebooks.py` writes them."""
+    folder = REPOSITORY / "docs" / "notebooks"
+    writer = runpy.run_path(str(REPOSITORY / "assets" / "write_notebooks.py"))
+    assert {file.stem for file in folder.iterdir()} == set(writer["GUIDES"])
+    for page in writer["GUIDES"]:
+        text = (folder / f"{page}.ipynb").read_text(encoding="utf-8")
+        assert text == writer["notebook"](page)
+        cells = json.loads(text)["cells"]
+        code = "\n".join(cell["source"] for cell in cells if cell["cell_type"] == "code")
+        assert ast.dump(ast.parse(code)) == ast.dump(ast.parse(PROGRAMS[f"docs/{page}.md"]))
+        assert f"(notebooks/{page}.ipynb)" in (REPOSITORY / "docs" / f"{page}.md").read_text(encoding="utf-8")
 
 
 def public(file: Path) -> set[str]:
