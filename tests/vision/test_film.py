@@ -173,7 +173,7 @@ def test_quiet_frames_are_those_in_which_little_moves():
         frame = place.copy()
         frame[10:30, x : x + 10] = 0
         images.append(np.rint(frame * (1 - 0.02 * i)).astype(np.uint8))
-    nothing = [None] * len(images)
+    nothing: list[np.ndarray | None] = [None] * len(images)
     film = Film(tuple(map(str, range(12))), 0.1 * np.arange(12), images, nothing, nothing, 1, ())
     assert film.quiet(1) == [7]
     first, *others = film.quiet(3)
