@@ -118,6 +118,7 @@ def tracked(frames: int = 3) -> Tracked:
         overlays=tuple(overlays),
         messages=("this <is> made up",),
         seconds=0.1,
+        repeats=np.ones(frames),
     )
 
 

@@ -7,8 +7,9 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import ndimage
 
-from dano.vision import read_film
+from dano.vision import Film, read_film
 
 H, W = 48, 64
 
@@ -146,3 +147,35 @@ def test_what_is_wrong_with_a_film_is_said(tmp_path):
         read_film(short)
     with pytest.raises(ValueError, match="slow_motion must be finite and > 0, got 0"):
         read_film(short, slow_motion=0.0)
+
+
+@pytest.mark.parametrize(("shift", "gain", "still"), [(0.0, 1.2, True), (0.04, 1.0, True), (0.3, 0.9, False)])
+def test_what_lies_still_is_told_from_what_creeps(shift, gain, still):
+    rng = np.random.default_rng(2)
+    large = ndimage.gaussian_filter(rng.uniform(0, 1, (60, 80, 3)), (1.5, 1.5, 0))
+    large = 0.2 + 0.4 * (large - large.min()) / np.ptp(large)
+    images = []
+    for x, g in ((0.0, 1.0), (shift, gain)):
+        frame = g * ndimage.shift(large, (0, x, 0)) + 0.01 * rng.normal(size=large.shape)
+        images.append(np.rint(255 * np.clip(frame, 0, 1)).astype(np.uint8))
+    film = Film(("0", "1"), np.array([0, 1 / 30]), images, [None] * 2, [None] * 2, 1, ())
+    region = np.zeros((60, 80), bool)
+    region[15:45, 20:60] = True
+    assert film.is_still(0, 1, region) == still
+    assert not film.is_still(0, 1, np.zeros_like(region))
+
+
+def test_quiet_frames_are_those_in_which_little_moves():
+    rng = np.random.default_rng(0)
+    place, images = rng.integers(60, 200, (40, 60, 3)), []
+    # It moves in frames 0 to 5 and 9 to 11, and lies still from 6 to 8; the exposure changes throughout.
+    for i, x in enumerate([0, 5, 10, 15, 20, 25, 30, 30, 30, 36, 42, 48]):
+        frame = place.copy()
+        frame[10:30, x : x + 10] = 0
+        images.append(np.rint(frame * (1 - 0.02 * i)).astype(np.uint8))
+    nothing: list[np.ndarray | None] = [None] * len(images)
+    film = Film(tuple(map(str, range(12))), 0.1 * np.arange(12), images, nothing, nothing, 1, ())
+    assert film.quiet(1) == [7]
+    first, *others = film.quiet(3)
+    assert first == 7
+    assert sorted(others)[0] < 4 and sorted(others)[1] > 7

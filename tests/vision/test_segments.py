@@ -4,8 +4,8 @@ import numpy as np
 from scipy import ndimage
 
 from dano.vision.drawing import GAMMA
+from dano.vision.tracking._light import bare_brightness
 from dano.vision.tracking._segments import (
-    bare_brightness,
     like_object,
     overlap,
     Palette,
@@ -30,6 +30,37 @@ def test_a_place_is_seen_in_the_frame_s_shadow_and_exposure():
     inside = seen[~free] / colours[~free]
     assert inside.min() > 0.45
     assert inside.max() < 0.95
+
+
+def test_the_exposure_of_a_frame_is_that_of_most_of_the_place():
+    random = np.random.default_rng(6)
+    colours = random.uniform(0.1, 0.6, (60, 80, 3)).astype(np.float32)
+    gain = np.array([1.4, 1.3, 1.25])
+    image = gain * colours + 0.01 * random.normal(size=colours.shape)
+    image[10:40, 20:60] = 0.05
+    frames = [np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)] * 2
+    place = Place(colours, frames)
+    np.testing.assert_allclose(place.exposure((frames[0] / 255).astype(np.float32)), gain, rtol=0.01)
+    # What is brighter by an exposure is no noise.
+    assert place.noise < 0.02
+    # A black frame can still be brought to some brightness.
+    assert (place.exposure(np.zeros_like(colours)) > 0).all()
+
+
+def test_what_looks_like_a_shadow_is_the_object_if_it_has_its_colours():
+    rng = np.random.default_rng(8)
+    place = ndimage.gaussian_filter(rng.uniform(0.5, 0.9, (80, 100, 1)), (2, 2, 0)) * np.ones(3)
+    y, x = np.mgrid[:80, :100]
+    truth = (y > 20) & (y < 55) & (x > 30) & (x < 75)
+    # Half of the object is as grey as the place in a shadow; the shadow beside it is no object.
+    grey = np.where((x + y) % 24 < 12, 1, 0)[..., None]
+    look = grey * np.array([0.36, 0.37, 0.40]) + (1 - grey) * np.array([0.8, 0.4, 0.2])
+    image = np.where(((y > 45) & (x > 60) & (x < 90))[..., None], 0.8 * place, place)
+    image = np.where(truth[..., None], look, image) + 0.02 * rng.normal(size=place.shape)
+    known = Place(place, [np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)] * 2)
+    palette = Palette((look + 0.03 * rng.normal(size=look.shape))[truth].clip(0, 1))
+    assert overlap(unlike_place(image, known), truth.astype(float)) < 0.75
+    assert overlap(unlike_place(image, known, palette), truth.astype(float)) > 0.9
 
 
 def test_a_table_is_bright_where_the_object_passes_with_its_shadow():

@@ -7,25 +7,16 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy import ndimage
+from vision.drawn_films import above, BACK, drawn, errors, film_of, fine_frame, LIGHT, path, ramp, ROUGH, SIZE
 
-from dano import HalfSpace, Pose
 from dano.cli import main
 from dano.identify import load_motion
-from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate, quat_to_matrix
+from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply
 from dano.scene_file import asset_look
-from dano.vision import adjust_poses, Camera, compose, Film, Item, Light, PosedCamera, track, TrackOptions
-from dano.vision.drawing import GAMMA
-from dano.vision.tracking._edges import common_offset, edge_offset, moved_edge
-from dano.vision.tracking._light import LightFit, ShadowFit
-from dano.vision.tracking._placement import Drift, Placement
-from dano.vision.tracking._refine import Refined
-from dano.vision.tracking._segments import overlap
-from dano.vision.tracking._subject import Subject
-from dano.vision.tracking._sureness import covariance_of, unobservable
-
-SIZE = (96, 72)
-LIGHT = np.array([-0.4, -0.5, 0.77])
-BACK = np.array([0.1, 0.6, 0.2])
+from dano.vision import adjust_poses, Light, track, TrackOptions
+from dano.vision.tracking._placement import Placement
+from dano.vision.tracking._segments import moved_edge, overlap
+from dano.vision.tracking._walk import Walk
 
 
 @pytest.fixture(scope="module")
@@ -35,36 +26,7 @@ def bunny():
 
 @pytest.fixture(scope="module")
 def camera():
-    """Looks along +y at the origin from half a metre away, a little from above."""
-    eye, forward = np.array([0.0, -0.48, 0.2]), np.array([0.0, 0.48, -0.14])
-    forward = forward / np.linalg.norm(forward)
-    right = np.array([1.0, 0, 0])
-    up = np.cross(right, forward)
-    pose = np.stack([right, up, -forward, eye], axis=1)
-    return PosedCamera(pose, focal=200.0, width=SIZE[0], height=SIZE[1])
-
-
-def path(count, speed=(0.006, 0.002, 0.001), spin=(0.05, 0.08, 0.12)):
-    """Poses of a steady motion."""
-    start = quat_exp(np.array([0.2, -0.1, 0.8]))
-    position = np.array([-0.02, 0.0, 0.0]) + np.outer(np.arange(count), speed)
-    orientation = np.stack([quat_multiply(start, quat_exp(i * np.array(spin))) for i in range(count)])
-    return position, orientation
-
-
-def drawn(field, camera, position, orientation):
-    """Frame and mask: not the object is moved, but the camera, the other way, by the library's drawing."""
-    rotation = quat_to_matrix(orientation)
-    pose = rotation.T @ np.concatenate([camera.pose[:, :3], (camera.position - position)[:, None]], axis=1)
-    seen = field.picture(camera.replaced(camera_to_world=pose), rotation.T @ LIGHT)
-    return np.rint(255 * seen.over(BACK)).astype(np.uint8), seen.opacity
-
-
-def film_of(frames, masks, times=None):
-    n = len(frames)
-    stamps = np.arange(n) / 30 if times is None else times
-    names = tuple(map(str, range(n)))
-    return Film(names, stamps, list(frames), list(masks), [None] * n, 1, ())
+    return above()
 
 
 @pytest.fixture(scope="module")
@@ -76,75 +38,26 @@ def filmed(bunny, camera):
     return position, orientation, frames, masks
 
 
-def errors(found, position, orientation, rows):
-    shift = np.linalg.norm(found.position[rows] - position[rows], axis=1) / 0.12
-    turned = quat_log(quat_multiply(quat_conjugate(found.orientation[rows]), orientation[rows]))
-    return shift, np.linalg.norm(turned, axis=1)
-
-
-ROUGH = TrackOptions(rays=700, views=24, turns=12, candidates=2)
-
-
-def test_slopes_are_differences_of_what_is_seen(bunny, camera):
-    subject = Subject(bunny)
-    position, orientation = path(1)
-    place = Placement(position[0], orientation[0])
-    y, x = np.mgrid[16:56:2, 30:66:2]
-    pixels = np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
-    lamps = (Light(LIGHT), Light((1, 0, 0.5), intensity=0.3), Light((-1, 0, 0.2), intensity=0.2))
-    seen = subject.picture(place, lamps, camera, pixels, slopes=True)
-    for k in range(6):
-        # A step of half a pixel: what the eye could see.
-        step = np.zeros(6)
-        step[k] = 0.012
-        high, low = (
-            subject.picture(place.moved(s * step, subject.radius), lamps, camera, pixels) for s in (1, -1)
-        )
-        # Colours jump where one part of the object hides another, which no derivative tells.
-        for slope, values, least in (
-            (seen.opacity_slope[:, k], (high.opacity - low.opacity) / 0.024, 0.85),
-            (seen.colour_slope[:, :, k], (high.colour - low.colour) / 0.024, 0.75),
-        ):
-            cosine = np.sum(slope * values) / np.linalg.norm(slope) / np.linalg.norm(values)
-            assert cosine > least
-            assert np.linalg.norm(slope) == pytest.approx(np.linalg.norm(values), rel=0.4)
-
-
-def test_exposures_are_those_of_a_moving_object(bunny, camera):
-    subject = Subject(bunny)
-    position, orientation = path(1)
-    velocity, spin = np.array([0.5, 0.1, -0.2]), np.array([0.0, 1.5, 2.0])
-    still = Placement(position[0], orientation[0])
-    y, x = np.mgrid[12:60:3, 26:74:3]
-    pixels = np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
-    lamps = (Light(LIGHT), Light((1, 0, 0.5), intensity=0.3), Light((-1, 0, 0.2), intensity=0.2))
-
-    def later(time, rows):
-        """The object itself moved, not the rays."""
-        turned = quat_multiply(quat_exp(time * spin), still.orientation)
-        place = subject.around(subject.middle(still) + time * velocity, turned)
-        return subject.picture(place, lamps, camera, pixels[rows])
-
-    everything = np.arange(len(pixels))
-    drift = Drift(velocity, spin, 0.02, 0.0)
-    blurred = dataclasses.replace(still, drift=drift)
-    seen = subject.picture(blurred, lamps, camera, pixels)
-    speed = (np.linalg.norm(velocity) + subject.radius * np.linalg.norm(spin)) / (
-        camera.pixel_angle * np.linalg.norm(subject.middle(still) - camera.position)
-    )
-    moments = drift.moments(pixels[:, 1] / camera.height, speed)
-    assert moments.shape[1] == 5
-    mean = np.mean([later(t, everything).opacity for t in moments[0]], axis=0)
-    np.testing.assert_allclose(seen.opacity, mean, atol=5e-3)
-    sharp = subject.picture(still, lamps, camera, pixels)
-    assert np.abs(sharp.opacity - mean).max() > 0.2
-
-    rolling = dataclasses.replace(still, drift=Drift(velocity, spin, 0.0, 0.03))
-    seen = subject.picture(rolling, lamps, camera, pixels)
-    for row in np.unique(pixels[:, 1])[::5]:
-        rows = np.flatnonzero(pixels[:, 1] == row)
-        late = (row / camera.height - 0.5) * 0.03
-        np.testing.assert_allclose(seen.opacity[rows], later(late, rows).opacity, atol=5e-3)
+def test_a_jump_is_caught_up_with_where_masks_need_no_pose(bunny, camera, tmp_path, monkeypatch):
+    rng = np.random.default_rng(5)
+    back = np.kron(rng.uniform(0.2, 0.6, (18, 24, 3)), np.ones((4, 4, 1)))
+    # From one frame to the next by half the size; the second frame is a fifth brighter.
+    position = np.array([[-0.04, 0.0, 0.0], [0.02, 0.01, 0.0]])
+    orientation = np.tile(quat_exp(np.array([0.2, -0.1, 0.8])), (2, 1))
+    frames = [fine_frame(bunny, camera, p, q, back)[0] for p, q in zip(position, orientation, strict=True)]
+    frames[1] = np.rint(np.clip(1.2 * frames[1], 0, 255)).astype(np.uint8)
+    file = tmp_path / "place.png"
+    Image.fromarray(np.rint(255 * back).astype(np.uint8)).save(file)
+    options = dataclasses.replace(ROUGH, masks="object")
+    walk = Walk(film_of(frames, [None, None]), bunny, camera, options, file)
+    monkeypatch.setattr(walk, "_searched", lambda i: None)
+    walk.begin(Placement(position[0], orientation[0]))
+    walk.step(0)
+    walk.step(1)
+    found = walk.result()
+    shift, turn = errors(found, position, orientation, slice(None))
+    assert found.status == ("tracked", "tracked")
+    assert (shift.max() < 0.05, turn.max() < np.radians(4)) == (True, True), (shift, turn)
 
 
 def test_pixels_pull_wrong_poses_towards_the_true_ones(bunny, camera, filmed):
@@ -194,6 +107,25 @@ def test_a_film_is_tracked_and_its_end_lies_outside(bunny, camera, filmed):
     outline = found.overlays[2]
     assert outline is not None
     assert overlap(masks[2][outline.window], outline.opacity) > 0.93
+
+
+def test_frames_in_which_it_lies_still_share_one_pose(bunny, camera, filmed):
+    rng = np.random.default_rng(7)
+    position, orientation, frames, masks = filmed
+    rows = [0, 1, 2, 2, 2, 2]
+    noisy = [
+        np.rint(np.clip(frames[i] + 4 * rng.normal(size=frames[i].shape), 0, 255)).astype(np.uint8)
+        for i in rows
+    ]
+    # Masks that are wrong in another place in each frame.
+    given = [np.roll(masks[i], k % 2, axis=k // 2 % 2) for k, i in enumerate(rows)]
+    start = position[0], orientation[0]
+    found = track(film_of(noisy, given), bunny, camera, ROUGH, start=start)
+    assert np.ptp(found.position[2:], axis=0).max() < 2e-3 * 0.12
+    for q in found.orientation[3:]:
+        assert np.linalg.norm(turn_of(found.orientation[2], q)) < 2e-3
+    shift, _ = errors(found, position[rows], orientation[rows], slice(None))
+    assert np.median(shift) < 0.02
 
 
 def turn_of(p, q):
@@ -306,28 +238,6 @@ def test_what_is_wrong_is_said(bunny, camera, filmed):
         TrackOptions(rays=3)
 
 
-@pytest.mark.parametrize("change", [-2.0, -1.0, 0.0, 1.0, 2.0])
-def test_the_edge_of_a_mask_is_found_in_the_picture_and_moved_there(change):
-    y, x = np.mgrid[:90, :120]
-    inside = 25.3 - np.hypot(y - 44.2, (x - 61.7) / 1.4)  # pixels, nearly: an ellipse of closed form
-    truth = np.clip(0.5 + inside, 0, 1)
-    rng = np.random.default_rng(0)
-    texture = ndimage.gaussian_filter(rng.normal(size=(2, 90, 120, 3)), (0, 1.5, 1.5, 0))
-    image = truth[..., None] * (0.7 + 0.15 * texture[0]) + (1 - truth[..., None]) * (0.3 + 0.15 * texture[1])
-    mask = np.clip(0.5 + inside + change, 0, 1)
-    seen = np.ones(mask.shape, bool)
-    offset = edge_offset(mask, image, seen)
-    # Sideways a unit of the ellipse is 1.4 pixels.
-    assert offset == pytest.approx(1.2 * change, abs=0.35)
-    assert overlap(moved_edge(mask, -offset), truth) > 0.975
-    # A plain picture shows no edge, and what differs from frame to frame is not a common offset.
-    assert np.isnan(edge_offset(mask, np.full_like(image, 0.5), seen))
-    assert np.isnan(edge_offset(np.zeros_like(mask), image, seen))
-    assert common_offset([offset] * 5) == (pytest.approx(offset) if change else 0)
-    assert common_offset([-2.0, 2.0, -1.5, 1.5]) == 0
-    assert common_offset([offset, np.nan, np.nan]) == 0
-
-
 @pytest.mark.parametrize("grown", [-1.5, 1.5])
 def test_masks_of_a_wrong_size_are_moved_and_that_is_said(bunny, camera, filmed, grown):
     position, orientation, frames, masks = filmed
@@ -337,63 +247,6 @@ def test_masks_of_a_wrong_size_are_moved_and_that_is_said(bunny, camera, filmed,
     place, _ = errors(found, position, orientation, slice(None))
     # A pixel and a half of 40 is 4 % of the distance, or 17 % of the size.
     assert np.median(place) < 0.03
-
-
-def test_the_sun_is_found_between_the_directions_that_lamps_have(bunny, camera):
-    subject = Subject(bunny)
-    light = LightFit(subject)
-    sun = np.array([-0.35, -0.55, 0.76]) / np.linalg.norm([-0.35, -0.55, 0.76])
-    sky = np.random.default_rng(1).normal(size=(16, 3))
-    sky[:, 2] = np.abs(sky[:, 2])
-    dark = Light((0.0, 0.0, 1.0), intensity=0.0)
-    y, x = np.mgrid[10:62:2, 24:72:2]
-    pixels = np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
-    for turn in ((0.2, -0.1, 0.8), (0.5, 0.4, -1.2), (-0.3, 0.2, 2.4)):
-        place = subject.around(np.zeros(3), quat_exp(np.array(turn)))
-        # Sunlight and that of a cloudy sky add up, in linear light.
-        shares = [(sun, 0.8), *((towards, 0.3 / len(sky)) for towards in sky)]
-        pictures = [
-            subject.picture(place, (Light(towards), dark, dark), camera, pixels) for towards, _ in shares
-        ]
-        inside = pictures[0].opacity > 0.95
-        linear = sum(
-            share * seen.colour[inside] ** GAMMA for (_, share), seen in zip(shares, pictures, strict=True)
-        )
-        light.add(place, camera, pixels[inside], linear ** (1 / GAMMA))
-
-    def off():
-        strongest = max(light.lamps, key=lambda lamp: float(np.sum(lamp.colour)))
-        return np.degrees(np.arccos(np.clip(np.asarray(strongest.place) @ sun, -1, 1)))
-
-    before = off()
-    light.find_sun()
-    assert before > 8
-    assert off() < 5
-
-
-@pytest.mark.parametrize("sun", [(-0.5, -0.35, 0.79), (0.7, 0.3, 0.5)])
-def test_the_shadow_on_a_table_says_where_the_sun_is(bunny, sun):
-    towards = np.array(sun) / np.linalg.norm(sun)
-    camera = Camera((0.14, -0.42, 0.3), (0.0, 0.0, 0.03), width=160, height=120)
-    lamps, table = [Light(towards, intensity=0.8)], Item(HalfSpace())
-    rng = np.random.default_rng(3)
-    texture = ndimage.gaussian_filter(rng.uniform(0.6, 1.0, (120, 160)), 1.0)[..., None]
-    bare = compose([table], camera, lamps, ambient=0.3).colour * texture
-    shadows, nothing = (ShadowFit(Subject(bunny), 0.0, keep=6) for _ in range(2))
-    for x, angle in ((-0.03, 0.4), (0.02, 1.5)):
-        place = Placement(np.array([x, 0.01, 0.0]), np.array([np.cos(angle / 2), 0, 0, np.sin(angle / 2)]))
-        pose = Pose(place.position, place.orientation)
-        seen = compose([Item(bunny, pose), table], camera, lamps, ambient=0.3)
-        free = ~ndimage.binary_dilation(seen.identity == 0, iterations=2)
-        noise = 0.01 * rng.normal(size=bare.shape)
-        # A third less exposure, which shades are relative to.
-        image = np.clip(0.85 * seen.colour * texture + noise, 0, 1)
-        shadows.add(place, camera, image, np.sum(bare**GAMMA, axis=2), free)
-        nothing.add(place, camera, np.clip(0.85 * bare + noise, 0, 1), np.sum(bare**GAMMA, axis=2), free)
-    found = shadows.sun()
-    assert found is not None
-    assert np.degrees(np.arccos(found @ towards)) < 2
-    assert nothing.sun() is None
 
 
 def test_a_fast_spin_is_followed_from_the_first_frame_on(bunny, camera):
@@ -406,43 +259,6 @@ def test_a_fast_spin_is_followed_from_the_first_frame_on(bunny, camera):
     assert found.n_tracked == 5
     _, turn = errors(found, position, orientation, slice(None))
     assert np.degrees(turn).max() < 5
-
-
-def ramp():
-    values = np.random.default_rng(0).integers(0, 255, (SIZE[1], SIZE[0], 3))
-    return values.astype(np.uint8)
-
-
-def test_directions_that_are_not_seen_are_said_and_have_large_variances(bunny):
-    subject = Subject(bunny)
-    # Curvature as of a surface of revolution about y of the object's frame.
-    axis = np.array([0, 0, 0, 0, 1.0, 0])
-    hessian = 1e6 * (np.eye(6) - np.outer(axis, axis))
-    window = (slice(0, 1), slice(0, 1))
-    place = Placement(np.zeros(3), np.array([1.0, 0, 0, 0]))
-    blind = Refined(place, 0.0, 1.0, 0.0, hessian, 1e-8 * np.eye(6), window, np.zeros((1, 1)))
-    texts = unobservable([blind, blind], subject)
-    assert len(texts) == 1
-    assert "turns about the axis (0.00, 1.00, 0.00)" in texts[0]
-    eye = np.array([0, -0.5, 0])
-    covariance = covariance_of(blind, subject, eye)
-    assert np.sqrt(covariance[4, 4]) > 1.5
-    assert np.sqrt(covariance[3, 3]) < 0.01
-    # A scale that is not known shows along the line of sight.
-    assert covariance[1, 1] > 2 * covariance[0, 0]
-    seen = blind._replace(hessian=1e6 * np.eye(6))
-    assert unobservable([seen, seen], subject) == []
-
-
-def test_placements_turn_about_the_ball(bunny):
-    subject = Subject(bunny)
-    turn = quat_exp(np.array([0.3, 0.2, -0.5]))
-    place = subject.around(np.array([0.1, 0.2, 0.3]), turn)
-    np.testing.assert_allclose(subject.middle(place), [0.1, 0.2, 0.3], atol=1e-12)
-    moved = place.moved(np.array([0.5, 0, 0, 0, 0, 0.2]), subject.radius)
-    np.testing.assert_allclose(moved.position - place.position, [0.5 * subject.radius, 0, 0], atol=1e-12)
-    ahead = quat_rotate(quat_conjugate(turn), quat_rotate(moved.orientation, np.array([1.0, 0, 0])))
-    np.testing.assert_allclose(ahead, [np.cos(0.2), np.sin(0.2), 0], atol=1e-12)
 
 
 def test_the_command_writes_a_motion_and_a_page(tmp_path, camera, filmed, capsys):

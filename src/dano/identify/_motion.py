@@ -152,13 +152,17 @@ class Motion:
 
     @classmethod
     def from_tracked(cls, tracked: "Tracked", name: str) -> "Motion":
-        """Poses of an object that was tracked in a film, with their covariances, as those of a body."""
+        """Poses of an object that was tracked in a film, with their covariances, as those of a body.
+
+        Frames of a motion count as independent. Those of a film that was tracked as one motion are not, and
+        their covariances are multiplied by how many frames say the same.
+        """
         return cls.create(
             tracked.times,
             name,
             position=tracked.position,
             orientation=tracked.orientation,
-            covariance=tracked.covariance,
+            covariance=tracked.covariance * tracked.repeats[:, None, None],
             point="origin",
         )
 

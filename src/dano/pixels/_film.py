@@ -20,7 +20,7 @@ from dano.maths import Numbers, quat_normalize, quat_rotate, quat_to_matrix
 from dano.scene import Control, Scene, State
 from dano.vision import AbstractCamera, AbstractModel, GAMMA, LearnedField, Light, Part, Sampling, through
 
-FILM_SAMPLING = Sampling(24, 16, 8, moves=True)
+FILM_SAMPLING = Sampling(24, 16, 8, moves=True, grazes=True)
 """How finely rays are sampled: a picture to compare, not one to look at.
 
 By measurement, inside pictures of a ball and of the shipped bunny: colours are three times closer to those of

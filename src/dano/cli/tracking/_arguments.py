@@ -29,7 +29,8 @@ class Filming:
         slow_motion: How many times slower the video plays than it was filmed.
         shutter: How long a frame is exposed [s], if what moves is blurred.
         readout: How much later the last row of a frame is exposed than the first (rolling shutter) [s].
-        table: Height z of a level table under the object [m]: its shadow there says where the sun is.
+        table: Height z of a level table under the object [m]: it lies and slides there, and its shadow says
+            where the sun is.
         every: Take every so many-th frame.
         since: Take frames from this time on [s], as a player shows it.
         until: Take frames up to this time [s].

@@ -60,15 +60,19 @@ class Sampling(NamedTuple):
         colours: Of these, those seen most, whose colour is computed.
         moves: Whether derivatives see the sections move with the surface. Without it they stand still, which
             is wrong for what is seen inside an outline, and better behaved far from a match.
+        grazes: Whether one of the fine sections' edges lies where a ray is closest to a surface. Without it
+            what only grazes an object comes out too clear: the silhouette of a soap of 90 pixels was 0.2
+            pixels too small all around, by which it seems 2 % of its size nearer.
     """
 
     coarse: int = 48
     fine: int = 16
     colours: int = 5
     moves: bool = False
+    grazes: bool = False
 
 
-DRAWING = Sampling(96, 32, 8)
+DRAWING = Sampling(96, 32, 8, grazes=True)
 """For pictures to look at and to measure errors by."""
 
 
@@ -108,6 +112,11 @@ class AbstractModel(eqx.Module):
         """The same edges, with derivatives as if they moved along the rays with what is seen there."""
         del rays, sharpness
         return edges
+
+    def closest(self, rays: Rays, edges: Float[Array, "rays edges"]) -> Float[Array, "rays 1"]:
+        """Where along rays the least gets through, from edges of coarse sections."""
+        del rays
+        return 0.5 * (edges[:, :1] + edges[:, -1:])
 
 
 class AbstractMedium(AbstractModel):
@@ -150,6 +159,20 @@ class AbstractSurface(AbstractModel):
         blurred = jnp.minimum(sharpness, 2 * (edges.shape[1] - 1) / length)[:, None]
         return surface_interest(self.distance_at(rays.at(edges)).reshape(edges.shape), blurred)
 
+    def closest(self, rays: Rays, edges: Float[Array, "rays edges"]) -> Float[Array, "rays 1"]:
+        """See `AbstractModel.closest`: the least distance, by the parabola through the least one of edges.
+
+        The opacity of a ray is that of its least distance (see `surface_alpha`), if an edge lies there. To
+        first order it does not move when the surface does, so it has no derivative.
+        """
+        edges = jax.lax.stop_gradient(edges)
+        distance = jax.lax.stop_gradient(self.distance_at(rays.at(edges)).reshape(edges.shape))
+        least = jnp.argmin(distance[:, 1:-1], axis=1)[:, None] + 1
+        before, here, after = (jnp.take_along_axis(distance, least + i, axis=1) for i in (-1, 0, 1))
+        bend = jnp.maximum(before + after - 2 * here, 1e-9)
+        shift = jnp.clip(0.5 * (before - after) / bend, -1, 1)
+        return jnp.take_along_axis(edges, least, axis=1) + shift * (edges[:, 1:2] - edges[:, :1])
+
     def attached(
         self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
     ) -> Float[Array, "rays edges"]:
@@ -181,9 +204,12 @@ def sections(
 ) -> tuple[Float[Array, "rays edges"], Float[Array, "rays sections"]]:
     """Edges of the fine sections, around what coarse ones found, and their opacity; arguments as of `see`."""
     keys = (None, None) if key is None else jax.random.split(key)
-    edges = stratified_edges(rays.near, rays.far, sampling.coarse, keys[0])
+    coarse = stratified_edges(rays.near, rays.far, sampling.coarse, keys[0])
+    count = sampling.fine - sampling.grazes
     # Weights for sampling are not differentiated: `importance_edges` stops their gradient.
-    edges = importance_edges(edges, model.interest(rays, edges, sharpness), sampling.fine, keys[1])
+    edges = importance_edges(coarse, model.interest(rays, coarse, sharpness), count, keys[1])
+    if sampling.grazes:
+        edges = jnp.sort(jnp.concatenate([edges, model.closest(rays, coarse)], axis=1), axis=1)
     if sampling.moves:
         edges = model.attached(rays, edges, sharpness)
     return edges, model.alpha(rays, edges, sharpness)

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
 
 from dano.checks import checked_path
 from dano.progress import Progress
@@ -21,6 +22,12 @@ _FEWEST = 2
 
 _UNEVEN = 0.2
 """Share by which times between frames may differ before the rate is called variable."""
+
+_FLOW_BLUR = 1.0
+"""Standard deviation of the filter of pictures whose displacement is measured [pixels]."""
+
+_UNMOVED = 0.15
+"""Displacement up to which a thing lies still [pixels]: a film of it is exact to a few hundredths."""
 
 
 class Film(NamedTuple):
@@ -71,6 +78,47 @@ class Film(NamedTuple):
         return original.replaced(
             focal=original.focal / k, centre=original.centre / k, width=self.size[0], height=self.size[1]
         )
+
+    def is_still(self, i: int, j: int, region: Bool[np.ndarray, "height width"]) -> bool:
+        """Whether a thing lies still between two frames.
+
+        The least squares shift, turn, growth and exposure of its pictures say so (Lucas and Kanade 1981).
+        They are right for motions below a pixel only; others must be told apart by poses.
+
+        Args:
+            i: One frame.
+            j: The other.
+            region: Where the thing is seen, its edges included.
+        """
+        rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
+        if not len(rows):
+            return False
+        window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        first, second = (
+            ndimage.gaussian_filter(self.images[k][window].mean(axis=2, dtype=np.float64), _FLOW_BLUR)
+            for k in (i, j)
+        )
+        y, x = (v[region[window]] - 0.5 * n for v, n in zip(np.mgrid[window], self.size[::-1], strict=True))
+        y, x = y - y.mean(), x - x.mean()
+        down, right = (slope[region[window]] for slope in np.gradient(0.5 * (first + second)))
+        seen = 0.5 * (first + second)[region[window]]
+        flow = np.stack(
+            [right, down, right * x + down * y, down * x - right * y, seen, np.ones(len(x))], axis=1
+        )
+        away = (first - second)[region[window]]
+        found = np.linalg.lstsq(flow, away, rcond=None)[0]
+        reach = float(np.hypot(x, y).max())
+        return bool(np.hypot(*found[:2]) + reach * np.hypot(*found[2:4]) < _UNMOVED)
+
+    def quiet(self, count: int) -> list[int]:
+        """Frames in which little moves, spread over the film, the quietest one first."""
+        small = np.stack([image[::4, ::4].mean(axis=2, dtype=np.float32) for image in self.images])
+        # A camera's exposure is no motion.
+        small = small / np.maximum(np.median(small, axis=(1, 2), keepdims=True), 1)
+        change = np.abs(np.diff(small, axis=0)).mean(axis=(1, 2))
+        change = np.maximum(np.append(change, 0), np.append(0, change))
+        parts = np.array_split(np.arange(len(change)), min(count, len(change)))
+        return sorted((int(part[np.argmin(change[part])]) for part in parts), key=lambda i: change[i])
 
     def place(self, file: str | Path) -> Float[np.ndarray, "height width 3"]:
         """A picture of the place without the object, as the frames are read, in [0, 1].

@@ -4,16 +4,19 @@ Shades on the object say roughly where the sun is, as far as the learned look is
 table says it to a degree or two: there the outline of the object is all that counts.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import ndimage
 from scipy.optimize import minimize, nnls
 
 from dano.maths import even_directions
 from dano.vision.capture import AbstractCamera, Light
 from dano.vision.drawing import GAMMA
 from dano.vision.tracking._placement import Placement
+from dano.vision.tracking._segments import OFTEN
 from dano.vision.tracking._subject import CHUNK, Subject
 
 LAMPS = 3
@@ -67,8 +70,32 @@ _SHADE_NOISE = 0.01
 _REWEIGHTED = 4
 """Fits of shades by least squares, each weighted by what the one before missed (convention)."""
 
+_BRIGHTER = 0.25
+"""Share of the frames that are brighter than what is taken for the place without a shadow."""
+
 _DARK = 0.01
 """Linear brightness of a table below which it shows no shadow."""
+
+
+def bare_brightness(
+    images: list[np.ndarray], masks: list[np.ndarray | None]
+) -> Float[np.ndarray, "height width"]:
+    """Linear brightness of what the object hides now and then and its shadow passes; NaN where always hidden.
+
+    Shadows darken: of the frames in which a pixel is free, one of the brighter ones tells.
+    """
+    rows = np.linspace(0, len(images) - 1, min(len(images), OFTEN)).astype(int)
+    light = np.stack([np.sum((images[i] / np.float32(255)) ** np.float32(GAMMA), axis=2) for i in rows])
+    for one, i in zip(light, rows, strict=True):
+        mask = masks[i]
+        if mask is None:
+            one[:] = -1
+        else:
+            one[ndimage.binary_dilation(mask > 0.02)] = -1
+    count = np.sum(light >= 0, axis=0)
+    light = np.sort(light, axis=0)
+    at = len(light) - 1 - np.floor(_BRIGHTER * np.maximum(count - 1, 0)).astype(int)
+    return np.where(count > 0, np.take_along_axis(light, at[None], axis=0)[0], np.nan).astype(np.float64)
 
 
 def unlit() -> tuple[Light, ...]:
@@ -98,6 +125,14 @@ class LightFit:
         self._views: list[tuple[Placement, AbstractCamera, np.ndarray]] = []
         self._sun: np.ndarray | None = None
         self._places = even_directions(_DIRECTIONS)
+
+    def afresh(self, keep: int) -> "LightFit":
+        """Nothing known but where the sun was, to begin there; so many frames will count."""
+        result = LightFit(self._subject, keep, None if self._shadows is None else self._shadows.table)
+        result._sun = self._sun
+        if result._shadows is not None and self._shadows is not None:
+            result._shadows.towards = self._shadows.towards
+        return result
 
     def add(
         self,
@@ -177,6 +212,9 @@ class LightFit:
     def _column(self, view: tuple[Placement, AbstractCamera, np.ndarray], towards: np.ndarray) -> np.ndarray:
         """Light that pixels of a frame get from a lamp of power one (n, 3)."""
         place, camera, pixels = view
+        if place.drift is not None:
+            # Lamps are far: what is blurred is lit as it is in the middle of the exposure.
+            place = dataclasses.replace(place, drift=place.drift._replace(shutter=0.0))
         dark = Light((0.0, 0.0, 1.0), intensity=0.0)
         seen = self._subject.picture(place, (Light(towards), *[dark] * (LAMPS - 1)), camera, pixels)
         return np.maximum(seen.colour / np.maximum(seen.opacity, 0.5)[:, None], 0) ** GAMMA
@@ -230,11 +268,16 @@ class _Shadow(NamedTuple):
 
 
 class ShadowFit:
-    """Where the sun is, from the shadow of a known object on a level table (host)."""
+    """Where the sun is, from the shadow of a known object on a level table (host).
+
+    Attributes:
+        table: Height of the table [m, W].
+        towards: Direction towards the sun; None while it is not known.
+    """
 
     def __init__(self, subject: Subject, table: float, keep: int):
-        self._subject, self._table, self._keep = subject, table, keep
-        self._sun: np.ndarray | None = None
+        self._subject, self.table, self._keep = subject, table, keep
+        self.towards: np.ndarray | None = None
         self._lamps = unlit()
         self._frames: list[_Shadow] = []
         self._above = even_directions(_DIRECTIONS, 0.0)
@@ -242,7 +285,7 @@ class ShadowFit:
 
     def add(self, place: Placement, camera: AbstractCamera, image: np.ndarray, bare, free) -> None:
         """See `LightFit.add_shadow`."""
-        height = camera.position[2] - self._table
+        height = camera.position[2] - self.table
         if height <= 0:
             return
         y, x = np.nonzero(free & (bare > _DARK))
@@ -272,11 +315,15 @@ class ShadowFit:
                 return np.inf
             return sum(_unlikely(one, self._hidden(one.place, one.points, towards)) for one in self._frames)
 
-        begin = min(even_directions(_SHADOW_STARTS, _LOWEST), key=unlike) if self._sun is None else self._sun
+        begin = (
+            min(even_directions(_SHADOW_STARTS, _LOWEST), key=unlike)
+            if self.towards is None
+            else self.towards
+        )
         best = _best_direction(unlike, begin, _SHADOW_TURN, _SHADOW_TRIES)
         without = sum(_unlikely(one, np.zeros(len(one.shade))) for one in self._frames)
-        self._sun = best if without - unlike(best) > _SURE else None
-        return self._sun
+        self.towards = best if without - unlike(best) > _SURE else None
+        return self.towards
 
     def _hidden(self, place: Placement, points: np.ndarray, towards: np.ndarray) -> np.ndarray:
         """How much of the light from a direction the object keeps from points, 0 to 1."""

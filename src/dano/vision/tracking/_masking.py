@@ -9,17 +9,20 @@ from scipy import ndimage
 
 from dano.vision.capture import background_mask, Light, PosedCamera, View
 from dano.vision.drawing import GAMMA
-from dano.vision.tracking._edges import common_offset, edge_offset, moved_edge
 from dano.vision.tracking._film import Film
-from dano.vision.tracking._light import LightFit
+from dano.vision.tracking._light import bare_brightness, LightFit
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
-from dano.vision.tracking._refine import silhouette, Target, window_of
+from dano.vision.tracking._refine import MASK_NOISE, OWN_MASK_NOISE, silhouette, Target, window_of
 from dano.vision.tracking._segments import (
-    bare_brightness,
+    common_offset,
+    differs,
+    edge_offset,
     like_object,
+    moved_edge,
     Palette,
     Place,
+    SHADES,
     uncommon,
     unlike_place,
 )
@@ -68,6 +71,8 @@ class Masking:
         self._colours: list[np.ndarray] = []
         self._place: Place | None = None
         self._last: tuple[int, np.ndarray] | None = None
+        self._own: Palette | None = None
+        self._exposures: dict[int, np.ndarray] = {}
         self.notes: list[str] = []
         given = any(mask is not None for mask in film.masks)
         self.source = options.masks
@@ -86,6 +91,10 @@ class Masking:
                 "masks: what is behind the object is taken from the median of all frames; a picture of"
                 " the place without it (background) is better"
             )
+
+    def knows(self, colours: Float[np.ndarray, "n 3"]) -> None:
+        """Look for what has an object's colours, whose sRGB from all sides is given, under any light."""
+        self._own, self._last = Palette(np.clip(np.concatenate([k * colours for k in SHADES]), 0, 1)), None
 
     def _offset(self) -> float:
         """By how much given masks are too large [pixels]."""
@@ -117,7 +126,13 @@ class Masking:
         return View(name=self._film.names[i], camera=anywhere, image=self._image(i), mask=None)
 
     def _image(self, i: int) -> Float[np.ndarray, "height width 3"]:
-        return self._film.images[i].astype(np.float32) / 255
+        """A frame, as bright as the place is known."""
+        image = self._film.images[i].astype(np.float32) / 255
+        if self._place is None:
+            return image
+        if i not in self._exposures:
+            self._exposures[i] = self._place.exposure(image)
+        return np.minimum(image / self._exposures[i], 1)
 
     def _seen(self, i: int) -> np.ndarray:
         occluder = self._film.occluders[i]
@@ -191,7 +206,7 @@ class Masking:
                 return None
         else:
             assert self._place is not None
-            mask = unlike_place(self._image(i), self._place)
+            mask = unlike_place(self._image(i), self._place, self._own)
         self._last = i, mask
         return mask
 
@@ -221,7 +236,8 @@ class Masking:
             target = _near(target, window_of(subject, place, camera, 1.0))
             if self._place is None:
                 return target
-            return target._replace(behind=self._place.seen_in(target.image, target.mask < 0.05))
+            behind = self._place.seen_in(target.image, target.mask < 0.05)
+            return target._replace(behind=behind, mask_noise=MASK_NOISE)
         window = window_of(subject, place, camera, 1.5)
         if window is None:
             return None
@@ -239,8 +255,12 @@ class Masking:
             free[window] &= ~ndimage.binary_dilation(expected > 0.02, iterations=int(np.ceil(blur)))
             behind = self._place.seen_in(image, free & (mask < 0.05))
         # Beside something else it is not known where the object ends.
-        sure = not found.other.any()
-        return Target(camera, image.astype(np.float64), mask, seen, behind, sure)
+        noise = None if found.other.any() else OWN_MASK_NOISE
+        telling = None
+        if behind is not None:
+            telling = np.zeros(mask.shape, bool)
+            telling[window] = differs(expected, colour, behind[window])
+        return Target(camera, image.astype(np.float64), mask, seen, behind, noise, telling)
 
     def learn(self, target: Target, window: tuple[slice, slice], shape: np.ndarray) -> None:
         """Take the object's colours in a frame into account, where it surely is."""

@@ -31,8 +31,9 @@ class TrackOptions:
             time of a frame is the middle of its exposure.
         readout: How much later the last row of a frame is exposed than the first (rolling shutter) [s]; the
             time of a frame is that of its middle row.
-        table: Height z of a level table [m, W] under the object, whose shadow on it says where the sun is;
-            None: no table is known, and colours say it, less well.
+        table: Height z of a level table [m, W] under the object. It lies and slides there on one of the faces
+            of its hull, and its shadow says where the sun is; None: no table is known, and colours say where
+            the sun is, less well.
         seed: Of all random numbers.
     """
 

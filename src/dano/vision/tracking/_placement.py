@@ -41,6 +41,13 @@ class Drift(NamedTuple):
         """Of the fastest point of a ball around the middle, at most [m/s]."""
         return float(np.linalg.norm(self.velocity) + radius * np.linalg.norm(self.spin))
 
+    def apart(self, other: "Drift", radius: float) -> float:
+        """How differently points of that ball move in two motions while a frame is exposed, at most [m]."""
+        speed = np.linalg.norm(self.velocity - other.velocity) + radius * np.linalg.norm(
+            self.spin - other.spin
+        )
+        return float(speed) * (self.shutter + self.readout)
+
     def moments(self, rows: Float[np.ndarray, " n"], speed: float) -> Float[np.ndarray, "n k"]:
         """Times at which pixels see the object, from the middle of the exposure of the middle row [s].
 
@@ -73,4 +80,12 @@ class Placement:
         turned = quat_multiply(self.orientation, quat_exp(np.asarray(change[3:], np.float64)))
         return dataclasses.replace(
             self, position=self.position + radius * change[:3], orientation=turned / np.linalg.norm(turned)
+        )
+
+    def led_to(self, later: "Placement", share: float) -> "Placement":
+        """Where a steady motion from here to a later placement leads, a share of that time after it."""
+        turn = quat_log(quat_multiply(quat_conjugate(self.orientation), later.orientation))
+        return Placement(
+            later.position + share * (later.position - self.position),
+            quat_multiply(later.orientation, quat_exp(share * turn)),
         )

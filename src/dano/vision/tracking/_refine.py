@@ -15,26 +15,26 @@ from scipy import ndimage
 from dano.vision.capture import Light, PosedCamera
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._segments import overlap
-from dano.vision.tracking._subject import Seen, Subject
+from dano.vision.tracking._subject import BAND, Seen, Subject, window_of
 
-_MASK_NOISE = 0.12
-"""Standard deviation of a mask at the edge, least."""
+MASK_NOISE = 0.12
+"""Standard deviation of a given mask at its edge."""
 
-_OWN_MASK_NOISE = 0.25
+OWN_MASK_NOISE = 0.25
 """Standard deviation of a mask that was made of colours, where it counts beside them: with 0.12 a
 soap that slides is nearer to the truth, with 0.3 one that tumbles."""
 
 _COLOUR_NOISE = 0.025
 """Standard deviation of a colour, in sRGB, least: a learned look is not better."""
 
-_SHADE_DOUBT = 0.3
+_SHADE_DOUBT = 0.5
 """Standard deviation of how bright a place is that the object's shadow may reach, as a share."""
+
+_LOOK_DOUBT = 0.1
+"""Standard deviation of how bright a part of the object is, as a share: its light is known roughly."""
 
 _OUTLIER = 3.0
 """Standard deviations from which residuals lose weight (Geman and McClure)."""
-
-_BAND = 4
-"""Pixels on each side of an edge that take part."""
 
 _TILE = 6
 """Side of the tiles [pixels] within which errors of neighbouring pixels are taken to be one."""
@@ -45,6 +45,9 @@ _BLUR = 3.0
 _COLOURED_EDGE = 6.0
 """By which variances grow where colours alone say where the object ends: light passes its rim, and its shadow
 lies beside it (measured in rendered films, with their true poses)."""
+
+_FURTHEST = 0.1
+"""Change of a pose [radii, rad] up to which one step says where a picture wants it."""
 
 _SMALL = 0.02
 """Predicted move [pixels] that ends the search."""
@@ -59,7 +62,8 @@ class Target(NamedTuple):
         mask: Where the object is, 0 to 1.
         seen: Where nothing else stands in front of it.
         behind: What would be seen there without the object, in this frame's light; None if it is not known.
-        sure: Whether the mask counts beside what is behind.
+        mask_noise: Standard deviation of the mask at its edge; None: it does not count beside what is behind.
+        telling: Where it counts then: the object is not alike to what is behind it; None: everywhere.
     """
 
     camera: PosedCamera
@@ -67,7 +71,8 @@ class Target(NamedTuple):
     mask: Float[np.ndarray, "height width"]
     seen: Bool[np.ndarray, "height width"]
     behind: Float[np.ndarray, "height width 3"] | None = None
-    sure: bool = False
+    mask_noise: float | None = None
+    telling: Bool[np.ndarray, "height width"] | None = None
 
     def reduced(self, factor: int) -> "Target":
         """The same with so many pixels a side averaged into one."""
@@ -84,7 +89,8 @@ class Target(NamedTuple):
         )
         behind = None if self.behind is None else mean(self.behind)
         seen = mean(self.seen.astype(float)) > 0.99
-        return Target(camera, mean(self.image), mean(self.mask), seen, behind, self.sure)
+        telling = None if self.telling is None else mean(self.telling.astype(float)) > 0.5
+        return Target(camera, mean(self.image), mean(self.mask), seen, behind, self.mask_noise, telling)
 
 
 class Refined(NamedTuple):
@@ -121,39 +127,12 @@ class _Rows(NamedTuple):
     colour_error: float
 
 
-def window_of(
-    subject: Subject, place: Placement, camera: PosedCamera, margin: float = 1.25
-) -> tuple[slice, slice] | None:
-    """The part of a picture that shows the object's ball; None if it lies outside or behind."""
-    middle = camera.project(subject.middle(place)[None])[0]
-    if not np.isfinite(middle).all() or middle[2] < 1.05 * subject.radius:
-        return None
-    reach = margin * subject.radius / middle[2] * float(camera.focal.mean()) + _BAND
-    low, high = np.floor(middle[:2] - reach).astype(int), np.ceil(middle[:2] + reach).astype(int)
-    low, high = np.maximum(low, 0), np.minimum(high, [camera.width, camera.height])
-    if np.any(high - low < 4):
-        return None
-    return slice(low[1], high[1]), slice(low[0], high[0])
-
-
-def pixels_of(window: tuple[slice, slice]) -> Float[np.ndarray, "n 2"]:
-    """Image coordinates of the middles of the pixels of a window, row by row."""
-    y, x = np.mgrid[window]
-    return np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
-
-
 def silhouette(
     subject: Subject, place: Placement, lamps: tuple[Light, ...], camera: PosedCamera, window
 ) -> tuple[np.ndarray, np.ndarray]:
     """Opacity and colour over black of the pixels of a window."""
-    pixels = pixels_of(window)
-    near = subject.reached(place, camera, pixels)
-    opacity, colour = np.zeros(len(pixels)), np.zeros((len(pixels), 3))
-    if near.any():
-        seen = subject.picture(place, lamps, camera, pixels[near])
-        opacity[near], colour[near] = seen.opacity, seen.colour
-    shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
-    return opacity.reshape(shape), colour.reshape(*shape, 3)
+    opacity, colour = subject.whole(place, lamps, camera)
+    return opacity[window].copy(), colour[window].copy()
 
 
 def aligned(subject: Subject, target: Target, place: Placement, lamps: tuple[Light, ...]) -> Placement:
@@ -208,7 +187,6 @@ def refine(
     if len(index) < 24:
         return None
     damping, best, change = 1e-3, None, np.zeros(6)
-    pixel = target.camera.pixel_angle
     for _ in range(steps + 1):
         moved = place if best is None else best[0].moved(change, subject.radius)
         rows = _rows(subject, target, moved, lamps, index, loss)
@@ -220,11 +198,41 @@ def refine(
         scale = np.diag(np.diagonal(hessian)) + 1e-9 * np.trace(hessian) * np.eye(6)
         change = -np.linalg.solve(hessian + damping * scale, gradient)
         change *= min(1.0, 0.35 / max(float(np.abs(change).max()), 1e-9))
-        away = np.linalg.norm(subject.middle(best[0]) - target.camera.position)
-        if np.abs(change).max() * subject.radius < _SMALL * pixel * away:
+        if np.abs(change).max() * subject.radius < _SMALL * subject.pixel(best[0], target.camera):
             break
     assert best is not None
     return _refined(subject, target, lamps, *best, index)
+
+
+def linearized(
+    subject: Subject,
+    target: Target,
+    place: Placement,
+    lamps: tuple[Light, ...],
+    *,
+    loss: str,
+    rays: int,
+    random: np.random.Generator,
+) -> Refined | None:
+    """What a picture says of a pose near a given one: one step of Gauss and Newton from there.
+
+    Arguments and result are those of `refine`. Its cost, overlap and silhouette are those of the given pose.
+    """
+    window = window_of(subject, place, target.camera)
+    if window is None:
+        return None
+    opacity, _ = silhouette(subject, place, lamps, target.camera, window)
+    index = _chosen(opacity, target, window, rays, random)
+    if len(index) < 24:
+        return None
+    rows = _rows(subject, target, place, lamps, index, loss)
+    found = _refined(subject, target, lamps, place, rows, index)
+    if found is None:
+        return None
+    gradient, hessian = _normal(rows)
+    change = -np.linalg.solve(hessian + 1e-6 * np.trace(hessian) * np.eye(6), gradient)
+    change *= min(1.0, _FURTHEST / max(float(np.abs(change).max()), 1e-9))
+    return found._replace(place=place.moved(change, subject.radius))
 
 
 def _chosen(opacity, target: Target, window, rays: int, random: np.random.Generator) -> np.ndarray:
@@ -233,8 +241,8 @@ def _chosen(opacity, target: Target, window, rays: int, random: np.random.Genera
     solid, given = opacity > 0.5, mask > 0.5
     edge = np.zeros(mask.shape, bool)
     for shape in (solid, given):
-        edge |= ndimage.binary_dilation(shape, iterations=_BAND) & ~ndimage.binary_erosion(
-            shape, iterations=_BAND, border_value=1
+        edge |= ndimage.binary_dilation(shape, iterations=BAND) & ~ndimage.binary_erosion(
+            shape, iterations=BAND, border_value=1
         )
     inner = solid & ~edge
     picked = []
@@ -250,12 +258,13 @@ def _chosen(opacity, target: Target, window, rays: int, random: np.random.Genera
 def _rows(subject: Subject, target: Target, place: Placement, lamps, index: np.ndarray, loss: str) -> _Rows:
     y, x = index.T
     pixels = np.stack([x, y], axis=1) + 0.5
-    seen = subject.picture(place, lamps, target.camera, pixels, slopes=True)
+    behind = None if target.behind is None or loss != "photometric" else target.behind[y, x]
+    seen = subject.picture(place, lamps, target.camera, pixels, slopes=True, behind=behind)
     if loss == "paper":
         return _paper_rows(target, seen, index)
     if loss == "photometric" and target.behind is not None:
         return _composed_rows(target, seen, index)
-    sigma = _MASK_NOISE
+    sigma = MASK_NOISE
     residual = ((seen.opacity - target.mask[y, x]) / sigma)[:, None]
     slope = (seen.opacity_slope / sigma)[:, None]
     weight, cost = _robust(np.abs(residual[:, 0]))
@@ -284,13 +293,15 @@ def _composed_rows(target: Target, seen: Seen, index: np.ndarray) -> _Rows:
     away = seen.colour + (1 - alpha) * behind - target.image[y, x]
     change = seen.colour_slope - behind[..., None] * seen.opacity_slope[:, None]
     inside = (seen.opacity > 0.9) & (target.mask[y, x] > 0.5)
-    # How bright the place is, in the object's shadow above all, is known roughly.
-    doubt = _SHADE_DOUBT * (1 - alpha) * behind
-    rows = _colour_rows(away, change, inside, np.ones(len(index), bool), doubt)
-    if not target.sure:
+    common = np.stack([_SHADE_DOUBT * (1 - alpha) * behind, _LOOK_DOUBT * seen.colour], axis=2)
+    rows = _colour_rows(*_without_common(away, change, common, index), inside, np.ones(len(index), bool))
+    if target.mask_noise is None:
         return rows
-    residual = (seen.opacity - target.mask[y, x]) / _OWN_MASK_NOISE
-    slope = seen.opacity_slope / _OWN_MASK_NOISE
+    residual = (seen.opacity - target.mask[y, x]) / target.mask_noise
+    slope = seen.opacity_slope / target.mask_noise
+    if target.telling is not None:
+        told = target.telling[y, x]
+        residual, slope = np.where(told, residual, 0), np.where(told[:, None], slope, 0)
     weight, cost = _robust(np.abs(residual))
     return _Rows(
         np.concatenate([rows.residual, residual[:, None]], axis=1),
@@ -301,12 +312,49 @@ def _composed_rows(target: Target, seen: Seen, index: np.ndarray) -> _Rows:
     )
 
 
+def _without_common(
+    away: np.ndarray, change: np.ndarray, common: np.ndarray, index: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Differences of colours and their derivatives without what neighbouring pixels share.
+
+    A shadow beside the object, or a shade on it, is wrong for a whole tile of pixels, by a share that is not
+    known. The likeliest shares are subtracted, which is least squares with two more unknowns for each tile.
+    Otherwise many pixels that are wrong together would pull like as many that are right.
+
+    Args:
+        away: Differences in sRGB (n, 3).
+        change: Their derivatives (n, 3, 6).
+        common: Differences that are expected in a tile with variance one (n, 3, m).
+        index: Rows and columns of the pixels (n, 2).
+    """
+    tile = _tiles(index)
+    both = np.concatenate([away[..., None], change], axis=2)
+    noise = _COLOUR_NOISE
+    rest = both
+    for _ in range(2):
+        weight, _ = _robust(np.sqrt(np.mean(rest[..., 0] ** 2, axis=1)) / noise)
+        weight = weight / (3 * noise**2)
+        square = np.zeros((tile.max() + 1, common.shape[2], common.shape[2])) + np.eye(common.shape[2])
+        mixed = np.zeros((tile.max() + 1, common.shape[2], both.shape[2]))
+        np.add.at(square, tile, np.einsum("n,nci,ncj->nij", weight, common, common))
+        np.add.at(mixed, tile, np.einsum("n,nci,ncj->nij", weight, common, both))
+        rest = both - np.einsum("nci,nij->ncj", common, np.linalg.solve(square, mixed)[tile])
+        usual = float(np.median(np.sqrt(np.mean(rest[..., 0] ** 2, axis=1))))
+        noise = max(1.2 * usual, _COLOUR_NOISE)
+    return rest[..., 0], rest[..., 1:]
+
+
+def _tiles(index: np.ndarray) -> np.ndarray:
+    """Number of the tile of each pixel."""
+    tiles = index // _TILE
+    return np.unique(tiles[:, 0] * 100003 + tiles[:, 1], return_inverse=True)[1]
+
+
 def _colour_rows(
     away: np.ndarray,
     change: np.ndarray,
     inside: np.ndarray,
     counted: np.ndarray,
-    doubt: np.ndarray | None = None,
 ) -> _Rows:
     """Rows of differences of colours over their noise, which pixels inside the object tell.
 
@@ -315,18 +363,10 @@ def _colour_rows(
         change: Their derivatives (n, 3, 6).
         inside: Pixels that show the object and nothing else.
         counted: Pixels that count.
-        doubt: Differences (n, 3) that are expected with variance one beside the noise, e.g. of brightness.
     """
     lengths = np.sqrt(np.mean(away**2, axis=1))
     error = float(np.median(lengths[inside])) if inside.any() else float("nan")
     noise = max(1.2 * error, _COLOUR_NOISE) if inside.any() else 1.0
-    if doubt is not None:
-        # (σ² I + d dᵀ)^(−1/2) σ: what lies along d counts less.
-        square = np.sum(doubt**2, axis=1)
-        less = (1 - 1 / np.sqrt(1 + square / noise**2)) / np.maximum(square, 1e-12)
-        away = away - (less * np.sum(doubt * away, axis=1))[:, None] * doubt
-        change = change - (less[:, None] * np.einsum("nc,nck->nk", doubt, change))[:, None] * doubt[..., None]
-        lengths = np.sqrt(np.mean(away**2, axis=1))
     weight, cost = _robust(np.where(counted, lengths / noise, 0))
     # Costs of different noise can be compared only with what the noise itself costs.
     total = float(np.mean(np.where(counted, cost + np.log(noise / _COLOUR_NOISE), 0)))
@@ -358,9 +398,9 @@ def _paper_rows(target: Target, seen: Seen, index: np.ndarray) -> _Rows:
         return ndimage.gaussian_filter(grid, _BLUR, mode="constant")[y, x]
 
     away = seen.opacity - target.mask[index[:, 0], index[:, 1]]
-    residual = np.stack([away, blurred(away)], axis=1) / _MASK_NOISE
+    residual = np.stack([away, blurred(away)], axis=1) / MASK_NOISE
     slopes = np.stack([blurred(column) for column in seen.opacity_slope.T], axis=1)
-    slope = np.stack([seen.opacity_slope, slopes], axis=1) / _MASK_NOISE
+    slope = np.stack([seen.opacity_slope, slopes], axis=1) / MASK_NOISE
     cost = float(0.5 * np.mean(np.sum(residual**2, axis=1)))
     return _Rows(residual, slope, np.ones_like(residual), cost, float("nan"))
 
@@ -392,8 +432,7 @@ def _refined(
 
 def _covariance(rows: _Rows, hessian: np.ndarray, index: np.ndarray) -> np.ndarray:
     """H⁻¹ (Σ gₜ gₜᵀ) H⁻¹ over tiles of pixels t with correlated errors (Huber's sandwich, clustered)."""
-    tiles = index // _TILE
-    _, tile = np.unique(tiles[:, 0] * 100003 + tiles[:, 1], return_inverse=True)
+    tile = _tiles(index)
     each = np.einsum("nki,nk->ni", rows.weight[..., None] * rows.slope, rows.residual)
     sums = np.zeros((tile.max() + 1, 6))
     np.add.at(sums, tile, each)

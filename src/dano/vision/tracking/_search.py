@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from dano.maths import even_directions, quat_conjugate, quat_from_matrix, quat_log, quat_multiply
+from dano.maths import even_directions, quat_conjugate, quat_exp, quat_from_matrix, quat_log, quat_multiply
 from dano.vision.capture import Light
 from dano.vision.tracking._light import LAMPS, LightFit
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
-from dano.vision.tracking._refine import pixels_of, refine, Refined, silhouette, Target
-from dano.vision.tracking._subject import CHUNK, Subject
+from dano.vision.tracking._refine import refine, Refined, silhouette, Target
+from dano.vision.tracking._subject import CHUNK, pixels_of, Subject
 
 _SIDE = 32
 """Pixels a side of rendered views: a chunk of rays."""
@@ -31,6 +31,15 @@ _REACH = 1.7
 
 _SIDES = 24
 """Directions from which the object's colours are collected."""
+
+_ALIKE = 0.03
+"""By which overlaps of starts may differ for colours to decide."""
+
+_OTHER = np.radians(12)
+"""Angle above which two starts are different ones."""
+
+_ASIDE = np.radians(15)
+"""By how much poses are turned that are tried beside one that fits badly."""
 
 _DIFFERENT = np.radians(18)
 """Least angle between candidates."""
@@ -75,7 +84,9 @@ def search(
 ) -> list[Start]:
     """Poses that explain a picture, best first; none if the mask is empty or nothing fits."""
     guesses = _guesses(subject, target, options)
-    coarse = target.reduced(max(1, round(_size(subject, guesses, target) / _COARSE)) if guesses else 1)
+    coarse = target.reduced(
+        max(1, round(subject.pixels(guesses[0].place, target.camera) / _COARSE)) if guesses else 1
+    )
     refined = []
     for guess in guesses[: 2 * options.candidates]:
         found = refine(
@@ -119,6 +130,27 @@ def half_turns(subject: Subject, place: Placement) -> list[Placement]:
     middle = subject.middle(place)
     turns = np.eye(4)[1:]
     return [subject.around(middle, quat_multiply(place.orientation, turn)) for turn in turns]
+
+
+def likeliest(subject: Subject, target: Target, loss: str, starts: list[Start]) -> tuple[Start, float]:
+    """Of starts whose silhouettes fit alike, the one whose colours fit best; and how clearly."""
+    most = max(start.refined.overlap for start in starts)
+    alike = sorted((s for s in starts if s.refined.overlap > most - _ALIKE), key=lambda s: s.score)
+    alike = distinct(alike, lambda start: start.refined.place, _OTHER)
+    if loss != "photometric":
+        values = [start.score for start in alike]
+    else:
+        found = [(unlikeness(subject, target, start), start) for start in alike]
+        found.sort(key=lambda pair: pair[0])
+        values, alike = [value for value, _ in found], [start for _, start in found]
+    return alike[0], min((value / max(values[0], 1e-9) for value in values[1:]), default=np.inf)
+
+
+def turned_aside(subject: Subject, place: Placement) -> list[Placement]:
+    """A pose turned both ways about each of the object's axes by a small angle."""
+    turns = [_ASIDE * sign * axis for axis in np.eye(3) for sign in (1, -1)]
+    middle = subject.middle(place)
+    return [subject.around(middle, quat_multiply(place.orientation, quat_exp(turn))) for turn in turns]
 
 
 def unlikeness(subject: Subject, target: Target, start: Start) -> float:
@@ -169,11 +201,6 @@ def learn_light(subject: Subject, target: Target, place: Placement, window, shap
     inside = core if core.sum() > 60 else inside
     pixels = pixels_of(window)[inside.ravel()]
     light.add(place, target.camera, pixels, target.image[window][inside])
-
-
-def _size(subject: Subject, guesses: list[_Guess], target: Target) -> float:
-    away = np.linalg.norm(subject.middle(guesses[0].place) - target.camera.position)
-    return subject.size / float(away) / target.camera.pixel_angle
 
 
 def _headlight(target: Target) -> tuple[Light, ...]:

@@ -1,5 +1,6 @@
-"""Masks of films: what is unlike the place, and like the object where it is expected."""
+"""Masks of films: what is unlike the place, like the object where it is expected; wrong masks."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,20 +13,35 @@ from dano.vision.drawing import GAMMA
 _BINS = 16
 """Bins of each colour channel of what the object looks like."""
 
-_SHADES = (1.0, 0.85, 0.7, 0.55, 0.4)
-"""By which a cast shadow may darken the place."""
+SHADES = (1.0, 0.85, 0.7, 0.55, 0.4)
+"""By which a cast shadow may darken the place, and the sides of an object that are turned from the sun."""
 
 _SHADOW_PRIOR = 0.4
 """How likely that is beside no shadow."""
 
-_OFTEN = 40
-"""Frames that the median of the place is taken of."""
+_DARKENED_PRIOR = 0.1
+"""The same anywhere in a picture, where objects are seen that have the colours of shadows."""
 
-_BRIGHTER = 0.25
-"""Share of the frames that are brighter than what is taken for the place without a shadow."""
+_ROUGHLY = 0.7
+"""How likely its colours are so; else they may be any."""
+
+_PATCH = 1.5
+"""Standard deviation of the filter that takes neighbouring pixels for one thing [pixels]."""
+
+OFTEN = 40
+"""Frames that the median of the place is taken of."""
 
 _STILL = 0.05
 """Usual change of a pixel over a film, in sRGB, up to which the camera stands still."""
+
+_EVERY = 3
+"""Rows and columns after which pixels are taken for the exposure (convention)."""
+
+_EXPOSURES = 0.1, 10.0
+"""Least and largest ratio of brightnesses, in sRGB."""
+
+_DARKEST = 0.05
+"""Least sRGB of a pixel that tells it."""
 
 _LEAST_AREA = 24
 """Pixels below which a mask says nothing."""
@@ -58,8 +74,38 @@ of the bunny itself more than 1 in 5 % of its pixels."""
 _LOOK_NOISE = 0.07
 """Standard deviation of a pixel of the object from how it is rendered, in sRGB: `_UNLIKE` is more."""
 
+_LOOK_REACH = 2.0
+"""Standard deviation of the filter that carries colours of an object beyond its edge [pixels]."""
+
+_UNALIKE = 0.1
+"""Difference of colours [sRGB] from which a mask that is made of them is believed: some 1.5 `_LOOK_NOISE`."""
+
 _PIECE = 0.1
 """Share of the largest part's area from which another one belongs to an object that something cuts."""
+
+_FINER = 5
+"""Parts of a pixel, each way, that distances from a mask's edge are measured in; odd."""
+
+_EDGE_REACH = 4
+"""Distance on both sides of a mask's edge in which the picture's edge is looked for [pixels]."""
+
+_EDGE_SMOOTH = 0.7
+"""Standard deviation of the filter that gradients are taken with [pixels]: noise of single pixels."""
+
+_EDGE_NEAR = 2.0
+"""Distance from the strongest gradient of what is averaged [pixels]: the edge of a picture is a few wide."""
+
+_LEAST_PIXELS = 20
+"""Pixels at a distance from which their mean says something."""
+
+_EDGE_PLAIN = 1.3
+"""Ratio of the gradient at the edge to the one beside it from which there is an edge."""
+
+_EDGE_CERTAIN = 0.5
+"""Standard deviation of the offsets of a film up to which they are one offset [pixels]."""
+
+_EDGE_LEAST = 0.5
+"""Offset from which masks are moved [pixels]: edges are measured to some 0.2 pixels."""
 
 
 class Place:
@@ -71,9 +117,10 @@ class Place:
     """
 
     def __init__(self, colours: Float[np.ndarray, "height width 3"], images: list[np.ndarray]):
-        some = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), 5)).astype(int)]
-        away = [np.abs(image.astype(np.float32) / 255 - colours) for image in some]
         self.colours = colours.astype(np.float32)
+        some = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), 5)).astype(int)]
+        some = [image.astype(np.float32) / 255 for image in some]
+        away = [np.abs(image / self.exposure(image) - self.colours) for image in some]
         self.noise = max(1.48 * float(np.median(away)), 0.008)
 
     @classmethod
@@ -83,7 +130,7 @@ class Place:
         Raises:
             ValueError: If the camera moves.
         """
-        rows = np.linspace(0, len(images) - 1, min(len(images), _OFTEN)).astype(int)
+        rows = np.linspace(0, len(images) - 1, min(len(images), OFTEN)).astype(int)
         stack = np.stack([images[i] for i in rows])
         middle = np.median(stack, axis=0).astype(np.float32)
         usual = float(np.median(np.abs(stack - middle[None])) / 255)
@@ -94,13 +141,24 @@ class Place:
             )
         return cls(middle / 255, list(stack))
 
-    def log_likelihood(self, image: Float[np.ndarray, "*shape 3"], window=()) -> Float[np.ndarray, "*shape"]:
-        """Logarithm of the density of colours of the place, lit or in a shadow."""
+    def exposure(self, image: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "3"]:
+        """How much brighter a frame shows most of the place: a camera's exposure follows what it sees."""
+        some = slice(None, None, _EVERY)
+        frame, known = image[some, some], self.colours[some, some]
+        bright = known.min(axis=2) > _DARKEST
+        if not bright.any():
+            return np.ones(3, frame.dtype)
+        return np.clip(np.median(frame[bright] / known[bright], axis=0), *_EXPOSURES)
+
+    def log_likelihood(
+        self, image: Float[np.ndarray, "*shape 3"], window=(), shadow: float = _SHADOW_PRIOR
+    ) -> Float[np.ndarray, "*shape"]:
+        """Logarithm of the density of colours of the place, lit or in a shadow, of some likelihood."""
         colours = self.colours[window]
         best = np.full(image.shape[:2], -np.inf)
-        for shade in _SHADES:
+        for shade in SHADES:
             square = np.sum((image - shade * colours) ** 2, axis=2) / (2 * (1.5 * self.noise) ** 2)
-            best = np.maximum(best, -square + (0 if shade == 1.0 else np.log(_SHADOW_PRIOR)))
+            best = np.maximum(best, -square + (0 if shade == 1.0 else np.log(shadow)))
         return best - 1.5 * np.log(2 * np.pi) - 3 * np.log(1.5 * self.noise)
 
     def seen_in(
@@ -117,27 +175,6 @@ class Place:
         # Far from everything that is free the place is as bright as in the picture of it.
         shade = (sums[0] + _SHADE_PRIOR) / (sums[1] + _SHADE_PRIOR)
         return np.clip(shade, *_SHADE_RANGE)[..., None] * self.colours
-
-
-def bare_brightness(
-    images: list[np.ndarray], masks: list[np.ndarray | None]
-) -> Float[np.ndarray, "height width"]:
-    """Linear brightness of what the object hides now and then and its shadow passes; NaN where always hidden.
-
-    Shadows darken: of the frames in which a pixel is free, one of the brighter ones tells.
-    """
-    rows = np.linspace(0, len(images) - 1, min(len(images), _OFTEN)).astype(int)
-    light = np.stack([np.sum((images[i] / np.float32(255)) ** np.float32(GAMMA), axis=2) for i in rows])
-    for one, i in zip(light, rows, strict=True):
-        mask = masks[i]
-        if mask is None:
-            one[:] = -1
-        else:
-            one[ndimage.binary_dilation(mask > 0.02)] = -1
-    count = np.sum(light >= 0, axis=0)
-    light = np.sort(light, axis=0)
-    at = len(light) - 1 - np.floor(_BRIGHTER * np.maximum(count - 1, 0)).astype(int)
-    return np.where(count > 0, np.take_along_axis(light, at[None], axis=0)[0], np.nan).astype(np.float64)
 
 
 class Palette:
@@ -157,12 +194,21 @@ class Palette:
 
 
 def unlike_place(
-    image: Float[np.ndarray, "height width 3"], place: Place
+    image: Float[np.ndarray, "height width 3"], place: Place, palette: Palette | None = None
 ) -> Float[np.ndarray, "height width"]:
-    """What differs from the place by more than a shadow, its largest part."""
-    # The object may have any colour: density one.
-    ratio = ndimage.gaussian_filter(np.clip(-place.log_likelihood(image), -8, 8), 1.0)
-    return _main(ratio)
+    """What differs from the place by more than a shadow, its largest part.
+
+    Args:
+        image: A frame.
+        place: What is seen where the object is not.
+        palette: Colours of the object, roughly; None: it may have any.
+    """
+    if palette is None:
+        # Density one.
+        return _main(ndimage.gaussian_filter(np.clip(-place.log_likelihood(image), -8, 8), 1.0))
+    own = np.logaddexp(np.log(1 - _ROUGHLY), np.log(_ROUGHLY) + palette.log_likelihood(image))
+    ratio = own - place.log_likelihood(image, shadow=_DARKENED_PRIOR)
+    return _main(ndimage.gaussian_filter(np.clip(ratio, -8, 8), _PATCH))
 
 
 def uncommon(
@@ -259,6 +305,26 @@ def like_object(
     return Segments(_main(np.where(other, -12, ratio), _PIECE), other)
 
 
+def differs(
+    expected: Float[np.ndarray, "height width"],
+    colour: Float[np.ndarray, "height width 3"],
+    behind: Float[np.ndarray, "height width 3"],
+) -> Bool[np.ndarray, "height width"]:
+    """Where an object differs from the place behind it, lit or in a shadow: there masks are right.
+
+    Where they are alike a mask has a bite. Bites are on one side only, and many: an object seems smaller.
+
+    Args:
+        expected: Rendered silhouette.
+        colour: Rendered over black.
+        behind: The place.
+    """
+    share = ndimage.gaussian_filter(expected, _LOOK_REACH) + 1e-3
+    look = ndimage.gaussian_filter(colour, (_LOOK_REACH, _LOOK_REACH, 0)) / share[..., None]
+    apart = [np.sqrt(np.mean((look - shade * behind) ** 2, axis=2)) for shade in SHADES]
+    return np.min(apart, axis=0) > _UNALIKE
+
+
 def _as_rendered(
     image: Float[np.ndarray, "height width 3"],
     expected: Float[np.ndarray, "height width"],
@@ -332,3 +398,85 @@ def overlap(
         mask, silhouette = mask * seen, silhouette * seen
     union = float(np.maximum(mask, silhouette).sum())
     return float(np.minimum(mask, silhouette).sum()) / union if union > 0 else 0.0
+
+
+def edge_offset(
+    mask: Float[np.ndarray, "height width"],
+    image: Float[np.ndarray, "height width 3"],
+    seen: Bool[np.ndarray, "height width"],
+) -> float:
+    """How far a mask reaches beyond the edge in the picture [pixels]; negative if it is too small.
+
+    The mean gradient of the picture is taken at each distance from the mask's edge, all around the object.
+    It is largest where the object ends, whatever its texture.
+
+    Args:
+        mask: 0 to 1.
+        image: sRGB in [0, 1].
+        seen: Where nothing stands in front.
+
+    Returns:
+        NaN where the picture shows no clear edge.
+    """
+    window = _around(mask, 2 * _EDGE_REACH)
+    if window is None:
+        return float("nan")
+    inside = _inside(mask[window])
+    # What hides the object has an edge of its own, and cuts the mask there.
+    counted = ~ndimage.binary_dilation(~seen[window], iterations=2 * _EDGE_REACH)
+    gradient = np.linalg.norm(
+        [ndimage.gaussian_gradient_magnitude(image[window][..., c], _EDGE_SMOOTH) for c in range(3)], axis=0
+    )
+    distances = np.arange(-_EDGE_REACH, _EDGE_REACH + 0.25, 0.5)
+    profile = np.zeros(len(distances))
+    for k, distance in enumerate(distances):
+        some = counted & (np.abs(inside - distance) <= 0.5)
+        if some.sum() < _LEAST_PIXELS:
+            return float("nan")
+        profile[k] = gradient[some].mean()
+    beside = np.interp(distances, distances[[0, -1]], profile[[0, -1]])
+    if profile.max() < _EDGE_PLAIN * max(beside[np.argmax(profile)], 1e-6):
+        return float("nan")
+    weight = np.maximum(profile - beside, 0) * (
+        np.abs(distances - distances[np.argmax(profile - beside)]) <= _EDGE_NEAR
+    )
+    return float(np.sum(weight * distances) / np.sum(weight))
+
+
+def common_offset(offsets: Sequence[float]) -> float:
+    """The offset that the masks of a film share [pixels]; 0 if it is small or not certain."""
+    known = np.array([offset for offset in offsets if np.isfinite(offset)])
+    if len(known) < 0.5 * len(offsets) or not len(known):
+        return 0.0
+    middle = float(np.median(known))
+    if abs(middle) < _EDGE_LEAST or np.std(known) > _EDGE_CERTAIN:
+        return 0.0
+    return middle
+
+
+def moved_edge(mask: Float[np.ndarray, "height width"], outwards: float) -> Float[np.ndarray, "height width"]:
+    """A mask with its edge moved [pixels], about a pixel soft."""
+    result = np.zeros_like(mask)
+    near = _around(mask, int(np.ceil(abs(outwards))) + 2)
+    if near is not None:
+        result[near] = np.clip(0.5 + _inside(mask[near]) + outwards, 0, 1)
+    return result
+
+
+def _around(mask: Float[np.ndarray, "height width"], margin: int) -> tuple[slice, slice] | None:
+    """The part of a picture that a mask and some pixels around it cover; None if there is no mask."""
+    near = ndimage.binary_dilation(mask > 0.5, iterations=margin)
+    rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
+    return (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)) if len(rows) else None
+
+
+def _inside(mask: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Distance from a mask's edge [pixels], positive inside."""
+    solid = mask > 0.5
+    if not solid.any() or solid.all():
+        return np.where(solid, np.inf, -np.inf)
+    # Distances between whole pixels are too short beside slanted edges, by up to 0.15 pixels.
+    fine = ndimage.zoom(mask, _FINER, order=1, grid_mode=True, mode="nearest") > 0.5
+    outside, inside = (ndimage.distance_transform_edt(part) for part in (~fine, fine))
+    distance = np.where(fine, inside - 0.5, 0.5 - outside) / _FINER
+    return distance[_FINER // 2 :: _FINER, _FINER // 2 :: _FINER]

@@ -1,5 +1,7 @@
 """What is tracked, as the renderer sees it, and how what is seen changes with its pose."""
 
+import dataclasses
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -7,24 +9,38 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy import ndimage
 
-from dano.maths import quat_exp, quat_multiply, quat_rotate, quat_to_matrix
-from dano.vision.capture import AbstractCamera, Light
-from dano.vision.drawing import Part, through
+from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate, quat_to_matrix
+from dano.vision.capture import AbstractCamera, Light, PosedCamera
+from dano.vision.drawing import GAMMA, Part, through
 from dano.vision.radiance import LearnedField, Sampling, SurfaceModel
 from dano.vision.tracking._placement import Drift, Placement
+from dano.vision.trajectory import Solid, solid_of
 
 CHUNK = 512
 """Rays at once: one size, one compilation."""
 
-SAMPLING = Sampling(48, 12, 2)
+SAMPLING = Sampling(48, 12, 2, grazes=True)
 """Coarser than for pictures to look at: a pixel of a film has noise of its own."""
 
 _SOFT = 3.0
 """Pixels by which the edge of a silhouette lies outside the box, at most."""
 
+BAND = 4
+"""Pixels on each side of an edge that take part in what pictures say."""
+
+_NEARLY = 0.02, np.radians(2)
+"""Share of the size, and angle, by which a pose may be beside the one that other frames lead to."""
+
+_BLACK = 1e-3
+"""Least sRGB: the curve of a camera is steep at black."""
+
 _LOOSE = 0.02
 """Share of its size by which the object's density reaches out of the box of its surface."""
+
+_WIDE = 1.5
+"""Radii around the middle up to which a picture shows the object, by blur and rolling shutter, too."""
 
 _STEEPEST = 4.0
 """Sharpness of a silhouette times the width of a pixel: its edge is as soft as a pixel's average makes it."""
@@ -63,7 +79,20 @@ class Subject:
         self.size = float((upper - lower).max())
         self.lit = bool(field.model.appearance.lit)
         self._model = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), field.model)
+        self._field = field
         self._drawn = float(field.drawn_sharpness)
+        self._last: tuple[tuple, np.ndarray, np.ndarray] | None = None
+
+    @functools.cached_property
+    def solid(self) -> Solid:
+        """What lies and slides: its hull, and its centre of mass if it is equally dense."""
+        values, box = np.asarray(self._field.model.distances), self._field.model.box
+        inside = np.argwhere(values < 0)
+        slope = np.stack([np.gradient(values, box.spacing, axis=k) for k in range(3)], axis=-1)
+        skin = np.abs(values) < box.spacing
+        slope = slope[skin] / np.maximum(np.sum(slope[skin] ** 2, axis=1, keepdims=True), 1e-9)
+        points = box.origin + box.spacing * np.argwhere(skin) - values[skin][:, None] * slope
+        return solid_of(points, box.origin + box.spacing * inside.mean(axis=0))
 
     def middle(self, place: Placement) -> Float[np.ndarray, "3"]:
         """The ball's centre [m, W]."""
@@ -73,12 +102,26 @@ class Subject:
         """The placement with an orientation whose ball lies around a point [m, W]."""
         return Placement(middle - quat_to_matrix(orientation) @ self.centre, orientation)
 
+    def pixel(self, place: Placement, camera: AbstractCamera) -> float:
+        """What one pixel of a camera covers at the middle [m]."""
+        away = float(np.linalg.norm(self.middle(place) - camera.position))
+        return max(away, self.radius) * camera.pixel_angle
+
+    def pixels(self, place: Placement, camera: AbstractCamera) -> float:
+        """Size of the object in a picture [pixels]."""
+        return self.size / self.pixel(place, camera)
+
+    def off(self, place: Placement, expected: Placement) -> float:
+        """How far a pose is from an expected one, in units of `_NEARLY`."""
+        moved = self.middle(place) - self.middle(expected)
+        turned = quat_log(quat_multiply(quat_conjugate(expected.orientation), place.orientation))
+        return float(np.linalg.norm(moved) / (_NEARLY[0] * self.size) + np.linalg.norm(turned) / _NEARLY[1])
+
     def reached(
         self, place: Placement, camera: AbstractCamera, pixels: Float[np.ndarray, "n 2"]
     ) -> Bool[np.ndarray, " n"]:
         """Which pixels may show the object: their rays pass the box around it, or by less than its edge."""
-        away = max(float(np.linalg.norm(self.middle(place) - camera.position)), self.radius)
-        margin = _SOFT * camera.pixel_angle * away + _LOOSE * self.size
+        margin = _SOFT * self.pixel(place, camera) + _LOOSE * self.size
         drift = place.drift
         if drift is not None:
             margin += 0.5 * (drift.shutter + drift.readout) * drift.speed(self.radius)
@@ -143,25 +186,85 @@ class Subject:
         pixels: Float[np.ndarray, "n 2"],
         *,
         slopes: bool = False,
+        behind: Float[np.ndarray, "n 3"] | None = None,
     ) -> Seen:
         """What a camera sees at image coordinates [pixels], in the mean of its exposure.
 
-        Colours are averaged as sRGB: where an object is opaque they differ little within the blur.
+        Args:
+            place: Where the object is, and how it moves.
+            lamps: Light that it is under.
+            camera: From where.
+            pixels: Image coordinates.
+            slopes: Whether derivatives are wanted.
+            behind: SRGB behind the object. An exposure is a mean of light: before what is bright a blurred
+                thing seems narrower. Colours are then such that, laid over what is behind, they are the
+                camera's. None: colours are averaged as sRGB.
         """
         directions, pixel = camera.directions(pixels), camera.pixel_angle
         origins = np.broadcast_to(camera.position, directions.shape)
         drift = place.drift
         if drift is None:
             return self.see(place, lamps, origins, directions, pixel, slopes=slopes)
-        away = max(float(np.linalg.norm(self.middle(place) - camera.position)), self.radius)
-        moments = drift.moments(pixels[:, 1] / camera.height, drift.speed(self.radius) / (pixel * away))
+        speed = drift.speed(self.radius) / self.pixel(place, camera)
+        moments = drift.moments(pixels[:, 1] / camera.height, speed)
         exposures = [
             self.see(
                 place, lamps, *self._meanwhile(place, drift, late, origins, directions), pixel, slopes=slopes
             )
             for late in moments.T
         ]
-        return Seen(*(np.mean(column, axis=0) for column in zip(*exposures, strict=True)))
+        mean = Seen(*(np.mean(column, axis=0) for column in zip(*exposures, strict=True)))
+        return mean if behind is None or len(exposures) == 1 else _exposed(exposures, mean, behind)
+
+    def whole(
+        self, place: Placement, lamps: tuple[Light, ...], camera: PosedCamera
+    ) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width 3"]]:
+        """Opacity and colour over black of a whole picture.
+
+        Of a moving object the picture in the middle of the exposure is spread over the others: a mask or an
+        overlap need no more. The last one is kept: a mask is made from it, pixels are chosen by it, and
+        an overlap is measured.
+        """
+        asked = (place, lamps, camera)
+        if self._last is None or any(a is not b for a, b in zip(self._last[0], asked, strict=True)):
+            opacity = np.zeros((camera.height, camera.width))
+            colour = np.zeros((camera.height, camera.width, 3))
+            window = window_of(self, place, camera, _WIDE)
+            pixels = np.zeros((0, 2)) if window is None else pixels_of(window)
+            pixels = pixels[self.reached(place, camera, pixels)]
+            if len(pixels):
+                still = dataclasses.replace(place, drift=None)
+                seen, (x, y) = self.picture(still, lamps, camera, pixels), pixels.astype(int).T
+                opacity[y, x], colour[y, x] = seen.opacity, seen.colour
+                if place.drift is not None:
+                    both = np.concatenate([opacity[..., None], colour], axis=2)
+                    spread = self._spread(place, place.drift, camera, pixels, both)
+                    opacity[y, x], colour[y, x] = spread[:, 0], spread[:, 1:]
+            self._last = asked, opacity, colour
+        return self._last[1:]
+
+    def _spread(
+        self,
+        place: Placement,
+        drift: Drift,
+        camera: PosedCamera,
+        pixels: Float[np.ndarray, "n 2"],
+        sharp: Float[np.ndarray, "height width k"],
+    ) -> Float[np.ndarray, "n k"]:
+        """Mean over the exposure of a picture of the object, as if it were flat and facing the camera."""
+        directions, facing = camera.directions(pixels), camera.axes[2]
+        middle = self.middle(place)
+        ahead = (middle - camera.position) @ facing / (directions @ facing)
+        points = camera.position + ahead[:, None] * directions
+        speed = drift.speed(self.radius) / self.pixel(place, camera)
+        moments = drift.moments(pixels[:, 1] / camera.height, speed)
+        total = np.zeros((len(pixels), sharp.shape[2]))
+        for late in moments.T:
+            here, _ = self._meanwhile(place, drift, late, points, directions)
+            x, y = camera.project(here)[:, :2].T - 0.5
+            for k, channel in enumerate(np.moveaxis(sharp, 2, 0)):
+                total[:, k] += ndimage.map_coordinates(channel, [y, x], order=1, mode="nearest")
+        return total / moments.shape[1]
 
     def _meanwhile(
         self,
@@ -176,6 +279,42 @@ class Subject:
         back = quat_exp(-late[:, None] * drift.spin)
         here = middle + quat_rotate(back, origins - middle - late[:, None] * drift.velocity)
         return here, quat_rotate(back, directions)
+
+
+def _exposed(exposures: list[Seen], mean: Seen, behind: Float[np.ndarray, "n 3"]) -> Seen:
+    """The mean of exposures as light, as colours that are to be laid over what is behind."""
+    frames = [np.clip(one.colour + (1 - one.opacity[:, None]) * behind, _BLACK, None) for one in exposures]
+    light = np.mean([frame**GAMMA for frame in frames], axis=0)
+    colour = light ** (1 / GAMMA) - (1 - mean.opacity[:, None]) * behind
+    if not len(mean.opacity_slope):
+        return mean._replace(colour=colour)
+    slope = np.zeros_like(mean.colour_slope)
+    for frame, one in zip(frames, exposures, strict=True):
+        change = one.colour_slope - behind[..., None] * one.opacity_slope[:, None]
+        slope += (frame ** (GAMMA - 1))[..., None] * change / len(exposures)
+    slope *= (light ** (1 / GAMMA - 1))[..., None]
+    return mean._replace(colour=colour, colour_slope=slope + behind[..., None] * mean.opacity_slope[:, None])
+
+
+def window_of(
+    subject: Subject, place: Placement, camera: PosedCamera, margin: float = 1.25
+) -> tuple[slice, slice] | None:
+    """The part of a picture that shows the object's ball; None if it lies outside or behind."""
+    middle = camera.project(subject.middle(place)[None])[0]
+    if not np.isfinite(middle).all() or middle[2] < 1.05 * subject.radius:
+        return None
+    reach = margin * subject.radius / middle[2] * float(camera.focal.mean()) + BAND
+    low, high = np.floor(middle[:2] - reach).astype(int), np.ceil(middle[:2] + reach).astype(int)
+    low, high = np.maximum(low, 0), np.minimum(high, [camera.width, camera.height])
+    if np.any(high - low < 4):
+        return None
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def pixels_of(window: tuple[slice, slice]) -> Float[np.ndarray, "n 2"]:
+    """Image coordinates of the middles of the pixels of a window, row by row."""
+    y, x = np.mgrid[window]
+    return np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
 
 
 def _filled(rows: Float[np.ndarray, "n 3"], last: Float[np.ndarray, "3"]) -> Array:

@@ -1,0 +1,482 @@
+"""A film half tracked: the pose in each frame, from those in the frames beside it."""
+
+import dataclasses
+import functools
+import time
+
+import numpy as np
+from jaxtyping import Float
+
+from dano.vision.capture import PosedCamera
+from dano.vision.radiance import LearnedField
+from dano.vision.tracking._film import Film
+from dano.vision.tracking._light import LightFit
+from dano.vision.tracking._masking import BLIND, Masking
+from dano.vision.tracking._options import TrackOptions
+from dano.vision.tracking._placement import Drift, Placement
+from dano.vision.tracking._refine import aligned, refine, Refined, Target, window_of
+from dano.vision.tracking._result import HIDDEN, LOST, OUTSIDE, TRACKED, Tracked, tracked
+from dano.vision.tracking._search import (
+    colours_of,
+    half_turns,
+    learn_light,
+    likeliest,
+    score,
+    search,
+    Start,
+    turned_aside,
+)
+from dano.vision.tracking._segments import overlap
+from dano.vision.tracking._subject import CHUNK, Subject
+from dano.vision.tracking._whole import region_of, Whole
+
+_COARSE = 24
+"""Size of the object [pixels] at the coarsest level of the pyramid."""
+
+_STEPS = 4
+"""Steps of a refinement, most."""
+
+_SHARP = 0.7
+"""Difference of ways during an exposure that hardly shows [pixels]."""
+
+_LIGHT_EVERY = 4
+"""Frames after which the light is fitted again; exposure and clouds change slower."""
+
+_FOUND = 0.75
+"""Overlap from which a search has found the object."""
+
+_UNLIKE = 0.1
+"""Usual difference of colours [sRGB] above which a segment is rejected as a different object: a blurred,
+noisy object has 0.055."""
+
+_TWIN = 1.5
+"""Ratio of the scores of two things in a frame up to which both look like the object."""
+
+_WORSE = 0.03
+"""By how much less than usually a silhouette must overlap for other poses to be tried."""
+
+_PALER = 1.5
+"""How many times larger than usual the difference of colours must be for that."""
+
+_TRIED = 3
+"""Frames in which the object is looked for at first, most."""
+
+_CONVINCING = 0.45
+"""Score of a start from which no other frame is tried: an overlap of 0.93, and colours within 0.05."""
+
+_CAUGHT = 0.4
+"""Overlap with a thing from which it may be the object, turned meanwhile."""
+
+_FAR_WORSE = 2.2
+"""How many times larger than usual a score may be: frames of a fast motion have 1.5 times."""
+
+_NEAR = 4
+"""Frames between two that say where the object is in others near them."""
+
+_PULL = 0.01
+"""What so much costs in a score, which is known to about as much."""
+
+
+class Walk:
+    """A film half tracked (host)."""
+
+    def __init__(
+        self, film: Film, field: LearnedField, camera: PosedCamera, options: TrackOptions, background
+    ):
+        self._film, self._options = film, options
+        self._subject = Subject(field)
+        self._camera = film.camera(camera)
+        self._masking = Masking(film, options, background)
+        self._light = LightFit(self._subject, table=options.table)
+        self._random = np.random.default_rng(options.seed)
+        self._found: list[Refined | None] = [None] * len(film.times)
+        self._status: list[str] = [LOST] * len(film.times)
+        self._path: list[int] = []
+        self._begun: tuple[int, list[tuple[Start, float]]] | None = None
+        self._given: Placement | None = None
+        self._missed = 0
+        self._ambiguity = np.inf
+        self._seconds: list[float] = []
+
+    @functools.cached_property
+    def _colours(self) -> Float[np.ndarray, "n 3"]:
+        return colours_of(self._subject)
+
+    def begin(self, place: Placement) -> None:
+        """Take a pose for the one in the first frame."""
+        self._given = place
+
+    def first(self) -> int:
+        """The frame to begin with: own masks are best where nothing is blurred, and some are wrong."""
+        if self._masking.source == "object":
+            self._masking.knows(self._colours)
+        if self._given is not None or self._masking.source != "object":
+            return 0
+        for i in self._film.quiet(_TRIED):
+            found = self._starts(i)
+            if found and (self._begun is None or found[0][0].score < self._begun[1][0][0].score):
+                self._begun = i, found
+            if self._begun is not None and self._begun[1][0][0].score < _CONVINCING:
+                break
+        return 0 if self._begun is None else self._begun[0]
+
+    def turn_back(self) -> None:
+        """Go on from the first frame backwards."""
+        self._path, self._missed = sorted(self._path, reverse=True), 0
+
+    def step(self, i: int) -> None:
+        """Track the next frame, after or before the others."""
+        began = time.perf_counter()
+        before = self._expected(i)
+        searched = before is None
+        if before is None:
+            found, status = self._searched(i), LOST
+        else:
+            found, status = self._unmoved(i), TRACKED
+            if found is None:
+                found, status = self._followed(i, before)
+            if status == LOST:
+                found, status = self._followed(i, self._caught_up(i, before))
+            self._seconds.append(time.perf_counter() - began)
+            if found is None and status == LOST and self._missed == 0:
+                found, searched = self._searched(i), True
+        if found is not None:
+            found, status = self._exposed(i, found), TRACKED
+            self._missed = 0
+            count = self._status.count(TRACKED)
+            if searched or count < _LIGHT_EVERY or count % _LIGHT_EVERY == 0:
+                known = self._light.known
+                self._learn(i, found)
+                if count > _LIGHT_EVERY:
+                    self._light.find_sun()
+                if self._light.known and not known:
+                    # Colours count only now.
+                    found = self._fine(i, found.place, self._light) or found
+        else:
+            self._missed += 1
+        self._found[i], self._status[i] = found, status
+        self._path.append(i)
+        if found is not None and self._status.count(TRACKED) == _LIGHT_EVERY:
+            self._settle()
+
+    def _settle(self) -> None:
+        """Refine the first frames again, under the light that several frames tell."""
+        self._light.find_sun()
+        for j, found in enumerate(self._found):
+            if found is not None:
+                self._found[j] = self._fine(j, found.place, self._light) or found
+
+    def _expected(self, i: int) -> Placement | None:
+        """The pose at constant velocity; None if there is nothing to go by."""
+        if not self._path:
+            return self._given
+        seen = [j for j in self._path if self._found[j] is not None]
+        if not seen or self._missed > self._options.search_every:
+            return None
+        last = self._place(seen[-1])
+        if len(seen) < 2 or abs(seen[-1] - seen[-2]) > 3:
+            return last
+        return dataclasses.replace(self._carried(seen[-2], seen[-1], i), drift=last.drift)
+
+    def _caught_up(self, i: int, last: Placement) -> Placement:
+        """A pose moved to the thing in a frame that it fits best: it may move faster than was expected."""
+        shapes, lamps = [], self._light.lamps
+        for part in self._masking.parts(i, self._camera):
+            moved = aligned(self._subject, part, last, lamps)
+            shape, _ = self._subject.whole(moved, lamps, self._camera)
+            shapes.append((overlap(part.mask, shape, part.seen), moved))
+        best = max(shapes, key=lambda one: one[0], default=(0.0, last))
+        return best[1] if best[0] > _CAUGHT else last
+
+    def _carried(self, j: int, k: int, i: int) -> Placement:
+        """The pose in frame i at the constant velocity that leads from frame j to k."""
+        times = self._film.times
+        return self._place(j).led_to(self._place(k), (times[i] - times[k]) / (times[k] - times[j]))
+
+    def look_again(self) -> None:
+        """Begin once more in frames that fit worse than usual, or were lost: where other frames say."""
+        better, more = self._look_between(), self._look_back()
+        # What is usual is known only when most frames are right.
+        if better or more:
+            self._look_between()
+
+    def _look_between(self) -> bool:
+        """Begin where frames around say; returns whether some fit better.
+
+        What spins fast is not near its first pose in the second frame, and nothing tells yet how it moves.
+        """
+        fits = {i: (found.overlap, found.colour_error) for i, found in enumerate(self._found) if found}
+        overlap, colour = np.median(list(fits.values()), axis=0) if fits else (0.0, 0.0)
+        # Colours that are not known are no worse.
+        good = [i for i, fit in fits.items() if fit[0] > overlap - _WORSE and not fit[1] > _PALER * colour]
+        better = False
+        for i in sorted(set(range(len(self._found))) - set(good)):
+            before, after = [j for j in good if j < i][-2:], [j for j in good if j > i][:2]
+            pair = [before[-1], after[0]] if before and after else [*before, *after]
+            if len(pair) < 2 or max(*pair, i) - min(*pair, i) > _NEAR:
+                continue
+            better = self._taken_up(i, self._carried(pair[0], pair[1], i)) or better
+        return better
+
+    def _look_back(self) -> bool:
+        """Follow the object backwards into frames where it was lost, or is not where later frames lead.
+
+        It may come into the picture beside something else, and be alone only later; it may have been hidden
+        and taken up again beside its place; and in the first frames nothing tells how it moves.
+        """
+        better = False
+        for i in reversed(range(len(self._found) - 1)):
+            if self._found[i + 1] is None:
+                continue
+            known, after = self._found[i], self._place(i + 1)
+            further = i + 2 < len(self._found) and self._found[i + 2] is not None
+            carried = self._carried(i + 2, i + 1, i) if further else after
+            if known is not None and (not further or self._is_led_to(i, known.place, carried)):
+                continue
+            better = self._taken_up(i, dataclasses.replace(carried, drift=after.drift)) or better
+        return better
+
+    def _is_led_to(self, i: int, place: Placement, carried: Placement) -> bool:
+        """Whether the frames after one lead to its pose, at constant velocity or as that changed before."""
+        away = self._subject.off(place, carried)
+        if away < 1 or i + 3 >= len(self._found) or self._found[i + 3] is None:
+            return away < 1
+        return away < 1 + self._subject.off(self._place(i + 1), self._carried(i + 3, i + 2, i + 1))
+
+    def _taken_up(self, i: int, expected: Placement) -> bool:
+        """Track a frame once more from an expected pose; returns whether the answer differs.
+
+        Of poses that fit alike the one nearer to where it was expected is likelier.
+        """
+        found, status = self._followed(i, expected)
+        # The coarse levels see further, but what is hidden in part may lead them away.
+        near = self._fine(i, expected, self._light) if status in (TRACKED, LOST) else None
+        if near is not None and not self._is_it(near):
+            near = None
+        poses = [one for one in (self._found[i], found, near) if one is not None]
+        if not poses:
+            return False
+        best = min(poses, key=lambda one: score(one) + _PULL * self._subject.off(one.place, expected))
+        if best is self._found[i]:
+            return False
+        self._found[i], self._status[i] = self._exposed(i, best), TRACKED
+        return True
+
+    def _exposed(self, i: int, found: Refined) -> Refined:
+        """The pose once more, with how the object moves while the frame is exposed."""
+        options = self._options
+        seen = [j for j, one in enumerate(self._found) if one is not None and j != i]
+        if not (options.shutter or options.readout) or not seen:
+            return found
+        near = min(seen, key=lambda j: abs(j - i))
+        last = self._place(near)
+        duration = float(self._film.times[i] - self._film.times[near])
+        drift = Drift.between(
+            last, found.place, duration, self._subject.middle, options.shutter, options.readout
+        )
+        known = found.place.drift or Drift(np.zeros(3), np.zeros(3), options.shutter, options.readout)
+        away = drift.apart(known, self._subject.radius) / self._subject.pixel(found.place, self._camera)
+        place = dataclasses.replace(found.place, drift=drift)
+        if away < _SHARP:
+            return found._replace(place=place)
+        if last.drift is None and len(seen) == 1:
+            # The first frame was taken for one of an object at rest.
+            begun = self._fine(near, dataclasses.replace(last, drift=drift), self._light)
+            self._found[near] = begun or self._found[near]
+        return self._fine(i, place, self._light) or found
+
+    def _place(self, i: int) -> Placement:
+        found = self._found[i]
+        assert found is not None
+        return found.place
+
+    def _searched(self, i: int) -> Refined | None:
+        """Look for the object in all orientations; now and then only."""
+        if self._missed % self._options.search_every:
+            return None
+        found = self._begun[1] if self._begun is not None and self._begun[0] == i else self._starts(i)
+        if not found:
+            return None
+        best, ambiguity = found[0]
+        if not self._light.known:
+            self._ambiguity = ambiguity
+            self._note_alike(i, best, [one for one, _ in found if one is not best])
+        self._light = best.light
+        return best.refined
+
+    def _starts(self, i: int) -> list[tuple[Start, float]]:
+        """Where the object may be in a frame, likeliest first, and how clearly it is turned as it is."""
+        # Other masks are taken to show the object alone, or know nothing else to be there.
+        colours = self._colours if self._masking.source == "object" else None
+        parts = self._masking.parts(i, self._camera, colours)
+        found = [one for target in parts if (one := self._searched_in(i, target)) is not None]
+        return sorted(found, key=lambda pair: pair[0].score)
+
+    def _note_alike(self, i: int, best: Start, others: list[Start]) -> None:
+        """Say it if more than one thing in a frame looks like the object."""
+        like = [one for one in others if one.score < _TWIN * best.score]
+        if like:
+            middles = np.stack([self._subject.middle(one.refined.place) for one in (best, *like)])
+            places = [f"({x:.0f}, {y:.0f})" for x, y, _ in self._camera.project(middles)]
+            self._masking.notes.append(
+                f"{len(like) + 1} things in frame {self._film.names[i]} look like the object; the one at"
+                f" pixel {places[0]} was taken, others are at {', '.join(places[1:])}: give start for another"
+            )
+
+    def _searched_in(self, i: int, target: Target) -> tuple[Start, float] | None:
+        """The likeliest start for one thing that a frame shows, and how clearly it is."""
+        starts = search(self._subject, target, self._options, self._random)
+        # At low resolution a wrong pose may look as good as the right one, so all are finished.
+        finished = [self._finished(i, start.refined.place, start.light) for start in starts]
+        finer = sorted((s for s in finished if s is not None), key=lambda s: s.score)
+        if not finer or finer[0].refined.overlap < _FOUND:
+            return None
+        # A light that was fitted to a wrong pose is wrong.
+        turned = [
+            self._finished(i, place, LightFit(self._subject, table=self._options.table))
+            for place in half_turns(self._subject, finer[0].refined.place)
+        ]
+        best, ambiguity = likeliest(
+            self._subject, target, self._options.loss, [*finer, *(s for s in turned if s is not None)]
+        )
+        return None if self._is_another(best.refined) else (best, ambiguity)
+
+    def _finished(self, i: int, place: Placement, light: LightFit) -> Start | None:
+        """A start at full resolution, under the light that it implies itself."""
+        found = self._fine(i, place, light)
+        if found is None:
+            return None
+        own = LightFit(self._subject, table=self._options.table)
+        target = self._masking.near(i, self._subject, found.place, light.lamps, self._camera, 2.0)
+        if target is not None and self._options.loss == "photometric":
+            learn_light(self._subject, target, found.place, found.window, found.silhouette, own)
+            if own.known and not light.known:
+                # Without light colours did not count, and costs could not be compared.
+                found = self._fine(i, found.place, own) or found
+        return Start(found, own if own.known else light, score(found))
+
+    def _unmoved(self, i: int) -> Refined | None:
+        """The pose of the frame before, if the object lies still between both; None if it moves."""
+        last = self._path[-1] if self._path else i
+        before = self._found[last] if abs(i - last) == 1 else None
+        if before is None or self._masking.hidden(i, before.window) > 1 - BLIND:
+            return None
+        if not self._film.is_still(last, i, region_of(before, self._film.images[i].shape[:2])):
+            return None
+        found = self._fine(i, dataclasses.replace(before.place, drift=None), self._light, 1)
+        return found if found is not None and self._is_it(found) else None
+
+    def _followed(self, i: int, before: Placement) -> tuple[Refined | None, str]:
+        window = window_of(self._subject, before, self._camera)
+        middle = self._camera.project(self._subject.middle(before)[None])[0]
+        if window is None or not (
+            0 <= middle[0] <= self._camera.width and 0 <= middle[1] <= self._camera.height
+        ):
+            return None, OUTSIDE
+        if self._masking.hidden(i, window) > 1 - BLIND:
+            return None, HIDDEN
+        found = self._refined(i, before, self._light)
+        if found is None or not self._is_it(found):
+            return None, LOST
+        return found, TRACKED
+
+    def _is_it(self, found: Refined) -> bool:
+        """Whether shape and colours are the object's, and fit not much worse than in the other frames."""
+        if found.overlap < self._options.lost or self._is_another(found):
+            return False
+        fits = [score(one) for one in self._found if one is not None]
+        return len(fits) < _LIGHT_EVERY or score(found) < max(
+            _FAR_WORSE * float(np.median(fits)), _CONVINCING
+        )
+
+    def _is_another(self, found: Refined) -> bool:
+        """Whether colours say that a segment of the right shape is a different object."""
+        return self._options.loss == "photometric" and found.colour_error > _UNLIKE
+
+    def _refined(self, i: int, before: Placement, light: LightFit) -> Refined | None:
+        """The pose near an expected one; also from beside it if that fits worse than usual."""
+        found = self._from_coarse(i, before, light)
+        usual = [other.overlap for other in self._found if other is not None]
+        if found is not None and usual and found.overlap < np.median(usual) - _WORSE:
+            around = [self._from_coarse(i, place, light) for place in turned_aside(self._subject, before)]
+            known = [other for other in [found, *around] if other is not None]
+            found = min(known, key=score)
+        return None if found is None else self._fine(i, found.place, light)
+
+    def _from_coarse(self, i: int, before: Placement, light: LightFit) -> Refined | None:
+        """By silhouettes first, which are seen from further away; then by colours."""
+        size = self._subject.pixels(before, self._camera)
+        target = self._masking.near(i, self._subject, before, light.lamps, self._camera, 0.06 * size)
+        if target is None:
+            return None
+        coarse = target.reduced(max(1, round(size / _COARSE)))
+        place, found = aligned(self._subject, coarse, before, light.lamps), None
+        last = self._loss(light)
+        for loss in ("silhouette", last) if last == "photometric" else (last,):
+            found = refine(
+                self._subject,
+                coarse,
+                place,
+                light.lamps,
+                loss=loss,
+                steps=_STEPS,
+                rays=CHUNK,
+                random=self._random,
+            )
+            if found is None:
+                return None
+            place = found.place
+        return found
+
+    def _fine(self, i: int, place: Placement, light: LightFit, steps: int = _STEPS) -> Refined | None:
+        target = self._masking.near(i, self._subject, place, light.lamps, self._camera, 2.0)
+        if target is None:
+            return None
+        # All frames together are looked at with all rays.
+        return self._refine(
+            target, place, light, self._loss(light), steps, max(self._options.rays // 2, CHUNK)
+        )
+
+    def _refine(self, target: Target, place: Placement, light: LightFit, loss: str, steps: int, rays: int):
+        subject, random = self._subject, self._random
+        return refine(subject, target, place, light.lamps, loss=loss, steps=steps, rays=rays, random=random)
+
+    def _loss(self, light: LightFit) -> str:
+        return "silhouette" if self._options.loss == "photometric" and not light.known else self._options.loss
+
+    def _learn(self, i: int, found: Refined) -> None:
+        if self._options.loss != "photometric":
+            return
+        target = self._masking.near(i, self._subject, found.place, self._light.lamps, self._camera, 2.0)
+        if target is not None:
+            learn_light(self._subject, target, found.place, found.window, found.silhouette, self._light)
+            self._masking.learn(target, found.window, found.silhouette)
+            self._masking.learn_shadow(i, target, found.place, self._light)
+
+    def result(self) -> Tracked:
+        """What was found.
+
+        Raises:
+            ValueError: If nothing was.
+        """
+        if not any(self._found):
+            raise ValueError(
+                f"video: the object was found in none of {len(self._found)} frames: it must be in the"
+                " picture, of the size that camera and object say, and masks must show it (see docs/track.md)"
+            )
+        began = time.perf_counter()
+        whole = Whole(self._film, self._subject, self._camera, self._options, self._found)
+        self._light = whole.look(self._masking, self._light, self._random)
+        share = (time.perf_counter() - began) / len(self._found)
+        return tracked(
+            self._film,
+            self._subject,
+            self._camera.position,
+            whole.found,
+            self._status,
+            self._light.lamps,
+            notes=self._masking.notes,
+            ambiguity=self._ambiguity,
+            seconds=[share + one for one in self._seconds],
+            motion=whole.motion,
+        )

@@ -1,0 +1,189 @@
+"""All frames of a film together: one motion, from what each frame says near it."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool
+from scipy import ndimage
+
+from dano.vision.capture import PosedCamera
+from dano.vision.tracking._film import Film
+from dano.vision.tracking._light import LightFit
+from dano.vision.tracking._masking import Masking
+from dano.vision.tracking._options import TrackOptions
+from dano.vision.tracking._placement import Drift, Placement
+from dano.vision.tracking._refine import linearized, Refined, silhouette, window_of
+from dano.vision.tracking._result import own_covariance, SCALE_DOUBT
+from dano.vision.tracking._search import learn_light
+from dano.vision.tracking._subject import Subject
+from dano.vision.trajectory import Poses, Scenery, Smoothed, smoothed
+
+_PASSES = 2
+"""Times that frames are looked at again, at the poses of the motion."""
+
+_STEPS = 4
+"""Steps of Gauss and Newton in a frame that is not where the motion has it, most."""
+
+_LIGHT_FRAMES = 6
+"""Frames, spread over the film, that the light is fitted to at these poses."""
+
+_EDGE_DOUBT = 0.1
+"""By how much colours alone may show the edge beside the true one, in all frames alike [pixels]: a camera
+sharpens, and a video is compressed."""
+
+_RIM = 3
+"""Pixels around a silhouette in which a motion shows."""
+
+_FAR = 3.0
+"""Displacement by the poses from which frames are not compared [pixels]: it would not be measured."""
+
+
+class Whole:
+    """A film whose frames have been tracked one by one (host).
+
+    Attributes:
+        found: What each frame says near the motion.
+        motion: The motion.
+    """
+
+    def __init__(
+        self,
+        film: Film,
+        subject: Subject,
+        camera: PosedCamera,
+        options: TrackOptions,
+        found: Sequence[Refined | None],
+    ):
+        self._film, self._subject, self._camera, self._options = film, subject, camera, options
+        self.found = list(found)
+        self._still = self._stillness()
+        self.motion = self._smoothed()
+
+    def look(self, masking: Masking, light: LightFit, random: np.random.Generator) -> LightFit:
+        """Look at the frames again where the motion has them, under the light that they have there."""
+        for _ in range(_PASSES):
+            light = self._relit(masking, light)
+            for i in self._known():
+                self.found[i] = self._looked_at(i, masking, light, random) or self.found[i]
+            self.motion = self._smoothed()
+        return light
+
+    def _looked_at(
+        self, i: int, masking: Masking, light: LightFit, random: np.random.Generator
+    ) -> Refined | None:
+        """What a frame says near the motion; of what lies further away, near that."""
+        place, found = self._place(i), None
+        for _ in range(_STEPS):
+            target = masking.near(i, self._subject, place, light.lamps, self._camera, 2.0)
+            if target is None:
+                return found
+            found = linearized(
+                self._subject,
+                target,
+                place,
+                light.lamps,
+                loss=self._options.loss,
+                rays=self._options.rays,
+                random=random,
+            )
+            if found is None or self._subject.off(found.place, place) < 1:
+                return found
+            place = found.place
+        return found
+
+    def _known(self) -> list[int]:
+        return [i for i, one in enumerate(self.found) if one is not None]
+
+    def _smoothed(self) -> Smoothed:
+        n = len(self.found)
+        poses = Poses(np.full((n, 3), np.nan), np.full((n, 4), np.nan), np.full((n, 6, 6), np.nan))
+        for i, one in enumerate(self.found):
+            if one is not None:
+                poses.position[i], poses.orientation[i] = one.place.position, one.place.orientation
+                poses.covariance[i] = own_covariance(one, self._subject)
+        scenery = Scenery(
+            self._subject.solid, self._still, self._options.table, self._camera.position, self._scale()
+        )
+        return smoothed(self._film.times, poses, scenery)
+
+    def _scale(self) -> float:
+        """Share by which the object may look too large or too small in all frames alike."""
+        masks = self._film.masks
+        if self._options.masks in ("auto", "given") and any(mask is not None for mask in masks):
+            return SCALE_DOUBT
+        sizes = [self._subject.pixels(one.place, self._camera) for one in self.found if one is not None]
+        return float(np.hypot(SCALE_DOUBT, 2 * _EDGE_DOUBT / np.median(sizes))) if sizes else SCALE_DOUBT
+
+    def _place(self, i: int) -> Placement:
+        """Where the motion has the object in a frame, and how it moves meanwhile."""
+        place = self._bare(i)
+        options, known = self._options, self._known()
+        if not (options.shutter or options.readout) or len(known) < 2:
+            return place
+        k = known.index(i)
+        first, last = known[max(k - 1, 0)], known[min(k + 1, len(known) - 1)]
+        duration = float(self._film.times[last] - self._film.times[first])
+        drift = Drift.between(
+            self._bare(first),
+            self._bare(last),
+            duration,
+            self._subject.middle,
+            options.shutter,
+            options.readout,
+        )
+        return dataclasses.replace(place, drift=drift)
+
+    def _bare(self, i: int) -> Placement:
+        poses = self.motion.poses
+        return Placement(poses.position[i], poses.orientation[i])
+
+    def _relit(self, masking: Masking, light: LightFit) -> LightFit:
+        """The light that some frames show at the poses of the motion."""
+        known = self._known()
+        if self._options.loss != "photometric":
+            return light
+        fit = light.afresh(_LIGHT_FRAMES)
+        for k in np.unique(np.linspace(0, len(known) - 1, min(_LIGHT_FRAMES, len(known))).astype(int)):
+            i = known[k]
+            place = self._place(i)
+            target = masking.near(i, self._subject, place, light.lamps, self._camera, 2.0)
+            window = window_of(self._subject, place, self._camera)
+            if target is not None and window is not None:
+                shape, _ = silhouette(self._subject, place, light.lamps, self._camera, window)
+                learn_light(self._subject, target, place, window, shape, fit)
+                masking.learn_shadow(i, target, place, fit)
+        fit.find_sun()
+        return fit if fit.known else light
+
+    def _stillness(self) -> Bool[np.ndarray, " T_minus_1"]:
+        """Whether the object lies still between a frame and the next one, by their pictures."""
+        still = np.zeros(len(self.found) - 1, bool)
+        begun, shape = 0, self._film.images[0].shape[:2]
+        for i in range(len(still)):
+            if not still[i - 1] or i == 0:
+                begun = i
+            first, second = self.found[i], self.found[i + 1]
+            if first is None or second is None or self._apart(first, second) > _FAR:
+                continue
+            region = region_of(first, shape) | region_of(second, shape)
+            # What creeps lies still from one frame to the next, but not from the first one on.
+            still[i] = self._film.is_still(i, i + 1, region) and self._film.is_still(begun, i + 1, region)
+        return still
+
+    def _apart(self, first: Refined, second: Refined) -> float:
+        """Displacement of the middle in the picture [pixels], across the line of sight."""
+        middles = np.stack([self._subject.middle(one.place) for one in (first, second)])
+        return float(np.linalg.norm(np.diff(self._camera.project(middles)[:, :2], axis=0)))
+
+
+def region_of(one: Refined, shape: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
+    """Where a picture of some height and width shows the object, and a motion of it.
+
+    Args:
+        one: The object's pose there.
+        shape: Of the picture.
+    """
+    region = np.zeros(shape, bool)
+    region[one.window] = one.silhouette > 0.5
+    return ndimage.binary_dilation(region, iterations=_RIM)

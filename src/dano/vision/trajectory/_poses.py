@@ -1,0 +1,37 @@
+"""Poses of the frames of a film, in arrays."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from dano.maths import quat_exp, quat_multiply
+
+
+class Poses(NamedTuple):
+    """Poses of the frames of a film, NaN where there is none.
+
+    Attributes:
+        position: [m, W].
+        orientation: wxyz, F → W.
+        covariance: Of position [m, W] and rotation vector [rad, F].
+    """
+
+    position: Float[np.ndarray, "T 3"]
+    orientation: Float[np.ndarray, "T 4"]
+    covariance: Float[np.ndarray, "T 6 6"]
+
+    @property
+    def known(self) -> Bool[np.ndarray, " T"]:
+        """Frames that have a pose."""
+        return np.isfinite(self.position[:, 0])
+
+    def taken(self, rows) -> "Poses":
+        """Those of some frames."""
+        return Poses(*(x[rows] for x in self))
+
+    def moved(self, change: Float[np.ndarray, "T 6"], size: float) -> "Poses":
+        """Shifted by `change[:, :3]` sizes [W], then turned by rotation vectors `change[:, 3:]` [rad, F]."""
+        turned = quat_multiply(self.orientation, quat_exp(np.asarray(change[:, 3:], np.float64)))
+        turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        return self._replace(position=self.position + size * change[:, :3], orientation=turned)

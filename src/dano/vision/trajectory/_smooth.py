@@ -1,0 +1,429 @@
+"""One motion for a whole film: poses of all frames at once, by what each frame shows and how things move.
+
+Least squares over all frames: what the pixels of a frame say of its pose, as a Gaussian (`Poses`); third
+differences of position and rotation, which vanish under constant acceleration and spin; differences between
+frames in which the object lies still; and, above a known table, height and tilt of an object that lies or
+slides on one of its faces. A wrong size of the object moves it along the line of sight in all frames alike.
+Weights of frames and of differences are those of Student's and Cauchy's
+distributions, found again in every step (iteratively reweighted least squares).
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate
+from dano.vision.trajectory._poses import Poses
+from dano.vision.trajectory._support import Face, Solid
+
+_STEADY = 0.004
+"""Scale of Cauchy's distribution of third differences of position [sizes] and of rotation [rad], in space."""
+
+_STILL = 2e-4
+"""Standard deviation of what changes between frames in which the object lies still: in sizes, and [rad]."""
+
+_LEVEL, _FLAT = 1.5e-3, 2e-3
+"""Standard deviations of the height [sizes] and tilt [rad] with which a face lies on a table in a frame."""
+
+_BASE, _LEAN = 4e-3, 6e-3
+"""By how much the learned face may lie beside the true one: height [sizes] and tilt [rad], one for a film."""
+
+_ABOVE, _TILTED = 0.06, np.radians(8)
+"""Height [sizes] and tilt [rad] up to which an object lies on a face; more, where poses are less certain."""
+
+_SHORTEST = 3
+"""Frames in a row in which it must."""
+
+_FREEDOM = 4.0
+"""Degrees of freedom of Student's distribution of what single frames are off by."""
+
+_TOLERANT = 64.0
+"""Standard deviations from which third differences lose weight, in the first step; half in each one after."""
+
+_DOUBTED = 0.3
+"""Weight of a frame below which what it says is tried for itself."""
+
+_PASSES = 16
+"""Steps of Gauss and Newton, most."""
+
+_ENDED = 1e-6
+"""Largest change [sizes, rad] that ends them."""
+
+_CALIBRATIONS = 3
+"""Motions that are found, each with covariances of frames as the one before tells them."""
+
+_LEAST_FREE = 1.0
+"""Least number of six that a frame is free in from its own motion (convention)."""
+
+_MEDIAN = 0.8914
+"""Of χ² with six degrees of freedom, over six."""
+
+_EPSILON = 1e-6
+"""Step of differences [sizes, rad]."""
+
+
+class Smoothed(NamedTuple):
+    """A motion for a whole film.
+
+    Attributes:
+        poses: Of all frames that had one.
+        weight: How much of what the frame says was believed, 0 to 1, shape (T,); NaN where there is no pose.
+        supported: Frames in which the object lies or slides on a face, shape (T,).
+        away: What frames by themselves say less the motion: in sizes [W] and [rad, F], shape (T, 6).
+        inflation: Factor by which variances of frames were too small.
+        repeats: In how many poses what one frame says is found again, ≥ 1, shape (T,); NaN where there is
+            none. Poses that frames share have small covariances, but are not independent: with covariances so
+            many times larger they say together, as if they were, what the frames say together.
+    """
+
+    poses: Poses
+    weight: Float[np.ndarray, " T"]
+    supported: Bool[np.ndarray, " T"]
+    away: Float[np.ndarray, "T 6"]
+    inflation: float
+    repeats: Float[np.ndarray, " T"]
+
+
+class Scenery(NamedTuple):
+    """What is known of a motion beside the frames.
+
+    Attributes:
+        solid: The object.
+        still: Whether it moves between a frame and the next one, shape (T − 1,): True if it does not.
+        table: Height of a level table [m, W]; None: none is known.
+        eye: Where the camera is [m, W]; None: what frames say has no distance in common that may be wrong.
+        scale: Standard deviation of the share by which all frames see it too near or too far, because the
+            object is known too small or too large.
+    """
+
+    solid: Solid
+    still: Bool[np.ndarray, " T_minus_1"]
+    table: float | None = None
+    eye: Float[np.ndarray, "3"] | None = None
+    scale: float = 0.0
+
+
+def smoothed(times: Float[np.ndarray, " T"], poses: Poses, scenery: Scenery) -> Smoothed:
+    """The likeliest motion.
+
+    Args:
+        times: [s].
+        poses: What frames say by themselves; a covariance is that of its errors in this frame alone.
+        scenery: What else is known.
+    """
+    n, rows = len(times), np.flatnonzero(poses.known)
+    weight, supported, away = np.full(n, np.nan), np.zeros(n, bool), np.full((n, 6), np.nan)
+    if not len(rows):
+        return Smoothed(poses, weight, supported, away, 1.0, weight.copy())
+    resting = _at_rest(scenery.still, rows)
+    seen = poses.taken(rows)
+    # Frames of a thing that lies still are one picture with much the same errors: together they say as much.
+    together = _together(resting, len(rows))
+    seen = seen._replace(covariance=seen.covariance * together[:, None, None])
+    problem = _Problem(times[rows], seen, scenery, resting)
+    found = problem.solved(seen, [])
+    # Which face it lies on is seen better once frames agree on a motion.
+    runs = [] if scenery.table is None else _runs(found, scenery.solid, scenery.table)
+    inflation, more = 1.0, seen
+    for _ in range(_CALIBRATIONS):
+        inflation = max(1.0, inflation * _disagreement(seen, found, problem.seen(found), together, inflation))
+        more = seen._replace(covariance=inflation * seen.covariance)
+        found = problem.solved(more, runs, scenery.table or 0.0)
+    result = Poses(*(x.copy() for x in poses))
+    for whole, part in zip(result, found, strict=True):
+        whole[rows] = part
+    weight[rows] = np.minimum(problem.weight, 1.0)
+    for run in runs:
+        supported[rows[run.rows]] = True
+    unit = np.repeat([scenery.solid.size, 1.0], 3)
+    away[rows] = difference(problem.seen(found), seen) / unit
+    # The share of a pose that its own frame decides, of one that all others know nothing of.
+    own = problem.weight * np.einsum("nij,nji->n", np.linalg.inv(more.covariance), found.covariance) / 6
+    repeats = np.full(n, np.nan)
+    repeats[rows] = np.clip(1 / own, 1, len(rows))
+    return Smoothed(result, weight, supported, away, inflation, repeats)
+
+
+def _together(resting: np.ndarray, n: int) -> Float[np.ndarray, " n"]:
+    """How many frames each one lies still with, itself included."""
+    number = np.cumsum(~np.isin(np.arange(n), resting[:, 1]))
+    return np.bincount(number)[number].astype(float)
+
+
+def _disagreement(
+    seen: Poses, found: Poses, expected: Poses, together: np.ndarray, inflation: float
+) -> float:
+    """Variance of what frames are off by from their motion, over what their inflated covariances say."""
+    away = difference(expected, seen)
+    inverse = np.linalg.inv(inflation * seen.covariance)
+    square = np.einsum("ni,nij,nj->n", away, inverse, away)
+    # What a frame itself contributed to the motion does not show.
+    free = 6 - np.einsum("nij,nji->n", inverse, found.covariance)
+    ratio = square / np.maximum(free, _LEAST_FREE)
+    order = np.argsort(ratio)
+    share = np.cumsum((1 / together)[order])
+    return float(ratio[order][np.searchsorted(share, 0.5 * share[-1])] / _MEDIAN)
+
+
+def difference(first: Poses, second: Poses) -> Float[np.ndarray, "n 6"]:
+    """What leads from first poses to second ones: position [m, W], rotation vector [rad, F]."""
+    turn = quat_log(quat_multiply(quat_conjugate(first.orientation), second.orientation))
+    return np.concatenate([second.position - first.position, turn], axis=1)
+
+
+class _Run(NamedTuple):
+    """Frames in a row in which an object lies on one face."""
+
+    face: Face
+    rows: Int[np.ndarray, " m"]
+
+
+class _Minimum(NamedTuple):
+    """Where steps ended.
+
+    Attributes:
+        poses: Of the frames.
+        shared: Height and tilts of the face of each run, then the share by which frames see too far.
+    """
+
+    poses: Poses
+    shared: Float[np.ndarray, " m"]
+    weight: Float[np.ndarray, " n"]
+    cost: float
+    inverse: Any
+
+
+def _at_rest(still: np.ndarray, rows: np.ndarray) -> Int[np.ndarray, "m 2"]:
+    """Pairs of neighbours among known frames between which nothing moves."""
+    pairs = [(k, k + 1) for k in range(len(rows) - 1) if still[rows[k] : rows[k + 1]].all()]
+    return np.array(pairs, int).reshape(-1, 2)
+
+
+def _runs(poses: Poses, solid: Solid, table: float) -> list[_Run]:
+    """Where an object lies on a face, by its height above the table and its tilt."""
+    n, runs = len(poses.position), []
+    if not solid.faces:
+        return []
+    scaled = poses.covariance / np.outer(*[np.repeat([solid.size, 1.0], 3)] * 2)
+    high = _ABOVE + 2 * np.sqrt(scaled[:, 2, 2])
+    tilted = _TILTED + 2 * np.sqrt(np.linalg.eigvalsh(scaled[:, 3:, 3:])[:, -1])
+    tilts = []
+    for face in solid.faces:
+        turned = quat_rotate(poses.orientation, np.broadcast_to(face.down, (n, 3)))
+        tilts.append(np.arccos(np.clip(-turned[:, 2], -1, 1)))
+    nearest = np.argmin(tilts, axis=0)
+    for k, face in enumerate(solid.faces):
+        point = quat_rotate(poses.orientation, np.broadcast_to(face.point, (n, 3)))
+        height = (poses.position + point)[:, 2]
+        lies = (np.abs(height - table) < high * solid.size) & (tilts[k] < tilted) & (nearest == k)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], lies, [False]]).astype(int)))
+        runs += [_Run(face, np.arange(a, b)) for a, b in edges.reshape(-1, 2) if b - a >= _SHORTEST]
+    return runs
+
+
+class _Problem:
+    """Least squares over the frames that have a pose (host)."""
+
+    def __init__(self, times: np.ndarray, poses: Poses, scenery: Scenery, resting: np.ndarray):
+        self._poses, self._solid, self._resting = poses, scenery.solid, resting
+        solid, self._eye, self._scale = scenery.solid, scenery.eye, max(scenery.scale, _EPSILON)
+        self._further = 0.0
+        self._unit = np.repeat([solid.size, 1.0], 3)
+        self._roots = np.zeros((len(times), 6, 6))
+        n = len(times)
+        self._fours = np.arange(max(n - 3, 0))[:, None] + np.arange(4)
+        self._rates = _third_differences(times[self._fours])
+        self.weight = self._weight = np.ones(n)
+        self._tolerance, self._cost = 1.0, 0.0
+        self._runs: list[_Run] = []
+        self._table = 0.0
+
+    def solved(self, poses: Poses, runs: list[_Run], table: float = 0.0) -> Poses:
+        """Poses at the minimum, with their covariance, given those of frames and runs of frames on a table.
+
+        Single wrong frames and blows both break a steady motion. At first differences keep their weight,
+        which finds the wrong frames. Then each stretch that is not believed is tried as its frames have it.
+        """
+        self._poses, self._runs, self._table = poses, runs, table
+        self._roots = np.linalg.inv(np.linalg.cholesky(poses.covariance / np.outer(self._unit, self._unit)))
+        best = self._descended(self._poses, np.zeros(3 * len(runs) + 1), _TOLERANT)
+        doubted = np.flatnonzero(np.diff(np.concatenate([[0], best.weight < _DOUBTED, [0]]).astype(int)))
+        for first, last in doubted.reshape(-1, 2):
+            rows = slice(first, last)
+            begun = Poses(*(x.copy() for x in best.poses))
+            for whole, own in zip(begun, self._poses, strict=True):
+                whole[rows] = own[rows]
+            other = self._descended(begun, best.shared, 1.0)
+            best = min(best, other, key=lambda one: one.cost)
+        self.weight, self._further = best.weight, float(best.shared[-1])
+        n = len(self._poses.position)
+        blocks = np.stack([_block(best.inverse, k, 6 * n + len(best.shared)) for k in range(n)])
+        return best.poses._replace(covariance=blocks * np.outer(self._unit, self._unit))
+
+    def seen(self, poses: Poses, further: float | None = None) -> Poses:
+        """What frames are expected to say of poses, all further away by a share; default: as was found."""
+        if self._eye is None:
+            return poses
+        share = self._further if further is None else further
+        arm = quat_rotate(poses.orientation, np.broadcast_to(self._solid.middle, poses.position.shape))
+        return poses._replace(position=poses.position + share * (poses.position + arm - self._eye))
+
+    def _descended(self, poses: Poses, shared: np.ndarray, tolerance: float) -> "_Minimum":
+        """Gauss and Newton's steps from poses; `tolerance` is where differences lose weight at first."""
+        n, k = len(poses.position), 0
+        while True:
+            self._tolerance, k = max(tolerance / 2**k, 1.0), k + 1
+            jacobian, residual = self._system(poses, shared)
+            inverse = splu((jacobian.T @ jacobian).tocsc())
+            found = _Minimum(poses, shared, self._weight, self._cost, inverse)
+            step = -inverse.solve(jacobian.T @ residual)
+            poses = poses.moved(step[: 6 * n].reshape(n, 6), self._solid.size)
+            shared = shared + step[6 * n :]
+            if k == _PASSES or (self._tolerance == 1 and np.abs(step).max() < _ENDED):
+                return found
+
+    def _system(self, poses: Poses, shared: np.ndarray):
+        """Jacobian (sparse) and residuals at poses, both weighted; notes cost and weights of frames."""
+        n, self._cost = len(poses.position), 0.0
+        width = 6 * n + len(shared)
+        parts = []
+        if len(self._fours):
+            parts.append(self._steady(poses))
+        if len(self._resting):
+            parts.append(self._rest(poses))
+        rows = [self._said(poses, shared[-1], width)]
+        rows += [_spread(frames, slopes, residual, width) for frames, slopes, residual in parts]
+        for k, run in enumerate(self._runs):
+            rows.append(self._lying(poses, run, shared[3 * k : 3 * k + 3], 6 * n + 3 * k, width))
+        rows.append(self._prior(shared, width))
+        matrices, residuals = zip(*rows, strict=True)
+        return sparse.vstack(matrices).tocsr(), np.concatenate(residuals)
+
+    def _prior(self, shared: np.ndarray, width: int):
+        """How far a learned object may differ from the true one."""
+        runs = (len(shared) - 1) // 3
+        known = 1 / np.append(np.tile([_BASE, _LEAN, _LEAN], runs), self._scale)
+        self._cost += 0.5 * float(np.sum((known * shared) ** 2))
+        rows = np.arange(len(shared))
+        matrix = sparse.csr_matrix((known, (rows, width - len(shared) + rows)), shape=(len(shared), width))
+        return matrix, known * shared
+
+    def _said(self, poses: Poses, further: float, width: int):
+        """What frames say, weighted as by Student's distribution."""
+
+        def away(moved: Poses, share: float = further) -> np.ndarray:
+            apart = difference(self._poses, self.seen(moved, share)) / self._unit
+            return np.einsum("nij,nj->ni", self._roots, apart)
+
+        residual = away(poses)
+        square = np.sum(residual**2, axis=1)
+        self._weight = (_FREEDOM + 6) / (_FREEDOM + square)
+        self._cost += 0.5 * (_FREEDOM + 6) * float(np.sum(np.log1p(square / _FREEDOM)))
+        root = np.sqrt(self._weight)[:, None]
+        matrix, residual = _spread(*self._linear(away, poses, np.arange(len(square))[:, None], root), width)
+        slope = (root * (away(poses, further + _EPSILON) - away(poses)) / _EPSILON).ravel()
+        place = np.arange(len(slope)), np.full(len(slope), width - 1)
+        return matrix + sparse.csr_matrix((slope, place), shape=matrix.shape), residual
+
+    def _steady(self, poses: Poses):
+        """Third differences, weighted as by Cauchy's distribution: a blow is allowed."""
+
+        def jerk(moved: Poses) -> np.ndarray:
+            first, four = self._fours[:, 1], self._fours
+            base = np.repeat(moved.orientation[first], 4, axis=0)
+            turns = quat_log(quat_multiply(quat_conjugate(base), moved.orientation[four.ravel()]))
+            middle = moved.position + quat_rotate(
+                moved.orientation, np.broadcast_to(self._solid.middle, moved.position.shape)
+            )
+            both = np.concatenate(
+                [(middle[four] - middle[first][:, None]) / self._solid.size, turns.reshape(*four.shape, 3)],
+                axis=2,
+            )
+            return np.einsum("ij,ijk->ik", self._rates, both) / _STEADY
+
+        residual = jerk(poses)
+        squares = np.stack([np.sum(part**2, axis=1) for part in np.split(residual, 2, axis=1)], axis=1)
+        weight = 4 / (1 + squares / self._tolerance**2)
+        self._cost += 2 * float(np.sum(np.log1p(squares)))
+        return self._linear(jerk, poses, self._fours, np.sqrt(np.repeat(weight, 3, axis=1)))
+
+    def _rest(self, poses: Poses):
+        """What changes between frames in which nothing moves."""
+        first, second = self._resting.T
+
+        def change(moved: Poses) -> np.ndarray:
+            return difference(moved.taken(first), moved.taken(second)) / self._unit / _STILL
+
+        self._cost += 0.5 * float(np.sum(change(poses) ** 2))
+        return self._linear(change, poses, self._resting, np.ones((len(first), 6)))
+
+    def _linear(self, function, poses: Poses, frames: Int[np.ndarray, "m k"], root: np.ndarray):
+        """Derivatives of residuals by the frames they depend on: (frames, slopes (m, r, k, 6), residuals)."""
+        value, count = function(poses), frames.shape[1]
+        slopes = np.zeros((*value.shape, count, 6))
+        for turn in range(count):
+            # Residuals depend on neighbouring frames: of these, one in so many is moved at a time.
+            some = np.arange(len(poses.position)) % count == turn
+            for c in range(6):
+                change = np.zeros((len(some), 6))
+                change[some, c] = _EPSILON
+                slope = (function(poses.moved(change, self._solid.size)) - value) / _EPSILON
+                for j in range(count):
+                    mine = some[frames[:, j]]
+                    slopes[mine, :, j, c] = slope[mine]
+        return frames, slopes * root[:, :, None, None], value * root
+
+    def _lying(self, poses: Poses, run: _Run, shared: np.ndarray, column: int, width: int):
+        """Height and tilt of a face over the table, beside where all frames of the run have it."""
+        rows, face, size = run.rows, run.face, self._solid.size
+        side = np.cross(face.down, np.eye(3)[np.argmin(np.abs(face.down))])
+        side /= np.linalg.norm(side)
+        across = np.stack([side, np.cross(face.down, side)])
+
+        def off(moved: Poses, base: np.ndarray) -> np.ndarray:
+            turn, m = moved.orientation[rows], len(rows)
+            down = face.down + base[1:] @ across
+            point = quat_rotate(turn, np.broadcast_to(face.point, (m, 3)))
+            height = (moved.position[rows] + point)[:, 2] - self._table
+            tilt = quat_rotate(turn, np.broadcast_to(down, (m, 3)))[:, :2]
+            return np.concatenate([((height / size - base[0]) / _LEVEL)[:, None], tilt / _FLAT], axis=1)
+
+        # What rocks, or has left the table for a moment, does not lie there.
+        plain = off(poses, shared)
+        square = np.sum(plain**2, axis=1)
+        root = np.sqrt(4 / (1 + square / self._tolerance**2))[:, None]
+        self._cost += 2 * float(np.sum(np.log1p(square)))
+        part = self._linear(lambda moved: off(moved, shared), poses, rows[:, None], root)
+        matrix, residual = _spread(*part, width)
+        slopes = [(off(poses, shared + _EPSILON * e) - plain) / _EPSILON for e in np.eye(3)]
+        common = np.stack([(root * slope).ravel() for slope in slopes], axis=1)
+        place = np.repeat(np.arange(len(common)), 3), np.tile(column + np.arange(3), len(common))
+        matrix = matrix + sparse.csr_matrix((common.ravel(), place), shape=matrix.shape)
+        return matrix, residual
+
+
+def _spread(frames: np.ndarray, slopes: np.ndarray, residual: np.ndarray, width: int):
+    """A sparse matrix of derivatives by all frames, and residuals in one column."""
+    m, r, k, _ = slopes.shape
+    columns = 6 * frames[:, None, :, None] + np.arange(6)
+    columns = np.broadcast_to(columns, (m, r, k, 6))
+    rows = np.broadcast_to(np.arange(m * r).reshape(m, r, 1, 1), (m, r, k, 6))
+    matrix = sparse.csr_matrix((slopes.ravel(), (rows.ravel(), columns.ravel())), shape=(m * r, width))
+    return matrix, residual.ravel()
+
+
+def _block(inverse, k: int, width: int) -> Float[np.ndarray, "6 6"]:
+    """Covariance of one frame."""
+    unit = np.zeros((width, 6))
+    unit[6 * k : 6 * k + 6] = np.eye(6)
+    return inverse.solve(unit)[6 * k : 6 * k + 6]
+
+
+def _third_differences(times: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
+    """Weights that make third differences of values at four times; 1, 3, 3, 1 where these are even."""
+    apart = times[:, :, None] - times[:, None, :] + np.eye(4)
+    weights = 1 / apart.prod(axis=2)
+    return 8 * weights / np.abs(weights).sum(axis=1, keepdims=True)

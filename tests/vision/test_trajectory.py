@@ -1,0 +1,192 @@
+"""The motion that noisy poses of a film are of: hidden frames, rest, a table, blows, honest covariances."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dano.vision.trajectory import Poses, Scenery, smoothed, Solid, solid_of
+
+FRAMES = 24
+SIDES = np.array([0.10, 0.06, 0.04])
+HIDDEN = np.array([14, 15, 16, 17, 18])
+SURE = np.repeat([3e-4, 4e-3], 3)
+NOWHERE = np.zeros(FRAMES - 1, bool)
+
+
+@pytest.fixture(scope="module")
+def box() -> Solid:
+    """A cuboid, its origin in a corner."""
+    grid = np.stack(np.meshgrid(*[[0, 0.5, 1]] * 3), axis=-1).reshape(-1, 3) * SIDES
+    return solid_of(grid, 0.5 * SIDES)
+
+
+def truth(kick: float = 0.0):
+    """Times, positions and orientations of a thing that slides, slows down and spins; a blow at frame 8."""
+    times = np.arange(FRAMES) / 30
+    late = np.maximum(times - 8 / 30, 0)
+    position = np.stack([0.3 * times - times**2 + kick * late, 0.1 * times, 0 * times], axis=1)
+    return times, position, Rotation.from_rotvec(np.outer(times, [2.0, 1.0, 0.5]))
+
+
+def seen(position, orientation, spread, seed=0, covariance=None) -> Poses:
+    """Poses with errors of the given standard deviations along six directions, each (T, 6, 6)."""
+    rng = np.random.default_rng(seed)
+    noise = np.einsum("nij,nj->ni", spread, rng.normal(size=(len(position), 6)))
+    turned = orientation * Rotation.from_rotvec(noise[:, 3:])
+    if covariance is None:
+        covariance = spread @ np.swapaxes(spread, 1, 2)
+    return Poses(position + noise[:, :3], np.roll(turned.as_quat(), 1, axis=1), covariance)
+
+
+def hidden_spread(reach, seed=0):
+    """One direction is hardly seen in some frames."""
+    rng = np.random.default_rng(100 + seed)
+    spread = np.tile(np.diag(SURE), (FRAMES, 1, 1))
+    for i in HIDDEN:
+        way = rng.normal(size=6)
+        way = way / np.linalg.norm(way)
+        spread[i] += reach * np.outer(way * np.repeat([SIDES.max(), 1.0], 3), way)
+    return spread
+
+
+def off(poses: Poses, position, orientation) -> np.ndarray:
+    """Errors of position [m] and rotation vector [rad]."""
+    turned = orientation.inv() * Rotation.from_quat(np.roll(poses.orientation, -1, axis=1))
+    return np.concatenate([poses.position - position, turned.as_rotvec()], axis=1)
+
+
+@pytest.mark.parametrize("kick", [0.0, 0.5])
+def test_hidden_frames_lie_where_others_lead(box, kick):
+    times, position, orientation = truth(kick)
+    given = seen(position, orientation, hidden_spread(0.3))
+    found = smoothed(times, given, Scenery(box, NOWHERE))
+    before, after = (np.abs(off(poses, position, orientation)) for poses in (given, found.poses))
+    assert before[HIDDEN, :3].max() > 0.1 * SIDES.max() and before[HIDDEN, 3:].max() > np.radians(5)
+    assert after[:, :3].max() < 0.01 * SIDES.max() and after[:, 3:].max() < np.radians(1)
+
+
+def test_covariances_are_honest(box):
+    squares = []
+    for seed in range(8):
+        times, position, orientation = truth()
+        found = smoothed(
+            times, seen(position, orientation, hidden_spread(0.3, seed), seed), Scenery(box, NOWHERE)
+        )
+        away = off(found.poses, position, orientation)
+        squares.append(
+            np.einsum("ni,ni->n", away, np.linalg.solve(found.poses.covariance, away[..., None])[..., 0])
+        )
+    # Six numbers each: their mean is 6. Differences have a least spread, so regions are rather too large.
+    assert 2 < np.mean(squares) < 8
+
+
+def test_a_single_wrong_frame_is_not_believed(box):
+    times, position, orientation = truth()
+    given = seen(position, orientation, np.tile(np.diag(SURE), (FRAMES, 1, 1)))
+    given.position[6] += [0.01, -0.02, 0.01]
+    found = smoothed(times, given, Scenery(box, NOWHERE))
+    assert np.abs(off(found.poses, position, orientation)[6, :3]).max() < 1e-3
+    assert found.weight[6] < 0.1 < 0.5 < np.median(found.weight)
+
+
+def test_a_missing_frame_stays_missing(box):
+    times, position, orientation = truth()
+    given = seen(position, orientation, np.tile(np.diag(SURE), (FRAMES, 1, 1)))
+    given.position[9] = given.orientation[9] = np.nan
+    found = smoothed(times, given, Scenery(box, NOWHERE))
+    assert np.isnan(found.poses.position[9]).all() and np.isnan(found.weight[9])
+    known = found.poses.taken(given.known)
+    assert np.abs(off(known, position[given.known], orientation[given.known])[:, :3]).max() < 1e-3
+    nowhere = Poses(*(np.full_like(x, np.nan) for x in given))
+    assert np.isnan(smoothed(times, nowhere, Scenery(box, NOWHERE)).weight).all()
+
+
+def test_the_ways_a_box_can_lie(box):
+    down = {tuple(np.rint(face.down).astype(int)) for face in box.faces}
+    assert down == {(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)}
+    for face in box.faces:
+        np.testing.assert_allclose(np.abs(face.point - 0.5 * SIDES).sum(), 0.5 * np.abs(face.down) @ SIDES)
+    # With its centre of mass at one end it would fall over from all faces but the ends.
+    grid = np.stack(np.meshgrid(*[[0, 0.5, 1]] * 3), axis=-1).reshape(-1, 3) * SIDES
+    loaded = solid_of(grid, np.array([0.0999, 0.03, 0.02]))
+    assert {tuple(np.rint(face.down).astype(int)) for face in loaded.faces} == {(1, 0, 0), (-1, 0, 0)}
+
+
+def test_a_box_does_not_lie_on_its_rounded_edges():
+    """Long edges of a learned box are flat over 6 mm of 80, square to the line from the centre of mass."""
+    sides = 0.5 * np.array([0.08, 0.055, 0.04])
+    way = sides[1:] / np.linalg.norm(sides[1:])
+    depth = way @ sides[1:] - 3e-3
+    low = (depth - way[0] * sides[1]) / way[1], (depth - way[1] * sides[2]) / way[0]
+    quarter = np.array([[sides[0], sides[1], low[0]], [sides[0], low[1], sides[2]]])
+    signs = np.stack(np.meshgrid(*[[-1, 1]] * 3), axis=-1).reshape(-1, 1, 3)
+    faces = solid_of((signs * quarter).reshape(-1, 3), np.zeros(3)).faces
+    assert len(faces) == 6
+    assert all(np.abs(face.down).max() > 0.99 for face in faces)
+
+
+@pytest.mark.parametrize("table", [None, 0.2])
+def test_errors_along_the_line_of_sight_are_undone_by_rest_and_a_table(box, table):
+    times = np.arange(FRAMES) / 30
+    slide = np.minimum(times, 0.5)
+    along = 0.6 * slide - 0.6 * slide**2
+    position = np.stack([along, 0.3 * along, np.full(FRAMES, 0.2)], axis=1)
+    orientation = Rotation.from_rotvec(np.outer(np.full(FRAMES, 0.4), [0, 0, 1.0]))
+    sight = np.array([0.3, 0.75, -0.6])
+    spread = np.tile(np.diag(SURE), (FRAMES, 1, 1))
+    spread[:, :3, :3] += 0.03 * SIDES.max() * np.outer(sight, sight)
+    still = times[:-1] >= 0.5
+    given = seen(position, orientation, spread, 3)
+    found = smoothed(times, given, Scenery(box, still, table))
+    before, after = (
+        np.linalg.norm(off(p, position, orientation)[:, :3], axis=1) for p in (given, found.poses)
+    )
+    rest = found.poses.position[15:]
+    assert np.ptp(given.position[15:], axis=0).max() > 0.02 * SIDES.max()
+    assert np.ptp(rest, axis=0).max() < 0.002 * SIDES.max()
+    if table is None:
+        assert not found.supported.any()
+        assert np.median(after) < 0.5 * np.median(before)
+    else:
+        assert found.supported.all()
+        assert np.median(after) < 0.006 * SIDES.max() < 0.5 * np.median(before)
+
+
+@pytest.mark.parametrize("table", [None, 0.2])
+def test_a_wrong_size_is_told_by_a_table_or_doubted(box, table):
+    """A thing known 1 % too large is seen 1 % too far away in all frames, and a table says so."""
+    times = np.arange(FRAMES) / 30
+    position = np.stack([0.3 * times - 0.2 * times**2, 0.1 * times, np.full(FRAMES, 0.2)], axis=1)
+    orientation = Rotation.from_rotvec(np.outer(np.full(FRAMES, 0.4), [0, 0, 1.0]))
+    eye, doubt = np.array([0.2, -0.5, 0.7]), 0.01
+    given = seen(position, orientation, np.tile(np.diag(SURE), (FRAMES, 1, 1)), 5)
+    middle = position + orientation.apply(0.5 * SIDES)
+    sight = (middle - eye) / np.linalg.norm(middle - eye, axis=1)[:, None]
+    given = given._replace(position=given.position + 0.01 * (middle - eye))
+    found = smoothed(times, given, Scenery(box, NOWHERE, table, eye, doubt))
+    away = np.einsum("ni,ni->n", off(found.poses, position, orientation)[:, :3], sight)
+    stated = np.sqrt(np.einsum("ni,nij,nj->n", sight, found.poses.covariance[:, :3, :3], sight))
+    distance = np.linalg.norm(middle - eye, axis=1)
+    if table is None:
+        np.testing.assert_allclose(stated, doubt * distance, rtol=0.1)
+    else:
+        assert stated.max() < 0.2 * doubt * distance.min()
+    assert (np.abs(away) < 2.5 * stated).all()
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, FRAMES])
+def test_frames_that_share_a_pose_say_together_what_one_picture_says(box, frames):
+    """n poses at rest have the covariance S of one frame each; as if independent they must sum to S⁻¹."""
+    spread = np.tile(np.diag(SURE), (frames, 1, 1))
+    place, turn = np.zeros((frames, 3)), Rotation.identity(frames)
+    given = Poses(place, np.roll(turn.as_quat(), 1, axis=1), spread @ spread)
+    found = smoothed(np.arange(frames) / 30, given, Scenery(box, np.ones(frames - 1, bool)))
+    # What lies still may move by a fraction of what a frame is sure of.
+    np.testing.assert_allclose(found.repeats, frames, rtol=0.1)
+    told = np.linalg.inv(found.poses.covariance * found.repeats[:, None, None]).sum(axis=0)
+    # What fits exactly is believed more, by Student's distribution with four degrees of freedom.
+    np.testing.assert_allclose(np.diag(told), (4 + 6) / 4 * SURE**-2, rtol=0.1)
+    # Frames that know nothing of each other are independent.
+    if frames < 4:
+        alone = smoothed(np.arange(frames) / 30, given, Scenery(box, np.zeros(frames - 1, bool)))
+        np.testing.assert_allclose(alone.repeats, 1, rtol=1e-6)
