@@ -10,10 +10,11 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_items, checked_kind, checked_optional, shown
 from dano.contact import checked_parameter, ContactParams
-from dano.maths import checked_array, checked_quaternion, is_traced, Numbers, stacked
+from dano.maths import checked_array, is_traced, Numbers
 from dano.notebook import card, cloud
 from dano.objects import checked_inertia
 from dano.scene._bodies import Body
+from dano.scene._by_name import ByName, control_arrays, joint_arrays, merged, state_arrays
 from dano.scene._contacts import Contact, prepared
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
 from dano.scene._joints import Joint, Layout, layout_of
@@ -312,50 +313,36 @@ class Scene(eqx.Module):
         joints = (*self.joints[:i], dataclasses.replace(self.joints[i], **changes), *self.joints[i + 1 :])
         return dataclasses.replace(self, joints=joints)
 
-    def initial_state(self, /, **bodies: dict[str, Numbers]) -> State:
+    def initial_state(self, states: ByName | None = None, /, **bodies: Mapping[str, Numbers]) -> State:
         """A state: bodies by keyword, each a dict of `position, orientation, velocity, omega`.
 
-        Bodies on joints have `q` and `v` instead: angle [rad] and rate, or length [m] and rate; three numbers
-        of a ball or a planar joint, see `Joint`. Bodies that are not named rest at the origin, or at q = 0.
-        Orientations are normalised.
+        `position` is that of the centre of mass. In its place `origin` is that of the body's field frame, the
+        origin of the file of a mesh or a field. Bodies on joints have `q` and `v` instead: angle [rad] and
+        rate, or length [m] and rate; three numbers of a ball or a planar joint, see `Joint`. Bodies that are
+        not named rest at the origin, or at q = 0. Orientations are normalised.
+
+        Args:
+            states: The same as a dict, for names that are no identifiers: `{"left arm": dict(q=0.1)}`.
+            bodies: By keyword.
 
         Raises:
-            ValueError: If a body or quantity is unknown, a shape is wrong, a number is not finite, or a
-                quaternion is zero.
+            ValueError: If a body or quantity is unknown, a body is given twice, a shape is wrong, a number is
+                not finite, or a quaternion is zero.
 
         Warns:
             RuntimeWarning: If a joint starts beyond its limits.
         """
-        return self.state_of(bodies)
+        return self.state_of(merged("states", states, bodies))
 
-    def state_of(
-        self, bodies: Mapping[str, dict[str, Numbers]], joint_names: Mapping[str, str] | None = None
-    ) -> State:
+    def state_of(self, bodies: ByName, joint_names: Mapping[str, str] | None = None) -> State:
         """`initial_state` of bodies in a mapping, with names of joints for messages, by their bodies'."""
-        rows: dict[str, list[Array]] = {name: [] for name in STATE_SIZES}
-        layout = self.layout
         for name in bodies:
             self.index(name)
-        default: dict[str, Numbers] = {
-            "position": (0.0,) * 3,
-            "orientation": (1.0, 0.0, 0.0, 0.0),
-            "velocity": (0.0,) * 3,
-            "omega": (0.0,) * 3,
-        }
-        for i, name in enumerate(self.names):
-            given = _given("state", name, bodies)
-            valid = _state_keys(layout, i)
-            for key in given:
-                if key not in valid:
-                    why = "" if layout.joint_of(i) is None else ", for it hangs on a joint"
-                    raise ValueError(f"state of {name!r} must be given by {valid}{why}, got {key!r}")
-            for key, size in STATE_SIZES.items():
-                label, value = f"{key} of {name!r}", given[key] if key in given else default[key]
-                check = checked_quaternion(label, value) if size == 4 else checked_array(label, value, (3,))
-                rows[key].append(check.astype(self.timestep.dtype))
-        state = State(*(stacked(rows[key]) for key in STATE_SIZES))
+        dtype = self.timestep.dtype
+        state = State(**state_arrays(self.bodies, self.layout, bodies, dtype))
         if self.joints:
-            state = self.filled(dataclasses.replace(state, **self._joint_values(bodies, JOINT_QUANTITIES)))
+            of_joints = joint_arrays(self.joints, bodies, JOINT_QUANTITIES, dtype)
+            state = self.filled(dataclasses.replace(state, **of_joints))
         self.check_state(state)
         warn_of_limits(self.layout, self.joints, state.q, self.timestep, joint_names or {})
         return state
@@ -394,23 +381,6 @@ class Scene(eqx.Module):
         self.check_state(state)
         return frames_of(self.chains, state)
 
-    def _joint_values(
-        self, bodies: Mapping[str, dict[str, Numbers]], keys: Sequence[str]
-    ) -> dict[str, Array]:
-        """Numbers of the joints that have coordinates, given by their bodies' names; zero by default."""
-        names = [(joint.child, joint.width) for joint in self.joints if joint.width]
-        dtype = self.timestep.dtype
-
-        def numbers(key: str, name: str, width: int) -> Array:
-            shape = () if width == 1 else (width,)
-            given = bodies.get(name, {}).get(key, 0.0 if width == 1 else (0.0,) * width)
-            return jnp.atleast_1d(checked_array(f"{key} of {name!r}", given, shape)).astype(dtype)
-
-        return {
-            key: jnp.concatenate([numbers(key, *name) for name in names] or [jnp.zeros(0, dtype)])
-            for key in keys
-        }
-
     def check_state(self, state: State) -> None:
         """Check a concrete state against the scene; traced values pass.
 
@@ -447,53 +417,27 @@ class Scene(eqx.Module):
             if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
                 raise ValueError(f"state.{key} must be finite, got {shown(np.asarray(value).tolist())}")
 
-    def control(self, /, **bodies: dict[str, Numbers]) -> Control:
+    def control(self, controls: ByName | None = None, /, **bodies: Mapping[str, Numbers]) -> Control:
         """Control for one step: bodies by keyword, each a dict of `force` [N, W] and `torque` [N m, W].
 
         Bodies on joints may have `effort`, the torque [N m] or force [N] of the joint, and where a motor
         drives it `command`. Those of a ball or a planar joint are three numbers.
 
+        Args:
+            controls: The same as a dict, for names that are no identifiers.
+            bodies: By keyword.
+
         Raises:
-            ValueError: If a body or quantity is unknown or a shape is wrong.
+            ValueError: If a body or quantity is unknown, a body is given twice, or a shape is wrong.
         """
-        rows: dict[str, list[Array]] = {"force": [], "torque": []}
-        for name in bodies:
+        given, dtype = merged("controls", controls, bodies), self.timestep.dtype
+        for name in given:
             self.index(name)
-        layout = self.layout
-        for i, name in enumerate(self.names):
-            given = _given("control", name, bodies)
-            joint = layout.joint_of(i)
-            driven = joint is not None and layout.width(joint) > 0
-            valid = [*rows, *(["effort"] if driven else [])]
-            if joint is not None and self.joints[joint].motor is not None:
-                valid.append("command")
-            for key in given:
-                if key not in valid:
-                    raise ValueError(f"control of {name!r} must be given by {valid}, got {key!r}")
-            for key, values in rows.items():
-                value = checked_array(f"{key} of {name!r}", given.get(key, (0.0,) * 3), (3,))
-                values.append(value.astype(self.timestep.dtype))
         of_joints: dict[str, Array] = {}
         if self.joints:
             keys = ("effort", "command") if self.driven else ("effort",)
-            of_joints = self._joint_values(bodies, keys)
-        return Control(jnp.stack(rows["force"]), jnp.stack(rows["torque"]), **of_joints)
-
-
-def _given(what: str, name: str, bodies: Mapping[str, dict[str, Numbers]]) -> dict[str, Numbers]:
-    """What was given of a body, by quantity."""
-    given = bodies.get(name, {})
-    if not isinstance(given, Mapping):
-        raise ValueError(f"{what} of {name!r} must be a dict such as dict(…=…), got {shown(given)}")
-    return dict(given)
-
-
-def _state_keys(layout: Layout, body: int) -> list[str]:
-    """What the state of a body is given by."""
-    joint = layout.joint_of(body)
-    if joint is None:
-        return list(STATE_SIZES)
-    return list(JOINT_QUANTITIES) if layout.width(joint) else []
+            of_joints = joint_arrays(self.joints, given, keys, dtype)
+        return Control(**control_arrays(self.bodies, self.joints, self.layout, given, dtype), **of_joints)
 
 
 def _as_leaf(value: Array, like: Array) -> Array:

@@ -52,7 +52,7 @@ from dano.scene_file._table import located, Table
 if TYPE_CHECKING:
     from dano.vision import LearnedField
 
-_STATE = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
+_STATE = {"position": 3, "origin": 3, "orientation": 4, "velocity": 3, "omega": 3}
 _GEOMETRY = ("object", "field", "asset", "shape")
 _BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE, *JOINT_QUANTITIES)
 _JOINT = {"axis": 3, "anchor": 3, "position": 3, "orientation": 4}
