@@ -281,6 +281,7 @@ def test_laws_that_kernels_do_not_know():
         scene_tables(own)
 
 
+@pytest.mark.slow
 def test_joints():
     """An arm that touches by both laws: steps and their derivatives."""
     scene, state = reaching()

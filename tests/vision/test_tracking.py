@@ -249,6 +249,7 @@ def test_masks_of_a_wrong_size_are_moved_and_that_is_said(bunny, camera, filmed,
     assert np.median(place) < 0.03
 
 
+@pytest.mark.slow
 def test_a_fast_spin_is_followed_from_the_first_frame_on(bunny, camera):
     """31° a frame, which nothing tells before the third one."""
     position, orientation = path(5, spin=(0.2, 0.4, -0.3))
