@@ -7,26 +7,15 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy import ndimage
-from vision.drawn_films import above, BACK, drawn, errors, film_of, fine_frame, LIGHT, path, ramp, ROUGH, SIZE
+from vision.drawn_films import BACK, drawn, errors, film_of, fine_frame, LIGHT, path, ramp, ROUGH, SIZE
 
 from dano.cli import main
 from dano.identify import load_motion
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply
-from dano.scene_file import asset_look
 from dano.vision import adjust_poses, Light, track, TrackOptions
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._segments import moved_edge, overlap
 from dano.vision.tracking._walk import Walk
-
-
-@pytest.fixture(scope="module")
-def bunny():
-    return asset_look("trained_bunny")
-
-
-@pytest.fixture(scope="module")
-def camera():
-    return above()
 
 
 @pytest.fixture(scope="module")

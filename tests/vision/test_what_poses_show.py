@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy import ndimage
-from vision.drawn_films import above, fine_frame, LIGHT, path, SIZE
+from vision.drawn_films import fine_frame, LIGHT, path, SIZE
 
 from dano import HalfSpace, Pose
 from dano.maths import quat_conjugate, quat_exp, quat_multiply, quat_rotate
@@ -26,16 +26,6 @@ from dano.vision.tracking._refine import (
 from dano.vision.tracking._result import covariance_of, unobservable
 from dano.vision.tracking._segments import common_offset, differs, edge_offset, moved_edge, overlap
 from dano.vision.tracking._subject import _exposed, Seen, Subject
-
-
-@pytest.fixture(scope="module")
-def bunny():
-    return asset_look("trained_bunny")
-
-
-@pytest.fixture(scope="module")
-def camera():
-    return above()
 
 
 def test_slopes_are_differences_of_what_is_seen(bunny, camera):

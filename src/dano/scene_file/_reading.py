@@ -36,6 +36,7 @@ from dano.scene import (
     MOTOR_KINDS,
     Scene,
     State,
+    STATE_SIZES,
 )
 from dano.scene_file._objects import (
     build_object,
@@ -52,7 +53,7 @@ from dano.scene_file._table import located, Table
 if TYPE_CHECKING:
     from dano.vision import LearnedField
 
-_STATE = {"position": 3, "origin": 3, "orientation": 4, "velocity": 3, "omega": 3}
+_STATE = {**STATE_SIZES, "origin": 3}
 _GEOMETRY = ("object", "field", "asset", "shape")
 _BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE, *JOINT_QUANTITIES)
 _JOINT = {"axis": 3, "anchor": 3, "position": 3, "orientation": 4}

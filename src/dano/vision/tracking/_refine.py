@@ -49,6 +49,9 @@ lies beside it (measured in rendered films, with their true poses)."""
 _FURTHEST = 0.1
 """Change of a pose [radii, rad] up to which one step says where a picture wants it."""
 
+_FEWEST = 24
+"""Pixels that must take part: four for each of the six numbers of a pose (convention)."""
+
 _SMALL = 0.02
 """Predicted move [pixels] that ends the search."""
 
@@ -179,12 +182,8 @@ def refine(
     Returns:
         None if the object is out of the picture.
     """
-    window = window_of(subject, place, target.camera)
-    if window is None:
-        return None
-    opacity, _ = silhouette(subject, place, lamps, target.camera, window)
-    index = _chosen(opacity, target, window, rays, random)
-    if len(index) < 24:
+    index = _chosen(subject, target, place, lamps, rays, random)
+    if index is None:
         return None
     damping, best, change = 1e-3, None, np.zeros(6)
     for _ in range(steps + 1):
@@ -218,12 +217,8 @@ def linearized(
 
     Arguments and result are those of `refine`. Its cost, overlap and silhouette are those of the given pose.
     """
-    window = window_of(subject, place, target.camera)
-    if window is None:
-        return None
-    opacity, _ = silhouette(subject, place, lamps, target.camera, window)
-    index = _chosen(opacity, target, window, rays, random)
-    if len(index) < 24:
+    index = _chosen(subject, target, place, lamps, rays, random)
+    if index is None:
         return None
     rows = _rows(subject, target, place, lamps, index, loss)
     found = _refined(subject, target, lamps, place, rows, index)
@@ -235,8 +230,22 @@ def linearized(
     return found._replace(place=place.moved(change, subject.radius))
 
 
-def _chosen(opacity, target: Target, window, rays: int, random: np.random.Generator) -> np.ndarray:
-    """Rows and columns of the pixels that take part: edges first, of the inside as many as fit."""
+def _chosen(
+    subject: Subject,
+    target: Target,
+    place: Placement,
+    lamps: tuple[Light, ...],
+    rays: int,
+    random: np.random.Generator,
+) -> np.ndarray | None:
+    """Rows and columns of the pixels that take part: edges first, of the inside as many as fit.
+
+    None where the object is out of the picture, or too small in it.
+    """
+    window = window_of(subject, place, target.camera)
+    if window is None:
+        return None
+    opacity, _ = silhouette(subject, place, lamps, target.camera, window)
     mask, seen = target.mask[window], target.seen[window]
     solid, given = opacity > 0.5, mask > 0.5
     edge = np.zeros(mask.shape, bool)
@@ -252,7 +261,8 @@ def _chosen(opacity, target: Target, window, rays: int, random: np.random.Genera
         if len(some) > most:
             some = some[np.sort(random.choice(len(some), most, replace=False))]
         picked.append(some)
-    return np.concatenate(picked) + [window[0].start, window[1].start]
+    index = np.concatenate(picked) + [window[0].start, window[1].start]
+    return index if len(index) >= _FEWEST else None
 
 
 def _rows(subject: Subject, target: Target, place: Placement, lamps, index: np.ndarray, loss: str) -> _Rows:
