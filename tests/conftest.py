@@ -31,9 +31,9 @@ MUCH_MEMORY = 1.2e9
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
-# Files whose programs compile longer than they run. Compiling takes half as long without optimizing, but
-# photographs that are rendered and trained on would then take twice as long.
-COMPILES_LONG = ("engine/test_gradients.py",)
+# Folders and files whose programs run longer than they compile: photographs that are rendered and trained on.
+# Compiling takes half as long without optimizing.
+RUNS_LONG = tuple(os.environ.get("RUNS_LONG", "vision").split(","))
 
 # Shapes and types are checked while tracing; kernels are compiled by Warp, which takes plain functions only.
 COMPILED = ("physics",)
@@ -60,8 +60,9 @@ def few_programs():
 
 @pytest.fixture(scope="module", autouse=True)
 def optimized(request: pytest.FixtureRequest):
-    """Whether programs of a module are optimized: see `COMPILES_LONG`."""
-    jax.config.update("jax_disable_most_optimizations", "/".join(request.path.parts[-2:]) in COMPILES_LONG)
+    """Whether programs of a module are optimized: see `RUNS_LONG`."""
+    name = str(request.path.relative_to(REPOSITORY / "tests"))
+    jax.config.update("jax_disable_most_optimizations", not name.startswith(RUNS_LONG))
 
 
 @pytest.fixture(scope="session")

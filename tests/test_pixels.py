@@ -130,6 +130,7 @@ def test_an_open_shutter_blurs_along_the_way_and_loses_no_light(scene, look):
     assert blurred_light == pytest.approx(light, rel=0.05)
 
 
+@pytest.mark.slow
 def test_derivatives_inside_a_picture_are_differences(look):
     """Where nothing appears or disappears: pixels on the ball before it and after it moves."""
     box = look.model.box

@@ -77,6 +77,7 @@ def apart(a, b) -> float:
     return max(float(np.abs(getattr(a, name) - getattr(b, name)).max()) for name in ("position", "q", "v"))
 
 
+@pytest.mark.slow
 def test_every_joint_moves_as_in_our_engine(runs):
     """Both engines are of first order in the timestep where there is damping: they close in on each other."""
     ends, _, _ = runs
@@ -271,6 +272,7 @@ def test_a_neural_object_rebounds_the_same():
     assert float(run.states.velocity[-1, 0, 2]) == pytest.approx(0.7, abs=0.05)
 
 
+@pytest.mark.slow
 def test_objects_touch_as_hulls_where_asked():
     bar = dano.NeuralObject.from_field(dano.Box((0.05, 0.02, 0.02)), mass=0.2, n_samples=300, resolution=24)
     bodies = [dano.Body("bar", bar), dano.Body("floor", dano.HalfSpace(), fixed=True)]

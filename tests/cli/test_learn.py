@@ -31,6 +31,7 @@ def test_photographs_are_checked_and_drawn(images: Path, run, tmp_path: Path):
     assert missing.code == 2 and "no such folder" in missing.err
 
 
+@pytest.mark.slow
 def test_training_leaves_object_grid_field_report_and_figures(images: Path, run, tmp_path: Path):
     output, figures = tmp_path / "egg.dano", tmp_path / "egg.json"
     previews = "--previews", tmp_path / "previews"

@@ -24,6 +24,7 @@ def photos(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_table_says_what_was_found_and_the_file_can_be_trained_on(photos: Path, run, tmp_path: Path):
     output = tmp_path / "transforms.json"
     choices = "--marker-size", TAG_SIDE, "--focal", FOCAL, "--features", 900

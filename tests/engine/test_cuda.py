@@ -80,6 +80,7 @@ def height(velocity, scene, state):
     return jnp.sum(rolled(scene, velocity, state)[0][-1] ** 2)
 
 
+@pytest.mark.slow
 def test_lanes_list_the_same_points(stack, in_lanes):
     """Every point, once, and nothing else, whatever lane found it."""
     scene, state = stack

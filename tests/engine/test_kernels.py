@@ -187,9 +187,14 @@ def test_derivatives_on_a_grid():
     bodies = [
         dano.Body("ball", dano.Sphere(0.02), mass=0.3),
         dano.Body("grid", grid("quadratic"), fixed=True),
+        # Beside it, so that kernels are those of most scenes with sampled bodies.
+        dano.Body("box", dano.Box((0.01, 0.01, 0.01)), fixed=True),
     ]
-    scene = dano.Scene.create(bodies, [dano.Contact("ball", "grid")], timestep=H)
-    state = scene.initial_state(ball=dict(position=(0.003, 0.002, 0.0598), velocity=(0.1, 0, 0)))
+    contacts = [dano.Contact("ball", "grid"), dano.Contact("ball", "box")]
+    scene = dano.Scene.create(bodies, contacts, timestep=H)
+    state = scene.initial_state(
+        ball=dict(position=(0.003, 0.002, 0.0598), velocity=(0.1, 0, 0)), box=dict(position=(0.2, 0, 0))
+    )
 
     def end(speed):
         moved = eqx.tree_at(lambda s: s.velocity, state, state.velocity.at[0].add(speed))

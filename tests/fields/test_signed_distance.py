@@ -222,6 +222,7 @@ def test_overlapping_parts_weigh_once(trimesh):
     assert float(made.inertia[2, 2]) == pytest.approx(about_z, rel=0.01)
 
 
+@pytest.mark.slow
 def test_thin_walls_choose_the_resolution_or_say_what_would_do(trimesh):
     plate = trimesh.creation.box((0.1, 0.1, 0.0007))
     field = mesh_field(plate)

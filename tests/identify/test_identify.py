@@ -119,6 +119,7 @@ def test_equal_leaves_need_no_new_program():
 
 
 # Of 95 % intervals, 15 to 20 of 20 hold the truth with a probability of 0.9997; all 20 may.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n_fits", "least", "most", "rel"),
     [(20, 15, 20, 0.5), pytest.param(100, 90, 99, 0.3, marks=pytest.mark.slow)],

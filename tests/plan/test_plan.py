@@ -351,6 +351,7 @@ def test_a_first_pass_may_cover_all_that_bounds_allow(puck):
         dano.SamplingOptions(first="sobol")
 
 
+@pytest.mark.slow
 def test_contact_is_looked_for_where_the_first_guess_makes_none(pushing):
     scene, state, task = pushing
     stages = []

@@ -133,6 +133,7 @@ def near(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_an_unknown_scale_and_a_wrong_focal_length_are_said_and_runs_repeat(near: Path, tmp_path: Path):
     options = PoseOptions(focal=1.3 * FOCAL, up="cameras", features=FEW)
     found = estimate_poses(near, options)
@@ -256,6 +257,7 @@ def test_captures_that_cannot_work_are_refused_in_words(
         estimate_poses(tmp_path, PoseOptions(features=FEW))
 
 
+@pytest.mark.slow
 def test_models_that_have_nothing_in_common_are_said(near: Path, tmp_path: Path):
     folder = tmp_path / "two"
     shutil.copytree(near, folder)
@@ -290,6 +292,7 @@ def film(path: Path, views: list[PosedCamera]) -> None:
         container.mux(stream.encode())
 
 
+@pytest.mark.slow
 def test_a_video_leaves_its_frames_or_nothing(tmp_path: Path):
     film(tmp_path / "walk.mp4", [camera(0.1 * i, 0.6) for i in range(12)])
     found = estimate_poses(

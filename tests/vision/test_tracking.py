@@ -27,6 +27,7 @@ def filmed(bunny, camera):
     return position, orientation, frames, masks
 
 
+@pytest.mark.slow
 def test_a_jump_is_caught_up_with_where_masks_need_no_pose(bunny, camera, tmp_path, monkeypatch):
     rng = np.random.default_rng(5)
     back = np.kron(rng.uniform(0.2, 0.6, (18, 24, 3)), np.ones((4, 4, 1)))
@@ -98,6 +99,7 @@ def test_a_film_is_tracked_and_its_end_lies_outside(bunny, camera, filmed):
     assert overlap(masks[2][outline.window], outline.opacity) > 0.93
 
 
+@pytest.mark.slow
 def test_frames_in_which_it_lies_still_share_one_pose(bunny, camera, filmed):
     rng = np.random.default_rng(7)
     position, orientation, frames, masks = filmed
@@ -131,6 +133,7 @@ def test_the_start_is_found_among_all_orientations(bunny, camera, filmed):
     assert (np.degrees(turn.max()) < 5, shift.max() < 0.1) == (True, True), (turn, shift)
 
 
+@pytest.mark.slow
 def test_what_pushes_the_object_is_neither_it_nor_the_place(bunny, camera, tmp_path):
     """A block touches the object from the first frame on, hides a part of it, and stays behind."""
     rng = np.random.default_rng(5)
@@ -227,6 +230,7 @@ def test_what_is_wrong_is_said(bunny, camera, filmed):
         TrackOptions(rays=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grown", [-1.5, 1.5])
 def test_masks_of_a_wrong_size_are_moved_and_that_is_said(bunny, camera, filmed, grown):
     position, orientation, frames, masks = filmed

@@ -174,11 +174,13 @@ def test_a_lens_that_is_off_centre_is_corrected_for_held_out_views_too(photos: C
     assert np.mean(errors) < 0.5
 
 
+@pytest.mark.slow
 def test_resolution_of_the_photographs_follows_the_grid():
     coarse = train(capture(12, 2, 96), TrainOptions(**{**vars(QUICK), "iterations": 2, "check_every": 2}))
     assert {view.image.shape for view in coarse.capture.views} == {(48, 48, 3)}
 
 
+@pytest.mark.slow
 def test_what_photographs_cannot_tell_is_said():
     good = survey(capture(12, 0), 32)
     assert good.residual < 0.03 and good.warnings == ()

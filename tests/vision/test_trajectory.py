@@ -65,6 +65,7 @@ def test_hidden_frames_lie_where_others_lead(box, kick):
     assert after[:, :3].max() < 0.01 * SIDES.max() and after[:, 3:].max() < np.radians(1)
 
 
+@pytest.mark.slow
 def test_covariances_are_honest(box):
     squares = []
     for seed in range(8):

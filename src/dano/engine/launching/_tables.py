@@ -35,6 +35,8 @@ _MARGIN = 0.001
 _SINK = 0.01
 # … and by this share of the thinner one's half thickness. Impacts are at most as deep.
 _THIN = 0.25
+# Another part of a body, whose impact is left to the next step, gets in by at most this share of the size.
+_DEEPEST = 0.04
 # How samples turn with their body: see `dano.physics.pairs`.
 _TURNING = {"fixed": 0, "axis": 1, "ball": 2}
 
@@ -327,7 +329,7 @@ def _pairs(
         follows=jnp.asarray([float(smooth[j] and not smooth[i]) for i, j, _ in pairs], dtype),
         sink=jnp.minimum(_SINK * size, _THIN * thickness),
         impact_depth=jnp.minimum(_impact_depths(scene, dtype)[contact], _THIN * thickness),
-        deepest=_THIN * thickness,
+        deepest=jnp.minimum(_DEEPEST * size, _THIN * thickness),
         margin=_MARGIN * size + 2 * gravity_step.astype(dtype),
     )
     return rows, np.array(pairs, np.int32)
