@@ -31,9 +31,9 @@ MUCH_MEMORY = 1.2e9
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
-# Folders and files whose programs run longer than they compile: photographs that are rendered and trained on.
+# Folders whose programs run longer than they compile: photographs that are rendered and trained on, and fields.
 # Compiling takes half as long without optimizing.
-RUNS_LONG = tuple(os.environ.get("RUNS_LONG", "vision").split(","))
+RUNS_LONG = ("fields", "objects", "vision")
 
 # Shapes and types are checked while tracing; kernels are compiled by Warp, which takes plain functions only.
 COMPILED = ("physics",)

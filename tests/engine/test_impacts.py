@@ -56,6 +56,30 @@ def test_where_in_a_step_bodies_meet_does_not_matter():
     assert steps.max() < 0.2 * (ends.max() - ends.min()) + 2e-5
 
 
+def test_a_corner_that_friction_jams_throws_nothing_out():
+    """A ball that spins along a floor meets a wall: with friction above 1 on both, their impulses have no bound."""
+    h, speed, radius = 4.6e-3, 0.47, 0.0137
+    params = dano.ContactParams(sliding_friction=1.34, restitution=0.44)
+    bodies = [
+        dano.Body("ball", dano.Sphere(radius), mass=0.13),
+        dano.Body("floor", dano.HalfSpace(), fixed=True),
+        dano.Body("wall", dano.HalfSpace((-1.0, 0.0, 0.0)), fixed=True),
+    ]
+    contacts = [dano.Contact("ball", name, params) for name in ("floor", "wall")]
+    scene = dano.Scene.create(bodies, contacts, timestep=h)
+
+    def run(ahead):
+        place = jnp.stack([-radius - ahead, jnp.zeros(()), jnp.asarray(radius - 1e-5)])
+        start = dict(position=place, velocity=(speed, 0, 0), omega=(-17.0, -22.0, -19.0))
+        return dano.simulate(scene, scene.initial_state(ball=start), 4).states
+
+    states = jax.vmap(run)(jnp.linspace(1e-4, 2 * h * speed, 24))
+    ways = np.linalg.norm(np.diff(np.asarray(states.position[:, :, 0]), axis=1), axis=-1)
+    assert ways.max() < 1.2 * h * speed
+    assert np.asarray(states.velocity[:, -1, 0, 0]).max() < 0
+    assert np.linalg.norm(states.velocity[:, :, 0], axis=-1).max() < 1.05 * speed
+
+
 @pytest.mark.parametrize("shape", [BOX, dano.Ellipsoid((0.05, 0.04, 0.03))], ids=["box", "ellipsoid"])
 def test_derivatives_after_impacts(shape):
     """By friction, speed, height and depth, against differences of a tiny step; forward mode is the same."""

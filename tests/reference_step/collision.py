@@ -1,5 +1,6 @@
 """Finding contact: docs/theory/contact.md, "Which side is sampled" and from "Finding contact" on."""
 
+from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
@@ -473,8 +474,10 @@ def halved(found):
 
 
 def together(bodies, found):
-    """Sides of bodies that touch others that move, too: their impulses do not wait for the impact."""
-    crowded = {k for points in found for k in points[:2] if all(bodies.moves[list(points[:2])])}
+    """Sides of bodies that touch a third one, too: their impulses do not wait for the impact."""
+    pairs = {frozenset(points[:2]) for points in found}
+    touched = Counter(k for pair in pairs for k in pair if bodies.moves[k])
+    crowded = {k for k, n in touched.items() if n > 1}
     return [
         points._replace(delays=0.0, way=max(points.share, 0.0))
         if points.delays and crowded & set(points[:2])

@@ -274,17 +274,17 @@ def lasting_meeting(
 
 @wp.func
 def touches_others(scene: Scene, room: Room, world: int, lane: int, n_found: int, f: int) -> bool:
-    """Whether the body that moves in a pair is near others that move, too."""
+    """Whether the body that moves in a pair touches a third one, too."""
     index = scene.pair_index[room.found[world, f * _LANES + lane].pair]
-    moves = index.first
-    if scene.body_index[index.first].row < 0:
-        moves = index.second
     found = bool(False)
     for g in range(n_found):
         other = scene.pair_index[room.found[world, g * _LANES + lane].pair]
-        if other.first == moves or other.second == moves:
-            both = scene.body_index[other.first].row >= 0 and scene.body_index[other.second].row >= 0
-            found = found or both
+        same = other.first == index.first and other.second == index.second
+        if not same and (other.first != index.second or other.second != index.first):
+            moves = index.first
+            if scene.body_index[index.first].row < 0:
+                moves = index.second
+            found = found or other.first == moves or other.second == moves
     return found
 
 
@@ -292,7 +292,8 @@ def touches_others(scene: Scene, room: Room, world: int, lane: int, n_found: int
 def keep_together(scene: Scene, room: Room, world: int, lane: int, n_found: int):
     """Have impulses on bodies that touch others, too, take effect all at once: at the start of the step.
 
-    What is pressed from both sides would else go on by what one of them does until the other begins.
+    What is pressed from two sides would else go on by what one of them does until the other begins: in a corner
+    that friction jams, the two impulses have no bound.
     """
     for f in range(n_found):
         k = f * _LANES + lane
