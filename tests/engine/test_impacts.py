@@ -57,7 +57,7 @@ def test_where_in_a_step_bodies_meet_does_not_matter():
 
 
 def test_a_corner_that_friction_jams_throws_nothing_out():
-    """A ball that spins along a floor meets a wall: with friction above 1 on both, their impulses have no bound."""
+    """A ball that spins along a floor meets a wall: friction above 1 on both bounds no impulse."""
     h, speed, radius = 4.6e-3, 0.47, 0.0137
     params = dano.ContactParams(sliding_friction=1.34, restitution=0.44)
     bodies = [

@@ -292,8 +292,8 @@ def touches_others(scene: Scene, room: Room, world: int, lane: int, n_found: int
 def keep_together(scene: Scene, room: Room, world: int, lane: int, n_found: int):
     """Have impulses on bodies that touch others, too, take effect all at once: at the start of the step.
 
-    What is pressed from two sides would else go on by what one of them does until the other begins: in a corner
-    that friction jams, the two impulses have no bound.
+    What is pressed from two sides would else go on by what one of them does until the other begins: in a
+    corner that friction jams, the two impulses have no bound.
     """
     for f in range(n_found):
         k = f * _LANES + lane
