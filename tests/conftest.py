@@ -31,9 +31,9 @@ MUCH_MEMORY = 1.2e9
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
-# Folders whose programs run longer than they compile: photographs that are rendered and trained on, fields.
-# Compiling takes half as long without optimizing.
-RUNS_LONG = ("fields", "objects", "vision")
+# Folders whose programs run longer than they compile (photographs that are rendered and trained on, fields), and
+# one that compares to the last digits. Compiling takes half as long without optimizing.
+RUNS_LONG = ("fields", "objects", "reference_step", "vision")
 
 # Shapes and types are checked while tracing; kernels are compiled by Warp, which takes plain functions only.
 COMPILED = ("physics",)
