@@ -155,18 +155,31 @@ def _identify(w: World) -> Iterator[Call]:
                 "nan": {"position": kinds.NAN},
             },
             "initial": CHOICE,
-            "huber": OPTIONAL_POSITIVE,
-            "window": OPTIONAL_COUNT,
-            "starts": COUNT,
-            "continuity": OPTIONAL_POSITIVE,
-            "checkpoint": {**kinds.target(w.folder, ".npz"), "another ending": w.folder / "out.txt"},
+            "options": instance(optional=True),
         },
         {
-            "checkpoint": "",
             "controls": "control",
             "observed": "",
             "parameters": "parameter",
             "state": "state",
+        },
+    )
+    yield Call(
+        "IdentifyOptions",
+        dano.IdentifyOptions,
+        {"window": 5},
+        {
+            "window": OPTIONAL_COUNT,
+            "continuity": OPTIONAL_POSITIVE,
+            "huber": OPTIONAL_POSITIVE,
+            "starts": COUNT,
+            "seed": {"share": 2.5, "text": "a", "negative": -1},
+            "max_iterations": COUNT,
+            "tolerance": POSITIVE,
+            "jacobian": CHOICE,
+            "batch": OPTIONAL_COUNT,
+            "checkpoint": {"number": 3, "thing": kinds.Thing(), "another ending": w.folder / "out.txt"},
+            "resume": {"of nothing": True},
         },
     )
     times = {
