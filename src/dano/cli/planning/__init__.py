@@ -85,7 +85,7 @@ def _drawn(loaded, given, found: Planned, command: Plan, progress: Progress) -> 
     """The pictures that were asked for."""
     files: dict[str, Path] = {}
     if command.video is not None or command.strip is not None:
-        from dano.report import film_plan
+        from dano.report import film_plan, PLAN_VIDEO
 
         film_plan(
             loaded.scene,
@@ -93,8 +93,8 @@ def _drawn(loaded, given, found: Planned, command: Plan, progress: Progress) -> 
             found,
             command.video,
             strip=command.strip,
-            slow_motion=command.slow_motion,
             looks=loaded.looks(),
+            options=dataclasses.replace(PLAN_VIDEO, slow_motion=command.slow_motion),
             progress=progress,
         )
         named = {"video": command.video, "strip": command.strip}
