@@ -97,6 +97,7 @@ from dano.plan import (
     Limit as Limit,
     Plan as Plan,
     plan as plan,
+    PlanOptions as PlanOptions,
     SamplingOptions as SamplingOptions,
     Task as Task,
 )

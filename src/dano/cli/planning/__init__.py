@@ -13,7 +13,7 @@ from dano.cli._arguments import Plan
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
-from dano.plan import OPTIONS, Plan as Planned, plan as find_plan, SamplingOptions
+from dano.plan import Plan as Planned, plan as find_plan
 
 
 def plan(command: Plan) -> None:
@@ -51,18 +51,11 @@ def plan(command: Plan) -> None:
 
 
 def _found(loaded, given, command: Plan, progress: Progress) -> Planned:
-    search = given.search
-    options = OPTIONS._replace(max_seconds=search.max_seconds)
-    if search.max_iterations is not None:
-        options = options._replace(max_iterations=search.max_iterations)
-    sampling = SamplingOptions(max_seconds=search.max_seconds)
-    names = ("passes", "samples", "knots", "deviation", "first")
-    asked = {name: getattr(search, name) for name in names}
-    sampling = dataclasses.replace(sampling, **{name: x for name, x in asked.items() if x is not None})
-    most = options.max_iterations * options.max_updates
+    options = given.options
+    most = options.ilqr.max_iterations * options.ilqr.max_updates
 
     def tell(stage: str, iteration: int, cost: float) -> bool:
-        whole = sampling.passes if stage == "sampling" else most
+        whole = options.sampling.passes if stage == "sampling" else most
         progress(f"{stage}, cost {cost:.3g}", iteration / whole)
         return interrupted()
 
@@ -70,13 +63,9 @@ def _found(loaded, given, command: Plan, progress: Progress) -> Planned:
         loaded.scene,
         loaded.state,
         given.task,
-        method=command.method or search.method,
+        method=command.method or given.method,
         controls=given.controls,
-        explore=search.explore,
-        softening=search.softening,
         options=options,
-        sampling=sampling,
-        seed=search.seed,
         callback=tell,
     )
 
