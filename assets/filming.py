@@ -2,7 +2,7 @@
 
 import io
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ from jax.core import Tracer
 from PIL import Image
 
 import dano
-from dano.report import render_trajectory
+from dano.report import render_trajectory, VideoOptions
+from dano.vision import LearnedField
 
 MOST_BYTES = 300_000
 """Of a picture of the documentation."""
@@ -63,12 +64,18 @@ def recorded_in_mujoco() -> Iterator[list[tuple[mujoco.MjModel, np.ndarray]]]:
         mujoco.mj_step = step
 
 
-def frames_of(scene: dano.Scene, run: dano.Trajectory, slow_motion: float = 1.0, **options: Any) -> Frames:
-    """Frames of a run as `render_trajectory` draws them; `options` are its own."""
+def frames_of(
+    scene: dano.Scene,
+    run: dano.Trajectory,
+    slow_motion: float = 1.0,
+    looks: Mapping[str, LearnedField] | None = None,
+    **style: Any,
+) -> Frames:
+    """Frames of a run as `render_trajectory` draws them; `style` are more fields of its options."""
+    options = VideoOptions(fps=FPS, slow_motion=slow_motion, **{"size": SIZE, "clock": False, **style})
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
-        options = {"size": SIZE, "fps": FPS, "clock": False, **options}
-        render_trajectory(scene, run, path, slow_motion=slow_motion, **options)
+        render_trajectory(scene, run, path, looks=looks, options=options)
         return read_film(path)
 
 

@@ -208,7 +208,7 @@ def test_friction_is_found_from_pixels(scene, look, watched, tmp_path):
         camera,
         rough,
         [friction],
-        options=TrackOptions(masks="given", rays=1500),
+        tracking=TrackOptions(masks="given", rays=1500),
         initial="velocities",
     )
     before, after = (float(fit.values["mu"]) for fit in (found.poses, found.fit))

@@ -46,9 +46,10 @@ FILM = """
 from pathlib import Path
 import jax
 jax.config.update("jax_enable_x64", True)
-from dano.report import render_trajectory
+from dano.report import render_trajectory, VideoOptions
 from dano.scene_file import load_run
 
 run = load_run(Path("run.npz"))
-render_trajectory(run.source.scene, run.trajectory, "run.mp4", fps=100, size=(1280, 720))
+options = VideoOptions(fps=100, size=(1280, 720))
+render_trajectory(run.source.scene, run.trajectory, "run.mp4", options=options)
 """

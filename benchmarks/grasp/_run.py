@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 import dano
 from benchmarks._measure import load_average, parse_arguments, report, Row
-from dano.plan import Plan, SamplingOptions, Task
+from dano.plan import Plan, PlanOptions, SamplingOptions, Task
 from dano.scene_file import load_scene, load_task
 
 SCENE, TASK = (Path(__file__).parent / name for name in ("scene.toml", "task.toml"))
@@ -90,9 +90,8 @@ class Hand:
         """A plan by the cross-entropy method."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
-            return dano.plan(
-                self.scene, state, self.task, method="cem", controls=guess, sampling=search, seed=seed
-            )
+            options = PlanOptions(sampling=search, seed=seed)
+            return dano.plan(self.scene, state, self.task, method="cem", controls=guess, options=options)
 
 
 def _at(state: dano.State, q: Float[Array, " k"]) -> dano.State:

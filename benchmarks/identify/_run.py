@@ -43,7 +43,7 @@ class Outcome:
     seconds: float
 
 
-def fitted(case: _cases.Case, seed: int, starts: int, **options) -> Outcome:
+def fitted(case: _cases.Case, seed: int, options: dano.IdentifyOptions) -> Outcome:
     """Fit one motion from several starts."""
     motion = _cases.observed(case, seed)
     noise = {"position": _cases.POSITION, "orientation": _cases.ROTATION}
@@ -51,7 +51,7 @@ def fitted(case: _cases.Case, seed: int, starts: int, **options) -> Outcome:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         fit = dano.identify(
-            case.scene, motion, case.parameters, initial="states", noise=noise, starts=starts, **options
+            case.scene, motion, case.parameters, initial="states", noise=noise, options=options
         )
     seconds = time.perf_counter() - began
     names = list(case.truth)
@@ -79,16 +79,18 @@ def run() -> None:
     arguments = parse_arguments("Fits through impacts from ten starts.", _options)
     load, rows = load_average(), []
     kinds = [arguments.only] if arguments.only else list(_cases.CASES)
-    options = {"smooth": False} if arguments.plain else {}
+    options = dano.IdentifyOptions(starts=arguments.starts, smooth=not arguments.plain)
     for kind in kinds:
         case = _cases.CASES[kind]()
         n = 2 if arguments.quick else arguments.fits or FITS[kind]
         found = []
         for seed in range(n):
-            found.append(fitted(case, seed, arguments.starts, **options))
+            found.append(fitted(case, seed, options))
             print(kind, found[-1], flush=True)
         rows += _rows(kind, found)
-    settings = {"dtype": "float64", "starts": arguments.starts, "quick": arguments.quick, **options}
+    settings = {"dtype": "float64", "starts": options.starts, "quick": arguments.quick}
+    if arguments.plain:
+        settings["smooth"] = options.smooth
     report("identify", rows, settings, load, arguments.json)
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 import dano
 from benchmarks._subjects import authors_bunny
 from dano.maths import quat_from_axis_angle, quat_multiply
-from dano.plan import Actuator, follow, Goal, Plan, SamplingOptions, Task
+from dano.plan import Actuator, follow, Goal, Plan, PlanOptions, SamplingOptions, Task
 
 TIMESTEP, N_STEPS, PUSH_STEPS = 0.02, 60, 160
 FRICTION, RADIUS, BALL_MASS = 0.05, 0.25, 10.0
@@ -170,8 +170,9 @@ def outcome(
 
 def _sampled(planned: dano.Scene, given: Case, seconds: float) -> float:
     """The larger error that CEM leaves in the same time."""
-    options = SamplingOptions(passes=200, max_seconds=seconds, price=1e2, last_price=1e5)
-    found = dano.plan(planned, given.state, given.task, method="cem", controls=given.guess, sampling=options)
+    sampling = SamplingOptions(passes=200, max_seconds=seconds, price=1e2, last_price=1e5)
+    options = PlanOptions(sampling=sampling)
+    found = dano.plan(planned, given.state, given.task, method="cem", controls=given.guess, options=options)
     return max(goal.error for goal in found.goals)
 
 

@@ -76,7 +76,7 @@ def fits(case: Case, seeds: int) -> Iterator[dano.Identification]:
             list(case.parameters),
             controls=controls,
             noise=dict(q=NOISE),
-            window=case.window,
+            options=dano.IdentifyOptions(window=case.window),
         )
 
 

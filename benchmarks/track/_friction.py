@@ -44,7 +44,7 @@ def fit_film(
             camera,
             Motion.from_tracked(found, name),
             [friction],
-            options=options,
+            tracking=options,
             background=background,
             initial="states",
         )

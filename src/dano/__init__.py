@@ -82,6 +82,7 @@ from dano.engine import (
 from dano.identify import (
     Identification as Identification,
     identify as identify,
+    IdentifyOptions as IdentifyOptions,
     load_motion as load_motion,
     Motion as Motion,
     motion_of_joints as motion_of_joints,
@@ -96,6 +97,7 @@ from dano.plan import (
     Limit as Limit,
     Plan as Plan,
     plan as plan,
+    PlanOptions as PlanOptions,
     SamplingOptions as SamplingOptions,
     Task as Task,
 )

@@ -71,7 +71,9 @@ def test_a_plan_is_found_written_and_drawn(folder, run):
 
 def test_a_task_file_says_what_the_task_is(folder):
     given = load_task(folder / "task.toml", load_scene(folder / "scene.toml").scene)
-    assert given.task.n_steps == 10 and given.search.method == "ilqr" and given.search.max_seconds == 600
+    assert given.task.n_steps == 10 and given.method == "ilqr"
+    assert given.options.ilqr.max_seconds == given.options.sampling.max_seconds == 600
+    assert given.options.explore is None and given.options.sampling.passes == 30
     np.testing.assert_array_equal(given.controls, np.tile([1.0, 0.0], (10, 1)))
     assert given.task.goals[0].axes == "xy" and given.task.limits[0].name == "limit of velocity of puck"
 
@@ -132,9 +134,9 @@ def test_commands_of_motors_are_controls_of_a_task(tmp_path):
         ("position = [0.3, 0.1, 0.0]", "positoin = [0, 0, 0]", "did you mean 'position'"),
         ("within = 1e-4", "within = 0.0", "within of the goal of 'puck' must be > 0"),
         ('quantity = "velocity"', 'quantity = "speed"', "must be one of position, velocity"),
-        ("max_seconds = 600.0", "max_seconds = 0.0", "max_seconds must be > 0 s, got 0.0"),
+        ("max_seconds = 600.0", "max_seconds = 0.0", r"max_seconds must be finite and > 0, got 0.0"),
         ("max_seconds = 600.0", 'method = "lqr"', "method must be one of .*; did you mean 'ilqr'"),
-        ("max_seconds = 600.0", "softening = [2.0]", "softening must be factors between 0 and 1"),
+        ("max_seconds = 600.0", "softening = [2.0]", r"softening must hold factors between 0 and 1, got 2.0"),
         ("max_seconds = 600.0", 'first = "evn"', "first must be one of .*; did you mean 'even'"),
         ("[search]", "[search", "must be a TOML task file"),
     ],

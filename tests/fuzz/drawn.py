@@ -14,8 +14,8 @@ EXAMPLES = 12
 CHEAP = (
     "Sphere Box Capsule Cylinder Ellipsoid HalfSpace Pose ContactParams CentroidLaw DistributedLaw Contact"
     " Joint Loop Motor MassProperties ContactSamples SurfaceSamples Target Actuator Goal Limit Task"
-    " SamplingOptions VariationalEngine Parameter Motion.create Scene.initial_state Scene.control"
-    " Scene.index posed scaled"
+    " SamplingOptions PlanOptions IdentifyOptions VariationalEngine Parameter Motion.create"
+    " Scene.initial_state Scene.control Scene.index posed scaled"
 ).split()
 """Functions that only check and keep what they are given."""
 

@@ -33,8 +33,9 @@ def spring_case() -> "Case":
     start = scene.initial_state(ball={"position": (1, 0, 0)})
     run = dano.simulate(scene, start, 200, controls=Spring(jnp.asarray(60.0)))
     stiffness = dano.Parameter("k", lambda c: c.stiffness, 1.0, 200.0, start=150.0, of="controls")
-    options = {"controls": Spring(jnp.asarray(1.0)), "noise": {"position": 1e-3}, "starts": 6}
-    return scene, dano.Motion.from_trajectory(run, every=10), [stiffness], options
+    given = {"controls": Spring(jnp.asarray(1.0)), "noise": {"position": 1e-3}}
+    options = dano.IdentifyOptions(starts=6)
+    return scene, dano.Motion.from_trajectory(run, every=10), [stiffness], given, options
 
 
 def basin_case() -> "Case":
@@ -45,10 +46,11 @@ def basin_case() -> "Case":
     omega = np.where(np.arange(12)[:, None, None] == 0, seen.omega, np.nan)
     motion = dataclasses.replace(seen, omega=omega, velocity=np.full_like(omega, np.nan))
     gravity = dano.Parameter("g", lambda s: s.gravity, -20.0, 20.0, start=[0.0, 0.0, -5.0])
-    return scene, motion, [gravity], dict(initial="states", window=4, continuity=(1e3, 1.0), noise=NOISE)
+    options = dano.IdentifyOptions(window=4, continuity=(1e3, 1.0))
+    return scene, motion, [gravity], dict(initial="states", noise=NOISE), options
 
 
-Case = tuple[dano.Scene, dano.Motion, list[dano.Parameter], dict[str, Any]]
+Case = tuple[dano.Scene, dano.Motion, list[dano.Parameter], dict[str, Any], dano.IdentifyOptions]
 
 
 def same(one: dano.Identification, other: dano.Identification) -> None:
@@ -65,9 +67,9 @@ def same(one: dano.Identification, other: dano.Identification) -> None:
 
 @pytest.mark.parametrize("case", [spring_case, basin_case])
 def test_a_search_that_is_killed_again_and_again(case, tmp_path, monkeypatch):
-    scene, motion, parameters, options = case()
-    path = tmp_path / "search.npz"
-    whole = dano.identify(scene, motion, parameters, **options)
+    scene, motion, parameters, given, options = case()
+    resumed = dataclasses.replace(options, checkpoint=tmp_path / "search.npz", resume=True)
+    whole = dano.identify(scene, motion, parameters, options=options, **given)
     monkeypatch.setattr(Pace, "every", 0.0)
     monkeypatch.setattr(Pace, "share", 0)
     write, written = Checkpoint._write, []
@@ -82,7 +84,7 @@ def test_a_search_that_is_killed_again_and_again(case, tmp_path, monkeypatch):
     ends, fit = 0, None
     while fit is None:
         try:
-            fit = dano.identify(scene, motion, parameters, checkpoint=path, resume=True, **options)
+            fit = dano.identify(scene, motion, parameters, options=resumed, **given)
         except MemoryError:
             ends += 1
     assert ends >= 3
@@ -92,8 +94,8 @@ def test_a_search_that_is_killed_again_and_again(case, tmp_path, monkeypatch):
 
 
 def test_a_search_that_is_interrupted_is_kept_and_goes_on(tmp_path):
-    scene, motion, parameters, options = spring_case()
-    path = tmp_path / "search.npz"
+    scene, motion, parameters, given, options = spring_case()
+    kept = dataclasses.replace(options, checkpoint=tmp_path / "search.npz")
 
     def stop(description, share):
         if description.startswith("fitting") and share > 0.5:
@@ -101,59 +103,56 @@ def test_a_search_that_is_interrupted_is_kept_and_goes_on(tmp_path):
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        part = dano.identify(scene, motion, parameters, checkpoint=path, progress=stop, **options)
+        part = dano.identify(scene, motion, parameters, options=kept, progress=stop, **given)
     assert not part.converged or len(part.minima) < 6
     told = []
     fit = dano.identify(
         scene,
         motion,
         parameters,
-        checkpoint=path,
-        resume=True,
+        options=dataclasses.replace(kept, resume=True),
         progress=lambda *said: told.append(said),
-        **options,
+        **given,
     )
-    same(dano.identify(scene, motion, parameters, **options), fit)
+    same(dano.identify(scene, motion, parameters, options=options, **given), fit)
     assert min(share for what, share in told if what.startswith("fitting")) > 0.5
 
 
 def test_a_checkpoint_of_another_search_is_refused(tmp_path):
-    scene, motion, parameters, options = spring_case()
+    scene, motion, parameters, given, options = spring_case()
     path = tmp_path / "search.npz"
+    kept = dataclasses.replace(options, checkpoint=path)
 
     def stop(description, share):
         if description.startswith("fitting"):
             raise KeyboardInterrupt
 
-    def search(**other):
-        given: dict[str, Any] = {"scene": scene, "observed": motion, "parameters": parameters}
+    def search(options: dano.IdentifyOptions, **other):
+        usual: dict[str, Any] = {"scene": scene, "observed": motion, "parameters": parameters}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
-            keywords: Any = given | options | {"progress": stop} | other
-            return dano.identify(**keywords)
+            keywords: Any = usual | given | {"progress": stop} | other
+            return dano.identify(options=options, **keywords)
 
-    search(checkpoint=path)
-    before = path.read_bytes()
+    search(kept)
+    before, resumed = path.read_bytes(), dataclasses.replace(kept, resume=True)
     wider = [dataclasses.replace(parameters[0], upper=300.0)]
     moved = dataclasses.replace(motion, position=motion.position + 1e-12)
     for other in (
         {"scene": scene.replace_body("ball", mass_scale=2.0)},
         {"observed": moved},
         {"parameters": wider},
-        {"starts": 5},
-        {"huber": 2.0},
+        {"options": dataclasses.replace(resumed, starts=5)},
+        {"options": dataclasses.replace(resumed, huber=2.0)},
     ):
         with pytest.raises(
-            ValueError, match="search.npz must be of this search, with the same scene, motion"
+            ValueError,
+            match="options.checkpoint .*search.npz must be of this search, with the same scene, motion",
         ):
-            search(checkpoint=path, resume=True, **other)
+            search(**{"options": resumed, **other})
     assert path.read_bytes() == before
     path.write_bytes(before[:100])
     with pytest.raises(ValueError, match="search.npz is not a readable dano-search file"):
-        search(checkpoint=path, resume=True)
-    with pytest.raises(ValueError, match="resume needs a checkpoint"):
-        search(resume=True)
-    with pytest.raises(ValueError, match="checkpoint must end in .npz"):
-        search(checkpoint=tmp_path / "search.json")
+        search(resumed)
     with pytest.raises(ValueError, match="existing directory"):
-        search(checkpoint=tmp_path / "missing" / "search.npz")
+        search(dataclasses.replace(options, checkpoint=tmp_path / "missing" / "search.npz"))

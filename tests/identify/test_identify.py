@@ -3,6 +3,7 @@
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -96,7 +97,13 @@ def test_both_jacobians_give_the_same_answer(observed):
     rng = np.random.default_rng(3)
     motion = noisy(observed.part(0, 8), rng)
     fits = [
-        dano.identify(ball_scene(), motion, [FRICTION], initial=["velocity"], jacobian=mode, tolerance=1e-3)
+        dano.identify(
+            ball_scene(),
+            motion,
+            [FRICTION],
+            initial=["velocity"],
+            options=dano.IdentifyOptions(jacobian=mode, tolerance=1e-3),
+        )
         for mode in ("forward", "reverse")
     ]
     assert fits[0].values["mu"] == pytest.approx(fits[1].values["mu"], abs=1e-6)
@@ -105,7 +112,8 @@ def test_both_jacobians_give_the_same_answer(observed):
 
 @pytest.mark.slow
 def test_windows_may_be_simulated_at_once(observed):
-    fit = dano.identify(ball_scene(), observed, [FRICTION], initial="given", window=8, batch=3)
+    options = dano.IdentifyOptions(window=8, batch=3)
+    fit = dano.identify(ball_scene(), observed, [FRICTION], initial="given", options=options)
     assert fit.values["mu"] == pytest.approx(0.25, abs=1e-3)
 
 
@@ -149,7 +157,8 @@ def test_outliers_pull_less_with_hubers_loss(observed):
     wrong[[5, 11, 16], 0, 0] += (0.01, 0.02, -0.01)
     motion = dataclasses.replace(motion, position=wrong)
     plain = dano.identify(ball_scene(), motion, [FRICTION], initial="states", noise=NOISE)
-    robust = dano.identify(ball_scene(), motion, [FRICTION], initial="states", noise=NOISE, huber=2.0)
+    options = dano.IdentifyOptions(huber=2.0)
+    robust = dano.identify(ball_scene(), motion, [FRICTION], initial="states", noise=NOISE, options=options)
     assert abs(robust.values["mu"] - 0.25) < 0.02
     assert abs(robust.values["mu"] - 0.25) < 0.3 * abs(plain.values["mu"] - 0.25)
     assert robust.standard_errors["mu"] < plain.standard_errors["mu"]
@@ -163,9 +172,8 @@ def test_multiple_shooting(observed, continuity):
         motion,
         [FRICTION],
         initial="states",
-        window=8,
-        continuity=continuity,
         noise=NOISE,
+        options=dano.IdentifyOptions(window=8, continuity=continuity),
     )
     assert fit.initial_states.position.shape[0] == 3
     assert abs(fit.values["mu"] - 0.25) < 4 * fit.standard_errors["mu"]
@@ -175,10 +183,13 @@ def test_multiple_shooting(observed, continuity):
 
 def test_windows_that_are_tied_more_and_more_tightly(observed):
     motion = noisy(observed, np.random.default_rng(7))
-    options = {"initial": "states", "window": 8, "noise": NOISE}
-    loose = dano.identify(ball_scene(), motion, [FRICTION], continuity=3.0, **options)
-    tied = dano.identify(ball_scene(), motion, [FRICTION], continuity=(3.0, 0.1, 0.01), **options)
-    whole = dano.identify(ball_scene(), motion, [FRICTION], initial="states", noise=NOISE)
+
+    def fitted(options=None):
+        return dano.identify(ball_scene(), motion, [FRICTION], initial="states", noise=NOISE, options=options)
+
+    loose = fitted(dano.IdentifyOptions(window=8, continuity=3.0))
+    tied = fitted(dano.IdentifyOptions(window=8, continuity=(3.0, 0.1, 0.01)))
+    whole = fitted()
     assert tied.standard_errors["mu"] < loose.standard_errors["mu"]
     # Windows that meet are one window.
     assert tied.values["mu"] == pytest.approx(whole.values["mu"], abs=0.1 * whole.standard_errors["mu"])
@@ -187,25 +198,29 @@ def test_windows_that_are_tied_more_and_more_tightly(observed):
 
 def test_a_fit_may_go_on_from_an_earlier_one(observed):
     motion = noisy(observed, np.random.default_rng(7))
-    options = {"initial": "states", "window": 8, "noise": NOISE}
-    loose = dano.identify(ball_scene(), motion, [FRICTION], continuity=3.0, **options)
-    sequence = dano.identify(ball_scene(), motion, [FRICTION], continuity=(3.0, 0.1), **options)
-    fit = dano.identify(ball_scene(), motion, [FRICTION], continuity=0.1, after=loose, **options)
+
+    def fitted(continuity, after=None, window=8, initial="states", smooth=True):
+        options = dano.IdentifyOptions(window=window, continuity=continuity, smooth=smooth)
+        return dano.identify(
+            ball_scene(), motion, [FRICTION], initial=initial, noise=NOISE, after=after, options=options
+        )
+
+    loose = fitted(3.0)
+    sequence = fitted((3.0, 0.1))
+    fit = fitted(0.1, loose)
     assert fit.loss_history[-1] == pytest.approx(sequence.loss_history[-1], rel=1e-3)
     # At its own minimum there is nothing left to do, but to look at how rough the loss is.
-    again = dano.identify(ball_scene(), motion, [FRICTION], continuity=0.1, after=fit, **options)
+    again = fitted(0.1, fit)
     assert len(again.loss_history) == 1 and not again.smoothed
-    blind = dano.identify(
-        ball_scene(), motion, [FRICTION], continuity=0.1, after=fit, smooth=False, **options
-    )
+    blind = fitted(0.1, fit, smooth=False)
     assert blind.evaluations == 1
     assert again.values["mu"] == pytest.approx(fit.values["mu"], abs=1e-12)
     # What was not estimated before begins as measured.
-    given = dano.identify(ball_scene(), motion, [FRICTION], initial="given", window=8, noise=NOISE)
-    states = dano.identify(ball_scene(), motion, [FRICTION], continuity=0.1, after=given, **options)
+    given = fitted(None, initial="given")
+    states = fitted(0.1, given)
     assert states.loss_history[-1] == pytest.approx(sequence.loss_history[-1], rel=1e-3)
     with pytest.raises(ValueError, match="after must be a fit of the same motions in the same windows: 5 "):
-        dano.identify(ball_scene(), motion, [FRICTION], initial="states", window=4, after=loose)
+        fitted(None, loose, window=4)
 
 
 def test_windows_leave_a_wrong_basin_by_where_the_ones_before_end():
@@ -219,9 +234,8 @@ def test_windows_leave_a_wrong_basin_by_where_the_ones_before_end():
         dataclasses.replace(seen, omega=omega, velocity=np.full_like(omega, np.nan)),
         [dano.Parameter("gravity", lambda s: s.gravity, -20.0, 20.0, start=[0.0, 0.0, -5.0])],
         initial="states",
-        window=4,
-        continuity=(1e3, 1.0),
         noise=NOISE,
+        options=dano.IdentifyOptions(window=4, continuity=(1e3, 1.0)),
     )
     np.testing.assert_allclose(fit.initial_states.omega[:, 0], [[0, 0, 40.0]] * 3, atol=1e-3)
     np.testing.assert_allclose(fit.values["gravity"], [0, 0, -9.81], atol=1e-3)
@@ -242,9 +256,8 @@ def test_a_motion_in_a_wrong_basin_among_motions_that_fit():
         seen,
         [dano.Parameter("gravity", lambda s: s.gravity, -20.0, 20.0, start=[0.0, 0.0, -5.0])],
         initial="states",
-        window=4,
-        continuity=(1e3, 1.0),
         noise=NOISE,
+        options=dano.IdentifyOptions(window=4, continuity=(1e3, 1.0)),
     )
     spins = np.repeat([3.0, 40.0, -5.0], 3)
     np.testing.assert_allclose(fit.initial_states.omega[:, 0, 2], spins, atol=1e-3)
@@ -305,7 +318,12 @@ def test_velocities_are_compared_at_their_own_times():
     gravity = dano.Parameter("gravity", lambda s: s.gravity, -20.0, 20.0)
     for motion in (fine, sampled):
         fit = dano.identify(
-            fall(0.004), motion, [gravity], window=3, initial="given", noise={"velocity": 0.01}
+            fall(0.004),
+            motion,
+            [gravity],
+            initial="given",
+            noise={"velocity": 0.01},
+            options=dano.IdentifyOptions(window=3),
         )
         np.testing.assert_allclose(fit.values["gravity"], [0, 0, -9.81], atol=1e-6)
         np.testing.assert_allclose(fit.guessed[0].velocity, motion.velocity, atol=1e-9)
@@ -369,7 +387,8 @@ def test_recorded_forces_do_as_well_as_the_policy():
     control = dano.Control(jnp.asarray(rows), jnp.zeros((50, 2, 3)))
     # Cut, so that windows must find their own rows.
     rows[25:, 0, 0] = 3.0
-    fit = dano.identify(scene, motion, [MASS], controls=[control], window=17, initial="given")
+    options = dano.IdentifyOptions(window=17)
+    fit = dano.identify(scene, motion, [MASS], controls=[control], initial="given", options=options)
     assert fit.values["alpha"] == pytest.approx(1.0, abs=1e-4)
 
 
@@ -452,7 +471,8 @@ def test_many_starts_find_the_lower_minimum():
     options = {"controls": Spring(jnp.asarray(1.0)), "noise": {"position": 1e-3}}
     with pytest.warns(RuntimeWarning, match="misses the observed positions by .* try more starts"):
         alone = dano.identify(scene, motion, [stiffness], **options)
-    many = dano.identify(scene, motion, [stiffness], starts=6, **options)
+    search = dano.IdentifyOptions(starts=6)
+    many = dano.identify(scene, motion, [stiffness], options=search, **options)
     assert abs(alone.values["k"] - 60) > 1
     assert many.values["k"] == pytest.approx(60, abs=1e-3)
     assert many.minima[0].loss <= many.minima[-1].loss and len(many.minima) == 6
@@ -517,23 +537,47 @@ def test_bad_input():
     refuse("must be > 0 to have a logarithm", parameters=changed(coordinates="log", start=0.0))
     refuse("noise of position", noise={"position": 0.0})
     refuse("noise must be given for some", noise={"place": 1.0})
-    refuse("window must be ≥ 2", window=1)
-    refuse("continuity needs", continuity=0.1)
-    refuse("sequence of it must fall", continuity=(0.1, 0.3), window=4, initial="states")
-    refuse("huber must be", huber=-1.0)
-    refuse("starts must lie between", starts=0)
     refuse("initial must be one of", initial="everything")
     refuse("initial must list", initial=["speed"])
-    refuse("jacobian must be", jacobian="sideways")
+    tied = dano.IdentifyOptions(window=4, continuity=0.1)
+    refuse(
+        "options.continuity needs initial='states', got initial \\['velocity",
+        initial="velocities",
+        options=tied,
+    )
     refuse("state must be one for all", state=[None, None])
     refuse("more numbers than there are unknowns", observed=sliding_motion(2), initial="states")
-    refuse("finite bounds", parameters=changed(upper=np.inf), starts=3)
+    many = dano.IdentifyOptions(starts=3)
+    refuse("options.starts > 1 needs finite bounds", parameters=changed(upper=np.inf), options=many)
     nobody = dataclasses.replace(sliding_motion(), names=("cube",))
     refuse("bodies of the scene", observed=nobody)
     only_turns = dataclasses.replace(sliding_motion(), position=np.full((10, 1, 3), np.nan))
     refuse("must have a frame with positions", observed=only_turns)
     only_floor = dataclasses.replace(sliding_motion(), names=("floor",))
     refuse("not observed: give the state", observed=only_floor)
+
+
+@pytest.mark.parametrize(
+    ("match", "wrong"),
+    [
+        ("window must be ≥ 2, got 1", {"window": 1}),
+        ("continuity needs window, got continuity 0.1 and window None", {"continuity": 0.1}),
+        ("a sequence of it must fall", {"continuity": (0.1, 0.3), "window": 4}),
+        ("continuity must be finite and > 0", {"continuity": np.nan, "window": 4}),
+        ("huber must be", {"huber": -1.0}),
+        ("starts must lie between", {"starts": 0}),
+        ("seed must be ≥ 0", {"seed": -1}),
+        ("jacobian must be one of auto, forward, reverse, got 'sideways'", {"jacobian": "sideways"}),
+        ("max_iterations must be", {"max_iterations": 0}),
+        ("tolerance must be", {"tolerance": 0.0}),
+        ("batch must be ≥ 1", {"batch": 0}),
+        ("resume needs a checkpoint", {"resume": True}),
+        ("checkpoint must end in .npz, got search.json", {"checkpoint": "search.json"}),
+    ],
+)
+def test_options_out_of_range(match, wrong):
+    with pytest.raises(ValueError, match=match):
+        dano.IdentifyOptions(**wrong)
 
 
 def test_an_interrupt_returns_the_best_so_far(truth):
@@ -604,9 +648,13 @@ def test_covariances_weigh_as_generalised_least_squares_does():
     position = flight.position[:, 0] + noise
     seen = dano.Motion.create(times, "ball", position=position, covariance=whole)
     gravity = dano.Parameter("g", lambda s: s.gravity, np.full(3, -20.0), np.full(3, 20.0))
-    fit = dano.identify(
-        scene, seen, [gravity], state=start, noise={"position": 1e-3}, initial=["velocity"], tolerance=1e-4
-    )
+    given: dict[str, Any] = {
+        "state": start,
+        "noise": {"position": 1e-3},
+        "initial": ["velocity"],
+        "options": dano.IdentifyOptions(tolerance=1e-4),
+    }
+    fit = dano.identify(scene, seen, [gravity], **given)
     # x = v t + ½ g t (t + h): the integrator's own sum.
     factors = np.stack([times, 0.5 * times * (times + H)], axis=1)[1:]
     design = np.einsum("tk,ij->tikj", factors, np.eye(3)).reshape(n - 1, 3, 6)
@@ -617,7 +665,5 @@ def test_covariances_weigh_as_generalised_least_squares_does():
     assert np.all(np.abs(np.asarray(fit.values["g"]) - expected) < 0.02 * errors)
     # Without the covariances it comes out elsewhere, so that the comparison says something.
     plain = dataclasses.replace(seen, covariance=None)
-    other = dano.identify(
-        scene, plain, [gravity], state=start, noise={"position": 1e-3}, initial=["velocity"], tolerance=1e-4
-    )
+    other = dano.identify(scene, plain, [gravity], **given)
     assert np.any(np.abs(np.asarray(other.values["g"]) - expected) > 0.3 * errors)

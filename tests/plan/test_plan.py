@@ -237,9 +237,9 @@ def test_a_step_of_the_task_may_hold_several_of_the_scene(puck):
 
 def test_sampling_finds_contact_that_derivatives_do_not_show(pushing):
     scene, state, task = pushing
-    few = dano.SamplingOptions(passes=6, samples=24)
+    few = dano.PlanOptions(sampling=dano.SamplingOptions(passes=6, samples=24), seed=1)
     for method in ("cem", "mppi"):
-        made = dano.plan(scene, state, task, method=method, sampling=few, seed=1)
+        made = dano.plan(scene, state, task, method=method, options=few)
         # From no control at all, where the cube would stay 0.304 m away.
         assert made.goals[0].error < 0.2, made.describe()
         assert made.solution is None and method in made.describe()
@@ -302,8 +302,17 @@ def test_a_task_of_another_scene_is_said(puck):
         dano.plan(puck, state, drive(position=(0, 0, 0)), method="pso")
     with pytest.raises(ValueError, match="controls must have shape"):
         dano.plan(puck, state, drive(position=(0, 0, 0)), controls=np.zeros((3, 1)))
+
+
+def test_options_out_of_range():
     with pytest.raises(ValueError, match="softening must hold factors between 0 and 1, got 2"):
-        dano.plan(puck, state, drive(position=(0, 0, 0)), softening=[2.0])
+        dano.PlanOptions(softening=[2.0])
+    with pytest.raises(ValueError, match="explore must be ≥ 0, got -1"):
+        dano.PlanOptions(explore=-1)
+    with pytest.raises(ValueError, match="seed must be ≥ 0"):
+        dano.PlanOptions(seed=-1)
+    with pytest.raises(ValueError, match="first must be one of normal, even, got 'sobol'"):
+        dano.SamplingOptions(first="sobol")
 
 
 @pytest.mark.slow
@@ -323,8 +332,9 @@ def test_sampling_moves_the_first_guess(pushing):
     scene, state, task = pushing
     guess = np.zeros((40, 3))
     guess[:20, 0] = 5.0
-    options = dano.SamplingOptions(passes=2, samples=6, knots=1, deviation=0.1)
-    made = dano.plan(scene, state, task, method="cem", controls=guess, sampling=options)
+    sampling = dano.SamplingOptions(passes=2, samples=6, knots=1, deviation=0.1)
+    options = dano.PlanOptions(sampling=sampling)
+    made = dano.plan(scene, state, task, method="cem", controls=guess, options=options)
     moved = np.asarray(made.values) - guess
     np.testing.assert_allclose(moved, np.broadcast_to(moved[:1], moved.shape), atol=1e-12)
     assert np.abs(moved).max() > 0
@@ -339,16 +349,15 @@ def test_a_first_pass_may_cover_all_that_bounds_allow(puck):
     )
     forces = {}
     for first in ("normal", "even"):
-        options = dano.SamplingOptions(passes=1, samples=16, knots=1, deviation=1e-3, first=first)
+        sampling = dano.SamplingOptions(passes=1, samples=16, knots=1, deviation=1e-3, first=first)
+        options = dano.PlanOptions(sampling=sampling)
         guess = np.zeros((N_STEPS, 1))
-        made = dano.plan(puck, puck.initial_state(), task, method="cem", controls=guess, sampling=options)
+        made = dano.plan(puck, puck.initial_state(), task, method="cem", controls=guess, options=options)
         forces[first] = np.asarray(made.values)[:, 0]
     assert np.abs(forces["normal"]).max() < 1
     # A sample in every 2.5 N, but for the first two, which are the guess: no more than three of these away.
     assert np.all(np.abs(forces["even"] - 16) < 7.5)
     assert np.all(np.abs(forces["even"]) <= 20)
-    with pytest.raises(ValueError, match="first must be one of normal, even, got 'sobol'"):
-        dano.SamplingOptions(first="sobol")
 
 
 @pytest.mark.slow
@@ -369,7 +378,7 @@ def test_what_does_not_need_to_be_touched_is_not_explored(pushing, pushed, drive
     # A guess that makes contact, a body that is driven itself.
     assert pushed.explored == "" and driven[1].explored == ""
     scene, state, task = pushing
-    never = dano.plan(scene, state, task, explore=0)
+    never = dano.plan(scene, state, task, options=dano.PlanOptions(explore=0))
     assert never.explored == "" and not never.reached
     # The derivative is zero; a small force at all times would touch, and the end says what that is worth.
     assert "the derivative along" in never.message and "the force of hand along x it is 0" in never.message

@@ -1,8 +1,11 @@
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from report import made_up
 from vision.models import learned
 
 import dano
@@ -11,16 +14,19 @@ from dano.report import (
     _video,
     CAMERAS,
     draw_object,
+    film_plan,
+    PLAN_VIDEO,
     render_side_by_side,
     render_start,
     render_trajectory,
+    VideoOptions,
 )
 from dano.report._object import with_error
 from dano.report._overlay import draw_label
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import stage
 from dano.scene_file import drop_scene, parse_scene
-from dano.vision import LearnedField
+from dano.vision import Camera, LearnedField
 
 av = pytest.importorskip("av")
 Image = pytest.importorskip("PIL.Image")
@@ -97,9 +103,8 @@ def test_a_film_shows_what_an_object_has_learned_to_look_like(cube, tmp_path):
             run,
             None,
             strip=tmp_path / "strip.png",
-            size=SIZE,
-            contact_points=False,
             looks=looks,
+            options=VideoOptions(size=SIZE, contact_points=False),
         )
         pictures.append(np.asarray(Image.open(tmp_path / "strip.png")).astype(int))
     painted, black = pictures
@@ -115,11 +120,8 @@ def test_video_has_every_frame_and_moves(run: Run, tmp_path):
     render_trajectory(
         *run,
         path,
-        fps=20,
-        size=SIZE,
-        slow_motion=1.5,
-        camera="fixed",
         strip=strip,
+        options=VideoOptions(fps=20, size=SIZE, slow_motion=1.5, camera="fixed"),
         progress=lambda *x: told.append(x),
     )
     with av.open(path) as container:
@@ -152,9 +154,8 @@ def stopped(run: Run, steps: int) -> Run:
 def test_two_runs_are_side_by_side_and_the_shorter_one_stands_at_its_end(run: Run, tmp_path):
     path, strip = tmp_path / "both.mp4", tmp_path / "both.png"
     (scene, whole), (_, half) = run, stopped(run, 25)
-    render_side_by_side(
-        (scene, scene), (whole, half), path, fps=20, size=SIZE, clock=False, camera="fixed", strip=strip
-    )
+    options = VideoOptions(fps=20, size=SIZE, clock=False, camera="fixed")
+    render_side_by_side((scene, scene), (whole, half), path, strip=strip, options=options)
     with av.open(path) as container:
         frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
     assert len(frames) == 11  # as long as the longer one
@@ -182,8 +183,8 @@ def test_arrows_of_two_runs_have_one_scale(run: Run):
         scene = dano.Scene.create([body, scene.bodies[1]], [dano.Contact("ball", "floor")], timestep=0.01)
         rest = dano.simulate(scene, scene.initial_state(ball=dict(position=(0, 0, 0.2))), 100)
         runs.append((scene, rest))
-    style = _video._Style(20, SIZE, 1.0, True, True, "auto", None)
-    takes = [_video._take(scene, rest, stage(scene), 21, style) for scene, rest in runs]
+    options = VideoOptions(fps=20, size=SIZE)
+    takes = [_video.take_of(scene, rest, stage(scene), 21, options) for scene, rest in runs]
     touched = [take.touched for take in _video._with_equal_arrows(takes) if take.touched is not None]
     small, large = (each.shares[-1, 0] for each in touched)
     assert large == pytest.approx(2 * small, rel=1e-3) and 0 < large < 2.5
@@ -205,7 +206,8 @@ def test_a_label_stays_in_its_corner():
         ({"labels": ("one",)}, "labels must be two"),
         ({"labels": "ab"}, "labels must be a list of"),
         ({"looks": [None]}, "looks must be two"),
-        ({"size": (8000, 64)}, "size must be two even numbers from 16 to 4056"),
+        ({"options": VideoOptions(size=(8000, 64))}, "options.size must be two even numbers from 16 to 4056"),
+        ({"options": VideoOptions(colours={"cat": "#000000"})}, "body must be one of"),
         ({"path": None}, "path or strip"),
     ],
 )
@@ -213,7 +215,7 @@ def test_bad_pairs_are_refused(run: Run, tmp_path, options, message):
     count = {"scenes": 2, "trajectories": 2} | options
     given = {"scenes": [run[0]] * count.pop("scenes"), "trajectories": [run[1]] * count.pop("trajectories")}
     with pytest.raises(ValueError, match=message):
-        render_side_by_side(**{"path": tmp_path / "run.mp4", "size": SIZE} | count | given)
+        render_side_by_side(**{"path": tmp_path / "run.mp4"} | count | given)
     assert not list(tmp_path.iterdir())
 
 
@@ -244,7 +246,8 @@ def test_moving_bodies_fill_a_third_of_the_height_and_stay_in_view(run: Run):
 
 def test_a_motion_shorter_than_a_frame_is_one_picture(run: Run, tmp_path):
     path, strip = tmp_path / "run.mp4", tmp_path / "run.png"
-    render_trajectory(*run, path, fps=1, size=SIZE, strip=strip, contact_points=False)
+    options = VideoOptions(fps=1, size=SIZE, contact_points=False)
+    render_trajectory(*run, path, strip=strip, options=options)
     with av.open(path) as container:
         assert len(list(container.decode(video=0))) == 1
     with Image.open(strip) as sheet:
@@ -259,8 +262,9 @@ def test_an_interrupted_video_leaves_what_was_there(run: Run, tmp_path):
         if share > 0.3:
             raise KeyboardInterrupt
 
+    options = VideoOptions(fps=10, size=SIZE, contact_points=False)
     with pytest.raises(KeyboardInterrupt):
-        render_trajectory(*run, path, fps=10, size=SIZE, contact_points=False, progress=interrupt)
+        render_trajectory(*run, path, options=options, progress=interrupt)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -270,17 +274,69 @@ def test_an_interrupted_video_leaves_what_was_there(run: Run, tmp_path):
     [
         ("missing/run.mp4", {}, "existing directory"),
         ("run.avi", {}, "must end in .mp4"),
-        ("run.mp4", {"size": (95, 64)}, "even"),
-        ("run.mp4", {"fps": 0}, "fps must be finite and > 0"),
-        ("run.mp4", {"slow_motion": -1.0}, "slow_motion must be finite and > 0"),
+        ("run.mp4", {"slow_motion": 1e9}, "options.slow_motion must be at most"),
         ("run.mp4", {"colours": {"cat": "#000000"}}, "body must be one of"),
         (None, {}, "path or strip"),
     ],
 )
 def test_bad_videos_are_refused(run: Run, tmp_path, name, options, message):
+    options = VideoOptions(size=SIZE, **options)
     with pytest.raises(ValueError, match=message):
-        render_trajectory(*run, None if name is None else tmp_path / name, **{"size": SIZE} | options)
+        render_trajectory(*run, None if name is None else tmp_path / name, options=options)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"size": (95, 64)}, "even"),
+        ({"camera": Camera((0, -2, 0), width=95, height=64)}, "even"),
+        ({"camera": "above"}, "camera must be one of auto, fixed, follow, got 'above'"),
+        ({"fps": 0}, "fps must be finite and > 0"),
+        ({"slow_motion": -1.0}, "slow_motion must be finite and > 0"),
+    ],
+)
+def test_options_of_films_out_of_range(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        VideoOptions(**wrong)
+
+
+def test_a_colour_may_be_of_a_body_of_one_of_two_scenes(run: Run, tmp_path):
+    """What is orange in both is blue where its name is the one with a colour."""
+    (scene, whole), path = run, tmp_path / "both.png"
+    other = dano.Scene.create(
+        bodies=[dano.Body("other", dano.Sphere(0.2), mass=1.0), scene.bodies[1]],
+        contacts=[dano.Contact("other", "floor")],
+        timestep=0.01,
+    )
+    renamed = dataclasses.replace(whole, names=other.names)
+    options = VideoOptions(
+        fps=2, size=SIZE, clock=False, contact_points=False, camera="fixed", colours={"other": "#1040ff"}
+    )
+    render_side_by_side((scene, other), (whole, renamed), None, strip=path, options=options)
+    sheet = np.asarray(Image.open(path)).astype(int)
+    blue = sheet[..., 2] - sheet[..., 0] > 60
+    assert blue[SIZE[1] + 2 :].sum() > 20 and blue[: SIZE[1]].sum() == 0
+
+
+def test_ghosts_stand_where_goals_are(run: Run, tmp_path):
+    """A second, paler orange ball to the right of where the first one ends."""
+    scene, whole = run
+    goal = dano.Goal("ball", position=(1.3, 0, 0.199))
+    task = dano.Task(n_steps=50, actuators=[dano.Actuator("ball", limit=1.0)], goals=[goal])
+    strip = tmp_path / "plan.png"
+    camera = Camera((0.4, -4, 0.5), (0.4, 0, 0.2), width=192, height=96)
+    options = dataclasses.replace(PLAN_VIDEO, fps=2, camera=camera)
+    film_plan(scene, task, made_up.plan(task, whole), strip=strip, options=options)
+    first = np.asarray(Image.open(strip)).astype(int)[:96, :192]
+    warmth = first[..., 0] - first[..., 2]
+    ball, ghost = (
+        warmth[tuple(camera.project(np.array([[x, 0, 0.199]]))[0, 1::-1].astype(int))] for x in (-0.5, 1.3)
+    )
+    assert ball > 60 and 0.2 * ball < ghost < 0.7 * ball
+    assert np.abs(warmth[:, :20]).max() < 30
+    # Plans are filmed without clock and contacts unless they are asked for.
+    assert (PLAN_VIDEO.clock, PLAN_VIDEO.contact_points, PLAN_VIDEO.camera) == (False, False, "fixed")
 
 
 def test_frames_fall_between_steps(run):
@@ -323,7 +379,6 @@ def test_a_scale_is_a_round_length_below():
 
 def test_the_bar_is_as_long_as_what_it_stands_for():
     from dano.report._overlay import draw_clock
-    from dano.vision import Camera
 
     camera = Camera((0, -2, 0), (0, 0, 0), width=640, height=400)
     grey = np.full((400, 640, 3), 200, np.uint8)

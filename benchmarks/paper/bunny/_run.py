@@ -2,6 +2,7 @@
 
 import argparse
 import concurrent.futures
+import dataclasses
 import json
 import multiprocessing
 import time
@@ -21,39 +22,49 @@ LIMITS = {CLEAN: 0.1, NOISY: 1.5}  # %
 SETS, SUCCESSES = 50, 0.96
 PAPER = "paper: < 1.5 % without noise, at the step of the data"
 
+
+class Search(NamedTuple):
+    """One of several searches, each of which goes on from where the one before ended.
+
+    Attributes:
+        timestep: [s].
+        initial: What is estimated of initial states.
+        noise: Standard deviations by quantity.
+        options: How the search runs.
+    """
+
+    timestep: float
+    initial: str
+    noise: dict[str, float]
+    options: dano.IdentifyOptions
+
+
 # Without noise impacts, which differ from step to step, are the only errors: a small step, and residuals that
 # count linearly. Windows tell of impacts one by one; the ball meets the bunny at about frame 20. The way
 # there is found at a step that is five times as long.
 COARSE_TIMESTEP = 5e-4  # s
 CLEAN_TIMESTEP, CLEAN_FRAMES = 1e-4, slice(15, 45)
-CLEAN_OPTIONS: dict[str, Any] = {
-    "initial": "given",
-    "window": 10,
-    "noise": {"position": 1e-3, "orientation": 1e-2, "velocity": 1e-2, "omega": 1e-1},
-    "huber": 0.01,
-}
+CLEAN_NOISE = {"position": 1e-3, "orientation": 1e-2, "velocity": 1e-2, "omega": 1e-1}
+CLEAN_OPTIONS = dano.IdentifyOptions(window=10, huber=0.01)
+ROUGHLY: dict[str, Any] = {"max_iterations": 15, "tolerance": 1.0}
 CLEAN_SEARCHES = (
-    (COARSE_TIMESTEP, CLEAN_OPTIONS | {"max_iterations": 15, "tolerance": 1.0}),
-    (CLEAN_TIMESTEP, CLEAN_OPTIONS),
+    Search(COARSE_TIMESTEP, "given", CLEAN_NOISE, dataclasses.replace(CLEAN_OPTIONS, **ROUGHLY)),
+    Search(CLEAN_TIMESTEP, "given", CLEAN_NOISE, CLEAN_OPTIONS),
 )
 # With noise states are estimated too, in windows that are tied more and more tightly; but not from so far
 # off, where they would fit to wrong parameters: first the parameters alone, with states as measured. The
 # tightest ties, which tell the most of friction, also tell of the step, so the last search takes a small one.
 NOISE = (1e-3, np.pi / 180)  # m, rad
 NOISY_TIMESTEP, NOISY_FRAMES = 2e-4, slice(5, 55)
-NEAR_OPTIONS: dict[str, Any] = {
-    "initial": "given",
-    "window": 10,
-    "noise": {"position": NOISE[0], "orientation": NOISE[1]},
-    "max_iterations": 15,
-    "tolerance": 1.0,
-}
-STATES_OPTIONS: dict[str, Any] = {**NEAR_OPTIONS, "initial": "states", "max_iterations": 30}
-LOOSE, TIGHT = (1.0, 0.3), 0.1
+NOISY_NOISE = {"position": NOISE[0], "orientation": NOISE[1]}
+NEAR_OPTIONS = dano.IdentifyOptions(window=10, **ROUGHLY)
+LOOSE, TIGHT = (
+    dataclasses.replace(NEAR_OPTIONS, max_iterations=30, continuity=gaps) for gaps in ((1.0, 0.3), 0.1)
+)
 NOISY_SEARCHES = (
-    (COARSE_TIMESTEP, NEAR_OPTIONS),
-    (COARSE_TIMESTEP, STATES_OPTIONS | {"continuity": LOOSE}),
-    (NOISY_TIMESTEP, STATES_OPTIONS | {"continuity": TIGHT}),
+    Search(COARSE_TIMESTEP, "given", NOISY_NOISE, NEAR_OPTIONS),
+    Search(COARSE_TIMESTEP, "states", NOISY_NOISE, LOOSE),
+    Search(NOISY_TIMESTEP, "states", NOISY_NOISE, TIGHT),
 )
 SEARCHES = {CLEAN: CLEAN_SEARCHES, NOISY: NOISY_SEARCHES}
 TRUTH = {"mass scale": 1.0, "friction": _data.FRICTION}
@@ -147,12 +158,10 @@ def _identified(task: tuple[int, list[str]]) -> dict[str, Result]:
     return {group: _fit(subject.bunny, motions[group], SEARCHES[group]) for group in groups}
 
 
-def _fit(
-    bunny: dano.NeuralObject, motions: list[dano.Motion], searches: tuple[tuple[float, dict[str, Any]], ...]
-) -> Result:
-    """Searches at these timesteps [s] with these options, each from where the last one ended."""
+def _fit(bunny: dano.NeuralObject, motions: list[dano.Motion], searches: tuple[Search, ...]) -> Result:
+    """Searches, each from where the last one ended."""
     fit, evaluations, seconds = None, 0, 0.0
-    for timestep, options in searches:
+    for timestep, initial, noise, options in searches:
         scene = _data.scene(bunny, timestep)
         with warnings.catch_warnings():
             # At so small residuals the solver's own precision may end a search; errors tell how it went.
@@ -163,8 +172,10 @@ def _fit(
                 _data.parameters(),
                 state=scene.initial_state(),
                 controls=_data.Pull(),
+                initial=initial,
+                noise=noise,
                 after=fit,
-                **options,
+                options=options,
             )
         evaluations, seconds = evaluations + fit.evaluations, seconds + fit.seconds
     assert fit is not None

@@ -114,7 +114,5 @@ def _identified(body: dano.NeuralObject, runs: list[_mujoco.Run]) -> dano.Identi
         controls=controls,
         initial=["velocity"],
         noise={"position": POSITION_NOISE},
-        window=WINDOW,
-        tolerance=1.0,
-        max_iterations=60,
+        options=dano.IdentifyOptions(window=WINDOW, tolerance=1.0, max_iterations=60),
     )

@@ -290,7 +290,7 @@ def _after_bounce(lowest: np.ndarray, height: np.ndarray) -> int:
 
 def _film(pair: Pair, path: Path) -> None:
     """Both, side by side, dropped alike."""
-    from dano.report import render_trajectory
+    from dano.report import render_trajectory, VideoOptions
 
     contacts = [
         dano.Contact(name, "floor", dano.ContactParams(sliding_friction=_FRICTION), dano.DistributedLaw())
@@ -311,4 +311,5 @@ def _film(pair: Pair, path: Path) -> None:
     run = dano.simulate(scene, scene.initial_state(**states), n_steps=round(2.0 / _TIMESTEP))
     look = LearnedField.of_object(pair.path)
     looks = {} if look is None else {"trained": look}
-    render_trajectory(scene, run, path, strip=path.with_suffix(".png"), slow_motion=2.0, looks=looks)
+    strip, options = path.with_suffix(".png"), VideoOptions(slow_motion=2.0)
+    render_trajectory(scene, run, path, strip=strip, looks=looks, options=options)

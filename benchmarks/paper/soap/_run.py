@@ -186,7 +186,14 @@ def _scaled(folder: Path, starts: int) -> list[Row]:
         # The loss is rough, and is said to be.
         warnings.simplefilter("ignore", RuntimeWarning)
         fit, seconds = _twice(
-            lambda: dano.identify(scene, motion, [friction], noise=noise, starts=starts, initial="given")
+            lambda: dano.identify(
+                scene,
+                motion,
+                [friction],
+                noise=noise,
+                initial="given",
+                options=dano.IdentifyOptions(starts=starts),
+            )
         )
     unit = LENGTH / MESH_LENGTH
     ends = ", ".join(f"{m.values['friction']:.3f} ({m.loss:.2f})" for m in fit.minima)

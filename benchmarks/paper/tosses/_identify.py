@@ -106,9 +106,7 @@ def identify(simulator: Dano, train: Tosses) -> Found:
                 _parameters(simulator, values),
                 initial="given",
                 noise=NOISE,
-                huber=huber,
-                max_iterations=20,
-                tolerance=0.3,
+                options=dano.IdentifyOptions(huber=huber, max_iterations=20, tolerance=0.3),
             )
         values |= fit.values
         evaluations, seconds = evaluations + fit.evaluations, seconds + fit.seconds

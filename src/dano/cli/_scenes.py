@@ -327,7 +327,7 @@ class _Artist:
         """Order the film of a run; the paths of what will be there, for the report."""
         if not self._draws:
             return {}
-        from dano.report import render_trajectory
+        from dano.report import render_trajectory, VideoOptions
 
         order = self._thread.submit(
             render_trajectory,
@@ -335,9 +335,8 @@ class _Artist:
             rollout.trajectory,
             video,
             strip=strip,
-            fps=DEMO_FPS,
             looks=loaded.looks(),
-            size=DEMO_SIZE,
+            options=VideoOptions(fps=DEMO_FPS, size=DEMO_SIZE),
             progress=self._tell,
         )
         self._order(order, video)
@@ -406,24 +405,19 @@ def _run(
 
 def _draw(loaded: list[scene_file.SceneFile], trajectories: list[Trajectory], command: Simulate) -> None:
     """A film of one run, or of two side by side."""
-    from dano.report import render_side_by_side, render_trajectory
+    from dano.report import render_side_by_side, render_trajectory, VideoOptions
 
     progress = Progress()
-    options: dict[str, Any] = {
-        "strip": command.strip,
-        "slow_motion": command.slow_motion,
-        "camera": command.camera,
-        "size": command.size,
-        "progress": progress,
-    }
+    film = VideoOptions(size=command.size, slow_motion=command.slow_motion, camera=command.camera)
+    given: dict[str, Any] = {"strip": command.strip, "options": film, "progress": progress}
     scenes, looks = [each.scene for each in loaded], [each.looks() for each in loaded]
     if command.beside is None:
-        render_trajectory(scenes[0], trajectories[0], command.video, looks=looks[0], **options)
+        render_trajectory(scenes[0], trajectories[0], command.video, looks=looks[0], **given)
     else:
         labels = [command.scene.stem, command.beside.stem]
         if labels[0] == labels[1]:
             labels = [str(command.scene), str(command.beside)]
-        render_side_by_side(scenes, trajectories, command.video, labels=labels, looks=looks, **options)
+        render_side_by_side(scenes, trajectories, command.video, labels=labels, looks=looks, **given)
     progress.close()
 
 

@@ -1,5 +1,6 @@
 """What a search has found so far, in a file: one that was interrupted or killed goes on with it."""
 
+import dataclasses
 import hashlib
 import re
 import warnings
@@ -63,8 +64,8 @@ class Checkpoint:
         data = read_archive(self._path, _FORM, _VERSION)
         if str(data.get("digest")) != self._digest:
             raise ValueError(
-                f"checkpoint {self._path} must be of this search, with the same scene, motions, options and"
-                " version of dano: remove it, or search without resuming"
+                f"options.checkpoint {self._path} must be of this search, with the same scene, motions,"
+                " options and version of dano: remove it, or search without resuming"
             )
         self._points = list(data["points"])
         self._ended = [_solution(data, f"{i}_") for i in range(int(data["ended"]))]
@@ -172,7 +173,11 @@ def digest_of(setup: Setup, motions: Sequence[Motion], *others: Any) -> str:
         others: Trees of arrays that matter, too.
     """
     space = setup.space
-    options = setup.initial, setup.noise, setup.windows, setup.search, space.selections
+    # Where it is kept does not matter, nor how the same gaps were given.
+    how = dataclasses.replace(
+        setup.options, continuity=setup.options.gaps or None, checkpoint=None, resume=False
+    )
+    options = setup.initial, setup.noise, how, space.selections
     said = hashlib.sha256(_stable(f"{version('dano')} {options}").encode())
     arrays = [(m.times, m.position, m.orientation, m.velocity, m.omega, m.covariance, m.q) for m in motions]
     said.update(_stable(str([(m.names, m.point, m.lag) for m in motions])).encode())

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from dano.checks import checked_function, checked_items, checked_kind, checked_path
+from dano.checks import checked_function, checked_items, checked_kind, checked_optional
 from dano.engine import AbstractEngine, checked_engine, Policy
 from dano.identify._checkpoint import Checkpoint, digest_of
 from dano.identify._joint_log import joint_table
@@ -22,7 +22,7 @@ from dano.identify._problem import Problem
 from dano.identify._residuals import Linearized, Smoothing
 from dano.identify._result import Errors, Identification, Minimum
 from dano.identify._scales import check_scales
-from dano.identify._settings import deviations, estimated, Noise, Search, Setup, Windowing
+from dano.identify._settings import deviations, estimated, IdentifyOptions, Setup
 from dano.identify._settling import ripple_covariance, worth_of
 from dano.identify._uncertainty import uncertainty
 from dano.identify._windows import Plan
@@ -43,20 +43,9 @@ def identify(
     controls: Control | Policy | Sequence[Control | None] | None = None,
     initial: str | Sequence[str] | None = None,
     noise: Mapping[str, float] | None = None,
-    huber: float | None = None,
-    window: int | None = None,
-    continuity: float | Sequence[float] | None = None,
     after: Identification | None = None,
-    starts: int = 1,
-    seed: int = 0,
-    jacobian: str = "auto",
-    max_iterations: int = 100,
-    tolerance: float = 0.1,
-    batch: int | None = None,
-    smooth: bool = True,
+    options: IdentifyOptions | None = None,
     engine: AbstractEngine | None = None,
-    checkpoint: str | os.PathLike[str] | None = None,
-    resume: bool = False,
     progress: Callable[[str, float], None] | None = None,
 ) -> Identification:
     """Find the parameters of a scene with which it moves as observed.
@@ -78,22 +67,9 @@ def identify(
         noise: Standard deviations of the quantities that count: position [m], orientation [rad], velocity
             [m/s], omega [rad/s], q [rad or m]. Default: poses. If the motion has covariances, they replace
             `noise`.
-        huber: Length of a residual, in standard deviations, from which it counts linearly.
-        window: Frames of the windows that motions are cut into (multiple shooting); default: no cuts.
-        continuity: Allowed gap between windows, as multiple of `noise`, or a falling sequence of it, searched
-            with one after the other. Needs `initial="states"`. Default: any gap.
         after: An earlier fit of the same windows; this one goes on from its values and initial states.
-        starts: Points to start from: the scene's values, and others in the bounds.
-        seed: Of everything random.
-        jacobian: "forward" costs one rollout per unknown, "reverse" several per observed number, or "auto".
-        max_iterations: Steps of each search.
-        tolerance: Stop when the predicted move of the parameters is below this, in standard errors.
-        smooth: Whether to go on by slopes over visible steps where the loss is rough: to the minimum of its
-            trend, with standard errors that hold the ripples.
-        batch: Windows that a device simulates at once; default one on a CPU, many on a GPU.
+        options: How the search runs; default `IdentifyOptions()`.
         engine: Default `VariationalEngine()`.
-        checkpoint: File (.npz) that a long search is kept in while it runs, and when interrupted.
-        resume: Go on from `checkpoint` if it exists; the result is as if the search had never stopped.
         progress: Called with a description and the share done. Ctrl-C returns the best so far.
 
     Returns:
@@ -104,16 +80,17 @@ def identify(
         ValueError: If an argument is out of range, does not fit the others, or makes too much work.
     """
     _check(scene, state, controls, progress)
+    options = checked_optional("options", options, IdentifyOptions) or IdentifyOptions()
     motions = _motions("observed", observed, scene, least=1)
     state = _started_in(scene, motions) if state is None else state
     chosen = estimated(initial, motions)
     space = space_of(scene, controls, _started(parameters, after))
-    deviation = Noise(deviations(scene, motions, noise), huber)
-    windows = Windowing.create(window, continuity, chosen)
-    search = Search(starts, seed, jacobian, max_iterations, tolerance, batch, bool(smooth))
-    setup = Setup(space, scene, controls, chosen, deviation, windows, search, checked_engine(engine))
-    check_scales(scene, motions, window, state if isinstance(state, State) else None)
-    kept = _kept(checkpoint, resume, setup, motions, state, after)
+    if options.gaps and len(chosen) < len(QUANTITIES):
+        raise ValueError(f"options.continuity needs initial='states', got initial {list(chosen)}")
+    sigmas = deviations(scene, motions, noise)
+    setup = Setup(space, scene, controls, chosen, sigmas, options, checked_engine(engine))
+    check_scales(scene, motions, options.window, state if isinstance(state, State) else None)
+    kept = _kept(setup, motions, state, after)
     found = _fitted(setup, motions, _motions("held_out", held_out, scene), state, after, kept, progress)
     for message in found.messages:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
@@ -136,32 +113,21 @@ def _fitted(
     if after is not None:
         problem.begin_near(after.initial_states, after.initial)
     tell("compiling", 0.0)
-    solutions = _searched(problem, setup.search, kept, tell)
+    solutions = _searched(problem, setup.options, kept, tell)
     held_errors = _held_out(setup, held, state, solutions[0].solution)
     found = _identification(setup, problem, motions, solutions, held_errors, began)
     tell("done", 1.0)
     return found
 
 
-def _kept(
-    path: str | os.PathLike[str] | None,
-    resume: bool,
-    setup: Setup,
-    motions: tuple[Motion, ...],
-    state: Any,
-    after: Identification | None,
-) -> Checkpoint:
+def _kept(setup: Setup, motions: tuple[Motion, ...], state: Any, after: Identification | None) -> Checkpoint:
     """Where the search is kept; with `resume`, what was kept there."""
-    if path is None:
-        if resume:
-            raise ValueError("resume needs a checkpoint to go on from, got checkpoint None")
+    options = setup.options
+    if options.checkpoint is None:
         return Checkpoint(None, "")
-    file = checked_path("checkpoint", path)
-    if file.suffix.lower() != ".npz":
-        raise ValueError(f"checkpoint must end in .npz, got {file}")
     begun = None if after is None else after.initial_states
-    kept = Checkpoint(file, digest_of(setup, motions, state, begun))
-    if resume:
+    kept = Checkpoint(Path(options.checkpoint), digest_of(setup, motions, state, begun))
+    if options.resume:
         kept.read()
     return kept
 
@@ -179,8 +145,8 @@ def _held_out(
     """Errors of motions that were not fitted, with their own initial states; None without motions."""
     if not held:
         return None
-    problem, search = Problem(setup, held, state), setup.search
-    fixed = problem.search(best.x, search.max_iterations, search.tolerance, None, free=False)
+    problem, options = Problem(setup, held, state), setup.options
+    fixed = problem.search(best.x, options.max_iterations, options.tolerance, None, free=False)
     return _errors(problem.plan, held, problem.simulate(fixed.x, fixed.blocks))
 
 
@@ -193,17 +159,17 @@ class _Ended(NamedTuple):
 
 
 def _searched(
-    problem: Problem, search: Search, kept: Checkpoint, tell: Callable[[str, float], None]
+    problem: Problem, options: IdentifyOptions, kept: Checkpoint, tell: Callable[[str, float], None]
 ) -> list[_Ended]:
     """Where the search from each start ended, best first."""
     ended = []
-    points = kept.points(lambda: problem.points(search.starts))
+    points = kept.points(lambda: problem.points(options.starts))
     for k, x in enumerate(points):
 
         def said(i: int, loss: float, k: int = k) -> None:
-            tell(f"fitting, loss {loss:.6g}", (k + i / search.max_iterations) / len(points))
+            tell(f"fitting, loss {loss:.6g}", (k + i / options.max_iterations) / len(points))
 
-        solution = problem.search(x, search.max_iterations, search.tolerance, said, kept=kept)
+        solution = problem.search(x, options.max_iterations, options.tolerance, said, kept=kept)
         ended.append(_Ended(solution, problem.smoothing, problem.roughness))
         if solution.stop is Stop.INTERRUPTED:
             break
@@ -226,7 +192,7 @@ def _identification(
     at_start = problem.simulate(space.start, plan.start)
     known = np.asarray(at_best.lengths)
     seen = known[known >= 0]
-    sure = uncertainty(space, best.x, best.normal, seen, setup.noise.huber, plan.n_data, scene, ripple)
+    sure = uncertainty(space, best.x, best.normal, seen, setup.options.huber, plan.n_data, scene, ripple)
     values, errors = values_at(space.selections, best.x, sure.covariance)
     fit_errors = _errors(plan, motions, at_best)
     messages = list(sure.messages)

@@ -49,13 +49,13 @@ class Problem:
 
     def __init__(self, setup: Setup, motions: Sequence[Motion], state: Any):
         space, scene, controls, initial = setup.space, setup.scene, setup.controls, setup.initial
-        noise, huber, search = setup.noise.deviations, setup.noise.huber, setup.search
-        self.space, self.noise, self.seed = space, noise, search.seed
-        self.ties = setup.windows.continuity
+        noise, options = setup.noise, setup.options
+        self.space, self.noise, self.seed = space, noise, options.seed
+        self.ties = options.gaps
         self.spacing = float(np.median(np.concatenate([np.diff(motion.times) for motion in motions])))
         self.simulations = 0
         self.lower, self.upper = space.lower, space.upper
-        self.smooth = search.smooth
+        self.smooth = options.smooth
         self.smoothing: Smoothing | None = None
         self.roughness = np.zeros((0, 0))
         self._last: _Last | None = None
@@ -68,7 +68,7 @@ class Problem:
             controls=[None] * len(motions) if policy is not None else _control_list(scene, controls, motions),
             noise=noise,
             initial=initial,
-            window=setup.windows.frames,
+            window=options.window,
             continuous=bool(self.ties),
         )
         self.plan = self._planned()
@@ -88,7 +88,7 @@ class Problem:
         numbers = max(1, self.plan.n_data // n_windows)
         # A backward pass per observed number costs about four forward ones.
         costly = unknowns > 4 * numbers
-        reverse = search.jacobian == "reverse" or (search.jacobian == "auto" and costly)
+        reverse = options.jacobian == "reverse" or (options.jacobian == "auto" and costly)
         on_cpu = jax.default_backend() == "cpu"
         self.jumps = None
         if self.ties:
@@ -100,7 +100,7 @@ class Problem:
             policy,
             setup.engine,
             self.plan.windows,
-            None if huber is None else jnp.asarray(huber, dtype),
+            None if options.huber is None else jnp.asarray(options.huber, dtype),
             # Starts are compared as the first search sees them.
             None if self.jumps is None else self.ties[0] * self.jumps,
             space.selections,
@@ -109,7 +109,7 @@ class Problem:
             self.start,
             self.plan.n_steps,
             reverse,
-            search.batch or (1 if on_cpu else _BATCH),
+            options.batch or (1 if on_cpu else _BATCH),
             device_mesh(),
         )
 
@@ -201,7 +201,7 @@ class Problem:
         if starts == 1:
             return points
         if not (np.all(np.isfinite(self.space.lower)) and np.all(np.isfinite(self.space.upper))):
-            raise ValueError("starts > 1 needs finite bounds on every parameter")
+            raise ValueError("options.starts > 1 needs finite bounds on every parameter")
         from scipy.stats import qmc
 
         n = _LOOKS * (starts - 1)

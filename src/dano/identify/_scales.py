@@ -61,7 +61,7 @@ def _check_times(times: np.ndarray, h: float, window: int | None) -> None:
     if span / h > _MOST_STEPS:
         raise ValueError(
             f"times must be in seconds, and span at most {_MOST_STEPS} steps of {h:.4g} s unless cut by"
-            f" window, got {span:.4g} s; if they are milliseconds, divide them by 1000"
+            f" options.window, got {span:.4g} s; if they are milliseconds, divide them by 1000"
         )
     between = float(np.median(np.diff(times)))
     if len(times) > 5 and between > _SLOW_CAMERA:

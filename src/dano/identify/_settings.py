@@ -1,12 +1,21 @@
-"""What `identify` may be told, in groups: noise, windows, search."""
+"""What `identify` may be told: how the search runs, what is estimated of initial states, and the noise."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from dano.checks import checked_choice, checked_count, checked_items, checked_kind, checked_number
+from dano.checks import (
+    checked_choice,
+    checked_count,
+    checked_items,
+    checked_kind,
+    checked_number,
+    checked_path,
+    shown,
+)
 from dano.engine import AbstractEngine
 from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Space
@@ -16,92 +25,86 @@ from dano.scene import Scene
 _MOST_STARTS = 10_000
 """More starts than that would each cost several simulations of all windows: hours of work."""
 
+_JACOBIANS = ("auto", "forward", "reverse")
+
 _NOISE = (*QUANTITIES, "q")
 
 _INITIAL = {"given": (), "velocities": ("velocity", "omega"), "states": tuple(QUANTITIES)}
 
 
 @dataclass(frozen=True)
-class Noise:
-    """How far observations may be from the truth.
+class IdentifyOptions:
+    """How a search for parameters runs.
 
     Attributes:
-        deviations: Standard deviation of each quantity that counts.
+        window: Frames of the windows that motions are cut into (multiple shooting); None: no cuts.
+        continuity: Allowed gap between windows, as multiple of `noise`, or a falling sequence of it, searched
+            with one after the other. Needs `window`, and all of the initial states to be estimated
+            (`initial="states"`). None: any gap.
         huber: Length of a residual, in standard deviations, from which it counts linearly; None: never.
+        smooth: Whether to go on by slopes over visible steps where the loss is rough: to the minimum of its
+            trend, with standard errors that hold the ripples.
+        starts: Points to start from: the scene's values, and others in the bounds.
+        seed: Of everything random.
+        max_iterations: Steps of each search.
+        tolerance: Stop when the predicted move of the parameters is below this, in standard errors.
+        jacobian: "forward" costs one rollout per unknown, "reverse" several per observed number, or "auto".
+        batch: Windows that a device simulates at once; None: one on a CPU, many on a GPU.
+        checkpoint: File (.npz) that a long search is kept in while it runs, and when interrupted; None: none.
+        resume: Go on from `checkpoint` if it exists; the result is as if the search had never stopped.
     """
 
-    deviations: dict[str, float]
-    huber: float | None
+    window: int | None = None
+    continuity: float | Sequence[float] | None = None
+    huber: float | None = None
+    smooth: bool = True
+    starts: int = 1
+    seed: int = 0
+    max_iterations: int = 100
+    tolerance: float = 0.1
+    jacobian: str = "auto"
+    batch: int | None = None
+    checkpoint: str | os.PathLike[str] | None = None
+    resume: bool = False
 
-    def __post_init__(self):
-        if self.huber is not None:
-            checked_number("huber", self.huber, above=0)
-
-
-@dataclass(frozen=True)
-class Windowing:
-    """How motions are cut.
-
-    Attributes:
-        frames: Frames of a window; None: motions are not cut.
-        continuity: Allowed gaps between windows, in standard deviations, searched with one after the other;
-            empty: any gap.
-    """
-
-    frames: int | None
-    continuity: tuple[float, ...]
-
-    @classmethod
-    def create(
-        cls, window: int | None, continuity: float | Sequence[float] | None, initial: tuple[str, ...]
-    ) -> "Windowing":
-        """From the arguments of `identify`.
+    def __post_init__(self) -> None:
+        """Check what can be checked without a scene and motions.
 
         Raises:
-            ValueError: If they are out of range, or do not fit what is estimated of the initial states.
+            ValueError: If one is out of range, or does not fit the others.
         """
-        if window is not None:
-            window = checked_count("window", window, least=2)
-        known = continuity is not None
-        gaps = tuple(np.atleast_1d(checked_numbers("continuity", continuity)).tolist()) if known else ()
-        if gaps:
-            if not all(gap > 0 for gap in gaps) or any(b >= a for a, b in zip(gaps, gaps[1:], strict=False)):
-                raise ValueError(f"continuity must be > 0, and a sequence of it must fall, got {list(gaps)}")
-            if window is None or len(initial) < len(QUANTITIES):
-                raise ValueError(
-                    f"continuity needs window and initial='states', got window {window},"
-                    f" initial {list(initial)}"
-                )
-        return cls(window, gaps)
-
-
-@dataclass(frozen=True)
-class Search:
-    """How the minimum is looked for.
-
-    Attributes:
-        starts: Points to start from.
-        seed: Of everything random.
-        jacobian: "auto", "forward" or "reverse".
-        max_iterations: Steps of each search.
-        tolerance: Predicted move of the parameters, in standard errors, below which a search ends.
-        batch: Windows that a device simulates at once; None: by the device.
-        smooth: Whether to go on by slopes over visible steps where the loss is rough.
-    """
-
-    starts: int
-    seed: int
-    jacobian: str
-    max_iterations: int
-    tolerance: float
-    batch: int | None
-    smooth: bool = True
-
-    def __post_init__(self):
+        if self.window is not None:
+            checked_count("window", self.window, least=2)
+        if self.gaps and self.window is None:
+            raise ValueError(f"continuity needs window, got continuity {self.continuity} and window None")
+        if self.huber is not None:
+            checked_number("huber", self.huber, above=0)
         checked_count("starts", self.starts, most=_MOST_STARTS)
-        checked_choice("jacobian", self.jacobian, ("auto", "forward", "reverse"))
-        checked_number("tolerance", self.tolerance, above=0)
+        checked_count("seed", self.seed, least=0)
         checked_count("max_iterations", self.max_iterations)
+        checked_number("tolerance", self.tolerance, above=0)
+        checked_choice("jacobian", self.jacobian, _JACOBIANS)
+        if self.batch is not None:
+            checked_count("batch", self.batch)
+        if self.checkpoint is None:
+            if self.resume:
+                raise ValueError("resume needs a checkpoint to go on from, got checkpoint None")
+        elif checked_path("checkpoint", self.checkpoint).suffix.lower() != ".npz":
+            raise ValueError(f"checkpoint must end in .npz, got {self.checkpoint}")
+
+    @property
+    def gaps(self) -> tuple[float, ...]:
+        """Allowed gaps, searched with one after the other, in standard deviations; empty: any gap."""
+        if self.continuity is None:
+            return ()
+        gaps = np.atleast_1d(checked_numbers("continuity", self.continuity))
+        positive = np.all(np.isfinite(gaps) & (gaps > 0))
+        if gaps.ndim > 1 or not positive or np.any(np.diff(gaps) >= 0):
+            raise ValueError(
+                "continuity must be finite and > 0, and a sequence of it must fall, got"
+                f" {shown(self.continuity)}"
+            )
+        return tuple(gaps.tolist())
 
 
 @dataclass(frozen=True)
@@ -113,9 +116,8 @@ class Setup:
         scene: The scene.
         controls: As they were given.
         initial: Quantities that are estimated of the state in which each window begins.
-        noise: See `Noise`.
-        windows: See `Windowing`.
-        search: See `Search`.
+        noise: Standard deviation of each quantity that counts.
+        options: How the search runs.
         engine: What simulates.
     """
 
@@ -123,9 +125,8 @@ class Setup:
     scene: Scene
     controls: Any
     initial: tuple[str, ...]
-    noise: Noise
-    windows: Windowing
-    search: Search
+    noise: dict[str, float]
+    options: IdentifyOptions
     engine: AbstractEngine
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dano.checks import checked_count, checked_kind
+from dano.checks import checked_count, checked_kind, checked_optional
 from dano.identify import Identification, identify, Motion, Parameter
 from dano.progress import Progress
 from dano.scene import Scene
@@ -57,7 +57,7 @@ def identify_in_film(
     motion: Motion,
     parameters: Sequence[Parameter],
     *,
-    options: TrackOptions | None = None,
+    tracking: TrackOptions | None = None,
     background: str | Path | None = None,
     passes: int = 6,
     progress: Progress | None = None,
@@ -78,12 +78,12 @@ def identify_in_film(
         camera: Which took the film.
         motion: Poses of that one body, as `Motion.from_tracked` gives them, at the film's times.
         parameters: What is unknown.
-        options: How pixels are compared, as for `track`; without a `table` the scene's level half-space below
-            the body is taken for it, if there is one.
+        tracking: How pixels are compared, as for `track`; without a `table` the scene's level half-space
+            below the body is taken for it, if there is one.
         background: Picture of the place without the object.
         passes: Steps on pixels at most.
         progress: Told how far it is.
-        **settings: More arguments of `identify`, such as `initial` or `controls`.
+        **settings: More arguments of `identify`, such as `initial`, `controls` or `options`.
 
     Raises:
         ValueError: If the motion is not of one body at the film's times, or as `identify` and `track` say.
@@ -95,7 +95,8 @@ def identify_in_film(
     _check(film, motion, settings)
     passes = checked_count("passes", passes)
     body = motion.names[0]
-    options = _with_table(scene, motion, options or TrackOptions())
+    tracking = checked_optional("tracking", tracking, TrackOptions) or TrackOptions()
+    tracking = _with_table(scene, motion, tracking)
     before = identify(scene, motion, parameters, progress=progress, **settings)
     fit, history, settled, lamps = before, [before.values], False, None
     found = None
@@ -107,7 +108,7 @@ def identify_in_film(
             camera,
             seen.position[:, 0],
             seen.orientation[:, 0],
-            options,
+            tracking,
             background=background,
             lamps=lamps,
             progress=progress,

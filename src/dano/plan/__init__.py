@@ -6,12 +6,12 @@ from dano.plan._execution import (
     NEW_PLANS as NEW_PLANS,
     Replan as Replan,
 )
+from dano.plan._options import PlanOptions as PlanOptions
 from dano.plan._plan import (
     GoalError as GoalError,
     load_controls as load_controls,
     Method as Method,
     METHODS as METHODS,
-    OPTIONS as OPTIONS,
     Plan as Plan,
     plan as plan,
 )

@@ -12,13 +12,14 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_count, checked_kind, checked_optional
 from dano.engine import AbstractEngine, checked_engine, compiler_options
-from dano.plan._plan import goal_errors, GoalError, OPTIONS, Plan
+from dano.plan._options import PlanOptions
+from dano.plan._plan import goal_errors, GoalError, Plan
 from dano.plan._problem import Difference, problem_of, Scales, VIOLATION
 from dano.plan._task import Task
 from dano.scene import Scene, State
 from dano.solvers import optimal_trajectory, TrajectoryOptions, TrajectorySolution
 
-NEW_PLANS = OPTIONS._replace(max_updates=1, max_iterations=15, penalty=1e5)
+NEW_PLANS = PlanOptions().ilqr._replace(max_updates=1, max_iterations=15, penalty=1e5)
 """Of new plans on the way: goals and limits as costs.
 
 With multipliers goals would be met to the last digit. But a new plan is carried out for some steps only, in a
@@ -71,7 +72,7 @@ def follow(
     substeps: int = 1,
     feedback: bool = True,
     every: int | None = None,
-    options: TrajectoryOptions | None = None,
+    ilqr: TrajectoryOptions | None = None,
     engine: AbstractEngine | None = None,
 ) -> Execution:
     """Carry a plan out in a scene that may differ from the planned one.
@@ -94,14 +95,14 @@ def follow(
         substeps: Steps of `plant` in a step of the plan.
         feedback: Whether to use the plan's gains.
         every: Steps between new plans; None: no new plans.
-        options: Of new plans; default `dano.plan.NEW_PLANS`.
+        ilqr: Of new plans; default `dano.plan.NEW_PLANS`.
         engine: Default `VariationalEngine()`.
 
     Raises:
         ValueError: If timesteps do not fit, or `scene` is missing.
     """
     began, engine = time.perf_counter(), checked_engine(engine)
-    checked_optional("options", options, TrajectoryOptions)
+    ilqr = checked_optional("ilqr", ilqr, TrajectoryOptions) or NEW_PLANS
     _check(plant, state, task, plan, scene, substeps, every)
     finer = 1 if scene is None else _substeps("scene", scene, plan)
     scales, n_steps = Scales.of(task), task.n_steps
@@ -115,7 +116,7 @@ def follow(
     for step in range(0, n_steps, length):
         if step and scene is not None:
             guess = scales.scaled(values)
-            solution, replan = _again(scene, task, engine, now, guess, step, finer, options or NEW_PLANS)
+            solution, replan = _again(scene, task, engine, now, guess, step, finer, ilqr)
             replans.append(replan)
             values = scales.physical(solution.controls)
             gains = solution.gains * scales.width[None, :, None]
@@ -148,12 +149,12 @@ def _again(
     guess: Float[Array, "T m"],
     step: int,
     substeps: int,
-    options: TrajectoryOptions,
+    ilqr: TrajectoryOptions,
 ) -> tuple[TrajectorySolution, Replan]:
     """A plan from a step of the task on, at the front of the arrays."""
     began = time.perf_counter()
     problem = problem_of(scene, task, engine, task.n_steps - step, substeps)
-    solution = optimal_trajectory(problem, now, guess, options=options, compiler_options=compiler_options())
+    solution = optimal_trajectory(problem, now, guess, options=ilqr, compiler_options=compiler_options())
     reached = all(violation.amount <= VIOLATION for violation in solution.violations)
     return solution, Replan(step, reached, time.perf_counter() - began)
 

@@ -4,7 +4,7 @@ import dataclasses
 import os
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -17,9 +17,7 @@ from jaxtyping import Array, Float
 from dano.archive import read_archive, write_archive
 from dano.checks import (
     checked_choice,
-    checked_count,
     checked_function,
-    checked_items,
     checked_kind,
     checked_optional,
 )
@@ -27,14 +25,14 @@ from dano.engine import AbstractEngine, checked_engine, compiler_options, simula
 from dano.gradients import Check, check
 from dano.maths import checked_array
 from dano.plan._exploring import explored, to_touch
+from dano.plan._options import PlanOptions
 from dano.plan._problem import problem_of, Scales, VIOLATION
-from dano.plan._sampling import costs, rated, sampled, SamplingOptions
+from dano.plan._sampling import costs, rated, sampled
 from dano.plan._softening import gradual, softened
 from dano.plan._task import Limit, Task
 from dano.scene import Control, Scene, State, state_arrays, Trajectory
 from dano.solvers import (
     optimal_trajectory,
-    TrajectoryOptions,
     TrajectoryProblem,
     TrajectorySolution,
     TrajectoryStop,
@@ -50,10 +48,6 @@ _ENDED = (TrajectoryStop.STOPPED, TrajectoryStop.TIME)
 
 Method = Literal["ilqr", "cem", "mppi"]
 METHODS = ("ilqr", "cem", "mppi")
-OPTIONS = TrajectoryOptions(
-    tolerance=1e-4, constraint_tolerance=VIOLATION, max_iterations=40, max_updates=20, penalty=10.0
-)
-"""Of plans through contact, whose last digits mean nothing."""
 
 
 class GoalError(NamedTuple):
@@ -190,13 +184,9 @@ def plan(
     *,
     method: str = "ilqr",
     controls: Float[Array, "T m"] | np.ndarray | None = None,
-    explore: int | None = None,
-    softening: Sequence[float] = (),
     warm: Plan | None = None,
-    options: TrajectoryOptions | None = None,
-    sampling: SamplingOptions | None = None,
+    options: PlanOptions | None = None,
     engine: AbstractEngine | None = None,
-    seed: int = 0,
     callback: Callable[[str, int, float], object] | None = None,
 ) -> Plan:
     """Find controls that do a task.
@@ -212,16 +202,9 @@ def plan(
         task: Goals, limits and actuators.
         method: How to search: "ilqr", "cem" or "mppi".
         controls: First guess [N, N m], shape (T, m); default: zero.
-        explore: Passes of CEM that improve the first guess; 0 for none. Default: where with the first guess
-            no driven body touches one that misses its goal, paths that lead to contact are looked for,
-            because derivatives do not lead there. The plan then says so (`Plan.explored`).
-        softening: Factors < 1 of the contacts' stiffness to plan with first; each plan starts from the one
-            before.
         warm: Plan of a similar problem: its controls and multipliers are the first guess.
-        options: Of iLQR; default `OPTIONS` of this module.
-        sampling: Of CEM and MPPI.
+        options: How the search runs; default `PlanOptions()`.
         engine: Default `VariationalEngine()`.
-        seed: Of the samples.
         callback: Called with the stage, the iteration and the cost; if it returns True, the search stops.
 
     Returns:
@@ -234,10 +217,9 @@ def plan(
     checked_kind("scene", scene, Scene)
     scene.check_state(state)
     checked_kind("task", task, Task).check(scene)
-    _check_search(method, explore, softening)
-    seed, warm = checked_count("seed", seed, least=0), checked_optional("warm", warm, Plan)
-    options = checked_optional("options", options, TrajectoryOptions)
-    sampling = checked_optional("sampling", sampling, SamplingOptions)
+    checked_choice("method", method, METHODS)
+    checked_optional("warm", warm, Plan)
+    options = checked_optional("options", options, PlanOptions) or PlanOptions()
     if callback is not None:
         checked_function("callback", callback)
     engine, state = checked_engine(engine), scene.filled(state)
@@ -245,17 +227,17 @@ def plan(
     guess = scales.scaled(_first_guess(task, controls, warm))
     problem = problem_of(scene, task, engine)
     tell = callback or (lambda stage, iteration, cost: None)
-    search = sampling or SamplingOptions()
-    if method != "ilqr" or explore:
+    if method != "ilqr" or options.explore:
+        search = options.sampling
         if method == "ilqr":
-            search = dataclasses.replace(search, passes=explore)
+            search = dataclasses.replace(search, passes=options.explore)
         found = sampled(
             problem,
             state,
             guess,
             method="cem" if method == "ilqr" else method,
             options=search,
-            key=jax.random.key(seed),
+            key=jax.random.key(options.seed),
             progress=lambda turn, cost: tell("sampling", turn, cost),
             compiler_options=compiler_options(),
         )
@@ -263,10 +245,10 @@ def plan(
         if method != "ilqr":
             why = "interrupted" if found.interrupted else f"all {search.passes} passes of sampling were made"
             return _plan(scene, state, task, scales, engine, guess, None, why, method, began)
-    given = _Given(scene, state, task, engine, softening, warm, options or OPTIONS, tell)
+    given = _Given(scene, state, task, engine, warm, options, tell)
     why, solution = "", None
-    if explore is None:
-        why, solution = _explored(given, problem, guess, scales, seed)
+    if options.explore is None:
+        why, solution = _explored(given, problem, guess, scales)
     solution = solution or given.optimised(guess)
     if solution.stop is TrajectoryStop.INFEASIBLE:
         solution = _pushed(given, solution)
@@ -277,15 +259,6 @@ def plan(
     return dataclasses.replace(made, explored=why)
 
 
-def _check_search(method: str, explore: int | None, softening: Sequence[float]) -> None:
-    checked_choice("method", method, METHODS)
-    if explore is not None:
-        checked_count("explore", explore, least=0)
-    for factor in checked_items("softening", softening, float, int):
-        if not 0 < factor < 1:
-            raise ValueError(f"softening must hold factors between 0 and 1, got {factor}")
-
-
 class _Given(NamedTuple):
     """What every optimisation of a call of `plan` has in common."""
 
@@ -293,9 +266,8 @@ class _Given(NamedTuple):
     state: State
     task: Task
     engine: AbstractEngine
-    softening: Sequence[float]
     warm: Plan | None
-    options: TrajectoryOptions
+    options: PlanOptions
     tell: Callable[[str, int, float], object]
 
     def optimised(self, guess: Array, penalty: float = 0.0) -> TrajectorySolution:
@@ -305,18 +277,19 @@ class _Given(NamedTuple):
             multipliers = self.warm.solution.multipliers
         began = time.perf_counter()
         stages = [
-            (f"optimising with {f:g} of the stiffness", softened(self.scene, f)) for f in self.softening
+            (f"optimising with {f:g} of the stiffness", softened(self.scene, f))
+            for f in self.options.softening
         ]
-        solution = None
+        ilqr, solution = self.options.ilqr, None
         for name, stage in (*stages, ("optimising", self.scene)):
-            limit = self.options.max_seconds
+            limit = ilqr.max_seconds
             left = None if limit is None else max(0.0, limit - (time.perf_counter() - began))
             solution = optimal_trajectory(
                 problem_of(stage, self.task, self.engine),
                 self.state,
                 guess,
                 multipliers=multipliers,
-                options=self.options._replace(max_seconds=left, penalty=max(penalty, self.options.penalty)),
+                options=ilqr._replace(max_seconds=left, penalty=max(penalty, ilqr.penalty)),
                 callback=lambda p, name=name: self.tell(name, p.iteration, p.cost),
                 compiler_options=compiler_options(),
             )
@@ -337,7 +310,7 @@ def _pushed(given: _Given, solution: TrajectorySolution) -> TrajectorySolution:
 
 
 def _explored(
-    given: _Given, problem: TrajectoryProblem, guess: Array, scales: Scales, seed: int
+    given: _Given, problem: TrajectoryProblem, guess: Array, scales: Scales
 ) -> tuple[str, TrajectorySolution | None]:
     """Why contact was looked for and the trajectory that came of it; nothing if the guess makes contact."""
     scene, task = given.scene, given.task
@@ -352,7 +325,7 @@ def _explored(
         return f"{why}, and no contact of the scene lets it", None
     best = None
     for attempt in range(_ATTEMPTS):
-        key = jax.random.key(seed + attempt)
+        key = jax.random.key(given.options.seed + attempt)
         found = explored(problem, scene, task, states, reaches, key, given.tell, compiler_options())
         if found is None:
             return f"{why}, and no control leads it there", None

@@ -14,7 +14,11 @@ from dano.report._identification import (
 )
 from dano.report._live import Pictures as Pictures
 from dano.report._object import draw_object as draw_object
-from dano.report._plan import draw_controls as draw_controls, film_plan as film_plan
+from dano.report._plan import (
+    draw_controls as draw_controls,
+    film_plan as film_plan,
+    PLAN_VIDEO as PLAN_VIDEO,
+)
 from dano.report._resample import frame_count as frame_count
 from dano.report._tracking import (
     draw_tracked as draw_tracked,
@@ -30,6 +34,7 @@ from dano.report._video import (
     render_side_by_side as render_side_by_side,
     render_start as render_start,
     render_trajectory as render_trajectory,
+    VideoOptions as VideoOptions,
 )
 from dano.report.viewing import (
     LiveView as LiveView,

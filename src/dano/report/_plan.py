@@ -4,22 +4,19 @@ import os
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import UInt8
 
 from dano.archive import checked_output, replacing
-from dano.checks import checked_function, checked_kind, checked_optional
+from dano.checks import checked_kind
 from dano.plan import Plan, Task
 from dano.progress import Progress
-from dano.report._framing import camera_for
-from dano.report._resample import frame_times, poses_at
+from dano.report._resample import frame_times
 from dano.report._stage import Stage, stage
-from dano.report._video import check_film, moments_of, require, write_film
+from dano.report._video import check_film, checked_video, film, require, take_of, VideoOptions
 from dano.scene import Scene
-from dano.vision import Camera, Item, LearnedField, render
+from dano.vision import Item, LearnedField
 
-# How much of a ghost is seen, and pictures in a strip (chosen by eye).
-_GHOST = 0.4
-_MOMENTS = 6
+PLAN_VIDEO = VideoOptions(camera="fixed", contact_points=False, clock=False)
+"""Of plans: nothing but bodies and ghosts, all in view all the time."""
 
 
 def film_plan(
@@ -29,11 +26,8 @@ def film_plan(
     path: str | os.PathLike[str] | None = None,
     *,
     strip: str | os.PathLike[str] | None = None,
-    fps: int = 30,
-    slow_motion: float = 1.0,
-    size: tuple[int, int] = (640, 400),
-    camera: Camera | None = None,
     looks: Mapping[str, LearnedField] | None = None,
+    options: VideoOptions | None = None,
     progress: Progress | None = None,
 ) -> None:
     """Film a plan, with a ghost of every body at the position or orientation that its goals ask for.
@@ -44,11 +38,8 @@ def film_plan(
         plan: The plan.
         path: The video (.mp4), or None.
         strip: A picture of some moments (.png), or None.
-        fps: Frames per second.
-        slow_motion: How many times slower than life the video plays.
-        size: Width and height [pixels], even numbers.
-        camera: From where; default: such that all bodies stay in view. Replaces `size`.
         looks: What bodies have learned to look like, by name.
+        options: How the film looks; default `PLAN_VIDEO`.
         progress: Called with a description and the share done.
 
     Raises:
@@ -59,27 +50,12 @@ def film_plan(
     checked_kind("scene", scene, Scene)
     checked_kind("task", task, Task)
     checked_kind("plan", plan, Plan)
-    if (eye := checked_optional("camera", camera, Camera)) is not None:
-        size = eye.width, eye.height
-    if progress is not None:
-        checked_function("progress", progress)
-    video, still = check_film([(scene, plan.trajectory)], path, strip, size)
-    times = frame_times(plan.trajectory, fps, slow_motion)
-    drawn = stage(scene, None, looks)
-    camera = camera_for(scene, drawn, plan.trajectory, *size) if camera is None else camera
-    position, orientation = poses_at(plan.trajectory, times)
-    ghosts = _ghosts(scene, task, plan, drawn)
-
-    def picture(frame: int) -> UInt8[np.ndarray, "height width 3"]:
-        items = drawn.posed(position[frame], orientation[frame])
-        image = render(items, camera, floor=False)
-        if not ghosts:
-            return image
-        both = render([*items, *ghosts], camera, floor=False)
-        return np.round((1 - _GHOST) * image + _GHOST * both.astype(float)).astype(np.uint8)
-
-    moments = moments_of(position, _MOMENTS)
-    write_film(lambda frame: [picture(frame)], len(times), moments, (video, still), fps, progress)
+    options = checked_video(options, PLAN_VIDEO)
+    outputs = check_film([(scene, plan.trajectory)], path, strip, options, progress)
+    count = len(frame_times(plan.trajectory, options.fps, options.slow_motion))
+    drawn = stage(scene, options.colours, looks)
+    take = take_of(scene, plan.trajectory, drawn, count, options)
+    film([take._replace(ghosts=_ghosts(scene, task, plan, drawn))], options, outputs, progress)
 
 
 def _ghosts(scene: Scene, task: Task, plan: Plan, drawn: Stage) -> list[Item]:

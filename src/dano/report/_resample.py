@@ -20,7 +20,7 @@ def frame_times(
         ValueError: See `frame_count`.
     """
     times = np.asarray(trajectory.times, dtype=np.float64)
-    count = frame_count(float(times[-1] - times[0]), slow_motion, fps)
+    count = _counted(float(times[-1] - times[0]), slow_motion, fps, "options.slow_motion")
     return times[0] + np.arange(count) / (fps * slow_motion)
 
 
@@ -38,10 +38,15 @@ def frame_count(duration: float, slow_motion: int | float, fps: int | float = 30
     """
     for name, value in (("duration", duration), ("fps", fps), ("slow_motion", slow_motion)):
         checked_number(name, value, above=0)
+    return _counted(duration, slow_motion, fps, "slow_motion")
+
+
+def _counted(duration: float, slow_motion: int | float, fps: int | float, name: str) -> int:
+    """Number of frames; `name`: of the argument, for errors."""
     count = duration * fps * slow_motion
     if not count < MOST_FRAMES:
         raise ValueError(
-            f"slow_motion must be at most {MOST_FRAMES / (duration * fps):.3g}, so that a video of"
+            f"{name} must be at most {MOST_FRAMES / (duration * fps):.3g}, so that a video of"
             f" {duration:.4g} s has at most {MOST_FRAMES} frames, got {slow_motion:g} with fps {fps:g}"
         )
     return int(np.floor(count + 1e-6)) + 1

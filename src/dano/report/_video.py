@@ -3,6 +3,7 @@
 import contextlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,7 +11,15 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dano.archive import checked_output, replacing
-from dano.checks import checked_choice, checked_function, checked_items, checked_kind, checked_path
+from dano.checks import (
+    checked_choice,
+    checked_function,
+    checked_items,
+    checked_kind,
+    checked_number,
+    checked_optional,
+    checked_path,
+)
 from dano.extras import optional
 from dano.progress import Progress
 from dano.report._framing import CAMERAS, cameras_for, Seen, seen_of, together
@@ -18,7 +27,7 @@ from dano.report._overlay import draw_clock, draw_label, draw_touches
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import check_run, Stage, stage, Touches, touches
 from dano.scene import Scene, State, Trajectory
-from dano.vision import Camera, LearnedField, prepare, render
+from dano.vision import Camera, Item, LearnedField, prepare, render
 
 MOST_PIXELS = 8192
 """Longest side of a film: what common decoders of H.264 can show."""
@@ -28,22 +37,69 @@ _STRIP_MOMENTS = 6
 """Moments in a picture strip: two rows of three (convention)."""
 _ROW_MOMENTS = 4
 """Moments in a row of a picture strip of two runs (convention)."""
+_GHOST = 0.4
+"""How much of a ghost is seen (chosen by eye)."""
 
 
-class _Style(NamedTuple):
-    """How runs are filmed: arguments of `render_trajectory`."""
+@dataclass(frozen=True)
+class VideoOptions:
+    """How films of runs look.
 
-    fps: int
-    size: tuple[int, int]
-    slow_motion: int | float
-    contact_points: bool
-    clock: bool
-    camera: Camera | str
-    progress: Progress | None
+    Attributes:
+        fps: Frames per second of the video.
+        size: Width and height [pixels], even numbers; of each half where two runs are side by side.
+        slow_motion: How many times slower than life the video plays.
+        camera: From where: a camera, which replaces `size`; or "fixed", which sees all bodies all the time;
+            "follow", which shifts with those that move; "auto", which follows if bodies would otherwise fill
+            less than a third of the height.
+        contact_points: Whether to draw where bodies touch, and the contact force as an arrow.
+        clock: Whether to draw the time, and a bar that says how long things are in the middle of the motion.
+        colours: "#rrggbb" by body name, for those that shall have a certain one, whatever they have learned
+            to look like; None for none.
+    """
+
+    fps: int = 30
+    size: tuple[int, int] = (640, 400)
+    slow_motion: int | float = 1.0
+    camera: Camera | str = "auto"
+    contact_points: bool = True
+    clock: bool = True
+    colours: Mapping[str, str] | None = None
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without a scene.
+
+        Raises:
+            ValueError: If a number is out of range, or the camera is unknown.
+        """
+        checked_number("fps", self.fps, above=0)
+        checked_number("slow_motion", self.slow_motion, above=0)
+        if isinstance(self.camera, str):
+            checked_choice("camera", self.camera, CAMERAS)
+        else:
+            checked_kind("camera", self.camera, Camera, hint=f", or one of {', '.join(CAMERAS)}")
+        checked_size(self.pixels)
+        checked_optional("colours", self.colours, Mapping)
+
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """Width and height of pictures: those of the camera, if there is one."""
+        return self.size if isinstance(self.camera, str) else (self.camera.width, self.camera.height)
 
 
-class _Take(NamedTuple):
-    """A run as a film shows it: what is drawn of it, and where that is in each frame."""
+class Take(NamedTuple):
+    """A run as a film shows it: what is drawn of it, and where that is in each frame.
+
+    Attributes:
+        seen: What the camera keeps in view.
+        drawn: Bodies.
+        times: Of the frames [s].
+        position: Of the centres of mass [m, W].
+        orientation: Of the bodies.
+        touched: Contacts; None if they are not drawn.
+        label: Written in a corner, if it is not empty.
+        ghosts: Drawn through, and over all.
+    """
 
     seen: Seen
     drawn: Stage
@@ -51,7 +107,8 @@ class _Take(NamedTuple):
     position: Float[np.ndarray, "frames bodies 3"]
     orientation: Float[np.ndarray, "frames bodies 4"]
     touched: Touches | None
-    label: str
+    label: str = ""
+    ghosts: Sequence[Item] = ()
 
 
 def render_trajectory(
@@ -59,15 +116,9 @@ def render_trajectory(
     trajectory: Trajectory,
     path: str | os.PathLike[str] | None,
     *,
-    fps: int = 30,
-    size: tuple[int, int] = (640, 400),
-    slow_motion: int | float = 1.0,
-    contact_points: bool = True,
-    clock: bool = True,
     strip: str | os.PathLike[str] | None = None,
-    camera: Camera | str = "auto",
-    colours: dict[str, str] | None = None,
     looks: Mapping[str, LearnedField] | None = None,
+    options: VideoOptions | None = None,
     progress: Progress | None = None,
 ) -> None:
     """Film a trajectory: an MP4 video (H.264), a strip of still pictures, or both.
@@ -78,18 +129,10 @@ def render_trajectory(
         scene: The scene.
         trajectory: What happened in it; poses between its steps are interpolated.
         path: The video, ending in .mp4; None for none.
-        fps: Frames per second of the video.
-        size: Width and height [pixels], even numbers.
-        slow_motion: How many times slower than life the video plays.
-        contact_points: Whether to draw where bodies touch, and the contact force as an arrow.
-        clock: Whether to draw the time, and a bar that says how long things are in the middle of the motion.
         strip: A PNG with some moments of the motion, from left to right; None for none.
-        camera: From where: a camera, which replaces `size`; or "fixed", which sees all bodies all the time;
-            "follow", which shifts with those that move; "auto", which follows if bodies would otherwise fill
-            less than a third of the height.
-        colours: "#rrggbb" by body name, for those that shall have a certain one.
         looks: What bodies have learned to look like, by name: `LearnedField.of_object`, or
-            `SceneFile.looks`. A colour takes precedence.
+            `SceneFile.looks`.
+        options: How the film looks; default `VideoOptions()`.
         progress: Called with a description and the share done.
 
     Raises:
@@ -97,10 +140,11 @@ def render_trajectory(
             is a directory, lies in none, or has another ending.
         ImportError: If av or pillow is missing.
     """
-    style = _Style(fps, size, slow_motion, contact_points, clock, camera, progress)
-    style, outputs = _checked(style, [(scene, trajectory)], path, strip)
-    count = len(frame_times(trajectory, fps, slow_motion))
-    _film([_take(scene, trajectory, stage(scene, colours, looks), count, style)], style, outputs)
+    options = checked_video(options)
+    outputs = check_film([(scene, trajectory)], path, strip, options, progress)
+    count = len(frame_times(trajectory, options.fps, options.slow_motion))
+    take = take_of(scene, trajectory, stage(scene, options.colours, looks), count, options)
+    film([take], options, outputs, progress)
 
 
 def render_start(
@@ -145,14 +189,9 @@ def render_side_by_side(
     path: str | os.PathLike[str] | None,
     *,
     labels: Sequence[str] = ("", ""),
-    looks: Sequence[Mapping[str, LearnedField] | None] = (None, None),
-    fps: int = 30,
-    size: tuple[int, int] = (640, 400),
-    slow_motion: int | float = 1.0,
-    contact_points: bool = True,
-    clock: bool = True,
     strip: str | os.PathLike[str] | None = None,
-    camera: Camera | str = "auto",
+    looks: Sequence[Mapping[str, LearnedField] | None] = (None, None),
+    options: VideoOptions | None = None,
     progress: Progress | None = None,
 ) -> None:
     """Film two runs beside one another, to compare them.
@@ -165,14 +204,9 @@ def render_side_by_side(
         trajectories: What happened in them.
         path: The video, ending in .mp4; None for none.
         labels: What is written over the two halves.
-        looks: What bodies have learned to look like, for each scene as in `render_trajectory`.
-        fps: Frames per second of the video.
-        size: Width and height of a half [pixels], even numbers.
-        slow_motion: How many times slower than life the video plays.
-        contact_points: Whether to draw where bodies touch, and the contact force as an arrow.
-        clock: Whether to draw the time, and a bar that says how long things are in the middle of the motion.
         strip: A PNG with some moments, a row for each run; None for none.
-        camera: As in `render_trajectory`.
+        looks: What bodies have learned to look like, for each scene as in `render_trajectory`.
+        options: How the film looks; default `VideoOptions()`. Colours are of bodies of either scene.
         progress: Called with a description and the share done.
 
     Raises:
@@ -183,14 +217,21 @@ def render_side_by_side(
     trajectories = _two("trajectories", trajectories, Trajectory)
     labels = _two("labels", labels, str)
     looks = _two("looks", looks, Mapping, type(None))
-    style = _Style(fps, size, slow_motion, contact_points, clock, camera, progress)
-    style, outputs = _checked(style, list(zip(scenes, trajectories, strict=True)), path, strip)
-    count = max(len(frame_times(trajectory, fps, slow_motion)) for trajectory in trajectories)
+    options, runs = checked_video(options), list(zip(scenes, trajectories, strict=True))
+    outputs = check_film(runs, path, strip, options, progress)
+    count = max(len(frame_times(run, options.fps, options.slow_motion)) for run in trajectories)
     takes = [
-        _take(scene, trajectory, stage(scene, None, look), count, style, label)
-        for scene, trajectory, label, look in zip(scenes, trajectories, labels, looks, strict=True)
+        take_of(*run, stage(run[0], colours, look), count, options)._replace(label=label)
+        for run, colours, look, label in zip(runs, _shared(options, scenes), looks, labels, strict=True)
     ]
-    _film(_with_equal_arrows(takes), style, outputs)
+    film(_with_equal_arrows(takes), options, outputs, progress)
+
+
+def _shared(options: VideoOptions, scenes: Sequence[Scene]) -> list[dict[str, str]]:
+    """The colours of each scene's bodies; those that no scene has are left to all, where they are errors."""
+    colours = options.colours or {}
+    known = {name for scene in scenes for name in scene.names}
+    return [{k: c for k, c in colours.items() if k in scene.names or k not in known} for scene in scenes]
 
 
 def _two(name: str, values: Any, *kinds: type) -> tuple[Any, ...]:
@@ -200,55 +241,56 @@ def _two(name: str, values: Any, *kinds: type) -> tuple[Any, ...]:
     return values
 
 
-def _checked(
-    style: _Style, runs: Sequence[tuple[Scene, Trajectory]], path: Any, strip: Any
-) -> tuple[_Style, tuple[Path | None, Path | None]]:
-    """How to film, and output paths, after checks that need no work."""
-    camera, size = style.camera, style.size
-    if isinstance(camera, str):
-        checked_choice("camera", camera, CAMERAS)
-    else:
-        checked_kind("camera", camera, Camera, hint=f", or one of {', '.join(CAMERAS)}")
-        size = camera.width, camera.height
-    if style.progress is not None:
-        checked_function("progress", style.progress)
-    outputs = check_film(runs, path, strip, size)
-    return style._replace(size=(size[0], size[1])), outputs
+def checked_video(options: VideoOptions | None, usual: VideoOptions | None = None) -> VideoOptions:
+    """`options`, or the usual ones in place of None.
+
+    Raises:
+        ValueError: If they are something else.
+    """
+    return checked_optional("options", options, VideoOptions) or usual or VideoOptions()
 
 
-def checked_size(size: Sequence[int], count: int = 1) -> tuple[int, int]:
+def checked_size(size: Sequence[int], count: int = 1, name: str = "size") -> tuple[int, int]:
     """Width and height of films and strips [pixels].
 
     Args:
         size: Of the picture of a run.
         count: Runs that are side by side.
+        name: Of the argument, for errors.
 
     Raises:
         ValueError: If they are not even numbers in range.
     """
-    size, most = checked_items("size", size, int), MOST_PIXELS if count == 1 else _MOST_OF_HALF
+    size, most = checked_items(name, size, int), MOST_PIXELS if count == 1 else _MOST_OF_HALF
     if len(size) != 2 or not all(16 <= n <= most and n % 2 == 0 for n in size):
         raise ValueError(
-            f"size must be two even numbers from 16 to {most} pixels (video codecs need them even),"
+            f"{name} must be two even numbers from 16 to {most} pixels (video codecs need them even),"
             f" got {list(size)}"
         )
     return size[0], size[1]
 
 
 def check_film(
-    runs: Sequence[tuple[Scene, Trajectory]], path: Any, strip: Any, size: Any
+    runs: Sequence[tuple[Scene, Trajectory]],
+    path: Any,
+    strip: Any,
+    options: VideoOptions,
+    progress: Progress | None,
 ) -> tuple[Path | None, Path | None]:
     """Output paths, after checks that need no work.
 
     Raises:
-        ValueError: If there is none, one cannot be written, a run is not of its scene, or the size is wrong.
+        ValueError: If there is none, one cannot be written, a run is not of its scene, or a picture is too
+            large to stand beside another one.
         ImportError: If av or pillow is missing.
     """
     if path is None and strip is None:
         raise ValueError("path or strip must be given, got None for both")
     for scene, trajectory in runs:
         check_run(scene, trajectory)
-    checked_size(size, len(runs))
+    checked_size(options.pixels, len(runs), "options.size")
+    if progress is not None:
+        checked_function("progress", progress)
     checked = []
     for name, output, suffix in (("path", path, ".mp4"), ("strip", strip, ".png")):
         if output is not None and checked_path(name, output).suffix.lower() != suffix:
@@ -260,20 +302,18 @@ def check_film(
     return checked[0], checked[1]
 
 
-def _take(
-    scene: Scene, trajectory: Trajectory, drawn: Stage, count: int, style: _Style, label: str = ""
-) -> _Take:
+def take_of(scene: Scene, trajectory: Trajectory, drawn: Stage, count: int, options: VideoOptions) -> Take:
     """A run at the times of so many frames; after its end it stands still."""
-    since = np.arange(count) / (style.fps * style.slow_motion)
+    since = np.arange(count) / (options.fps * options.slow_motion)
     known = np.asarray(trajectory.times, dtype=np.float64)
     times = np.minimum(known[0] + since, known[-1])
     position, orientation = poses_at(trajectory, times)
-    touched = touches(scene, trajectory, times) if style.contact_points else None
+    touched = touches(scene, trajectory, times) if options.contact_points else None
     seen = seen_of(scene, drawn, position, orientation)
-    return _Take(seen, drawn, times, position, orientation, touched, label)
+    return Take(seen, drawn, times, position, orientation, touched)
 
 
-def _with_equal_arrows(takes: Sequence[_Take]) -> list[_Take]:
+def _with_equal_arrows(takes: Sequence[Take]) -> list[Take]:
     """The takes with arrows that are as long in all of them for the same force."""
     usual = max((take.touched.usual for take in takes if take.touched is not None), default=0.0)
     if usual == 0:
@@ -283,14 +323,20 @@ def _with_equal_arrows(takes: Sequence[_Take]) -> list[_Take]:
     ]
 
 
-def _film(takes: Sequence[_Take], style: _Style, outputs: tuple[Path | None, Path | None]) -> None:
-    """Draw runs from left to right, all from the same camera."""
+def film(
+    takes: Sequence[Take],
+    options: VideoOptions,
+    outputs: tuple[Path | None, Path | None],
+    progress: Progress | None,
+) -> None:
+    """Draw runs from left to right, all from the same camera: a video, a strip of some moments, or both."""
     count = len(takes[0].times)
-    if isinstance(style.camera, str):
-        step = 1 / (style.fps * style.slow_motion)
-        cameras = cameras_for(together([take.seen for take in takes]), step, style.size, style.camera)
+    if isinstance(options.camera, str):
+        step = 1 / (options.fps * options.slow_motion)
+        seen = together([take.seen for take in takes])
+        cameras = cameras_for(seen, step, options.pixels, options.camera)
     else:
-        cameras = [style.camera] * count
+        cameras = [options.camera] * count
     if count > 1:
         prepare([item for take in takes for item in take.drawn.items], cameras[0])
     sizes = [item.radius for take in takes for item in take.drawn.items if item.plane is None]
@@ -299,17 +345,21 @@ def _film(takes: Sequence[_Take], style: _Style, outputs: tuple[Path | None, Pat
     moments = moments_of(position, _STRIP_MOMENTS if len(takes) == 1 else _ROW_MOMENTS)
 
     def pictures(frame: int) -> list[np.ndarray]:
-        return [_picture(take, cameras[frame], frame, arrow, style.clock) for take in takes]
+        return [_picture(take, cameras[frame], frame, arrow, options.clock) for take in takes]
 
-    write_film(pictures, count, moments, outputs, style.fps, style.progress)
+    _write(pictures, count, moments, outputs, options.fps, progress)
 
 
 def _picture(
-    take: _Take, camera: Camera, frame: int, arrow: float, clock: bool
+    take: Take, camera: Camera, frame: int, arrow: float, clock: bool
 ) -> UInt8[np.ndarray, "height width 3"]:
     """A frame of a run; `arrow`: length [m] of a usual force."""
     drawn, position = take.drawn, take.position[frame]
-    image = render(drawn.posed(position, take.orientation[frame]), camera, floor=False)
+    items = drawn.posed(position, take.orientation[frame])
+    image = render(items, camera, floor=False)
+    if take.ghosts:
+        both = render([*items, *take.ghosts], camera, floor=False)
+        image = np.round((1 - _GHOST) * image + _GHOST * both.astype(float)).astype(np.uint8)
     if take.touched is not None:
         image = draw_touches(image, camera, take.touched, frame, arrow)
     if clock:
@@ -320,7 +370,7 @@ def _picture(
     return draw_label(image, take.label) if take.label else image
 
 
-def write_film(
+def _write(
     pictures: Callable[[int], Sequence[UInt8[np.ndarray, "height width 3"]]],
     count: int,
     moments: Int[np.ndarray, " moments"],

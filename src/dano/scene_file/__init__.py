@@ -35,4 +35,4 @@ from dano.scene_file._runs import (
     save_run as save_run,
 )
 from dano.scene_file._schedule import Schedule as Schedule
-from dano.scene_file._tasks import load_task as load_task, Search as Search, TaskFile as TaskFile
+from dano.scene_file._tasks import load_task as load_task, TaskFile as TaskFile

@@ -12,7 +12,19 @@ import numpy as np
 
 from dano.archive import checked_input
 from dano.names import did_you_mean
-from dano.plan import Actuator, FIRST_DRAWS, Goal, KINDS, Limit, Method, METHODS, QUANTITIES, Task
+from dano.plan import (
+    Actuator,
+    FIRST_DRAWS,
+    Goal,
+    KINDS,
+    Limit,
+    Method,
+    METHODS,
+    PlanOptions,
+    QUANTITIES,
+    SamplingOptions,
+    Task,
+)
 from dano.scene import Scene
 from dano.scene_file._table import is_number, located, Table
 
@@ -20,39 +32,10 @@ _TOP = ("duration", "n_steps", "actuators", "goals", "limits", "search")
 _ACTUATOR = ("body", "kind", "limit", "lower", "upper", "axes", "cost", "start")
 _GOAL = ("body", *QUANTITIES, "running", "final", "required", "within", "axes")
 _LIMIT = ("body", "quantity", "lower", "upper", "axes")
-_SEARCH_COUNTS = ("max_iterations", "passes", "samples", "knots")
-_SEARCH = ("method", "explore", "softening", "seed", "max_seconds", *_SEARCH_COUNTS, "deviation", "first")
-
-
-@dataclass(frozen=True)
-class Search:
-    """How a task file wants its plan to be searched for.
-
-    Attributes:
-        method: See `dano.plan`.
-        explore: See `dano.plan`.
-        softening: See `dano.plan`.
-        seed: See `dano.plan`.
-        max_seconds: Time limit [s]; None: none.
-        max_iterations: Of an inner minimum; None: the default.
-        passes: Of sampling; None: the default.
-        samples: In a pass; None: the default.
-        knots: Moments at which they draw; None: the default.
-        deviation: First deviation, as a share of the bounds; None: the default.
-        first: How the first pass draws, "normal" or "even"; None: the default.
-    """
-
-    method: Method
-    explore: int | None
-    softening: tuple[float, ...]
-    seed: int
-    max_seconds: float | None
-    max_iterations: int | None
-    passes: int | None
-    samples: int | None
-    knots: int | None
-    deviation: float | None
-    first: str | None
+_SAMPLING = ("passes", "samples", "knots", "deviation", "first")
+_SEARCH = ("method", "explore", "softening", "seed", "max_seconds", "max_iterations", *_SAMPLING)
+_FEWEST = 4
+"""Samples of a pass below which there is nothing to choose from."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +45,16 @@ class TaskFile:
     Attributes:
         task: The task.
         controls: First guess [N, N m], shape (T, m).
-        search: How to search.
+        method: How to search, as in `dano.plan`.
+        options: How the search runs.
         path: The file.
         text: Its text.
     """
 
     task: Task
     controls: np.ndarray
-    search: Search
+    method: Method
+    options: PlanOptions
     path: Path
     text: str
 
@@ -103,7 +88,7 @@ def load_task(path: str | os.PathLike[str], scene: Scene) -> TaskFile:
         task = Task(n_steps, [actuator for actuator, _ in read], goals, limits)
         task.check(scene)
     start = np.concatenate([first for _, first in read], axis=1)
-    return TaskFile(task, start, _search(top), source, text)
+    return TaskFile(task, start, *_search(top), source, text)
 
 
 def _rows(top: Table, name: str, valid: Sequence[str]) -> list[Table]:
@@ -202,28 +187,31 @@ def _limit(table: Table, scene: Scene) -> Limit:
         return Limit(body, table.word("quantity"), axes=table.word("axes", None, "xyz"), **bounds)
 
 
-def _search(top: Table) -> Search:
+def _search(top: Table) -> tuple[Method, PlanOptions]:
+    """How a plan is searched for; what the table leaves out is as in Python."""
     table = top.table("search", _SEARCH)
-    counts: dict[str, int | None] = {}
-    for key in _SEARCH_COUNTS:
-        counts[key] = table.integer(key, 1) if key in table else None
-        least = 4 if key == "samples" else 1
-        if key in table and cast(int, counts[key]) < least:
-            raise table.wrong(key, f"≥ {least}")
-    explore = table.integer("explore", 0) if "explore" in table else None
-    if explore is not None and explore < 0:
-        raise table.wrong("explore", "≥ 0")
-    softening = _numbers(table, "softening") if "softening" in table else ()
-    softening = softening if isinstance(softening, tuple) else (softening,)
-    if not all(0 < factor < 1 for factor in softening):
-        raise table.wrong("softening", "factors between 0 and 1")
-    seconds = table.number("max_seconds") if "max_seconds" in table else None
-    if seconds is not None and seconds <= 0:
-        raise table.wrong("max_seconds", "> 0 s")
-    deviation = table.number("deviation") if "deviation" in table else None
-    if deviation is not None and deviation <= 0:
-        raise table.wrong("deviation", "> 0")
-    first = table.word("first", FIRST_DRAWS) if "first" in table else None
     method = cast(Method, table.word("method", METHODS, "ilqr"))
-    seed = table.integer("seed", 0)
-    return Search(method, explore, softening, seed, seconds, **counts, deviation=deviation, first=first)
+    ilqr: dict[str, Any] = {}
+    sampling: dict[str, Any] = {}
+    options: dict[str, Any] = {"seed": table.integer("seed", 0)}
+    if "max_seconds" in table:
+        ilqr["max_seconds"] = sampling["max_seconds"] = table.number("max_seconds")
+    if "max_iterations" in table:
+        ilqr["max_iterations"] = table.integer("max_iterations", 1)
+        if ilqr["max_iterations"] < 1:
+            raise table.wrong("max_iterations", "≥ 1")
+    sampling |= {key: table.integer(key, 1) for key in ("passes", "samples", "knots") if key in table}
+    if sampling.get("samples", _FEWEST) < _FEWEST:
+        raise table.wrong("samples", f"≥ {_FEWEST}")
+    if "deviation" in table:
+        sampling["deviation"] = table.number("deviation")
+    if "first" in table:
+        sampling["first"] = table.word("first", FIRST_DRAWS)
+    if "explore" in table:
+        options["explore"] = table.integer("explore", 0)
+    if "softening" in table:
+        softening = _numbers(table, "softening")
+        options["softening"] = softening if isinstance(softening, tuple) else (softening,)
+    with located(table.where):
+        drawn = SamplingOptions(**sampling)
+        return method, PlanOptions(ilqr=PlanOptions().ilqr._replace(**ilqr), sampling=drawn, **options)

@@ -314,24 +314,46 @@ def _vision(w: World) -> Iterator[Call]:
 def _pictures(w: World) -> Iterator[Call]:
     shown = {"scene": w.scene, "trajectory": w.trajectory}
     other = {"scene": {**instance(), "another": w.door}, "trajectory": instance()}
+    small = report.VideoOptions(size=(32, 32))
     yield Call(
         "report.render_trajectory",
         report.render_trajectory,
-        {**shown, "path": w.folder / "out.mp4", "size": (32, 32)},
+        {**shown, "path": w.folder / "out.mp4", "options": small},
         {
             **other,
             "path": {**kinds.target(w.folder, ".mp4"), "another ending": w.folder / "out.gif"},
             "strip": {**kinds.target(w.folder, ".png"), "another ending": w.folder / "out.gif"},
-            "size": kinds.SIZE,
-            "fps": {**POSITIVE, "huge": 10**9},
-            "slow_motion": {**POSITIVE, "huge": 1e12},
-            "camera": instance(optional=True),
-            "colours": {"unknown": {"wall": "#ffffff"}, "no colour": {"ball": "octarine"}, "number": 3},
+            "options": instance(optional=True),
             "looks": kinds.LOOKS,
             "progress": FUNCTION,
         },
-        {"path": "", "strip": "", "scene": "", "colours": "", "looks": ""},
+        {"path": "", "strip": "", "scene": "", "looks": ""},
     )
+    yield Call(
+        "report.VideoOptions",
+        report.VideoOptions,
+        {},
+        {
+            "size": kinds.SIZE,
+            "fps": POSITIVE,
+            "slow_motion": POSITIVE,
+            "camera": instance(),
+            "colours": {"number": 3},
+        },
+    )
+    endless = {"many": report.VideoOptions(fps=10**9), "slow": report.VideoOptions(slow_motion=1e12)}
+    strange = {"unknown": {"wall": "#ffffff"}, "no colour": {"ball": "octarine"}}
+    coloured = {
+        name: report.VideoOptions(size=(32, 32), colours=colours) for name, colours in strange.items()
+    }
+    for bad, says in ((endless, "options.slow_motion"), (coloured, "")):
+        yield Call(
+            "report.render_trajectory",
+            report.render_trajectory,
+            {**shown, "path": w.folder / "out.mp4"},
+            {"options": bad},
+            {"options": says},
+        )
     two = {"one": [w.scene], "none": [], "another": [3, 4], "number": 3, "nothing": None}
     yield Call(
         "report.render_side_by_side",
@@ -340,7 +362,7 @@ def _pictures(w: World) -> Iterator[Call]:
             "scenes": [w.scene] * 2,
             "trajectories": [w.trajectory] * 2,
             "path": w.folder / "out.mp4",
-            "size": (32, 32),
+            "options": small,
         },
         {
             "scenes": {**two, "another": [w.scene, w.door]},
@@ -354,10 +376,7 @@ def _pictures(w: World) -> Iterator[Call]:
                 "one": [None],
                 "no look": [{"ball": 3}, {}],
             },
-            "size": kinds.SIZE,
-            "fps": {**POSITIVE, "huge": 10**9},
-            "slow_motion": {**POSITIVE, "huge": 1e12},
-            "camera": instance(optional=True),
+            "options": instance(optional=True),
             "progress": FUNCTION,
         },
         {"path": "", "strip": "", "scenes": "", "trajectories": "", "looks": ""},

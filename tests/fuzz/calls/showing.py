@@ -78,16 +78,18 @@ def _plans(w: World) -> Iterator[Call]:
     yield Call(
         "report.film_plan",
         report.film_plan,
-        {"scene": w.scene, **plan, "path": w.folder / "out.mp4", "size": (32, 32)},
+        {
+            "scene": w.scene,
+            **plan,
+            "path": w.folder / "out.mp4",
+            "options": report.VideoOptions(size=(32, 32)),
+        },
         {
             "scene": {**instance(), "another": w.door},
             **bad,
             "path": {**kinds.target(w.folder, ".mp4"), "another ending": w.folder / "out.gif"},
             "strip": {**kinds.target(w.folder, ".png"), "another ending": w.folder / "out.gif"},
-            "fps": {**POSITIVE, "huge": 10**9},
-            "slow_motion": {**POSITIVE, "huge": 1e12},
-            "size": kinds.SIZE,
-            "camera": instance(optional=True),
+            "options": instance(optional=True),
             "looks": kinds.LOOKS,
             "progress": FUNCTION,
         },

@@ -155,18 +155,41 @@ def _identify(w: World) -> Iterator[Call]:
                 "nan": {"position": kinds.NAN},
             },
             "initial": CHOICE,
-            "huber": OPTIONAL_POSITIVE,
-            "window": OPTIONAL_COUNT,
-            "starts": COUNT,
-            "continuity": OPTIONAL_POSITIVE,
-            "checkpoint": {**kinds.target(w.folder, ".npz"), "another ending": w.folder / "out.txt"},
+            "options": instance(optional=True),
         },
         {
-            "checkpoint": "",
             "controls": "control",
             "observed": "",
             "parameters": "parameter",
             "state": "state",
+        },
+    )
+    yield Call(
+        "IdentifyOptions",
+        dano.IdentifyOptions,
+        {"window": 5},
+        {
+            "window": {**OPTIONAL_COUNT, "one frame": 1},
+            "continuity": {
+                **OPTIONAL_POSITIVE,
+                "rising": (0.1, 0.3),
+                "equal": (0.3, 0.3),
+                "deep": [[0.3, 0.1]],
+            },
+            "huber": OPTIONAL_POSITIVE,
+            "starts": {**COUNT, "too many": 10**6},
+            "seed": {"share": 2.5, "text": "a", "negative": -1},
+            "max_iterations": COUNT,
+            "tolerance": POSITIVE,
+            "jacobian": CHOICE,
+            "batch": OPTIONAL_COUNT,
+            "checkpoint": {
+                "number": 3,
+                "thing": kinds.Thing(),
+                "null": "a\0.npz",
+                "another ending": w.folder / "out.txt",
+            },
+            "resume": {"of nothing": True},
         },
     )
     times = {
@@ -332,6 +355,18 @@ def _plan(w: World) -> Iterator[Call]:
             "max_seconds": OPTIONAL_POSITIVE,
         },
     )
+    yield Call(
+        "PlanOptions",
+        dano.PlanOptions,
+        {},
+        {
+            "explore": {"share": 2.5, "negative": -1, "text": "a"},
+            "softening": {"number": 3.0, "negative": [-1.0], "text": "soft"},
+            "ilqr": {**instance(), "other options": dano.SamplingOptions()},
+            "sampling": instance(),
+            "seed": {"share": 2.5, "text": "a", "negative": -1},
+        },
+    )
     good = {"scene": w.scene, "state": w.state, "task": w.task}
     yield Call(
         "plan",
@@ -343,13 +378,9 @@ def _plan(w: World) -> Iterator[Call]:
             "task": instance(),
             "method": CHOICE,
             "controls": {"short": np.zeros((2, 3)), "nan": np.full((4, 3), kinds.NAN), "text": "push"},
-            "explore": {"share": 2.5, "negative": -1, "text": "a"},
-            "softening": {"number": 3.0, "negative": [-1.0], "text": "soft"},
             "warm": instance(optional=True),
             "options": instance(optional=True),
-            "sampling": instance(optional=True),
             "engine": instance(optional=True),
-            "seed": {"share": 2.5, "text": "a"},
             "callback": FUNCTION,
         },
     )
@@ -357,7 +388,13 @@ def _plan(w: World) -> Iterator[Call]:
         "follow",
         dano.follow,
         {"plant": w.scene, "state": w.state, "task": w.task, "plan": None},
-        {"plant": instance(), "task": instance(), "plan": instance(), "substeps": COUNT},
+        {
+            "plant": instance(),
+            "task": instance(),
+            "plan": instance(),
+            "substeps": COUNT,
+            "ilqr": instance(optional=True),
+        },
     )
     yield Call(
         "plan.load_controls",

@@ -88,7 +88,7 @@ def film_of(command: Identify) -> Callable[..., Seen]:
             camera,
             motion,
             chosen,
-            options=filming.options_of(command.filming),
+            tracking=filming.options_of(command.filming),
             background=command.filming.background,
             progress=progress,
             **settings,

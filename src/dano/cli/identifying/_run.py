@@ -13,7 +13,14 @@ from dano.cli._console import Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import missing_for_pictures
 from dano.cli.identifying._arguments import Identify
-from dano.identify import Identification, identify as fit_parameters, load_motion, Motion, Parameter
+from dano.identify import (
+    Identification,
+    identify as fit_parameters,
+    IdentifyOptions,
+    load_motion,
+    Motion,
+    Parameter,
+)
 from dano.names import did_you_mean
 from dano.scene import Scene
 from dano.solvers import Stop
@@ -33,6 +40,7 @@ def identify(command: Identify) -> None:
         from dano.cli.identifying._film import film_of
 
         fit_pixels = film_of(command)
+    options = _options(command, kept)
     # An interrupted search returns its best so far.
     progress = Progress(stops=False)
     loaded = scene_file.load_scene(command.scene, timestep=command.timestep, progress=progress)
@@ -41,14 +49,20 @@ def identify(command: Identify) -> None:
         [_motion(path, command, loaded.scene) for path in paths]
         for paths in (command.motions, command.held_out)
     )
-    settings = {"state": loaded.state, "controls": loaded.controls, "held_out": others} | _options(command)
+    settings = {
+        "state": loaded.state,
+        "controls": loaded.controls,
+        "held_out": others,
+        "initial": command.initial,
+        "noise": _noise(command),
+        "options": options,
+    }
     with warnings.catch_warnings():
         # They are in the result, and said at the end.
         warnings.simplefilter("ignore", RuntimeWarning)
         seen = None
         if fit_pixels is None:
-            keeping = {"checkpoint": kept, "resume": command.resume}
-            fit = fit_parameters(loaded.scene, found, chosen, progress=progress, **keeping, **settings)
+            fit = fit_parameters(loaded.scene, found, chosen, progress=progress, **settings)
         else:
             seen = fit_pixels(loaded.scene, found[0], chosen, progress, settings)
             fit = seen.found.fit
@@ -104,12 +118,21 @@ def _checked(command: Identify) -> Path | None:
     return output.with_name(f"{output.stem}.checkpoint.npz") if regular else None
 
 
-def _options(command: Identify) -> dict[str, Any]:
-    """Arguments of `dano.identify` that the command has, too."""
+def _noise(command: Identify) -> dict[str, float] | None:
     noise = {"position": command.position_noise, "orientation": command.rotation_noise}
-    names = ("initial", "huber", "window", "continuity", "starts")
-    given = {key: value for key, value in noise.items() if value is not None}
-    return {"noise": given or None, **{name: getattr(command, name) for name in names}}
+    return {key: value for key, value in noise.items() if value is not None} or None
+
+
+def _options(command: Identify, kept: Path | None) -> IdentifyOptions:
+    """How the search runs; one of pixels is not kept."""
+    return IdentifyOptions(
+        window=command.window,
+        continuity=command.continuity,
+        huber=command.huber,
+        starts=command.starts,
+        checkpoint=kept if command.video is None else None,
+        resume=command.resume,
+    )
 
 
 def _write_report(command: Identify, fit: Identification, seen: "Seen | None") -> None:

@@ -13,7 +13,7 @@ from dano.cli._arguments import Plan
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
-from dano.plan import OPTIONS, Plan as Planned, plan as find_plan, SamplingOptions
+from dano.plan import Plan as Planned, plan as find_plan
 
 
 def plan(command: Plan) -> None:
@@ -51,18 +51,11 @@ def plan(command: Plan) -> None:
 
 
 def _found(loaded, given, command: Plan, progress: Progress) -> Planned:
-    search = given.search
-    options = OPTIONS._replace(max_seconds=search.max_seconds)
-    if search.max_iterations is not None:
-        options = options._replace(max_iterations=search.max_iterations)
-    sampling = SamplingOptions(max_seconds=search.max_seconds)
-    names = ("passes", "samples", "knots", "deviation", "first")
-    asked = {name: getattr(search, name) for name in names}
-    sampling = dataclasses.replace(sampling, **{name: x for name, x in asked.items() if x is not None})
-    most = options.max_iterations * options.max_updates
+    options = given.options
+    most = options.ilqr.max_iterations * options.ilqr.max_updates
 
     def tell(stage: str, iteration: int, cost: float) -> bool:
-        whole = sampling.passes if stage == "sampling" else most
+        whole = options.sampling.passes if stage == "sampling" else most
         progress(f"{stage}, cost {cost:.3g}", iteration / whole)
         return interrupted()
 
@@ -70,13 +63,9 @@ def _found(loaded, given, command: Plan, progress: Progress) -> Planned:
         loaded.scene,
         loaded.state,
         given.task,
-        method=command.method or search.method,
+        method=command.method or given.method,
         controls=given.controls,
-        explore=search.explore,
-        softening=search.softening,
         options=options,
-        sampling=sampling,
-        seed=search.seed,
         callback=tell,
     )
 
@@ -85,7 +74,7 @@ def _drawn(loaded, given, found: Planned, command: Plan, progress: Progress) -> 
     """The pictures that were asked for."""
     files: dict[str, Path] = {}
     if command.video is not None or command.strip is not None:
-        from dano.report import film_plan
+        from dano.report import film_plan, PLAN_VIDEO
 
         film_plan(
             loaded.scene,
@@ -93,8 +82,8 @@ def _drawn(loaded, given, found: Planned, command: Plan, progress: Progress) -> 
             found,
             command.video,
             strip=command.strip,
-            slow_motion=command.slow_motion,
             looks=loaded.looks(),
+            options=dataclasses.replace(PLAN_VIDEO, slow_motion=command.slow_motion),
             progress=progress,
         )
         named = {"video": command.video, "strip": command.strip}

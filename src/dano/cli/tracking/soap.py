@@ -139,7 +139,7 @@ def _identify(command: Track, case: Path, page: Path, result: Path) -> None:
         camera,
         load_motion(command.output),
         [friction],
-        options=options_of(command.filming),
+        tracking=options_of(command.filming),
         background=command.filming.background,
         initial="states",
         progress=progress,
