@@ -31,7 +31,7 @@ MUCH_MEMORY = 1.2e9
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
-# Folders whose programs run longer than they compile (photographs that are rendered and trained on, fields), and
+# Folders whose programs run longer than they compile (photographs that are rendered, fields), and
 # one that compares to the last digits. Compiling takes half as long without optimizing.
 RUNS_LONG = ("fields", "objects", "reference_step", "vision")
 
