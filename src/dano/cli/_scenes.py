@@ -48,6 +48,9 @@ def simulate(command: Simulate) -> None:
     clock = running.Clock(since_start=running.is_program())
     clock("reading the scene")
     loaded = [load(scene, command.steps, command.timestep) for scene in scenes]
+    if command.camera == "scene":
+        # What is wrong with it is said before the run.
+        loaded[0].camera()
     if video is not None or strip is not None:
         from dano.report import frame_count
 
@@ -412,7 +415,7 @@ def _draw(loaded: list[scene_file.SceneFile], trajectories: list[Trajectory], co
     options: dict[str, Any] = {
         "strip": command.strip,
         "slow_motion": command.slow_motion,
-        "camera": command.camera,
+        "camera": loaded[0].camera() if command.camera == "scene" else command.camera,
         "size": command.size,
         "progress": progress,
     }

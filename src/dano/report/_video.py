@@ -18,7 +18,7 @@ from dano.report._overlay import draw_clock, draw_label, draw_touches
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import check_run, Stage, stage, Touches, touches
 from dano.scene import Scene, State, Trajectory
-from dano.vision import Camera, LearnedField, prepare, render
+from dano.vision import AbstractCamera, LearnedField, prepare, render
 
 MOST_PIXELS = 8192
 """Longest side of a film: what common decoders of H.264 can show."""
@@ -38,7 +38,7 @@ class _Style(NamedTuple):
     slow_motion: int | float
     contact_points: bool
     clock: bool
-    camera: Camera | str
+    camera: AbstractCamera | str
     progress: Progress | None
 
 
@@ -65,7 +65,7 @@ def render_trajectory(
     contact_points: bool = True,
     clock: bool = True,
     strip: str | os.PathLike[str] | None = None,
-    camera: Camera | str = "auto",
+    camera: AbstractCamera | str = "auto",
     colours: dict[str, str] | None = None,
     looks: Mapping[str, LearnedField] | None = None,
     progress: Progress | None = None,
@@ -152,7 +152,7 @@ def render_side_by_side(
     contact_points: bool = True,
     clock: bool = True,
     strip: str | os.PathLike[str] | None = None,
-    camera: Camera | str = "auto",
+    camera: AbstractCamera | str = "auto",
     progress: Progress | None = None,
 ) -> None:
     """Film two runs beside one another, to compare them.
@@ -208,7 +208,7 @@ def _checked(
     if isinstance(camera, str):
         checked_choice("camera", camera, CAMERAS)
     else:
-        checked_kind("camera", camera, Camera, hint=f", or one of {', '.join(CAMERAS)}")
+        checked_kind("camera", camera, AbstractCamera, hint=f", or one of {', '.join(CAMERAS)}")
         size = camera.width, camera.height
     if style.progress is not None:
         checked_function("progress", style.progress)
@@ -305,7 +305,7 @@ def _film(takes: Sequence[_Take], style: _Style, outputs: tuple[Path | None, Pat
 
 
 def _picture(
-    take: _Take, camera: Camera, frame: int, arrow: float, clock: bool
+    take: _Take, camera: AbstractCamera, frame: int, arrow: float, clock: bool
 ) -> UInt8[np.ndarray, "height width 3"]:
     """A frame of a run; `arrow`: length [m] of a usual force."""
     drawn, position = take.drawn, take.position[frame]
