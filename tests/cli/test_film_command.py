@@ -23,7 +23,7 @@ class Kitchen:
     def __init__(self, folder: Path):
         self.folder, self.said, self.times = folder, [], iter(map(float, range(0, 10000, 7)))
         self.went_on: list[bool] = []
-        self.fails: dict[str, Exception] = {}
+        self.fails: dict[str, BaseException] = {}
         self.choices = {"cut": {"size": 1}, "cook": {}, "serve": {}}
         (folder / "walk").mkdir()
         (folder / "walk" / "a.png").write_bytes(b"a")

@@ -33,6 +33,8 @@ class Train:
             background.
         mass: Mass of the object [kg].
         mass_density: Mass per volume [kg/m³], used if no mass is given.
+        table: Height z of a level table that the object stands on in the photographs [m]: nothing of it is
+            below.
         resume: Continue a training that was interrupted.
         no_report: Write no report.
         seed: Seed of all random numbers.
@@ -51,6 +53,7 @@ class Train:
     network: Path | None = None
     mass: float | None = None
     mass_density: float = 1000.0
+    table: float | None = None
     resume: bool = False
     no_report: bool = False
     seed: int = 0

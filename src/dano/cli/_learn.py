@@ -262,6 +262,7 @@ def train(command: Train) -> None:
             network=command.network,
             mass=command.mass,
             mass_density=command.mass_density,
+            table=command.table,
             checkpoint=checkpoint,
             resume=command.resume,
             previews=command.previews,

@@ -89,6 +89,7 @@ def _learn(place: Place, goes_on: bool) -> None:
         resolution=asked.resolution,
         iterations=asked.iterations,
         mass=asked.mass,
+        table=0.0,
         seed=asked.seed,
         resume=goes_on,
     )()

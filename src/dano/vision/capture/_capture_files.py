@@ -124,10 +124,12 @@ def load_camera(
             )
         content = {**content, **frames[0]}
     _check_model(source, {**content, "frames": []})
-    shape = tuple(content.get(key) if side is None else side for key, side in (("h", height), ("w", width)))
-    if None in shape:
+    height, width = (
+        content.get(key) if side is None else side for key, side in (("h", height), ("w", width))
+    )
+    if height is None or width is None:
         raise ValueError(f"{source}: camera must state w and h, or width and height must be given")
-    return _camera(source, source.name, {"transform_matrix": None, **content}, shape)
+    return _camera(source, source.name, {"transform_matrix": None, **content}, (height, width))
 
 
 def _named(source: Path, frames: Any, name: str) -> list[dict[str, Any]]:
