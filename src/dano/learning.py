@@ -55,6 +55,7 @@ def train_object(
     network: str | os.PathLike[str] | None = None,
     mass: float | None = None,
     mass_density: float = 1000.0,
+    table: float | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
     previews: str | Path | None = None,
@@ -70,6 +71,8 @@ def train_object(
         network: Segmentation network (ONNX) for photographs without masks; default: a plain background.
         mass: Of the object [kg]; default: `mass_density` times its volume.
         mass_density: Mass per volume [kg/m³].
+        table: Height z of a level table that the object stands on in the photographs [m]: nothing of it is
+            below, which no photograph shows. None: it is not known.
         checkpoint: File that the state of training is written to, also when interrupted.
         resume: Go on from `checkpoint` if it exists.
         previews: Folder for pictures of what has been learned so far.
@@ -86,6 +89,8 @@ def train_object(
     for name, value in (("mass", mass), ("mass_density", mass_density)):
         if name == "mass_density" or value is not None:
             checked_number(name, value, above=0)
+    if table is not None:
+        checked_number("table", table)
     checked_count("downscale", downscale)
     options = checked_optional("options", options, TrainOptions) or TrainOptions()
     if not isinstance(photographs, Capture):
@@ -97,6 +102,8 @@ def train_object(
 
     say("visual hull", 0.0)
     trained = train(capture, options, checkpoint=checkpoint, resume=resume, progress=say, previews=previews)
+    if table is not None:
+        trained = trained._replace(field=trained.field.above(table))
     say("solid", 0.0)
     made = NeuralObject.from_field(
         trained.field,

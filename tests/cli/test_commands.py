@@ -19,6 +19,7 @@ from dano.cli import _scenes
 from dano.cli._outputs import run_files
 from dano.fields import GridField, load_field, save_field
 from dano.scene_file import _objects as shipped, _pieces, load_run, load_scene
+from dano.vision import read_film
 
 
 def test_help_without_arguments(run):
@@ -265,6 +266,24 @@ def test_simulate_draws(run, scene, tmp_path, monkeypatch):
     ((_, trajectory, video), options) = calls[0]
     assert trajectory.names == ("egg", "floor")
     assert (video, options["strip"]) == (paths[1], paths[2])
+
+
+def test_a_run_is_drawn_by_the_camera_that_the_scene_names(run, scene, tmp_path):
+    film = tmp_path / "run.mp4"
+    words = "simulate", scene, "-o", tmp_path / "run.npz", "--video", film, "--camera", "scene", "--steps", 40
+    answer = run(*words)
+    assert answer.code == 2 and "camera must be a non-empty string, got None" in answer.err
+    # Looks down on the floor from half a metre; its picture is no square.
+    above = {"fl_x": 60, "w": 64, "h": 48, "transform_matrix": np.diag([1.0, 1, 1, 1]).tolist()}
+    above["transform_matrix"][2][3] = 0.5
+    (tmp_path / "camera.json").write_text(json.dumps(above), encoding="utf-8")
+    scene.write_text('camera = "camera.json"\n' + scene.read_text(encoding="utf-8"), encoding="utf-8")
+    answer = run(*words)
+    assert answer.code == 0, answer.err
+    frame = read_film(film).images[0].astype(float)
+    assert frame.shape == (48, 64, 3)
+    # The egg is in the middle, and not at the left.
+    assert np.abs(frame[20:28, 28:36].mean((0, 1)) - frame[20:28, :8].mean((0, 1))).max() > 20
 
 
 def test_two_scenes_are_simulated_and_filmed_side_by_side(run, scene, tmp_path, monkeypatch):

@@ -256,6 +256,7 @@ BAD = {
         "timestep must be finite and > 0 s, got -0.1",
     ),
     "wrong type": ('n_steps = "many"\n' + BODY, "n_steps must be a whole number, got 'many'"),
+    "no camera file": ("n_steps = 1\ncamera = 3\n" + BODY, "camera must be a non-empty string, got 3"),
     "no body": ("n_steps = 1\n", "at least one [[bodies]] table"),
     "nameless body": (
         'n_steps = 1\n[[bodies]]\nshape = "sphere"\n',

@@ -88,6 +88,11 @@ def photograph(view: PosedCamera, top: np.ndarray, skin: np.ndarray) -> tuple[np
     return np.rint(255 * shown).astype(np.uint8), averaged(hit * 1.0)
 
 
+def sample_table(top: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Brightness of the table, 0 to 1, at points on it [m]."""
+    return _sample(top, _texels(points))
+
+
 def _light(grey: np.ndarray) -> np.ndarray:
     return np.where(grey < 0.04045, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4)
 

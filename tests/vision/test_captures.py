@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from vision.photographs import capture, directions, pose, write_png, write_transforms
 
-from dano.vision import background_mask, Capture, load_capture, View, with_masks
+from dano.cli.tracking.filming import named_frame
+from dano.vision import background_mask, Capture, load_camera, load_capture, View, with_masks
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +39,25 @@ def test_transforms_of_nerfstudio(photos: Capture, tmp_path: Path):
     check(read, photos)
     assert read.has_masks and read.is_lit
     assert len(load_capture(tmp_path / "transforms.json").views) == 4
+
+
+def test_the_camera_of_one_of_several_pictures(photos: Capture, tmp_path: Path):
+    write_transforms(tmp_path, photos)
+    file = tmp_path / "transforms.json"
+    names = [row["file_path"] for row in json.loads(file.read_text(encoding="utf-8"))["frames"]]
+    for name, view in zip(names, photos.views, strict=True):
+        for given in (name, Path(name).name):
+            found = load_camera(file, 16, 16, frame=given)
+            np.testing.assert_allclose(found.pose, view.camera.pose, atol=1e-12)
+        assert named_frame(Path(f"{file}:{name}")) == (file, name)
+    assert named_frame(file) == (file, None) and named_frame(Path("a:b.png")) == (Path("a:b.png"), None)
+    with pytest.raises(ValueError, match="frame must be one of .*, got 'film.png', which 0 are called"):
+        load_camera(file, 16, 16, frame="film.png")
+    with pytest.raises(ValueError, match="or a single frame that has it, got 4 frames"):
+        load_camera(file, 16, 16)
+    edit(tmp_path, lambda content: [row.pop("w", None) for row in (content, *content["frames"])])
+    with pytest.raises(ValueError, match="camera must state w and h, or width and height"):
+        load_camera(file, height=16, frame=names[0])
 
 
 def test_blender_scenes(photos: Capture, tmp_path: Path):

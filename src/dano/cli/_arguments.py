@@ -33,6 +33,8 @@ class Train:
             background.
         mass: Mass of the object [kg].
         mass_density: Mass per volume [kg/m³], used if no mass is given.
+        table: Height z of a level table that the object stands on in the photographs [m]: nothing of it is
+            below.
         resume: Continue a training that was interrupted.
         no_report: Write no report.
         seed: Seed of all random numbers.
@@ -51,6 +53,7 @@ class Train:
     network: Path | None = None
     mass: float | None = None
     mass_density: float = 1000.0
+    table: float | None = None
     resume: bool = False
     no_report: bool = False
     seed: int = 0
@@ -278,7 +281,8 @@ class Simulate:
         steps: Number of steps; default: the scene's.
         timestep: Timestep [s]; default: the scene's.
         camera: fixed: sees all bodies all the time; follow: shifts with those that move; auto: follows if
-            bodies would otherwise fill less than a third of the height.
+            bodies would otherwise fill less than a third of the height; scene: the one that the (first) scene
+            file names, whose size pictures have.
         size: Width and height of pictures [pixels], even numbers.
         slow_motion: Video seconds per simulated second.
         resume: Go on with a run that was interrupted or killed; the result is the same to the last bit.
@@ -292,7 +296,7 @@ class Simulate:
     strip: Path | None = None
     steps: int | None = None
     timestep: float | None = None
-    camera: Literal["auto", "fixed", "follow"] = "auto"
+    camera: Literal["auto", "fixed", "follow", "scene"] = "auto"
     size: tuple[int, int] = (640, 400)
     slow_motion: float = 1.0
     resume: bool = False

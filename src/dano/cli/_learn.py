@@ -148,13 +148,31 @@ def data(command: Data) -> None:
                 raise ImportError(missing)
             say(f"warning: not drawn, {missing}")
             picture = None
+    _, report = look(command.images, command.network, picture, downscale=command.downscale)
+    if command.json:
+        put_json(report)
+        return
+    print_data(report)
+
+
+def look(
+    images: Path, network: Path | None, picture: Path | None, *, downscale: int = 1
+) -> tuple[Capture, dict[str, Any]]:
+    """Photographs with masks, given or made, and what they say of themselves in numbers.
+
+    Args:
+        images: Folder or file of photographs with cameras.
+        network: Segmentation network for those without masks.
+        picture: Where to draw cameras and outlines; None: nowhere.
+        downscale: Average so many pixels a side into one.
+    """
     progress = Progress()
     progress("reading photographs", 0.0)
-    capture = load_capture(command.images, downscale=command.downscale)
+    capture = load_capture(images, downscale=downscale)
     given = capture.has_masks
     if not given:
         progress("making masks", 0.2)
-        capture = with_masks(capture, command.network)
+        capture = with_masks(capture, network)
     progress("visual hull", 0.4)
     found = survey(capture, 64)
     progress.close()
@@ -164,10 +182,7 @@ def data(command: Data) -> None:
 
         draw_capture(capture, found, picture)
         report["picture"] = str(picture)
-    if command.json:
-        put_json(report)
-        return
-    _print_data(report)
+    return capture, report
 
 
 def describe(capture: Capture, found: Survey, *, masks_given: bool) -> dict[str, Any]:
@@ -193,7 +208,8 @@ def describe(capture: Capture, found: Survey, *, masks_given: bool) -> dict[str,
     }
 
 
-def _print_data(report: dict[str, Any]) -> None:
+def print_data(report: dict[str, Any]) -> None:
+    """Print what `look` found."""
     counts = report["views"]
     put(f"photographs         {report['source']}")
     put(
@@ -246,6 +262,7 @@ def train(command: Train) -> None:
             network=command.network,
             mass=command.mass,
             mass_density=command.mass_density,
+            table=command.table,
             checkpoint=checkpoint,
             resume=command.resume,
             previews=command.previews,

@@ -28,6 +28,7 @@ from dano.cli._arguments import (
     View,
 )
 from dano.cli.checking import Check
+from dano.cli.film import Film
 from dano.cli.identifying import Identify
 from dano.cli.tracking import Track
 from dano.names import did_you_mean
@@ -49,6 +50,7 @@ GROUPS: dict[str, dict[str, _Row]] = {
         "inspect": _Row(Inspect, "dano inspect mug.dano"),
     },
     "From photographs and films": {
+        "film": _Row(Film, "dano film walk/ slide.mp4 --marker-size 0.08 -o soap.dano"),
         "poses": _Row(Poses, "dano poses photos/ --marker-size 0.05"),
         "data": _Row(Data, "dano data photos/"),
         "track": _Row(Track, "dano track throw.mp4 mug.dano --camera camera.json"),

@@ -48,6 +48,9 @@ def simulate(command: Simulate) -> None:
     clock = running.Clock(since_start=running.is_program())
     clock("reading the scene")
     loaded = [load(scene, command.steps, command.timestep) for scene in scenes]
+    if command.camera == "scene":
+        # What is wrong with it is said before the run.
+        loaded[0].camera()
     if video is not None or strip is not None:
         from dano.report import frame_count
 
@@ -408,7 +411,11 @@ def _draw(loaded: list[scene_file.SceneFile], trajectories: list[Trajectory], co
     from dano.report import render_side_by_side, render_trajectory, VideoOptions
 
     progress = Progress()
-    film = VideoOptions(size=command.size, slow_motion=command.slow_motion, camera=command.camera)
+    film = VideoOptions(
+        size=command.size,
+        slow_motion=command.slow_motion,
+        camera=loaded[0].camera() if command.camera == "scene" else command.camera,
+    )
     given: dict[str, Any] = {"strip": command.strip, "options": film, "progress": progress}
     scenes, looks = [each.scene for each in loaded], [each.looks() for each in loaded]
     if command.beside is None:

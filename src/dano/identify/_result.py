@@ -11,7 +11,7 @@ from dano.gradients import Check
 from dano.identify._motion import Motion
 from dano.identify._uncertainty import quantile
 from dano.notebook import card, curves, numbers
-from dano.scene import Scene, State
+from dano.scene import Scene, State, state_arrays
 from dano.solvers import Stop
 
 
@@ -143,6 +143,11 @@ class Identification:
             else _plain(self.held_out_errors._asdict()),
             "loss_history": _plain(self.loss_history),
             "labels": list(self.labels),
+            "bodies": list(self.scene.names),
+            "initial_state": {
+                name: _plain(np.asarray(states)[0])
+                for name, states in state_arrays(self.initial_states).items()
+            },
             "covariance": _plain(self.covariance),
             "minima": [
                 {"values": _plain(m.values), "loss": m.loss, "stop": m.stop.value} for m in self.minima

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dano.report._stage import Touches
-from dano.vision import AbstractCamera, Camera
+from dano.vision import AbstractCamera
 
 # Colours, chosen by eye.
 _DOT = (24, 26, 30)
@@ -14,7 +14,11 @@ _FINE = 3
 
 
 def draw_touches(
-    picture: UInt8[np.ndarray, "height width 3"], camera: Camera, touched: Touches, frame: int, length: float
+    picture: UInt8[np.ndarray, "height width 3"],
+    camera: AbstractCamera,
+    touched: Touches,
+    frame: int,
+    length: float,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The picture with a dot and a force arrow at every contact of one frame.
 

@@ -27,7 +27,7 @@ from dano.report._overlay import draw_clock, draw_label, draw_touches
 from dano.report._resample import frame_times, poses_at
 from dano.report._stage import check_run, Stage, stage, Touches, touches
 from dano.scene import Scene, State, Trajectory
-from dano.vision import Camera, Item, LearnedField, prepare, render
+from dano.vision import AbstractCamera, Item, LearnedField, prepare, render
 
 MOST_PIXELS = 8192
 """Longest side of a film: what common decoders of H.264 can show."""
@@ -61,7 +61,7 @@ class VideoOptions:
     fps: int = 30
     size: tuple[int, int] = (640, 400)
     slow_motion: int | float = 1.0
-    camera: Camera | str = "auto"
+    camera: AbstractCamera | str = "auto"
     contact_points: bool = True
     clock: bool = True
     colours: Mapping[str, str] | None = None
@@ -77,7 +77,7 @@ class VideoOptions:
         if isinstance(self.camera, str):
             checked_choice("camera", self.camera, CAMERAS)
         else:
-            checked_kind("camera", self.camera, Camera, hint=f", or one of {', '.join(CAMERAS)}")
+            checked_kind("camera", self.camera, AbstractCamera, hint=f", or one of {', '.join(CAMERAS)}")
         checked_size(self.pixels)
         checked_optional("colours", self.colours, Mapping)
 
@@ -351,7 +351,7 @@ def film(
 
 
 def _picture(
-    take: Take, camera: Camera, frame: int, arrow: float, clock: bool
+    take: Take, camera: AbstractCamera, frame: int, arrow: float, clock: bool
 ) -> UInt8[np.ndarray, "height width 3"]:
     """A frame of a run; `arrow`: length [m] of a usual force."""
     drawn, position = take.drawn, take.position[frame]

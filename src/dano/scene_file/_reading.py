@@ -51,7 +51,7 @@ from dano.scene_file._schedule import read_schedule, Schedule
 from dano.scene_file._table import located, Table
 
 if TYPE_CHECKING:
-    from dano.vision import LearnedField
+    from dano.vision import LearnedField, PosedCamera
 
 _STATE = {**STATE_SIZES, "origin": 3}
 _GEOMETRY = ("object", "field", "asset", "shape")
@@ -70,19 +70,8 @@ _FLAGS = ("adhesive", "compliant")
 """Those of them that are true or false; the others are numbers."""
 _BYTES_PER_STEP = 500
 """Of a body in memory: state, joined pieces, and contact forces."""
-_TOP = (
-    "timestep",
-    "gravity",
-    "duration",
-    "n_steps",
-    "bodies",
-    "joints",
-    "loops",
-    "robots",
-    "contacts",
-    "default_contact",
-    "controls",
-)
+_TOP = ("timestep", "gravity", "duration", "n_steps", "camera")
+_TOP += ("bodies", "joints", "loops", "robots", "contacts", "default_contact", "controls")
 
 
 @functools.cache
@@ -137,6 +126,17 @@ class SceneFile:
         """
         read = {source: object_look(source) for source in set(self.objects.values())}
         return {name: look for name, source in self.objects.items() if (look := read[source]) is not None}
+
+    def camera(self) -> "PosedCamera":
+        """The camera that the file names: for pictures.
+
+        Raises:
+            ValueError: If it names none, or that cannot be read.
+        """
+        from dano.vision import load_camera
+
+        named = Table(str(self.path), tomllib.loads(self.text), None).word("camera")
+        return load_camera(self.path.parent / named)
 
 
 def load_scene(
@@ -199,13 +199,12 @@ def parse_scene(
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path} must be a TOML scene file: {error}") from error
     top = Table(str(path), data, _TOP)
-    h = (
-        top.number("timestep", 0.01)
-        if timestep is None
-        else checked_number("timestep", timestep, above=0, unit="s")
-    )
+    asked = None if timestep is None else checked_number("timestep", timestep, above=0, unit="s")
+    h = top.number("timestep", 0.01) if asked is None else asked
     if not (math.isfinite(h) and h > 0):
         raise ValueError(f"{path}: timestep must be finite and > 0 s, got {h}")
+    if "camera" in top:
+        top.word("camera")
     steps = _steps(top, h) if n_steps is None else n_steps
     if steps < 1:
         raise ValueError(f"{path}: n_steps must be ≥ 1, got {steps}")

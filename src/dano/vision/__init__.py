@@ -29,6 +29,12 @@ from dano.vision.drawing import (
     through as through,
     usual_level as usual_level,
 )
+from dano.vision.preflight import (
+    check_slide as check_slide,
+    check_walk as check_walk,
+    SlideCheck as SlideCheck,
+    WalkCheck as WalkCheck,
+)
 from dano.vision.radiance import (
     AbstractMedium as AbstractMedium,
     AbstractModel as AbstractModel,
@@ -48,7 +54,10 @@ from dano.vision.radiance import (
 from dano.vision.structure import (
     estimate_poses as estimate_poses,
     EstimatedPoses as EstimatedPoses,
+    is_video as is_video,
     KnownLength as KnownLength,
+    mask_folder as mask_folder,
+    picture_files as picture_files,
     PlacedMarker as PlacedMarker,
     pose_errors as pose_errors,
     PosedPicture as PosedPicture,
@@ -57,6 +66,7 @@ from dano.vision.structure import (
     save_transforms as save_transforms,
     Scale as Scale,
     Up as Up,
+    write_frames as write_frames,
 )
 from dano.vision.tracking import (
     adjust_poses as adjust_poses,

@@ -14,7 +14,8 @@ class Filming:
     """How the film was taken, and what tells the object from the rest.
 
     Attributes:
-        camera: Intrinsics and pose of the camera: a .json file as of `dano poses`, with one frame.
+        camera: Intrinsics and pose of the camera: a .json file as of `dano poses`, with one frame, or
+            FILE:PICTURE, such as walk.json:film.png, for that of one of several.
         focal: Focal length, or two, across and down [pixels], instead of --camera.
         centre: Principal point [pixels]; default: the middle.
         distortion: k1 k2 p1 p2 of OpenCV's model.

@@ -75,7 +75,8 @@ def camera_of(filming: Filming, film: Film) -> PosedCamera:
     """
     width, height = (n * film.shrunk for n in film.size)
     if filming.camera is not None:
-        return load_camera(filming.camera, width, height)
+        file, frame = named_frame(filming.camera)
+        return load_camera(file, width, height, frame=frame)
     assert filming.eye is not None
     axes = Camera(filming.eye, filming.look_at, width=width, height=height).axes
     pose = np.concatenate([axes.T * np.array([1.0, 1.0, -1.0]), np.array(filming.eye)[:, None]], axis=1)
@@ -90,6 +91,15 @@ def camera_of(filming: Filming, film: Film) -> PosedCamera:
         centre=filming.centre,
         distortion=(k1, k2, 0.0, p1, p2),
     )
+
+
+def named_frame(camera: Path) -> tuple[Path, str | None]:
+    """A file of cameras, and the picture whose camera is meant, if FILE:PICTURE says one."""
+    file, colon, frame = str(camera).rpartition(":")
+    # A file may have a colon in its name, or a drive before it.
+    if camera.exists() or not colon or not file.lower().endswith(".json"):
+        return camera, None
+    return Path(file), frame
 
 
 def look_of(name: str, argument: str) -> LearnedField:

@@ -94,24 +94,29 @@ def load_capture(path: str | Path, *, hold_out: int | None = None, downscale: in
     return Capture(views, path)
 
 
-def load_camera(path: str | Path, width: int, height: int) -> PosedCamera:
+def load_camera(
+    path: str | Path, width: int | None = None, height: int | None = None, *, frame: str | None = None
+) -> PosedCamera:
     """Read one camera that stands still, for pictures of a size.
 
     Args:
         path: A .json file in nerfstudio's convention: fl_x (or camera_angle_x), w, h, cx, cy, k1 …, and
             transform_matrix, of itself or of its only frame. Without w and h the intrinsics are those of
             pictures of the size asked for.
-        width: Of the pictures [pixels].
-        height: Of the pictures [pixels].
+        width: Of the pictures [pixels]; None: as the file says.
+        height: Of the pictures [pixels]; None likewise.
+        frame: Name of the picture whose camera it is, where the file holds several.
 
     Raises:
-        ValueError: If the file is missing or lacks something, holds several frames, or the pictures have
-            another shape.
+        ValueError: If the file is missing or lacks something, holds several frames and none was chosen, or
+            the pictures have another shape.
     """
     source = checked_path("path", path)
     content = _json(source)
     frames = content.get("frames", [])
-    if "transform_matrix" not in content:
+    if frame is not None:
+        frames = _named(source, frames, frame)
+    if frame is not None or "transform_matrix" not in content:
         if not isinstance(frames, list) or len(frames) != 1:
             raise ValueError(
                 f"{source}: camera must have one transform_matrix, or a single frame that has it, got"
@@ -119,7 +124,27 @@ def load_camera(path: str | Path, width: int, height: int) -> PosedCamera:
             )
         content = {**content, **frames[0]}
     _check_model(source, {**content, "frames": []})
+    height, width = (
+        content.get(key) if side is None else side for key, side in (("h", height), ("w", width))
+    )
+    if height is None or width is None:
+        raise ValueError(f"{source}: camera must state w and h, or width and height must be given")
     return _camera(source, source.name, {"transform_matrix": None, **content}, (height, width))
+
+
+def _named(source: Path, frames: Any, name: str) -> list[dict[str, Any]]:
+    """The frame of a picture, by its path or the last part of it.
+
+    Raises:
+        ValueError: If there is not exactly one.
+    """
+    rows = [f for f in frames if isinstance(f, dict)] if isinstance(frames, list) else []
+    known = [str(row.get("file_path")) for row in rows]
+    found = [row for row, file in zip(rows, known, strict=True) if name in (file, Path(file).name)]
+    if len(found) != 1:
+        names = f"one of {', '.join(known[:6])}{', …' * (len(known) > 6)}" if known else "given for frames"
+        raise ValueError(f"{source}: frame must be {names}, got {name!r}, which {len(found)} are called")
+    return found
 
 
 def _cut_out(views: Sequence[View]) -> list[View]:

@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -98,6 +99,24 @@ class LearnedField(AbstractField):
     def occupied(self) -> np.ndarray:
         """Nodes of the model's box that a ray must not skip."""
         return self.model.distances < 2.5 * self.model.box.spacing
+
+    def above(self, height: float) -> "LearnedField":
+        """The field less what lies below a level table that the object stands on.
+
+        Photographs of something on a table do not show it from below: silhouettes leave a wedge there. The
+        solid that is both learned and above z has the distance max(d, height − z).
+
+        Args:
+            height: Of the table, z [m].
+
+        Raises:
+            ValueError: If nothing lies above it.
+        """
+        model = self.model
+        z = float(model.origin[2]) + float(model.spacing) * np.arange(model.distance.shape[2])
+        below = jnp.asarray((height - z) / float(model.scale), model.distance.dtype)
+        cut = eqx.tree_at(lambda m: m.distance, model, jnp.maximum(model.distance, below[None, None]))
+        return LearnedField.from_model(cut, float(self.drawn_sharpness))
 
     def picture(self, camera: AbstractCamera, light: Numbers | None = None) -> Picture:
         """What a camera sees.

@@ -32,6 +32,9 @@ _SAME_MASK = 0.97
 _CHECKED_PAIRS = 60
 """Pairs of pictures whose motion is looked at: enough for a median (convention)."""
 
+CommonPoints = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], Photograph, Photograph]
+"""Coordinates of points that two pictures share [pixels], in each, and the pictures."""
+
 
 def motion_fault(
     photographs: Sequence[Photograph], matches: Matches, options: PoseOptions, *, still: float | None = None
@@ -53,9 +56,6 @@ def motion_fault(
         for pair, found in zip(matches.pairs, matches.verified, strict=True)
         if len(found) >= 2 * FEWEST_MATCHES
     ]
-    if len(pairs) < 3:
-        return None
-    pairs = [pairs[i] for i in np.linspace(0, len(pairs) - 1, min(len(pairs), _CHECKED_PAIRS)).astype(int)]
     points = [
         (
             matches.coordinates[a][found[:, 0]],
@@ -64,6 +64,27 @@ def motion_fault(
             photographs[b],
         )
         for (a, b), found in pairs
+    ]
+    return only_turned(points, photographs, options)
+
+
+def only_turned(
+    points: Sequence[CommonPoints], photographs: Sequence[Photograph], options: PoseOptions
+) -> str | None:
+    """What to say of a camera that only turned between pictures, by points that they have in common.
+
+    Args:
+        points: Of pairs of pictures.
+        photographs: All pictures.
+        options: See there.
+
+    Returns:
+        A sentence; None if the camera moved, or pairs are too few to say.
+    """
+    if len(points) < 3:
+        return None
+    points = [
+        points[i] for i in np.linspace(0, len(points) - 1, min(len(points), _CHECKED_PAIRS)).astype(int)
     ]
     moved = np.array([np.median(np.linalg.norm(x - y, axis=1)) for x, y, _, _ in points])
     longest = max(max(photograph.size) for photograph in photographs)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dano.checks import checked_number
+from dano.checks import checked_count, checked_number, checked_path
 from dano.progress import Progress
 from dano.vision.structure._photographs import VIDEOS
 from dano.vision.structure._sharpness import blur
@@ -37,10 +37,10 @@ def stretch(since: int | float | None, until: int | float | None) -> tuple[float
 
 
 def write_frames(
-    video: Path,
-    folder: Path,
+    video: str | Path,
+    folder: str | Path,
     count: int,
-    progress: Progress,
+    progress: Progress | None = None,
     *,
     prefix: str = "",
     between: tuple[float, float] = (-math.inf, math.inf),
@@ -64,6 +64,9 @@ def write_frames(
         ValueError: If the video cannot be read, or the folder holds something.
         ImportError: If av is missing.
     """
+    video, folder = checked_path("video", video), checked_path("folder", folder)
+    checked_count("count", count)
+    progress = progress or (lambda _what, _share: None)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"frames must be a new or empty folder, got {folder}")
     if not video.is_file():

@@ -41,6 +41,7 @@ class Film(NamedTuple):
         occluders: Where something else stands in front of the object, likewise.
         shrunk: Pixels of the original a side that were averaged into one.
         notes: Sentences about times and sizes.
+        start: When a player shows the first of these frames [s].
     """
 
     names: tuple[str, ...]
@@ -50,6 +51,7 @@ class Film(NamedTuple):
     occluders: list[Float[np.ndarray, "height width"] | None]
     shrunk: int
     notes: tuple[str, ...]
+    start: float = 0.0
 
     @property
     def size(self) -> tuple[int, int]:
@@ -214,6 +216,7 @@ def read_film(
         _masks("occluders", occluders, taken, total, images[0].shape[:2], shrunk) or [None] * len(images),
         shrunk,
         tuple(_notes(times, slow_motion, shrunk)),
+        float(stamps[0]),
     )
 
 

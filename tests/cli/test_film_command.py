@@ -1,0 +1,238 @@
+"""`dano film`: what is kept of stages, and what is said before and while they run."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dano.cli.film import Film, STAGES
+from dano.cli.film._after import stages_after
+from dano.cli.film._before import stages_before
+from dano.cli.film._place import place_of
+from dano.cli.film._slide import find_slide
+from dano.cli.film._stages import run_stages, Stage
+from dano.identify import Motion
+
+
+class Kitchen:
+    """Three stages that each append a letter to what the one before left, told what they did."""
+
+    def __init__(self, folder: Path):
+        self.folder, self.said, self.times = folder, [], iter(map(float, range(0, 10000, 7)))
+        self.went_on: list[bool] = []
+        self.fails: dict[str, BaseException] = {}
+        self.choices = {"cut": {"size": 1}, "cook": {}, "serve": {}}
+        (folder / "walk").mkdir()
+        (folder / "walk" / "a.png").write_bytes(b"a")
+
+    def stages(self) -> list[Stage]:
+        chain = [
+            ("cut", self.folder / "walk"),
+            ("cook", self.folder / "cut"),
+            ("serve", self.folder / "cook"),
+        ]
+        return [
+            Stage(
+                name,
+                f"{name}ting it",
+                {source.name: [source]},
+                self.choices[name],
+                [self.folder / name],
+                self._maker(name, source),
+                f"Sharpen the {name}",
+            )
+            for name, source in chain
+        ]
+
+    def _maker(self, name: str, source: Path) -> Callable[[bool], None]:
+        def make(goes_on: bool) -> None:
+            self.went_on.append(goes_on)
+            if name in self.fails:
+                raise self.fails[name]
+            text = "walk" if source.is_dir() else source.read_text(encoding="utf-8")
+            (self.folder / name).write_text(f"{text} {name} {self.choices[name]}", encoding="utf-8")
+
+        return make
+
+    def run(self, **asked: str) -> list[str]:
+        self.said.clear()
+        self.went_on.clear()
+        record = self.folder / "stages.json"
+        return run_stages(
+            self.stages(), record, tell=self.said.append, clock=lambda: next(self.times), **asked
+        )
+
+
+@pytest.fixture
+def kitchen(tmp_path: Path) -> Kitchen:
+    return Kitchen(tmp_path)
+
+
+def test_what_is_done_is_taken_up_again(kitchen: Kitchen):
+    assert kitchen.run() == ["cut", "cook", "serve"]
+    assert kitchen.said[:2] == ["cut (1 of 3): cutting it", "cut (1 of 3): done in 7 s"]
+    assert kitchen.went_on == [False] * 3
+    assert kitchen.run() == []
+    assert kitchen.said == [
+        f"{name} ({i} of 3): taken up again, it took 7 s and nothing has changed"
+        for i, name in enumerate(("cut", "cook", "serve"), 1)
+    ]
+
+
+def test_another_input_makes_what_depends_on_it_again(kitchen: Kitchen):
+    kitchen.run()
+    (kitchen.folder / "cut").write_text("by hand", encoding="utf-8")
+    assert kitchen.run() == ["cook", "serve"]
+    assert kitchen.said[1] == "cook (2 of 3): cookting it, once more, because of another cut"
+    assert (kitchen.folder / "serve").read_text(encoding="utf-8").startswith("by hand cook")
+    # A file more in the folder, and a choice.
+    (kitchen.folder / "walk" / "b.png").write_bytes(b"b")
+    assert kitchen.run(last="cut") == ["cut"]
+    assert "because of another walk" in kitchen.said[0]
+    kitchen.choices["cut"] = {"size": 2}
+    assert "because of another size" in (kitchen.run(last="cut"), kitchen.said)[1][0]
+
+
+def test_what_a_stage_leaves_unchanged_costs_those_after_it_nothing(kitchen: Kitchen):
+    kitchen.run()
+    (kitchen.folder / "cut").unlink()
+    assert kitchen.run() == ["cut"]
+    assert "because cut is gone" in kitchen.said[0]
+
+
+def test_from_and_to(kitchen: Kitchen):
+    assert kitchen.run(last="cook") == ["cut", "cook"]
+    assert not (kitchen.folder / "serve").exists()
+    assert kitchen.run(first="cook") == ["cook", "serve"]
+    assert kitchen.said[0] == "cut (1 of 3): taken as it is"
+    assert kitchen.run(first="cook", last="cook") == ["cook"]
+    (kitchen.folder / "cut").unlink()
+    with pytest.raises(ValueError, match="from=serve needs what stage cut makes, but .*cut is not there"):
+        kitchen.run(first="serve")
+    for asked, message in (
+        ({"first": "cok"}, "from must be one of cut, cook, serve, got 'cok'; did you mean 'cook'"),
+        ({"last": "eat"}, "to must be one of cut, cook, serve, got 'eat'"),
+        ({"first": "serve", "last": "cut"}, "from must not come after to"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            kitchen.run(**asked)
+
+
+def test_a_failure_names_the_stage_and_what_to_do_and_the_next_run_goes_on_there(kitchen: Kitchen):
+    kitchen.fails["cook"] = ValueError("the pot is too small.")
+    with pytest.raises(ValueError, match=r"^stage cook: the pot is too small\. Sharpen the cook$"):
+        kitchen.run()
+    kitchen.fails["cook"] = ImportError("no pot")
+    with pytest.raises(ImportError, match="^stage cook: no pot$"):
+        kitchen.run()
+    # What was interrupted may go on from what it kept, unless its inputs are others.
+    assert kitchen.went_on == [True]
+    kitchen.fails.clear()
+    assert kitchen.run() == ["cook", "serve"]
+    assert "because it did not end" in kitchen.said[1] and kitchen.went_on == [True, False]
+    kitchen.fails["serve"] = KeyboardInterrupt()
+    kitchen.choices["serve"] = {"hot": True}
+    with pytest.raises(KeyboardInterrupt):
+        kitchen.run()
+    kitchen.fails.clear()
+    kitchen.choices["serve"] = {"hot": False}
+    assert kitchen.run() == ["serve"] and kitchen.went_on == [False]
+
+
+def test_a_stage_that_leaves_nothing_has_failed(kitchen: Kitchen):
+    stages = [dataclasses.replace(stage, make=lambda _: None) for stage in kitchen.stages()]
+    with pytest.raises(ValueError, match="stage cut: .*cut was not written"):
+        run_stages(stages, kitchen.folder / "stages.json", tell=kitchen.said.append)
+
+
+def test_a_broken_record_is_no_reason_to_fail(kitchen: Kitchen):
+    kitchen.run()
+    (kitchen.folder / "stages.json").write_text('{"stages": {"cut": 3}}', encoding="utf-8")
+    assert kitchen.run() == ["cut", "cook", "serve"]
+
+
+def moving(speeds: list[float], lost: tuple[int, ...] = ()) -> Motion:
+    """Along x, a frame each 1/30 s, at these speeds [m/s]."""
+    times = np.arange(len(speeds)) / 30
+    position = np.zeros((len(speeds), 3))
+    position[1:, 0] = np.cumsum(0.5 * (np.array(speeds[1:]) + speeds[:-1])) / 30
+    position[list(lost)] = np.nan
+    orientation = np.tile([1.0, 0, 0, 0], (len(speeds), 1))
+    return Motion.create(times, "soap", position=position, orientation=orientation, point="origin")
+
+
+SLOWING = [0.9 - 0.1 * i for i in range(9)]
+
+
+def test_a_slide_begins_where_the_hand_lets_go_and_ends_at_rest():
+    # The hand is faster and faster for eight frames; friction then slows by 3 m/s².
+    found = find_slide(moving([0.0] * 5 + [0.1 * i for i in range(1, 9)] + SLOWING + [0.0] * 12))
+    assert 13 <= found.first <= 16 and 22 <= found.last <= 28
+    assert found.since == found.first / 30
+    # A film that begins in the slide.
+    assert find_slide(moving(SLOWING + [0.0] * 9)).first == 0
+    # Someone who knows better.
+    assert find_slide(moving([0.5] * 10 + SLOWING + [0.0] * 5), release=0.42).first == 13
+    lost = find_slide(moving(SLOWING + [0.0] * 9, lost=(0, 1)))
+    assert lost.first >= 2
+
+
+def test_a_slide_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match="the object must slide, but it moves by 0 cm/s at most"):
+        find_slide(moving([0.0] * 20))
+    with pytest.raises(ValueError, match="6 frames at least after the hand has let go, got"):
+        find_slide(moving([0.1 * i for i in range(20)]))
+
+
+@pytest.fixture
+def inputs(tmp_path: Path) -> Film:
+    (tmp_path / "walk").mkdir()
+    (tmp_path / "walk" / "a.png").write_bytes(b"no picture")
+    (tmp_path / "slide.mp4").write_bytes(b"no film")
+    return Film(tmp_path / "walk", tmp_path / "slide.mp4", 0.08, tmp_path / "my soap.dano")
+
+
+def test_stages_are_those_that_options_name_and_each_reads_what_others_write(inputs: Film):
+    place = place_of(inputs)
+    assert place.folder.name == "my soap_film" and place.body == "my_soap"
+    stages = [*stages_before(place), *stages_after(place)]
+    assert tuple(stage.name for stage in stages) == STAGES
+    given = {inputs.slide, *place.photographs}
+    for stage in stages:
+        read = {path for paths in stage.files.values() for path in paths}
+        assert read <= given | {place.folder / "masks"}, stage.name
+        given |= set(stage.outputs)
+    # What is asked of training is no reason to find cameras again.
+    other = place_of(dataclasses.replace(inputs, resolution=32, release=0.2))
+    changed = [
+        stage.name
+        for stage, now in zip(stages, [*stages_before(other), *stages_after(other)], strict=True)
+        if stage.choices != now.choices
+    ]
+    assert changed == ["object", "friction"]
+
+
+def test_what_cannot_work_is_said_at_once(inputs: Film, run, tmp_path: Path):
+    walk, slide, output = inputs.walk, inputs.slide, inputs.output
+    fine = ("film", walk, slide, "--marker-size", 0.08, "-o", output)
+    for arguments, message in (
+        (("film", walk, slide, "-o", output), "--marker-size"),
+        (("film", walk, walk, *fine[3:]), "slide must be a film (.mp4, .mov, …)"),
+        (("film", walk, tmp_path / "no.mp4", *fine[3:]), "no.mp4, which does not exist"),
+        (("film", tmp_path / "no", slide, *fine[3:]), "images must be a folder of pictures or a video"),
+        ((*fine[:-1], tmp_path / "soap.npz"), "output path must end in .dano"),
+        ((*fine, "--masks", tmp_path / "no"), "masks must be there, got"),
+        ((*fine, "--network", tmp_path / "no.onnx"), "network must be there, got"),
+        ((*fine, "--from", "motion", "--to", "check"), "from must not come after to"),
+        ((*fine, "--from", "motion"), "from=motion needs what stage check makes"),
+        (fine, "stage check: "),
+    ):
+        answer = run(*arguments)
+        assert answer.code == 2 and message in answer.err, answer.err
+    assert "run the same command again" in answer.err
+    assert not output.exists()
+    kept = json.loads((tmp_path / "my soap_film" / "stages.json").read_text(encoding="utf-8"))
+    assert kept["stages"]["check"]["seconds"] is None
