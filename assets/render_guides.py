@@ -2,7 +2,7 @@
 
 Guides show what their own programs do, run as they stand on the page; the gallery shows the runs of the
 programs in `examples/`. Each picture is a WebP of at most 300 kB. Needs the extras `all`, `mktestdocs`,
-`frax`, and `MUJOCO_GL=egl` where there is no screen; `guides/worlds` the extra `mjwarp`.
+`frax`, `pybullet`, and `MUJOCO_GL=egl` where there is no screen; `guides/worlds` the extra `mjwarp`.
 
 Usage: python assets/render_guides.py docs/images [NAME …]    (a quarter of an hour on two cores)
 """
@@ -401,6 +401,7 @@ PICTURES: dict[str, Callable[[], Frames]] = {
     "examples/08_mujoco_kick": mujoco_example("08_mujoco_kick", (0.1, 0, 0.2), (1.15, 90, -14)),
     "examples/09_mujoco_push": mujoco_example("09_mujoco_push", (-0.08, 0, 0.03), (0.8, 75, -28)),
     "examples/10_mujoco_panda": mujoco_example("10_mujoco_panda", (0.35, 0, 0.28), (1.5, 115, -12)),
+    "examples/12_mujoco_grip": mujoco_example("12_mujoco_grip", (0.47, 0, 0.16), (0.75, 150, -22)),
 }
 """How each picture is made, by its path below the folder of images."""
 

@@ -120,3 +120,13 @@ def test_mujoco_worlds():
     # As Coulomb says of a point, which does not rock.
     expected = 0.3**2 / (2 * 9.81 * answer["friction"])
     assert answer["way"] == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.skipif(find_spec("pybullet_data") is None, reason="the package pybullet ships the Panda")
+def test_mujoco_grip():
+    pytest.importorskip("mujoco")
+    answer = run("12_mujoco_grip")
+    # Way of the arm, less what the mug's weight bends it; a mug that turns in the fingers would slip on them.
+    assert answer["lifted"] == pytest.approx(0.1, abs=0.004)
+    assert answer["slip"] < 0.002
+    assert answer["upright"] > np.cos(np.radians(3))

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.bridge [--json FILE] [--quick]`."""
+"""`python -m benchmarks.bridge [NAME …] [--json FILE] [--quick]`."""
 
 import os
 

@@ -1,30 +1,26 @@
-"""Two fast fingers close on an object and hold it, and small balls fall on few samples."""
+"""Two fast fingers close on an object and hold it."""
 
 import time
 
 import mujoco
 import numpy as np
 
-import dano
 from benchmarks._measure import Row
+from benchmarks.bridge._toys import TYPES
 from dano.mujoco import Bridge
 from dano.scene_file import load_asset
 
-TYPES = mujoco.mjtGeom
 SPEED, MASS, WAY, HALF = 7.7, 0.1, 0.05, 0.005
 """Of a finger: speed at which it arrives undamped [m/s], mass [kg], way [m], half of its thickness [m]."""
 MOST_TIME = 60.0
 """CPU time of a step that is asked for [µs]."""
-FALL, SECONDS = 0.05, 0.6
 
 
-def held_rows(name: str, quick: bool) -> list[Row]:
-    """What fingers and balls do at steps of 1, 2 and 5 ms."""
-    rows = []
-    for timestep in (0.002,) if quick else (0.001, 0.002, 0.005):
-        rows += _fingers(name, timestep)
-        rows += [_balls(radius, timestep) for radius in (0.001, 0.002, 0.004)]
-    return rows
+def finger_rows(*, quick: bool) -> list[Row]:
+    """What they do at steps of 1, 2 and 5 ms."""
+    return [
+        row for h in ((0.002,) if quick else (0.001, 0.002, 0.005)) for row in _fingers("trained_bunny", h)
+    ]
 
 
 def _fingers(name: str, timestep: float) -> list[Row]:
@@ -67,28 +63,3 @@ def _fingers(name: str, timestep: float) -> list[Row]:
         Row(group, "turn at rest", turn, "rad/s"),
         Row(group, "time of a step while they hold", 1e6 * taken, "µs", MOST_TIME),
     ]
-
-
-def _balls(radius: float, timestep: float) -> Row:
-    """How deep balls sink into a bar of 500 samples."""
-    spec = mujoco.MjSpec()
-    spec.option.timestep = timestep
-    spec.worldbody.add_geom(type=TYPES.mjGEOM_PLANE, size=[1, 1, 0.1])
-    spec.worldbody.add_body(name="bar", pos=[0, 0, 0.02]).add_freejoint()
-    places = [(x, y) for x in (-0.03, 0.001, 0.029) for y in (-0.011, 0.003)]
-    for k, (x, y) in enumerate(places):
-        ball = spec.worldbody.add_body(name=f"ball {k}", pos=[x, y, 0.04 + FALL])
-        ball.add_freejoint()
-        ball.add_geom(type=TYPES.mjGEOM_SPHERE, size=[radius, 0, 0], density=2000)
-    bridge = Bridge(spec)
-    bar = dano.NeuralObject.from_field(dano.Box((0.05, 0.02, 0.02)), mass=0.2, n_samples=500, resolution=32)
-    bridge.attach("bar", bar, look=False)
-    model = bridge.compile()
-    data, deepest = mujoco.MjData(model), 0.0
-    with bridge:
-        for _ in range(round(SECONDS / timestep)):
-            mujoco.mj_step(model, data)
-            heights = [data.body(f"ball {k}").xpos[2] - 0.04 for k in range(len(places))]
-            deepest = max(deepest, radius - min(heights))
-    group = f"Balls on a bar of 500 samples, {1000 * timestep:g} ms"
-    return Row(group, f"{1000 * radius:g} mm, sunk in", 100 * deepest / radius, "% of radius", 100.0)

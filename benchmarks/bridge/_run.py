@@ -1,7 +1,5 @@
 """The trained bunny and soap on MuJoCo's geoms through the bridge, beside MuJoCo's own hull of them."""
 
-import contextlib
-import datetime
 import resource
 import time
 from typing import NamedTuple
@@ -9,11 +7,12 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from benchmarks._measure import load_average, parse_arguments, report, Row
+from benchmarks._measure import load_average, parse_arguments, parts_option, report, Row, rows_of_parts
 from benchmarks.bridge._agreement import agreement_row, HOLLOW, hollow, HOLLOW_NODES, with_article
-from benchmarks.bridge._grip import held_rows
-from dano.exchange import solid_triangles
-from dano.mujoco import Bridge
+from benchmarks.bridge._grip import finger_rows
+from benchmarks.bridge._hold import hold_rows
+from benchmarks.bridge._probes import probe_rows
+from benchmarks.bridge._toys import compiled, meshes, TYPES, Way
 from dano.scene_file import load_asset
 
 SETTLE, WATCH = 4.0, 1.0
@@ -24,7 +23,7 @@ MOST_TIME = 60.0
 LONG_RUN = 600.0
 LONG_TIMESTEP = 0.01
 TIMESTEP = 0.002
-TYPES = mujoco.mjtGeom
+NAMES = ("trained_bunny", "trained_soap")
 LYING = (0.7071067811865476, 0.0, 0.7071067811865476, 0.0)
 SUPPORTS = ("plane", "box", "sphere", "capsule", "cylinder", "ellipsoid", "mesh", "height field")
 
@@ -40,30 +39,38 @@ class Rest(NamedTuple):
 
 
 def run() -> None:
-    arguments = parse_arguments("Measure neural objects on bodies of MuJoCo models.")
+    arguments = parse_arguments("Measure neural objects on bodies of MuJoCo models.", parts_option(PARTS))
     load = load_average()
-    rows = []
-    supports = SUPPORTS[:1] if arguments.quick else SUPPORTS
-    for name in ("trained_bunny", "trained_soap"):
-        for support in supports:
-            rows += _rest_rows(name, support, TIMESTEP)
-    for name in () if arguments.quick else ("trained_bunny", "trained_soap"):
-        for timestep in (0.001, 0.005, 0.01):
-            rows += _rest_rows(name, "plane", timestep)
-    for name in ("trained_bunny", "trained_soap"):
-        rows += [
-            agreement_row(name, support, *_model(name, support, TIMESTEP, False)) for support in supports
-        ]
-    rows += held_rows("trained_bunny", arguments.quick)
-    rows.append(_memory_row(10.0 if arguments.quick else LONG_RUN))
+    parts, rows = rows_of_parts(PARTS, arguments)
     settings = {
-        "date": datetime.datetime.now().isoformat(timespec="minutes"),
+        "parts": parts,
         "mujoco": mujoco.__version__,
         "settled": f"{SETTLE:g} s, then watched {WATCH:g} s",
         "clock": "CPU time of the process, one thread",
         "round supports": "sphere of 0.5 m, capsule and cylinder of 0.3 m, ellipsoid of 0.6, 0.5, 0.3 m",
     }
     report("bridge", rows, settings, load, arguments.json)
+
+
+def _all_rest_rows(*, quick: bool) -> list[Row]:
+    """How still objects lie on all geoms, and on a plane at other steps."""
+    rows = []
+    for name in NAMES:
+        for support in SUPPORTS[:1] if quick else SUPPORTS:
+            rows += _rest_rows(name, support, TIMESTEP)
+    for name in () if quick else NAMES:
+        for timestep in (0.001, 0.005, 0.01):
+            rows += _rest_rows(name, "plane", timestep)
+    return rows
+
+
+def _agreement_rows(*, quick: bool) -> list[Row]:
+    """How far objects are from those of our engine."""
+    return [
+        agreement_row(name, support, *_model(name, support, TIMESTEP, False))
+        for name in NAMES
+        for support in (SUPPORTS[:1] if quick else SUPPORTS)
+    ]
 
 
 def _rest_rows(name: str, support: str, timestep: float) -> list[Row]:
@@ -104,21 +111,9 @@ def _model(name: str, support: str, timestep: float, own: bool):
     spec.option.timestep = timestep
     spec.worldbody.add_geom(**_support(spec, support))
     height = 0.065 if "bunny" in name else 0.02
-    body = spec.worldbody.add_body(name="toy", pos=[0, 0, height])
-    body.add_freejoint()
-    if not own:
-        bridge = Bridge(spec)
-        bridge.attach("toy", obj, look=False)
-        return bridge.compile(), bridge
-    assert obj.solid is not None
-    mesh, _ = solid_triangles(obj.solid, 40)
-    inertia = np.asarray(obj.mass.inertia)
-    body.mass, body.ipos = float(obj.mass.mass), np.asarray(obj.mass.com)
-    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    body.explicitinertial = True
-    spec.add_mesh(name="toy", uservert=mesh.vertices.ravel().tolist(), userface=mesh.faces.ravel().tolist())
-    body.add_geom(type=TYPES.mjGEOM_MESH, meshname="toy")
-    return spec.compile(), contextlib.nullcontext()
+    spec.worldbody.add_body(name="toy", pos=[0, 0, height]).add_freejoint()
+    way: Way = "hull" if own else "samples"
+    return compiled(spec, "toy", obj, way, meshes(obj, way))
 
 
 def _support(spec, support: str) -> dict:
@@ -148,8 +143,9 @@ def _support(spec, support: str) -> dict:
     return {"type": TYPES.mjGEOM_HFIELD, "hfieldname": "hollow"}
 
 
-def _memory_row(seconds: float) -> Row:
+def _memory_rows(*, quick: bool) -> list[Row]:
     """What a long run adds to the process, with a reset every second of it."""
+    seconds = 10.0 if quick else LONG_RUN
     model, bridge = _model("trained_bunny", "plane", LONG_TIMESTEP, False)
     data = mujoco.MjData(model)
     each = round(1 / LONG_TIMESTEP)
@@ -160,9 +156,20 @@ def _memory_row(seconds: float) -> Row:
             mujoco.mj_resetData(model, data)
             mujoco.mj_step(model, data, each)
     name = f"growth of the process over {seconds:g} simulated seconds"
-    return Row("Memory", name, (_resident() - before) / 2**20, "MiB", 1.0)
+    return [Row("Memory", name, (_resident() - before) / 2**20, "MiB", 1.0)]
 
 
 def _resident() -> int:
     with open("/proc/self/statm", encoding="ascii") as file:
         return int(file.read().split()[1]) * resource.getpagesize()
+
+
+PARTS = {
+    "rest": _all_rest_rows,
+    "agreement": _agreement_rows,
+    "fingers": finger_rows,
+    "hold": hold_rows,
+    "probes": probe_rows,
+    "memory": _memory_rows,
+}
+"""What is measured, by name."""
