@@ -32,7 +32,7 @@ _SAME_MASK = 0.97
 _CHECKED_PAIRS = 60
 """Pairs of pictures whose motion is looked at: enough for a median (convention)."""
 
-CommonPoints = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], Photograph, Photograph]
+CommonPoints = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"], Photograph, Photograph]
 """Coordinates of points that two pictures share [pixels], in each, and the pictures."""
 
 
@@ -94,11 +94,9 @@ def only_turned(
     if explained.mean() < 0.8:
         return None
     return (
-        f"the camera only turned (rotations leave {np.median(left):.1f} of {np.median(moved):.0f} pixels of"
-        f" motion"
-        f" unexplained in {100 * explained.mean():.0f} % of the pairs): walk around the object, pictures"
-        f" from one"
-        " place show no depth"
+        f"the camera only turned (rotations leave {np.median(left):.1f} of {np.median(moved):.0f} pixels"
+        f" of motion unexplained in {100 * explained.mean():.0f} % of the pairs): walk around the object,"
+        " pictures from one place show no depth"
     )
 
 
