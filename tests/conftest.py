@@ -32,8 +32,8 @@ MUCH_MEMORY = 1.2e9
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 # Folders whose programs run longer than they compile (photographs that are rendered, fields), and
-# one that compares to the last digits. Compiling takes half as long without optimizing.
-RUNS_LONG = ("fields", "objects", "reference_step", "vision")
+# two that compare to the last digits. Compiling takes half as long without optimizing.
+RUNS_LONG = ("fields", "objects", "reference_step", "test_assets", "vision")
 
 # Shapes and types are checked while tracing; kernels are compiled by Warp, which takes plain functions only.
 COMPILED = ("physics",)
