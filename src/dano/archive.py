@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import lzma
 import math
 import os
@@ -12,7 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO, cast, IO
+from typing import Any, BinaryIO, cast, IO
 
 import numpy as np
 
@@ -88,6 +89,17 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             # A full disk names no file.
             raise OSError(f"{target} cannot be written: {error.strerror}") from error
         raise
+
+
+def write_json(file: Path, content: Any) -> None:
+    """Write numbers and words for other programs, whole or not at all."""
+    write_text(file, json.dumps(content, indent=1) + "\n")
+
+
+def write_text(file: Path, text: str) -> None:
+    """Write a file, whole or not at all."""
+    with replacing(file) as target:
+        target.write(text.encode())
 
 
 def checked_output(path: str | os.PathLike[str]) -> Path:

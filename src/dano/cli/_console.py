@@ -61,7 +61,12 @@ def _time_left(passed: float, share: float) -> str:
     if passed < 1 or not 0.02 <= share < 1:
         return ""
     left = passed * (1 - share) / share
-    return f", {left:.0f} s left" if left < 100 else f", {left / 60:.0f} min left"
+    return f", {duration(left)} left"
+
+
+def duration(seconds: float) -> str:
+    """How long something takes, in words."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
 def end_line() -> None:

@@ -1,6 +1,5 @@
 """`dano poses`, `dano data` and `dano train`: from photographs to objects."""
 
-import json
 import math
 import warnings
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dano.archive import replacing
+from dano.archive import write_json
 from dano.cli._arguments import Data, Poses, Train
 from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
@@ -294,8 +293,7 @@ def _write(learned: LearnedObject, outputs: dict[str, Path], *, report: bool, js
     if report:
         write_training_report(outputs["report"], trained, trained.capture, made, estimates, title=output.stem)
     if json_file is not None:
-        with replacing(json_file) as file:
-            file.write((json.dumps(summary, indent=1) + "\n").encode())
+        write_json(json_file, summary)
     # What it was for is done.
     outputs["checkpoint"].unlink(missing_ok=True)
     for text in trained.warnings:

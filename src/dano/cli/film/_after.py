@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from dano.archive import write_text
 from dano.cli._arguments import Simulate, Train
 from dano.cli._console import say
-from dano.cli.film._place import Place, read_json, TABLE, write_text
+from dano.cli.film._place import Place, read_json, TABLE
 from dano.cli.film._slide import find_slide
 from dano.cli.film._stages import AGAIN, Stage
 from dano.cli.identifying import Identify

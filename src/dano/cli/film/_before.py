@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dano.archive import replacing
+from dano.archive import replacing, write_json
 from dano.cli._arguments import Poses
 from dano.cli._console import Progress, put, say
 from dano.cli._learn import look, print_data
-from dano.cli.film._place import Place, read_json, write_json
+from dano.cli.film._place import Place, read_json
 from dano.cli.film._stages import AGAIN, Stage
 from dano.vision import check_slide, check_walk, is_video, read_film, write_frames
 

@@ -5,7 +5,6 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dano.archive import replacing
 from dano.cli._outputs import check_output, missing_for_pictures
 from dano.cli.film._arguments import Film
 from dano.cli.tracking import Filming
@@ -105,14 +104,3 @@ def place_of(command: Film) -> Place:
 def read_json(file: Path) -> dict[str, Any]:
     """What a stage left."""
     return json.loads(file.read_text(encoding="utf-8"))
-
-
-def write_json(file: Path, content: dict[str, Any]) -> None:
-    """Leave it for other stages, whole or not at all."""
-    write_text(file, json.dumps(content, indent=1) + "\n")
-
-
-def write_text(file: Path, text: str) -> None:
-    """Write a file, whole or not at all."""
-    with replacing(file) as target:
-        target.write(text.encode())

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dano.archive import replacing
+from dano.archive import write_json
+from dano.cli._console import duration
 from dano.names import did_you_mean
 
 _BLOCK = 2**20
@@ -97,7 +98,7 @@ def run_stages(
         inputs, before = stage.inputs(), known.get(stage.name)
         if first is None and _is_done(stage, before, inputs):
             assert before is not None
-            tell(f"{label}: taken up again, it took {_seconds(before['seconds'])} and nothing has changed")
+            tell(f"{label}: taken up again, it took {duration(before['seconds'])} and nothing has changed")
             continue
         tell(f"{label}: {stage.what}{_because(stage, before, inputs)}")
         goes_on = before is not None and before["seconds"] is None and before["inputs"] == inputs
@@ -106,7 +107,7 @@ def run_stages(
         _make(stage, goes_on)
         seconds = clock() - began
         _write(record, known, stage.name, inputs, seconds)
-        tell(f"{label}: done in {_seconds(seconds)}")
+        tell(f"{label}: done in {duration(seconds)}")
         made.append(stage.name)
     return made
 
@@ -187,8 +188,7 @@ def _write(
 ) -> None:
     """Remember a stage; `seconds` is None until it has ended."""
     known[name] = {"inputs": inputs, "seconds": seconds}
-    with replacing(record) as file:
-        file.write((json.dumps({"stages": known}, indent=1) + "\n").encode())
+    write_json(record, {"stages": known})
 
 
 def _fingerprint(paths: Iterable[Path]) -> str:
@@ -210,7 +210,3 @@ def _files(paths: Iterable[Path]) -> Iterable[Path]:
             yield path
         else:
             yield from sorted(file for file in path.glob("*") if file.is_file())
-
-
-def _seconds(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

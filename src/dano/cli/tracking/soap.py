@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import dano
-from dano.archive import replacing
+from dano.archive import replacing, write_json
 from dano.cli._arguments import Train
 from dano.cli._console import Progress, put, put_json
 from dano.cli._learn import train
@@ -156,8 +156,7 @@ def _identify(command: Track, case: Path, page: Path, result: Path) -> None:
         "frames_used": found.tracked.n_tracked,
         "frames": len(found.tracked.status),
     }
-    with replacing(result) as file:
-        file.write((json.dumps(numbers, indent=1) + "\n").encode())
+    write_json(result, numbers)
 
 
 def _write_page(

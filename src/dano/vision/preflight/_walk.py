@@ -15,6 +15,7 @@ from dano.vision.structure import (
     BLURRED,
     detect_markers,
     FEWEST,
+    FEWEST_VIEWS,
     mask_folder,
     only_turned,
     Photograph,
@@ -24,9 +25,6 @@ from dano.vision.structure import (
 
 _MOST = 16
 """Photographs that are looked at, spread over all: enough for a median, and a few seconds (convention)."""
-
-_FEWEST_MARKED = 3
-"""Photographs with a marker below which its size cannot be checked, as `dano poses` has it."""
 
 _TRIED = 3
 """Photographs whose background is looked at."""
@@ -140,9 +138,9 @@ def _check_markers(
         ValueError: If they are such.
     """
     marked = sum(map(bool, found))
-    if marked < _FEWEST_MARKED:
+    if marked < FEWEST_VIEWS:
         raise ValueError(
-            f"photographs must show a marker of {options.marker_family} in {_FEWEST_MARKED} of them at least,"
+            f"photographs must show a marker of {options.marker_family} in {FEWEST_VIEWS} of them at least,"
             f" got {marked} of the {len(seen)} looked at: is the family right, has the sheet a white border,"
             " is it flat, whole and in the picture?"
         )

@@ -8,7 +8,11 @@ from dano.vision.structure._estimate import (
 )
 from dano.vision.structure._file import save_transforms as save_transforms
 from dano.vision.structure._gauge import Scale as Scale, Up as Up
-from dano.vision.structure._markers import detect_markers as detect_markers, PlacedMarker as PlacedMarker
+from dano.vision.structure._markers import (
+    detect_markers as detect_markers,
+    FEWEST_VIEWS as FEWEST_VIEWS,
+    PlacedMarker as PlacedMarker,
+)
 from dano.vision.structure._options import (
     FEWEST as FEWEST,
     KnownLength as KnownLength,

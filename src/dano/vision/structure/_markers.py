@@ -16,7 +16,7 @@ from dano.vision.structure._colmap import opencv
 from dano.vision.structure._similarity import fit_similarity
 from dano.vision.structure._triangulation import triangulate
 
-_FEWEST_VIEWS = 3
+FEWEST_VIEWS = 3
 """Pictures of a marker below which its corners cannot be checked."""
 
 _EDGE = 0.05
@@ -144,7 +144,7 @@ def place_markers(
     placed = []
     for number in sorted({number for found in seen for number in found}):
         views = [i for i, found in enumerate(seen) if number in found]
-        if len(views) >= _FEWEST_VIEWS:
+        if len(views) >= FEWEST_VIEWS:
             placed.append(
                 _placed(number, [cameras[i] for i in views], np.stack([seen[i][number] for i in views]))
             )
