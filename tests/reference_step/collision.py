@@ -206,8 +206,8 @@ def unit(v):
 def depths_of(scene, side):
     """Depths [m]: of an impact; predicted in contact that lasts; of parts whose impact is the next step's."""
     (_, size, thickness) = np.minimum(*(np.asarray(scene.bodies[k].extent)[3:] for k in (side.i, side.j)))
-    delta = min(side.law.delta, 0.25 * thickness)
     thin = 0.25 * thickness
+    delta = min(side.law.delta, thin)
     return delta, max(delta, min(0.01 * size, thin)), min(0.04 * size, thin)
 
 

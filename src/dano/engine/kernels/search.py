@@ -276,14 +276,14 @@ def lasting_meeting(
 def touches_others(scene: Scene, room: Room, world: int, lane: int, n_found: int, f: int) -> bool:
     """Whether the body that moves in a pair touches a third one, too."""
     index = scene.pair_index[room.found[world, f * _LANES + lane].pair]
+    moves = index.first
+    if scene.body_index[index.first].row < 0:
+        moves = index.second
     found = bool(False)
     for g in range(n_found):
         other = scene.pair_index[room.found[world, g * _LANES + lane].pair]
         same = other.first == index.first and other.second == index.second
         if not same and (other.first != index.second or other.second != index.first):
-            moves = index.first
-            if scene.body_index[index.first].row < 0:
-                moves = index.second
             found = found or other.first == moves or other.second == moves
     return found
 
