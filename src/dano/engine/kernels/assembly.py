@@ -98,7 +98,12 @@ def row_of(values: wp.array2d(dtype=vec6), world: int, row: int) -> vec6:
 
 @wp.func
 def twist_of(
-    scene: Scene, room: Room, world: int, row: int, values: wp.array2d(dtype=vec6), offset: real
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    row: int,
+    values: wp.array2d(dtype=vec6),
+    offset: real,
 ) -> vec6:
     """How contact sees a body move, by its row, with values of the unknowns; see `body_twist`."""
     if wp.static(TREES):
@@ -108,7 +113,12 @@ def twist_of(
 
 @wp.func
 def pair_twist(
-    scene: Scene, room: Room, world: int, found: FoundPair, velocities: wp.array2d(dtype=vec6), offset: real
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    found: FoundPair,
+    velocities: wp.array2d(dtype=vec6),
+    offset: real,
 ) -> Twist:
     """Relative twist of the bodies of a pair at given velocities.
 
@@ -136,7 +146,7 @@ def slip_of(point: Point, motion: Motion) -> Motion:
 
 
 @wp.func
-def fit_duals(scene: Scene, room: Room, world: int, lane: int, n_found: int):
+def fit_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
     """Duals that fit the accepted velocities."""
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
@@ -151,7 +161,7 @@ def fit_duals(scene: Scene, room: Room, world: int, lane: int, n_found: int):
 
 
 @wp.func
-def follow_duals(scene: Scene, room: Room, world: int, lane: int, n_found: int, length: real):
+def follow_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, length: real):
     """Accept the duals at a share of the last step; find their change along the new one, in `room.step`."""
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
@@ -224,14 +234,14 @@ def whole_jacobian(sums: Halves) -> mat66:
 
 
 @wp.func
-def clear_blocks(room: Room, world: int, lane: int, m: int):
+def clear_blocks(room: wp.ref[Room], world: int, lane: int, m: int):
     """Zero the blocks in use, each lane a part."""
     for e in range(lane, n_listed(room, world, m), _LANES):
         room.blocks[world, room.listed[world, e]] = mat66()
 
 
 @wp.func
-def add_momentum(scene: Scene, room: Room, world: int, lane: int, m: int, h: real):
+def add_momentum(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, m: int, h: real):
     """What each body's momentum gains in the step beyond what it comes with, and the derivative."""
     for i in range(lane, scene.moving.shape[0], _LANES):
         b = i
@@ -253,7 +263,13 @@ def add_momentum(scene: Scene, room: Room, world: int, lane: int, m: int, h: rea
 
 @wp.func
 def add_contact(
-    scene: Scene, room: Room, world: int, found: FoundPair, m: int, wrench: vec6, jacobian: mat66
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    found: FoundPair,
+    m: int,
+    wrench: vec6,
+    jacobian: mat66,
 ):
     """Take a pair's wrench, and its derivative, from the balance of both bodies."""
     index = scene.pair_index[found.pair]

@@ -20,7 +20,7 @@ _LANES, _FIXED = wp.constant(LANES), wp.constant(FIXED)
 
 
 @wp.func
-def pair_impulse(scene: Scene, room: Room, world: int, found: FoundPair) -> vec6:
+def pair_impulse(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair) -> vec6:
     """Impulse of a pair at the first body's centre of mass, as it was linearised last [N s, N m s, W]."""
     h = scene.timestep[world, 0]
     wrench = vec6()
@@ -36,7 +36,7 @@ def pair_impulse(scene: Scene, room: Room, world: int, found: FoundPair) -> vec6
 
 
 @wp.func
-def pair_slope(scene: Scene, room: Room, world: int, found: FoundPair) -> mat66:
+def pair_slope(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair) -> mat66:
     """Its derivative by the twist of the first body relative to the second."""
     h = scene.timestep[world, 0]
     halves = Halves()
@@ -52,14 +52,16 @@ def pair_slope(scene: Scene, room: Room, world: int, found: FoundPair) -> mat66:
 
 
 @wp.func
-def moving_of(scene: Scene, found: FoundPair) -> int:
+def moving_of(scene: wp.ref[Scene], found: FoundPair) -> int:
     """The body that moves of a pair of which the other is fixed."""
     index = scene.pair_index[found.pair]
     return wp.where(scene.body_index[index.first].row >= 0, index.first, index.second)
 
 
 @wp.func
-def meetings_of(scene: Scene, room: Room, world: int, n_found: int, body: int) -> tuple[real, real, real]:
+def meetings_of(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, body: int
+) -> tuple[real, real, real]:
     """How many impulses on a body wait for when it meets another, by how much, and the sum of moments τ_β."""
     count = real(0.0)
     waits = real(0.0)
@@ -74,7 +76,7 @@ def meetings_of(scene: Scene, room: Room, world: int, n_found: int, body: int) -
 
 
 @wp.func
-def balance_when_met(scene: Scene, room: Room, world: int, n_found: int):
+def balance_when_met(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int):
     """Balance angular momenta where bodies meet: with the inertia that they have then.
 
     Of impulses that take effect at several moments the mean counts. Everything is right to first order in h
@@ -91,14 +93,14 @@ def balance_when_met(scene: Scene, room: Room, world: int, n_found: int):
 
 
 @wp.func
-def freed(room: Room, world: int, i: int, row: int, impulse: vec6) -> vec6:
+def freed(room: wp.ref[Room], world: int, i: int, row: int, impulse: vec6) -> vec6:
     """M⁻¹ P: change of a body's velocity and spin by an impulse, by its number and its row."""
     linear = room.bodies[world, i].inverse_mass * linear_part(impulse)
     return joined(linear, wp.inverse(room.inertia[world, row]) * angular_part(impulse))
 
 
 @wp.func
-def find_moved(scene: Scene, room: Room, world: int, lane: int, n_found: int):
+def find_moved(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
     """Velocities by which positions change within a step that is solved, in `room.moved`."""
     if lane == 0:
         for b in range(scene.n_blocks):

@@ -18,7 +18,7 @@ _LANES = wp.constant(LANES)
 
 
 @wp.func
-def find_pattern(scene: Scene, room: Room, world: int, n_found: int):
+def find_pattern(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int):
     """Which blocks are coupled, with what elimination fills in; its order, and later neighbours.
 
     Trees that touch nothing are not in it: see `dano.engine.kernels.trees.factor`.
@@ -60,7 +60,7 @@ def find_pattern(scene: Scene, room: Room, world: int, n_found: int):
 
 
 @wp.func
-def begin_degrees(scene: Scene, room: Room, world: int, m: int):
+def begin_degrees(scene: wp.ref[Scene], room: wp.ref[Room], world: int, m: int):
     """With how many others that are to be eliminated each block is coupled."""
     for i in range(m):
         degree = int(0)
@@ -74,7 +74,7 @@ def begin_degrees(scene: Scene, room: Room, world: int, m: int):
 
 
 @wp.func
-def eliminate(room: Room, world: int, m: int, best: int):
+def eliminate(room: wp.ref[Room], world: int, m: int, best: int):
     """List the later neighbours of a block, which its elimination couples with each other."""
     n = int(0)
     for j in range(m):
@@ -94,7 +94,7 @@ def eliminate(room: Room, world: int, m: int, best: int):
 
 
 @wp.func
-def list_blocks(room: Room, world: int, m: int):
+def list_blocks(room: wp.ref[Room], world: int, m: int):
     """List the blocks in use, row by row."""
     n = int(0)
     for i in range(m):
@@ -106,7 +106,7 @@ def list_blocks(room: Room, world: int, m: int):
 
 
 @wp.func
-def n_listed(room: Room, world: int, row: int) -> int:
+def n_listed(room: wp.ref[Room], world: int, row: int) -> int:
     """Number of blocks in use in the rows before one: where those of a row begin in the list."""
     if row == 0:
         return 0
@@ -136,7 +136,7 @@ def inverse(m: mat66) -> mat66:
 
 
 @wp.func
-def solve_blocks(room: Room, world: int, lane: int, m: int):
+def solve_blocks(room: wp.ref[Room], world: int, lane: int, m: int):
     """Solve `spare` x = x in place, x in `room.step`; `spare` is used up.
 
     Both have to be known to all lanes; the solution is known to the first.
@@ -172,7 +172,7 @@ def solve_blocks(room: Room, world: int, lane: int, m: int):
 
 
 @wp.func
-def copy_blocks(room: Room, world: int, lane: int, m: int):
+def copy_blocks(room: wp.ref[Room], world: int, lane: int, m: int):
     """Copy the Jacobian into `spare`, each lane a part."""
     for e in range(lane, n_listed(room, world, m), _LANES):
         k = room.listed[world, e]
@@ -180,7 +180,7 @@ def copy_blocks(room: Room, world: int, lane: int, m: int):
 
 
 @wp.func
-def copy_transposed_blocks(room: Room, world: int, lane: int, m: int):
+def copy_transposed_blocks(room: wp.ref[Room], world: int, lane: int, m: int):
     """Copy the transpose of the Jacobian into `spare`, each lane a part."""
     for e in range(lane, n_listed(room, world, m), _LANES):
         k = room.listed[world, e]

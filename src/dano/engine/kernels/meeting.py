@@ -70,7 +70,7 @@ class Plane:
 
 
 @wp.func
-def plane_of(scene: Scene, world: int, solid: Solid, turning: int, x: vec3) -> Plane:
+def plane_of(scene: wp.ref[Scene], world: int, solid: Solid, turning: int, x: vec3) -> Plane:
     """The plane that samples near, from any point x of the solid's frame."""
     plane = Plane()
     plane.is_one = solid.kind.kind == _HALF_SPACE and solid.count == 1 and turning == 0
@@ -80,7 +80,9 @@ def plane_of(scene: Scene, world: int, solid: Solid, turning: int, x: vec3) -> P
 
 
 @wp.func
-def reach_of_block(scene: Scene, world: int, pose: PairPose, plane: Plane, block: int, stretch: real) -> real:
+def reach_of_block(
+    scene: wp.ref[Scene], world: int, pose: PairPose, plane: Plane, block: int, stretch: real
+) -> real:
     """By how much samples of a block are nearer to a solid than its middle at most [m].
 
     A plane sees how thick a block is, where it sees it from above.
@@ -101,7 +103,7 @@ def middle_of(body: Body, state: BodyState) -> vec3:
 
 
 @wp.func
-def solid_of_body(scene: Scene, world: int, body: int) -> Solid:
+def solid_of_body(scene: wp.ref[Scene], world: int, body: int) -> Solid:
     """What the samples of others press on."""
     index = scene.body_index[body]
     return solid_of(scene.solids, world, index.first_leaf, index.leaves)
@@ -123,7 +125,14 @@ def gain_of(a: BodyState, b: BodyState, lever: real) -> real:
 
 @wp.func
 def is_near(
-    scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, margin: real, h: real
+    scene: wp.ref[Scene],
+    world: int,
+    a: BodyState,
+    b: BodyState,
+    first: int,
+    second: int,
+    margin: real,
+    h: real,
 ) -> bool:
     """Whether two bodies may meet within the step, by the balls around them."""
     body = scene.bodies[world, first]
@@ -146,7 +155,14 @@ def is_near(
 
 @wp.func
 def facing(
-    scene: Scene, world: int, a: BodyState, b: BodyState, first: int, second: int, share: real, h: real
+    scene: wp.ref[Scene],
+    world: int,
+    a: BodyState,
+    b: BodyState,
+    first: int,
+    second: int,
+    share: real,
+    h: real,
 ) -> vec3:
     """Direction that samples of the first body face after a share of the step [F]."""
     solid = solid_of_body(scene, world, second)
@@ -157,7 +173,7 @@ def facing(
 
 @wp.func
 def posed(
-    scene: Scene,
+    scene: wp.ref[Scene],
     world: int,
     a: BodyState,
     b: BodyState,
@@ -175,7 +191,14 @@ def posed(
 
 @wp.func
 def find_near_blocks(
-    scene: Scene, room: Room, world: int, lane: int, pose: PairPose, first: int, second: int, way: real
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    lane: int,
+    pose: PairPose,
+    first: int,
+    second: int,
+    way: real,
 ) -> tuple[int, int]:
     """Blocks with samples no further from the solid than anything moves in a step, into `room.near`.
 
@@ -329,7 +352,7 @@ class Soonest:
 
 @wp.func
 def look_at_block(
-    scene: Scene, world: int, solid: Solid, pose: PairPose, ask: Ask, block: int, seen: Soonest
+    scene: wp.ref[Scene], world: int, solid: Solid, pose: PairPose, ask: Ask, block: int, seen: Soonest
 ) -> Soonest:
     """What the samples of a block say besides those seen before; where they cannot be sooner, its middle."""
     found = seen
@@ -365,7 +388,7 @@ def look_at_block(
 
 @wp.func
 def most_nearing(
-    scene: Scene, world: int, solid: Solid, body: Body, a: BodyState, b: BodyState, way: real, h: real
+    scene: wp.ref[Scene], world: int, solid: Solid, body: Body, a: BodyState, b: BodyState, way: real, h: real
 ) -> real:
     """Most by which a point of a body nears a solid within the step [m].
 
@@ -383,8 +406,8 @@ def most_nearing(
 
 @wp.func
 def meeting(
-    scene: Scene,
-    room: Room,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
     world: int,
     lane: int,
     a: BodyState,

@@ -69,7 +69,9 @@ def reaches(scene: Scene, world: int, field: Field, view: View, ball: vec4) -> b
 
 
 @wp.func
-def next_block(scene: Scene, world: int, index: PatchSideIndex, field: Field, view: View, i: int) -> int:
+def next_block(
+    scene: wp.ref[Scene], world: int, index: PatchSideIndex, field: Field, view: View, i: int
+) -> int:
     """The first block of a side, from the i-th of a lane on, that may reach; their number where none does."""
     k = int(i)
     searches = bool(True)
@@ -110,7 +112,7 @@ def sums_of_samples(
 
 
 @wp.func
-def side_field(scene: Scene, world: int, index: PatchSideIndex) -> Field:
+def side_field(scene: wp.ref[Scene], world: int, index: PatchSideIndex) -> Field:
     """The field that the samples of a side query."""
     return field_of(scene.solids, scene.patches.fields, world, index.first_part, index.parts)
 
@@ -138,13 +140,13 @@ def reached_sums(
 
 
 @wp.func
-def side_sign(scene: Scene, c: int, index: PatchSideIndex) -> real:
+def side_sign(scene: wp.ref[Scene], c: int, index: PatchSideIndex) -> real:
     """1 where the sampled body is the first of a contact, else −1."""
     return wp.where(index.sampled == scene.patches.contacts[c].first, ONE, -ONE)
 
 
 @wp.func
-def contact_patch(scene: Scene, room: Room, world: int, lane: int, c: int) -> Patch:
+def contact_patch(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, c: int) -> Patch:
     """Overlap of the bodies of a contact; all lanes know it."""
     contact = scene.patches.contacts[c]
     patch = Patch()
@@ -176,7 +178,7 @@ def contact_patch(scene: Scene, room: Room, world: int, lane: int, c: int) -> Pa
 
 
 @wp.func
-def find_patches(scene: Scene, room: Room, world: int, lane: int, n_found: int) -> int:
+def find_patches(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int) -> int:
     """Overlaps of all contacts with a patch law, in `room.patches`.
 
     What touches is listed behind `n_found` pairs.
@@ -207,7 +209,7 @@ def find_patches(scene: Scene, room: Room, world: int, lane: int, n_found: int) 
 
 
 @wp.func
-def n_patches(room: Room, world: int) -> int:
+def n_patches(room: wp.ref[Room], world: int) -> int:
     """How many patches touch."""
     n = int(0)
     if wp.static(PATCHES):
@@ -216,20 +218,20 @@ def n_patches(room: Room, world: int) -> int:
 
 
 @wp.func
-def contact_of(scene: Scene, found: FoundPair) -> int:
+def contact_of(scene: wp.ref[Scene], found: FoundPair) -> int:
     """Index of the contact of a pair that touches."""
     return scene.pair_index[found.pair].contact
 
 
 @wp.func
-def motion_at_patch(room: Room, world: int, c: int, twist: Twist) -> PatchMotion:
+def motion_at_patch(room: wp.ref[Room], world: int, c: int, twist: Twist) -> PatchMotion:
     """Motion at a patch, from the relative twist at the first body's centre of mass."""
     velocity = twist.velocity + wp.cross(twist.spin, room.patches.arms[world, c])
     return patch_motion(room.patches.patches[world, c].normal, velocity, twist.spin)
 
 
 @wp.func
-def fit_patch_duals(scene: Scene, room: Room, world: int, lane: int, n_found: int):
+def fit_patch_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
     """Duals that fit the accepted velocities."""
     for k in range(lane, room.patches.count[world, 0], _LANES):
         found = room.found[world, (n_found + k) * _LANES + lane]
@@ -244,7 +246,7 @@ def fit_patch_duals(scene: Scene, room: Room, world: int, lane: int, n_found: in
 
 
 @wp.func
-def any_sticks(scene: Scene, room: Room, world: int, n_found: int) -> bool:
+def any_sticks(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int) -> bool:
     """Whether a patch that touches has friction that sticks."""
     found = bool(False)
     for k in range(room.patches.count[world, 0]):
@@ -254,7 +256,7 @@ def any_sticks(scene: Scene, room: Room, world: int, n_found: int) -> bool:
 
 
 @wp.func
-def follow_patch_duals(scene: Scene, room: Room, world: int, lane: int, n_found: int):
+def follow_patch_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
     """Accept the duals at a share of the last step; find their change along the new one, in `room.step`."""
     for k in range(lane, room.patches.count[world, 0], _LANES):
         found = room.found[world, (n_found + k) * _LANES + lane]
@@ -276,7 +278,7 @@ def follow_patch_duals(scene: Scene, room: Room, world: int, lane: int, n_found:
 
 
 @wp.func
-def tried_duals(room: Room, world: int, c: int, length: real) -> PatchDuals:
+def tried_duals(room: wp.ref[Room], world: int, c: int, length: real) -> PatchDuals:
     """Duals of a patch at a share of the step."""
     duals = room.patches.duals[world, c]
     changes = room.patches.changes[world, c]
@@ -301,7 +303,9 @@ def jacobian_about_com(found: PatchJacobian, arm: vec3) -> mat66:
 
 
 @wp.func
-def add_patches(scene: Scene, room: Room, world: int, lane: int, n_found: int, trial: Trial, fit: Fit) -> Fit:
+def add_patches(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, trial: Trial, fit: Fit
+) -> Fit:
     """Take what patches give from the balance of their bodies, at the velocities that are tried.
 
     Args:

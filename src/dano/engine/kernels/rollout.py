@@ -81,7 +81,7 @@ class Launch:
 
 
 @wp.func
-def row_before(scene: Scene, launch: Launch, world: int, t: int, i: int) -> StateRow:
+def row_before(scene: wp.ref[Scene], launch: wp.ref[Launch], world: int, t: int, i: int) -> StateRow:
     """State of a body at the start of a step."""
     n = scene.body_index.shape[0]
     if t == 0:
@@ -90,7 +90,7 @@ def row_before(scene: Scene, launch: Launch, world: int, t: int, i: int) -> Stat
 
 
 @wp.func
-def push_of(scene: Scene, launch: Launch, world: int, t: int, i: int) -> Push:
+def push_of(scene: wp.ref[Scene], launch: wp.ref[Launch], world: int, t: int, i: int) -> Push:
     """Control of a body in a step; none where there are no pushes."""
     push = Push()
     if launch.pushes.shape[1] > 0:
@@ -99,7 +99,9 @@ def push_of(scene: Scene, launch: Launch, world: int, t: int, i: int) -> Push:
 
 
 @wp.func
-def begin_body(scene: Scene, room: Room, world: int, i: int, row: StateRow, push: Push) -> real:
+def begin_body(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int, row: StateRow, push: Push
+) -> real:
     """What is known of a body at the start of a step; returns the size of its velocities."""
     h = scene.timestep[world, 0]
     body = scene.bodies[world, i]
@@ -155,7 +157,7 @@ def begin_body(scene: Scene, room: Room, world: int, i: int, row: StateRow, push
 
 
 @wp.func
-def adds_energy(scene: Scene, room: Room, world: int) -> bool:
+def adds_energy(scene: wp.ref[Scene], room: wp.ref[Room], world: int) -> bool:
     """Whether contact adds kinetic energy: its impulses times the means of velocities before and after."""
     h = scene.timestep[world, 0]
     work = real(0.0)
@@ -193,7 +195,7 @@ def adds_energy(scene: Scene, room: Room, world: int) -> bool:
 
 
 @wp.func
-def restart(scene: Scene, room: Room, world: int):
+def restart(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Begin from the old velocities."""
     if wp.static(TREES):
         for b in range(scene.n_blocks):
@@ -205,7 +207,7 @@ def restart(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def advance_hanging(room: Room, world: int, node: int, i: int, row: StateRow) -> StateRow:
+def advance_hanging(room: wp.ref[Room], world: int, node: int, i: int, row: StateRow) -> StateRow:
     """Velocities of a body on a joint at the end of a step; poses follow from its coordinates."""
     after = row
     twist = room.trees.twists[world, node]
@@ -215,7 +217,7 @@ def advance_hanging(room: Room, world: int, node: int, i: int, row: StateRow) ->
 
 
 @wp.func
-def was_tried(scene: Scene, room: Room, world: int) -> bool:
+def was_tried(scene: wp.ref[Scene], room: wp.ref[Room], world: int) -> bool:
     """Whether the solution is what was tried last, of which displacements are known."""
     same = bool(True)
     for b in range(scene.n_blocks):
@@ -225,7 +227,7 @@ def was_tried(scene: Scene, room: Room, world: int) -> bool:
 
 
 @wp.func
-def advance_trees(scene: Scene, room: Room, world: int, launch: Launch, t: int):
+def advance_trees(scene: wp.ref[Scene], room: wp.ref[Room], world: int, launch: wp.ref[Launch], t: int):
     """Coordinates at the end of a step, and poses of the bodies on joints, whose velocities are known."""
     n = scene.body_index.shape[0]
     k = scene.trees.coordinates.shape[0]
@@ -250,7 +252,7 @@ def advance_trees(scene: Scene, room: Room, world: int, launch: Launch, t: int):
 
 
 @wp.func
-def begin_coordinates(scene: Scene, room: Room, world: int, launch: Launch, t: int):
+def begin_coordinates(scene: wp.ref[Scene], room: wp.ref[Room], world: int, launch: wp.ref[Launch], t: int):
     """Joint coordinates at the start of a step, and the poses of bodies that follow from them."""
     k = scene.trees.coordinates.shape[0]
     for c in range(k):
@@ -263,7 +265,7 @@ def begin_coordinates(scene: Scene, room: Room, world: int, launch: Launch, t: i
 
 
 @wp.func
-def begin_step_of_trees(scene: Scene, room: Room, world: int, launch: Launch, t: int):
+def begin_step_of_trees(scene: wp.ref[Scene], room: wp.ref[Room], world: int, launch: wp.ref[Launch], t: int):
     """What is known of trees at the start of a step, with the coordinates known."""
     begin_joints(scene, room, world, launch.efforts, launch.commands, t * scene.trees.coordinates.shape[0])
     for b in range(scene.n_blocks):
@@ -274,7 +276,9 @@ def begin_step_of_trees(scene: Scene, room: Room, world: int, launch: Launch, t:
 
 
 @wp.func
-def begin_unpushed(scene: Scene, room: Room, world: int, lane: int, launch: Launch, t: int):
+def begin_unpushed(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, launch: wp.ref[Launch], t: int
+):
     """What is known at the start of a step that was not, or need not be, pushed."""
     for i in range(scene.body_index.shape[0]):
         push = Push()
@@ -288,7 +292,7 @@ def begin_unpushed(scene: Scene, room: Room, world: int, lane: int, launch: Laun
 
 
 @wp.func
-def find_touching(scene: Scene, room: Room, world: int, lane: int) -> tuple[int, int, bool]:
+def find_touching(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int) -> tuple[int, int, bool]:
     """What may press within a step, listed in `room.found`: pairs with points, then patches that touch.
 
     Returns:
@@ -311,7 +315,7 @@ def find_touching(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
 
 
 @wp.func
-def any_hits(room: Room, world: int, lane: int, n_found: int) -> bool:
+def any_hits(room: wp.ref[Room], world: int, lane: int, n_found: int) -> bool:
     """Whether one of the pairs with points has an impact."""
     hits = bool(False)
     for f in range(n_found):
@@ -320,7 +324,7 @@ def any_hits(room: Room, world: int, lane: int, n_found: int) -> bool:
 
 
 @wp.func
-def advance_body(scene: Scene, room: Room, world: int, i: int, row: StateRow) -> StateRow:
+def advance_body(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int, row: StateRow) -> StateRow:
     """A body at the end of a step: x⁺ = x + h v, q⁺ = q ⊗ turn, with v and turn of `Room.moved`."""
     h = scene.timestep[world, 0]
     m = scene.body_index[i].row

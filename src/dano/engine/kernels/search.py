@@ -59,7 +59,9 @@ _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
 
 
 @wp.func
-def list_point(room: Room, world: int, at: int, point: Point, sample: int, entry: int, presses_back: bool):
+def list_point(
+    room: wp.ref[Room], world: int, at: int, point: Point, sample: int, entry: int, presses_back: bool
+):
     """Write a point into a lane's list."""
     room.points[world, at] = point
     where = FoundPoint()
@@ -118,8 +120,8 @@ def block_share(lane: int, bits: wp.uint32) -> BlockShare:
 
 @wp.func
 def find_points(
-    scene: Scene,
-    room: Room,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
     world: int,
     lane: int,
     pose: PairPose,
@@ -236,7 +238,7 @@ def impact_of(
 
 
 @wp.func
-def share_impacts(scene: Scene, room: Room, world: int, lane: int, n_found: int):
+def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
     """Halve impacts that samples of both bodies have part in."""
     for f in range(1, n_found):
         one = f * _LANES + lane
@@ -254,8 +256,8 @@ def share_impacts(scene: Scene, room: Room, world: int, lane: int, n_found: int)
 
 @wp.func
 def lasting_meeting(
-    scene: Scene,
-    room: Room,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
     world: int,
     lane: int,
     a: BodyState,
@@ -273,7 +275,9 @@ def lasting_meeting(
 
 
 @wp.func
-def touches_others(scene: Scene, room: Room, world: int, lane: int, n_found: int, f: int) -> bool:
+def touches_others(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, f: int
+) -> bool:
     """Whether the body that moves in a pair touches a third one, too."""
     index = scene.pair_index[room.found[world, f * _LANES + lane].pair]
     moves = index.first
@@ -289,7 +293,7 @@ def touches_others(scene: Scene, room: Room, world: int, lane: int, n_found: int
 
 
 @wp.func
-def keep_together(scene: Scene, room: Room, world: int, lane: int, n_found: int):
+def keep_together(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
     """Have impulses on bodies that touch others, too, take effect all at once: at the start of the step.
 
     What is pressed from two sides would else go on by what one of them does until the other begins: in a
@@ -306,7 +310,9 @@ def keep_together(scene: Scene, room: Room, world: int, lane: int, n_found: int)
 
 
 @wp.func
-def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: int, at: int, end: int) -> int:
+def find_pair(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, p: int, entry: int, at: int, end: int
+) -> int:
     """List the points of a pair that is near, and write the pair into `room.found`.
 
     Geometry of an impact is taken when bodies are as deep as in one: in the step before if they are deeper.
@@ -394,7 +400,7 @@ def find_pair(scene: Scene, room: Room, world: int, lane: int, p: int, entry: in
 
 
 @wp.func
-def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int, bool]:
+def find_contacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int) -> tuple[int, bool]:
     """All points that may press within a step, in each lane's part of the list.
 
     Returns:
@@ -427,7 +433,13 @@ def find_contacts(scene: Scene, room: Room, world: int, lane: int) -> tuple[int,
 
 @wp.func
 def fix_laws(
-    scene: Scene, room: Room, world: int, lane: int, n_found: int, rebound: real, differentiates: bool
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    lane: int,
+    n_found: int,
+    rebound: real,
+    differentiates: bool,
 ):
     """The constants of the law at every point.
 

@@ -212,7 +212,7 @@ def narrowed(search: Search, work: real) -> Search:
 
 
 @wp.func
-def measure(scene: Scene, room: Room, world: int, lane: int) -> Measured:
+def measure(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int) -> Measured:
     """Of the residual and Jacobian at the velocities that were tried."""
     m = scene.n_blocks
     found = Measured()
@@ -242,7 +242,7 @@ def measure(scene: Scene, room: Room, world: int, lane: int) -> Measured:
 
 
 @wp.func
-def largest_error(scene: Scene, room: Room, world: int) -> real:
+def largest_error(scene: wp.ref[Scene], room: wp.ref[Room], world: int) -> real:
     """Largest residual over mass or inertia at the velocities that were tried [m/s, rad/s]."""
     error = measure_joints(scene, room, world).error
     for i in range(scene.n_blocks):
@@ -285,7 +285,7 @@ def newton_step(scene: Scene, room: Room, world: int, lane: int, share: real, ke
 
 
 @wp.func
-def absolute_product(room: Room, world: int, block: int, v: vec6) -> vec6:
+def absolute_product(room: wp.ref[Room], world: int, block: int, v: vec6) -> vec6:
     """Σ |a_rc v_c| of each row of a block."""
     a = room.blocks[world, block]
     found = vec6()

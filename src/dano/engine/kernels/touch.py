@@ -54,7 +54,7 @@ class Seen:
 
 
 @wp.func
-def overlap_of(room: Room, world: int, first: int, end: int, place: vec3) -> Overlap:
+def overlap_of(room: wp.ref[Room], world: int, first: int, end: int, place: vec3) -> Overlap:
     """Sums over points of a lane, whose arms begin at `place`."""
     found = Overlap()
     for k in range(first, end):
@@ -113,7 +113,7 @@ def touch(scene: Scene, room: Room, launch: Launch, seen: Seen):
 
 
 @wp.func
-def misses(scene: Scene, room: Room, world: int, lane: int) -> real:
+def misses(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int) -> real:
     """How far Newton's step from the velocities at the end would lead, forces in loops aside [m/s, rad/s]."""
     newton_step(scene, room, world, lane, ONE, False)
     wait()
@@ -130,7 +130,9 @@ def misses(scene: Scene, room: Room, world: int, lane: int) -> real:
 
 
 @wp.func
-def settle_with(scene: Scene, room: Room, launch: Launch, world: int, lane: int, rebound: real) -> int:
+def settle_with(
+    scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, lane: int, rebound: real
+) -> int:
     """The step at its end, with a share of the restitution; returns the number of pairs that are near."""
     if lane == 0:
         launch.reports[world, 0].rebound = rebound

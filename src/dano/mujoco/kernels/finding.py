@@ -61,7 +61,7 @@ class Side:
 
 
 @wp.func
-def part_state(model: Model, data: Data, world: int, index: PartIndex, h: real) -> BodyState:
+def part_state(model: wp.ref[Model], data: wp.ref[Data], world: int, index: PartIndex, h: real) -> BodyState:
     """Where the frame of a part is, and how it moves. Its centre of mass is that of its body."""
     state = BodyState()
     rotation = data.geom_xmat[world, index.geom]
@@ -88,7 +88,7 @@ def middle_of(part: Part, state: BodyState) -> vec3:
 
 
 @wp.func
-def side_pose(known: Known, side: Side, share: real, h: real) -> PairPose:
+def side_pose(known: wp.ref[Known], side: Side, share: real, h: real) -> PairPose:
     """Pose of the two parts after a share of the step, samples turned to the other part."""
     toward = vec3(ONE, ZERO, ZERO)
     # Only objects, whose solids are grids, are asked by samples that turn.
@@ -170,7 +170,7 @@ def next_near_block(
 
 
 @wp.func
-def meeting(known: Known, model: Model, side: Side, sink: real, way: real, h: real) -> real:
+def meeting(known: wp.ref[Known], model: wp.ref[Model], side: Side, sink: real, way: real, h: real) -> real:
     """Share of the step after which the first sample has sunk in by `sink`; 1 if none does within the step.
 
     The root of the depth of the deepest sample, by Newton's method, from the start of the step on.
@@ -236,9 +236,9 @@ def side_touch(
 
 @wp.func
 def list_side(
-    known: Known,
-    model: Model,
-    work: Work,
+    known: wp.ref[Known],
+    model: wp.ref[Model],
+    work: wp.ref[Work],
     side: Side,
     margin: real,
     gap: real,
@@ -304,7 +304,14 @@ def list_side(
 
 @wp.func
 def list_pair(
-    known: Known, model: Model, data: Data, work: Work, options: Options, world: int, pair: int, begin: int
+    known: wp.ref[Known],
+    model: wp.ref[Model],
+    data: wp.ref[Data],
+    work: wp.ref[Work],
+    options: Options,
+    world: int,
+    pair: int,
+    begin: int,
 ) -> int:
     """Contacts of a pair, from a row on; the row beyond the last, or −2 less the geom that may not touch."""
     h = options.timestep

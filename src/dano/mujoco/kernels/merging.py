@@ -36,7 +36,7 @@ _AGAINST = wp.constant(real(1e-3))
 
 
 @wp.func
-def too_low(work: Work, begin: int, end: int, most: int) -> real:
+def too_low(work: wp.ref[Work], begin: int, end: int, most: int) -> real:
     """θ, the first score after so many others [m³]."""
     for k in range(most + 1):
         work.scores[k] = ZERO
@@ -77,7 +77,7 @@ def pull(head: Touch, touch: Touch, near: real) -> real:
 
 
 @wp.func
-def find_heads(work: Work, begin: int, end: int, most: int) -> int:
+def find_heads(work: wp.ref[Work], begin: int, end: int, most: int) -> int:
     """Say of each sample what it keeps, and list heads; how many."""
     low = too_low(work, begin, end, most)
     heads = int(0)
@@ -93,7 +93,7 @@ def find_heads(work: Work, begin: int, end: int, most: int) -> int:
 
 
 @wp.func
-def pull_on(work: Work, touch: Touch, heads: int, near: real) -> real:
+def pull_on(work: wp.ref[Work], touch: Touch, heads: int, near: real) -> real:
     """How much all heads draw a sample."""
     total = ZERO
     for k in range(heads):
@@ -113,7 +113,7 @@ def tangents(n: vec3) -> vec9:
 
 
 @wp.func
-def led_touch(work: Work, head: int, begin: int, end: int, near: real) -> tuple[Touch, real]:
+def led_touch(work: wp.ref[Work], head: int, begin: int, end: int, near: real) -> tuple[Touch, real]:
     """One touch for the share of a head, and the number of samples that it stands for, (Σw)²/Σw².
 
     Its weight times its normal is their force. It presses if one of them does.
@@ -156,7 +156,7 @@ def led_touch(work: Work, head: int, begin: int, end: int, near: real) -> tuple[
 
 @wp.func
 def write(
-    work: Work,
+    work: wp.ref[Work],
     at: int,
     touch: Touch,
     presses: bool,
@@ -200,7 +200,7 @@ def write(
 
 @wp.func
 def merge(
-    work: Work,
+    work: wp.ref[Work],
     at: int,
     begin: int,
     end: int,

@@ -23,7 +23,7 @@ _HARD = wp.constant(real(0.99))
 
 
 @wp.func
-def do_touch(model: Model, a: PartIndex, b: PartIndex) -> bool:
+def do_touch(model: wp.ref[Model], a: PartIndex, b: PartIndex) -> bool:
     """Whether the bits of two parts let them touch."""
     contype = model.geom_contype[a.geom]
     conaffinity = model.geom_conaffinity[a.geom]
@@ -34,7 +34,7 @@ def do_touch(model: Model, a: PartIndex, b: PartIndex) -> bool:
 
 
 @wp.func
-def mixed(model: Model, options: Options, world: int, a: int, b: int) -> Settings:
+def mixed(model: wp.ref[Model], options: Options, world: int, a: int, b: int) -> Settings:
     """What MuJoCo takes for two of its geoms, by priority, solmix and size. Margins and gaps add up."""
     found = Settings()
     found.gap = model.geom_gap[world, a] + model.geom_gap[world, b]
@@ -69,7 +69,12 @@ def mixed(model: Model, options: Options, world: int, a: int, b: int) -> Setting
 
 @wp.func
 def pair_settings(
-    known: Known, model: Model, options: Options, given: wp.array(dtype=Settings), world: int, pair: int
+    known: wp.ref[Known],
+    model: wp.ref[Model],
+    options: Options,
+    given: wp.array(dtype=Settings),
+    world: int,
+    pair: int,
 ) -> Settings:
     """Parameters of a pair, of no direction where its parts do not touch."""
     found = Settings()

@@ -84,7 +84,9 @@ class Rooms:
 
 
 @wp.func
-def append(contacts: Contacts, at: int, world: int, number: int, row: ContactRow, index: ContactIndex):
+def append(
+    contacts: wp.ref[Contacts], at: int, world: int, number: int, row: ContactRow, index: ContactIndex
+):
     """Write the contact of a pair with a number to a place."""
     contacts.dist[at] = row.dist
     contacts.pos[at] = row.pos

@@ -25,7 +25,7 @@ _ROOT = wp.constant(ROOT)
 
 
 @wp.func
-def block_of(scene: Scene, row: int) -> int:
+def block_of(scene: wp.ref[Scene], row: int) -> int:
     """Block of unknowns of a body that moves freely, by its row."""
     if wp.static(TREES):
         return scene.trees.nodes[row].place // 6
@@ -33,7 +33,7 @@ def block_of(scene: Scene, row: int) -> int:
 
 
 @wp.func
-def hangs(scene: Scene, row: int) -> bool:
+def hangs(scene: wp.ref[Scene], row: int) -> bool:
     """Whether a body is on a joint, by its row; −1 for one that does not move."""
     if wp.static(TREES):
         return row >= 0 and scene.trees.nodes[row].kind != _ROOT
@@ -41,7 +41,15 @@ def hangs(scene: Scene, row: int) -> bool:
 
 
 @wp.func
-def pull_body(scene: Scene, room: Room, bars: Changes, world: int, i: int, row: StateRow, bar: BodyState):
+def pull_body(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    world: int,
+    i: int,
+    row: StateRow,
+    bar: BodyState,
+):
     """Add derivatives by a body's row and properties from those by its state."""
     h = scene.timestep[world, 0]
     body = scene.bodies[world, i]
@@ -61,7 +69,14 @@ def pull_body(scene: Scene, room: Room, bars: Changes, world: int, i: int, row: 
 
 @wp.func
 def pull_momentum(
-    scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, t: int, i: int, row: StateRow
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    launch: wp.ref[Launch],
+    world: int,
+    t: int,
+    i: int,
+    row: StateRow,
 ):
     """Add derivatives through the momentum that a body comes with, gravity and control."""
     h = scene.timestep[world, 0]
@@ -87,7 +102,7 @@ def pull_momentum(
 
 
 @wp.func
-def moment_of(room: Room, world: int, i: int) -> Moment:
+def moment_of(room: wp.ref[Room], world: int, i: int) -> Moment:
     """When the angular momentum of a body is balanced."""
     moment = Moment()
     moment.met = room.bodies[world, i].met
@@ -96,7 +111,7 @@ def moment_of(room: Room, world: int, i: int) -> Moment:
 
 
 @wp.func
-def add_moment(room: Room, world: int, b: int, bar: Moment):
+def add_moment(room: wp.ref[Room], world: int, b: int, bar: Moment):
     """Add derivatives by when the angular momentum of a body is balanced."""
     room.moment_bar[world, b].met += bar.met
     room.moment_bar[world, b].lead += bar.lead
@@ -110,7 +125,15 @@ def is_zero(row: StateRow) -> bool:
 
 
 @wp.func
-def pull_advance(scene: Scene, room: Room, bars: Changes, world: int, i: int, row: StateRow, after: StateRow):
+def pull_advance(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    world: int,
+    i: int,
+    row: StateRow,
+    after: StateRow,
+):
     """Derivatives by the velocities and the row of a body from those by its row at the end of a step."""
     h = scene.timestep[world, 0]
     m = scene.body_index[i].row
@@ -139,7 +162,7 @@ def pull_advance(scene: Scene, room: Room, bars: Changes, world: int, i: int, ro
 
 
 @wp.func
-def subtract_slope(scene: Scene, room: Room, world: int, lane: int, f: int):
+def subtract_slope(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, f: int):
     """Take what the delayed impulse of a pair makes of positions by its velocities off their derivatives."""
     found = room.found[world, f * _LANES + lane]
     slope = pair_slope(scene, room, world, found)
@@ -163,7 +186,14 @@ def subtract_slope(scene: Scene, room: Room, world: int, lane: int, f: int):
 @after_adjoints
 @wp.func
 def pull_delays(
-    scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, lane: int, t: int, n_found: int
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    launch: wp.ref[Launch],
+    world: int,
+    lane: int,
+    t: int,
+    n_found: int,
 ):
     """Derivatives by velocities and by masses through impulses that take effect within the step."""
     for f in range(n_found):

@@ -76,7 +76,7 @@ class PairBar:
 
 
 @wp.func
-def leaf_at(scene: Scene, world: int, body: int, x: vec3) -> Solid:
+def leaf_at(scene: wp.ref[Scene], world: int, body: int, x: vec3) -> Solid:
     """The leaf of a body's solid that counts at a point."""
     solid = solid_of_body(scene, world, body)
     if wp.static(UNIONS):
@@ -86,9 +86,9 @@ def leaf_at(scene: Scene, world: int, body: int, x: vec3) -> Solid:
 
 @wp.func
 def pull_sample(
-    scene: Scene,
-    room: Room,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     s: int,
@@ -114,9 +114,9 @@ def pull_sample(
 
 @wp.func
 def pull_patch_of_impact(
-    scene: Scene,
-    room: Room,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     found: FoundPair,
@@ -159,9 +159,9 @@ def pull_patch_of_impact(
 
 @wp.func
 def pull_points(
-    scene: Scene,
-    room: Room,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     found: FoundPair,
@@ -242,7 +242,7 @@ def pull_points(
 
 @wp.func
 def solved_fixed_point(
-    scene: Scene,
+    scene: wp.ref[Scene],
     world: int,
     solid: Solid,
     a: BodyState,
@@ -270,8 +270,8 @@ def solved_fixed_point(
 
 @wp.func
 def pull_facing(
-    scene: Scene,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     first: int,
@@ -320,8 +320,8 @@ def pull_facing(
 
 @wp.func
 def pull_pose(
-    scene: Scene,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     found: FoundPair,
@@ -400,9 +400,9 @@ def pull_pose(
 @after_adjoints
 @wp.func
 def pull_pair(
-    scene: Scene,
-    room: Room,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     found: FoundPair,

@@ -50,7 +50,9 @@ _LANES = wp.constant(LANES)
 
 
 @wp.func
-def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: int) -> int:
+def settle(
+    scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, lane: int, t: int
+) -> int:
     """A step at its solution: contacts, laws and the Jacobian; returns the number of pairs with points."""
     n = scene.body_index.shape[0]
     begin_unpushed(scene, room, world, lane, launch, t)
@@ -98,7 +100,7 @@ def settle(scene: Scene, room: Room, launch: Launch, world: int, lane: int, t: i
 
 
 @wp.func
-def solve_transposed(scene: Scene, room: Room, world: int, lane: int):
+def solve_transposed(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int):
     """Virtual velocities λ of a settled step, (∂R/∂V)ᵀ λ = V̄, in `room.step`, from V̄ in `room.residual`."""
     m = scene.n_blocks
     copy_transposed_blocks(room, world, lane, m)
@@ -125,10 +127,10 @@ def is_moved(values: wp.array2d(dtype=vec6), world: int, block: int) -> bool:
 @after_adjoints
 @wp.func
 def pull_touching(
-    scene: Scene,
-    room: Room,
-    bars: Changes,
-    launch: Launch,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    launch: wp.ref[Launch],
     world: int,
     t: int,
     found: FoundPair,
@@ -165,7 +167,14 @@ def pull_touching(
 
 @after_adjoints
 @wp.func
-def pull_end(scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, t: int):
+def pull_end(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    launch: wp.ref[Launch],
+    world: int,
+    t: int,
+):
     """Derivatives by what a step begins with, and by its velocities, from those by its end.
 
     The latter are in `room.residual`. Chains are those without virtual velocities, see `follow_chains`.
@@ -184,7 +193,7 @@ def pull_end(scene: Scene, room: Room, bars: Changes, launch: Launch, world: int
 
 
 @wp.func
-def twists_of_pair(scene: Scene, room: Room, world: int, found: FoundPair) -> Virtual:
+def twists_of_pair(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair) -> Virtual:
     """How contact sees the bodies of a pair move at the end of the step, and with virtual velocities."""
     index = scene.pair_index[found.pair]
     first = scene.body_index[index.first].row
@@ -209,7 +218,9 @@ def is_moved_pair(twists: Virtual) -> bool:
 
 
 @wp.func
-def moment_bar_of(scene: Scene, room: Room, world: int, n_found: int, found: FoundPair) -> Moment:
+def moment_bar_of(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, found: FoundPair
+) -> Moment:
     """A pair's part of derivatives by when the angular momentum of the body that moves is balanced."""
     bar = Moment()
     if wp.static(not TREES):
@@ -225,7 +236,14 @@ def moment_bar_of(scene: Scene, room: Room, world: int, n_found: int, found: Fou
 @after_adjoints
 @wp.func
 def pull_equations(
-    scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, lane: int, t: int, n_found: int
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    launch: wp.ref[Launch],
+    world: int,
+    lane: int,
+    t: int,
+    n_found: int,
 ):
     """Add derivatives of −λ · R of a settled step, with virtual velocities λ in `room.step`."""
     if lane == 0:

@@ -57,7 +57,13 @@ _LANES = wp.constant(LANES)
 
 @wp.func
 def clear_pair(
-    scene: Scene, room: Room, bars: Changes, world: int, lane: int, found: FoundPair, has_points: bool
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    world: int,
+    lane: int,
+    found: FoundPair,
+    has_points: bool,
 ):
     """Zero the derivatives that a pair adds to."""
     index = scene.pair_index[found.pair]
@@ -89,7 +95,12 @@ def clear_pair(
 
 @wp.func
 def change_of_points(
-    scene: Scene, changes: Changes, bars: Changes, world: int, found: FoundPair, direction: int
+    scene: wp.ref[Scene],
+    changes: wp.ref[Changes],
+    bars: wp.ref[Changes],
+    world: int,
+    found: FoundPair,
+    direction: int,
 ) -> real:
     """Change of an equation of a pair by the law of its points and the solid that they press on."""
     index = scene.pair_index[found.pair]
@@ -106,11 +117,11 @@ def change_of_points(
 
 @wp.func
 def change_of_pair(
-    scene: Scene,
-    room: Room,
-    launch: Launch,
-    changes: Changes,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    launch: wp.ref[Launch],
+    changes: wp.ref[Changes],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     t: int,
@@ -154,7 +165,7 @@ def change_of_pair(
 
 @wp.func
 def add_change(
-    scene: Scene,
+    scene: wp.ref[Scene],
     to: wp.array2d(dtype=vec6),
     world: int,
     found: FoundPair,
@@ -178,8 +189,8 @@ def add_change(
 
 @wp.func
 def add_meeting(
-    scene: Scene,
-    room: Room,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
     world: int,
     n_found: int,
     found: FoundPair,
@@ -199,7 +210,14 @@ def add_meeting(
 
 @wp.func
 def add_shift(
-    scene: Scene, room: Room, launch: Launch, changes: Changes, world: int, t: int, f: int, direction: int
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    launch: wp.ref[Launch],
+    changes: wp.ref[Changes],
+    world: int,
+    t: int,
+    f: int,
+    direction: int,
 ):
     """Add what the change of the way between two bodies makes of the moment on the second."""
     n = scene.body_index.shape[0]
@@ -219,7 +237,15 @@ def add_shift(
 
 
 @wp.func
-def push_momentum(scene: Scene, room: Room, launch: Launch, changes: Changes, world: int, t: int, i: int):
+def push_momentum(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    launch: wp.ref[Launch],
+    changes: wp.ref[Changes],
+    world: int,
+    t: int,
+    i: int,
+):
     """Add what the changes make of the momentum that a body comes with, in all directions."""
     n = scene.body_index.shape[0]
     m = scene.moving.shape[0]
@@ -250,7 +276,14 @@ def push_momentum(scene: Scene, room: Room, launch: Launch, changes: Changes, wo
 
 @wp.func
 def change_of_delay(
-    scene: Scene, room: Room, changes: Changes, world: int, i: int, d: int, row: StateRow, moved: StateRow
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    changes: wp.ref[Changes],
+    world: int,
+    i: int,
+    d: int,
+    row: StateRow,
+    moved: StateRow,
 ) -> vec6:
     """Change of what a body's velocities lose to impulses that take effect within the step, D = M⁻¹ τ P."""
     n = scene.body_index.shape[0]
@@ -277,7 +310,7 @@ def change_of_delay(
 
 
 @wp.func
-def add_delayed(scene: Scene, room: Room, world: int, lane: int, f: int, d: int):
+def add_delayed(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, f: int, d: int):
     """Add what changes of velocities, in `room.step`, make of the delayed impulse of a pair."""
     m = scene.moving.shape[0]
     found = room.found[world, f * _LANES + lane]
@@ -297,7 +330,14 @@ def add_delayed(scene: Scene, room: Room, world: int, lane: int, f: int, d: int)
 
 @wp.func
 def push_advance(
-    scene: Scene, room: Room, launch: Launch, changes: Changes, world: int, t: int, i: int, d: int
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    launch: wp.ref[Launch],
+    changes: wp.ref[Changes],
+    world: int,
+    t: int,
+    i: int,
+    d: int,
 ):
     """Change of a body's state at the end of a step, from those at its start and of its velocities."""
     n = scene.body_index.shape[0]
@@ -335,11 +375,11 @@ def push_advance(
 @after_adjoints
 @wp.func
 def push_pair(
-    scene: Scene,
-    room: Room,
-    launch: Launch,
-    changes: Changes,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    launch: wp.ref[Launch],
+    changes: wp.ref[Changes],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     t: int,
@@ -402,11 +442,11 @@ def push_pair(
 @after_adjoints
 @wp.func
 def push_step_of_bodies(
-    scene: Scene,
-    room: Room,
-    launch: Launch,
-    changes: Changes,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    launch: wp.ref[Launch],
+    changes: wp.ref[Changes],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     t: int,

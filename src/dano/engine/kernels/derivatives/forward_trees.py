@@ -53,7 +53,7 @@ _LANES = wp.constant(LANES)
 
 
 @wp.func
-def clear_bars(scene: Scene, room: Room, bars: Changes, world: int, t: int):
+def clear_bars(scene: wp.ref[Scene], room: wp.ref[Room], bars: wp.ref[Changes], world: int, t: int):
     """Zero the derivatives by everything but samples."""
     n = scene.body_index.shape[0]
     k = scene.trees.coordinates.shape[0]
@@ -95,7 +95,7 @@ def clear_bars(scene: Scene, room: Room, bars: Changes, world: int, t: int):
 
 
 @wp.func
-def clear_end(scene: Scene, room: Room, world: int):
+def clear_end(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Ask for nothing of the end of a step."""
     for i in range(scene.body_index.shape[0]):
         room.after_bar[world, i] = StateRow()
@@ -106,7 +106,13 @@ def clear_end(scene: Scene, room: Room, world: int):
 
 @wp.func
 def change_of_state(
-    scene: Scene, room: Room, launch: Launch, changes: Changes, world: int, t: int, d: int
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    launch: wp.ref[Launch],
+    changes: wp.ref[Changes],
+    world: int,
+    t: int,
+    d: int,
 ) -> real:
     """What the change of the state at the start of a step makes, from the derivatives by it."""
     n = scene.body_index.shape[0]
@@ -129,7 +135,13 @@ def change_of_state(
 
 @wp.func
 def change_of_controls(
-    scene: Scene, launch: Launch, changes: Changes, bars: Changes, world: int, t: int, d: int
+    scene: wp.ref[Scene],
+    launch: wp.ref[Launch],
+    changes: wp.ref[Changes],
+    bars: wp.ref[Changes],
+    world: int,
+    t: int,
+    d: int,
 ) -> real:
     """… of the controls of the step."""
     n = scene.body_index.shape[0]
@@ -149,7 +161,7 @@ def change_of_controls(
 
 
 @wp.func
-def change_of_scene(changes: Changes, bars: Changes, world: int, d: int) -> real:
+def change_of_scene(changes: wp.ref[Changes], bars: wp.ref[Changes], world: int, d: int) -> real:
     """… of the scene, but for samples."""
     change = real(0.0)
     for i in range(bars.bodies.shape[1]):
@@ -187,7 +199,14 @@ def change_of_scene(changes: Changes, bars: Changes, world: int, d: int) -> real
 
 @wp.func
 def change_along(
-    scene: Scene, room: Room, launch: Launch, changes: Changes, bars: Changes, world: int, t: int, d: int
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    launch: wp.ref[Launch],
+    changes: wp.ref[Changes],
+    bars: wp.ref[Changes],
+    world: int,
+    t: int,
+    d: int,
 ) -> real:
     """What the changes in a direction make of a number, from its derivatives by everything but samples."""
     return (
@@ -199,11 +218,11 @@ def change_along(
 
 @wp.func
 def take_samples(
-    scene: Scene,
-    room: Room,
-    launch: Launch,
-    changes: Changes,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    launch: wp.ref[Launch],
+    changes: wp.ref[Changes],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     n_found: int,
@@ -237,7 +256,7 @@ def take_samples(
 
 
 @wp.func
-def solve_directions(scene: Scene, room: Room, launch: Launch, world: int, lane: int):
+def solve_directions(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, lane: int):
     """Changes of the velocities, in place of those of the equations, in `room.missing`."""
     m = scene.n_blocks
     for d in range(launch.n_directions):
@@ -259,7 +278,14 @@ def solve_directions(scene: Scene, room: Room, launch: Launch, world: int, lane:
 
 @wp.func
 def end_change(
-    scene: Scene, room: Room, launch: Launch, changes: Changes, bars: Changes, world: int, t: int, d: int
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    launch: wp.ref[Launch],
+    changes: wp.ref[Changes],
+    bars: wp.ref[Changes],
+    world: int,
+    t: int,
+    d: int,
 ) -> real:
     """Change of a number of a step's end, by velocities, too."""
     change = change_along(scene, room, launch, changes, bars, world, t, d)
@@ -270,7 +296,15 @@ def end_change(
 
 @after_adjoints
 @wp.func
-def push_end(scene: Scene, room: Room, launch: Launch, changes: Changes, bars: Changes, world: int, t: int):
+def push_end(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    launch: wp.ref[Launch],
+    changes: wp.ref[Changes],
+    bars: wp.ref[Changes],
+    world: int,
+    t: int,
+):
     """Changes of a step's end in all directions, from those of its velocities in `room.missing`."""
     n = scene.body_index.shape[0]
     k = scene.trees.coordinates.shape[0]
@@ -316,11 +350,11 @@ def push_end(scene: Scene, room: Room, launch: Launch, changes: Changes, bars: C
 @after_adjoints
 @wp.func
 def push_step_of_trees(
-    scene: Scene,
-    room: Room,
-    launch: Launch,
-    changes: Changes,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    launch: wp.ref[Launch],
+    changes: wp.ref[Changes],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     t: int,

@@ -28,7 +28,12 @@ _LANES, _BLOCK, _GRID = wp.constant(LANES), wp.constant(BLOCK), wp.constant(GRID
 
 @wp.func
 def change_by_samples(
-    room: Room, changes: Changes, bars: Changes, world: int, found: FoundPair, direction: int
+    room: wp.ref[Room],
+    changes: wp.ref[Changes],
+    bars: wp.ref[Changes],
+    world: int,
+    found: FoundPair,
+    direction: int,
 ) -> real:
     """What the changes of samples that touch make of an equation; the part of a lane."""
     change = real(0.0)
@@ -41,7 +46,7 @@ def change_by_samples(
 
 
 @wp.func
-def clear_samples(room: Room, bars: Changes, world: int, found: FoundPair):
+def clear_samples(room: wp.ref[Room], bars: wp.ref[Changes], world: int, found: FoundPair):
     """Zero the derivatives by samples that touch."""
     if bars.samples.shape[1] > 0:
         for k in range(found.first, found.end):
@@ -49,14 +54,14 @@ def clear_samples(room: Room, bars: Changes, world: int, found: FoundPair):
 
 
 @wp.func
-def has_own_samples(scene: Scene, first: int, side: int) -> bool:
+def has_own_samples(scene: wp.ref[Scene], first: int, side: int) -> bool:
     """Whether the samples of a side are not those of the contact's first side: two bodies of one object."""
     index = scene.patches.side_index
     return side == first or index[side].first_block != index[first].first_block
 
 
 @wp.func
-def has_own_field(scene: Scene, first: int, side: int) -> bool:
+def has_own_field(scene: wp.ref[Scene], first: int, side: int) -> bool:
     """Whether the field of a side is not that of the contact's first side."""
     index = scene.patches.side_index
     return side == first or index[side].first_part != index[first].first_part
@@ -64,7 +69,13 @@ def has_own_field(scene: Scene, first: int, side: int) -> bool:
 
 @wp.func
 def change_by_weighted(
-    scene: Scene, changes: Changes, bars: Changes, world: int, lane: int, found: FoundPair, direction: int
+    scene: wp.ref[Scene],
+    changes: wp.ref[Changes],
+    bars: wp.ref[Changes],
+    world: int,
+    lane: int,
+    found: FoundPair,
+    direction: int,
 ) -> real:
     """What the changes of weighted samples of a contact make of an equation; the part of a lane."""
     change = real(0.0)
@@ -81,7 +92,7 @@ def change_by_weighted(
 
 
 @wp.func
-def clear_weighted(scene: Scene, bars: Changes, world: int, lane: int, found: FoundPair):
+def clear_weighted(scene: wp.ref[Scene], bars: wp.ref[Changes], world: int, lane: int, found: FoundPair):
     """Zero the derivatives by the weighted samples of a contact."""
     if bars.weighted.shape[1] > 0:
         contact = scene.patches.contacts[contact_of(scene, found)]
@@ -94,7 +105,7 @@ def clear_weighted(scene: Scene, bars: Changes, world: int, lane: int, found: Fo
 
 @wp.func
 def change_by_leaves(
-    changes: Changes, bars: Changes, world: int, first: int, count: int, direction: int
+    changes: wp.ref[Changes], bars: wp.ref[Changes], world: int, first: int, count: int, direction: int
 ) -> real:
     """What the changes of some leaves make of an equation."""
     change = real(0.0)
@@ -106,7 +117,7 @@ def change_by_leaves(
 
 
 @wp.func
-def clear_leaves(bars: Changes, world: int, first: int, count: int):
+def clear_leaves(bars: wp.ref[Changes], world: int, first: int, count: int):
     """Zero the derivatives by some leaves."""
     if bars.leaves.shape[1] > 0:
         for k in range(first, first + count):
@@ -115,7 +126,7 @@ def clear_leaves(bars: Changes, world: int, first: int, count: int):
 
 @wp.func
 def change_by_field(
-    scene: Scene, changes: Changes, bars: Changes, world: int, s: int, direction: int
+    scene: wp.ref[Scene], changes: wp.ref[Changes], bars: wp.ref[Changes], world: int, s: int, direction: int
 ) -> real:
     """What the changes of a side's field make of an equation."""
     index = scene.patches.side_index[s]
@@ -133,7 +144,12 @@ def change_by_field(
 
 @wp.func
 def change_by_patch(
-    scene: Scene, changes: Changes, bars: Changes, world: int, found: FoundPair, direction: int
+    scene: wp.ref[Scene],
+    changes: wp.ref[Changes],
+    bars: wp.ref[Changes],
+    world: int,
+    found: FoundPair,
+    direction: int,
 ) -> real:
     """What the changes of a patch's material, sides and fields make of an equation."""
     c = contact_of(scene, found)
@@ -152,7 +168,7 @@ def change_by_patch(
 
 
 @wp.func
-def clear_patch(scene: Scene, bars: Changes, world: int, found: FoundPair):
+def clear_patch(scene: wp.ref[Scene], bars: wp.ref[Changes], world: int, found: FoundPair):
     """Zero the derivatives by a patch's material, sides and fields."""
     c = contact_of(scene, found)
     contact = scene.patches.contacts[c]
@@ -173,7 +189,7 @@ def clear_patch(scene: Scene, bars: Changes, world: int, found: FoundPair):
 
 @wp.func
 def add_distance_changes(
-    scene: Scene, room: Room, world: int, lane: int, solid: Solid, x: vec3, bar: Distance
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, solid: Solid, x: vec3, bar: Distance
 ):
     """Add what changes of coefficients make of an equation through a sampled distance at a point."""
     if wp.static(GRID in KINDS):
@@ -185,7 +201,9 @@ def add_distance_changes(
 
 
 @wp.func
-def add_density_changes(scene: Scene, room: Room, world: int, lane: int, solid: Solid, x: vec3, bar: Density):
+def add_density_changes(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, solid: Solid, x: vec3, bar: Density
+):
     """Add what changes of coefficients make of an equation through a grid of densities at a point."""
     for d in range(room.splines.shape[1] // _LANES):
         kind = moved_kind(scene.solids, solid.kind, d)
@@ -196,14 +214,14 @@ def add_density_changes(scene: Scene, room: Room, world: int, lane: int, solid: 
 
 
 @wp.func
-def clear_splines(room: Room, world: int, lane: int):
+def clear_splines(room: wp.ref[Room], world: int, lane: int):
     """Zero what changes of coefficients make of an equation."""
     for d in range(room.splines.shape[1] // _LANES):
         room.splines[world, d * _LANES + lane] = ZERO
 
 
 @wp.func
-def change_by_splines(room: Room, world: int, lane: int, direction: int) -> real:
+def change_by_splines(room: wp.ref[Room], world: int, lane: int, direction: int) -> real:
     """What changes of coefficients make of an equation; the part of a lane."""
     change = real(0.0)
     if room.splines.shape[1] > 0:

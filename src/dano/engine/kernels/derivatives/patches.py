@@ -51,14 +51,14 @@ summed_view, total_view = sum_of(View), total_of(View)
 
 
 @wp.func
-def add_edge(bars: Changes, world: int, part: int, bar: real):
+def add_edge(bars: wp.ref[Changes], world: int, part: int, bar: real):
     """Add a derivative by the width of a part's edge."""
     if bars.parts.shape[1] > 0:
         bars.parts[world, part].edge += bar
 
 
 @wp.func
-def add_mass(bars: Changes, world: int, body: int, bar: real):
+def add_mass(bars: wp.ref[Changes], world: int, body: int, bar: real):
     """Add a derivative by a mass."""
     if bars.bodies.shape[1] > 0:
         bars.bodies[world, body].mass += bar
@@ -66,7 +66,14 @@ def add_mass(bars: Changes, world: int, body: int, bar: real):
 
 @wp.func
 def pull_place(
-    scene: Scene, room: Room, bars: Changes, world: int, lane: int, field: Field, x: vec3, bar: Density
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    world: int,
+    lane: int,
+    field: Field,
+    x: vec3,
+    bar: Density,
 ) -> vec3:
     """Derivative by a point in a field's frame from one by the density there; adds those by the field."""
     leading = densest(scene.solids, scene.patches.fields, world, field, x)
@@ -96,9 +103,9 @@ def pull_place(
 
 @wp.func
 def pull_samples(
-    scene: Scene,
-    room: Room,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     index: PatchSideIndex,
@@ -152,9 +159,9 @@ def add_side(bar: PairBar, is_first: bool, sampled: BodyState, queried: BodyStat
 
 @wp.func
 def pull_cap(
-    scene: Scene,
-    room: Room,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     c: int,
@@ -184,9 +191,9 @@ def pull_cap(
 
 @wp.func
 def pull_side(
-    scene: Scene,
-    room: Room,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     c: int,
@@ -218,7 +225,7 @@ def pull_side(
 
 
 @wp.func
-def summed_sides(scene: Scene, room: Room, world: int, c: int) -> Sums:
+def summed_sides(scene: wp.ref[Scene], room: wp.ref[Room], world: int, c: int) -> Sums:
     """Sums over the samples of both sides of a contact, in the world."""
     contact = scene.patches.contacts[c]
     sums = Sums()
@@ -235,9 +242,9 @@ def summed_sides(scene: Scene, room: Room, world: int, c: int) -> Sums:
 
 @wp.func
 def pull_patch(
-    scene: Scene,
-    room: Room,
-    bars: Changes,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
     world: int,
     lane: int,
     found: FoundPair,

@@ -46,7 +46,7 @@ add_loop = addition_of(Loop)
 
 @wp.func
 def row_change(
-    launch: Launch, changes: Changes, world: int, t: int, i: int, direction: int, n: int
+    launch: wp.ref[Launch], changes: wp.ref[Changes], world: int, t: int, i: int, direction: int, n: int
 ) -> StateRow:
     """Change of a body's state at the start of a step."""
     if t == 0:

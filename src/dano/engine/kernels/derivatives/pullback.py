@@ -15,7 +15,7 @@ from dano.physics.real import ZERO
 
 
 @wp.func
-def begin_bars(scene: Scene, room: Room, world: int):
+def begin_bars(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Nothing is asked of what comes after the last step."""
     for i in range(scene.body_index.shape[0]):
         room.after_bar[world, i] = StateRow()
@@ -25,7 +25,7 @@ def begin_bars(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def add_asked(scene: Scene, room: Room, bars: Changes, world: int, t: int):
+def add_asked(scene: wp.ref[Scene], room: wp.ref[Room], bars: wp.ref[Changes], world: int, t: int):
     """Add what is asked of the end of a step itself."""
     n = scene.body_index.shape[0]
     for i in range(n):
@@ -37,7 +37,7 @@ def add_asked(scene: Scene, room: Room, bars: Changes, world: int, t: int):
 
 
 @wp.func
-def go_back(scene: Scene, room: Room, world: int):
+def go_back(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """The start of a step is the end of the one before."""
     for i in range(scene.body_index.shape[0]):
         room.after_bar[world, i] = room.state_bar[world, i]

@@ -31,7 +31,7 @@ _ENDLESS = wp.constant(real(1e30))
 
 
 @wp.func
-def com_of(scene: Scene, world: int, body: int) -> vec3:
+def com_of(scene: wp.ref[Scene], world: int, body: int) -> vec3:
     """Centre of mass of a body [m, F]; zero of the world, −1."""
     if body < 0:
         return vec3()
@@ -39,7 +39,7 @@ def com_of(scene: Scene, world: int, body: int) -> vec3:
 
 
 @wp.func
-def chain_of(room: Room, world: int, node: int, body: int) -> Chain:
+def chain_of(room: wp.ref[Room], world: int, node: int, body: int) -> Chain:
     """How a node's body stands and moves; for no node how a body, or −1 for the world, stands still."""
     if node >= 0:
         return room.trees.chains[world, node]
@@ -54,7 +54,7 @@ def chain_of(room: Room, world: int, node: int, body: int) -> Chain:
 
 
 @wp.func
-def speeds_of(room: Room, world: int, node: Node) -> JointSpeeds:
+def speeds_of(room: wp.ref[Room], world: int, node: Node) -> JointSpeeds:
     """Velocities of a joint's coordinates."""
     speeds = JointSpeeds()
     speeds.before = velocities_of(room.old, world, node)
@@ -64,7 +64,7 @@ def speeds_of(room: Room, world: int, node: Node) -> JointSpeeds:
 
 
 @wp.func
-def coordinates_of(scene: Scene, room: Room, world: int, node: Node) -> vec3:
+def coordinates_of(scene: wp.ref[Scene], room: wp.ref[Room], world: int, node: Node) -> vec3:
     """Coordinates of a joint at the start of the step, as many as it has."""
     q = vec3()
     for part in range(node.width):
@@ -73,7 +73,7 @@ def coordinates_of(scene: Scene, room: Room, world: int, node: Node) -> vec3:
 
 
 @wp.func
-def follow_chains(scene: Scene, room: Room, launch: Launch, world: int, t: int):
+def follow_chains(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, t: int):
     """How bodies on trees move at the end of a step, and with the virtual velocities in `room.step`."""
     h = scene.timestep[world, 0]
     for n in range(scene.trees.nodes.shape[0]):
@@ -109,7 +109,7 @@ def add_place(bars: wp.array2d(dtype=StateRow), world: int, body: int, position:
 
 
 @wp.func
-def add_chain(scene: Scene, room: Room, world: int, node: int, body: int, bar: Chain):
+def add_chain(scene: wp.ref[Scene], room: wp.ref[Room], world: int, node: int, body: int, bar: Chain):
     """Add a derivative by how a body stands and moves, see `chain_of`."""
     if node >= 0:
         sums = room.trees.chain_bars[world, node]
@@ -128,14 +128,14 @@ def add_chain(scene: Scene, room: Room, world: int, node: int, body: int, bar: C
 
 
 @wp.func
-def add_com(bars: Changes, world: int, body: int, bar: vec3):
+def add_com(bars: wp.ref[Changes], world: int, body: int, bar: vec3):
     """Add a derivative by a centre of mass; −1 for the world."""
     if body >= 0 and bars.bodies.shape[1] > 0:
         bars.bodies[world, body].com += bar
 
 
 @wp.func
-def add_timestep(bars: Changes, world: int, bar: real):
+def add_timestep(bars: wp.ref[Changes], world: int, bar: real):
     """Add a derivative by h."""
     if bars.timestep.shape[1] > 0:
         bars.timestep[world, 0] += bar
@@ -158,7 +158,7 @@ def add_coordinates(values: wp.array2d(dtype=real), world: int, node: Node, bar:
 
 
 @wp.func
-def add_hanging(room: Room, world: int, node: int, state: BodyState, twist: vec6, work: vec6):
+def add_hanging(room: wp.ref[Room], world: int, node: int, state: BodyState, twist: vec6, work: vec6):
     """Add derivatives by how contact sees a body on a joint."""
     sums = room.trees.hanging_bars[world, node]
     sums.state.position += state.position
@@ -174,7 +174,15 @@ def add_hanging(room: Room, world: int, node: int, state: BodyState, twist: vec6
 
 
 @wp.func
-def pull_hanging(scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, t: int, n: int):
+def pull_hanging(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    launch: wp.ref[Launch],
+    world: int,
+    t: int,
+    n: int,
+):
     """Add derivatives through a body on a joint and its joint, to what carries it."""
     h = scene.timestep[world, 0]
     node = scene.trees.nodes[n]
@@ -223,7 +231,14 @@ def pull_hanging(scene: Scene, room: Room, bars: Changes, launch: Launch, world:
 
 
 @wp.func
-def pull_chains(scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, t: int):
+def pull_chains(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    launch: wp.ref[Launch],
+    world: int,
+    t: int,
+):
     """Add derivatives through how bodies of trees stand and move, which are used up.
 
     Those by velocities at the end are added to `room.residual`.
@@ -257,7 +272,7 @@ def pull_chains(scene: Scene, room: Room, bars: Changes, launch: Launch, world: 
 
 
 @wp.func
-def carrier_after(scene: Scene, launch: Launch, world: int, t: int, body: int) -> Carrier:
+def carrier_after(scene: wp.ref[Scene], launch: wp.ref[Launch], world: int, t: int, body: int) -> Carrier:
     """What a joint hangs on at the end of a step."""
     carrier = Carrier()
     carrier.orientation = quat(ZERO, ZERO, ZERO, ONE)
@@ -270,7 +285,14 @@ def carrier_after(scene: Scene, launch: Launch, world: int, t: int, body: int) -
 
 
 @wp.func
-def pull_places(scene: Scene, room: Room, bars: Changes, launch: Launch, world: int, t: int):
+def pull_places(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    launch: wp.ref[Launch],
+    world: int,
+    t: int,
+):
     """Add derivatives through poses of bodies on joints at a step's end, to `after_bar` and `q_after`."""
     m = scene.trees.nodes.shape[0]
     for k in range(m):
@@ -299,7 +321,7 @@ def pull_places(scene: Scene, room: Room, bars: Changes, launch: Launch, world: 
 
 
 @wp.func
-def pull_coordinates(scene: Scene, room: Room, bars: Changes, world: int):
+def pull_coordinates(scene: wp.ref[Scene], room: wp.ref[Room], bars: wp.ref[Changes], world: int):
     """Derivatives through joint coordinates at the end of a step, q⁺ = q + h y, and their velocities."""
     h = scene.timestep[world, 0]
     for c in range(scene.trees.coordinates.shape[0]):
@@ -326,7 +348,7 @@ def pull_coordinates(scene: Scene, room: Room, bars: Changes, world: int):
 
 
 @wp.func
-def ask_of_end(scene: Scene, room: Room, world: int):
+def ask_of_end(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Derivatives by the velocities of bodies on joints at the end of a step as those of `pull_chains`."""
     for n in range(scene.trees.nodes.shape[0]):
         node = scene.trees.nodes[n]
@@ -342,7 +364,7 @@ def ask_of_end(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def pull_laws(scene: Scene, room: Room, bars: Changes, world: int, t: int):
+def pull_laws(scene: wp.ref[Scene], room: wp.ref[Room], bars: wp.ref[Changes], world: int, t: int):
     """Add derivatives through what acts on joint coordinates."""
     h = scene.timestep[world, 0]
     k = scene.trees.coordinates.shape[0]
@@ -375,7 +397,7 @@ def pull_laws(scene: Scene, room: Room, bars: Changes, world: int, t: int):
 
 
 @wp.func
-def origin_of(scene: Scene, room: Room, world: int, node: int) -> vec3:
+def origin_of(scene: wp.ref[Scene], room: wp.ref[Room], world: int, node: int) -> vec3:
     """Origin of a node's tree [m, W]; anything for no node."""
     if node < 0:
         return vec3()
@@ -383,7 +405,7 @@ def origin_of(scene: Scene, room: Room, world: int, node: int) -> vec3:
 
 
 @wp.func
-def pull_loops(scene: Scene, room: Room, bars: Changes, world: int):
+def pull_loops(scene: wp.ref[Scene], room: wp.ref[Room], bars: wp.ref[Changes], world: int):
     """Add derivatives through the loops."""
     h = scene.timestep[world, 0]
     for row in range(scene.trees.loop_index.shape[0]):
@@ -405,7 +427,7 @@ def pull_loops(scene: Scene, room: Room, bars: Changes, world: int):
 
 
 @wp.func
-def settle_trees(scene: Scene, room: Room, launch: Launch, world: int, t: int):
+def settle_trees(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, t: int):
     """Generalised velocities and forces in loops at the solution of a step, in `room.velocity`."""
     k = scene.trees.coordinates.shape[0]
     for c in range(k):
@@ -420,7 +442,7 @@ def settle_trees(scene: Scene, room: Room, launch: Launch, world: int, t: int):
 
 
 @wp.func
-def transpose_entries(scene: Scene, room: Room, world: int):
+def transpose_entries(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Transpose the matrix of trees that touch nothing."""
     for k in range(room.trees.lower.shape[1]):
         lower = room.trees.lower[world, k]

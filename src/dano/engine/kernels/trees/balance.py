@@ -54,13 +54,13 @@ _LIGHT = wp.constant(real(0.01))
 
 
 @wp.func
-def lever_of(room: Room, world: int, node: Node) -> vec3:
+def lever_of(room: wp.ref[Room], world: int, node: Node) -> vec3:
     """From the origin of its tree to a body's centre of mass at the start of a step [m, W]."""
     return room.bodies[world, node.body].position - room.bodies[world, node.origin].position
 
 
 @wp.func
-def clear_trees(scene: Scene, world: int, values: wp.array2d(dtype=vec6)):
+def clear_trees(scene: wp.ref[Scene], world: int, values: wp.array2d(dtype=vec6)):
     """Zero the blocks of trees and of loops."""
     for b in range(scene.n_blocks):
         index = scene.trees.blocks[b]
@@ -69,7 +69,7 @@ def clear_trees(scene: Scene, world: int, values: wp.array2d(dtype=vec6)):
 
 
 @wp.func
-def gather_momenta(scene: Scene, room: Room, world: int):
+def gather_momenta(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Add wrenches of bodies to `room.residual` as generalised momenta; `wrenches` are used up."""
     m = scene.trees.nodes.shape[0]
     for i in range(m):
@@ -86,7 +86,9 @@ def gather_momenta(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def gather_slopes(scene: Scene, room: Room, world: int, last: wp.array2d(dtype=vec6), symmetric: bool):
+def gather_slopes(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, last: wp.array2d(dtype=vec6), symmetric: bool
+):
     """The derivative of generalised momenta by generalised velocities; `composites` are used up.
 
     Args:
@@ -133,7 +135,7 @@ def gather_slopes(scene: Scene, room: Room, world: int, last: wp.array2d(dtype=v
 
 
 @wp.func
-def momenta_before(scene: Scene, room: Room, world: int) -> real:
+def momenta_before(scene: wp.ref[Scene], room: wp.ref[Room], world: int) -> real:
     """Generalised mass at the start of a step, and scales; returns the size of velocities [m/s]."""
     clear_trees(scene, world, room.residual)
     clear_trees(scene, world, room.scale)
@@ -169,8 +171,8 @@ def momenta_before(scene: Scene, room: Room, world: int) -> real:
 
 @wp.func
 def begin_joints(
-    scene: Scene,
-    room: Room,
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
     world: int,
     efforts: wp.array2d(dtype=real),
     commands: wp.array2d(dtype=real),
@@ -207,7 +209,7 @@ def begin_joints(
 
 
 @wp.func
-def begin_trees(scene: Scene, room: Room, world: int):
+def begin_trees(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """What is known of trees at the start of a step, in `room.trees.sizes` the size of velocities."""
     h = scene.timestep[world, 0]
     start_motions(scene, room, world)
@@ -239,7 +241,7 @@ def begin_trees(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def fit_joint_duals(scene: Scene, room: Room, world: int):
+def fit_joint_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Duals that fit the accepted velocities."""
     for c in range(scene.trees.coordinates.shape[0]):
         coordinate = scene.trees.coordinates[c]
@@ -250,7 +252,7 @@ def fit_joint_duals(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def add_tree_momentum(scene: Scene, room: Room, world: int, length: real):
+def add_tree_momentum(scene: wp.ref[Scene], room: wp.ref[Room], world: int, length: real):
     """What trees miss at the velocities that are tried, contact and loops aside.
 
     Args:
@@ -289,7 +291,7 @@ def add_tree_momentum(scene: Scene, room: Room, world: int, length: real):
 
 
 @wp.func
-def add_tree_slopes(scene: Scene, room: Room, world: int):
+def add_tree_slopes(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """The derivative of what `add_tree_momentum` finds, kinks aside, and in `sizes` the size of its terms."""
     h = scene.timestep[world, 0]
     for n in range(scene.trees.nodes.shape[0]):
@@ -327,7 +329,7 @@ class JointsMeasured:
 
 
 @wp.func
-def measure_joints(scene: Scene, room: Room, world: int) -> JointsMeasured:
+def measure_joints(scene: wp.ref[Scene], room: wp.ref[Room], world: int) -> JointsMeasured:
     """What the duals of joints miss at the velocities that were tried."""
     h = scene.timestep[world, 0]
     found = JointsMeasured()
@@ -346,7 +348,7 @@ def measure_joints(scene: Scene, room: Room, world: int) -> JointsMeasured:
 
 
 @wp.func
-def eliminate_joint_duals(scene: Scene, room: Room, world: int, keeps: bool):
+def eliminate_joint_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, keeps: bool):
     """Take the duals out of the linear system for a step: `room.step` and the matrices that are used up.
 
     Args:
@@ -375,7 +377,7 @@ def eliminate_joint_duals(scene: Scene, room: Room, world: int, keeps: bool):
 
 
 @wp.func
-def same_mode(scene: Scene, room: Room, world: int, begins: bool) -> bool:
+def same_mode(scene: wp.ref[Scene], room: wp.ref[Room], world: int, begins: bool) -> bool:
     """Whether the matrix that was factored last has the modes of joints: which stick, slip or stop.
 
     Args:
@@ -393,7 +395,7 @@ def same_mode(scene: Scene, room: Room, world: int, begins: bool) -> bool:
 
 
 @wp.func
-def follow_joint_duals(scene: Scene, room: Room, world: int, length: real, share: real):
+def follow_joint_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, length: real, share: real):
     """Accept the duals at a share of the last step; find their change along the new one, in `room.step`.
 
     Args:
@@ -415,7 +417,7 @@ def follow_joint_duals(scene: Scene, room: Room, world: int, length: real, share
 
 
 @wp.func
-def finish_joint_duals(scene: Scene, room: Room, world: int):
+def finish_joint_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Accept the duals at the end of the whole step, where nothing is tried any more."""
     for c in range(scene.trees.coordinates.shape[0]):
         coordinate = scene.trees.coordinates[c]
@@ -428,7 +430,7 @@ def finish_joint_duals(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def solve_trees(scene: Scene, room: Room, world: int, keeps: bool):
+def solve_trees(scene: wp.ref[Scene], room: wp.ref[Room], world: int, keeps: bool):
     """Newton's step of trees that touch nothing, from `room.step` in place; see `eliminate_joint_duals`."""
     if not keeps:
         factor(scene, room, world)
@@ -436,7 +438,7 @@ def solve_trees(scene: Scene, room: Room, world: int, keeps: bool):
 
 
 @wp.func
-def resolve_joints(scene: Scene, room: Room, world: int):
+def resolve_joints(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Velocities with kinks that fit their duals, of a solution."""
     for c in range(scene.trees.coordinates.shape[0]):
         coordinate = scene.trees.coordinates[c]

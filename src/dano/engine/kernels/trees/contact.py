@@ -13,7 +13,7 @@ _ROOT = wp.constant(ROOT)
 
 
 @wp.func
-def free_block(scene: Scene, row: int) -> int:
+def free_block(scene: wp.ref[Scene], row: int) -> int:
     """Block of a body that moves freely and carries nothing; −1 for others."""
     node = scene.trees.nodes[row]
     if node.alone == 0:
@@ -23,7 +23,12 @@ def free_block(scene: Scene, row: int) -> int:
 
 @wp.func
 def body_twist(
-    scene: Scene, room: Room, world: int, row: int, velocities: wp.array2d(dtype=vec6), offset: real
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    row: int,
+    velocities: wp.array2d(dtype=vec6),
+    offset: real,
 ) -> vec6:
     """How contact sees a body move: J y + c, or without c.
 
@@ -44,7 +49,7 @@ def body_twist(
 
 
 @wp.func
-def push_body(scene: Scene, room: Room, world: int, row: int, wrench: vec6):
+def push_body(scene: wp.ref[Scene], room: wp.ref[Room], world: int, row: int, wrench: vec6):
     """Add Jᵀ of a wrench to the residual."""
     if row >= 0:
         node = scene.trees.nodes[row]
@@ -57,7 +62,7 @@ def push_body(scene: Scene, room: Room, world: int, row: int, wrench: vec6):
 
 
 @wp.func
-def add_slopes(scene: Scene, room: Room, world: int, row: int, other: int, slopes: mat66):
+def add_slopes(scene: wp.ref[Scene], room: wp.ref[Room], world: int, row: int, other: int, slopes: mat66):
     """Add Jᵀ K J, of two bodies, to the Jacobian; rows may be −1."""
     if row < 0 or other < 0:
         return
@@ -87,7 +92,14 @@ def add_slopes(scene: Scene, room: Room, world: int, row: int, other: int, slope
 
 @wp.func
 def add_pulled(
-    scene: Scene, room: Room, world: int, a: int, b: int, com_difference: vec3, wrench: vec6, jacobian: mat66
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    a: int,
+    b: int,
+    com_difference: vec3,
+    wrench: vec6,
+    jacobian: mat66,
 ):
     """Take a pair's wrench on the first body, and its derivative, from the balance of both bodies.
 

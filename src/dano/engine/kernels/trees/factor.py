@@ -15,7 +15,7 @@ from dano.physics.real import mat66, ONE, real, vec6, ZERO
 
 
 @wp.func
-def clear_entries(scene: Scene, room: Room, world: int):
+def clear_entries(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Zero the matrix."""
     for k in range(scene.trees.order.shape[0]):
         u = scene.trees.order[k]
@@ -27,7 +27,7 @@ def clear_entries(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def add_entry(scene: Scene, room: Room, world: int, row: int, column: int, value: real):
+def add_entry(scene: wp.ref[Scene], room: wp.ref[Room], world: int, row: int, column: int, value: real):
     """Add to one of its entries."""
     if row == column:
         room.trees.diagonal[world, row] = room.trees.diagonal[world, row] + value
@@ -40,13 +40,13 @@ def add_entry(scene: Scene, room: Room, world: int, row: int, column: int, value
 
 
 @wp.func
-def in_solve(scene: Scene, room: Room, world: int, u: int) -> bool:
+def in_solve(scene: wp.ref[Scene], room: wp.ref[Room], world: int, u: int) -> bool:
     """Whether an unknown of a tree is solved for here, and not with those that its tree touches."""
     return room.trees.coupled[world, scene.trees.blocks[u // 6].tree] == 0
 
 
 @wp.func
-def factor_mass(scene: Scene, room: Room, world: int):
+def factor_mass(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Factor a symmetric matrix, of which only the diagonal and `upper` are read: as `factor` does."""
     for k in range(scene.trees.order.shape[0]):
         p = scene.trees.order[scene.trees.order.shape[0] - 1 - k]
@@ -71,7 +71,7 @@ def factor_mass(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def factor(scene: Scene, room: Room, world: int):
+def factor(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Factor the matrix of the trees that touch nothing."""
     for k in range(scene.trees.order.shape[0]):
         p = scene.trees.order[scene.trees.order.shape[0] - 1 - k]
@@ -99,7 +99,7 @@ def factor(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def solve_factored(scene: Scene, room: Room, world: int):
+def solve_factored(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Solve for `room.step` in place, of the trees that touch nothing."""
     n = scene.trees.order.shape[0]
     for k in range(n):
@@ -134,7 +134,7 @@ def solve_factored(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def effective_mass(scene: Scene, room: Room, world: int, u: int) -> real:
+def effective_mass(scene: wp.ref[Scene], room: wp.ref[Room], world: int, u: int) -> real:
     """What an unknown weighs when all others are free: 1/(M⁻¹)_uu, from `factor_mass` [kg m² or kg]."""
     p = int(u)
     while p >= 0:
@@ -159,7 +159,7 @@ def effective_mass(scene: Scene, room: Room, world: int, u: int) -> real:
 
 
 @wp.func
-def mobility(scene: Scene, room: Room, world: int, node: Node) -> mat66:
+def mobility(scene: wp.ref[Scene], room: wp.ref[Room], world: int, node: Node) -> mat66:
     """J M⁻¹ Jᵀ of a body that may touch something, from `factor_mass`: its twist by a unit of impulse."""
     deepest = int(-1)
     for k in range(node.first_column, node.first_column + node.columns):
@@ -189,13 +189,13 @@ def mobility(scene: Scene, room: Room, world: int, node: Node) -> mat66:
 
 
 @wp.func
-def add_to_block(room: Room, world: int, m: int, row: int, column: int, value: real):
+def add_to_block(room: wp.ref[Room], world: int, m: int, row: int, column: int, value: real):
     """Add to an entry of the Jacobian by blocks."""
     room.blocks[world, (row // 6) * m + column // 6][row % 6, column % 6] += value
 
 
 @wp.func
-def spread_over_blocks(scene: Scene, room: Room, world: int):
+def spread_over_blocks(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Add the matrix of trees that touch something to the Jacobian by blocks."""
     m = scene.n_blocks
     for k in range(scene.trees.order.shape[0]):
@@ -218,7 +218,9 @@ def spread_over_blocks(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def entries_size(scene: Scene, room: Room, world: int, values: wp.array2d(dtype=vec6)) -> real:
+def entries_size(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, values: wp.array2d(dtype=vec6)
+) -> real:
     """Largest sum of the terms of a row of the trees that touch nothing, in velocities [m/s]."""
     for k in range(scene.trees.order.shape[0]):
         u = scene.trees.order[k]

@@ -49,7 +49,7 @@ def velocities_of(values: wp.array2d(dtype=vec6), world: int, node: Node) -> vec
 
 
 @wp.func
-def displacement_of(room: Room, world: int, node: int) -> Displacement:
+def displacement_of(room: wp.ref[Room], world: int, node: int) -> Displacement:
     """Of a node's body; of what stands still for none."""
     if node >= 0:
         return room.trees.displacements[world, node]
@@ -59,7 +59,7 @@ def displacement_of(room: Room, world: int, node: int) -> Displacement:
 
 
 @wp.func
-def place_trees(scene: Scene, room: Room, world: int):
+def place_trees(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Poses of the bodies on joints from those of the others and the joint coordinates, all in the room."""
     for n in range(scene.trees.nodes.shape[0]):
         node = scene.trees.nodes[n]
@@ -83,7 +83,7 @@ def place_trees(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def start_motions(scene: Scene, room: Room, world: int):
+def start_motions(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """What each generalised velocity does at the start of a step."""
     for n in range(scene.trees.nodes.shape[0]):
         node = scene.trees.nodes[n]
@@ -105,7 +105,9 @@ def start_motions(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def move_root(room: Room, world: int, n: int, node: Node, velocities: wp.array2d(dtype=vec6), h: real):
+def move_root(
+    room: wp.ref[Room], world: int, n: int, node: Node, velocities: wp.array2d(dtype=vec6), h: real
+):
     """How a body that moves freely moves with what it carries."""
     y = velocities[world, node.place // 6]
     moved = Displacement()
@@ -117,7 +119,13 @@ def move_root(room: Room, world: int, n: int, node: Node, velocities: wp.array2d
 
 @wp.func
 def move_hanging(
-    scene: Scene, room: Room, world: int, n: int, node: Node, velocities: wp.array2d(dtype=vec6), h: real
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    n: int,
+    node: Node,
+    velocities: wp.array2d(dtype=vec6),
+    h: real,
 ):
     """How a body on a joint moves."""
     frame = room.trees.frames[world, n]
@@ -136,7 +144,9 @@ def move_hanging(
 
 
 @wp.func
-def move_trees(scene: Scene, room: Room, world: int, velocities: wp.array2d(dtype=vec6), h: real):
+def move_trees(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, velocities: wp.array2d(dtype=vec6), h: real
+):
     """Displacements and twists of all bodies of trees in a step."""
     for n in range(scene.trees.nodes.shape[0]):
         node = scene.trees.nodes[n]
@@ -154,7 +164,9 @@ def move_trees_again(scene: Scene, room: Room, world: int, velocities: wp.array2
 
 
 @wp.func
-def end_motions(scene: Scene, room: Room, world: int, velocities: wp.array2d(dtype=vec6), h: real):
+def end_motions(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, velocities: wp.array2d(dtype=vec6), h: real
+):
     """What each generalised velocity does at the end of the step that `move_trees` found, over h."""
     for n in range(scene.trees.nodes.shape[0]):
         node = scene.trees.nodes[n]
@@ -187,7 +199,9 @@ def end_motions(scene: Scene, room: Room, world: int, velocities: wp.array2d(dty
 
 
 @wp.func
-def chain_twist(scene: Scene, room: Room, world: int, node: Node, velocities: wp.array2d(dtype=vec6)) -> vec6:
+def chain_twist(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, node: Node, velocities: wp.array2d(dtype=vec6)
+) -> vec6:
     """J y of a body on a joint that may touch something [m/s; rad/s, W]."""
     twist = vec6()
     for k in range(node.first_column, node.first_column + node.columns):
@@ -197,7 +211,9 @@ def chain_twist(scene: Scene, room: Room, world: int, node: Node, velocities: wp
 
 
 @wp.func
-def see_from_contact(scene: Scene, room: Room, world: int, velocities: wp.array2d(dtype=vec6), h: real):
+def see_from_contact(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, velocities: wp.array2d(dtype=vec6), h: real
+):
     """How contact sees bodies on joints move: by J y + c, which is their twist at the old velocities."""
     move_trees_again(scene, room, world, velocities, h)
     for n in range(scene.trees.nodes.shape[0]):
@@ -224,7 +240,7 @@ def see_from_contact(scene: Scene, room: Room, world: int, velocities: wp.array2
 
 
 @wp.func
-def advance_coordinates(scene: Scene, room: Room, world: int):
+def advance_coordinates(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Joint coordinates at the end of a step, q⁺ = q + h y, and their velocities."""
     h = scene.timestep[world, 0]
     for n in range(scene.trees.nodes.shape[0]):
@@ -245,7 +261,7 @@ def advance_coordinates(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def turns_too_far(scene: Scene, room: Room, world: int) -> bool:
+def turns_too_far(scene: wp.ref[Scene], room: wp.ref[Room], world: int) -> bool:
     """Whether joints turn a body by more than a step can tell from a turn the other way."""
     h = scene.timestep[world, 0]
     too_far = bool(False)

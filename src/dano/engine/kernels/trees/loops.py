@@ -17,7 +17,7 @@ _POSITIONS = wp.constant(real(8.0 * _EPSILON**0.25))
 
 
 @wp.func
-def end_of(room: Room, world: int, body: int) -> LoopEnd:
+def end_of(room: wp.ref[Room], world: int, body: int) -> LoopEnd:
     """Where a body is at the start of a step."""
     end = LoopEnd()
     end.orientation = quat(ZERO, ZERO, ZERO, ONE)
@@ -28,7 +28,7 @@ def end_of(room: Room, world: int, body: int) -> LoopEnd:
 
 
 @wp.func
-def end_after(room: Room, world: int, body: int, node: int) -> LoopEnd:
+def end_after(room: wp.ref[Room], world: int, body: int, node: int) -> LoopEnd:
     """Where a body is at the end of a step."""
     end = end_of(room, world, body)
     if node >= 0:
@@ -39,7 +39,7 @@ def end_after(room: Room, world: int, body: int, node: int) -> LoopEnd:
 
 
 @wp.func
-def forces_of(scene: Scene, values: wp.array2d(dtype=vec6), world: int, row: int) -> vec6:
+def forces_of(scene: wp.ref[Scene], values: wp.array2d(dtype=vec6), world: int, row: int) -> vec6:
     """Forces in a loop among the unknowns [N, N m]; zero of those that it has not."""
     index = scene.trees.loop_index[row]
     forces = vec6()
@@ -49,7 +49,7 @@ def forces_of(scene: Scene, values: wp.array2d(dtype=vec6), world: int, row: int
 
 
 @wp.func
-def spread_loop_side(scene: Scene, room: Room, world: int, row: int, is_second: bool):
+def spread_loop_side(scene: wp.ref[Scene], room: wp.ref[Room], world: int, row: int, is_second: bool):
     """Add the derivative of a gap by velocities that move one side, at the start, to `room.trees.spread`."""
     index = scene.trees.loop_index[row]
     loop = scene.trees.loops[world, row]
@@ -71,7 +71,7 @@ def spread_loop_side(scene: Scene, room: Room, world: int, row: int, is_second: 
 
 
 @wp.func
-def begin_loops(scene: Scene, room: Room, world: int):
+def begin_loops(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Compliance of the loops, from `factor_mass`, and what they add to the size of velocities.
 
     Gaps come out of positions: rounding in these counts 1/h times.
@@ -111,7 +111,9 @@ def begin_loops(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def add_loop_side(scene: Scene, room: Room, world: int, row: int, forces: vec6, is_second: bool):
+def add_loop_side(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, row: int, forces: vec6, is_second: bool
+):
     """What one side of a loop adds to residual and Jacobian."""
     h = scene.timestep[world, 0]
     m = scene.n_blocks
@@ -145,7 +147,7 @@ def add_loop_side(scene: Scene, room: Room, world: int, row: int, forces: vec6, 
 
 
 @wp.func
-def add_loops(scene: Scene, room: Room, world: int):
+def add_loops(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Gaps and what forces in loops give, at what is tried, and the derivative of both."""
     m = scene.n_blocks
     end_motions(scene, room, world, room.tried, scene.timestep[world, 0])

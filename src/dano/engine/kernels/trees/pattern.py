@@ -9,14 +9,14 @@ _ROOT = wp.constant(ROOT)
 
 
 @wp.func
-def couple(room: Room, world: int, m: int, i: int, j: int):
+def couple(room: wp.ref[Room], world: int, m: int, i: int, j: int):
     """Say that two blocks are coupled."""
     room.used[world, i * m + j] = 1
     room.used[world, j * m + i] = 1
 
 
 @wp.func
-def couple_block(scene: Scene, room: Room, world: int, block: int, row: int):
+def couple_block(scene: wp.ref[Scene], room: wp.ref[Room], world: int, block: int, row: int):
     """Couple a block with all that move a body."""
     m = scene.n_blocks
     node = scene.trees.nodes[row]
@@ -28,7 +28,7 @@ def couple_block(scene: Scene, room: Room, world: int, block: int, row: int):
 
 
 @wp.func
-def couple_pair(scene: Scene, room: Room, world: int, a: int, b: int):
+def couple_pair(scene: wp.ref[Scene], room: wp.ref[Room], world: int, a: int, b: int):
     """Couple what moves two bodies that touch, by their rows; −1 for one that does not move."""
     if a >= 0 and b >= 0:
         node = scene.trees.nodes[a]
@@ -40,7 +40,7 @@ def couple_pair(scene: Scene, room: Room, world: int, a: int, b: int):
 
 
 @wp.func
-def mark_tree(scene: Scene, room: Room, world: int, row: int):
+def mark_tree(scene: wp.ref[Scene], room: wp.ref[Room], world: int, row: int):
     """Say that the tree of a body touches something."""
     if row >= 0:
         tree = scene.trees.nodes[row].tree
@@ -49,7 +49,7 @@ def mark_tree(scene: Scene, room: Room, world: int, row: int):
 
 
 @wp.func
-def couple_loops(scene: Scene, room: Room, world: int):
+def couple_loops(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Couple forces in loops with what moves their ends."""
     m = scene.n_blocks
     for row in range(scene.trees.loop_index.shape[0]):
@@ -68,7 +68,7 @@ def couple_loops(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def couple_trees(scene: Scene, room: Room, world: int):
+def couple_trees(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Couple the blocks of trees that touch something or are closed by loops, not those of the others."""
     m = scene.n_blocks
     for i in range(m):
@@ -85,7 +85,7 @@ def couple_trees(scene: Scene, room: Room, world: int):
 
 
 @wp.func
-def mark_trees(scene: Scene, room: Room, world: int):
+def mark_trees(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Say which trees are closed by loops; none touches anything yet."""
     for tree in range(scene.trees.closed.shape[0]):
         room.trees.coupled[world, tree] = scene.trees.closed[tree]
