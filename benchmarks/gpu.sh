@@ -1,5 +1,7 @@
 #!/bin/bash
 # Kernels on an NVIDIA GPU: compared with the CPU, and timed. benchmarks/gpu.sh [RESULT.json]; less than five minutes.
+# BESIDE names a file of `python -m benchmarks.gpu --keep FILE`: another machine's CPU is compared. CACHE names a
+# folder of kernels that were compiled before.
 # It installs nothing. PYTHON names an interpreter with dano and JAX for CUDA; without it .venv's, or python3.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -15,18 +17,19 @@ assert jax.devices("cuda"), "JAX finds no GPU: pip install 'jax[cuda12]'"
 assert warp.get_cuda_device_count(), "Warp finds no GPU: see its words above"
 CHECK
 # Compiling takes longest and one core each, so all kernels at once; they are kept in dano's cache.
-cache=$(mktemp -d)
-trap 'rm -rf "$cache"' EXIT
+made=$(mktemp -d)
+trap 'rm -rf "$made"' EXIT
+cache=${CACHE:-$made}
 export DANO_CACHE_DIR=$cache
 begin=$SECONDS
 for name in bunny bunny32 boxes panda; do
-  XLA_PYTHON_CLIENT_PREALLOCATE=false "$python" -m benchmarks.gpu --compile "$name" --json "$cache/$name.json" > "$cache/$name.log" 2>&1 &
+  XLA_PYTHON_CLIENT_PREALLOCATE=false "$python" -m benchmarks.gpu --compile "$name" --json "$made/$name.json" > "$made/$name.log" 2>&1 &
 done
 wait
-cat "$cache"/*.log
+cat "$made"/*.log
 echo "compiled in $((SECONDS - begin)) s"
-"$python" -m benchmarks.gpu --json "$result"
-"$python" - "$result" "$cache"/*.json <<'JOIN'
+"$python" -m benchmarks.gpu ${BESIDE:+--beside "$BESIDE"} --json "$result"
+"$python" - "$result" "$made"/*.json <<'JOIN'
 import json
 import sys
 

@@ -1,8 +1,8 @@
 """Scenes whose rollouts a launch of a kernel makes, and the programs that are timed."""
 
 import importlib.util
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,11 @@ class Case:
     narrow: bool = False
     backward: bool = False
     room: int = _BUNNY_ROOM
+
+    def begun(self, leaves: Sequence[np.ndarray]) -> "Case":
+        """The same rollouts from the numbers of a state that another machine found."""
+        begun = jax.tree.unflatten(jax.tree.structure(self.state), [jnp.asarray(x) for x in leaves])
+        return replace(self, state=begun)
 
     def inputs(self, worlds: int) -> tuple[dano.Scene, dano.State, jax.Array]:
         """What a program is given: arrays of the scene, the state, velocities of each world's first body."""

@@ -27,7 +27,7 @@ def run() -> None:
     warm_up()
     gpu = _gpu()
     device = gpu or jax.devices("cpu")[0]
-    rows = []
+    rows, kept = [], {}
     for name, made in cases().items():
         if arguments.compile not in (None, name):
             continue
@@ -40,11 +40,22 @@ def run() -> None:
         if arguments.compile is not None:
             rows += _compiled(case, worlds, arguments.steps, device)
             continue
+        if arguments.keep is not None:
+            kept[name] = _kept(case, min(worlds, _COMPARED_WORLDS))
+            continue
+        on_cpu = None
+        if arguments.beside is not None:
+            on_cpu, case = _read(arguments.beside, name, case)
         if gpu is None:
             rows.append(skipped(case.name, "beside the CPU", "no GPU"))
         else:
-            rows.append(_beside_cpu(case, gpu, min(worlds, _COMPARED_WORLDS)))
+            rows.append(_beside_cpu(case, gpu, min(worlds, _COMPARED_WORLDS), on_cpu))
         rows += _timed(case, worlds, arguments.steps, device)
+    if arguments.keep is not None:
+        np.savez(
+            arguments.keep, **{f"{name}/{key}": x for name, each in kept.items() for key, x in each.items()}
+        )
+        return
     settings = {
         "date": datetime.datetime.now().isoformat(timespec="minutes"),
         "device": f"{device.platform}: {device.device_kind}",
@@ -59,6 +70,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--worlds", type=int, metavar="N", help="rollouts at once, instead of each case's own"
     )
+    parser.add_argument(
+        "--keep", metavar="FILE", help="only write what the CPU finds, for --beside elsewhere"
+    )
+    parser.add_argument("--beside", metavar="FILE", help="compare with what another machine's CPU found")
     parser.add_argument("--steps", type=int, metavar="N", default=N_STEPS, help="steps of a rollout")
 
 
@@ -87,12 +102,35 @@ def _compiled(case: Case, worlds: int, n_steps: int, device: Any) -> list[Row]:
     return rows
 
 
-def _beside_cpu(case: Case, gpu: Any, worlds: int) -> Row:
+Found = tuple[np.ndarray, np.ndarray]
+"""Positions, and which steps were solved."""
+
+
+def _on(device: Any, case: Case, worlds: int) -> Found:
+    position, solved = jax.jit(case.program(COMPARED))(*jax.device_put(case.inputs(worlds), device))
+    return np.asarray(position), np.asarray(solved)
+
+
+def _kept(case: Case, worlds: int) -> dict[str, np.ndarray]:
+    """What the CPU finds, and from which state."""
+    position, solved = _on(jax.devices("cpu")[0], case, worlds)
+    begun = {f"state{k}": np.asarray(x) for k, x in enumerate(jax.tree.leaves(case.state))}
+    return {"position": position, "solved": solved, **begun}
+
+
+def _read(path: str, name: str, case: Case) -> tuple[Found, Case]:
+    """What was kept of a case, and the case from the same state."""
+    with np.load(path) as kept:
+        n = len(jax.tree.leaves(case.state))
+        begun = case.begun([kept[f"{name}/state{k}"] for k in range(n)])
+        return (kept[f"{name}/position"], kept[f"{name}/solved"]), begun
+
+
+def _beside_cpu(case: Case, gpu: Any, worlds: int, on_cpu: Found | None) -> Row:
     """Largest difference of a position in any step."""
-    ends = []
-    for device in (gpu, jax.devices("cpu")[0]):
-        position, solved = jax.jit(case.program(COMPARED))(*jax.device_put(case.inputs(worlds), device))
-        ends.append((np.asarray(position), np.asarray(solved)))
+    if on_cpu is None:
+        on_cpu = _on(jax.devices("cpu")[0], case, worlds)
+    ends = _on(gpu, case, worlds), on_cpu
     (one, solved), (other, solved_there) = ends
     note = f"{COMPARED} steps of {worlds} worlds; solved {solved.mean():.1%}"
     note += f", on the CPU {solved_there.mean():.1%}"
