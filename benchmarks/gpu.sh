@@ -1,5 +1,5 @@
 #!/bin/bash
-# Kernels on an NVIDIA GPU: compared with the CPU, and timed. benchmarks/gpu.sh [RESULT.json]; less than five minutes.
+# Kernels on an NVIDIA GPU: compared with the CPU, and timed. benchmarks/gpu.sh [RESULT.json]; ten minutes.
 # BESIDE names a file of `python -m benchmarks.gpu --keep FILE`: another machine's CPU is compared. CACHE names a
 # folder of kernels that were compiled before.
 # It installs nothing. PYTHON names an interpreter with dano and JAX for CUDA; without it .venv's, or python3.

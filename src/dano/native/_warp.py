@@ -33,7 +33,7 @@ def compiled_kernel(
     begin()
     with _quietly(), _said(f"compiling {what} for this machine, once …"):
         kernel = made()
-        # Machine code, which this cache keeps; what Warp writes otherwise is compiled by the driver once more.
+        # Machine code, which this cache keeps; Warp's usual output is compiled by the driver once more.
         kernel.module.options["cuda_output"] = "cubin"
         try:
             # Who else wants it waits, instead of compiling it, too.
