@@ -94,7 +94,7 @@ def _with_values(robot: Robot, scene: Scene) -> Description:
 
 def _inertial(body) -> tuple[float, np.ndarray, np.ndarray]:
     scale = float(body.mass_scale)
-    com = np.asarray(body.com, float) + np.asarray(body.com_offset, float)
+    com = np.asarray(body.centre_of_mass, float)
     return float(body.mass) * scale, com, np.asarray(body.inertia, float) * scale
 
 

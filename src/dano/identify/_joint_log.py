@@ -79,7 +79,7 @@ def motion_of_joints(scene: Scene, times: Numbers, q: Numbers, *, state: State |
         return scene.frames(dataclasses.replace(base, q=row, v=jnp.zeros_like(row)))
 
     frames = jax.vmap(placed)(rows)
-    com = jnp.stack([body.com + body.com_offset for body in scene.bodies]).astype(scene.timestep.dtype)
+    com = jnp.stack([body.centre_of_mass for body in scene.bodies]).astype(scene.timestep.dtype)
     hanging = list(scene.layout.children)
     origin = frames.position - quat_rotate(frames.orientation, com[None])
     return Motion.create(

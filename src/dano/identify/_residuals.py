@@ -413,7 +413,7 @@ def _at(states: State, where) -> State:
 
 def _shifted(scene: Scene, state: State, origins, sign: int) -> State:
     """From origins of the field frames to centres of mass (+) or back (−), for the bodies marked."""
-    arm = jnp.stack([body.com + body.com_offset for body in scene.bodies])
+    arm = jnp.stack([body.centre_of_mass for body in scene.bodies])
     arm = jnp.where(origins[:, None], sign * arm, 0).astype(state.position.dtype)
     arm = jnp.broadcast_to(arm, state.position.shape)
     return dataclasses.replace(

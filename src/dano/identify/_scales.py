@@ -131,7 +131,7 @@ def _gaps(body, motion: Motion, row: int, known, normal: np.ndarray, offset: flo
     """Distance of a body's lowest point from a plane in each known frame [m]."""
     points = np.asarray(body.surface.points[:3])
     turned = np.asarray(quat_to_matrix(motion.orientation[known, row]))
-    arm = np.zeros(3) if motion.point == "origin" else np.asarray(body.com + body.com_offset)
+    arm = np.zeros(3) if motion.point == "origin" else np.asarray(body.centre_of_mass)
     lowest = (np.einsum("tij,i->tj", turned, normal) @ (points - arm[:, None])).min(axis=1)
     return motion.position[known, row] @ normal - offset + lowest
 

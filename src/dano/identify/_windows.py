@@ -371,7 +371,7 @@ def _initial(scene, motion, full, smooth, state, first: int, h: float, what: str
 def _joint_start(scene, motion, start, state, first: int, origins) -> dict[str, np.ndarray]:
     """Coordinates and velocities of the joints: those of observed bodies from their poses, others stated."""
     layout = scene.layout
-    com = np.stack([np.asarray(body.com + body.com_offset) for body in scene.bodies])
+    com = np.stack([np.asarray(body.centre_of_mass) for body in scene.bodies])
     arms = quat_rotate(start["orientation"], np.where(origins[:, None], com, 0.0))
     turning = quat_rotate(start["orientation"], start["omega"])
     dtype = scene.timestep.dtype

@@ -195,7 +195,7 @@ def _add_loops(mujoco: Any, spec: Any, scene: Scene, added: dict[str | None, Any
 
 def _middle(body: Body) -> Float[np.ndarray, "3"]:
     """Centre of mass [m, F]."""
-    return np.asarray(body.com + body.com_offset, np.float64)
+    return np.asarray(body.centre_of_mass, np.float64)
 
 
 def _geom(mujoco: Any, shape: AbstractShape, name: str):

@@ -151,7 +151,7 @@ class Twin:
         for name, body in objects.items():
             assert body.object is not None
             if name in sampled:
-                middle = np.asarray(body.com + body.com_offset, np.float64)
+                middle = np.asarray(body.centre_of_mass, np.float64)
                 self._attached.attach(name, body.object, position=-middle, look=False)
             else:
                 add_mesh(mujoco, spec, body, body.object, touch)

@@ -136,7 +136,7 @@ def _placed(
     x, q = states.position[:, rows], quat_normalize(states.orientation[:, rows])
     near = jnp.where(jnp.sum(q[before] * q[after], axis=-1, keepdims=True) < 0, -q[after], q[after])
     orientation = quat_normalize((1 - share) * q[before] + share * near)
-    arms = jnp.stack([scene.bodies[i].com + scene.bodies[i].com_offset for i in rows])
+    arms = jnp.stack([scene.bodies[i].centre_of_mass for i in rows])
     arms = jnp.broadcast_to(arms.astype(orientation.dtype), (*orientation.shape[:2], 3))
     return (1 - share) * x[before] + share * x[after] - quat_rotate(orientation, arms), orientation
 

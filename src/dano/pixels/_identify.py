@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dano.checks import checked_count, checked_kind, checked_optional
-from dano.identify import Identification, identify, Motion, Parameter
+from dano.identify import Identification, identify, IdentifyOptions, Motion, Parameter
 from dano.progress import Progress
 from dano.scene import Scene
 from dano.vision import adjust_poses, Film, LearnedField, Light, PosedCamera, Tracked, TrackOptions
@@ -97,9 +97,12 @@ def identify_in_film(
     body = motion.names[0]
     tracking = checked_optional("tracking", tracking, TrackOptions) or TrackOptions()
     tracking = _with_table(scene, motion, tracking)
-    before = identify(scene, motion, parameters, progress=progress, **settings)
+    options = checked_optional("options", settings.pop("options", None), IdentifyOptions) or IdentifyOptions()
+    # The trend of a rough loss is worth its simulations only where the search ends.
+    on_the_way = dataclasses.replace(options, smooth=False)
+    before = identify(scene, motion, parameters, progress=progress, options=options, **settings)
     fit, history, settled, lamps = before, [before.values], False, None
-    found = None
+    found = pulled = None
     for k in range(passes):
         seen = fit.fitted[0]
         found = adjust_poses(
@@ -116,11 +119,15 @@ def identify_in_film(
         lamps = found.lamps if k + 1 >= _LIGHT_PASSES else None
         pulled = Motion.from_tracked(found, body)
         last = fit
-        fit = identify(scene, pulled, parameters, after=fit, progress=progress, **settings)
+        fit = identify(
+            scene, pulled, parameters, after=fit, progress=progress, options=on_the_way, **settings
+        )
         history.append(fit.values)
         if settled := _moved(last, fit) < _SETTLED and k + 1 >= _LIGHT_PASSES:
             break
-    assert found is not None
+    assert found is not None and pulled is not None
+    if options.smooth:
+        fit = identify(scene, pulled, parameters, after=fit, progress=progress, options=options, **settings)
     return FilmFit(fit, before, found, tuple(history), settled)
 
 

@@ -345,7 +345,7 @@ def _trajectory(fit: Identification, motion: Motion) -> Trajectory:
         turns = _filled(motion.orientation[:, column], orientation[0, row])
         places = _filled(motion.position[:, column], position[0, row])
         if motion.point == "origin":
-            com = np.asarray(scene.bodies[row].com + scene.bodies[row].com_offset)
+            com = np.asarray(scene.bodies[row].centre_of_mass)
             places = places + quat_rotate(turns, com[None])
         position[:, row], orientation[:, row] = places, turns
     zero = jnp.zeros((n, len(scene.bodies), 3))

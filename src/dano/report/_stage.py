@@ -94,7 +94,7 @@ def stage(
         else:
             items.append(Item(body.field, Pose(), colour, level=level_of(body)))
         rows.append(row)
-        offsets.append(np.asarray(body.com, np.float64) + np.asarray(body.com_offset, np.float64))
+        offsets.append(np.asarray(body.centre_of_mass, np.float64))
         used += not plane
     if not items:
         raise ValueError(

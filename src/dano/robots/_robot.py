@@ -326,7 +326,7 @@ class Robot:
             return *own, jnp.zeros((6, scene.layout.n_velocities), dtype)
         i = scene.index(body)
         q = frames.orientation[i]
-        arm = quat_rotate(q, own[0] - (scene.bodies[i].com + scene.bodies[i].com_offset).astype(dtype))
+        arm = quat_rotate(q, own[0] - scene.bodies[i].centre_of_mass.astype(dtype))
         spins = quat_rotate(q[None], frames.jacobian[i, 3:].T)
         velocities = frames.jacobian[i, :3].T + jnp.cross(spins, arm[None])
         jacobian = jnp.concatenate([velocities, spins], axis=1).T

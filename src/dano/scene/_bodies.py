@@ -152,6 +152,11 @@ class Body(eqx.Module):
         """What other bodies' surface samples press on: the shape, or the object's signed distance."""
         return self.shape if self.object is None else self.object.solid
 
+    @property
+    def centre_of_mass(self) -> Float[Array, "3"]:
+        """Where the centre of mass lies, with its offset [m, F]."""
+        return self.com + self.com_offset
+
     def typical_support(self, depth: float) -> float:
         """Σ A d [m³] of the samples below a floor when the lowest of them lies at a depth [m].
 
@@ -229,7 +234,7 @@ class Body(eqx.Module):
             position: Of the centre of mass [m, W].
             rotation: B → W.
         """
-        com = self.com + self.com_offset
+        com = self.centre_of_mass
         arm = -sum(rotation[:, i] * com[i] for i in range(3))
         return Collider(
             self.field,

@@ -69,7 +69,7 @@ def state_arrays(
             row[key] = check.astype(dtype)
         if _ORIGIN in numbers:
             origin = checked_array(f"origin of {body.name!r}", numbers[_ORIGIN], (3,)).astype(dtype)
-            com = (body.com + body.com_offset).astype(dtype)
+            com = body.centre_of_mass.astype(dtype)
             row["position"] = origin + quat_rotate(row["orientation"], com)
         for key, value in row.items():
             rows[key].append(value)

@@ -140,13 +140,13 @@ class Scene(eqx.Module):
     @property
     def chains(self) -> Chains:
         """The trees that bodies and joints make, as arrays."""
-        com = jnp.stack([body.com + body.com_offset for body in self.bodies])
+        com = jnp.stack([body.centre_of_mass for body in self.bodies])
         return chains_of(self.layout, self.joints, com.astype(self.timestep.dtype))
 
     @property
     def closing(self) -> Loops | None:
         """The loops as arrays; None if there are none."""
-        com = jnp.stack([body.com + body.com_offset for body in self.bodies])
+        com = jnp.stack([body.centre_of_mass for body in self.bodies])
         return loops_of(self.names, self.loops, com.astype(self.timestep.dtype))
 
     @property

@@ -176,7 +176,7 @@ def scene_tables(scene: Scene) -> Tables:
     structure = structure_of_trees(scene, touching)
     index = [[row, *surface_index[i], *solid_index[i]] for i, row in enumerate(structure.rows)]
     extents = jnp.stack([_extent(body) for body in bodies]).astype(dtype)
-    com = jnp.stack([body.com + body.com_offset for body in bodies]).astype(dtype)
+    com = jnp.stack([body.centre_of_mass for body in bodies]).astype(dtype)
     mass = jnp.stack([body.mass * body.mass_scale for body in bodies]).astype(dtype)
     inertia = jnp.stack([body.inertia * body.mass_scale for body in bodies]).astype(dtype)
     body_rows = packed(

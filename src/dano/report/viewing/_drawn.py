@@ -78,7 +78,7 @@ class Drawn:
     def replace(self, scene: Scene, trajectory: Trajectory) -> None:
         """Show another run of the same bodies in place of the first."""
         self._bodies, self._runs[0] = scene, trajectory
-        self._coms = [np.asarray(body.com + body.com_offset, np.float64) for body in scene.bodies]
+        self._coms = [np.asarray(body.centre_of_mass, np.float64) for body in scene.bodies]
         times = np.asarray(trajectory.times, np.float64)
         self.touched = touches(scene, trajectory, times)
         force = None if self.touched is None else np.linalg.norm(self.touched.forces, axis=-1).sum(axis=-1)
