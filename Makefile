@@ -12,7 +12,7 @@ PYTEST_ARGS = --numprocesses 2 --dist loadfile
 INSTALL = $(BIN)/python -m pip install --constraint constraints.txt
 PACKAGE := pyproject.toml constraints.txt
 
-.PHONY: help demo test check format docs bench-check clean
+.PHONY: help demo test check format docs wheel bench-check clean
 
 help:
 	@echo "make demo     install dano and show a first simulation"
@@ -20,6 +20,7 @@ help:
 	@echo "make check    lint, format check, import layers, types"
 	@echo "make format   apply the formatter and the safe lint fixes"
 	@echo "make docs     build the documentation into site/"
+	@echo "make wheel    build the wheel, install it into an empty environment and simulate"
 	@echo "make bench-check   which stored accuracies miss their targets, which tables are out of date"
 	@echo "make clean    remove .venv, caches and build products"
 
@@ -41,6 +42,14 @@ format: $(VENV)/.dev
 
 docs: $(VENV)/.docs
 	$(BIN)/mkdocs build --strict
+
+# Without the clone in sight: what the wheel lacks is missed.
+wheel: $(VENV)/.pip
+	rm -rf build dist $(VENV)/empty
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	$(BIN)/python -m venv $(VENV)/empty
+	$(VENV)/empty/bin/python -m pip install --quiet --constraint constraints.txt dist/*.whl
+	cd $(VENV)/empty && bin/dano --version && bin/dano check bunny && bin/dano simulate bunny -o bunny.npz
 
 bench-check: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.figures --check

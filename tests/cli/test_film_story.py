@@ -11,6 +11,7 @@ from vision.tabletop import TAG_SIDE
 import dano
 from dano.cli.film import STAGES
 from dano.identify import load_motion
+from dano.scene_file import load_run
 
 
 @pytest.mark.slow
@@ -28,11 +29,10 @@ def test_photographs_and_a_film_become_an_object_that_moves_as_filmed(run, tmp_p
         "--background",
         empty,
     )
-    words += ("--resolution", 40, "--iterations", 150, "--to", "motion", "--json")
+    words += ("--resolution", 40, "--iterations", 150, "--json")
     answer = run(*words)
     assert answer.code == 0, answer.err
-    done = STAGES[: STAGES.index("motion") + 1]
-    assert json.loads(answer.out)["made"] == list(done)
+    assert json.loads(answer.out)["made"] == list(STAGES)
     # It stands on the table, whose height the marker says.
     points = np.asarray(dano.NeuralObject.load(tmp_path / "box.dano").surface.points)
     assert abs(points[:, 2].min()) < 0.002
@@ -41,5 +41,11 @@ def test_photographs_and_a_film_become_an_object_that_moves_as_filmed(run, tmp_p
     filmed = sliding_box.place(9.0) - sliding_box.place(0.0)
     # So coarse an object, cut by the edge of the first frame, is 3 % off.
     assert np.linalg.norm(way - filmed) < 0.06 * np.linalg.norm(filmed)
+    friction = json.loads((tmp_path / "box_film" / "friction.json").read_text())
+    assert friction["values"]["box,table.sliding_friction"] == pytest.approx(sliding_box.FRICTION, rel=0.05)
+    # The scene moves as the film does, and nothing is pressed into the table at its start.
+    run_found = load_run(tmp_path / "box_film" / "run.npz").trajectory
+    np.testing.assert_allclose(run_found.states.position[-1, 0, :2], sliding_box.place(9.0)[:2], atol=0.005)
+    assert np.linalg.norm(run_found.states.velocity[0, 0]) < 1.2 * sliding_box.SPEED
     again = run(*words)
-    assert json.loads(again.out)["made"] == [] and again.err.count("taken up again") == len(done)
+    assert json.loads(again.out)["made"] == [] and again.err.count("taken up again") == len(STAGES)

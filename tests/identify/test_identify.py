@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -434,6 +435,13 @@ def test_centre_of_mass_and_inertia_from_free_flight():
     # Without a known torque only ratios of the inertia show.
     found = fit.values["inertia"]
     np.testing.assert_allclose(found / np.trace(found), inertia / np.trace(inertia), atol=1e-5)
+    # What it begins with is a state as simulations take it, whatever point was tracked.
+    begun = jax.tree.map(lambda x: x[0], fit.initial_states)
+    again = dano.simulate(fit.scene, begun, 200)
+    np.testing.assert_allclose(again.states.position, run.states.position, atol=1e-5)
+    with pytest.warns(RuntimeWarning, match="cannot be told apart"):
+        further = dano.identify(tumbling(), motion, parameters, initial="velocities", after=fit)
+    assert further.loss_history[0] <= fit.loss_history[-1] * 1.01 + 1e-9
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._motion_files import load_motion
 from dano.identify._parameters import Parameter, space_of, values_at, with_values
 from dano.identify._problem import Problem
-from dano.identify._residuals import Linearized, Smoothing
+from dano.identify._residuals import Linearized, shifted, Smoothing
 from dano.identify._result import Errors, Identification, Minimum
 from dano.identify._scales import check_scales
 from dano.identify._settings import deviations, estimated, IdentifyOptions, Setup
@@ -111,7 +111,7 @@ def _fitted(
     tell = progress or (lambda description, share: None)
     problem = Problem(setup, motions, state)
     if after is not None:
-        problem.begin_near(after.initial_states, after.initial)
+        problem.begin_near(after)
     tell("compiling", 0.0)
     solutions = _searched(problem, setup.options, kept, tell)
     held_errors = _held_out(setup, held, state, solutions[0].solution)
@@ -208,6 +208,7 @@ def _identification(
         messages.append(missed)
     x = jnp.asarray(best.x, scene.timestep.dtype)
     controls = setup.controls
+    found = with_values(space.selections, "scene", scene, x)
     return Identification(
         values=values,
         standard_errors=errors,
@@ -222,10 +223,10 @@ def _identification(
             Minimum(values_at(space.selections, s.x, sure.covariance)[0], s.normal.loss, s.stop)
             for s, *_ in ended
         ),
-        scene=with_values(space.selections, "scene", scene, x),
+        scene=found,
         controls=controls if controls is None else with_values(space.selections, "controls", controls, x),
         initial=setup.initial,
-        initial_states=best.blocks,
+        initial_states=shifted(found, best.blocks, plan.windows.origins, 1),
         motions=motions,
         fitted=_as_motions(plan, motions, at_best, scene),
         guessed=_as_motions(plan, motions, at_start, scene),

@@ -13,7 +13,8 @@ from jaxtyping import Array
 from dano.engine import device_mesh
 from dano.identify._checkpoint import Checkpoint
 from dano.identify._motion import Motion, QUANTITIES
-from dano.identify._residuals import Linearized, linearized, Model, moved, Smoothing, Start
+from dano.identify._residuals import Linearized, linearized, Model, moved, shifted, Smoothing, Start
+from dano.identify._result import Identification
 from dano.identify._settings import Setup
 from dano.identify._settling import settled
 from dano.identify._windows import draw_velocities, plan_windows
@@ -113,16 +114,17 @@ class Problem:
             device_mesh(),
         )
 
-    def begin_near(self, states: State, estimated: tuple[str, ...]) -> None:
+    def begin_near(self, after: Identification) -> None:
         """Begin where an earlier fit left what it estimated of the windows' states, if this one does too."""
-        start = self.plan.start
+        start, states = self.plan.start, after.initial_states
         if states.position.shape != start.position.shape:
             here, there = start.position.shape[:2], states.position.shape[:2]
             raise ValueError(
                 "after must be a fit of the same motions in the same windows: "
                 f"{here[0]} windows of {here[1]} bodies, got {there[0]} of {there[1]}"
             )
-        taken = [key for key in self.start.initial if key in estimated]
+        states = shifted(after.scene, states, self.plan.windows.origins, -1)
+        taken = [key for key in self.start.initial if key in after.initial]
         if self.start.turning:
             poses = any(key in taken for key in ("position", "orientation"))
             taken += [name for name, mine in (("q", poses), ("v", "velocity" in taken)) if mine]

@@ -375,7 +375,7 @@ def _residuals(model: Model, window: Windows, start: State, following: State, x,
     start = model.start.moved(start, change)
     trajectory = simulate(
         scene,
-        _shifted(scene, start, window.origins, 1),
+        shifted(scene, start, window.origins, 1),
         model.n_steps,
         controls=controls,
         engine=model.engine,
@@ -384,14 +384,14 @@ def _residuals(model: Model, window: Windows, start: State, following: State, x,
     places = _at(states, window.frame)
     speeds = _at(states, window.moment)
     mixed = dataclasses.replace(places, velocity=speeds.velocity, omega=speeds.omega, v=None)
-    predicted = _shifted(scene, mixed, window.origins, -1)
+    predicted = shifted(scene, mixed, window.origins, -1)
     rows = jnp.stack([_row(model, window, predicted, key) for key in model.quantities], axis=2)
     if window.whitening is not None:
         rows = _whitened(model, rows, window.whitening[:, _bodies(model)])
     # Not empty: mapping in batches cannot put empty arrays together.
     jump = jnp.zeros(1, rows.dtype)
     if model.jumps is not None:
-        last = _shifted(scene, _at(states, tuple(part[None] for part in window.end)), window.origins, -1)
+        last = shifted(scene, _at(states, tuple(part[None] for part in window.end)), window.origins, -1)
         last = jax.tree.map(lambda leaf: leaf[0], last)
         jump = window.chained * model.start.jump(following, last) / model.jumps
     used = jnp.arange(model.n_steps) <= jnp.max(window.frame[0])
@@ -411,10 +411,17 @@ def _at(states: State, where) -> State:
     return eqx.tree_at(lambda s: s.orientation, mixed, quat_normalize(mixed.orientation))
 
 
-def _shifted(scene: Scene, state: State, origins, sign: int) -> State:
-    """From origins of the field frames to centres of mass (+) or back (−), for the bodies marked."""
+def shifted(scene: Scene, state: State, origins, sign: int) -> State:
+    """From origins of the field frames to centres of mass (+) or back (−), for the bodies marked.
+
+    Args:
+        scene: The scene.
+        state: States, shape (…, bodies, ·).
+        origins: The bodies marked, shape (bodies,) or as the states.
+        sign: 1 or −1.
+    """
     arm = jnp.stack([body.centre_of_mass for body in scene.bodies])
-    arm = jnp.where(origins[:, None], sign * arm, 0).astype(state.position.dtype)
+    arm = jnp.where(origins[..., None], sign * arm, 0).astype(state.position.dtype)
     arm = jnp.broadcast_to(arm, state.position.shape)
     return dataclasses.replace(
         state,

@@ -60,7 +60,7 @@ class Identification:
         scene: The scene with the values.
         controls: The controls with the values, as they were given.
         initial: Quantities that were estimated of the state in which each window begins.
-        initial_states: State in which each window begins.
+        initial_states: State in which each window begins, of centres of mass, whatever the motions say.
         motions: What was observed.
         fitted: What the simulation says at the frames of each motion, with the values found.
         guessed: The same at the start of the search.

@@ -343,11 +343,11 @@ def _trajectory(fit: Identification, motion: Motion) -> Trajectory:
     for column, name in enumerate(motion.names):
         row = scene.index(name)
         turns = _filled(motion.orientation[:, column], orientation[0, row])
-        places = _filled(motion.position[:, column], position[0, row])
+        places = motion.position[:, column]
         if motion.point == "origin":
             com = np.asarray(scene.bodies[row].centre_of_mass)
             places = places + quat_rotate(turns, com[None])
-        position[:, row], orientation[:, row] = places, turns
+        position[:, row], orientation[:, row] = _filled(places, position[0, row]), turns
     zero = jnp.zeros((n, len(scene.bodies), 3))
     states = State(jnp.asarray(position), jnp.asarray(orientation), zero, zero)
     none = jnp.zeros(n - 1)

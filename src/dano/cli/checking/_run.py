@@ -80,8 +80,9 @@ def _print(found: scene_file.SceneCheck) -> None:
     if cost.room is not None:
         put(f"points      room for {cost.room} point contacts in a step; room for more is made when needed")
     put(f"compile     {cost.compile_seconds:.1f} s; less when this scene was compiled before")
+    measured = f"the first {cost.steps} of" if cost.steps < found.n_steps else "all"
     put(
         f"a step      {1e6 * cost.step_seconds:.0f} µs, {1e6 * cost.slowest_seconds:.0f} µs in the slowest"
-        f" twenty: measured on the first {cost.steps} of {found.n_steps}"
+        f" twenty: measured on {measured} {found.n_steps}"
     )
     put(f"the run     {mean:.2g} s to {slowest:.2g} s predicted, without compiling and pictures")

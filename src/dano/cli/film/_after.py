@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ from dano.cli.film._slide import find_slide
 from dano.cli.film._stages import AGAIN, Stage
 from dano.cli.identifying import Identify
 from dano.cli.tracking import Track
+from dano.engine import simulate
 from dano.identify import load_motion, save_motion
+from dano.scene_file import parse_scene
 from dano.vision import read_film
 
 _STEP = 0.004
@@ -142,12 +145,15 @@ def _simulate(place: Place) -> None:
     found = read_json(folder / "friction.json")
     name = f"{place.body},{TABLE}.sliding_friction"
     row = found["bodies"].index(place.body)
-    start = {key: values[row] for key, values in found["initial_state"].items()}
-    lines = [f"{key} = {[round(float(x), 7) for x in values]}" for key, values in start.items()]
     times = load_motion(folder / "slide.npz").times
-    text = _scene_text(
-        place, float(times[-1] - times[0]) + _LONGER, f"{found['values'][name]:.6g}", "\n".join(lines)
-    )
+    duration, friction = float(times[-1] - times[0]) + _LONGER, f"{found['values'][name]:.6g}"
+    start = {key: values[row] for key, values in found["initial_state"].items()}
+    text = _scene_text(place, duration, friction, _lines(start))
+    loaded = parse_scene(text, folder / "scene.toml", n_steps=1)
+    # Poses do not tell a velocity into the table: it is gone with the first step.
+    after = simulate(loaded.scene, loaded.state, n_steps=1).states
+    start = {key: np.asarray(getattr(after, key))[-1, row] for key in start}
+    text = _scene_text(place, duration, friction, _lines(start))
     error = found["standard_errors"][name]
     stated = "" if error is None else f" ± {error:.2g}"
     write_text(
@@ -160,6 +166,11 @@ def _simulate(place: Place) -> None:
         video=folder / "run.mp4",
         camera="scene",
     )()
+
+
+def _lines(start: Mapping[str, Sequence[float]]) -> str:
+    """Quantities of a state as lines of a scene file."""
+    return "\n".join(f"{key} = {[round(float(x), 7) for x in values]}" for key, values in start.items())
 
 
 def _scene_text(place: Place, duration: float, friction: str, start: str) -> str:
