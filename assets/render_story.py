@@ -9,6 +9,7 @@ Usage: python assets/render_story.py docs/images WALK SLIDE.mp4 STORY    (STORY:
 import argparse
 from pathlib import Path
 
+import av
 import numpy as np
 from filming import read_film, write_webp
 from PIL import Image
@@ -33,7 +34,10 @@ def main() -> None:
     (folder / "guides").mkdir(exist_ok=True)
     write_webp(folder / "guides" / "phone.webp", [taken(picture_files(arguments.walk), film)])
     write_webp(folder / "phone_masks.webp", [reduced(read_picture(story / "masks.png"), 960)])
-    write_webp(folder / "phone_story.webp", beside(film, read_film(story / "run.mp4")))
+    run = story / "run.mp4"
+    write_webp(
+        folder / "phone_story.webp", beside(film, rate_of(arguments.slide), read_film(run), rate_of(run))
+    )
 
 
 def taken(photographs: list[Path], film: list[np.ndarray]) -> np.ndarray:
@@ -45,11 +49,25 @@ def taken(photographs: list[Path], film: list[np.ndarray]) -> np.ndarray:
     return np.concatenate([_row([sized(picture, CELL) for picture in row]) for row in rows], axis=0)
 
 
-def beside(film: list[np.ndarray], run: list[np.ndarray]) -> list[np.ndarray]:
-    """Frames of the film beside those of the simulation that was fitted to it."""
-    count = min(len(film), len(run))
-    size = (2 * CELL[0] * 3 // 4, 2 * CELL[1] * 3 // 4)
-    return [_row([sized(film[i], size), sized(run[i], size)]) for i in range(count)]
+def beside(
+    film: list[np.ndarray], film_rate: float, run: list[np.ndarray], run_rate: float
+) -> list[np.ndarray]:
+    """The simulation that was fitted to a film, and the film at the same times; rates in frames a second."""
+    height, width = film[0].shape[:2]
+    size = (3 * CELL[0] // 2, 3 * CELL[0] * height // (2 * width))
+    last = len(film) - 1
+    return [
+        _row([sized(film[min(round(k * film_rate / run_rate), last)], size), sized(picture, size)])
+        for k, picture in enumerate(run)
+    ]
+
+
+def rate_of(path: Path) -> float:
+    """Frames a second of a film."""
+    with av.open(str(path)) as container:
+        rate = container.streams.video[0].average_rate
+    assert rate is not None
+    return float(rate)
 
 
 def _row(pictures: list[np.ndarray]) -> np.ndarray:

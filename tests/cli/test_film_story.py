@@ -45,7 +45,8 @@ def test_photographs_and_a_film_become_an_object_that_moves_as_filmed(run, tmp_p
     assert friction["values"]["box,table.sliding_friction"] == pytest.approx(sliding_box.FRICTION, rel=0.05)
     # The scene moves as the film does, and nothing is pressed into the table at its start.
     run_found = load_run(tmp_path / "box_film" / "run.npz").trajectory
-    np.testing.assert_allclose(run_found.states.position[-1, 0, :2], sliding_box.place(9.0)[:2], atol=0.005)
+    slid = np.asarray(run_found.states.position[-1, 0] - run_found.states.position[0, 0])
+    assert np.linalg.norm(slid - filmed) < 0.1 * np.linalg.norm(filmed)
     assert np.linalg.norm(run_found.states.velocity[0, 0]) < 1.2 * sliding_box.SPEED
     again = run(*words)
     assert json.loads(again.out)["made"] == [] and again.err.count("taken up again") == len(STAGES)
