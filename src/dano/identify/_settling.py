@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.stats import qmc
 
 from dano.gradients import Check, check
 from dano.identify._residuals import Linearized, Smoothing
@@ -41,8 +42,8 @@ _LONGEST, _WORSE = 4.0, 1.5
 _HALVINGS = 3
 # Sets of independent directions: so many pairs of draws for each unknown.
 _BLOCKS = 2
-# Places at which the loss is looked at.
-_PLACES = 11
+# Places at which the loss is looked at: along a line, and within all bounds.
+_PLACES, _LOOKS = 11, 64
 
 
 @runtime_checkable
@@ -158,8 +159,35 @@ def _grown(problem: Smoothed, point: _Point, widest: np.ndarray) -> _Point:
     """A point from which the beginning of motions is right, and more and more of them."""
     for share in _BEGINNINGS:
         problem.count(share)
+        point = _looked(problem, point)
         point = _descended(_walk(problem, point, widest), point)
     problem.count(1.0)
+    return point
+
+
+def _looked(problem: Smoothed, point: _Point) -> _Point:
+    """The point with the values of bounded parameters that fit best, of many all over their bounds.
+
+    A walk that meets an impact with a wrong restitution finds other motions that fit a little.
+    """
+    problem.smoothing = None
+    bounded = np.flatnonzero(np.isfinite(problem.upper - problem.lower))
+    if not bounded.size:
+        return point
+    lower, upper = problem.lower[bounded], problem.upper[bounded]
+    least = problem.linearize(point.x, point.blocks).loss
+    shares = qmc.Sobol(len(bounded), seed=problem.seed).random(_LOOKS)
+    tried = lower + shares * (upper - lower)
+    for sweep in range(1 + len(bounded)):
+        if sweep > 0:
+            k = sweep - 1
+            tried = np.tile(point.x[bounded], (_PLACES, 1))
+            tried[:, k] = np.linspace(lower[k], upper[k], _PLACES)
+        for values in tried:
+            x = point.x.copy()
+            x[bounded] = values
+            if (loss := problem.linearize(x, point.blocks).loss) < least:
+                point, least = point._replace(x=x), loss
     return point
 
 
