@@ -9,7 +9,7 @@ import pytest
 import dano
 from dano.identify._residuals import _plane_through
 from dano.identify._settling import _directions
-from dano.maths import quat_exp, quat_multiply
+from dano.maths import quat_exp, quat_from_axis_angle, quat_multiply
 
 N = 4
 
@@ -93,3 +93,49 @@ def test_a_throw_is_found_from_far_away_starts():
     rough = [fit for fit in fits if fit.smoothed]
     for fit in rough:
         assert fit.worth is not None and fit.to_dict()["worth"] == fit.worth.summary
+
+
+@pytest.mark.slow
+def test_a_tumbling_bunny_has_one_answer():
+    """Searches by the beginnings of the motion alone ended at another bounce, with a restitution of .36."""
+    bunny = dano.Body("bunny", dano.load_object("bunny"))
+
+    def scene(friction, restitution):
+        params = dano.ContactParams(sliding_friction=friction, restitution=restitution)
+        floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
+        return dano.Scene.create([bunny, floor], [dano.Contact("bunny", "floor", params)], timestep=0.005)
+
+    true, rng = scene(0.3, 0.3), np.random.default_rng(0)
+    axis, around = rng.standard_normal(3), rng.uniform(0, 2 * np.pi)
+    start = true.initial_state(
+        bunny=dict(
+            position=(0, 0, 0.12),
+            orientation=quat_from_axis_angle(axis, rng.uniform(0, np.pi)),
+            velocity=0.8 * np.array([np.cos(around), np.sin(around), 0]),
+            omega=3.0 * rng.standard_normal(3),
+        )
+    )
+    run = dano.simulate(true, start, 80)
+    seen = np.array(run.states.position)[::2, :1]
+    turn = quat_exp(jnp.asarray(1e-2 * rng.standard_normal(seen.shape)))
+    motion = dano.Motion.create(
+        np.array(run.times)[::2],
+        "bunny",
+        position=seen + 1e-3 * rng.standard_normal(seen.shape),
+        orientation=np.asarray(quat_multiply(run.states.orientation[::2, :1], turn)),
+    )
+    parameters = [
+        dano.Parameter("friction", lambda s: s.contact("bunny", "floor").sliding_friction, 0.05, 0.8),
+        dano.Parameter("restitution", lambda s: s.contact("bunny", "floor").restitution, 0.0, 0.8),
+    ]
+    noise = {"position": 1e-3, "orientation": 1e-2}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        fits = [
+            dano.identify(scene(*guess), motion, parameters, initial="states", noise=noise)
+            for guess in ((0.5, 0.5), (0.72, 0.04))
+        ]
+    for name in ("friction", "restitution"):
+        error = fits[0].standard_errors[name]
+        assert abs(fits[0].values[name] - 0.3) < 4 * error
+        assert abs(fits[1].values[name] - fits[0].values[name]) < 0.5 * error
