@@ -50,6 +50,7 @@ wheel: $(VENV)/.pip
 	$(BIN)/python -m venv $(VENV)/empty
 	$(VENV)/empty/bin/python -m pip install --quiet --constraint constraints.txt dist/*.whl
 	cd $(VENV)/empty && bin/dano --version && bin/dano check bunny && bin/dano simulate bunny -o bunny.npz
+	rm -rf build $(VENV)/empty
 
 bench-check: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.figures --check
