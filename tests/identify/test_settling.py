@@ -51,11 +51,35 @@ def test_a_ripple_is_measured_and_does_not_make_the_slope():
     assert float(jnp.sqrt(jnp.mean(found.ripple**2))) == pytest.approx(1e-2, rel=0.6)
 
 
-def thrown(friction, restitution):
-    box = dano.Body("box", dano.Box((0.05, 0.04, 0.03)), mass=1.0)
+def on_floor(body, friction, restitution):
     params = dano.ContactParams(sliding_friction=friction, restitution=restitution)
     floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
-    return dano.Scene.create([box, floor], [dano.Contact("box", "floor", params)], timestep=0.005)
+    return dano.Scene.create([body, floor], [dano.Contact(body.name, "floor", params)], timestep=0.005)
+
+
+def thrown(friction, restitution):
+    return on_floor(dano.Body("box", dano.Box((0.05, 0.04, 0.03)), mass=1.0), friction, restitution)
+
+
+def watched(name, run, rng):
+    """Every other pose of a body, with noise, and that noise."""
+    noise = {"position": 1e-3, "orientation": 1e-2}
+    seen = np.array(run.states.position)[::2, :1]
+    turn = quat_exp(jnp.asarray(noise["orientation"] * rng.standard_normal(seen.shape)))
+    motion = dano.Motion.create(
+        np.array(run.times)[::2],
+        name,
+        position=seen + noise["position"] * rng.standard_normal(seen.shape),
+        orientation=np.asarray(quat_multiply(run.states.orientation[::2, :1], turn)),
+    )
+    return motion, noise
+
+
+def friction_and_restitution(name):
+    return [
+        dano.Parameter("friction", lambda s: s.contact(name, "floor").sliding_friction, 0.05, 0.8),
+        dano.Parameter("restitution", lambda s: s.contact(name, "floor").restitution, 0.0, 0.8),
+    ]
 
 
 def test_a_throw_is_found_from_far_away_starts():
@@ -63,20 +87,8 @@ def test_a_throw_is_found_from_far_away_starts():
     start = scene.initial_state(
         box=dict(position=(0, 0, 0.1), orientation=(1, 0.3, 0.2, 0.1), velocity=(0.8, 0, 0), omega=(2, 4, 1))
     )
-    run = dano.simulate(scene, start, 60)
-    seen = np.array(run.states.position)[::2, :1]
-    turn = quat_exp(jnp.asarray(1e-2 * rng.standard_normal(seen.shape)))
-    motion = dano.Motion.create(
-        np.array(run.times)[::2],
-        "box",
-        position=seen + 1e-3 * rng.standard_normal(seen.shape),
-        orientation=np.asarray(quat_multiply(run.states.orientation[::2, :1], turn)),
-    )
-    parameters = [
-        dano.Parameter("friction", lambda s: s.contact("box", "floor").sliding_friction, 0.05, 0.8),
-        dano.Parameter("restitution", lambda s: s.contact("box", "floor").restitution, 0.0, 0.8),
-    ]
-    noise = {"position": 1e-3, "orientation": 1e-2}
+    motion, noise = watched("box", dano.simulate(scene, start, 60), rng)
+    parameters = friction_and_restitution("box")
     fits = []
     for guess in ((0.6, 0.6), (0.1, 0.1)):
         with warnings.catch_warnings():
@@ -99,13 +111,7 @@ def test_a_throw_is_found_from_far_away_starts():
 def test_a_tumbling_bunny_has_one_answer():
     """Searches by the beginnings of the motion alone ended at another bounce, with a restitution of .36."""
     bunny = dano.Body("bunny", dano.load_object("bunny"))
-
-    def scene(friction, restitution):
-        params = dano.ContactParams(sliding_friction=friction, restitution=restitution)
-        floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
-        return dano.Scene.create([bunny, floor], [dano.Contact("bunny", "floor", params)], timestep=0.005)
-
-    true, rng = scene(0.3, 0.3), np.random.default_rng(0)
+    true, rng = on_floor(bunny, 0.3, 0.3), np.random.default_rng(0)
     axis, around = rng.standard_normal(3), rng.uniform(0, 2 * np.pi)
     start = true.initial_state(
         bunny=dict(
@@ -115,24 +121,12 @@ def test_a_tumbling_bunny_has_one_answer():
             omega=3.0 * rng.standard_normal(3),
         )
     )
-    run = dano.simulate(true, start, 80)
-    seen = np.array(run.states.position)[::2, :1]
-    turn = quat_exp(jnp.asarray(1e-2 * rng.standard_normal(seen.shape)))
-    motion = dano.Motion.create(
-        np.array(run.times)[::2],
-        "bunny",
-        position=seen + 1e-3 * rng.standard_normal(seen.shape),
-        orientation=np.asarray(quat_multiply(run.states.orientation[::2, :1], turn)),
-    )
-    parameters = [
-        dano.Parameter("friction", lambda s: s.contact("bunny", "floor").sliding_friction, 0.05, 0.8),
-        dano.Parameter("restitution", lambda s: s.contact("bunny", "floor").restitution, 0.0, 0.8),
-    ]
-    noise = {"position": 1e-3, "orientation": 1e-2}
+    motion, noise = watched("bunny", dano.simulate(true, start, 80), rng)
+    parameters = friction_and_restitution("bunny")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         fits = [
-            dano.identify(scene(*guess), motion, parameters, initial="states", noise=noise)
+            dano.identify(on_floor(bunny, *guess), motion, parameters, initial="states", noise=noise)
             for guess in ((0.5, 0.5), (0.72, 0.04))
         ]
     for name in ("friction", "restitution"):

@@ -4,6 +4,7 @@ After a search, planes through draws of the unknowns say how far the answer is f
 ripples scatter it. Where both are small beside the standard errors, derivatives were worth having and nothing
 happens. Else the search begins again, by Gauss–Newton steps with slopes over visible steps: first for the
 beginning of the motions, so that an impact is met about when it happened before what comes after it counts.
+Before each longer beginning the loss is looked at all over the bounds.
 """
 
 from collections.abc import Iterator
