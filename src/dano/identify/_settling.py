@@ -12,7 +12,6 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import qmc
 
 from dano.gradients import Check, check
 from dano.identify._residuals import Linearized, Smoothing
@@ -171,6 +170,8 @@ def _looked(problem: Smoothed, point: _Point) -> _Point:
 
     A walk that meets an impact with a wrong restitution finds other motions that fit a little.
     """
+    from scipy.stats import qmc
+
     problem.smoothing = None
     bounded = np.flatnonzero(np.isfinite(problem.upper - problem.lower))
     if not bounded.size:
