@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 
 import dano
-from dano.identify._residuals import _plane_through
+from dano.identify._planes import plane_through, Smoothing
 from dano.identify._settling import _directions
 from dano.maths import quat_exp, quat_from_axis_angle, quat_multiply
 
 N = 4
 
 
-def plane(residuals, at, scale):
+def plane(residuals, at, scale, lower=(), upper=()):
     spread = np.diag(scale)
-    rows = jnp.asarray(_directions(N, 3))
-    return _plane_through(
-        lambda u: (residuals(u), u), at, rows, jnp.asarray(spread), jnp.asarray(np.linalg.inv(spread))
-    )
+    parts = _directions(N, 3), spread, np.linalg.inv(spread), np.array(lower, float), np.array(upper, float)
+    draws, spread, inverse, lower, upper = map(jnp.asarray, parts)
+    smoothing = Smoothing(draws, spread[None], inverse[None], lower, upper)
+    return plane_through(lambda u: (residuals(u), u), at, smoothing, spread, inverse)
 
 
 def test_a_plane_through_a_parabola_has_its_slope_and_no_ripple():
@@ -49,6 +49,20 @@ def test_a_ripple_is_measured_and_does_not_make_the_slope():
     # The derivative at the point is 1000 times as large.
     np.testing.assert_allclose(found.slope[0], slope, atol=0.02)
     assert float(jnp.sqrt(jnp.mean(found.ripple**2))) == pytest.approx(1e-2, rel=0.6)
+
+
+@pytest.mark.parametrize(("at", "lower", "upper"), [(0.0, 0.0, np.inf), (0.9, 0.0, 1.0), (0.1, 0.0, 0.2)])
+def test_draws_stay_within_the_bounds_and_the_plane_goes_on_to_them(at, lower, upper):
+    slope, scale = np.arange(1.0, 1.0 + N), np.array([0.04, 1.0, 1.0, 1.0])
+    point = jnp.zeros(N).at[0].set(at)
+
+    def residuals(u):
+        inside = (u[0] >= lower) & (u[0] <= upper)
+        return jnp.where(inside, jnp.stack([jnp.asarray(slope) @ u + 7.0]), jnp.nan)
+
+    found, _ = plane(residuals, point, scale, [lower], [upper])
+    np.testing.assert_allclose(found.slope[0], slope, rtol=1e-9)
+    np.testing.assert_allclose(found.value, slope[0] * at + 7.0, rtol=1e-9)
 
 
 def on_floor(body, friction, restitution):

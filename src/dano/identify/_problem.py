@@ -13,7 +13,8 @@ from jaxtyping import Array
 from dano.engine import device_mesh
 from dano.identify._checkpoint import Checkpoint
 from dano.identify._motion import Motion, QUANTITIES
-from dano.identify._residuals import Linearized, linearized, Model, moved, shifted, Smoothing, Start
+from dano.identify._planes import Smoothing
+from dano.identify._residuals import Linearized, linearized, losses, Model, moved, shifted, Start
 from dano.identify._result import Identification
 from dano.identify._settings import Setup
 from dano.identify._settling import settled
@@ -136,7 +137,7 @@ class Problem:
     def simulate(self, x: np.ndarray, start: State) -> Linearized:
         """All windows at coordinates and initial states; those as last time are not simulated again."""
         at = jnp.asarray(x, self.model.scene.timestep.dtype)
-        following = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), start)
+        following = _following(start)
         changed = np.ones(len(self.plan.rows), bool)
         last = self._last
         if last is not None and not (last.model is self.model and last.smoothing is self.smoothing):
@@ -153,6 +154,14 @@ class Problem:
         self._last = _Last(self.model, self.smoothing, at, (start, following), found)
         self.simulations += int(changed.sum())
         return found
+
+    def loss(self, x: np.ndarray, start: State) -> float:
+        """The loss at coordinates and initial states, without derivatives where one device does the work."""
+        if jax.process_count() * self.model.mesh.size > 1:
+            return self.linearize(x, start).loss
+        self.simulations += len(self.plan.rows)
+        at = jnp.asarray(x, self.model.scene.timestep.dtype)
+        return float(np.sum(losses(self.model, at, start, _following(start))))
 
     @property
     def evaluations(self) -> int:
@@ -209,8 +218,8 @@ class Problem:
         n = _LOOKS * (starts - 1)
         unit = qmc.Sobol(len(self.space.start), seed=self.seed).random(1 << (n - 1).bit_length())[:n]
         tried = self.space.lower + unit * (self.space.upper - self.space.lower)
-        losses = np.array([self.linearize(x, self.plan.start).loss for x in tried])
-        order = np.argsort(np.where(np.isfinite(losses), losses, np.inf))
+        found = np.array([self.loss(x, self.plan.start) for x in tried])
+        order = np.argsort(np.where(np.isfinite(found), found, np.inf))
         return points + [tried[i] for i in order[: starts - 1]]
 
     def search(
@@ -420,6 +429,11 @@ def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> Normal
 def _by_owner(owner: np.ndarray, loss: np.ndarray, jump: np.ndarray) -> np.ndarray:
     """Loss of each motion, jumps between its windows included."""
     return np.bincount(owner, loss + 0.5 * np.sum(jump**2, axis=1))
+
+
+def _following(start: State) -> State:
+    """Initial states of the windows that come next; the last one's its own."""
+    return jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), start)
 
 
 def _different(states: tuple[State, State], others: tuple[State, State]) -> np.ndarray:

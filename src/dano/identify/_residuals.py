@@ -1,13 +1,7 @@
-"""Residuals of windows, and their normal equations, in one compiled program each.
-
-Where bodies hit each other, residuals are rough: their derivatives are those of ripples, and a search ends in
-one of many small minima. Then unknowns are drawn around the point, in pairs ± d of independent directions,
-and a plane is put through the residuals. Its slopes take the place of derivatives and its middle that of
-residuals; what is left beside it, the ripple, tells how far the answer may be off because of it.
-"""
+"""Residuals of windows, and their normal equations, in one compiled program each."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,8 +15,9 @@ from dano.engine import AbstractEngine, compiled, difference, gather, map_rows, 
 from dano.identify._joint_log import joint_table
 from dano.identify._motion import QUANTITIES
 from dano.identify._parameters import Selection, with_values
+from dano.identify._planes import plane_through, Smoothing
 from dano.identify._windows import Windows
-from dano.maths import einsum, product, quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
+from dano.maths import einsum, quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
 from dano.scene import Control, Scene, State
 
 
@@ -140,34 +135,6 @@ class Model(NamedTuple):
     mesh: Mesh
 
 
-class Smoothing(NamedTuple):
-    """Where unknowns of windows are drawn: at u ± L d.
-
-    Attributes:
-        draws: Rows d, without their opposites, shape (K, u); Σ d dᵀ = K 1.
-        spread: L of each window, shape (windows, u, u).
-        inverse: L⁻¹.
-    """
-
-    draws: Float[Array, "k u"]
-    spread: Float[Array, "w u u"]
-    inverse: Float[Array, "w u u"]
-
-
-class Plane(NamedTuple):
-    """The plane through the residuals around a point.
-
-    Attributes:
-        value: Its middle.
-        slope: By the unknowns.
-        ripple: By which residuals miss it in their odd part, so that curvature does not count.
-    """
-
-    value: Float[Array, " r"]
-    slope: Float[Array, "r u"]
-    ripple: Float[Array, "k r"]
-
-
 class Linearized(NamedTuple):
     """A simulation of all windows, with derivatives: leaves with a leading axis of windows.
 
@@ -272,9 +239,7 @@ def _linearized(
             slope, (rows, jump, predicted, unconverged) = jacobian(residuals, has_aux=True)(at)
             middle, ripple = rows, jnp.zeros((1, slope.shape[0]), slope.dtype)
         else:
-            plane, (rows, jump, predicted, unconverged) = _plane_through(
-                residuals, at, smoothing.draws, *seen_from
-            )
+            plane, (rows, jump, predicted, unconverged) = plane_through(residuals, at, smoothing, *seen_from)
             slope, ripple = plane.slope, plane.ripple
             middle, jump = plane.value[: rows.size].reshape(rows.shape), plane.value[rows.size :]
         weights, lengths, loss = _robust(model, middle)
@@ -299,27 +264,9 @@ def _linearized(
         return jax.lax.cond(item[3], one, lambda item: _nothing(model, item[1], p, draws), item)
 
     # A row for every window, also without smoothing.
-    spread = (wanted, wanted) if smoothing is None else smoothing[1:]
+    spread = (wanted, wanted) if smoothing is None else smoothing[1:3]
     rows = model.windows, start, following, wanted, spread
     return map_rows(one_or_none, rows, batch_size=model.batch, mesh=model.mesh)
-
-
-def _plane_through(
-    residuals: Callable[[Array], tuple[Array, Any]], at: Float[Array, " u"], draws, spread, inverse
-) -> tuple[Plane, Any]:
-    """The plane around a point, and what else the residuals at the point say; see `Smoothing`."""
-    moves = product(draws, spread.T)
-    unknowns = at[None] + jnp.concatenate([jnp.zeros_like(moves[:1]), moves, -moves])
-    rows, others = jax.vmap(residuals)(unknowns)
-    k = moves.shape[0]
-    above, below = rows[1 : 1 + k], rows[1 + k :]
-    odd = 0.5 * (above - below)
-    by_draw = product(draws.T, odd) / k
-    # Each odd part is the mean of two, and slopes took as many draws as there are unknowns.
-    share = 2 * k / max(1, k - at.shape[0])
-    ripple = jnp.sqrt(jnp.asarray(share, rows.dtype)) * (odd - product(draws, by_draw))
-    plane = Plane(0.5 * jnp.mean(above + below, axis=0), product(by_draw.T, inverse), ripple)
-    return plane, jax.tree.map(lambda leaf: leaf[0], others)
 
 
 def _nothing(model: Model, state: State, p: int, draws: int) -> Linearized:
@@ -343,6 +290,17 @@ def _nothing(model: Model, state: State, p: int, draws: int) -> Linearized:
         zeros(draws, unknowns),
         zeros(draws, jumps),
     )
+
+
+@compiled
+def losses(model: Model, x: Float[Array, " p"], start: State, following: State) -> Float[Array, " w"]:
+    """Losses of windows, jumps included, without derivatives."""
+
+    def one(item):
+        rows, jump, _, _ = _residuals(model, *item, x, _no_change(model))
+        return _robust(model, rows)[2] + 0.5 * jnp.sum(jump * jump)
+
+    return map_rows(one, (model.windows, start, following), batch_size=model.batch, mesh=model.mesh)
 
 
 @compiled

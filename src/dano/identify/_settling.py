@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.gradients import Check, check
-from dano.identify._residuals import Linearized, Smoothing
+from dano.identify._planes import Smoothing
+from dano.identify._residuals import Linearized
 from dano.solvers import eliminated, gauss_newton, NormalEquations, Solution, Stop
 
 # Widest draws of a parameter: a share of its range, or of its value without bounds.
@@ -59,6 +60,10 @@ class Smoothed(Protocol):
 
     def linearize(self, x: np.ndarray, start: Any, /) -> NormalEquations:
         """The model at coordinates and initial states."""
+        ...
+
+    def loss(self, x: np.ndarray, start: Any, /) -> float:
+        """Of the model at coordinates and initial states, `smoothing` or not."""
         ...
 
     def simulate(self, x: np.ndarray, start: Any, /) -> Linearized:
@@ -120,7 +125,7 @@ def settled(problem: Smoothed, solution: Solution, first: tuple[np.ndarray, Any]
     widest = np.concatenate([_ranges(problem, solution.x), problem.start_widths()])
     rows = _directions(len(widest), problem.seed)
     here = _Point(solution.x, solution.blocks)
-    problem.smoothing = _evenly(rows, widest, here)
+    problem.smoothing = _evenly(problem, rows, widest, here)
     problem.smoothing = _drawn(rows, widest, _seen(problem, here), problem)
     sight = _seen(problem, here)
     steady = sight.away <= _STEADY and sight.scatter <= _STEADY
@@ -172,12 +177,11 @@ def _looked(problem: Smoothed, point: _Point) -> _Point:
     """
     from scipy.stats import qmc
 
-    problem.smoothing = None
     bounded = np.flatnonzero(np.isfinite(problem.upper - problem.lower))
     if not bounded.size:
         return point
     lower, upper = problem.lower[bounded], problem.upper[bounded]
-    least = problem.linearize(point.x, point.blocks).loss
+    least = problem.loss(point.x, point.blocks)
     shares = qmc.Sobol(len(bounded), seed=problem.seed).random(_LOOKS)
     tried = lower + shares * (upper - lower)
     for sweep in range(1 + len(bounded)):
@@ -188,7 +192,7 @@ def _looked(problem: Smoothed, point: _Point) -> _Point:
         for values in tried:
             x = point.x.copy()
             x[bounded] = values
-            if (loss := problem.linearize(x, point.blocks).loss) < least:
+            if (loss := problem.loss(x, point.blocks)) < least:
                 point, least = point._replace(x=x), loss
     return point
 
@@ -253,7 +257,7 @@ def _averaged(problem: Smoothed, point: _Point, widest: np.ndarray) -> _End:
 def _walk(problem: Smoothed, point: _Point, widest: np.ndarray) -> Iterator[tuple[_Point, _Sight]]:
     """Points of Gauss–Newton steps by slopes over visible steps, each with draws of its own."""
     seed = problem.seed
-    problem.smoothing = _evenly(_directions(len(widest), seed), widest, point)
+    problem.smoothing = _evenly(problem, _directions(len(widest), seed), widest, point)
     sight = _seen(problem, point)
     while True:
         seed += 1
@@ -306,7 +310,7 @@ def worth_of(problem: Smoothed, solution: Solution) -> Check:
     if smoothing is None:
         widest = np.concatenate([_ranges(problem, solution.x), problem.start_widths()])
         point = _Point(solution.x, solution.blocks)
-        problem.smoothing = _evenly(_directions(len(widest), problem.seed), widest, point)
+        problem.smoothing = _evenly(problem, _directions(len(widest), problem.seed), widest, point)
     errors = _seen(problem, _Point(solution.x, solution.blocks)).errors
     problem.smoothing = None
     normal = problem.linearize(solution.x, solution.blocks)
@@ -323,7 +327,7 @@ def worth_of(problem: Smoothed, solution: Solution) -> Check:
 
     def loss(share: Any) -> float:
         x = np.clip(solution.x + float(share) * step, problem.lower, problem.upper)
-        return problem.linearize(x, problem.retract(solution.blocks, float(share) * follow)).loss
+        return problem.loss(x, problem.retract(solution.blocks, float(share) * follow))
 
     found = check(
         loss, 0.0, gradient=slope, scale=1.0, steps=(1.0, 0.1), points=_PLACES, labels=["the next step"]
@@ -361,10 +365,10 @@ def _variance(problem: Smoothed, normal: NormalEquations) -> float:
     return max(2 * normal.loss / max(problem.freedom, 1), _QUIET)
 
 
-def _evenly(rows: np.ndarray, widest: np.ndarray, point: _Point) -> Smoothing:
+def _evenly(problem: Smoothed, rows: np.ndarray, widest: np.ndarray, point: _Point) -> Smoothing:
     """The widest draws."""
     windows = len(point.blocks.position)
-    return _smoothing(rows, np.tile(np.diag(widest), (windows, 1, 1)))
+    return _smoothing(problem, rows, np.tile(np.diag(widest), (windows, 1, 1)))
 
 
 def _drawn(rows: np.ndarray, widest: np.ndarray, sight: _Sight, problem: Smoothed) -> Smoothing:
@@ -381,11 +385,12 @@ def _drawn(rows: np.ndarray, widest: np.ndarray, sight: _Sight, problem: Smoothe
     whole += variance * np.diag(1 / widest**2)
     unit = whole * widest[:, None] * widest[None]
     covariance = _LAST**2 * variance * np.linalg.inv(unit) + _LEAST**2 * np.eye(len(widest))
-    return _smoothing(rows, widest[None, :, None] * np.linalg.cholesky(covariance))
+    return _smoothing(problem, rows, widest[None, :, None] * np.linalg.cholesky(covariance))
 
 
-def _smoothing(rows: np.ndarray, spread: np.ndarray) -> Smoothing:
-    return Smoothing(*(jnp.asarray(part) for part in (rows, spread, np.linalg.inv(spread))))
+def _smoothing(problem: Smoothed, rows: np.ndarray, spread: np.ndarray) -> Smoothing:
+    parts = rows, spread, np.linalg.inv(spread), problem.lower, problem.upper
+    return Smoothing(*(jnp.asarray(part) for part in parts))
 
 
 def _ranges(problem: Smoothed, x: np.ndarray) -> np.ndarray:
