@@ -12,6 +12,7 @@ from dano.scene_file import load_asset
 
 TIMESTEP, EVERY = 0.005, 2  # s; steps from frame to frame
 POSITION, ROTATION = 1e-3, 1e-2  # m, rad: noise
+STILL = {"velocity": 1e-3, "omega": 1e-2}  # m/s, rad/s: what is known of a body that stands
 BALL_MASS, BALL_RADIUS, BALL_SPEED = 0.5, 0.03, 0.8  # kg, m, m/s
 FLOOR = "floor"
 
@@ -27,6 +28,7 @@ class Case:
         truth: By name.
         n_steps: Of a motion.
         begin: A random initial state of the true scene.
+        standing: Bodies that are known to stand in the first frame.
     """
 
     scene: dano.Scene
@@ -35,6 +37,12 @@ class Case:
     truth: dict[str, float]
     n_steps: int
     begin: Callable[[np.random.Generator], dano.State]
+    standing: tuple[str, ...] = ()
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Standard deviations of what is observed."""
+        return {"position": POSITION, "orientation": ROTATION, **(STILL if self.standing else {})}
 
 
 def throws() -> Case:
@@ -103,7 +111,8 @@ def pushes() -> Case:
         dano.Parameter("friction", lambda s: s.contact("bunny", FLOOR).sliding_friction, 0.05, 0.8),
         dano.Parameter("mass", lambda s: s.body("bunny").mass_scale, 0.3, 3.0),
     )
-    return Case(scene(0.5, 2.0), true, parameters, {"friction": 0.25, "mass": 1.0}, 60, begin)
+    truth = {"friction": 0.25, "mass": 1.0}
+    return Case(scene(0.5, 2.0), true, parameters, truth, 60, begin, ("bunny",))
 
 
 def soap() -> Case:
@@ -145,7 +154,7 @@ def _standing(scene: dano.Scene, height: float, turn: tuple[float, ...]) -> tupl
 
 
 def observed(case: Case, seed: int) -> dano.Motion:
-    """What a camera sees of a random motion: poses of all bodies that move, with noise."""
+    """What a camera sees of a random motion: poses of all bodies that move, with noise, and what stands."""
     rng = np.random.default_rng(seed)
     run = dano.simulate(case.true, case.begin(rng), case.n_steps)
     names = [body.name for body in case.true.bodies if not body.fixed]
@@ -156,4 +165,9 @@ def observed(case: Case, seed: int) -> dano.Motion:
     turned = quat_multiply(orientation, quat_exp(jnp.asarray(turn)))
     seen = position + POSITION * rng.standard_normal(position.shape)
     times = np.array(run.times)[::EVERY]
-    return dano.Motion.create(times, names, position=seen, orientation=np.asarray(turned))
+    known = {}
+    if case.standing:
+        still = np.full(seen.shape, np.nan)
+        still[0, [names.index(name) for name in case.standing]] = 0
+        known = {"velocity": still, "omega": still}
+    return dano.Motion.create(times, names, position=seen, orientation=np.asarray(turned), **known)

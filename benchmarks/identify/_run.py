@@ -46,12 +46,11 @@ class Outcome:
 def fitted(case: _cases.Case, seed: int, options: dano.IdentifyOptions) -> Outcome:
     """Fit one motion from several starts."""
     motion = _cases.observed(case, seed)
-    noise = {"position": _cases.POSITION, "orientation": _cases.ROTATION}
     began = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         fit = dano.identify(
-            case.scene, motion, case.parameters, initial="states", noise=noise, options=options
+            case.scene, motion, case.parameters, initial="states", noise=case.noise, options=options
         )
     seconds = time.perf_counter() - began
     names = list(case.truth)
