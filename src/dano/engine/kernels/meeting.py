@@ -3,13 +3,22 @@
 import warp as wp
 
 from dano.engine.kernels.lanes import first_of, least
-from dano.engine.kernels.tables import BLOCK, Body, Room, RUN, SamplePair, Scene
+from dano.engine.kernels.near import (
+    find_near_blocks,
+    gain_of,
+    middle_of,
+    Plane,
+    plane_of,
+    posed,
+    reach_of_block,
+    solid_of_body,
+    stretch_of,
+)
+from dano.engine.kernels.tables import BLOCK, Body, Room, SamplePair, Scene
 from dano.physics.features import LANES, WIDE
 from dano.physics.pairs import (
     approach,
     BodyState,
-    facing_direction,
-    pair_pose,
     PairPose,
     spin_of_samples,
     way_of,
@@ -17,11 +26,11 @@ from dano.physics.pairs import (
 from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec3, ZERO
 from dano.physics.rotations import matrix
 from dano.physics.samples import position_in_solid, solid_normal
-from dano.physics.solids.distances import Solid, solid_clearance, solid_distance, solid_of
+from dano.physics.solids.distances import Solid, solid_distance
 from dano.physics.solids.grids import STEEPEST
 from dano.physics.solids.leaves import Distance, HALF_SPACE
 
-_LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
+_LANES, _BLOCK = wp.constant(LANES), wp.constant(BLOCK)
 _HALF_SPACE = wp.constant(HALF_SPACE)
 # Most steps of the search for the moment when bodies meet, the share of the step that ends it, and by how
 # much it goes on at least past samples that are slow.
@@ -46,201 +55,6 @@ class Meeting:
     critical: int
     nears: bool
     least: real
-
-
-@wp.func
-def stretch_of(body: Body, turning: int) -> real:
-    """Largest factor by which sample coordinates are enlarged."""
-    if turning == 2:
-        return wp.max(body.scale[0], wp.max(body.scale[1], body.scale[2]))
-    return ONE
-
-
-@wp.struct
-class Plane:
-    """What a body nears, if it is a plane.
-
-    Attributes:
-        is_one: Whether it is one, and samples are fixed to the body.
-        normal: Unit normal in the axes of the solid.
-    """
-
-    is_one: bool
-    normal: vec3
-
-
-@wp.func
-def plane_of(scene: wp.ref[Scene], world: int, solid: Solid, turning: int, x: vec3) -> Plane:
-    """The plane that samples near, from any point x of the solid's frame."""
-    plane = Plane()
-    plane.is_one = solid.kind.kind == _HALF_SPACE and solid.count == 1 and turning == 0
-    if plane.is_one:
-        plane.normal = solid_normal(solid_distance(scene.solids, world, solid, x).gradient)
-    return plane
-
-
-@wp.func
-def reach_of_block(
-    scene: wp.ref[Scene], world: int, pose: PairPose, plane: Plane, block: int, stretch: real
-) -> real:
-    """By how much samples of a block are nearer to a solid than its middle at most [m].
-
-    A plane sees how thick a block is, where it sees it from above.
-    """
-    radius = scene.balls[world, block][3] * stretch
-    if plane.is_one:
-        slab = scene.slabs[world, block]
-        along = wp.dot(plane.normal, pose.points * vec3(slab[0], slab[1], slab[2]))
-        across = wp.sqrt(wp.max(ONE - along * along, ZERO))
-        return wp.min(radius, slab[3] * wp.abs(along) + radius * across)
-    return radius
-
-
-@wp.func
-def middle_of(body: Body, state: BodyState) -> vec3:
-    """Centre of the ball around a body at the start of the step [m, W]."""
-    return state.position + matrix(state.orientation) * (body.middle - body.com)
-
-
-@wp.func
-def solid_of_body(scene: wp.ref[Scene], world: int, body: int) -> Solid:
-    """What the samples of others press on."""
-    index = scene.body_index[body]
-    return solid_of(scene.solids, world, index.first_leaf, index.leaves)
-
-
-@wp.func
-def gain_of(a: BodyState, b: BodyState, lever: real) -> real:
-    """Most that a velocity of a point gains relative to another body within a step [m/s].
-
-    Args:
-        a: The body of the point.
-        b: The other body.
-        lever: Largest distance of the point from the first body's centre of mass [m].
-    """
-    of_spins = wp.length(a.spin_gain) * lever
-    of_spins += wp.length(b.spin_gain) * (lever + wp.length(a.position - b.position))
-    return wp.length(a.gain - b.gain) + of_spins
-
-
-@wp.func
-def is_near(
-    scene: wp.ref[Scene],
-    world: int,
-    a: BodyState,
-    b: BodyState,
-    first: int,
-    second: int,
-    margin: real,
-    h: real,
-) -> bool:
-    """Whether two bodies may meet within the step, by the balls around them."""
-    body = scene.bodies[world, first]
-    other = scene.bodies[world, second]
-    x = middle_of(body, a)
-    reach = (
-        body.radius
-        + margin
-        + h * (wp.length(a.velocity - b.velocity) + wp.length(a.spin) * wp.length(body.middle - body.com))
-        + h * gain_of(a, b, wp.length(body.middle - body.com))
-    )
-    solid = solid_of_body(scene, world, second)
-    if solid.kind.kind == _HALF_SPACE:
-        in_solid = wp.transpose(matrix(b.orientation)) * (x - b.position) + b.com
-        return solid_clearance(scene.solids, world, solid, in_solid, reach) <= reach
-    reach += other.radius + h * wp.length(b.spin) * wp.length(other.middle - other.com)
-    apart = x - middle_of(other, b)
-    return wp.dot(apart, apart) <= reach * reach
-
-
-@wp.func
-def facing(
-    scene: wp.ref[Scene],
-    world: int,
-    a: BodyState,
-    b: BodyState,
-    first: int,
-    second: int,
-    share: real,
-    h: real,
-) -> vec3:
-    """Direction that samples of the first body face after a share of the step [F]."""
-    solid = solid_of_body(scene, world, second)
-    index = scene.body_index[first]
-    scale = scene.bodies[world, first].scale
-    return facing_direction(scene.solids, world, solid, a, b, share, h, index.turning, scale)
-
-
-@wp.func
-def posed(
-    scene: wp.ref[Scene],
-    world: int,
-    a: BodyState,
-    b: BodyState,
-    first: int,
-    second: int,
-    share: real,
-    h: real,
-    follows: real,
-) -> PairPose:
-    """Pose of a pair after a share of the step."""
-    toward = facing(scene, world, a, b, first, second, share, h)
-    turning = scene.body_index[first].turning
-    return pair_pose(a, b, share, h, toward, turning, scene.bodies[world, first].scale, follows)
-
-
-@wp.func
-def find_near_blocks(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    world: int,
-    lane: int,
-    pose: PairPose,
-    first: int,
-    second: int,
-    way: real,
-) -> tuple[int, int]:
-    """Blocks with samples no further from the solid than anything moves in a step, into `room.near`.
-
-    Samples that keep facing the solid do not move with their body: then it is all of them.
-
-    Returns:
-        Number of blocks, and the one that comes closest, −1 where there is none.
-    """
-    index = scene.body_index[first]
-    solid = solid_of_body(scene, world, second)
-    closest = INFINITY
-    lowest = int(-1)
-    found = int(0)
-    beyond = int(0)
-    at = lane * (room.near.shape[1] // _LANES)
-    for i in range(lane, index.blocks, _LANES):
-        b = index.first_block + i
-        listed = True
-        if index.turning == 0:
-            if wp.static(LANES == 1):
-                if i < beyond:
-                    listed = False
-                elif i % _RUN == 0:
-                    run = scene.runs[world, b]
-                    x = pose.points * vec3(run[0], run[1], run[2]) + pose.origin
-                    far = way + STEEPEST * run[3]
-                    if solid_clearance(scene.solids, world, solid, x, far) > far:
-                        beyond = i + _RUN
-                        listed = False
-            if listed:
-                ball = scene.balls[world, b]
-                x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
-                reach = way + ball[3]
-                clear = solid_clearance(scene.solids, world, solid, x, reach)
-                listed = clear <= reach
-                if clear - ball[3] < closest:
-                    closest = clear - ball[3]
-                    lowest = b
-        if listed:
-            room.near[world, at + found] = b
-            found += 1
-    return found, lowest
 
 
 @wp.struct

@@ -7,11 +7,10 @@ is listed if the old velocities take it into the other body by the end of the st
 import warp as wp
 
 from dano.engine.kernels.lanes import lanes_where, total, total3
-from dano.engine.kernels.meeting import (
+from dano.engine.kernels.meeting import Meeting, meeting
+from dano.engine.kernels.near import (
     facing,
     is_near,
-    Meeting,
-    meeting,
     plane_of,
     posed,
     reach_of_block,

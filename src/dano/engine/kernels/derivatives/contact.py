@@ -26,7 +26,7 @@ from dano.engine.kernels.derivatives.products import (
     total_pose,
 )
 from dano.engine.kernels.lanes import total, total6
-from dano.engine.kernels.meeting import posed, solid_of_body
+from dano.engine.kernels.near import posed, solid_of_body
 from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
 from dano.physics.features import TREES, TURNING, UNIONS
 from dano.physics.impacts import Impact, Patch
