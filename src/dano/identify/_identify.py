@@ -173,7 +173,22 @@ def _searched(
         ended.append(_Ended(solution, problem.smoothing, problem.roughness))
         if solution.stop is Stop.INTERRUPTED:
             break
+    if any(each.smoothing is not None for each in ended):
+        # Else a start that ends in a ripple near the minimum of the trend gives another answer.
+        for k, each in enumerate(ended):
+            if any(other.solution.stop is Stop.INTERRUPTED for other in ended):
+                break
+            ended[k] = _smoothed(problem, each, points[k])
     return sorted(ended, key=lambda each: each.solution.normal.loss)
+
+
+def _smoothed(problem: Problem, ended: _Ended, first: np.ndarray) -> _Ended:
+    """Where the search from a start ends in the trend of the loss."""
+    if ended.smoothing is not None:
+        return ended
+    problem.smoothing, problem.roughness = None, np.zeros((0, 0))
+    solution = problem.settled(ended.solution, first, rough=True)
+    return _Ended(solution, problem.smoothing, problem.roughness)
 
 
 def _identification(

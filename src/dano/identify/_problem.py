@@ -265,7 +265,7 @@ class Problem:
         self.smoothing = None
         if self.jumps is None:
             solution = minimise(x, self.plan.start, tolerance)
-            return self._settled(solution, x) if free else solution
+            return self.settled(solution, x) if free else solution
         rough = tolerance if len(self.ties) == 1 else max(tolerance, _NEAR)
         self.model = self.model._replace(jumps=self.ties[0] * self.jumps)
         solution = minimise(x, self.plan.start, rough)
@@ -282,13 +282,19 @@ class Problem:
                 break
             self.model = self.model._replace(jumps=tie * self.jumps)
             solution = minimise(solution.x, solution.blocks, tolerance if tie == self.ties[-1] else rough)
-        return self._settled(solution, x) if free else solution
+        return self.settled(solution, x) if free else solution
 
-    def _settled(self, solution: Solution, first: np.ndarray) -> Solution:
-        """The solution, or that of the trend where the loss is rough."""
+    def settled(self, solution: Solution, first: np.ndarray, *, rough: bool = False) -> Solution:
+        """The solution, or that of the trend where the loss is rough.
+
+        Args:
+            solution: Where a search ended.
+            first: Coordinates at which it began.
+            rough: Whether the loss is known to be rough, from another start.
+        """
         if not self.smooth or not self.model.scene.pairs or solution.stop is Stop.INTERRUPTED:
             return solution
-        return settled(self, solution, (first, self.plan.start))
+        return settled(self, solution, (first, self.plan.start), rough=rough)
 
     def count(self, share: float) -> None:
         """Let a share of the frames of each window count, the first ones; all of them by 1."""

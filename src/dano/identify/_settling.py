@@ -112,13 +112,16 @@ class _Point(NamedTuple):
     blocks: Any
 
 
-def settled(problem: Smoothed, solution: Solution, first: tuple[np.ndarray, Any]) -> Solution:
+def settled(
+    problem: Smoothed, solution: Solution, first: tuple[np.ndarray, Any], *, rough: bool = False
+) -> Solution:
     """The solution, or that of the trend if the loss is rough there; `problem.smoothing` says which.
 
     Args:
         problem: The problem; its `smoothing` is that of the answer afterwards, or None.
         solution: Where a search by derivatives ended.
         first: Parameters and initial states at which it began.
+        rough: Whether the loss is known to be rough, from another start.
     """
     if solution.stop is Stop.PERFECT:
         return solution
@@ -129,7 +132,7 @@ def settled(problem: Smoothed, solution: Solution, first: tuple[np.ndarray, Any]
     problem.smoothing = _drawn(rows, widest, _seen(problem, here), problem)
     sight = _seen(problem, here)
     steady = sight.away <= _STEADY and sight.scatter <= _STEADY
-    if solution.stop.converged and steady and not _blind(solution, sight):
+    if not rough and solution.stop.converged and steady and not _blind(solution, sight):
         problem.smoothing = None
         return solution
     try:
