@@ -7,6 +7,7 @@ import collections
 import ctypes
 import functools
 import sys
+import threading
 import weakref
 from collections.abc import Collection
 from typing import Any, NamedTuple
@@ -25,8 +26,8 @@ _LEAST = 64
 """Slots of the smallest table."""
 _SHIFT = 6
 """Bits of an address that say little, as the callback has it."""
-_KEPT = 4096
-"""Tables that are kept after they are replaced."""
+_KEPT = 16
+"""Tables that are kept, the one in use among them."""
 
 
 def _place(begin: int, number: Any) -> int:
@@ -101,7 +102,10 @@ class Direct:
         self._mujoco = mujoco
         self._head = _head(mujoco)
         self._slot = ctypes.c_void_p.in_dll(_library(mujoco), "mjcb_passive")
+        self._lock = threading.Lock()
         self._entries: dict[int, _Known] = {}
+        # Slots lead to them until there are new ones.
+        self._dead: list[Any] = []
         # Another thread may be looking something up there just now.
         self._old: collections.deque[Any] = collections.deque(maxlen=_KEPT)
         self._slots, self._used = self._emptied(_LEAST), 0
@@ -113,9 +117,11 @@ class Direct:
 
     def install(self) -> None:
         """Let MuJoCo call it instead of the function of Python that it calls now."""
-        if self._slot.value != self._address:
-            self._head[Head.PYTHON] = self._slot.value
-            self._slot.value = self._address
+        with self._lock:
+            now = self._slot.value
+            if now != self._address:
+                self._head[Head.PYTHON] = now
+                self._slot.value = self._address
 
     def knows(self, data: Any, search: Search) -> bool:
         """Whether data are known, with that search."""
@@ -147,24 +153,27 @@ class Direct:
         def forget(_: Any) -> None:
             # Whatever comes to lie at that address is for Python first.
             entry[Entry.MODEL] = 0
-            self._old.append(entry)
+            self._dead.append(entry)
             if key in self._entries and self._entries[key].entry is entry:
                 del self._entries[key]
 
         ends = weakref.ref(model, forget), weakref.ref(data, forget)
-        self._entries[key] = _Known(entry, *ends, search, (writer, standing, bounds, arguments))
-        self._put(key, entry)
+        with self._lock:
+            self._entries[key] = _Known(entry, *ends, search, (writer, standing, bounds, arguments))
+            self._put(key, entry)
 
     def clear(self) -> None:
         """Forget all data."""
-        self._entries.clear()
-        self._slots, self._used = self._emptied(_LEAST), 0
+        with self._lock:
+            self._entries.clear()
+            self._slots, self._used = self._emptied(_LEAST), 0
 
     def _emptied(self, capacity: int) -> Int[np.ndarray, " words"]:
         """A table with empty slots, which the callback reads from now on."""
         slots = np.zeros(1 + 2 * capacity, np.int64)
         slots[0] = capacity
-        self._old.append(slots)
+        self._old.append((slots, self._dead))
+        self._dead = []
         self._head[Head.SLOTS] = slots.ctypes.data
         return slots
 
@@ -174,7 +183,8 @@ class Direct:
             while capacity < 4 * len(self._entries):
                 capacity *= 2
             self._slots, self._used = self._emptied(capacity), 0
-            for other, known in list(self._entries.items()):
+            # Data may die meanwhile.
+            for other, known in self._entries.copy().items():
                 self._fill(other, known.entry)
         self._fill(key, entry)
 
