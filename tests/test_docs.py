@@ -21,7 +21,7 @@ PROGRAMS = {
 # Pages whose programs take a minute each to compile; what they show has tests of its own beside it.
 LONG = ("docs/identify.md", "docs/joints.md", "docs/learn.md", "docs/robots.md")
 # Packages that few have.
-NEEDS = {"docs/worlds.md": "newton"}
+NEEDS = {"docs/worlds.md": ("newton", "pxr")}
 # Of the command line, the commands are what is public.
 PACKAGES = [p for p in sorted((REPOSITORY / "src" / "dano").glob("*/__init__.py")) if p.parent.name != "cli"]
 WIDEST = 90
@@ -32,8 +32,8 @@ WIDEST = 90
     "page", [pytest.param(page, marks=pytest.mark.slow if page in LONG else ()) for page in PROGRAMS]
 )
 def test_python_blocks_run(page: str, tmp_path: Path):
-    if page in NEEDS:
-        pytest.importorskip(NEEDS[page], reason=f"{page} needs {NEEDS[page]}")
+    for package in NEEDS.get(page, ()):
+        pytest.importorskip(package, reason=f"{page} needs {package}")
     # One process a page, its blocks joined: a page may change JAX's configuration, as its reader would.
     command = [sys.executable, "-c", PROGRAMS[page]]
     # A page runs each program briefly, so code without LLVM's optimisations is done sooner.

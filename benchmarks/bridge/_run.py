@@ -12,6 +12,7 @@ from benchmarks.bridge._agreement import agreement_row, HOLLOW, hollow, HOLLOW_N
 from benchmarks.bridge._grip import finger_rows
 from benchmarks.bridge._hold import hold_rows
 from benchmarks.bridge._probes import probe_rows
+from benchmarks.bridge._threads import thread_rows
 from benchmarks.bridge._toys import compiled, meshes, TYPES, Way
 from dano.scene_file import load_asset
 
@@ -170,6 +171,7 @@ PARTS = {
     "fingers": finger_rows,
     "hold": hold_rows,
     "probes": probe_rows,
+    "threads": thread_rows,
     "memory": _memory_rows,
 }
 """What is measured, by name."""

@@ -6,6 +6,9 @@ import pytest
 import dano
 from dano.maths import Pose
 
+QUICK = {"resolution": 20, "collision": "hull"}
+TOLERANCE = 1e-6
+
 
 def angle() -> dano.AbstractField:
     """Two bars of 10 × 4 × 4 and 4 × 4 × 9 cm that form an L, somewhere off the origin."""
@@ -23,3 +26,11 @@ def tensor(moments, rotation) -> np.ndarray:
     """Inertia from principal moments and the matrix of their axes."""
     rotation = np.reshape(rotation, (3, 3))
     return rotation @ np.diag(moments) @ rotation.T
+
+
+def check_mass(thing, mass, com, inertia):
+    """Check that an object has a mass, a centre of mass and an inertia about it."""
+    assert mass == pytest.approx(float(thing.mass.mass), rel=TOLERANCE)
+    np.testing.assert_allclose(com, thing.mass.com, atol=TOLERANCE * thing.size)
+    scale = float(np.abs(np.asarray(thing.mass.inertia)).max())
+    np.testing.assert_allclose(inertia, thing.mass.inertia, atol=TOLERANCE * scale)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from export.conftest import tensor
+from export.conftest import check_mass, QUICK, tensor
 
 import dano
 from dano.contact import ContactParams
@@ -16,9 +16,6 @@ from dano.exchange._triangles import solid_triangles
 from dano.exchange._urdf import roll_pitch_yaw
 from dano.maths import quat_to_matrix
 
-QUICK = {"resolution": 20, "collision": "hull"}
-TOLERANCE = 1e-6
-
 
 @pytest.fixture(scope="module")
 def folder(thing, tmp_path_factory):
@@ -27,13 +24,6 @@ def folder(thing, tmp_path_factory):
     contact = ContactParams(sliding_friction=0.35, restitution=0.25, stiffness=1e6)
     export_object(thing, place, to=["mjcf", "urdf", "obj"], contact=contact, **QUICK)
     return place
-
-
-def check_mass(thing, mass, com, inertia):
-    assert mass == pytest.approx(float(thing.mass.mass), rel=TOLERANCE)
-    np.testing.assert_allclose(com, thing.mass.com, atol=TOLERANCE * thing.size)
-    scale = float(np.abs(np.asarray(thing.mass.inertia)).max())
-    np.testing.assert_allclose(inertia, thing.mass.inertia, atol=TOLERANCE * scale)
 
 
 def mujoco_mass(model):
@@ -115,29 +105,6 @@ def test_pybullet_reads_the_urdf(thing, folder):
     assert friction == pytest.approx(0.35)
     # The post of the L, from below and from above, with PyBullet's margin of 1 mm.
     np.testing.assert_allclose([ray[3][2] for ray in rays], (0.009, 0.101), atol=2e-4)
-
-
-def test_usd_holds_mass_pieces_and_friction(thing, tmp_path):
-    pytest.importorskip("pxr")
-    from pxr import Usd, UsdGeom, UsdPhysics  # pyright: ignore[reportMissingImports]
-
-    contact = ContactParams(sliding_friction=0.35, restitution=0.25)
-    export_object(thing, tmp_path / "angle", to="usd", contact=contact, **QUICK)
-    stage = Usd.Stage.Open(str(tmp_path / "angle" / "angle.usd"))
-    assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1
-    body = stage.GetDefaultPrim()
-    assert body.HasAPI(UsdPhysics.RigidBodyAPI)
-    mass = UsdPhysics.MassAPI(body)
-    axes = mass.GetPrincipalAxesAttr().Get()
-    matrix = quat_to_matrix(np.array([axes.GetReal(), *axes.GetImaginary()]))
-    moments = np.array(mass.GetDiagonalInertiaAttr().Get())
-    # Of single precision.
-    check_mass(thing, mass.GetMassAttr().Get(), mass.GetCenterOfMassAttr().Get(), tensor(moments, matrix))
-    piece = stage.GetPrimAtPath("/angle/collision_000")
-    assert UsdPhysics.MeshCollisionAPI(piece).GetApproximationAttr().Get() == "convexHull"
-    rubbing = UsdPhysics.MaterialAPI(stage.GetPrimAtPath("/angle/contact"))
-    assert rubbing.GetDynamicFrictionAttr().Get() == pytest.approx(0.35)
-    assert rubbing.GetRestitutionAttr().Get() == pytest.approx(0.25)
 
 
 def test_folder_says_what_is_in_it_and_what_is_lost(folder):

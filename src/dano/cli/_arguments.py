@@ -378,7 +378,8 @@ class Export:
     Attributes:
         object: A neural object (.dano), a shipped one (bunny, …), or a mesh or field.
         output: The folder; new, empty, or of an earlier export, which is replaced.
-        to: Formats, one or several: mjcf (MuJoCo), urdf (PyBullet, ROS), usd (Isaac), obj (meshes only).
+        to: Formats, one or several: mjcf (MuJoCo), urdf (PyBullet, ROS), usd (Isaac, Newton), obj (meshes
+            only).
         name: Of the body and the files; default: the object's file's.
         collision: coacd: convex decomposition; hull: convex hull; auto: the first if coacd is installed.
         concavity: How deep a convex piece may cut across, as a share of the size.

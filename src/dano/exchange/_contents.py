@@ -25,6 +25,7 @@ class Contents(NamedTuple):
         com: Centre of mass [m, F], shape (3,).
         inertia: About the centre of mass, in the axes of F [kg m²], shape (3, 3).
         mesh: What is seen.
+        resolution: Nodes along the longest axis that it was made with.
         normals: At its vertices, shape (v, 3).
         texture: Its colours, if they are known.
         pieces: Convex solids whose union stands for the object in contact.
@@ -36,6 +37,7 @@ class Contents(NamedTuple):
     com: Float[np.ndarray, "3"]
     inertia: Float[np.ndarray, "3 3"]
     mesh: Triangles
+    resolution: int
     normals: Float[np.ndarray, "v 3"]
     texture: Texture | None
     pieces: list[Triangles]

@@ -50,7 +50,8 @@ _LOAD = {
     "mjcf": "MuJoCo: `python -m mujoco.viewer --mjcf=scene.xml`, or attach"
     ' `MjSpec.from_file("{name}.xml")` to a model of yours',
     "urdf": 'PyBullet: `loadURDF("{name}.urdf", flags=pybullet.URDF_USE_INERTIA_FROM_FILE)`',
-    "usd": 'USD: `Usd.Stage.Open("{name}.usd")`, or a reference to it in a stage of yours',
+    "usd": 'USD: `Usd.Stage.Open("{name}.usd")`, or a reference to it in a stage of yours; Newton:'
+    ' `newton.ModelBuilder().add_usd("{name}.usd")`',
     "obj": "any program: `meshes/visual.obj`; what it weighs is in `export.json`",
 }
 _BYTES_PER_NODE = 400
@@ -108,7 +109,7 @@ def export_object(
         name: Of the body and the files; default: the folder's.
         look: What photographs have taught, for colours.
         contact: Parameters of its contacts; default `ContactParams()`. Friction goes into every format but
-            OBJ, restitution into USD, the rest nowhere.
+            OBJ, restitution into USD, stiffness into USD for Newton, the rest nowhere.
         collision: "coacd": convex decomposition; "hull": convex hull; "auto": the first if CoACD is
             installed.
         concavity: Of CoACD: how deep a piece may be concave, as a share of the size; in [0.01, 1].
@@ -154,6 +155,7 @@ def export_object(
         com=np.asarray(obj.mass.com, np.float64),
         inertia=np.asarray(obj.mass.inertia, np.float64),
         mesh=mesh,
+        resolution=resolution,
         normals=normals,
         texture=None if look is None else painted(look, mesh, normals, texture_size),
         pieces=pieces,
@@ -308,10 +310,11 @@ def _notes(contents: Contents, formats: list[str], how: str) -> list[str]:
         else f"{n} convex piece{'s' if n > 1 else ''} (CoACD), which fill{'s' if n == 1 else ''} what is"
         " less concave than was asked for"
     )
+    unknown = [] if "usd" in formats else ["stiffness"]
     lost = [
         field
         for field in (
-            "stiffness",
+            *unknown,
             "restitution_velocity",
             "hysteresis",
             "friction_fading",

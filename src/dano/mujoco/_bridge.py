@@ -15,6 +15,7 @@ import numpy as np
 
 from dano.checks import checked_count
 from dano.maths import Numbers
+from dano.mujoco._direct import Direct, direct
 from dano.mujoco._model import carry, carry_compiled, concerns, library, names_of, without_callback
 from dano.mujoco._settings import is_gap_beyond, Writer
 from dano.mujoco._table import body_index, Chooser, MOST, Table
@@ -75,6 +76,7 @@ class Bridge:
         self._tables: dict[int, tuple[Any, Table | None]] = {}
         self._local = threading.local()
         self._before: Any = None
+        self._direct: Direct | None = None
         self._depth = 0
 
     def attach(
@@ -123,6 +125,8 @@ class Bridge:
             carry_compiled(mujoco, self.target, body_index(self.target, body), body, thing)
         self._things[body] = thing
         self._tables.clear()
+        if self._direct is not None:
+            self._direct.clear()
 
     def compile(self) -> Any:
         """Compile the spec, also within `with`.
@@ -141,7 +145,10 @@ class Bridge:
         if not self._things:
             raise ValueError("bridge must have an object: attach one before it is entered")
         if self._depth == 0:
-            self._before = self._mujoco.get_mjcb_passive()
+            with without_callback(self._mujoco) as before:
+                # Who chooses, or was there before, is Python's.
+                self._before = before
+                self._direct = direct(self._mujoco) if before is None and self._choose is None else None
             self._mujoco.set_mjcb_passive(self._passive)
             self._stand_in(False)
         self._depth += 1
@@ -151,7 +158,9 @@ class Bridge:
         self._depth -= 1
         if self._depth == 0:
             self._mujoco.set_mjcb_passive(self._before)
-            self._before = None
+            if self._direct is not None:
+                self._direct.clear()
+            self._before = self._direct = None
             self._stand_in(True)
 
     def _stand_in(self, collides: bool) -> None:
@@ -245,6 +254,21 @@ class Bridge:
         if self._before is not None:
             self._before(model, data)
         self._append(model, data)
+        # Unless a function of somebody else's has called this one.
+        if self._direct is not None and self._mujoco.get_mjcb_passive() == self._passive:
+            self._hand_over(self._direct, model, data)
+
+    def _hand_over(self, callback: Direct, model: Any, data: Any) -> None:
+        """Let the next steps of some data do without Python, if there is a search in them."""
+        table = self._table(model)
+        search = None if table is None else table.search_in(data)
+        if table is not None and search is not None and not callback.knows(data, search):
+            callback.add(model, data, search, table.geoms, self._longest_fall())
+        callback.install()
+
+    def _longest_fall(self) -> float:
+        """In a step [m]."""
+        return _LONGEST_FALL * min(thing.size for thing in self._things.values())
 
     def _table(self, model: Any) -> Table | None:
         """What is known of a model; None if it was not made by a bridge."""
@@ -278,10 +302,9 @@ class Bridge:
 
     def _check_timestep(self, model: Any) -> None:
         h, g = model.opt.timestep, model.opt.gravity
-        size = min(thing.size for thing in self._things.values())
-        strength = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
-        if h * h * strength > _LONGEST_FALL * size:
+        fall, strength = self._longest_fall(), math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+        if h * h * strength > fall:
             raise ValueError(
-                f"model.opt.timestep must be at most {math.sqrt(_LONGEST_FALL * size / strength):.2g} s, in "
-                f"which gravity moves an object of {size:.3g} m by a tenth of its size, got {h:.3g}"
+                f"model.opt.timestep must be at most {math.sqrt(fall / strength):.2g} s, in which gravity"
+                f" moves an object of {fall / _LONGEST_FALL:.3g} m by a tenth of its size, got {h:.3g}"
             )

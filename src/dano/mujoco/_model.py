@@ -119,10 +119,13 @@ def concerns(model: Any, name: str) -> bool:
 
 @contextmanager
 def without_callback(mujoco: Any):
-    """Take the passive callback away: MuJoCo's compiler, which runs a step, cannot call one of Python."""
+    """Take the passive callback away: MuJoCo's compiler, which runs a step, cannot call one of Python.
+
+    It is what the block is given.
+    """
     before = mujoco.get_mjcb_passive()
     mujoco.set_mjcb_passive(None)
     try:
-        yield
+        yield before
     finally:
         mujoco.set_mjcb_passive(before)

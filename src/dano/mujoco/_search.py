@@ -1,5 +1,6 @@
 """The search for contacts as a launch of a kernel: tables of a model, and MuJoCo's arrays where they are."""
 
+import ctypes
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from dano.mujoco._settings import is_gap_beyond, Settings
 from dano.mujoco._solids import Geom, object_solid, Solid
 from dano.mujoco._surfaces import Surface
 from dano.mujoco._things import Thing
+from dano.mujoco.kernels.words import REALS, WHOLES
 from dano.native import compiled_kernel, Features, instance, kind_numbers, lower_bounds
 
 _TABLES, _FINDING = "dano.mujoco.kernels.tables", "dano.mujoco.kernels.finding"
@@ -20,8 +22,6 @@ _BLOCK = 16
 """Samples of a block, as kernels have it."""
 _TOLD = 6
 """Numbers of `dano.mujoco.kernels.tables.Options`."""
-_REALS, _WHOLES = 28, 13
-"""Real and whole numbers of a contact, see `dano.mujoco.kernels.tables`."""
 _LANES = 64
 """Threads of a block on a GPU: each needs many registers."""
 _FLAT = 10.0
@@ -225,7 +225,7 @@ class Search:
         import warp as wp
 
         tables, n = known.tables, len(known.pairs)
-        self.rows, self.wholes = np.zeros((most * n, _REALS)), np.zeros((most * n, _WHOLES), np.int32)
+        self.rows, self.wholes = np.zeros((most * n, REALS)), np.zeros((most * n, WHOLES), np.int32)
         self.options, self.settings = np.zeros(_TOLD), np.zeros((n, 15))
         self.options[1], self.options[4] = most, is_gap_beyond(mujoco)
         self.found = np.zeros(1, np.int32)
@@ -243,9 +243,22 @@ class Search:
         self.launch: Callable[[], None] = self._command.launch
         self.lines = list(zip(self.rows, self.wholes, strict=True))
 
+    def call(self) -> tuple[int, Any, Any]:
+        """Address of the kernel, and the two structures that it is called with; calls do not keep them."""
+        bounds, *given = self._command.params
+        arguments = _arguments(*map(type, given))(*given)
+        return ctypes.cast(self._command.hooks.forward, ctypes.c_void_p).value or 0, bounds, arguments
+
     def give(self, pair: int, settings: Settings | None) -> None:
         """Say what the parameters of a pair are."""
         self.settings[pair] = 0.0 if settings is None else settings.numbers()
+
+
+@functools.cache
+def _arguments(*types: type) -> type:
+    """The structure in which a kernel of Warp takes its arguments on a CPU."""
+    fields = [(f"argument_{i}", each) for i, each in enumerate(types)]
+    return type("Arguments", (ctypes.Structure,), {"_fields_": fields})
 
 
 def _seen(array: np.ndarray, dtype: Any, n: int) -> Any:

@@ -78,6 +78,10 @@ class Writer:
         if not np.array_equal(read, self._reals) or not np.array_equal(counted, self._wholes):
             raise RuntimeError(f"mjContact of MuJoCo {mujoco.__version__} is not laid out as dano knows it")
 
+    def places(self) -> tuple[int, int]:
+        """Addresses of its real and its whole numbers; they are there as long as this is."""
+        return self._reals.ctypes.data, self._wholes.ctypes.data
+
     def add(self, model: Any, data: Any, reals, wholes) -> bool:
         """Add one by the numbers of `dano.mujoco.kernels.tables`; False: full."""
         self._reals[:] = reals

@@ -141,6 +141,11 @@ class Table:
         self._known = self._look(model)
         return self.find(model, data)
 
+    def search_in(self, data: Any) -> Search | None:
+        """The search that has been made for some data, if it still is the one."""
+        found = self._searches.get(id(data))
+        return found[2] if found is not None and found[0]() is data and found[1] is self._known else None
+
     def _search(self, model: Any, data: Any) -> Search:
         key, known = id(data), self._known
         found = self._searches.get(key)

@@ -263,6 +263,9 @@ def list_side(
         reach = margin + way
     points = pose.points
     origin = pose.origin
+    # Where the distance was asked for last, and what it was: a bound for samples beside it.
+    seen_at = vec3()
+    seen = real(-INFINITY)
     at = int(begin)
     block = int(side.index.first_block)
     last = block + side.index.blocks
@@ -274,9 +277,14 @@ def list_side(
                 x = points * sample.point + origin
                 # Most samples of a near block are not near.
                 d = Distance()
-                d.value = quick_clearance(known, side.other, x)
+                if side.other.solid == _GRID:
+                    d.value = seen - STEEPEST * wp.length(x - seen_at)
+                if d.value <= reach:
+                    d.value = quick_clearance(known, side.other, x)
                 if d.value <= reach:
                     d = part_distance(known, model, side.other, x)
+                    seen = d.value
+                    seen_at = x
                 if d.value <= reach:
                     normal = solid_normal(d.gradient)
                     area = facing_area(pose, sample, normal)

@@ -5,15 +5,17 @@ import warp as wp
 from dano.mujoco.kernels.tables import Known, Model, PartIndex
 from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
 from dano.physics.solids.distances import leaf_clearance, leaf_distance
-from dano.physics.solids.leaves import Distance, HALF_SPACE
-from dano.physics.solids.shapes import ELLIPSOID
+from dano.physics.solids.grids import closest_in_grid, coarse_bound, place_in_grid
+from dano.physics.solids.leaves import Distance, GRID, HALF_SPACE
+from dano.physics.solids.shapes import BOX, ELLIPSOID
 
 HULL, HEIGHTS, NONE, UNKNOWN = 100, 101, -1, -2
 """Kinds of solids besides those of `dano.physics.solids`: convex hulls of meshes; height fields; none;
 those of geoms that may not touch an object."""
 
 _HULL, _HEIGHTS = wp.constant(HULL), wp.constant(HEIGHTS)
-_ELLIPSOID, _HALF_SPACE = wp.constant(ELLIPSOID), wp.constant(HALF_SPACE)
+_BOX, _ELLIPSOID = wp.constant(BOX), wp.constant(ELLIPSOID)
+_GRID, _HALF_SPACE = wp.constant(GRID), wp.constant(HALF_SPACE)
 
 
 @wp.func(inline=True)
@@ -84,6 +86,17 @@ def part_distance(known: Known, model: Model, part: PartIndex, x: vec3) -> Dista
 
 
 @wp.func(inline=True)
+def grid_bound(known: Known, part: PartIndex, x: vec3) -> real:
+    """A lower bound on `part_distance` of an object [m]: that of a few cells, and the way to them."""
+    leaf = known.solids.leaves[0, part.at]
+    kind = known.solids.kinds[part.at]
+    u = place_in_grid(leaf, (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position)))
+    closest = closest_in_grid(kind, u)
+    away = wp.length(wp.cw_mul(u - closest, leaf.spacing))
+    return leaf.factor * (coarse_bound(known.solids, 0, kind, closest) + away)
+
+
+@wp.func(inline=True)
 def quick_clearance(known: Known, part: PartIndex, x: vec3) -> real:
     """A lower bound on the distance of a part's solid [m] where that takes far less than the distance."""
     bound = real(-INFINITY)
@@ -94,6 +107,12 @@ def quick_clearance(known: Known, part: PartIndex, x: vec3) -> real:
         # |y / a| grows by no more than 1 / min a along any way, and no root has to be found for it.
         a = known.solids.leaves[0, part.at].sizes
         bound = wp.min(a[0], wp.min(a[1], a[2])) * (wp.length(wp.cw_div(x, a)) - ONE)
+    elif part.solid == _BOX:
+        # Beyond the farthest face.
+        half = known.solids.leaves[0, part.at].sizes
+        bound = wp.max(wp.abs(x[0]) - half[0], wp.max(wp.abs(x[1]) - half[1], wp.abs(x[2]) - half[2]))
+    elif part.solid == _GRID:
+        bound = grid_bound(known, part, x)
     return bound
 
 
@@ -108,6 +127,10 @@ def part_clearance(known: Known, model: Model, part: PartIndex, x: vec3, enough:
         bound = x[2] - model.hfield_size[part.at][2]
     elif part.solid == _ELLIPSOID:
         bound = quick_clearance(known, part, x)
+    elif part.solid == _BOX:
+        bound = quick_clearance(known, part, x)
+        if bound <= enough:
+            bound = part_distance(known, model, part, x).value
     else:
         bound = leaf_clearance(
             known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x, enough

@@ -1,0 +1,227 @@
+"""The passive callback of MuJoCo without Python: for what a bridge has seen once, steps stay in machine code.
+
+Threads of a rollout wait for Python's lock otherwise, and a step spends half of its time in the interpreter.
+"""
+
+import collections
+import ctypes
+import functools
+import sys
+import threading
+import weakref
+from collections.abc import Collection
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from dano.mujoco._search import Search
+from dano.mujoco._settings import Writer
+from dano.mujoco.kernels.words import Entry, Head
+from dano.native import compiled_kernel, Features, instance
+
+_PAGE = 4096
+"""Bytes from one address where memory may end to the next."""
+_LEAST = 64
+"""Slots of the smallest table."""
+_SHIFT = 6
+"""Bits of an address that say little, as the callback has it."""
+_KEPT = 16
+"""Tables that are kept, the one in use among them."""
+
+
+def _place(begin: int, number: Any) -> int:
+    """How many bytes from an address on a number stands first, aligned by its size. It must be there."""
+    size, at = number.itemsize, begin
+    while True:
+        end = (at // _PAGE + 1) * _PAGE
+        count = (end - at) // size
+        values = np.frombuffer(ctypes.string_at(at, count * size), number.dtype)
+        found = np.flatnonzero(values == number)
+        if len(found):
+            return at - begin + size * int(found[0])
+        at += count * size
+
+
+def _head(mujoco: Any) -> Int[np.ndarray, " words"]:
+    """The words about this MuJoCo; without what Python is called by, and the slots.
+
+    Numbers are looked for where they have been put in a model and a data of its own.
+
+    Raises:
+        AttributeError: If MuJoCo's library does not show its functions.
+    """
+    box = '<geom type="box" size="0.1 0.1 0.1"/>'
+    body = f'<body pos="0 0 0.19"><freejoint/>{box}</body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{box}{body}</worldbody></mujoco>")
+    data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)
+    contact, disabled = data.contact, mujoco.mjtDisableBit
+    # Of the first contact, which begins with its distance.
+    begin = contact.pos.ctypes.data - 8
+    head = np.zeros(len(Head), np.int64)
+    library = _library(mujoco)
+    for word, name in {
+        Head.ADD: "mj_addContact",
+        Head.MAKE: "mj_makeConstraint",
+        Head.ISLAND: "mj_island",
+        Head.PROJECT: "mj_projectConstraint",
+    }.items():
+        head[word] = ctypes.cast(getattr(library, name), ctypes.c_void_p).value or 0
+    head[Head.STRIDE] = contact.geom.strides[0]
+    head[Head.GEOM] = contact.geom.ctypes.data + 4 - begin
+    head[Head.CONTACT] = _place(data._address, np.int64(begin))
+    head[Head.XPOS] = _place(data._address, np.int64(data.xpos.ctypes.data))
+    head[Head.GRAVITY] = model.opt.gravity.ctypes.data - model._address
+    for owner, name, word, mark in (
+        (model.opt, "timestep", Head.TIMESTEP, np.float64(0.0012345678)),
+        (model.opt, "disableflags", Head.DISABLED, np.int32(0x2C5A3719)),
+        (model.opt, "enableflags", Head.ENABLED, np.int32(0x3B61D52E)),
+        (data, "ncon", Head.NCON, np.int32(0x4A17E6C3)),
+    ):
+        before = getattr(owner, name)
+        setattr(owner, name, mark.item())
+        head[word] = _place((data if owner is data else model)._address, mark)
+        setattr(owner, name, before)
+    head[Head.OFF] = int(disabled.mjDSBL_CONTACT) | int(disabled.mjDSBL_CONSTRAINT)
+    head[Head.OVERRIDE] = int(mujoco.mjtEnableBit.mjENBL_OVERRIDE)
+    return head
+
+
+class Direct:
+    """The callback, of which there is one in a process, and what it knows."""
+
+    def __init__(self, mujoco: Any):
+        """Compile it.
+
+        Raises:
+            AttributeError: If MuJoCo's library does not show its functions.
+        """
+        import warp as wp
+
+        self._mujoco = mujoco
+        self._head = _head(mujoco)
+        self._slot = ctypes.c_void_p.in_dll(_library(mujoco), "mjcb_passive")
+        self._lock = threading.Lock()
+        self._entries: dict[int, _Known] = {}
+        # Slots lead to them until there are new ones.
+        self._dead: list[Any] = []
+        # Another thread may be looking something up there just now.
+        self._old: collections.deque[Any] = collections.deque(maxlen=_KEPT)
+        self._slots, self._used = self._emptied(_LEAST), 0
+        # Its machine code is there as long as it is.
+        self._kernel = compiled_kernel(_kernel)
+        address = wp.zeros(1, dtype=wp.int64, device="cpu")
+        wp.launch(self._kernel, 1, [self._head.ctypes.data, address], device="cpu")
+        self._address = int(address.numpy()[0])
+
+    def install(self) -> None:
+        """Let MuJoCo call it instead of the function of Python that it calls now."""
+        with self._lock:
+            now = self._slot.value
+            if now != self._address:
+                self._head[Head.PYTHON] = now
+                self._slot.value = self._address
+
+    def knows(self, data: Any, search: Search) -> bool:
+        """Whether data are known, with that search."""
+        found = self._entries.get(data._address)
+        return found is not None and found.data() is data and found.search is search
+
+    def add(self, model: Any, data: Any, search: Search, geoms: Collection[int], fall: float) -> None:
+        """Know data from now on.
+
+        Args:
+            model: Their model.
+            data: The data.
+            search: The search in them.
+            geoms: That stand for objects.
+            fall: Longest fall in a step, h² g [m].
+        """
+        key, entry = data._address, np.zeros(len(Entry), np.int64)
+        writer, standing = Writer(self._mujoco), np.array(sorted(geoms), np.int32)
+        kernel, bounds, arguments = search.call()
+        entry[Entry.MODEL], entry[Entry.XPOS] = model._address, data.xpos.ctypes.data
+        entry[Entry.KERNEL] = kernel
+        entry[Entry.BOUNDS], entry[Entry.ARGUMENTS] = map(ctypes.addressof, (bounds, arguments))
+        entry[Entry.OPTIONS], entry[Entry.FOUND] = search.options.ctypes.data, search.found.ctypes.data
+        entry[Entry.ROWS], entry[Entry.WHOLES] = search.rows.ctypes.data, search.wholes.ctypes.data
+        entry[Entry.CONTACT], entry[Entry.INDEX] = writer.places()
+        entry[Entry.GEOMS], entry[Entry.N_GEOMS] = standing.ctypes.data, len(standing)
+        entry[Entry.FALL] = np.float64(fall * fall).view(np.int64)
+
+        def forget(_: Any) -> None:
+            # Whatever comes to lie at that address is for Python first.
+            entry[Entry.MODEL] = 0
+            self._dead.append(entry)
+            if key in self._entries and self._entries[key].entry is entry:
+                del self._entries[key]
+
+        ends = weakref.ref(model, forget), weakref.ref(data, forget)
+        with self._lock:
+            self._entries[key] = _Known(entry, *ends, search, (writer, standing, bounds, arguments))
+            self._put(key, entry)
+
+    def clear(self) -> None:
+        """Forget all data."""
+        with self._lock:
+            self._entries.clear()
+            self._slots, self._used = self._emptied(_LEAST), 0
+
+    def _emptied(self, capacity: int) -> Int[np.ndarray, " words"]:
+        """A table with empty slots, which the callback reads from now on."""
+        slots = np.zeros(1 + 2 * capacity, np.int64)
+        slots[0] = capacity
+        self._old.append((slots, self._dead))
+        self._dead = []
+        self._head[Head.SLOTS] = slots.ctypes.data
+        return slots
+
+    def _put(self, key: int, entry: Int[np.ndarray, " words"]) -> None:
+        capacity = int(self._slots[0])
+        if 2 * self._used >= capacity:
+            while capacity < 4 * len(self._entries):
+                capacity *= 2
+            self._slots, self._used = self._emptied(capacity), 0
+            # Data may die meanwhile.
+            for other, known in self._entries.copy().items():
+                self._fill(other, known.entry)
+        self._fill(key, entry)
+
+    def _fill(self, key: int, entry: Int[np.ndarray, " words"]) -> None:
+        """Put an entry into its slot, as the callback looks for it."""
+        capacity = int(self._slots[0])
+        i = (key >> _SHIFT) % capacity
+        while self._slots[1 + 2 * i] not in (0, key):
+            i = (i + 1) % capacity
+        self._used += int(self._slots[1 + 2 * i] == 0)
+        self._slots[2 + 2 * i] = entry.ctypes.data
+        self._slots[1 + 2 * i] = key
+
+
+class _Known(NamedTuple):
+    """What is known of data, and what the callback reads of it."""
+
+    entry: Int[np.ndarray, " words"]
+    model: "weakref.ref[Any]"
+    data: "weakref.ref[Any]"
+    search: Search
+    kept: tuple[Any, ...]
+
+
+@functools.cache
+def direct(mujoco: Any) -> Direct | None:
+    """The callback of this process; None where MuJoCo's library does not show its functions."""
+    try:
+        return Direct(mujoco)
+    except AttributeError:
+        return None
+
+
+def _kernel() -> Any:
+    return instance(Features(WIDE=True), "dano.mujoco.kernels.callback").make_callback
+
+
+def _library(mujoco: Any) -> ctypes.CDLL:
+    """The part of the package through which the symbols of MuJoCo's library are found."""
+    return ctypes.CDLL(sys.modules[mujoco.mj_step.__module__].__file__)
