@@ -30,8 +30,7 @@ def with_panel(page: str, scene: Scene, drawn: Drawn, title: str, frame: float) 
     numbers = drawn.numbers
     some = np.unique(np.linspace(0, len(numbers.times) - 1, _POINTS).astype(int))
     graphs = [("energy", "J", "#2a6f97", numbers.energy), ("contact force", "N", "#d62839", numbers.force)]
-    position, middle = drawn.camera
-    away = float(np.linalg.norm(position - middle))
+    middle, away = drawn.opening.wide.look_at, drawn.opening.wide.distance
     run = {
         "title": title,
         "times": _short(numbers.times[some]),
@@ -50,7 +49,7 @@ def with_panel(page: str, scene: Scene, drawn: Drawn, title: str, frame: float) 
     panel = (files("dano.report.viewing") / "panel.html").read_text(encoding="utf-8")
     page = page.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1)
     before, end, after = page.rpartition("</body>")
-    return before + panel.replace('"RUN"', text, 1) + end + after
+    return drawn.opening.in_page(before + panel.replace('"RUN"', text, 1) + end + after)
 
 
 def _unit(way: tuple[float, float, float]) -> np.ndarray:
