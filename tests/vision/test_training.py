@@ -121,7 +121,7 @@ def test_an_interrupted_training_resumes_where_it_was(trained: Trained, photos: 
     np.testing.assert_array_equal(again.field.model.distance, trained.field.model.distance)
     assert again.scores == trained.scores
     other = TrainOptions(**{**vars(QUICK), "batch": 256})
-    with pytest.raises(ValueError, match="other photographs or options"):
+    with pytest.raises(ValueError, match="the same photographs and options"):
         train(photos, other, checkpoint=file, resume=True)
 
 
@@ -137,7 +137,7 @@ def test_a_full_disk_does_not_end_training(photos: Capture, tmp_path: Path, monk
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dano.vision.training._checkpoint.write_archive", full)
+    monkeypatch.setattr("dano.archive.write_archive", full)
     with pytest.warns(UserWarning, match="could not be written"):
         train(
             photos,
