@@ -116,7 +116,12 @@ def test_an_interrupted_training_resumes_where_it_was(trained: Trained, photos: 
 
     with pytest.raises(KeyboardInterrupt):
         train(photos, QUICK, checkpoint=file, progress=interrupt)
-    again = train(photos, QUICK, checkpoint=file, resume=True)
+    said = []
+    again = train(
+        photos, QUICK, checkpoint=file, resume=True, progress=lambda what, share: said.append((what, share))
+    )
+    # Numbers stand behind a comma: what is before it is one piece of work, whose time left can be told.
+    assert {what.partition(",")[0] for what, _ in said if "rays/s" in what} == {"training"}
     # Same seed, same random numbers at each step: the same field as without the interruption.
     np.testing.assert_array_equal(again.field.model.distance, trained.field.model.distance)
     assert again.scores == trained.scores

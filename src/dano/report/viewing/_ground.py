@@ -11,6 +11,8 @@ _AXES = ((214, 40, 57), (46, 139, 87), (44, 111, 187))
 """Colours of x, y and z (convention)."""
 
 _LINES = (200, 204, 210)
+"""Colour of the grid."""
+
 _CELLS = 8
 """Least number of cells along the longer side of what stands on the grid."""
 

@@ -14,6 +14,7 @@ from dano.scene import Scene
 _POINTS = 400
 # Where cameras stand, from the middle of what moves, in distances of the one that the page opens with.
 _CAMERAS = {"front": (0.0, -1.0, 0.25), "side": (1.0, 0.0, 0.25), "top": (0.0, -0.02, 1.0)}
+# Pairs whose friction is listed.
 _MOST_CONTACTS = 12
 
 

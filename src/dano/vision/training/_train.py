@@ -281,7 +281,7 @@ class _Trainer:
         if self.progress is not None:
             quality = f"{self.history[-1].psnr:.1f} dB " if self.history else ""
             share = iteration / self.options.iterations
-            self.progress(f"training {quality}{speed / 1000:.0f}k rays/s", share)
+            self.progress(f"training, {quality}{speed / 1000:.0f}k rays/s", share)
 
     def _trial(self, state: _State, rays: RaySet) -> float:
         """Mean loss of the last of a few steps: translucency deceives a fog, but not a surface."""
