@@ -67,6 +67,8 @@ def test_errors_of_what_was_not_observed_are_not_said():
     assert _errors_text(seen) == "position 1.2 mm (last frame 2), rotation 0.5° (last frame 0.25)"
     places = seen._replace(mean_rotation=float("nan"), final_rotation=float("nan"))
     assert _errors_text(places) == "position 1.2 mm (last frame 2)"
+    rates = places._replace(mean_position=float("nan"), final_position=float("nan"))
+    assert _errors_text(rates) == "1 standard deviations of the noise"
 
 
 @pytest.mark.slow

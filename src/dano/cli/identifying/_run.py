@@ -225,11 +225,12 @@ def _errors_text(errors: Errors) -> str:
         ("position", 1e3 * errors.mean_position, 1e3 * errors.final_position, " mm"),
         ("rotation", np.degrees(errors.mean_rotation), np.degrees(errors.final_rotation), "°"),
     )
-    return ", ".join(
+    seen = [
         f"{name} {mean:.3g}{unit} (last frame {last:.3g})"
         for name, mean, last, unit in rows
         if np.isfinite(mean)
-    )
+    ]
+    return ", ".join(seen) or f"{errors.rms:.3g} standard deviations of the noise"
 
 
 def _print(fit: Identification) -> None:
