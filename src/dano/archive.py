@@ -9,6 +9,7 @@ import os
 import shutil
 import tempfile
 import time
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -181,6 +182,65 @@ class Pace:
         write_archive(path, arrays)
         self._written = time.monotonic()
         self._price = self._written - began
+
+
+class WorkInProgress:
+    """A file of work that is not done: what was interrupted or killed goes on with it.
+
+    Attributes:
+        path: The file; None where nothing is kept.
+    """
+
+    def __init__(self, path: Path | None, form: tuple[str, int], digest: str, belongs: str):
+        """Nothing is read or written yet.
+
+        Args:
+            path: The file, or None.
+            form: Format and version of the file.
+            digest: Of all that decides the result; a file with another one is refused.
+            belongs: What the file must be of and what to do if it is not, in words.
+        """
+        self.path = path
+        self._form, self._digest, self._belongs = form, digest, belongs
+        self._pace = Pace()
+
+    def read(self) -> dict[str, np.ndarray] | None:
+        """What earlier work has left; None if there is no file.
+
+        Raises:
+            ValueError: If the file is of another format, or of other work.
+        """
+        if self.path is None or not self.path.exists():
+            return None
+        data = read_archive(self.path, *self._form)
+        if str(data.get("digest")) != self._digest:
+            raise ValueError(f"checkpoint {self.path} must be of {self._belongs}")
+        return data
+
+    def due(self) -> bool:
+        """Whether it is time to write."""
+        return self.path is not None and self._pace.due()
+
+    def write(self, arrays: Mapping[str, Any]) -> bool:
+        """Write what is known, and say whether it is kept.
+
+        A full disk is warned of, as it must not cost what has been done.
+        """
+        if self.path is None:
+            return False
+        about = {"format": self._form[0], "version": self._form[1], "digest": self._digest}
+        members = {name: np.asarray(value) for name, value in {**about, **arrays}.items()}
+        try:
+            self._pace.write(self.path, members)
+        except OSError as error:
+            warnings.warn(f"checkpoint {self.path} could not be written: {error}", stacklevel=2)
+            return False
+        return True
+
+    def remove(self) -> None:
+        """Remove the file: the work is done."""
+        if self.path is not None:
+            self.path.unlink(missing_ok=True)
 
 
 class Arrays:

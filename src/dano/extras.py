@@ -2,7 +2,7 @@
 
 import importlib
 import importlib.util
-from typing import Any
+from typing import Any, NamedTuple
 
 
 def is_installed(module: str) -> bool:
@@ -24,4 +24,48 @@ def optional(module: str, need: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ImportError(f"{need}: pip install 'dano[{extra}]'") from error
+        raise ImportError(_message(need, extra)) from error
+
+
+class Package(NamedTuple):
+    """An optional package that several places need.
+
+    Attributes:
+        module: Its name.
+        need: What needs it, in words.
+        extra: The extra of dano that installs it.
+    """
+
+    module: str
+    need: str
+    extra: str
+
+    def load(self) -> Any:
+        """Import it.
+
+        Raises:
+            ImportError: As `optional`.
+        """
+        return optional(*self)
+
+    def check(self) -> None:
+        """Look for it before work begins, without the time that importing takes.
+
+        Raises:
+            ImportError: As `optional`.
+        """
+        if not is_installed(self.module):
+            raise ImportError(_message(self.need, self.extra))
+
+
+COLMAP = Package("pycolmap", "poses of photographs need pycolmap", "poses")
+OPENCV = Package("cv2", "poses of photographs need OpenCV", "poses")
+NETWORKS = Package("onnxruntime", "masks by a network need onnxruntime", "segment")
+PHOTOGRAPHS = Package("PIL.Image", "reading photographs needs pillow", "train")
+VIDEO_FILES = Package("av", "reading videos needs av", "view")
+MESHES = Package("trimesh", "reading meshes needs trimesh", "mesh")
+DISTANCES = Package("igl", "signed distances of meshes need libigl", "mesh")
+
+
+def _message(need: str, extra: str) -> str:
+    return f"{need}: pip install 'dano[{extra}]'"

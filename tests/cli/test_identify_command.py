@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import dano
+from dano.cli.identifying._run import _errors_text
+from dano.identify import Errors
 from dano.identify._problem import Problem
 from dano.solvers import bounded_least_squares
 
@@ -58,6 +60,15 @@ def test_finds_the_friction(files, run):
     # A .csv does not say that its velocities are those of half a step before: 3 % too much friction.
     assert result["values"]["ball,floor.sliding_friction"] == pytest.approx(0.25, rel=1e-6)
     assert result["converged"] and np.isfinite(result["standard_errors"]["ball,floor.sliding_friction"])
+
+
+def test_errors_of_what_was_not_observed_are_not_said():
+    seen = Errors(1.2e-3, 2e-3, np.radians(0.5), np.radians(0.25), 1.0)
+    assert _errors_text(seen) == "position 1.2 mm (last frame 2), rotation 0.5° (last frame 0.25)"
+    places = seen._replace(mean_rotation=float("nan"), final_rotation=float("nan"))
+    assert _errors_text(places) == "position 1.2 mm (last frame 2)"
+    rates = places._replace(mean_position=float("nan"), final_position=float("nan"))
+    assert _errors_text(rates) == "1 standard deviations of the noise"
 
 
 @pytest.mark.slow

@@ -75,6 +75,18 @@ def test_a_run_that_was_killed_has_left_its_pieces(run, scene, tmp_path, monkeyp
     assert not kept.exists()
 
 
+def test_a_full_disk_does_not_end_a_run(run, scene, tmp_path, monkeypatch):
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Pace, "every", 0.0)
+    monkeypatch.setattr(Pace, "share", 0)
+    monkeypatch.setattr("dano.archive.write_archive", full)
+    answer = run("simulate", scene, "-o", tmp_path / "run.npz")
+    assert answer.code == 0 and "run.checkpoint.npz could not be written" in answer.err
+    assert (tmp_path / "run.npz").exists()
+
+
 @pytest.mark.usefixtures("interruptible")
 def test_the_second_of_two_runs_goes_on_without_the_first(run, scene, tmp_path, monkeypatch):
     monkeypatch.setattr(Pace, "every", 0.0)

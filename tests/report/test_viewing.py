@@ -4,6 +4,7 @@ import json
 import re
 import socket
 import urllib.request
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,9 +18,10 @@ from dano.report.viewing._capture import _camera_length
 from dano.report.viewing._drawn import Drawn, Shown
 from dano.report.viewing._field import Surface
 from dano.report.viewing._meshes import add_coloured, body_mesh, BodyMesh, shape_mesh, surface_mesh
+from dano.report.viewing._opening import open_on
 from dano.report.viewing._serving import serve
 from dano.scene_file import asset_look, load_asset
-from dano.vision import Capture, LearnedField, visual_hull
+from dano.vision import Camera, Capture, LearnedField, visual_hull
 
 
 def free_port() -> int:
@@ -257,6 +259,24 @@ def test_a_written_page_says_what_a_run_is(fall, tmp_path):
     assert ["friction, ball – floor", "0.2", None] in parameters
     assert said["frame"] == pytest.approx(0.1 / 3, rel=0.01)
     assert set(said["cameras"]) == {"front", "side", "top"}
+    # The camera of an upright window is chosen before anything else on the page runs.
+    assert page.index("window.stepBack =") < page.index("</head>") < page.index("window.stepBack *")
+
+
+@pytest.mark.parametrize(("width", "filled"), [(46, 0.85), (95, 0.45), (150, 0.85)])
+@pytest.mark.parametrize("level", [False, True])
+def test_windows_of_any_shape_open_on_all(width, filled, level):
+    server = SimpleNamespace(initial_camera=SimpleNamespace(), on_client_connect=lambda _: None)
+    places = np.random.default_rng(0).normal(size=(40, 3)) * (1.0, 1.0, 0.2)
+    opening = open_on(server, places, np.zeros(40), 0.05, level=level)
+    start = server.initial_camera
+    window = SimpleNamespace(aspect=width / 100, position=start.position, look_at=start.look_at)
+    opening.choose(SimpleNamespace(camera=window))
+    camera = Camera(window.position, window.look_at, vertical_fov=start.fov, width=width, height=100)
+    seen = camera.project(places)[:, :2]
+    assert seen.min() > 0 and (seen.max(axis=0) < (width, 100)).all()
+    # Near: what is seen fills so much of the window in one direction.
+    assert (np.ptp(seen, axis=0) / (width, 100)).max() > filled
 
 
 def test_learned_colours_are_linear_in_meshes():

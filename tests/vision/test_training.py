@@ -116,12 +116,17 @@ def test_an_interrupted_training_resumes_where_it_was(trained: Trained, photos: 
 
     with pytest.raises(KeyboardInterrupt):
         train(photos, QUICK, checkpoint=file, progress=interrupt)
-    again = train(photos, QUICK, checkpoint=file, resume=True)
+    said = []
+    again = train(
+        photos, QUICK, checkpoint=file, resume=True, progress=lambda what, share: said.append((what, share))
+    )
+    # Numbers stand behind a comma: what is before it is one piece of work, whose time left can be told.
+    assert {what.partition(",")[0] for what, _ in said if "rays/s" in what} == {"training"}
     # Same seed, same random numbers at each step: the same field as without the interruption.
     np.testing.assert_array_equal(again.field.model.distance, trained.field.model.distance)
     assert again.scores == trained.scores
     other = TrainOptions(**{**vars(QUICK), "batch": 256})
-    with pytest.raises(ValueError, match="other photographs or options"):
+    with pytest.raises(ValueError, match="the same photographs and options"):
         train(photos, other, checkpoint=file, resume=True)
 
 
@@ -137,7 +142,7 @@ def test_a_full_disk_does_not_end_training(photos: Capture, tmp_path: Path, monk
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dano.vision.training._checkpoint.write_archive", full)
+    monkeypatch.setattr("dano.archive.write_archive", full)
     with pytest.warns(UserWarning, match="could not be written"):
         train(
             photos,

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dano.checks import checked_count
-from dano.extras import optional
+from dano.extras import DISTANCES, optional
 from dano.fields._redistance import spread_distances
 from dano.fields._signed_distance import SignedDistanceGrid
 from dano.fields.meshes import mesh_moments
@@ -86,7 +86,7 @@ def hull_field(points: Float[np.ndarray, "n 3"], resolution: int = 48) -> Signed
     """
     resolution = checked_count("resolution", resolution, least=8, most=512)
     trimesh = optional("trimesh", "hulls of meshes need trimesh", "mesh")
-    igl = optional("igl", "signed distances of meshes need libigl", "mesh")
+    igl = DISTANCES.load()
     points, _ = convex_hull(points)
     lower, upper = points.min(axis=0), points.max(axis=0)
     # Thin plates need nodes inside, too.

@@ -9,7 +9,7 @@ import numpy as np
 
 from dano.caches import cache_folder
 from dano.checks import shown
-from dano.extras import optional
+from dano.extras import MESHES
 from dano.fields import (
     AbstractShape,
     Box,
@@ -172,7 +172,7 @@ def _read(solid: Solid) -> Triangles:
     assert solid.path is not None
     if solid.path.suffix.lower() == ".dae":
         return read_collada(solid.path)
-    trimesh = optional("trimesh", "reading meshes needs trimesh", "mesh")
+    trimesh = MESHES.load()
     try:
         mesh = trimesh.load_mesh(solid.path)
     except Exception as error:  # each of trimesh's readers raises its own kinds
@@ -192,7 +192,7 @@ def _scaled(mesh: Triangles, scale: Sequence[float]) -> Triangles:
 
 
 def _distance(mesh: Triangles) -> SignedDistanceGrid:
-    trimesh = optional("trimesh", "reading meshes needs trimesh", "mesh")
+    trimesh = MESHES.load()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         return mesh_field(trimesh.Trimesh(*mesh, process=False), _RESOLUTION)

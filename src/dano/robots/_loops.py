@@ -13,9 +13,8 @@ from dano.checks import checked_items, checked_kind
 from dano.names import did_you_mean
 from dano.scene import Scene, State
 
-# Gap [m, rad] at which loops count as closed, and steps to get there.
-_CLOSED, _STEPS = 1e-12, 60
-_FLOAT32 = 1e-5
+# Gap [m, rad] at which loops count as closed in float64, in float32, and steps to get there.
+_CLOSED, _FLOAT32, _STEPS = 1e-12, 1e-5, 60
 # Largest change of a coordinate in a step [rad or m].
 _LONGEST = 0.5
 

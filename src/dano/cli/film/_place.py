@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from dano.cli._outputs import check_output, missing_for_pictures
 from dano.cli.film._arguments import Film
 from dano.cli.tracking import Filming
-from dano.extras import is_installed
+from dano.extras import COLMAP, OPENCV
 from dano.vision import is_video, mask_folder, picture_files, PoseOptions
 
 TABLE = "table"
@@ -85,8 +85,8 @@ def place_of(command: Film) -> Place:
             raise ValueError(f"{name} must be there, got {path}, which does not exist")
     if missing := missing_for_pictures(video=True):
         raise ImportError(missing)
-    if not (is_installed("pycolmap") and is_installed("cv2")):
-        raise ImportError("cameras need pycolmap and OpenCV: pip install 'dano[poses]'")
+    COLMAP.check()
+    OPENCV.check()
     filmed = is_video(command.walk) and command.walk.is_file()
     photographs = [command.walk] if filmed else picture_files(command.walk)
     body = re.sub(r"\W+", "_", command.output.name.split(".")[0]).strip("_")

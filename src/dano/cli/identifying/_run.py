@@ -14,6 +14,7 @@ from dano.cli._interrupt import interrupted
 from dano.cli._outputs import missing_for_pictures
 from dano.cli.identifying._arguments import Identify
 from dano.identify import (
+    Errors,
     Identification,
     identify as fit_parameters,
     IdentifyOptions,
@@ -218,6 +219,20 @@ def _motion(path: Path, command: Identify, scene: Scene) -> Motion:
     return motion.named(scene)
 
 
+def _errors_text(errors: Errors) -> str:
+    """How far the fitted motion is from the observed one, in what was observed."""
+    rows = (
+        ("position", 1e3 * errors.mean_position, 1e3 * errors.final_position, " mm"),
+        ("rotation", np.degrees(errors.mean_rotation), np.degrees(errors.final_rotation), "°"),
+    )
+    seen = [
+        f"{name} {mean:.3g}{unit} (last frame {last:.3g})"
+        for name, mean, last, unit in rows
+        if np.isfinite(mean)
+    ]
+    return ", ".join(seen) or f"{errors.rms:.3g} standard deviations of the noise"
+
+
 def _print(fit: Identification) -> None:
     put("parameter                            value        standard error    95 % interval")
     for name, value in fit.values.items():
@@ -231,9 +246,5 @@ def _print(fit: Identification) -> None:
     put()
     for label, errors in (("fit", fit.errors), ("held out", fit.held_out_errors)):
         if errors is not None:
-            put(
-                f"{label:<10}  position {1e3 * errors.mean_position:.3g} mm (last frame "
-                f"{1e3 * errors.final_position:.3g}), rotation {np.degrees(errors.mean_rotation):.3g}° "
-                f"(last {np.degrees(errors.final_rotation):.3g})"
-            )
+            put(f"{label:<10}  {_errors_text(errors)}")
     put(f"stopped     {fit.stop.value}; {fit.evaluations} evaluations, {fit.seconds:.1f} s")

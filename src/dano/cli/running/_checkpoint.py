@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano import __version__
-from dano.archive import Pace, read_archive
+from dano.archive import WorkInProgress
 from dano.scene import JOINT_QUANTITIES, State, state_arrays, STATE_SIZES, Trajectory
 from dano.scene_file import SceneFile
 
-_FORM, _VERSION = "dano-checkpoint", 1
+_FORM = "dano-checkpoint", 1
 _REPORTED = ("residuals", "iterations", "converged")
 
 
@@ -21,16 +21,20 @@ class Checkpoint:
     """Pieces of a run on disk.
 
     Attributes:
-        path: The file; None where the output is not a file, and nothing is kept.
+        file: Where they are kept; its path is None where the output is not a file.
     """
 
     def __init__(self, output: Path, loaded: SceneFile):
         """A checkpoint of a run; nothing is written yet."""
         regular = not output.exists() or output.is_file()
-        self.path = output.with_name(f"{output.stem}.checkpoint.npz") if regular else None
-        self._digest = _digest(loaded)
+        self.file = WorkInProgress(
+            output.with_name(f"{output.stem}.checkpoint.npz") if regular else None,
+            _FORM,
+            _digest(loaded),
+            "this scene, with the same step, number of steps and version of dano: remove it, or run without"
+            " --resume",
+        )
         self._names = loaded.scene.names
-        self._pace = Pace()
 
     def read(self) -> list[Trajectory]:
         """The pieces that an earlier run has left; none if there is no file.
@@ -38,38 +42,31 @@ class Checkpoint:
         Raises:
             ValueError: If the file is not a checkpoint, or one of another run.
         """
-        if self.path is None or not self.path.exists():
+        data = self.file.read()
+        if data is None:
             return []
-        data = read_archive(self.path, _FORM, _VERSION)
-        if str(data.get("digest")) != self._digest:
-            raise ValueError(
-                f"checkpoint {self.path} must be of this scene, with the same step, number of steps and"
-                " version of dano: remove it, or run without --resume"
-            )
         count = int(data["pieces"])
         return [
             self._piece({name: data[f"{name}_{i}"] for name in self._members(data)}) for i in range(count)
         ]
 
-    def keep(self, pieces: Sequence[Trajectory], *, now: bool = False) -> None:
-        """Write the pieces, if it is time to, or at once."""
-        if self.path is None or not (now or self._pace.due()):
-            return
+    def keep(self, pieces: Sequence[Trajectory], *, now: bool = False) -> bool:
+        """Write the pieces, if it is time to, or at once; whether they were written."""
+        if not (now or self.file.due()):
+            return False
         arrays = {
-            f"{name}_{i}": np.asarray(value)
+            f"{name}_{i}": value
             for i, piece in enumerate(pieces)
             for name, value in (
                 *state_arrays(piece.states).items(),
                 *((name, getattr(piece, name)) for name in _REPORTED),
             )
         }
-        about = {"format": _FORM, "version": _VERSION, "digest": self._digest, "pieces": len(pieces)}
-        self._pace.write(self.path, {**{name: np.array(value) for name, value in about.items()}, **arrays})
+        return self.file.write({"pieces": len(pieces), **arrays})
 
     def remove(self) -> None:
         """Remove the file: the run is complete."""
-        if self.path is not None:
-            self.path.unlink(missing_ok=True)
+        self.file.remove()
 
     @staticmethod
     def _members(data: dict[str, np.ndarray]) -> list[str]:

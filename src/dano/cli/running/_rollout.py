@@ -78,9 +78,8 @@ def roll_out(
                 kept.keep(pieces)
         progress("simulating", 1.0)
     except KeyboardInterrupt:
-        if kept is None or kept.path is None or sum(seconds[1:]) < WORTH:
+        if kept is None or sum(seconds[1:]) < WORTH or not kept.keep(pieces, now=True):
             raise
-        kept.keep(pieces, now=True)
         done = len(pieces) * length
         raise KeyboardInterrupt(f"{done} of {loaded.n_steps} steps are kept, --resume goes on") from None
     progress.close()

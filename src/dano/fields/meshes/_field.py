@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.checks import checked_count, checked_number
-from dano.extras import optional
+from dano.extras import DISTANCES
 from dano.fields._redistance import spread_distances
 from dano.fields._shapes import SolidMoments
 from dano.fields._signed_distance import SignedDistanceGrid
@@ -260,7 +260,7 @@ def _arrays(solid: "trimesh.Trimesh") -> tuple[np.ndarray, np.ndarray]:
 
 
 def _igl() -> Any:
-    return optional("igl", "signed distances of meshes need libigl", "mesh")
+    return DISTANCES.load()
 
 
 def _mesh_distances(

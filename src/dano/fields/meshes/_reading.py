@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from dano.checks import checked_choice, checked_number, shown
-from dano.extras import is_installed, optional
+from dano.extras import MESHES, Package
 
 if TYPE_CHECKING:
     import trimesh
@@ -66,7 +66,7 @@ def read_mesh(mesh: "str | Path | trimesh.Trimesh | trimesh.Scene", factor: floa
         ValueError: If it cannot be read, holds no faces, or has vertices that are not finite.
         ImportError: If trimesh, or what it needs for the format, is missing.
     """
-    optional("trimesh", "reading meshes needs trimesh", "mesh")
+    MESHES.check()
     import trimesh
 
     name, own = "mesh", True
@@ -99,9 +99,9 @@ def _loaded(path: Path) -> Any:
     if not path.is_file():
         raise ValueError(f"{path}: no such file; expected a triangle mesh")
     needed = _NEEDS.get(path.suffix.lower())
-    if needed is not None and not is_installed(needed):
-        extra = _EXTRAS.get(needed, "mesh")
-        raise ImportError(f"{path}: reading {path.suffix} needs {needed}: pip install 'dano[{extra}]'")
+    if needed is not None:
+        need = f"{path}: reading {path.suffix} needs {needed}"
+        Package(needed, need, _EXTRAS.get(needed, "mesh")).check()
     try:
         return trimesh.load_scene(path)
     except Exception as error:  # each of trimesh's readers raises its own kinds

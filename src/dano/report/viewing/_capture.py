@@ -12,7 +12,8 @@ from dano.checks import checked_kind, checked_text
 from dano.exchange import level_triangles
 from dano.maths import quat_from_matrix
 from dano.report._capture import SPLIT_COLOURS
-from dano.report.viewing._ground import add_ground, add_note, open_on
+from dano.report.viewing._ground import add_ground, add_note
+from dano.report.viewing._opening import open_on
 from dano.report.viewing._serving import serve, Viewer, write_file
 from dano.vision import Capture, checked_colour, View, visual_hull
 
@@ -87,7 +88,7 @@ def write_capture_view(capture: Capture, path: str | os.PathLike[str], *, unit: 
     def fill(server: Any) -> str:
         shown = _ShownCapture(server, capture, unit)
         add_note(server, [shown.said, shown.ground.said], shown.ground)
-        return server.get_scene_serializer().as_html()
+        return shown.opening.in_page(server.get_scene_serializer().as_html())
 
     write_file(path, fill)
 
@@ -103,6 +104,7 @@ class _ShownCapture:
     Attributes:
         said: How many photographs there are, in words.
         ground: The plane z = 0.
+        opening: Where the page opens.
     """
 
     def __init__(self, server: Any, capture: Capture, unit: str):
@@ -120,7 +122,8 @@ class _ShownCapture:
         self.ground = add_ground(
             server, points.min(axis=0), points.max(axis=0), height=0.0, axes_at=np.zeros(3), unit=unit
         )
-        open_on(server, np.concatenate([points, self.ground.points]))
+        seen = np.concatenate([points, self.ground.points])
+        self.opening = open_on(server, seen, np.zeros(len(seen)), margin=0.1, level=True)
 
     def _add_camera(self, index: int, view: View, length: float) -> None:
         camera = view.camera

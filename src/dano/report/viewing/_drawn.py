@@ -11,8 +11,9 @@ from dano.maths import Pose, quat_from_matrix, quat_to_matrix
 from dano.report._resample import poses_at
 from dano.report._stage import Touches, touches
 from dano.report.viewing._meshes import add_coloured, body_mesh
+from dano.report.viewing._opening import open_on, Opening
 from dano.scene import Body, pulls, Scene, Trajectory
-from dano.vision import Camera, checked_colour, Item, LearnedField, PALETTE
+from dano.vision import checked_colour, Item, LearnedField, PALETTE
 
 _GHOST = 0.35
 """Opacity of the bodies of a second run."""
@@ -49,7 +50,7 @@ class Drawn:
     Attributes:
         numbers: Energy and contact force over the run.
         colours: "#rrggbb" of bodies that have one colour, by their index.
-        camera: Where the page opens from, and what it looks at [m, W].
+        opening: Where the page opens.
         touched: Contact forces; None without contacts.
     """
 
@@ -65,12 +66,11 @@ class Drawn:
         self._runs = [trajectory] if beside is None else [trajectory, beside]
         self._handles: list[list[Any]] = []
         self.colours: dict[int, str] = {}
-        self.camera = np.array([1.0, -1.0, 1.0]), np.zeros(3)
         sizes = [body.size for body in scene.bodies if np.isfinite(body.size)]
         self._length = 0.3 * float(np.median(sizes)) if sizes else 1.0
         self._scene.set_up_direction("+z")
         self._place(scene, looks)
-        self._aim(scene)
+        self.opening = self._aim(scene)
         self._forces: Any = None
         self._extras: list[Any] = []
         self.replace(scene, trajectory)
@@ -107,19 +107,16 @@ class Drawn:
                 used += 1
             self._handles.append(handles)
 
-    def _aim(self, scene: Scene) -> None:
+    def _aim(self, scene: Scene) -> Opening:
         """Let the page open on the bodies that move, near enough to see them, over the whole run."""
-        moving = [i for i, body in enumerate(scene.bodies) if not body.fixed and np.isfinite(body.size)]
-        if not moving:
-            return
-        runs = [np.asarray(run.states.position, np.float64)[:, moving].reshape(-1, 3) for run in self._runs]
+        sized = [i for i, body in enumerate(scene.bodies) if np.isfinite(body.size)]
+        shown = [i for i in sized if not scene.bodies[i].fixed] or sized
+        if not shown:
+            return open_on(self._server, np.zeros((1, 3)), np.ones(1), margin=0.05)
+        runs = [np.asarray(run.states.position, np.float64)[:, shown].reshape(-1, 3) for run in self._runs]
         places = np.concatenate(runs)
-        radii = np.resize([0.5 * scene.bodies[i].size for i in moving], len(places))
-        camera = Camera.framing(places, radii, width=3, height=2, margin=0.05)
-        start = self._server.initial_camera
-        start.up, start.fov = (0.0, 0.0, 1.0), camera.vertical_fov
-        start.position, start.look_at = tuple(camera.position), tuple(camera.look_at)
-        self.camera = camera.position, camera.look_at
+        radii = np.resize([0.5 * scene.bodies[i].size for i in shown], len(places))
+        return open_on(self._server, places, radii, margin=0.05)
 
     def show(self, time: float, shown: Shown) -> None:
         """Move everything to a time [s]."""

@@ -14,8 +14,9 @@ from dano.exchange import enclosed, level_triangles, signed_distances, Triangles
 from dano.fields import AbstractField, AbstractShape, bake, GridField, SignedDistanceGrid
 from dano.objects import node_values
 from dano.report._overlay import round_below
-from dano.report.viewing._ground import add_ground, add_note, open_on
+from dano.report.viewing._ground import add_ground, add_note
 from dano.report.viewing._meshes import add_coloured, BodyMesh, shape_mesh, vertex_colours
+from dano.report.viewing._opening import open_on
 from dano.report.viewing._serving import serve, Viewer, write_file
 from dano.vision import checked_colour, LearnedField, PALETTE, usual_level
 
@@ -85,7 +86,7 @@ def write_field_view(
     def fill(server: Any) -> str:
         shown = _ShownField(server, field, level)
         add_note(server, [shown.said, shown.ground.said], shown.ground)
-        return server.get_scene_serializer().as_html()
+        return shown.opening.in_page(server.get_scene_serializer().as_html())
 
     write_file(path, fill)
 
@@ -196,6 +197,7 @@ class _ShownField:
         surface: Of the field.
         said: Size and volume of what is shown, in words.
         ground: What it stands on.
+        opening: Where the page opens.
     """
 
     def __init__(self, server: Any, field: AbstractField, level: float | None):
@@ -211,7 +213,8 @@ class _ShownField:
         ends = np.array([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)], np.float64)
         self.ground = add_ground(server, *ends, height=float(ends[0, 2]))
         corners = ends[np.indices((2, 2, 2)).reshape(3, -1), np.arange(3)[:, None]].T
-        open_on(server, np.concatenate([corners, self.ground.points]))
+        seen = np.concatenate([corners, self.ground.points])
+        self.opening = open_on(server, seen, np.zeros(len(seen)), margin=0.1, level=True)
 
     def _draw(self, mesh: BodyMesh, level: float | None) -> None:
         scene = self._server.scene

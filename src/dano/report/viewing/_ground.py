@@ -1,4 +1,4 @@
-"""Where things are and how large: a grid of a stated spacing, axes, and a page that opens on all of them."""
+"""Where things are and how large: a grid of a stated spacing, axes."""
 
 from typing import Any, NamedTuple
 
@@ -6,12 +6,13 @@ import numpy as np
 from jaxtyping import Float
 
 from dano.report._overlay import length_text, round_below
-from dano.vision import Camera
 
 _AXES = ((214, 40, 57), (46, 139, 87), (44, 111, 187))
 """Colours of x, y and z (convention)."""
 
 _LINES = (200, 204, 210)
+"""Colour of the grid."""
+
 _CELLS = 8
 """Least number of cells along the longer side of what stands on the grid."""
 
@@ -90,19 +91,6 @@ def _add_axes(scene: Any, at: np.ndarray, length: float) -> Float[np.ndarray, "3
 def add_note(server: Any, lines: list[str], ground: Ground) -> None:
     """Text before the grid, for pages without a panel."""
     server.scene.add_label("/note", "\n".join(lines), position=ground.front, anchor="top-center")
-
-
-def open_on(server: Any, points: Float[np.ndarray, "n 3"]) -> None:
-    """Let the page open with all of some points in view."""
-    camera = Camera.framing(points, np.zeros(len(points)), width=3, height=2, margin=0.1)
-    # Turned so that there is as much room above as below.
-    seen = camera.project(points)[:, :2]
-    middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
-    away = float(np.linalg.norm(camera.look_at - camera.position))
-    start = server.initial_camera
-    start.up, start.fov = (0.0, 0.0, 1.0), camera.vertical_fov
-    start.position = tuple(camera.position)
-    start.look_at = tuple(camera.position + away * camera.directions(middle[None])[0])
 
 
 def _length(value: float, unit: str) -> str:

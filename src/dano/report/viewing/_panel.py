@@ -14,6 +14,7 @@ from dano.scene import Scene
 _POINTS = 400
 # Where cameras stand, from the middle of what moves, in distances of the one that the page opens with.
 _CAMERAS = {"front": (0.0, -1.0, 0.25), "side": (1.0, 0.0, 0.25), "top": (0.0, -0.02, 1.0)}
+# Pairs whose friction is listed.
 _MOST_CONTACTS = 12
 
 
@@ -30,8 +31,7 @@ def with_panel(page: str, scene: Scene, drawn: Drawn, title: str, frame: float) 
     numbers = drawn.numbers
     some = np.unique(np.linspace(0, len(numbers.times) - 1, _POINTS).astype(int))
     graphs = [("energy", "J", "#2a6f97", numbers.energy), ("contact force", "N", "#d62839", numbers.force)]
-    position, middle = drawn.camera
-    away = float(np.linalg.norm(position - middle))
+    middle, away = drawn.opening.wide.look_at, drawn.opening.wide.distance
     run = {
         "title": title,
         "times": _short(numbers.times[some]),
@@ -50,7 +50,7 @@ def with_panel(page: str, scene: Scene, drawn: Drawn, title: str, frame: float) 
     panel = (files("dano.report.viewing") / "panel.html").read_text(encoding="utf-8")
     page = page.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1)
     before, end, after = page.rpartition("</body>")
-    return before + panel.replace('"RUN"', text, 1) + end + after
+    return drawn.opening.in_page(before + panel.replace('"RUN"', text, 1) + end + after)
 
 
 def _unit(way: tuple[float, float, float]) -> np.ndarray:

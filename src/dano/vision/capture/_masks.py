@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
+from dano.extras import NETWORKS
 from dano.fields import largest_part
 from dano.vision.capture._capture import Capture, View
 from dano.vision.capture._hull import object_box, silhouettes
@@ -171,10 +172,7 @@ class _Network:
     def __init__(self, path: Path):
         if not path.is_file():
             raise ValueError(f"network must be an ONNX file, got {path}, which does not exist")
-        try:
-            import onnxruntime  # pyright: ignore[reportMissingImports]
-        except ImportError as error:
-            raise ImportError("segmentation needs onnxruntime: pip install 'dano[segment]'") from error
+        onnxruntime = NETWORKS.load()
         try:
             self._session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime has exceptions of its own, not derived from a common one

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy import ndimage
 
-from dano.extras import optional
+from dano.extras import optional, PHOTOGRAPHS
 
 _HEIF = (".heic", ".heif", ".hif")
 PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".avif", *_HEIF)
@@ -200,7 +200,7 @@ _BESIDE = (".json", ".txt", ".csv", ".toml", ".md", ".npz", ".dano", ".aae", ".x
 
 def _opened(file: Path) -> Any:
     """A picture of pillow, as it is stored."""
-    image = optional("PIL.Image", "reading photographs needs pillow", "train")
+    image = PHOTOGRAPHS.load()
     if file.suffix.lower() in _HEIF:
         heif = optional("pillow_heif", f"{file}: reading HEIC pictures needs pillow-heif", "train")
         heif.register_heif_opener()
@@ -214,7 +214,7 @@ def _opened(file: Path) -> Any:
 
 def _transposed(picture: Any, orientation: int) -> Any:
     """Stored pixels turned upright."""
-    how = optional("PIL.Image", "reading photographs needs pillow", "train").Transpose
+    how = PHOTOGRAPHS.load().Transpose
     turns = {
         2: how.FLIP_LEFT_RIGHT,
         3: how.ROTATE_180,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dano.checks import checked_items, checked_kind, checked_path
-from dano.extras import is_installed
+from dano.extras import NETWORKS
 from dano.progress import Progress
 from dano.vision.capture import background_mask, PosedCamera, read_picture, View
 from dano.vision.structure import (
@@ -174,8 +174,7 @@ def _mask_source(seen: Sequence[Photograph], network: str | os.PathLike[str] | N
     if network is not None:
         if not Path(network).is_file():
             raise ValueError(f"network must be an .onnx file, got {network}, which does not exist")
-        if not is_installed("onnxruntime"):
-            raise ImportError("masks by a network need onnxruntime: pip install 'dano[segment]'")
+        NETWORKS.check()
         return "network"
     for photograph in without[:: max(1, len(without) // _TRIED)][:_TRIED]:
         _check_background(photograph)

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from types import ModuleType
 from typing import Any
 
+from dano.extras import COLMAP, OPENCV
+
 _POLL = 0.1
 """Seconds between looks at whether work has ended or was interrupted."""
 
@@ -17,11 +19,7 @@ def colmap() -> ModuleType:
     Raises:
         ImportError: If it is missing.
     """
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise ImportError("poses of photographs need pycolmap: pip install 'dano[poses]'") from error
-    return pycolmap
+    return COLMAP.load()
 
 
 def opencv() -> ModuleType:
@@ -30,11 +28,7 @@ def opencv() -> ModuleType:
     Raises:
         ImportError: If it is missing.
     """
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError("poses of photographs need OpenCV: pip install 'dano[poses]'") from error
-    return cv2
+    return OPENCV.load()
 
 
 @contextlib.contextmanager

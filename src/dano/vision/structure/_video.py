@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from dano.checks import checked_count, checked_number, checked_path
+from dano.extras import VIDEO_FILES
 from dano.progress import Progress
 from dano.vision.structure._photographs import VIDEOS
 from dano.vision.structure._sharpness import blur
@@ -136,11 +137,9 @@ def timed_frames(video: Path) -> Iterator[tuple[float, np.ndarray]]:
 
 
 def _decoded(video: Path) -> Iterator[Any]:
-    try:
-        import av
-        from av.error import FFmpegError
-    except ImportError as error:
-        raise ImportError("reading videos needs av: pip install 'dano[view]'") from error
+    av = VIDEO_FILES.load()
+    from av.error import FFmpegError
+
     try:
         with av.open(str(video)) as container:
             if not container.streams.video:

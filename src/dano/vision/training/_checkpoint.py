@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import json
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dano.archive import read_archive, write_archive
+from dano.archive import WorkInProgress
 from dano.vision.capture import Capture
 from dano.vision.training._options import TrainOptions
 
-FORMAT, VERSION = "dano-training", 1
+# Version 1 had another name for the digest.
+_FORM = "dano-training", 2
 
 
 class Checkpoint(NamedTuple):
@@ -45,39 +45,29 @@ class Checkpoint(NamedTuple):
         return jax.tree.unflatten(structure, [jnp.asarray(x) for x in self.leaves])
 
 
-def name_of(options: TrainOptions, capture: Capture) -> str:
-    """What a checkpoint must belong to: options, but for the time limit, and photographs."""
+def file_of(path: Path | None, options: TrainOptions, capture: Capture) -> WorkInProgress:
+    """The file of a training with some options, but for the time limit, and photographs."""
     told = {**dataclasses.asdict(options), "seconds": None}
     names = [(view.name, view.split, view.image.shape) for view in capture.views]
-    return hashlib.sha256(json.dumps([told, names], default=str).encode()).hexdigest()
+    digest = hashlib.sha256(json.dumps([told, names], default=str).encode()).hexdigest()
+    belongs = "this training, with the same photographs and options: remove it, or train without resuming"
+    return WorkInProgress(path, _FORM, digest, belongs)
 
 
-def save(path: Path, name: str, iteration: int, tree: Any, history: Sequence[Sequence[float]]) -> None:
-    """Write a checkpoint; a full disk is warned of, as it must not cost what has been learned."""
-    members = {f"leaf_{i:03d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
-    members |= {
-        "format": np.array(FORMAT),
-        "version": np.array(VERSION),
-        "training": np.array(name),
-        "iteration": np.array(iteration),
-        "history": np.array(history, np.float64),
-    }
-    try:
-        write_archive(path, members)
-    except OSError as error:
-        warnings.warn(f"checkpoint {path} could not be written: {error}", stacklevel=2)
+def save(file: WorkInProgress, iteration: int, tree: Any, history: Sequence[Sequence[float]]) -> None:
+    """Write a checkpoint."""
+    leaves = {f"leaf_{i:03d}": leaf for i, leaf in enumerate(jax.tree.leaves(tree))}
+    file.write({**leaves, "iteration": iteration, "history": np.array(history, np.float64)})
 
 
-def load(path: Path, name: str) -> Checkpoint:
-    """Read a checkpoint.
+def load(file: WorkInProgress) -> Checkpoint | None:
+    """Read a checkpoint; None if there is none.
 
     Raises:
         ValueError: If it is of another training, or damaged.
     """
-    data = read_archive(path, FORMAT, VERSION)
-    if str(data["training"]) != name:
-        raise ValueError(
-            f"{path} is of a training with other photographs or options: remove it, or train without resuming"
-        )
+    data = file.read()
+    if data is None:
+        return None
     leaves = [data[key] for key in sorted(data) if key.startswith("leaf_")]
     return Checkpoint(int(data["iteration"]), leaves, data["history"])

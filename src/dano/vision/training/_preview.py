@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dano.archive import replacing
+from dano.extras import optional
 
 # Height to which small pictures are enlarged, and space between pictures [pixels] (convention).
 _LEAST_HEIGHT = 96
@@ -25,10 +26,7 @@ def checked_folder(folder: str | Path) -> Path:
         raise ValueError(f"previews must be a folder, got the file {path}")
     if not path.parent.is_dir():
         raise ValueError(f"previews must be in an existing folder, got {path} in missing {path.parent}")
-    try:
-        import PIL  # noqa: F401  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError("previews need pillow: pip install 'dano[train]'") from error
+    optional("PIL", "previews need pillow", "train")
     path.mkdir(exist_ok=True)
     return path
 

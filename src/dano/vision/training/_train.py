@@ -197,7 +197,8 @@ class _Trainer:
         previews: Path | None,
     ):
         self.capture, self.options, self.found = capture, options, found
-        self.checkpoint, self.progress, self.previews = checkpoint, progress, previews
+        self.checkpoint = _checkpoint.file_of(checkpoint, options, capture)
+        self.progress, self.previews = progress, previews
         self.history: list[HistoryEntry] = []
         self.key = jax.random.key(options.seed)
         held = capture.split("test") or capture.split("train")
@@ -280,7 +281,7 @@ class _Trainer:
         if self.progress is not None:
             quality = f"{self.history[-1].psnr:.1f} dB " if self.history else ""
             share = iteration / self.options.iterations
-            self.progress(f"training {quality}{speed / 1000:.0f}k rays/s", share)
+            self.progress(f"training, {quality}{speed / 1000:.0f}k rays/s", share)
 
     def _trial(self, state: _State, rays: RaySet) -> float:
         """Mean loss of the last of a few steps: translucency deceives a fog, but not a surface."""
@@ -387,12 +388,9 @@ class _Trainer:
         return entry
 
     def _save(self, state: _State) -> None:
-        if self.checkpoint is not None:
-            rows = [[float(x) for x in entry] for entry in self.history]
-            name = _checkpoint.name_of(self.options, self.capture)
-            _checkpoint.save(
-                self.checkpoint, name, state.iteration, (state.learned, state.optimiser, state.blur), rows
-            )
+        rows = [[float(x) for x in entry] for entry in self.history]
+        tree = state.learned, state.optimiser, state.blur
+        _checkpoint.save(self.checkpoint, state.iteration, tree, rows)
 
     def resumed(self) -> _State | None:
         """The state in the checkpoint; None if there is no checkpoint.
@@ -400,9 +398,9 @@ class _Trainer:
         Raises:
             ValueError: If it is of another training, or damaged.
         """
-        if self.checkpoint is None or not self.checkpoint.exists():
+        stored = _checkpoint.load(self.checkpoint)
+        if stored is None:
             return None
-        stored = _checkpoint.load(self.checkpoint, _checkpoint.name_of(self.options, self.capture))
         state = self.fresh(self.found.hull, self.options.blur[0])
         if stored.iteration > self.switch or len(stored.leaves[0]) != len(state.model.distance):
             state = self.refined(state)
