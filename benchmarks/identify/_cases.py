@@ -165,9 +165,9 @@ def observed(case: Case, seed: int) -> dano.Motion:
     turned = quat_multiply(orientation, quat_exp(jnp.asarray(turn)))
     seen = position + POSITION * rng.standard_normal(position.shape)
     times = np.array(run.times)[::EVERY]
-    known = {}
-    if case.standing:
-        still = np.full(seen.shape, np.nan)
-        still[0, [names.index(name) for name in case.standing]] = 0
-        known = {"velocity": still, "omega": still}
-    return dano.Motion.create(times, names, position=seen, orientation=np.asarray(turned), **known)
+    turned = np.asarray(turned)
+    if not case.standing:
+        return dano.Motion.create(times, names, position=seen, orientation=turned)
+    still = np.full(seen.shape, np.nan)
+    still[0, [names.index(name) for name in case.standing]] = 0
+    return dano.Motion.create(times, names, position=seen, orientation=turned, velocity=still, omega=still)

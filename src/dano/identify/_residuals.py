@@ -297,7 +297,8 @@ def losses(model: Model, x: Float[Array, " p"], start: State, following: State) 
     """Losses of windows, jumps included, without derivatives."""
 
     def one(item):
-        rows, jump, _, _ = _residuals(model, *item, x, _no_change(model))
+        window, state, after = item
+        rows, jump, _, _ = _residuals(model, window, state, after, x, _no_change(model))
         return _robust(model, rows)[2] + 0.5 * jnp.sum(jump * jump)
 
     return map_rows(one, (model.windows, start, following), batch_size=model.batch, mesh=model.mesh)
