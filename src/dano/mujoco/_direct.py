@@ -22,6 +22,8 @@ from dano.native import compiled_kernel, Features, instance
 
 _PAGE = 4096
 """Bytes from one address where memory may end to the next."""
+_FARTHEST = 1 << 20
+"""Bytes within which a number must stand: an `mjData` has some 200,000."""
 _LEAST = 64
 """Slots of the smallest table."""
 _SHIFT = 6
@@ -31,9 +33,13 @@ _KEPT = 16
 
 
 def _place(begin: int, number: Any) -> int:
-    """How many bytes from an address on a number stands first, aligned by its size. It must be there."""
+    """How many bytes from an address on a number stands first, aligned by its size.
+
+    Raises:
+        AttributeError: If it is not near.
+    """
     size, at = number.itemsize, begin
-    while True:
+    while at < begin + _FARTHEST:
         end = (at // _PAGE + 1) * _PAGE
         count = (end - at) // size
         values = np.frombuffer(ctypes.string_at(at, count * size), number.dtype)
@@ -41,6 +47,7 @@ def _place(begin: int, number: Any) -> int:
         if len(found):
             return at - begin + size * int(found[0])
         at += count * size
+    raise AttributeError(f"{number!r} is not in the structure")
 
 
 def _head(mujoco: Any) -> Int[np.ndarray, " words"]:
@@ -49,7 +56,7 @@ def _head(mujoco: Any) -> Int[np.ndarray, " words"]:
     Numbers are looked for where they have been put in a model and a data of its own.
 
     Raises:
-        AttributeError: If MuJoCo's library does not show its functions.
+        AttributeError: If MuJoCo's library does not show its functions, or is laid out in another way.
     """
     box = '<geom type="box" size="0.1 0.1 0.1"/>'
     body = f'<body pos="0 0 0.19"><freejoint/>{box}</body>'
