@@ -179,9 +179,11 @@ class Pace:
     def write(self, path: Path, arrays: Mapping[str, np.ndarray]) -> None:
         """Write arrays as `write_archive` does, and remember what it cost."""
         began = time.monotonic()
-        write_archive(path, arrays)
-        self._written = time.monotonic()
-        self._price = self._written - began
+        try:
+            write_archive(path, arrays)
+        finally:
+            self._written = time.monotonic()
+            self._price = self._written - began
 
 
 class WorkInProgress:
@@ -224,7 +226,7 @@ class WorkInProgress:
     def write(self, arrays: Mapping[str, Any]) -> bool:
         """Write what is known, and say whether it is kept.
 
-        A full disk is warned of, as it must not cost what has been done.
+        A full or lost disk is warned of, as it must not cost what has been done.
         """
         if self.path is None:
             return False
@@ -232,7 +234,7 @@ class WorkInProgress:
         members = {name: np.asarray(value) for name, value in {**about, **arrays}.items()}
         try:
             self._pace.write(self.path, members)
-        except OSError as error:
+        except (OSError, ValueError) as error:
             warnings.warn(f"checkpoint {self.path} could not be written: {error}", stacklevel=2)
             return False
         return True

@@ -7,7 +7,11 @@ from typing import Any, NamedTuple
 
 def is_installed(module: str) -> bool:
     """Whether a module can be imported; nothing is imported."""
-    return importlib.util.find_spec(module) is not None
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:
+        # Of a module within a package, which is missing.
+        return False
 
 
 def optional(module: str, need: str, extra: str) -> Any:

@@ -2,6 +2,8 @@
 
 import contextlib
 import gc
+import threading
+import time
 
 import mujoco
 import numpy as np
@@ -166,6 +168,31 @@ def test_data_come_and_go(entered):
             mujoco.mj_step(model, reference, 20)
             many.clear()
             gc.collect()
+
+
+def test_blocks_may_end_while_threads_step():
+    bridge, model = attached()
+    data, ended = dropped(model), threading.Event()
+
+    def step() -> None:
+        while not ended.is_set():
+            # A step that is about to ask Python does not find it any more.
+            with contextlib.suppress(mujoco.UnexpectedError):
+                mujoco.mj_step(model, data, 20)
+
+    stepping = threading.Thread(target=step)
+    stepping.start()
+    try:
+        for _ in range(300):
+            with bridge:
+                time.sleep(1e-3)
+            # Memory that was freed would be these numbers.
+            junk = [np.full(size, 0x4141414141, np.int64) for size in (14, 76, 129)]
+            assert junk[0][0] > 0
+    finally:
+        ended.set()
+        stepping.join()
+    assert np.all(np.isfinite(data.qpos))
 
 
 def test_another_model_with_the_same_data_is_looked_at(entered):

@@ -147,7 +147,7 @@ def test_a_checkpoint_of_another_search_is_refused(tmp_path):
     ):
         with pytest.raises(
             ValueError,
-            match="options.checkpoint .*search.npz must be of this search, with the same scene, motion",
+            match="checkpoint .*search.npz must be of this search, with the same scene, motion",
         ):
             search(**{"options": resumed, **other})
     assert path.read_bytes() == before

@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import re
-import warnings
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -13,13 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dano.archive import checked_output, Pace, read_archive
+from dano.archive import checked_output, WorkInProgress
 from dano.identify._motion import Motion
 from dano.identify._settings import Setup
 from dano.scene import JOINT_QUANTITIES, State, state_arrays, STATE_SIZES
 from dano.solvers import Iterate, NormalEquations, Solution, Stop
 
-_FORM, _VERSION = "dano-search", 1
+_FORM = "dano-search", 1
 
 Keep = Callable[[Iterate], None]
 
@@ -44,9 +43,13 @@ class Checkpoint:
 
     def __init__(self, path: Path | None, digest: str):
         """Nothing is read or written yet; without a path, nothing ever is."""
-        self._path = None if path is None else checked_output(path)
-        self._digest = digest
-        self._pace = Pace()
+        self._file = WorkInProgress(
+            None if path is None else checked_output(path),
+            _FORM,
+            digest,
+            "this search, with the same scene, motions, options and version of dano: remove it, or search"
+            " without resuming",
+        )
         self._points: list[np.ndarray] = []
         # Each with the number of simulations until then.
         self._ended: list[tuple[Solution, int]] = []
@@ -59,14 +62,9 @@ class Checkpoint:
         Raises:
             ValueError: If the file is not a checkpoint, or one of another search.
         """
-        if self._path is None or not self._path.exists():
+        data = self._file.read()
+        if data is None:
             return
-        data = read_archive(self._path, _FORM, _VERSION)
-        if str(data.get("digest")) != self._digest:
-            raise ValueError(
-                f"options.checkpoint {self._path} must be of this search, with the same scene, motions,"
-                " options and version of dano: remove it, or search without resuming"
-            )
         self._points = list(data["points"])
         self._ended = [_solution(data, f"{i}_") for i in range(int(data["ended"]))]
         self._now = _iterate(data) if "now_x" in data else None
@@ -110,10 +108,9 @@ class Checkpoint:
 
     def _write(self, *, now: bool) -> None:
         """Write what is known, if it is time to, or at once."""
-        if self._path is None or not (now or self._pace.due()):
+        if not (now or self._file.due()):
             return
-        about = {"format": _FORM, "version": _VERSION, "digest": self._digest, "ended": len(self._ended)}
-        members: dict[str, Any] = {**about, "points": self._points}
+        members: dict[str, Any] = {"ended": len(self._ended), "points": self._points}
         for i, (solution, simulations) in enumerate(self._ended):
             members |= _members(f"{i}_", solution, simulations) | {f"{i}_stop": solution.stop.name}
         if self._now is not None:
@@ -121,11 +118,7 @@ class Checkpoint:
             members |= _members("now_", iterate, simulations)
             members |= {f"now_{name}": getattr(iterate, name) for name in ("damping", "growth", "slow")}
             members |= {"now_shared_spread": iterate.spread[0], "now_private_spread": iterate.spread[1]}
-        try:
-            self._pace.write(self._path, {name: np.asarray(value) for name, value in members.items()})
-        except OSError as error:
-            # A full disk must not cost what has been found.
-            warnings.warn(f"checkpoint {self._path} could not be written: {error}", stacklevel=2)
+        self._file.write(members)
 
 
 def _members(prefix: str, found: Solution | Iterate, simulations: int) -> dict[str, Any]:

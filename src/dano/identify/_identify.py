@@ -178,8 +178,11 @@ def _searched(
         for k, each in enumerate(ended):
             if any(other.solution.stop is Stop.INTERRUPTED for other in ended):
                 break
+            tell("smoothing", k / len(ended))
             ended[k] = _smoothed(problem, each, points[k])
-    return sorted(ended, key=lambda each: each.solution.normal.loss)
+    # Losses of planes and those of ripples are not alike; ripples are left only where it was interrupted.
+    rough = any(each.smoothing is not None for each in ended)
+    return sorted(ended, key=lambda e: (rough and e.smoothing is None, e.solution.normal.loss))
 
 
 def _smoothed(problem: Problem, ended: _Ended, first: np.ndarray) -> _Ended:

@@ -158,7 +158,11 @@ class Problem:
     def loss(self, x: np.ndarray, start: State) -> float:
         """The loss at coordinates and initial states, without derivatives where one device does the work."""
         if jax.process_count() * self.model.mesh.size > 1:
-            return self.linearize(x, start).loss
+            kept, self.smoothing = self.smoothing, None
+            try:
+                return self.linearize(x, start).loss
+            finally:
+                self.smoothing = kept
         self.simulations += len(self.plan.rows)
         at = jnp.asarray(x, self.model.scene.timestep.dtype)
         return float(np.sum(losses(self.model, at, start, _following(start))))

@@ -223,6 +223,7 @@ def _linearized(
     smoothing: Smoothing | None,
 ) -> Linearized:
     p, draws = x.shape[0], 1 if smoothing is None else smoothing.draws.shape[0]
+    smoothing = jax.tree.map(lambda part: part.astype(x.dtype), smoothing)
 
     def one(item):
         window, state, after, _, seen_from = item

@@ -33,6 +33,8 @@ _SLOW, _BETTER = 2, 0.9
 # Steps about the minimum, of which those count whose loss is no more than so many times the least.
 _LIKE = 2.0
 _LAST_STEPS = 8
+# Drift of these that is none beside the standard errors, and most steps until there is none.
+_STILL, _MOST_STEPS = 0.1, 40
 # Drift of these that counts as no drift, in its own standard errors.
 _DRIFT = 3.0
 # Least variance of residuals, as a share of what the stated noise has.
@@ -125,6 +127,15 @@ def settled(
     """
     if solution.stop is Stop.PERFECT:
         return solution
+    try:
+        return _settled(problem, solution, _Point(*first), rough)
+    except KeyboardInterrupt:
+        problem.count(1.0)
+        problem.smoothing = None
+        return solution._replace(stop=Stop.INTERRUPTED)
+
+
+def _settled(problem: Smoothed, solution: Solution, first: _Point, rough: bool) -> Solution:
     widest = np.concatenate([_ranges(problem, solution.x), problem.start_widths()])
     rows = _directions(len(widest), problem.seed)
     here = _Point(solution.x, solution.blocks)
@@ -135,14 +146,9 @@ def settled(
     if not rough and solution.stop.converged and steady and not _blind(solution, sight):
         problem.smoothing = None
         return solution
-    try:
-        grown = _grown(problem, _Point(*first), widest)
-        begin = grown if _loss(problem, grown) < _loss(problem, here) else here
-        end = _averaged(problem, begin, widest)
-    except KeyboardInterrupt:
-        problem.count(1.0)
-        problem.smoothing = None
-        return solution._replace(stop=Stop.INTERRUPTED)
+    grown = _grown(problem, first, widest)
+    begin = grown if _loss(problem, grown) < _loss(problem, here) else here
+    end = _averaged(problem, begin, widest)
     problem.roughness = end.scatter
     losses = np.array([*solution.losses, end.sight.normal.loss])
     stop = Stop.LOSS if end.steady else Stop.STUCK
@@ -232,8 +238,7 @@ class _End(NamedTuple):
 def _averaged(problem: Smoothed, point: _Point, widest: np.ndarray) -> _End:
     """Walk to the minimum of the trend and about it, and take the middle of the points that fit."""
     point = _descended(_walk(problem, point, widest), point)
-    walk = _walk(problem, point, widest)
-    seen = [next(walk) for _ in range(_LAST_STEPS)]
+    seen = _last_of(_walk(problem, point, widest))
     losses = np.array([sight.normal.loss for _, sight in seen])
     fits = losses <= _LIKE * losses.min()
     last = np.array([here.x for here, _ in seen])[fits]
@@ -250,11 +255,29 @@ def _averaged(problem: Smoothed, point: _Point, widest: np.ndarray) -> _End:
             if after.normal.loss < sight.normal.loss:
                 held, sight = other, after
                 break
-    half = len(last) // 2
-    drift = np.abs(last[:half].mean(axis=0) - last[half:].mean(axis=0)) if half else np.zeros(len(middle))
     unsure = np.sqrt(np.diag(scatter) * 4 / len(last))
-    steady = bool(np.all(drift <= _DRIFT * unsure + _STEADY * sight.errors))
+    steady = bool(np.all(_drift(last) <= _DRIFT * unsure + _STEADY * sight.errors))
     return _End(held, sight, scatter, steady)
+
+
+def _last_of(walk: Iterator[tuple[_Point, _Sight]]) -> list[tuple[_Point, _Sight]]:
+    """The last steps of a walk that has come to rest; the second half of all where it does not."""
+    seen = []
+    for _ in range(_MOST_STEPS):
+        seen.append(next(walk))
+        last = seen[-_LAST_STEPS:]
+        drift = _drift(np.array([here.x for here, _ in last]))
+        if len(last) == _LAST_STEPS and np.all(drift <= _STILL * last[-1][1].errors):
+            return last
+    return seen[len(seen) // 2 :]
+
+
+def _drift(points: np.ndarray) -> np.ndarray:
+    """How far the middles of both halves of some points are apart."""
+    half = len(points) // 2
+    if not half:
+        return np.zeros(points.shape[1])
+    return np.abs(points[:half].mean(axis=0) - points[half:].mean(axis=0))
 
 
 def _walk(problem: Smoothed, point: _Point, widest: np.ndarray) -> Iterator[tuple[_Point, _Sight]]:
@@ -370,8 +393,8 @@ def _variance(problem: Smoothed, normal: NormalEquations) -> float:
 
 def _evenly(problem: Smoothed, rows: np.ndarray, widest: np.ndarray, point: _Point) -> Smoothing:
     """The widest draws."""
-    windows = len(point.blocks.position)
-    return _smoothing(problem, rows, np.tile(np.diag(widest), (windows, 1, 1)))
+    windows, unknowns = len(point.blocks.position), len(widest)
+    return _smoothing(problem, rows, widest, np.tile(np.eye(unknowns), (windows, 1, 1)))
 
 
 def _drawn(rows: np.ndarray, widest: np.ndarray, sight: _Sight, problem: Smoothed) -> Smoothing:
@@ -385,14 +408,17 @@ def _drawn(rows: np.ndarray, widest: np.ndarray, sight: _Sight, problem: Smoothe
     # What other windows say of the parameters, and no wider than the widest.
     whole = hessian.copy()
     whole[:, :p, :p] += np.sum(own, axis=0) - own
-    whole += variance * np.diag(1 / widest**2)
-    unit = whole * widest[:, None] * widest[None]
-    covariance = _LAST**2 * variance * np.linalg.inv(unit) + _LEAST**2 * np.eye(len(widest))
-    return _smoothing(problem, rows, widest[None, :, None] * np.linalg.cholesky(covariance))
+    one = np.eye(len(widest))
+    unit = whole * widest[:, None] * widest[None] + variance * one
+    covariance = _LAST**2 * variance * np.linalg.inv(unit) + _LEAST**2 * one
+    return _smoothing(problem, rows, widest, np.linalg.cholesky(covariance))
 
 
-def _smoothing(problem: Smoothed, rows: np.ndarray, spread: np.ndarray) -> Smoothing:
-    parts = rows, spread, np.linalg.inv(spread), problem.lower, problem.upper
+def _smoothing(problem: Smoothed, rows: np.ndarray, widest: np.ndarray, unit: np.ndarray) -> Smoothing:
+    """Draws by spreads in units of the widest; what has no width stays where it is and has no slope."""
+    free = widest > 0
+    back = np.where(free, 1 / np.where(free, widest, 1), 0)
+    parts = rows, widest[:, None] * unit, np.linalg.inv(unit) * back, problem.lower, problem.upper
     return Smoothing(*(jnp.asarray(part) for part in parts))
 
 

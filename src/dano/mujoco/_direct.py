@@ -3,7 +3,6 @@
 Threads of a rollout wait for Python's lock otherwise, and a step spends half of its time in the interpreter.
 """
 
-import collections
 import ctypes
 import functools
 import sys
@@ -28,8 +27,6 @@ _LEAST = 64
 """Slots of the smallest table."""
 _SHIFT = 6
 """Bits of an address that say little, as the callback has it."""
-_KEPT = 16
-"""Tables that are kept, the one in use among them."""
 
 
 def _place(begin: int, number: Any) -> int:
@@ -77,8 +74,10 @@ def _head(mujoco: Any) -> Int[np.ndarray, " words"]:
         head[word] = ctypes.cast(getattr(library, name), ctypes.c_void_p).value or 0
     head[Head.STRIDE] = contact.geom.strides[0]
     head[Head.GEOM] = contact.geom.ctypes.data + 4 - begin
-    head[Head.CONTACT] = _place(data._address, np.int64(begin))
-    head[Head.XPOS] = _place(data._address, np.int64(data.xpos.ctypes.data))
+    positions = _place(data._address, np.int64(data.xpos.ctypes.data))
+    # Contacts begin where the arena does, to which another pointer leads, before positions.
+    head[Head.CONTACT] = positions + _place(data._address + positions, np.int64(begin))
+    head[Head.XPOS] = positions
     head[Head.GRAVITY] = model.opt.gravity.ctypes.data - model._address
     for owner, name, word, mark in (
         (model.opt, "timestep", Head.TIMESTEP, np.float64(0.0012345678)),
@@ -109,13 +108,13 @@ class Direct:
         self._mujoco = mujoco
         self._head = _head(mujoco)
         self._slot = ctypes.c_void_p.in_dll(_library(mujoco), "mjcb_passive")
-        self._lock = threading.Lock()
+        # Weak references call back within it.
+        self._lock = threading.RLock()
         self._entries: dict[int, _Known] = {}
-        # Slots lead to them until there are new ones.
-        self._dead: list[Any] = []
-        # Another thread may be looking something up there just now.
-        self._old: collections.deque[Any] = collections.deque(maxlen=_KEPT)
-        self._slots, self._used = self._emptied(_LEAST), 0
+        # Nothing leads to them any more, but threads may still be reading them.
+        self._old: list[Any] = []
+        self._slots, self._used = _slots(_LEAST), 0
+        self._head[Head.SLOTS] = self._slots.ctypes.data
         # Its machine code is there as long as it is.
         self._kernel = compiled_kernel(_kernel)
         address = wp.zeros(1, dtype=wp.int64, device="cpu")
@@ -159,51 +158,72 @@ class Direct:
 
         def forget(_: Any) -> None:
             # Whatever comes to lie at that address is for Python first.
-            entry[Entry.MODEL] = 0
-            self._dead.append(entry)
-            if key in self._entries and self._entries[key].entry is entry:
-                del self._entries[key]
+            with self._lock:
+                if key in self._entries and self._entries[key].entry is entry:
+                    self._fill(key, None)
+                    self._leave(self._entries.pop(key))
 
         ends = weakref.ref(model, forget), weakref.ref(data, forget)
         with self._lock:
+            before = self._entries.get(key)
             self._entries[key] = _Known(entry, *ends, search, (writer, standing, bounds, arguments))
             self._put(key, entry)
+            self._leave(before)
 
     def clear(self) -> None:
         """Forget all data."""
         with self._lock:
-            self._entries.clear()
-            self._slots, self._used = self._emptied(_LEAST), 0
+            known, self._entries = self._entries, {}
+            self._replace(_slots(_LEAST))
+            self._leave(known)
 
-    def _emptied(self, capacity: int) -> Int[np.ndarray, " words"]:
-        """A table with empty slots, which the callback reads from now on."""
-        slots = np.zeros(1 + 2 * capacity, np.int64)
-        slots[0] = capacity
-        self._old.append((slots, self._dead))
-        self._dead = []
+    def _replace(self, slots: Int[np.ndarray, " slots"]) -> None:
+        """Let the callback read another table from now on."""
+        before, self._slots, self._used = self._slots, slots, int(np.count_nonzero(slots[1::2]))
         self._head[Head.SLOTS] = slots.ctypes.data
-        return slots
+        self._leave(before)
+
+    def _leave(self, old: Any) -> None:
+        """Keep what the callback no longer finds until no thread can be reading it."""
+        # Who comes in later finds what is there now. What is new here waits for the next time: a thread that
+        # has just come in may not be seen yet.
+        if self._head[Head.INSIDE] == 0:
+            self._old.clear()
+        self._old.append(old)
 
     def _put(self, key: int, entry: Int[np.ndarray, " words"]) -> None:
         capacity = int(self._slots[0])
         if 2 * self._used >= capacity:
             while capacity < 4 * len(self._entries):
                 capacity *= 2
-            self._slots, self._used = self._emptied(capacity), 0
+            slots = _slots(capacity)
             # Data may die meanwhile.
             for other, known in self._entries.copy().items():
-                self._fill(other, known.entry)
+                _fill(slots, other, known.entry)
+            self._replace(slots)
         self._fill(key, entry)
 
-    def _fill(self, key: int, entry: Int[np.ndarray, " words"]) -> None:
-        """Put an entry into its slot, as the callback looks for it."""
-        capacity = int(self._slots[0])
-        i = (key >> _SHIFT) % capacity
-        while self._slots[1 + 2 * i] not in (0, key):
-            i = (i + 1) % capacity
-        self._used += int(self._slots[1 + 2 * i] == 0)
-        self._slots[2 + 2 * i] = entry.ctypes.data
-        self._slots[1 + 2 * i] = key
+    def _fill(self, key: int, entry: Int[np.ndarray, " words"] | None) -> None:
+        self._used += _fill(self._slots, key, entry)
+
+
+def _slots(capacity: int) -> Int[np.ndarray, " slots"]:
+    """A table with empty slots."""
+    slots = np.zeros(1 + 2 * capacity, np.int64)
+    slots[0] = capacity
+    return slots
+
+
+def _fill(slots: Int[np.ndarray, " slots"], key: int, entry: Int[np.ndarray, " words"] | None) -> int:
+    """Put an entry into its slot, as the callback looks for it; 1 if the slot was empty, else 0."""
+    capacity = int(slots[0])
+    i = (key >> _SHIFT) % capacity
+    while slots[1 + 2 * i] not in (0, key):
+        i = (i + 1) % capacity
+    new = int(slots[1 + 2 * i] == 0)
+    slots[2 + 2 * i] = 0 if entry is None else entry.ctypes.data
+    slots[1 + 2 * i] = key
+    return new
 
 
 class _Known(NamedTuple):

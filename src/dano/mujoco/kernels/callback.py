@@ -30,7 +30,7 @@ typedef wp::int32 whole;
 typedef wp::float64 real;
 typedef void (*Stage)(const void*, void*);
 typedef whole (*Add)(const void*, void*, const void*);
-static const word* known = nullptr;
+static word* known = nullptr;
 struct Callback {
     static bool is_added(const word* head, const word* entry, const char* data) {
         const whole n = *(const whole*)(data + head[Head::NCON]);
@@ -74,17 +74,19 @@ struct Callback {
         return true;
     }
     static void passive(const void* model, void* data) {
-        const word* head = __atomic_load_n(&known, __ATOMIC_ACQUIRE);
-        const word* slots = (const word*)__atomic_load_n(head + Head::SLOTS, __ATOMIC_ACQUIRE);
+        word* head = __atomic_load_n(&known, __ATOMIC_ACQUIRE);
+        __atomic_fetch_add(head + Head::INSIDE, 1, __ATOMIC_SEQ_CST);
+        const word* slots = (const word*)__atomic_load_n(head + Head::SLOTS, __ATOMIC_SEQ_CST);
         const word mask = slots[0] - 1;
         word i = ((word)data >> 6) & mask;
         while (slots[1 + 2 * i] != 0 && slots[1 + 2 * i] != (word)data) i = (i + 1) & mask;
         const word* entry = slots[1 + 2 * i] == 0 ? nullptr : (const word*)slots[2 + 2 * i];
-        if (entry == nullptr || !is_done(head, entry, (const char*)model, (char*)data))
-            ((Stage)head[Head::PYTHON])(model, data);
+        const bool done = entry != nullptr && is_done(head, entry, (const char*)model, (char*)data);
+        __atomic_fetch_sub(head + Head::INSIDE, 1, __ATOMIC_SEQ_CST);
+        if (!done) ((Stage)head[Head::PYTHON])(model, data);
     }
 };
-__atomic_store_n(&known, (const word*)head, __ATOMIC_RELEASE);
+__atomic_store_n(&known, (word*)head, __ATOMIC_RELEASE);
 return (wp::int64)&Callback::passive;
 """
 )

@@ -42,7 +42,9 @@ class Head(enum.IntEnum):
     GEOM = 15
     """Place of the second geom in `mjContact`."""
     SLOTS = 16
-    """Address of a hash table: its capacity, a power of two, then `mjData` and entry of each slot."""
+    """Address of a hash table: its capacity, a power of two, then `mjData` and entry of each slot or 0."""
+    INSIDE = 17
+    """How many threads may be reading a table or an entry."""
 
 
 class Entry(enum.IntEnum):

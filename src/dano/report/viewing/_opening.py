@@ -68,7 +68,7 @@ class Opening(NamedTuple):
     def choose(self, client: Any) -> None:
         """Move the camera of a window that has just been opened, if it is upright."""
         shape = client.camera.aspect
-        if shape >= 1:
+        if shape >= 1 or shape <= 0:
             return
         back = max(1.0, _UPRIGHT[0] / _UPRIGHT[1] / shape)
         client.camera.position = self.upright.look_at + back * (self.upright.position - self.upright.look_at)
