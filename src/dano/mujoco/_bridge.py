@@ -77,6 +77,8 @@ class Bridge:
         self._local = threading.local()
         self._before: Any = None
         self._direct: Direct | None = None
+        # Steps of other threads may be under way where a block ends.
+        self._ending = threading.RLock()
         self._depth = 0
 
     def attach(
@@ -157,10 +159,11 @@ class Bridge:
     def __exit__(self, *_: object) -> None:
         self._depth -= 1
         if self._depth == 0:
-            self._mujoco.set_mjcb_passive(self._before)
-            if self._direct is not None:
-                self._direct.clear()
-            self._before = self._direct = None
+            with self._ending:
+                self._mujoco.set_mjcb_passive(self._before)
+                if self._direct is not None:
+                    self._direct.clear()
+                self._before = self._direct = None
             self._stand_in(True)
 
     def _stand_in(self, collides: bool) -> None:
@@ -251,20 +254,24 @@ class Bridge:
         return added
 
     def _passive(self, model: Any, data: Any) -> None:
-        if self._before is not None:
-            self._before(model, data)
+        before = self._before
+        if before is not None:
+            before(model, data)
         self._append(model, data)
-        # Unless a function of somebody else's has called this one.
-        if self._direct is not None and self._mujoco.get_mjcb_passive() == self._passive:
-            self._hand_over(self._direct, model, data)
+        self._hand_over(model, data)
 
-    def _hand_over(self, callback: Direct, model: Any, data: Any) -> None:
+    def _hand_over(self, model: Any, data: Any) -> None:
         """Let the next steps of some data do without Python, if there is a search in them."""
         table = self._table(model)
         search = None if table is None else table.search_in(data)
-        if table is not None and search is not None and not callback.knows(data, search):
-            callback.add(model, data, search, table.geoms, self._longest_fall())
-        callback.install()
+        with self._ending:
+            callback = self._direct
+            # A function of somebody else's may have called this one.
+            if callback is None or self._mujoco.get_mjcb_passive() != self._passive:
+                return
+            if table is not None and search is not None and not callback.knows(data, search):
+                callback.add(model, data, search, table.geoms, self._longest_fall())
+            callback.install()
 
     def _longest_fall(self) -> float:
         """In a step [m]."""
