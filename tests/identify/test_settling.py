@@ -1,5 +1,6 @@
 """Fits where the loss is rough: planes through draws, and a throw whose derivatives lead nowhere."""
 
+import dataclasses
 import warnings
 
 import jax.numpy as jnp
@@ -117,8 +118,23 @@ def test_a_throw_is_found_from_far_away_starts():
         # Where the minimum of the trend is, ripples add about as much as the noise.
         assert fit.errors.rms < 2
     rough = [fit for fit in fits if fit.smoothed]
+    assert rough
     for fit in rough:
         assert fit.worth is not None and fit.to_dict()["worth"] == fit.worth.summary
+
+
+def test_a_parameter_without_room_is_held():
+    scene, rng = thrown(0.3, 0.3), np.random.default_rng(2)
+    start = scene.initial_state(box=dict(position=(0, 0, 0.08), velocity=(0.8, 0, 0), omega=(1, 2, 1)))
+    motion, noise = watched("box", dano.simulate(scene, start, 40), rng)
+    friction, held = friction_and_restitution("box")
+    held = dataclasses.replace(held, lower=0.3, upper=0.3)
+    with warnings.catch_warnings():
+        # That it lies on its bound is said where the data pull it further.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        fit = dano.identify(thrown(0.5, 0.3), motion, [friction, held], initial="states", noise=noise)
+    assert fit.values["restitution"] == pytest.approx(0.3)
+    assert abs(fit.values["friction"] - 0.3) < 4 * fit.standard_errors["friction"]
 
 
 @pytest.mark.slow
