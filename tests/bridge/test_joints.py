@@ -11,7 +11,7 @@ from engine.trees import coordinates
 
 import dano
 from dano.mujoco import MuJoCoEngine
-from dano.mujoco._rebound import damping_ratio, rebound, spring_of
+from dano.mujoco._settings import damping_ratio, rebound, spring_of
 
 GRAVITY = 9.81
 ROD = dano.Box((0.1, 0.02, 0.01))

@@ -14,8 +14,7 @@ import numpy as np
 from dano.checks import checked_function, checked_items, checked_kind, checked_optional
 from dano.engine import AbstractEngine, checked_engine, Policy
 from dano.identify._checkpoint import Checkpoint, digest_of
-from dano.identify._joint_log import joint_table
-from dano.identify._motion import Motion, QUANTITIES
+from dano.identify._motion import joint_table, Motion, QUANTITIES
 from dano.identify._motion_files import load_motion
 from dano.identify._parameters import Parameter, space_of, values_at, with_values
 from dano.identify._problem import Problem

@@ -12,8 +12,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.engine import AbstractEngine, compiled, difference, gather, map_rows, retract, simulate
-from dano.identify._joint_log import joint_table
-from dano.identify._motion import QUANTITIES
+from dano.identify._motion import joint_table, QUANTITIES
 from dano.identify._parameters import Selection, with_values
 from dano.identify._planes import plane_through, Smoothing
 from dano.identify._windows import Windows

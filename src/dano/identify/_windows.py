@@ -8,8 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.identify._joint_log import joint_numbers, joint_widths
-from dano.identify._motion import JOINT_NUMBERS, Motion, QUANTITIES, SMOOTHING_FRAMES
+from dano.identify._motion import (
+    JOINT_NUMBERS,
+    joint_numbers,
+    joint_widths,
+    Motion,
+    QUANTITIES,
+    SMOOTHING_FRAMES,
+)
 from dano.maths import quat_rotate
 from dano.scene import Control, Layout, Scene, State
 

@@ -12,8 +12,7 @@ from jaxtyping import Float, Int
 from dano.maths import quat_exp, quat_log
 from dano.mujoco._bridge import Bridge
 from dano.mujoco._model import library
-from dano.mujoco._rebound import spring_of
-from dano.mujoco._settings import LEAST_FRICTION, Settings
+from dano.mujoco._settings import LEAST_FRICTION, Settings, spring_of
 from dano.mujoco._spec import add_mesh, AS_SAMPLES, joint_names, motor_name, spec_of, weigh_later
 from dano.scene import Scene
 
