@@ -33,7 +33,7 @@ _SLOW, _BETTER = 2, 0.9
 # Steps about the minimum, of which those count whose loss is no more than so many times the least.
 _LIKE = 2.0
 _LAST_STEPS = 8
-# Drift of these that is none beside the standard errors, and most steps until there is none.
+# Drift of these below which they rest, in standard errors, and most steps until then.
 _STILL, _MOST_STEPS = 0.1, 40
 # Drift of these that counts as no drift, in its own standard errors.
 _DRIFT = 3.0
