@@ -188,7 +188,7 @@ def _smoothed(problem: Problem, ended: _Ended, first: np.ndarray) -> _Ended:
     """Where the search from a start ends in the trend of the loss."""
     if ended.smoothing is not None:
         return ended
-    problem.smoothing, problem.roughness = None, np.zeros((0, 0))
+    problem.smoothing = None
     solution = problem.settled(ended.solution, first, rough=True)
     return _Ended(solution, problem.smoothing, problem.roughness)
 

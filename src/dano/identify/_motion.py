@@ -1,4 +1,4 @@
-"""Motions: poses of bodies over time, as a tracker, a file or another simulation gives them."""
+"""Motions: poses of bodies over time, from a tracker, a file, another simulation or a log of joints."""
 
 import dataclasses
 import warnings

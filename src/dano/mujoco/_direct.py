@@ -16,7 +16,7 @@ from jaxtyping import Int
 
 from dano.mujoco._search import Search
 from dano.mujoco._settings import Writer
-from dano.mujoco.kernels.words import Entry, Head
+from dano.mujoco.kernels.words import Entry, Head, SHIFT
 from dano.native import compiled_kernel, Features, instance
 
 _PAGE = 4096
@@ -25,8 +25,6 @@ _FARTHEST = 1 << 20
 """Bytes within which a number must stand: an `mjData` has some 200,000."""
 _LEAST = 64
 """Slots of the smallest table."""
-_SHIFT = 6
-"""Bits of an address that say little, as the callback has it."""
 
 
 def _place(begin: int, number: Any) -> int:
@@ -217,7 +215,7 @@ def _slots(capacity: int) -> Int[np.ndarray, " slots"]:
 def _fill(slots: Int[np.ndarray, " slots"], key: int, entry: Int[np.ndarray, " words"] | None) -> int:
     """Put an entry into its slot, as the callback looks for it; 1 if the slot was empty, else 0."""
     capacity = int(slots[0])
-    i = (key >> _SHIFT) % capacity
+    i = (key >> SHIFT) % capacity
     while slots[1 + 2 * i] not in (0, key):
         i = (i + 1) % capacity
     new = int(slots[1 + 2 * i] == 0)

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from dano.mujoco.kernels.words import REALS, WHOLES
+
 LEAST_FRICTION = 1e-5
 """MuJoCo's mjMINMU."""
 
@@ -86,9 +88,9 @@ class Writer:
         self._add = mujoco.mj_addContact
         self._contact = contact = mujoco.MjContact()
         begin, whole = contact.pos.ctypes.data - 8, contact.geom.ctypes.data - 12
-        self._reals = np.ctypeslib.as_array((ctypes.c_double * 28).from_address(begin))
-        self._wholes = np.ctypeslib.as_array((ctypes.c_int32 * 13).from_address(whole))
-        self._reals[:], self._wholes[:] = np.arange(28) + 0.5, np.arange(13) + 40
+        self._reals = np.ctypeslib.as_array((ctypes.c_double * REALS).from_address(begin))
+        self._wholes = np.ctypeslib.as_array((ctypes.c_int32 * WHOLES).from_address(whole))
+        self._reals[:], self._wholes[:] = np.arange(REALS) + 0.5, np.arange(WHOLES) + 40
         read = [contact.dist, *contact.pos, *contact.frame, contact.includemargin, *contact.friction]
         read += [*contact.solref, *contact.solreffriction, *contact.solimp]
         counted = [contact.dim, contact.geom1, contact.geom2, *contact.geom, *contact.flex, *contact.elem]

@@ -147,13 +147,12 @@ class Table:
         return found[2] if found is not None and found[0]() is data and found[1] is self._known else None
 
     def _search(self, model: Any, data: Any) -> Search:
-        key, known = id(data), self._known
-        found = self._searches.get(key)
-        if found is None or found[0]() is not data or found[1] is not known:
+        key, known, found = id(data), self._known, self.search_in(data)
+        if found is None:
             gone = weakref.ref(data, lambda _: self._searches.pop(key, None))
-            made = Search(self._mujoco, model, data, known, self._most)
-            self._searches[key] = found = gone, known, made
-        return found[2]
+            found = Search(self._mujoco, model, data, known, self._most)
+            self._searches[key] = gone, known, found
+        return found
 
 
 def _do_touch(model: Any, geom: Part, carrier: Part) -> bool:

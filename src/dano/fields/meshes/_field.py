@@ -2,7 +2,7 @@
 
 import warnings
 from pathlib import Path
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -111,7 +111,7 @@ def mesh_field(
     raw = read_mesh(mesh, checked_units(scale, units))
     name, notes = raw.name, []
     try:
-        closed = repaired(raw.vertices, raw.faces, _igl())
+        closed = repaired(raw.vertices, raw.faces, DISTANCES.load())
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
     solid = _parts(closed)
@@ -205,7 +205,7 @@ def _meet(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) ->
 
 def _winding(solid: "trimesh.Trimesh", point: np.ndarray) -> float:
     """How often a mesh winds around a point: 1 inside a solid, 0 outside."""
-    igl = _igl()
+    igl = DISTANCES.load()
     vertices, faces = _arrays(solid)
     return float(igl.fast_winding_number(vertices, faces, np.ascontiguousarray(point[None]))[0])
 
@@ -244,7 +244,7 @@ def _thinner(solid: _Solid, thickness: np.ndarray) -> list[float]:
     points = np.einsum("nk,nkd->nd", weights, triangles[some])
     inward = -np.asarray(solid.whole.face_normals)[some]
     below = (points[None] + thickness[:, None, None] * inward[None]).reshape(-1, 3)
-    igl = _igl()
+    igl = DISTANCES.load()
     outside = np.ones(len(below), bool)
     for part in solid.parts:
         outside &= igl.fast_winding_number(*_arrays(part), below) < 0.5
@@ -259,10 +259,6 @@ def _arrays(solid: "trimesh.Trimesh") -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _igl() -> Any:
-    return DISTANCES.load()
-
-
 def _mesh_distances(
     solid: "trimesh.Trimesh", origin: np.ndarray, spacing: float, shape: np.ndarray, closed: Repaired
 ) -> tuple[np.ndarray, bool]:
@@ -274,7 +270,7 @@ def _mesh_distances(
     import trimesh
     from scipy import ndimage
 
-    igl = _igl()
+    igl = DISTANCES.load()
     vertices, faces = _arrays(solid)
     # An exact query costs 12 µs; only nodes near the surface need one. Vertices of a mesh whose edges are
     # shorter than a cell mark them: no surface point is then further than 1.5 cells from a marked node.
@@ -318,6 +314,8 @@ def _border_faces(
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     beside = _BESIDE * spacing * normal / np.where(length > 0, length, 1)
     middle = corners.mean(axis=1)
-    winding = _igl().fast_winding_number(vertices, faces, np.concatenate([middle - beside, middle + beside]))
+    winding = DISTANCES.load().fast_winding_number(
+        vertices, faces, np.concatenate([middle - beside, middle + beside])
+    )
     inner, outer = np.split(winding > 0.5, 2)
     return np.ascontiguousarray(small[(inner != outer) & (length[:, 0] > 0)], np.int64)

@@ -8,7 +8,7 @@ import enum
 
 import warp as wp
 
-from dano.mujoco.kernels.words import Entry, Head, REALS, WHOLES
+from dano.mujoco.kernels.words import Entry, Head, REALS, SHIFT, WHOLES
 
 
 def _constants(names: type[enum.IntEnum]) -> str:
@@ -22,7 +22,7 @@ _PROGRAM = (
     f"""
 {_constants(Head)}
 {_constants(Entry)}
-const int n_reals = {REALS}, n_wholes = {WHOLES};
+const int n_reals = {REALS}, n_wholes = {WHOLES}, shift = {SHIFT};
 """
     + """
 typedef wp::int64 word;
@@ -78,7 +78,7 @@ struct Callback {
         __atomic_fetch_add(head + Head::INSIDE, 1, __ATOMIC_SEQ_CST);
         const word* slots = (const word*)__atomic_load_n(head + Head::SLOTS, __ATOMIC_SEQ_CST);
         const word mask = slots[0] - 1;
-        word i = ((word)data >> 6) & mask;
+        word i = ((word)data >> shift) & mask;
         while (slots[1 + 2 * i] != 0 && slots[1 + 2 * i] != (word)data) i = (i + 1) & mask;
         const word* entry = slots[1 + 2 * i] == 0 ? nullptr : (const word*)slots[2 + 2 * i];
         const bool done = entry != nullptr && is_done(head, entry, (const char*)model, (char*)data);

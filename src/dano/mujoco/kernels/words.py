@@ -4,6 +4,8 @@ import enum
 
 REALS, WHOLES = 28, 13
 """Real and whole numbers of a contact, see `dano.mujoco.kernels.tables`."""
+SHIFT = 6
+"""Bits of an address that say little: slots are looked for by the others."""
 
 
 class Head(enum.IntEnum):
