@@ -20,7 +20,7 @@ import warp as wp
 from dano.physics.features import LAW
 from dano.physics.friction import following_friction, Friction, friction, friction_with_dual, Slip
 from dano.physics.impacts import fading_in, Impact, impact_goal, impact_limit, is_impact, may_rest
-from dano.physics.real import ONE, real, vec3, ZERO
+from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
 from dano.physics.samples import Point
 
 
@@ -106,6 +106,21 @@ class PointLaw:
     limit: real
     if LAW:
         numbers: vec3
+
+
+@wp.struct
+class Gate:
+    """Whether a point stays apart, in few numbers: of the points that are listed few press.
+
+    Attributes:
+        normal: Of the point.
+        moment: Of a unit pressure at it [m].
+        rate: Separating speed from which on the point stays out [m/s], infinite where it is in.
+    """
+
+    normal: vec3
+    moment: vec3
+    rate: real
 
 
 @wp.struct
@@ -233,10 +248,23 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
 
 
 @wp.func
-def is_apart(law: PointLaw, rate: real) -> bool:
-    """Whether a point that is not sunk in stays out, and has no impact: then d − θ h v_n says all."""
-    apart = law.depth <= ZERO and law.depth - law.ahead * rate <= ZERO and law.blow == ZERO
-    return apart and (law.guard == ZERO or rate >= law.limit)
+def gate_of(point: Point, law: PointLaw) -> Gate:
+    """When a point that is not sunk in, and has no impact, stays out: then d − θ h v_n says all."""
+    gate = Gate()
+    gate.normal = point.normal
+    gate.moment = point.moment
+    gate.rate = INFINITY
+    if law.depth <= ZERO and law.blow == ZERO:
+        gate.rate = law.depth / law.ahead
+        if law.guard > ZERO:
+            gate.rate = wp.max(gate.rate, law.limit)
+    return gate
+
+
+@wp.func
+def is_apart(gate: Gate, velocity: vec3, spin: vec3) -> bool:
+    """Whether a point stays out, at the relative twist at the first body's centre."""
+    return wp.dot(gate.normal, velocity) + wp.dot(gate.moment, spin) >= gate.rate
 
 
 @wp.func

@@ -35,6 +35,8 @@ from dano.physics.twists import (
 )
 
 _LANES, _FIXED = wp.constant(LANES), wp.constant(FIXED)
+# Marks of a point, which add up: it has duals at the accepted velocities; it presses at those tried last.
+_KNOWN, _PRESSES = wp.constant(1), wp.constant(2)
 
 
 @wp.struct
@@ -54,9 +56,11 @@ class Fit:
 
 @wp.struct
 class Halves:
-    """A derivative of wrenches by twists, by its halves, and sums of grip, which belong to both of them.
+    """A wrench and its derivative by twists, by its halves, and sums of grip, which belong to both of them.
 
     Attributes:
+        presses: 1 where a point presses, else 0.
+        wrench: At the first body's centre of mass [N s, N m s, W].
         force: Derivative of the force by the twist.
         moment: Of the moment.
         grip: Σ g.
@@ -64,6 +68,8 @@ class Halves:
         grip_square: Σ g r rᵀ.
     """
 
+    presses: real
+    wrench: vec6
     force: mat36
     moment: mat36
     grip: real
@@ -156,8 +162,8 @@ def fit_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n
             motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
             room.duals[world, k] = fitting_duals(room.laws[world, k], motion)
             room.changes[world, k] = Duals()
-            linear = Linear()
-            room.linear[world, k] = linear
+            room.linear[world, k].held = ZERO
+            room.marks[world, k] = _KNOWN
 
 
 @wp.func
@@ -167,30 +173,43 @@ def follow_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int
         found = room.found[world, f * _LANES + lane]
         twist = pair_twist(scene, room, world, found, room.step, ZERO)
         for k in range(found.first, found.end):
-            linear = room.linear[world, k]
-            tried = Duals()
-            changes = Duals()
-            if linear.pressure.value > ZERO or linear.grip > ZERO:
+            mark = room.marks[world, k]
+            if mark >= _PRESSES:
+                linear = room.linear[world, k]
                 before = room.duals[world, k].direction
+                tried = Duals()
                 tried.friction = linear.friction
                 tried.direction = before + length * room.changes[world, k].direction
                 change = point_motion(room.points[world, k], twist.velocity, twist.spin)
                 after = following_duals(linear, tried, change)
+                changes = Duals()
                 changes.friction = after.friction - tried.friction
                 changes.direction = after.direction - tried.direction
-            room.duals[world, k] = tried
-            room.changes[world, k] = changes
+                room.duals[world, k] = tried
+                room.changes[world, k] = changes
+                room.marks[world, k] = _PRESSES + _KNOWN
+            elif mark > 0:
+                room.duals[world, k] = Duals()
+                room.changes[world, k] = Duals()
+                room.marks[world, k] = 0
 
 
 @wp.func
-def add_point_jacobian(sums: Halves, point: Point, linear: Linear, weight: real, rolls: bool) -> Halves:
+def presses(room: wp.ref[Room], world: int, point: int) -> bool:
+    """Whether a point presses, or is held by friction, at the velocities that were tried last."""
+    return room.marks[world, point] >= _PRESSES
+
+
+@wp.func
+def add_point_jacobian(sums: wp.ref[Halves], point: Point, linear: Linear, weight: real, rolls: bool):
     """Add the derivative of a point's impulse by the twist at the first body's centre of mass.
 
     With a6 = (a, r × a), n6 = (n, moment), x6 = (n, r × n), h times its area w, and X v = r × v that is
 
         w (c6 n6ᵀ − f n6 n6ᵀ − l6 û6ᵀ − g (E − x6 x6ᵀ)),    E = Σ_k e6_k e6_kᵀ = [[1, −X], [X, −X²]].
 
-    Where samples turn with their body, n6 = x6 and three of the terms are one product.
+    Where samples turn with their body, n6 = x6 and three of the terms are one product. Sums are changed in
+    place: a kernel that hands them on by value copies them twice a point, which takes longer than the rest.
 
     Args:
         sums: To add to.
@@ -221,11 +240,24 @@ def add_point_jacobian(sums: Halves, point: Point, linear: Linear, weight: real,
     sums.grip += grip
     sums.grip_arm += grip * r
     sums.grip_square += wp.outer(grip * r, r)
-    return sums
 
 
 @wp.func
-def whole_jacobian(sums: Halves) -> mat66:
+def add_impulse(sums: wp.ref[Halves], fit: wp.ref[Fit], point: Point, linear: Linear, weight: real):
+    """Add a point's impulse at the first body's centre of mass, and what its duals miss."""
+    friction = linear.friction + linear.friction_change
+    force = weight * (linear.pressure.value * point.normal + friction)
+    moment = weight * (linear.pressure.value * point.moment + wp.cross(point.arm, friction))
+    sums.wrench += joined(force, moment)
+    sums.presses = ONE
+    change = linear.friction_change
+    missed = wp.abs(change[0]) + wp.abs(change[1]) + wp.abs(change[2])
+    fit.unfit += weight * (missed + wp.abs(linear.pressure.change))
+    fit.push += weight * linear.pressure.value
+
+
+@wp.func
+def whole_jacobian(sums: wp.ref[Halves]) -> mat66:
     """The derivative that is summed by its halves; − g E is added for all points at once."""
     eye = wp.identity(n=3, dtype=real)
     x = wp.skew(sums.grip_arm)
@@ -310,20 +342,20 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
         twist = pair_twist(scene, room, world, found, room.tried, ONE)
-        wrench = vec6()
-        halves = Halves()
+        sums = Halves()
         rolls = bool(False)
         if wp.static(len(TURNING) > 1):
             rolls = scene.body_index[scene.pair_index[found.pair].first].turning != _FIXED
-        presses = ZERO
         for k in range(found.first, found.end):
-            point = room.points[world, k]
-            law = room.laws[world, k]
-            motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
-            if is_apart(law, motion.rate) and not trial.holds:
-                room.linear[world, k].pressure.value = ZERO
-                room.linear[world, k].grip = ZERO
+            mark = room.marks[world, k]
+            known = wp.where(mark >= _PRESSES, mark - _PRESSES, mark)
+            if is_apart(room.gates[world, k], twist.velocity, twist.spin) and not trial.holds:
+                if mark != known:
+                    room.marks[world, k] = known
             else:
+                point = room.points[world, k]
+                law = room.laws[world, k]
+                motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
                 duals = room.duals[world, k]
                 changes = room.changes[world, k]
                 duals.friction = duals.friction + trial.length * changes.friction
@@ -333,20 +365,15 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
                 room.linear[world, k] = linear
                 weight = h * point.area
                 fit.renewed += weight * wp.abs(linear.held - held)
+                room.marks[world, k] = known
                 if linear.pressure.value > ZERO or linear.grip > ZERO:
-                    presses = ONE
-                    friction = linear.friction + linear.friction_change
-                    force = weight * (linear.pressure.value * point.normal + friction)
-                    moment = weight * (linear.pressure.value * point.moment + wp.cross(point.arm, friction))
-                    wrench += joined(force, moment)
-                    halves = add_point_jacobian(halves, point, linear, weight, rolls)
-                    change = linear.friction_change
-                    missed = wp.abs(change[0]) + wp.abs(change[1]) + wp.abs(change[2])
-                    fit.unfit += weight * (missed + wp.abs(linear.pressure.change))
-                    fit.push += weight * linear.pressure.value
-        if total(presses) > ZERO:
+                    room.marks[world, k] = _PRESSES + known
+                    add_impulse(sums, fit, point, linear, weight)
+                    add_point_jacobian(sums, point, linear, weight, rolls)
+        wrench = sums.wrench
+        if total(sums.presses) > ZERO:
             wrench = total6(wrench)
-            jacobian = total66(whole_jacobian(halves))
+            jacobian = total66(whole_jacobian(sums))
             if lane == 0:
                 add_contact(scene, room, world, found, m, wrench, jacobian)
         if lane == 0 and room.wrenches.shape[1] > 0:

@@ -7,7 +7,7 @@ it. One of an impact that happens after the share τ of the step changes positio
 
 import warp as wp
 
-from dano.engine.kernels.assembly import add_point_jacobian, Halves, whole_jacobian
+from dano.engine.kernels.assembly import add_point_jacobian, Halves, presses, whole_jacobian
 from dano.engine.kernels.lanes import total6, total66, wait
 from dano.engine.kernels.tables import FoundPair, Room, Scene
 from dano.physics.features import LANES, POINTS, TREES, TURNING
@@ -25,8 +25,8 @@ def pair_impulse(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: Fo
     h = scene.timestep[world, 0]
     wrench = vec6()
     for k in range(found.first, found.end):
-        linear = room.linear[world, k]
-        if linear.pressure.value > ZERO:
+        if presses(room, world, k):
+            linear = room.linear[world, k]
             point = room.points[world, k]
             friction = linear.friction + linear.friction_change
             force = linear.pressure.value * point.normal + friction
@@ -44,10 +44,10 @@ def pair_slope(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: Foun
     if wp.static(len(TURNING) > 1):
         rolls = scene.body_index[scene.pair_index[found.pair].first].turning != _FIXED
     for k in range(found.first, found.end):
-        linear = room.linear[world, k]
-        if linear.pressure.value > ZERO or linear.grip > ZERO:
+        if presses(room, world, k):
+            linear = room.linear[world, k]
             point = room.points[world, k]
-            halves = add_point_jacobian(halves, point, linear, h * point.area, rolls)
+            add_point_jacobian(halves, point, linear, h * point.area, rolls)
     return total66(whole_jacobian(halves))
 
 

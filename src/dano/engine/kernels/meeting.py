@@ -154,12 +154,14 @@ class Soonest:
     Attributes:
         further: Share of the step until it may.
         critical: The sample, −1 where none does within the step.
+        block: Share of the step until one of the block that was looked at last may.
         fastest: Most by which one nears the solid in a step [m].
         close: Least distance that one may have by the end of the step [m].
     """
 
     further: real
     critical: int
+    block: real
     fastest: real
     close: real
 
@@ -170,6 +172,7 @@ def look_at_block(
 ) -> Soonest:
     """What the samples of a block say besides those seen before; where they cannot be sooner, its middle."""
     found = seen
+    found.block = INFINITY
     ball = scene.balls[world, block]
     x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
     d = solid_distance(scene.solids, world, solid, x)
@@ -182,8 +185,10 @@ def look_at_block(
         asked = asked or middle.left <= radius
         if not asked:
             if may_meet(middle.left - radius, middle.near, ask.bend, ask.rest):
-                asked = ahead_of(middle.left - radius, middle.near, ask.bend) < found.further
+                found.block = ahead_of(middle.left - radius, middle.near, ask.bend)
+                asked = found.block < found.further
     if asked:
+        found.block = INFINITY
         for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
             x = position_in_solid(pose, scene.samples[world, s].point)
             d = solid_distance(scene.solids, world, solid, x)
@@ -194,6 +199,11 @@ def look_at_block(
                 counts = own.near + ask.bend * ask.rest > own.counts
                 if counts and may_meet(own.left, own.near, ask.bend, ask.rest):
                     ahead = soonest(own.left, own.near, ask.bend, own.counts)
+                    # A sample that is slow, or met, is looked at again each time.
+                    if own.left > ZERO and own.near > own.counts:
+                        found.block = wp.min(found.block, ahead)
+                    else:
+                        found.block = -INFINITY
                     if ahead < found.further:
                         found.further = ahead
                         found.critical = s
@@ -292,6 +302,7 @@ def meeting(
     n = int(-1)
     k = int(0)
     at = lane * (room.near.shape[1] // _LANES)
+    again = bool(True)
     while k < _ADVANCES:
         pose = posed(scene, world, a, b, first, second, share, h, pair.follows)
         if n < 0:
@@ -305,8 +316,12 @@ def meeting(
             seen = look_at_block(scene, world, solid, pose, ask, likely, seen)
         for i in range(n):
             block = room.near[world, at + i]
-            if block != likely:
+            if block == likely:
+                if again:
+                    room.until[world, at + i] = share
+            elif again or room.until[world, at + i] < wp.min(share + seen.further, ONE):
                 seen = look_at_block(scene, world, solid, pose, ask, block, seen)
+                room.until[world, at + i] = share + seen.block
         closest = least(seen.further)
         critical = seen.critical
         if closest < seen.further:
@@ -320,6 +335,8 @@ def meeting(
             met.least = wp.min(least(seen.close), -sink)
         before = share
         share = wp.max(share + closest, since)
+        # What a block cannot do before a later moment says nothing of an earlier one.
+        again = share < before
         k += 1
         if share >= ONE:
             met.critical = -1

@@ -41,7 +41,7 @@ from dano.physics.pairs import (
     falling,
     PairPose,
 )
-from dano.physics.point_law import Material, point_law
+from dano.physics.point_law import gate_of, Material, point_law
 from dano.physics.real import HALF, ONE, real, TWO, vec3, ZERO
 from dano.physics.samples import (
     facing_area,
@@ -460,4 +460,7 @@ def fix_laws(
         if not differentiates:
             material.gradual = ZERO
         for k in range(found.first, found.end):
-            room.laws[world, k] = point_law(material, room.points[world, k], found.impact)
+            point = room.points[world, k]
+            law = point_law(material, point, found.impact)
+            room.laws[world, k] = law
+            room.gates[world, k] = gate_of(point, law)

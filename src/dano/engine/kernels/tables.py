@@ -12,7 +12,7 @@ from dano.physics.impacts import Impact, Patch
 from dano.physics.overlap import Part, WeightedSample
 from dano.physics.pairs import BodyState
 from dano.physics.patch_law import PatchMaterial
-from dano.physics.point_law import Duals, Linear, Material, PointLaw
+from dano.physics.point_law import Duals, Gate, Linear, Material, PointLaw
 from dano.physics.real import mat33, mat66, real, vec3, vec4, vec6
 from dano.physics.samples import Point, Sample
 from dano.physics.solids.leaves import Leaf, Solids
@@ -238,10 +238,13 @@ class Room:
         where: Of each point where it was found, shape (worlds, capacity).
         points: The points.
         laws: Their constants.
+        gates: Whether they stay apart.
+        marks: Whether they have duals, and whether they press: see `dano.engine.kernels.assembly`.
         duals: At the accepted velocities.
         changes: Of the duals by the whole step.
         linear: The law as it was linearised last.
         near: Blocks whose samples may meet a solid within the step, of each lane a part.
+        until: Share of the step before which none of such a block does.
         blocks: Of the Jacobian, shape (worlds, blocks · blocks).
         spare: The same, used up by the solve.
         used: Whether a block is not zero.
@@ -279,10 +282,13 @@ class Room:
     where: wp.array2d(dtype=FoundPoint)
     points: wp.array2d(dtype=Point)
     laws: wp.array2d(dtype=PointLaw)
+    gates: wp.array2d(dtype=Gate)
+    marks: wp.array2d(dtype=wp.int32)
     duals: wp.array2d(dtype=Duals)
     changes: wp.array2d(dtype=Duals)
     linear: wp.array2d(dtype=Linear)
     near: wp.array2d(dtype=wp.int32)
+    until: wp.array2d(dtype=real)
     blocks: wp.array2d(dtype=mat66)
     spare: wp.array2d(dtype=mat66)
     used: wp.array2d(dtype=wp.int32)

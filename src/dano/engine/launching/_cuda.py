@@ -25,7 +25,8 @@ PLATFORM = "CUDA"
 # of which each lane has a part that is that much longer than its share: lanes do not find equally many.
 _OF_EACH_LANE = ("room.found",)
 _OF_POINTS = tuple(
-    f"room.{name}" for name in ("near", "where", "points", "laws", "duals", "changes", "linear")
+    f"room.{name}"
+    for name in ("near", "until", "where", "points", "laws", "gates", "marks", "duals", "changes", "linear")
 )
 _MORE_POINTS = 16
 # Boundary of each array in the room [bytes].

@@ -153,9 +153,9 @@ def room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> di
         **dict.fromkeys(("velocity", "old", "tried", "best", "moved", "step", "residual", "scale"), blocks),
         **dict.fromkeys(("order", "counts", "degrees", "ends"), blocks),
         **dict.fromkeys(("blocks", "spare", "used", "later", "listed"), blocks * blocks),
-        **dict.fromkeys(("where", "points", "laws", "duals", "changes", "linear"), points),
+        **dict.fromkeys(("where", "points", "laws", "gates", "marks", "duals", "changes", "linear"), points),
         "found": pairs,
-        "near": int(max(tables.whole.arrays["scene.body_index"][:, 2], default=0)),
+        **dict.fromkeys(("near", "until"), int(max(tables.whole.arrays["scene.body_index"][:, 2], default=0))),
     }
     room = {f"room.{name}": length for name, length in lengths.items()}
     if "scene.trees.nodes" in tables.whole.arrays:

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.assembly import slip_of
+from dano.engine.kernels.assembly import presses, slip_of
 from dano.engine.kernels.derivatives.adjoint import (
     after_adjoints,
     distance_work,
@@ -187,8 +187,8 @@ def pull_points(
     twists_bar = Virtual()
     twist = relative_twist(twists.first, twists.second, pose.com_difference)
     for k in range(found.first, found.end):
-        linear = room.linear[world, k]
-        if linear.pressure.value > ZERO:
+        if presses(room, world, k):
+            linear = room.linear[world, k]
             where = room.where[world, k]
             point = room.points[world, k]
             motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
