@@ -147,6 +147,7 @@ def room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> di
     """Lengths of the arrays that a world works in."""
     m, pairs = len(tables.structure.moving), len(tables.whole.arrays["scene.pair_index"])
     blocks = tables.structure.n_blocks
+    most = int(max(tables.whole.arrays["scene.body_index"][:, 2], default=0))
     lengths = {
         "bodies": n,
         **dict.fromkeys(("momentum", "inertia"), m),
@@ -155,7 +156,7 @@ def room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> di
         **dict.fromkeys(("blocks", "spare", "used", "later", "listed"), blocks * blocks),
         **dict.fromkeys(("where", "points", "laws", "gates", "marks", "duals", "changes", "linear"), points),
         "found": pairs,
-        **dict.fromkeys(("near", "until"), int(max(tables.whole.arrays["scene.body_index"][:, 2], default=0))),
+        **dict.fromkeys(("near", "until"), most),
     }
     room = {f"room.{name}": length for name, length in lengths.items()}
     if "scene.trees.nodes" in tables.whole.arrays:
