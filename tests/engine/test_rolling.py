@@ -1,5 +1,6 @@
 """Bodies whose place of touch wanders, against rigid equations of rolling without slip at high order."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -43,3 +44,28 @@ def test_rolls_as_rigid_equations_say(roller, shape, tilt, omega, seconds, toler
     found = Rotation.from_quat(np.asarray(run.states.orientation[:, 0]), scalar_first=True)
     turned = (Rotation.from_matrix(rotations).inv() * found).magnitude()
     assert turned.max() < tolerance * np.pi
+
+
+@pytest.mark.parametrize(("share", "climbs"), [(0.88, False), (1.0, True)])
+def test_a_wheel_climbs_a_step_at_the_critical_force(share, climbs):
+    """Statics: a force at the axle whose moment about the edge exceeds that of the weight lifts the wheel."""
+    radius, height, mass, h = 0.1, 0.03, 1.0, 0.005
+    reach = np.sqrt(radius**2 - (radius - height) ** 2)
+    critical = mass * 9.81 * reach / (radius - height)
+    bodies = [
+        dano.Body("wheel", dano.Cylinder(radius, 0.025), mass=mass),
+        dano.Body("step", dano.Box((0.3, 0.3, height / 2)), fixed=True),
+        dano.Body("floor", dano.HalfSpace(), fixed=True),
+    ]
+    material = dano.ContactParams(sliding_friction=0.8)
+    scene = dano.Scene.create(bodies, others=material, timestep=h)
+    lying = (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0)
+    state = scene.initial_state(
+        wheel=dict(position=(-reach, 0, radius), orientation=lying),
+        step=dict(position=(0.3, 0, height / 2)),
+    )
+    control = scene.control(wheel=dict(force=(share * critical, 0, 0)))
+    pushed = jax.tree.map(lambda x: jnp.broadcast_to(x, (200, *x.shape)), control)
+    run = dano.simulate(scene, state, controls=pushed)
+    assert bool(jnp.all(run.converged))
+    assert bool(jnp.max(run.states.position[:, 0, 2]) > radius + 0.8 * height) == climbs

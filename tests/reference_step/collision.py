@@ -116,6 +116,11 @@ class Pair:
         points, vectors = self.turned(self.toward)
         self.places = self.world(points)
         self.vectors = vectors @ self.R.T
+        if self.turning == "axis":
+            self.front = self.R @ about_z(self.toward) @ np.array([1, 0, 0])
+        if self.turning == "ball":
+            S = semi_axes(self.body.shape)
+            self.front = unit(self.R @ (from_z(-unit(S * self.toward)) @ np.array([0, 0, -1]) / S))
 
     def world(self, points):
         """Points of the first body's field frame in the world."""
@@ -341,6 +346,21 @@ def find(scene, bodies, shares=None):
     return together(bodies, halved([points for points in found if len(points.area)]))
 
 
+def rounded(pair, normal):
+    """Normals with those of a round surface where the solid's are not those of a face: at its edges."""
+    own = -unit_rows(pair.vectors)
+    if pair.turning == "axis":
+        own = np.where(np.abs(own @ pair.R[:, 2:]) > 1e-6, normal, own)
+    cosine = -normal @ pair.front
+    share = smooth_step((np.cos(np.pi / 12) - cosine) / (np.cos(np.pi / 12) - np.cos(np.pi / 6)))[:, None]
+    return unit_rows(normal + share * (own - normal))
+
+
+def unit_rows(vectors):
+    """Vectors of unit length."""
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
 def listed(scene, bodies, side, met):
     """The listed points of a side whose geometry is taken when its bodies meet."""
     bodies = bodies.falling() if met.falls else bodies.held()
@@ -350,6 +370,8 @@ def listed(scene, bodies, side, met):
     facing = -np.sum(pair.vectors * normal, axis=1)
     size = np.linalg.norm(pair.vectors, axis=1)
     other = (distance < 0) & (facing < -0.5 * size)  # in the solid, and turned away from its nearest side
+    if pair.turning != "fixed":
+        normal = rounded(pair, normal)
     normal = np.where(other[:, None], -pair.vectors / size[:, None], normal)
     area = side.half * np.where(other, size, np.maximum(facing, 0))
 

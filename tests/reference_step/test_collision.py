@@ -13,7 +13,11 @@ import dano
 CASES = [
     *((name, what) for name in scenes.PAIRS for what in ("sliding", "tilted", "hitting", "deep")),
     *((name, f"spinning at {spin:.0f} rad/s") for name in scenes.PAIRS for spin in scenes.SPINS[1::2]),
-    *((name, what) for name in ("box on table", "ellipsoid on table") for what in ("at the edge", "inside")),
+    *(
+        (name, what)
+        for name in ("box on table", "ball on table", "ellipsoid on table")
+        for what in ("at the edge", "inside")
+    ),
     ("cylinder on floor", "on its end"),
 ]
 

@@ -106,19 +106,10 @@ def delayed(impact: Impact, delays: real, share: real, h: real) -> Impact:
 
 
 @wp.func
-def with_sample(
-    patch: Patch,
-    area: real,
-    sunk: real,
-    depth: real,
-    approach: real,
-    arm: vec3,
-    normal: vec3,
-) -> Patch:
-    """A patch with one more sample.
+def patch_of_sample(area: real, sunk: real, depth: real, approach: real, arm: vec3, normal: vec3) -> Patch:
+    """What a sample adds to a patch.
 
     Args:
-        patch: The patch.
         area: Of the sample [m²].
         sunk: Its depth where geometry is taken [m].
         depth: δ [m].
@@ -126,15 +117,13 @@ def with_sample(
         arm: From the first body's centre of mass [m, W].
         normal: Unit normal [W].
     """
-    found = patch
-    weight = area * fading_in(sunk / depth)
-    found.load += weight
-    found.arm += weight * arm
-    found.normal += weight * normal
-    near = area * fading_in(sunk / depth + ONE)
-    found.near_load += near
-    found.near_rate += near * approach
-    return found
+    own = Patch()
+    own.load = area * fading_in(sunk / depth)
+    own.arm = own.load * arm
+    own.normal = own.load * normal
+    own.near_load = area * fading_in(sunk / depth + ONE)
+    own.near_rate = own.near_load * approach
+    return own
 
 
 @wp.func

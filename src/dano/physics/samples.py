@@ -3,8 +3,9 @@
 import warp as wp
 
 from dano.physics.features import TURNING, WIDE
+from dano.physics.impacts import smooth_step
 from dano.physics.pairs import AXIS, BALL, FIXED, PairPose
-from dano.physics.real import HALF, real, vec3, ZERO
+from dano.physics.real import HALF, ONE, real, vec3, ZERO
 from dano.physics.solids.leaves import Distance
 
 _FIXED = wp.constant(FIXED)
@@ -12,6 +13,11 @@ _AXIS = wp.constant(AXIS)
 _BALL = wp.constant(BALL)
 # A sample faces the other way if its normal and that of the solid differ by less than 60°: the cosine.
 _TURNED = wp.constant(real(0.5))
+# Cosines of the angles between where a round body faces a solid and the solid's normal at a sample: up to 15°
+# the sample is on a face, from 30° on it is at an edge.
+_ON_FACE, _ON_EDGE = wp.constant(real(0.9659258262890683)), wp.constant(real(0.8660254037844387))
+# Component of a normal along the axis below which it belongs to the side of a cylinder.
+_ROUND = wp.constant(real(1e-6))
 # A number whose inverse is finite.
 _TINY = wp.constant(real(1e-300 if WIDE else 1e-36))
 
@@ -65,6 +71,36 @@ class Point:
 def solid_normal(gradient: vec3) -> vec3:
     """Unit normal; far below the surface of a sampled distance the gradient may vanish."""
     return gradient / wp.sqrt(wp.max(wp.dot(gradient, gradient), real(1e-12)))
+
+
+@wp.func
+def round_normal(pose: PairPose, sample: Sample, turning: int, normal: vec3) -> vec3:
+    """Normal where a ball, or the side of what turns about an axis, presses on an edge.
+
+    Inside a solid the nearest side changes from one face of an edge to the other, so a row of samples that
+    faces the edge would be held in a notch. An edge has all normals between those of its faces: there the
+    normal of the round surface counts. On a face the solid has that of where the round body faces it.
+
+    Args:
+        pose: The pair of bodies.
+        sample: The sample.
+        turning: How samples turn with their body.
+        normal: Of the solid.
+    """
+    own = -(pose.vectors * sample.area)
+    own = own / wp.sqrt(wp.max(wp.dot(own, own), _TINY))
+    front = vec3(ZERO, ZERO, -ONE)
+    if turning == _AXIS:
+        if wp.abs(wp.dot(own, pose.axis)) > _ROUND:
+            return normal
+        front = vec3(ONE, ZERO, ZERO)
+    front = pose.vectors * front
+    cosine = -wp.dot(front, normal) / wp.length(front)
+    share = smooth_step((_ON_FACE - cosine) / (_ON_FACE - _ON_EDGE))
+    if share == ZERO:
+        return normal
+    mixed = normal + share * (own - normal)
+    return mixed / wp.sqrt(wp.dot(mixed, mixed))
 
 
 @wp.func
@@ -135,6 +171,9 @@ def point_contact(
     point = Point()
     normal = solid_normal(d.gradient)
     area = facing_area(pose, sample, normal)
+    if wp.static(len(TURNING) > 1):
+        if turning != _FIXED:
+            normal = round_normal(pose, sample, turning, normal)
     if presses_back:
         vector = pose.vectors * sample.area
         area = wp.length(vector)

@@ -37,6 +37,12 @@ def sum_of(structure: Any) -> Any:
     return written(structure, "summed", ["def summed(a: S, b: S) -> S:", *lines, "    return a"])
 
 
+def adding_of(structure: Any) -> Any:
+    """Add a structure to another in place: where that is one of several ways to go on, nothing is copied."""
+    lines = [f"    a.{name} += b.{name}" for name, _ in plain_fields(structure)]
+    return written(structure, "adding", ["def adding(a: wp.ref[S], b: S):", *lines])
+
+
 def scaled_of(structure: Any) -> Any:
     """A number times a structure."""
     lines = [f"    a.{name} = a.{name} * s" for name, _ in plain_fields(structure)]

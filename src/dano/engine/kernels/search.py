@@ -32,9 +32,9 @@ from dano.physics.impacts import (
     Impact,
     no_impact,
     Patch,
+    patch_of_sample,
     share_of_impact,
     stiffness_of_impact,
-    with_sample,
 )
 from dano.physics.pairs import (
     BodyState,
@@ -194,10 +194,15 @@ def find_points(
                         if point.depth - h * point.rate > -pair.margin or (share < ONE and in_patch):
                             if in_patch:
                                 load += point.area * wp.max(point.sunk, ZERO)
-                                patch = with_sample(
-                                    patch, point.area, point.sunk, pair.impact_depth, point.approach,
-                                    point.arm, point.normal,
+                                own = patch_of_sample(
+                                    point.area, point.sunk, pair.impact_depth, point.approach, point.arm,
+                                    point.normal,
                                 )  # fmt: skip
+                                patch.load += own.load
+                                patch.arm += own.arm
+                                patch.normal += own.normal
+                                patch.near_load += own.near_load
+                                patch.near_rate += own.near_rate
                             if at < end:
                                 list_point(room, world, at, point, s, entry, turned)
                             at += 1

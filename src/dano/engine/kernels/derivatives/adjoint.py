@@ -14,7 +14,7 @@ import warp as wp
 from dano.engine.kernels.tables import Body, Moment, Push, StateRow
 from dano.physics.features import TREES
 from dano.physics.friction import friction_near, Slip
-from dano.physics.impacts import Impact, Patch, share_of_impact, stiffness_of_impact, with_sample
+from dano.physics.impacts import Impact, Patch, patch_of_sample, share_of_impact, stiffness_of_impact
 from dano.physics.momentum import angular_momentum, end_of_impact, gyroscopic_gain, turned_inertia
 from dano.physics.pairs import (
     BodyState,
@@ -247,8 +247,7 @@ def impact_patch_work(
 ) -> real:
     """⟨bar, what a sample adds to the patch of an impact⟩."""
     point = point_contact(pose, sample, d, turning, False, stiffness_share, share * h)
-    own = Patch()
-    own = with_sample(own, point.area, point.sunk, depth, point.approach, point.arm, point.normal)
+    own = patch_of_sample(point.area, point.sunk, depth, point.approach, point.arm, point.normal)
     return (
         bar.load * own.load
         + wp.dot(bar.arm, own.arm)

@@ -17,11 +17,11 @@ from dano.engine.kernels.derivatives.adjoint import (
 from dano.engine.kernels.derivatives.pair_changes import add_distance_changes
 from dano.engine.kernels.derivatives.products import (
     add_to_leaf,
+    add_to_material,
+    add_to_pose,
     scaled_body,
     scaled_leaf,
     summed_body,
-    summed_material,
-    summed_pose,
     total_material,
     total_pose,
 )
@@ -146,7 +146,7 @@ def pull_patch_of_impact(
             by_pose = pull_sample(
                 scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance
             )
-            pose_bar = summed_pose(pose_bar, by_pose)
+            add_to_pose(pose_bar, by_pose)
             share_bar += by_share
             h_bar += by_h
             depth_bar += by_depth
@@ -207,7 +207,7 @@ def pull_points(
             by_pose = pull_sample(
                 scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance
             )
-            pose_bar = summed_pose(pose_bar, by_pose)
+            add_to_pose(pose_bar, by_pose)
             impact_bar.share += by_impact.share
             impact_bar.stiffness += by_impact.stiffness
             impact_bar.depth += by_impact.depth
@@ -215,7 +215,7 @@ def pull_points(
             impact_bar.delays += by_impact.delays
             impact_bar.way += by_impact.way
             impact_bar.rest += by_impact.rest
-            material_bar = summed_material(material_bar, by_material)
+            add_to_material(material_bar, by_material)
             share_bar += by_share
             h_bar += by_h
             stiffness_share_bar += by_share_of
@@ -228,7 +228,8 @@ def pull_points(
     stiffness_share_bar = total(stiffness_share_bar)
     if lane == 0:
         if bars.materials.shape[1] > 0:
-            whole = summed_material(bars.materials[world, index.contact], material_bar)
+            whole = bars.materials[world, index.contact]
+            add_to_material(whole, material_bar)
             bars.materials[world, index.contact] = whole
         if bars.pairs.shape[1] > 0:
             bars.pairs[world, found.pair].share += stiffness_share_bar
@@ -461,7 +462,7 @@ def pull_pair(
         by_pose, by_share, by_h_of_patch, by_depth = pull_patch_of_impact(
             scene, room, bars, world, lane, found, pose, patch_bar
         )
-        pose_bar = summed_pose(pose_bar, by_pose)
+        add_to_pose(pose_bar, by_pose)
         share_bar += by_share
         h_bar += by_h_of_patch
         impact_bar.depth += total(by_depth)

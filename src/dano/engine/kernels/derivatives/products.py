@@ -12,7 +12,7 @@ from dano.physics.point_law import Material
 from dano.physics.real import ONE, vec6
 from dano.physics.samples import Sample
 from dano.physics.solids.leaves import Leaf
-from dano.physics.structures import addition_of, product_of, scaled_of, sum_of
+from dano.physics.structures import adding_of, addition_of, product_of, scaled_of, sum_of
 from dano.physics.trees.joint_laws import JointLaw
 from dano.physics.trees.joints import Joint
 from dano.physics.trees.loops import Loop
@@ -31,8 +31,8 @@ joint_product = product_of(Joint)
 law_product = product_of(JointLaw)
 loop_product = product_of(Loop)
 
-summed_material, total_material = sum_of(Material), total_of(Material)
-summed_pose, total_pose = sum_of(PairPose), total_of(PairPose)
+add_to_material, total_material = adding_of(Material), total_of(Material)
+add_to_pose, total_pose = adding_of(PairPose), total_of(PairPose)
 summed_body, scaled_body = sum_of(BodyState), scaled_of(BodyState)
 scaled_leaf = scaled_of(Leaf)
 
