@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from dano.engine.launching._plans import Build, Plan
+from dano.engine.launching._plans import Build, OfWidth, Plan
 
 
 class Arguments:
@@ -26,6 +26,8 @@ class Arguments:
         self._given = {argument.label: argument.type() for argument in self._kernel.adj.args}
         self.places = [*plan.inputs, *plan.outputs]
         for place, value in plan.numbers.items():
+            if isinstance(value, OfWidth):
+                value = value.wide if build.wide else value.narrow
             self.put(place, value)
 
     def _found(self, place: str) -> tuple[Any, str, Any]:

@@ -15,7 +15,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
 from dano.engine.launching import _cpu, _cuda
-from dano.engine.launching._plans import Plan as Plan, plan as plan, Shape as Shape
+from dano.engine.launching._plans import OfWidth as OfWidth, Plan as Plan, plan as plan, Shape as Shape
 
 launch_p = Primitive("dano_launch")
 launch_p.multiple_results = True

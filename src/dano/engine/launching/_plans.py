@@ -27,6 +27,13 @@ class Build(NamedTuple):
     wide: bool = True
 
 
+class OfWidth(NamedTuple):
+    """A number that is another one where those inside a kernel have 64 bits, or 32."""
+
+    wide: float
+    narrow: float
+
+
 class Plan:
     """A launch but for its real numbers.
 
@@ -38,7 +45,7 @@ class Plan:
         outputs: The same of the outputs.
         whole: Arrays of whole numbers, the same for all worlds, by place.
         room: Lengths of the arrays that a world of one lane works in, by place.
-        numbers: Other fields of the parameters, by place.
+        numbers: Other fields of the parameters, by place, some of them `OfWidth`.
     """
 
     def __init__(

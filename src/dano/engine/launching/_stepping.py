@@ -11,7 +11,7 @@ from dano.contact import CHUNK
 from dano.engine._reports import Report, SolverOptions
 from dano.engine.joints import tree_lengths
 from dano.engine.launching import _derivatives  # noqa: F401  rules for derivatives of launches
-from dano.engine.launching._launch import launch, Plan, plan, Shape
+from dano.engine.launching._launch import launch, OfWidth, Plan, plan, Shape
 from dano.engine.launching._tables import Tables
 from dano.scene import Control, State
 
@@ -122,14 +122,15 @@ def _plan(
     options: SolverOptions,
     dtype,
 ) -> Plan:
-    epsilon = float(jnp.finfo(dtype).eps)
-    relative = epsilon**0.75 if options.tolerance is None else options.tolerance
+    relative = float(jnp.finfo(dtype).eps) ** 0.75 if options.tolerance is None else options.tolerance
+    # Kernels on a CPU compute with 64 bits whatever goes in and comes out.
+    rounding = OfWidth(*(float(np.finfo(x).eps) for x in (np.float64, np.float32)))
     numbers = {
         "scene.n_blocks": tables.structure.n_blocks,
         "launch.n_steps": n_steps,
         "launch.options.tolerance": relative,
-        "launch.options.rounding": epsilon,
-        "launch.options.fit": epsilon**0.375,
+        "launch.options.rounding": rounding,
+        "launch.options.fit": OfWidth(*(x**0.375 for x in rounding)),
         "launch.options.max_passes": options.max_iterations,
     }
     shapes = {name: Shape(*x.shape) for name, x in inputs.items()}
