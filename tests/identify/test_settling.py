@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import dano
+from benchmarks.identify import _cases
 from dano.identify._planes import plane_through, Smoothing
 from dano.identify._settling import _directions
 from dano.maths import quat_exp, quat_from_axis_angle, quat_multiply
@@ -121,6 +122,23 @@ def test_a_throw_is_found_from_far_away_starts():
     assert rough
     for fit in rough:
         assert fit.worth is not None and fit.to_dict()["worth"] == fit.worth.summary
+
+
+@pytest.mark.slow
+def test_a_walk_begins_again_where_residuals_are_not_those_of_the_noise():
+    """A throw of which another motion fits the first impacts: with it χ² is three times what it should be."""
+    case = _cases.CASES["throws"]()
+    motion = _cases.observed(case, 12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        options = dano.IdentifyOptions(starts=2)
+        fit = dano.identify(
+            case.scene, motion, case.parameters, initial="states", noise=case.noise, options=options
+        )
+    for end in fit.minima:
+        assert 2 * end.loss < 1.5 * fit.freedom
+        for name, truth in case.truth.items():
+            assert abs(end.values[name] - truth) < 3 * fit.standard_errors[name]
 
 
 def test_a_parameter_without_room_is_held():

@@ -43,6 +43,8 @@ _QUIET = 1e-2
 _LONGEST, _WORSE = 4.0, 1.5
 # Halvings of a step.
 _HALVINGS = 3
+# χ² of residuals beyond so many deviations is not that of the stated noise; then so many walks begin again.
+_UNLIKELY, _AGAIN = 5.0, 2
 # Sets of independent directions: so many pairs of draws for each unknown.
 _BLOCKS = 2
 # Places at which the loss is looked at: along a line, and within all bounds.
@@ -148,7 +150,7 @@ def _settled(problem: Smoothed, solution: Solution, first: _Point, rough: bool) 
         return solution
     grown = _grown(problem, first, widest)
     begin = grown if _loss(problem, grown) < _loss(problem, here) else here
-    end = _averaged(problem, begin, widest)
+    end = _fitting(problem, _averaged(problem, begin, widest), first, widest)
     problem.roughness = end.scatter
     losses = np.array([*solution.losses, end.sight.normal.loss])
     stop = Stop.LOSS if end.steady else Stop.STUCK
@@ -258,6 +260,23 @@ def _averaged(problem: Smoothed, point: _Point, widest: np.ndarray) -> _End:
     unsure = np.sqrt(np.diag(scatter) * 4 / len(last))
     steady = bool(np.all(_drift(last) <= _DRIFT * unsure + _STEADY * sight.errors))
     return _End(held, sight, scatter, steady)
+
+
+def _fitting(problem: Smoothed, end: _End, first: _Point, widest: np.ndarray) -> _End:
+    """The end, or that of a walk with other draws where its residuals are not those of the stated noise.
+
+    Which motion a walk follows through the first impacts is up to its draws.
+    """
+    seed = problem.seed
+    most = 0.5 * (problem.freedom + _UNLIKELY * np.sqrt(2 * problem.freedom))
+    for k in range(_AGAIN):
+        if end.sight.normal.loss > most:
+            problem.seed = seed + (k + 1) * _MOST_STEPS * len(_BEGINNINGS)
+            begin = _grown(problem, first, widest)
+            if _loss(problem, begin) < end.sight.normal.loss:
+                end = min(end, _averaged(problem, begin, widest), key=lambda e: e.sight.normal.loss)
+    problem.seed = seed
+    return end
 
 
 def _last_of(walk: Iterator[tuple[_Point, _Sight]]) -> list[tuple[_Point, _Sight]]:
