@@ -28,7 +28,7 @@ class Build(NamedTuple):
 
 
 class OfWidth(NamedTuple):
-    """A number that is another one where those inside a kernel have 64 bits, or 32."""
+    """A number that depends on whether those inside a kernel have 64 bits or 32."""
 
     wide: float
     narrow: float
