@@ -267,15 +267,17 @@ def _fitting(problem: Smoothed, end: _End, first: _Point, widest: np.ndarray) ->
 
     Which motion a walk follows through the first impacts is up to its draws.
     """
-    seed = problem.seed
+    seed, smoothing = problem.seed, problem.smoothing
     most = 0.5 * (problem.freedom + _UNLIKELY * np.sqrt(2 * problem.freedom))
     for k in range(_AGAIN):
         if end.sight.normal.loss > most:
             problem.seed = seed + (k + 1) * _MOST_STEPS * len(_BEGINNINGS)
             begin = _grown(problem, first, widest)
             if _loss(problem, begin) < end.sight.normal.loss:
-                end = min(end, _averaged(problem, begin, widest), key=lambda e: e.sight.normal.loss)
-    problem.seed = seed
+                other = _averaged(problem, begin, widest)
+                if other.sight.normal.loss < end.sight.normal.loss:
+                    end, smoothing = other, problem.smoothing
+    problem.seed, problem.smoothing = seed, smoothing
     return end
 
 
