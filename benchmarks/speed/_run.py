@@ -97,7 +97,7 @@ def _rows(repeats: int, arguments: argparse.Namespace) -> list[Row]:
     missing: list[Row] = []
     names = _chosen(arguments, missing)
     subjects = [_subjects.shipped_bunny()]
-    authors = None if arguments.quick or arguments.only else _subjects.authors_bunny()
+    authors = None if arguments.quick else _subjects.authors_bunny()
     if authors is not None:
         subjects.append(authors)
     elif not arguments.quick and not arguments.only:
