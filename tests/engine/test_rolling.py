@@ -1,5 +1,7 @@
 """Bodies whose place of touch wanders, against rigid equations of rolling without slip at high order."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -69,3 +71,38 @@ def test_a_wheel_climbs_a_step_at_the_critical_force(share, climbs):
     run = dano.simulate(scene, state, controls=pushed)
     assert bool(jnp.all(run.converged))
     assert bool(jnp.max(run.states.position[:, 0, 2]) > radius + 0.8 * height) == climbs
+
+
+@pytest.mark.parametrize("shape", [dano.Cylinder(0.1, 0.025), dano.Sphere(0.1)], ids=["cylinder", "ball"])
+def test_derivatives_at_an_edge(shape):
+    """Where a round body that presses on an edge goes, by speed, friction and height: beside differences."""
+    radius, height = 0.1, 0.03
+    reach = np.sqrt(radius**2 - (radius - height) ** 2)
+    bodies = [
+        dano.Body("wheel", shape, mass=1.0),
+        dano.Body("step", dano.Box((0.3, 0.3, height / 2)), fixed=True),
+    ]
+    material = dano.ContactParams(sliding_friction=0.4)
+    scene = dano.Scene.create(bodies, [dano.Contact("wheel", "step", material)], timestep=0.002)
+    start = scene.initial_state(
+        wheel=dict(
+            position=(1e-3 - reach, 0, radius),
+            orientation=(np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0),
+            omega=(0, 0, -0.5),
+        ),
+        step=dict(position=(0.3, 0, height / 2)),
+    )
+
+    def end(given):
+        speed, friction, z = given
+        velocity, position = start.velocity.at[0, 0].set(speed), start.position.at[0, 2].set(z)
+        state = dataclasses.replace(start, velocity=velocity, position=position)
+        changed = scene.replace_contact("wheel", "step", sliding_friction=friction)
+        return dano.simulate(changed, state, 12).states.position[-1, 0, ::2]
+
+    given = jnp.array([0.3, 0.4, radius])
+    reverse, forward = jax.jacrev(end)(given), jax.jacfwd(end)(given)
+    steps = 1e-6 * jnp.eye(3)
+    expected = jnp.stack([(end(given + step) - end(given - step)) / 2e-6 for step in steps], axis=1)
+    np.testing.assert_allclose(reverse, expected, atol=1e-5)
+    np.testing.assert_allclose(reverse, forward, atol=1e-7)

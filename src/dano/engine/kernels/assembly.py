@@ -243,12 +243,18 @@ def add_point_jacobian(sums: wp.ref[Halves], point: Point, linear: Linear, weigh
 
 
 @wp.func
-def add_impulse(sums: wp.ref[Halves], fit: wp.ref[Fit], point: Point, linear: Linear, weight: real):
-    """Add a point's impulse at the first body's centre of mass, and what its duals miss."""
+def point_impulse(point: Point, linear: Linear, weight: real) -> vec6:
+    """Impulse of a point at the first body's centre of mass [N s, N m s, W]; `weight` is h times its area."""
     friction = linear.friction + linear.friction_change
     force = weight * (linear.pressure.value * point.normal + friction)
     moment = weight * (linear.pressure.value * point.moment + wp.cross(point.arm, friction))
-    sums.wrench += joined(force, moment)
+    return joined(force, moment)
+
+
+@wp.func
+def add_impulse(sums: wp.ref[Halves], fit: wp.ref[Fit], point: Point, linear: Linear, weight: real):
+    """Add a point's impulse, and what its duals miss."""
+    sums.wrench += point_impulse(point, linear, weight)
     sums.presses = ONE
     change = linear.friction_change
     missed = wp.abs(change[0]) + wp.abs(change[1]) + wp.abs(change[2])

@@ -7,7 +7,7 @@ it. One of an impact that happens after the share τ of the step changes positio
 
 import warp as wp
 
-from dano.engine.kernels.assembly import add_point_jacobian, Halves, presses, whole_jacobian
+from dano.engine.kernels.assembly import add_point_jacobian, Halves, point_impulse, presses, whole_jacobian
 from dano.engine.kernels.lanes import total6, total66, wait
 from dano.engine.kernels.tables import FoundPair, Room, Scene
 from dano.physics.features import LANES, POINTS, TREES, TURNING
@@ -26,12 +26,8 @@ def pair_impulse(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: Fo
     wrench = vec6()
     for k in range(found.first, found.end):
         if presses(room, world, k):
-            linear = room.linear[world, k]
             point = room.points[world, k]
-            friction = linear.friction + linear.friction_change
-            force = linear.pressure.value * point.normal + friction
-            moment = linear.pressure.value * point.moment + wp.cross(point.arm, friction)
-            wrench += (h * point.area) * joined(force, moment)
+            wrench += point_impulse(point, room.linear[world, k], h * point.area)
     return total6(wrench)
 
 
