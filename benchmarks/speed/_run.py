@@ -100,7 +100,7 @@ def _rows(repeats: int, arguments: argparse.Namespace) -> list[Row]:
     authors = None if arguments.quick else _subjects.authors_bunny()
     if authors is not None:
         subjects.append(authors)
-    elif not arguments.quick and not arguments.only:
+    elif not arguments.quick:
         missing.append(skipped(_dano.FLOOR, "authors' bunny", NO_DATA))
     cases: list[Case] = []
     for name in names:
