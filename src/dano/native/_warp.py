@@ -35,6 +35,7 @@ def compiled_kernel(
         kernel = made()
         # Machine code, which this cache keeps; Warp's usual output is compiled by the driver once more.
         kernel.module.options["cuda_output"] = "cubin"
+        kernel.module.options["cpu_compiler_flags"] = _flags()
         try:
             # Who else wants it waits, instead of compiling it, too.
             with _lock_of(kernel.module.name, device, lanes):
@@ -45,6 +46,17 @@ def compiled_kernel(
                 f"{what} cannot be compiled in {folder}: {error}; DANO_CACHE_DIR names another folder"
             ) from error
     return kernel
+
+
+def _flags() -> str | None:
+    """Those that Warp gives its compiler, and sums of products as one operation: steps a sixth faster.
+
+    Sums and products stand in functions of their own, where the compiler keeps them apart otherwise.
+    """
+    import warp as wp
+
+    flags = wp.config.cpu_compiler_flags
+    return None if flags is None else f"{flags} -ffp-contract=fast"
 
 
 @functools.cache

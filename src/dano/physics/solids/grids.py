@@ -77,6 +77,9 @@ def tensor_product(
     """Σ c_ijk w_i w_j w_k and its gradient per cell."""
     d = Distance()
     for i in range(len(wx)):
+        plane = ZERO
+        plane_y = ZERO
+        plane_z = ZERO
         for j in range(len(wx)):
             at = base + i * stride_x + j * stride_y
             line = ZERO
@@ -85,8 +88,11 @@ def tensor_product(
                 c = coefficients[world, at + k]
                 line += c * wz[k]
                 line_z += c * dz[k]
-            d.value += wx[i] * wy[j] * line
-            d.gradient += vec3(dx[i] * wy[j] * line, wx[i] * dy[j] * line, wx[i] * wy[j] * line_z)
+            plane += wy[j] * line
+            plane_y += dy[j] * line
+            plane_z += wy[j] * line_z
+        d.value += wx[i] * plane
+        d.gradient += vec3(dx[i] * plane, wx[i] * plane_y, wx[i] * plane_z)
     return d
 
 
