@@ -226,6 +226,21 @@ def way_of(a: BodyState, b: BodyState, middle: vec3, radius: real, h: real) -> r
 
 
 @wp.func
+def speed_within(pose: PairPose, x: vec3, radius: real) -> real:
+    """Most speed of points of the first body in a ball relative to the second body [m/s].
+
+    Args:
+        pose: The pair.
+        x: Centre of the ball [m].
+        radius: Its radius [m].
+    """
+    arm = x - pose.com
+    speed = wp.length(pose.velocity + wp.cross(pose.spin, arm)) + wp.length(pose.spin) * radius
+    gained = wp.length(pose.spin_gained_on_way) * (wp.length(arm) + radius)
+    return speed + wp.length(pose.gained_on_way) + gained
+
+
+@wp.func
 def pair_pose(
     first: BodyState,
     second: BodyState,

@@ -3,7 +3,7 @@
 import warp as wp
 
 from dano.engine.kernels.lanes import total, total6, total66, wait
-from dano.engine.kernels.linear_solve import n_listed
+from dano.engine.kernels.linear_solve import is_in, n_listed, touches
 from dano.engine.kernels.tables import FoundPair, Room, Scene
 from dano.engine.kernels.trees.balance import add_tree_momentum
 from dano.engine.kernels.trees.contact import add_pulled, body_twist, free_block
@@ -152,24 +152,39 @@ def slip_of(point: Point, motion: Motion) -> Motion:
 
 
 @wp.func
-def fit_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
-    """Duals that fit the accepted velocities."""
+def fit_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, island: int):
+    """Duals of an island that fit the accepted velocities."""
     for f in range(n_found):
+        if not touches(scene, room, world, f, island):
+            continue
         found = room.found[world, f * _LANES + lane]
         twist = pair_twist(scene, room, world, found, room.velocity, ONE)
         for k in range(found.first, found.end):
-            point = room.points[world, k]
-            motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
-            room.duals[world, k] = fitting_duals(room.laws[world, k], motion)
+            room.duals[world, k] = Duals()
             room.changes[world, k] = Duals()
             room.linear[world, k].held = ZERO
-            room.marks[world, k] = _KNOWN
+            room.marks[world, k] = 0
+            if not is_apart(room.gates[world, k], twist.velocity, twist.spin):
+                point = room.points[world, k]
+                motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
+                room.duals[world, k] = fitting_duals(room.laws[world, k], motion)
+                room.marks[world, k] = _KNOWN
 
 
 @wp.func
-def follow_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, length: real):
+def follow_duals(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    lane: int,
+    n_found: int,
+    length: real,
+    island: int,
+):
     """Accept the duals at a share of the last step; find their change along the new one, in `room.step`."""
     for f in range(n_found):
+        if not touches(scene, room, world, f, island):
+            continue
         found = room.found[world, f * _LANES + lane]
         twist = pair_twist(scene, room, world, found, room.step, ZERO)
         for k in range(found.first, found.end):
@@ -272,20 +287,24 @@ def whole_jacobian(sums: wp.ref[Halves]) -> mat66:
 
 
 @wp.func
-def clear_blocks(room: wp.ref[Room], world: int, lane: int, m: int):
-    """Zero the blocks in use, each lane a part."""
+def clear_blocks(room: wp.ref[Room], world: int, lane: int, m: int, island: int):
+    """Zero the blocks in use of an island, each lane a part."""
     for e in range(lane, n_listed(room, world, m), _LANES):
-        room.blocks[world, room.listed[world, e]] = mat66()
+        k = room.listed[world, e]
+        if is_in(room, world, k // m, island):
+            room.blocks[world, k] = mat66()
 
 
 @wp.func
-def add_momentum(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, m: int, h: real):
-    """What each body's momentum gains in the step beyond what it comes with, and the derivative."""
+def add_momentum(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, m: int, h: real, island: int
+):
+    """What momenta of bodies of an island gain in the step beyond what they come with, and the derivative."""
     for i in range(lane, scene.moving.shape[0], _LANES):
         b = i
         if wp.static(TREES):
             b = free_block(scene, i)
-        if b >= 0:
+        if b >= 0 and is_in(room, world, b, island):
             body = scene.bodies[world, scene.moving[i]]
             v = room.tried[world, b]
             spin = angular_part(v)
@@ -331,14 +350,14 @@ def add_contact(
 
 
 @wp.func(inline=True)
-def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, trial: Trial) -> Fit:
-    """Residual and Jacobian as momenta at the velocities that are tried, duals at a share of the step."""
+def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, trial: Trial, island: int) -> Fit:
+    """Residual and Jacobian of an island at the velocities that are tried, duals at a share of the step."""
     h = scene.timestep[world, 0]
     m = scene.n_blocks
     fit = Fit()
-    clear_blocks(room, world, lane, m)
+    clear_blocks(room, world, lane, m, island)
     wait()
-    add_momentum(scene, room, world, lane, m, h)
+    add_momentum(scene, room, world, lane, m, h, island)
     wait()
     if lane == 0:
         if wp.static(TREES):
@@ -346,6 +365,8 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
         if wp.static(LOOPS):
             add_loops(scene, room, world)
     for f in range(n_found):
+        if not touches(scene, room, world, f, island):
+            continue
         found = room.found[world, f * _LANES + lane]
         twist = pair_twist(scene, room, world, found, room.tried, ONE)
         sums = Halves()

@@ -1,5 +1,8 @@
 """Linear systems of 6 × 6 blocks, most of which are empty: bodies that touch few others.
 
+Bodies that touch each other, or through others, are an *island*. On a CPU, islands of free bodies are solved
+one after the other: where one takes many passes, the others are not looked at.
+
 Elimination without exchanges between blocks. The next body is always one that is coupled with the fewest
 others, so that little is filled in (minimum degree). Matrices of a step are inertia plus dissipation: their
 pivots stay away from singular.
@@ -10,11 +13,44 @@ import warp as wp
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.pattern import couple, couple_pair, couple_trees, mark_tree, mark_trees
-from dano.physics.features import LANES, TREES
-from dano.physics.real import mat33, mat66
+from dano.physics.features import LANES, PATCHES, TREES
+from dano.physics.real import mat33, mat66, real, vec6
 from dano.physics.twists import joined_blocks
 
 _LANES = wp.constant(LANES)
+ISLANDS = LANES == 1 and not TREES and not PATCHES
+"""Whether islands are solved one after the other. Lanes of a GPU look at all pairs at once."""
+EVERYWHERE = wp.constant(-1)
+"""Stands for all islands."""
+
+
+@wp.func
+def is_in(room: wp.ref[Room], world: int, row: int, island: int) -> bool:
+    """Whether a block belongs to an island."""
+    return island == EVERYWHERE or room.islands[world, row] == island
+
+
+@wp.func
+def touches(scene: wp.ref[Scene], room: wp.ref[Room], world: int, f: int, island: int) -> bool:
+    """Whether a pair that is near belongs to an island: of its bodies at least one moves."""
+    if island == EVERYWHERE:
+        return True
+    index = scene.pair_index[room.found[world, f].pair]
+    a = scene.body_index[index.first].row
+    if a < 0:
+        a = scene.body_index[index.second].row
+    return room.islands[world, a] == island
+
+
+@wp.func
+def join(room: wp.ref[Room], world: int, m: int, a: int, b: int):
+    """Make one island of those of two blocks, with the number of its first block."""
+    first = wp.min(room.islands[world, a], room.islands[world, b])
+    last = wp.max(room.islands[world, a], room.islands[world, b])
+    if first < last:
+        for i in range(last, m):
+            if room.islands[world, i] == last:
+                room.islands[world, i] = first
 
 
 @wp.func
@@ -28,6 +64,7 @@ def find_pattern(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: 
         room.used[world, k] = 0
     for i in range(m):
         room.used[world, i * m + i] = 1
+        room.islands[world, i] = i
     if wp.static(TREES):
         mark_trees(scene, room, world)
     for f in range(n_found):
@@ -40,6 +77,7 @@ def find_pattern(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: 
             mark_tree(scene, room, world, b)
         elif a >= 0 and b >= 0:
             couple(room, world, m, a, b)
+            join(room, world, m, a, b)
     for i in range(m):
         room.counts[world, i] = -1
         room.order[world, i] = -1
@@ -136,14 +174,14 @@ def inverse(m: mat66) -> mat66:
 
 
 @wp.func
-def solve_blocks(room: wp.ref[Room], world: int, lane: int, m: int):
-    """Solve `spare` x = x in place, x in `room.step`; `spare` is used up.
+def solve_blocks(room: wp.ref[Room], world: int, lane: int, m: int, island: int):
+    """Solve `spare` x = x in place, x in `room.step`, for an island; `spare` is used up.
 
     Both have to be known to all lanes; the solution is known to the first.
     """
     for s in range(m):
         k = room.order[world, s]
-        if k >= 0:
+        if k >= 0 and is_in(room, world, k, island):
             n = room.counts[world, k]
             if lane == 0:
                 room.spare[world, k * m + k] = inverse(room.spare[world, k * m + k])
@@ -163,7 +201,7 @@ def solve_blocks(room: wp.ref[Room], world: int, lane: int, m: int):
     if lane == 0:
         for t in range(m):
             k = room.order[world, m - 1 - t]
-            if k >= 0:
+            if k >= 0 and is_in(room, world, k, island):
                 x = room.step[world, k]
                 for a in range(room.counts[world, k]):
                     i = room.later[world, k * m + a]
@@ -172,11 +210,51 @@ def solve_blocks(room: wp.ref[Room], world: int, lane: int, m: int):
 
 
 @wp.func
-def copy_blocks(room: wp.ref[Room], world: int, lane: int, m: int):
-    """Copy the Jacobian into `spare`, each lane a part."""
+def worse_of(error: real, room: wp.ref[Room], world: int, row: int) -> real:
+    """The larger one of an error and a block's residual over mass or inertia [m/s, rad/s]; it may be NaN."""
+    residual = room.residual[world, row]
+    scale = room.scale[world, row]
+    worse = real(error)
+    for c in range(6):
+        missed = wp.abs(scale[c] * residual[c])
+        if not (missed <= worse):
+            worse = missed
+    return worse
+
+
+@wp.func
+def absolute_product(room: wp.ref[Room], world: int, block: int, v: vec6) -> vec6:
+    """Σ |a_rc v_c| of each row of a block."""
+    a = room.blocks[world, block]
+    found = vec6()
+    for r in range(6):
+        for c in range(6):
+            found[r] = found[r] + wp.abs(a[r, c] * v[c])
+    return found
+
+
+@wp.func
+def copy_rows(
+    room: wp.ref[Room],
+    world: int,
+    m: int,
+    island: int,
+    values: wp.array2d(dtype=vec6),
+    into: wp.array2d(dtype=vec6),
+):
+    """Copy numbers of an island."""
+    for i in range(m):
+        if is_in(room, world, i, island):
+            into[world, i] = values[world, i]
+
+
+@wp.func
+def copy_blocks(room: wp.ref[Room], world: int, lane: int, m: int, island: int):
+    """Copy the Jacobian of an island into `spare`, each lane a part."""
     for e in range(lane, n_listed(room, world, m), _LANES):
         k = room.listed[world, e]
-        room.spare[world, k] = room.blocks[world, k]
+        if is_in(room, world, k // m, island):
+            room.spare[world, k] = room.blocks[world, k]
 
 
 @wp.func

@@ -49,12 +49,14 @@ class Meeting:
         critical: Sample that has sunk in by then, −1 where none does within the step.
         nears: Whether a sample nears the other body fast enough to count.
         least: No sample gets closer to the other body than that [m].
+        slow: Whether nothing moves fast enough to have met, which nothing was asked for.
     """
 
     share: real
     critical: int
     nears: bool
     least: real
+    slow: bool
 
 
 @wp.struct
@@ -280,6 +282,7 @@ def meeting(
     way = way_of(a, b, middle_of(body, a), body.radius, h)
     most = most_nearing(scene, world, solid, body, a, b, way, h)
     if most <= least_way:
+        met.slow = True
         return met
     # Seen from the second body, velocities turn with both bodies.
     axis = matrix(a.orientation) * vec3(ZERO, ZERO, ONE)

@@ -40,6 +40,7 @@ from dano.physics.pairs import (
     BodyState,
     falling,
     PairPose,
+    speed_within,
 )
 from dano.physics.point_law import gate_of, Material, point_law
 from dano.physics.real import HALF, ONE, real, TWO, vec3, ZERO
@@ -130,7 +131,6 @@ def find_points(
     entry: int,
     share: real,
     h: real,
-    reach: real,
     turned: bool,
     begin: int,
     end: int,
@@ -149,6 +149,10 @@ def find_points(
     body = scene.bodies[world, first]
     stretch = stretch_of(body, index.turning)
     plane = plane_of(scene, world, solid, index.turning, pose.origin)
+    # No motion within the step takes a sample from beyond reach to the margin.
+    rest = (ONE - share) * h
+    sinks = wp.where(share < ONE, pair.impact_depth, ZERO)
+    reach = wp.max(pair.margin + rest * speed_within(pose, pose.com, TWO * body.radius), sinks)
     at = begin
     beyond = int(0)
     # All lanes go through as many rounds: samples of the blocks that are listed in one are shared.
@@ -166,21 +170,24 @@ def find_points(
                 if solid_clearance(scene.solids, world, solid, x, far) > far:
                     beyond = i + _RUN
                     listed = False
+        near = reach
         if listed:
             ball = scene.balls[world, b]
             x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
-            near = reach + reach_of_block(scene, world, pose, plane, b, stretch)
-            listed = solid_clearance(scene.solids, world, solid, x, near) <= near
-        rest = lanes_where(lane, listed)
-        while rest != wp.uint32(0):
-            share_of = block_share(lane, rest)
-            rest = share_of.rest
+            if index.turning == 0:
+                # Samples that are fixed to the body move as the middle of their block, or nearly.
+                near = wp.min(reach, wp.max(pair.margin + rest * speed_within(pose, x, ball[3]), sinks))
+            far = near + reach_of_block(scene, world, pose, plane, b, stretch)
+            listed = solid_clearance(scene.solids, world, solid, x, far) <= far
+        left = lanes_where(lane, listed)
+        while left != wp.uint32(0):
+            share_of = block_share(lane, left)
+            left = share_of.rest
             first_sample = _BLOCK * (b - lane + share_of.block) + share_of.begin
             for s in range(first_sample, first_sample + share_of.count):
                 sample = scene.samples[world, s]
                 x = position_in_solid(pose, sample.point)
                 d = solid_distance(scene.solids, world, solid, x)
-                # No motion within the step takes a sample beyond reach to the margin.
                 if d.value <= reach:
                     facing = facing_area(pose, sample, solid_normal(d.gradient))
                     back = bool(False)
@@ -331,7 +338,6 @@ def find_pair(
     a = room.bodies[world, index.first]
     b = room.bodies[world, index.second]
     material = scene.materials[world, index.contact]
-    body = scene.bodies[world, index.first]
     alone = bool(False)
     if wp.static(not TREES):
         alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
@@ -348,6 +354,8 @@ def find_pair(
             scene, room, world, lane, falling(a, 1), falling(b, 1), pair, index.first, index.second, h,
             pair.impact_depth, slow, slow, wp.where(alone, -ONE, ZERO),
         )  # fmt: skip
+        # What moves so slowly has no impact.
+        lasts = met.slow
     if lasts:
         met = lasting_meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, sink)
     after = at
@@ -361,14 +369,9 @@ def find_pair(
         seen = falling(a, found.falls)
         other = falling(b, found.falls)
         pose = posed(scene, world, seen, other, index.first, index.second, met.share, h, pair.follows)
-        speed = wp.length(pose.velocity) + wp.length(pose.spin) * TWO * body.radius
-        speed += wp.length(pose.gained_on_way) + wp.length(pose.spin_gained_on_way) * TWO * body.radius
-        reach = pair.margin + (ONE - met.share) * h * speed
-        if met.share < ONE:
-            reach = wp.max(reach, pair.impact_depth)
         patch = Patch()
         after, patch, load, turned_load = find_points(
-            scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h, reach,
+            scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h,
             False, at, end, patch,
         )  # fmt: skip
         patch.load = total(patch.load)
@@ -379,7 +382,7 @@ def find_pair(
         # What faces the other way presses where its load is the larger one.
         if total(turned_load) > total(load):
             after, patch, _load, _turned = find_points(
-                scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h, reach,
+                scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h,
                 True, after, end, patch,
             )  # fmt: skip
         found.patch = patch

@@ -20,7 +20,17 @@ import warp as wp
 
 from dano.engine.kernels.assembly import assemble, fit_duals, follow_duals, Trial
 from dano.engine.kernels.lanes import greatest, total, wait
-from dano.engine.kernels.linear_solve import copy_blocks, n_listed, solve_blocks
+from dano.engine.kernels.linear_solve import (
+    absolute_product,
+    copy_blocks,
+    copy_rows,
+    EVERYWHERE,
+    is_in,
+    ISLANDS,
+    n_listed,
+    solve_blocks,
+    worse_of,
+)
 from dano.engine.kernels.patches import add_patches, any_sticks, fit_patch_duals, follow_patch_duals
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.balance import (
@@ -212,8 +222,8 @@ def narrowed(search: Search, work: real) -> Search:
 
 
 @wp.func
-def measure(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int) -> Measured:
-    """Of the residual and Jacobian at the velocities that were tried."""
+def measure(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, island: int) -> Measured:
+    """Of the residual and Jacobian of an island at the velocities that were tried."""
     m = scene.n_blocks
     found = Measured()
     if wp.static(TREES):
@@ -223,17 +233,16 @@ def measure(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int) -> 
             found.error = of_joints.error
             found.size = wp.max(of_joints.size, room.trees.sizes[world, 1])
     for i in range(lane, m, _LANES):
-        residual = room.residual[world, i]
+        if not is_in(room, world, i, island):
+            continue
+        found.work += wp.dot(room.step[world, i], room.residual[world, i])
+        found.error = worse_of(found.error, room, world, i)
         scale = room.scale[world, i]
-        found.work += wp.dot(room.step[world, i], residual)
         size = vec6()
         for e in range(n_listed(room, world, i), room.ends[world, i]):
             k = room.listed[world, e]
             size += absolute_product(room, world, k, room.tried[world, k % m])
         for c in range(6):
-            missed = wp.abs(scale[c] * residual[c])
-            if not (missed <= found.error):
-                found.error = missed
             found.size = wp.max(found.size, scale[c] * size[c])
     found.work = total(found.work)
     found.error = greatest(found.error)
@@ -246,17 +255,12 @@ def largest_error(scene: wp.ref[Scene], room: wp.ref[Room], world: int) -> real:
     """Largest residual over mass or inertia at the velocities that were tried [m/s, rad/s]."""
     error = measure_joints(scene, room, world).error
     for i in range(scene.n_blocks):
-        residual = room.residual[world, i]
-        scale = room.scale[world, i]
-        for k in range(6):
-            missed = wp.abs(scale[k] * residual[k])
-            if not (missed <= error):
-                error = missed
+        error = worse_of(error, room, world, i)
     return error
 
 
 @wp.func(inline=True)
-def newton_step(scene: Scene, room: Room, world: int, lane: int, share: real, keeps: bool):
+def newton_step(scene: Scene, room: Room, world: int, lane: int, share: real, keeps: bool, island: int):
     """A share of Newton's step from what was tried, in `room.step`.
 
     Args:
@@ -266,40 +270,32 @@ def newton_step(scene: Scene, room: Room, world: int, lane: int, share: real, ke
         lane: Which lane of it.
         share: The share.
         keeps: Whether trees have the derivative of the step before.
+        island: Of which bodies.
     """
     m = scene.n_blocks
-    copy_blocks(room, world, lane, m)
+    copy_blocks(room, world, lane, m, island)
     for i in range(lane, m, _LANES):
-        room.step[world, i] = -room.residual[world, i]
+        if is_in(room, world, i, island):
+            room.step[world, i] = -room.residual[world, i]
     wait()
     if wp.static(TREES):
         if lane == 0:
             eliminate_joint_duals(scene, room, world, keeps)
         wait()
-    solve_blocks(room, world, lane, m)
+    solve_blocks(room, world, lane, m, island)
     if lane == 0:
         if wp.static(TREES):
             solve_trees(scene, room, world, keeps)
         for i in range(m):
-            room.step[world, i] = share * room.step[world, i]
-
-
-@wp.func
-def absolute_product(room: wp.ref[Room], world: int, block: int, v: vec6) -> vec6:
-    """Σ |a_rc v_c| of each row of a block."""
-    a = room.blocks[world, block]
-    found = vec6()
-    for r in range(6):
-        for c in range(6):
-            found[r] = found[r] + wp.abs(a[r, c] * v[c])
-    return found
+            if is_in(room, world, i, island):
+                room.step[world, i] = share * room.step[world, i]
 
 
 @wp.func(inline=True)
-def solve(
-    scene: Scene, room: Room, world: int, lane: int, n_found: int, size: real, options: Options
+def solve_island(
+    scene: Scene, room: Room, world: int, lane: int, n_found: int, size: real, options: Options, island: int
 ) -> Solved:
-    """Velocities at the end of a step, in `room.velocity`, from those that it holds.
+    """Velocities of an island at the end of a step, in `room.velocity`, from those that it holds.
 
     Args:
         scene: The scene.
@@ -309,16 +305,18 @@ def solve(
         n_found: Number of pairs that are near.
         size: Magnitude of the terms in the residual [m/s], to which rounding in it is relative.
         options: When to stop.
+        island: Which bodies.
     """
     m = scene.n_blocks
     if lane == 0:
         for i in range(m):
-            room.best[world, i] = room.velocity[world, i]
-            room.step[world, i] = vec6()
+            if is_in(room, world, i, island):
+                room.best[world, i] = room.velocity[world, i]
+                room.step[world, i] = vec6()
         if wp.static(TREES):
             fit_joint_duals(scene, room, world)
     if wp.static(POINTS):
-        fit_duals(scene, room, world, lane, n_found)
+        fit_duals(scene, room, world, lane, n_found, island)
     n_near = n_found
     if wp.static(PATCHES):
         n_near += room.patches.count[world, 0]
@@ -352,14 +350,15 @@ def solve(
         wait()
         if lane == 0:
             for i in range(m):
-                room.tried[world, i] = room.velocity[world, i] + search.length * room.step[world, i]
+                if is_in(room, world, i, island):
+                    room.tried[world, i] = room.velocity[world, i] + search.length * room.step[world, i]
         wait()
         trial = Trial()
         trial.length = search.length
         trial.softness = level.softness
         trial.holds = level.holds
         trial.mix = mix
-        fit = assemble(scene, room, world, lane, n_found, trial)
+        fit = assemble(scene, room, world, lane, n_found, trial, island)
         if wp.static(PATCHES):
             fit = add_patches(scene, room, world, lane, n_found, trial, fit)
         wait()
@@ -380,7 +379,7 @@ def solve(
             if lane == 0 and needs:
                 add_tree_slopes(scene, room, world)
             wait()
-        seen = measure(scene, room, world, lane)
+        seen = measure(scene, room, world, lane, island)
         tolerance = wp.max(options.tolerance * (ONE + size), real(16.0) * options.rounding * seen.size)
         hard = level.softness == ONE
         enough = tolerance
@@ -423,8 +422,7 @@ def solve(
             search = narrowed(search, seen.work)
         else:
             if lane == 0:
-                for i in range(m):
-                    room.velocity[world, i] = room.tried[world, i]
+                copy_rows(room, world, m, island, room.tried, room.velocity)
             if wp.static(TREES):
                 if n_near == 0 and found.converged and seen.error > _EXACT * options.rounding * (ONE + size):
                     # A last step, not looked at, takes what is left to rounding.
@@ -432,13 +430,13 @@ def solve(
                     keeps = not needs
                     part = ONE
             if finishes or not found.converged:
-                newton_step(scene, room, world, lane, part, keeps)
+                newton_step(scene, room, world, lane, part, keeps, island)
                 if wp.static(TREES):
                     if lane == 0:
                         follow_joint_duals(scene, room, world, search.length, part)
                 wait()
                 if wp.static(POINTS):
-                    follow_duals(scene, room, world, lane, n_found, search.length)
+                    follow_duals(scene, room, world, lane, n_found, search.length, island)
                 if wp.static(PATCHES):
                     follow_patch_duals(scene, room, world, lane, n_found)
                 # The next pass is no longer of the same function where bounds are renewed: it is accepted.
@@ -447,16 +445,15 @@ def solve(
                     if wp.static(TREES):
                         begun = measure_joints(scene, room, world).work
                     for i in range(m):
-                        begun += wp.dot(room.step[world, i], room.residual[world, i])
+                        if is_in(room, world, i, island):
+                            begun += wp.dot(room.step[world, i], room.residual[world, i])
                 search = begin_search(begun)
             before = seen.error
         if improves and lane == 0:
-            for i in range(m):
-                room.best[world, i] = room.tried[world, i]
+            copy_rows(room, world, m, island, room.tried, room.best)
         found.passes += 1
     if not found.converged and lane == 0:
-        for i in range(m):
-            room.velocity[world, i] = room.best[world, i]
+        copy_rows(room, world, m, island, room.best, room.velocity)
     if wp.static(TREES):
         if found.converged and lane == 0:
             if finishes:
@@ -467,3 +464,32 @@ def solve(
     wait()
     found.residual = wp.where(found.converged, before, best)
     return found
+
+
+@wp.func(inline=True)
+def solve(
+    scene: Scene, room: Room, world: int, lane: int, n_found: int, size: real, options: Options
+) -> Solved:
+    """Velocities at the end of a step, in `room.velocity`, from those that it holds: island by island.
+
+    Args: those of `solve_island`.
+
+    Returns:
+        How all of them ended: the largest residual, the most passes.
+    """
+    whole = Solved()
+    whole.converged = True
+    islands = int(1)
+    if wp.static(ISLANDS):
+        islands = scene.n_blocks
+    for i in range(islands):
+        island = EVERYWHERE
+        if wp.static(ISLANDS):
+            island = room.islands[world, i]
+        # An island has the number of its first body.
+        if island == EVERYWHERE or island == i:
+            one = solve_island(scene, room, world, lane, n_found, size, options, island)
+            whole.residual = wp.max(whole.residual, one.residual)
+            whole.passes = wp.max(whole.passes, one.passes)
+            whole.converged = whole.converged and one.converged
+    return whole

@@ -252,6 +252,7 @@ class Room:
         later: …
         counts: …
         degrees: With how many others a block is coupled.
+    islands: First of the blocks with which a block is coupled, by others, too: see `linear_solve`.
         listed: The blocks that are not zero, row by row.
         ends: Where those of each row end in this list.
         velocity: Accepted, of each free body [m/s; rad/s, W], or six coordinates of joints; (worlds, blocks).
@@ -296,6 +297,7 @@ class Room:
     later: wp.array2d(dtype=wp.int32)
     counts: wp.array2d(dtype=wp.int32)
     degrees: wp.array2d(dtype=wp.int32)
+    islands: wp.array2d(dtype=wp.int32)
     listed: wp.array2d(dtype=wp.int32)
     ends: wp.array2d(dtype=wp.int32)
     velocity: wp.array2d(dtype=vec6)

@@ -4,6 +4,7 @@ import warp as wp
 
 from dano.engine.kernels.derivatives.equations import settle
 from dano.engine.kernels.lanes import total, total3, wait
+from dano.engine.kernels.linear_solve import EVERYWHERE
 from dano.engine.kernels.patches import contact_of
 from dano.engine.kernels.rollout import any_hits, begin_unpushed, find_touching, Launch, REBOUNDS
 from dano.engine.kernels.solve import newton_step
@@ -115,7 +116,7 @@ def touch(scene: Scene, room: Room, launch: Launch, seen: Seen):
 @wp.func
 def misses(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int) -> real:
     """How far Newton's step from the velocities at the end would lead, forces in loops aside [m/s, rad/s]."""
-    newton_step(scene, room, world, lane, ONE, False)
+    newton_step(scene, room, world, lane, ONE, False, EVERYWHERE)
     wait()
     found = real(0.0)
     if wp.static(TREES):

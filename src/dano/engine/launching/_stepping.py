@@ -153,7 +153,7 @@ def room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> di
         "bodies": n,
         **dict.fromkeys(("momentum", "inertia"), m),
         **dict.fromkeys(("velocity", "old", "tried", "best", "moved", "step", "residual", "scale"), blocks),
-        **dict.fromkeys(("order", "counts", "degrees", "ends"), blocks),
+        **dict.fromkeys(("order", "counts", "degrees", "islands", "ends"), blocks),
         **dict.fromkeys(("blocks", "spare", "used", "later", "listed"), blocks * blocks),
         **dict.fromkeys(("where", "points", "laws", "gates", "marks", "duals", "changes", "linear"), points),
         "found": pairs,

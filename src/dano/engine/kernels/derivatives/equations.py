@@ -28,7 +28,7 @@ from dano.engine.kernels.derivatives.trees import (
 )
 from dano.engine.kernels.impacts import find_moved, meetings_of, moving_of
 from dano.engine.kernels.lanes import wait
-from dano.engine.kernels.linear_solve import copy_transposed_blocks, find_pattern, solve_blocks
+from dano.engine.kernels.linear_solve import copy_transposed_blocks, EVERYWHERE, find_pattern, solve_blocks
 from dano.engine.kernels.patches import add_patches, fit_patch_duals
 from dano.engine.kernels.rollout import begin_unpushed, find_touching, Launch, row_before
 from dano.engine.kernels.search import fix_laws
@@ -80,13 +80,13 @@ def settle(
     wait()
     if wp.static(POINTS):
         fix_laws(scene, room, world, lane, n_found, launch.reports[world, t].rebound, True)
-        fit_duals(scene, room, world, lane, n_found)
+        fit_duals(scene, room, world, lane, n_found, EVERYWHERE)
     if wp.static(PATCHES):
         fit_patch_duals(scene, room, world, lane, n_found)
     wait()
     trial = Trial()
     trial.softness = ONE
-    fit = assemble(scene, room, world, lane, n_found, trial)
+    fit = assemble(scene, room, world, lane, n_found, trial, EVERYWHERE)
     if wp.static(PATCHES):
         add_patches(scene, room, world, lane, n_found, trial, fit)
     wait()
@@ -112,7 +112,7 @@ def solve_transposed(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane:
             transpose_entries(scene, room, world)
             eliminate_joint_duals(scene, room, world, False)
     wait()
-    solve_blocks(room, world, lane, m)
+    solve_blocks(room, world, lane, m, EVERYWHERE)
     if wp.static(TREES):
         if lane == 0:
             solve_trees(scene, room, world, False)

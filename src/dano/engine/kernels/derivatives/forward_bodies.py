@@ -43,7 +43,7 @@ from dano.engine.kernels.derivatives.products import (
 )
 from dano.engine.kernels.impacts import freed, meetings_of, moving_of, pair_slope
 from dano.engine.kernels.lanes import total, wait
-from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
+from dano.engine.kernels.linear_solve import copy_blocks, EVERYWHERE, solve_blocks
 from dano.engine.kernels.patches import n_patches
 from dano.engine.kernels.rollout import Launch, push_of, row_before
 from dano.engine.kernels.tables import Body, Changes, FoundPair, Moment, Room, SamplePair, Scene, StateRow
@@ -472,9 +472,9 @@ def push_step_of_bodies(
         if lane == 0:
             for k in range(m):
                 room.step[world, k] = room.missing[world, d * m + k]
-        copy_blocks(room, world, lane, m)
+        copy_blocks(room, world, lane, m, EVERYWHERE)
         wait()
-        solve_blocks(room, world, lane, m)
+        solve_blocks(room, world, lane, m, EVERYWHERE)
         wait()
         for f in range(n_found):
             if room.found[world, f * _LANES + lane].impact.delays > ZERO:

@@ -33,7 +33,7 @@ from dano.engine.kernels.derivatives.products import (
 )
 from dano.engine.kernels.derivatives.trees import follow_chains
 from dano.engine.kernels.lanes import total, wait
-from dano.engine.kernels.linear_solve import copy_blocks, solve_blocks
+from dano.engine.kernels.linear_solve import copy_blocks, EVERYWHERE, solve_blocks
 from dano.engine.kernels.patch_tables import PatchSide
 from dano.engine.kernels.patches import n_patches
 from dano.engine.kernels.rollout import Launch
@@ -260,7 +260,7 @@ def solve_directions(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[La
     """Changes of the velocities, in place of those of the equations, in `room.missing`."""
     m = scene.n_blocks
     for d in range(launch.n_directions):
-        copy_blocks(room, world, lane, m)
+        copy_blocks(room, world, lane, m, EVERYWHERE)
         wait()
         if lane == 0:
             for b in range(m):
@@ -268,7 +268,7 @@ def solve_directions(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[La
             # Matrices of trees that touch nothing are factored once.
             eliminate_joint_duals(scene, room, world, d > 0)
         wait()
-        solve_blocks(room, world, lane, m)
+        solve_blocks(room, world, lane, m, EVERYWHERE)
         if lane == 0:
             solve_trees(scene, room, world, d > 0)
             for b in range(m):
