@@ -3,9 +3,9 @@
 Least squares over all frames: what the pixels of a frame say of its pose, as a Gaussian (`Poses`); third
 differences of position and rotation, which vanish under constant acceleration and spin; differences between
 frames in which the object lies still; and, above a known table, height and tilt of an object that lies or
-slides on one of its faces. A wrong size of the object moves it along the line of sight in all frames alike.
-Weights of frames and of differences are those of Student's and Cauchy's
-distributions, found again in every step (iteratively reweighted least squares).
+slides on one of its faces, and g where it falls freely. A wrong size of the object moves it along the line of
+sight in all frames alike. Weights of frames, of differences and of what a table says are those of Student's
+and Cauchy's distributions, found again in every step (iteratively reweighted least squares).
 """
 
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate
+from dano.vision.trajectory._flight import AIR, centres_of_mass, Flight, flights, GRAVITY, no_flight
 from dano.vision.trajectory._poses import Poses
 from dano.vision.trajectory._support import Face, Solid
 
@@ -30,6 +31,9 @@ _LEVEL, _FLAT = 1.5e-3, 2e-3
 
 _BASE, _LEAN = 4e-3, 6e-3
 """By how much the learned face may lie beside the true one: height [sizes] and tilt [rad], one for a film."""
+
+_LOADED = 0.03
+"""By how much the centre of mass may lie beside that of an even filling [sizes], one for a film."""
 
 _ABOVE, _TILTED = 0.06, np.radians(8)
 """Height [sizes] and tilt [rad] up to which an object lies on a face; more, where poses are less certain."""
@@ -124,14 +128,17 @@ def smoothed(times: Float[np.ndarray, " T"], poses: Poses, scenery: Scenery) -> 
     together = _together(resting, len(rows))
     seen = seen._replace(covariance=seen.covariance * together[:, None, None])
     problem = _Problem(times[rows], seen, scenery, resting)
-    found = problem.solved(seen, [])
+    found = problem.solved(seen, [], no_flight())
     # Which face it lies on is seen better once frames agree on a motion.
-    runs = [] if scenery.table is None else _runs(found, scenery.solid, scenery.table)
+    runs, flight = [], no_flight()
+    if scenery.table is not None:
+        runs = _runs(found, scenery.solid, scenery.table)
+        flight = flights(times[rows], found, scenery.solid, scenery.table)
     inflation, more = 1.0, seen
     for _ in range(_CALIBRATIONS):
         inflation = max(1.0, inflation * _disagreement(seen, found, problem.seen(found), together, inflation))
         more = seen._replace(covariance=inflation * seen.covariance)
-        found = problem.solved(more, runs, scenery.table or 0.0)
+        found = problem.solved(more, runs, flight, scenery.table or 0.0)
     result = Poses(*(x.copy() for x in poses))
     for whole, part in zip(result, found, strict=True):
         whole[rows] = part
@@ -186,7 +193,8 @@ class _Minimum(NamedTuple):
 
     Attributes:
         poses: Of the frames.
-        shared: Height and tilts of the face of each run, then the share by which frames see too far.
+        shared: Height and tilts of the face of each run; where the centre of mass lies beside the expected
+            one [sizes, F], if there is a flight; then the share by which frames see too far.
     """
 
     poses: Poses
@@ -239,17 +247,18 @@ class _Problem:
         self.weight = self._weight = np.ones(n)
         self._tolerance, self._cost = 1.0, 0.0
         self._runs: list[_Run] = []
+        self._flight = no_flight()
         self._table = 0.0
 
-    def solved(self, poses: Poses, runs: list[_Run], table: float = 0.0) -> Poses:
-        """Poses at the minimum, with their covariance, given those of frames and runs of frames on a table.
+    def solved(self, poses: Poses, runs: list[_Run], flight: Flight, table: float = 0.0) -> Poses:
+        """Poses at the minimum, with their covariance, given those of frames, and where it lies or falls.
 
         Single wrong frames and blows both break a steady motion. At first differences keep their weight,
         which finds the wrong frames. Then each stretch that is not believed is tried as its frames have it.
         """
-        self._poses, self._runs, self._table = poses, runs, table
+        self._poses, self._runs, self._flight, self._table = poses, runs, flight, table
         self._roots = np.linalg.inv(np.linalg.cholesky(poses.covariance / np.outer(self._unit, self._unit)))
-        best = self._descended(self._poses, np.zeros(3 * len(runs) + 1), _TOLERANT)
+        best = self._descended(self._poses, np.zeros(len(self._doubts)), _TOLERANT)
         doubted = np.flatnonzero(np.diff(np.concatenate([[0], best.weight < _DOUBTED, [0]]).astype(int)))
         for first, last in doubted.reshape(-1, 2):
             rows = slice(first, last)
@@ -298,14 +307,23 @@ class _Problem:
         rows += [_spread(frames, slopes, residual, width) for frames, slopes, residual in parts]
         for k, run in enumerate(self._runs):
             rows.append(self._lying(poses, run, shared[3 * k : 3 * k + 3], 6 * n + 3 * k, width))
+        if len(self._flight.threes):
+            column = 3 * len(self._runs)
+            rows.append(self._falling(poses, shared[column : column + 3], 6 * n + column, width))
         rows.append(self._prior(shared, width))
         matrices, residuals = zip(*rows, strict=True)
         return sparse.vstack(matrices).tocsr(), np.concatenate(residuals)
 
+    @property
+    def _doubts(self) -> Float[np.ndarray, " m"]:
+        """Standard deviations of what is shared by frames (see `_Minimum`)."""
+        lying = np.tile([_BASE, _LEAN, _LEAN], len(self._runs))
+        falling = np.full(3 if len(self._flight.threes) else 0, _LOADED)
+        return np.concatenate([lying, falling, [self._scale]])
+
     def _prior(self, shared: np.ndarray, width: int):
         """How far a learned object may differ from the true one."""
-        runs = (len(shared) - 1) // 3
-        known = 1 / np.append(np.tile([_BASE, _LEAN, _LEAN], runs), self._scale)
+        known = 1 / self._doubts
         self._cost += 0.5 * float(np.sum((known * shared) ** 2))
         rows = np.arange(len(shared))
         matrix = sparse.csr_matrix((known, (rows, width - len(shared) + rows)), shape=(len(shared), width))
@@ -398,11 +416,24 @@ class _Problem:
         self._cost += 2 * float(np.sum(np.log1p(square)))
         part = self._linear(lambda moved: off(moved, shared), poses, rows[:, None], root)
         matrix, residual = _spread(*part, width)
-        slopes = [(off(poses, shared + _EPSILON * e) - plain) / _EPSILON for e in np.eye(3)]
-        common = np.stack([(root * slope).ravel() for slope in slopes], axis=1)
-        place = np.repeat(np.arange(len(common)), 3), np.tile(column + np.arange(3), len(common))
-        matrix = matrix + sparse.csr_matrix((common.ravel(), place), shape=matrix.shape)
-        return matrix, residual
+        return matrix + _common(off, poses, shared, plain, root, column, matrix.shape), residual
+
+    def _falling(self, poses: Poses, shared: np.ndarray, column: int, width: int):
+        """Acceleration of the centre of mass less g, by Cauchy's distribution: something may push it."""
+        (threes, rates), size = self._flight, self._solid.size
+
+        def pushed(moved: Poses, beside: np.ndarray) -> np.ndarray:
+            com = centres_of_mass(moved, self._solid.com + size * beside)
+            return (np.einsum("mk,mki->mi", rates, com[threes]) - GRAVITY) / AIR
+
+        plain = pushed(poses, shared)
+        square = np.sum(plain**2, axis=1)
+        root = np.sqrt(4 / (1 + square / self._tolerance**2))[:, None]
+        self._cost += 2 * float(np.sum(np.log1p(square)))
+        matrix, residual = _spread(
+            *self._linear(lambda moved: pushed(moved, shared), poses, threes, root), width
+        )
+        return matrix + _common(pushed, poses, shared, plain, root, column, matrix.shape), residual
 
 
 def _spread(frames: np.ndarray, slopes: np.ndarray, residual: np.ndarray, width: int):
@@ -413,6 +444,14 @@ def _spread(frames: np.ndarray, slopes: np.ndarray, residual: np.ndarray, width:
     rows = np.broadcast_to(np.arange(m * r).reshape(m, r, 1, 1), (m, r, k, 6))
     matrix = sparse.csr_matrix((slopes.ravel(), (rows.ravel(), columns.ravel())), shape=(m * r, width))
     return matrix, residual.ravel()
+
+
+def _common(function, poses: Poses, shared, plain, root, column: int, shape: tuple[int, int]):
+    """A sparse matrix of derivatives by three numbers that frames share, from a column on."""
+    slopes = [(function(poses, shared + _EPSILON * e) - plain) / _EPSILON for e in np.eye(3)]
+    common = np.stack([(root * slope).ravel() for slope in slopes], axis=1)
+    place = np.repeat(np.arange(len(common)), 3), np.tile(column + np.arange(3), len(common))
+    return sparse.csr_matrix((common.ravel(), place), shape=shape)
 
 
 def _block(inverse, k: int, width: int) -> Float[np.ndarray, "6 6"]:

@@ -30,12 +30,14 @@ class Solid(NamedTuple):
     Attributes:
         size: Longest side of its box [m].
         middle: Point that motions are told of [m, F].
+        com: Centre of mass [m, F].
         corners: Of its convex hull [m, F].
         faces: On which it can lie.
     """
 
     size: float
     middle: Float[np.ndarray, "3"]
+    com: Float[np.ndarray, "3"]
     corners: Float[np.ndarray, "n 3"]
     faces: tuple[Face, ...]
 
@@ -65,7 +67,8 @@ def solid_of(points: Float[np.ndarray, "n 3"], com: Float[np.ndarray, "3"]) -> S
         new = all(normal[i] @ face.down < 1 - 1e-9 for face in faces)
         if new and _margin(corners, normal[i], foot[i], height[i]) > _STEADY * size:
             faces.append(Face(normal[i], foot[i]))
-    return Solid(size, 0.5 * (corners.min(axis=0) + corners.max(axis=0)), corners, tuple(faces))
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    return Solid(size, middle, np.asarray(com, np.float64), corners, tuple(faces))
 
 
 def _margin(corners: np.ndarray, down: np.ndarray, foot: np.ndarray, height: float) -> float:

@@ -1,0 +1,99 @@
+"""Where a thing falls freely: its centre of mass then gains g, whatever else it does."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from dano.maths import quat_rotate
+from dano.vision.trajectory._poses import Poses
+from dano.vision.trajectory._support import Solid
+
+GRAVITY = np.array([0.0, 0.0, -9.81])
+"""[m/s², W]; varies by a quarter of a percent on Earth."""
+
+AIR = 0.3
+"""Standard deviation of what air adds to it in a frame [m/s²]: a box of 100 g at 2 m/s is slowed by 0.1."""
+
+_CLEAR = 0.05
+"""Height [sizes] of its lowest corner over the table from which a thing touches nothing."""
+
+_SHORTEST = 5
+"""Frames in a row in which it must."""
+
+_LIKE = 3.0
+"""By how much the acceleration of the whole stretch may differ from g [m/s²]: what a hand carries, or lies on
+something, differs by more."""
+
+
+class Flight(NamedTuple):
+    """Frames in a row in which a thing falls freely.
+
+    Attributes:
+        threes: Neighbouring frames, shape (m, 3).
+        rates: Weights of their positions that make an acceleration [1/s²], shape (m, 3).
+    """
+
+    threes: Int[np.ndarray, "m 3"]
+    rates: Float[np.ndarray, "m 3"]
+
+
+def no_flight() -> Flight:
+    """Where nothing is known of a flight."""
+    return Flight(np.zeros((0, 3), int), np.zeros((0, 3)))
+
+
+def flights(times: Float[np.ndarray, " n"], poses: Poses, solid: Solid, table: float) -> Flight:
+    """Where a thing falls freely above a level table.
+
+    Args:
+        times: Of the frames [s].
+        poses: Of the frames.
+        solid: The thing.
+        table: Its height [m, W].
+    """
+    com = centres_of_mass(poses, solid.com)
+    threes: list[np.ndarray] = []
+    for first, last in _stretches(_is_clear(poses, solid, table)):
+        rows = np.arange(first, last)
+        if _falls(times[rows], com[rows], poses.covariance[rows, :3, :3]):
+            threes.append(rows[:-2, None] + np.arange(3))
+    if not threes:
+        return no_flight()
+    found = np.concatenate(threes)
+    return Flight(found, accelerating(times[found]))
+
+
+def centres_of_mass(poses: Poses, com: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
+    """[m, W] from one in the object's frame."""
+    return poses.position + quat_rotate(poses.orientation, np.broadcast_to(com, poses.position.shape))
+
+
+def accelerating(times: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+    """Weights of positions at three times that make the acceleration of the parabola through them [1/s²]."""
+    apart = times[:, :, None] - times[:, None, :] + np.eye(3)
+    return 2 / apart.prod(axis=2)
+
+
+def _is_clear(poses: Poses, solid: Solid, table: float) -> Bool[np.ndarray, " n"]:
+    n, corners = len(poses.position), len(solid.corners)
+    turned = quat_rotate(np.repeat(poses.orientation, corners, axis=0), np.tile(solid.corners, (n, 1)))
+    lowest = poses.position[:, 2] + turned[:, 2].reshape(n, corners).min(axis=1)
+    return lowest > table + _CLEAR * solid.size + np.sqrt(poses.covariance[:, 2, 2])
+
+
+def _stretches(holds: Bool[np.ndarray, " n"]) -> list[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(int))).reshape(-1, 2)
+    return [(int(a), int(b)) for a, b in edges if b - a >= _SHORTEST]
+
+
+def _falls(times: np.ndarray, com: np.ndarray, covariance: np.ndarray) -> bool:
+    """Whether the parabola through positions, by their covariances, has the acceleration g, or nearly."""
+    t = times - times.mean()
+    powers = np.stack([np.ones_like(t), t, 0.5 * t**2], axis=1)
+    weight = np.linalg.inv(covariance)
+    normal = np.einsum("na,nij,nb->aibj", powers, weight, powers).reshape(9, 9)
+    right = np.einsum("na,nij,nj->ai", powers, weight, com).reshape(9)
+    found = np.linalg.solve(normal, right)[6:]
+    spread = np.sqrt(np.diag(np.linalg.inv(normal))[6:])
+    return bool(np.all(np.abs(found - GRAVITY) < _LIKE + 3 * spread))
