@@ -68,7 +68,8 @@ def train_object(
         options: How to train; default `TrainOptions()`.
         downscale: Average so many pixels a side into one; for files only.
         views: Train on so many of the views only.
-        network: Segmentation network (ONNX) for photographs without masks; default: a plain background.
+        network: Segmentation network (ONNX) for photographs without masks; default: a plain background, or
+            what stands on the table.
         mass: Of the object [kg]; default: `mass_density` times its volume.
         mass_density: Mass per volume [kg/m³].
         table: Height z of a level table that the object stands on in the photographs [m]: nothing of it is
@@ -96,7 +97,7 @@ def train_object(
     if not isinstance(photographs, Capture):
         photographs = checked_path("photographs", photographs)
     say = progress or _silent
-    capture, given = _masked(photographs, downscale, network, say)
+    capture, given = _masked(photographs, downscale, network, table, say)
     if views is not None:
         capture = capture.thinned(views)
 
@@ -122,6 +123,7 @@ def _masked(
     photographs: str | os.PathLike[str] | Capture,
     downscale: int,
     network: str | os.PathLike[str] | None,
+    table: float | None,
     say: Progress,
 ) -> tuple[Capture, bool]:
     """Photographs with masks, and whether they came with them."""
@@ -135,7 +137,7 @@ def _masked(
     if capture.has_masks:
         return capture, True
     say("making masks", 0.0)
-    return with_masks(capture, None if network is None else Path(network)), False
+    return with_masks(capture, None if network is None else Path(network), table), False
 
 
 def _volume(trained: Trained) -> float:

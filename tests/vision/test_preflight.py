@@ -93,10 +93,10 @@ def test_blur_in_all_of_them_and_in_some(photos: list[Path], tmp_path: Path):
     assert any("2 of 7 photographs are blurred" in text for text in found.warnings)
 
 
-def test_an_object_that_nothing_tells_from_the_table(photos: list[Path], tmp_path: Path):
+def test_where_masks_come_from(photos: list[Path], tmp_path: Path):
     bare = walk(tmp_path)
-    with pytest.raises(ValueError, match="the background is not plain .* give masks, or a segmentation"):
-        check_walk(bare, OPTIONS)
+    # It stands on the table, which has a marker.
+    assert check_walk(bare, OPTIONS).masks == "table"
     with pytest.raises(ValueError, match="network must be an .onnx file"):
         check_walk(bare, OPTIONS, network=tmp_path / "no.onnx")
     folder = with_masks(bare)

@@ -202,7 +202,8 @@ def test_a_flight_tells_distances(box, rate):
     orientation = Rotation.from_rotvec(np.outer(times, [5.0, 6.0, -3.0]))
     # The centre of mass lies beside that of an even filling.
     position = com - orientation.apply(0.5 * SIDES + [0.002, -0.001, 0])
-    sight = com - [0.6, -0.9, 0.8]
+    eye = np.array([0.6, -0.9, 0.8])
+    sight = com - eye
     sight /= np.linalg.norm(sight, axis=1)[:, None]
     spread = np.tile(np.diag(SURE), (FRAMES, 1, 1))
     spread[:, :3, :3] += 0.02 * SIDES.max() * np.einsum("ni,nj->nij", sight, sight)
@@ -210,12 +211,12 @@ def test_a_flight_tells_distances(box, rate):
     given.position[:2] += 0.3 * SIDES.max() * sight[:2]
     errors = []
     for table in (0.0, None):
-        found = smoothed(times, given, Scenery(box, NOWHERE, table))
+        found = smoothed(times, given, Scenery(box, NOWHERE, table, eye))
         errors.append(np.linalg.norm(off(found.poses, position, orientation)[:, :3], axis=1))
     known, unknown = errors
     assert np.median(known) < 0.01 * SIDES.max() and known.max() < 0.02 * SIDES.max()
     assert unknown.max() > 10 * known.max()
     # What is carried at this height, or flies in slow motion that was not stated, does not fall by g.
     for slow in (1e3, 4.0):
-        found = [smoothed(slow * times, given, Scenery(box, NOWHERE, table)) for table in (0.0, None)]
+        found = [smoothed(slow * times, given, Scenery(box, NOWHERE, table, eye)) for table in (0.0, None)]
         np.testing.assert_array_equal(found[0].poses.position, found[1].poses.position)

@@ -34,7 +34,7 @@ class Train:
         mass: Mass of the object [kg].
         mass_density: Mass per volume [kg/m³], used if no mass is given.
         table: Height z of a level table that the object stands on in the photographs [m]: nothing of it is
-            below.
+            below, and photographs without masks get those of what stands there.
         resume: Continue a training that was interrupted.
         no_report: Write no report.
         seed: Seed of all random numbers.
@@ -144,6 +144,7 @@ class Data:
         no_png: Draw nothing.
         downscale: Average so many pixels a side into one.
         network: Segmentation network (.onnx) for photographs without masks.
+        table: Height z of a level table [m]: without a network, masks are those of what stands on it.
         json: Print one JSON object instead of text.
     """
 
@@ -152,6 +153,7 @@ class Data:
     no_png: bool = False
     downscale: int = 1
     network: Path | None = None
+    table: float | None = None
     json: bool = False
 
     def __call__(self) -> None:

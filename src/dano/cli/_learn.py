@@ -147,7 +147,9 @@ def data(command: Data) -> None:
                 raise ImportError(missing)
             say(f"warning: not drawn, {missing}")
             picture = None
-    _, report = look(command.images, command.network, picture, downscale=command.downscale)
+    _, report = look(
+        command.images, command.network, picture, downscale=command.downscale, table=command.table
+    )
     if command.json:
         put_json(report)
         return
@@ -155,7 +157,12 @@ def data(command: Data) -> None:
 
 
 def look(
-    images: Path, network: Path | None, picture: Path | None, *, downscale: int = 1
+    images: Path,
+    network: Path | None,
+    picture: Path | None,
+    *,
+    downscale: int = 1,
+    table: float | None = None,
 ) -> tuple[Capture, dict[str, Any]]:
     """Photographs with masks, given or made, and what they say of themselves in numbers.
 
@@ -164,6 +171,7 @@ def look(
         network: Segmentation network for those without masks.
         picture: Where to draw cameras and outlines; None: nowhere.
         downscale: Average so many pixels a side into one.
+        table: Height z of the table that the object stands on [m]; None: it is not known.
     """
     progress = Progress()
     progress("reading photographs", 0.0)
@@ -171,7 +179,7 @@ def look(
     given = capture.has_masks
     if not given:
         progress("making masks", 0.2)
-        capture = with_masks(capture, network)
+        capture = with_masks(capture, network, table)
     progress("visual hull", 0.4)
     found = survey(capture, 64)
     progress.close()

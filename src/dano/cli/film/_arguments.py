@@ -29,7 +29,8 @@ class Film:
         marker_family: Its dictionary, by OpenCV's name.
         masks: Folder with a mask for each photograph of the walk, bright where the object is; default:
             `masks` in or beside the folder of photographs, their alpha channel, or made.
-        network: Segmentation network (.onnx) that makes masks; default: what differs from a plain background.
+        network: Segmentation network (.onnx) that makes masks; default: what stands on the table, or differs
+            from a plain background.
         background: Picture of the film's place without the object.
         slow_motion: How many times slower the film plays than it was filmed.
         shutter: How long a frame of the film is exposed [s], if what moves is blurred.

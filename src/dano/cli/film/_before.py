@@ -119,7 +119,9 @@ def _masks(place: Place) -> None:
     """Those that are given, or made; and whether silhouettes and cameras fit together."""
     folder = place.folder
     masks, content = folder / "masks", read_json(folder / "photographs.json")
-    capture, report = look(folder / "photographs.json", place.command.network, folder / "masks.png")
+    capture, report = look(
+        folder / "photographs.json", place.command.network, folder / "masks.png", table=0.0
+    )
     if report["masks"] == "made":
         masks.mkdir(exist_ok=True)
         for row, view in zip(content["frames"], capture.views, strict=True):

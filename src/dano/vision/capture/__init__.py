@@ -16,6 +16,7 @@ from dano.vision.capture._light import Light as Light
 from dano.vision.capture._masks import (
     background_mask as background_mask,
     check_masks as check_masks,
+    is_plain as is_plain,
     with_masks as with_masks,
 )
 from dano.vision.capture._node_grid import NodeGrid as NodeGrid, resampled as resampled

@@ -1,4 +1,4 @@
-"""Masks for photographs that have none: from a plain background, or by a segmentation network."""
+"""Masks for photographs that have none: from a plain background, a table, or by a segmentation network."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +13,7 @@ from dano.vision.capture._capture import Capture, View
 from dano.vision.capture._hull import object_box, silhouettes
 from dano.vision.capture._node_grid import NodeGrid
 from dano.vision.capture._ray_set import rays_of
+from dano.vision.capture._standing import standing_masks
 
 _BORDER = 0.03
 """Share of the image on each side that is taken for background."""
@@ -31,7 +32,7 @@ _DOUBTED, _USUAL = 0.1, 0.01
 lie beside such points if masks are made well and poses are right."""
 
 
-def with_masks(capture: Capture, network: str | Path | None = None) -> Capture:
+def with_masks(capture: Capture, network: str | Path | None = None, table: float | None = None) -> Capture:
     """The capture with a mask for every view: given ones stay, the others are made.
 
     What was made is compared: where most silhouettes agree on a solid, the parts of others that lie beside it
@@ -41,18 +42,25 @@ def with_masks(capture: Capture, network: str | Path | None = None) -> Capture:
         capture: Photographs.
         network: Segmentation network as an ONNX file, such as ISNet or U²-Net: image (1, 3, h, w) in, mask in
             [0, 1] out. None: what differs from the background, whose colour the image's border shows.
+        table: Height z of a level table [m, W]. Without a network, where the background is not plain, what
+            stands on the table is found: the photographs are taken from around it. Needs the extra `poses`.
 
     Raises:
-        ValueError: If the background is not plain and there is no network, or the masks come out empty.
-        ImportError: If there is a network but no onnxruntime.
+        ValueError: If the background is not plain and there is neither network nor table, the masks come out
+            empty, or nothing stands on the table.
+        ImportError: If there is a network but no onnxruntime, or OpenCV is needed and missing.
     """
     if all(view.mask is not None for view in capture.views):
         return capture
-    segment = background_mask if network is None else _Network(Path(network))
+    if network is None and table is not None and not all(map(is_plain, capture.views)):
+        masks = standing_masks(capture.views, table)
+    else:
+        segment = background_mask if network is None else _Network(Path(network))
+        masks = [segment(view) if view.mask is None else view.mask for view in capture.views]
     made = Capture(
         [
-            view.replaced(mask=segment(view).astype(np.float32)) if view.mask is None else view
-            for view in capture.views
+            view.replaced(mask=mask.astype(np.float32)) if view.mask is None else view
+            for view, mask in zip(capture.views, masks, strict=True)
         ]
     )
     views = [
@@ -91,14 +99,12 @@ def background_mask(view: View) -> Float[np.ndarray, "height width"]:
         ValueError: If the border of the image is of many colours.
     """
     image = view.image
-    rim = max(2, round(_BORDER * min(image.shape[:2])))
-    border = np.ones(image.shape[:2], dtype=bool)
-    border[rim:-rim, rim:-rim] = False
-    colour, away, spread = _against(image, border)
+    colour, away, spread = _against(image, _border(image))
     if spread > _PLAIN:
         raise ValueError(
             f"{view.name}: the background is not plain (its colours differ by {spread:.2f} from their median,"
-            f" at most {_PLAIN} can be told from an object): give masks, or a segmentation network"
+            f" at most {_PLAIN} can be told from an object): give masks, a segmentation network, or the"
+            " height of the table that the object stands on"
         )
     solid = _unlike(away, spread)
     if not solid.any():
@@ -106,6 +112,18 @@ def background_mask(view: View) -> Float[np.ndarray, "height width"]:
     solid = ndimage.binary_fill_holes(largest_part(solid))
     assert solid is not None
     return _coverage(image, colour, solid)
+
+
+def is_plain(view: View) -> bool:
+    """Whether the border of a photograph is of one colour."""
+    return _against(view.image, _border(view.image))[2] <= _PLAIN
+
+
+def _border(image: np.ndarray) -> np.ndarray:
+    rim = max(2, round(_BORDER * min(image.shape[:2])))
+    border = np.ones(image.shape[:2], dtype=bool)
+    border[rim:-rim, rim:-rim] = False
+    return border
 
 
 def _against(image: np.ndarray, outside: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:

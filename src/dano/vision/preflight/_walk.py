@@ -10,7 +10,7 @@ import numpy as np
 from dano.checks import checked_items, checked_kind, checked_path
 from dano.extras import NETWORKS
 from dano.progress import Progress
-from dano.vision.capture import background_mask, PosedCamera, read_picture, View
+from dano.vision.capture import background_mask, is_plain, PosedCamera, read_picture, View
 from dano.vision.structure import (
     BLURRED,
     detect_markers,
@@ -42,7 +42,7 @@ class WalkCheck(NamedTuple):
         blur: Median measure of blur, from 0, sharp, to 1.
         marked: How many of those looked at show a marker.
         markers: Numbers of the markers.
-        masks: Where masks come from: "given", "network" or "background".
+        masks: Where masks come from: "given", "network", "background" or "table".
         warnings: Sentences for the user.
     """
 
@@ -176,18 +176,21 @@ def _mask_source(seen: Sequence[Photograph], network: str | os.PathLike[str] | N
             raise ValueError(f"network must be an .onnx file, got {network}, which does not exist")
         NETWORKS.check()
         return "network"
-    for photograph in without[:: max(1, len(without) // _TRIED)][:_TRIED]:
-        _check_background(photograph)
+    tried = [_as_view(each) for each in without[:: max(1, len(without) // _TRIED)][:_TRIED]]
+    if not all(map(is_plain, tried)):
+        return "table"
+    for view in tried:
+        background_mask(view)
     return "background"
 
 
-def _check_background(photograph: Photograph) -> None:
+def _as_view(photograph: Photograph) -> View:
     image = read_picture(photograph.file).colours
     step = max(1, max(image.shape) // _SMALL)
     image = np.asarray(image[::step, ::step], np.float32)
     height, width = image.shape[:2]
     camera = PosedCamera(np.eye(4), focal=float(width), width=width, height=height)
-    background_mask(View(name=photograph.name, camera=camera, image=image))
+    return View(name=photograph.name, camera=camera, image=image)
 
 
 def _warnings(

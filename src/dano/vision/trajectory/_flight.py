@@ -21,9 +21,12 @@ _CLEAR = 0.05
 _SHORTEST = 5
 """Frames in a row in which it must."""
 
-_LIKE = 3.0
-"""By how much the acceleration of the whole stretch may differ from g [m/s²]: what a hand carries, or lies on
-something, differs by more."""
+_LIKE, _CONFIDENT = 1.5, 3.0
+"""Standard deviation of the acceleration of a stretch about g [m/s²], and how many of them it may be off: what a
+hand carries, or lies on something, is further off."""
+
+_DEEP = 0.3
+"""Error along the line of sight that poses may have, unsaid [sizes]: across it they show the acceleration."""
 
 
 class Flight(NamedTuple):
@@ -43,7 +46,13 @@ def no_flight() -> Flight:
     return Flight(np.zeros((0, 3), int), np.zeros((0, 3)))
 
 
-def flights(times: Float[np.ndarray, " n"], poses: Poses, solid: Solid, table: float) -> Flight:
+def flights(
+    times: Float[np.ndarray, " n"],
+    poses: Poses,
+    solid: Solid,
+    table: float,
+    eye: Float[np.ndarray, "3"] | None,
+) -> Flight:
     """Where a thing falls freely above a level table.
 
     Args:
@@ -51,12 +60,17 @@ def flights(times: Float[np.ndarray, " n"], poses: Poses, solid: Solid, table: f
         poses: Of the frames.
         solid: The thing.
         table: Its height [m, W].
+        eye: Where the camera is [m, W]; None: errors have no common direction.
     """
-    com = centres_of_mass(poses, solid.com)
+    com, covariance = centres_of_mass(poses, solid.com), poses.covariance[:, :3, :3]
+    if eye is not None:
+        sight = com - eye
+        sight = _DEEP * solid.size * sight / np.linalg.norm(sight, axis=1)[:, None]
+        covariance = covariance + np.einsum("ni,nj->nij", sight, sight)
     threes: list[np.ndarray] = []
     for first, last in _stretches(_is_clear(poses, solid, table)):
         rows = np.arange(first, last)
-        if _falls(times[rows], com[rows], poses.covariance[rows, :3, :3]):
+        if _falls(times[rows], com[rows], covariance[rows]):
             threes.append(rows[:-2, None] + np.arange(3))
     if not threes:
         return no_flight()
@@ -94,6 +108,6 @@ def _falls(times: np.ndarray, com: np.ndarray, covariance: np.ndarray) -> bool:
     weight = np.linalg.inv(covariance)
     normal = np.einsum("na,nij,nb->aibj", powers, weight, powers).reshape(9, 9)
     right = np.einsum("na,nij,nj->ai", powers, weight, com).reshape(9)
-    found = np.linalg.solve(normal, right)[6:]
-    spread = np.sqrt(np.diag(np.linalg.inv(normal))[6:])
-    return bool(np.all(np.abs(found - GRAVITY) < _LIKE + 3 * spread))
+    off = np.linalg.solve(normal, right)[6:] - GRAVITY
+    spread = np.linalg.inv(normal)[6:, 6:] + _LIKE**2 * np.eye(3)
+    return bool(off @ np.linalg.solve(spread, off) < _CONFIDENT**2)

@@ -133,7 +133,7 @@ def smoothed(times: Float[np.ndarray, " T"], poses: Poses, scenery: Scenery) -> 
     runs, flight = [], no_flight()
     if scenery.table is not None:
         runs = _runs(found, scenery.solid, scenery.table)
-        flight = flights(times[rows], found, scenery.solid, scenery.table)
+        flight = flights(times[rows], found, scenery.solid, scenery.table, scenery.eye)
     inflation, more = 1.0, seen
     for _ in range(_CALIBRATIONS):
         inflation = max(1.0, inflation * _disagreement(seen, found, problem.seen(found), together, inflation))
