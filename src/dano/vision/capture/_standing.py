@@ -192,7 +192,7 @@ def _unlike(view: View, top: _Tabletop, gain: np.ndarray, table: float) -> Float
     rays, eye = view.camera.rays().reshape(-1, 3), view.camera.position
     away = (table - eye[2]) / np.where(rays[:, 2] < -1e-6, rays[:, 2], np.nan)
     place = ((eye + away[:, None] * rays)[:, :2] - top.corner) / top.spacing
-    known = np.isfinite(place).all(axis=1) & (place >= 0).all(axis=1) & (place <= _CELLS - 1).all(axis=1)
+    known = (away > 0) & (place >= 0).all(axis=1) & (place <= _CELLS - 1).all(axis=1)
     column, row = np.rint(np.where(known[:, None], place, 0)).astype(int).T
     seen = _features(view.image / np.maximum(gain, 1e-3)).reshape(len(rays), -1)
     off = np.maximum(top.least[row, column] - seen, seen - top.most[row, column]).max(axis=1)
@@ -312,8 +312,13 @@ def _cut(opencv, view: View, labels: np.ndarray) -> Bool[np.ndarray, "height wid
     )
     picture = np.ascontiguousarray(np.rint(255 * view.image[window][..., ::-1]).astype(np.uint8))
     part = np.ascontiguousarray(labels[window])
+    likely = (part == opencv.GC_FGD) | (part == opencv.GC_PR_FGD)
+    mask = np.zeros(labels.shape, bool)
+    if likely.all() or not likely.any():
+        # Of one of the two no colours are known.
+        mask[window] = likely
+        return mask
     opencv.setRNGSeed(0)
     opencv.grabCut(picture, part, None, np.zeros((1, 65)), np.zeros((1, 65)), 4, opencv.GC_INIT_WITH_MASK)
-    mask = np.zeros(labels.shape, bool)
     mask[window] = (part == opencv.GC_FGD) | (part == opencv.GC_PR_FGD)
     return mask

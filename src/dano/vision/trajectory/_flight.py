@@ -22,8 +22,8 @@ _SHORTEST = 5
 """Frames in a row in which it must."""
 
 _LIKE, _CONFIDENT = 1.5, 3.0
-"""Standard deviation of the acceleration of a stretch about g [m/s²], and how many of them it may be off: what
-a hand carries, or lies on something, is further off."""
+"""Standard deviation of the acceleration of a stretch about g [m/s²], and how many of them it may be off.
+What a hand carries, or lies on something, is further off."""
 
 _DEEP = 0.3
 """Error along the line of sight that poses may have, unsaid [sizes]: across it they show the acceleration."""
