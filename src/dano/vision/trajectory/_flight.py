@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dano.maths import quat_rotate
-from dano.vision.trajectory._poses import Poses
+from dano.vision.trajectory._poses import Poses, stretches
 from dano.vision.trajectory._support import Solid
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -68,7 +68,7 @@ def flights(
         sight = _DEEP * solid.size * sight / np.linalg.norm(sight, axis=1)[:, None]
         covariance = covariance + np.einsum("ni,nj->nij", sight, sight)
     threes: list[np.ndarray] = []
-    for first, last in _stretches(_is_clear(poses, solid, table)):
+    for first, last in stretches(_is_clear(poses, solid, table), _SHORTEST):
         rows = np.arange(first, last)
         if _falls(times[rows], com[rows], covariance[rows]):
             threes.append(rows[:-2, None] + np.arange(3))
@@ -94,11 +94,6 @@ def _is_clear(poses: Poses, solid: Solid, table: float) -> Bool[np.ndarray, " n"
     turned = quat_rotate(np.repeat(poses.orientation, corners, axis=0), np.tile(solid.corners, (n, 1)))
     lowest = poses.position[:, 2] + turned[:, 2].reshape(n, corners).min(axis=1)
     return lowest > table + _CLEAR * solid.size + np.sqrt(poses.covariance[:, 2, 2])
-
-
-def _stretches(holds: Bool[np.ndarray, " n"]) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(int))).reshape(-1, 2)
-    return [(int(a), int(b)) for a, b in edges if b - a >= _SHORTEST]
 
 
 def _falls(times: np.ndarray, com: np.ndarray, covariance: np.ndarray) -> bool:

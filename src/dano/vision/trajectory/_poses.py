@@ -35,3 +35,9 @@ class Poses(NamedTuple):
         turned = quat_multiply(self.orientation, quat_exp(np.asarray(change[:, 3:], np.float64)))
         turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
         return self._replace(position=self.position + size * change[:, :3], orientation=turned)
+
+
+def stretches(holds: Bool[np.ndarray, " T"], shortest: int = 1) -> list[tuple[int, int]]:
+    """Where something holds for so many frames: the first one of each stretch, and the one after its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(int))).reshape(-1, 2)
+    return [(int(first), int(last)) for first, last in edges if last - first >= shortest]

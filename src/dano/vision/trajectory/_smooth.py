@@ -17,7 +17,7 @@ from scipy.sparse.linalg import splu
 
 from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate
 from dano.vision.trajectory._flight import AIR, centres_of_mass, Flight, flights, GRAVITY, no_flight
-from dano.vision.trajectory._poses import Poses
+from dano.vision.trajectory._poses import Poses, stretches
 from dano.vision.trajectory._support import Face, Solid
 
 _STEADY = 0.004
@@ -227,8 +227,7 @@ def _runs(poses: Poses, solid: Solid, table: float) -> list[_Run]:
         point = quat_rotate(poses.orientation, np.broadcast_to(face.point, (n, 3)))
         height = (poses.position + point)[:, 2]
         lies = (np.abs(height - table) < high * solid.size) & (tilts[k] < tilted) & (nearest == k)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], lies, [False]]).astype(int)))
-        runs += [_Run(face, np.arange(a, b)) for a, b in edges.reshape(-1, 2) if b - a >= _SHORTEST]
+        runs += [_Run(face, np.arange(*ends)) for ends in stretches(lies, _SHORTEST)]
     return runs
 
 
@@ -259,8 +258,7 @@ class _Problem:
         self._poses, self._runs, self._flight, self._table = poses, runs, flight, table
         self._roots = np.linalg.inv(np.linalg.cholesky(poses.covariance / np.outer(self._unit, self._unit)))
         best = self._descended(self._poses, np.zeros(len(self._doubts)), _TOLERANT)
-        doubted = np.flatnonzero(np.diff(np.concatenate([[0], best.weight < _DOUBTED, [0]]).astype(int)))
-        for first, last in doubted.reshape(-1, 2):
+        for first, last in stretches(best.weight < _DOUBTED):
             rows = slice(first, last)
             begun = Poses(*(x.copy() for x in best.poses))
             for whole, own in zip(begun, self._poses, strict=True):
@@ -410,13 +408,7 @@ class _Problem:
             return np.concatenate([((height / size - base[0]) / _LEVEL)[:, None], tilt / _FLAT], axis=1)
 
         # What rocks, or has left the table for a moment, does not lie there.
-        plain = off(poses, shared)
-        square = np.sum(plain**2, axis=1)
-        root = np.sqrt(4 / (1 + square / self._tolerance**2))[:, None]
-        self._cost += 2 * float(np.sum(np.log1p(square)))
-        part = self._linear(lambda moved: off(moved, shared), poses, rows[:, None], root)
-        matrix, residual = _spread(*part, width)
-        return matrix + _common(off, poses, shared, plain, root, column, matrix.shape), residual
+        return self._allowing(off, poses, shared, rows[:, None], column, width)
 
     def _falling(self, poses: Poses, shared: np.ndarray, column: int, width: int):
         """Acceleration of the centre of mass less g, by Cauchy's distribution: something may push it."""
@@ -426,14 +418,29 @@ class _Problem:
             com = centres_of_mass(moved, self._solid.com + size * beside)
             return (np.einsum("mk,mki->mi", rates, com[threes]) - GRAVITY) / AIR
 
-        plain = pushed(poses, shared)
+        return self._allowing(pushed, poses, shared, threes, column, width)
+
+    def _allowing(self, function, poses: Poses, shared, frames: np.ndarray, column: int, width: int):
+        """Residuals of frames and three numbers that they share, by Cauchy's distribution, and derivatives.
+
+        Args:
+            function: Of poses and these numbers, shape (m, r).
+            poses: At which.
+            shared: The numbers.
+            frames: Which frames each residual depends on, shape (m, k).
+            column: Of the first of the numbers.
+            width: Of the matrix.
+        """
+        plain = function(poses, shared)
         square = np.sum(plain**2, axis=1)
         root = np.sqrt(4 / (1 + square / self._tolerance**2))[:, None]
         self._cost += 2 * float(np.sum(np.log1p(square)))
-        matrix, residual = _spread(
-            *self._linear(lambda moved: pushed(moved, shared), poses, threes, root), width
-        )
-        return matrix + _common(pushed, poses, shared, plain, root, column, matrix.shape), residual
+        part = self._linear(lambda moved: function(moved, shared), poses, frames, root)
+        matrix, residual = _spread(*part, width)
+        slopes = [(function(poses, shared + _EPSILON * e) - plain) / _EPSILON for e in np.eye(3)]
+        common = np.stack([(root * slope).ravel() for slope in slopes], axis=1)
+        place = np.repeat(np.arange(len(common)), 3), np.tile(column + np.arange(3), len(common))
+        return matrix + sparse.csr_matrix((common.ravel(), place), shape=matrix.shape), residual
 
 
 def _spread(frames: np.ndarray, slopes: np.ndarray, residual: np.ndarray, width: int):
@@ -444,14 +451,6 @@ def _spread(frames: np.ndarray, slopes: np.ndarray, residual: np.ndarray, width:
     rows = np.broadcast_to(np.arange(m * r).reshape(m, r, 1, 1), (m, r, k, 6))
     matrix = sparse.csr_matrix((slopes.ravel(), (rows.ravel(), columns.ravel())), shape=(m * r, width))
     return matrix, residual.ravel()
-
-
-def _common(function, poses: Poses, shared, plain, root, column: int, shape: tuple[int, int]):
-    """A sparse matrix of derivatives by three numbers that frames share, from a column on."""
-    slopes = [(function(poses, shared + _EPSILON * e) - plain) / _EPSILON for e in np.eye(3)]
-    common = np.stack([(root * slope).ravel() for slope in slopes], axis=1)
-    place = np.repeat(np.arange(len(common)), 3), np.tile(column + np.arange(3), len(common))
-    return sparse.csr_matrix((common.ravel(), place), shape=shape)
 
 
 def _block(inverse, k: int, width: int) -> Float[np.ndarray, "6 6"]:
