@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -53,7 +54,7 @@ def run() -> None:
         for source in arguments.masks:
             # A hand that passes in front is part of the place only in its own masks.
             if source == "given" or not case.is_hard:
-                rows += _tracked(case, source)
+                rows += _told(_tracked(case, source))
     plain = [case for case in cases if case.name in _ORDINARY]
     if plain and arguments.starts and not arguments.quick:
         rows.append(_starts(plain, arguments.starts))
@@ -64,8 +65,16 @@ def run() -> None:
         films = read_phone_films(arguments.phone, names=arguments.only, held=arguments.held)
         for filmed in films[: 1 if arguments.quick else None]:
             for source in arguments.masks:
-                rows += phone_rows(filmed, source, friction=arguments.friction)
+                rows += _told(phone_rows(filmed, source, friction=arguments.friction))
     report("track", rows, settings, load, arguments.json)
+
+
+def _told(rows: list[Row]) -> list[Row]:
+    """Rows, printed at once: all films together take an hour."""
+    for row in rows:
+        value = "" if row.value is None else f"{row.value:.3g} {row.unit}"
+        print(f"{row.group}: {row.name} {value}  {row.note}", file=sys.stderr, flush=True)
+    return rows
 
 
 def _options(parser: argparse.ArgumentParser) -> None:

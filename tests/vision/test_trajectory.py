@@ -175,6 +175,31 @@ def test_a_wrong_size_is_told_by_a_table_or_doubted(box, table):
     assert (np.abs(away) < 2.5 * stated).all()
 
 
+@pytest.mark.parametrize("alike", [0.0, 4.0])
+def test_what_all_frames_are_off_alike_is_told_by_a_table(box, alike):
+    """All frames see a sliding box tilted by 4°, and so beside its place; a table knows better."""
+    times = np.arange(FRAMES) / 30
+    position = np.stack([0.3 * times - 0.2 * times**2, 0.1 * times, np.full(FRAMES, 0.2)], axis=1)
+    orientation = Rotation.from_rotvec(np.outer(np.full(FRAMES, 0.4), [0, 0, 1.0]))
+    # A tilt about x goes with a shift along y, as in the picture of a box whose shadow is taken for its side.
+    spread = np.diag(SURE)
+    spread[1, 3] = 0.03 * np.radians(1.5)
+    spread[3, 3] = np.radians(1.5)
+    given = seen(position, orientation, np.tile(spread, (FRAMES, 1, 1)) * 0.1, 6)
+    bias = spread @ np.array([0, 0, 0, 2.7, 0, 0])
+    tilted = orientation * Rotation.from_rotvec(bias[3:])
+    covariance = np.tile(spread @ spread.T, (FRAMES, 1, 1))
+    given = Poses(given.position + bias[:3], np.roll(tilted.as_quat(), 1, axis=1), covariance)
+    found = smoothed(times, given, Scenery(box, NOWHERE, 0.2, alike=alike))
+    away = np.abs(off(found.poses, position, orientation))
+    assert found.supported.all() and np.degrees(np.abs(bias[3])) > 4
+    if alike:
+        assert np.degrees(away[:, 3]).max() < 0.6
+        assert away[:, 1].max() < 0.3 * abs(bias[1])
+    else:
+        assert np.degrees(away[:, 3]).max() > 0.8
+
+
 @pytest.mark.parametrize("frames", [1, 2, 3, FRAMES])
 def test_frames_that_share_a_pose_say_together_what_one_picture_says(box, frames):
     """n poses at rest have the covariance S of one frame each; as if independent they must sum to S⁻¹."""

@@ -16,6 +16,7 @@ from dano.vision.tracking._light import LightFit, ShadowFit, unlit
 from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.tracking._refine import (
     _without_common,
+    _without_shadow,
     MASK_NOISE,
     refine,
     Refined,
@@ -24,6 +25,7 @@ from dano.vision.tracking._refine import (
     window_of,
 )
 from dano.vision.tracking._result import covariance_of, unobservable
+from dano.vision.tracking._search import half_turns, told_apart, turn_evidence
 from dano.vision.tracking._segments import common_offset, differs, edge_offset, moved_edge, overlap
 from dano.vision.tracking._subject import _exposed, Seen, Subject
 
@@ -107,6 +109,64 @@ def test_what_a_tile_shares_does_not_pull():
     np.testing.assert_allclose(found, true, atol=2e-3)
     plain = np.linalg.lstsq(change.reshape(-1, 6), away.ravel(), rcond=None)[0]
     assert np.abs(plain - true).max() > 5 * np.abs(found - true).max()
+
+
+def test_a_dark_strip_beside_the_object_does_not_pull():
+    """Of an edge over a place, a strip outside is in its shadow: 40 % darker, in the same hue."""
+    behind = np.tile([0.5, 0.7, 0.8], (400, 1))
+    rng = np.random.default_rng(2)
+    change = rng.normal(size=(400, 3, 6))
+    strip = np.arange(400) < 60
+    true = rng.normal(size=6) * 0.01
+    away = change @ true + np.where(strip, 0.4, 0)[:, None] * behind
+    found = {}
+    for cast in (0.0, 0.3):
+        rest, slopes = _without_shadow(away, change, behind, np.where(strip, cast, 0))
+        found[cast] = np.linalg.lstsq(slopes.reshape(-1, 6), rest.ravel(), rcond=None)[0]
+    assert np.abs(found[0.3] - true).max() < 0.1 * np.abs(found[0.0] - true).max()
+    # What is brighter is no shadow, and counts in full.
+    bright, slopes = _without_shadow(-0.4 * behind, change, behind, np.full(400, 0.3))
+    np.testing.assert_array_equal(bright, -0.4 * behind)
+    np.testing.assert_array_equal(slopes, change)
+
+
+def test_clearance_is_the_distance_from_the_surface(bunny):
+    subject, place = (
+        Subject(bunny),
+        Placement(np.array([0.3, -0.1, 0.2]), quat_exp(np.array([0.3, 0.5, -1.0]))),
+    )
+    middle = subject.middle(place)
+    # Far away: between the distances from the ball around it and from its middle.
+    ways = np.random.default_rng(3).normal(size=(50, 3))
+    ways /= np.linalg.norm(ways, axis=1)[:, None]
+    far = subject.clearance(place, middle + 4 * subject.radius * ways)
+    assert (far > 0.9 * 3 * subject.radius).all() and (far < 4 * subject.radius).all()
+    # Where rays meet it there is none.
+    eye = Camera(middle + [0.0, -0.5, 0.3], middle, width=32, height=32)
+    pixels = np.stack(np.meshgrid(np.arange(8, 24), np.arange(8, 24)), axis=-1).reshape(-1, 2) + 0.5
+    away, opacity = subject.distances(place, eye, pixels)
+    met = opacity > 0.99
+    points = eye.position + away[:, None] * eye.directions(pixels)
+    assert met.sum() > 20
+    assert np.median(np.abs(subject.clearance(place, points[met]))) < 0.01 * subject.size
+
+
+def test_a_word_says_how_a_soap_is_turned(camera):
+    """The soap is a box but for a word on one side: one of four half turns has it where it is seen."""
+    soap = asset_look("trained_soap")
+    assert soap is not None
+    subject, place = Subject(soap), Placement(np.zeros(3), quat_exp(np.array([0.8, 0.0, 0.2])))
+    near = camera.replaced(focal=2 * camera.focal, centre=2 * camera.centre, width=192, height=144)
+    image, mask = fine_frame(soap, near, place.position, place.orientation, np.full((144, 192, 3), 0.2))
+    noise = np.random.default_rng(0).normal(0, 0.02, image.shape)
+    target = Target(near, np.clip(image / 255 + noise, 0, 1), mask, np.ones(mask.shape, bool))
+    found = turn_evidence(subject, [(target, place)], unlit())[:, 0]
+    turn, clear = told_apart(found)
+    assert turn == 0 and clear > 1.5, found
+    # Begun with the wrong side, the turn back is told.
+    for h, turned in enumerate(half_turns(subject, place), start=1):
+        found = turn_evidence(subject, [(target, turned)], unlit())[:, 0]
+        assert told_apart(found)[0] == h, found
 
 
 def test_masks_are_believed_where_the_object_differs_from_the_place():

@@ -26,7 +26,7 @@ from dano.vision.tracking._segments import (
     uncommon,
     unlike_place,
 )
-from dano.vision.tracking._subject import Subject
+from dano.vision.tracking._subject import pixels_of, Subject
 
 _EDGE_FRAMES = 8
 """Frames, spread over a film, in which edges of given masks are measured."""
@@ -53,6 +53,12 @@ _REMEMBERED = 4
 """Frames whose colours of the object are kept. Before there are so many, the light that they tell is not
 known well enough to say how the object looks."""
 
+_CAST = 0.3
+"""Share by which an object darkens what it stands on, standard deviation beside its edge."""
+
+_CAST_REACH = 8.0
+"""Distance from the object at which that ends [pixels]: `Place.seen_in` sees what is wider."""
+
 _MOST_THINGS = 6
 """Things that are looked at, largest first."""
 
@@ -67,6 +73,7 @@ class Masking:
 
     def __init__(self, film: Film, options: TrackOptions, background: str | Path | None):
         self._film = film
+        self._table = options.table
         self._palette: Palette | None = None
         self._colours: list[np.ndarray] = []
         self._place: Place | None = None
@@ -254,13 +261,33 @@ class Masking:
             free = seen.copy()
             free[window] &= ~ndimage.binary_dilation(expected > 0.02, iterations=int(np.ceil(blur)))
             behind = self._place.seen_in(image, free & (mask < 0.05))
-        # Beside something else it is not known where the object ends.
-        noise = None if found.other.any() else OWN_MASK_NOISE
-        telling = None
-        if behind is not None:
-            telling = np.zeros(mask.shape, bool)
-            telling[window] = differs(expected, colour, behind[window])
-        return Target(camera, image.astype(np.float64), mask, seen, behind, noise, telling)
+        target = Target(camera, image.astype(np.float64), mask, seen, behind)
+        if behind is None:
+            return target
+        cast = self._cast(subject, place, camera, window)
+        if cast is not None or found.other.any():
+            # A mask takes the object's shadow for the object, and beside something else it does not know.
+            return target._replace(cast=cast)
+        telling = np.zeros(mask.shape, bool)
+        telling[window] = differs(expected, colour, behind[window])
+        return target._replace(mask_noise=OWN_MASK_NOISE, telling=telling)
+
+    def _cast(
+        self, subject: Subject, place: Placement, camera: PosedCamera, window: tuple[slice, slice]
+    ) -> Float[np.ndarray, "height width"] | None:
+        """See `Target.cast`: on a known table, near where the object is close to it."""
+        if self._table is None or camera.position[2] <= self._table:
+            return None
+        pixels = pixels_of(window)
+        directions = camera.directions(pixels)
+        rows = np.flatnonzero(directions[:, 2] < 0)
+        ahead = (self._table - camera.position[2]) / directions[rows, 2]
+        points = camera.position + ahead[:, None] * directions[rows]
+        apart = subject.clearance(place, points) / subject.pixel(place, camera)
+        result, part = np.zeros((camera.height, camera.width)), np.zeros(len(pixels))
+        part[rows] = _CAST * np.clip(1 - apart / _CAST_REACH, 0, 1)
+        result[window] = part.reshape(result[window].shape)
+        return result
 
     def learn(self, target: Target, window: tuple[slice, slice], shape: np.ndarray) -> None:
         """Take the object's colours in a frame into account, where it surely is."""

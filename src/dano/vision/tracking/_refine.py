@@ -67,6 +67,7 @@ class Target(NamedTuple):
         behind: What would be seen there without the object, in this frame's light; None if it is not known.
         mask_noise: Standard deviation of the mask at its edge; None: it does not count beside what is behind.
         telling: Where it counts then: the object is not alike to what is behind it; None: everywhere.
+        cast: Share by which the object's shadow may darken pixels beside it, standard deviation; None: none.
     """
 
     camera: PosedCamera
@@ -76,6 +77,7 @@ class Target(NamedTuple):
     behind: Float[np.ndarray, "height width 3"] | None = None
     mask_noise: float | None = None
     telling: Bool[np.ndarray, "height width"] | None = None
+    cast: Float[np.ndarray, "height width"] | None = None
 
     def reduced(self, factor: int) -> "Target":
         """The same with so many pixels a side averaged into one."""
@@ -93,7 +95,8 @@ class Target(NamedTuple):
         behind = None if self.behind is None else mean(self.behind)
         seen = mean(self.seen.astype(float)) > 0.99
         telling = None if self.telling is None else mean(self.telling.astype(float)) > 0.5
-        return Target(camera, mean(self.image), mean(self.mask), seen, behind, self.mask_noise, telling)
+        cast = None if self.cast is None else mean(self.cast)
+        return Target(camera, mean(self.image), mean(self.mask), seen, behind, self.mask_noise, telling, cast)
 
 
 class Refined(NamedTuple):
@@ -292,7 +295,7 @@ def _rows(subject: Subject, target: Target, place: Placement, lamps, index: np.n
 
 
 def _composed_rows(target: Target, seen: Seen, index: np.ndarray) -> _Rows:
-    """Object over what is known to be behind it, less the frame: no mask stands between, but some count too.
+    """Object over what is known to be behind it, less the frame; some masks count, too.
 
     Light passes the rim of a translucent object, which then looks as if it were smaller; its mask does not.
     """
@@ -304,7 +307,10 @@ def _composed_rows(target: Target, seen: Seen, index: np.ndarray) -> _Rows:
     change = seen.colour_slope - behind[..., None] * seen.opacity_slope[:, None]
     inside = (seen.opacity > 0.9) & (target.mask[y, x] > 0.5)
     common = np.stack([_SHADE_DOUBT * (1 - alpha) * behind, _LOOK_DOUBT * seen.colour], axis=2)
-    rows = _colour_rows(*_without_common(away, change, common, index), inside, np.ones(len(index), bool))
+    away, change = _without_common(away, change, common, index)
+    if target.cast is not None:
+        away, change = _without_shadow(away, change, (1 - alpha) * behind, target.cast[y, x])
+    rows = _colour_rows(away, change, inside, np.ones(len(index), bool))
     if target.mask_noise is None:
         return rows
     residual = (seen.opacity - target.mask[y, x]) / target.mask_noise
@@ -320,6 +326,29 @@ def _composed_rows(target: Target, seen: Seen, index: np.ndarray) -> _Rows:
         rows.cost + float(cost.mean()),
         rows.colour_error,
     )
+
+
+def _without_shadow(
+    away: np.ndarray, change: np.ndarray, behind: np.ndarray, cast: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Differences of colours and their derivatives, of which little is left that a shadow would explain.
+
+    Where an object stands there is a dark strip beside it, a few pixels wide. On a place of nearly its colour
+    that strip looks like the object. There a pixel that is darker than expected says little; its hue counts.
+
+    Args:
+        away: Differences in sRGB (n, 3).
+        change: Their derivatives (n, 3, 6).
+        behind: What pixels show of the place, without the shadow (n, 3).
+        cast: Share by which it may darken them, standard deviation (n,).
+    """
+    length = np.linalg.norm(behind, axis=1)
+    towards = behind / np.maximum(length, 1e-9)[:, None]
+    darker = np.sum(away * towards, axis=1)
+    kept = _COLOUR_NOISE / np.hypot(_COLOUR_NOISE, cast * length)
+    less = np.where(darker > 0, 1 - kept, 0)[:, None] * towards
+    along = np.einsum("nc,nci->ni", towards, change)
+    return away - less * darker[:, None], change - less[..., None] * along[:, None]
 
 
 def _without_common(

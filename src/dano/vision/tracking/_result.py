@@ -73,7 +73,8 @@ class Tracked(NamedTuple):
         lamps: Light that the film is under.
         ambiguity: How well the next-best orientation explains the first frame: its difference of colours and
             of their pattern over that of the best; ∞ if none has a silhouette that fits as well. Near 1 the
-            start may be another.
+            start may be another. Where later frames show a pattern better: its evidence over that of the next
+            half turn, if that is more.
         overlays: Silhouettes at these poses, None where there is none.
         messages: What a user should know, in sentences.
         seconds: Time a frame took [s], the search at the start not included.

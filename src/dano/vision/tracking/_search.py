@@ -5,19 +5,22 @@ lies for each, and turns about the line of sight are made by turning pictures. T
 the picture says, and compared again.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy import ndimage
 
 from dano.maths import even_directions, quat_conjugate, quat_exp, quat_from_matrix, quat_log, quat_multiply
 from dano.vision.capture import Light
 from dano.vision.tracking._light import LAMPS, LightFit
 from dano.vision.tracking._options import TrackOptions
+from dano.vision.tracking._patterns import pattern, smooth
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._refine import refine, Refined, silhouette, Target
+from dano.vision.tracking._segments import overlap
 from dano.vision.tracking._subject import CHUNK, pixels_of, Subject
 
 _SIDE = 32
@@ -53,8 +56,15 @@ _AREA = 40.0
 _SPECKLE = 1.2
 """Standard deviation of the blur that takes the noise of pixels away [pixels]."""
 
-_FINE = 1.0, 3.0
-"""Standard deviations of the filters between which a pattern is fine [pixels]."""
+_TELLING = 12.0
+"""Evidence of a pattern from which it may decide how an object is turned (see `Pattern`). Sides that are
+known only in another light have had up to 9 by chance."""
+
+_CLEARER = 1.4
+"""How many times more it must be than for any other half turn."""
+
+_LITTLE = 0.1
+"""Evidence that patterns have by chance."""
 
 
 Item = TypeVar("Item")
@@ -128,8 +138,40 @@ def colours_of(subject: Subject) -> Float[np.ndarray, "n 3"]:
 def half_turns(subject: Subject, place: Placement) -> list[Placement]:
     """A pose turned by 180° about each axis of the object's box, by which many things look nearly alike."""
     middle = subject.middle(place)
-    turns = np.eye(4)[1:]
-    return [subject.around(middle, quat_multiply(place.orientation, turn)) for turn in turns]
+    turned = [subject.around(middle, quat_multiply(place.orientation, turn)) for turn in np.eye(4)[1:]]
+    return [dataclasses.replace(one, drift=place.drift) for one in turned]
+
+
+def turn_evidence(
+    subject: Subject, frames: Sequence[tuple[Target, Placement]], lamps: tuple[Light, ...]
+) -> Float[np.ndarray, "4 frames"]:
+    """How much patterns speak for poses as they are, and after half turns; 0 where silhouettes are unlike.
+
+    Args:
+        subject: The object.
+        frames: Some frames, and the poses in them.
+        lamps: Light.
+
+    Returns:
+        `Pattern.evidence`; rows as in `half_turns`, after the first.
+    """
+    evidence, fits = np.zeros((4, len(frames))), np.zeros((4, len(frames)))
+    for k, (target, place) in enumerate(frames):
+        for h, turned in enumerate([place, *half_turns(subject, place)]):
+            shape, _ = subject.whole(turned, lamps, target.camera)
+            fits[h, k] = overlap(target.mask, shape, target.seen)
+            if fits[h, k] > fits[0, k] - _ALIKE:
+                evidence[h, k] = pattern(subject, target, turned, lamps).evidence
+    alike = np.median(fits - fits[0], axis=1) > -_ALIKE
+    return np.where(alike[:, None], evidence, 0.0)
+
+
+def told_apart(most: Float[np.ndarray, "4"]) -> tuple[int, float]:
+    """Which of the half turns has the most evidence, and how many times that of the next; (0, 1): unsure."""
+    best, second = np.sort(most)[[-1, -2]]
+    if best < _TELLING or best < _CLEARER * second:
+        return 0, 1.0
+    return int(np.argmax(most)), float(best / max(second, _LITTLE))
 
 
 def likeliest(subject: Subject, target: Target, loss: str, starts: list[Start]) -> tuple[Start, float]:
@@ -157,7 +199,7 @@ def unlikeness(subject: Subject, target: Target, start: Start) -> float:
     """How much colours differ where the object is, and how little their pattern agrees; a pure number.
 
     The first factor is the root mean square difference, noise of single pixels averaged out: which faces are
-    seen. The second is one less the correlation of what is fine, such as writing, which light hardly changes.
+    seen. The second is one less the correlation of what is fine, such as writing.
     """
     window = start.refined.window
     shape, colour = silhouette(subject, start.refined.place, start.light.lamps, target.camera, window)
@@ -166,21 +208,9 @@ def unlikeness(subject: Subject, target: Target, start: Start) -> float:
     if inside.sum() < _AREA:
         return float("inf")
     look, image = colour / np.maximum(shape, 0.5)[..., None], target.image[window]
-    away = _smooth(look - image, inside, _SPECKLE)[inside]
-    fine, given = (
-        (_smooth(x, inside, _FINE[0]) - _smooth(x, inside, _FINE[1]))[inside] for x in (look, image)
-    )
-    alike = np.sum(fine * given) / max(float(np.linalg.norm(fine) * np.linalg.norm(given)), 1e-12)
+    away = smooth(look - image, inside, _SPECKLE)[inside]
+    alike = pattern(subject, target, start.refined.place, start.light.lamps).correlation
     return float(np.sqrt(np.mean(away**2)) * (1 - alike))
-
-
-def _smooth(
-    values: Float[np.ndarray, "height width 3"], inside: Bool[np.ndarray, "height width"], sigma: float
-) -> Float[np.ndarray, "height width 3"]:
-    """Gaussian mean [pixels] over what is inside."""
-    share = np.maximum(ndimage.gaussian_filter(inside.astype(float), sigma), 1e-3)
-    kept = np.where(inside[..., None], values, 0)
-    return ndimage.gaussian_filter(kept, (sigma, sigma, 0)) / share[..., None]
 
 
 def score(refined: Refined) -> float:

@@ -94,6 +94,16 @@ class Subject:
         points = box.origin + box.spacing * np.argwhere(skin) - values[skin][:, None] * slope
         return solid_of(points, box.origin + box.spacing * inside.mean(axis=0))
 
+    def clearance(self, place: Placement, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Distance of points [m, W] from the object's surface [m], less than 0 inside."""
+        box = self._field.model.box
+        own = (points - place.position) @ quat_to_matrix(place.orientation)
+        at = (own - box.origin) / box.spacing
+        last = np.array(box.shape) - 1
+        outside = box.spacing * np.linalg.norm(np.maximum(np.maximum(-at, at - last), 0), axis=1)
+        values = np.asarray(self._field.model.distances)
+        return ndimage.map_coordinates(values, at.T, order=1, mode="nearest") + outside
+
     def middle(self, place: Placement) -> Float[np.ndarray, "3"]:
         """The ball's centre [m, W]."""
         return place.position + quat_to_matrix(place.orientation) @ self.centre
@@ -155,28 +165,55 @@ class Subject:
             slopes: Whether derivatives are wanted.
         """
         away = max(float(np.linalg.norm(self.middle(place) - origins[0])), self.radius)
-        sharpness = np.float32(min(self._drawn, _STEEPEST / (pixel * away)))
+        sharpness = min(self._drawn, _STEEPEST / (pixel * away))
         n = len(directions)
         rows = [np.zeros((0,)), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3, 6))]
         parts = [rows]
         for start in range(0, n, CHUNK):
             rays = slice(start, min(start + CHUNK, n))
-            looking = _Looking(
-                self._model,
-                jnp.asarray(place.position, jnp.float32),
-                jnp.asarray(place.orientation, jnp.float32),
-                jnp.asarray(self.radius, jnp.float32),
-                sharpness,
-                lamps,
-                _filled(origins[rays], origins[0]),
-                # Rays that only fill the chunk look away from the object.
-                _filled(directions[rays], -directions[0]),
-            )
+            looking = self._looking(place, lamps, sharpness, origins[rays], directions[rays])
             found = _linearized(looking) if slopes else _seen(looking)
             parts.append(
                 [np.asarray(x, np.float64)[: len(origins[rays])] for x in found] + rows[len(found) :]
             )
         return Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def _looking(
+        self,
+        place: Placement,
+        lamps: tuple[Light, ...],
+        sharpness: float,
+        origins: Float[np.ndarray, "n 3"],
+        directions: Float[np.ndarray, "n 3"],
+    ) -> "_Looking":
+        """At most a chunk of rays; those that only fill it look away from the object."""
+        return _Looking(
+            self._model,
+            jnp.asarray(place.position, jnp.float32),
+            jnp.asarray(place.orientation, jnp.float32),
+            jnp.asarray(self.radius, jnp.float32),
+            np.float32(sharpness),
+            lamps,
+            _filled(origins, origins[0]),
+            _filled(directions, -directions[0]),
+        )
+
+    def distances(
+        self, place: Placement, camera: AbstractCamera, pixels: Float[np.ndarray, "n 2"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """How far it is from a camera to the object at rest [m], in pixels, and its opacity there."""
+        lamps = (Light((0.0, 0.0, 1.0), intensity=0.0),)
+        result, eye = np.zeros((2, len(pixels))), camera.position
+        rows = np.flatnonzero(self.reached(place, camera, pixels))
+        for start in range(0, len(rows), CHUNK):
+            some = rows[start : start + CHUNK]
+            directions = camera.directions(pixels[some])
+            looking = self._looking(
+                place, lamps, self._drawn, np.broadcast_to(eye, directions.shape), directions
+            )
+            result[:, some] = np.stack(_far(looking))[:, : len(some)]
+        away, opacity = result
+        return away / np.maximum(opacity, 1e-3), opacity
 
     def picture(
         self,
@@ -334,27 +371,33 @@ class _Looking(NamedTuple):
     origins: Array
     directions: Array
 
-    def moved(self, change: Array) -> tuple[Array, Array]:
-        """Opacity and colour that rays see after a change of the pose, as in `Placement.moved`."""
+    def moved(self, change: Array) -> tuple[Array, Array, Array]:
+        """Opacity, colour and mean distance times opacity after a change of the pose (`Placement.moved`)."""
         turned = quat_multiply(self.orientation, quat_exp(change[3:]))
         place = self.position + self.radius * change[:3]
         part = Part(self.model, quat_to_matrix(turned), place, jnp.asarray(self.sharpness))
         limit = jnp.full(len(self.directions), jnp.inf, jnp.float32)
-        colour, _, (opacity,), _ = through(
+        colour, away, (opacity,), _ = through(
             (part,), (self.lamps,), self.origins, self.directions, limit, 0.0, SAMPLING
         )
-        return opacity, colour
+        return opacity, colour, away
 
 
 @eqx.filter_jit
 def _seen(looking: _Looking) -> tuple[Array, Array]:
-    return looking.moved(jnp.zeros(6, jnp.float32))
+    return looking.moved(jnp.zeros(6, jnp.float32))[:2]
+
+
+@eqx.filter_jit
+def _far(looking: _Looking) -> tuple[Array, Array]:
+    opacity, _, away = looking.moved(jnp.zeros(6, jnp.float32))
+    return away, opacity
 
 
 @eqx.filter_jit
 def _linearized(looking: _Looking) -> tuple[Array, Array, Array, Array]:
     def both(change: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        found = looking.moved(change)
+        found = looking.moved(change)[:2]
         return found, found
 
     slope, (opacity, colour) = jax.jacfwd(both, has_aux=True)(jnp.zeros(6, jnp.float32))

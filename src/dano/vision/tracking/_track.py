@@ -61,5 +61,6 @@ def track(
         if i == first - 1:
             walk.turn_back()
         walk.step(i)
+    walk.turn_over()
     walk.look_again()
     return walk.result()

@@ -28,6 +28,7 @@ from dano.vision.tracking._search import (
 )
 from dano.vision.tracking._segments import overlap
 from dano.vision.tracking._subject import CHUNK, Subject
+from dano.vision.tracking._turned import turned
 from dano.vision.tracking._whole import region_of, Whole
 
 _COARSE = 24
@@ -193,6 +194,18 @@ class Walk:
         times = self._film.times
         return self._place(j).led_to(self._place(k), (times[i] - times[k]) / (times[k] - times[j]))
 
+    def turn_over(self) -> None:
+        """Turn all poses by 180° if patterns say so: where tracking began there may have been none."""
+        places = {i: one.place for i, one in enumerate(self._found) if one is not None}
+        options = self._options
+        if self._given is not None or options.loss != "photometric" or not places:
+            return
+        found = turned(self._subject, self._masking, self._camera, self._light, places, options.table)
+        self._ambiguity, self._light = max(self._ambiguity, found.clear), found.light
+        for i, place in (found.places or {}).items():
+            fine = self._fine(i, place, self._light)
+            self._found[i], self._status[i] = fine, LOST if fine is None else TRACKED
+
     def look_again(self) -> None:
         """Begin once more in frames that fit worse than usual, or were lost: where other frames say."""
         better, more = self._look_between(), self._look_back()
@@ -347,7 +360,7 @@ class Walk:
         if found is None:
             return None
         own = LightFit(self._subject, table=self._options.table)
-        target = self._masking.near(i, self._subject, found.place, light.lamps, self._camera, 2.0)
+        target = self._target(i, found.place, light)
         if target is not None and self._options.loss == "photometric":
             learn_light(self._subject, target, found.place, found.window, found.silhouette, own)
             if own.known and not light.known:
@@ -429,13 +442,16 @@ class Walk:
         return found
 
     def _fine(self, i: int, place: Placement, light: LightFit, steps: int = _STEPS) -> Refined | None:
-        target = self._masking.near(i, self._subject, place, light.lamps, self._camera, 2.0)
+        target = self._target(i, place, light)
         if target is None:
             return None
         # All frames together are looked at with all rays.
         return self._refine(
             target, place, light, self._loss(light), steps, max(self._options.rays // 2, CHUNK)
         )
+
+    def _target(self, i: int, place: Placement, light: LightFit) -> Target | None:
+        return self._masking.near(i, self._subject, place, light.lamps, self._camera, 2.0)
 
     def _refine(self, target: Target, place: Placement, light: LightFit, loss: str, steps: int, rays: int):
         subject, random = self._subject, self._random
@@ -447,7 +463,7 @@ class Walk:
     def _learn(self, i: int, found: Refined) -> None:
         if self._options.loss != "photometric":
             return
-        target = self._masking.near(i, self._subject, found.place, self._light.lamps, self._camera, 2.0)
+        target = self._target(i, found.place, self._light)
         if target is not None:
             learn_light(self._subject, target, found.place, found.window, found.silhouette, self._light)
             self._masking.learn(target, found.window, found.silhouette)

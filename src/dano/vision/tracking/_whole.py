@@ -1,7 +1,7 @@
 """All frames of a film together: one motion, from what each frame says near it."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool
@@ -25,12 +25,16 @@ _PASSES = 2
 _STEPS = 4
 """Steps of Gauss and Newton in a frame that is not where the motion has it, most."""
 
-_LIGHT_FRAMES = 6
+LIGHT_FRAMES = 6
 """Frames, spread over the film, that the light is fitted to at these poses."""
 
 _EDGE_DOUBT = 0.1
 """By how much colours alone may show the edge beside the true one, in all frames alike [pixels]: a camera
 sharpens, and a video is compressed."""
+
+_ALIKE = 4.0
+"""Standard deviations by which all frames may be off alike where an object stands on a known table: its
+shadow is beside it there, and the table tells (measured in rendered films)."""
 
 _RIM = 3
 """Pixels around a silhouette in which a motion shows."""
@@ -102,18 +106,20 @@ class Whole:
             if one is not None:
                 poses.position[i], poses.orientation[i] = one.place.position, one.place.orientation
                 poses.covariance[i] = own_covariance(one, self._subject)
+        scale, alike = self._alike()
         scenery = Scenery(
-            self._subject.solid, self._still, self._options.table, self._camera.position, self._scale()
+            self._subject.solid, self._still, self._options.table, self._camera.position, scale, alike
         )
         return smoothed(self._film.times, poses, scenery)
 
-    def _scale(self) -> float:
-        """Share by which the object may look too large or too small in all frames alike."""
+    def _alike(self) -> tuple[float, float]:
+        """Share by which it may look too large, and standard deviations that all frames may be off alike."""
         masks = self._film.masks
         if self._options.masks in ("auto", "given") and any(mask is not None for mask in masks):
-            return SCALE_DOUBT
+            return SCALE_DOUBT, 0.0
         sizes = [self._subject.pixels(one.place, self._camera) for one in self.found if one is not None]
-        return float(np.hypot(SCALE_DOUBT, 2 * _EDGE_DOUBT / np.median(sizes))) if sizes else SCALE_DOUBT
+        edge = _EDGE_DOUBT / np.median(sizes) if sizes else 0.0
+        return float(np.hypot(SCALE_DOUBT, 2 * edge)), 0.0 if self._options.table is None else _ALIKE
 
     def _place(self, i: int) -> Placement:
         """Where the motion has the object in a frame, and how it moves meanwhile."""
@@ -143,18 +149,9 @@ class Whole:
         known = self._known()
         if self._options.loss != "photometric":
             return light
-        fit = light.afresh(_LIGHT_FRAMES)
-        for k in np.unique(np.linspace(0, len(known) - 1, min(_LIGHT_FRAMES, len(known))).astype(int)):
-            i = known[k]
-            place = self._place(i)
-            target = masking.near(i, self._subject, place, light.lamps, self._camera, 2.0)
-            window = window_of(self._subject, place, self._camera)
-            if target is not None and window is not None:
-                shape, _ = silhouette(self._subject, place, light.lamps, self._camera, window)
-                learn_light(self._subject, target, place, window, shape, fit)
-                masking.learn_shadow(i, target, place, fit)
-        fit.find_sun()
-        return fit if fit.known else light
+        some = np.unique(np.linspace(0, len(known) - 1, min(LIGHT_FRAMES, len(known))).astype(int))
+        places = {known[k]: self._place(known[k]) for k in some}
+        return relit(self._subject, masking, self._camera, light, places)
 
     def _stillness(self) -> Bool[np.ndarray, " T_minus_1"]:
         """Whether the object lies still between a frame and the next one, by their pictures."""
@@ -175,6 +172,22 @@ class Whole:
         """Displacement of the middle in the picture [pixels], across the line of sight."""
         middles = np.stack([self._subject.middle(one.place) for one in (first, second)])
         return float(np.linalg.norm(np.diff(self._camera.project(middles)[:, :2], axis=0)))
+
+
+def relit(
+    subject: Subject, masking: Masking, camera: PosedCamera, light: LightFit, places: Mapping[int, Placement]
+) -> LightFit:
+    """The light that some frames show with the object at given poses, which is near a known light."""
+    fit = light.afresh(len(places))
+    for i, place in places.items():
+        target = masking.near(i, subject, place, light.lamps, camera, 2.0)
+        window = window_of(subject, place, camera)
+        if target is not None and window is not None:
+            shape, _ = silhouette(subject, place, light.lamps, camera, window)
+            learn_light(subject, target, place, window, shape, fit)
+            masking.learn_shadow(i, target, place, fit)
+    fit.find_sun()
+    return fit if fit.known else light
 
 
 def region_of(one: Refined, shape: tuple[int, int]) -> Bool[np.ndarray, "height width"]:

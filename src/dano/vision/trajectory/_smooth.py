@@ -101,6 +101,8 @@ class Scenery(NamedTuple):
         eye: Where the camera is [m, W]; None: what frames say has no distance in common that may be wrong.
         scale: Standard deviation of the share by which all frames see it too near or too far, because the
             object is known too small or too large.
+        alike: How many of their standard deviations all frames may be off alike, because of what is wrong in
+            all of them, such as the object's own shadow beside it.
     """
 
     solid: Solid
@@ -108,6 +110,7 @@ class Scenery(NamedTuple):
     table: float | None = None
     eye: Float[np.ndarray, "3"] | None = None
     scale: float = 0.0
+    alike: float = 0.0
 
 
 def smoothed(times: Float[np.ndarray, " T"], poses: Poses, scenery: Scenery) -> Smoothed:
@@ -194,7 +197,8 @@ class _Minimum(NamedTuple):
     Attributes:
         poses: Of the frames.
         shared: Height and tilts of the face of each run; where the centre of mass lies beside the expected
-            one [sizes, F], if there is a flight; then the share by which frames see too far.
+            one [sizes, F], if there is a flight; how many standard deviations all frames are off alike, six
+            numbers; then the share by which they see too far.
     """
 
     poses: Poses
@@ -236,7 +240,8 @@ class _Problem:
 
     def __init__(self, times: np.ndarray, poses: Poses, scenery: Scenery, resting: np.ndarray):
         self._poses, self._solid, self._resting = poses, scenery.solid, resting
-        solid, self._eye, self._scale = scenery.solid, scenery.eye, max(scenery.scale, _EPSILON)
+        solid, self._eye = scenery.solid, scenery.eye
+        self._alike = np.maximum([*[scenery.alike] * 6, scenery.scale], _EPSILON)
         self._further = 0.0
         self._unit = np.repeat([solid.size, 1.0], 3)
         self._roots = np.zeros((len(times), 6, 6))
@@ -301,7 +306,7 @@ class _Problem:
             parts.append(self._steady(poses))
         if len(self._resting):
             parts.append(self._rest(poses))
-        rows = [self._said(poses, shared[-1], width)]
+        rows = [self._said(poses, shared[-7:], width)]
         rows += [_spread(frames, slopes, residual, width) for frames, slopes, residual in parts]
         for k, run in enumerate(self._runs):
             rows.append(self._lying(poses, run, shared[3 * k : 3 * k + 3], 6 * n + 3 * k, width))
@@ -317,7 +322,7 @@ class _Problem:
         """Standard deviations of what is shared by frames (see `_Minimum`)."""
         lying = np.tile([_BASE, _LEAN, _LEAN], len(self._runs))
         falling = np.full(3 if len(self._flight.threes) else 0, _LOADED)
-        return np.concatenate([lying, falling, [self._scale]])
+        return np.concatenate([lying, falling, self._alike])
 
     def _prior(self, shared: np.ndarray, width: int):
         """How far a learned object may differ from the true one."""
@@ -327,22 +332,22 @@ class _Problem:
         matrix = sparse.csr_matrix((known, (rows, width - len(shared) + rows)), shape=(len(shared), width))
         return matrix, known * shared
 
-    def _said(self, poses: Poses, further: float, width: int):
+    def _said(self, poses: Poses, alike: Float[np.ndarray, "7"], width: int):
         """What frames say, weighted as by Student's distribution."""
 
-        def away(moved: Poses, share: float = further) -> np.ndarray:
-            apart = difference(self._poses, self.seen(moved, share)) / self._unit
-            return np.einsum("nij,nj->ni", self._roots, apart)
+        def away(moved: Poses, alike: np.ndarray = alike) -> np.ndarray:
+            apart = difference(self._poses, self.seen(moved, alike[-1])) / self._unit
+            return np.einsum("nij,nj->ni", self._roots, apart) + alike[:6]
 
         residual = away(poses)
         square = np.sum(residual**2, axis=1)
         self._weight = (_FREEDOM + 6) / (_FREEDOM + square)
         self._cost += 0.5 * (_FREEDOM + 6) * float(np.sum(np.log1p(square / _FREEDOM)))
         root = np.sqrt(self._weight)[:, None]
-        matrix, residual = _spread(*self._linear(away, poses, np.arange(len(square))[:, None], root), width)
-        slope = (root * (away(poses, further + _EPSILON) - away(poses)) / _EPSILON).ravel()
-        place = np.arange(len(slope)), np.full(len(slope), width - 1)
-        return matrix + sparse.csr_matrix((slope, place), shape=matrix.shape), residual
+        part = self._linear(away, poses, np.arange(len(square))[:, None], root)
+        slopes = [away(poses, alike + _EPSILON * e) - residual for e in np.eye(7)]
+        common = np.stack([(root * slope).ravel() / _EPSILON for slope in slopes], axis=1)
+        return _with_shared(_spread(*part, width), common, width - 7)
 
     def _steady(self, poses: Poses):
         """Third differences, weighted as by Cauchy's distribution: a blow is allowed."""
@@ -436,11 +441,17 @@ class _Problem:
         root = np.sqrt(4 / (1 + square / self._tolerance**2))[:, None]
         self._cost += 2 * float(np.sum(np.log1p(square)))
         part = self._linear(lambda moved: function(moved, shared), poses, frames, root)
-        matrix, residual = _spread(*part, width)
         slopes = [(function(poses, shared + _EPSILON * e) - plain) / _EPSILON for e in np.eye(3)]
         common = np.stack([(root * slope).ravel() for slope in slopes], axis=1)
-        place = np.repeat(np.arange(len(common)), 3), np.tile(column + np.arange(3), len(common))
-        return matrix + sparse.csr_matrix((common.ravel(), place), shape=matrix.shape), residual
+        return _with_shared(_spread(*part, width), common, column)
+
+
+def _with_shared(part, slopes: Float[np.ndarray, "m k"], column: int):
+    """Derivatives by poses, and residuals, with those by what frames share, from a column on."""
+    matrix, residual = part
+    m, k = slopes.shape
+    place = np.repeat(np.arange(m), k), np.tile(column + np.arange(k), m)
+    return matrix + sparse.csr_matrix((slopes.ravel(), place), shape=matrix.shape), residual
 
 
 def _spread(frames: np.ndarray, slopes: np.ndarray, residual: np.ndarray, width: int):
