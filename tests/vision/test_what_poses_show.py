@@ -25,9 +25,10 @@ from dano.vision.tracking._refine import (
     window_of,
 )
 from dano.vision.tracking._result import covariance_of, unobservable
-from dano.vision.tracking._search import half_turns, told_apart, turn_evidence
+from dano.vision.tracking._search import half_turns
 from dano.vision.tracking._segments import common_offset, differs, edge_offset, moved_edge, overlap
 from dano.vision.tracking._subject import _exposed, Seen, Subject
+from dano.vision.tracking._whole import told_apart, turn_evidence
 
 
 def test_slopes_are_differences_of_what_is_seen(bunny, camera):

@@ -6,21 +6,20 @@ the picture says, and compared again.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from dano.maths import even_directions, quat_conjugate, quat_exp, quat_from_matrix, quat_log, quat_multiply
 from dano.vision.capture import Light
 from dano.vision.tracking._light import LAMPS, LightFit
 from dano.vision.tracking._options import TrackOptions
-from dano.vision.tracking._patterns import pattern, smooth
 from dano.vision.tracking._placement import Placement
-from dano.vision.tracking._refine import refine, Refined, silhouette, Target
-from dano.vision.tracking._segments import overlap
+from dano.vision.tracking._refine import refine, Refined, silhouette, Target, window_of
 from dano.vision.tracking._subject import CHUNK, pixels_of, Subject
 
 _SIDE = 32
@@ -35,7 +34,7 @@ _REACH = 1.7
 _SIDES = 24
 """Directions from which the object's colours are collected."""
 
-_ALIKE = 0.03
+ALIKE = 0.03
 """By which overlaps of starts may differ for colours to decide."""
 
 _OTHER = np.radians(12)
@@ -56,15 +55,27 @@ _AREA = 40.0
 _SPECKLE = 1.2
 """Standard deviation of the blur that takes the noise of pixels away [pixels]."""
 
-_TELLING = 12.0
-"""Evidence of a pattern from which it may decide how an object is turned (see `Pattern`). Sides that are
-known only in another light have had up to 9 by chance."""
+_FINE = 1.0, 3.0
+"""Standard deviations of the filters between which a pattern is fine [pixels]."""
 
-_CLEARER = 1.4
-"""How many times more it must be than for any other half turn."""
+_RIM = 3
+"""Pixels beside an edge in which what is behind it, or the camera, is seen."""
 
-_LITTLE = 0.1
-"""Evidence that patterns have by chance."""
+_SHIFT = 2
+"""By how much a pattern may lie beside where it is drawn, each way [pixels]: a pose that is turned by 180°
+was found with another pattern."""
+
+_SEEN = 60
+"""Pixels from which a pattern says something."""
+
+_APART = 25.0
+"""Pixels of filtered noise that know as much as an independent one: (4 `_FINE[0]`)², and some for video."""
+
+_DARKEST = 0.02
+"""Least sRGB, of which a logarithm is taken: light multiplies."""
+
+_OPAQUE = 0.9
+"""Opacity from which the distance of a pixel is that of the surface."""
 
 
 Item = TypeVar("Item")
@@ -82,6 +93,18 @@ class Start(NamedTuple):
     refined: Refined
     light: LightFit
     score: float
+
+
+class Pattern(NamedTuple):
+    """How a pattern agrees.
+
+    Attributes:
+        correlation: Of what is fine in the picture and as rendered, −1 to 1; 0 where too little is seen.
+        evidence: By how much the logarithm of the likelihood grows because of it, ≥ 0.
+    """
+
+    correlation: float
+    evidence: float
 
 
 class _Guess(NamedTuple):
@@ -142,42 +165,10 @@ def half_turns(subject: Subject, place: Placement) -> list[Placement]:
     return [dataclasses.replace(one, drift=place.drift) for one in turned]
 
 
-def turn_evidence(
-    subject: Subject, frames: Sequence[tuple[Target, Placement]], lamps: tuple[Light, ...]
-) -> Float[np.ndarray, "4 frames"]:
-    """How much patterns speak for poses as they are, and after half turns; 0 where silhouettes are unlike.
-
-    Args:
-        subject: The object.
-        frames: Some frames, and the poses in them.
-        lamps: Light.
-
-    Returns:
-        `Pattern.evidence`; rows as in `half_turns`, after the first.
-    """
-    evidence, fits = np.zeros((4, len(frames))), np.zeros((4, len(frames)))
-    for k, (target, place) in enumerate(frames):
-        for h, turned in enumerate([place, *half_turns(subject, place)]):
-            shape, _ = subject.whole(turned, lamps, target.camera)
-            fits[h, k] = overlap(target.mask, shape, target.seen)
-            if fits[h, k] > fits[0, k] - _ALIKE:
-                evidence[h, k] = pattern(subject, target, turned, lamps).evidence
-    alike = np.median(fits - fits[0], axis=1) > -_ALIKE
-    return np.where(alike[:, None], evidence, 0.0)
-
-
-def told_apart(most: Float[np.ndarray, "4"]) -> tuple[int, float]:
-    """Which of the half turns has the most evidence, and how many times that of the next; (0, 1): unsure."""
-    best, second = np.sort(most)[[-1, -2]]
-    if best < _TELLING or best < _CLEARER * second:
-        return 0, 1.0
-    return int(np.argmax(most)), float(best / max(second, _LITTLE))
-
-
 def likeliest(subject: Subject, target: Target, loss: str, starts: list[Start]) -> tuple[Start, float]:
     """Of starts whose silhouettes fit alike, the one whose colours fit best; and how clearly."""
     most = max(start.refined.overlap for start in starts)
-    alike = sorted((s for s in starts if s.refined.overlap > most - _ALIKE), key=lambda s: s.score)
+    alike = sorted((s for s in starts if s.refined.overlap > most - ALIKE), key=lambda s: s.score)
     alike = distinct(alike, lambda start: start.refined.place, _OTHER)
     if loss != "photometric":
         values = [start.score for start in alike]
@@ -208,9 +199,85 @@ def unlikeness(subject: Subject, target: Target, start: Start) -> float:
     if inside.sum() < _AREA:
         return float("inf")
     look, image = colour / np.maximum(shape, 0.5)[..., None], target.image[window]
-    away = smooth(look - image, inside, _SPECKLE)[inside]
+    away = _smooth(look - image, inside, _SPECKLE)[inside]
     alike = pattern(subject, target, start.refined.place, start.light.lamps).correlation
     return float(np.sqrt(np.mean(away**2)) * (1 - alike))
+
+
+def pattern(subject: Subject, target: Target, place: Placement, lamps: tuple[Light, ...]) -> Pattern:
+    """Compare the fine pattern of an object at a pose, such as writing, with a picture, for any light.
+
+    How bright a side is depends on light, and of a side that no photograph showed in such a light a learned
+    look is a guess. Where a letter is depends on nothing but the pose. Edges between sides look alike at all
+    poses that have one silhouette: what normals alone explain does not count.
+    """
+    window = window_of(subject, place, target.camera)
+    if window is None:
+        return Pattern(0.0, 0.0)
+    shape, colour = silhouette(subject, place, lamps, target.camera, window)
+    normals, solid = _normals(subject, target, place, window)
+    inside = solid & (shape > 0.95) & (target.mask[window] > 0.7) & target.seen[window]
+    inside = ndimage.binary_erosion(inside, iterations=_RIM)
+    inner = ndimage.binary_erosion(inside, iterations=_SHIFT)
+    if inner.sum() < _SEEN:
+        return Pattern(0.0, 0.0)
+    look = colour / np.maximum(shape, 0.5)[..., None]
+    basis, _ = np.linalg.qr(_fine(_by_normals(normals), inside)[inner])
+    drawn, seen = (_fine(_brightness(x), inside) for x in (look, target.image[window]))
+    seen = _unexplained(seen[inner][:, 0], basis)
+    steps = range(-_SHIFT, _SHIFT + 1)
+    shifted = (np.roll(drawn, step, axis=(0, 1))[inner][:, 0] for step in itertools.product(steps, steps))
+    correlation = max(_correlation(_unexplained(one, basis), seen) for one in shifted)
+    believed = min(max(correlation, 0.0), 0.999)
+    # Of two series of normal numbers, for the best gain.
+    return Pattern(correlation, -0.5 * float(np.log1p(-(believed**2))) * int(inner.sum()) / _APART)
+
+
+def _unexplained(values: Float[np.ndarray, " n"], basis: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
+    return values - basis @ (basis.T @ values)
+
+
+def _correlation(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"]) -> float:
+    return float(first @ second / max(float(np.linalg.norm(first) * np.linalg.norm(second)), 1e-12))
+
+
+def _smooth(
+    values: Float[np.ndarray, "height width k"], inside: Bool[np.ndarray, "height width"], sigma: float
+) -> Float[np.ndarray, "height width k"]:
+    """Gaussian mean [pixels] over what is inside."""
+    share = np.maximum(ndimage.gaussian_filter(inside.astype(float), sigma), 1e-3)
+    kept = np.where(inside[..., None], values, 0)
+    return ndimage.gaussian_filter(kept, (sigma, sigma, 0)) / share[..., None]
+
+
+def _fine(
+    values: Float[np.ndarray, "height width k"], inside: Bool[np.ndarray, "height width"]
+) -> Float[np.ndarray, "height width k"]:
+    return _smooth(values, inside, _FINE[0]) - _smooth(values, inside, _FINE[1])
+
+
+def _brightness(colour: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width 1"]:
+    return np.log(np.maximum(colour, _DARKEST)).mean(axis=2, keepdims=True)
+
+
+def _by_normals(n: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width k"]:
+    """Functions of normals that shades are made of: spherical harmonics to degree two, and lamps that set."""
+    x, y, z = np.moveaxis(n, 2, 0)
+    degree_two = (x * y, y * z, x * z, x**2 - y**2, 3 * z**2 - 1)
+    return np.stack([x, y, z, *degree_two, np.abs(x), np.abs(y), np.abs(z)], axis=2)
+
+
+def _normals(
+    subject: Subject, target: Target, place: Placement, window: tuple[slice, slice]
+) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
+    """Normals of the surface that pixels show [W], and where they show one."""
+    pixels, shape = pixels_of(window), target.mask[window].shape
+    away, opacity = subject.distances(place, target.camera, pixels)
+    points = target.camera.position + away[:, None] * target.camera.directions(pixels)
+    solid = opacity.reshape(shape) > _OPAQUE
+    points = _smooth(points.reshape(*shape, 3), solid, 0.7 * _FINE[0])
+    across = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
+    return across / np.maximum(np.linalg.norm(across, axis=2, keepdims=True), 1e-12), solid
 
 
 def score(refined: Refined) -> float:

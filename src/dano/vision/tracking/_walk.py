@@ -28,8 +28,7 @@ from dano.vision.tracking._search import (
 )
 from dano.vision.tracking._segments import overlap
 from dano.vision.tracking._subject import CHUNK, Subject
-from dano.vision.tracking._turned import turned
-from dano.vision.tracking._whole import region_of, Whole
+from dano.vision.tracking._whole import region_of, turned, Whole
 
 _COARSE = 24
 """Size of the object [pixels] at the coarsest level of the pyramid."""

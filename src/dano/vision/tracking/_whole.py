@@ -2,20 +2,22 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from dano.vision.capture import PosedCamera
+from dano.vision.capture import Light, PosedCamera
 from dano.vision.tracking._film import Film
 from dano.vision.tracking._light import LightFit
 from dano.vision.tracking._masking import Masking
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Drift, Placement
-from dano.vision.tracking._refine import linearized, Refined, silhouette, window_of
+from dano.vision.tracking._refine import linearized, Refined, silhouette, Target, window_of
 from dano.vision.tracking._result import own_covariance, SCALE_DOUBT
-from dano.vision.tracking._search import learn_light
+from dano.vision.tracking._search import ALIKE, half_turns, learn_light, pattern
+from dano.vision.tracking._segments import overlap
 from dano.vision.tracking._subject import Subject
 from dano.vision.trajectory import Poses, Scenery, Smoothed, smoothed
 
@@ -36,11 +38,39 @@ _ALIKE = 4.0
 """Standard deviations by which all frames may be off alike where an object stands on a known table: its
 shadow is beside it there, and the table tells (measured in rendered films)."""
 
+_COMPARED = 8
+"""Frames, spread over the film, whose patterns say how the object is turned."""
+
+
+_TELLING = 12.0
+"""Evidence of a pattern from which it may decide how an object is turned (see `Pattern`). Sides that are
+known only in another light have had up to 9 by chance."""
+
+_CLEARER = 1.4
+"""How many times more it must be than for any other half turn."""
+
+_LITTLE = 0.1
+"""Evidence that patterns have by chance."""
+
 _RIM = 3
 """Pixels around a silhouette in which a motion shows."""
 
 _FAR = 3.0
 """Displacement by the poses from which frames are not compared [pixels]: it would not be measured."""
+
+
+class Turned(NamedTuple):
+    """What patterns say of all poses.
+
+    Attributes:
+        places: Poses after a half turn; None: they stay.
+        light: As these poses imply it: a light that was fitted to wrong ones is wrong.
+        clear: As in `told_apart`.
+    """
+
+    places: dict[int, Placement] | None
+    light: LightFit
+    clear: float
 
 
 class Whole:
@@ -188,6 +218,73 @@ def relit(
             masking.learn_shadow(i, target, place, fit)
     fit.find_sun()
     return fit if fit.known else light
+
+
+def turned(
+    subject: Subject,
+    masking: Masking,
+    camera: PosedCamera,
+    light: LightFit,
+    places: Mapping[int, Placement],
+    table: float | None,
+) -> Turned:
+    """Turn the poses of a film by 180° if patterns say so.
+
+    What a look is wrong about, such as a side that was photographed in the shade only, is wrong in all
+    frames, which so do not add up: the frame decides in which patterns are seen best.
+
+    Args:
+        subject: The object.
+        masking: Masks of the film.
+        camera: Which took it.
+        light: Light at the poses as they are.
+        places: Poses of frames.
+        table: Height of a known table [m, W].
+    """
+    rows = list(places)
+    some = [rows[k] for k in np.unique(np.linspace(0, len(rows) - 1, _COMPARED).astype(int))]
+    targets = {i: masking.near(i, subject, places[i], light.lamps, camera, 2.0) for i in some}
+    frames = [(target, places[i]) for i, target in targets.items() if target is not None]
+    if not frames:
+        return Turned(None, light, 1.0)
+    turn, clear = told_apart(turn_evidence(subject, frames, light.lamps).max(axis=1))
+    if turn == 0:
+        return Turned(None, light, clear)
+    after = {i: half_turns(subject, place)[turn - 1] for i, place in places.items()}
+    lit = {i: after[i] for i in rows[:: len(rows) // LIGHT_FRAMES or 1]}
+    return Turned(after, relit(subject, masking, camera, LightFit(subject, table=table), lit), clear)
+
+
+def turn_evidence(
+    subject: Subject, frames: Sequence[tuple[Target, Placement]], lamps: tuple[Light, ...]
+) -> Float[np.ndarray, "4 frames"]:
+    """How much patterns speak for poses as they are, and after half turns; 0 where silhouettes are unlike.
+
+    Args:
+        subject: The object.
+        frames: Some frames, and the poses in them.
+        lamps: Light.
+
+    Returns:
+        `Pattern.evidence`; rows as in `half_turns`, after the first.
+    """
+    evidence, fits = np.zeros((4, len(frames))), np.zeros((4, len(frames)))
+    for k, (target, place) in enumerate(frames):
+        for h, turned in enumerate([place, *half_turns(subject, place)]):
+            shape, _ = subject.whole(turned, lamps, target.camera)
+            fits[h, k] = overlap(target.mask, shape, target.seen)
+            if fits[h, k] > fits[0, k] - ALIKE:
+                evidence[h, k] = pattern(subject, target, turned, lamps).evidence
+    alike = np.median(fits - fits[0], axis=1) > -ALIKE
+    return np.where(alike[:, None], evidence, 0.0)
+
+
+def told_apart(most: Float[np.ndarray, "4"]) -> tuple[int, float]:
+    """Which of the half turns has the most evidence, and how many times that of the next; (0, 1): unsure."""
+    best, second = np.sort(most)[[-1, -2]]
+    if best < _TELLING or best < _CLEARER * second:
+        return 0, 1.0
+    return int(np.argmax(most)), float(best / max(second, _LITTLE))
 
 
 def region_of(one: Refined, shape: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
