@@ -14,13 +14,10 @@ from dano.vision.tracking._light import LightFit
 from dano.vision.tracking._masking import BLIND, Masking
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Drift, Placement
-from dano.vision.tracking._refine import refine, Refined, silhouette, window_of
+from dano.vision.tracking._refine import refine, Refined, window_of
 from dano.vision.tracking._result import HIDDEN, LOST, OUTSIDE, TRACKED, Tracked, tracked
-from dano.vision.tracking._search import learn_light
 from dano.vision.tracking._subject import Subject
-
-_LIGHT_FRAMES = 6
-"""Frames, spread over the film, that the light is fitted to."""
+from dano.vision.tracking._whole import learn_frame, LIGHT_FRAMES
 
 _STEPS = 3
 """Of Gauss and Newton: residuals saturate some pixels away from an edge, where one step does not get far."""
@@ -72,7 +69,7 @@ def adjust_poses(
             raise ValueError(f"{name} must have shape ({n}, {width}), got {np.shape(array)}")
     subject, near = Subject(field), film.camera(camera)
     places = _places(film, subject, np.asarray(position), np.asarray(orientation), chosen)
-    masking, light = Masking(film, chosen, background), LightFit(subject, _LIGHT_FRAMES, chosen.table)
+    masking, light = Masking(film, chosen, background), LightFit(subject, LIGHT_FRAMES, chosen.table)
     if lamps is not None:
         light.lamps, light.known = lamps, True
     elif chosen.loss == "photometric":
@@ -153,14 +150,10 @@ def _learn_light(
 ) -> None:
     """Fit the light to some frames at their poses, as the look says."""
     rows = [i for i, place in enumerate(places) if place is not None]
-    for k in np.unique(np.linspace(0, len(rows) - 1, min(_LIGHT_FRAMES, len(rows))).astype(int)):
+    for k in np.unique(np.linspace(0, len(rows) - 1, min(LIGHT_FRAMES, len(rows))).astype(int)):
         i, place = rows[k], places[rows[k]]
         assert place is not None
-        target = masking.near(i, subject, place, light.lamps, camera, 2.0)
-        window = window_of(subject, place, camera)
-        if target is not None and window is not None:
-            shape, _ = silhouette(subject, place, light.lamps, camera, window)
-            learn_light(subject, target, place, window, shape, light)
-            masking.learn(target, window, shape)
-            masking.learn_shadow(i, target, place, light)
+        learned = learn_frame(i, subject, masking, camera, place, light.lamps, light)
+        if learned is not None:
+            masking.learn(*learned)
     light.find_sun()

@@ -249,6 +249,15 @@ def _powers(rows: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return answer
 
 
+def on_table(
+    camera: AbstractCamera, pixels: Float[np.ndarray, "n 2"], table: float
+) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, "m 3"]]:
+    """Which pixels show a level table of height z [m, W], and where on it; none if it is above the camera."""
+    directions, height = camera.directions(pixels), camera.position[2] - table
+    down = (directions[:, 2] < 0) & (height > 0)
+    return down, camera.position - height / directions[down, 2:] * directions[down]
+
+
 class _Shadow(NamedTuple):
     """What a frame shows of the table around the object.
 
@@ -285,14 +294,9 @@ class ShadowFit:
 
     def add(self, place: Placement, camera: AbstractCamera, image: np.ndarray, bare, free) -> None:
         """See `LightFit.add_shadow`."""
-        height = camera.position[2] - self.table
-        if height <= 0:
-            return
         y, x = np.nonzero(free & (bare > _DARK))
-        directions = camera.directions(np.stack([x, y], axis=1) + 0.5)
-        down = directions[:, 2] < 0
-        y, x, directions = y[down], x[down], directions[down]
-        points = camera.position - height / directions[:, 2:] * directions
+        down, points = on_table(camera, np.stack([x, y], axis=1) + 0.5, self.table)
+        y, x = y[down], x[down]
         near = np.linalg.norm((points - self._subject.middle(place))[:, :2], axis=1)
         rows = np.flatnonzero(near < _SHADOW_REACH * self._subject.radius)
         if len(rows) < CHUNK:

@@ -10,7 +10,7 @@ from scipy import ndimage
 from dano.vision.capture import background_mask, Light, PosedCamera, View
 from dano.vision.drawing import GAMMA
 from dano.vision.tracking._film import Film
-from dano.vision.tracking._light import bare_brightness, LightFit
+from dano.vision.tracking._light import bare_brightness, LightFit, on_table
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._refine import MASK_NOISE, OWN_MASK_NOISE, silhouette, Target, window_of
@@ -279,13 +279,10 @@ class Masking:
         if self._table is None or camera.position[2] <= self._table:
             return None
         pixels = pixels_of(window)
-        directions = camera.directions(pixels)
-        rows = np.flatnonzero(directions[:, 2] < 0)
-        ahead = (self._table - camera.position[2]) / directions[rows, 2]
-        points = camera.position + ahead[:, None] * directions[rows]
+        down, points = on_table(camera, pixels, self._table)
         apart = subject.clearance(place, points) / subject.pixel(place, camera)
         result, part = np.zeros((camera.height, camera.width)), np.zeros(len(pixels))
-        part[rows] = _CAST * np.clip(1 - apart / _CAST_REACH, 0, 1)
+        part[down] = _CAST * np.clip(1 - apart / _CAST_REACH, 0, 1)
         result[window] = part.reshape(result[window].shape)
         return result
 

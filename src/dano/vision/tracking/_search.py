@@ -194,7 +194,7 @@ def unlikeness(subject: Subject, target: Target, start: Start) -> float:
     """
     window = start.refined.window
     shape, colour = silhouette(subject, start.refined.place, start.light.lamps, target.camera, window)
-    inside = (shape > 0.95) & (target.mask[window] > 0.7) & target.seen[window]
+    inside = _alone(target, window, shape)
     inside = ndimage.binary_erosion(inside, iterations=2)
     if inside.sum() < _AREA:
         return float("inf")
@@ -202,6 +202,13 @@ def unlikeness(subject: Subject, target: Target, start: Start) -> float:
     away = _smooth(look - image, inside, _SPECKLE)[inside]
     alike = pattern(subject, target, start.refined.place, start.light.lamps).correlation
     return float(np.sqrt(np.mean(away**2)) * (1 - alike))
+
+
+def _alone(
+    target: Target, window: tuple[slice, slice], shape: Float[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """Where a picture shows the object and nothing else, by its rendered silhouette and its mask."""
+    return (shape > 0.95) & (target.mask[window] > 0.7) & target.seen[window]
 
 
 def pattern(subject: Subject, target: Target, place: Placement, lamps: tuple[Light, ...]) -> Pattern:
@@ -216,7 +223,7 @@ def pattern(subject: Subject, target: Target, place: Placement, lamps: tuple[Lig
         return Pattern(0.0, 0.0)
     shape, colour = silhouette(subject, place, lamps, target.camera, window)
     normals, solid = _normals(subject, target, place, window)
-    inside = solid & (shape > 0.95) & (target.mask[window] > 0.7) & target.seen[window]
+    inside = solid & _alone(target, window, shape)
     inside = ndimage.binary_erosion(inside, iterations=_RIM)
     inner = ndimage.binary_erosion(inside, iterations=_SHIFT)
     if inner.sum() < _SEEN:
@@ -292,7 +299,7 @@ def _learn(subject: Subject, target: Target, refined: Refined, light: LightFit) 
 
 def learn_light(subject: Subject, target: Target, place: Placement, window, shape, light: LightFit) -> None:
     """Fit the light to pixels of a picture that show the object and nothing else."""
-    inside = (shape > 0.95) & (target.mask[window] > 0.7) & target.seen[window]
+    inside = _alone(target, window, shape)
     # The edge itself may be mixed with what is behind.
     core = ndimage.binary_erosion(inside)
     inside = core if core.sum() > 60 else inside

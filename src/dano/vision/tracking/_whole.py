@@ -41,7 +41,6 @@ shadow is beside it there, and the table tells (measured in rendered films)."""
 _COMPARED = 8
 """Frames, spread over the film, whose patterns say how the object is turned."""
 
-
 _TELLING = 12.0
 """Evidence of a pattern from which it may decide how an object is turned (see `Pattern`). Sides that are
 known only in another light have had up to 9 by chance."""
@@ -210,14 +209,29 @@ def relit(
     """The light that some frames show with the object at given poses, which is near a known light."""
     fit = light.afresh(len(places))
     for i, place in places.items():
-        target = masking.near(i, subject, place, light.lamps, camera, 2.0)
-        window = window_of(subject, place, camera)
-        if target is not None and window is not None:
-            shape, _ = silhouette(subject, place, light.lamps, camera, window)
-            learn_light(subject, target, place, window, shape, fit)
-            masking.learn_shadow(i, target, place, fit)
+        learn_frame(i, subject, masking, camera, place, light.lamps, fit)
     fit.find_sun()
     return fit if fit.known else light
+
+
+def learn_frame(
+    i: int,
+    subject: Subject,
+    masking: Masking,
+    camera: PosedCamera,
+    place: Placement,
+    lamps: tuple[Light, ...],
+    fit: LightFit,
+) -> tuple[Target, tuple[slice, slice], Float[np.ndarray, "_ _"]] | None:
+    """Take a frame into account for the light; what it shows, where, and the silhouette; None: nothing."""
+    target = masking.near(i, subject, place, lamps, camera, 2.0)
+    window = window_of(subject, place, camera)
+    if target is None or window is None:
+        return None
+    shape, _ = silhouette(subject, place, lamps, camera, window)
+    learn_light(subject, target, place, window, shape, fit)
+    masking.learn_shadow(i, target, place, fit)
+    return target, window, shape
 
 
 def turned(
@@ -270,11 +284,11 @@ def turn_evidence(
     """
     evidence, fits = np.zeros((4, len(frames))), np.zeros((4, len(frames)))
     for k, (target, place) in enumerate(frames):
-        for h, turned in enumerate([place, *half_turns(subject, place)]):
-            shape, _ = subject.whole(turned, lamps, target.camera)
+        for h, other in enumerate([place, *half_turns(subject, place)]):
+            shape, _ = subject.whole(other, lamps, target.camera)
             fits[h, k] = overlap(target.mask, shape, target.seen)
             if fits[h, k] > fits[0, k] - ALIKE:
-                evidence[h, k] = pattern(subject, target, turned, lamps).evidence
+                evidence[h, k] = pattern(subject, target, other, lamps).evidence
     alike = np.median(fits - fits[0], axis=1) > -ALIKE
     return np.where(alike[:, None], evidence, 0.0)
 
