@@ -12,16 +12,17 @@ from dano.maths import quat_conjugate, quat_exp, quat_multiply, quat_rotate
 from dano.scene_file import asset_look
 from dano.vision import Camera, compose, Item, Light
 from dano.vision.drawing import GAMMA
+from dano.vision.tracking._film import Target
 from dano.vision.tracking._light import LightFit, ShadowFit, unlit
 from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.tracking._refine import (
+    _along,
     _without_common,
     _without_shadow,
     MASK_NOISE,
     refine,
     Refined,
     silhouette,
-    Target,
     window_of,
 )
 from dano.vision.tracking._result import covariance_of, unobservable
@@ -150,6 +151,28 @@ def test_clearance_is_the_distance_from_the_surface(bunny):
     points = eye.position + away[:, None] * eye.directions(pixels)
     assert met.sum() > 20
     assert np.median(np.abs(subject.clearance(place, points[met]))) < 0.01 * subject.size
+
+
+def test_costs_along_a_move_make_the_curvature_there_and_leave_the_rest():
+    random = np.random.default_rng(3)
+    root = random.normal(size=(6, 6))
+    hessian, gradient, move = root @ root.T + np.eye(6), random.normal(size=6), random.normal(size=6)
+
+    def parabola(curvature: float, slope: float) -> tuple[float, float, float]:
+        cost = 7.0
+        return cost, cost - slope + 0.5 * curvature, cost + slope + 0.5 * curvature
+
+    steep = move @ hessian @ move
+    # Costs of Gauss and Newton's own parabola change nothing.
+    same = _along(move, gradient, hessian, *parabola(steep, gradient @ move))
+    np.testing.assert_allclose(same[0], gradient, atol=1e-10)
+    np.testing.assert_allclose(same[1], hessian, atol=1e-10)
+    slope, flatter = _along(move, gradient, hessian, *parabola(0.3 * steep, -0.2))
+    assert slope @ move == pytest.approx(-0.2) and move @ flatter @ move == pytest.approx(0.3 * steep)
+    across = random.normal(size=6)
+    across -= move * (move @ hessian @ across) / steep
+    assert slope @ across == pytest.approx(gradient @ across)
+    np.testing.assert_allclose(flatter @ across, hessian @ across, atol=1e-10)
 
 
 def test_a_word_says_how_a_soap_is_turned(camera):

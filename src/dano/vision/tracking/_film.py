@@ -138,6 +138,49 @@ class Film(NamedTuple):
         return pixels.astype(np.float32) / 255
 
 
+class Target(NamedTuple):
+    """What a frame shows, at one level of its pyramid.
+
+    Attributes:
+        camera: Of the reduced picture.
+        image: sRGB in [0, 1].
+        mask: Where the object is, 0 to 1.
+        seen: Where nothing else stands in front of it.
+        behind: What would be seen there without the object, in this frame's light; None if it is not known.
+        mask_noise: Standard deviation of the mask at its edge; None: it does not count beside what is behind.
+        telling: Where it counts then: the object is not alike to what is behind it; None: everywhere.
+        cast: Share by which the object's shadow may darken pixels beside it, standard deviation; None: none.
+    """
+
+    camera: PosedCamera
+    image: Float[np.ndarray, "height width 3"]
+    mask: Float[np.ndarray, "height width"]
+    seen: Bool[np.ndarray, "height width"]
+    behind: Float[np.ndarray, "height width 3"] | None = None
+    mask_noise: float | None = None
+    telling: Bool[np.ndarray, "height width"] | None = None
+    cast: Float[np.ndarray, "height width"] | None = None
+
+    def reduced(self, factor: int) -> "Target":
+        """The same with so many pixels a side averaged into one."""
+        if factor == 1:
+            return self
+        h, w = self.mask.shape[0] // factor, self.mask.shape[1] // factor
+
+        def mean(x: np.ndarray) -> np.ndarray:
+            x = x[: h * factor, : w * factor]
+            return x.reshape(h, factor, w, factor, *x.shape[2:]).mean(axis=(1, 3))
+
+        camera = self.camera.replaced(
+            focal=self.camera.focal / factor, centre=self.camera.centre / factor, width=w, height=h
+        )
+        behind = None if self.behind is None else mean(self.behind)
+        seen = mean(self.seen.astype(float)) > 0.99
+        telling = None if self.telling is None else mean(self.telling.astype(float)) > 0.5
+        cast = None if self.cast is None else mean(self.cast)
+        return Target(camera, mean(self.image), mean(self.mask), seen, behind, self.mask_noise, telling, cast)
+
+
 def read_film(
     path: str | Path,
     *,

@@ -9,11 +9,11 @@ from scipy import ndimage
 
 from dano.vision.capture import background_mask, Light, PosedCamera, View
 from dano.vision.drawing import GAMMA
-from dano.vision.tracking._film import Film
+from dano.vision.tracking._film import Film, Target
 from dano.vision.tracking._light import bare_brightness, LightFit, on_table
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
-from dano.vision.tracking._refine import MASK_NOISE, OWN_MASK_NOISE, silhouette, Target, window_of
+from dano.vision.tracking._refine import MASK_NOISE, OWN_MASK_NOISE, silhouette, window_of
 from dano.vision.tracking._segments import (
     common_offset,
     differs,

@@ -5,14 +5,14 @@ deviation and weighted robustly; derivatives are the renderer's. Levenberg's dam
 went too far.
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy import ndimage
 
 from dano.vision.capture import Light, PosedCamera
+from dano.vision.tracking._film import Target
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._segments import overlap
 from dano.vision.tracking._subject import BAND, Seen, Subject, window_of
@@ -49,54 +49,21 @@ lies beside it (measured in rendered films, with their true poses)."""
 _FURTHEST = 0.1
 """Change of a pose [radii, rad] up to which one step says where a picture wants it."""
 
+_WIDE, _WIDEST = 3.0, 0.15
+"""How far the direction that a picture shows least is looked at: standard deviations, and at most [radii].
+Costs are flat over so much: in rendered films they have a tenth to a half of the curvature there."""
+
+_FLATTEST = 0.1
+"""Least curvature there, over that of Gauss and Newton."""
+
+_GROUND = 1e-6
+"""Curvature that is added for directions that change nothing, as a share of the trace."""
+
 _FEWEST = 24
 """Pixels that must take part: four for each of the six numbers of a pose (convention)."""
 
 _SMALL = 0.02
 """Predicted move [pixels] that ends the search."""
-
-
-class Target(NamedTuple):
-    """What a frame shows, at one level of its pyramid.
-
-    Attributes:
-        camera: Of the reduced picture.
-        image: sRGB in [0, 1].
-        mask: Where the object is, 0 to 1.
-        seen: Where nothing else stands in front of it.
-        behind: What would be seen there without the object, in this frame's light; None if it is not known.
-        mask_noise: Standard deviation of the mask at its edge; None: it does not count beside what is behind.
-        telling: Where it counts then: the object is not alike to what is behind it; None: everywhere.
-        cast: Share by which the object's shadow may darken pixels beside it, standard deviation; None: none.
-    """
-
-    camera: PosedCamera
-    image: Float[np.ndarray, "height width 3"]
-    mask: Float[np.ndarray, "height width"]
-    seen: Bool[np.ndarray, "height width"]
-    behind: Float[np.ndarray, "height width 3"] | None = None
-    mask_noise: float | None = None
-    telling: Bool[np.ndarray, "height width"] | None = None
-    cast: Float[np.ndarray, "height width"] | None = None
-
-    def reduced(self, factor: int) -> "Target":
-        """The same with so many pixels a side averaged into one."""
-        if factor == 1:
-            return self
-        h, w = self.mask.shape[0] // factor, self.mask.shape[1] // factor
-
-        def mean(x: np.ndarray) -> np.ndarray:
-            x = x[: h * factor, : w * factor]
-            return x.reshape(h, factor, w, factor, *x.shape[2:]).mean(axis=(1, 3))
-
-        camera = self.camera.replaced(
-            focal=self.camera.focal / factor, centre=self.camera.centre / factor, width=w, height=h
-        )
-        behind = None if self.behind is None else mean(self.behind)
-        seen = mean(self.seen.astype(float)) > 0.99
-        telling = None if self.telling is None else mean(self.telling.astype(float)) > 0.5
-        cast = None if self.cast is None else mean(self.cast)
-        return Target(camera, mean(self.image), mean(self.mask), seen, behind, self.mask_noise, telling, cast)
 
 
 class Refined(NamedTuple):
@@ -139,24 +106,6 @@ def silhouette(
     """Opacity and colour over black of the pixels of a window."""
     opacity, colour = subject.whole(place, lamps, camera)
     return opacity[window].copy(), colour[window].copy()
-
-
-def aligned(subject: Subject, target: Target, place: Placement, lamps: tuple[Light, ...]) -> Placement:
-    """A pose moved across the line of sight so that its silhouette lies where the mask does."""
-    window = window_of(subject, place, target.camera)
-    if window is None or target.mask.sum() < 4:
-        return place
-    shape, _ = silhouette(subject, place, lamps, target.camera, window)
-    y, x = np.mgrid[: target.mask.shape[0], : target.mask.shape[1]]
-    # A silhouette that something hides in part is not centred.
-    if shape.sum() < 4 or not target.seen[window].all():
-        return place
-    given = np.array([(target.mask * v).sum() for v in (x, y)]) / target.mask.sum()
-    here = np.array([(shape * v[window]).sum() for v in (x, y)]) / shape.sum()
-    depth = float((subject.middle(place) - target.camera.position) @ target.camera.axes[2])
-    right, up, _ = target.camera.axes
-    shift = (given - here) * depth / target.camera.focal
-    return dataclasses.replace(place, position=place.position + shift[0] * right - shift[1] * up)
 
 
 def refine(
@@ -216,9 +165,12 @@ def linearized(
     rays: int,
     random: np.random.Generator,
 ) -> Refined | None:
-    """What a picture says of a pose near a given one: one step of Gauss and Newton from there.
+    """What a picture says of a pose near a given one: one step of Newton from there.
 
     Arguments and result are those of `refine`. Its cost, overlap and silhouette are those of the given pose.
+    Where colours say where the object ends, the cost is much flatter along what a picture shows least, mostly
+    the line of sight, than Gauss and Newton's parabola: what no longer fits loses weight. There a parabola
+    through three poses takes its place.
     """
     index = _chosen(subject, target, place, lamps, rays, random)
     if index is None:
@@ -228,9 +180,43 @@ def linearized(
     if found is None:
         return None
     gradient, hessian = _normal(rows)
-    change = -np.linalg.solve(hessian + 1e-6 * np.trace(hessian) * np.eye(6), gradient)
+    if loss == "photometric" and target.behind is not None:
+        move = _least_shown(found)
+        costs = [rows.cost]
+        for sign in (-1, 1):
+            moved = place.moved(sign * move, subject.radius)
+            costs.append(_rows(subject, target, moved, lamps, index, loss, slopes=False).cost)
+        gradient, flatter = _along(move, gradient, hessian, *(len(index) * np.array(costs)))
+        change = np.linalg.solve(flatter + _GROUND * np.trace(flatter) * np.eye(6), hessian)
+        # Huber's sandwich with this Hessian.
+        found, hessian = found._replace(covariance=change @ found.covariance @ change.T), flatter
+    change = -np.linalg.solve(hessian + _GROUND * np.trace(hessian) * np.eye(6), gradient)
     change *= min(1.0, _FURTHEST / max(float(np.abs(change).max()), 1e-9))
     return found._replace(place=place.moved(change, subject.radius))
+
+
+def _least_shown(found: Refined) -> Float[np.ndarray, "6"]:
+    """A move of the pose along what a picture shows least, with what is likeliest then of all else."""
+    values, vectors = np.linalg.eigh(found.covariance)
+    ground = _GROUND * np.trace(found.hessian) * np.eye(6)
+    move = np.linalg.solve(found.hessian + ground, vectors[:, -1])
+    return move / np.linalg.norm(move) * min(_WIDE * np.sqrt(values[-1]), _WIDEST)
+
+
+def _along(
+    move: Float[np.ndarray, "6"],
+    gradient: Float[np.ndarray, "6"],
+    hessian: Float[np.ndarray, "6 6"],
+    cost: float,
+    before: float,
+    after: float,
+) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6 6"]]:
+    """Gradient and Hessian that have along one move the parabola through the costs at its ends and middle."""
+    image = hessian @ move
+    steep = float(move @ image)
+    kept = np.clip((before - 2 * cost + after) / steep, _FLATTEST, 1.0)
+    gradient = gradient + (0.5 * (after - before) - float(gradient @ move)) / steep * image
+    return gradient, hessian - (1 - kept) / steep * np.outer(image, image)
 
 
 def _chosen(
@@ -268,11 +254,23 @@ def _chosen(
     return index if len(index) >= _FEWEST else None
 
 
-def _rows(subject: Subject, target: Target, place: Placement, lamps, index: np.ndarray, loss: str) -> _Rows:
+def _rows(
+    subject: Subject,
+    target: Target,
+    place: Placement,
+    lamps: tuple[Light, ...],
+    index: np.ndarray,
+    loss: str,
+    *,
+    slopes: bool = True,
+) -> _Rows:
     y, x = index.T
     pixels = np.stack([x, y], axis=1) + 0.5
     behind = None if target.behind is None or loss != "photometric" else target.behind[y, x]
-    seen = subject.picture(place, lamps, target.camera, pixels, slopes=True, behind=behind)
+    seen = subject.picture(place, lamps, target.camera, pixels, slopes=slopes, behind=behind)
+    if not slopes:
+        nothing = np.zeros((len(index), 3, 6))
+        seen = seen._replace(opacity_slope=nothing[:, 0], colour_slope=nothing)
     if loss == "paper":
         return _paper_rows(target, seen, index)
     if loss == "photometric" and target.behind is not None:

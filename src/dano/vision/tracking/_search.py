@@ -16,10 +16,11 @@ from scipy import ndimage
 
 from dano.maths import even_directions, quat_conjugate, quat_exp, quat_from_matrix, quat_log, quat_multiply
 from dano.vision.capture import Light
+from dano.vision.tracking._film import Target
 from dano.vision.tracking._light import LAMPS, LightFit
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
-from dano.vision.tracking._refine import refine, Refined, silhouette, Target, window_of
+from dano.vision.tracking._refine import refine, Refined, silhouette, window_of
 from dano.vision.tracking._subject import CHUNK, pixels_of, Subject
 
 _SIDE = 32
@@ -99,7 +100,7 @@ class Pattern(NamedTuple):
     """How a pattern agrees.
 
     Attributes:
-        correlation: Of what is fine in the picture and as rendered, −1 to 1; 0 where too little is seen.
+        correlation: Of what is fine in the picture and as rendered, 0 to 1; 0 where too little is seen.
         evidence: By how much the logarithm of the likelihood grows because of it, ≥ 0.
     """
 
@@ -179,6 +180,24 @@ def likeliest(subject: Subject, target: Target, loss: str, starts: list[Start]) 
     return alike[0], min((value / max(values[0], 1e-9) for value in values[1:]), default=np.inf)
 
 
+def aligned(subject: Subject, target: Target, place: Placement, lamps: tuple[Light, ...]) -> Placement:
+    """A pose moved across the line of sight so that its silhouette lies where the mask does."""
+    window = window_of(subject, place, target.camera)
+    if window is None or target.mask.sum() < 4:
+        return place
+    shape, _ = silhouette(subject, place, lamps, target.camera, window)
+    y, x = np.mgrid[: target.mask.shape[0], : target.mask.shape[1]]
+    # A silhouette that something hides in part is not centred.
+    if shape.sum() < 4 or not target.seen[window].all():
+        return place
+    given = np.array([(target.mask * v).sum() for v in (x, y)]) / target.mask.sum()
+    here = np.array([(shape * v[window]).sum() for v in (x, y)]) / shape.sum()
+    depth = float((subject.middle(place) - target.camera.position) @ target.camera.axes[2])
+    right, up, _ = target.camera.axes
+    shift = (given - here) * depth / target.camera.focal
+    return dataclasses.replace(place, position=place.position + shift[0] * right - shift[1] * up)
+
+
 def turned_aside(subject: Subject, place: Placement) -> list[Placement]:
     """A pose turned both ways about each of the object's axes by a small angle."""
     turns = [_ASIDE * sign * axis for axis in np.eye(3) for sign in (1, -1)]
@@ -215,8 +234,9 @@ def pattern(subject: Subject, target: Target, place: Placement, lamps: tuple[Lig
     """Compare the fine pattern of an object at a pose, such as writing, with a picture, for any light.
 
     How bright a side is depends on light, and of a side that no photograph showed in such a light a learned
-    look is a guess. Where a letter is depends on nothing but the pose. Edges between sides look alike at all
-    poses that have one silhouette: what normals alone explain does not count.
+    look is a guess. Where a letter is depends on nothing but the pose. What is carved is bright towards the
+    light and dark away from it: slopes of the pattern count with it, by factors that are not known. Edges
+    between sides look alike at all poses that have one silhouette: what normals alone explain does not count.
     """
     window = window_of(subject, place, target.camera)
     if window is None:
@@ -232,20 +252,24 @@ def pattern(subject: Subject, target: Target, place: Placement, lamps: tuple[Lig
     basis, _ = np.linalg.qr(_fine(_by_normals(normals), inside)[inner])
     drawn, seen = (_fine(_brightness(x), inside) for x in (look, target.image[window]))
     seen = _unexplained(seen[inner][:, 0], basis)
+    carved = np.concatenate([drawn, *np.gradient(drawn, axis=(0, 1))], axis=2)
     steps = range(-_SHIFT, _SHIFT + 1)
-    shifted = (np.roll(drawn, step, axis=(0, 1))[inner][:, 0] for step in itertools.product(steps, steps))
+    shifted = (np.roll(carved, step, axis=(0, 1))[inner] for step in itertools.product(steps, steps))
     correlation = max(_correlation(_unexplained(one, basis), seen) for one in shifted)
-    believed = min(max(correlation, 0.0), 0.999)
+    believed = min(correlation, 0.999)
     # Of two series of normal numbers, for the best gain.
     return Pattern(correlation, -0.5 * float(np.log1p(-(believed**2))) * int(inner.sum()) / _APART)
 
 
-def _unexplained(values: Float[np.ndarray, " n"], basis: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
+def _unexplained(values: Float[np.ndarray, "n *m"], basis: Float[np.ndarray, "n k"]) -> np.ndarray:
     return values - basis @ (basis.T @ values)
 
 
-def _correlation(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"]) -> float:
-    return float(first @ second / max(float(np.linalg.norm(first) * np.linalg.norm(second)), 1e-12))
+def _correlation(carved: Float[np.ndarray, "n 3"], seen: Float[np.ndarray, " n"]) -> float:
+    """Of what is seen with a pattern and its slopes (multiple correlation); 0 if it shows their negative."""
+    share, *_ = np.linalg.lstsq(carved, seen, rcond=None)
+    length = max(float(np.linalg.norm(seen)), 1e-12)
+    return float(np.linalg.norm(carved @ share)) / length if share[0] > 0 else 0.0
 
 
 def _smooth(

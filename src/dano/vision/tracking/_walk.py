@@ -9,14 +9,15 @@ from jaxtyping import Float
 
 from dano.vision.capture import PosedCamera
 from dano.vision.radiance import LearnedField
-from dano.vision.tracking._film import Film
+from dano.vision.tracking._film import Film, Target
 from dano.vision.tracking._light import LightFit
 from dano.vision.tracking._masking import BLIND, Masking
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Drift, Placement
-from dano.vision.tracking._refine import aligned, refine, Refined, Target, window_of
+from dano.vision.tracking._refine import refine, Refined, window_of
 from dano.vision.tracking._result import HIDDEN, LOST, OUTSIDE, TRACKED, Tracked, tracked
 from dano.vision.tracking._search import (
+    aligned,
     colours_of,
     half_turns,
     learn_light,
