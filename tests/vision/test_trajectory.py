@@ -200,6 +200,27 @@ def test_what_all_frames_are_off_alike_is_told_by_a_table(box, alike):
         assert np.degrees(away[:, 3]).max() > 0.8
 
 
+def test_a_face_that_is_far_more_tilted_than_a_true_one_says_no_height(box):
+    """Nobody photographs the bottom: a bump of 3 mm on it, and the hull's face there is tilted by 3.4°."""
+    times = np.arange(FRAMES) / 30
+    position = np.stack([0.3 * times - 0.2 * times**2, 0.1 * times, np.full(FRAMES, 0.2)], axis=1)
+    orientation = Rotation.from_rotvec(np.outer(np.full(FRAMES, 0.4), [0, 0, 1.0]))
+    sight = np.array([0.3, 0.75, -0.6])
+    spread = np.tile(np.diag(SURE), (FRAMES, 1, 1))
+    spread[:, :3, :3] += 0.05 * SIDES.max() * np.outer(sight, sight)
+    given = seen(position, orientation, spread, 3)
+    bottom = next(face for face in box.faces if face.down[2] < -0.9)
+    bumpy = bottom._replace(
+        down=np.array([0.0, 0.06, -1.0]) / np.hypot(0.06, 1), point=bottom.point - [0, 0, 3e-3]
+    )
+    learned = box._replace(faces=tuple(bumpy if face is bottom else face for face in box.faces))
+    found = smoothed(times, given, Scenery(learned, NOWHERE, 0.2))
+    assert found.supported.all()
+    away = off(found.poses, position, orientation)[:, :3]
+    # Twice as near as the bump would have it.
+    assert np.abs(away[:, 2]).max() < 1.5e-3
+
+
 @pytest.mark.parametrize("frames", [1, 2, 3, FRAMES])
 def test_frames_that_share_a_pose_say_together_what_one_picture_says(box, frames):
     """n poses at rest have the covariance S of one frame each; as if independent they must sum to S⁻¹."""

@@ -162,9 +162,9 @@ def test_costs_along_a_move_make_the_curvature_there_and_leave_the_rest():
         cost = 7.0
         return cost, cost - slope + 0.5 * curvature, cost + slope + 0.5 * curvature
 
-    steep = move @ hessian @ move
+    steep = float(move @ hessian @ move)
     # Costs of Gauss and Newton's own parabola change nothing.
-    same = _along(move, gradient, hessian, *parabola(steep, gradient @ move))
+    same = _along(move, gradient, hessian, *parabola(steep, float(gradient @ move)))
     np.testing.assert_allclose(same[0], gradient, atol=1e-10)
     np.testing.assert_allclose(same[1], hessian, atol=1e-10)
     slope, flatter = _along(move, gradient, hessian, *parabola(0.3 * steep, -0.2))

@@ -325,9 +325,17 @@ class _Problem:
         return np.concatenate([lying, falling, self._alike])
 
     def _prior(self, shared: np.ndarray, width: int):
-        """How far a learned object may differ from the true one."""
+        """How far a learned object may differ from the true one; a face as by Student's distribution.
+
+        Nobody photographs what an object stands on. If frames say that a face is far more tilted than a true
+        one may be, then its height is not believed either.
+        """
         known = 1 / self._doubts
-        self._cost += 0.5 * float(np.sum((known * shared) ** 2))
+        faces = known[: 3 * len(self._runs)].reshape(-1, 3)
+        square = np.sum((faces * shared[: faces.size].reshape(-1, 3)) ** 2, axis=1)
+        self._cost += 0.5 * (_FREEDOM + 3) * float(np.sum(np.log1p(square / _FREEDOM)))
+        self._cost += 0.5 * float(np.sum((known * shared)[faces.size :] ** 2))
+        faces *= np.sqrt((_FREEDOM + 3) / (_FREEDOM + square))[:, None]
         rows = np.arange(len(shared))
         matrix = sparse.csr_matrix((known, (rows, width - len(shared) + rows)), shape=(len(shared), width))
         return matrix, known * shared
