@@ -42,7 +42,7 @@ _SHORTEST = 3
 """Frames in a row in which it must."""
 
 _FREEDOM = 4.0
-"""Degrees of freedom of Student's distribution of what single frames are off by."""
+"""Degrees of freedom of Student's distribution of what single frames, and learned faces, are off by."""
 
 _TOLERANT = 64.0
 """Standard deviations from which third differences lose weight, in the first step; half in each one after."""
@@ -333,9 +333,9 @@ class _Problem:
         known = 1 / self._doubts
         faces = known[: 3 * len(self._runs)].reshape(-1, 3)
         square = np.sum((faces * shared[: faces.size].reshape(-1, 3)) ** 2, axis=1)
-        self._cost += 0.5 * (_FREEDOM + 3) * float(np.sum(np.log1p(square / _FREEDOM)))
-        self._cost += 0.5 * float(np.sum((known * shared)[faces.size :] ** 2))
-        faces *= np.sqrt((_FREEDOM + 3) / (_FREEDOM + square))[:, None]
+        weight, cost = _by_student(square, 3)
+        self._cost += cost + 0.5 * float(np.sum((known * shared)[faces.size :] ** 2))
+        known[: faces.size] *= np.repeat(np.sqrt(weight), 3)
         rows = np.arange(len(shared))
         matrix = sparse.csr_matrix((known, (rows, width - len(shared) + rows)), shape=(len(shared), width))
         return matrix, known * shared
@@ -349,8 +349,8 @@ class _Problem:
 
         residual = away(poses)
         square = np.sum(residual**2, axis=1)
-        self._weight = (_FREEDOM + 6) / (_FREEDOM + square)
-        self._cost += 0.5 * (_FREEDOM + 6) * float(np.sum(np.log1p(square / _FREEDOM)))
+        self._weight, cost = _by_student(square, 6)
+        self._cost += cost
         root = np.sqrt(self._weight)[:, None]
         part = self._linear(away, poses, np.arange(len(square))[:, None], root)
         slopes = [away(poses, alike + _EPSILON * e) - residual for e in np.eye(7)]
@@ -452,6 +452,12 @@ class _Problem:
         slopes = [(function(poses, shared + _EPSILON * e) - plain) / _EPSILON for e in np.eye(3)]
         common = np.stack([(root * slope).ravel() for slope in slopes], axis=1)
         return _with_shared(_spread(*part, width), common, column)
+
+
+def _by_student(square: Float[np.ndarray, " n"], count: int) -> tuple[Float[np.ndarray, " n"], float]:
+    """Weights and cost of so many residuals each, of known sums of squares, by Student's distribution."""
+    weight = (_FREEDOM + count) / (_FREEDOM + square)
+    return weight, 0.5 * (_FREEDOM + count) * float(np.sum(np.log1p(square / _FREEDOM)))
 
 
 def _with_shared(part, slopes: Float[np.ndarray, "m k"], column: int):
