@@ -1,30 +1,36 @@
 """Masks of what stands on a level table, for photographs from around it.
 
-All photographs show the same table: what a point of it looks like is the median of those in which nothing
-hides it. What differs from that is the object, something else that stands there, or an error of the median.
-An object is where nearly all photographs agree (space carving, Kutulakos and Seitz 2000). Near its outline in
-each photograph, colours decide which pixels belong to it (GrabCut, Rother, Kolmogorov and Blake 2004).
+What differs from the table is the object, something else that stands there, or an error of the table's
+picture. An object is where nearly all photographs agree (space carving, Kutulakos and Seitz 2000). Near its
+outline in each photograph, the table's picture, colours and edges decide which pixels belong to it. Both are
+repeated: what hides the table is known better each time, and so is the table.
 """
 
-import warnings
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from dano.extras import OPENCV
 from dano.vision.capture._capture import View
-from dano.vision.capture._hull import viewed_ball
+from dano.vision.capture._cut import cut_in_two
+from dano.vision.capture._hull import LOST, viewed_ball
 from dano.vision.capture._node_grid import NodeGrid
-from dano.vision.capture._ray_set import rays_of
+from dano.vision.capture._tabletop import (
+    Behind,
+    evidence_of,
+    GAUSSIAN,
+    histogram,
+    noise_of,
+    pixels,
+    Tabletop,
+)
 
-_WIDEST = 640
-"""Of the pictures in which the object is looked for [pixels]."""
+_WIDEST, _FINEST = 640, 800
+"""Of the pictures in which the object is looked for, and of the part of one around it [pixels]."""
 
-_CELLS, _NODES = 320, 72
-"""Of the picture of the table, and of the box in which the object is looked for, along an axis."""
+_NODES = 72
+"""Of the box in which the object is looked for, along an axis."""
 
 _HIGH = 0.6
 """Height of this box over half its width."""
@@ -53,37 +59,53 @@ _BEGUN = 0.6
 """Share of the most agreement that is enough at first. The foot of an object of one colour is taken for the
 table then, which most photographs show so, and only its top stands out, of which each shows another part."""
 
-_RIM = 2
-"""Nodes around the object within which its outline is looked for."""
-
 _MARGIN = 4
 """Nodes around what was found in which there may be more of it."""
 
-_CARVINGS = 2
-"""Times that the object is carved from outlines, which are found again around it."""
+_AROUND = 1.6
+"""Half the side of the table's picture around an object, over the longest side of the object."""
+
+_WINDOW = 0.8
+"""The same of the part of a photograph."""
+
+_CARVINGS = ((False, 0.15), (False, 0.1), (True, LOST))
+"""Times that the object is carved from outlines, which are found again around it: whether the pictures are
+fine, and the share of them that may be wrong about a point."""
+
+_RIM, _NEAR = 3, 0.1
+"""Pixels around a solid that may still show it, and the share of the picture around it that is like
+what it stands on."""
+
+_NOISE = 0.02
+"""Of a pixel [sRGB], least: in so much a table of one colour differs from its median."""
+
+_CLEARLY = 3.0
+"""Standard deviations from which a pixel shows no table."""
+
+_DEEP = 0.3
+"""Share of the way into a mask from which it certainly shows the object."""
+
+_BORDER, _EDGE = 4.0, 0.2
+"""Cost of a border where a picture has no edges, as evidence of a pixel, and the share of it at an edge."""
+
+_INSIDE = 1.0
+"""Evidence that a pixel well inside the solid shows the object, and one beside it not."""
+
+_SHY = 0.2
+"""Evidence that a pixel at the solid's rim shows table where the table is not known: rims
+were too wide so far."""
+
+_FLAT = 4
+"""Nodes over the table below which nothing ends: shadows and cards taken for the object are flat."""
+
+_CERTAIN = 0.5
+"""Evidence with which a pixel beside a mask shows the table."""
+
+_NEVER = 50.0
+"""Evidence against a pixel far from the solid."""
 
 _SOFT = 0.6
 """Standard deviation of the blur of an edge [pixels]."""
-
-
-class _Tabletop(NamedTuple):
-    """What a table looks like from above.
-
-    Attributes:
-        corner: Of the first cell's middle [m, W].
-        spacing: Of the cells [m].
-        least: Of each of `_features` around each cell, (n, n, 5).
-        most: The largest.
-        varies: By how much photographs differ there usually; infinite where too few show it, (n, n).
-        gain: Brightness of each photograph over that of all, shape (views, 3).
-    """
-
-    corner: Float[np.ndarray, "2"]
-    spacing: float
-    least: Float[np.ndarray, "n n 5"]
-    most: Float[np.ndarray, "n n 5"]
-    varies: Float[np.ndarray, "n n"]
-    gain: Float[np.ndarray, "views 3"]
 
 
 def standing_masks(views: Sequence[View], table: float) -> list[Float[np.ndarray, "height width"]]:
@@ -95,129 +117,63 @@ def standing_masks(views: Sequence[View], table: float) -> list[Float[np.ndarray
 
     Raises:
         ValueError: If there are too few, or nothing stands there that most of them agree on.
-        ImportError: If OpenCV is missing.
     """
     if len(views) < _FEWEST:
         raise ValueError(
             f"masks of what stands on a table need at least {_FEWEST} photographs from around it, got"
             f" {len(views)}: take more, or give masks"
         )
-    opencv = OPENCV.load()
-    small = [view.resized(max(1, -(-max(view.image.shape[:2]) // _WIDEST))) for view in views]
+    box, solid = _begun(views, table)
+    windows = [_window(view, box, solid) for view in views]
+    near = [_part(view, window) for view, window in zip(views, windows, strict=True)]
+    coarse, fine = (_shrunk(near, n) for n in (_times(views, _WIDEST), _times(near, _FINEST)))
+    masks: list[np.ndarray] | None = None
+    for as_fine, lost in _CARVINGS:
+        parts = fine if as_fine else coarse
+        evidence, masks = _outlines(parts, table, box, solid, masks)
+        box = _closer(box, solid)
+        solid = _carved(parts, masks, evidence, box, lost)
+    _, masks = _outlines(fine, table, box, solid, masks)
+    return [_placed(view, *of) for view, *of in zip(views, windows, masks, strict=True)]
+
+
+def _times(views: Sequence[View], most: int) -> int:
+    """How many pixels become one in the largest of some pictures."""
+    return max(1, -(-max(max(view.image.shape[:2]) for view in views) // most))
+
+
+def _begun(views: Sequence[View], table: float) -> tuple[NodeGrid, Bool[np.ndarray, "nx ny nz"]]:
+    """A box, and roughly what in it stands out from the table."""
+    times = _times(views, _WIDEST)
+    small = [view.resized(times) for view in views]
     centre, radius = viewed_ball(views)
     half = 0.5 * radius
     lower = np.array([centre[0] - half, centre[1] - half, table])
     upper = np.array([centre[0] + half, centre[1] + half, table + _HIGH * radius])
     box = NodeGrid.around(lower, upper, _NODES)
-    top = _tabletop(small, table, lower[:2], 2 * half)
-    unlike = [_unlike(view, top, gain, table) for view, gain in zip(small, top.gain, strict=True)]
-    begun = _agreed(small, unlike, box, centre, _BEGUN)
-    around = ndimage.binary_dilation(_down_to_table(begun), iterations=2 * _MARGIN)
-    rough = [_begun(opencv, view, shown, box, around) for view, shown in zip(small, unlike, strict=True)]
-    for _ in range(_CARVINGS):
-        solid = _agreed(small, rough, box, centre, 1.0)
-        box = _closer(box, solid)
-        solid = _agreed(small, rough, box, centre, 1.0)
-        rough = [_outlined(opencv, view, box, solid) for view in small]
-    solid = _agreed(small, rough, box, centre, 1.0)
-    return [_outlined(opencv, view, box, solid) for view in views]
+    top = Tabletop.of(small, None, table, lower[:2], 2 * half)
+    unlike = [_unlike(Behind.of(view, top, gain)) for view, gain in zip(small, top.gain, strict=True)]
+    return box, _agreed(small, unlike, box, centre)
 
 
-def _down_to_table(solid: np.ndarray) -> Bool[np.ndarray, "nx ny nz"]:
-    """A solid with all that is below: at its foot, the table's median is first that of the object itself."""
-    return np.flip(np.maximum.accumulate(np.flip(solid, axis=2), axis=2), axis=2)
-
-
-def _closer(box: NodeGrid, solid: np.ndarray) -> NodeGrid:
-    """A finer box around what was found."""
-    index = np.argwhere(solid)
-    first = np.append(index.min(axis=0)[:2] - _MARGIN, 0)
-    lower, upper = box.origin + box.spacing * first, box.origin + box.spacing * (index.max(axis=0) + _MARGIN)
-    return NodeGrid.around(lower, upper, _NODES)
-
-
-def _tabletop(views: Sequence[View], table: float, corner: np.ndarray, side: float) -> _Tabletop:
-    """The median of photographs, brought to one brightness."""
-    spacing = side / (_CELLS - 1)
-    y, x = np.mgrid[:_CELLS, :_CELLS] * spacing
-    points = np.stack([corner[0] + x.ravel(), corner[1] + y.ravel(), np.full(x.size, table)], axis=1)
-    seen = np.stack([_colours(view, points) for view in views])
-    with np.errstate(invalid="ignore"), warnings.catch_warnings():
-        # Where no photograph shows the table there is no median.
-        warnings.simplefilter("ignore", RuntimeWarning)
-        gain = np.ones((len(views), 3))
-        for _ in range(2):
-            level = np.nanmedian(seen / gain[:, None], axis=0)
-            gain = np.nanmedian(np.where(level > 0.02, seen / np.maximum(level, 0.02), np.nan), axis=1)
-            gain = np.where(np.isfinite(gain), gain, 1.0)
-        level = np.nanmedian(seen / gain[:, None], axis=0)
-        varies = np.nanmedian(np.abs(seen / gain[:, None] - level).max(axis=2), axis=0)
-    few = np.isfinite(seen[..., 0]).sum(axis=0) < 3
-    level = _features(np.where(few[:, None], 0.5, level).reshape(_CELLS, _CELLS, 3))
-    varies = np.where(few, np.inf, varies).reshape(_CELLS, _CELLS)
-    around = (3, 3, 1)
-    return _Tabletop(
-        corner,
-        spacing,
-        ndimage.minimum_filter(level, around),
-        ndimage.maximum_filter(level, around),
-        varies,
-        gain,
-    )
-
-
-def _colours(view: View, points: np.ndarray) -> Float[np.ndarray, "n 3"]:
-    """Of points in a photograph; NaN where it does not show them."""
-    column, row, seen = _pixels(view, points)
-    colours = np.full((len(points), 3), np.nan, np.float32)
-    place = np.stack([row[seen], column[seen]])
-    for c in range(3):
-        colours[seen, c] = ndimage.map_coordinates(view.image[..., c], place, order=1, mode="nearest")
-    return colours
-
-
-def _pixels(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Column and row of points, counted from the middle of the first pixel, and which are in the picture."""
-    height, width = view.image.shape[:2]
-    place = view.camera.project(points)
-    column, row = place[:, 0] - 0.5, place[:, 1] - 0.5
-    inside = (column > -0.5) & (row > -0.5) & (column < width - 0.5) & (row < height - 0.5)
-    seen = (place[:, 2] > 0) & inside & np.isfinite(column) & np.isfinite(row)
-    return np.clip(column, 0, width - 1), np.clip(row, 0, height - 1), seen
-
-
-def _unlike(view: View, top: _Tabletop, gain: np.ndarray, table: float) -> Float[np.ndarray, "height width"]:
+def _unlike(behind: Behind) -> Float[np.ndarray, "height width"]:
     """1 where a photograph shows something else than the table, 0 where not, NaN beyond what is known."""
-    shape = view.image.shape[:2]
-    rays, eye = view.camera.rays().reshape(-1, 3), view.camera.position
-    away = (table - eye[2]) / np.where(rays[:, 2] < -1e-6, rays[:, 2], np.nan)
-    place = ((eye + away[:, None] * rays)[:, :2] - top.corner) / top.spacing
-    known = (away > 0) & (place >= 0).all(axis=1) & (place <= _CELLS - 1).all(axis=1)
-    column, row = np.rint(np.where(known[:, None], place, 0)).astype(int).T
-    seen = _features(view.image / np.maximum(gain, 1e-3)).reshape(len(rays), -1)
-    off = np.maximum(top.least[row, column] - seen, seen - top.most[row, column]).max(axis=1)
-    varies = top.varies[row, column]
-    unlike = ndimage.gaussian_filter(off.reshape(shape), 0.7) > _UNLIKE + varies.reshape(shape)
-    patches = ndimage.gaussian_filter(unlike.astype(np.float32), _PATCH).ravel() > _PART
-    return np.where(known & np.isfinite(varies), patches.astype(float), np.nan).reshape(shape)
-
-
-def _features(colours: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 5"]:
-    """Colours, and what they differ by among each other: a grey table may be bright and dark, but not red."""
-    return np.concatenate([colours, colours[..., :2] - colours[..., 1:]], axis=-1)
+    off, varies = behind.off.max(axis=-1), behind.varies.max(axis=-1)
+    unlike = ndimage.gaussian_filter(off, 0.7) > _UNLIKE + varies
+    patches = ndimage.gaussian_filter(unlike.astype(np.float32), _PATCH) > _PART
+    return np.where(behind.known, patches.astype(float), np.nan)
 
 
 def _agreed(
-    views: Sequence[View], unlike: Sequence[np.ndarray], box: NodeGrid, centre: np.ndarray, enough: float
+    views: Sequence[View], unlike: Sequence[np.ndarray], box: NodeGrid, centre: np.ndarray
 ) -> Bool[np.ndarray, "nx ny nz"]:
-    """Where most photographs show something else than the table: the part nearest to what they look at.
+    """Where many photographs show something else than the table: the part nearest to what they look at.
 
     Args:
         views: The photographs.
         unlike: Of each one, what shows something else.
         box: Nodes that are asked.
         centre: What the photographs look at [m, W].
-        enough: Share of `_AGREE`, or of the most that agree anywhere, that is enough.
 
     Raises:
         ValueError: If there is none.
@@ -225,12 +181,12 @@ def _agreed(
     nodes = box.nodes
     votes, count = np.zeros(len(nodes)), np.zeros(len(nodes))
     for view, shown in zip(views, unlike, strict=True):
-        column, row, seen = _pixels(view, nodes)
+        column, row, seen = pixels(view, nodes)
         value = np.where(seen, shown[np.rint(row).astype(int), np.rint(column).astype(int)], np.nan)
         votes += np.nan_to_num(value)
         count += np.isfinite(value)
     share = np.where(count >= _LEAST_VIEWS * len(views), votes / np.maximum(count, 1), 0)
-    agreed = share >= max(enough * min(_AGREE, float(share.max())), _LEAST_SHARE)
+    agreed = share >= max(_BEGUN * min(_AGREE, float(share.max())), _LEAST_SHARE)
     # A node thick, the table's own errors may agree.
     inner = ndimage.binary_erosion(agreed.reshape(box.shape), border_value=1)
     parts, n = ndimage.label(ndimage.binary_dilation(inner))
@@ -247,78 +203,202 @@ def _agreed(
     return ndimage.binary_fill_holes(parts == best)
 
 
-def _shown(view: View, box: NodeGrid, solid: np.ndarray) -> Bool[np.ndarray, "height width"]:
-    """The pixels that look through a solid."""
-    shown = np.zeros(view.image.shape[:2], bool)
+def _down_to_table(solid: np.ndarray) -> Bool[np.ndarray, "nx ny nz"]:
+    """A solid with all that is below: at its foot, the table's median is first that of the object itself."""
+    return np.flip(np.maximum.accumulate(np.flip(solid, axis=2), axis=2), axis=2)
+
+
+def _closer(box: NodeGrid, solid: np.ndarray) -> NodeGrid:
+    """A finer box around what was found."""
     index = np.argwhere(solid)
-    ends = np.stack([index.min(axis=0) - 1, index.max(axis=0) + 1])
-    corners = np.stack(np.meshgrid(*ends.T), axis=-1).reshape(-1, 3)
-    place = view.camera.project(box.origin + box.spacing * corners)
+    first = np.append(index.min(axis=0)[:2] - _MARGIN, 0)
+    lower, upper = box.origin + box.spacing * first, box.origin + box.spacing * (index.max(axis=0) + _MARGIN)
+    return NodeGrid.around(lower, upper, _NODES)
+
+
+def _extent(box: NodeGrid, solid: np.ndarray) -> tuple[np.ndarray, float]:
+    """Middle and longest side of a solid [m]."""
+    index = np.argwhere(solid)
+    low, high = index.min(axis=0), index.max(axis=0)
+    return box.origin + box.spacing * 0.5 * (low + high), box.spacing * float(np.max(high - low) + 1)
+
+
+def _window(view: View, box: NodeGrid, solid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First and last column and row of the part of a photograph around a solid."""
+    middle, side = _extent(box, solid)
+    corners = np.stack(np.meshgrid(*3 * [(-_WINDOW * side, _WINDOW * side)]), axis=-1).reshape(-1, 3)
+    place = view.camera.project(middle + corners)
+    size = np.array(view.image.shape[1::-1])
     if (place[:, 2] <= 0).any():
-        return shown
-    low = np.maximum(np.floor(place[:, :2].min(axis=0)).astype(int), 0)
-    high = np.minimum(np.ceil(place[:, :2].max(axis=0)).astype(int), shown.shape[::-1])
-    width, height = high - low
-    if width > 0 and height > 0:
-        part = view.camera.replaced(centre=view.camera.centre - low, width=int(width), height=int(height))
-        window = np.zeros((height, width), bool)
-        window.ravel()[rays_of(part, None, box, solid)[0]] = True
-        shown[low[1] : high[1], low[0] : high[0]] = window
-    return shown
+        return np.zeros(2, int), size
+    low, high = np.floor(place[:, :2].min(axis=0)), np.ceil(place[:, :2].max(axis=0))
+    low = np.clip(low.astype(int), 0, size - 1)
+    return low, np.clip(high.astype(int), low + 1, size)
 
 
-def _begun(
-    opencv, view: View, unlike: np.ndarray, box: NodeGrid, around: np.ndarray
-) -> Float[np.ndarray, "height width"]:
-    """What has the colours of what stands out from the table, in the part of a photograph where it may be."""
-    near = _shown(view, box, around)
-    seeds = ndimage.binary_opening(near & (unlike == 1))
-    if not seeds.any():
-        # It says nothing.
-        return np.full(near.shape, np.nan)
-    labels = np.where(near, opencv.GC_PR_BGD, opencv.GC_BGD).astype(np.uint8)
-    labels[seeds] = opencv.GC_FGD
-    return _cut(opencv, view, labels).astype(float)
+def _part(view: View, window: tuple[np.ndarray, np.ndarray]) -> View:
+    """That part as a photograph of its own."""
+    low, high = window
+    width, height = (int(n) for n in high - low)
+    camera = view.camera.replaced(centre=view.camera.centre - low, width=width, height=height)
+    return view.replaced(image=view.image[low[1] : high[1], low[0] : high[0]], camera=camera, mask=None)
 
 
-def _outlined(opencv, view: View, box: NodeGrid, solid: np.ndarray) -> Float[np.ndarray, "height width"]:
-    """The object in a photograph: its outline is where colours change near that of the solid."""
-    likely, above = _shown(view, box, solid), _shown(view, box, _down_to_table(solid))
-    if not likely.any():
-        return likely.astype(np.float32)
-    middle = box.origin + box.spacing * np.argwhere(solid).mean(axis=0)
-    distance = float(np.linalg.norm(middle - view.camera.position))
-    rim = max(2, round(_RIM * box.spacing * float(np.mean(view.camera.focal)) / distance))
-    inside, outside = (
-        ndimage.distance_transform_edt(likely),
-        ndimage.distance_transform_edt(~(likely | above)),
-    )
-    labels = np.where(outside <= rim, opencv.GC_PR_BGD, opencv.GC_BGD).astype(np.uint8)
-    labels[likely] = opencv.GC_PR_FGD
-    # What was found by patches of pixels is too large by half a patch.
-    patch = _PATCH * max(1, max(likely.shape) / _WIDEST)
-    labels[np.asarray(inside) > min(rim + 2 * patch, 0.5 * np.max(inside))] = opencv.GC_FGD
-    filled = ndimage.binary_fill_holes(_cut(opencv, view, labels))
-    return ndimage.gaussian_filter(np.asarray(filled, np.float32), _SOFT)
+def _shrunk(views: Sequence[View], times: int) -> list[View]:
+    return [view.resized(min(times, *view.image.shape[:2])) for view in views]
 
 
-def _cut(opencv, view: View, labels: np.ndarray) -> Bool[np.ndarray, "height width"]:
-    """GrabCut from labels, in a window around what may be the object."""
-    rows, columns = (np.flatnonzero((labels != opencv.GC_BGD).any(axis=axis)) for axis in (1, 0))
-    pad = max(8, len(rows) // 4)
-    window = (
-        slice(max(rows[0] - pad, 0), rows[-1] + pad + 1),
-        slice(max(columns[0] - pad, 0), columns[-1] + pad + 1),
-    )
-    picture = np.ascontiguousarray(np.rint(255 * view.image[window][..., ::-1]).astype(np.uint8))
-    part = np.ascontiguousarray(labels[window])
-    likely = (part == opencv.GC_FGD) | (part == opencv.GC_PR_FGD)
-    mask = np.zeros(labels.shape, bool)
-    if likely.all() or not likely.any():
-        # Of one of the two no colours are known.
-        mask[window] = likely
+def _fitted(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """A mask in another resolution."""
+    if mask.shape == shape:
         return mask
-    opencv.setRNGSeed(0)
-    opencv.grabCut(picture, part, None, np.zeros((1, 65)), np.zeros((1, 65)), 4, opencv.GC_INIT_WITH_MASK)
-    mask[window] = (part == opencv.GC_FGD) | (part == opencv.GC_PR_FGD)
-    return mask
+    times = [n / m for n, m in zip(shape, mask.shape, strict=True)]
+    return ndimage.zoom(mask, times, order=1, mode="nearest", grid_mode=True)
+
+
+def _placed(view: View, window: tuple[np.ndarray, np.ndarray], mask: np.ndarray) -> np.ndarray:
+    """The mask of a whole photograph, from that of its window."""
+    whole, (low, high) = np.zeros(view.image.shape[:2], np.float32), window
+    width, height = (int(n) for n in high - low)
+    whole[low[1] : high[1], low[0] : high[0]] = _fitted(mask.astype(np.float32), (height, width)) > 0.5
+    return ndimage.gaussian_filter(whole, _SOFT)
+
+
+def _shown(view: View, box: NodeGrid, solid: np.ndarray) -> Bool[np.ndarray, "height width"]:
+    """The pixels that look through a solid: its outermost nodes as discs, and what they surround."""
+    shown = np.zeros(view.image.shape[:2], bool)
+    rim = np.argwhere(solid & ~ndimage.binary_erosion(solid))
+    place = view.camera.project(box.origin + box.spacing * rim)
+    place = place[place[:, 2] > 0]
+    if not len(place):
+        return shown
+    node = box.spacing * float(np.mean(view.camera.focal)) / float(np.median(place[:, 2]))
+    column, row = np.floor(place[:, :2]).astype(int).T
+    inside = (column >= 0) & (row >= 0) & (column < shown.shape[1]) & (row < shown.shape[0])
+    shown[row[inside], column[inside]] = True
+    if not shown.any():
+        return shown
+    # Nodes lie up to √2 apart across the line of sight, and a node is half of one wide on each side.
+    closed = ndimage.binary_fill_holes(np.asarray(ndimage.distance_transform_edt(~shown)) <= max(node, 1.0))
+    return np.asarray(ndimage.distance_transform_edt(closed)) > 0.5 * node
+
+
+def _outlines(
+    views: Sequence[View], table: float, box: NodeGrid, solid: np.ndarray, masks: Sequence[np.ndarray] | None
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """How much speaks for the object in each pixel of some photographs, and its masks.
+
+    Args:
+        views: Photographs of what is around a solid.
+        table: Height of the table [m, W].
+        box: Nodes of the solid.
+        solid: What was found so far.
+        masks: The masks from which it was.
+    """
+    middle, side = _extent(box, solid)
+    hidden = None
+    if masks is not None:
+        under = ndimage.binary_dilation(_down_to_table(solid))
+        hidden = [_shown(view, box, under) for view in views]
+    top = Tabletop.of(views, hidden, table, middle[:2] - _AROUND * side, 2 * _AROUND * side)
+    behind = [Behind.of(view, top, gain) for view, gain in zip(views, top.gain, strict=True)]
+    shown = [_shown(view, box, solid) for view in views]
+    away = [_away(here) for here in shown]
+    noise = max(_NOISE, 1.2 * noise_of(behind, [far > _RIM for far in away]))
+    clear = [here & _clearly(of, noise) for here, of in zip(shown, behind, strict=True)]
+    if masks is not None:
+        deep = [_deep(here & (_fitted(m, here.shape) > 0.5)) for here, m in zip(shown, masks, strict=True)]
+        clear = [a | b for a, b in zip(clear, deep, strict=True)]
+    near = [
+        (far > _RIM) & (far <= _NEAR * max(far.shape)) & of.known
+        for far, of in zip(away, behind, strict=True)
+    ]
+    thing, around = (
+        histogram(np.concatenate([of.picture[where] for of, where in zip(behind, places, strict=True)]))
+        for places in (clear, near)
+    )
+    evidence = [evidence_of(of, thing, around, noise) for of in behind]
+    outlined = [_outlined(*of, box, solid) for of in zip(views, evidence, behind, strict=True)]
+    return evidence, outlined
+
+
+def _clearly(behind: Behind, noise: float) -> Bool[np.ndarray, "height width"]:
+    """Where a photograph certainly shows no table."""
+    varies = np.where(behind.known[..., None], behind.varies, np.inf)
+    off = np.max(behind.off[..., :3] / np.maximum(GAUSSIAN * varies, noise), axis=-1)
+    return ndimage.gaussian_filter((off > _CLEARLY).astype(np.float32), 1.0) > 0.4
+
+
+def _deep(mask: np.ndarray) -> Bool[np.ndarray, "height width"]:
+    """The inner part of a mask."""
+    inside = np.asarray(ndimage.distance_transform_edt(mask))
+    return inside > max(_DEEP * float(inside.max()), 1.0)
+
+
+def _away(shown: np.ndarray) -> Float[np.ndarray, "height width"]:
+    """How far pixels are from a solid."""
+    return np.asarray(ndimage.distance_transform_edt(~shown)) if shown.any() else np.full(shown.shape, np.inf)
+
+
+def _outlined(
+    view: View, evidence: np.ndarray, behind: Behind, box: NodeGrid, solid: np.ndarray
+) -> Float[np.ndarray, "height width"]:
+    """The object in a photograph: 1 inside, 0 outside."""
+    under = _down_to_table(solid)
+    core, rim, most = (
+        _shown(view, box, of)
+        for of in (
+            ndimage.binary_erosion(solid),
+            ndimage.binary_dilation(under),
+            ndimage.binary_dilation(under, iterations=3),
+        )
+    )
+    if not most.any():
+        return most.astype(np.float32)
+    expected = (
+        np.where(core, _INSIDE, 0.0) - np.where(rim, 0.0, _INSIDE) - np.where(behind.known | core, 0.0, _SHY)
+    )
+    smooth = ndimage.gaussian_filter(view.image, (0.7, 0.7, 0))
+    slope = np.sqrt(sum(np.sum(np.square(np.gradient(smooth[..., c])), axis=0) for c in range(3)))
+    usual = 2 * float(np.median(slope[rim])) + 1e-3
+    border = _BORDER * (_EDGE + (1 - _EDGE) * np.exp(-0.5 * (slope / usual) ** 2))
+    return (cut_in_two(np.where(most, evidence + expected, -_NEVER), border) > 0.5).astype(np.float32)
+
+
+def _carved(
+    views: Sequence[View],
+    masks: Sequence[np.ndarray],
+    evidence: Sequence[np.ndarray],
+    box: NodeGrid,
+    lost: float,
+) -> Bool[np.ndarray, "nx ny nz"]:
+    """What masks leave of a box: its largest part.
+
+    Raises:
+        ValueError: If they leave nothing.
+    """
+    nodes = box.nodes
+    of, against, count = (np.zeros(len(nodes), int) for _ in range(3))
+    for view, mask, speaks in zip(views, masks, evidence, strict=True):
+        column, row, seen = pixels(view, nodes)
+        column, row = np.rint(column).astype(int), np.rint(row).astype(int)
+        inside = mask[row, column] > 0.5
+        of += seen & inside
+        # What hides the object, and what may have the table's colours, says nothing.
+        against += seen & ~inside & (speaks[row, column] < -_CERTAIN)
+        count += seen
+    left = (
+        (count >= _LEAST_VIEWS * len(views))
+        & (of >= _LEAST_VIEWS * count)
+        & (against <= int(lost * len(views)))
+    )
+    parts, n = ndimage.label(left.reshape(box.shape))
+    if n == 0:
+        raise ValueError(
+            "outlines of what stands on the table must fit together, but no point lies in nearly all of them:"
+            " give masks, or a segmentation network"
+        )
+    sizes = ndimage.sum_labels(np.ones(box.shape), parts, np.arange(1, n + 1))
+    solid = ndimage.binary_fill_holes(parts == 1 + int(np.argmax(sizes)))
+    high = solid[:, :, _FLAT:].any(axis=2, keepdims=True)
+    return solid & high if high.any() else solid
