@@ -6,6 +6,7 @@ from vision.sliding_box import photograph, place
 from vision.tabletop import camera
 
 from dano.vision import Capture, View, with_masks
+from dano.vision.capture._cut import cut_in_two
 
 NOWHERE = np.array([9.0, 9.0, 0.1])
 
@@ -33,6 +34,29 @@ def made(photographed: tuple[Capture, list[np.ndarray]]) -> list[np.ndarray]:
     """Masks that the table's height gives."""
     views = with_masks(photographed[0], table=0.0).views
     return [view.mask for view in views if view.mask is not None]
+
+
+@pytest.mark.parametrize("radius, stays", [(6.0, True), (10.0, True), (3.0, False)])
+def test_a_disc_is_cut_out_if_it_pays_for_its_border(radius: float, stays: bool):
+    """Its border costs 2πr times 2, its inside is worth πr²: both are alike for r = 4."""
+    y, x = np.mgrid[:41, :41] - 20.0
+    inside = np.hypot(x, y) < radius
+    share = cut_in_two(np.where(inside, 1.0, -1.0), np.full(inside.shape, 2.0)) > 0.5
+    assert share.any() == stays
+    if stays:
+        # Corners of the pixels are rounded off.
+        assert np.sum(share != inside) < 0.05 * np.sum(inside)
+
+
+def test_noise_is_cut_where_the_edge_is():
+    """Evidence of single pixels is wrong in every fourth; an edge of the picture costs less."""
+    random = np.random.default_rng(0)
+    true = np.zeros((60, 60), bool)
+    true[15:45, 10:40] = True
+    evidence = np.where(true, 1.0, -1.0) * np.where(random.random(true.shape) < 0.25, -1, 1)
+    border = np.full(true.shape, 4.0)
+    border[true ^ np.roll(true, -1, 0)] = border[true ^ np.roll(true, -1, 1)] = 0.8
+    assert np.sum((cut_in_two(evidence, border) > 0.5) != true) < 0.03 * true.sum()
 
 
 def test_they_fit_the_true_ones(photographed, made):

@@ -43,12 +43,12 @@ def with_masks(capture: Capture, network: str | Path | None = None, table: float
         network: Segmentation network as an ONNX file, such as ISNet or U²-Net: image (1, 3, h, w) in, mask in
             [0, 1] out. None: what differs from the background, whose colour the image's border shows.
         table: Height z of a level table [m, W]. Without a network, where the background is not plain, what
-            stands on the table is found: the photographs are taken from around it. Needs the extra `poses`.
+            stands on the table is found: the photographs are taken from around it.
 
     Raises:
         ValueError: If the background is not plain and there is neither network nor table, the masks come out
             empty, or nothing stands on the table.
-        ImportError: If there is a network but no onnxruntime, or OpenCV is needed and missing.
+        ImportError: If there is a network but no onnxruntime.
     """
     if all(view.mask is not None for view in capture.views):
         return capture

@@ -50,6 +50,9 @@ _DIFFERENT = np.radians(18)
 _COARSE = 26
 """Size of the object [pixels] at which candidates are refined."""
 
+_COARSELY, _FEW = 24, 4
+"""Size of the object [pixels] at the coarsest level in which it is followed, and steps there."""
+
 _AREA = 40.0
 """Pixels that a mask must have for a search."""
 
@@ -309,6 +312,25 @@ def _normals(
     points = _smooth(points.reshape(*shape, 3), solid, 0.7 * _FINE[0])
     across = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
     return across / np.maximum(np.linalg.norm(across, axis=2, keepdims=True), 1e-12), solid
+
+
+def from_coarse(
+    subject: Subject,
+    target: Target,
+    before: Placement,
+    lamps: tuple[Light, ...],
+    loss: str,
+    random: np.random.Generator,
+) -> Refined | None:
+    """The pose near another one: by silhouettes first, which are seen from further away; then by colours."""
+    coarse = target.reduced(max(1, round(subject.pixels(before, target.camera) / _COARSELY)))
+    place, found = aligned(subject, coarse, before, lamps), None
+    for stage in ("silhouette", loss) if loss == "photometric" else (loss,):
+        found = refine(subject, coarse, place, lamps, loss=stage, steps=_FEW, rays=CHUNK, random=random)
+        if found is None:
+            return None
+        place = found.place
+    return found
 
 
 def score(refined: Refined) -> float:

@@ -19,6 +19,7 @@ from dano.vision.tracking._result import HIDDEN, LOST, OUTSIDE, TRACKED, Tracked
 from dano.vision.tracking._search import (
     aligned,
     colours_of,
+    from_coarse,
     half_turns,
     learn_light,
     likeliest,
@@ -30,9 +31,6 @@ from dano.vision.tracking._search import (
 from dano.vision.tracking._segments import overlap
 from dano.vision.tracking._subject import CHUNK, Subject
 from dano.vision.tracking._whole import region_of, turned, Whole
-
-_COARSE = 24
-"""Size of the object [pixels] at the coarsest level of the pyramid."""
 
 _STEPS = 4
 """Steps of a refinement, most."""
@@ -73,6 +71,9 @@ _FAR_WORSE = 2.2
 
 _NEAR = 4
 """Frames between two that say where the object is in others near them."""
+
+_LITTLE = 15.0
+"""How far apart (see `Subject.off`) poses before and after a gap may be to say where it is within."""
 
 _PULL = 0.01
 """What so much costs in a score, which is known to about as much."""
@@ -226,7 +227,10 @@ class Walk:
         for i in sorted(set(range(len(self._found))) - set(good)):
             before, after = [j for j in good if j < i][-2:], [j for j in good if j > i][:2]
             pair = [before[-1], after[0]] if before and after else [*before, *after]
-            if len(pair) < 2 or max(*pair, i) - min(*pair, i) > _NEAR:
+            if len(pair) < 2:
+                continue
+            away = self._subject.off(*(self._place(j) for j in pair))
+            if max(*pair, i) - min(*pair, i) > _NEAR and not (pair[0] < i < pair[1] and away < _LITTLE):
                 continue
             better = self._taken_up(i, self._carried(pair[0], pair[1], i)) or better
         return better
@@ -296,7 +300,9 @@ class Walk:
             # The first frame was taken for one of an object at rest.
             begun = self._fine(near, dataclasses.replace(last, drift=drift), self._light)
             self._found[near] = begun or self._found[near]
-        return self._fine(i, place, self._light) or found
+        fine = self._fine(i, place, self._light)
+        # Where the frame beside it is wrong, so is the drift.
+        return found if fine is None or not self._is_it(fine) else fine
 
     def _place(self, i: int) -> Placement:
         found = self._found[i]
@@ -311,6 +317,9 @@ class Walk:
         if not found:
             return None
         best, ambiguity = found[0]
+        if not self._is_it(best.refined):
+            # A hand before it may have left little of it to see.
+            return None
         if not self._light.known:
             self._ambiguity = ambiguity
             self._note_alike(i, best, [one for one, _ in found if one is not best])
@@ -417,45 +426,30 @@ class Walk:
         return None if found is None else self._fine(i, found.place, light)
 
     def _from_coarse(self, i: int, before: Placement, light: LightFit) -> Refined | None:
-        """By silhouettes first, which are seen from further away; then by colours."""
         size = self._subject.pixels(before, self._camera)
         target = self._masking.near(i, self._subject, before, light.lamps, self._camera, 0.06 * size)
         if target is None:
             return None
-        coarse = target.reduced(max(1, round(size / _COARSE)))
-        place, found = aligned(self._subject, coarse, before, light.lamps), None
-        last = self._loss(light)
-        for loss in ("silhouette", last) if last == "photometric" else (last,):
-            found = refine(
-                self._subject,
-                coarse,
-                place,
-                light.lamps,
-                loss=loss,
-                steps=_STEPS,
-                rays=CHUNK,
-                random=self._random,
-            )
-            if found is None:
-                return None
-            place = found.place
-        return found
+        return from_coarse(self._subject, target, before, light.lamps, self._loss(light), self._random)
 
     def _fine(self, i: int, place: Placement, light: LightFit, steps: int = _STEPS) -> Refined | None:
         target = self._target(i, place, light)
         if target is None:
             return None
-        # All frames together are looked at with all rays.
-        return self._refine(
-            target, place, light, self._loss(light), steps, max(self._options.rays // 2, CHUNK)
+        return refine(
+            self._subject,
+            target,
+            place,
+            light.lamps,
+            loss=self._loss(light),
+            steps=steps,
+            # All frames together are looked at with all rays.
+            rays=max(self._options.rays // 2, CHUNK),
+            random=self._random,
         )
 
     def _target(self, i: int, place: Placement, light: LightFit) -> Target | None:
         return self._masking.near(i, self._subject, place, light.lamps, self._camera, 2.0)
-
-    def _refine(self, target: Target, place: Placement, light: LightFit, loss: str, steps: int, rays: int):
-        subject, random = self._subject, self._random
-        return refine(subject, target, place, light.lamps, loss=loss, steps=steps, rays=rays, random=random)
 
     def _loss(self, light: LightFit) -> str:
         return "silhouette" if self._options.loss == "photometric" and not light.known else self._options.loss
