@@ -44,7 +44,7 @@ def test_a_jump_is_caught_up_with_where_masks_need_no_pose(bunny, camera, tmp_pa
     walk.begin(Placement(position[0], orientation[0]))
     walk.step(0)
     walk.step(1)
-    found = walk.result()
+    found = walk.result(lambda share: None)
     shift, turn = errors(found, position, orientation, slice(None))
     assert found.status == ("tracked", "tracked")
     assert (shift.max() < 0.05, turn.max() < np.radians(4)) == (True, True), (shift, turn)

@@ -95,7 +95,10 @@ _SHY = 0.2
 """Evidence that a pixel at the solid's rim shows table where the table is not known: rims
 were too wide so far."""
 
-_FLAT = 4
+_REACH = 3
+"""Nodes around what was found through which outlines may pass, but at last."""
+
+_FLAT = 6
 """Nodes over the table below which nothing ends: shadows and cards taken for the object are flat."""
 
 _CERTAIN = 0.5
@@ -133,7 +136,7 @@ def standing_masks(views: Sequence[View], table: float) -> list[Float[np.ndarray
         evidence, masks = _outlines(parts, table, box, solid, masks)
         box = _closer(box, solid)
         solid = _carved(parts, masks, evidence, box, lost)
-    _, masks = _outlines(fine, table, box, solid, masks)
+    _, masks = _outlines(fine, table, box, solid, masks, reach=1)
     return [_placed(view, *of) for view, *of in zip(views, windows, masks, strict=True)]
 
 
@@ -284,7 +287,12 @@ def _shown(view: View, box: NodeGrid, solid: np.ndarray) -> Bool[np.ndarray, "he
 
 
 def _outlines(
-    views: Sequence[View], table: float, box: NodeGrid, solid: np.ndarray, masks: Sequence[np.ndarray] | None
+    views: Sequence[View],
+    table: float,
+    box: NodeGrid,
+    solid: np.ndarray,
+    masks: Sequence[np.ndarray] | None,
+    reach: int = _REACH,
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """How much speaks for the object in each pixel of some photographs, and its masks.
 
@@ -294,6 +302,7 @@ def _outlines(
         box: Nodes of the solid.
         solid: What was found so far.
         masks: The masks from which it was.
+        reach: Nodes around the solid that outlines may pass through.
     """
     middle, side = _extent(box, solid)
     hidden = None
@@ -318,7 +327,7 @@ def _outlines(
         for places in (clear, near)
     )
     evidence = [evidence_of(of, thing, around, noise) for of in behind]
-    outlined = [_outlined(*of, box, solid) for of in zip(views, evidence, behind, strict=True)]
+    outlined = [_outlined(*of, box, solid, reach) for of in zip(views, evidence, behind, strict=True)]
     return evidence, outlined
 
 
@@ -341,7 +350,7 @@ def _away(shown: np.ndarray) -> Float[np.ndarray, "height width"]:
 
 
 def _outlined(
-    view: View, evidence: np.ndarray, behind: Behind, box: NodeGrid, solid: np.ndarray
+    view: View, evidence: np.ndarray, behind: Behind, box: NodeGrid, solid: np.ndarray, reach: int
 ) -> Float[np.ndarray, "height width"]:
     """The object in a photograph: 1 inside, 0 outside."""
     under = _down_to_table(solid)
@@ -350,14 +359,13 @@ def _outlined(
         for of in (
             ndimage.binary_erosion(solid),
             ndimage.binary_dilation(under),
-            ndimage.binary_dilation(under, iterations=3),
+            ndimage.binary_dilation(under, iterations=reach),
         )
     )
     if not most.any():
         return most.astype(np.float32)
-    expected = (
-        np.where(core, _INSIDE, 0.0) - np.where(rim, 0.0, _INSIDE) - np.where(behind.known | core, 0.0, _SHY)
-    )
+    expected = np.where(core, _INSIDE, 0.0) - np.where(rim, 0.0, _INSIDE)
+    expected -= np.where(behind.known | core, 0.0, _SHY)
     smooth = ndimage.gaussian_filter(view.image, (0.7, 0.7, 0))
     slope = np.sqrt(sum(np.sum(np.square(np.gradient(smooth[..., c])), axis=0) for c in range(3)))
     usual = 2 * float(np.median(slope[rim])) + 1e-3

@@ -18,6 +18,9 @@ from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._result import Tracked
 from dano.vision.tracking._walk import Walk
 
+_SEARCHED, _WALKED, _AGAIN = 0.1, 0.55, 0.7
+"""Shares of the time after the search, after all frames, and after those that fit worse (measured)."""
+
 
 def track(
     film: Film,
@@ -55,12 +58,14 @@ def track(
         turn = checked_quaternion("orientation of start", start[1])
         walk.begin(Placement(np.asarray(place, np.float64), np.asarray(turn, np.float64)))
     tell, n = progress or (lambda text, share: None), len(film.times)
+    tell("looking for the object", 0.0)
     first = walk.first()
     for k, i in enumerate([*range(first, n), *reversed(range(first))]):
-        tell(f"tracking, frame {film.names[i]}", k / n)
+        tell(f"tracking, frame {film.names[i]}", _SEARCHED + (_WALKED - _SEARCHED) * k / n)
         if i == first - 1:
             walk.turn_back()
         walk.step(i)
+    tell("tracking, frames that fit worse", _WALKED)
     walk.turn_over()
     walk.look_again()
-    return walk.result()
+    return walk.result(lambda share: tell("tracking, all frames together", _AGAIN + (1 - _AGAIN) * share))

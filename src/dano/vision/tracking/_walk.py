@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import time
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
@@ -96,8 +97,7 @@ class Walk:
         self._path: list[int] = []
         self._begun: tuple[int, list[tuple[Start, float]]] | None = None
         self._given: Placement | None = None
-        self._missed = 0
-        self._ambiguity = np.inf
+        self._missed, self._ambiguity = 0, np.inf
         self._seconds: list[float] = []
 
     @functools.cached_property
@@ -226,14 +226,20 @@ class Walk:
         better = False
         for i in sorted(set(range(len(self._found))) - set(good)):
             before, after = [j for j in good if j < i][-2:], [j for j in good if j > i][:2]
-            pair = [before[-1], after[0]] if before and after else [*before, *after]
-            if len(pair) < 2:
+            between = [before[-1], after[0]] if before and after else []
+            pair = next((some for some in (between, before, after) if self._tell(i, some)), None)
+            if pair is None or not self._taken_up(i, self._carried(pair[0], pair[1], i)):
                 continue
-            away = self._subject.off(*(self._place(j) for j in pair))
-            if max(*pair, i) - min(*pair, i) > _NEAR and not (pair[0] < i < pair[1] and away < _LITTLE):
-                continue
-            better = self._taken_up(i, self._carried(pair[0], pair[1], i)) or better
+            better = True
+            # What was taken up leads to the next one.
+            good = sorted([*good, i])
         return better
+
+    def _tell(self, i: int, pair: list[int]) -> bool:
+        """Whether two frames say where the object is in a third one."""
+        if len(pair) < 2 or max(*pair, i) - min(*pair, i) <= _NEAR:
+            return len(pair) == 2
+        return pair[0] < i < pair[1] and self._subject.off(*map(self._place, pair)) < _LITTLE
 
     def _look_back(self) -> bool:
         """Follow the object backwards into frames where it was lost, or is not where later frames lead.
@@ -361,7 +367,7 @@ class Walk:
         best, ambiguity = likeliest(
             self._subject, target, self._options.loss, [*finer, *(s for s in turned if s is not None)]
         )
-        return None if self._is_another(best.refined) else (best, ambiguity)
+        return (best, ambiguity) if self._may_be_it(best.refined) else None
 
     def _finished(self, i: int, place: Placement, light: LightFit) -> Start | None:
         """A start at full resolution, under the light that it implies itself."""
@@ -404,16 +410,16 @@ class Walk:
 
     def _is_it(self, found: Refined) -> bool:
         """Whether shape and colours are the object's, and fit not much worse than in the other frames."""
-        if found.overlap < self._options.lost or self._is_another(found):
+        if not self._may_be_it(found):
             return False
         fits = [score(one) for one in self._found if one is not None]
         return len(fits) < _LIGHT_EVERY or score(found) < max(
             _FAR_WORSE * float(np.median(fits)), _CONVINCING
         )
 
-    def _is_another(self, found: Refined) -> bool:
-        """Whether colours say that a segment of the right shape is a different object."""
-        return self._options.loss == "photometric" and found.colour_error > _UNLIKE
+    def _may_be_it(self, found: Refined) -> bool:
+        colours_count = self._options.loss == "photometric"
+        return found.overlap >= self._options.lost and not (colours_count and found.colour_error > _UNLIKE)
 
     def _refined(self, i: int, before: Placement, light: LightFit) -> Refined | None:
         """The pose near an expected one; also from beside it if that fits worse than usual."""
@@ -455,16 +461,14 @@ class Walk:
         return "silhouette" if self._options.loss == "photometric" and not light.known else self._options.loss
 
     def _learn(self, i: int, found: Refined) -> None:
-        if self._options.loss != "photometric":
-            return
-        target = self._target(i, found.place, self._light)
+        target = self._target(i, found.place, self._light) if self._options.loss == "photometric" else None
         if target is not None:
             learn_light(self._subject, target, found.place, found.window, found.silhouette, self._light)
             self._masking.learn(target, found.window, found.silhouette)
             self._masking.learn_shadow(i, target, found.place, self._light)
 
-    def result(self) -> Tracked:
-        """What was found.
+    def result(self, tell: Callable[[float], None]) -> Tracked:
+        """What was found, after all frames have been looked at together; `tell` is told the share done.
 
         Raises:
             ValueError: If nothing was.
@@ -476,7 +480,10 @@ class Walk:
             )
         began = time.perf_counter()
         whole = Whole(self._film, self._subject, self._camera, self._options, self._found)
-        self._light = whole.look(self._masking, self._light, self._random)
+        self._light = whole.look(self._masking, self._light, self._random, self._may_be_it, tell)
+        for i in range(len(self._found)):
+            if self._status[i] == TRACKED and whole.found[i] is None:
+                self._status[i] = LOST
         share = (time.perf_counter() - began) / len(self._found)
         return tracked(
             self._film,

@@ -1,7 +1,7 @@
 """All frames of a film together: one motion, from what each frame says near it."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -94,12 +94,25 @@ class Whole:
         self._still = self._stillness()
         self.motion = self._smoothed()
 
-    def look(self, masking: Masking, light: LightFit, random: np.random.Generator) -> LightFit:
-        """Look at the frames again where the motion has them, under the light that they have there."""
-        for _ in range(_PASSES):
+    def look(
+        self,
+        masking: Masking,
+        light: LightFit,
+        random: np.random.Generator,
+        may_be_it: Callable[[Refined], bool],
+        tell: Callable[[float], None],
+    ) -> LightFit:
+        """Look at the frames again where the motion has them, under the light that they have there.
+
+        What does not fit there, such as a hand in front of the object, is nothing to go by.
+        """
+        for k in range(_PASSES):
             light = self._relit(masking, light)
             for i in self._known():
+                tell((k + i / len(self.found)) / _PASSES)
                 self.found[i] = self._looked_at(i, masking, light, random) or self.found[i]
+            fits = [one if one is not None and may_be_it(one) else None for one in self.found]
+            self.found = fits if any(fits) else self.found
             self.motion = self._smoothed()
         return light
 
