@@ -418,8 +418,8 @@ class Walk:
         )
 
     def _may_be_it(self, found: Refined) -> bool:
-        colours_count = self._options.loss == "photometric"
-        return found.overlap >= self._options.lost and not (colours_count and found.colour_error > _UNLIKE)
+        another = self._options.loss == "photometric" and found.colour_error > _UNLIKE
+        return bool(found.overlap >= self._options.lost and not another)
 
     def _refined(self, i: int, before: Placement, light: LightFit) -> Refined | None:
         """The pose near an expected one; also from beside it if that fits worse than usual."""
