@@ -137,7 +137,7 @@ def standing_masks(views: Sequence[View], table: float) -> list[Float[np.ndarray
         box = _closer(box, solid)
         solid = _carved(parts, masks, evidence, box, lost)
     _, masks = _outlines(fine, table, box, solid, masks, reach=1)
-    return [_placed(view, *of) for view, *of in zip(views, windows, masks, strict=True)]
+    return [_placed(*of) for of in zip(views, windows, masks, strict=True)]
 
 
 def _times(views: Sequence[View], most: int) -> int:
@@ -269,7 +269,8 @@ def _placed(view: View, window: tuple[np.ndarray, np.ndarray], mask: np.ndarray)
 
 def _shown(view: View, box: NodeGrid, solid: np.ndarray) -> Bool[np.ndarray, "height width"]:
     """The pixels that look through a solid: its outermost nodes as discs, and what they surround."""
-    shown = np.zeros(view.image.shape[:2], bool)
+    height, width = view.image.shape[:2]
+    shown = np.zeros((height, width), bool)
     rim = np.argwhere(solid & ~ndimage.binary_erosion(solid))
     place = view.camera.project(box.origin + box.spacing * rim)
     place = place[place[:, 2] > 0]
@@ -277,11 +278,11 @@ def _shown(view: View, box: NodeGrid, solid: np.ndarray) -> Bool[np.ndarray, "he
         return shown
     node = box.spacing * float(np.mean(view.camera.focal)) / float(np.median(place[:, 2]))
     column, row = np.floor(place[:, :2]).astype(int).T
-    inside = (column >= 0) & (row >= 0) & (column < shown.shape[1]) & (row < shown.shape[0])
+    inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
     shown[row[inside], column[inside]] = True
     if not shown.any():
         return shown
-    # Nodes lie up to √2 apart across the line of sight, and a node is half of one wide on each side.
+    # Gaps between neighbours are closed; the outermost nodes reach half a spacing further.
     closed = ndimage.binary_fill_holes(np.asarray(ndimage.distance_transform_edt(~shown)) <= max(node, 1.0))
     return np.asarray(ndimage.distance_transform_edt(closed)) > 0.5 * node
 
