@@ -13,8 +13,8 @@ from dano.progress import Progress
 from dano.scene import Scene
 from dano.vision import adjust_poses, Film, LearnedField, Light, PosedCamera, Tracked, TrackOptions
 
-_SETTLED = 0.25
-"""Move of a parameter, in its standard errors, below which the search ends: it adds 3 % to its error."""
+_SETTLED = 0.1
+"""Move of a parameter, in its standard errors, below which the search ends."""
 
 _LIGHT_PASSES = 2
 """Passes in which the light is fitted: after that poses are right, and it would only follow the noise."""
@@ -34,7 +34,7 @@ class FilmFit(NamedTuple):
         poses: The same from the poses alone, which the search began with.
         tracked: What the film shows at the motion found: quality and status of frames, light, silhouettes.
         history: Values of the parameters after each pass, the first of them from the poses alone.
-        settled: Whether the last pass moved no value by more than a quarter of its standard error.
+        settled: Whether the last pass moved no value by more than a tenth of its standard error.
     """
 
     fit: Identification
