@@ -306,11 +306,16 @@ def _outlines(
         reach: Nodes around the solid that outlines may pass through.
     """
     middle, side = _extent(box, solid)
-    hidden = None
-    if masks is not None:
-        under = ndimage.binary_dilation(_down_to_table(solid))
-        hidden = [_shown(view, box, under) for view in views]
-    top = Tabletop.of(views, hidden, table, middle[:2] - _AROUND * side, 2 * _AROUND * side)
+    under = _down_to_table(solid)
+    solids = (
+        ndimage.binary_erosion(solid),
+        ndimage.binary_dilation(under),
+        ndimage.binary_dilation(under, iterations=reach),
+    )
+    core, rim, most = ([_shown(view, box, of) for view in views] for of in solids)
+    top = Tabletop.of(
+        views, None if masks is None else rim, table, middle[:2] - _AROUND * side, 2 * _AROUND * side
+    )
     behind = [Behind.of(view, top, gain) for view, gain in zip(views, top.gain, strict=True)]
     shown = [_shown(view, box, solid) for view in views]
     away = [_away(here) for here in shown]
@@ -328,14 +333,13 @@ def _outlines(
         for places in (clear, near)
     )
     evidence = [evidence_of(of, thing, around, noise) for of in behind]
-    outlined = [_outlined(*of, box, solid, reach) for of in zip(views, evidence, behind, strict=True)]
+    outlined = [_outlined(*of) for of in zip(views, evidence, behind, core, rim, most, strict=True)]
     return evidence, outlined
 
 
 def _clearly(behind: Behind, noise: float) -> Bool[np.ndarray, "height width"]:
     """Where a photograph certainly shows no table."""
-    varies = np.where(behind.known[..., None], behind.varies, np.inf)
-    off = np.max(behind.off[..., :3] / np.maximum(GAUSSIAN * varies, noise), axis=-1)
+    off = np.max(behind.off[..., :3] / np.maximum(GAUSSIAN * behind.varies, noise), axis=-1)
     return ndimage.gaussian_filter((off > _CLEARLY).astype(np.float32), 1.0) > 0.4
 
 
@@ -351,18 +355,18 @@ def _away(shown: np.ndarray) -> Float[np.ndarray, "height width"]:
 
 
 def _outlined(
-    view: View, evidence: np.ndarray, behind: Behind, box: NodeGrid, solid: np.ndarray, reach: int
+    view: View, evidence: np.ndarray, behind: Behind, core: np.ndarray, rim: np.ndarray, most: np.ndarray
 ) -> Float[np.ndarray, "height width"]:
-    """The object in a photograph: 1 inside, 0 outside."""
-    under = _down_to_table(solid)
-    core, rim, most = (
-        _shown(view, box, of)
-        for of in (
-            ndimage.binary_erosion(solid),
-            ndimage.binary_dilation(under),
-            ndimage.binary_dilation(under, iterations=reach),
-        )
-    )
+    """The object in a photograph: 1 inside, 0 outside.
+
+    Args:
+        view: The photograph.
+        evidence: How much speaks for the object in each pixel.
+        behind: What each would show of the table.
+        core: Pixels well inside the solid found so far.
+        rim: Those inside, or at most a node beside.
+        most: Those that may show the object.
+    """
     if not most.any():
         return most.astype(np.float32)
     expected = np.where(core, _INSIDE, 0.0) - np.where(rim, 0.0, _INSIDE)
