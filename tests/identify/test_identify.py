@@ -478,10 +478,12 @@ def test_many_starts_find_the_lower_minimum():
     stiffness = dano.Parameter("k", lambda c: c.stiffness, 1.0, 200.0, start=150.0, of="controls")
     options = {"controls": Spring(jnp.asarray(1.0)), "noise": {"position": 1e-3}}
     with pytest.warns(RuntimeWarning, match="misses the observed positions by .* try more starts"):
-        alone = dano.identify(scene, motion, [stiffness], **options)
+        alone = dano.identify(scene, motion, [stiffness], options=dano.IdentifyOptions(starts=1), **options)
+    by_default = dano.identify(scene, motion, [stiffness], **options)
     search = dano.IdentifyOptions(starts=6)
     many = dano.identify(scene, motion, [stiffness], options=search, **options)
     assert abs(alone.values["k"] - 60) > 1
+    assert by_default.values["k"] == pytest.approx(60, abs=1e-3)
     assert many.values["k"] == pytest.approx(60, abs=1e-3)
     assert many.minima[0].loss <= many.minima[-1].loss and len(many.minima) == 6
 

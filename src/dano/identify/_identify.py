@@ -14,8 +14,6 @@ import numpy as np
 from dano.checks import checked_function, checked_items, checked_kind, checked_optional
 from dano.engine import AbstractEngine, checked_engine, Policy
 from dano.identify._checkpoint import Checkpoint, digest_of
-from dano.identify._motion import joint_table, Motion, QUANTITIES
-from dano.identify._motion_files import load_motion
 from dano.identify._parameters import Parameter, space_of, values_at, with_values
 from dano.identify._problem import Problem
 from dano.identify._residuals import Linearized, shifted, Smoothing
@@ -25,6 +23,7 @@ from dano.identify._settings import deviations, estimated, IdentifyOptions, Setu
 from dano.identify._settling import ripple_covariance, worth_of
 from dano.identify._uncertainty import uncertainty
 from dano.identify._windows import Plan
+from dano.identify.motions import joint_table, load_motion, Motion, QUANTITIES
 from dano.maths import quat_conjugate, quat_log, quat_multiply
 from dano.scene import Control, Scene, State, Trajectory
 from dano.solvers import Solution, Stop
@@ -209,7 +208,10 @@ def _identification(
     at_start = problem.simulate(space.start, plan.start)
     known = np.asarray(at_best.lengths)
     seen = known[known >= 0]
-    sure = uncertainty(space, best.x, best.normal, seen, setup.options.huber, plan.n_data, scene, ripple)
+    least = problem.least_variance
+    sure = uncertainty(
+        space, best.x, best.normal, seen, setup.options.huber, plan.n_data, scene, ripple, least
+    )
     values, errors = values_at(space.selections, best.x, sure.covariance)
     fit_errors = _errors(plan, motions, at_best)
     messages = list(sure.messages)

@@ -11,19 +11,24 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.engine import device_mesh
+from dano.identify._chains import by_owner, chained, unchained
 from dano.identify._checkpoint import Checkpoint
-from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._planes import Smoothing
 from dano.identify._residuals import Linearized, linearized, losses, Model, moved, shifted, Start
 from dano.identify._result import Identification
 from dano.identify._settings import Setup
 from dano.identify._settling import settled
 from dano.identify._windows import draw_velocities, plan_windows
+from dano.identify.motions import Motion, QUANTITIES
 from dano.scene import Control, Scene, State
 from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
 
 # Points whose loss is computed for each start that is refined.
 _LOOKS = 4
+# Parameters up to which all of the bounds are looked at by default, at so many points.
+_SCANNED, _SCANS = 2, 16
+# Least variance of residuals, as a share of what the stated noise has.
+_QUIET = 1e-2
 # Windows that fit worse than most by the first factor are restarted. The result is kept if the loss of their
 # motion falls by the second.
 _POOR, _BETTER = 2.0, 5.0
@@ -74,7 +79,9 @@ class Problem:
             continuous=bool(self.ties),
         )
         self.plan = self._planned()
-        self.measured = True
+        self.measured, self._near = True, False
+        # Frames of a tracked film share errors, and scatter less than they are off.
+        self.least_variance = _QUIET if self.plan.windows.common is None else 1.0
         dtype = scene.timestep.dtype
         self.start = _start_of(scene, self.plan.bodies, initial)
         self.private = self.start.size
@@ -117,6 +124,7 @@ class Problem:
 
     def begin_near(self, after: Identification) -> None:
         """Begin where an earlier fit left what it estimated of the windows' states, if this one does too."""
+        self._near = True
         start, states = self.plan.start, after.initial_states
         if states.position.shape != start.position.shape:
             here, there = start.position.shape[:2], states.position.shape[:2]
@@ -184,7 +192,7 @@ class Problem:
         loss, gradient, hessian, jump, slope = (np.asarray(v, float) for v in found[:5])
         p, k = len(self.space.start), self.private
         if self.model.jumps is not None:
-            return _chained(p, k, self.plan.owner, self.model.jumps, loss, gradient, hessian, jump, slope)
+            return chained(p, k, self.plan.owner, self.model.jumps, loss, gradient, hessian, jump, slope)
         return NormalEquations(
             float(loss.sum()),
             gradient[:, :p].sum(axis=0),
@@ -206,25 +214,40 @@ class Problem:
             return start
         n = len(self.plan.rows)
         if self.model.jumps is not None:
-            change = _unchained(change, self.plan.owner, self.private)
+            change = unchained(change, self.plan.owner, self.private)
         rows = jnp.asarray(change.reshape(n, self.private), self.model.scene.timestep.dtype)
         return moved(start, rows, self.start)
 
-    def points(self, starts: int) -> list[np.ndarray]:
-        """Where to start: the given start, and the best by loss of many others in the bounds."""
-        points = [self.space.start]
-        if starts == 1:
-            return points
-        if not (np.all(np.isfinite(self.space.lower)) and np.all(np.isfinite(self.space.upper))):
-            raise ValueError("options.starts > 1 needs finite bounds on every parameter")
-        from scipy.stats import qmc
+    def points(self, starts: int | None) -> list[np.ndarray]:
+        """Where to start: the given start, and the best by loss of many others in the bounds.
 
-        n = _LOOKS * (starts - 1)
-        unit = qmc.Sobol(len(self.space.start), seed=self.seed).random(1 << (n - 1).bit_length())[:n]
-        tried = self.space.lower + unit * (self.space.upper - self.space.lower)
+        Args:
+            starts: How many; None: one, with one or two bounded parameters the best of some in the bounds.
+        """
+        lower, upper = self.space.lower, self.space.upper
+        bounded = bool(np.all(np.isfinite(lower)) and np.all(np.isfinite(upper)))
+        if starts is None:
+            if self._near or not bounded or len(lower) > _SCANNED:
+                return [self.space.start]
+            tried = [self.space.start, *self._spread(_SCANS)]
+            # The program of the search itself: another one takes longer to compile than this.
+            found = [self.linearize(x, self.plan.start).loss for x in tried]
+            return [tried[int(np.argmin(np.where(np.isfinite(found), found, np.inf)))]]
+        if starts == 1:
+            return [self.space.start]
+        if not bounded:
+            raise ValueError("options.starts > 1 needs finite bounds on every parameter")
+        tried = self._spread(_LOOKS * (starts - 1))
         found = np.array([self.loss(x, self.plan.start) for x in tried])
         order = np.argsort(np.where(np.isfinite(found), found, np.inf))
-        return points + [tried[i] for i in order[: starts - 1]]
+        return [self.space.start] + [tried[i] for i in order[: starts - 1]]
+
+    def _spread(self, count: int) -> np.ndarray:
+        """So many points all over the bounds."""
+        from scipy.stats import qmc
+
+        unit = qmc.Sobol(len(self.space.start), seed=self.seed).random(1 << (count - 1).bit_length())[:count]
+        return self.space.lower + unit * (self.space.upper - self.space.lower)
 
     def search(
         self,
@@ -389,7 +412,7 @@ class Problem:
         return worse & (losses > _BETTER)
 
     def _by_motion(self, found: Linearized) -> np.ndarray:
-        return _by_owner(self.plan.owner, np.asarray(found.loss), np.asarray(found.jump))
+        return by_owner(self.plan.owner, np.asarray(found.loss), np.asarray(found.jump))
 
 
 def _usual(noise: Mapping[str, float], span: float) -> list[float]:
@@ -400,45 +423,6 @@ def _usual(noise: Mapping[str, float], span: float) -> list[float]:
     for slow, fast in (("position", "velocity"), ("orientation", "omega")):
         usual[fast] = min(usual[fast], usual[slow] / span)
     return [usual[key] for key in QUANTITIES]
-
-
-def _chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> NormalEquations:
-    """Normal equations with one block for each motion, whose windows are tied by their jumps."""
-    counts = np.bincount(owner)
-    size = int(counts.max()) * k
-    place = np.concatenate([np.arange(n) for n in counts])
-    m = len(counts)
-    shared, shared_hessian = gradient[:, :p].sum(axis=0), hessian[:, :p, :p].sum(axis=0)
-    g, b, c = np.zeros((m, size)), np.zeros((m, size, size)), np.zeros((m, size, p))
-    # Windows that a shorter motion does not have stay where they are.
-    for i, n in enumerate(counts):
-        tail = np.arange(n * k, size)
-        b[i, tail, tail] = 1.0
-    losses = _by_owner(owner, loss, jump)
-    # The jump falls one to one as the next window's beginning moves towards the end of this one.
-    step = 1 / np.asarray(jumps)
-    for w, (i, j) in enumerate(zip(owner, place, strict=True)):
-        mine = slice(j * k, (j + 1) * k)
-        g[i, mine] += gradient[w, p:]
-        b[i, mine, mine] += hessian[w, p:, p:]
-        c[i, mine] += hessian[w, p:, :p]
-        if j + 1 == counts[i]:
-            continue
-        by_x, by_mine, by_next = slope[w, :, :p], slope[w, :, p:], -np.diag(step)
-        following = slice((j + 1) * k, (j + 2) * k)
-        shared += by_x.T @ jump[w]
-        shared_hessian += by_x.T @ by_x
-        for rows, a in ((mine, by_mine), (following, by_next)):
-            g[i, rows] += a.T @ jump[w]
-            c[i, rows] += a.T @ by_x
-            for columns, d in ((mine, by_mine), (following, by_next)):
-                b[i, rows, columns] += a.T @ d
-    return NormalEquations(float(losses.sum()), shared, shared_hessian, g, b, c, losses)
-
-
-def _by_owner(owner: np.ndarray, loss: np.ndarray, jump: np.ndarray) -> np.ndarray:
-    """Loss of each motion, jumps between its windows included."""
-    return np.bincount(owner, loss + 0.5 * np.sum(jump**2, axis=1))
 
 
 def _following(start: State) -> State:
@@ -466,11 +450,6 @@ def _start_of(scene: Scene, bodies: Sequence[int], initial: tuple[str, ...]) -> 
     on_joints = any(i in layout.children for i in bodies)
     free = tuple(i for i in bodies if i in layout.free)
     return Start(free, tuple(kind == "hinge" for kind in kinds) if on_joints else (), initial)
-
-
-def _unchained(change: np.ndarray, owner: np.ndarray, k: int) -> np.ndarray:
-    counts = np.bincount(owner)
-    return np.concatenate([change[i, : n * k].reshape(n, k) for i, n in enumerate(counts)])
 
 
 def _for_each(name: str, given: Any, motions: Sequence[Motion]) -> list[Any]:

@@ -12,10 +12,10 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.engine import AbstractEngine, compiled, difference, gather, map_rows, retract, simulate
-from dano.identify._motion import joint_table, QUANTITIES
 from dano.identify._parameters import Selection, with_values
 from dano.identify._planes import plane_through, Smoothing
 from dano.identify._windows import Windows
+from dano.identify.motions import joint_table, QUANTITIES
 from dano.maths import einsum, quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
 from dano.scene import Control, Scene, State
 
@@ -346,7 +346,7 @@ def _residuals(model: Model, window: Windows, start: State, following: State, x,
     predicted = shifted(scene, mixed, window.origins, -1)
     rows = jnp.stack([_row(model, window, predicted, key) for key in model.quantities], axis=2)
     if window.whitening is not None:
-        rows = _whitened(model, rows, window.whitening[:, _bodies(model)])
+        rows = _whitened(model, rows, window)
     # Not empty: mapping in batches cannot put empty arrays together.
     jump = jnp.zeros(1, rows.dtype)
     if model.jumps is not None:
@@ -404,16 +404,21 @@ def _row(model: Model, window: Windows, predicted: State, key: str) -> Float[Arr
     return weight * (found - seen)
 
 
-def _whitened(model: Model, rows: Float[Array, "f b q 3"], whitening: Float[Array, "f b 6 6"]) -> Array:
+def _whitened(model: Model, rows: Float[Array, "f b q 3"], window: Windows) -> Array:
     """Residuals of poses as independent ones of variance one; others as they are."""
     poses = [key for key in ("position", "orientation") if key in model.quantities]
     if not poses:
         return rows
     index = [model.quantities.index(key) for key in poses]
     numbers = np.concatenate([3 * ("position", "orientation").index(key) + np.arange(3) for key in poses])
-    part = whitening[:, :, numbers][..., numbers]
+    bodies = _bodies(model)
+    assert window.whitening is not None
+    part = window.whitening[:, bodies][:, :, numbers][..., numbers]
     flat = rows[:, :, np.array(index)].reshape(*rows.shape[:2], len(numbers))
     white = einsum("fbij,fbj->fbi", part, flat)
+    if window.common is not None:
+        common = window.common[:, bodies][:, :, numbers]
+        white = white - einsum("fbik,bk->fbi", common, einsum("fbik,fbi->bk", common, white))
     return rows.at[:, :, np.array(index)].set(white.reshape(*rows.shape[:2], len(index), 3))
 
 

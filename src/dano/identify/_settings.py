@@ -17,8 +17,8 @@ from dano.checks import (
     shown,
 )
 from dano.engine import AbstractEngine
-from dano.identify._motion import Motion, QUANTITIES
 from dano.identify._parameters import Space
+from dano.identify.motions import Motion, QUANTITIES
 from dano.maths import checked_numbers
 from dano.scene import Scene
 
@@ -44,7 +44,8 @@ class IdentifyOptions:
         huber: Length of a residual, in standard deviations, from which it counts linearly; None: never.
         smooth: Whether to go on by slopes over visible steps where the loss is rough: to the minimum of its
             trend, with standard errors that hold the ripples.
-        starts: Points to start from: the scene's values, and others in the bounds.
+        starts: Points to start from: the scene's values, and others in the bounds. None: one, of one or two
+            parameters with bounds the best of 16 all over these, else the scene's values.
         seed: Of everything random.
         max_iterations: Steps of each search.
         tolerance: Stop when the predicted move of the parameters is below this, in standard errors.
@@ -58,7 +59,7 @@ class IdentifyOptions:
     continuity: float | Sequence[float] | None = None
     huber: float | None = None
     smooth: bool = True
-    starts: int = 1
+    starts: int | None = None
     seed: int = 0
     max_iterations: int = 100
     tolerance: float = 0.1
@@ -79,7 +80,8 @@ class IdentifyOptions:
             raise ValueError(f"continuity needs window, got continuity {self.continuity} and window None")
         if self.huber is not None:
             checked_number("huber", self.huber, above=0)
-        checked_count("starts", self.starts, most=_MOST_STARTS)
+        if self.starts is not None:
+            checked_count("starts", self.starts, most=_MOST_STARTS)
         checked_count("seed", self.seed, least=0)
         checked_count("max_iterations", self.max_iterations)
         checked_number("tolerance", self.tolerance, above=0)

@@ -37,8 +37,6 @@ _LAST_STEPS = 8
 _STILL, _MOST_STEPS = 0.1, 40
 # Drift of these that counts as no drift, in its own standard errors.
 _DRIFT = 3.0
-# Least variance of residuals, as a share of what the stated noise has.
-_QUIET = 1e-2
 # Longest step, in widest draws; and by what a loss may grow that is accepted.
 _LONGEST, _WORSE = 4.0, 1.5
 # Halvings of a step.
@@ -60,6 +58,7 @@ class Smoothed(Protocol):
     lower: np.ndarray
     upper: np.ndarray
     freedom: int
+    least_variance: float
     seed: int
 
     def linearize(self, x: np.ndarray, start: Any, /) -> NormalEquations:
@@ -144,10 +143,16 @@ def _settled(problem: Smoothed, solution: Solution, first: _Point, rough: bool) 
     problem.smoothing = _evenly(problem, rows, widest, here)
     problem.smoothing = _drawn(rows, widest, _seen(problem, here), problem)
     sight = _seen(problem, here)
+    if sight.away > _STEADY and sight.scatter <= _STEADY and sight.normal.loss <= _most(problem):
+        # What fits as well as can be is a minimum: the widest draws bend, so that these were too wide.
+        problem.smoothing = _drawn(rows, widest, sight, problem)
+        sight = _seen(problem, here)
     steady = sight.away <= _STEADY and sight.scatter <= _STEADY
-    if not rough and solution.stop.converged and steady and not _blind(solution, sight):
+    ended = solution.stop.converged or solution.stop is Stop.STUCK
+    if not rough and ended and steady and not _blind(solution, sight):
         problem.smoothing = None
-        return solution
+        # Where derivatives find no step, but planes say that none is needed, it is a minimum.
+        return solution if solution.stop.converged else solution._replace(stop=Stop.LOSS)
     grown = _grown(problem, first, widest)
     begin = grown if _loss(problem, grown) < _loss(problem, here) else here
     end = _fitting(problem, _averaged(problem, begin, widest), first, widest)
@@ -268,9 +273,8 @@ def _fitting(problem: Smoothed, end: _End, first: _Point, widest: np.ndarray) ->
     Which motion a walk follows through the first impacts is up to its draws.
     """
     seed, smoothing = problem.seed, problem.smoothing
-    most = 0.5 * (problem.freedom + _UNLIKELY * np.sqrt(2 * problem.freedom))
     for k in range(_AGAIN):
-        if end.sight.normal.loss > most:
+        if end.sight.normal.loss > _most(problem):
             problem.seed = seed + (k + 1) * _MOST_STEPS * len(_BEGINNINGS)
             begin = _grown(problem, first, widest)
             if _loss(problem, begin) < end.sight.normal.loss:
@@ -279,6 +283,11 @@ def _fitting(problem: Smoothed, end: _End, first: _Point, widest: np.ndarray) ->
                     end, smoothing = other, problem.smoothing
     problem.seed, problem.smoothing = seed, smoothing
     return end
+
+
+def _most(problem: Smoothed) -> float:
+    """Loss beyond which residuals are not those of the stated noise."""
+    return 0.5 * (problem.freedom + _UNLIKELY * np.sqrt(2 * problem.freedom))
 
 
 def _last_of(walk: Iterator[tuple[_Point, _Sight]]) -> list[tuple[_Point, _Sight]]:
@@ -409,7 +418,7 @@ def _seen(problem: Smoothed, point: _Point) -> _Sight:
 
 def _variance(problem: Smoothed, normal: NormalEquations) -> float:
     """Of the residuals; what is far below the noise that was stated makes no difference."""
-    return max(2 * normal.loss / max(problem.freedom, 1), _QUIET)
+    return max(2 * normal.loss / max(problem.freedom, 1), problem.least_variance)
 
 
 def _evenly(problem: Smoothed, rows: np.ndarray, widest: np.ndarray, point: _Point) -> Smoothing:

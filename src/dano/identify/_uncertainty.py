@@ -44,11 +44,13 @@ def uncertainty(
     n_data: int,
     scene: Scene,
     ripple: np.ndarray | None = None,
+    least: float = 0.0,
 ) -> Uncertainty:
     """Covariance s² (JᵀWJ)⁻¹ of the coordinates, initial states eliminated.
 
     s² is the variance of the residuals per degree of freedom, so that only the ratios of the standard
-    deviations given as noise matter. With Huber's loss s² is that of Huber (Robust Statistics, 1981, 7.6).
+    deviations given as noise matter, but not less than `least`. With Huber's loss s² is that of Huber (Robust
+    Statistics, 1981, 7.6).
 
     Args:
         space: The parameters.
@@ -59,6 +61,7 @@ def uncertainty(
         n_data: How many numbers were observed.
         scene: The scene at the start, for the words.
         ripple: Covariance of the coordinates that a rough loss adds, shape (p, p); default none.
+        least: Least s²; 1 where residuals are smaller because frames share what they are off by.
     """
     p = len(x)
     _, hessian = eliminated(normal)
@@ -73,6 +76,7 @@ def uncertainty(
         clipped = float(np.sum(np.minimum(lengths, huber) ** 2))
         # The normal equations have weights that average to about `inside`: one of its two factors.
         variance = share**2 * clipped / max(freedom, 1) / max(inside, 1e-3)
+    variance = max(variance, least)
     covariance = np.full((p, p), np.nan)
     free = np.flatnonzero(~on_bound)
     messages = [

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.identify._motion import (
+from dano.identify._tracked import add_told, common_of, pose_deviations, told_of, whitening_of
+from dano.identify.motions import (
     JOINT_NUMBERS,
     joint_numbers,
     joint_widths,
@@ -52,6 +53,7 @@ class Windows(eqx.Module):
     joints: Float[Array, "w f n 3"] | None
     weights: dict[str, Float[Array, "w f n"]]
     whitening: Float[Array, "w f n 6 6"] | None
+    common: Float[Array, "w f n 6 7"] | None
     end: tuple[Int[Array, " w"], Float[Array, " w"]]
     chained: Float[Array, " w"]
     controls: Control | None
@@ -139,6 +141,9 @@ def plan_windows(
     moment = _located(_stacked(late) / h, n_steps)
     first_step = np.array([_steps_to(piece["times"][0] - piece["origin"], h) for piece in pieces])
     forces = [piece["control"] for piece in pieces]
+    deviations = pose_deviations(weights)
+    white = whitening_of(pieces, deviations)
+    common = common_of(scene, pieces, deviations, white)
     windows = Windows(
         jnp.asarray([piece["times"][0] - piece["origin"] for piece in pieces], dtype),
         jnp.asarray(first_step),
@@ -148,7 +153,8 @@ def plan_windows(
         observed,
         joints,
         weights,
-        _whitening(pieces, weights, dtype),
+        None if white is None else jnp.asarray(white, dtype),
+        None if common is None else jnp.asarray(common, dtype),
         _arrays(_located(np.array(until) / h, n_steps), dtype),
         jnp.asarray(np.append(owner[1:] == owner[:-1], False), dtype),
         _control_rows(scene, forces, first_step, n_steps),
@@ -203,37 +209,15 @@ def _weighed(
             counts[:, 0] = False
         if counts.any():
             weights[key] = jnp.asarray(counts / noise[key], dtype)
+    for key in ("velocity", "omega"):
+        if key in initial:
+            add_told(key, [piece["told"][key] for piece in pieces], seen, observed, weights)
     if not weights:
         raise ValueError(
             f"observed must hold, after the first frame, values of some of {list(noise)}, got none"
         )
     joints = observed.pop("q", None)
     return State(**observed), joints, weights
-
-
-def _whitening(pieces: list[dict], weights: Mapping[str, Array], dtype) -> Array | None:
-    """See `Windows`."""
-    if all(piece["covariance"] is None for piece in pieces):
-        return None
-    shape = next(iter(weights.values())).shape
-    result = np.tile(np.eye(6), (*shape, 1, 1))
-    # Standard deviations by which residuals have been divided, where they count.
-    sizes = np.zeros((*shape, 6))
-    for first, key in ((0, "position"), (3, "orientation")):
-        if key in weights:
-            weight = np.asarray(weights[key])
-            sizes[..., first : first + 3] = np.where(weight > 0, 1 / np.maximum(weight, 1e-300), 0)[..., None]
-    for w, piece in enumerate(pieces):
-        if piece["covariance"] is None:
-            continue
-        for f, n in np.argwhere(np.isfinite(piece["covariance"]).all(axis=(-2, -1))):
-            on = np.flatnonzero(sizes[w, f, n] > 0)
-            if len(on) == 0:
-                continue
-            scale = sizes[w, f, n, on]
-            scaled = piece["covariance"][f, n][np.ix_(on, on)] / np.outer(scale, scale)
-            result[w, f, n][np.ix_(on, on)] = np.linalg.inv(np.linalg.cholesky(scaled))
-    return jnp.asarray(result, dtype)
 
 
 def draw_velocities(
@@ -321,6 +305,8 @@ def _cut(
                     "control": control,
                     "q": _joints_on_all_bodies(scene, motion, first, last),
                     "covariance": _covariance_on_all_bodies(scene, motion, first, last),
+                    "alike": motion.alike,
+                    "told": told_of(scene, motion, smooth, first, smoothing),
                     **{key: full[key][first:last] for key in QUANTITIES},
                 }
             )

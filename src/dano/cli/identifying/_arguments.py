@@ -30,7 +30,8 @@ class Identify:
         window: Cut motions into windows of this many frames; default: do not cut.
         continuity: Allowed gap between a window's end and the next one's start, in standard deviations;
             default: any.
-        starts: Number of points within the bounds to start from.
+        starts: Number of points within the bounds to start from; default: one, of one or two parameters with
+            bounds the best of 16.
         held_out: Motions that are not fitted; the error on them is measured.
         order: Order of the quaternions in .npz files; default: wxyz, unless they cannot be meant so.
         point: What positions refer to: centre of mass (com) or origin of the field's frame (origin).
@@ -58,7 +59,7 @@ class Identify:
     huber: float | None = None
     window: int | None = None
     continuity: float | None = None
-    starts: int = 1
+    starts: int | None = None
     held_out: tuple[Path, ...] = ()
     order: Literal["wxyz", "xyzw"] | None = None
     point: Literal["com", "origin"] | None = None

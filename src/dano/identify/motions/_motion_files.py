@@ -20,7 +20,6 @@ from dano.archive import (
     write_archive,
 )
 from dano.checks import checked_choice, checked_items, checked_kind, checked_number
-from dano.identify._motion import Motion, QUANTITIES, UNNAMED
 from dano.identify.logs import (
     in_metres,
     LENGTH_UNITS,
@@ -30,6 +29,7 @@ from dano.identify.logs import (
     TIME_UNITS,
     understood,
 )
+from dano.identify.motions._motion import Motion, QUANTITIES, UNNAMED
 
 _SYNONYMS = {
     "times": ("times", "time", "t", "timestamp"),
@@ -83,7 +83,7 @@ def load_motion(
 
     .npz: what `save_motion` or `Trajectory.save` wrote, or arrays `times` (T,), `position`, `orientation`,
     `velocity`, `omega` of shape (T, ·) or (T, n, ·) (also `time`, `pos`, `quat`, `vel`, …), and `names`;
-    `covariance` of shape (T, 6, 6) or (T, n, 6, 6), as `Motion` has it.
+    `covariance` of shape (T, 6, 6) or (T, n, 6, 6), and `alike`, as `Motion` has them.
     .csv, .txt, .tum: a header with `time`, `x, y, z`, `qw, qx, qy, qz`, `vx, vy, vz`, `wx, wy, wz`, each
     optional but the time; with several bodies `bunny.x` and so on. Also the columns of ROS
     (`field.pose.position.x`), EuRoC (`p_RS_R_x [m]`) and TUM (without a header), and units in names
@@ -151,6 +151,7 @@ def load_motion(
             point="origin" if "origin" in (stated, point) else "com",
             lag=float(arrays.get("lag", 0.0)),
             covariance=arrays.get("covariance"),
+            alike=arrays.get("alike"),
             q=arrays.get("q"),
         )
     except ValueError as error:
@@ -197,7 +198,7 @@ def _mend(
 def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
     """Write a motion to an .npz or .csv file, replacing an existing one only when complete.
 
-    A .csv does not keep `point`, `lag`, `covariance` and `q`.
+    A .csv does not keep `point`, `lag`, `covariance`, `alike` and `q`.
 
     Raises:
         ValueError: If the suffix is another, `path` is a directory or its parent does not exist.
@@ -209,9 +210,9 @@ def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
         form, version = MOTION
         words = {"format": form, "version": version, "names": motion.names, "point": motion.point}
         words["lag"] = motion.lag
-        for name in ("covariance", "q"):
+        for name in ("covariance", "alike", "q"):
             if getattr(motion, name) is not None:
-                arrays[name] = getattr(motion, name)
+                arrays[name] = np.asarray(getattr(motion, name))
         write_archive(target, {**arrays, **{key: np.array(value) for key, value in words.items()}})
         return
     if target.suffix.lower() != ".csv":
@@ -255,7 +256,7 @@ def _read_npz(source: Path) -> _Read:
             f"{source} must hold one of {list(QUANTITIES)} as arrays, got members {sorted(data)}"
         )
     # A trajectory has joint coordinates in an order of its own.
-    for key in ("point", "lag", "covariance", *(["q"] if form == MOTION[0] else [])):
+    for key in ("point", "lag", "covariance", "alike", *(["q"] if form == MOTION[0] else [])):
         if key in data:
             arrays[key] = data[key]
     if form == TRAJECTORY[0]:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_choice, checked_count, checked_items, checked_kind, checked_number, shown
 from dano.identify.logs import unwrapped
+from dano.identify.motions._slopes import slope, slope_deviation
 from dano.maths import (
     checked_floating,
     checked_numbers,
@@ -37,6 +38,10 @@ JOINT_NUMBERS = 3
 
 # Frames that a local parabola is fitted to for velocities: three on each side.
 SMOOTHING_FRAMES = 7
+# What all poses of a film are off by alike: an offset in sizes and a turn [rad], because nobody photographs
+# what an object stands on, and its distance is as wrong as its size; and a share of its way: a tracker knows
+# sizes to 1.5e-3, and an edge that is seen a tenth of a pixel beside the true one is as much of 100 pixels.
+_BESIDE, _TURNED, _TOO_FAR = 0.01, 6e-3, 2.5e-3
 # Finite differences of a motion and its own angular velocity differ by noise, but not by so large a share.
 _INCONSISTENT = 0.5
 
@@ -58,6 +63,9 @@ class Motion:
         covariance: Of each pose, or None if no more is known than one noise for all: of the position [m, W],
             then of the rotation vector [rad, B] by which the true orientation follows the observed one,
             shape (T, n, 6, 6); NaN where it is unknown.
+        alike: By how much poses with a covariance may be off in all frames alike, as standard deviations: an
+            offset, in sizes of the body, a turn [rad], and a share by which the body goes too far. None: not
+            at all, and covariances are those of independent errors.
         q: Coordinates of the joint that each body hangs on [rad or m], or None if they were not observed,
             shape (T, n, 3): as many numbers as the joint has, then zeros. Poses of such a motion follow from
             them, and do not count beside them.
@@ -72,6 +80,7 @@ class Motion:
     point: str = "com"
     lag: float = 0.0
     covariance: np.ndarray | None = None
+    alike: tuple[float, float, float] | None = None
     q: np.ndarray | None = None
 
     @classmethod
@@ -87,6 +96,7 @@ class Motion:
         point: str = "com",
         lag: float = 0.0,
         covariance: Numbers | None = None,
+        alike: Numbers | None = None,
         q: Numbers | None = None,
     ) -> "Motion":
         """A motion from arrays of shape (T, n, ·), or (T, ·) for a single body.
@@ -102,6 +112,7 @@ class Motion:
             point: What positions and velocities refer to: "com" or "origin".
             lag: How long before a frame its velocities hold [s].
             covariance: Of each pose, as a tracker gives it, shape (T, n, 6, 6), or (T, 6, 6) for one body.
+            alike: By how much poses may be off in all frames alike, see the attribute; needs `covariance`.
             q: Joint coordinates of each body, see the attribute; `motion_of_joints` makes them.
 
         Raises:
@@ -126,10 +137,12 @@ class Motion:
             if not any(np.isfinite(arrays[key][:, row]).all(axis=-1).any() for key in QUANTITIES):
                 raise ValueError(f"motion of {name!r} must hold at least one observed frame, got none")
         arrays["orientation"] = _unit_quaternions(arrays["orientation"])
-        motion = cls(stamps, **arrays, names=names, point=point, lag=lag)
+        motion = cls(stamps, *(arrays[key] for key in QUANTITIES), names=names, point=point, lag=lag)
         if covariance is not None:
             matrices = _covariances(covariance, len(stamps), len(names))
             motion = dataclasses.replace(motion, covariance=matrices)
+        if alike is not None:
+            motion = dataclasses.replace(motion, alike=_alike(alike, covariance))
         if q is not None:
             motion = dataclasses.replace(motion, q=_frames("q", q, len(stamps), len(names)))
         _check_rotation(motion)
@@ -168,7 +181,8 @@ class Motion:
         """Poses of an object that was tracked in a film, with their covariances, as those of a body.
 
         Frames of a motion count as independent. Those of a film that was tracked as one motion are not, and
-        their covariances are multiplied by how many frames say the same.
+        their covariances are multiplied by how many frames say the same. What all of them are off by alike is
+        that of a learned object and its camera (`alike`).
         """
         return cls.create(
             tracked.times,
@@ -176,6 +190,7 @@ class Motion:
             position=tracked.position,
             orientation=tracked.orientation,
             covariance=tracked.covariance * tracked.repeats[:, None, None],
+            alike=(_BESIDE, _TURNED, _TOO_FAR),
             point="origin",
         )
 
@@ -221,12 +236,41 @@ class Motion:
         for row in range(len(self.names)):
             places, turns = self.position[:, row], self.orientation[:, row]
             for t in np.flatnonzero(~np.isfinite(velocity[:, row]).all(axis=1)):
-                velocity[t, row] = _slope(self.times, places, shift[t], frames)
+                velocity[t, row] = slope(self.times, places, shift[t], frames)
             for t in np.flatnonzero(~np.isfinite(omega[:, row]).all(axis=1)):
                 if np.isfinite(turns[t]).all():
                     vectors = quat_log(quat_multiply(quat_conjugate(turns[t : t + 1]), turns))
-                    omega[t, row] = _slope(self.times, vectors, shift[t], frames)
+                    omega[t, row] = slope(self.times, vectors, shift[t], frames)
         return dataclasses.replace(self, velocity=velocity, omega=omega)
+
+    def velocity_deviations(self, frame: int, frames: int = SMOOTHING_FRAMES) -> dict[str, np.ndarray]:
+        """By how much velocities of `with_velocities` may be off at a frame, as covariances of poses say.
+
+        Where poses scatter more about the parabola than these, as they do around an impact, that says it.
+
+        Returns:
+            "velocity" [m/s] and "omega" [rad/s], shape (bodies,); NaN where no velocity was filled in, or
+            poses have no covariances.
+        """
+        found = {key: np.full(len(self.names), np.nan) for key in ("velocity", "omega")}
+        if self.covariance is None:
+            return found
+        when = self.times[frame] - self.lag
+        spread = np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+        for row in range(len(self.names)):
+            turns = quat_log(
+                quat_multiply(
+                    quat_conjugate(self.orientation[frame : frame + 1, row]), self.orientation[:, row]
+                )
+            )
+            parts = (
+                ("velocity", self.position[:, row], spread[:, row, :3]),
+                ("omega", turns, spread[:, row, 3:]),
+            )
+            for key, values, widths in parts:
+                if not np.isfinite(getattr(self, key)[frame, row]).all():
+                    found[key][row] = slope_deviation(self.times, np.hstack([values, widths]), when, frames)
+        return found
 
 
 def _frames(name: str, value: Numbers | None, n_frames: int, n_bodies: int) -> np.ndarray:
@@ -268,6 +312,19 @@ def _covariances(value: Numbers, n_frames: int, n_bodies: int) -> np.ndarray:
     return array
 
 
+def _alike(value: Numbers, covariance: Numbers | None) -> tuple[float, float, float]:
+    if covariance is None:
+        raise ValueError("alike needs the covariance of poses, got covariance None")
+    widths = checked_numbers("alike", value)
+    if widths.shape != (3,) or not np.all(np.isfinite(widths) & (widths >= 0)):
+        raise ValueError(
+            "alike must be three standard deviations ≥ 0, of an offset [sizes], a turn [rad] and a share, got"
+            f" {value}"
+        )
+    offset, turn, share = widths.tolist()
+    return offset, turn, share
+
+
 def _unit_quaternions(orientation: np.ndarray) -> np.ndarray:
     norms = np.linalg.norm(orientation, axis=-1)
     wrong = np.isfinite(norms) & (np.abs(norms - 1) > 0.05)
@@ -285,18 +342,6 @@ def _unit_quaternions(orientation: np.ndarray) -> np.ndarray:
         flips = np.concatenate([[0], np.cumsum(turns)]) % 2 == 1
         unit[seen[flips[: len(seen)]], body] *= -1
     return unit
-
-
-def _slope(times: np.ndarray, values: np.ndarray, when: float, frames: int) -> np.ndarray:
-    """Derivative at a time of the parabola through the nearest known values; a line through only two."""
-    known = np.flatnonzero(np.isfinite(values).all(axis=1))
-    nearest = known[np.argsort(np.abs(times[known] - when), kind="stable")[:frames]]
-    if len(nearest) < 2:
-        return np.full(values.shape[1], np.nan)
-    degree = 1 if len(nearest) < 4 else 2
-    reach = float(np.ptp(times[nearest]))
-    coefficients = np.polynomial.polynomial.polyfit((times[nearest] - when) / reach, values[nearest], degree)
-    return coefficients[1] / reach
 
 
 def _check_rotation(motion: Motion) -> None:
