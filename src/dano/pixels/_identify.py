@@ -69,7 +69,8 @@ def identify_in_film(
     simulated poses, and residuals of silhouettes and colours, weighted robustly, are linearised there: a step
     of Gauss–Newton on pixels, through renderer and simulation, in parameters and initial state. The light is
     fitted in between. Frames in which tracking fails count as far as their pixels say something about the
-    simulated motion. Memory is that of one frame beside the rollout.
+    simulated motion; others are no surer than their poses, whose errors were compared with each other. Memory
+    is that of one frame beside the rollout.
 
     Args:
         scene: The scene, with values for whatever is not a parameter.
@@ -117,7 +118,7 @@ def identify_in_film(
             progress=progress,
         )
         lamps = found.lamps if k + 1 >= _LIGHT_PASSES else None
-        pulled = Motion.from_tracked(found, body)
+        pulled = _no_surer(Motion.from_tracked(found, body), motion)
         last = fit
         fit = identify(
             scene, pulled, parameters, after=fit, progress=progress, options=on_the_way, **settings
@@ -143,6 +144,24 @@ def _with_table(scene: Scene, motion: Motion, options: TrackOptions) -> TrackOpt
             heights.append(plane[1] / float(plane[0][2]))
     below = [height for height in heights if height <= reach]
     return dataclasses.replace(options, table=max(below)) if below else options
+
+
+def _no_surer(pulled: Motion, motion: Motion) -> Motion:
+    """Poses that pixels pull to, in no direction surer than a motion of the same frames has them.
+
+    Its covariances know how far frames disagree; those of single frames do not.
+    """
+    assert pulled.covariance is not None
+    if motion.covariance is None:
+        return pulled
+    covariance = pulled.covariance.copy()
+    known = np.isfinite(covariance).all(axis=(-2, -1)) & np.isfinite(motion.covariance).all(axis=(-2, -1))
+    root = np.linalg.cholesky(covariance[known])
+    inverse = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(inverse @ motion.covariance[known] @ inverse.swapaxes(-1, -2))
+    wider = root @ vectors * np.sqrt(np.maximum(values, 1.0))[..., None, :]
+    covariance[known] = wider @ wider.swapaxes(-1, -2)
+    return dataclasses.replace(pulled, covariance=covariance)
 
 
 def _moved(before: Identification, after: Identification) -> float:
