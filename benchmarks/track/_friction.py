@@ -1,5 +1,6 @@
 """Parameters from tracked poses and from pixels."""
 
+import dataclasses
 import warnings
 from pathlib import Path
 
@@ -10,6 +11,9 @@ from dano.identify import identify, Motion
 from dano.pixels import FilmFit, identify_in_film
 from dano.scene_file import load_asset
 from dano.vision import Film, LearnedField, PosedCamera, Tracked, TrackOptions
+
+STARTS = 10
+"""Starts of fits to one film, all over the bounds of its friction."""
 
 SLIDES = ("soap_slide", "bunny_slide", "soap_hard", "bunny_hard")
 """Films of slides on the table alone."""
@@ -26,7 +30,38 @@ def fit_film(
     background: Path | None,
 ) -> FilmFit:
     """Friction of a slide, from poses and from pixels."""
-    scene = dano.Scene.create(
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return identify_in_film(
+            _on_table(name, body),
+            film,
+            look,
+            camera,
+            Motion.from_tracked(found, name),
+            [_friction(name)],
+            tracking=options,
+            background=background,
+            initial="states",
+        )
+
+
+def fit_from_starts(name: str, body: dano.NeuralObject, found: Tracked) -> list[dano.Identification]:
+    """Friction of a slide from its poses, from starts all over the bounds."""
+    scene, motion = _on_table(name, body), Motion.from_tracked(found, name)
+    first = _friction(name)
+    options = dano.IdentifyOptions(starts=1)
+    fits = []
+    for start in np.linspace(first.lower, first.upper, STARTS + 2)[1:-1]:
+        parameter = dataclasses.replace(first, start=float(start))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            fits.append(identify(scene, motion, [parameter], initial="states", options=options))
+    return fits
+
+
+def _on_table(name: str, body: dano.NeuralObject) -> dano.Scene:
+    """The body on a level table, with a friction to start from."""
+    return dano.Scene.create(
         bodies=[
             dano.Body(name, body),
             dano.Body("table", dano.HalfSpace(), fixed=True),
@@ -34,20 +69,11 @@ def fit_film(
         contacts=[dano.Contact(name, "table", dano.ContactParams(sliding_friction=0.5))],
         timestep=1 / 120,
     )
-    friction = dano.Parameter("mu", lambda s: s.contact(name, "table").sliding_friction, 0.02, 1.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        return identify_in_film(
-            scene,
-            film,
-            look,
-            camera,
-            Motion.from_tracked(found, name),
-            [friction],
-            tracking=options,
-            background=background,
-            initial="states",
-        )
+
+
+def _friction(name: str) -> dano.Parameter:
+    """What is looked for."""
+    return dano.Parameter("mu", lambda s: s.contact(name, "table").sliding_friction, 0.02, 1.0)
 
 
 def fit_centre_of_mass(name: str, found: Tracked, frames: int) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 import dano
 from benchmarks._measure import Row
 from benchmarks.track._cases import Case, errors, in_region, read_case
-from benchmarks.track._friction import fit_film
+from benchmarks.track._friction import fit_film, fit_from_starts, STARTS
 from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate
 from dano.scene_file import load_object
 from dano.vision import Film, LearnedField, track, Tracked
@@ -85,7 +85,23 @@ def phone_rows(filmed: PhoneFilm, source: str, *, friction: bool) -> list[Row]:
             note = f"{value:.4f} ± {error:.4f}, truth {case.friction}"
             off = 100 * abs(value / case.friction - 1)
             rows.append(Row(group, f"friction from {name}, error", off, "%", 3.0, note=note))
+            low, high = np.asarray(one.interval("mu"), float)
+            outside = float(max(low - case.friction, case.friction - high, 0.0) / error)
+            rows.append(Row(group, f"truth outside the 95 % interval from {name}", outside, "errors", 0.0))
+        rows += _from_starts(group, filmed, found)
     return rows
+
+
+def _from_starts(group: str, filmed: PhoneFilm, found: Tracked) -> list[Row]:
+    """Whether friction is the same whatever a search begins with."""
+    fits = fit_from_starts(filmed.case.object, filmed.body, found)
+    values = np.array([float(fit.values["mu"]) for fit in fits])
+    middle = float(np.median(values))
+    error = float(np.median([float(fit.standard_errors["mu"]) for fit in fits]))
+    same = int(np.sum(np.abs(values - middle) < 0.5 * error))
+    ended = sum(fit.stop.converged for fit in fits)
+    note = f"of {STARTS}, {ended} in a minimum; {fits[-1].seconds:.0f} s each"
+    return [Row(group, "starts with the same friction", same, "", STARTS, at_least=True, note=note)]
 
 
 def without_masks(film: Film) -> Film:
