@@ -16,7 +16,7 @@ from dano.cli.film._stages import AGAIN, Stage
 from dano.cli.identifying import Identify
 from dano.cli.tracking import Track
 from dano.engine import simulate
-from dano.identify import load_motion, save_motion
+from dano.identify import load_motion, Motion, save_motion
 from dano.scene_file import parse_scene
 from dano.vision import read_film
 
@@ -122,7 +122,8 @@ def _fit(place: Place) -> None:
     part = find_slide(motion, release)
     half = 0.5 * float(np.median(np.diff(shown)))
     slid = motion.part(part.first, part.last)
-    save_motion(folder / "slide.npz", dataclasses.replace(slid, times=slid.times - slid.times[0]))
+    slid = dataclasses.replace(slid, times=slid.times - slid.times[0], alike=_alike(place, slid))
+    save_motion(folder / "slide.npz", slid)
     say(f"the slide lasts from {shown[part.first]:.2f} to {shown[part.last - 1]:.2f} s of the film")
     duration = part.until - part.since
     write_text(folder / "slide.toml", _scene_text(place, duration, "0.3", ""))
@@ -137,6 +138,16 @@ def _fit(place: Place) -> None:
         look=str(asked.output),
         filming=place.filming(float(shown[part.first]) - half, float(shown[part.last - 1]) + half),
     )()
+
+
+def _alike(place: Place, slid: Motion) -> tuple[float, float, float] | None:
+    """What all poses are off by alike, with the scale of the cameras: it makes ways too long by a share."""
+    file = place.folder / "cameras.json"
+    scale = read_json(file).get("scale", {}).get("relative_error") if file.is_file() else None
+    if slid.alike is None or scale is None:
+        return slid.alike
+    offset, turn, share = slid.alike
+    return offset, turn, float(np.hypot(share, scale))
 
 
 def _simulate(place: Place) -> None:

@@ -29,7 +29,7 @@ _STILL = 2e-4
 _LEVEL, _FLAT = 1.5e-3, 2e-3
 """Standard deviations of the height [sizes] and tilt [rad] with which a face lies on a table in a frame."""
 
-_BASE, _LEAN = 4e-3, 6e-3
+_BASE, _LEAN = 4e-3, 3e-3
 """By how much the learned face may lie beside the true one: height [sizes] and tilt [rad], one for a film."""
 
 _LOADED = 0.03
