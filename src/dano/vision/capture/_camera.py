@@ -13,6 +13,9 @@ from dano.maths import checked_array, checked_numbers, is_traced, Numbers
 
 Slopes = TypeVar("Slopes", np.ndarray, Array)
 
+_NEWTON, _EXACT = 8, 1e-12
+"""Steps at most, and the miss in slopes that ends them, of what undoes a distortion (convention)."""
+
 _ROTATION_TOLERANCE = 1e-3
 """By which the columns of a pose may fail to be orthonormal: what files with four digits round off."""
 
@@ -325,27 +328,34 @@ def _distorted(slopes: Float[np.ndarray, "n 2"], coefficients: np.ndarray) -> Fl
 
 
 def _undistorted(image: Float[np.ndarray, "n 2"], coefficients: np.ndarray) -> Float[np.ndarray, "n 2"]:
-    """Newton's method with a Jacobian by differences, from the distorted slopes."""
-    step = 1e-6
+    """Slopes whose image is known, by Newton's method."""
     slopes = image.copy()
-    for _ in range(8):
+    for _ in range(_NEWTON):
         miss = _distorted(slopes, coefficients) - image
-        a, b = (
-            (_distorted(slopes + step * axis, coefficients) - _distorted(slopes - step * axis, coefficients))
-            / (2 * step)
-            for axis in np.eye(2)
-        )
-        determinant = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        if np.max(np.abs(miss), initial=0.0) < _EXACT:
+            break
+        across, cross, down = _slopes_of_distorted(slopes, coefficients)
+        determinant = across * down - cross * cross
         # Beyond the fold of a strong distortion there is no solution; the constructor has checked.
         determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
-        slopes = slopes - np.stack(
-            [
-                (b[:, 1] * miss[:, 0] - b[:, 0] * miss[:, 1]) / determinant,
-                (a[:, 0] * miss[:, 1] - a[:, 1] * miss[:, 0]) / determinant,
-            ],
-            axis=1,
-        )
+        step = (down * miss[:, 0] - cross * miss[:, 1], across * miss[:, 1] - cross * miss[:, 0])
+        slopes = slopes - np.stack(step, axis=1) / determinant[:, None]
     return slopes
+
+
+def _slopes_of_distorted(
+    slopes: Float[np.ndarray, "n 2"], coefficients: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """∂x_d/∂x, ∂x_d/∂y = ∂y_d/∂x, and ∂y_d/∂y of `distorted`."""
+    (x, y), (k1, k2, k3, p1, p2) = slopes.T, coefficients
+    square = x * x + y * y
+    radial = 1 + square * (k1 + square * (k2 + square * k3))
+    slope = 2 * (k1 + square * (2 * k2 + 3 * square * k3))
+    return (
+        radial + x * x * slope + 2 * p1 * y + 6 * p2 * x,
+        x * y * slope + 2 * p1 * x + 2 * p2 * y,
+        radial + y * y * slope + 6 * p1 * y + 2 * p2 * x,
+    )
 
 
 def view_axes(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
