@@ -19,7 +19,7 @@ from dano.vision.structure._triangulation import triangulate
 FEWEST_VIEWS = 3
 """Pictures of a marker below which its corners cannot be checked."""
 
-_EDGE = 0.1
+_EDGE = 0.07
 """By how much all edges may be found too far in or out [pixels], which no picture's absence shows: a phone
 sharpens (a side of 65 pixels came out 0.4 % too short)."""
 
@@ -173,7 +173,7 @@ def _placed(number: int, cameras: list[PosedCamera], corners: Float[np.ndarray, 
         centre=points.mean(0),
         axes=axes,
         side=side,
-        side_error=float(np.sqrt(max(scatter, 0.5 * misfit**2) + 2 * (_EDGE / pixels) ** 2)),
+        side_error=float(np.sqrt(max(scatter, 0.5 * misfit**2) + (2 * _EDGE / pixels) ** 2)),
         axis_error=float(np.sqrt(max(tilt, 2 * misfit**2))),
         residual=float(np.sqrt(np.mean(residuals**2))),
     )

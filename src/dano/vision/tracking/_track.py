@@ -65,7 +65,8 @@ def track(
         if i == first - 1:
             walk.turn_back()
         walk.step(i)
-    tell("tracking, frames that fit worse", _WALKED)
+    worse = "tracking, frames that fit worse"
+    tell(worse, _WALKED)
     walk.turn_over()
-    walk.look_again()
+    walk.look_again(lambda share: tell(worse, _WALKED + (_AGAIN - _WALKED) * share))
     return walk.result(lambda share: tell("tracking, all frames together", _AGAIN + (1 - _AGAIN) * share))

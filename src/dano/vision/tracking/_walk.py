@@ -207,9 +207,9 @@ class Walk:
             fine = self._fine(i, place, self._light)
             self._found[i], self._status[i] = fine, LOST if fine is None else TRACKED
 
-    def look_again(self) -> None:
+    def look_again(self, tell: Callable[[float], None]) -> None:
         """Begin once more in frames that fit worse than usual, or were lost: where other frames say."""
-        better, more = self._look_between(), self._look_back()
+        better, more = self._look_between(), self._look_back(tell)
         # What is usual is known only when most frames are right.
         if better or more:
             self._look_between()
@@ -241,7 +241,7 @@ class Walk:
             return len(pair) == 2
         return pair[0] < i < pair[1] and self._subject.off(*map(self._place, pair)) < _LITTLE
 
-    def _look_back(self) -> bool:
+    def _look_back(self, tell: Callable[[float], None]) -> bool:
         """Follow the object backwards into frames where it was lost, or is not where later frames lead.
 
         It may come into the picture beside something else, and be alone only later; it may have been hidden
@@ -249,6 +249,7 @@ class Walk:
         """
         better = False
         for i in reversed(range(len(self._found) - 1)):
+            tell(1 - i / len(self._found))
             if self._found[i + 1] is None:
                 continue
             known, after = self._found[i], self._place(i + 1)
