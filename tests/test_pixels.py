@@ -260,3 +260,31 @@ def test_what_is_wrong_is_said(scene, look):
         film(scene, state, 2, {"cube": look}, camera, (Light((0, 0, 1)),))
     with pytest.raises(ValueError, match="lights must hold a Light"):
         film(scene, state, 2, {"ball": look}, camera, ())
+
+
+def test_pixels_and_motion_meet_half_way_and_neither_makes_the_other_surer():
+    from dano.pixels._identify import _fused
+
+    times, turns = np.arange(3.0), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
+    width = np.diag([1e-3, 1e-3, 5e-3, 1e-2, 1e-2, 1e-2]) ** 2
+
+    def motion(x: float, scale: float, known: slice) -> Motion:
+        covariance, position = np.full((3, 6, 6), np.nan), np.full((3, 3), np.nan)
+        covariance[known], position[known] = scale * width, [x, 0.0, 0.0]
+        return Motion.create(
+            times, "box", position=position, orientation=turns, covariance=covariance, point="origin"
+        )
+
+    told = motion(0.0, 1.0, slice(0, 3))
+    same = _fused(motion(0.004, 1.0, slice(0, 2)), told)
+    assert same.position[:2, 0, 0] == pytest.approx(0.002, rel=1e-9)
+    np.testing.assert_allclose(same.covariance[0, 0], width, rtol=1e-9)
+    # The third frame is the motion's, which counts half.
+    assert same.position[2, 0, 0] == 0.0
+    np.testing.assert_allclose(same.covariance[2, 0], 2 * width, rtol=1e-9)
+    # Pixels that seem to be surer are not.
+    surer = _fused(motion(0.004, 1e-4, slice(0, 2)), told)
+    np.testing.assert_allclose(surer.covariance[0, 0], width, rtol=1e-9)
+    # Those that hardly know leave a pose where it is.
+    vague = _fused(motion(0.004, 1e6, slice(0, 2)), told)
+    assert np.abs(vague.position[0, 0, 0]) < 1e-8

@@ -9,12 +9,14 @@ import numpy as np
 
 from dano.checks import checked_count, checked_kind, checked_optional
 from dano.identify import Identification, identify, IdentifyOptions, Motion, Parameter
+from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply
 from dano.progress import Progress
 from dano.scene import Scene
 from dano.vision import adjust_poses, Film, LearnedField, Light, PosedCamera, Tracked, TrackOptions
 
-_SETTLED = 0.1
-"""Move of a parameter, in its standard errors, below which the search ends."""
+_SETTLED = 0.25
+"""Move of a parameter, in its standard errors, that ends the search: each pass moves it by about half of what
+the one before did, and as much is left."""
 
 _LIGHT_PASSES = 2
 """Passes in which the light is fitted: after that poses are right, and it would only follow the noise."""
@@ -34,7 +36,7 @@ class FilmFit(NamedTuple):
         poses: The same from the poses alone, which the search began with.
         tracked: What the film shows at the motion found: quality and status of frames, light, silhouettes.
         history: Values of the parameters after each pass, the first of them from the poses alone.
-        settled: Whether the last pass moved no value by more than a tenth of its standard error.
+        settled: Whether the last pass moved no value by more than a quarter of its standard error.
     """
 
     fit: Identification
@@ -68,9 +70,9 @@ def identify_in_film(
     Begins with the parameters that poses of the body give (`identify`). Then the film is rendered at the
     simulated poses, and residuals of silhouettes and colours, weighted robustly, are linearised there: a step
     of Gauss–Newton on pixels, through renderer and simulation, in parameters and initial state. The light is
-    fitted in between. Frames in which tracking fails count as far as their pixels say something about the
-    simulated motion; others are no surer than their poses, whose errors were compared with each other. Memory
-    is that of one frame beside the rollout.
+    fitted in between. Poses of the motion, which all frames together have made, count as much as what the
+    pixels of a frame say near the simulated one, and neither makes the other surer. Memory is that of one
+    frame beside the rollout.
 
     Args:
         scene: The scene, with values for whatever is not a parameter.
@@ -118,7 +120,7 @@ def identify_in_film(
             progress=progress,
         )
         lamps = found.lamps if k + 1 >= _LIGHT_PASSES else None
-        pulled = _no_surer(Motion.from_tracked(found, body), motion)
+        pulled = _fused(Motion.from_tracked(found, body), motion)
         last = fit
         fit = identify(
             scene, pulled, parameters, after=fit, progress=progress, options=on_the_way, **settings
@@ -146,22 +148,46 @@ def _with_table(scene: Scene, motion: Motion, options: TrackOptions) -> TrackOpt
     return dataclasses.replace(options, table=max(below)) if below else options
 
 
-def _no_surer(pulled: Motion, motion: Motion) -> Motion:
-    """Poses that pixels pull to, in no direction surer than a motion of the same frames has them.
+def _fused(pulled: Motion, motion: Motion) -> Motion:
+    """Poses that pixels pull to together with those of a motion of the same film, by covariance intersection.
 
-    Its covariances know how far frames disagree; those of single frames do not.
+    Both say what the same pixels show, one frame by frame, the other in the light of all frames: half of what
+    each says is never too sure (Julier and Uhlmann 1997). Without the motion nothing holds a pose along the
+    line of sight, and a slide may hop there.
     """
     assert pulled.covariance is not None
     if motion.covariance is None:
         return pulled
-    covariance = pulled.covariance.copy()
-    known = np.isfinite(covariance).all(axis=(-2, -1)) & np.isfinite(motion.covariance).all(axis=(-2, -1))
-    root = np.linalg.cholesky(covariance[known])
+    told = [np.isfinite(each.covariance[:, 0]).all(axis=(-2, -1)) for each in (pulled, motion)]
+    both = told[0] & told[1]
+    here, there = np.zeros((2, len(both), 6, 6))
+    here[told[0]] = np.linalg.inv(pulled.covariance[told[0], 0])
+    there[told[1]] = np.linalg.inv(motion.covariance[told[1], 0])
+    here[both] = _no_surer(here[both], there[both])
+    covariance = np.full(pulled.covariance.shape, np.nan)
+    some = told[0] | told[1]
+    covariance[some, 0] = np.linalg.inv(0.5 * (here + there)[some])
+    # A frame in which pixels say nothing is that of the motion.
+    position = np.where(told[0][:, None, None], pulled.position, motion.position)
+    orientation = np.where(told[0][:, None, None], pulled.orientation, motion.orientation)
+    turn = quat_log(quat_multiply(quat_conjugate(orientation[both, 0]), motion.orientation[both, 0]))
+    apart = np.concatenate([motion.position[both, 0] - position[both, 0], turn], axis=1)
+    step = 0.5 * np.einsum("nij,njk,nk->ni", covariance[both, 0], there[both], apart)
+    position[both, 0] += step[:, :3]
+    orientation[both, 0] = quat_multiply(orientation[both, 0], quat_exp(step[:, 3:]))
+    return dataclasses.replace(pulled, position=position, orientation=orientation, covariance=covariance)
+
+
+def _no_surer(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Information (n, 6, 6), in no direction more than another.
+
+    A single frame does not know how far frames disagree.
+    """
+    root = np.linalg.cholesky(other)
     inverse = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(inverse @ motion.covariance[known] @ inverse.swapaxes(-1, -2))
-    wider = root @ vectors * np.sqrt(np.maximum(values, 1.0))[..., None, :]
-    covariance[known] = wider @ wider.swapaxes(-1, -2)
-    return dataclasses.replace(pulled, covariance=covariance)
+    values, vectors = np.linalg.eigh(inverse @ one @ inverse.swapaxes(-1, -2))
+    part = root @ vectors * np.sqrt(np.clip(values, 0.0, 1.0))[..., None, :]
+    return part @ part.swapaxes(-1, -2)
 
 
 def _moved(before: Identification, after: Identification) -> float:
