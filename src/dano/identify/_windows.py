@@ -39,6 +39,8 @@ class Windows(eqx.Module):
         whitening: What makes residuals of pose with these weights, position then orientation, independent and
             of variance one, by the motions' covariances, shape (w, frames, bodies, 6, 6); None if no motion
             has any.
+        common: Columns U, shape (w, frames, bodies, 6, 7), by which these residuals r become r − U Uᵀ r: what
+            all poses of a body are off by alike does not count; None if no motion says it (`Motion.alike`).
         end: Where the next window of the same motion begins, as `frame` has it.
         chained: Whether there is such a window, 1 or 0.
         controls: Forces and torques of each step, or None.
