@@ -158,24 +158,29 @@ def _fused(pulled: Motion, motion: Motion) -> Motion:
     assert pulled.covariance is not None
     if motion.covariance is None:
         return pulled
-    told = [np.isfinite(each.covariance[:, 0]).all(axis=(-2, -1)) for each in (pulled, motion)]
-    both = told[0] & told[1]
-    here, there = np.zeros((2, len(both), 6, 6))
-    here[told[0]] = np.linalg.inv(pulled.covariance[told[0], 0])
-    there[told[1]] = np.linalg.inv(motion.covariance[told[1], 0])
+    here, seen = _information(pulled.covariance[:, 0])
+    there, told = _information(motion.covariance[:, 0])
+    both, some = seen & told, seen | told
     here[both] = _no_surer(here[both], there[both])
     covariance = np.full(pulled.covariance.shape, np.nan)
-    some = told[0] | told[1]
     covariance[some, 0] = np.linalg.inv(0.5 * (here + there)[some])
     # A frame in which pixels say nothing is that of the motion.
-    position = np.where(told[0][:, None, None], pulled.position, motion.position)
-    orientation = np.where(told[0][:, None, None], pulled.orientation, motion.orientation)
+    position = np.where(seen[:, None, None], pulled.position, motion.position)
+    orientation = np.where(seen[:, None, None], pulled.orientation, motion.orientation)
     turn = quat_log(quat_multiply(quat_conjugate(orientation[both, 0]), motion.orientation[both, 0]))
     apart = np.concatenate([motion.position[both, 0] - position[both, 0], turn], axis=1)
     step = 0.5 * np.einsum("nij,njk,nk->ni", covariance[both, 0], there[both], apart)
     position[both, 0] += step[:, :3]
     orientation[both, 0] = quat_multiply(orientation[both, 0], quat_exp(step[:, 3:]))
     return dataclasses.replace(pulled, position=position, orientation=orientation, covariance=covariance)
+
+
+def _information(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inverses of covariances (n, 6, 6), zero where they are not known, and which are."""
+    known = np.asarray(np.isfinite(covariance).all(axis=(-2, -1)))
+    inverse = np.zeros(covariance.shape)
+    inverse[known] = np.linalg.inv(covariance[known])
+    return inverse, known
 
 
 def _no_surer(one: np.ndarray, other: np.ndarray) -> np.ndarray:
