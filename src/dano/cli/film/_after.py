@@ -179,7 +179,7 @@ def _simulate(place: Place) -> None:
     )()
 
 
-def _lines(start: Mapping[str, Sequence[float]]) -> str:
+def _lines(start: Mapping[str, Sequence[float] | np.ndarray]) -> str:
     """Quantities of a state as lines of a scene file."""
     return "\n".join(f"{key} = {[round(float(x), 7) for x in values]}" for key, values in start.items())
 
