@@ -88,10 +88,7 @@ class Subject:
         """What lies and slides: its hull, and its centre of mass if it is equally dense."""
         values, box = np.asarray(self._field.model.distances), self._field.model.box
         inside = np.argwhere(values < 0)
-        slope = np.stack([np.gradient(values, box.spacing, axis=k) for k in range(3)], axis=-1)
-        skin = np.abs(values) < box.spacing
-        slope = slope[skin] / np.maximum(np.sum(slope[skin] ** 2, axis=1, keepdims=True), 1e-9)
-        points = box.origin + box.spacing * np.argwhere(skin) - values[skin][:, None] * slope
+        points = box.origin + box.spacing * _crossings(values)
         return solid_of(points, box.origin + box.spacing * inside.mean(axis=0))
 
     def clearance(self, place: Placement, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
@@ -346,6 +343,21 @@ def window_of(
     if np.any(high - low < 4):
         return None
     return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def _crossings(values: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "n 3"]:
+    """Where lines between neighbours of a grid pass through zero, in cells from its first node.
+
+    Steps along slopes would leave the surface: they vanish where something was cut off, as by a table.
+    """
+    points = []
+    for axis, unit in enumerate(np.eye(3)):
+        low, high = np.moveaxis(values, axis, 0)[:-1], np.moveaxis(values, axis, 0)[1:]
+        through = (low < 0) != (high < 0)
+        nodes = np.argwhere(np.moveaxis(through, 0, axis))
+        start, end = (np.moveaxis(part, 0, axis)[tuple(nodes.T)] for part in (low, high))
+        points.append(nodes + (start / (start - end))[:, None] * unit)
+    return np.concatenate(points)
 
 
 def pixels_of(window: tuple[slice, slice]) -> Float[np.ndarray, "n 2"]:
