@@ -28,7 +28,7 @@ from dano.vision.tracking._refine import (
 from dano.vision.tracking._result import covariance_of, unobservable
 from dano.vision.tracking._search import half_turns
 from dano.vision.tracking._segments import common_offset, differs, edge_offset, moved_edge, overlap
-from dano.vision.tracking._subject import _exposed, Seen, Subject
+from dano.vision.tracking._subject import _crossings, _exposed, Seen, Subject
 from dano.vision.tracking._whole import told_apart, turn_evidence
 
 
@@ -408,3 +408,15 @@ def test_placements_turn_about_the_ball(bunny):
     np.testing.assert_allclose(moved.position - place.position, [0.5 * subject.radius, 0, 0], atol=1e-12)
     ahead = quat_rotate(quat_conjugate(turn), quat_rotate(moved.orientation, np.array([1.0, 0, 0])))
     np.testing.assert_allclose(ahead, [np.cos(0.2), np.sin(0.2), 0], atol=1e-12)
+
+
+def test_the_surface_is_where_distances_change_sign():
+    """A ball cut off by a table: distances below the cut are no distances, and their slopes vanish there."""
+    x, y, z = (np.stack(np.meshgrid(*[np.arange(24.0)] * 3, indexing="ij")) - 11.5) / 8.0
+    values = np.where(z < -0.32, 0.3, np.sqrt(x**2 + y**2 + z**2) - 1.0)
+    points = (_crossings(values) - 11.5) / 8.0
+    round_ = np.linalg.norm(points, axis=1)
+    above = points[:, 2] > -0.3
+    assert above.sum() > 500 and np.abs(round_[above] - 1).max() < 3e-3
+    # Within one cell of the cut, wherever between its nodes the sign changes.
+    assert np.all(points[:, 2] > -0.32 - 1 / 8)
