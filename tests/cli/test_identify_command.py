@@ -159,7 +159,7 @@ def test_an_interrupted_search_keeps_its_best_and_says_so(files, run, monkeypatc
     monkeypatch.setattr(Problem, "search", search)
     answer = run(
         "identify", files / "scene.toml", files / "slide.csv", "-p", "ball,floor.sliding_friction:0:1:0.6",
-        "-o", files / "fit.json", "--report", files / "fit.html",
+        "--starts", 1, "-o", files / "fit.json", "--report", files / "fit.html",
     )  # fmt: skip
     # What the search was replaced by keeps nothing.
     assert (answer.code, answer.err) == (130, "dano: interrupted; the values are the best so far\n")
@@ -173,6 +173,7 @@ def test_an_interrupted_search_keeps_its_best_and_says_so(files, run, monkeypatc
 def test_an_interrupted_search_says_how_it_goes_on(files, run, monkeypatch):
     words = (
         "identify", files / "scene.toml", files / "slide.npz", "-p", "ball,floor.sliding_friction:0:1:0.6",
+        "--starts", 1,
     )  # fmt: skip
     whole, part = files / "whole.json", files / "part.json"
     assert run(*words, "-o", whole).code == 0
@@ -213,6 +214,7 @@ main(sys.argv[1:])
 def test_a_search_in_a_process_that_was_killed_goes_on(files, run):
     words = (
         "identify", files / "scene.toml", files / "slide.npz", "-p", "ball,floor.sliding_friction:0:1:0.6",
+        "--starts", 1,
     )  # fmt: skip
     whole, part = files / "whole.json", files / "part.json"
     assert run(*words, "-o", whole).code == 0
