@@ -8,7 +8,7 @@ from scipy import ndimage
 from vision.drawn_films import fine_frame, LIGHT, path, SIZE
 
 from dano import HalfSpace, Pose
-from dano.maths import quat_conjugate, quat_exp, quat_multiply, quat_rotate
+from dano.maths import quat_conjugate, quat_exp, quat_multiply, quat_rotate, quat_to_matrix
 from dano.scene_file import asset_look
 from dano.vision import Camera, compose, Item, Light
 from dano.vision.drawing import GAMMA
@@ -25,7 +25,7 @@ from dano.vision.tracking._refine import (
     silhouette,
     window_of,
 )
-from dano.vision.tracking._result import covariance_of, unobservable
+from dano.vision.tracking._result import covariance_of, shared_covariance, unobservable
 from dano.vision.tracking._search import half_turns
 from dano.vision.tracking._segments import common_offset, differs, edge_offset, moved_edge, overlap
 from dano.vision.tracking._subject import _crossings, _exposed, Seen, Subject
@@ -420,3 +420,20 @@ def test_the_surface_is_where_distances_change_sign():
     assert above.sum() > 500 and np.abs(round_[above] - 1).max() < 3e-3
     # Within one cell of the cut, wherever between its nodes the sign changes.
     assert np.all(points[:, 2] > -0.32 - 1 / 8)
+
+
+def test_a_doubt_of_the_turn_is_one_about_the_middle(bunny):
+    """The frame of an object may lie far beside it: its middle is as sure all the same."""
+    far, near = Subject(bunny), Subject(bunny)
+    far.centre, near.centre = np.array([0.1, -0.2, 0.02]), np.zeros(3)
+    turn = np.asarray(quat_exp(np.array([0.3, -0.2, 0.5])))
+    away = shared_covariance(far, turn)
+    # How the middle p + R c moves with the pose, by differences.
+    middle = np.eye(6)
+    for k in range(3):
+        step = np.zeros(3)
+        step[k] = 1e-6
+        moved = quat_to_matrix(quat_multiply(turn, np.asarray(quat_exp(step)))) @ far.centre
+        middle[:3, 3 + k] = (moved - quat_to_matrix(turn) @ far.centre) / 1e-6
+    np.testing.assert_allclose(middle @ away @ middle.T, shared_covariance(near, turn), atol=1e-10)
+    assert away[0, 0] > 3 * shared_covariance(near, turn)[0, 0]

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from dano.maths import quat_to_matrix
 from dano.vision.capture import Light
 from dano.vision.tracking._film import Film
 from dano.vision.tracking._refine import Refined
@@ -139,7 +140,7 @@ def tracked(
             covariance[i] = covariance_of(one, subject, eye)
             if motion is not None:
                 position[i], orientation[i] = motion.poses.position[i], motion.poses.orientation[i]
-                covariance[i] = motion.poses.covariance[i] + shared_covariance(subject)
+                covariance[i] = motion.poses.covariance[i] + shared_covariance(subject, orientation[i])
             quality[i], colour[i] = one.overlap, one.colour_error
             overlays[i] = Overlay(one.window, one.silhouette)
     known = [one for one in found if one is not None]
@@ -226,15 +227,21 @@ def own_covariance(found: Refined, subject: Subject) -> Float[np.ndarray, "6 6"]
     return 0.5 * (result + result.T)
 
 
-def shared_covariance(subject: Subject) -> Float[np.ndarray, "6 6"]:
-    """Covariance of errors of an object's frame that all frames of a film share and none shows."""
-    return np.diag(np.repeat([(_PLACE_DOUBT * subject.size) ** 2, _TURN_DOUBT**2], 3))
+def shared_covariance(subject: Subject, orientation: Float[np.ndarray, "4"]) -> Float[np.ndarray, "6 6"]:
+    """Covariance of errors of an object's frame that all frames of a film share and none shows.
+
+    The object is turned about its middle: an origin that lies elsewhere goes with it.
+    """
+    alone = np.diag(np.repeat([(_PLACE_DOUBT * subject.size) ** 2, _TURN_DOUBT**2], 3))
+    carried = np.eye(6)
+    carried[:3, 3:] = quat_to_matrix(orientation) @ np.cross(np.eye(3), subject.centre)
+    return carried @ alone @ carried.T
 
 
 def covariance_of(found: Refined, subject: Subject, eye: Float[np.ndarray, "3"]) -> Float[np.ndarray, "6 6"]:
     """Covariance of position [m, W] and rotation vector [rad, F], seen from a point [m, W]."""
     result, away = (
-        own_covariance(found, subject) + shared_covariance(subject),
+        own_covariance(found, subject) + shared_covariance(subject, found.place.orientation),
         subject.middle(found.place) - eye,
     )
     result[:3, :3] += SCALE_DOUBT**2 * np.outer(away, away)
