@@ -16,6 +16,9 @@ Slopes = TypeVar("Slopes", np.ndarray, Array)
 _NEWTON, _EXACT = 8, 1e-12
 """Steps at most, and the miss in slopes that ends them, of what undoes a distortion (convention)."""
 
+_STEP = 1e-30
+"""Imaginary step of derivatives: its square is nothing beside one (convention)."""
+
 _ROTATION_TOLERANCE = 1e-3
 """By which the columns of a pose may fail to be orthonormal: what files with four digits round off."""
 
@@ -346,16 +349,11 @@ def _undistorted(image: Float[np.ndarray, "n 2"], coefficients: np.ndarray) -> F
 def _slopes_of_distorted(
     slopes: Float[np.ndarray, "n 2"], coefficients: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """∂x_d/∂x, ∂x_d/∂y = ∂y_d/∂x, and ∂y_d/∂y of `distorted`."""
-    (x, y), (k1, k2, k3, p1, p2) = slopes.T, coefficients
-    square = x * x + y * y
-    radial = 1 + square * (k1 + square * (k2 + square * k3))
-    slope = 2 * (k1 + square * (2 * k2 + 3 * square * k3))
-    return (
-        radial + x * x * slope + 2 * p1 * y + 6 * p2 * x,
-        x * y * slope + 2 * p1 * x + 2 * p2 * y,
-        radial + y * y * slope + 6 * p1 * y + 2 * p2 * x,
-    )
+    """∂x_d/∂x, ∂x_d/∂y = ∂y_d/∂x, and ∂y_d/∂y of `distorted`: exact for polynomials, by an imaginary step."""
+    x, y = slopes.T
+    across, cross = distorted(x + 1j * _STEP, y, coefficients)
+    _, down = distorted(x, y + 1j * _STEP, coefficients)
+    return across.imag / _STEP, cross.imag / _STEP, down.imag / _STEP
 
 
 def view_axes(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
