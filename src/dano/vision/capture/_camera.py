@@ -353,7 +353,7 @@ def _slopes_of_distorted(
     x, y = slopes.T
     across, cross = distorted(x + 1j * _STEP, y, coefficients)
     _, down = distorted(x, y + 1j * _STEP, coefficients)
-    return across.imag / _STEP, cross.imag / _STEP, down.imag / _STEP
+    return np.imag(across) / _STEP, np.imag(cross) / _STEP, np.imag(down) / _STEP
 
 
 def view_axes(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
