@@ -277,6 +277,7 @@ def test_pixels_and_motion_meet_half_way_and_neither_makes_the_other_surer():
 
     told = motion(0.0, 1.0, slice(0, 3))
     same = _fused(motion(0.004, 1.0, slice(0, 2)), told)
+    assert same.covariance is not None
     assert same.position[:2, 0, 0] == pytest.approx(0.002, rel=1e-9)
     np.testing.assert_allclose(same.covariance[0, 0], width, rtol=1e-9)
     # The third frame is the motion's, which counts half.
@@ -284,6 +285,7 @@ def test_pixels_and_motion_meet_half_way_and_neither_makes_the_other_surer():
     np.testing.assert_allclose(same.covariance[2, 0], 2 * width, rtol=1e-9)
     # Pixels that seem to be surer are not.
     surer = _fused(motion(0.004, 1e-4, slice(0, 2)), told)
+    assert surer.covariance is not None
     np.testing.assert_allclose(surer.covariance[0, 0], width, rtol=1e-9)
     # Those that hardly know leave a pose where it is.
     vague = _fused(motion(0.004, 1e6, slice(0, 2)), told)
