@@ -24,7 +24,7 @@ def test_a_place_is_seen_in_the_frame_s_shadow_and_exposure():
     free = np.ones((40, 50), bool)
     free[15:25, 20:30] = False
     image[~free] = 0.1
-    seen = place.seen_in(image, free)
+    seen = place.seen_in(image, free, (slice(0, image.shape[0]), slice(0, image.shape[1])))
     np.testing.assert_allclose(seen[:, :15], 0.5 * colours[:, :15], rtol=0.02)
     np.testing.assert_allclose(seen[:, 40:], 0.9 * colours[:, 40:], rtol=0.02)
     inside = seen[~free] / colours[~free]

@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from dano.vision.radiance._trilinear import smooth_slope_at
 from dano.vision.radiance._volume import (
+    by_halves,
     composite,
     density_alpha,
     importance_edges,
@@ -89,3 +90,18 @@ def test_smooth_slopes_are_interpolated_central_differences(n_points):
     ]
     expected = [ndimage.map_coordinates(node, u, order=1) for node in nodes]
     np.testing.assert_allclose(smooth_slope_at(jnp.asarray(grid), jnp.asarray(u)), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [6, 7])
+def test_halves_of_rays_make_a_whole(count):
+    rows, rest = jnp.arange(3.0 * count).reshape(count, 3), jnp.linspace(1, 2, count)
+
+    def looked_up(scale, pair):
+        first, second = pair
+        return jnp.sin(scale * first) * second[:, None]
+
+    scale = jnp.asarray(0.7)
+    halves = by_halves(lambda *pair: looked_up(scale, pair), rows, rest)
+    np.testing.assert_allclose(halves, looked_up(scale, (rows, rest)), rtol=1e-12)
+    slope = jax.grad(lambda s: by_halves(lambda *pair: looked_up(s, pair), rows, rest).sum())(scale)
+    np.testing.assert_allclose(slope, (rows * jnp.cos(scale * rows) * rest[:, None]).sum(), rtol=1e-12)

@@ -11,6 +11,7 @@ from dano import HalfSpace, Pose
 from dano.maths import quat_conjugate, quat_exp, quat_multiply, quat_rotate, quat_to_matrix
 from dano.scene_file import asset_look
 from dano.vision import Camera, compose, Item, Light
+from dano.vision.capture import PosedCamera
 from dano.vision.drawing import GAMMA
 from dano.vision.tracking._film import Target
 from dano.vision.tracking._light import LightFit, ShadowFit, unlit
@@ -397,6 +398,28 @@ def test_directions_that_are_not_seen_are_said_and_have_large_variances(bunny):
     assert covariance[1, 1] > 2 * covariance[0, 0]
     seen = blind._replace(hessian=1e6 * np.eye(6))
     assert unobservable([seen, seen], subject) == []
+
+
+def test_a_picture_from_each_second_pixel_has_the_same_edge(bunny, camera):
+    """Looked at closely, through a lens that bends; what is interpolated lies inside."""
+    subject = Subject(bunny)
+    position, orientation = path(1)
+    place = Placement(position[0], orientation[0])
+    near = PosedCamera(
+        np.concatenate([camera.axes.T * [1, 1, -1], camera.position[:, None]], axis=1),
+        focal=3 * camera.focal.mean(),
+        width=3 * camera.width,
+        height=3 * camera.height,
+        distortion=(0.05, -0.01, 0.0, 0.002, 0.001),
+    )
+    (whole, colour), (sparse, some) = (
+        subject.whole(place, unlit(), near, pattern=pattern) for pattern in (True, False)
+    )
+    assert (whole > 0.5).sum() > 5000
+    np.testing.assert_allclose(sparse, whole, atol=0.02)
+    assert np.sqrt(np.mean((some - colour)[whole > 0.9] ** 2)) < 0.03
+    pixels = np.array([[0.5, 0.5], [100.5, 7.5], [near.width - 0.5, near.height - 0.5]])
+    np.testing.assert_allclose(subject._directions(near, pixels), near.directions(pixels), atol=1e-12)
 
 
 def test_placements_turn_about_the_ball(bunny):

@@ -269,11 +269,17 @@ class PosedCamera(AbstractCamera):
         """Angle that a pixel in the middle of the image spans [rad]."""
         return 1 / float(np.mean(self.focal))
 
+    def slopes(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Slopes to the right and downwards of the directions of image coordinates [pixels]."""
+        slopes = (np.asarray(pixels, dtype=np.float64) - self.centre) / self.focal
+        return _undistorted(slopes, self.distortion) if np.any(self.distortion) else slopes
+
     def directions(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
         """See `AbstractCamera.directions`."""
-        slopes = (np.asarray(pixels, dtype=np.float64) - self.centre) / self.focal
-        if np.any(self.distortion):
-            slopes = _undistorted(slopes, self.distortion)
+        return self.towards(self.slopes(pixels))
+
+    def towards(self, slopes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+        """Unit vectors [W] with slopes to the right and downwards."""
         right, up, forward = self.axes
         towards = forward + slopes[:, :1] * right - slopes[:, 1:] * up
         return towards / np.linalg.norm(towards, axis=1, keepdims=True)

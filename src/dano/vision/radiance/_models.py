@@ -18,6 +18,7 @@ from dano.vision.capture import NodeGrid, Rays
 from dano.vision.radiance._appearance import Appearance, Share
 from dano.vision.radiance._trilinear import smooth_slope_at, value_and_slope_at, value_at
 from dano.vision.radiance._volume import (
+    by_halves,
     composite,
     density_alpha,
     importance_edges,
@@ -100,11 +101,16 @@ class AbstractModel(eqx.Module):
     ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
         """SRGB sent from points against directions of view, and unit outward normals there."""
 
-    def interest(
+    def scouted(
         self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> Float[Array, "rays sections"]:
-        """How much of what is seen is decided in sections: where to sample finely."""
-        return section_weights(self.alpha(rays, edges, sharpness))
+    ) -> tuple[Float[Array, "rays sections"], Float[Array, "rays 1"]]:
+        """Where to sample finely, without derivatives.
+
+        Returns:
+            How much of what is seen is decided in sections, and where along rays the least gets through.
+        """
+        weights = section_weights(self.alpha(rays, edges, sharpness))
+        return jax.lax.stop_gradient((weights, 0.5 * (edges[:, :1] + edges[:, -1:])))
 
     def attached(
         self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
@@ -112,11 +118,6 @@ class AbstractModel(eqx.Module):
         """The same edges, with derivatives as if they moved along the rays with what is seen there."""
         del rays, sharpness
         return edges
-
-    def closest(self, rays: Rays, edges: Float[Array, "rays edges"]) -> Float[Array, "rays 1"]:
-        """Where along rays the least gets through, from edges of coarse sections."""
-        del rays
-        return 0.5 * (edges[:, :1] + edges[:, -1:])
 
 
 class AbstractMedium(AbstractModel):
@@ -149,29 +150,30 @@ class AbstractSurface(AbstractModel):
         self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
     ) -> Float[Array, "rays sections"]:
         """See `surface_alpha`."""
-        return surface_alpha(self.distance_at(rays.at(edges)).reshape(edges.shape), jnp.asarray(sharpness))
+        return surface_alpha(self._along(rays, edges), jnp.asarray(sharpness))
 
-    def interest(
+    def scouted(
         self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> Float[Array, "rays sections"]:
-        """See `surface_interest`; as blurred as sections are long, or the surface hides between two edges."""
+    ) -> tuple[Float[Array, "rays sections"], Float[Array, "rays 1"]]:
+        """See `surface_interest`; as blurred as sections are long, or the surface hides between two edges.
+
+        Where the least gets through the distance is least, by the parabola through the least one of edges.
+        The opacity of a ray is that of its least distance (see `surface_alpha`), if an edge lies there. To
+        first order that place does not move when the surface does.
+        """
+        distance = jax.lax.stop_gradient(self._along(rays, edges))
         length = jnp.maximum(rays.far - rays.near, 1e-9)
         blurred = jnp.minimum(sharpness, 2 * (edges.shape[1] - 1) / length)[:, None]
-        return surface_interest(self.distance_at(rays.at(edges)).reshape(edges.shape), blurred)
-
-    def closest(self, rays: Rays, edges: Float[Array, "rays edges"]) -> Float[Array, "rays 1"]:
-        """See `AbstractModel.closest`: the least distance, by the parabola through the least one of edges.
-
-        The opacity of a ray is that of its least distance (see `surface_alpha`), if an edge lies there. To
-        first order it does not move when the surface does, so it has no derivative.
-        """
-        edges = jax.lax.stop_gradient(edges)
-        distance = jax.lax.stop_gradient(self.distance_at(rays.at(edges)).reshape(edges.shape))
         least = jnp.argmin(distance[:, 1:-1], axis=1)[:, None] + 1
         before, here, after = (jnp.take_along_axis(distance, least + i, axis=1) for i in (-1, 0, 1))
         bend = jnp.maximum(before + after - 2 * here, 1e-9)
         shift = jnp.clip(0.5 * (before - after) / bend, -1, 1)
-        return jnp.take_along_axis(edges, least, axis=1) + shift * (edges[:, 1:2] - edges[:, :1])
+        closest = jnp.take_along_axis(edges, least, axis=1) + shift * (edges[:, 1:2] - edges[:, :1])
+        return jax.lax.stop_gradient((surface_interest(distance, blurred), closest))
+
+    def _along(self, rays: Rays, edges: Float[Array, "rays edges"]) -> Float[Array, "rays edges"]:
+        """Signed distances [m] at distances along rays."""
+        return by_halves(lambda some, t: self.distance_at(some.at(t)).reshape(t.shape), rays, edges)
 
     def attached(
         self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
@@ -206,10 +208,10 @@ def sections(
     keys = (None, None) if key is None else jax.random.split(key)
     coarse = stratified_edges(rays.near, rays.far, sampling.coarse, keys[0])
     count = sampling.fine - sampling.grazes
-    # Weights for sampling are not differentiated: `importance_edges` stops their gradient.
-    edges = importance_edges(coarse, model.interest(rays, coarse, sharpness), count, keys[1])
+    weights, closest = model.scouted(*jax.lax.stop_gradient((rays, coarse, sharpness)))
+    edges = importance_edges(coarse, weights, count, keys[1])
     if sampling.grazes:
-        edges = jnp.sort(jnp.concatenate([edges, model.closest(rays, coarse)], axis=1), axis=1)
+        edges = jnp.sort(jnp.concatenate([edges, closest], axis=1), axis=1)
     if sampling.moves:
         edges = model.attached(rays, edges, sharpness)
     return edges, model.alpha(rays, edges, sharpness)

@@ -80,6 +80,7 @@ class Masking:
         self._last: tuple[int, np.ndarray] | None = None
         self._own: Palette | None = None
         self._exposures: dict[int, np.ndarray] = {}
+        self._ground: tuple[PosedCamera, np.ndarray, np.ndarray] | None = None
         self.notes: list[str] = []
         given = any(mask is not None for mask in film.masks)
         self.source = options.masks
@@ -243,7 +244,10 @@ class Masking:
             target = _near(target, window_of(subject, place, camera, 1.0))
             if self._place is None:
                 return target
-            behind = self._place.seen_in(target.image, target.mask < 0.05)
+            window = window_of(subject, place, camera, 1.5)
+            if window is None:
+                return target
+            behind = self._place.seen_in(target.image, target.mask < 0.05, window)
             return target._replace(behind=behind, mask_noise=MASK_NOISE)
         window = window_of(subject, place, camera, 1.5)
         if window is None:
@@ -260,7 +264,7 @@ class Masking:
         if self._place is not None:
             free = seen.copy()
             free[window] &= ~ndimage.binary_dilation(expected > 0.02, iterations=int(np.ceil(blur)))
-            behind = self._place.seen_in(image, free & (mask < 0.05))
+            behind = self._place.seen_in(image, free & (mask < 0.05), window)
         target = Target(camera, image.astype(np.float64), mask, seen, behind)
         if behind is None:
             return target
@@ -278,12 +282,16 @@ class Masking:
         """See `Target.cast`: on a known table, near where the object is close to it."""
         if self._table is None or camera.position[2] <= self._table:
             return None
-        pixels = pixels_of(window)
-        down, points = on_table(camera, pixels, self._table)
-        apart = subject.clearance(place, points) / subject.pixel(place, camera)
-        result, part = np.zeros((camera.height, camera.width)), np.zeros(len(pixels))
-        part[down] = _CAST * np.clip(1 - apart / _CAST_REACH, 0, 1)
-        result[window] = part.reshape(result[window].shape)
+        if self._ground is None or self._ground[0] is not camera:
+            size = (camera.height, camera.width)
+            down, points = on_table(camera, pixels_of((slice(0, size[0]), slice(0, size[1]))), self._table)
+            places = np.full((len(down), 3), np.nan)
+            places[down] = points
+            self._ground = camera, down.reshape(size), places.reshape(*size, 3)
+        _, down, places = self._ground
+        apart = subject.clearance(place, places[window][down[window]]) / subject.pixel(place, camera)
+        result = np.zeros(down.shape)
+        result[window][down[window]] = _CAST * np.clip(1 - apart / _CAST_REACH, 0, 1)
         return result
 
     def learn(self, target: Target, window: tuple[slice, slice], shape: np.ndarray) -> None:

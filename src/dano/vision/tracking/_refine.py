@@ -101,10 +101,16 @@ class _Rows(NamedTuple):
 
 
 def silhouette(
-    subject: Subject, place: Placement, lamps: tuple[Light, ...], camera: PosedCamera, window
+    subject: Subject,
+    place: Placement,
+    lamps: tuple[Light, ...],
+    camera: PosedCamera,
+    window: tuple[slice, slice],
+    *,
+    pattern: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Opacity and colour over black of the pixels of a window."""
-    opacity, colour = subject.whole(place, lamps, camera)
+    """Opacity and colour over black of the pixels of a window; see `Subject.whole`."""
+    opacity, colour = subject.whole(place, lamps, camera, pattern=pattern)
     return opacity[window].copy(), colour[window].copy()
 
 

@@ -21,7 +21,7 @@ from dano.vision.tracking._light import LAMPS, LightFit
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._refine import refine, Refined, silhouette, window_of
-from dano.vision.tracking._subject import CHUNK, pixels_of, Subject
+from dano.vision.tracking._subject import FEW_RAYS, pixels_of, Subject
 
 _SIDE = 32
 """Pixels a side of rendered views: a chunk of rays."""
@@ -148,7 +148,14 @@ def search(
             continue
         _learn(subject, coarse, first, light)
         found = refine(
-            subject, coarse, first.place, light.lamps, loss="photometric", steps=5, rays=CHUNK, random=random
+            subject,
+            coarse,
+            first.place,
+            light.lamps,
+            loss="photometric",
+            steps=5,
+            rays=FEW_RAYS,
+            random=random,
         )
         if found is not None:
             _learn(subject, coarse, found, light)
@@ -215,7 +222,9 @@ def unlikeness(subject: Subject, target: Target, start: Start) -> float:
     seen. The second is one less the correlation of what is fine, such as writing.
     """
     window = start.refined.window
-    shape, colour = silhouette(subject, start.refined.place, start.light.lamps, target.camera, window)
+    shape, colour = silhouette(
+        subject, start.refined.place, start.light.lamps, target.camera, window, pattern=True
+    )
     inside = _alone(target, window, shape)
     inside = ndimage.binary_erosion(inside, iterations=2)
     if inside.sum() < _AREA:
@@ -244,7 +253,7 @@ def pattern(subject: Subject, target: Target, place: Placement, lamps: tuple[Lig
     window = window_of(subject, place, target.camera)
     if window is None:
         return Pattern(0.0, 0.0)
-    shape, colour = silhouette(subject, place, lamps, target.camera, window)
+    shape, colour = silhouette(subject, place, lamps, target.camera, window, pattern=True)
     normals, solid = _normals(subject, target, place, window)
     inside = solid & _alone(target, window, shape)
     inside = ndimage.binary_erosion(inside, iterations=_RIM)
@@ -326,7 +335,7 @@ def from_coarse(
     coarse = target.reduced(max(1, round(subject.pixels(before, target.camera) / _COARSELY)))
     place, found = aligned(subject, coarse, before, lamps), None
     for stage in ("silhouette", loss) if loss == "photometric" else (loss,):
-        found = refine(subject, coarse, place, lamps, loss=stage, steps=_FEW, rays=CHUNK, random=random)
+        found = refine(subject, coarse, place, lamps, loss=stage, steps=_FEW, rays=FEW_RAYS, random=random)
         if found is None:
             return None
         place = found.place

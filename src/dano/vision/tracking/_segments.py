@@ -49,6 +49,9 @@ _LEAST_AREA = 24
 _SHADE_BLUR = 3.0
 """Standard deviation of the blur over which a place is taken to be equally bright [pixels]."""
 
+_SHADE_REACH = 12
+"""Where that blur ends [pixels]."""
+
 _SHADE_PRIOR = 1e-3
 """Brightness by which the shade falls back to one where nothing of the place is seen."""
 
@@ -162,19 +165,29 @@ class Place:
         return best - 1.5 * np.log(2 * np.pi) - 3 * np.log(1.5 * self.noise)
 
     def seen_in(
-        self, image: Float[np.ndarray, "height width 3"], free: Bool[np.ndarray, "height width"]
+        self,
+        image: Float[np.ndarray, "height width 3"],
+        free: Bool[np.ndarray, "height width"],
+        window: tuple[slice, slice],
     ) -> Float[np.ndarray, "height width 3"]:
         """The place as a frame shows it: in its shadows and exposure, carried on to where it is hidden.
 
         Args:
             image: The frame.
             free: Where it surely shows the place.
+            window: Which part counts; beside it the place is as in the picture of it.
         """
-        weight = free.astype(np.float64)
-        sums = [ndimage.gaussian_filter(weight * x.mean(axis=2), _SHADE_BLUR) for x in (image, self.colours)]
+        near = tuple(slice(max(part.start - _SHADE_REACH, 0), part.stop + _SHADE_REACH) for part in window)
+        weight, known = free[near].astype(np.float64), self.colours[near]
+        sums = [
+            ndimage.gaussian_filter(weight * x.mean(axis=2), _SHADE_BLUR, radius=_SHADE_REACH)
+            for x in (image[near], known)
+        ]
         # Far from everything that is free the place is as bright as in the picture of it.
         shade = (sums[0] + _SHADE_PRIOR) / (sums[1] + _SHADE_PRIOR)
-        return np.clip(shade, *_SHADE_RANGE)[..., None] * self.colours
+        seen = self.colours.astype(np.float64)
+        seen[near] = np.clip(shade, *_SHADE_RANGE)[..., None] * known
+        return seen
 
 
 class Palette:

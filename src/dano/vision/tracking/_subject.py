@@ -18,8 +18,11 @@ from dano.vision.radiance import LearnedField, Sampling, SurfaceModel
 from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.trajectory import Solid, solid_of
 
-CHUNK = 512
-"""Rays at once: one size, one compilation."""
+_CHUNK = 1024
+"""Rays at once: one size, one compilation. More would be hardly faster, fewer are half as fast."""
+
+FEW_RAYS = 512
+"""Rays that say roughly where an object is, and how it is lit."""
 
 SAMPLING = Sampling(48, 12, 2, grazes=True)
 """Coarser than for pictures to look at: a pixel of a film has noise of its own."""
@@ -41,6 +44,12 @@ _LOOSE = 0.02
 
 _WIDE = 1.5
 """Radii around the middle up to which a picture shows the object, by blur and rolling shutter, too."""
+
+_LENSES = 8
+"""Cameras whose lenses are kept: of a film and of its reduced frames."""
+
+_EVEN = 0.02
+"""Difference of opacities of neighbouring pixels up to which those between are interpolated."""
 
 _STEEPEST = 4.0
 """Sharpness of a silhouette times the width of a pixel: its edge is as soft as a pixel's average makes it."""
@@ -82,6 +91,7 @@ class Subject:
         self._field = field
         self._drawn = float(field.drawn_sharpness)
         self._last: tuple[tuple, np.ndarray, np.ndarray] | None = None
+        self._slopes: dict[bytes, np.ndarray] = {}
 
     @functools.cached_property
     def solid(self) -> Solid:
@@ -133,7 +143,7 @@ class Subject:
         if drift is not None:
             margin += 0.5 * (drift.shutter + drift.readout) * drift.speed(self.radius)
         turn = quat_to_matrix(place.orientation)
-        directions = camera.directions(pixels) @ turn
+        directions = self._directions(camera, pixels) @ turn
         origin = (camera.position - place.position) @ turn
         # Distances at which rays cross the three pairs of planes of the box; parallel ones by rounding.
         safe = np.where(np.abs(directions) < 1e-12, 1e-12, directions)
@@ -166,8 +176,7 @@ class Subject:
         n = len(directions)
         rows = [np.zeros((0,)), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3, 6))]
         parts = [rows]
-        for start in range(0, n, CHUNK):
-            rays = slice(start, min(start + CHUNK, n))
+        for rays in _chunks(n):
             looking = self._looking(place, lamps, sharpness, origins[rays], directions[rays])
             found = _linearized(looking) if slopes else _seen(looking)
             parts.append(
@@ -186,9 +195,9 @@ class Subject:
         """At most a chunk of rays; those that only fill it look away from the object."""
         return _Looking(
             self._model,
-            jnp.asarray(place.position, jnp.float32),
-            jnp.asarray(place.orientation, jnp.float32),
-            jnp.asarray(self.radius, jnp.float32),
+            _single(place.position),
+            _single(place.orientation),
+            _single(self.radius),
             np.float32(sharpness),
             lamps,
             _filled(origins, origins[0]),
@@ -202,9 +211,9 @@ class Subject:
         lamps = (Light((0.0, 0.0, 1.0), intensity=0.0),)
         result, eye = np.zeros((2, len(pixels))), camera.position
         rows = np.flatnonzero(self.reached(place, camera, pixels))
-        for start in range(0, len(rows), CHUNK):
-            some = rows[start : start + CHUNK]
-            directions = camera.directions(pixels[some])
+        for rays in _chunks(len(rows)):
+            some = rows[rays]
+            directions = self._directions(camera, pixels[some])
             looking = self._looking(
                 place, lamps, self._drawn, np.broadcast_to(eye, directions.shape), directions
             )
@@ -228,54 +237,108 @@ class Subject:
             place: Where the object is, and how it moves.
             lamps: Light that it is under.
             camera: From where.
-            pixels: Image coordinates.
+            pixels: Image coordinates of the middles of pixels.
             slopes: Whether derivatives are wanted.
             behind: SRGB behind the object. An exposure is a mean of light: before what is bright a blurred
                 thing seems narrower. Colours are then such that, laid over what is behind, they are the
                 camera's. None: colours are averaged as sRGB.
         """
-        directions, pixel = camera.directions(pixels), camera.pixel_angle
+        directions, pixel = self._directions(camera, pixels), camera.pixel_angle
         origins = np.broadcast_to(camera.position, directions.shape)
         drift = place.drift
         if drift is None:
             return self.see(place, lamps, origins, directions, pixel, slopes=slopes)
         speed = drift.speed(self.radius) / self.pixel(place, camera)
         moments = drift.moments(pixels[:, 1] / camera.height, speed)
-        exposures = [
-            self.see(
-                place, lamps, *self._meanwhile(place, drift, late, origins, directions), pixel, slopes=slopes
-            )
-            for late in moments.T
-        ]
+        rays = [self._meanwhile(place, drift, late, origins, directions) for late in moments.T]
+        here, towards = map(np.concatenate, zip(*rays, strict=True))
+        at_once = self.see(place, lamps, here, towards, pixel, slopes=slopes)
+        each = (np.split(column, moments.shape[1]) for column in at_once)
+        exposures = [Seen(*columns) for columns in zip(*each, strict=True)]
         mean = Seen(*(np.mean(column, axis=0) for column in zip(*exposures, strict=True)))
         return mean if behind is None or len(exposures) == 1 else _exposed(exposures, mean, behind)
 
     def whole(
-        self, place: Placement, lamps: tuple[Light, ...], camera: PosedCamera
+        self, place: Placement, lamps: tuple[Light, ...], camera: PosedCamera, *, pattern: bool = False
     ) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width 3"]]:
         """Opacity and colour over black of a whole picture.
 
         Of a moving object the picture in the middle of the exposure is spread over the others: a mask or an
         overlap need no more. The last one is kept: a mask is made from it, pixels are chosen by it, and
         an overlap is measured.
+
+        Args:
+            place: Where the object is, and how it moves.
+            lamps: Light that it is under.
+            camera: From where.
+            pattern: Whether each pixel inside the object counts, not only its edge and how bright parts are.
         """
-        asked = (place, lamps, camera)
+        asked = (place, lamps, camera, pattern)
         if self._last is None or any(a is not b for a, b in zip(self._last[0], asked, strict=True)):
-            opacity = np.zeros((camera.height, camera.width))
-            colour = np.zeros((camera.height, camera.width, 3))
+            both = np.zeros((camera.height, camera.width, 4))
             window = window_of(self, place, camera, _WIDE)
             pixels = np.zeros((0, 2)) if window is None else pixels_of(window)
             pixels = pixels[self.reached(place, camera, pixels)]
             if len(pixels):
-                still = dataclasses.replace(place, drift=None)
-                seen, (x, y) = self.picture(still, lamps, camera, pixels), pixels.astype(int).T
-                opacity[y, x], colour[y, x] = seen.opacity, seen.colour
+                still, (x, y) = dataclasses.replace(place, drift=None), pixels.astype(int).T
+                sparse = len(pixels) > _CHUNK and not pattern
+                both[y, x] = (self._sparsely if sparse else self._everywhere)(still, lamps, camera, pixels)
                 if place.drift is not None:
-                    both = np.concatenate([opacity[..., None], colour], axis=2)
-                    spread = self._spread(place, place.drift, camera, pixels, both)
-                    opacity[y, x], colour[y, x] = spread[:, 0], spread[:, 1:]
-            self._last = asked, opacity, colour
+                    both[y, x] = self._spread(place, place.drift, camera, pixels, both)
+            self._last = asked, both[..., 0], both[..., 1:]
         return self._last[1:]
+
+    def _everywhere(
+        self,
+        place: Placement,
+        lamps: tuple[Light, ...],
+        camera: PosedCamera,
+        pixels: Float[np.ndarray, "n 2"],
+    ) -> Float[np.ndarray, "n 4"]:
+        """Opacity and colour of pixels."""
+        seen = self.picture(place, lamps, camera, pixels)
+        return np.concatenate([seen.opacity[:, None], seen.colour], axis=1)
+
+    def _sparsely(
+        self,
+        place: Placement,
+        lamps: tuple[Light, ...],
+        camera: PosedCamera,
+        pixels: Float[np.ndarray, "n 2"],
+    ) -> Float[np.ndarray, "n 4"]:
+        """Opacity and colour of pixels: of each second row and column, and of all where the opacity changes.
+
+        Between them they are interpolated. That takes less than half as many rays.
+        """
+        x, y = pixels.astype(int).T
+        low = np.array([y.min(), x.min()]) // 2
+        corner = (x % 2 == 0) & (y % 2 == 0)
+        grid = np.zeros((*(np.array([y.max(), x.max()]) // 2 - low + 2), 4))
+        result, at = np.zeros((len(pixels), 4)), (y // 2 - low[0], x // 2 - low[1])
+        result[corner] = self._everywhere(place, lamps, camera, pixels[corner])
+        grid[at[0][corner], at[1][corner]] = result[corner]
+        opacity = grid[..., 0]
+        changes = ndimage.maximum_filter(opacity, 3) - ndimage.minimum_filter(opacity, 3) > _EVEN
+        edge = changes[at] & ~corner
+        if edge.any():
+            result[edge] = self._everywhere(place, lamps, camera, pixels[edge])
+        rest = ~corner & ~edge
+        result[rest] = _between(grid, 0.5 * y[rest] - low[0], 0.5 * x[rest] - low[1])
+        return result
+
+    def _directions(
+        self, camera: AbstractCamera, pixels: Float[np.ndarray, "n 2"]
+    ) -> Float[np.ndarray, "n 3"]:
+        """Of the middles of pixels: a lens is undone for all of them once, which takes long."""
+        if not isinstance(camera, PosedCamera) or not np.any(camera.distortion):
+            return camera.directions(pixels)
+        lens = np.concatenate([camera.focal, camera.centre, camera.distortion, [camera.width, camera.height]])
+        if lens.tobytes() not in self._slopes:
+            everywhere = pixels_of((slice(0, camera.height), slice(0, camera.width)))
+            slopes = camera.slopes(everywhere).reshape(camera.height, camera.width, 2)
+            self._slopes = {**dict(list(self._slopes.items())[1 - _LENSES :]), lens.tobytes(): slopes}
+        x, y = pixels.astype(int).T
+        return camera.towards(self._slopes[lens.tobytes()][y, x])
 
     def _spread(
         self,
@@ -286,19 +349,19 @@ class Subject:
         sharp: Float[np.ndarray, "height width k"],
     ) -> Float[np.ndarray, "n k"]:
         """Mean over the exposure of a picture of the object, as if it were flat and facing the camera."""
-        directions, facing = camera.directions(pixels), camera.axes[2]
+        directions, facing = self._directions(camera, pixels), camera.axes[2]
         middle = self.middle(place)
         ahead = (middle - camera.position) @ facing / (directions @ facing)
         points = camera.position + ahead[:, None] * directions
         speed = drift.speed(self.radius) / self.pixel(place, camera)
         moments = drift.moments(pixels[:, 1] / camera.height, speed)
-        total = np.zeros((len(pixels), sharp.shape[2]))
-        for late in moments.T:
-            here, _ = self._meanwhile(place, drift, late, points, directions)
-            x, y = camera.project(here)[:, :2].T - 0.5
-            for k, channel in enumerate(np.moveaxis(sharp, 2, 0)):
-                total[:, k] += ndimage.map_coordinates(channel, [y, x], order=1, mode="nearest")
-        return total / moments.shape[1]
+        # An exposure is short: a point's way in the picture is straight.
+        first, last = (
+            camera.project(self._meanwhile(place, drift, late, points, directions)[0])[:, 1::-1] - 0.5
+            for late in moments[:, [0, -1]].T
+        )
+        shares = np.linspace(0, 1, moments.shape[1])
+        return np.mean([_between(sharp, *(first + share * (last - first)).T) for share in shares], axis=0)
 
     def _meanwhile(
         self,
@@ -366,9 +429,34 @@ def pixels_of(window: tuple[slice, slice]) -> Float[np.ndarray, "n 2"]:
     return np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
 
 
+def _between(
+    picture: Float[np.ndarray, "height width k"], y: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n k"]:
+    """Values of a picture between its pixels, by rows and columns; those of the edge outside of it."""
+    height, width, k = picture.shape
+    y, x = np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
+    i, j = np.minimum(y.astype(int), height - 2), np.minimum(x.astype(int), width - 2)
+    down, right, flat, first = (y - i)[:, None], (x - j)[:, None], picture.reshape(-1, k), i * width + j
+    above = flat[first] + right * (flat[first + 1] - flat[first])
+    below = flat[first + width] + right * (flat[first + width + 1] - flat[first + width])
+    return above + down * (below - above)
+
+
+def _chunks(n: int) -> list[slice]:
+    """Which of so many rays are looked along at once."""
+    return [slice(start, min(start + _CHUNK, n)) for start in range(0, n, _CHUNK)]
+
+
 def _filled(rows: Float[np.ndarray, "n 3"], last: Float[np.ndarray, "3"]) -> Array:
     """Rows of a chunk, with others put in where it has fewer."""
-    return jnp.asarray(np.concatenate([rows, np.tile(last, (CHUNK - len(rows), 1))]), jnp.float32)
+    filled = np.empty((_CHUNK, 3), np.float32)
+    filled[: len(rows)], filled[len(rows) :] = rows, last
+    return jnp.asarray(filled)
+
+
+def _single(x: np.ndarray | float) -> Array:
+    """In single precision, by NumPy: JAX would start a program for it."""
+    return jnp.asarray(np.asarray(x, np.float32))
 
 
 class _Looking(NamedTuple):

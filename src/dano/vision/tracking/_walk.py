@@ -30,7 +30,7 @@ from dano.vision.tracking._search import (
     turned_aside,
 )
 from dano.vision.tracking._segments import overlap
-from dano.vision.tracking._subject import CHUNK, Subject
+from dano.vision.tracking._subject import FEW_RAYS, Subject
 from dano.vision.tracking._whole import region_of, turned, Whole
 
 _STEPS = 4
@@ -425,12 +425,15 @@ class Walk:
     def _refined(self, i: int, before: Placement, light: LightFit) -> Refined | None:
         """The pose near an expected one; also from beside it if that fits worse than usual."""
         found = self._from_coarse(i, before, light)
+        if found is None:
+            return None
+        fine = self._fine(i, found.place, light)
         usual = [other.overlap for other in self._found if other is not None]
-        if found is not None and usual and found.overlap < np.median(usual) - _WORSE:
-            around = [self._from_coarse(i, place, light) for place in turned_aside(self._subject, before)]
-            known = [other for other in [found, *around] if other is not None]
-            found = min(known, key=score)
-        return None if found is None else self._fine(i, found.place, light)
+        if not usual or (fine is not None and fine.overlap > np.median(usual) - _WORSE):
+            return fine
+        around = [self._from_coarse(i, place, light) for place in turned_aside(self._subject, before)]
+        best = min((other for other in [found, *around] if other is not None), key=score)
+        return fine if best is found else self._fine(i, best.place, light)
 
     def _from_coarse(self, i: int, before: Placement, light: LightFit) -> Refined | None:
         size = self._subject.pixels(before, self._camera)
@@ -450,8 +453,8 @@ class Walk:
             light.lamps,
             loss=self._loss(light),
             steps=steps,
-            # All frames together are looked at with all rays.
-            rays=max(self._options.rays // 2, CHUNK),
+            # All frames together are looked at with all rays; of what is blurred neighbours say the same.
+            rays=max(self._options.rays // (2 if place.drift is None else 4), FEW_RAYS),
             random=self._random,
         )
 

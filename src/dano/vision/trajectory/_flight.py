@@ -78,7 +78,7 @@ def flights(
     return Flight(found, accelerating(times[found]))
 
 
-def centres_of_mass(poses: Poses, com: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
+def centres_of_mass(poses: Poses, com: Float[np.ndarray, "3"]) -> Float[np.ndarray, "*batch n 3"]:
     """[m, W] from one in the object's frame."""
     return poses.position + quat_rotate(poses.orientation, np.broadcast_to(com, poses.position.shape))
 

@@ -28,13 +28,13 @@ class Poses(NamedTuple):
 
     def taken(self, rows) -> "Poses":
         """Those of some frames."""
-        return Poses(*(x[rows] for x in self))
+        return Poses(self.position[..., rows, :], self.orientation[..., rows, :], self.covariance[rows])
 
-    def moved(self, change: Float[np.ndarray, "T 6"], size: float) -> "Poses":
-        """Shifted by `change[:, :3]` sizes [W], then turned by rotation vectors `change[:, 3:]` [rad, F]."""
-        turned = quat_multiply(self.orientation, quat_exp(np.asarray(change[:, 3:], np.float64)))
-        turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
-        return self._replace(position=self.position + size * change[:, :3], orientation=turned)
+    def moved(self, change: Float[np.ndarray, "*batch T 6"], size: float) -> "Poses":
+        """Shifted by `change[…, :3]` sizes [W], then turned by rotation vectors `change[…, 3:]` [rad, F]."""
+        turned = quat_multiply(self.orientation, quat_exp(np.asarray(change[..., 3:], np.float64)))
+        turned = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+        return self._replace(position=self.position + size * change[..., :3], orientation=turned)
 
 
 def stretches(holds: Bool[np.ndarray, " T"], shortest: int = 1) -> list[tuple[int, int]]:

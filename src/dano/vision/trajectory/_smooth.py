@@ -178,10 +178,10 @@ def _disagreement(
     return float(ratio[order][np.searchsorted(share, 0.5 * share[-1])] / _MEDIAN)
 
 
-def difference(first: Poses, second: Poses) -> Float[np.ndarray, "n 6"]:
+def difference(first: Poses, second: Poses) -> Float[np.ndarray, "*batch n 6"]:
     """What leads from first poses to second ones: position [m, W], rotation vector [rad, F]."""
     turn = quat_log(quat_multiply(quat_conjugate(first.orientation), second.orientation))
-    return np.concatenate([second.position - first.position, turn], axis=1)
+    return np.concatenate([second.position - first.position, turn], axis=-1)
 
 
 class _Run(NamedTuple):
@@ -345,7 +345,7 @@ class _Problem:
 
         def away(moved: Poses, alike: np.ndarray = alike) -> np.ndarray:
             apart = difference(self._poses, self.seen(moved, alike[-1])) / self._unit
-            return np.einsum("nij,nj->ni", self._roots, apart) + alike[:6]
+            return np.einsum("nij,...nj->...ni", self._roots, apart) + alike[:6]
 
         residual = away(poses)
         square = np.sum(residual**2, axis=1)
@@ -362,16 +362,12 @@ class _Problem:
 
         def jerk(moved: Poses) -> np.ndarray:
             first, four = self._fours[:, 1], self._fours
-            base = np.repeat(moved.orientation[first], 4, axis=0)
-            turns = quat_log(quat_multiply(quat_conjugate(base), moved.orientation[four.ravel()]))
-            middle = moved.position + quat_rotate(
-                moved.orientation, np.broadcast_to(self._solid.middle, moved.position.shape)
-            )
-            both = np.concatenate(
-                [(middle[four] - middle[first][:, None]) / self._solid.size, turns.reshape(*four.shape, 3)],
-                axis=2,
-            )
-            return np.einsum("ij,ijk->ik", self._rates, both) / _STEADY
+            base = quat_conjugate(moved.orientation[..., first, None, :])
+            turns = quat_log(quat_multiply(base, moved.orientation[..., four, :]))
+            middle = centres_of_mass(moved, self._solid.middle)
+            ways = (middle[..., four, :] - middle[..., first, None, :]) / self._solid.size
+            both = np.concatenate([ways, turns], axis=-1)
+            return np.einsum("ij,...ijk->...ik", self._rates, both) / _STEADY
 
         residual = jerk(poses)
         squares = np.stack([np.sum(part**2, axis=1) for part in np.split(residual, 2, axis=1)], axis=1)
@@ -391,18 +387,15 @@ class _Problem:
 
     def _linear(self, function, poses: Poses, frames: Int[np.ndarray, "m k"], root: np.ndarray):
         """Derivatives of residuals by the frames they depend on: (frames, slopes (m, r, k, 6), residuals)."""
-        value, count = function(poses), frames.shape[1]
-        slopes = np.zeros((*value.shape, count, 6))
+        value, count, n = function(poses), frames.shape[1], len(poses.position)
+        # Residuals depend on neighbouring frames: of these, one in so many is moved at a time.
+        change = np.zeros((count, 6, n, 6))
         for turn in range(count):
-            # Residuals depend on neighbouring frames: of these, one in so many is moved at a time.
-            some = np.arange(len(poses.position)) % count == turn
-            for c in range(6):
-                change = np.zeros((len(some), 6))
-                change[some, c] = _EPSILON
-                slope = (function(poses.moved(change, self._solid.size)) - value) / _EPSILON
-                for j in range(count):
-                    mine = some[frames[:, j]]
-                    slopes[mine, :, j, c] = slope[mine]
+            change[turn, range(6), turn::count, range(6)] = _EPSILON
+        moved = poses.moved(change.reshape(-1, n, 6), self._solid.size)
+        slope = (function(moved) - value).reshape(count, 6, *value.shape) / _EPSILON
+        mine = (slope[turn, :, range(len(turn))] for turn in (frames % count).T)
+        slopes = np.stack([part.transpose(0, 2, 1) for part in mine], axis=2)
         return frames, slopes * root[:, :, None, None], value * root
 
     def _lying(self, poses: Poses, run: _Run, shared: np.ndarray, column: int, width: int):
@@ -413,12 +406,12 @@ class _Problem:
         across = np.stack([side, np.cross(face.down, side)])
 
         def off(moved: Poses, base: np.ndarray) -> np.ndarray:
-            turn, m = moved.orientation[rows], len(rows)
+            turn = moved.orientation[..., rows, :]
             down = face.down + base[1:] @ across
-            point = quat_rotate(turn, np.broadcast_to(face.point, (m, 3)))
-            height = (moved.position[rows] + point)[:, 2] - self._table
-            tilt = quat_rotate(turn, np.broadcast_to(down, (m, 3)))[:, :2]
-            return np.concatenate([((height / size - base[0]) / _LEVEL)[:, None], tilt / _FLAT], axis=1)
+            shape = turn[..., :3].shape
+            point, towards = (quat_rotate(turn, np.broadcast_to(x, shape)) for x in (face.point, down))
+            height = (moved.position[..., rows, :] + point)[..., 2:] - self._table
+            return np.concatenate([(height / size - base[0]) / _LEVEL, towards[..., :2] / _FLAT], axis=-1)
 
         # What rocks, or has left the table for a moment, does not lie there.
         return self._allowing(off, poses, shared, rows[:, None], column, width)
@@ -429,7 +422,7 @@ class _Problem:
 
         def pushed(moved: Poses, beside: np.ndarray) -> np.ndarray:
             com = centres_of_mass(moved, self._solid.com + size * beside)
-            return (np.einsum("mk,mki->mi", rates, com[threes]) - GRAVITY) / AIR
+            return (np.einsum("mk,...mki->...mi", rates, com[..., threes, :]) - GRAVITY) / AIR
 
         return self._allowing(pushed, poses, shared, threes, column, width)
 
