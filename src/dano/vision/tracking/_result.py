@@ -78,7 +78,7 @@ class Tracked(NamedTuple):
             half turn, if that is more.
         overlays: Silhouettes at these poses, None where there is none.
         messages: What a user should know, in sentences.
-        seconds: Time a frame took [s], the search at the start not included.
+        seconds: Time after the search at the start, over the number of frames [s].
         repeats: In how many poses what one frame shows is found again, shape (T,); see `Smoothed`.
     """
 
@@ -112,7 +112,7 @@ def tracked(
     *,
     notes: Sequence[str] = (),
     ambiguity: float = np.inf,
-    seconds: Sequence[float] = (),
+    seconds: float = 0.0,
     motion: Smoothed | None = None,
 ) -> Tracked:
     """Poses of a film put together.
@@ -126,7 +126,7 @@ def tracked(
         lamps: Light.
         notes: Sentences about masks.
         ambiguity: As in `Tracked`.
-        seconds: Time of each frame [s].
+        seconds: As in `Tracked`.
         motion: Of all frames together; None: each frame has its own pose.
     """
     n = len(found)
@@ -159,7 +159,7 @@ def tracked(
         ambiguity,
         tuple(overlays),
         tuple(texts),
-        float(np.mean(seconds)) if len(seconds) else 0.0,
+        seconds,
         np.where(np.isfinite(position[:, 0]), 1.0, np.nan) if motion is None else motion.repeats,
     )
 

@@ -98,7 +98,7 @@ class Walk:
         self._begun: tuple[int, list[tuple[Start, float]]] | None = None
         self._given: Placement | None = None
         self._missed, self._ambiguity = 0, np.inf
-        self._seconds: list[float] = []
+        self._since: float | None = None
 
     @functools.cached_property
     def _colours(self) -> Float[np.ndarray, "n 3"]:
@@ -128,18 +128,17 @@ class Walk:
 
     def step(self, i: int) -> None:
         """Track the next frame, after or before the others."""
-        began = time.perf_counter()
         before = self._expected(i)
         searched = before is None
         if before is None:
             found, status = self._searched(i), LOST
         else:
+            self._since = self._since or time.perf_counter()
             found, status = self._unmoved(i), TRACKED
             if found is None:
                 found, status = self._followed(i, before)
             if status == LOST:
                 found, status = self._followed(i, self._caught_up(i, before))
-            self._seconds.append(time.perf_counter() - began)
             if found is None and status == LOST and self._missed == 0:
                 found, searched = self._searched(i), True
         if found is not None:
@@ -482,13 +481,12 @@ class Walk:
                 f"video: the object was found in none of {len(self._found)} frames: it must be in the"
                 " picture, of the size that camera and object say, and masks must show it (see docs/track.md)"
             )
-        began = time.perf_counter()
         whole = Whole(self._film, self._subject, self._camera, self._options, self._found)
         self._light = whole.look(self._masking, self._light, self._random, self._may_be_it, tell)
         for i in range(len(self._found)):
             if self._status[i] == TRACKED and whole.found[i] is None:
                 self._status[i] = LOST
-        share = (time.perf_counter() - began) / len(self._found)
+        taken = 0.0 if self._since is None else time.perf_counter() - self._since
         return tracked(
             self._film,
             self._subject,
@@ -498,6 +496,6 @@ class Walk:
             self._light.lamps,
             notes=self._masking.notes,
             ambiguity=self._ambiguity,
-            seconds=[share + one for one in self._seconds],
+            seconds=taken / len(self._found),
             motion=whole.motion,
         )
