@@ -355,9 +355,12 @@ class Subject:
         points = camera.position + ahead[:, None] * directions
         speed = drift.speed(self.radius) / self.pixel(place, camera)
         moments = drift.moments(pixels[:, 1] / camera.height, speed)
-        # An exposure is short: a point's way in the picture is straight.
+        # An exposure is short: a point's way in the picture is straight. Behind the camera it shows nothing.
         first, last = (
-            camera.project(self._meanwhile(place, drift, late, points, directions)[0])[:, 1::-1] - 0.5
+            np.nan_to_num(camera.project(self._meanwhile(place, drift, late, points, directions)[0]))[
+                :, 1::-1
+            ]
+            - 0.5
             for late in moments[:, [0, -1]].T
         )
         shares = np.linspace(0, 1, moments.shape[1])
