@@ -29,8 +29,9 @@ from dano.vision.tracking._refine import (
 from dano.vision.tracking._result import covariance_of, shared_covariance, unobservable
 from dano.vision.tracking._search import half_turns
 from dano.vision.tracking._segments import common_offset, differs, edge_offset, moved_edge, overlap
-from dano.vision.tracking._subject import _crossings, _exposed, Seen, Subject
+from dano.vision.tracking._subject import _exposed, Seen, Subject
 from dano.vision.tracking._whole import told_apart, turn_evidence
+from dano.vision.trajectory import crossings
 
 
 def test_slopes_are_differences_of_what_is_seen(bunny, camera):
@@ -437,7 +438,7 @@ def test_the_surface_is_where_distances_change_sign():
     """A ball cut off by a table: distances below the cut are no distances, and their slopes vanish there."""
     x, y, z = (np.stack(np.meshgrid(*[np.arange(24.0)] * 3, indexing="ij")) - 11.5) / 8.0
     values = np.where(z < -0.32, 0.3, np.sqrt(x**2 + y**2 + z**2) - 1.0)
-    points = (_crossings(values) - 11.5) / 8.0
+    points = (crossings(values) - 11.5) / 8.0
     round_ = np.linalg.norm(points, axis=1)
     above = points[:, 2] > -0.3
     assert above.sum() > 500 and np.abs(round_[above] - 1).max() < 3e-3

@@ -104,13 +104,13 @@ class AbstractModel(eqx.Module):
     def scouted(
         self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
     ) -> tuple[Float[Array, "rays sections"], Float[Array, "rays 1"]]:
-        """Where to sample finely, without derivatives.
+        """Where to sample finely; what calls it takes no derivatives of that.
 
         Returns:
             How much of what is seen is decided in sections, and where along rays the least gets through.
         """
         weights = section_weights(self.alpha(rays, edges, sharpness))
-        return jax.lax.stop_gradient((weights, 0.5 * (edges[:, :1] + edges[:, -1:])))
+        return weights, 0.5 * (edges[:, :1] + edges[:, -1:])
 
     def attached(
         self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
@@ -161,7 +161,7 @@ class AbstractSurface(AbstractModel):
         The opacity of a ray is that of its least distance (see `surface_alpha`), if an edge lies there. To
         first order that place does not move when the surface does.
         """
-        distance = jax.lax.stop_gradient(self._along(rays, edges))
+        distance = self._along(rays, edges)
         length = jnp.maximum(rays.far - rays.near, 1e-9)
         blurred = jnp.minimum(sharpness, 2 * (edges.shape[1] - 1) / length)[:, None]
         least = jnp.argmin(distance[:, 1:-1], axis=1)[:, None] + 1
@@ -169,7 +169,7 @@ class AbstractSurface(AbstractModel):
         bend = jnp.maximum(before + after - 2 * here, 1e-9)
         shift = jnp.clip(0.5 * (before - after) / bend, -1, 1)
         closest = jnp.take_along_axis(edges, least, axis=1) + shift * (edges[:, 1:2] - edges[:, :1])
-        return jax.lax.stop_gradient((surface_interest(distance, blurred), closest))
+        return surface_interest(distance, blurred), closest
 
     def _along(self, rays: Rays, edges: Float[Array, "rays edges"]) -> Float[Array, "rays edges"]:
         """Signed distances [m] at distances along rays."""
@@ -208,7 +208,9 @@ def sections(
     keys = (None, None) if key is None else jax.random.split(key)
     coarse = stratified_edges(rays.near, rays.far, sampling.coarse, keys[0])
     count = sampling.fine - sampling.grazes
-    weights, closest = model.scouted(*jax.lax.stop_gradient((rays, coarse, sharpness)))
+    # Where it is looked has no derivative: nothing is kept for one.
+    scout, seen, where, steep = jax.lax.stop_gradient((model, rays, coarse, sharpness))
+    weights, closest = scout.scouted(seen, where, steep)
     edges = importance_edges(coarse, weights, count, keys[1])
     if sampling.grazes:
         edges = jnp.sort(jnp.concatenate([edges, closest], axis=1), axis=1)

@@ -17,7 +17,7 @@ from dano.vision.capture import AbstractCamera, Light
 from dano.vision.drawing import GAMMA
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._segments import OFTEN
-from dano.vision.tracking._subject import FEW_RAYS, Subject
+from dano.vision.tracking._subject import ROUGH, Subject
 
 LAMPS = 3
 """Lamps that a film is lit by: a sun, a sky, and what a table throws back."""
@@ -299,9 +299,9 @@ class ShadowFit:
         y, x = y[down], x[down]
         near = np.linalg.norm((points - self._subject.middle(place))[:, :2], axis=1)
         rows = np.flatnonzero(near < _SHADOW_REACH * self._subject.radius)
-        if len(rows) < FEW_RAYS:
+        if len(rows) < ROUGH:
             return
-        rows = np.sort(self._random.choice(rows, FEW_RAYS, replace=False))
+        rows = np.sort(self._random.choice(rows, ROUGH, replace=False))
         points, y, x = points[rows], y[rows], x[rows]
         shade = np.sum(image[y, x] ** GAMMA, axis=1) / bare[y, x]
         sky = sum(up[2] * self._hidden(place, points, up) for up in self._above) / self._above[:, 2].sum()

@@ -21,7 +21,7 @@ from dano.vision.tracking._light import LAMPS, LightFit
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._refine import refine, Refined, silhouette, window_of
-from dano.vision.tracking._subject import FEW_RAYS, pixels_of, Subject
+from dano.vision.tracking._subject import pixels_of, ROUGH, Subject
 
 _SIDE = 32
 """Pixels a side of rendered views: a chunk of rays."""
@@ -148,14 +148,7 @@ def search(
             continue
         _learn(subject, coarse, first, light)
         found = refine(
-            subject,
-            coarse,
-            first.place,
-            light.lamps,
-            loss="photometric",
-            steps=5,
-            rays=FEW_RAYS,
-            random=random,
+            subject, coarse, first.place, light.lamps, loss="photometric", steps=5, rays=ROUGH, random=random
         )
         if found is not None:
             _learn(subject, coarse, found, light)
@@ -335,7 +328,7 @@ def from_coarse(
     coarse = target.reduced(max(1, round(subject.pixels(before, target.camera) / _COARSELY)))
     place, found = aligned(subject, coarse, before, lamps), None
     for stage in ("silhouette", loss) if loss == "photometric" else (loss,):
-        found = refine(subject, coarse, place, lamps, loss=stage, steps=_FEW, rays=FEW_RAYS, random=random)
+        found = refine(subject, coarse, place, lamps, loss=stage, steps=_FEW, rays=ROUGH, random=random)
         if found is None:
             return None
         place = found.place

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,12 +17,12 @@ from dano.vision.capture import AbstractCamera, Light, PosedCamera
 from dano.vision.drawing import GAMMA, Part, through
 from dano.vision.radiance import LearnedField, Sampling, SurfaceModel
 from dano.vision.tracking._placement import Drift, Placement
-from dano.vision.trajectory import Solid, solid_of
+from dano.vision.trajectory import crossings, Solid, solid_of
 
 _CHUNK = 1024
 """Rays at once: one size, one compilation. More would be hardly faster, fewer are half as fast."""
 
-FEW_RAYS = 512
+ROUGH = 512
 """Rays that say roughly where an object is, and how it is lit."""
 
 SAMPLING = Sampling(48, 12, 2, grazes=True)
@@ -98,7 +99,7 @@ class Subject:
         """What lies and slides: its hull, and its centre of mass if it is equally dense."""
         values, box = np.asarray(self._field.model.distances), self._field.model.box
         inside = np.argwhere(values < 0)
-        points = box.origin + box.spacing * _crossings(values)
+        points = box.origin + box.spacing * crossings(values)
         return solid_of(points, box.origin + box.spacing * inside.mean(axis=0))
 
     def clearance(self, place: Placement, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
@@ -281,50 +282,17 @@ class Subject:
             pixels = pixels[self.reached(place, camera, pixels)]
             if len(pixels):
                 still, (x, y) = dataclasses.replace(place, drift=None), pixels.astype(int).T
+
+                def values(some: np.ndarray) -> np.ndarray:
+                    seen = self.picture(still, lamps, camera, some)
+                    return np.concatenate([seen.opacity[:, None], seen.colour], axis=1)
+
                 sparse = len(pixels) > _CHUNK and not pattern
-                both[y, x] = (self._sparsely if sparse else self._everywhere)(still, lamps, camera, pixels)
+                both[y, x] = _sparsely(values, pixels) if sparse else values(pixels)
                 if place.drift is not None:
                     both[y, x] = self._spread(place, place.drift, camera, pixels, both)
             self._last = asked, both[..., 0], both[..., 1:]
         return self._last[1:]
-
-    def _everywhere(
-        self,
-        place: Placement,
-        lamps: tuple[Light, ...],
-        camera: PosedCamera,
-        pixels: Float[np.ndarray, "n 2"],
-    ) -> Float[np.ndarray, "n 4"]:
-        """Opacity and colour of pixels."""
-        seen = self.picture(place, lamps, camera, pixels)
-        return np.concatenate([seen.opacity[:, None], seen.colour], axis=1)
-
-    def _sparsely(
-        self,
-        place: Placement,
-        lamps: tuple[Light, ...],
-        camera: PosedCamera,
-        pixels: Float[np.ndarray, "n 2"],
-    ) -> Float[np.ndarray, "n 4"]:
-        """Opacity and colour of pixels: of each second row and column, and of all where the opacity changes.
-
-        Between them they are interpolated. That takes less than half as many rays.
-        """
-        x, y = pixels.astype(int).T
-        low = np.array([y.min(), x.min()]) // 2
-        corner = (x % 2 == 0) & (y % 2 == 0)
-        grid = np.zeros((*(np.array([y.max(), x.max()]) // 2 - low + 2), 4))
-        result, at = np.zeros((len(pixels), 4)), (y // 2 - low[0], x // 2 - low[1])
-        result[corner] = self._everywhere(place, lamps, camera, pixels[corner])
-        grid[at[0][corner], at[1][corner]] = result[corner]
-        opacity = grid[..., 0]
-        changes = ndimage.maximum_filter(opacity, 3) - ndimage.minimum_filter(opacity, 3) > _EVEN
-        edge = changes[at] & ~corner
-        if edge.any():
-            result[edge] = self._everywhere(place, lamps, camera, pixels[edge])
-        rest = ~corner & ~edge
-        result[rest] = _between(grid, 0.5 * y[rest] - low[0], 0.5 * x[rest] - low[1])
-        return result
 
     def _directions(
         self, camera: AbstractCamera, pixels: Float[np.ndarray, "n 2"]
@@ -411,25 +379,32 @@ def window_of(
     return slice(low[1], high[1]), slice(low[0], high[0])
 
 
-def _crossings(values: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "n 3"]:
-    """Where lines between neighbours of a grid pass through zero, in cells from its first node.
-
-    Steps along slopes would leave the surface: they vanish where something was cut off, as by a table.
-    """
-    points = []
-    for axis, unit in enumerate(np.eye(3)):
-        low, high = np.moveaxis(values, axis, 0)[:-1], np.moveaxis(values, axis, 0)[1:]
-        through = (low < 0) != (high < 0)
-        nodes = np.argwhere(np.moveaxis(through, 0, axis))
-        start, end = (np.moveaxis(part, 0, axis)[tuple(nodes.T)] for part in (low, high))
-        points.append(nodes + (start / (start - end))[:, None] * unit)
-    return np.concatenate(points)
-
-
 def pixels_of(window: tuple[slice, slice]) -> Float[np.ndarray, "n 2"]:
     """Image coordinates of the middles of the pixels of a window, row by row."""
     y, x = np.mgrid[window]
     return np.stack([x.ravel(), y.ravel()], axis=1) + 0.5
+
+
+def _sparsely(
+    values: Callable[[Float[np.ndarray, "m 2"]], Float[np.ndarray, "m k"]], pixels: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n k"]:
+    """Values of pixels: of each second row and column, and of all where the first value changes.
+
+    Between them they are interpolated. That takes less than half as many rays.
+    """
+    x, y = pixels.astype(int).T
+    low = np.array([y.min(), x.min()]) // 2
+    at, corner = (y // 2 - low[0], x // 2 - low[1]), (x % 2 == 0) & (y % 2 == 0)
+    known = values(pixels[corner])
+    grid = np.zeros((*(np.array([y.max(), x.max()]) // 2 - low + 2), known.shape[1]))
+    grid[at[0][corner], at[1][corner]] = known
+    opacity = grid[..., 0]
+    changes = ndimage.maximum_filter(opacity, 3) - ndimage.minimum_filter(opacity, 3) > _EVEN
+    edge = changes[at] & ~corner
+    result = _between(grid, 0.5 * y - low[0], 0.5 * x - low[1])
+    if edge.any():
+        result[edge] = values(pixels[edge])
+    return result
 
 
 def _between(

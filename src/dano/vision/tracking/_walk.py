@@ -30,7 +30,7 @@ from dano.vision.tracking._search import (
     turned_aside,
 )
 from dano.vision.tracking._segments import overlap
-from dano.vision.tracking._subject import FEW_RAYS, Subject
+from dano.vision.tracking._subject import ROUGH, Subject
 from dano.vision.tracking._whole import region_of, turned, Whole
 
 _STEPS = 4
@@ -98,7 +98,7 @@ class Walk:
         self._begun: tuple[int, list[tuple[Start, float]]] | None = None
         self._given: Placement | None = None
         self._missed, self._ambiguity = 0, np.inf
-        self._since: float | None = None
+        self._since = np.inf
 
     @functools.cached_property
     def _colours(self) -> Float[np.ndarray, "n 3"]:
@@ -133,7 +133,7 @@ class Walk:
         if before is None:
             found, status = self._searched(i), LOST
         else:
-            self._since = self._since or time.perf_counter()
+            self._since = min(self._since, time.perf_counter())
             found, status = self._unmoved(i), TRACKED
             if found is None:
                 found, status = self._followed(i, before)
@@ -453,7 +453,7 @@ class Walk:
             loss=self._loss(light),
             steps=steps,
             # All frames together are looked at with all rays; of what is blurred neighbours say the same.
-            rays=max(self._options.rays // (2 if place.drift is None else 4), FEW_RAYS),
+            rays=max(self._options.rays // (2 if place.drift is None else 4), ROUGH),
             random=self._random,
         )
 
@@ -486,7 +486,6 @@ class Walk:
         for i in range(len(self._found)):
             if self._status[i] == TRACKED and whole.found[i] is None:
                 self._status[i] = LOST
-        taken = 0.0 if self._since is None else time.perf_counter() - self._since
         return tracked(
             self._film,
             self._subject,
@@ -496,6 +495,6 @@ class Walk:
             self._light.lamps,
             notes=self._masking.notes,
             ambiguity=self._ambiguity,
-            seconds=taken / len(self._found),
+            seconds=max(time.perf_counter() - self._since, 0.0) / len(self._found),
             motion=whole.motion,
         )

@@ -7,4 +7,9 @@ from dano.vision.trajectory._smooth import (
     Smoothed as Smoothed,
     smoothed as smoothed,
 )
-from dano.vision.trajectory._support import Face as Face, Solid as Solid, solid_of as solid_of
+from dano.vision.trajectory._support import (
+    crossings as crossings,
+    Face as Face,
+    Solid as Solid,
+    solid_of as solid_of,
+)

@@ -71,6 +71,21 @@ def solid_of(points: Float[np.ndarray, "n 3"], com: Float[np.ndarray, "3"]) -> S
     return Solid(size, middle, np.asarray(com, np.float64), corners, tuple(faces))
 
 
+def crossings(values: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "n 3"]:
+    """Where lines between neighbours of a grid pass through zero, in cells from its first node.
+
+    Steps along slopes would leave the surface: they vanish where something was cut off, as by a table.
+    """
+    points = []
+    for axis, unit in enumerate(np.eye(3)):
+        low, high = np.moveaxis(values, axis, 0)[:-1], np.moveaxis(values, axis, 0)[1:]
+        through = (low < 0) != (high < 0)
+        nodes = np.argwhere(np.moveaxis(through, 0, axis))
+        start, end = (np.moveaxis(part, 0, axis)[tuple(nodes.T)] for part in (low, high))
+        points.append(nodes + (start / (start - end))[:, None] * unit)
+    return np.concatenate(points)
+
+
 def _margin(corners: np.ndarray, down: np.ndarray, foot: np.ndarray, height: float) -> float:
     """How far the foot lies within what touches the table, where nothing is quite flat [m]."""
     side = np.cross(down, np.eye(3)[np.argmin(np.abs(down))])
