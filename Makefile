@@ -9,14 +9,18 @@ IS_NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
 PYTHON = $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	if $$python -c '$(IS_NEW_ENOUGH)' 2>/dev/null; then echo $$python; break; fi; done)
 PYTEST_ARGS = --numprocesses 2 --dist loadfile
+# Processors and GPUs whose kernels are compiled; a wheel for everybody wants
+# make wheel KERNELS="--levels x86-64-v3 x86-64-v4 --architectures 80 90 100 120"
+KERNELS = --levels x86-64-v3
 INSTALL = $(BIN)/python -m pip install --constraint constraints.txt
 PACKAGE := pyproject.toml constraints.txt
 
-.PHONY: help demo test check format docs wheel bench-check clean
+.PHONY: help demo test kernels check format docs wheel bench-check clean
 
 help:
 	@echo "make demo     install dano and show a first simulation"
 	@echo "make test     install everything and run the tests"
+	@echo "make kernels  compile the kernels that tests share and the wheel brings"
 	@echo "make check    lint, format check, import layers, types"
 	@echo "make format   apply the formatter and the safe lint fixes"
 	@echo "make docs     build the documentation into site/"
@@ -27,8 +31,12 @@ help:
 demo: $(VENV)/.demo
 	$(BIN)/dano demo
 
-test: $(VENV)/.dev
+test: kernels
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+# What was made from the same sources stays.
+kernels: $(VENV)/.dev
+	$(BIN)/python assets/make_kernels.py $(KERNELS)
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -43,13 +51,15 @@ format: $(VENV)/.dev
 docs: $(VENV)/.docs
 	$(BIN)/mkdocs build --strict
 
-# Without the clone in sight: what the wheel lacks is missed.
-wheel: $(VENV)/.pip
+# Without the clone in sight, nor a home: what the wheel lacks is missed.
+wheel: kernels
 	rm -rf build dist $(VENV)/empty
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 	$(BIN)/python -m venv $(VENV)/empty
 	$(VENV)/empty/bin/python -m pip install --quiet --constraint constraints.txt dist/*.whl
-	cd $(VENV)/empty && bin/dano --version && bin/dano check bunny && bin/dano simulate bunny -o bunny.npz
+	cp tests/wheel/first_step.py $(VENV)/empty
+	cd $(VENV)/empty && mkdir home && export HOME=$$PWD/home && bin/python first_step.py \
+		&& bin/dano --version && bin/dano check bunny && bin/dano simulate bunny -o bunny.npz
 	rm -rf build $(VENV)/empty
 
 bench-check: $(VENV)/.dev
@@ -57,7 +67,7 @@ bench-check: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.check
 
 clean:
-	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) build dist site src/dano/compiled .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 
 # Each stamp is touched last, so an interrupted installation is taken up again.
 $(VENV)/.pip:

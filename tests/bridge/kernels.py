@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from dano.mujoco._search import _views, Known, part_of_geom
+from dano.mujoco._search import filled, Known, part_of_geom
 from dano.mujoco._solids import geom_of
 from dano.native import Features, instance
 
@@ -48,9 +48,15 @@ def mixed(model) -> dict[str, np.ndarray]:
     """Parameters of contacts of the first two geoms."""
     tables, _, mix = _kernels()
     found = wp.zeros(1, dtype=tables.Settings, device="cpu")
-    wp.launch(mix, 1, [_views(tables.Model, model), tables.Options(), found], device="cpu")
+    wp.launch(mix, 1, [_shown(tables, model), tables.Options(), found], device="cpu")
     row = found.numpy()[0]
     return {name: row[name] for name in row.dtype.names}
+
+
+def _shown(tables, model):
+    """Arrays of a model as kernels read them."""
+    arrays = {f"model.{name}": getattr(model, name) for name in tables.Model.vars}
+    return filled(tables.Model(), arrays, "model", "cpu")
 
 
 def distances(model, part, points):
@@ -60,7 +66,7 @@ def distances(model, part, points):
     x = wp.array(np.ascontiguousarray(points, np.float64), dtype=tables.vec3, device="cpu")
     found = wp.zeros(len(points), dtype=tables.vec4, device="cpu")
     bounds = wp.zeros(len(points), dtype=tables.real, device="cpu")
-    wp.launch(ask, len(points), [known.known, _views(tables.Model, model), x, found, bounds], device="cpu")
+    wp.launch(ask, len(points), [known.structure(), _shown(tables, model), x, found, bounds], device="cpu")
     rows = found.numpy()
     return rows[:, 3], rows[:, :3], bounds.numpy()
 

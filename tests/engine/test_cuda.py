@@ -151,8 +151,8 @@ def test_programs_for_a_gpu(dtype, stack):
 def test_kernels_compile_for_gpus(kernel, wide, tmp_path: Path):
     """Into machine code, as on a machine with a GPU."""
     features = Features(
-        KINDS=frozenset({0, 6}), DEGREES=frozenset({2}), TURNING=frozenset({0}), UNIONS=False, PATCHES=False,
-        TREES=False, LOOPS=False, LANES=_cuda.LANES, WIDE=wide,
+        KINDS=frozenset({0, 6}), DEGREES=frozenset({2}), UNIONS=False, PATCHES=False, TREES=False,
+        LANES=_cuda.LANES, WIDE=wide,
     )  # fmt: skip
     module = getattr(instance(features, f"dano.engine.kernels.{KERNELS[kernel]}"), kernel).module
     module.options["block_dim"] = _cuda.LANES

@@ -13,11 +13,8 @@ from dano.native import Features, instance, leaf_tables
 FEATURES = Features(
     KINDS=frozenset(range(8)),
     DEGREES=frozenset({2, 3}),
-    TURNING=frozenset({0}),
     UNIONS=True,
-    POINTS=False,
     TREES=False,
-    LOOPS=False,
 )
 _MODULES = {"engine.kernels": ("tables", "rollout", "patches"), "physics": ("patch_law", "overlap", "real")}
 KERNELS = SimpleNamespace(

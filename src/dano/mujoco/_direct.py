@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from dano.mujoco._search import Search
+from dano.mujoco._search import CALLBACK, CALLBACK_FEATURES, Search
 from dano.mujoco._settings import Writer
 from dano.mujoco.kernels.words import Entry, Head, SHIFT
-from dano.native import compiled_kernel, Features, instance
+from dano.native import cpu_kernel, Launch, Parameters
 
 _PAGE = 4096
 """Bytes from one address where memory may end to the next."""
@@ -101,8 +101,6 @@ class Direct:
         Raises:
             AttributeError: If MuJoCo's library does not show its functions.
         """
-        import warp as wp
-
         self._mujoco = mujoco
         self._head = _head(mujoco)
         self._slot = ctypes.c_void_p.in_dll(_library(mujoco), "mjcb_passive")
@@ -114,10 +112,12 @@ class Direct:
         self._slots, self._used = _slots(_LEAST), 0
         self._head[Head.SLOTS] = self._slots.ctypes.data
         # Its machine code is there as long as it is.
-        self._kernel = compiled_kernel(_kernel)
-        address = wp.zeros(1, dtype=wp.int64, device="cpu")
-        wp.launch(self._kernel, 1, [self._head.ctypes.data, address], device="cpu")
-        self._address = int(address.numpy()[0])
+        self._kernel = cpu_kernel(CALLBACK_FEATURES, CALLBACK, "make_callback", what="the bridge")
+        given, address = Parameters(self._kernel.layout), np.zeros(1, np.int64)
+        given.put("head", self._head.ctypes.data)
+        given.show("address", address)
+        Launch(self._kernel, given, 1)()
+        self._address = int(address[0])
 
     def install(self) -> None:
         """Let MuJoCo call it instead of the function of Python that it calls now."""
@@ -144,10 +144,13 @@ class Direct:
         """
         key, entry = data._address, np.zeros(len(Entry), np.int64)
         writer, standing = Writer(self._mujoco), np.array(sorted(geoms), np.int32)
-        kernel, bounds, arguments = search.call()
+        launch = search.launch
         entry[Entry.MODEL], entry[Entry.XPOS] = model._address, data.xpos.ctypes.data
-        entry[Entry.KERNEL] = kernel
-        entry[Entry.BOUNDS], entry[Entry.ARGUMENTS] = map(ctypes.addressof, (bounds, arguments))
+        entry[Entry.KERNEL] = launch.kernel.address
+        entry[Entry.BOUNDS], entry[Entry.ARGUMENTS] = (
+            ctypes.addressof(launch.bounds),
+            launch.parameters.address,
+        )
         entry[Entry.OPTIONS], entry[Entry.FOUND] = search.options.ctypes.data, search.found.ctypes.data
         entry[Entry.ROWS], entry[Entry.WHOLES] = search.rows.ctypes.data, search.wholes.ctypes.data
         entry[Entry.CONTACT], entry[Entry.INDEX] = writer.places()
@@ -164,7 +167,7 @@ class Direct:
         ends = weakref.ref(model, forget), weakref.ref(data, forget)
         with self._lock:
             before = self._entries.get(key)
-            self._entries[key] = _Known(entry, *ends, search, (writer, standing, bounds, arguments))
+            self._entries[key] = _Known(entry, *ends, search, (writer, standing, launch))
             self._put(key, entry)
             self._leave(before)
 
@@ -241,10 +244,6 @@ def direct(mujoco: Any) -> Direct | None:
         return Direct(mujoco)
     except AttributeError:
         return None
-
-
-def _kernel() -> Any:
-    return instance(Features(WIDE=True), "dano.mujoco.kernels.callback").make_callback
 
 
 def _library(mujoco: Any) -> ctypes.CDLL:

@@ -1,8 +1,6 @@
 """The search for contacts as a launch of a kernel: tables of a model, and MuJoCo's arrays where they are."""
 
-import ctypes
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,12 +10,24 @@ from dano.mujoco._settings import is_gap_beyond, Settings
 from dano.mujoco._solids import Geom, object_solid, Solid
 from dano.mujoco._surfaces import Surface
 from dano.mujoco._things import Thing
+from dano.mujoco.kernels import words
 from dano.mujoco.kernels.words import REALS, WHOLES
-from dano.native import compiled_kernel, Features, instance, kind_numbers, lower_bounds
+from dano.native import (
+    compiled_kernel,
+    cpu_kernel,
+    Features,
+    instance,
+    kind_numbers,
+    Launch,
+    layout_of,
+    lower_bounds,
+    Parameters,
+)
 
 _TABLES, _FINDING = "dano.mujoco.kernels.tables", "dano.mujoco.kernels.finding"
+CALLBACK, CALLBACK_FEATURES = "dano.mujoco.kernels.callback", Features(WIDE=True)
 _WORLDS = "dano.mujoco.kernels.worlds"
-_SOLIDS, _LEAVES = "dano.mujoco.kernels.solids", "dano.physics.solids.leaves"
+_FEATURES = Features(KINDS=frozenset(range(7)), DEGREES=frozenset({2}), UNIONS=False)
 _BLOCK = 16
 """Samples of a block, as kernels have it."""
 _TOLD = 6
@@ -50,6 +60,11 @@ class Part(NamedTuple):
     thing: Thing | None
 
 
+def kernel_builds() -> list[tuple[Features, str]]:
+    """Features and modules of the kernels that bridges to MuJoCo usually ask for."""
+    return [(_FEATURES, _FINDING), (CALLBACK_FEATURES, CALLBACK)]
+
+
 def part_of_geom(body: int, geom: int, found: Geom) -> Part:
     """A geom of a model."""
     return Part(body, geom, found.solid, found.surface, found.scale, None)
@@ -79,56 +94,71 @@ class Known:
             device: Where MuJoCo Warp has its worlds, with numbers of 32 bits; None for MuJoCo itself.
         """
         degrees = {part.solid.degree for part in parts if part.solid.kind == "GRID"}
-        self.features = Features(
-            KINDS=frozenset(range(7)),
-            DEGREES=frozenset({2}) if degrees <= {2} else frozenset({1, 2, 3}),
-            UNIONS=False,
-            **({} if device is None else {"WIDE": False}),
-        )
+        self.features = _FEATURES if degrees <= {2} else _FEATURES.but(DEGREES=frozenset({1, 2, 3}))
+        if device is not None:
+            self.features = self.features.but(WIDE=False)
         self.device = device or "cpu"
-        self.lanes = 1 if self.device == "cpu" else _LANES
-        _array = functools.partial(_placed, device=self.device)
+        self.lanes = 1 if device is None else _LANES
         self.parts, self.pairs = parts, pairs
-        self.kernel: Any = compiled_kernel(lambda: self._kernel(device is not None), self.device, self.lanes)
-        self.tables = tables = instance(self.features, _TABLES)
-        structs = instance(self.features, _LEAVES)
-        sampled = [part.surface for part in parts if part.surface is not None]
-        planes = [part.solid.planes for part in parts if part.solid.planes is not None]
-        leaves, kinds, coefficients, bounds, at = _solids(structs, parts)
-        numbers, index = _parts(self.features, parts, at)
-        samples = _rows(tables.Sample, sum(len(each.points) for each in sampled))
-        if sampled:
-            samples["point"] = np.concatenate([each.points for each in sampled])
-            samples["area"] = np.concatenate([each.vectors for each in sampled])
-        precedence = np.concatenate([np.zeros(0), *(each.precedence for each in sampled)])
-        balls = np.concatenate([np.zeros((0, 4)), *(each.balls for each in sampled)])
-        solids = structs.Solids()
-        solids.leaves = _array(leaves[None], structs.Leaf)
-        solids.kinds = _array(kinds, structs.LeafKind)
-        solids.coefficients = _array(coefficients[None], structs.real)
-        solids.bounds = _array(bounds[None], structs.real)
-        self.known = known = tables.Known()
-        known.parts, known.index = _array(numbers, tables.Part), _array(index, tables.PartIndex)
-        touching = _rows(tables.TouchPair, len(pairs))
-        touching["first"], touching["second"] = pairs.T
-        touching["both"] = [not _is_flat(parts[a], parts[b]) for a, b in pairs]
-        known.pairs = _array(touching, tables.TouchPair)
-        known.samples, known.precedence = _array(samples, tables.Sample), _array(precedence, tables.real)
-        known.balls = _array(balls, tables.vec4)
-        runs = np.concatenate([np.zeros((0, 4)), *(each.runs for each in sampled)])
-        known.runs = _array(runs, tables.vec4)
-        known.solids = solids
-        known.planes = _array(np.concatenate([np.zeros((0, 4)), *planes]), tables.vec4)
-        known.sizes = _array(np.array(sizes, np.float64), tables.vec3)
+        self.kernel: Any = self._kernel(device)
+        layout = self.kernel.layout if device is None else layout_of(self.kernel)
+        self.arrays = _arrays(Parameters(layout), parts, pairs, sizes)
         most = [sum(_count(parts[i]) for i in pair) for pair in pairs]
         self.room = max(most, default=0)
 
-    def _kernel(self, in_worlds: bool) -> Any:
-        return (
-            instance(self.features, _WORLDS).find_in_worlds
-            if in_worlds
-            else instance(self.features, _FINDING).find
+    def _kernel(self, device: str | None) -> Any:
+        if device is None:
+            return cpu_kernel(self.features, _FINDING, "find", what="the bridge")
+        return compiled_kernel(
+            lambda: instance(self.features, _WORLDS).find_in_worlds, device, self.lanes, what="the bridge"
         )
+
+    def structure(self) -> Any:
+        """The arrays as a structure of Warp's, where the kernel runs."""
+        return filled(instance(self.features, _TABLES).Known(), self.arrays, "known", self.device)
+
+
+def filled(structure: Any, arrays: Mapping[str, np.ndarray], place: str, device: str) -> Any:
+    """A structure of Warp's with copies of arrays, by the places of its fields."""
+    import warp as wp
+
+    for name, variable in structure._cls.vars.items():
+        if not isinstance(variable.type, wp.array):
+            filled(getattr(structure, name), arrays, f"{place}.{name}", device)
+        elif f"{place}.{name}" in arrays:
+            values = arrays[f"{place}.{name}"]
+            shown = values if variable.type.ndim == 1 else values[None]
+            setattr(structure, name, wp.array(shown, dtype=variable.type.dtype, device=device))
+    return structure
+
+
+def _arrays(
+    like: Parameters, parts: Sequence[Part], pairs: Int[np.ndarray, "k 2"], sizes: Float[np.ndarray, "g 3"]
+) -> dict[str, np.ndarray]:
+    """Arrays of `dano.mujoco.kernels.tables.Known` by place."""
+    sampled = [part.surface for part in parts if part.surface is not None]
+    planes = [part.solid.planes for part in parts if part.solid.planes is not None]
+    solids, at = _solids(like, parts)
+    numbers, index = _parts(like, parts, at)
+    samples = like.rows("known.samples", sum(len(each.points) for each in sampled))
+    if sampled:
+        samples["point"] = np.concatenate([each.points for each in sampled])
+        samples["area"] = np.concatenate([each.vectors for each in sampled])
+    touching = like.rows("known.pairs", len(pairs))
+    touching["first"], touching["second"] = pairs.T
+    touching["both"] = [not _is_flat(parts[a], parts[b]) for a, b in pairs]
+    plain = {
+        "precedence": [np.zeros(0), *(each.precedence for each in sampled)],
+        "balls": [np.zeros((0, 4)), *(each.balls for each in sampled)],
+        "runs": [np.zeros((0, 4)), *(each.runs for each in sampled)],
+        "planes": [np.zeros((0, 4)), *planes],
+        "sizes": [np.asarray(sizes)],
+    }
+    found = {"parts": numbers, "index": index, "pairs": touching, "samples": samples}
+    for name, values in plain.items():
+        base = like.layout.arrays[f"known.{name}"].dtype.base
+        found[name] = np.ascontiguousarray(np.concatenate(values), base)
+    return {**{f"known.{name}": values for name, values in found.items()}, **solids}
 
 
 def _count(part: Part) -> int:
@@ -143,26 +173,16 @@ def _is_flat(part: Part, object_part: Part) -> bool:
     return part.solid.bend >= _FLAT * float(np.sqrt(areas.max()))
 
 
-def _number(features: Features, kind: str) -> int:
+def _number(kind: str) -> int:
     """Of a kind of solid by its name."""
-    return getattr(instance(features, _SOLIDS), kind) if kind not in kind_numbers() else kind_numbers()[kind]
+    return kind_numbers()[kind] if kind in kind_numbers() else getattr(words, kind)
 
 
-def _rows(struct: Any, n: int) -> np.ndarray:
-    """Rows of a structure, by the names of its fields."""
-    return np.zeros(n, dtype=struct.numpy_dtype())
-
-
-def _placed(values: np.ndarray, dtype: Any, device: str) -> Any:
-    import warp as wp
-
-    return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
-
-def _solids(structs: Any, parts: Sequence[Part]):
-    """Leaves, their kinds, spline coefficients and lower bounds, and for each part where its solid stands."""
+def _solids(like: Parameters, parts: Sequence[Part]) -> tuple[dict[str, np.ndarray], list[int]]:
+    """Leaves, kinds, spline coefficients and lower bounds by place, and for each part where its solid is."""
     own = [part for part in parts if part.solid.kind in kind_numbers()]
-    leaves, kinds = _rows(structs.Leaf, len(own)), _rows(structs.LeafKind, len(own))
+    leaves = like.rows("known.solids.leaves", len(own))
+    kinds = like.rows("known.solids.kinds", len(own))
     grids: dict[int, tuple[int, int]] = {}
     flat, first = [np.zeros(1)], 1
     bounds, first_bound = [np.zeros(1)], 1
@@ -193,18 +213,20 @@ def _solids(structs: Any, parts: Sequence[Part]):
         else:
             at.append(leaf)
             leaf += part.solid.kind in kind_numbers()
-    return leaves, kinds, np.concatenate(flat), np.concatenate(bounds), at
+    real = like.layout.arrays["known.solids.bounds"].dtype
+    found = {"leaves": leaves, "kinds": kinds, "coefficients": np.concatenate(flat).astype(real)}
+    found["bounds"] = np.concatenate(bounds).astype(real)
+    return {f"known.solids.{name}": values for name, values in found.items()}, at
 
 
-def _parts(features: Features, parts: Sequence[Part], at: Sequence[int]):
-    tables = instance(features, _TABLES)
-    numbers, index = _rows(tables.Part, len(parts)), _rows(tables.PartIndex, len(parts))
+def _parts(like: Parameters, parts: Sequence[Part], at: Sequence[int]):
+    numbers, index = like.rows("known.parts", len(parts)), like.rows("known.index", len(parts))
     block, run = 0, 0
     for row, whole, part, place in zip(numbers, index, parts, at, strict=True):
         thing = part.thing
         row["scale"], row["thickness"] = part.scale, part.solid.thickness
         whole["body"], whole["geom"], whole["is_object"] = part.body, part.geom, thing is not None
-        whole["solid"], whole["at"] = _number(features, part.solid.kind), place
+        whole["solid"], whole["at"] = _number(part.solid.kind), place
         whole["count"] = 0 if part.solid.planes is None else len(part.solid.planes)
         if thing is not None:
             row["middle"], row["radius"], row["thickness"] = thing.middle, thing.radius, thing.thickness
@@ -222,57 +244,37 @@ class Search:
 
     def __init__(self, mujoco: Any, model: Any, data: Any, known: Known, most: int):
         """`most`: contacts of a pair."""
-        import warp as wp
-
-        tables, n = known.tables, len(known.pairs)
+        n = len(known.pairs)
         self.rows, self.wholes = np.zeros((most * n, REALS)), np.zeros((most * n, WHOLES), np.int32)
         self.options, self.settings = np.zeros(_TOLD), np.zeros((n, 15))
         self.options[1], self.options[4] = most, is_gap_beyond(mujoco)
         self.found = np.zeros(1, np.int32)
-        work = tables.Work()
-        work.options = _seen(self.options, tables.Options, 1)
-        work.settings = _seen(self.settings, tables.Settings, n)
-        work.touches = wp.zeros(max(known.room, 1), dtype=tables.Touch, device="cpu")
-        work.scores = wp.zeros(most + 1, dtype=tables.real, device="cpu")
-        work.heads = wp.zeros(most, dtype=wp.int32, device="cpu")
-        work.rows = _seen(self.rows, tables.ContactRow, most * n)
-        work.index = _seen(self.wholes, tables.ContactIndex, most * n)
-        work.found = _seen(self.found, wp.int32, 1)
-        self.arguments = [known.known, _views(tables.Model, model), _views(tables.Data, data), work]
-        self._command: Any = wp.launch(known.kernel, 1, self.arguments, device="cpu", record_cmd=True)
-        self.launch: Callable[[], None] = self._command.launch
+        parameters = Parameters(known.kernel.layout)
+        work = {
+            "options": self.options[None],
+            "settings": self.settings,
+            "touches": parameters.rows("work.touches", max(known.room, 1)),
+            "scores": np.zeros(most + 1),
+            "heads": np.zeros(most, np.int32),
+            "rows": self.rows,
+            "index": self.wholes,
+            "found": self.found,
+        }
+        arrays = {**known.arrays, **{f"work.{name}": values for name, values in work.items()}}
+        for place, values in {**arrays, **views_of(parameters, model=model, data=data)}.items():
+            parameters.show(place, values)
+        self.launch = Launch(known.kernel, parameters, 1)
         self.lines = list(zip(self.rows, self.wholes, strict=True))
-
-    def call(self) -> tuple[int, Any, Any]:
-        """Address of the kernel, and the two structures that it is called with; calls do not keep them."""
-        bounds, *given = self._command.params
-        arguments = _arguments(*map(type, given))(*given)
-        return ctypes.cast(self._command.hooks.forward, ctypes.c_void_p).value or 0, bounds, arguments
 
     def give(self, pair: int, settings: Settings | None) -> None:
         """Say what the parameters of a pair are."""
         self.settings[pair] = 0.0 if settings is None else settings.numbers()
 
 
-@functools.cache
-def _arguments(*types: type) -> type:
-    """The structure in which a kernel of Warp takes its arguments on a CPU."""
-    fields = [(f"argument_{i}", each) for i, each in enumerate(types)]
-    return type("Arguments", (ctypes.Structure,), {"_fields_": fields})
-
-
-def _seen(array: np.ndarray, dtype: Any, n: int) -> Any:
-    """An array of NumPy's as kernels see it, in the same memory; it must outlive what is seen."""
-    import warp as wp
-
-    return wp.array(ptr=array.ctypes.data, dtype=dtype, shape=(n,), device="cpu", copy=False)
-
-
-def _views(struct: Any, owner: Any) -> Any:
-    """A structure of arrays of `mjModel` or `mjData` with their names, as of one world."""
-    views = struct()
-    for name, variable in struct.vars.items():
-        array = getattr(owner, name)
-        seen = _seen(array, variable.type.dtype, len(array))
-        setattr(views, name, seen if variable.type.ndim == 1 else seen.reshape((1, len(array))))
-    return views
+def views_of(parameters: Parameters, **owners: Any) -> dict[str, np.ndarray]:
+    """Arrays of `mjModel` and `mjData` by place, under their names."""
+    places = (place.split(".") for place in parameters.layout.arrays)
+    return {
+        f"{owner}.{name}": getattr(owners[owner], name)
+        for owner, name, *_ in (place for place in places if place[0] in owners)
+    }

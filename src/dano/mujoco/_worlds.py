@@ -14,7 +14,7 @@ from dano.mujoco._search import Known
 from dano.mujoco._settings import Settings
 from dano.native import begin, instance
 
-_WORLDS = "dano.mujoco.kernels.worlds"
+_WORLDS, _TABLES = "dano.mujoco.kernels.worlds", "dano.mujoco.kernels.tables"
 
 
 def warp_library() -> Any:
@@ -49,7 +49,8 @@ class Worlds:
 
         self._known, self._most = known, most
         self._kernels = instance(known.features, _WORLDS)
-        tables = known.tables
+        self._tables = tables = instance(known.features, _TABLES)
+        self._structure = known.structure()
         kind = np.dtype(tables.Settings.numpy_dtype())
         rows = np.zeros((len(known.pairs), kind.itemsize // np.float32().itemsize), np.float32)
         for row, settings in zip(rows, given or (), strict=False):
@@ -90,7 +91,7 @@ class Worlds:
     def _made(self, model: Any, data: Any) -> list[Any]:
         import warp as wp
 
-        known, kernels, tables = self._known, self._kernels, self._known.tables
+        known, kernels, tables = self._known, self._kernels, self._tables
         n, most, device = len(known.pairs), self._most, known.device
         if wp.get_device(device).is_capturing:
             raise ValueError(
@@ -109,7 +110,7 @@ class Worlds:
         for name, variable in kernels.Contacts.vars.items():
             setattr(contacts, name, _seen(getattr(data.contact, name), variable.type, None))
         arguments = [
-            known.known,
+            self._structure,
             _views(tables.Model, model, data.nworld),
             _views(tables.Data, data, data.nworld),
             rooms,

@@ -1,10 +1,21 @@
 """Kernels compiled for this machine, and solids as they read them."""
 
 from dano.native._cores import n_cores as n_cores, together as together
+from dano.native._cubins import (
+    ARCHITECTURES as ARCHITECTURES,
+    kernel_in_lanes as kernel_in_lanes,
+    make_cubin as make_cubin,
+)
+from dano.native._declared import fields_of as fields_of
 from dano.native._instances import Features as Features, instance as instance
+from dano.native._layout import (
+    Array as Array,
+    Layout as Layout,
+    layout_of as layout_of,
+    Parameters as Parameters,
+)
 from dano.native._leaves import (
     balls_around_runs as balls_around_runs,
-    degrees_of as degrees_of,
     is_known as is_known,
     kind_number as kind_number,
     kind_numbers as kind_numbers,
@@ -18,4 +29,13 @@ from dano.native._leaves import (
     shape_kinds as shape_kinds,
     slabs_of_blocks as slabs_of_blocks,
 )
-from dano.native._warp import begin as begin, compiled_kernel as compiled_kernel
+from dano.native._objects import (
+    cpu_kernel as cpu_kernel,
+    Kernel as Kernel,
+    Launch as Launch,
+    LEVELS as LEVELS,
+    make_object as make_object,
+    shipped_path as shipped_path,
+    what_is_shipped as what_is_shipped,
+)
+from dano.native._warp import begin as begin, compiled_kernel as compiled_kernel, FLAGS as FLAGS

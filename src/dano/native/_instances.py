@@ -29,6 +29,10 @@ class Features:
         """Any of the names in `dano.physics.features`."""
         self.values = tuple(sorted(values.items(), key=lambda item: item[0]))
 
+    def but(self, **values: Any) -> "Features":
+        """The same but for some values."""
+        return Features(**{**dict(self.values), **values})
+
     def __hash__(self) -> int:
         return hash(self.values)
 

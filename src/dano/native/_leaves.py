@@ -27,15 +27,13 @@ from dano.fields import (
     UnionShape,
 )
 from dano.maths import matmul, matvec, Pose
-from dano.native._instances import Features, instance
+from dano.physics.solids import kinds as numbers_of_kinds
 
 LEAF_WIDTH = 20
 """Numbers of a leaf."""
 # Blocks of a run: see `dano.engine.kernels.tables`.
 _RUN = 4
 _KIND_WIDTH = 7
-_NUMBERS = "dano.physics.solids.leaves", "dano.physics.solids.shapes"
-_NO_KINDS = Features(KINDS=frozenset())
 Known = AbstractPrimitive | SignedDistanceGrid | GridField
 """Fields that kernels know."""
 
@@ -43,10 +41,8 @@ Known = AbstractPrimitive | SignedDistanceGrid | GridField
 @functools.cache
 def kind_numbers() -> dict[str, int]:
     """Numbers of all kinds of leaves in kernels, by their names in capitals."""
-    modules = [instance(_NO_KINDS, name) for name in _NUMBERS]
-    known = {name: value for module in modules for name, value in vars(module).items()}
-    kinds = (*PRIMITIVES, SignedDistanceGrid.kind, GridField.kind)
-    return {kind.upper(): known[kind.upper()] for kind in kinds}
+    named = (*PRIMITIVES, SignedDistanceGrid.kind, GridField.kind)
+    return {kind.upper(): getattr(numbers_of_kinds, kind.upper()) for kind in named}
 
 
 def kind_number(kind: str) -> int:
@@ -54,9 +50,9 @@ def kind_number(kind: str) -> int:
     return kind_numbers()[kind.upper()]
 
 
-def shape_kinds() -> set[int]:
+def shape_kinds() -> frozenset[int]:
     """Numbers of the kinds of shapes with a name."""
-    return set(map(kind_number, PRIMITIVES))
+    return frozenset(map(kind_number, PRIMITIVES))
 
 
 class Placed(NamedTuple):
@@ -150,15 +146,6 @@ def kinds_of(leaves: Sequence[Placed]) -> set[int]:
     return {kind_number(each.leaf.kind) for each in leaves}
 
 
-def degrees_of(leaves: Sequence[Placed]) -> set[int]:
-    """Degrees of the splines of leaves that are grids."""
-    return {
-        degree_of(leaf.field.interpolation)
-        for leaf in leaves
-        if isinstance(leaf.field, SignedDistanceGrid | GridField)
-    }
-
-
 def leaf_tables(leaves: Sequence[Placed], dtype: DTypeLike) -> Leaves:
     """Rows of leaves."""
     if not leaves:
@@ -203,7 +190,7 @@ def lower_bounds(coefficients: Float[Array | np.ndarray, "x y z"], degree: int) 
         degree: Of the spline.
     """
     bound = jax.lax.stop_gradient(jnp.asarray(coefficients))
-    cell = instance(_NO_KINDS, _NUMBERS[0]).CELL
+    cell = numbers_of_kinds.CELL
     for axis, size in enumerate(coefficients.shape):
         n = (size - 2 * degree - 3) // cell + 1
         # From one before the own node of a block's first cell to two beyond that of its last.

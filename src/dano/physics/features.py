@@ -10,19 +10,16 @@ DEGREES = frozenset({1, 2, 3})
 """Degrees of the splines of sampled distances and densities."""
 UNIONS = True
 """Whether a solid has several leaves, or a density several parts."""
-POINTS = True
-"""Whether there are contacts with a point law."""
 LAW = ""
 """A file whose functions stand in place of those of `point_law`; none if empty."""
 PATCHES = True
 """Whether there are contacts with a patch law."""
-TURNING = frozenset({0, 1, 2})
-"""How samples turn with their bodies, see `pairs`."""
 TREES = True
 """Whether bodies hang on joints."""
-LOOPS = True
-"""Whether chains of joints are closed, see `loops`."""
 LANES = 1
 """Lanes of a world: 1 on a CPU, 32 on a GPU."""
 WIDE = True
 """Whether numbers have 64 bits."""
+ADJOINTS = True
+"""Whether adjoints of formulas are generated. Functions are marked for that when derivatives' modules run, so
+these have functions of their own: what others compile would depend on which of them ran first."""

@@ -13,8 +13,8 @@ from dano.physics.features import KINDS, UNIONS
 from dano.physics.real import HALF, INFINITY, mat33, ONE, real, TWO, vec3, vec4, ZERO
 from dano.physics.solids.distances import nearest_leaf, Solid, solid_clearance, solid_distance, solid_of
 from dano.physics.solids.grids import grid_spline, STEEPEST
-from dano.physics.solids.leaves import DENSITY, Distance, GRID, HALF_SPACE, Leaf, LeafKind, Solids
-from dano.physics.solids.shapes import CAPSULE, ELLIPSOID, SPHERE
+from dano.physics.solids.kinds import CAPSULE, DENSITY, ELLIPSOID, GRID, HALF_SPACE, SPHERE
+from dano.physics.solids.leaves import Distance, Leaf, LeafKind, Solids
 
 _DENSITY, _HALF_SPACE, _GRID = wp.constant(DENSITY), wp.constant(HALF_SPACE), wp.constant(GRID)
 _SPHERE, _CAPSULE, _ELLIPSOID = wp.constant(SPHERE), wp.constant(CAPSULE), wp.constant(ELLIPSOID)

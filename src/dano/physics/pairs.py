@@ -5,7 +5,7 @@ Geometry is taken where the old velocities take the bodies by a share τ of the 
 
 import warp as wp
 
-from dano.physics.features import TREES, TURNING
+from dano.physics.features import TREES
 from dano.physics.real import HALF, mat33, ONE, quat, real, vec3, ZERO
 from dano.physics.rotations import direction, interpolated, matrix, rotation_from_z
 from dano.physics.solids.distances import Solid, solid_distance
@@ -135,24 +135,20 @@ def facing_map(turn: mat33, toward: vec3, turning: int, scale: vec3) -> FacingMa
     found = FacingMap()
     found.points = turn
     found.vectors = turn
-    if wp.static(AXIS in TURNING):
-        squared = toward[0] * toward[0] + toward[1] * toward[1]
-        # A cylinder that stands on its end faces no way more than another.
-        if turning == _AXIS and squared > real(1e-12):
-            across = wp.sqrt(squared)
-            x = toward[0] / across
-            y = toward[1] / across
-            about = mat33(x, -y, ZERO, y, x, ZERO, ZERO, ZERO, ONE)
-            found.points = turn * about
-            found.vectors = turn * about
-    if wp.static(BALL in TURNING):
-        if turning == _BALL:
-            facing = rotation_from_z(-direction(wp.cw_mul(scale, toward)))
-            volume = scale[0] * scale[1] * scale[2]
-            found.points = turn * wp.diag(scale) * facing
-            found.vectors = (
-                turn * wp.diag(vec3(volume / scale[0], volume / scale[1], volume / scale[2])) * facing
-            )
+    squared = toward[0] * toward[0] + toward[1] * toward[1]
+    # A cylinder that stands on its end faces no way more than another.
+    if turning == _AXIS and squared > real(1e-12):
+        across = wp.sqrt(squared)
+        x = toward[0] / across
+        y = toward[1] / across
+        about = mat33(x, -y, ZERO, y, x, ZERO, ZERO, ZERO, ONE)
+        found.points = turn * about
+        found.vectors = turn * about
+    if turning == _BALL:
+        facing = rotation_from_z(-direction(wp.cw_mul(scale, toward)))
+        volume = scale[0] * scale[1] * scale[2]
+        found.points = turn * wp.diag(scale) * facing
+        found.vectors = turn * wp.diag(vec3(volume / scale[0], volume / scale[1], volume / scale[2])) * facing
     return found
 
 
@@ -286,21 +282,20 @@ def pair_pose(
     pose.vectors = seen.vectors
     pose.arms = turn
     pose.arm_offset = pose.origin - pose.com + inverse * ((follows * share * h) * moves)
-    if wp.static(len(TURNING) > 1):
-        if turning != _FIXED:
-            # What touches a plane with the same normal at the start: forces act there, and depths are
-            # those of the end. Together they are SHAKE's way with a constraint, which neither damps nor
-            # drives rolling. The faster a body spins, the nearer to the end: arms far from where depths
-            # are would miss impacts.
-            turn_squared = wp.dot(first.spin, first.spin) * h * h
-            fast = wp.min(turn_squared / (_FASTEST * _FASTEST), ONE)
-            before = inverse * rotation_after(first, fast * share)
-            stands = facing_map(before, wp.transpose(before) * (turn * toward), turning, scale)
-            pose.arms = stands.points
-            pose.arm_offset = -(before * first.com)
-            pose.axis = before * vec3(ZERO, ZERO, ONE)
-            lowest = pose.arm_offset - stands.points * vec3(ZERO, ZERO, ONE)
-            pose.lowest = lowest / wp.sqrt(wp.max(ONE, turn_squared))
+    if turning != _FIXED:
+        # What touches a plane with the same normal at the start: forces act there, and depths are
+        # those of the end. Together they are SHAKE's way with a constraint, which neither damps nor
+        # drives rolling. The faster a body spins, the nearer to the end: arms far from where depths
+        # are would miss impacts.
+        turn_squared = wp.dot(first.spin, first.spin) * h * h
+        fast = wp.min(turn_squared / (_FASTEST * _FASTEST), ONE)
+        before = inverse * rotation_after(first, fast * share)
+        stands = facing_map(before, wp.transpose(before) * (turn * toward), turning, scale)
+        pose.arms = stands.points
+        pose.arm_offset = -(before * first.com)
+        pose.axis = before * vec3(ZERO, ZERO, ONE)
+        lowest = pose.arm_offset - stands.points * vec3(ZERO, ZERO, ONE)
+        pose.lowest = lowest / wp.sqrt(wp.max(ONE, turn_squared))
     return pose
 
 
@@ -378,17 +373,17 @@ def facing_direction(
 ) -> vec3:
     """Direction in which the samples of a body face a solid, after a share of the step [F]."""
     toward = vec3(ONE, ZERO, ZERO)
-    if wp.static(len(TURNING) > 1):
-        inverse = wp.transpose(rotation_after(second, share))
-        turn = inverse * rotation_after(first, share)
-        com = inverse * (position_after(first, share, h) - position_after(second, share, h)) + second.com
-        origin = com - turn * first.com
-        if turning == _AXIS:
-            toward = seen_from(solids, world, solid, turn, origin).gradient
-        if wp.static(BALL in TURNING):
-            if turning == _BALL:
-                point = first_touch(solids, world, solid, turn, origin, scale)
-                toward = closer(solids, world, solid, turn, origin, scale, point).gradient
+    if turning == _FIXED:
+        return toward
+    inverse = wp.transpose(rotation_after(second, share))
+    turn = inverse * rotation_after(first, share)
+    com = inverse * (position_after(first, share, h) - position_after(second, share, h)) + second.com
+    origin = com - turn * first.com
+    if turning == _AXIS:
+        toward = seen_from(solids, world, solid, turn, origin).gradient
+    if turning == _BALL:
+        point = first_touch(solids, world, solid, turn, origin, scale)
+        toward = closer(solids, world, solid, turn, origin, scale, point).gradient
     return toward
 
 
@@ -402,12 +397,10 @@ def spin_of_samples(spin: vec3, axis: vec3, turning: int) -> vec3:
         turning: How samples turn.
     """
     follows = spin
-    if wp.static(AXIS in TURNING):
-        if turning == _AXIS:
-            follows = spin - wp.dot(spin, axis) * axis
-    if wp.static(BALL in TURNING):
-        if turning == _BALL:
-            follows = vec3()
+    if turning == _AXIS:
+        follows = spin - wp.dot(spin, axis) * axis
+    if turning == _BALL:
+        follows = vec3()
     return follows
 
 

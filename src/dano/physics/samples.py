@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.physics.features import TURNING, WIDE
+from dano.physics.features import WIDE
 from dano.physics.impacts import smooth_step
 from dano.physics.pairs import AXIS, BALL, FIXED, PairPose
 from dano.physics.real import HALF, ONE, real, vec3, ZERO
@@ -171,23 +171,20 @@ def point_contact(
     point = Point()
     normal = solid_normal(d.gradient)
     area = facing_area(pose, sample, normal)
-    if wp.static(len(TURNING) > 1):
-        if turning != _FIXED:
-            normal = round_normal(pose, sample, turning, normal)
+    if turning != _FIXED:
+        normal = round_normal(pose, sample, turning, normal)
     if presses_back:
         vector = pose.vectors * sample.area
         area = wp.length(vector)
         normal = -vector / area
     arm = pose.arms * sample.point + pose.arm_offset
     moment = wp.cross(arm, normal)
-    if wp.static(BALL in TURNING):
-        if turning == _BALL:
-            # The surface of a ball that turns does not move: all samples feel what the lowest of them does.
-            moment = wp.cross(pose.lowest, normal)
-    if wp.static(AXIS in TURNING):
-        if turning == _AXIS:
-            # … and about an axis nothing of the spin about it.
-            moment = moment - wp.dot(pose.axis, moment) * pose.axis
+    if turning == _BALL:
+        # The surface of a ball that turns does not move: all samples feel what the lowest of them does.
+        moment = wp.cross(pose.lowest, normal)
+    if turning == _AXIS:
+        # … and about an axis nothing of the spin about it.
+        moment = moment - wp.dot(pose.axis, moment) * pose.axis
     rate = wp.dot(pose.velocity, normal) + wp.dot(pose.spin, moment)
     point.arm = pose.rotation * arm
     point.normal = pose.rotation * normal
@@ -202,13 +199,12 @@ def point_contact(
     point.rate = rate
     point.approach = rate
     point.area = stiffness_share * area
-    if wp.static(len(TURNING) > 1):
-        if turning != _FIXED:
-            ahead = position_in_solid(pose, sample.point) - pose.com
-            changed = drift(pose, ahead, arm, normal)
-            nearing = wp.dot(normal, changed)
-            point.approach = rate - nearing
-            point.extra_slip = pose.rotation * (changed - nearing * normal)
+    if turning != _FIXED:
+        ahead = position_in_solid(pose, sample.point) - pose.com
+        changed = drift(pose, ahead, arm, normal)
+        nearing = wp.dot(normal, changed)
+        point.approach = rate - nearing
+        point.extra_slip = pose.rotation * (changed - nearing * normal)
     point.meets = point.approach + wp.dot(pose.gained, normal) + wp.dot(pose.spin_gained, moment)
     point.gains_after = wp.dot(pose.gains_after, normal)
     return point

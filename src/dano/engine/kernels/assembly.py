@@ -8,7 +8,7 @@ from dano.engine.kernels.tables import FoundPair, Room, Scene
 from dano.engine.kernels.trees.balance import add_tree_momentum
 from dano.engine.kernels.trees.contact import add_pulled, body_twist, free_block
 from dano.engine.kernels.trees.loops import add_loops
-from dano.physics.features import LANES, LOOPS, TREES, TURNING
+from dano.physics.features import LANES, TREES
 from dano.physics.momentum import angular_momentum, angular_momentum_jacobian
 from dano.physics.pairs import FIXED
 from dano.physics.point_law import (
@@ -239,15 +239,14 @@ def add_point_jacobian(sums: wp.ref[Halves], point: Point, linear: Linear, weigh
     push = weight * linear.by_pressure + (grip - weight * linear.pressure.damping) * n
     push_moment = wp.cross(r, push)
     along = joined(n, point.moment)
-    if wp.static(len(TURNING) > 1):
-        if rolls:
-            across = wp.cross(r, n)
-            facing = joined(n, across)
-            sums.force += wp.outer(grip * n, facing)
-            sums.moment += wp.outer(grip * across, facing)
-            push = push - grip * n
-            push_moment = wp.cross(r, weight * linear.by_pressure)
-            push_moment = push_moment - weight * linear.pressure.damping * point.moment
+    if rolls:
+        across = wp.cross(r, n)
+        facing = joined(n, across)
+        sums.force += wp.outer(grip * n, facing)
+        sums.moment += wp.outer(grip * across, facing)
+        push = push - grip * n
+        push_moment = wp.cross(r, weight * linear.by_pressure)
+        push_moment = push_moment - weight * linear.pressure.damping * point.moment
     slip = joined(linear.slip_direction, wp.cross(r, linear.slip_direction))
     turning = weight * linear.turning
     sums.force += wp.outer(push, along) - wp.outer(turning, slip)
@@ -362,17 +361,14 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
     if lane == 0:
         if wp.static(TREES):
             add_tree_momentum(scene, room, world, trial.length)
-        if wp.static(LOOPS):
-            add_loops(scene, room, world)
+        add_loops(scene, room, world)
     for f in range(n_found):
         if not touches(scene, room, world, f, island):
             continue
         found = room.found[world, f * _LANES + lane]
         twist = pair_twist(scene, room, world, found, room.tried, ONE)
         sums = Halves()
-        rolls = bool(False)
-        if wp.static(len(TURNING) > 1):
-            rolls = scene.body_index[scene.pair_index[found.pair].first].turning != _FIXED
+        rolls = scene.body_index[scene.pair_index[found.pair].first].turning != _FIXED
         for k in range(found.first, found.end):
             mark = room.marks[world, k]
             known = wp.where(mark >= _PRESSES, mark - _PRESSES, mark)

@@ -10,7 +10,7 @@ import warp as wp
 from dano.engine.kernels.assembly import add_point_jacobian, Halves, point_impulse, presses, whole_jacobian
 from dano.engine.kernels.lanes import total6, total66, wait
 from dano.engine.kernels.tables import FoundPair, Room, Scene
-from dano.physics.features import LANES, POINTS, TREES, TURNING
+from dano.physics.features import LANES, TREES
 from dano.physics.momentum import turned_inertia
 from dano.physics.pairs import FIXED, rotation_met
 from dano.physics.real import mat66, ONE, real, vec6, ZERO
@@ -36,9 +36,7 @@ def pair_slope(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: Foun
     """Its derivative by the twist of the first body relative to the second."""
     h = scene.timestep[world, 0]
     halves = Halves()
-    rolls = bool(False)
-    if wp.static(len(TURNING) > 1):
-        rolls = scene.body_index[scene.pair_index[found.pair].first].turning != _FIXED
+    rolls = scene.body_index[scene.pair_index[found.pair].first].turning != _FIXED
     for k in range(found.first, found.end):
         if presses(room, world, k):
             linear = room.linear[world, k]
@@ -102,7 +100,7 @@ def find_moved(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, 
         for b in range(scene.n_blocks):
             room.moved[world, b] = room.velocity[world, b]
     wait()
-    if wp.static(POINTS and not TREES):
+    if wp.static(not TREES):
         for f in range(n_found):
             found = room.found[world, f * _LANES + lane]
             if found.impact.delays > ZERO:

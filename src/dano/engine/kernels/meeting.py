@@ -28,7 +28,8 @@ from dano.physics.rotations import matrix
 from dano.physics.samples import position_in_solid, solid_normal
 from dano.physics.solids.distances import Solid, solid_distance
 from dano.physics.solids.grids import STEEPEST
-from dano.physics.solids.leaves import Distance, HALF_SPACE
+from dano.physics.solids.kinds import HALF_SPACE
+from dano.physics.solids.leaves import Distance
 
 _LANES, _BLOCK = wp.constant(LANES), wp.constant(BLOCK)
 _HALF_SPACE = wp.constant(HALF_SPACE)

@@ -10,7 +10,7 @@ from dano.physics.rotations import matrix
 from dano.physics.samples import solid_normal
 from dano.physics.solids.distances import Solid, solid_clearance, solid_distance, solid_of
 from dano.physics.solids.grids import STEEPEST
-from dano.physics.solids.leaves import HALF_SPACE
+from dano.physics.solids.kinds import HALF_SPACE
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
 _HALF_SPACE = wp.constant(HALF_SPACE)

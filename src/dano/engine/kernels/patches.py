@@ -45,8 +45,7 @@ from dano.physics.patch_law import (
 )
 from dano.physics.real import mat66, ONE, real, vec3, vec4, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix
-from dano.physics.solids.leaves import HALF_SPACE
-from dano.physics.solids.shapes import SPHERE
+from dano.physics.solids.kinds import HALF_SPACE, SPHERE
 from dano.physics.twists import joined, joined_blocks, Twist
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)

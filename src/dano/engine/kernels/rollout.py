@@ -19,7 +19,7 @@ from dano.engine.kernels.trees.kinematics import (
     unknown_of,
 )
 from dano.engine.kernels.trees.loops import begin_loops, forces_of
-from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
+from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.momentum import angular_momentum, end_of_impact, gyroscopic_gain, turned_inertia
 from dano.physics.pairs import BodyState, rotation_met
 from dano.physics.real import HALF, ONE, real, vec6, ZERO
@@ -240,10 +240,9 @@ def advance_trees(scene: wp.ref[Scene], room: wp.ref[Room], world: int, launch: 
         room.bodies[world, i].position = row.position
         room.bodies[world, i].orientation = from_wxyz(row.orientation)
     place_trees(scene, room, world)
-    if wp.static(LOOPS):
-        n_loops = scene.trees.loop_index.shape[0]
-        for row in range(n_loops):
-            launch.forces[world, t * n_loops + row] = forces_of(scene, room.velocity, world, row)
+    n_loops = scene.trees.loop_index.shape[0]
+    for row in range(n_loops):
+        launch.forces[world, t * n_loops + row] = forces_of(scene, room.velocity, world, row)
     for j in range(scene.trees.nodes.shape[0]):
         i = scene.trees.nodes[j].body
         if scene.trees.nodes[j].kind != _ROOT:
@@ -271,8 +270,7 @@ def begin_step_of_trees(scene: wp.ref[Scene], room: wp.ref[Room], world: int, la
     for b in range(scene.n_blocks):
         room.old[world, b] = room.velocity[world, b]
     begin_trees(scene, room, world)
-    if wp.static(LOOPS):
-        begin_loops(scene, room, world)
+    begin_loops(scene, room, world)
 
 
 @wp.func
@@ -299,14 +297,11 @@ def find_touching(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
         Number of pairs with points, of all that are listed, and whether there were more points than there is
         room for.
     """
-    n_found = int(0)
-    overflow = bool(False)
-    if wp.static(POINTS):
-        n_found, overflow = find_contacts(scene, room, world, lane)
-        if wp.static(not TREES):
-            wait()
-            if lane == 0:
-                balance_when_met(scene, room, world, n_found)
+    n_found, overflow = find_contacts(scene, room, world, lane)
+    if wp.static(not TREES):
+        wait()
+        if lane == 0:
+            balance_when_met(scene, room, world, n_found)
     n_near = n_found
     if wp.static(PATCHES):
         n_near = find_patches(scene, room, world, lane, n_found)
@@ -386,8 +381,7 @@ def rollout(scene: Scene, room: Room, launch: Launch):
         rebound = real(1.0)
         while again:
             rebound = ONE - real(attempt) / real(_REBOUNDS)
-            if wp.static(POINTS):
-                fix_laws(scene, room, world, lane, n_found, rebound, False)
+            fix_laws(scene, room, world, lane, n_found, rebound, False)
             wait()
             solved = solve(scene, room, world, lane, n_found, size, launch.options)
             again = False

@@ -44,7 +44,7 @@ from dano.engine.kernels.trees.balance import (
     same_mode,
     solve_trees,
 )
-from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
+from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec6, ZERO
 
 LEVELS = 11
@@ -315,8 +315,7 @@ def solve_island(
                 room.step[world, i] = vec6()
         if wp.static(TREES):
             fit_joint_duals(scene, room, world)
-    if wp.static(POINTS):
-        fit_duals(scene, room, world, lane, n_found, island)
+    fit_duals(scene, room, world, lane, n_found, island)
     n_near = n_found
     if wp.static(PATCHES):
         n_near += room.patches.count[world, 0]
@@ -367,7 +366,7 @@ def solve_island(
             # pass before serves: its relative error is about twice the factor by which the last step made the
             # residual smaller. Trees that loops close are solved by blocks, which every pass has to fill.
             needs = True
-            if wp.static(not LOOPS):
+            if scene.trees.loop_index.shape[0] == 0:
                 if n_near == 0:
                     missed = largest_error(scene, room, world)
                     enough = options.tolerance * (ONE + size)
@@ -435,8 +434,7 @@ def solve_island(
                     if lane == 0:
                         follow_joint_duals(scene, room, world, search.length, part)
                 wait()
-                if wp.static(POINTS):
-                    follow_duals(scene, room, world, lane, n_found, search.length, island)
+                follow_duals(scene, room, world, lane, n_found, search.length, island)
                 if wp.static(PATCHES):
                     follow_patch_duals(scene, room, world, lane, n_found)
                 # The next pass is no longer of the same function where bounds are renewed: it is accepted.

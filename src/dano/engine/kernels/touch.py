@@ -2,11 +2,11 @@
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.equations import settle
 from dano.engine.kernels.lanes import total, total3, wait
 from dano.engine.kernels.linear_solve import EVERYWHERE
 from dano.engine.kernels.patches import contact_of
 from dano.engine.kernels.rollout import any_hits, begin_unpushed, find_touching, Launch, REBOUNDS
+from dano.engine.kernels.settled import settle
 from dano.engine.kernels.solve import newton_step
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.kinematics import unknown_of

@@ -3,18 +3,17 @@
 import ctypes
 import functools
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import numpy as np
 
-from dano.engine.launching._arguments import Arguments
+from dano.engine.launching._arguments import given_arrays, parameters_of
 from dano.engine.launching._ffi import Call, register
-from dano.engine.launching._plans import Build, Plan, Shape
-from dano.native import n_cores, together
+from dano.engine.launching._plans import Plan, Shape
+from dano.native import Kernel, Launch, n_cores, together
 
-_BUILD = Build()
-_DEVICE = "cpu"
+# Arrays that worlds work in begin where a line of a cache does [bytes].
+_ALIGNED = 64
 _numbers = iter(range(10**12))
 
 
@@ -31,7 +30,6 @@ def call(
 def _target(plan: Plan, batched: tuple[bool, ...], n_worlds: int, dtype: np.dtype) -> str:
     """Name for `jax.ffi.ffi_call` of launches of so many worlds with numbers of a type."""
     name = f"dano_{plan.kernel}_{next(_numbers)}"
-    plan.compile(_BUILD, _DEVICE)
     launcher = _Launcher(plan, batched, n_worlds)
     register(name, launcher if dtype == np.float64 else _Widened(launcher), "cpu")
     return name
@@ -46,6 +44,8 @@ class _Launcher:
 
     def __init__(self, plan: Plan, batched: tuple[bool, ...], n_worlds: int):
         self.plan, self.batched, self.n_worlds = plan, batched, n_worlds
+        # Within a call it would be too late to say that it cannot be compiled.
+        self._kernel = plan.on_cpu()
         self._free: list[list[_Share]] = []
 
     def __call__(self, inputs: Sequence[int], outputs: Sequence[int], call: Call) -> None:
@@ -64,9 +64,9 @@ class _Launcher:
             for array, k in share.gradients:
                 array.grad = pointers[k]
         if len(shares) == 1:
-            shares[0].command.launch()
+            shares[0].launch()
         else:
-            together([share.command.launch for share in shares])
+            together([share.launch for share in shares])
         self._free.append(shares)
 
     def _shares(self) -> list["_Share"]:
@@ -74,7 +74,7 @@ class _Launcher:
         ends = [self.n_worlds * (k + 1) // n for k in range(n)]
         begins = [0, *ends[:-1]]
         return [
-            _Share(self.plan, self.batched, self.n_worlds, b, e - b)
+            _Share(self.plan, self._kernel, self.batched, self.n_worlds, b, e - b)
             for b, e in zip(begins, ends, strict=True)
         ]
 
@@ -105,22 +105,23 @@ def _narrow(pointer: int, shape: Shape, n: int) -> np.ndarray:
 
 
 class _Share:
-    """Parameters of a launch of some worlds."""
+    """A launch of some worlds, with parameters of its own."""
 
-    def __init__(self, plan: Plan, batched: tuple[bool, ...], n_worlds: int, first: int, count: int):
-        import warp as wp
-
-        arguments = Arguments(plan, _BUILD, _DEVICE)
-        arguments.point_all(batched, n_worlds)
-        self._kept: list[Any] = [arguments]
+    def __init__(
+        self, plan: Plan, kernel: Kernel, batched: tuple[bool, ...], n_worlds: int, first: int, count: int
+    ):
+        parameters = parameters_of(plan, kernel.layout, batched, n_worlds)
+        parameters.put("launch.first_world", first)
         for place, values in plan.whole.items():
-            arguments.point(place, (values.shape[0],), (values.strides[0],), values.ctypes.data)
-            self._kept.append(values)
-        for place, length in plan.room.items():
-            size = arguments.item(place)
-            memory: Any = wp.zeros(max(length, 1) * size, dtype=wp.uint8, device=_DEVICE)
+            parameters.point(place, (values.shape[0],), (values.strides[0],), values.ctypes.data)
+        sizes = [max(length, 1) * kernel.layout.arrays[place].item for place, length in plan.room.items()]
+        begins = np.cumsum([0, *(-(-size // _ALIGNED) * _ALIGNED for size in sizes)])
+        memory = np.zeros(begins[-1] + _ALIGNED, np.uint8)
+        start = -(-memory.ctypes.data // _ALIGNED) * _ALIGNED
+        for place, begin in zip(plan.room, begins[:-1].tolist(), strict=True):
             # One world after the other works in the same room.
-            arguments.point(place, (n_worlds, length), (0, size), memory.ptr)
-            self._kept.append(memory)
-        self.command = arguments.recorded(first, count)
-        self.arrays, self.gradients = arguments.pointers()
+            item = kernel.layout.arrays[place].item
+            parameters.point(place, (n_worlds, plan.room[place]), (0, item), start + begin)
+        self._kept = memory, plan
+        self.launch = Launch(kernel, parameters, count)
+        self.arrays, self.gradients = given_arrays(plan, parameters)

@@ -6,6 +6,7 @@ several streams do not share a room; and a call launches the same kernel wheneve
 so that XLA may record it (command buffers).
 """
 
+import ctypes
 import functools
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dano.engine.launching._arguments import Arguments
+from dano.engine.launching._arguments import given_arrays, parameters_of
 from dano.engine.launching._ffi import Call, register
 from dano.engine.launching._plans import Build, Plan
 
@@ -68,14 +69,14 @@ def call(
 
 def _layout(plan: Plan, build: Build) -> tuple[dict[str, tuple[int, int, int]], int]:
     """Where in a world's room each array begins [bytes], its length and item [bytes]; and the room's size."""
-    arguments = Arguments(plan, build, "cpu")
+    arrays = plan.layout(build).arrays
     places, at = {}, 0
     for place, length in plan.room.items():
         if place in _OF_EACH_LANE:
             length *= build.lanes
         if place in _OF_POINTS and length > 0:
             length = build.lanes * (-(-length // build.lanes) + _MORE_POINTS)
-        size = arguments.item(place)
+        size = arrays[place].item
         places[place] = at, length, size
         at += -(-length * size // _ALIGNED) * _ALIGNED
     return places, max(at, _ALIGNED)
@@ -144,18 +145,18 @@ class _Blocks:
     """
 
     def __init__(self, plan: Plan, batched: tuple[bool, ...], n_worlds: int, build: Build, device: str):
-        arguments = Arguments(plan, build, device)
-        arguments.point_all(batched, n_worlds)
+        self._parameters = parameters = parameters_of(
+            plan, plan.layout(build), batched, n_worlds, wide=build.wide
+        )
         for place, values in plan.whole.items():
-            arguments.point(place, (values.shape[0],), (arguments.item(place),))
+            parameters.point(place, (values.shape[0],), (parameters.layout.arrays[place].item,))
         places, size = _layout(plan, build)
         for place, (_, length, item) in places.items():
-            arguments.point(place, (n_worlds, length), (size, item))
-        self._command = arguments.recorded(0, n_worlds)
-        self._arrays, self._gradients = arguments.pointers()
-        self._whole = [arguments.descriptor(place) for place in plan.whole]
-        self._room = [(arguments.descriptor(place), at) for place, (at, _, _) in places.items()]
-        self._kept = arguments
+            parameters.point(place, (n_worlds, length), (size, item))
+        self._arrays, self._gradients = given_arrays(plan, parameters)
+        self._whole = [parameters.array(place) for place in plan.whole]
+        self._room = [(parameters.array(place), at) for place, (at, _, _) in places.items()]
+        self._command = _recorded(plan.in_lanes(build), (n_worlds, build.lanes), device)
         self.room_bytes = n_worlds * size
         self._n_inputs = len(plan.inputs)
 
@@ -171,4 +172,16 @@ class _Blocks:
             array.data = pointer
         for array, at in self._room:
             array.data = room + at
+        for given, (at, bytes_) in zip(
+            self._command.params[1:], self._parameters.layout.arguments.values(), strict=True
+        ):
+            ctypes.memmove(ctypes.addressof(given), self._parameters.address + at, bytes_)
         self._command.launch(stream)
+
+
+def _recorded(kernel: Any, dim: tuple[int, int], device: str) -> Any:
+    """A launch of Warp's, whose parameters are filled in before each call."""
+    import warp as wp
+
+    empty = [argument.type() for argument in kernel.adj.args]
+    return wp.launch(kernel, dim, empty, device=device, block_dim=dim[1], record_cmd=True)

@@ -115,7 +115,7 @@ def _pullback_plan(forward: Plan, which: tuple[int, ...]) -> Plan:
     return plan(
         "dano.engine.kernels.derivatives.pullback",
         "pullback",
-        forward.features,
+        forward.features.but(ADJOINTS=True),
         inputs,
         outputs,
         forward.whole,
@@ -224,7 +224,7 @@ def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) 
     return plan(
         "dano.engine.kernels.derivatives.pushforward",
         "pushforward",
-        forward.features,
+        forward.features.but(ADJOINTS=True),
         {**_places(forward), **changes},
         ends,
         forward.whole,

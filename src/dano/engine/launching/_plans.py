@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dano.native import compiled_kernel, Features, instance
+from dano.native import cpu_kernel, Features, instance, Kernel, kernel_in_lanes, Layout, layout_of
 
 
 class Shape(NamedTuple):
@@ -23,8 +23,8 @@ class Build(NamedTuple):
         wide: Whether numbers have 64 bits.
     """
 
-    lanes: int = 1
-    wide: bool = True
+    lanes: int
+    wide: bool
 
 
 class OfWidth(NamedTuple):
@@ -63,6 +63,7 @@ class Plan:
         self.module, self.kernel, self.features = module, kernel, features
         self.inputs, self.outputs, self.whole, self.room, self.numbers = inputs, outputs, whole, room, numbers
         self._compiled: set[tuple[Build, str]] = set()
+        self._layouts: dict[Build, Layout] = {}
 
     @property
     def gradients(self) -> dict[str, str]:
@@ -74,18 +75,28 @@ class Plan:
         """Whether the kernel adds to its outputs, which have to be zero before."""
         return self.kernel == "pullback"
 
-    def kernel_of(self, build: Build) -> Any:
-        """The kernel, not compiled."""
-        features = self.features
-        if build != Build():
-            features = Features(**{**dict(features.values), "LANES": build.lanes, "WIDE": build.wide})
-        return getattr(instance(features, self.module), self.kernel)
+    def on_cpu(self) -> Kernel:
+        """The kernel for one lane a world on this processor, which is compiled where nobody has."""
+        return cpu_kernel(self.features, self.module, self.kernel)
+
+    def in_lanes(self, build: Build) -> Any:
+        """The kernel of Warp's for worlds of several lanes, not compiled."""
+        return getattr(instance(self._in_lanes(build), self.module), self.kernel)
+
+    def _in_lanes(self, build: Build) -> Features:
+        return self.features.but(LANES=build.lanes, WIDE=build.wide)
+
+    def layout(self, build: Build) -> Layout:
+        """Where the kernel for several lanes reads its parameters."""
+        if build not in self._layouts:
+            self._layouts[build] = layout_of(self.in_lanes(build))
+        return self._layouts[build]
 
     def compile(self, build: Build, device: str) -> None:
-        """Compile the kernel for a device of Warp's, or load it: what goes wrong is said here."""
+        """Compile the kernel for lanes of a device of Warp's, or load it: what goes wrong is said here."""
         key = build, device
         if key not in self._compiled:
-            compiled_kernel(lambda: self.kernel_of(build), device, build.lanes)
+            kernel_in_lanes(self._in_lanes(build), self.module, self.kernel, device)
             self._compiled.add(key)
 
 

@@ -1,9 +1,6 @@
 """A scene as rows of numbers, as kernels read them (`dano.engine.kernels.tables`)."""
 
-import functools
 from collections.abc import Sequence
-from types import ModuleType
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,19 +9,17 @@ from jaxtyping import Array, DTypeLike, Float, Int
 
 from dano.contact import AbstractPatchLaw, ContactParams, DistributedLaw, Material, materials, SurfaceSet
 from dano.engine.joints import structure_of_trees, tree_rows, TreeStructure
+from dano.engine.launching._builds import build_for
 from dano.engine.launching._patch_tables import knows_law, patch_pairs, patch_tables, PatchTables
 from dano.native import (
     balls_around_runs,
-    degrees_of,
     Features,
-    instance,
+    fields_of,
     is_known,
-    kind_number,
     kinds_of,
     leaf_tables,
     leaves_of,
     Placed,
-    shape_kinds,
     slabs_of_blocks,
 )
 from dano.scene import Body, pressing_pairs, Scene
@@ -37,6 +32,7 @@ _SINK = 0.01
 _THIN = 0.25
 # Another part of a body, whose impact is left to the next step, gets in by at most this share of the size.
 _DEEPEST = 0.04
+_STRUCTURES = "dano.engine.kernels.tables"
 # How samples turn with their body: see `dano.physics.pairs`.
 _TURNING = {"fixed": 0, "axis": 1, "ball": 2}
 
@@ -79,53 +75,6 @@ def knows(scene: Scene) -> bool:
     return laws and solids and all(field is None or is_known(field) for field in queried)
 
 
-_STILL, _TURNS = frozenset({0}), frozenset({0, 1, 2})
-
-
-@functools.cache
-def _builds() -> list[frozenset[int]]:
-    """Kinds of leaves that builds know, from the smallest on.
-
-    Few builds serve all scenes: each takes some seconds to compile, once on a machine.
-    """
-    plane, grid, density = map(kind_number, ("half_space", "grid", "density"))
-    shapes = shape_kinds()
-    builds = {plane}, shapes, {plane, grid}, {plane, density}, {*shapes, grid}, {*shapes, grid, density}
-    return [frozenset(each) for each in builds]
-
-
-def features_of(
-    scene: Scene, pairs: Sequence[tuple[int, int, int]], leaves: Sequence[Placed], unions: bool, patches: bool
-) -> Features:
-    """The smallest build that knows what a scene needs.
-
-    Args:
-        scene: The scene.
-        pairs: Those with samples that press.
-        leaves: Of all solids and densities.
-        unions: Whether any of these has several.
-        patches: Whether there are contacts with a patch law.
-    """
-    kinds, degrees, turning = kinds_of(leaves), degrees_of(leaves), set()
-    for first, *_ in pairs:
-        surface = scene.bodies[first].surface
-        assert surface is not None
-        turning.add(_TURNING[surface.turning])
-    known = next(each for each in _builds() if kinds <= each)
-    of_grids = frozenset({2}) if degrees <= {2} else frozenset({1, 2, 3})
-    return Features(
-        LAW=_own_law(scene),
-        KINDS=known,
-        DEGREES=of_grids if known - shape_kinds() else frozenset(),
-        TURNING=_STILL if turning <= _STILL else _TURNS,
-        UNIONS=unions,
-        POINTS=bool(pairs) or not patches,
-        PATCHES=patches,
-        TREES=bool(scene.joints),
-        LOOPS=bool(scene.loops),
-    )
-
-
 def _own_law(scene: Scene) -> str:
     """The file of functions of the scene's point contacts, empty if they have the usual ones."""
     files = {law.functions or "" for law, _ in _point_laws(scene)}
@@ -135,13 +84,13 @@ def _own_law(scene: Scene) -> str:
     return files.pop() if files else ""
 
 
-def packed(struct: Any, **fields: Array) -> Float[Array, "rows width"]:
-    """Rows of a structure of real numbers, from arrays of its fields with an axis of rows.
+def packed(features: Features, struct: str, **fields: Array) -> Float[Array, "rows width"]:
+    """Rows of a structure of `dano.engine.kernels.tables`, from arrays of its fields with an axis of rows.
 
     Raises:
         ValueError: If a field is missing or too much.
     """
-    names = list(struct.vars)
+    names = list(fields_of(features, _STRUCTURES, struct))
     if set(names) != set(fields):
         raise ValueError(f"fields must be {names}, got {list(fields)}")
     n = fields[names[0]].shape[0]
@@ -168,8 +117,13 @@ def scene_tables(scene: Scene) -> Tables:
     patches = _patches(scene, len(pairs), len(solids))
     leaves = [*solids, *patches.leaves]
     unions = patches.unions or any(count > 1 for _, count in solid_index)
-    features = features_of(scene, pairs, leaves, unions, len(patches.pair_index) > 0)
-    kernels = instance(features, "dano.engine.kernels.tables")
+    features = build_for(
+        kinds_of(leaves),
+        law=_own_law(scene),
+        unions=unions,
+        patches=len(patches.pair_index) > 0,
+        trees=bool(scene.joints),
+    )
     surfaces, surface_index = _surfaces(scene, bodies, dtype)
     of_leaves = leaf_tables(leaves, dtype)
     touching = used | {int(i) for row in patches.pair_index for i in row[:2]}
@@ -180,7 +134,8 @@ def scene_tables(scene: Scene) -> Tables:
     mass = jnp.stack([body.mass * body.mass_scale for body in bodies]).astype(dtype)
     inertia = jnp.stack([body.inertia * body.mass_scale for body in bodies]).astype(dtype)
     body_rows = packed(
-        kernels.Body,
+        features,
+        "Body",
         mass=mass,
         inertia=inertia,
         com=com,
@@ -188,7 +143,7 @@ def scene_tables(scene: Scene) -> Tables:
         middle=extents[:, :3],
         radius=jnp.minimum(extents[:, 3], _FAR),
     )
-    pair_rows, pair_index = _pairs(scene, bodies, pairs, extents, kernels)
+    pair_rows, pair_index = _pairs(scene, bodies, pairs, extents, features)
     arrays = {
         "scene.bodies": body_rows,
         **surfaces,
@@ -196,7 +151,7 @@ def scene_tables(scene: Scene) -> Tables:
         "scene.solids.coefficients": of_leaves.coefficients,
         "scene.solids.bounds": of_leaves.bounds,
         "scene.pairs": pair_rows,
-        "scene.materials": _materials(scene, kernels, dtype),
+        "scene.materials": _materials(scene, features, dtype),
         "scene.gravity": scene.gravity[None].astype(dtype),
         "scene.timestep": scene.timestep[None, None],
     }
@@ -240,16 +195,16 @@ def _impact_depths(scene: Scene, dtype: DTypeLike) -> Float[Array, " contacts"]:
     )
 
 
-def _materials(scene: Scene, kernels: ModuleType, dtype: DTypeLike) -> Float[Array, "contacts width"]:
+def _materials(scene: Scene, features: Features, dtype: DTypeLike) -> Float[Array, "contacts width"]:
     groups = _point_laws(scene)
     if not groups:
         return jnp.zeros((0, len(Material._fields)), dtype)
     gravity = jnp.sqrt(jnp.sum(scene.gravity**2))
     fields = materials(groups, scene.timestep, gravity)._asdict()
-    if "numbers" in kernels.Material.vars:
+    if "numbers" in fields_of(features, _STRUCTURES, "Material"):
         rows = [jnp.broadcast_to(law.numbers, (p.sliding_friction.size, 3)) for law, p in groups]
         fields["numbers"] = jnp.concatenate(rows).astype(dtype)
-    return packed(kernels.Material, **fields)
+    return packed(features, "Material", **fields)
 
 
 def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
@@ -312,7 +267,7 @@ def _pairs(
     bodies: Sequence[Body],
     pairs: Sequence[tuple[int, int, int]],
     extents: Float[Array, "n 6"],
-    kernels: ModuleType,
+    features: Features,
 ):
     """Rows of the pairs whose first body's samples press on the second's solid, and their whole numbers."""
     dtype, h = extents.dtype, scene.timestep
@@ -324,7 +279,8 @@ def _pairs(
     smooth = [body.surface is not None and body.surface.turning != "fixed" for body in bodies]
     gravity_step = jnp.sqrt(jnp.sum(scene.gravity**2)) * h * h
     rows = packed(
-        kernels.SamplePair,
+        features,
+        "SamplePair",
         share=jnp.asarray([0.5 if (j, i) in both else 1.0 for i, j, _ in pairs], dtype),
         follows=jnp.asarray([float(smooth[j] and not smooth[i]) for i, j, _ in pairs], dtype),
         sink=jnp.minimum(_SINK * size, _THIN * thickness),

@@ -9,8 +9,9 @@ import warp as wp
 
 from dano.mujoco.kernels.merging import merge
 from dano.mujoco.kernels.mixing import pair_settings
-from dano.mujoco.kernels.solids import part_clearance, part_distance, quick_clearance, UNKNOWN
+from dano.mujoco.kernels.solids import part_clearance, part_distance, quick_clearance
 from dano.mujoco.kernels.tables import BLOCK, Data, Known, Model, Options, Part, PartIndex, RUN, Touch, Work
+from dano.mujoco.kernels.words import UNKNOWN
 from dano.physics.pairs import (
     approach,
     BodyState,
@@ -25,7 +26,8 @@ from dano.physics.rotations import turned
 from dano.physics.samples import facing_area, position_in_solid, solid_normal
 from dano.physics.solids.distances import solid_of
 from dano.physics.solids.grids import STEEPEST
-from dano.physics.solids.leaves import Distance, GRID, HALF_SPACE
+from dano.physics.solids.kinds import GRID, HALF_SPACE
+from dano.physics.solids.leaves import Distance
 
 _BLOCK, _GRID, _HALF_SPACE = wp.constant(BLOCK), wp.constant(GRID), wp.constant(HALF_SPACE)
 _RUN, _UNKNOWN = wp.constant(RUN), wp.constant(UNKNOWN)

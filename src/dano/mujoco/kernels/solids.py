@@ -3,15 +3,12 @@
 import warp as wp
 
 from dano.mujoco.kernels.tables import Known, Model, PartIndex
+from dano.mujoco.kernels.words import HEIGHTS, HULL
 from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
 from dano.physics.solids.distances import leaf_clearance, leaf_distance
 from dano.physics.solids.grids import closest_in_grid, coarse_bound, place_in_grid
-from dano.physics.solids.leaves import Distance, GRID, HALF_SPACE
-from dano.physics.solids.shapes import BOX, ELLIPSOID
-
-HULL, HEIGHTS, NONE, UNKNOWN = 100, 101, -1, -2
-"""Kinds of solids besides those of `dano.physics.solids`: convex hulls of meshes; height fields; none;
-those of geoms that may not touch an object."""
+from dano.physics.solids.kinds import BOX, ELLIPSOID, GRID, HALF_SPACE
+from dano.physics.solids.leaves import Distance
 
 _HULL, _HEIGHTS = wp.constant(HULL), wp.constant(HEIGHTS)
 _BOX, _ELLIPSOID = wp.constant(BOX), wp.constant(ELLIPSOID)

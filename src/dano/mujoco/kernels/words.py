@@ -80,3 +80,8 @@ class Entry(enum.IntEnum):
     """How many these are."""
     FALL = 13
     """A double: square of the longest fall in a step, h² g [m²]."""
+
+
+HULL, HEIGHTS, NONE, UNKNOWN = 100, 101, -1, -2
+"""Kinds of solids besides those of `dano.physics.solids`: convex hulls of meshes; height fields; none;
+those of geoms that may not touch an object."""

@@ -9,7 +9,8 @@ import warp as wp
 from dano.physics.features import KINDS, UNIONS
 from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
 from dano.physics.solids.grids import closest_in_grid, coarse_bound, grid_distance, place_in_grid
-from dano.physics.solids.leaves import Distance, GRID, Leaf, LeafKind, Solids
+from dano.physics.solids.kinds import GRID
+from dano.physics.solids.leaves import Distance, Leaf, LeafKind, Solids
 from dano.physics.solids.shapes import shape_distance
 
 _GRID = wp.constant(GRID)

@@ -6,7 +6,8 @@ import warp as wp
 
 from dano.physics.features import DEGREES
 from dano.physics.real import HALF, ONE, real, TWO, vec3, vec4, ZERO
-from dano.physics.solids.leaves import CELL, Distance, inverse_or_zero, Leaf, LeafKind, Solids
+from dano.physics.solids.kinds import CELL
+from dano.physics.solids.leaves import Distance, inverse_or_zero, Leaf, LeafKind, Solids
 
 vec2 = wp.types.vector(length=2, dtype=real)
 _CELL = wp.constant(CELL)

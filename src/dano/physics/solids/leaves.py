@@ -7,11 +7,6 @@ import warp as wp
 
 from dano.physics.real import mat33, ONE, real, vec3, ZERO
 
-HALF_SPACE, GRID, DENSITY = 0, 6, 7
-"""Kinds of leaves: planes, grids of distances and grids of densities; the others stand in `shapes`."""
-CELL = 4
-"""Cells of a grid along an axis that have one lower bound."""
-
 
 @wp.struct
 class Leaf:

@@ -1,17 +1,14 @@
 """Signed distances of shapes, with gradients, each in its own axes.
 
-To add a shape: a number, a function from y to a `Distance`, and two lines in `shape_distance`. The number is
-named as the `kind` of its class in `dano.fields`.
+To add a shape: a number in `kinds`, a function from y to a `Distance`, and two lines in `shape_distance`.
 """
 
 import warp as wp
 
 from dano.physics.features import KINDS
 from dano.physics.real import ONE, real, TWO, vec3, ZERO
-from dano.physics.solids.leaves import Distance, HALF_SPACE, inverse_or_zero, Leaf
-
-SPHERE, BOX, CAPSULE, CYLINDER, ELLIPSOID = range(1, 6)
-"""Kinds of leaves that are shapes; the next would be 8."""
+from dano.physics.solids.kinds import BOX, CAPSULE, CYLINDER, ELLIPSOID, HALF_SPACE, SPHERE
+from dano.physics.solids.leaves import Distance, inverse_or_zero, Leaf
 
 _HALF_SPACE, _SPHERE, _BOX = wp.constant(HALF_SPACE), wp.constant(SPHERE), wp.constant(BOX)
 _CAPSULE, _CYLINDER, _ELLIPSOID = wp.constant(CAPSULE), wp.constant(CYLINDER), wp.constant(ELLIPSOID)

@@ -13,6 +13,7 @@ from dano.engine.kernels.derivatives.products import add_row
 from dano.engine.kernels.impacts import freed, pair_slope
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.rollout import Launch, push_of, row_before
+from dano.engine.kernels.settled import block_of
 from dano.engine.kernels.tables import Changes, Moment, Room, Scene, StateRow
 from dano.physics.features import LANES, TREES
 from dano.physics.pairs import BodyState
@@ -22,22 +23,6 @@ from dano.physics.twists import shift
 
 _LANES = wp.constant(LANES)
 _ROOT = wp.constant(ROOT)
-
-
-@wp.func
-def block_of(scene: wp.ref[Scene], row: int) -> int:
-    """Block of unknowns of a body that moves freely, by its row."""
-    if wp.static(TREES):
-        return scene.trees.nodes[row].place // 6
-    return row
-
-
-@wp.func
-def hangs(scene: wp.ref[Scene], row: int) -> bool:
-    """Whether a body is on a joint, by its row; −1 for one that does not move."""
-    if wp.static(TREES):
-        return row >= 0 and scene.trees.nodes[row].kind != _ROOT
-    return False
 
 
 @wp.func

@@ -28,7 +28,7 @@ from dano.engine.kernels.derivatives.products import (
 from dano.engine.kernels.lanes import total, total6
 from dano.engine.kernels.near import posed, solid_of_body
 from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
-from dano.physics.features import TREES, TURNING, UNIONS
+from dano.physics.features import TREES, UNIONS
 from dano.physics.impacts import Impact, Patch
 from dano.physics.pairs import (
     BALL,
@@ -298,15 +298,14 @@ def pull_facing(
     point = vec3()
     solid = leaf_at(scene, world, second, origin)
     touched_bar = vec3()
-    if wp.static(BALL in TURNING):
-        if turning == _BALL:
-            whole = solid_of_body(scene, world, second)
-            point = first_touch(scene.solids, world, whole, turn, origin, scale)
-            solid = leaf_at(scene, world, second, origin + turn * point)
-            _a, _b, _c, _d, _e, _f, _g, _h, _i, by_point, _j, _k = wp.grad(facing_work)(
-                scene.solids, world, solid, a, b, share, h, turning, scale, point, toward_bar, touched_bar
-            )
-            touched_bar = solved_fixed_point(scene, world, solid, a, b, share, h, scale, point, by_point)
+    if turning == _BALL:
+        whole = solid_of_body(scene, world, second)
+        point = first_touch(scene.solids, world, whole, turn, origin, scale)
+        solid = leaf_at(scene, world, second, origin + turn * point)
+        _a, _b, _c, _d, _e, _f, _g, _h, _i, by_point, _j, _k = wp.grad(facing_work)(
+            scene.solids, world, solid, a, b, share, h, turning, scale, point, toward_bar, touched_bar
+        )
+        touched_bar = solved_fixed_point(scene, world, solid, a, b, share, h, scale, point, by_point)
     _l, _m, by_solid, by_first, by_second, by_share, by_h, _n, by_scale, _o, _p, _q = wp.grad(facing_work)(
         scene.solids, world, solid, a, b, share, h, turning, scale, point, toward_bar, touched_bar
     )
@@ -362,19 +361,18 @@ def pull_pose(
             sample_distance
         )(scene.solids, world, solid, a, b, found.share, h, toward, turning, scale, critical)
         slope = of_share
-        if wp.static(len(TURNING) > 1):
-            if turning > 0:
-                none = PairBar()
-                spare = Changes()
-                _h, along = pull_facing(
-                    scene, spare, world, lane, index.first, index.second, a, b, found.share, of_toward, none
-                )
-                slope += along
-                # What the points feel of the direction that they face depends on τ, too.
-                _i, turns = pull_facing(
-                    scene, spare, world, lane, index.first, index.second, a, b, found.share, toward_bar, none
-                )
-                share_bar += turns
+        if turning > 0:
+            none = PairBar()
+            spare = Changes()
+            _h, along = pull_facing(
+                scene, spare, world, lane, index.first, index.second, a, b, found.share, of_toward, none
+            )
+            slope += along
+            # What the points feel of the direction that they face depends on τ, too.
+            _i, turns = pull_facing(
+                scene, spare, world, lane, index.first, index.second, a, b, found.share, toward_bar, none
+            )
+            share_bar += turns
         if slope < ZERO:
             share = -share_bar / slope
             bar.first = summed_body(bar.first, scaled_body(share, of_first))
@@ -390,11 +388,10 @@ def pull_pose(
                 add_to_leaf(bars.leaves, world, solid.first, scaled_leaf(share, of_solid.leaf))
                 if bars.samples.shape[1] > 0:
                     bars.samples[world, found.critical].point += share * of_sample
-    if wp.static(len(TURNING) > 1):
-        if turning > 0:
-            bar, _j = pull_facing(
-                scene, bars, world, lane, index.first, index.second, a, b, found.share, toward_bar, bar
-            )
+    if turning > 0:
+        bar, _j = pull_facing(
+            scene, bars, world, lane, index.first, index.second, a, b, found.share, toward_bar, bar
+        )
     return bar
 
 

@@ -1,16 +1,10 @@
-"""A step at its solution, and derivatives of its equations along virtual velocities (docs/gradients.md)."""
+"""Derivatives of the equations of a settled step along virtual velocities (docs/gradients.md)."""
 
 import warp as wp
 
-from dano.engine.kernels.assembly import assemble, fit_duals, row_of, Trial, twist_of
+from dano.engine.kernels.assembly import row_of, twist_of
 from dano.engine.kernels.derivatives.adjoint import after_adjoints, Virtual
-from dano.engine.kernels.derivatives.bodies import (
-    block_of,
-    hangs,
-    pull_advance,
-    pull_body,
-    pull_momentum,
-)
+from dano.engine.kernels.derivatives.bodies import pull_advance, pull_body, pull_momentum
 from dano.engine.kernels.derivatives.contact import PairBar, pull_pair
 from dano.engine.kernels.derivatives.patches import pull_patch
 from dano.engine.kernels.derivatives.trees import (
@@ -23,80 +17,19 @@ from dano.engine.kernels.derivatives.trees import (
     pull_laws,
     pull_loops,
     pull_places,
-    settle_trees,
     transpose_entries,
 )
-from dano.engine.kernels.impacts import find_moved, meetings_of, moving_of
+from dano.engine.kernels.impacts import meetings_of, moving_of
 from dano.engine.kernels.lanes import wait
-from dano.engine.kernels.linear_solve import copy_transposed_blocks, EVERYWHERE, find_pattern, solve_blocks
-from dano.engine.kernels.patches import add_patches, fit_patch_duals
-from dano.engine.kernels.rollout import begin_unpushed, find_touching, Launch, row_before
-from dano.engine.kernels.search import fix_laws
+from dano.engine.kernels.linear_solve import copy_transposed_blocks, EVERYWHERE, solve_blocks
+from dano.engine.kernels.rollout import Launch, row_before
+from dano.engine.kernels.settled import block_of, hangs
 from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
-from dano.engine.kernels.trees.balance import (
-    add_tree_slopes,
-    clear_trees,
-    eliminate_joint_duals,
-    fit_joint_duals,
-    solve_trees,
-)
-from dano.physics.features import LANES, LOOPS, PATCHES, POINTS, TREES
-from dano.physics.momentum import spin_seen_from
-from dano.physics.pairs import rotation_met
-from dano.physics.real import ONE, TWO, vec6, ZERO
-from dano.physics.twists import joined
+from dano.engine.kernels.trees.balance import clear_trees, eliminate_joint_duals, solve_trees
+from dano.physics.features import LANES, PATCHES, TREES
+from dano.physics.real import ONE, vec6, ZERO
 
 _LANES = wp.constant(LANES)
-
-
-@wp.func
-def settle(
-    scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, lane: int, t: int
-) -> int:
-    """A step at its solution: contacts, laws and the Jacobian; returns the number of pairs with points."""
-    n = scene.body_index.shape[0]
-    begin_unpushed(scene, room, world, lane, launch, t)
-    n_found, n_near, _overflow = find_touching(scene, room, world, lane)
-    if lane == 0:
-        find_pattern(scene, room, world, n_near)
-        for i in range(n):
-            m = scene.body_index[i].row
-            if m >= 0 and not hangs(scene, m):
-                row = launch.states[world, t * n + i]
-                state = room.bodies[world, i]
-                omega = row.omega
-                if state.lead < ONE:
-                    inertia = scene.bodies[world, i].inertia
-                    omega = spin_seen_from(
-                        omega, inertia, scene.timestep[world, 0], ONE - TWO * state.met, state.lead
-                    )
-                spin = rotation_met(state) * omega
-                room.velocity[world, block_of(scene, m)] = joined(row.velocity, spin)
-        if wp.static(TREES):
-            settle_trees(scene, room, launch, world, t)
-            fit_joint_duals(scene, room, world)
-        for b in range(scene.n_blocks):
-            room.tried[world, b] = room.velocity[world, b]
-    wait()
-    if wp.static(POINTS):
-        fix_laws(scene, room, world, lane, n_found, launch.reports[world, t].rebound, True)
-        fit_duals(scene, room, world, lane, n_found, EVERYWHERE)
-    if wp.static(PATCHES):
-        fit_patch_duals(scene, room, world, lane, n_found)
-    wait()
-    trial = Trial()
-    trial.softness = ONE
-    fit = assemble(scene, room, world, lane, n_found, trial, EVERYWHERE)
-    if wp.static(PATCHES):
-        add_patches(scene, room, world, lane, n_found, trial, fit)
-    wait()
-    if wp.static(TREES):
-        if lane == 0:
-            add_tree_slopes(scene, room, world)
-        wait()
-    find_moved(scene, room, world, lane, n_found)
-    wait()
-    return n_found
 
 
 @wp.func
@@ -252,16 +185,15 @@ def pull_equations(
             if row >= 0 and not hangs(scene, row) and is_moved(room.step, world, block_of(scene, row)):
                 pull_momentum(scene, room, bars, launch, world, t, i, row_before(scene, launch, world, t, i))
     wait()
-    if wp.static(POINTS):
-        for f in range(n_found):
-            found = room.found[world, f * _LANES + lane]
-            twists = twists_of_pair(scene, room, world, found)
-            moment_bar = moment_bar_of(scene, room, world, n_found, found)
-            if is_moved_pair(twists) or moment_bar.met != ZERO or moment_bar.lead != ZERO:
-                rebound = launch.reports[world, t].rebound
-                bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, moment_bar)
-                if lane == 0:
-                    pull_touching(scene, room, bars, launch, world, t, found, bar)
+    for f in range(n_found):
+        found = room.found[world, f * _LANES + lane]
+        twists = twists_of_pair(scene, room, world, found)
+        moment_bar = moment_bar_of(scene, room, world, n_found, found)
+        if is_moved_pair(twists) or moment_bar.met != ZERO or moment_bar.lead != ZERO:
+            rebound = launch.reports[world, t].rebound
+            bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, moment_bar)
+            if lane == 0:
+                pull_touching(scene, room, bars, launch, world, t, found, bar)
     if wp.static(PATCHES):
         for p in range(room.patches.count[world, 0]):
             touching = room.found[world, (n_found + p) * _LANES + lane]
@@ -275,7 +207,6 @@ def pull_equations(
         if lane == 0:
             follow_chains(scene, room, launch, world, t)
             pull_laws(scene, room, bars, world, t)
-            if wp.static(LOOPS):
-                pull_loops(scene, room, bars, world)
+            pull_loops(scene, room, bars, world)
             pull_chains(scene, room, bars, launch, world, t)
         wait()

@@ -47,7 +47,7 @@ from dano.engine.kernels.linear_solve import copy_blocks, EVERYWHERE, solve_bloc
 from dano.engine.kernels.patches import n_patches
 from dano.engine.kernels.rollout import Launch, push_of, row_before
 from dano.engine.kernels.tables import Body, Changes, FoundPair, Moment, Room, SamplePair, Scene, StateRow
-from dano.physics.features import LANES, PATCHES, POINTS
+from dano.physics.features import LANES, PATCHES
 from dano.physics.point_law import Material
 from dano.physics.real import ONE, real, vec3, vec6, ZERO
 from dano.physics.twists import angular_part, joined, linear_part, shift
@@ -152,10 +152,9 @@ def change_of_pair(
     if changes.gravity.shape[1] > 0:
         change += wp.dot(bars.gravity[world, 0], changes.gravity[world, direction])
     of_samples = change_by_splines(room, world, lane, direction)
-    if wp.static(POINTS):
-        if has_points:
-            change += change_of_points(scene, changes, bars, world, found, direction)
-            of_samples += change_by_samples(room, changes, bars, world, found, direction)
+    if has_points:
+        change += change_of_points(scene, changes, bars, world, found, direction)
+        of_samples += change_by_samples(room, changes, bars, world, found, direction)
     if wp.static(PATCHES):
         if not has_points:
             change += change_by_patch(scene, changes, bars, world, found, direction)
@@ -414,10 +413,9 @@ def push_pair(
         else:
             moment_bar.lead = ONE
         bar = PairBar()
-        if wp.static(POINTS):
-            if has_points:
-                rebound = launch.reports[world, t].rebound
-                bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, moment_bar)
+        if has_points:
+            rebound = launch.reports[world, t].rebound
+            bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, moment_bar)
         if wp.static(PATCHES):
             if not has_points:
                 bar = pull_patch(scene, room, bars, world, lane, found, twists)

@@ -21,7 +21,8 @@ from dano.physics.real import real, vec3, ZERO
 from dano.physics.samples import Sample
 from dano.physics.solids.distances import Solid
 from dano.physics.solids.grids import distance_change, moved_kind, moved_solids
-from dano.physics.solids.leaves import Distance, GRID, Leaf
+from dano.physics.solids.kinds import GRID
+from dano.physics.solids.leaves import Distance, Leaf
 
 _LANES, _BLOCK, _GRID = wp.constant(LANES), wp.constant(BLOCK), wp.constant(GRID)
 

@@ -41,8 +41,7 @@ from dano.physics.overlap import (
 from dano.physics.pairs import BodyState
 from dano.physics.real import real, vec3, ZERO
 from dano.physics.solids.distances import leaf_distance
-from dano.physics.solids.leaves import HALF_SPACE
-from dano.physics.solids.shapes import SPHERE
+from dano.physics.solids.kinds import HALF_SPACE, SPHERE
 from dano.physics.structures import sum_of
 
 _LANES, _BLOCK, _DENSITY = wp.constant(LANES), wp.constant(BLOCK), wp.constant(DENSITY)

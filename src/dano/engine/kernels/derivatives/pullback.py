@@ -3,14 +3,15 @@
 import warp as wp
 
 from dano.engine.kernels.derivatives.bodies import pull_delays
-from dano.engine.kernels.derivatives.equations import pull_end, pull_equations, settle, solve_transposed
+from dano.engine.kernels.derivatives.equations import pull_end, pull_equations, solve_transposed
 from dano.engine.kernels.derivatives.products import add_row
 from dano.engine.kernels.derivatives.trees import follow_chains
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.rollout import Launch
+from dano.engine.kernels.settled import settle
 from dano.engine.kernels.tables import Changes, Room, Scene, StateRow
 from dano.engine.kernels.trees.balance import clear_trees
-from dano.physics.features import POINTS, TREES
+from dano.physics.features import TREES
 from dano.physics.real import ZERO
 
 
@@ -63,7 +64,7 @@ def pullback(scene: Scene, room: Room, launch: Launch, bars: Changes):
                 follow_chains(scene, room, launch, world, t)
             pull_end(scene, room, bars, launch, world, t)
         wait()
-        if wp.static(POINTS and not TREES):
+        if wp.static(not TREES):
             pull_delays(scene, room, bars, launch, world, lane, t, n_found)
             wait()
         solve_transposed(scene, room, world, lane)

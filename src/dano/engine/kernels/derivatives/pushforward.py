@@ -6,10 +6,10 @@ The change of a step's end follows from what the change of everything else makes
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.equations import settle
 from dano.engine.kernels.derivatives.forward_bodies import push_step_of_bodies
 from dano.engine.kernels.derivatives.forward_trees import push_step_of_trees
 from dano.engine.kernels.rollout import Launch
+from dano.engine.kernels.settled import settle
 from dano.engine.kernels.tables import Changes, Room, Scene
 from dano.physics.features import TREES
 

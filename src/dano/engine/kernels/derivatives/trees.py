@@ -427,21 +427,6 @@ def pull_loops(scene: wp.ref[Scene], room: wp.ref[Room], bars: wp.ref[Changes], 
 
 
 @wp.func
-def settle_trees(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, t: int):
-    """Generalised velocities and forces in loops at the solution of a step, in `room.velocity`."""
-    k = scene.trees.coordinates.shape[0]
-    for c in range(k):
-        u = scene.trees.coordinates[c].place
-        room.velocity[world, u // 6][u % 6] = launch.vs[world, t * k + c]
-    loops = scene.trees.loop_index.shape[0]
-    for row in range(loops):
-        forces = launch.forces[world, t * loops + row]
-        for c in range(scene.trees.loop_index[row].width):
-            u = scene.trees.loop_index[row].place + c
-            room.velocity[world, u // 6][u % 6] = forces[c]
-
-
-@wp.func
 def transpose_entries(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Transpose the matrix of trees that touch nothing."""
     for k in range(room.trees.lower.shape[1]):
