@@ -3,10 +3,11 @@
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.maths import library, with_rows
 from dano.scene._joints import Joint, Layout
 
 
@@ -42,26 +43,26 @@ class JointLaws(eqx.Module):
 
 def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
     """The laws of the joints of a scene."""
-    owners = [joints[j] for j in layout.with_coordinates]
+    owners, xp = [joints[j] for j in layout.with_coordinates], library(*jax.tree.leaves(joints))
 
     def summed(name: str, power: Callable[[Array], Array]) -> Float[Array, " k"]:
-        values = jnp.zeros(layout.n_joints, dtype)
+        values = xp.zeros(layout.n_joints, dtype)
         for j, _, place in layout.dofs:
             value = getattr(joints[j], name)
             if value is not None:
-                share = power(joints[j].ratio) if layout.follows[j] else jnp.ones_like(value)
-                values = values.at[place].add((share * value).astype(dtype))
+                share = power(joints[j].ratio) if layout.follows[j] else 1
+                values = with_rows(values, place, values[place] + xp.asarray(share * value, dtype))
         return values
 
     def of_some(name: str, power: Callable[[Array], Array]) -> Float[Array, " k"] | None:
         return summed(name, power) if any(getattr(joint, name) is not None for joint in joints) else None
 
     def column(values: list[Array]) -> Array:
-        return jnp.stack([x.astype(dtype) for x in values]) if values else jnp.zeros(0, dtype)
+        return xp.stack([x.astype(dtype) for x in values]) if values else xp.zeros(0, dtype)
 
     limits = motor = None
     if any(joint.limits is not None for joint in owners):
-        free = jnp.array([-jnp.inf, jnp.inf])
+        free = np.array([-np.inf, np.inf])
         limits = column([free if joint.limits is None else joint.limits for joint in owners])
     if any(joint.motor is not None for joint in owners):
         motor = column([_motor(joint) for joint in owners])
@@ -75,11 +76,11 @@ def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
     )
     springs = of_some("stiffness", lambda ratio: ratio)
     return JointLaws(
-        summed("damping", jnp.square),
-        of_some("armature", jnp.square),
+        summed("damping", xp.square),
+        of_some("armature", xp.square),
         springs,
         column([joint.rest for joint in owners]),
-        of_some("friction", jnp.abs),
+        of_some("friction", xp.abs),
         limits,
         motor,
         constant,
@@ -87,10 +88,11 @@ def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
     )
 
 
-def _motor(joint: Joint) -> Array:
+def _motor(joint: Joint) -> Array | np.ndarray:
     motor = joint.motor
     if motor is None:
-        return jnp.asarray(np.array([0.0, 0.0, 0.0, -np.inf, np.inf]))
-    stiffness = motor.stiffness if motor.kind == "position" else jnp.zeros_like(motor.stiffness)
-    damping = motor.damping if motor.kind != "effort" else jnp.zeros_like(motor.damping)
-    return jnp.concatenate([jnp.stack([motor.gear, stiffness, damping]), motor.limits])
+        return np.array([0.0, 0.0, 0.0, -np.inf, np.inf])
+    xp = library(*jax.tree.leaves(motor))
+    stiffness = motor.stiffness if motor.kind == "position" else xp.zeros_like(motor.stiffness)
+    damping = motor.damping if motor.kind != "effort" else xp.zeros_like(motor.damping)
+    return xp.concatenate([xp.stack([motor.gear, stiffness, damping]), motor.limits])

@@ -3,12 +3,21 @@
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from dano.checks import checked_choice, checked_text
-from dano.maths import checked_array, checked_quaternion, Numbers, quat_conjugate, quat_multiply, quat_rotate
+from dano.maths import (
+    checked_array,
+    checked_quaternion,
+    library,
+    Numbers,
+    quat_conjugate,
+    quat_multiply,
+    quat_rotate,
+)
 from dano.names import did_you_mean
 
 LOOP_KINDS = ("point", "weld")
@@ -98,7 +107,8 @@ class Loops(eqx.Module):
         apart = x[b] + quat_rotate(q[b], self.anchor) - x[a] - quat_rotate(q[a], self.position)
         rows = np.array(self.welds, int)
         turn = quat_multiply(quat_conjugate(quat_multiply(q[a[rows]], self.orientation[rows])), q[b[rows]])
-        return jnp.concatenate([apart.ravel(), (2 * jnp.sign(turn[:, :1]) * turn[:, 1:]).ravel()])
+        xp = library(apart, turn)
+        return xp.concatenate([apart.ravel(), (2 * xp.sign(turn[:, :1]) * turn[:, 1:]).ravel()])
 
     def slopes(
         self,
@@ -162,9 +172,10 @@ def loops_of(names: Sequence[str], loops: Sequence[Loop], com: Float[Array, "n 3
     first = tuple(len(names) if loop.first is None else names.index(loop.first) for loop in loops)
     second = tuple(names.index(loop.second) for loop in loops)
     welds = tuple(i for i, loop in enumerate(loops) if loop.kind == "weld")
-    centres = jnp.concatenate([com, jnp.zeros((1, 3), com.dtype)])
+    xp = library(com, *jax.tree.leaves(loops))
+    centres = xp.concatenate([com, xp.zeros((1, 3), com.dtype)])
     position, anchor, orientation = (
-        jnp.stack([getattr(loop, name) for loop in loops]).astype(com.dtype)
+        xp.stack([getattr(loop, name) for loop in loops]).astype(com.dtype)
         for name in ("position", "anchor", "orientation")
     )
     position, anchor = position - centres[np.array(first)], anchor - centres[np.array(second)]
@@ -173,8 +184,9 @@ def loops_of(names: Sequence[str], loops: Sequence[Loop], com: Float[Array, "n 3
 
 def _with_world(position: Array, orientation: Array) -> tuple[Array, Array]:
     """Poses with the world as the last row."""
-    still = jnp.array([[1.0, 0.0, 0.0, 0.0]], orientation.dtype)
+    xp = library(position, orientation)
+    still = np.array([[1.0, 0.0, 0.0, 0.0]], orientation.dtype)
     return (
-        jnp.concatenate([position, jnp.zeros((1, 3), position.dtype)]),
-        jnp.concatenate([orientation, still]),
+        xp.concatenate([position, np.zeros((1, 3), position.dtype)]),
+        xp.concatenate([orientation, still]),
     )
