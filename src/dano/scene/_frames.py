@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -250,6 +251,8 @@ def _descended(
         for rows in levels:
             carry, _ = level(carry, (rows, parents[rows], rows, children[rows]))
         return carry
+    # Their numbers of joints are traced in a loop, and NumPy's arrays take no such indices.
+    chains = jax.tree.map(jnp.asarray, chains)
     # Narrow levels do their first joint several times, and drop it: nothing has such rows.
     widest = max(len(rows) for rows in levels)
     spare = [np.arange(widest - len(rows)) for rows in levels]

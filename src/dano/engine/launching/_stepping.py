@@ -8,11 +8,13 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.contact import CHUNK
+from dano.engine._compiling import by_numpy_on_cpus
 from dano.engine._reports import Report, SolverOptions
 from dano.engine.joints import tree_lengths
 from dano.engine.launching import _derivatives  # noqa: F401  rules for derivatives of launches
 from dano.engine.launching._launch import launch, OfWidth, Plan, plan, Shape
 from dano.engine.launching._tables import Tables
+from dano.maths import library, Q
 from dano.scene import Control, State
 
 _MODULE = "dano.engine.kernels.rollout"
@@ -58,26 +60,42 @@ def rollout(
     n = state.position.shape[0]
     inputs = {**tables.rows, **given(state, controls, dtype)}
     found = launch(_plan(tables, inputs, n, n_steps, capacity, options, dtype), inputs)
-    states = found["launch.states"].reshape(n_steps, n, STATE)
-    position, orientation, velocity, omega = jnp.split(states, (3, 7, 10), axis=2)
+    states, report = _read(found, state, n_steps)
+    return states, jax.lax.stop_gradient(report)
+
+
+@by_numpy_on_cpus
+def _read(found: dict[str, Q], state: State, n_steps: int) -> tuple[State, Report]:
+    """States and reports of a launch from the state at its start."""
+    xp = library(*jax.tree.leaves((found, state)))
+    states = found["launch.states"].reshape(n_steps, state.position.shape[0], STATE)
+    position, orientation, velocity, omega = xp.split(states, (3, 7, 10), axis=2)
     residual, passes, solved, overflow, _ = found["launch.reports"].T
     report = Report(residual, passes.astype(int), (solved > 0) & (overflow == 0), overflow > 0)
-    states = State(position, orientation, velocity, omega)
+    states = dataclasses.replace(
+        state, position=position, orientation=orientation, velocity=velocity, omega=omega
+    )
     if state.q is not None and state.v is not None:
-        none = jnp.zeros((n_steps, state.q.shape[0]), dtype)
+        none = xp.zeros((n_steps, state.q.shape[0]), states.position.dtype)
         q, v = (found.get(f"launch.{name}", none).reshape(none.shape) for name in ("qs", "vs"))
         states = dataclasses.replace(states, q=q, v=v)
-    return states, jax.lax.stop_gradient(report)
+    return states, report
 
 
 def given(state: State, controls: Control | None, dtype) -> dict[str, Array]:
     """What a launch is given besides a scene: arrays by place."""
-    rows = jnp.concatenate([state.position, state.orientation, state.velocity, state.omega], axis=1)
-    inputs = {"launch.state": rows, "launch.pushes": jnp.zeros((0, _PUSH), dtype)}
+    return _given(state, controls, np.zeros((0, _PUSH), dtype))
+
+
+@by_numpy_on_cpus
+def _given(state: State, controls: Control | None, none: np.ndarray) -> dict[str, Array]:
+    xp = library(*jax.tree.leaves((state, controls)))
+    rows = xp.concatenate([state.position, state.orientation, state.velocity, state.omega], axis=1)
+    inputs = {"launch.state": rows, "launch.pushes": xp.asarray(none)}
     if state.q is not None and state.v is not None and state.q.size:
         inputs |= {"launch.q": state.q[:, None], "launch.v": state.v[:, None]}
     if controls is not None:
-        pushes = jnp.concatenate([controls.force, controls.torque], axis=-1)
+        pushes = xp.concatenate([controls.force, controls.torque], axis=-1)
         inputs["launch.pushes"] = pushes.reshape(-1, _PUSH)
         for name, values in (("efforts", controls.effort), ("commands", controls.command)):
             if values is not None and values.size:
