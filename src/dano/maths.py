@@ -24,13 +24,15 @@ Numbers = ArrayLike | Sequence[Any]
 
 Q = TypeVar("Q", Array, np.ndarray)
 """Arrays of JAX or of NumPy."""
+AnyArray = Array | np.ndarray | np.generic
+"""An array of JAX or of NumPy."""
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _SERIES = 1e-4
 """Below this, of the square of half an angle [rad²], five terms of a series are exact in float64."""
 
 
-def library(*arrays: Array | np.ndarray) -> ModuleType:
+def library(*arrays: AnyArray) -> ModuleType:
     """NumPy for its arrays, JAX's for others."""
     return np if all(isinstance(array, np.ndarray | np.generic) for array in arrays) else jnp
 
@@ -62,7 +64,7 @@ def on_host(tree: Any) -> Any:
     return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, tree)
 
 
-def with_rows(x: Q, rows: Any, values: Q) -> Q:
+def with_rows(x: AnyArray, rows: Any, values: AnyArray) -> Any:
     """An array with some rows, or other parts, replaced."""
     if library(x, values) is jnp:
         return jnp.asarray(x).at[rows].set(values)
@@ -72,13 +74,13 @@ def with_rows(x: Q, rows: Any, values: Q) -> Q:
 
 
 @by_numpy
-def stacked(rows: Sequence[Float[Array, "*shape"]]) -> Float[Array, "n *shape"]:
+def stacked(rows: Sequence[Float[Q, "*shape"]]) -> Float[Q, "n *shape"]:
     """Arrays as the rows of one."""
     return library(*rows).stack(list(rows))
 
 
 @by_numpy
-def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
+def safe_norm(x: Float[Q, "..."], axis: int = -1) -> Float[Q, "..."]:
     """Euclidean norm whose derivative at zero is zero instead of NaN."""
     xp = library(x)
     squared = xp.sum(x * x, axis=axis)
@@ -99,7 +101,7 @@ def column_norm(x: Float[Array, "k *batch"]) -> Float[Array, "*batch"]:
 
 
 @by_numpy
-def safe_normalize(x: Float[Array, "*shape"], axis: int = -1) -> Float[Array, "*shape"]:
+def safe_normalize(x: Float[Q, "*shape"], axis: int = -1) -> Float[Q, "*shape"]:
     """Unit vector along `x`; the zero vector where `x` is zero."""
     xp = library(x)
     norm = xp.expand_dims(safe_norm(x, axis), axis)
@@ -196,7 +198,7 @@ def quat_rotate(q: Float[Q, "*#batch 4"], v: Float[Q, "*#batch 3"]) -> Float[Q, 
     return v + w * t + cross(u, t)
 
 
-def quat_normalize(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
+def quat_normalize(q: Float[Q, "*batch 4"]) -> Float[Q, "*batch 4"]:
     """Unit quaternion along `q` (a zero quaternion stays zero: callers check)."""
     return safe_normalize(q)
 
@@ -270,12 +272,12 @@ def even_directions(count: int, lowest: float = -1.0) -> Float[np.ndarray, "n 3"
 _ALL_DIGITS = jax.lax.Precision.HIGHEST
 
 
-def product(a: Float[Q, "..."], b: Float[Q, "..."]) -> Float[Q, "..."]:
+def product(a: Float[AnyArray, "..."], b: Float[AnyArray, "..."]) -> Any:
     """``a @ b`` with all digits of their numbers on every device: for places, forces and masses."""
     return np.matmul(a, b) if library(a, b) is np else jnp.matmul(a, b, precision=_ALL_DIGITS)
 
 
-def einsum(subscripts: str, *arrays: Q) -> Q:
+def einsum(subscripts: str, *arrays: AnyArray) -> Any:
     """`jnp.einsum`, as `product`."""
     if library(*arrays) is np:
         return np.einsum(subscripts, *arrays)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.extend.core import find_top_trace
 
 from dano.maths import by_numpy, is_traced
+from dano.programs import keep_programs
 
 # XLA's newer code generator for fused operations on CPUs: without it a pile of eight boxes compiles in 10.4 s
 # instead of 16.6 s and a step takes 2.5 ms instead of 3.4 ms (benchmarks.speed, crowd-8, side by side).
@@ -44,6 +45,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def call(*args):
+        keep_programs()
         # JAX takes options of the outermost compilation only. Plain functions may hold traced numbers unseen.
         hidden = any(callable(leaf) for leaf in jax.tree.leaves(args))
         enclosed = hidden or is_traced(eqx.filter(args, eqx.is_array), jnp.zeros(()))

@@ -72,9 +72,7 @@ def _in_turn(engine: Any, scene: Scene, prepared: Any, state: State, policy: Any
     parts, now = [], state
     for first in range(0, n_steps, _ROWS):
         count = min(_ROWS, n_steps - first)
-        now, rows = _jitted_rows(
-            engine, scene, prepared, now, policy, np.int32(first), np.int32(count)
-        )
+        now, rows = _jitted_rows(engine, scene, prepared, now, policy, np.int32(first), np.int32(count))
         parts.append(_first_rows(rows, count))
     states, report = _joined(parts)
     return with_start(state, states), report

@@ -42,7 +42,11 @@ def mass_matrix(scene: Scene, state: State) -> Float[Array, "k k"]:
 
 @by_numpy
 def _mass_matrix(
-    chains: Chains, jacobian: Float[Q, "n 6 k"], mass: Float[Q, " m"], inertia: Float[Q, "m 3 3"], rows
+    chains: Chains,
+    jacobian: Float[Q, "n 6 k"],
+    mass: Float[Q, " m"],
+    inertia: Float[Q, "m 3 3"],
+    rows: np.ndarray,
 ) -> Float[Q, "k k"]:
     return chains.mass_matrix(jacobian[rows], mass, inertia)
 
@@ -76,9 +80,11 @@ def gravity_forces(scene: Scene, state: State) -> Float[Array, " k"]:
 
 
 @by_numpy
-def _weights(jacobian: Float[Q, "n 6 k"], mass: Float[Q, " m"], pull: Float[Q, "n 3"], rows) -> Float[Q, " k"]:
+def _weights(
+    jacobian: Float[Q, "n 6 k"], mass: Float[Q, " m"], pull: Float[Q, "n 3"], rows: np.ndarray
+) -> Float[Q, " k"]:
     force = -mass[:, None] * pull[rows]
-    return _pulled(jacobian[rows], force, np.zeros(force.shape, force.dtype))
+    return _pulled(jacobian[rows], force, 0 * force)
 
 
 def computed_torque(scene: Scene, state: State, acceleration: Numbers) -> Float[Array, " k"]:

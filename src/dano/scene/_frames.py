@@ -1,8 +1,7 @@
 """Where the bodies of trees are: forward kinematics, Jacobians, and states from joint coordinates."""
 
-import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.maths import (
+    AnyArray,
     einsum,
     library,
     product,
-    Q,
     quat_conjugate,
     quat_exp,
     quat_log,
@@ -24,7 +23,7 @@ from dano.maths import (
 )
 from dano.scene._joint_laws import joint_laws, JointLaws
 from dano.scene._joints import Joint, Layout
-from dano.scene._states import State
+from dano.scene._states import State, STATE_SIZES
 
 RESOLVED = 0.5
 """h |ω|/2 up to which a step resolves how a body spins: a turn of 60°."""
@@ -68,14 +67,14 @@ class Chains(eqx.Module):
     """
 
     layout: Layout = eqx.field(static=True)
-    axis: Float[Array, "j 3"]
-    anchor: Float[Array, "j 3"]
-    position: Float[Array, "j 3"]
-    orientation: Float[Array, "j 4"]
-    ratio: Float[Array, " j"]
-    shift: Float[Array, " j"]
+    axis: Float[AnyArray, "j 3"]
+    anchor: Float[AnyArray, "j 3"]
+    position: Float[AnyArray, "j 3"]
+    orientation: Float[AnyArray, "j 4"]
+    ratio: Float[AnyArray, " j"]
+    shift: Float[AnyArray, " j"]
     laws: JointLaws
-    com: Float[Array, "n 3"]
+    com: Float[AnyArray, "n 3"]
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -83,14 +82,17 @@ class Chains(eqx.Module):
         return self.layout.kinds
 
     @property
-    def table(self) -> Float[Array, "j 15"]:
+    def table(self) -> Float[AnyArray, "j 15"]:
         """Axis, anchor, position, orientation, ratio and shift of each joint."""
         parts = (self.axis, self.anchor, self.position, self.orientation)
         return library(*parts).concatenate([*parts, self.ratio[:, None], self.shift[:, None]], axis=1)
 
     def mass_matrix(
-        self, jacobian: Float[Array, "m 6 k"], mass: Float[Array, " m"], inertia: Float[Array, "m 3 3"]
-    ) -> Float[Array, "k k"]:
+        self,
+        jacobian: Float[AnyArray, "m 6 k"],
+        mass: Float[AnyArray, " m"],
+        inertia: Float[AnyArray, "m 3 3"],
+    ) -> Float[AnyArray, "k k"]:
         """Generalised mass, armature of joints included.
 
         Args:
@@ -119,13 +121,13 @@ class Poses(NamedTuple):
         pivot: A point on it [m, W], shape (j, 3).
     """
 
-    position: Float[Array, "n 3"]
-    orientation: Float[Array, "n 4"]
-    axis: Float[Array, "j 3"]
-    pivot: Float[Array, "j 3"]
+    position: Float[AnyArray, "n 3"]
+    orientation: Float[AnyArray, "n 4"]
+    axis: Float[AnyArray, "j 3"]
+    pivot: Float[AnyArray, "j 3"]
 
 
-def chains_of(layout: Layout, joints: Sequence[Joint], com: Float[Array, "n 3"]) -> Chains:
+def chains_of(layout: Layout, joints: Sequence[Joint], com: Float[AnyArray, "n 3"]) -> Chains:
     """The trees of a scene, in the dtype of the centres of mass [m, F]."""
     names = {"axis": 3, "anchor": 3, "position": 3, "orientation": 4}
     xp = library(com, *jax.tree.leaves(joints))
@@ -158,9 +160,9 @@ def triples(places: np.ndarray) -> np.ndarray:
 
 def place_links(
     chains: Chains,
-    position: Float[Array, "n 3"],
-    orientation: Float[Array, "n 4"],
-    q: Float[Array, " k"],
+    position: Float[AnyArray, "n 3"],
+    orientation: Float[AnyArray, "n 4"],
+    q: Float[AnyArray, " k"],
 ) -> Poses:
     """Poses of all bodies from those of the roots and the joint coordinates.
 
@@ -201,8 +203,14 @@ def place_links(
 
 
 def _descended(
-    chains: Chains, origin: Array, turned: Array, turn: Array, path: Array, axis: Array, pivot: Array
-) -> tuple[Array, Array, Array, Array]:
+    chains: Chains,
+    origin: AnyArray,
+    turned: AnyArray,
+    turn: AnyArray,
+    path: AnyArray,
+    axis: AnyArray,
+    pivot: AnyArray,
+) -> tuple[Any, Any, Any, Any]:
     """Places of bodies, and axes and pivots of joints, level by level from the roots on.
 
     Args:
@@ -263,7 +271,7 @@ def _descended(
     return jax.lax.scan(level, carry, (even, parents[even], joints, bodies))[0]
 
 
-def link_jacobian(chains: Chains, poses: Poses) -> Float[Array, "n 6 k"]:
+def link_jacobian(chains: Chains, poses: Poses) -> Float[AnyArray, "n 6 k"]:
     """Twists (velocity of the centre of mass, spin; W) of all bodies per generalised velocity.
 
     Generalised velocities are velocity and spin of the bodies that move freely, both in W, and those of the
@@ -305,7 +313,7 @@ def _turns(layout: Layout, joint: int, part: int) -> bool:
     return kind in ("hinge", "ball") or (kind == "planar" and part == 2)
 
 
-def _directions(chains: Chains, poses: Poses) -> Float[Array, "d 3"]:
+def _directions(chains: Chains, poses: Poses) -> Float[AnyArray, "d 3"]:
     """Axis of each motion of the joints [W]."""
     layout = chains.layout
     directions = poses.axis[np.array([j for j, _, _ in layout.dofs], int)]
@@ -325,7 +333,7 @@ def _directions(chains: Chains, poses: Poses) -> Float[Array, "d 3"]:
     return directions
 
 
-def plane_axes(axis: Float[Array, "m 3"]) -> Float[Array, "m 2 3"]:
+def plane_axes(axis: Float[AnyArray, "m 3"]) -> Float[AnyArray, "m 2 3"]:
     """The two directions along which the lengths of planar joints are measured, from their axes."""
     eye, xp = np.eye(3, dtype=axis.dtype), library(axis)
     start = xp.where((xp.abs(axis[:, 0]) < 0.99)[:, None], eye[:1], eye[1:2])
@@ -335,10 +343,10 @@ def plane_axes(axis: Float[Array, "m 3"]) -> Float[Array, "m 2 3"]:
 
 
 def step_twists(
-    before: tuple[Float[Array, "*n 3"], Float[Array, "*n 4"]],
-    after: tuple[Float[Array, "*n 3"], Float[Array, "*n 4"]],
-    h: Float[Array, ""],
-) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 3"]]:
+    before: tuple[Float[AnyArray, "*n 3"], Float[AnyArray, "*n 4"]],
+    after: tuple[Float[AnyArray, "*n 3"], Float[AnyArray, "*n 4"]],
+    h: Float[AnyArray, ""],
+) -> tuple[Float[AnyArray, "*n 3"], Float[AnyArray, "*n 3"]]:
     """Velocity [m/s, W] and spin [rad/s, B] with which a step of length h leads from a pose to another.
 
     They are what `dano.step` calls velocity and omega: x⁺ = x + h v and q⁺ = q ⊗ (cos a, sin a ω/|ω|), where
@@ -355,7 +363,7 @@ def step_twists(
     return velocity, 2 / h * xp.where(fast, (RESOLVED - float(np.arcsin(RESOLVED)) + angle) / size, 1) * sine
 
 
-def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:
+def filled(chains: Chains, state: State, h: Float[AnyArray, ""]) -> State:
     """The state with poses and velocities of bodies on joints as the joint coordinates say.
 
     Velocities are those of the step of length h that ends at the state, as everywhere: see `dano.step`.
@@ -383,16 +391,15 @@ def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:
         q,
     )
     velocity, omega = step_twists(earlier[:2], now[:2], h)
-    return dataclasses.replace(
+    found = {**now._asdict(), "velocity": velocity, "omega": omega}
+    return eqx.tree_at(
+        lambda state: [getattr(state, name) for name in STATE_SIZES],
         state,
-        position=with_rows(state.position, rows, now.position[rows]),
-        orientation=with_rows(state.orientation, rows, now.orientation[rows]),
-        velocity=with_rows(state.velocity, rows, velocity[rows]),
-        omega=with_rows(state.omega, rows, omega[rows]),
+        [with_rows(getattr(state, name), rows, found[name][rows]) for name in STATE_SIZES],
     )
 
 
-def _step_turn(omega: Float[Array, "*n 3"], h: Float[Array, ""]) -> Float[Array, "*n 4"]:
+def _step_turn(omega: Float[AnyArray, "*n 3"], h: Float[AnyArray, ""]) -> Float[AnyArray, "*n 4"]:
     """The turn [cos a, sin a ω/|ω|] of a step with a spin, in the frame of the spin.
 
     Sin a is x = h |ω|/2 up to `RESOLVED`; from there a grows like x.
@@ -407,7 +414,7 @@ def _step_turn(omega: Float[Array, "*n 3"], h: Float[Array, ""]) -> Float[Array,
     return xp.concatenate([cosine, share * (0.5 * h * omega)], axis=-1)
 
 
-def joint_values(chains: Chains, state: State) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+def joint_values(chains: Chains, state: State) -> tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]:
     """Coordinates q and velocities v of the joints from the poses and velocities of bodies.
 
     Angles are between −π and π. What the joints do not allow is left out: a hinge turns by the part of a
@@ -454,8 +461,8 @@ def joint_values(chains: Chains, state: State) -> tuple[Float[Array, " k"], Floa
     return q, v
 
 
-def frames_of(chains: Chains, state: State) -> Frames:
-    """Pose, twist and Jacobian of every body, see `Scene.frames`."""
+def frames_of(chains: Chains, state: State) -> tuple[Any, ...]:
+    """The arrays of the `Frames` of every body, see `Scene.frames`."""
     layout, dtype = chains.layout, state.position.dtype
     xp = library(state.position, state.orientation, state.velocity, state.omega, chains.axis, chains.com)
     if layout.children:
@@ -479,4 +486,4 @@ def frames_of(chains: Chains, state: State) -> Frames:
     if state.v is not None:
         speeds = xp.concatenate([speeds, state.v])
     twists = product(jacobian, speeds)
-    return Frames(poses.position, poses.orientation, twists[:, :3], twists[:, 3:], jacobian)
+    return poses.position, poses.orientation, twists[:, :3], twists[:, 3:], jacobian

@@ -1,13 +1,14 @@
 """What acts on joint coordinates, as arrays over them: springs, friction, limits, motors."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from dano.maths import library, with_rows
+from dano.maths import AnyArray, library, with_rows
 from dano.scene._joints import Joint, Layout
 
 
@@ -30,13 +31,13 @@ class JointLaws(eqx.Module):
         rough: Coordinates with limits, friction, or a motor that heeds the joint (static).
     """
 
-    damping: Float[Array, " k"]
-    armature: Float[Array, " k"] | None
-    stiffness: Float[Array, " k"] | None
-    rest: Float[Array, " k"]
-    friction: Float[Array, " k"] | None
-    limits: Float[Array, "k 2"] | None
-    motor: Float[Array, "k 5"] | None
+    damping: Float[AnyArray, " k"]
+    armature: Float[AnyArray, " k"] | None
+    stiffness: Float[AnyArray, " k"] | None
+    rest: Float[AnyArray, " k"]
+    friction: Float[AnyArray, " k"] | None
+    limits: Float[AnyArray, "k 2"] | None
+    motor: Float[AnyArray, "k 5"] | None
     constant: tuple[bool, ...] = eqx.field(static=True)
     rough: tuple[int, ...] = eqx.field(static=True)
 
@@ -45,7 +46,7 @@ def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
     """The laws of the joints of a scene."""
     owners, xp = [joints[j] for j in layout.with_coordinates], library(*jax.tree.leaves(joints))
 
-    def summed(name: str, power: Callable[[Array], Array]) -> Float[Array, " k"]:
+    def summed(name: str, power: Callable[[Any], Any]) -> Float[AnyArray, " k"]:
         values = xp.zeros(layout.n_joints, dtype)
         for j, _, place in layout.dofs:
             value = getattr(joints[j], name)
@@ -54,10 +55,10 @@ def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
                 values = with_rows(values, place, values[place] + xp.asarray(share * value, dtype))
         return values
 
-    def of_some(name: str, power: Callable[[Array], Array]) -> Float[Array, " k"] | None:
+    def of_some(name: str, power: Callable[[Any], Any]) -> Float[AnyArray, " k"] | None:
         return summed(name, power) if any(getattr(joint, name) is not None for joint in joints) else None
 
-    def column(values: list[Array]) -> Array:
+    def column(values: list[Any]) -> Any:
         return xp.stack([x.astype(dtype) for x in values]) if values else xp.zeros(0, dtype)
 
     limits = motor = None
@@ -88,7 +89,7 @@ def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
     )
 
 
-def _motor(joint: Joint) -> Array | np.ndarray:
+def _motor(joint: Joint) -> AnyArray:
     motor = joint.motor
     if motor is None:
         return np.array([0.0, 0.0, 0.0, -np.inf, np.inf])

@@ -1,6 +1,7 @@
 """Loops: what closes a chain of bodies on joints, so that bodies no longer make a tree."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,6 +11,7 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_choice, checked_text
 from dano.maths import (
+    AnyArray,
     checked_array,
     checked_quaternion,
     library,
@@ -88,16 +90,18 @@ class Loops(eqx.Module):
     first: tuple[int, ...] = eqx.field(static=True)
     second: tuple[int, ...] = eqx.field(static=True)
     welds: tuple[int, ...] = eqx.field(static=True)
-    position: Float[Array, "l 3"]
-    anchor: Float[Array, "l 3"]
-    orientation: Float[Array, "l 4"]
+    position: Float[AnyArray, "l 3"]
+    anchor: Float[AnyArray, "l 3"]
+    orientation: Float[AnyArray, "l 4"]
 
     @property
     def size(self) -> int:
         """How many numbers the loops hold at zero."""
         return 3 * (len(self.first) + len(self.welds))
 
-    def gaps(self, position: Float[Array, "n 3"], orientation: Float[Array, "n 4"]) -> Float[Array, " c"]:
+    def gaps(
+        self, position: Float[AnyArray, "n 3"], orientation: Float[AnyArray, "n 4"]
+    ) -> Float[AnyArray, " c"]:
         """How far the loops are from being closed, at poses of all bodies.
 
         Returns:
@@ -112,10 +116,10 @@ class Loops(eqx.Module):
 
     def slopes(
         self,
-        position: Float[Array, "n 3"],
-        orientation: Float[Array, "n 4"],
-        moved: Float[Array, "n 6 k"],
-    ) -> Float[Array, "c k"]:
+        position: Float[AnyArray, "n 3"],
+        orientation: Float[AnyArray, "n 4"],
+        moved: Float[AnyArray, "n 6 k"],
+    ) -> Float[AnyArray, "c k"]:
         """How the gaps change with numbers that move the bodies, where the loops are closed.
 
         Args:
@@ -165,7 +169,7 @@ def check_loops(names: Sequence[str], hanging: Sequence[int], loops: Sequence[Lo
             )
 
 
-def loops_of(names: Sequence[str], loops: Sequence[Loop], com: Float[Array, "n 3"]) -> Loops | None:
+def loops_of(names: Sequence[str], loops: Sequence[Loop], com: Float[AnyArray, "n 3"]) -> Loops | None:
     """The loops of a scene as arrays, in the dtype of the centres of mass [m, F]; None if there are none."""
     if not loops:
         return None
@@ -182,7 +186,7 @@ def loops_of(names: Sequence[str], loops: Sequence[Loop], com: Float[Array, "n 3
     return Loops(first, second, welds, position, anchor, orientation)
 
 
-def _with_world(position: Array, orientation: Array) -> tuple[Array, Array]:
+def _with_world(position: AnyArray, orientation: AnyArray) -> tuple[Any, Any]:
     """Poses with the world as the last row."""
     xp = library(position, orientation)
     still = np.array([[1.0, 0.0, 0.0, 0.0]], orientation.dtype)

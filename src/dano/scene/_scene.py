@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_items, checked_kind, checked_optional, shown
 from dano.contact import checked_parameter, ContactParams
-from dano.maths import by_numpy, checked_array, is_traced, library, Numbers, on_host
+from dano.maths import AnyArray, by_numpy, checked_array, is_traced, library, Numbers, on_host
 from dano.notebook import card, cloud
 from dano.objects import checked_inertia
 from dano.scene._bodies import Body
@@ -151,7 +151,7 @@ class Scene(eqx.Module):
         loops, com = self._with_centres(self.loops)
         return loops_of(self.names, loops, com)
 
-    def _with_centres(self, parts: Parts) -> tuple[Parts, Float[Array, "n 3"]]:
+    def _with_centres(self, parts: Parts) -> tuple[Parts, Float[AnyArray, "n 3"]]:
         """Joints or loops, and the centres of mass of all bodies [m, F]."""
         places = [(body.com, body.com_offset) for body in self.bodies]
         if not is_traced(parts, places):
@@ -389,7 +389,7 @@ class Scene(eqx.Module):
             ValueError: If the state does not fit the scene.
         """
         self.check_state(state)
-        return by_numpy(frames_of)(self.chains, state)
+        return Frames(*by_numpy(frames_of)(self.chains, state))
 
     def check_state(self, state: State) -> None:
         """Check a concrete state against the scene; traced values pass.

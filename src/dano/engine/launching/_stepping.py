@@ -1,6 +1,7 @@
 """Steps and rollouts as launches of kernels."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +15,8 @@ from dano.engine.joints import tree_lengths
 from dano.engine.launching import _derivatives  # noqa: F401  rules for derivatives of launches
 from dano.engine.launching._launch import launch, OfWidth, Plan, plan, Shape
 from dano.engine.launching._tables import Tables
-from dano.maths import library, Q
-from dano.scene import Control, State
+from dano.maths import AnyArray, library
+from dano.scene import Control, JOINT_QUANTITIES, State, STATE_SIZES
 
 _MODULE = "dano.engine.kernels.rollout"
 # Numbers of a body's state, of a push on it, and of what a step reports: see `dano.engine.kernels.tables`.
@@ -60,26 +61,21 @@ def rollout(
     n = state.position.shape[0]
     inputs = {**tables.rows, **given(state, controls, dtype)}
     found = launch(_plan(tables, inputs, n, n_steps, capacity, options, dtype), inputs)
-    states, report = _read(found, state, n_steps)
-    return states, jax.lax.stop_gradient(report)
+    moved, told = _read(found, state, n_steps)
+    return dataclasses.replace(state, **moved), jax.lax.stop_gradient(Report(*told))
 
 
 @by_numpy_on_cpus
-def _read(found: dict[str, Q], state: State, n_steps: int) -> tuple[State, Report]:
-    """States and reports of a launch from the state at its start."""
+def _read(found: dict[str, AnyArray], state: State, n_steps: int) -> tuple[dict[str, Any], tuple[Any, ...]]:
+    """States by quantity, and what reports say, of a launch from a state."""
     xp = library(*jax.tree.leaves((found, state)))
     states = found["launch.states"].reshape(n_steps, state.position.shape[0], STATE)
-    position, orientation, velocity, omega = xp.split(states, (3, 7, 10), axis=2)
+    moved = dict(zip(STATE_SIZES, xp.split(states, (3, 7, 10), axis=2), strict=True))
     residual, passes, solved, overflow, _ = found["launch.reports"].T
-    report = Report(residual, passes.astype(int), (solved > 0) & (overflow == 0), overflow > 0)
-    states = dataclasses.replace(
-        state, position=position, orientation=orientation, velocity=velocity, omega=omega
-    )
     if state.q is not None and state.v is not None:
-        none = xp.zeros((n_steps, state.q.shape[0]), states.position.dtype)
-        q, v = (found.get(f"launch.{name}", none).reshape(none.shape) for name in ("qs", "vs"))
-        states = dataclasses.replace(states, q=q, v=v)
-    return states, report
+        none = xp.zeros((n_steps, state.q.shape[0]), states.dtype)
+        moved |= {name: found.get(f"launch.{name}s", none).reshape(none.shape) for name in JOINT_QUANTITIES}
+    return moved, (residual, passes.astype(int), (solved > 0) & (overflow == 0), overflow > 0)
 
 
 def given(state: State, controls: Control | None, dtype) -> dict[str, Array]:
@@ -88,7 +84,7 @@ def given(state: State, controls: Control | None, dtype) -> dict[str, Array]:
 
 
 @by_numpy_on_cpus
-def _given(state: State, controls: Control | None, none: np.ndarray) -> dict[str, Array]:
+def _given(state: State, controls: Control | None, none: AnyArray) -> dict[str, Any]:
     xp = library(*jax.tree.leaves((state, controls)))
     rows = xp.concatenate([state.position, state.orientation, state.velocity, state.omega], axis=1)
     inputs = {"launch.state": rows, "launch.pushes": xp.asarray(none)}
