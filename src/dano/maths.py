@@ -6,7 +6,7 @@ quaternions compute NumPy arrays with NumPy, on the host and in their own dtype,
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -18,36 +18,75 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from dano.checks import shown
-from dano.hosted import hosted
 
 Numbers = ArrayLike | Sequence[Any]
 """What constructors take for an array: an array, a number, or (nested) lists and tuples of numbers."""
 
 Q = TypeVar("Q", Array, np.ndarray)
 """Arrays of JAX or of NumPy."""
+AnyArray = Array | np.ndarray | np.generic
+"""An array of JAX or of NumPy."""
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 _SERIES = 1e-4
 """Below this, of the square of half an angle [rad²], five terms of a series are exact in float64."""
 
 
-def _library(*arrays: Array | np.ndarray) -> ModuleType:
+def library(*arrays: AnyArray) -> ModuleType:
     """NumPy for its arrays, JAX's for others."""
-    return np if all(isinstance(array, np.ndarray) for array in arrays) else jnp
+    return np if all(isinstance(array, np.ndarray | np.generic) for array in arrays) else jnp
 
 
-@hosted
-def stacked(rows: Sequence[Float[Array, "*shape"]]) -> Float[Array, "n *shape"]:
+def by_numpy(function: Function) -> Function:
+    """The function, computed by NumPy unless an argument is traced.
+
+    Outside of `jax.jit`, JAX compiles a program for each operation on arrays of a new shape: 30 ms, for work
+    of a microsecond.
+
+    Args:
+        function: Of trees of arrays, to a tree of arrays, written for both libraries (see `library`). What
+            it makes of arrays of NumPy alone stays with NumPy.
+    """
+
+    @functools.wraps(function)
+    def call(*args, **options):
+        if is_traced(args) or not any(isinstance(x, jax.Array) for x in jax.tree.leaves(args)):
+            return function(*args, **options)
+        with np.errstate(all="ignore"):
+            found = function(*on_host(args), **options)
+        return jax.tree.map(lambda x: on_device(x) if isinstance(x, np.ndarray | np.generic) else x, found)
+
+    return call  # pyright: ignore[reportReturnType]
+
+
+def on_host(tree: Any) -> Any:
+    """A tree with NumPy's arrays in place of those of JAX, which must not be traced."""
+    return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, tree)
+
+
+def with_rows(x: AnyArray, rows: Any, values: AnyArray) -> Any:
+    """An array with some rows, or other parts, replaced."""
+    if library(x, values) is jnp:
+        return jnp.asarray(x).at[rows].set(values)
+    changed = np.array(x)
+    changed[rows] = values
+    return changed
+
+
+@by_numpy
+def stacked(rows: Sequence[Float[Q, "*shape"]]) -> Float[Q, "n *shape"]:
     """Arrays as the rows of one."""
-    return jnp.stack(list(rows))
+    return library(*rows).stack(list(rows))
 
 
-@hosted
-def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
+@by_numpy
+def safe_norm(x: Float[Q, "..."], axis: int = -1) -> Float[Q, "..."]:
     """Euclidean norm whose derivative at zero is zero instead of NaN."""
-    squared = jnp.sum(x * x, axis=axis)
+    xp = library(x)
+    squared = xp.sum(x * x, axis=axis)
     # The untaken branch must be safe too: 0 · ∞ in the chain rule would be NaN.
     positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
+    return xp.where(positive, xp.sqrt(xp.where(positive, squared, 1)), 0)
 
 
 def column_norm(x: Float[Array, "k *batch"]) -> Float[Array, "*batch"]:
@@ -61,11 +100,12 @@ def column_norm(x: Float[Array, "k *batch"]) -> Float[Array, "*batch"]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
 
 
-@hosted
-def safe_normalize(x: Float[Array, "*shape"], axis: int = -1) -> Float[Array, "*shape"]:
+@by_numpy
+def safe_normalize(x: Float[Q, "*shape"], axis: int = -1) -> Float[Q, "*shape"]:
     """Unit vector along `x`; the zero vector where `x` is zero."""
-    norm = jnp.expand_dims(safe_norm(x, axis), axis)
-    return x / jnp.where(norm > 0, norm, 1)
+    xp = library(x)
+    norm = xp.expand_dims(safe_norm(x, axis), axis)
+    return x / xp.where(norm > 0, norm, 1)
 
 
 def skew(v: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
@@ -86,7 +126,7 @@ def quat_multiply(p: Float[Q, "*#batch 4"], q: Float[Q, "*#batch 4"]) -> Float[Q
     """Hamilton product p ⊗ q: the rotation q followed by p."""
     pw, px, py, pz = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     qw, qx, qy, qz = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    return _library(p, q).stack(
+    return library(p, q).stack(
         [
             pw * qw - px * qx - py * qy - pz * qz,
             pw * qx + px * qw + py * qz - pz * qy,
@@ -99,13 +139,13 @@ def quat_multiply(p: Float[Q, "*#batch 4"], q: Float[Q, "*#batch 4"]) -> Float[Q
 
 def quat_conjugate(q: Float[Q, "*batch 4"]) -> Float[Q, "*batch 4"]:
     """Inverse rotation of a unit quaternion."""
-    return _library(q).concatenate([q[..., :1], -q[..., 1:]], axis=-1)
+    return library(q).concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
 def quat_to_matrix(q: Float[Q, "*batch 4"]) -> Float[Q, "*batch 3 3"]:
     """Rotation matrix of a unit quaternion (body → world)."""
     w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    stack = _library(q).stack
+    stack = library(q).stack
     return stack(
         [
             stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
@@ -122,7 +162,7 @@ def quat_from_matrix(matrix: Float[Q, "*batch 3 3"]) -> Float[Q, "*batch 4"]:
     The matrix gives 4 q qᵀ without a root. Its row with the largest diagonal entry, which is at least 1, is
     normalised (after Shepperd 1978, who divides by a root instead).
     """
-    xp = _library(matrix)
+    xp = library(matrix)
     m = [[matrix[..., i, j] for j in range(3)] for i in range(3)]
     x, y, z = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
     xy, xz, yz = m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]
@@ -152,20 +192,20 @@ def quat_from_matrix(matrix: Float[Q, "*batch 3 3"]) -> Float[Q, "*batch 4"]:
 
 def quat_rotate(q: Float[Q, "*#batch 4"], v: Float[Q, "*#batch 3"]) -> Float[Q, "*batch 3"]:
     """Rotate vector(s) `v` by unit quaternion(s) `q`."""
-    cross = _library(q, v).cross
+    cross = library(q, v).cross
     w, u = q[..., :1], q[..., 1:]
     t = 2 * cross(u, v)
     return v + w * t + cross(u, t)
 
 
-def quat_normalize(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
+def quat_normalize(q: Float[Q, "*batch 4"]) -> Float[Q, "*batch 4"]:
     """Unit quaternion along `q` (a zero quaternion stays zero: callers check)."""
     return safe_normalize(q)
 
 
 def quat_exp(vector: Float[Q, "*batch 3"]) -> Float[Q, "*batch 4"]:
     """Unit quaternion of a rotation vector [rad]: (cos |v|/2, sin |v|/2 · v/|v|), smooth at zero."""
-    xp = _library(vector)
+    xp = library(vector)
     half = 0.5 * vector
     squared = xp.sum(half * half, axis=-1, keepdims=True)
     small = squared < _SERIES
@@ -188,7 +228,7 @@ def quat_log(q: Float[Q, "*batch 4"]) -> Float[Q, "*batch 3"]:
 
     Smooth where the angle is below π. The direction does not change with the length of `q`. NaN stays NaN.
     """
-    xp = _library(q)
+    xp = library(q)
     q = xp.where(q[..., :1] < 0, -q, q)
     w, u = q[..., :1], q[..., 1:]
     squared = xp.sum(u * u, axis=-1, keepdims=True)
@@ -232,13 +272,15 @@ def even_directions(count: int, lowest: float = -1.0) -> Float[np.ndarray, "n 3"
 _ALL_DIGITS = jax.lax.Precision.HIGHEST
 
 
-def product(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
+def product(a: Float[AnyArray, "..."], b: Float[AnyArray, "..."]) -> Any:
     """``a @ b`` with all digits of their numbers on every device: for places, forces and masses."""
-    return jnp.matmul(a, b, precision=_ALL_DIGITS)
+    return np.matmul(a, b) if library(a, b) is np else jnp.matmul(a, b, precision=_ALL_DIGITS)
 
 
-def einsum(subscripts: str, *arrays: Array) -> Array:
+def einsum(subscripts: str, *arrays: AnyArray) -> Any:
     """`jnp.einsum`, as `product`."""
+    if library(*arrays) is np:
+        return np.einsum(subscripts, *arrays)
     return jnp.einsum(subscripts, *arrays, precision=_ALL_DIGITS)
 
 

@@ -15,7 +15,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     Args:
         argv: Arguments without the program's name; default those of the process, which then also keeps what
-            it compiles for the next one (see `dano.cli._compiled`).
+            it compiles for the next one (see `dano.programs`).
     """
     # Here and below: what a command needs is imported when it runs, so that `dano --help` answers at once.
     from dano.cli._console import end_line, say
@@ -61,21 +61,23 @@ def _run(argv: list[str], keep: bool) -> None:
     command = parse(argv)
     import jax
 
-    from dano.cli._compiled import compiled_programs
     from dano.cli._console import say
     from dano.cli._outputs import named
+    from dano.programs import keep_programs
 
     jax.config.update("jax_enable_x64", True)
     # Called from another program, JAX's settings are that program's.
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), contextlib.ExitStack() as end:
         warnings.showwarning = _say_warning
         # What dano says of its results is heard whatever the process makes of warnings, once.
         warnings.simplefilter("default", UserWarning)
-        with compiled_programs() if keep else contextlib.nullcontext():
-            command, line = named(command)
-            command()
-            if line is not None:
-                say(line)
+        if keep:
+            # Not when the process ends, which it may do at once.
+            end.callback(keep_programs())
+        command, line = named(command)
+        command()
+        if line is not None:
+            say(line)
 
 
 def _say_warning(message: Warning | str, *_: object, **__: object) -> None:

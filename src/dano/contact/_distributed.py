@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from dano.contact._laws import (
     AbstractContactLaw,
@@ -18,8 +18,7 @@ from dano.contact._laws import (
     Setting,
     STANDARD_GRAVITY,
 )
-from dano.hosted import hosted
-from dano.maths import checked_array, is_traced, Numbers
+from dano.maths import AnyArray, by_numpy, checked_array, floating, is_traced, library, Numbers, Q
 
 CHUNK = 16
 """Points that `VariationalEngine.capacity` counts as one."""
@@ -166,23 +165,17 @@ class DistributedLaw(AbstractContactLaw):
         return params.filled(
             restitution=0.0,
             restitution_velocity=_slow(setting.gravity, setting.size),
-            impact_depth=_impact_depth(setting.size),
+            impact_depth=floating(IMPACT_DEPTH * setting.size),
             hysteresis=0.35,
             friction_fading=0.0,
             friction_pressure=1000.0,
         )
 
 
-@hosted
-def _impact_depth(size: ArrayLike) -> Float[Array, ""]:
-    """Default depth [m] of impacts of bodies of a size [m]."""
-    return IMPACT_DEPTH * jnp.asarray(size)
-
-
-@hosted
-def _slow(gravity: Float[Array, ""], size: ArrayLike) -> Float[Array, ""]:
+@by_numpy
+def _slow(gravity: Float[Q, ""], size: Numbers) -> Float[AnyArray, ""]:
     """Speed [m/s] of an impact that counts as slow for bodies of a size [m]."""
-    return _SLOW * jnp.sqrt(gravity * SINKING * size)
+    return _SLOW * library(gravity).sqrt(gravity * SINKING * size)
 
 
 def combined(a: ContactParams, b: ContactParams) -> ContactParams:

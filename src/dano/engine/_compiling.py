@@ -7,8 +7,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.extend.core import find_top_trace
 
-from dano.maths import is_traced
+from dano.maths import by_numpy, is_traced
+from dano.programs import keep_programs
 
 # XLA's newer code generator for fused operations on CPUs: without it a pile of eight boxes compiles in 10.4 s
 # instead of 16.6 s and a step takes 2.5 ms instead of 3.4 ms (benchmarks.speed, crowd-8, side by side).
@@ -43,9 +45,36 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def call(*args):
+        keep_programs()
         # JAX takes options of the outermost compilation only. Plain functions may hold traced numbers unseen.
         hidden = any(callable(leaf) for leaf in jax.tree.leaves(args))
         enclosed = hidden or is_traced(eqx.filter(args, eqx.is_array), jnp.zeros(()))
         return nested(*args) if enclosed else alone()(*args)
 
     return call
+
+
+def is_enclosed() -> bool:
+    """Whether a transformation of JAX encloses the caller, so that functions may hold traced numbers."""
+    return type(find_top_trace(())).__name__ != "EvalTrace"
+
+
+def by_numpy_on_cpus(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, computed by NumPy where all arrays are known and a CPU's, and else compiled.
+
+    Args:
+        function: See `dano.maths.by_numpy`.
+    """
+    numerical, nested = by_numpy(function), compiled(function)
+
+    @functools.wraps(function)
+    def call(*args):
+        arrays = [x for x in jax.tree.leaves(args) if isinstance(x, jax.Array)]
+        known = not is_traced(arrays) and all(_is_on_cpu(x) for x in arrays)
+        return numerical(*args) if known else nested(*args)
+
+    return call
+
+
+def _is_on_cpu(array: jax.Array) -> bool:
+    return all(device.platform == "cpu" for device in array.devices())

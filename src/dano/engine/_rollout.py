@@ -11,15 +11,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from dano.checks import checked_count, checked_kind, checked_number
 from dano.contact import Patch
 from dano.engine import _touching, _variational
 from dano.engine._compiling import compiled
 from dano.engine._reports import Report, SolverOptions
-from dano.hosted import hosted
-from dano.maths import is_traced, quat_conjugate, quat_exp, quat_multiply
+from dano.engine._rolling import rolled
+from dano.maths import by_numpy, is_traced, Q, quat_conjugate, quat_exp, quat_multiply
 from dano.scene import Control, RESOLVED, Scene, State, Trajectory
 
 Policy = Callable[[State, Float[Array, ""]], Control]
@@ -140,19 +140,15 @@ def check_state(scene: Scene, state: State) -> None:
     """
     checked_kind("scene", scene, Scene)
     scene.check_state(state)
-    if scene.loops and state.position.ndim == 2 and not is_traced(state, scene):
-        gap = float(_jitted_gap(scene, state))
+    closing = scene.closing
+    if closing is not None and state.position.ndim == 2 and not is_traced(state, scene):
+        frames = scene.frames(state)
+        gap = float(np.max(np.abs(closing.gaps(np.asarray(frames.position), np.asarray(frames.orientation)))))
         if gap > (_OPEN if state.position.dtype == jnp.float64 else 100 * _OPEN):
             raise ValueError(
                 f"state must close the loops of the scene, got a gap of {gap:.3g} m or rad:"
                 " dano.close_loops(scene, state) closes them"
             )
-
-
-@compiled
-def _jitted_gap(scene, state):
-    frames = scene.frames(state)
-    return jnp.max(jnp.abs(scene.closing.gaps(frames.position, frames.orientation)))
 
 
 def checked_engine(engine: AbstractEngine | None) -> AbstractEngine:
@@ -200,8 +196,8 @@ def simulate(
 ) -> Trajectory:
     """Roll a scene out.
 
-    Compiled on first use for each scene structure and number of steps; differentiable in forward and reverse
-    mode with respect to every array in `scene`, `state` and `controls`, and batched by `jax.vmap`.
+    Compiled on first use for each scene structure; differentiable in forward and reverse mode with respect to
+    every array in `scene`, `state` and `controls`, and batched by `jax.vmap`.
 
     Args:
         scene: The scene.
@@ -237,22 +233,16 @@ def simulate(
     states, report = _with_room(
         engine,
         scene,
-        lambda engine: _jitted_rollout(engine, scene, state, controls, n_steps, checkpoint_every),
+        lambda engine: rolled(engine, scene, state, controls, n_steps, checkpoint_every),
     )
     _say(scene, states, report)
     times = _times(scene.timestep, n_steps)
     return Trajectory(times, states, report.residual, report.iterations, report.converged, scene.names)
 
 
-@hosted
-def _fast(omega: Float[Array, "steps n 3"], timestep: Float[Array, ""]) -> Bool[Array, "steps n"]:
-    """Whether bodies turn by more than 60° in a step."""
-    return jnp.sum(omega * omega, axis=-1) * timestep**2 > 4 * RESOLVED**2
-
-
-@hosted
-def _times(timestep: Float[Array, ""], n_steps: int) -> Float[Array, " steps"]:
-    return timestep * jnp.arange(n_steps + 1, dtype=timestep.dtype)
+@by_numpy
+def _times(timestep: Float[Q, ""], n_steps: int) -> Float[Q, " steps"]:
+    return timestep * np.arange(n_steps + 1, dtype=timestep.dtype)
 
 
 def linearize(
@@ -280,43 +270,6 @@ def linearize(
 @compiled
 def _jitted_step(engine, scene, state, control):
     return engine.step(scene, engine.prepare(scene), scene.filled(state), control)
-
-
-@compiled
-def _jitted_rollout(engine, scene, state, controls, n_steps, segment):
-    prepared, state = engine.prepare(scene), scene.filled(state)
-    if not callable(controls):
-        found = engine.rollout(scene, prepared, state, controls, n_steps)
-        if found is not None:
-            return _with_start(state, found[0]), found[1]
-
-    def advance(state, inputs):
-        index, control = inputs
-        if callable(controls):
-            control = controls(state, scene.timestep * index)
-        following, report = engine.step(scene, prepared, state, control)
-        return following, (following, report)
-
-    def scan(state, inputs):
-        return jax.lax.scan(advance, state, inputs)
-
-    steps = jnp.arange(n_steps, dtype=scene.timestep.dtype), None if callable(controls) else controls
-    if segment is None or segment >= n_steps:
-        _, (states, report) = scan(state, steps)
-    else:
-        whole = n_steps - n_steps % segment
-        head = jax.tree.map(lambda x: x[:whole].reshape(-1, segment, *x.shape[1:]), steps)
-        last, (states, report) = jax.lax.scan(jax.checkpoint(scan), state, head)
-        states, report = jax.tree.map(lambda x: x.reshape(whole, *x.shape[2:]), (states, report))
-        if whole < n_steps:
-            _, tail = scan(last, jax.tree.map(lambda x: x[whole:], steps))
-            states, report = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), (states, report), tail)
-    return _with_start(state, states), report
-
-
-def _with_start(state: State, states: State) -> State:
-    """States with the one that they begin with."""
-    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, states)
 
 
 @compiled
@@ -443,10 +396,12 @@ def _say(scene: Scene, following: State, report: Report) -> None:
             RuntimeWarning,
             stacklevel=3,
         )
-    omega = jax.lax.stop_gradient(following.omega).reshape(-1, len(scene.bodies), 3)
-    fast = np.asarray(_fast(omega, scene.timestep))[-converged.size :]
+    omega = jax.lax.stop_gradient(following.omega)
+    if is_traced(omega):
+        return
+    spins = np.linalg.norm(np.asarray(omega).reshape(-1, len(scene.bodies), 3), axis=2)[-converged.size :]
+    fast = 0.5 * float(scene.timestep) * spins > RESOLVED
     if fast.any():
-        spins = np.linalg.norm(np.asarray(omega), axis=2)[-converged.size :]
         names = ", ".join(repr(scene.names[i]) for i in np.flatnonzero(fast.any(axis=0)))
         warnings.warn(
             f"{names} turns by more than 60° in a step, first in step {np.flatnonzero(fast.any(axis=1))[0]}: "

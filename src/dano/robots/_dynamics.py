@@ -5,7 +5,9 @@ gravity terms. Springs, friction, damping, limits, motors and loops of joints ar
 """
 
 import dataclasses
+from collections.abc import Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,16 +15,19 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_kind
 from dano.maths import (
+    by_numpy,
     checked_array,
     checked_floating,
     einsum,
+    library,
     Numbers,
+    Q,
     quat_exp,
     quat_log,
     quat_multiply,
     quat_rotate,
 )
-from dano.scene import Control, joints_of, place_links, pulls, Scene, State, triples
+from dano.scene import Chains, Control, joints_of, place_links, pulls, Scene, State, triples
 
 
 def mass_matrix(scene: Scene, state: State) -> Float[Array, "k k"]:
@@ -32,7 +37,18 @@ def mass_matrix(scene: Scene, state: State) -> Float[Array, "k k"]:
         ValueError: If the state does not fit the scene.
     """
     mass, inertia, rows = _masses(scene)
-    return scene.chains.mass_matrix(scene.frames(state).jacobian[rows], mass, inertia)
+    return _mass_matrix(scene.chains, scene.frames(state).jacobian, mass, inertia, rows)
+
+
+@by_numpy
+def _mass_matrix(
+    chains: Chains,
+    jacobian: Float[Q, "n 6 k"],
+    mass: Float[Q, " m"],
+    inertia: Float[Q, "m 3 3"],
+    rows: np.ndarray,
+) -> Float[Q, "k k"]:
+    return chains.mass_matrix(jacobian[rows], mass, inertia)
 
 
 def bias_forces(scene: Scene, state: State) -> Float[Array, " k"]:
@@ -42,6 +58,12 @@ def bias_forces(scene: Scene, state: State) -> Float[Array, " k"]:
         ValueError: If the state does not fit the scene.
     """
     checked_kind("scene", scene, Scene)
+    scene.check_state(state)
+    return _jitted_bias(scene, state)
+
+
+@eqx.filter_jit
+def _jitted_bias(scene: Scene, state: State) -> Float[Array, " k"]:
     still = jnp.zeros(scene.layout.n_velocities, scene.timestep.dtype)
     force, torque, jacobian, rows = _needed(scene, state, still)
     return _pulled(jacobian[rows], force, torque)
@@ -54,9 +76,15 @@ def gravity_forces(scene: Scene, state: State) -> Float[Array, " k"]:
         ValueError: If the state does not fit the scene.
     """
     mass, _, rows = _masses(scene)
-    jacobian = scene.frames(state).jacobian[rows]
-    force = -mass[:, None] * pulls(scene)[rows]
-    return _pulled(jacobian, force, jnp.zeros_like(force))
+    return _weights(scene.frames(state).jacobian, mass, pulls(scene), rows)
+
+
+@by_numpy
+def _weights(
+    jacobian: Float[Q, "n 6 k"], mass: Float[Q, " m"], pull: Float[Q, "n 3"], rows: np.ndarray
+) -> Float[Q, " k"]:
+    force = -mass[:, None] * pull[rows]
+    return _pulled(jacobian[rows], force, 0 * force)
 
 
 def computed_torque(scene: Scene, state: State, acceleration: Numbers) -> Float[Array, " k"]:
@@ -109,8 +137,16 @@ def joint_reactions(
     given = jnp.zeros(shape) if wrenches is None else checked_array("wrenches", wrenches, shape)
     given = given.astype(dtype)
     scene.check_state(state)
+    return _jitted_reactions(scene, state, _checked_acceleration(scene, acceleration), given)
+
+
+@eqx.filter_jit
+def _jitted_reactions(
+    scene: Scene, state: State, acceleration: Float[Array, " k"], given: Float[Array, "n 6"]
+) -> Float[Array, "j 6"]:
+    layout, dtype = scene.layout, scene.timestep.dtype
     assert state.q is not None
-    force, torque, _, rows = _needed(scene, state, _checked_acceleration(scene, acceleration))
+    force, torque, _, rows = _needed(scene, state, acceleration)
     poses = place_links(scene.chains, state.position, state.orientation, state.q)
     turned = quat_rotate(poses.orientation[rows], torque)
     lacking = (-given).at[rows].add(jnp.concatenate([force, turned], axis=1))
@@ -165,10 +201,16 @@ def _masses(scene: Scene) -> tuple[Float[Array, " m"], Float[Array, "m 3 3"], np
     checked_kind("scene", scene, Scene)
     rows = np.array(scene.layout.moving, int)
     bodies = [scene.bodies[i] for i in rows]
-    dtype = scene.timestep.dtype
-    mass = jnp.stack([body.mass * body.mass_scale for body in bodies]).astype(dtype)
-    inertia = jnp.stack([body.inertia * body.mass_scale for body in bodies]).astype(dtype)
-    return mass, inertia, rows
+    numbers = [(body.mass, body.inertia, body.mass_scale) for body in bodies]
+    return *_scaled(numbers, scene.timestep), rows
+
+
+@by_numpy
+def _scaled(numbers: Sequence[tuple[Q, Q, Q]], timestep: Q) -> tuple[Float[Q, " m"], Float[Q, "m 3 3"]]:
+    """Masses and inertias times what they are multiplied with, in the dtype of the timestep."""
+    xp, dtype = library(timestep, *(x for each in numbers for x in each)), timestep.dtype
+    mass = xp.stack([mass * scale for mass, _, scale in numbers]).astype(dtype)
+    return mass, xp.stack([inertia * scale for _, inertia, scale in numbers]).astype(dtype)
 
 
 def _checked_acceleration(scene: Scene, acceleration: Numbers) -> Float[Array, " k"]:
@@ -195,8 +237,8 @@ def _needed(scene: Scene, state: State, acceleration: Float[Array, " k"]):
     return force, torque, jacobian, rows
 
 
-def _pulled(jacobian: Float[Array, "m 6 k"], force: Array, torque: Array) -> Float[Array, " k"]:
-    return einsum("mak,ma->k", jacobian, jnp.concatenate([force, torque], axis=1))
+def _pulled(jacobian: Float[Q, "m 6 k"], force: Q, torque: Q) -> Float[Q, " k"]:
+    return einsum("mak,ma->k", jacobian, library(force, torque).concatenate([force, torque], axis=1))
 
 
 def drifted(scene: Scene, state: State, share: Float[Array, ""]) -> State:

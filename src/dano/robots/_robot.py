@@ -12,10 +12,21 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_items, checked_kind
 from dano.contact import ContactParams
-from dano.maths import checked_array, checked_floating, is_traced, Numbers, quat_multiply, quat_rotate
+from dano.maths import (
+    by_numpy,
+    checked_array,
+    checked_floating,
+    is_traced,
+    library,
+    Numbers,
+    on_device,
+    Q,
+    quat_multiply,
+    quat_rotate,
+)
 from dano.names import did_you_mean
 from dano.robots.formats import Description, Drive, Keyframe
-from dano.scene import Body, Contact, Control, Joint, Loop, Scene, State
+from dano.scene import Body, Contact, Control, Frames, Joint, Loop, Scene, State
 
 
 @dataclass(frozen=True)
@@ -194,13 +205,10 @@ class Robot:
         bodies = {body.name: body for body in self.bodies}
         for name, place in self.places.items():
             place = frame.places[shown[name]] if name in shown else place
-            position, orientation = (jnp.asarray(x) for x in place)
-            arm = quat_rotate(orientation, bodies[name].com.astype(position.dtype))
-            given[name] = dict(position=position + arm, orientation=orientation)
-            if name in shown:
-                velocity, omega = (jnp.asarray(x) for x in frame.speeds[shown[name]])
-                spin = quat_rotate(orientation, omega)
-                given[name] |= dict(velocity=velocity + jnp.cross(spin, arm), omega=omega)
+            position, orientation = (np.asarray(x, bodies[name].com.dtype) for x in place)
+            given[name] = dict(orientation=orientation)
+            speeds = tuple(np.asarray(x) for x in frame.speeds[shown[name]]) if name in shown else None
+            given[name] |= _of_centre(bodies[name].com, position, orientation, speeds)
         return given
 
     def state(
@@ -320,17 +328,37 @@ class Robot:
                 f"link must be one of {list(self.frames)}, got {link!r}{did_you_mean(link, self.frames)}"
             )
         body, position, orientation = self.frames[link]
-        frames, dtype = scene.frames(state), scene.timestep.dtype
-        own = jnp.asarray(position, dtype), jnp.asarray(orientation, dtype)
+        dtype = scene.timestep.dtype
+        own = position.astype(dtype), orientation.astype(dtype)
         if body is None:
-            return *own, jnp.zeros((6, scene.layout.n_velocities), dtype)
+            return *map(on_device, own), jnp.zeros((6, scene.layout.n_velocities), dtype)
         i = scene.index(body)
-        q = frames.orientation[i]
-        arm = quat_rotate(q, own[0] - scene.bodies[i].centre_of_mass.astype(dtype))
-        spins = quat_rotate(q[None], frames.jacobian[i, 3:].T)
-        velocities = frames.jacobian[i, :3].T + jnp.cross(spins, arm[None])
-        jacobian = jnp.concatenate([velocities, spins], axis=1).T
-        return frames.position[i] + arm, quat_multiply(q, own[1]), jacobian
+        return _placed(scene.frames(state), scene.bodies[i].com, scene.bodies[i].com_offset, i, *own)
+
+
+@by_numpy
+def _of_centre(
+    com: Q, position: np.ndarray, orientation: np.ndarray, speeds: tuple[np.ndarray, np.ndarray] | None
+) -> dict[str, Q]:
+    """Where the centre of mass of a body is whose frame has a place, and how it moves."""
+    arm = quat_rotate(orientation, com)
+    if speeds is None:
+        return dict(position=position + arm)
+    velocity, omega = speeds
+    spin = quat_rotate(orientation, omega)
+    return dict(position=position + arm, velocity=velocity + library(arm).cross(spin, arm), omega=omega)
+
+
+@by_numpy
+def _placed(frames: Frames, com: Q, offset: Q, i: int, position: np.ndarray, orientation: np.ndarray):
+    """See `Robot.place`: of a frame in the field frame of body i."""
+    q = frames.orientation[i]
+    arm = quat_rotate(q, position - (com + offset).astype(position.dtype))
+    spins = quat_rotate(q[None], frames.jacobian[i, 3:].T)
+    xp = library(spins, arm)
+    velocities = frames.jacobian[i, :3].T + xp.cross(spins, arm[None])
+    jacobian = xp.concatenate([velocities, spins], axis=1).T
+    return frames.position[i] + arm, quat_multiply(q, orientation), jacobian
 
 
 def check_arguments(robot: Robot, scene: Scene, state: State) -> None:

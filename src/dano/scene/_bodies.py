@@ -8,9 +8,19 @@ from jaxtyping import Array, Float
 from dano.checks import checked_optional, checked_text
 from dano.contact import Collider, ContactParams, SampleSet, Support, SurfaceSet
 from dano.fields import AbstractField, AbstractShape, Ellipsoid, HalfSpace, SignedDistanceGrid, Sphere
-from dano.hosted import hosted
-from dano.maths import checked_array, floating, Numbers, quat_rotate, stacked
+from dano.maths import (
+    AnyArray,
+    by_numpy,
+    checked_array,
+    floating,
+    library,
+    Numbers,
+    Q,
+    quat_rotate,
+    stacked,
+)
 from dano.objects import checked_inertia, MassProperties, NeuralObject
+from dano.programs import keep_programs
 
 # Orientations over which the support of a body is sampled.
 ORIENTATIONS = 256
@@ -98,6 +108,7 @@ class Body(eqx.Module):
             ValueError: If the name is empty, the geometry is not a shape or object, or a mass property is
                 missing or out of range.
         """
+        keep_programs()
         self.name = checked_text("name", name)
         self.fixed = bool(fixed)
         self.material = checked_optional(f"material of body {name!r}", material, ContactParams)
@@ -216,7 +227,7 @@ class Body(eqx.Module):
         if isinstance(solid, SignedDistanceGrid):
             thickness = -float(np.min(np.asarray(solid.coefficients)))
         else:
-            thickness = 0.0 if solid is None else -float(_distance(solid, floating(middle)))
+            thickness = 0.0 if solid is None else -float(solid.sdf(floating(middle)))
         # The middle of a hollow solid is not a measure of its walls.
         thickness = thickness if thickness > 0 else 0.5 * float((upper - lower).min())
         radius = 0.5 * float(np.linalg.norm(upper - lower))
@@ -262,22 +273,15 @@ class Body(eqx.Module):
         return normal, float(self.shape.offset) + float(normal @ origin)
 
 
-@hosted
-def _over_mean(density: Float[Array, " n"]) -> Float[Array, ""]:
-    return 1 / jnp.mean(density)
+@by_numpy
+def _over_mean(density: Float[Q, " n"]) -> Float[AnyArray, ""]:
+    return 1 / library(density).mean(density)
 
 
-@hosted
-def _shared(
-    inertia: Float[Array, "3 3"], own: Float[Array, ""], mass: Float[Array, ""]
-) -> Float[Array, "3 3"]:
+@by_numpy
+def _shared(inertia: Float[Q, "3 3"], own: Float[Q, ""], mass: Float[Q, ""]) -> Float[Q, "3 3"]:
     """Inertia of a body with another mass than its own."""
     return inertia * (mass / own)
-
-
-@hosted
-def _distance(shape: AbstractShape, x: Float[Array, "3"]) -> Float[Array, ""]:
-    return shape.sdf(x)
 
 
 def _directions(n: int) -> np.ndarray:

@@ -7,7 +7,16 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from dano.checks import shown
-from dano.maths import checked_array, checked_quaternion, Numbers, quat_rotate, stacked
+from dano.maths import (
+    by_numpy,
+    checked_array,
+    checked_quaternion,
+    library,
+    Numbers,
+    Q,
+    quat_rotate,
+    stacked,
+)
 from dano.scene._bodies import Body
 from dano.scene._joints import Joint, Layout
 from dano.scene._states import JOINT_QUANTITIES, STATE_SIZES
@@ -69,11 +78,16 @@ def state_arrays(
             row[key] = check.astype(dtype)
         if _ORIGIN in numbers:
             origin = checked_array(f"origin of {body.name!r}", numbers[_ORIGIN], (3,)).astype(dtype)
-            com = body.centre_of_mass.astype(dtype)
-            row["position"] = origin + quat_rotate(row["orientation"], com)
+            row["position"] = _centre(origin, row["orientation"], body.com, body.com_offset)
         for key, value in row.items():
             rows[key].append(value)
     return {key: stacked(values) for key, values in rows.items()}
+
+
+@by_numpy
+def _centre(origin: Q, orientation: Q, com: Q, offset: Q) -> Q:
+    """Where the centre of mass is of a body whose field frame has an origin [m, W]."""
+    return origin + quat_rotate(orientation, (com + offset).astype(origin.dtype))
 
 
 def control_arrays(
@@ -98,7 +112,7 @@ def control_arrays(
         for key, values in rows.items():
             value = checked_array(f"{key} of {body.name!r}", numbers.get(key, (0.0,) * 3), (3,))
             values.append(value.astype(dtype))
-    return {key: jnp.stack(values) for key, values in rows.items()}
+    return {key: stacked(values) for key, values in rows.items()}
 
 
 def joint_arrays(
@@ -114,11 +128,15 @@ def joint_arrays(
     def numbers(key: str, name: str, width: int) -> Array:
         shape = () if width == 1 else (width,)
         value = given.get(name, {}).get(key, 0.0 if width == 1 else (0.0,) * width)
-        return jnp.atleast_1d(checked_array(f"{key} of {name!r}", value, shape)).astype(dtype)
+        return checked_array(f"{key} of {name!r}", value, shape).astype(dtype)
 
-    return {
-        key: jnp.concatenate([numbers(key, *name) for name in names] or [jnp.zeros(0, dtype)]) for key in keys
-    }
+    none = [jnp.zeros(0, dtype)]
+    return {key: _joined([numbers(key, *name) for name in names] or none) for key in keys}
+
+
+@by_numpy
+def _joined(parts: Sequence[Float[Q, "..."]]) -> Float[Q, " k"]:
+    return library(*parts).concatenate([x.reshape(-1) for x in parts])
 
 
 def _numbers(what: str, name: str, given: ByName) -> Mapping[str, Numbers]:

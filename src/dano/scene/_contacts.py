@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -21,8 +20,7 @@ from dano.contact import (
     SurfaceSet,
 )
 from dano.fields import AbstractShape, HalfSpace, PosedShape, Sphere
-from dano.hosted import hosted
-from dano.maths import floating, Numbers
+from dano.maths import AnyArray, by_numpy, floating, library, Numbers, Q
 from dano.objects import draw_contact_samples, NeuralObject, surface_quadrature
 from dano.scene._bodies import Body
 from dano.scene._states import State
@@ -191,19 +189,18 @@ def _none(x: Any) -> bool:
 
 def heaviest(bodies: Sequence[Body], gravity: Float[Array, "3"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Weight of the heaviest body [N], and the strength of gravity that it is taken with [m/s²]."""
-    return _heaviest([(body.mass, body.mass_scale) for body in bodies if not body.fixed], gravity)
+    masses = [(body.mass, body.mass_scale) for body in bodies if not body.fixed]
+    return _heaviest(masses, gravity)
 
 
-@hosted
-def _heaviest(
-    masses: list[tuple[Float[Array, ""], Float[Array, ""]]], gravity: Float[Array, "3"]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+@by_numpy
+def _heaviest(masses: list[tuple[Q, Q]], gravity: Float[Q, "3"]) -> tuple[AnyArray, AnyArray]:
     """See `heaviest`; of masses and what they are multiplied with."""
-    strength = jnp.sqrt(jnp.sum(gravity**2))
-    strength = jnp.where(strength > 0, strength, STANDARD_GRAVITY)
-    return functools.reduce(
-        jnp.maximum, [mass * scale for mass, scale in masses], floating(0.0)
-    ) * strength, strength
+    xp = library(gravity, *(x for each in masses for x in each))
+    strength = xp.sqrt(xp.sum(gravity**2))
+    strength = xp.where(strength > 0, strength, STANDARD_GRAVITY)
+    most = functools.reduce(xp.maximum, [mass * scale for mass, scale in masses], xp.zeros((), gravity.dtype))
+    return most * strength, strength
 
 
 def _needs_samples(a: Body, b: Body) -> bool:
@@ -270,8 +267,8 @@ def _stiffness(
     return _quotient(weight, floating(least))
 
 
-@hosted
-def _quotient(x: Float[Array, ""], y: Float[Array, ""]) -> Float[Array, ""]:
+@by_numpy
+def _quotient(x: Float[AnyArray, ""], y: Float[AnyArray, ""]) -> Float[AnyArray, ""]:
     return x / y.astype(x.dtype)
 
 

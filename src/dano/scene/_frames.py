@@ -1,8 +1,7 @@
 """Where the bodies of trees are: forward kinematics, Jacobians, and states from joint coordinates."""
 
-import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,16 +9,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.maths import einsum, product, quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
+from dano.maths import (
+    AnyArray,
+    einsum,
+    library,
+    product,
+    quat_conjugate,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+    quat_rotate,
+    with_rows,
+)
 from dano.scene._joint_laws import joint_laws, JointLaws
 from dano.scene._joints import Joint, Layout
-from dano.scene._states import State
+from dano.scene._states import State, STATE_SIZES
 
 RESOLVED = 0.5
 """h |ω|/2 up to which a step resolves how a body spins: a turn of 60°."""
 # Trees of so many joints are placed by a loop over their levels, which compiles several times faster than
 # levels one after the other, and runs a little slower.
-_MANY_JOINTS = 16
+_MANY_JOINTS = 4
 
 
 class Frames(eqx.Module):
@@ -57,14 +67,14 @@ class Chains(eqx.Module):
     """
 
     layout: Layout = eqx.field(static=True)
-    axis: Float[Array, "j 3"]
-    anchor: Float[Array, "j 3"]
-    position: Float[Array, "j 3"]
-    orientation: Float[Array, "j 4"]
-    ratio: Float[Array, " j"]
-    shift: Float[Array, " j"]
+    axis: Float[AnyArray, "j 3"]
+    anchor: Float[AnyArray, "j 3"]
+    position: Float[AnyArray, "j 3"]
+    orientation: Float[AnyArray, "j 4"]
+    ratio: Float[AnyArray, " j"]
+    shift: Float[AnyArray, " j"]
     laws: JointLaws
-    com: Float[Array, "n 3"]
+    com: Float[AnyArray, "n 3"]
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -72,14 +82,17 @@ class Chains(eqx.Module):
         return self.layout.kinds
 
     @property
-    def table(self) -> Float[Array, "j 15"]:
+    def table(self) -> Float[AnyArray, "j 15"]:
         """Axis, anchor, position, orientation, ratio and shift of each joint."""
         parts = (self.axis, self.anchor, self.position, self.orientation)
-        return jnp.concatenate([*parts, self.ratio[:, None], self.shift[:, None]], axis=1)
+        return library(*parts).concatenate([*parts, self.ratio[:, None], self.shift[:, None]], axis=1)
 
     def mass_matrix(
-        self, jacobian: Float[Array, "m 6 k"], mass: Float[Array, " m"], inertia: Float[Array, "m 3 3"]
-    ) -> Float[Array, "k k"]:
+        self,
+        jacobian: Float[AnyArray, "m 6 k"],
+        mass: Float[AnyArray, " m"],
+        inertia: Float[AnyArray, "m 3 3"],
+    ) -> Float[AnyArray, "k k"]:
         """Generalised mass, armature of joints included.
 
         Args:
@@ -95,7 +108,7 @@ class Chains(eqx.Module):
         if armature is None:
             return whole
         places = np.arange(whole.shape[0] - armature.shape[0], whole.shape[0])
-        return whole.at[places, places].add(armature)
+        return with_rows(whole, (places, places), whole[places, places] + armature)
 
 
 class Poses(NamedTuple):
@@ -108,25 +121,27 @@ class Poses(NamedTuple):
         pivot: A point on it [m, W], shape (j, 3).
     """
 
-    position: Float[Array, "n 3"]
-    orientation: Float[Array, "n 4"]
-    axis: Float[Array, "j 3"]
-    pivot: Float[Array, "j 3"]
+    position: Float[AnyArray, "n 3"]
+    orientation: Float[AnyArray, "n 4"]
+    axis: Float[AnyArray, "j 3"]
+    pivot: Float[AnyArray, "j 3"]
 
 
-def chains_of(layout: Layout, joints: Sequence[Joint], com: Float[Array, "n 3"]) -> Chains:
+def chains_of(layout: Layout, joints: Sequence[Joint], com: Float[AnyArray, "n 3"]) -> Chains:
     """The trees of a scene, in the dtype of the centres of mass [m, F]."""
     names = {"axis": 3, "anchor": 3, "position": 3, "orientation": 4}
+    xp = library(com, *jax.tree.leaves(joints))
+    rows = {name: [getattr(joint, name).astype(com.dtype) for joint in joints] for name in names}
     arrays = {
-        name: jnp.stack([getattr(joint, name) for joint in joints]) if joints else jnp.zeros((0, size))
+        name: xp.stack(rows[name]) if joints else xp.zeros((0, size), com.dtype)
         for name, size in names.items()
     }
     for name, usual in (("ratio", 1.0), ("shift", 0.0)):
-        given = [getattr(joint, name) if joint.mimics else jnp.asarray(usual) for joint in joints]
-        arrays[name] = jnp.stack([x.astype(com.dtype) for x in given]) if joints else jnp.zeros(0)
+        given = [getattr(joint, name) if joint.mimics else np.asarray(usual) for joint in joints]
+        arrays[name] = xp.stack([x.astype(com.dtype) for x in given]) if joints else xp.zeros(0, com.dtype)
     return Chains(
         layout,
-        **{name: x.astype(com.dtype) for name, x in arrays.items()},
+        **arrays,
         laws=joint_laws(layout, joints, com.dtype),
         com=com,
     )
@@ -145,9 +160,9 @@ def triples(places: np.ndarray) -> np.ndarray:
 
 def place_links(
     chains: Chains,
-    position: Float[Array, "n 3"],
-    orientation: Float[Array, "n 4"],
-    q: Float[Array, " k"],
+    position: Float[AnyArray, "n 3"],
+    orientation: Float[AnyArray, "n 4"],
+    q: Float[AnyArray, " k"],
 ) -> Poses:
     """Poses of all bodies from those of the roots and the joint coordinates.
 
@@ -157,38 +172,45 @@ def place_links(
         orientation: wxyz; the same.
         q: Joint coordinates [rad or m].
     """
-    layout = chains.layout
+    layout, xp = chains.layout, library(q, position, orientation, chains.axis, chains.com)
     turns = np.array([kind == "hinge" for kind in chains.kinds], bool)
     moves = np.array([kind == "slide" for kind in chains.kinds], bool)
     # A weld reads some coordinate and counts it zero times.
-    value = q[np.maximum(layout.coordinates, 0)] if layout.n_joints else jnp.zeros(len(turns), q.dtype)
+    value = q[np.maximum(layout.coordinates, 0)] if layout.n_joints else xp.zeros(len(turns), q.dtype)
     if any(layout.follows):
         value = chains.ratio * value + chains.shift
-    turn = jnp.where(turns, value, 0)[:, None] * chains.axis
-    path = jnp.where(moves, value, 0)[:, None] * chains.axis
+    turn = xp.where(turns, value, 0)[:, None] * chains.axis
+    path = xp.where(moves, value, 0)[:, None] * chains.axis
     balls, first = joints_of(layout, "ball")
     if balls.size:
-        turn = turn.at[balls].set(q[triples(first)])
+        turn = with_rows(turn, balls, q[triples(first)])
     planes, first = joints_of(layout, "planar")
     if planes.size:
         own = q[triples(first)]
-        turn = turn.at[planes].set(own[:, 2:] * chains.axis[planes])
-        path = path.at[planes].set(einsum("ma,mab->mb", own[:, :2], plane_axes(chains.axis[planes])))
+        turn = with_rows(turn, planes, own[:, 2:] * chains.axis[planes])
+        way = einsum("ma,mab->mb", own[:, :2], plane_axes(chains.axis[planes]))
+        path = with_rows(path, planes, way)
     # The world is the last row.
-    origin = jnp.concatenate([position - quat_rotate(orientation, chains.com), jnp.zeros((1, 3), q.dtype)])
-    turned = jnp.concatenate([orientation, jnp.array([[1.0, 0.0, 0.0, 0.0]], q.dtype)])
-    spots = jnp.zeros_like(chains.axis), jnp.zeros_like(chains.axis)
+    origin = xp.concatenate([position - quat_rotate(orientation, chains.com), xp.zeros((1, 3), q.dtype)])
+    turned = xp.concatenate([orientation, xp.array([[1.0, 0.0, 0.0, 0.0]], q.dtype)])
+    spots = xp.zeros_like(chains.axis), xp.zeros_like(chains.axis)
     origin, turned, axis, pivot = _descended(chains, origin, turned, turn, path, *spots)
     turned = turned[:-1]
     placed = origin[:-1] + quat_rotate(turned, chains.com)
     # Bodies that hang on nothing stay where they are to the last digit.
     roots = np.array([i not in layout.children for i in range(layout.bodies)])[:, None]
-    return Poses(jnp.where(roots, position, placed), turned, axis, pivot)
+    return Poses(xp.where(roots, position, placed), turned, axis, pivot)
 
 
 def _descended(
-    chains: Chains, origin: Array, turned: Array, turn: Array, path: Array, axis: Array, pivot: Array
-) -> tuple[Array, Array, Array, Array]:
+    chains: Chains,
+    origin: AnyArray,
+    turned: AnyArray,
+    turn: AnyArray,
+    path: AnyArray,
+    axis: AnyArray,
+    pivot: AnyArray,
+) -> tuple[Any, Any, Any, Any]:
     """Places of bodies, and axes and pivots of joints, level by level from the roots on.
 
     Args:
@@ -202,6 +224,13 @@ def _descended(
     """
     layout = chains.layout
     parents, children = np.array(layout.parents), np.array(layout.children)
+
+    by_numpy = library(origin, turned, turn, path) is np
+
+    def put(x, rows, values):
+        if by_numpy:
+            return with_rows(x, rows, values)
+        return x.at[rows].set(values, mode="drop", unique_indices=True)
 
     def level(carry, given):
         origin, turned, axis, pivot = carry
@@ -217,16 +246,21 @@ def _descended(
             + quat_rotate(rest, path[rows])
         )
         base = point - quat_rotate(child, chains.anchor[rows])
-        put = {"mode": "drop", "unique_indices": True}
-        origin, turned = origin.at[bodies].set(base, **put), turned.at[bodies].set(child, **put)
-        return (origin, turned, axis.at[joints].set(along, **put), pivot.at[joints].set(point, **put)), None
+        return (
+            put(origin, bodies, base),
+            put(turned, bodies, child),
+            put(axis, joints, along),
+            put(pivot, joints, point),
+        ), None
 
     carry = origin, turned, axis, pivot
     levels = [np.array(rows) for rows in layout.levels]
-    if len(children) < _MANY_JOINTS:
+    if by_numpy or len(children) < _MANY_JOINTS:
         for rows in levels:
             carry, _ = level(carry, (rows, parents[rows], rows, children[rows]))
         return carry
+    # Their numbers of joints are traced in a loop, and NumPy's arrays take no such indices.
+    chains = jax.tree.map(jnp.asarray, chains)
     # Narrow levels do their first joint several times, and drop it: nothing has such rows.
     widest = max(len(rows) for rows in levels)
     spare = [np.arange(widest - len(rows)) for rows in levels]
@@ -237,39 +271,41 @@ def _descended(
     return jax.lax.scan(level, carry, (even, parents[even], joints, bodies))[0]
 
 
-def link_jacobian(chains: Chains, poses: Poses) -> Float[Array, "n 6 k"]:
+def link_jacobian(chains: Chains, poses: Poses) -> Float[AnyArray, "n 6 k"]:
     """Twists (velocity of the centre of mass, spin; W) of all bodies per generalised velocity.
 
     Generalised velocities are velocity and spin of the bodies that move freely, both in W, and those of the
     joints.
     """
     layout, dtype = chains.layout, poses.position.dtype
+    xp = library(*poses, chains.axis, chains.ratio)
     n, f = layout.bodies, len(layout.free)
     eye = np.eye(3, dtype=dtype)
-    roots = jnp.zeros((n, 6, f, 6), dtype)
+    roots = xp.zeros((n, 6, f, 6), dtype)
     standing = [(i, r) for i, r in enumerate(layout.roots) if r >= 0]
     if standing:
         bodies, places = (np.array(column) for column in zip(*standing, strict=True))
         arm = poses.position[bodies] - poses.position[np.array(layout.free)[places]]
-        roots = roots.at[bodies, :3, places, :3].set(eye)
-        roots = roots.at[bodies, 3:, places, 3:].set(eye)
+        velocity, spin = slice(None, 3), slice(3, None)
+        roots = with_rows(roots, (bodies, velocity, places, velocity), eye)
+        roots = with_rows(roots, (bodies, spin, places, spin), eye)
         # v = v₀ + ω₀ × arm
-        crossed = jnp.cross(jnp.asarray(eye, dtype)[None], arm[:, None])
-        roots = roots.at[bodies, :3, places, 3:].set(crossed.transpose(0, 2, 1))
+        crossed = xp.cross(xp.asarray(eye)[None], arm[:, None])
+        roots = with_rows(roots, (bodies, velocity, places, spin), crossed.transpose(0, 2, 1))
     rows = np.array([j for j, _, _ in layout.dofs], int)
     turns = np.array([_turns(layout, j, part) for j, part, _ in layout.dofs], bool)[None, :, None]
     moved = np.array(layout.moved_by, bool).reshape(n, len(rows), 1)
     axis = _directions(chains, poses)[None]
     levers = poses.position[:, None] - poses.pivot[rows][None]
-    linear = jnp.where(turns, jnp.cross(axis, levers), axis)
-    columns = jnp.concatenate([jnp.where(moved, linear, 0), jnp.where(moved & turns, axis, 0)], axis=2)
+    linear = xp.where(turns, xp.cross(axis, levers), axis)
+    columns = xp.concatenate([xp.where(moved, linear, 0), xp.where(moved & turns, axis, 0)], axis=2)
     if any(layout.follows):
         # What a coordinate moves by itself, and what moves with it.
         places = np.array([place for _, _, place in layout.dofs])
-        share = jnp.zeros((len(rows), layout.n_joints), dtype)
-        share = share.at[np.arange(len(rows)), places].set(chains.ratio[rows])
+        share = xp.zeros((len(rows), layout.n_joints), dtype)
+        share = with_rows(share, (np.arange(len(rows)), places), chains.ratio[rows])
         columns = einsum("nda,dk->nka", columns, share)
-    return jnp.concatenate([roots.reshape(n, 6, 6 * f), columns.transpose(0, 2, 1)], axis=2)
+    return xp.concatenate([roots.reshape(n, 6, 6 * f), columns.transpose(0, 2, 1)], axis=2)
 
 
 def _turns(layout: Layout, joint: int, part: int) -> bool:
@@ -277,7 +313,7 @@ def _turns(layout: Layout, joint: int, part: int) -> bool:
     return kind in ("hinge", "ball") or (kind == "planar" and part == 2)
 
 
-def _directions(chains: Chains, poses: Poses) -> Float[Array, "d 3"]:
+def _directions(chains: Chains, poses: Poses) -> Float[AnyArray, "d 3"]:
     """Axis of each motion of the joints [W]."""
     layout = chains.layout
     directions = poses.axis[np.array([j for j, _, _ in layout.dofs], int)]
@@ -285,48 +321,49 @@ def _directions(chains: Chains, poses: Poses) -> Float[Array, "d 3"]:
     # A ball turns about the axes of its child.
     for j in joints_of(layout, "ball")[0]:
         q = poses.orientation[layout.children[j]]
-        axes = quat_rotate(q[None], jnp.eye(3, dtype=q.dtype))
-        directions = directions.at[np.array([index[j, part] for part in range(3)])].set(axes)
+        axes = quat_rotate(q[None], np.eye(3, dtype=q.dtype))
+        directions = with_rows(directions, np.array([index[j, part] for part in range(3)]), axes)
     for j in joints_of(layout, "planar")[0]:
         parent = layout.parents[j]
         rest = chains.orientation[j]
         if parent < layout.bodies:
             rest = quat_multiply(poses.orientation[parent], rest)
         axes = quat_rotate(rest[None], plane_axes(chains.axis[np.array([j])])[0])
-        directions = directions.at[np.array([index[j, part] for part in range(2)])].set(axes)
+        directions = with_rows(directions, np.array([index[j, part] for part in range(2)]), axes)
     return directions
 
 
-def plane_axes(axis: Float[Array, "m 3"]) -> Float[Array, "m 2 3"]:
+def plane_axes(axis: Float[AnyArray, "m 3"]) -> Float[AnyArray, "m 2 3"]:
     """The two directions along which the lengths of planar joints are measured, from their axes."""
-    eye = jnp.eye(3, dtype=axis.dtype)
-    start = jnp.where((jnp.abs(axis[:, 0]) < 0.99)[:, None], eye[:1], eye[1:2])
-    first = start - jnp.sum(axis * start, axis=1, keepdims=True) * axis
-    first = first / jnp.sqrt(jnp.sum(first * first, axis=1, keepdims=True))
-    return jnp.stack([first, jnp.cross(axis, first)], axis=1)
+    eye, xp = np.eye(3, dtype=axis.dtype), library(axis)
+    start = xp.where((xp.abs(axis[:, 0]) < 0.99)[:, None], eye[:1], eye[1:2])
+    first = start - xp.sum(axis * start, axis=1, keepdims=True) * axis
+    first = first / xp.sqrt(xp.sum(first * first, axis=1, keepdims=True))
+    return xp.stack([first, xp.cross(axis, first)], axis=1)
 
 
 def step_twists(
-    before: tuple[Float[Array, "*n 3"], Float[Array, "*n 4"]],
-    after: tuple[Float[Array, "*n 3"], Float[Array, "*n 4"]],
-    h: Float[Array, ""],
-) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 3"]]:
+    before: tuple[Float[AnyArray, "*n 3"], Float[AnyArray, "*n 4"]],
+    after: tuple[Float[AnyArray, "*n 3"], Float[AnyArray, "*n 4"]],
+    h: Float[AnyArray, ""],
+) -> tuple[Float[AnyArray, "*n 3"], Float[AnyArray, "*n 3"]]:
     """Velocity [m/s, W] and spin [rad/s, B] with which a step of length h leads from a pose to another.
 
     They are what `dano.step` calls velocity and omega: x⁺ = x + h v and q⁺ = q ⊗ (cos a, sin a ω/|ω|), where
     h |ω|/2 is sin a up to `RESOLVED`, and grows like a from there. Turns are at most 180°.
     """
+    xp = library(*before, *after, h)
     velocity = (after[0] - before[0]) / h
     turn = quat_multiply(quat_conjugate(before[1]), after[1])
-    sine = jnp.where(turn[..., :1] < 0, -1, 1) * turn[..., 1:]
-    squared = jnp.sum(sine * sine, axis=-1, keepdims=True)
+    sine = xp.where(turn[..., :1] < 0, -1, 1) * turn[..., 1:]
+    squared = xp.sum(sine * sine, axis=-1, keepdims=True)
     fast = squared > RESOLVED**2
-    size = jnp.sqrt(jnp.where(fast, squared, 1))
-    angle = jnp.arctan2(size, jnp.abs(turn[..., :1]))
-    return velocity, 2 / h * jnp.where(fast, (RESOLVED - float(np.arcsin(RESOLVED)) + angle) / size, 1) * sine
+    size = xp.sqrt(xp.where(fast, squared, 1))
+    angle = xp.arctan2(size, xp.abs(turn[..., :1]))
+    return velocity, 2 / h * xp.where(fast, (RESOLVED - float(np.arcsin(RESOLVED)) + angle) / size, 1) * sine
 
 
-def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:
+def filled(chains: Chains, state: State, h: Float[AnyArray, ""]) -> State:
     """The state with poses and velocities of bodies on joints as the joint coordinates say.
 
     Velocities are those of the step of length h that ends at the state, as everywhere: see `dano.step`.
@@ -338,16 +375,15 @@ def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:
     rows = np.array(layout.children)
     now = place_links(chains, state.position, state.orientation, state.q)
     # Where the roots were a step before.
-    moves = np.zeros((layout.bodies, 1))
+    moves = np.zeros((layout.bodies, 1), h.dtype)
     moves[list(layout.free)] = 1
-    moves = jnp.asarray(moves, h.dtype)
     back = _step_turn(-moves * state.omega, h)
     q = state.q - h * state.v
     _, first = joints_of(layout, "ball")
     if first.size:
         places = triples(first)
         turned = quat_multiply(quat_exp(state.q[places]), _step_turn(-state.v[places], h))
-        q = q.at[places].set(quat_log(turned))
+        q = with_rows(q, places, quat_log(turned))
     earlier = place_links(
         chains,
         state.position - h * moves * state.velocity,
@@ -355,42 +391,42 @@ def filled(chains: Chains, state: State, h: Float[Array, ""]) -> State:
         q,
     )
     velocity, omega = step_twists(earlier[:2], now[:2], h)
-    return dataclasses.replace(
+    found = {**now._asdict(), "velocity": velocity, "omega": omega}
+    return eqx.tree_at(
+        lambda state: [getattr(state, name) for name in STATE_SIZES],
         state,
-        position=state.position.at[rows].set(now.position[rows]),
-        orientation=state.orientation.at[rows].set(now.orientation[rows]),
-        velocity=state.velocity.at[rows].set(velocity[rows]),
-        omega=state.omega.at[rows].set(omega[rows]),
+        [with_rows(getattr(state, name), rows, found[name][rows]) for name in STATE_SIZES],
     )
 
 
-def _step_turn(omega: Float[Array, "*n 3"], h: Float[Array, ""]) -> Float[Array, "*n 4"]:
+def _step_turn(omega: Float[AnyArray, "*n 3"], h: Float[AnyArray, ""]) -> Float[AnyArray, "*n 4"]:
     """The turn [cos a, sin a ω/|ω|] of a step with a spin, in the frame of the spin.
 
     Sin a is x = h |ω|/2 up to `RESOLVED`; from there a grows like x.
     """
-    squared = 0.25 * h**2 * jnp.sum(omega * omega, axis=-1, keepdims=True)
+    xp = library(omega, h)
+    squared = 0.25 * h**2 * xp.sum(omega * omega, axis=-1, keepdims=True)
     fast = squared > RESOLVED**2
-    root = jnp.sqrt(1 - jnp.where(fast, RESOLVED**2, squared))
-    x = jnp.sqrt(jnp.where(fast, squared, 1))
+    root = xp.sqrt(1 - xp.where(fast, RESOLVED**2, squared))
+    x = xp.sqrt(xp.where(fast, squared, 1))
     angle = x + (float(np.arcsin(RESOLVED)) - RESOLVED)
-    cosine, share = jnp.where(fast, jnp.cos(angle), root), jnp.where(fast, jnp.sin(angle) / x, 1)
-    return jnp.concatenate([cosine, share * (0.5 * h * omega)], axis=-1)
+    cosine, share = xp.where(fast, xp.cos(angle), root), xp.where(fast, xp.sin(angle) / x, 1)
+    return xp.concatenate([cosine, share * (0.5 * h * omega)], axis=-1)
 
 
-def joint_values(chains: Chains, state: State) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+def joint_values(chains: Chains, state: State) -> tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]:
     """Coordinates q and velocities v of the joints from the poses and velocities of bodies.
 
     Angles are between −π and π. What the joints do not allow is left out: a hinge turns by the part of a
     rotation about its axis.
     """
-    layout = chains.layout
+    layout, xp = chains.layout, library(state.position, chains.axis, chains.com)
     rows = np.array(layout.with_coordinates, int)
     parents, children = np.array(layout.parents, int)[rows], np.array(layout.children, int)[rows]
     dtype = state.position.dtype
 
     def with_world(x, world):
-        return jnp.concatenate([x, jnp.asarray([world], dtype)])
+        return xp.concatenate([x, xp.asarray([world], dtype)])
 
     turned = with_world(state.orientation, [1.0, 0.0, 0.0, 0.0])
     origin = with_world(state.position - quat_rotate(state.orientation, chains.com), [0.0] * 3)
@@ -400,52 +436,54 @@ def joint_values(chains: Chains, state: State) -> tuple[Float[Array, " k"], Floa
     axis, anchor = chains.axis[rows], chains.anchor[rows]
     rest = quat_multiply(turned[parents], chains.orientation[rows])
     relative = quat_multiply(quat_conjugate(rest), turned[children])
-    angle = 2 * jnp.arctan2(jnp.sum(axis * relative[:, 1:], axis=1), relative[:, 0])
-    angle = jnp.where(angle > np.pi, angle - 2 * np.pi, jnp.where(angle < -np.pi, angle + 2 * np.pi, angle))
+    angle = 2 * xp.arctan2(xp.sum(axis * relative[:, 1:], axis=1), relative[:, 0])
+    angle = xp.where(angle > np.pi, angle - 2 * np.pi, xp.where(angle < -np.pi, angle + 2 * np.pi, angle))
     point = origin[children] + quat_rotate(turned[children], anchor)
     stands = origin[parents] + quat_rotate(turned[parents], chains.position[rows]) + quat_rotate(rest, anchor)
     along = quat_rotate(rest, axis)
     way = point - stands
-    speeds = [velocity[body] + jnp.cross(spin[body], point - centre[body]) for body in (children, parents)]
+    speeds = [velocity[body] + xp.cross(spin[body], point - centre[body]) for body in (children, parents)]
     turning, moving = spin[children] - spin[parents], speeds[0] - speeds[1]
     turns = np.array([chains.kinds[j] != "slide" for j in rows], bool)
-    q = jnp.where(turns, angle, jnp.sum(along * way, axis=1))
-    v = jnp.where(turns, jnp.sum(along * turning, axis=1), jnp.sum(along * moving, axis=1))
+    q = xp.where(turns, angle, xp.sum(along * way, axis=1))
+    v = xp.where(turns, xp.sum(along * turning, axis=1), xp.sum(along * moving, axis=1))
     _, first = joints_of(layout, "ball")
     if first.size:
-        q = q.at[triples(first)].set(quat_log(relative[first]))
+        q = with_rows(q, triples(first), quat_log(relative[first]))
         own = quat_rotate(quat_conjugate(turned[children[first]]), turning[first])
-        v = v.at[triples(first)].set(own)
+        v = with_rows(v, triples(first), own)
     planes, first = joints_of(layout, "planar")
     if first.size:
         axes = quat_rotate(rest[first][:, None], plane_axes(chains.axis[planes]))
         places = triples(first)[:, :2]
-        q = q.at[places].set(einsum("mab,mb->ma", axes, way[first]))
-        v = v.at[places].set(einsum("mab,mb->ma", axes, moving[first]))
+        q = with_rows(q, places, einsum("mab,mb->ma", axes, way[first]))
+        v = with_rows(v, places, einsum("mab,mb->ma", axes, moving[first]))
     return q, v
 
 
-def frames_of(chains: Chains, state: State) -> Frames:
-    """Pose, twist and Jacobian of every body, see `Scene.frames`."""
+def frames_of(chains: Chains, state: State) -> tuple[Any, ...]:
+    """The arrays of the `Frames` of every body, see `Scene.frames`."""
     layout, dtype = chains.layout, state.position.dtype
+    xp = library(state.position, state.orientation, state.velocity, state.omega, chains.axis, chains.com)
     if layout.children:
         assert state.q is not None
         poses = place_links(chains, state.position, state.orientation, state.q)
     else:
-        none = jnp.zeros((0, 3), dtype)
+        none = xp.zeros((0, 3), dtype)
         poses = Poses(state.position, state.orientation, none, none)
     jacobian = link_jacobian(chains, poses)
     free = np.array(layout.free, int)
     # Spins of free bodies are given in B, all spins are returned in B.
     own = quat_rotate(quat_conjugate(poses.orientation)[:, None], jacobian[:, 3:].transpose(0, 2, 1))
-    jacobian = jnp.concatenate([jacobian[:, :3], own.transpose(0, 2, 1)], axis=1)
+    jacobian = xp.concatenate([jacobian[:, :3], own.transpose(0, 2, 1)], axis=1)
     for place, i in enumerate(layout.free):
         columns = slice(6 * place + 3, 6 * place + 6)
         # Columns are images of the world's axes; those of the body's are their combinations.
-        axes = quat_rotate(poses.orientation[i][None], jnp.eye(3, dtype=dtype)).T
-        jacobian = jacobian.at[:, :, columns].set(product(jacobian[:, :, columns], axes))
-    speeds = jnp.concatenate([state.velocity[free], state.omega[free]], axis=1).ravel()
+        axes = quat_rotate(poses.orientation[i][None], np.eye(3, dtype=dtype)).T
+        turned = product(jacobian[:, :, columns], axes)
+        jacobian = with_rows(jacobian, (slice(None), slice(None), columns), turned)
+    speeds = xp.concatenate([state.velocity[free], state.omega[free]], axis=1).ravel()
     if state.v is not None:
-        speeds = jnp.concatenate([speeds, state.v])
+        speeds = xp.concatenate([speeds, state.v])
     twists = product(jacobian, speeds)
-    return Frames(poses.position, poses.orientation, twists[:, :3], twists[:, 3:], jacobian)
+    return poses.position, poses.orientation, twists[:, :3], twists[:, 3:], jacobian

@@ -1,12 +1,14 @@
 """What acts on joint coordinates, as arrays over them: springs, friction, limits, motors."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from dano.maths import AnyArray, library, with_rows
 from dano.scene._joints import Joint, Layout
 
 
@@ -29,39 +31,39 @@ class JointLaws(eqx.Module):
         rough: Coordinates with limits, friction, or a motor that heeds the joint (static).
     """
 
-    damping: Float[Array, " k"]
-    armature: Float[Array, " k"] | None
-    stiffness: Float[Array, " k"] | None
-    rest: Float[Array, " k"]
-    friction: Float[Array, " k"] | None
-    limits: Float[Array, "k 2"] | None
-    motor: Float[Array, "k 5"] | None
+    damping: Float[AnyArray, " k"]
+    armature: Float[AnyArray, " k"] | None
+    stiffness: Float[AnyArray, " k"] | None
+    rest: Float[AnyArray, " k"]
+    friction: Float[AnyArray, " k"] | None
+    limits: Float[AnyArray, "k 2"] | None
+    motor: Float[AnyArray, "k 5"] | None
     constant: tuple[bool, ...] = eqx.field(static=True)
     rough: tuple[int, ...] = eqx.field(static=True)
 
 
 def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
     """The laws of the joints of a scene."""
-    owners = [joints[j] for j in layout.with_coordinates]
+    owners, xp = [joints[j] for j in layout.with_coordinates], library(*jax.tree.leaves(joints))
 
-    def summed(name: str, power: Callable[[Array], Array]) -> Float[Array, " k"]:
-        values = jnp.zeros(layout.n_joints, dtype)
+    def summed(name: str, power: Callable[[Any], Any]) -> Float[AnyArray, " k"]:
+        values = xp.zeros(layout.n_joints, dtype)
         for j, _, place in layout.dofs:
             value = getattr(joints[j], name)
             if value is not None:
-                share = power(joints[j].ratio) if layout.follows[j] else jnp.ones_like(value)
-                values = values.at[place].add((share * value).astype(dtype))
+                share = power(joints[j].ratio) if layout.follows[j] else 1
+                values = with_rows(values, place, values[place] + xp.asarray(share * value, dtype))
         return values
 
-    def of_some(name: str, power: Callable[[Array], Array]) -> Float[Array, " k"] | None:
+    def of_some(name: str, power: Callable[[Any], Any]) -> Float[AnyArray, " k"] | None:
         return summed(name, power) if any(getattr(joint, name) is not None for joint in joints) else None
 
-    def column(values: list[Array]) -> Array:
-        return jnp.stack([x.astype(dtype) for x in values]) if values else jnp.zeros(0, dtype)
+    def column(values: list[Any]) -> Any:
+        return xp.stack([x.astype(dtype) for x in values]) if values else xp.zeros(0, dtype)
 
     limits = motor = None
     if any(joint.limits is not None for joint in owners):
-        free = jnp.array([-jnp.inf, jnp.inf])
+        free = np.array([-np.inf, np.inf])
         limits = column([free if joint.limits is None else joint.limits for joint in owners])
     if any(joint.motor is not None for joint in owners):
         motor = column([_motor(joint) for joint in owners])
@@ -75,11 +77,11 @@ def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
     )
     springs = of_some("stiffness", lambda ratio: ratio)
     return JointLaws(
-        summed("damping", jnp.square),
-        of_some("armature", jnp.square),
+        summed("damping", xp.square),
+        of_some("armature", xp.square),
         springs,
         column([joint.rest for joint in owners]),
-        of_some("friction", jnp.abs),
+        of_some("friction", xp.abs),
         limits,
         motor,
         constant,
@@ -87,10 +89,11 @@ def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
     )
 
 
-def _motor(joint: Joint) -> Array:
+def _motor(joint: Joint) -> AnyArray:
     motor = joint.motor
     if motor is None:
-        return jnp.asarray(np.array([0.0, 0.0, 0.0, -np.inf, np.inf]))
-    stiffness = motor.stiffness if motor.kind == "position" else jnp.zeros_like(motor.stiffness)
-    damping = motor.damping if motor.kind != "effort" else jnp.zeros_like(motor.damping)
-    return jnp.concatenate([jnp.stack([motor.gear, stiffness, damping]), motor.limits])
+        return np.array([0.0, 0.0, 0.0, -np.inf, np.inf])
+    xp = library(*jax.tree.leaves(motor))
+    stiffness = motor.stiffness if motor.kind == "position" else xp.zeros_like(motor.stiffness)
+    damping = motor.damping if motor.kind != "effort" else xp.zeros_like(motor.damping)
+    return xp.concatenate([xp.stack([motor.gear, stiffness, damping]), motor.limits])

@@ -1,14 +1,25 @@
 """Loops: what closes a chain of bodies on joints, so that bodies no longer make a tree."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from dano.checks import checked_choice, checked_text
-from dano.maths import checked_array, checked_quaternion, Numbers, quat_conjugate, quat_multiply, quat_rotate
+from dano.maths import (
+    AnyArray,
+    checked_array,
+    checked_quaternion,
+    library,
+    Numbers,
+    quat_conjugate,
+    quat_multiply,
+    quat_rotate,
+)
 from dano.names import did_you_mean
 
 LOOP_KINDS = ("point", "weld")
@@ -79,16 +90,18 @@ class Loops(eqx.Module):
     first: tuple[int, ...] = eqx.field(static=True)
     second: tuple[int, ...] = eqx.field(static=True)
     welds: tuple[int, ...] = eqx.field(static=True)
-    position: Float[Array, "l 3"]
-    anchor: Float[Array, "l 3"]
-    orientation: Float[Array, "l 4"]
+    position: Float[AnyArray, "l 3"]
+    anchor: Float[AnyArray, "l 3"]
+    orientation: Float[AnyArray, "l 4"]
 
     @property
     def size(self) -> int:
         """How many numbers the loops hold at zero."""
         return 3 * (len(self.first) + len(self.welds))
 
-    def gaps(self, position: Float[Array, "n 3"], orientation: Float[Array, "n 4"]) -> Float[Array, " c"]:
+    def gaps(
+        self, position: Float[AnyArray, "n 3"], orientation: Float[AnyArray, "n 4"]
+    ) -> Float[AnyArray, " c"]:
         """How far the loops are from being closed, at poses of all bodies.
 
         Returns:
@@ -98,14 +111,15 @@ class Loops(eqx.Module):
         apart = x[b] + quat_rotate(q[b], self.anchor) - x[a] - quat_rotate(q[a], self.position)
         rows = np.array(self.welds, int)
         turn = quat_multiply(quat_conjugate(quat_multiply(q[a[rows]], self.orientation[rows])), q[b[rows]])
-        return jnp.concatenate([apart.ravel(), (2 * jnp.sign(turn[:, :1]) * turn[:, 1:]).ravel()])
+        xp = library(apart, turn)
+        return xp.concatenate([apart.ravel(), (2 * xp.sign(turn[:, :1]) * turn[:, 1:]).ravel()])
 
     def slopes(
         self,
-        position: Float[Array, "n 3"],
-        orientation: Float[Array, "n 4"],
-        moved: Float[Array, "n 6 k"],
-    ) -> Float[Array, "c k"]:
+        position: Float[AnyArray, "n 3"],
+        orientation: Float[AnyArray, "n 4"],
+        moved: Float[AnyArray, "n 6 k"],
+    ) -> Float[AnyArray, "c k"]:
         """How the gaps change with numbers that move the bodies, where the loops are closed.
 
         Args:
@@ -155,26 +169,28 @@ def check_loops(names: Sequence[str], hanging: Sequence[int], loops: Sequence[Lo
             )
 
 
-def loops_of(names: Sequence[str], loops: Sequence[Loop], com: Float[Array, "n 3"]) -> Loops | None:
+def loops_of(names: Sequence[str], loops: Sequence[Loop], com: Float[AnyArray, "n 3"]) -> Loops | None:
     """The loops of a scene as arrays, in the dtype of the centres of mass [m, F]; None if there are none."""
     if not loops:
         return None
     first = tuple(len(names) if loop.first is None else names.index(loop.first) for loop in loops)
     second = tuple(names.index(loop.second) for loop in loops)
     welds = tuple(i for i, loop in enumerate(loops) if loop.kind == "weld")
-    centres = jnp.concatenate([com, jnp.zeros((1, 3), com.dtype)])
+    xp = library(com, *jax.tree.leaves(loops))
+    centres = xp.concatenate([com, xp.zeros((1, 3), com.dtype)])
     position, anchor, orientation = (
-        jnp.stack([getattr(loop, name) for loop in loops]).astype(com.dtype)
+        xp.stack([getattr(loop, name) for loop in loops]).astype(com.dtype)
         for name in ("position", "anchor", "orientation")
     )
     position, anchor = position - centres[np.array(first)], anchor - centres[np.array(second)]
     return Loops(first, second, welds, position, anchor, orientation)
 
 
-def _with_world(position: Array, orientation: Array) -> tuple[Array, Array]:
+def _with_world(position: AnyArray, orientation: AnyArray) -> tuple[Any, Any]:
     """Poses with the world as the last row."""
-    still = jnp.array([[1.0, 0.0, 0.0, 0.0]], orientation.dtype)
+    xp = library(position, orientation)
+    still = np.array([[1.0, 0.0, 0.0, 0.0]], orientation.dtype)
     return (
-        jnp.concatenate([position, jnp.zeros((1, 3), position.dtype)]),
-        jnp.concatenate([orientation, still]),
+        xp.concatenate([position, np.zeros((1, 3), position.dtype)]),
+        xp.concatenate([orientation, still]),
     )

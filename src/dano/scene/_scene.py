@@ -2,15 +2,15 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from dano.checks import checked_items, checked_kind, checked_optional, shown
 from dano.contact import checked_parameter, ContactParams
-from dano.maths import checked_array, is_traced, Numbers
+from dano.maths import AnyArray, by_numpy, checked_array, is_traced, library, Numbers, on_host
 from dano.notebook import card, cloud
 from dano.objects import checked_inertia
 from dano.scene._bodies import Body
@@ -32,6 +32,8 @@ from dano.scene._making import (
 from dano.scene._motors import Motor
 from dano.scene._others import Others, others_of
 from dano.scene._states import check_precision, Control, JOINT_QUANTITIES, State, STATE_SIZES
+
+Parts = TypeVar("Parts", tuple[Joint, ...], tuple[Loop, ...])
 
 
 class Scene(eqx.Module):
@@ -139,15 +141,23 @@ class Scene(eqx.Module):
 
     @property
     def chains(self) -> Chains:
-        """The trees that bodies and joints make, as arrays."""
-        com = jnp.stack([body.centre_of_mass for body in self.bodies])
-        return chains_of(self.layout, self.joints, com.astype(self.timestep.dtype))
+        """The trees that bodies and joints make, as arrays; of NumPy unless something in them is traced."""
+        joints, com = self._with_centres(self.joints)
+        return chains_of(self.layout, joints, com)
 
     @property
     def closing(self) -> Loops | None:
-        """The loops as arrays; None if there are none."""
-        com = jnp.stack([body.centre_of_mass for body in self.bodies])
-        return loops_of(self.names, self.loops, com.astype(self.timestep.dtype))
+        """The loops as arrays, as `chains`; None if there are none."""
+        loops, com = self._with_centres(self.loops)
+        return loops_of(self.names, loops, com)
+
+    def _with_centres(self, parts: Parts) -> tuple[Parts, Float[AnyArray, "n 3"]]:
+        """Joints or loops, and the centres of mass of all bodies [m, F]."""
+        places = [(body.com, body.com_offset) for body in self.bodies]
+        if not is_traced(parts, places):
+            parts, places = on_host((parts, places))
+        rows = [com + offset for com, offset in places]
+        return parts, library(*rows).stack(rows).astype(self.timestep.dtype)
 
     @property
     def driven(self) -> bool:
@@ -356,7 +366,7 @@ class Scene(eqx.Module):
             ValueError: If the state does not fit the scene.
         """
         self.check_state(state)
-        return filled(self.chains, state, self.timestep)
+        return by_numpy(filled)(self.chains, state, self.timestep) if self.joints else state
 
     def joint_values(self, state: State) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
         """Coordinates q and velocities v of the joints that poses and velocities of the bodies have.
@@ -367,7 +377,7 @@ class Scene(eqx.Module):
             ValueError: If the state is not a `State`, or not one of this scene's bodies.
         """
         self._check_bodies(state)
-        return joint_values(self.chains, state)
+        return by_numpy(joint_values)(self.chains, state)
 
     def frames(self, state: State) -> Frames:
         """Pose, twist and Jacobian of every body, for one state.
@@ -379,7 +389,7 @@ class Scene(eqx.Module):
             ValueError: If the state does not fit the scene.
         """
         self.check_state(state)
-        return frames_of(self.chains, state)
+        return Frames(*by_numpy(frames_of)(self.chains, state))
 
     def check_state(self, state: State) -> None:
         """Check a concrete state against the scene; traced values pass.

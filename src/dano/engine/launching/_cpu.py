@@ -8,13 +8,15 @@ import jax
 import numpy as np
 
 from dano.engine.launching._arguments import given_arrays, parameters_of
-from dano.engine.launching._ffi import Call, register
+from dano.engine.launching._ffi import Call, Handler, register
 from dano.engine.launching._plans import Plan, Shape
 from dano.native import Kernel, Launch, n_cores, together
 
 # Arrays that worlds work in begin where a line of a cache does [bytes].
 _ALIGNED = 64
 _numbers = iter(range(10**12))
+# Launchers that are kept, each with the room that its worlds work in.
+_MOST = 256
 
 
 def call(
@@ -26,12 +28,30 @@ def call(
     return jax.ffi.ffi_call(_target(plan, batched, n_worlds, np.dtype(dtype)), shapes)(*inputs)
 
 
+def launched(
+    plan: Plan, batched: tuple[bool, ...], n_worlds: int, inputs: Sequence[jax.Array]
+) -> list[jax.Array]:
+    """Outputs of a launch, outside of any program."""
+    dtype = np.dtype(inputs[0].dtype)
+    launcher = _launcher(plan, batched, n_worlds, dtype)
+    given = [np.ascontiguousarray(x) for x in inputs]
+    found = [np.empty((n_worlds, *shape), dtype) for shape in plan.outputs.values()]
+    launcher([x.ctypes.data for x in given], [x.ctypes.data for x in found], None)
+    return [jax.device_put(x) for x in found]
+
+
+@functools.lru_cache(maxsize=_MOST)
+def _launcher(plan: Plan, batched: tuple[bool, ...], n_worlds: int, dtype: np.dtype) -> Handler:
+    """What launches so many worlds with numbers of a type."""
+    launcher = _Launcher(plan, batched, n_worlds)
+    return launcher if dtype == np.float64 else _Widened(launcher)
+
+
 @functools.cache
 def _target(plan: Plan, batched: tuple[bool, ...], n_worlds: int, dtype: np.dtype) -> str:
-    """Name for `jax.ffi.ffi_call` of launches of so many worlds with numbers of a type."""
+    """Name for `jax.ffi.ffi_call` of such launches."""
     name = f"dano_{plan.kernel}_{next(_numbers)}"
-    launcher = _Launcher(plan, batched, n_worlds)
-    register(name, launcher if dtype == np.float64 else _Widened(launcher), "cpu")
+    register(name, _launcher(plan, batched, n_worlds, dtype), "cpu")
     return name
 
 
@@ -48,7 +68,7 @@ class _Launcher:
         self._kernel = plan.on_cpu()
         self._free: list[list[_Share]] = []
 
-    def __call__(self, inputs: Sequence[int], outputs: Sequence[int], call: Call) -> None:
+    def __call__(self, inputs: Sequence[int], outputs: Sequence[int], call: Call | None) -> None:
         """Launch."""
         try:
             shares = self._free.pop()
@@ -85,7 +105,7 @@ class _Widened:
     def __init__(self, launcher: _Launcher):
         self.launcher = launcher
 
-    def __call__(self, inputs: Sequence[int], outputs: Sequence[int], call: Call) -> None:
+    def __call__(self, inputs: Sequence[int], outputs: Sequence[int], call: Call | None) -> None:
         """Launch."""
         plan, n = self.launcher.plan, self.launcher.n_worlds
         given = zip(inputs, plan.inputs.values(), self.launcher.batched, strict=True)

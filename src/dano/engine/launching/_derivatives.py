@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.core import ShapedArray
+from jax.core import ShapedArray, Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -48,31 +48,47 @@ tangent_p = Primitive("dano_rollout_tangent")
 tangent_p.multiple_results = True
 
 
+def _refuse_second(*_: Any, **__: Any) -> Any:
+    raise NotImplementedError(
+        "second derivatives of a rollout are not available (jax.hessian, or a gradient of a gradient): "
+        "take differences of jax.grad, or Gauss–Newton as dano.identify does; see docs/gradients.md"
+    )
+
+
+ad.primitive_jvps[tangent_p] = _refuse_second
+
+
+def _is_differentiated(x: Any) -> bool:
+    """Whether another derivative is being taken by a number, whose own is asked for."""
+    while type(x).__name__ == "BatchTracer":
+        x = x.val
+    return isinstance(x, Tracer) and type(x).__name__ in ("JVPTracer", "LinearizeTracer")
+
+
 def _jvp(primals, tangents, *, plan: Plan, batched, n_worlds):
-    found = launch_p.bind(*primals, plan=plan, batched=batched, n_worlds=n_worlds)
     changes = [
         (i, t) for i, (t, name) in enumerate(zip(tangents, plan.inputs, strict=True))
         if not isinstance(t, ad.Zero) and name in CHANGING
     ]  # fmt: skip
-    zeros = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in found]
     if not changes:
-        return found, zeros
+        found = launch_p.bind(*primals, plan=plan, batched=batched, n_worlds=n_worlds)
+        return found, [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in found]
     if plan.kernel in ("touch", "press", "listing"):
         raise NotImplementedError(
             "derivatives of overlaps and contact forces are not available: take those of velocities, which"
             " change by them; see docs/gradients.md"
         )
-    if plan.kernel != "rollout":
-        raise NotImplementedError(
-            "second derivatives of a rollout are not available (jax.hessian, or a gradient of a gradient): "
-            "take differences of jax.grad, or Gauss–Newton as dano.identify does; see docs/gradients.md"
-        )
+    given = [x for x, name in zip(primals, plan.inputs, strict=True) if name in CHANGING]
+    if plan.kernel != "rollout" or any(map(_is_differentiated, given)):
+        _refuse_second()
+    found = launch_p.bind(*primals, plan=plan, batched=batched, n_worlds=n_worlds)
+    zeros = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in found]
     which = tuple(i for i, _ in changes)
     rows = [t if batched[i] else t[None] for i, t in changes]
     rows = [x[:, None] for x in rows]  # an axis of directions
-    given = (*batched, *(True for _ in found))
+    differ = (*batched, *(True for _ in found))
     moved = tangent_p.bind(
-        *primals, *found, *rows, plan=plan, batched=given, n_worlds=n_worlds, which=which,
+        *primals, *found, *rows, plan=plan, batched=differ, n_worlds=n_worlds, which=which,
         differs=tuple(batched[i] for i in which), n_directions=1,
     )  # fmt: skip
     changed = dict(zip(_changed(plan), moved, strict=True))

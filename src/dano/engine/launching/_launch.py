@@ -6,6 +6,7 @@ Whole numbers are the same for all worlds and stay on the device. A batch of wor
 share of it on each core, on a GPU a block of lanes each. A program is lowered for one of these, or for both.
 """
 
+import functools
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
+from dano.engine._compiling import by_numpy_on_cpus
 from dano.engine.launching import _cpu, _cuda
 from dano.engine.launching._plans import OfWidth as OfWidth, Plan as Plan, plan as plan, Shape as Shape
 
@@ -34,7 +36,12 @@ def launch(plan: Plan, inputs: dict[str, Any]) -> dict[str, Any]:
     dtype = inputs["launch.state"].dtype
     rows = [jnp.asarray(inputs[name]).astype(dtype).reshape(shape) for name, shape in plan.inputs.items()]
     found = launch_p.bind(*rows, plan=plan, batched=(False,) * len(rows), n_worlds=1)
-    return {name: x[0] for name, x in zip(plan.outputs, found, strict=True)}
+    return dict(zip(plan.outputs, _of_one_world(found), strict=True))
+
+
+@by_numpy_on_cpus
+def _of_one_world(found: list[Any]) -> list[Any]:
+    return [x[0] for x in found]
 
 
 @launch_p.def_abstract_eval
@@ -45,7 +52,14 @@ def _(*inputs, plan, batched, n_worlds):
 
 @launch_p.def_impl
 def _(*inputs, **parameters):
-    return jax.jit(lambda *given: launch_p.bind(*given, **parameters))(*inputs)
+    if all(device.platform == "cpu" for x in inputs for device in x.devices()):
+        return _cpu.launched(inputs=inputs, **parameters)
+    return _program(**parameters)(*inputs)
+
+
+@functools.lru_cache(maxsize=256)
+def _program(**parameters):
+    return jax.jit(lambda *given: launch_p.bind(*given, **parameters))
 
 
 def _lowered_for(platform):

@@ -1,6 +1,7 @@
 """Steps and rollouts as launches of kernels."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +9,14 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.contact import CHUNK
+from dano.engine._compiling import by_numpy_on_cpus
 from dano.engine._reports import Report, SolverOptions
 from dano.engine.joints import tree_lengths
 from dano.engine.launching import _derivatives  # noqa: F401  rules for derivatives of launches
 from dano.engine.launching._launch import launch, OfWidth, Plan, plan, Shape
 from dano.engine.launching._tables import Tables
-from dano.scene import Control, State
+from dano.maths import AnyArray, library
+from dano.scene import Control, JOINT_QUANTITIES, State, STATE_SIZES
 
 _MODULE = "dano.engine.kernels.rollout"
 # Numbers of a body's state, of a push on it, and of what a step reports: see `dano.engine.kernels.tables`.
@@ -58,26 +61,37 @@ def rollout(
     n = state.position.shape[0]
     inputs = {**tables.rows, **given(state, controls, dtype)}
     found = launch(_plan(tables, inputs, n, n_steps, capacity, options, dtype), inputs)
-    states = found["launch.states"].reshape(n_steps, n, STATE)
-    position, orientation, velocity, omega = jnp.split(states, (3, 7, 10), axis=2)
+    moved, told = _read(found, state, n_steps)
+    return dataclasses.replace(state, **moved), jax.lax.stop_gradient(Report(*told))
+
+
+@by_numpy_on_cpus
+def _read(found: dict[str, AnyArray], state: State, n_steps: int) -> tuple[dict[str, Any], tuple[Any, ...]]:
+    """States by quantity, and what reports say, of a launch from a state."""
+    xp = library(*jax.tree.leaves((found, state)))
+    states = found["launch.states"].reshape(n_steps, state.position.shape[0], STATE)
+    moved = dict(zip(STATE_SIZES, xp.split(states, (3, 7, 10), axis=2), strict=True))
     residual, passes, solved, overflow, _ = found["launch.reports"].T
-    report = Report(residual, passes.astype(int), (solved > 0) & (overflow == 0), overflow > 0)
-    states = State(position, orientation, velocity, omega)
     if state.q is not None and state.v is not None:
-        none = jnp.zeros((n_steps, state.q.shape[0]), dtype)
-        q, v = (found.get(f"launch.{name}", none).reshape(none.shape) for name in ("qs", "vs"))
-        states = dataclasses.replace(states, q=q, v=v)
-    return states, jax.lax.stop_gradient(report)
+        none = xp.zeros((n_steps, state.q.shape[0]), states.dtype)
+        moved |= {name: found.get(f"launch.{name}s", none).reshape(none.shape) for name in JOINT_QUANTITIES}
+    return moved, (residual, passes.astype(int), (solved > 0) & (overflow == 0), overflow > 0)
 
 
 def given(state: State, controls: Control | None, dtype) -> dict[str, Array]:
     """What a launch is given besides a scene: arrays by place."""
-    rows = jnp.concatenate([state.position, state.orientation, state.velocity, state.omega], axis=1)
-    inputs = {"launch.state": rows, "launch.pushes": jnp.zeros((0, _PUSH), dtype)}
+    return _given(state, controls, np.zeros((0, _PUSH), dtype))
+
+
+@by_numpy_on_cpus
+def _given(state: State, controls: Control | None, none: AnyArray) -> dict[str, Any]:
+    xp = library(*jax.tree.leaves((state, controls)))
+    rows = xp.concatenate([state.position, state.orientation, state.velocity, state.omega], axis=1)
+    inputs = {"launch.state": rows, "launch.pushes": xp.asarray(none)}
     if state.q is not None and state.v is not None and state.q.size:
         inputs |= {"launch.q": state.q[:, None], "launch.v": state.v[:, None]}
     if controls is not None:
-        pushes = jnp.concatenate([controls.force, controls.torque], axis=-1)
+        pushes = xp.concatenate([controls.force, controls.torque], axis=-1)
         inputs["launch.pushes"] = pushes.reshape(-1, _PUSH)
         for name, values in (("efforts", controls.effort), ("commands", controls.command)):
             if values is not None and values.size:

@@ -1,13 +1,15 @@
-"""Compiled programs of earlier commands, in a folder of the user: the second run compiles nothing.
+"""Compiled programs of earlier processes, in a folder of the user: the second run compiles nothing.
 
 JAX can keep what it compiles in a folder, but writes it in place and without locks, reads it without a
 checksum, never mends an entry that was cut off, and does not ask for which processor it was made. So each
-command gives JAX a folder of its own, filled with links to the shared entries that are whole and of this
-processor. What is new there is linked into the shared folder when the command ends: a link appears whole or
+process gives JAX a folder of its own, filled with links to the shared entries that are whole and of this
+processor. What is new there is linked into the shared folder when the process ends: a link appears whole or
 not at all, whoever else makes the same.
 """
 
+import atexit
 import contextlib
+import functools
 import hashlib
 import importlib
 import os
@@ -17,7 +19,7 @@ import socket
 import sys
 import tempfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -27,7 +29,7 @@ from dano.caches import cache_folder
 LIMIT = 64 * 2**20
 """Bytes of all entries; beyond, the oldest go."""
 
-# Programs that compile faster than this [s] are not kept: a command has many, and they add up.
+# Programs that compile faster than this [s] are not kept: a process has many, and they add up.
 _WORTH = 0.0
 _ENTRY = "-cache"
 _RUN = ".run-"
@@ -36,31 +38,39 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 _FEATURES = ("vendor_id", "model name", "flags", "Features", "CPU implementer", "CPU part", "isa")
 
 
-@contextlib.contextmanager
-def compiled_programs() -> Iterator[None]:
-    """Let JAX find and keep compiled programs until the block ends; for a process that ends with it, too.
+@functools.cache
+def keep_programs() -> Callable[[], None]:
+    """Let JAX find compiled programs, and keep them for the next process; once a process.
 
-    The folder is in `cache_folder`. Nothing is kept if there is none, if JAX has a cache already, or where it
-    is not known which instructions the processor has.
+    The folder is in `cache_folder`. Nothing is kept if there is none, if JAX has a cache already or none is
+    wanted, or where it is not known which instructions the processor has.
+
+    Returns:
+        What keeps them; the process calls it when it ends, if nobody has before.
     """
     try:
         folder = _folder()
         own = None if folder is None else _own_folder(folder)
     except OSError:
-        # A full disk, a folder of somebody else: commands work without.
+        # A full disk, a folder of somebody else: everything works without.
         folder = own = None
     if folder is None or own is None:
-        yield
-        return
+        return lambda: None
     _tell_jax(own)
-    known = {path.name for path in own.iterdir()}
-    try:
-        yield
-    finally:
+    known, process = {path.name for path in own.iterdir()}, os.getpid()
+
+    @functools.cache
+    def publish() -> None:
+        # What was forked off has no folder of its own.
+        if os.getpid() != process:
+            return
         with contextlib.suppress(OSError):
             _publish(own, folder, known)
             _prune(folder.parent)
         shutil.rmtree(own, ignore_errors=True)
+
+    atexit.register(publish)
+    return publish
 
 
 def _folder() -> Path | None:
@@ -105,11 +115,14 @@ def _processor() -> str | None:
 
 def _tell_jax(own: Path) -> None:
     import jax
+    from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
     jax.config.update("jax_compilation_cache_dir", str(own))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH)
     # They would make the name of the folder a part of what was compiled.
     jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
+    # Programs may have been compiled before; JAX does not look again whether there is a cache.
+    reset_cache()
 
 
 def _own_folder(folder: Path) -> Path:

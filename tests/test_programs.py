@@ -1,4 +1,4 @@
-"""What commands compile is kept for the next one: whole, for this processor, whoever else does the same."""
+"""What is compiled is kept for the next one: whole, for this processor, whoever else does the same."""
 
 import os
 import re
@@ -11,15 +11,18 @@ from pathlib import Path
 import pytest
 
 import dano
-from dano.cli import _compiled, main
+from dano import programs
+from dano.cli import main
 
 PROGRAM = """
 import os, sys
-from dano.cli._compiled import compiled_programs
+from dano.programs import keep_programs
 import jax, jax.numpy as jnp
 hits = []
 jax.monitoring.register_event_listener(lambda name, **_: hits.append(name) if "cache_hit" in name else None)
-with compiled_programs():
+jax.jit(jnp.sin)(1.0)
+keep_programs()
+if True:
     x = jax.jit(lambda x: jnp.linalg.inv(x @ x.T + jnp.eye(9)).sum())(jnp.ones((9, 9)))
     if "die" in sys.argv:
         os.kill(os.getpid(), 9)
@@ -53,7 +56,7 @@ def entries(root: Path) -> list[Path]:
     return [path for path in root.rglob("*-cache.*") if ".run-" not in str(path)]
 
 
-needs_features = pytest.mark.skipif(_compiled._processor() is None, reason="the processor is not known")
+needs_features = pytest.mark.skipif(programs._processor() is None, reason="the processor is not known")
 
 
 @needs_features
@@ -66,7 +69,7 @@ def test_second_process_compiles_nothing(start, tmp_path: Path):
     assert dying.returncode == -signal.SIGKILL
     assert len(list(tmp_path.rglob(".run-*"))) == 1
     found = entries(tmp_path)
-    assert found and all(_compiled._digest(path.read_bytes()) == path.name.split(".")[-1] for path in found)
+    assert found and all(programs._digest(path.read_bytes()) == path.name.split(".")[-1] for path in found)
 
     # Both may have made the same at the same time.
     programs = {path.name.split("-cache.")[0] for path in found}
@@ -90,51 +93,51 @@ def test_what_is_cut_off_is_not_published(tmp_path: Path):
     (own / "b-cache").write_bytes(whole[:-5])
     (own / "c-cache").write_bytes(b"\x28\xb5\x2f\xfd" + whole[:5])
     (own / "known-cache").write_bytes(whole)
-    _compiled._publish(own, folder, {"known-cache"})
+    programs._publish(own, folder, {"known-cache"})
     assert [path.name.split("-")[0] for path in folder.iterdir()] == ["a"]
 
 
 def test_oldest_entries_go(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(_compiled, "LIMIT", 250)
+    monkeypatch.setattr(programs, "LIMIT", 250)
     for age, (folder, name) in enumerate([("old", "a"), ("new", "b"), ("new", "c"), ("old", "d")]):
         (tmp_path / folder).mkdir(exist_ok=True)
         path = tmp_path / folder / f"{name}-cache.0"
         path.write_bytes(b"x" * 100)
         os.utime(path, (age, age))
-    _compiled._prune(tmp_path)
+    programs._prune(tmp_path)
     assert sorted(path.name[0] for path in entries(tmp_path)) == ["c", "d"]
 
 
 @needs_features
 def test_folder(tmp_path: Path, monkeypatch):
-    if _compiled._setting("jax_compilation_cache_dir"):
+    if programs._setting("jax_compilation_cache_dir"):
         pytest.skip("the tests run with a cache of their own")
     monkeypatch.setenv("DANO_CACHE_DIR", str(tmp_path))
-    here = _compiled._folder()
+    here = programs._folder()
     assert here is not None and re.fullmatch("[0-9a-f]{16}", here.name)
-    monkeypatch.setattr(_compiled, "_processor", lambda: "flags: fewer")
-    other = _compiled._folder()
+    monkeypatch.setattr(programs, "_processor", lambda: "flags: fewer")
+    other = programs._folder()
     assert other is not None and other != here
-    monkeypatch.setattr(_compiled, "_processor", lambda: None)
-    assert _compiled._folder() is None
+    monkeypatch.setattr(programs, "_processor", lambda: None)
+    assert programs._folder() is None
     monkeypatch.undo()
 
     monkeypatch.setenv("DANO_CACHE_DIR", str(tmp_path))
     here.chmod(0o777)
-    assert _compiled._folder() is None
+    assert programs._folder() is None
     here.chmod(0o700)
     monkeypatch.setenv("DANO_CACHE_DIR", "off")
-    assert _compiled._folder() is None
+    assert programs._folder() is None
     monkeypatch.delenv("DANO_CACHE_DIR")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-    folder = _compiled._folder()
+    folder = programs._folder()
     assert folder is not None and folder.parents[2] == tmp_path / "home"
 
 
 def test_only_the_program_keeps(run, tmp_path: Path, monkeypatch):
     """JAX's settings of a program that calls `main` with arguments stay as they are."""
     asked = []
-    monkeypatch.setattr(_compiled, "_folder", lambda: asked.append(None))
+    monkeypatch.setattr(programs, "_folder", lambda: asked.append(None))
     arguments = ["inspect", str(tmp_path / "missing.dano")]
     assert run(*arguments).code == 2
     assert not asked
