@@ -50,6 +50,7 @@ from dano.fields._signed_distance import (
 from dano.fields._spline import degree_of as degree_of
 from dano.fields.meshes import mesh_field as mesh_field, MESH_SUFFIXES as MESH_SUFFIXES, UNITS as UNITS
 from dano.fields.readers import (
+    companion_files as companion_files,
     FIELD_FORMATS as FIELD_FORMATS,
     FIELD_SUFFIXES as FIELD_SUFFIXES,
     is_splats as is_splats,
