@@ -6,6 +6,7 @@ quaternions compute NumPy arrays with NumPy, on the host and in their own dtype,
 """
 
 import functools
+import operator
 from collections.abc import Sequence
 from types import ModuleType
 from typing import Any, TypeVar
@@ -19,6 +20,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from dano.checks import shown
 from dano.hosted import hosted
+from dano.keys import seed_key
 
 Numbers = ArrayLike | Sequence[Any]
 """What constructors take for an array: an array, a number, or (nested) lists and tuples of numbers."""
@@ -30,9 +32,9 @@ _SERIES = 1e-4
 """Below this, of the square of half an angle [rad²], five terms of a series are exact in float64."""
 
 
-def _library(*arrays: Array | np.ndarray) -> ModuleType:
-    """NumPy for its arrays, JAX's for others."""
-    return np if all(isinstance(array, np.ndarray) for array in arrays) else jnp
+def library(*arrays: ArrayLike) -> ModuleType:
+    """NumPy for its arrays and numbers, JAX's for others."""
+    return np if all(isinstance(array, np.ndarray | np.generic | float | int) for array in arrays) else jnp
 
 
 @hosted
@@ -50,15 +52,16 @@ def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
 
 
-def column_norm(x: Float[Array, "k *batch"]) -> Float[Array, "*batch"]:
+def column_norm(x: Float[Q, "k *batch"]) -> Float[Q, "*batch"]:
     """Length of vectors stored as columns; its derivative at zero is zero instead of NaN.
 
     Faster than `safe_norm` over the first axis of many columns on a CPU.
     """
-    squared = functools.reduce(jnp.add, [row * row for row in x])
+    xp = library(x)
+    squared = functools.reduce(operator.add, [row * row for row in x])
     # The untaken branch must be safe too: 0 · ∞ in the chain rule would be NaN.
     positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
+    return xp.where(positive, xp.sqrt(xp.where(positive, squared, 1)), 0)
 
 
 @hosted
@@ -86,7 +89,7 @@ def quat_multiply(p: Float[Q, "*#batch 4"], q: Float[Q, "*#batch 4"]) -> Float[Q
     """Hamilton product p ⊗ q: the rotation q followed by p."""
     pw, px, py, pz = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     qw, qx, qy, qz = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    return _library(p, q).stack(
+    return library(p, q).stack(
         [
             pw * qw - px * qx - py * qy - pz * qz,
             pw * qx + px * qw + py * qz - pz * qy,
@@ -99,13 +102,13 @@ def quat_multiply(p: Float[Q, "*#batch 4"], q: Float[Q, "*#batch 4"]) -> Float[Q
 
 def quat_conjugate(q: Float[Q, "*batch 4"]) -> Float[Q, "*batch 4"]:
     """Inverse rotation of a unit quaternion."""
-    return _library(q).concatenate([q[..., :1], -q[..., 1:]], axis=-1)
+    return library(q).concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
 def quat_to_matrix(q: Float[Q, "*batch 4"]) -> Float[Q, "*batch 3 3"]:
     """Rotation matrix of a unit quaternion (body → world)."""
     w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    stack = _library(q).stack
+    stack = library(q).stack
     return stack(
         [
             stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
@@ -122,7 +125,7 @@ def quat_from_matrix(matrix: Float[Q, "*batch 3 3"]) -> Float[Q, "*batch 4"]:
     The matrix gives 4 q qᵀ without a root. Its row with the largest diagonal entry, which is at least 1, is
     normalised (after Shepperd 1978, who divides by a root instead).
     """
-    xp = _library(matrix)
+    xp = library(matrix)
     m = [[matrix[..., i, j] for j in range(3)] for i in range(3)]
     x, y, z = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
     xy, xz, yz = m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]
@@ -152,7 +155,7 @@ def quat_from_matrix(matrix: Float[Q, "*batch 3 3"]) -> Float[Q, "*batch 4"]:
 
 def quat_rotate(q: Float[Q, "*#batch 4"], v: Float[Q, "*#batch 3"]) -> Float[Q, "*batch 3"]:
     """Rotate vector(s) `v` by unit quaternion(s) `q`."""
-    cross = _library(q, v).cross
+    cross = library(q, v).cross
     w, u = q[..., :1], q[..., 1:]
     t = 2 * cross(u, v)
     return v + w * t + cross(u, t)
@@ -165,7 +168,7 @@ def quat_normalize(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
 
 def quat_exp(vector: Float[Q, "*batch 3"]) -> Float[Q, "*batch 4"]:
     """Unit quaternion of a rotation vector [rad]: (cos |v|/2, sin |v|/2 · v/|v|), smooth at zero."""
-    xp = _library(vector)
+    xp = library(vector)
     half = 0.5 * vector
     squared = xp.sum(half * half, axis=-1, keepdims=True)
     small = squared < _SERIES
@@ -188,7 +191,7 @@ def quat_log(q: Float[Q, "*batch 4"]) -> Float[Q, "*batch 3"]:
 
     Smooth where the angle is below π. The direction does not change with the length of `q`. NaN stays NaN.
     """
-    xp = _library(q)
+    xp = library(q)
     q = xp.where(q[..., :1] < 0, -q, q)
     w, u = q[..., :1], q[..., 1:]
     squared = xp.sum(u * u, axis=-1, keepdims=True)
@@ -447,7 +450,7 @@ def checked_key(key: PRNGKeyArray | None) -> PRNGKeyArray:
         ValueError: If it is not a single key of JAX.
     """
     if key is None:
-        return jax.random.key(0)
+        return seed_key(0)
     dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
     typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
     # What `jax.random.PRNGKey` makes.

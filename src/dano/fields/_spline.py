@@ -11,6 +11,7 @@ derivative order.
 """
 
 import functools
+import operator
 from collections.abc import Iterable
 from typing import Any
 
@@ -22,12 +23,16 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from dano.checks import checked_choice
+from dano.maths import is_traced, library, Q
 
 DEGREES = {"linear": 1, "quadratic": 2, "cubic": 3}
 """Degree of the spline of each kind of interpolation."""
 
 CHUNK = 1024
 """Most points evaluated at once on a CPU: 27 values of each still fit into a core's cache."""
+
+_HOST_CHUNK = 4096
+"""The same for NumPy, whose calls cost a microsecond each."""
 
 # How far β of a degree reaches from its node, in index units, is (degree + 1)/2. Points are clamped to where
 # all nodes of their stencil lie in the zero border, which is `border(degree)` nodes wide.
@@ -58,11 +63,12 @@ def multi_indices(order: int) -> list[tuple[int, int, int]]:
     ]
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
 def spline_jet(
-    coefficients: Float[Array, "nx ny nz"], u: Float[Array, "3 n"], degree: int, order: int
-) -> Float[Array, "rows n"]:
+    coefficients: Float[Q, "nx ny nz"], u: Float[Q, "3 n"], degree: int, order: int
+) -> Float[Q, "rows n"]:
     """Derivatives up to `order` of a spline at many points.
+
+    Arrays of NumPy are computed by NumPy: a third as fast, but nothing is compiled.
 
     Args:
         coefficients: c, with a border of `border(degree)` nodes on every side.
@@ -74,6 +80,21 @@ def spline_jet(
     Returns:
         One row per derivative, in the order of `multi_indices`, in index units and in the dtype of `u`.
     """
+    if library(coefficients, u) is jnp:
+        return _compiled_jet(coefficients, u, degree, order)
+    found = np.empty((len(multi_indices(order)), u.shape[1]), u.dtype)
+    with np.errstate(invalid="ignore"):
+        for start in range(0, u.shape[1], _HOST_CHUNK):
+            part = slice(start, start + _HOST_CHUNK)
+            found[:, part] = _rows(coefficients, u[:, part], degree, order)
+    return found
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
+def _compiled_jet(
+    coefficients: Float[Array, "nx ny nz"], u: Float[Array, "3 n"], degree: int, order: int
+) -> Float[Array, "rows n"]:
+    """`spline_jet` by JAX, with its derivatives."""
     n_points = u.shape[1]
     # Chunks only pay where a cache is small; an accelerator wants all points at once.
     if n_points <= CHUNK or jax.default_backend() != "cpu":
@@ -86,7 +107,7 @@ def spline_jet(
     return rows.transpose(1, 0, 2).reshape(rows.shape[1], -1)[:, :n_points]
 
 
-@functools.partial(spline_jet.defjvp, symbolic_zeros=True)
+@functools.partial(_compiled_jet.defjvp, symbolic_zeros=True)
 def _spline_jet_jvp(
     degree: int, order: int, primals: tuple[Array, Array], tangents: tuple[Any, Any]
 ) -> tuple[Array, Array]:
@@ -95,7 +116,7 @@ def _spline_jet_jvp(
     dcoefficients, du = tangents
     indices, next_indices = multi_indices(order), multi_indices(order + 1)
     # Third derivatives are asked for only by derivatives of Hessians; those may go through the gathers.
-    jet = _rows if order >= 2 else spline_jet
+    jet = _rows if order >= 2 else _compiled_jet
     higher = jet(coefficients, u, degree, order if isinstance(du, SymbolicZero) else order + 1)
     rows = higher[: len(indices)]
     tangent = jnp.zeros_like(rows)
@@ -118,8 +139,8 @@ def _raised(index: tuple[int, int, int], axis: int) -> tuple[int, int, int]:
 
 
 def _rows(
-    coefficients: Float[Array, "nx ny nz"], u: Float[Array, "3 n"], degree: int, order: int
-) -> Float[Array, "rows n"]:
+    coefficients: Float[Q, "nx ny nz"], u: Float[Q, "3 n"], degree: int, order: int
+) -> Float[Q, "rows n"]:
     """`spline_jet` of all points at once: gather a block per point, then contract it along z, y and x."""
     base, weights = _stencil(coefficients.shape, u, degree, order)
     block = _gather_blocks(coefficients, base, degree + 1).astype(u.dtype)
@@ -138,36 +159,37 @@ def _rows(
         for c in range(order + 1)
         for b in range(order + 1 - c)
     }
-    return jnp.stack(
+    return library(u).stack(
         [_total(along_y[b, c][q] * weights[a][q][0] for q in taps) for a, b, c in multi_indices(order)]
     )
 
 
-def _total(terms: Iterable[Array]) -> Array:
-    return functools.reduce(jnp.add, terms)
+def _total(terms: Iterable[Q]) -> Q:
+    return functools.reduce(operator.add, terms)
 
 
 def _stencil(
-    shape: tuple[int, ...], u: Float[Array, "3 n"], degree: int, order: int
-) -> tuple[Int[Array, "3 n"], list[list[Array]]]:
+    shape: tuple[int, ...], u: Float[Q, "3 n"], degree: int, order: int
+) -> tuple[Int[Q, "3 n"], list[list[Q]]]:
     """First node of each point's stencil, and its weights as ``weights[derivative][tap]`` of shape (3, n)."""
+    xp = library(u)
     lowest = _LOWEST[degree]
     n_border = border(degree)
     # Highest base node whose stencil still lies in the array; it is in the border, as `lowest` is.
     shift = 0 if degree == 1 else 1
     highest = np.asarray([size - n_border - 1 - degree + shift for size in shape], dtype=np.int32)
-    upper = jnp.asarray(highest[:, None], u.dtype)
-    u = jnp.minimum(jnp.maximum(u, jnp.asarray(lowest, u.dtype)), jnp.broadcast_to(upper, u.shape))
-    node = jnp.floor(u + 0.5) if degree == 2 else jnp.floor(u)
+    upper = xp.asarray(highest[:, None], u.dtype)
+    u = xp.minimum(xp.maximum(u, xp.asarray(lowest, u.dtype)), xp.broadcast_to(upper, u.shape))
+    node = xp.floor(u + 0.5) if degree == 2 else xp.floor(u)
     # A NaN point must give NaN, not an address: the integer is clamped once more, after the conversion.
-    base = jnp.clip(node.astype(jnp.int32), lowest, jnp.broadcast_to(jnp.asarray(highest[:, None]), u.shape))
-    return base + jnp.int32(n_border - shift), _weights(u - node, degree, order)
+    base = xp.clip(node.astype(np.int32), lowest, xp.broadcast_to(xp.asarray(highest[:, None]), u.shape))
+    return base + np.int32(n_border - shift), _weights(u - node, degree, order)
 
 
-def _weights(f: Float[Array, "3 n"], degree: int, order: int) -> list[list[Array]]:
+def _weights(f: Float[Q, "3 n"], degree: int, order: int) -> list[list[Q]]:
     """Weights of the stencil's nodes and their derivatives, at f past the base (quadratic: nearest) node."""
-    one = jnp.ones_like(f)
-    zero = jnp.zeros_like(f)
+    xp = library(f)
+    one, zero = xp.ones_like(f), xp.zeros_like(f)
     g = 1 - f
     if degree == 1:
         table = [[g, f], [-one, one]]
@@ -190,8 +212,13 @@ def _weights(f: Float[Array, "3 n"], degree: int, order: int) -> list[list[Array
 
 
 def _gather_blocks(
-    coefficients: Float[Array, "nx ny nz"], base: Int[Array, "3 n"], taps: int
-) -> Float[Array, "taps taps taps n"]:
+    coefficients: Float[Q, "nx ny nz"], base: Int[Q, "3 n"], taps: int
+) -> Float[Q, "taps taps taps n"]:
+    if library(coefficients, base) is np:
+        _, ny, nz = coefficients.shape
+        i, j, k = np.indices((taps, taps, taps))
+        first = (base[0].astype(np.intp) * ny + base[1]) * nz + base[2]
+        return np.ravel(coefficients)[((i * ny + j) * nz + k)[..., None] + first]
     # Point by point, and apart from what reads the block: XLA's CPU code without fusion emitters is three to
     # eight times slower where it gathers tap by tap.
     dimensions = lax.GatherDimensionNumbers(
@@ -201,6 +228,23 @@ def _gather_blocks(
         coefficients, base.T, dimensions, (taps, taps, taps), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS
     )
     return lax.optimization_barrier(block).transpose(1, 2, 3, 0)
+
+
+def node_values(coefficients: Float[Array, "px py pz"], degree: int) -> Float[Array, "nx ny nz"]:
+    """Values of a spline at the nodes inside its border."""
+    weights = {1: (1.0,), 2: (0.125, 0.75, 0.125), 3: (1 / 6, 2 / 3, 1 / 6)}[degree]
+    xp = np if not is_traced(coefficients) else jnp
+    values = xp.asarray(coefficients)
+    for axis, size in enumerate(values.shape):
+        # Nodes of the border next to the others count, too.
+        reach, inner = len(weights) // 2, size - 2 * border(degree)
+        first = border(degree) - reach
+        parts = [
+            weight * xp.take(values, np.arange(first + k, first + k + inner), axis)
+            for k, weight in enumerate(weights)
+        ]
+        values = _total(parts)
+    return jax.device_put(values) if xp is np else values
 
 
 def interpolating_coefficients(samples: np.ndarray, degree: int) -> np.ndarray:

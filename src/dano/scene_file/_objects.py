@@ -8,7 +8,6 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,6 +15,7 @@ from dano.archive import format_of, TRAJECTORY
 from dano.building import BuildOptions
 from dano.checks import checked_path
 from dano.fields import AbstractField, AbstractShape, FIELD_SUFFIXES, load_field, scaled
+from dano.keys import seed_key
 from dano.names import did_you_mean
 from dano.objects import field_size, NeuralObject
 from dano.scene_file._doubts import border_doubts, mass_doubt, size_doubts
@@ -160,7 +160,7 @@ def _made(field: AbstractField, options: BuildOptions, dashes: str, progress: Pr
         mass_scale=1.0 if options.mass_scale is None else options.mass_scale,
         mass=options.mass,
         resolution=options.resolution,
-        key=jax.random.key(options.seed),
+        key=seed_key(options.seed),
         progress=progress,
         **common,
     )

@@ -1,0 +1,101 @@
+"""Fields at many points of the host: grids by NumPy, the rest by compiled programs, in batches."""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from dano.fields._base import AbstractField
+from dano.fields._grid import GridField
+from dano.fields._shapes import AbstractShape
+from dano.fields._signed_distance import SignedDistanceGrid
+from dano.maths import is_traced
+
+BATCH = 1 << 16
+"""Points evaluated at once: large enough to amortise a call, small enough for a few MB of intermediates."""
+
+
+def density_at(field: AbstractField, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Density of a field at points [m, F]."""
+    if (host := on_host(field)) is not None:
+        return host.jet(_columns(points), 0).astype(np.float64)
+    out = np.empty(len(points))
+    for start in range(0, len(points), BATCH):
+        part = points[start : start + BATCH]
+        out[start : start + len(part)] = np.asarray(_densities(field, _padded(part, BATCH)))[: len(part)]
+    return out
+
+
+def jet_at(
+    field: AbstractField, points: Float[np.ndarray, "n 3"], of: Literal["jet", "sdf_jet"] = "jet"
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """Values and gradients of a field, or of the signed distance of a shape, at points [m, F].
+
+    Args:
+        field: The field.
+        points: The points.
+        of: "jet" of the density, "sdf_jet" of the signed distance.
+    """
+    if (host := on_host(field)) is not None:
+        value, gradient = getattr(host, of)(_columns(points), 1)
+        return value.astype(np.float64), gradient.T.astype(np.float64)
+    values, gradients, size = np.empty(len(points)), np.empty((len(points), 3)), BATCH // 2
+    for start in range(0, len(points), size):
+        part = points[start : start + size]
+        value, gradient = _jets(getattr(field, of), _padded(part, size).T)
+        values[start : start + len(part)] = np.asarray(value)[: len(part)]
+        gradients[start : start + len(part)] = np.asarray(gradient).T[: len(part)]
+    return values, gradients
+
+
+def distance_at(shape: AbstractShape, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Signed distance of a shape [m] at points [m, F]."""
+    if (host := on_host(shape)) is not None:
+        return host.sdf_jet(_columns(points), 0).astype(np.float64)
+    return jet_at(shape, points, "sdf_jet")[0]
+
+
+def normal_at(field: AbstractField, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Unit outward normals of a field at points [m, F]; zero where its density is flat."""
+    if on_host(field) is None:
+        return np.asarray(_normals(field, jnp.asarray(points)))
+    gradient = jet_at(field, points)[1]
+    # See `dano.fields._base.unit`.
+    scale = np.abs(gradient).max(axis=1, keepdims=True)
+    outward = -gradient / np.where(scale > 0, scale, 1)
+    length = np.linalg.norm(outward, axis=1, keepdims=True)
+    return outward / np.where(length > 0, length, 1)
+
+
+def on_host(field: AbstractField) -> GridField | SignedDistanceGrid | None:
+    """A grid with arrays of NumPy, which computes with NumPy; None for fields that need JAX."""
+    if not isinstance(field, GridField | SignedDistanceGrid) or is_traced(*jax.tree.leaves(field)):
+        return None
+    return jax.tree.map(np.asarray, field)
+
+
+def _columns(points: np.ndarray) -> np.ndarray:
+    """Points as columns, in the precision that JAX is set to."""
+    return np.ascontiguousarray(points.T, jnp.result_type(float))
+
+
+def _padded(points: np.ndarray, size: int) -> jax.Array:
+    return jnp.asarray(np.concatenate([points, np.repeat(points[-1:], size - len(points), axis=0)]))
+
+
+@eqx.filter_jit
+def _densities(field, points):
+    return jax.vmap(field.density)(points)
+
+
+@eqx.filter_jit
+def _jets(jet, points):
+    return jet(points, 1)
+
+
+@eqx.filter_jit
+def _normals(field, points):
+    return jax.lax.map(field.normal, points, batch_size=4096)
