@@ -8,7 +8,7 @@ _ASIDE = 1.7e-9, 2.3e-9
 _CELLS = 256
 """Most cells a side of the grid by which rays find the faces that they may meet."""
 
-_STEP = 0.6
+_STEP = 0.45
 """Cells between points along and across a face that mark the nodes next to them."""
 
 _AT_ONCE = 1 << 21
