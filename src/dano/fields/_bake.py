@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dano.checks import checked_count, checked_function, checked_kind
 from dano.fields._base import AbstractField
 from dano.fields._grid import GridField
-from dano.fields._host import density_at, on_host
+from dano.fields._host import density_at, host_jet
 from dano.fields._spline import degree_of
 from dano.keys import uniform
 from dano.maths import checked_key
@@ -123,7 +123,7 @@ def _batched_density(
     field: AbstractField, batch_size: int, dtype: np.dtype
 ) -> Callable[[Callable[[np.ndarray], np.ndarray], int, Callable[[int], None]], np.ndarray]:
     """A function that evaluates the field at points made batch by batch, so that memory stays bounded."""
-    host = on_host(field)
+    jet = host_jet(field)
 
     @eqx.filter_jit
     def compiled(field: AbstractField, x: Float[Array, "3 n"]) -> Float[Array, " n"]:
@@ -131,7 +131,7 @@ def _batched_density(
 
     def density(x: np.ndarray) -> np.ndarray:
         x = x.astype(dtype)
-        return np.asarray(compiled(field, jnp.asarray(x)) if host is None else host.jet(x, 0))
+        return np.asarray(compiled(field, jnp.asarray(x))) if jet is None else jet(x, 0)
 
     def evaluate(
         points: Callable[[np.ndarray], np.ndarray], n_points: int, report: Callable[[int], None]

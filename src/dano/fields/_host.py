@@ -1,6 +1,7 @@
 """Fields at many points of the host: grids by NumPy, the rest by compiled programs, in batches."""
 
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -10,7 +11,7 @@ from jaxtyping import Float
 
 from dano.fields._base import AbstractField
 from dano.fields._grid import GridField
-from dano.fields._shapes import AbstractShape
+from dano.fields._shapes import AbstractShape, occupancy_jet
 from dano.fields._signed_distance import SignedDistanceGrid
 from dano.maths import is_traced
 
@@ -18,10 +19,14 @@ BATCH = 1 << 16
 """Points evaluated at once: large enough to amortise a call, small enough for a few MB of intermediates."""
 
 
+_CHUNK = 2048
+"""Points that NumPy evaluates at once: 27 values of each still fit into a core's cache."""
+
+
 def density_at(field: AbstractField, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Density of a field at points [m, F]."""
-    if (host := on_host(field)) is not None:
-        return host.jet(_columns(points), 0).astype(np.float64)
+    if (jet := host_jet(field)) is not None:
+        return _in_chunks(jet, points, 0)
     out = np.empty(len(points))
     for start in range(0, len(points), BATCH):
         part = points[start : start + BATCH]
@@ -39,9 +44,8 @@ def jet_at(
         points: The points.
         of: "jet" of the density, "sdf_jet" of the signed distance.
     """
-    if (host := on_host(field)) is not None:
-        value, gradient = getattr(host, of)(_columns(points), 1)
-        return value.astype(np.float64), gradient.T.astype(np.float64)
+    if (jet := host_jet(field, of)) is not None:
+        return _in_chunks(jet, points, 1)
     values, gradients, size = np.empty(len(points)), np.empty((len(points), 3)), BATCH // 2
     for start in range(0, len(points), size):
         part = points[start : start + size]
@@ -53,14 +57,14 @@ def jet_at(
 
 def distance_at(shape: AbstractShape, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Signed distance of a shape [m] at points [m, F]."""
-    if (host := on_host(shape)) is not None:
-        return host.sdf_jet(_columns(points), 0).astype(np.float64)
+    if (jet := host_jet(shape, "sdf_jet")) is not None:
+        return _in_chunks(jet, points, 0)
     return jet_at(shape, points, "sdf_jet")[0]
 
 
 def normal_at(field: AbstractField, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Unit outward normals of a field at points [m, F]; zero where its density is flat."""
-    if on_host(field) is None:
+    if host_jet(field) is None:
         return np.asarray(_normals(field, jnp.asarray(points)))
     gradient = jet_at(field, points)[1]
     # See `dano.fields._base.unit`.
@@ -70,16 +74,32 @@ def normal_at(field: AbstractField, points: Float[np.ndarray, "n 3"]) -> Float[n
     return outward / np.where(length > 0, length, 1)
 
 
-def on_host(field: AbstractField) -> GridField | SignedDistanceGrid | None:
-    """A grid with arrays of NumPy, which computes with NumPy; None for fields that need JAX."""
+def host_jet(
+    field: AbstractField, of: Literal["jet", "sdf_jet"] = "jet"
+) -> Callable[[np.ndarray, int], Any] | None:
+    """The jet of a grid by NumPy, of points as columns and an order; None for fields that need JAX."""
     if not isinstance(field, GridField | SignedDistanceGrid) or is_traced(*jax.tree.leaves(field)):
         return None
-    return jax.tree.map(np.asarray, field)
+    # A grid of NumPy's arrays computes with NumPy.
+    host = jax.tree.map(np.asarray, field)
+    if of == "jet" and isinstance(host, SignedDistanceGrid):
+        edge = np.asarray(host.edge_width)
+        return lambda x, order: occupancy_jet(host.sdf_jet(x, order), edge.astype(x.dtype), order)
+    return getattr(host, of)
 
 
-def _columns(points: np.ndarray) -> np.ndarray:
-    """Points as columns, in the precision that JAX is set to."""
-    return np.ascontiguousarray(points.T, jnp.result_type(float))
+def _in_chunks(jet: Callable[[np.ndarray, int], Any], points: np.ndarray, order: int) -> Any:
+    """Values, or values and gradients, of a jet at points, in the precision that JAX is set to."""
+    dtype = jnp.result_type(float)
+    values, gradients = np.empty(len(points)), np.empty((len(points), 3) if order else 0)
+    for start in range(0, len(points), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        found = jet(np.ascontiguousarray(points[part].T, dtype), order)
+        if order:
+            values[part], gradients[part] = found[0], found[1].T
+        else:
+            values[part] = found
+    return (values, gradients) if order else values
 
 
 def _padded(points: np.ndarray, size: int) -> jax.Array:
