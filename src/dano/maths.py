@@ -6,6 +6,7 @@ quaternions compute NumPy arrays with NumPy, on the host and in their own dtype,
 """
 
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any, TypeVar
@@ -18,6 +19,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from dano.checks import shown
+from dano.keys import seed_key
 
 Numbers = ArrayLike | Sequence[Any]
 """What constructors take for an array: an array, a number, or (nested) lists and tuples of numbers."""
@@ -32,9 +34,9 @@ _SERIES = 1e-4
 """Below this, of the square of half an angle [rad²], five terms of a series are exact in float64."""
 
 
-def library(*arrays: AnyArray) -> ModuleType:
-    """NumPy for its arrays, JAX's for others."""
-    return np if all(isinstance(array, np.ndarray | np.generic) for array in arrays) else jnp
+def library(*arrays: AnyArray | float) -> ModuleType:
+    """NumPy for its arrays and numbers, JAX's for others."""
+    return np if all(isinstance(array, np.ndarray | np.generic | float | int) for array in arrays) else jnp
 
 
 def by_numpy(function: Function) -> Function:
@@ -89,15 +91,16 @@ def safe_norm(x: Float[Q, "..."], axis: int = -1) -> Float[Q, "..."]:
     return xp.where(positive, xp.sqrt(xp.where(positive, squared, 1)), 0)
 
 
-def column_norm(x: Float[Array, "k *batch"]) -> Float[Array, "*batch"]:
+def column_norm(x: Float[Q, "k *batch"]) -> Float[Q, "*batch"]:
     """Length of vectors stored as columns; its derivative at zero is zero instead of NaN.
 
     Faster than `safe_norm` over the first axis of many columns on a CPU.
     """
-    squared = functools.reduce(jnp.add, [row * row for row in x])
+    xp = library(x)
+    squared = functools.reduce(operator.add, [row * row for row in x])
     # The untaken branch must be safe too: 0 · ∞ in the chain rule would be NaN.
     positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
+    return xp.where(positive, xp.sqrt(xp.where(positive, squared, 1)), 0)
 
 
 @by_numpy
@@ -489,7 +492,7 @@ def checked_key(key: PRNGKeyArray | None) -> PRNGKeyArray:
         ValueError: If it is not a single key of JAX.
     """
     if key is None:
-        return jax.random.key(0)
+        return seed_key(0)
     dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
     typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
     # What `jax.random.PRNGKey` makes.

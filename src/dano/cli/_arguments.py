@@ -451,6 +451,32 @@ class Compare:
 
 
 @dataclass(frozen=True)
+class Cache:
+    """Show what is kept between commands, clear it, or limit it.
+
+    Objects built of meshes and fields, shapes of robots' meshes, kernels and compiled programs: how many, how
+    large, when used last. What is removed is made again when it is needed.
+
+    Attributes:
+        kinds: Only these; default: all.
+        clear: Remove them.
+        limit: Remove what was not used for longest until no more than this is left, such as 500MB.
+        json: Print one JSON object instead of text.
+    """
+
+    kinds: Positional[tuple[Literal["objects", "meshes", "kernels", "compiled"], ...]] = ()
+    clear: bool = False
+    limit: str | None = None
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from dano.cli import _cache
+
+        _cache.cache(self)
+
+
+@dataclass(frozen=True)
 class Demo:
     """Build the shipped objects, simulate a scene of them, and draw everything.
 

@@ -11,10 +11,9 @@ import numpy as np
 from dano.cli._arguments import Build, Inspect
 from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._outputs import check_output, missing_for_pictures
-from dano.fields import load_field
 from dano.objects import Interior, NeuralObject
 from dano.robots import read_robot, robot_doubts, robot_tree
-from dano.scene_file import build_object, load_object
+from dano.scene_file import load_object, object_of_file
 
 # Names of files that hold robots end so.
 _ROBOTS = (".urdf", ".xml", ".mjcf")
@@ -29,8 +28,7 @@ def build(command: Build) -> None:
     check_output(output, command.field)
     progress = Progress()
     progress("reading the field", 0.0)
-    field = load_field(command.field, units=options.units)
-    made = build_object(field, options, dashes="--", progress=progress)
+    made = object_of_file(command.field, options, dashes="--", progress=progress)
     progress.close()
     made.save(output)
     report = describe(made, output)

@@ -15,6 +15,7 @@ from tyro.conf import FlagCreatePairsOff
 from dano import __version__
 from dano.cli._arguments import (
     Build,
+    Cache,
     Compare,
     Data,
     Demo,
@@ -65,6 +66,9 @@ GROUPS: dict[str, dict[str, _Row]] = {
         "check": _Row(Check, "dano check scene.toml"),
         "identify": _Row(Identify, "dano identify scene.toml throw.npz -p mug,table.sliding_friction:0:1"),
         "plan": _Row(Plan, "dano plan scene.toml task.toml --video plan.mp4"),
+    },
+    "This program": {
+        "cache": _Row(Cache, "dano cache objects --limit 500MB"),
     },
 }
 """Commands in the order in which `dano --help` shows them: most used first."""

@@ -28,6 +28,12 @@ from dano.fields._convex import (
 from dano.fields._ellipsoid import Ellipsoid as Ellipsoid
 from dano.fields._grid import DensityMoments as DensityMoments, GridField as GridField
 from dano.fields._hash_grid import HashGrid as HashGrid
+from dano.fields._host import (
+    density_at as density_at,
+    distance_at as distance_at,
+    jet_at as jet_at,
+    normal_at as normal_at,
+)
 from dano.fields._parts import large_parts as large_parts, largest_part as largest_part
 from dano.fields._primitives import (
     Box as Box,
@@ -50,6 +56,7 @@ from dano.fields._signed_distance import (
 from dano.fields._spline import degree_of as degree_of
 from dano.fields.meshes import mesh_field as mesh_field, MESH_SUFFIXES as MESH_SUFFIXES, UNITS as UNITS
 from dano.fields.readers import (
+    companion_files as companion_files,
     FIELD_FORMATS as FIELD_FORMATS,
     FIELD_SUFFIXES as FIELD_SUFFIXES,
     is_splats as is_splats,

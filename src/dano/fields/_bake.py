@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -12,7 +11,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dano.checks import checked_count, checked_function, checked_kind
 from dano.fields._base import AbstractField
 from dano.fields._grid import GridField
+from dano.fields._host import density_at, host_jet
 from dano.fields._spline import degree_of
+from dano.keys import uniform
 from dano.maths import checked_key
 from dano.memory import check_nodes
 from dano.progress import Progress
@@ -115,7 +116,6 @@ def bake(
             f" {np.sum(~np.isfinite(samples))} NaN or infinite and a largest of {np.nanmax(samples)}"
         )
     grid = GridField.interpolating(samples, origin.astype(dtype), float(spacing), interpolation)
-    key = jax.random.key(0) if key is None else key
     return Baked(grid, _error(grid, evaluate, samples.max(), key))
 
 
@@ -123,10 +123,15 @@ def _batched_density(
     field: AbstractField, batch_size: int, dtype: np.dtype
 ) -> Callable[[Callable[[np.ndarray], np.ndarray], int, Callable[[int], None]], np.ndarray]:
     """A function that evaluates the field at points made batch by batch, so that memory stays bounded."""
+    jet = host_jet(field)
 
     @eqx.filter_jit
-    def density(field: AbstractField, x: Float[Array, "3 n"]) -> Float[Array, " n"]:
+    def compiled(field: AbstractField, x: Float[Array, "3 n"]) -> Float[Array, " n"]:
         return field.jet(x, 0)
+
+    def density(x: np.ndarray) -> np.ndarray:
+        x = x.astype(dtype)
+        return np.asarray(compiled(field, jnp.asarray(x))) if jet is None else jet(x, 0)
 
     def evaluate(
         points: Callable[[np.ndarray], np.ndarray], n_points: int, report: Callable[[int], None]
@@ -136,7 +141,7 @@ def _batched_density(
         for start in range(0, n_points, size):
             # The last batch repeats a point instead of shrinking: one compiled function serves all.
             rows = np.minimum(np.arange(start, start + size), n_points - 1)
-            values.append(np.asarray(density(field, jnp.asarray(points(rows), dtype))))
+            values.append(density(points(rows)))
             report(start + size)
         return np.concatenate(values)[:n_points]
 
@@ -145,10 +150,10 @@ def _batched_density(
 
 def _error(grid: GridField, evaluate: Callable, largest: float, key: PRNGKeyArray) -> BakeError:
     lower, upper = np.asarray(grid.bounds, dtype=np.float64)
-    uniform = np.asarray(jax.random.uniform(key, (3, _N_TESTS)), dtype=np.float64)
-    points = lower[:, None] + (upper - lower)[:, None] * uniform
+    shares = uniform(key, (3, _N_TESTS)).astype(np.float64)
+    points = lower[:, None] + (upper - lower)[:, None] * shares
     truth = evaluate(lambda rows: points[:, rows], _N_TESTS, lambda _: None).astype(np.float64)
-    baked = np.asarray(grid.jet(jnp.asarray(points, grid.spacing.dtype), 0), dtype=np.float64)
+    baked = density_at(grid, points.T)
     difference = baked - truth
     scale = max(float(largest), float(truth.max()))
     return BakeError(

@@ -7,6 +7,7 @@ from typing import Any, TYPE_CHECKING
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from dano.maths import safe_normalize
@@ -15,10 +16,11 @@ if TYPE_CHECKING:
     # The length of a jet depends on the value of `order`; types follow it only with overloads in every class.
     Jet = Any
 else:
+    _Array = Array | np.ndarray
     Jet = (
-        Float[Array, " n"]
-        | tuple[Float[Array, " n"], Float[Array, "3 n"]]
-        | tuple[Float[Array, " n"], Float[Array, "3 n"], Float[Array, "3 3 n"]]
+        Float[_Array, " n"]
+        | tuple[Float[_Array, " n"], Float[_Array, "3 n"]]
+        | tuple[Float[_Array, " n"], Float[_Array, "3 n"], Float[_Array, "3 3 n"]]
     )
     """φ, (φ, ∇φ) or (φ, ∇φ, ∇∇φ) of n points, structure-of-arrays: the points are the last axis."""
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from dano.fields._base import AbstractField, check_order, Jet, vmapped_jet
 from dano.hosted import hosted
-from dano.maths import checked_array, column_norm, is_traced, Numbers
+from dano.maths import checked_array, column_norm, is_traced, library, Numbers, Q
 
 DEFAULT_EDGE = 0.005
 """Edge width of a shape that states none, as a fraction of its size.
@@ -48,33 +48,35 @@ def scaled_moments(moments: SolidMoments, factor: Float[Array, ""]) -> SolidMome
     )
 
 
-def occupancy(sdf: Float[Array, "*batch"], edge: ArrayLike) -> Float[Array, "*batch"]:
+def occupancy(sdf: Float[Q, "*batch"], edge: ArrayLike) -> Float[Q, "*batch"]:
     """Smooth indicator of {sdf ≤ 0}: t²(3 − 2t) with t = clip(1/2 − sdf/edge, 0, 1).
 
     Args:
         sdf: Signed distance [m], negative inside.
         edge: Width of the band over which the occupancy falls from 1 to 0 [m]; 0 gives the hard indicator.
     """
-    edge = jnp.broadcast_to(jnp.asarray(edge, sdf.dtype), sdf.shape)
+    xp = library(sdf, edge)
+    edge = xp.broadcast_to(xp.asarray(edge, sdf.dtype), sdf.shape)
     smooth = edge > 0
     # The division must be finite in the untaken branch too, or its derivative is NaN.
-    t = jnp.clip(0.5 - sdf / jnp.where(smooth, edge, 1), 0, 1)
-    return jnp.where(smooth, t * t * (3 - 2 * t), (sdf <= 0).astype(sdf.dtype))
+    t = xp.clip(0.5 - sdf / xp.where(smooth, edge, 1), 0, 1)
+    return xp.where(smooth, t * t * (3 - 2 * t), (sdf <= 0).astype(sdf.dtype))
 
 
-def occupancy_jet(sdf_jet: Jet, edge: Float[Array, ""], order: int) -> Jet:
+def occupancy_jet(sdf_jet: Jet, edge: Float[Array | np.ndarray, ""], order: int) -> Jet:
     """Jet of the occupancy from the jet of the signed distance, by the chain rule."""
     if order == 0:
         return occupancy(sdf_jet, edge)
     sdf, gradient, *hessian = sdf_jet
+    xp = library(sdf, edge)
     smooth = edge > 0
-    width = jnp.where(smooth, edge, 1)
-    t = jnp.clip(0.5 - sdf / width, 0, 1)
-    first = jnp.where(smooth, -6 * t * (1 - t) / width, 0)
+    width = xp.where(smooth, edge, 1)
+    t = xp.clip(0.5 - sdf / width, 0, 1)
+    first = xp.where(smooth, -6 * t * (1 - t) / width, 0)
     value = occupancy(sdf, edge)
     if order == 1:
         return value, first[None] * gradient
-    second = jnp.where(smooth & (t > 0) & (t < 1), (6 - 12 * t) / width**2, 0)
+    second = xp.where(smooth & (t > 0) & (t < 1), (6 - 12 * t) / width**2, 0)
     outer = gradient[:, None] * gradient[None]
     return value, first[None] * gradient, second[None, None] * outer + first[None, None] * hessian[0]
 
@@ -129,9 +131,11 @@ class AbstractShape(AbstractField):
         """
         return vmapped_jet(self.sdf, x, order)
 
-    def jet(self, x: Float[Array, "3 n"], order: int) -> Jet:
+    def jet(self, x: Float[Q, "3 n"], order: int) -> Jet:
         """See `AbstractField.jet`: φ(s) of the signed distance, ∇φ = φ′ ∇s, ∇∇φ = φ″ ∇s ∇sᵀ + φ′ ∇∇s."""
-        return occupancy_jet(self.sdf_jet(x, order), self.edge_width.astype(x.dtype), order)
+        distances, edge = self.sdf_jet(x, order), self.edge_width.astype(x.dtype)
+        on_host = library(*jax.tree.leaves(distances)) is np
+        return occupancy_jet(distances, np.asarray(edge) if on_host else edge, order)
 
 
 def checked_edge(edge: ArrayLike | None) -> Float[Array, ""] | None:

@@ -11,9 +11,9 @@ from dano.fields._base import check_order, Jet
 from dano.fields._grid import checked_spacing, scaled_jet
 from dano.fields._redistance import spread_distances
 from dano.fields._shapes import AbstractShape, checked_edge, scaled_moments, SolidMoments
-from dano.fields._spline import border, degree_of, interpolating_coefficients, spline_jet
+from dano.fields._spline import border, degree_of, interpolating_coefficients, node_values, spline_jet
 from dano.hosted import hosted
-from dano.maths import checked_array, checked_floating, column_norm, is_traced, Numbers
+from dano.maths import checked_array, checked_floating, column_norm, is_traced, library, Numbers, Q
 
 _EXTENSION = 16
 """Nodes added by odd reflection, which continues a slope, to keep the spline filter's ends away."""
@@ -87,14 +87,9 @@ class SignedDistanceGrid(AbstractShape):
         self.solid_bounds = _corners(self.origin, self.spacing, cells)
 
     @property
-    @hosted
     def distances(self) -> Float[Array, "nx ny nz"]:
         """Signed distances [m] at the nodes."""
-        degree = degree_of(self.interpolation)
-        shape = [size - 2 * border(degree) for size in self.coefficients.shape]
-        nodes = jnp.stack(jnp.meshgrid(*map(jnp.arange, shape), indexing="ij")).reshape(3, -1)
-        values = spline_jet(self.coefficients, nodes.astype(self.coefficients.dtype), degree, 0)
-        return values[0].reshape(shape)
+        return node_values(self.coefficients, degree_of(self.interpolation))
 
     def leaf(self) -> dict[str, Array]:
         """See `AbstractPrimitive.leaf`."""
@@ -113,15 +108,16 @@ class SignedDistanceGrid(AbstractShape):
         """Largest extent of the solid [m], to within two cells."""
         return jnp.max(self.solid_bounds[1] - self.solid_bounds[0])
 
-    def _split(self, x: Float[Array, "3 n"]) -> tuple[Array, Array, Array]:
+    def _split(self, x: Float[Q, "3 n"]) -> tuple[Q, Q, Q]:
         """Closest points of the grid in index units, the way [m] from there to `x`, whether it is zero."""
+        xp = library(x, self.origin, self.spacing)
         n_border = border(degree_of(self.interpolation))
-        last = jnp.asarray([size - 2 * n_border - 1 for size in self.coefficients.shape], x.dtype)
+        last = xp.asarray([size - 2 * n_border - 1 for size in self.coefficients.shape], x.dtype)
         spacing = self.spacing.astype(x.dtype)[:, None]
         u = (x - self.origin.astype(x.dtype)[:, None]) / spacing
         inside = (u >= 0) & (u <= last[:, None])
-        closest = jnp.clip(u, 0, jnp.broadcast_to(last[:, None], u.shape))
-        return closest, jnp.where(inside, 0, (u - closest) * spacing), inside
+        closest = xp.clip(u, 0, xp.broadcast_to(last[:, None], u.shape))
+        return closest, xp.where(inside, 0, (u - closest) * spacing), inside
 
     def sdf(self, x: Float[Array, "3"]) -> Float[Array, ""]:
         """Signed distance [m] at `x` [m, F], as accurate as its interpolation."""
@@ -129,9 +125,10 @@ class SignedDistanceGrid(AbstractShape):
         rows = spline_jet(self.coefficients, closest, degree_of(self.interpolation), 0)
         return rows[0, 0] + column_norm(beyond)[0]
 
-    def sdf_jet(self, x: Float[Array, "3 n"], order: int) -> Jet:
+    def sdf_jet(self, x: Float[Q, "3 n"], order: int) -> Jet:
         """See `AbstractShape.sdf_jet`; closed forms, as fast as a `GridField`."""
         check_order(order)
+        xp = library(x, self.origin, self.spacing)
         closest, beyond, inside = self._split(x)
         rows = spline_jet(self.coefficients, closest, degree_of(self.interpolation), order)
         jet = scaled_jet(rows, self.spacing.astype(x.dtype), order)
@@ -139,14 +136,14 @@ class SignedDistanceGrid(AbstractShape):
         if order == 0:
             return jet + distance
         value, gradient, *hessian = jet
-        safe = jnp.where(distance > 0, distance, 1)[None]
+        safe = xp.where(distance > 0, distance, 1)[None]
         away = beyond / safe
         # Moving along an axis on which the point lies outside leaves the closest point where it is.
         moves = inside.astype(x.dtype)
         first = (value + distance, moves * gradient + away)
         if order == 1:
             return first
-        turning = jnp.eye(3, dtype=x.dtype)[:, :, None] * (1 - moves)[None] - away[:, None] * away[None]
+        turning = xp.eye(3, dtype=x.dtype)[:, :, None] * (1 - moves)[None] - away[:, None] * away[None]
         return *first, moves[:, None] * moves[None] * hessian[0] + turning / safe[None]
 
     def solid_moments(self) -> SolidMoments | None:

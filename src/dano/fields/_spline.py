@@ -11,6 +11,7 @@ derivative order.
 """
 
 import functools
+import operator
 from collections.abc import Iterable
 from typing import Any
 
@@ -22,12 +23,16 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from dano.checks import checked_choice
+from dano.maths import is_traced, library, Q
 
 DEGREES = {"linear": 1, "quadratic": 2, "cubic": 3}
 """Degree of the spline of each kind of interpolation."""
 
 CHUNK = 1024
 """Most points evaluated at once on a CPU: 27 values of each still fit into a core's cache."""
+
+_HOST_CHUNK = 2048
+"""The same for NumPy, whose calls cost a microsecond each."""
 
 # How far β of a degree reaches from its node, in index units, is (degree + 1)/2. Points are clamped to where
 # all nodes of their stencil lie in the zero border, which is `border(degree)` nodes wide.
@@ -58,11 +63,12 @@ def multi_indices(order: int) -> list[tuple[int, int, int]]:
     ]
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
 def spline_jet(
-    coefficients: Float[Array, "nx ny nz"], u: Float[Array, "3 n"], degree: int, order: int
-) -> Float[Array, "rows n"]:
+    coefficients: Float[Q, "nx ny nz"], u: Float[Q, "3 n"], degree: int, order: int
+) -> Float[Q, "rows n"]:
     """Derivatives up to `order` of a spline at many points.
+
+    Arrays of NumPy are computed by NumPy: a third as fast, but nothing is compiled.
 
     Args:
         coefficients: c, with a border of `border(degree)` nodes on every side.
@@ -74,6 +80,21 @@ def spline_jet(
     Returns:
         One row per derivative, in the order of `multi_indices`, in index units and in the dtype of `u`.
     """
+    if library(coefficients, u) is jnp:
+        return _compiled_jet(coefficients, u, degree, order)
+    found = np.empty((len(multi_indices(order)), u.shape[1]), u.dtype)
+    with np.errstate(invalid="ignore"):
+        for start in range(0, u.shape[1], _HOST_CHUNK):
+            part = slice(start, start + _HOST_CHUNK)
+            found[:, part] = _rows(coefficients, u[:, part], degree, order)
+    return found
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
+def _compiled_jet(
+    coefficients: Float[Array, "nx ny nz"], u: Float[Array, "3 n"], degree: int, order: int
+) -> Float[Array, "rows n"]:
+    """`spline_jet` by JAX, with its derivatives."""
     n_points = u.shape[1]
     # Chunks only pay where a cache is small; an accelerator wants all points at once.
     if n_points <= CHUNK or jax.default_backend() != "cpu":
@@ -86,7 +107,7 @@ def spline_jet(
     return rows.transpose(1, 0, 2).reshape(rows.shape[1], -1)[:, :n_points]
 
 
-@functools.partial(spline_jet.defjvp, symbolic_zeros=True)
+@functools.partial(_compiled_jet.defjvp, symbolic_zeros=True)
 def _spline_jet_jvp(
     degree: int, order: int, primals: tuple[Array, Array], tangents: tuple[Any, Any]
 ) -> tuple[Array, Array]:
@@ -95,7 +116,7 @@ def _spline_jet_jvp(
     dcoefficients, du = tangents
     indices, next_indices = multi_indices(order), multi_indices(order + 1)
     # Third derivatives are asked for only by derivatives of Hessians; those may go through the gathers.
-    jet = _rows if order >= 2 else spline_jet
+    jet = _rows if order >= 2 else _compiled_jet
     higher = jet(coefficients, u, degree, order if isinstance(du, SymbolicZero) else order + 1)
     rows = higher[: len(indices)]
     tangent = jnp.zeros_like(rows)
@@ -118,11 +139,11 @@ def _raised(index: tuple[int, int, int], axis: int) -> tuple[int, int, int]:
 
 
 def _rows(
-    coefficients: Float[Array, "nx ny nz"], u: Float[Array, "3 n"], degree: int, order: int
-) -> Float[Array, "rows n"]:
+    coefficients: Float[Q, "nx ny nz"], u: Float[Q, "3 n"], degree: int, order: int
+) -> Float[Q, "rows n"]:
     """`spline_jet` of all points at once: gather a block per point, then contract it along z, y and x."""
     base, weights = _stencil(coefficients.shape, u, degree, order)
-    block = _gather_blocks(coefficients, base, degree + 1).astype(u.dtype)
+    block = _gather_blocks(coefficients, base, degree + 1).astype(u.dtype, copy=False)
     taps = range(degree + 1)
     if order == 0 and degree == 3 and u.shape[1] > 1:
         # One expression a point: in stages, XLA works the weights out anew for each of 16 rows, three times
@@ -132,66 +153,82 @@ def _rows(
             [_total(block[i, j, q] * w[q][2] for q in taps) * w[j][1] * w[i][0] for j in taps] for i in taps
         ]
         return _total(_total(row) for row in rows)[None]
-    along_z = [_total(block[:, :, q] * weights[c][q][2][None, None] for q in taps) for c in range(order + 1)]
+    along_z = [_contracted(block, [w[2] for w in weights[c]]) for c in range(order + 1)]
     along_y = {
-        (b, c): _total(along_z[c][:, q] * weights[b][q][1][None] for q in taps)
+        (b, c): _contracted(along_z[c], [w[1] for w in weights[b]])
         for c in range(order + 1)
         for b in range(order + 1 - c)
     }
-    return jnp.stack(
-        [_total(along_y[b, c][q] * weights[a][q][0] for q in taps) for a, b, c in multi_indices(order)]
+    return library(u).stack(
+        [_contracted(along_y[b, c], [w[0] for w in weights[a]]) for a, b, c in multi_indices(order)]
     )
 
 
-def _total(terms: Iterable[Array]) -> Array:
-    return functools.reduce(jnp.add, terms)
+def _contracted(block: Float[Q, "*axes taps n"], weights: list[Q]) -> Float[Q, "*axes n"]:
+    """The sum over the last taps, each with the weight of its point."""
+    if library(block, *weights) is np:
+        # Without arrays for the products, which cost twice as much as these.
+        return np.einsum("...kn,kn->...n", block, np.stack(weights))
+    alone = (None,) * (block.ndim - 2)
+    return _total(block[..., q, :] * weight[alone] for q, weight in enumerate(weights))
+
+
+def _total(terms: Iterable[Q]) -> Q:
+    return functools.reduce(operator.add, terms)
 
 
 def _stencil(
-    shape: tuple[int, ...], u: Float[Array, "3 n"], degree: int, order: int
-) -> tuple[Int[Array, "3 n"], list[list[Array]]]:
+    shape: tuple[int, ...], u: Float[Q, "3 n"], degree: int, order: int
+) -> tuple[Int[Q, "3 n"], list[list[Q]]]:
     """First node of each point's stencil, and its weights as ``weights[derivative][tap]`` of shape (3, n)."""
+    xp = library(u)
     lowest = _LOWEST[degree]
     n_border = border(degree)
     # Highest base node whose stencil still lies in the array; it is in the border, as `lowest` is.
     shift = 0 if degree == 1 else 1
     highest = np.asarray([size - n_border - 1 - degree + shift for size in shape], dtype=np.int32)
-    upper = jnp.asarray(highest[:, None], u.dtype)
-    u = jnp.minimum(jnp.maximum(u, jnp.asarray(lowest, u.dtype)), jnp.broadcast_to(upper, u.shape))
-    node = jnp.floor(u + 0.5) if degree == 2 else jnp.floor(u)
+    upper = xp.asarray(highest[:, None], u.dtype)
+    u = xp.minimum(xp.maximum(u, xp.asarray(lowest, u.dtype)), upper)
+    node = xp.floor(u + 0.5) if degree == 2 else xp.floor(u)
     # A NaN point must give NaN, not an address: the integer is clamped once more, after the conversion.
-    base = jnp.clip(node.astype(jnp.int32), lowest, jnp.broadcast_to(jnp.asarray(highest[:, None]), u.shape))
-    return base + jnp.int32(n_border - shift), _weights(u - node, degree, order)
+    base = xp.minimum(xp.maximum(node.astype(np.int32), np.int32(lowest)), highest[:, None])
+    return base + np.int32(n_border - shift), _weights(u - node, degree, order)
 
 
-def _weights(f: Float[Array, "3 n"], degree: int, order: int) -> list[list[Array]]:
+def _weights(f: Float[Q, "3 n"], degree: int, order: int) -> list[list[Q]]:
     """Weights of the stencil's nodes and their derivatives, at f past the base (quadratic: nearest) node."""
-    one = jnp.ones_like(f)
-    zero = jnp.zeros_like(f)
-    g = 1 - f
+    xp = library(f)
+    one, g = xp.ones_like(f), 1 - f
     if degree == 1:
-        table = [[g, f], [-one, one]]
+        table = [lambda: [g, f], lambda: [-one, one]]
     elif degree == 2:
         table = [
-            [0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2],
-            [f - 0.5, -2 * f, f + 0.5],
-            [one, -2 * one, one],
+            lambda: [0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2],
+            lambda: [f - 0.5, -2 * f, f + 0.5],
+            lambda: [one, -2 * one, one],
         ]
     else:
         table = [
-            [g**3 / 6, 2 / 3 - f * f * (1 - 0.5 * f), 2 / 3 - g * g * (1 - 0.5 * g), f**3 / 6],
-            [-0.5 * g * g, f * (1.5 * f - 2), g * (2 - 1.5 * g), 0.5 * f * f],
-            [g, 3 * f - 2, 3 * g - 2, f],
-            [-one, 3 * one, -3 * one, one],
+            lambda: [g**3 / 6, 2 / 3 - f * f * (1 - 0.5 * f), 2 / 3 - g * g * (1 - 0.5 * g), f**3 / 6],
+            lambda: [-0.5 * g * g, f * (1.5 * f - 2), g * (2 - 1.5 * g), 0.5 * f * f],
+            lambda: [g, 3 * f - 2, 3 * g - 2, f],
+            lambda: [-one, 3 * one, -3 * one, one],
         ]
-    while len(table) <= order:
-        table.append([zero] * (degree + 1))
-    return table
+    rows = [row() for row in table[: order + 1]]
+    return rows + [[xp.zeros_like(f)] * (degree + 1)] * (order + 1 - len(rows))
 
 
 def _gather_blocks(
-    coefficients: Float[Array, "nx ny nz"], base: Int[Array, "3 n"], taps: int
-) -> Float[Array, "taps taps taps n"]:
+    coefficients: Float[Q, "nx ny nz"], base: Int[Q, "3 n"], taps: int
+) -> Float[Q, "taps taps taps n"]:
+    if library(coefficients, base) is np:
+        _, ny, nz = coefficients.shape
+        flat, first = np.ravel(coefficients), (base[0].astype(np.intp) * ny + base[1]) * nz + base[2]
+        block = np.empty((taps, taps, taps, base.shape[1]), flat.dtype)
+        for i, j, k in np.ndindex(taps, taps, taps):
+            # One place of the stencil for all points at a time: six times as fast as one array of all places.
+            block[i, j, k] = flat[(i * ny + j) * nz + k :][first]
+        return block
     # Point by point, and apart from what reads the block: XLA's CPU code without fusion emitters is three to
     # eight times slower where it gathers tap by tap.
     dimensions = lax.GatherDimensionNumbers(
@@ -201,6 +238,23 @@ def _gather_blocks(
         coefficients, base.T, dimensions, (taps, taps, taps), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS
     )
     return lax.optimization_barrier(block).transpose(1, 2, 3, 0)
+
+
+def node_values(coefficients: Float[Array, "px py pz"], degree: int) -> Float[Array, "nx ny nz"]:
+    """Values of a spline at the nodes inside its border."""
+    weights = {1: (1.0,), 2: (0.125, 0.75, 0.125), 3: (1 / 6, 2 / 3, 1 / 6)}[degree]
+    xp = np if not is_traced(coefficients) else jnp
+    values = xp.asarray(coefficients)
+    for axis, size in enumerate(values.shape):
+        # Nodes of the border next to the others count, too.
+        reach, inner = len(weights) // 2, size - 2 * border(degree)
+        first = border(degree) - reach
+        parts = [
+            weight * xp.take(values, np.arange(first + k, first + k + inner), axis)
+            for k, weight in enumerate(weights)
+        ]
+        values = _total(parts)
+    return jax.device_put(values) if xp is np else values
 
 
 def interpolating_coefficients(samples: np.ndarray, degree: int) -> np.ndarray:

@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from dano.checks import checked_kind
-from dano.fields import GridField
+from dano.fields import density_at, GridField
 from dano.maths import floating
-from dano.objects._mass import host_jet
 from dano.objects._samples import Lattice, plateau
 
 LEVELS = (0.5, 0.35, 0.25, 0.17, 0.12)
@@ -170,7 +169,7 @@ def node_values(grid: GridField) -> Float[np.ndarray, "nx ny nz"]:
     """Densities at the nodes of a grid, where its coefficients may overshoot."""
     origin, spacing = np.asarray(grid.origin, np.float64), np.asarray(grid.spacing, np.float64)
     nodes = origin + spacing * np.argwhere(np.ones(grid.shape, bool))
-    return host_jet(grid.jet, nodes)[0].reshape(grid.shape)
+    return density_at(grid, nodes).reshape(grid.shape)
 
 
 def sealed(lattice: Lattice, interior: Interior, inside: Bool[np.ndarray, "nx ny nz"]) -> GridField:

@@ -1,21 +1,22 @@
 """Mass, centre of mass and inertia of a density, with honest error bars."""
 
+import functools
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.checks import checked_count, checked_number
-from dano.fields import AbstractField, GridField, Jet
+from dano.fields import AbstractField, density_at, GridField
+from dano.keys import key_words
 from dano.maths import checked_array, checked_key, is_traced, Numbers
 
-Density = Callable[[Float[Array, "3"]], Float[Array, ""]]
+Density = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
+"""Densities at points [m, F] of the host."""
 Progress = Callable[[str, float], None]
 
-# Points evaluated at once: large enough to amortise a call, small enough for a few MB of intermediates.
+# Cells looked at together.
 BATCH = 1 << 16
 # Share by which a moment may exceed the sum of the other two: rounding of float32, and of files with four
 # digits.
@@ -126,7 +127,7 @@ def checked_inertia(name: str, value: Numbers) -> Float[Array, "3 3"]:
 
 
 def checked_density(field: AbstractField) -> Density:
-    """The field's density as a function, after checking that its bounds are finite.
+    """The field's density at points, after checking that its bounds are finite.
 
     Raises:
         ValueError: If they are not.
@@ -141,20 +142,16 @@ def checked_density(field: AbstractField) -> Density:
         raise ValueError(f"field must have finite bounds to become an object, got {bounds.tolist()}")
     if not np.all(bounds[1] > bounds[0]):
         raise ValueError(f"field must have bounds of positive extent, got {bounds.tolist()}")
-    return field.density
+    return functools.partial(density_at, field)
 
 
 def evaluate(density: Density, points: np.ndarray) -> np.ndarray:
-    """Density at host points (n, 3), in batches.
+    """Density at host points (n, 3).
 
     Raises:
         ValueError: If a value is negative or not finite.
     """
-    out = np.empty(len(points))
-    for start in range(0, len(points), BATCH):
-        part = points[start : start + BATCH]
-        padded = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)])
-        out[start : start + len(part)] = np.asarray(_batched(density, jnp.asarray(padded)))[: len(part)]
+    out = density(points)
     if not np.all(np.isfinite(out)):
         raise ValueError(
             f"field must have finite densities, got {out[~np.isfinite(out)][0]} "
@@ -165,40 +162,13 @@ def evaluate(density: Density, points: np.ndarray) -> np.ndarray:
     return out
 
 
-@eqx.filter_jit
-def _batched(density, points):
-    return jax.vmap(density)(points)
-
-
-def host_jet(jet: Callable[[Array, int], Jet], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values (n,) and gradients (n, 3) of a field or a signed distance at host points (n, 3), in batches.
-
-    Args:
-        jet: `AbstractField.jet` or `AbstractShape.sdf_jet` of an instance.
-        points: [m, F].
-    """
-    values, gradients = np.empty(len(points)), np.empty((len(points), 3))
-    for start in range(0, len(points), BATCH // 2):
-        part = points[start : start + BATCH // 2]
-        padded = np.concatenate([part, np.repeat(part[-1:], BATCH // 2 - len(part), axis=0)])
-        value, gradient = _compiled_jet(jet, jnp.asarray(padded.T))
-        values[start : start + len(part)] = np.asarray(value)[: len(part)]
-        gradients[start : start + len(part)] = np.asarray(gradient).T[: len(part)]
-    return values, gradients
-
-
-@eqx.filter_jit
-def _compiled_jet(jet, points):
-    return jet(points, 1)
-
-
 def cells(bounds: Float[Array, "2 3"], resolution: int, least: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Number of cells (3,) and their sides [m] (3,) of a grid of `resolution` cells on the longest axis.
 
     The cells are cubes, but for axes that have the least number of them.
     """
     resolution = checked_count("resolution", resolution, least=4)
-    extent = np.asarray(bounds[1] - bounds[0], dtype=np.float64)
+    extent = np.ptp(np.asarray(bounds), axis=0).astype(np.float64)
     count = np.maximum(np.ceil(extent / extent.max() * resolution - 1e-9).astype(int), least)
     return count, extent / count
 
@@ -217,9 +187,9 @@ def integrated(field: AbstractField, mass_scale, mass, resolution, key, progress
 
 
 def integrate(density, bounds, mass_scale, mass, resolution, key, progress) -> MassProperties:
-    """See `MassProperties.from_field`; `density` is a function of one point."""
+    """See `MassProperties.from_field`; of a density at points."""
     count, side = cells(bounds, resolution)
-    low = np.asarray(bounds[0], dtype=np.float64)
+    low = np.asarray(bounds)[0].astype(np.float64)
     center = low + 0.5 * count * side
     total = int(np.prod(count))
     sums, squares = np.zeros(10), np.zeros((10, 10))
@@ -258,7 +228,7 @@ def integrate(density, bounds, mass_scale, mass, resolution, key, progress) -> M
 
 def host_random(key: PRNGKeyArray | None) -> np.random.Generator:
     """NumPy's generator seeded by a JAX key; `jax.random.key(0)` if there is none."""
-    return np.random.default_rng(np.asarray(jax.random.key_data(checked_key(key))))
+    return np.random.default_rng(key_words(checked_key(key)))
 
 
 def check_scale(mass_scale: float, mass: float | None) -> None:

@@ -3,13 +3,11 @@
 import math
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.checks import checked_count, checked_kind
-from dano.fields import AbstractField, AbstractShape, GridField
+from dano.fields import AbstractField, AbstractShape, GridField, normal_at
 from dano.maths import checked_array, checked_key, checked_points, floating, Numbers
 from dano.objects._mass import cells, checked_density, Density, evaluate, host_random
 from dano.objects._surface import farthest_points
@@ -70,7 +68,7 @@ class Lattice(eqx.Module):
         """Evaluate a density on a lattice over its bounds.
 
         Args:
-            density: A function of one point.
+            density: Densities at points.
             bounds: [m, F].
             resolution: Cells along the longest axis.
             least: Cells along each axis; with more than one the cells of thin fields are flat.
@@ -79,7 +77,7 @@ class Lattice(eqx.Module):
             ValueError: If it is negative, not finite, or zero everywhere.
         """
         count, side = cells(bounds, resolution, least)
-        origin = np.asarray(bounds[0], dtype=np.float64)
+        origin = np.asarray(bounds)[0].astype(np.float64)
         corners = np.stack(np.meshgrid(*(np.arange(n + 1) for n in count), indexing="ij"), axis=-1).reshape(
             -1, 3
         )
@@ -190,18 +188,16 @@ class Region(eqx.Module):
         from scipy import ndimage
 
         mean = float(self.lattice.values[self.occupied].mean())
-        inside = jnp.asarray(ndimage.binary_erosion(self.occupied | self.cavity, np.ones((3, 3, 3))))
-        near = jnp.asarray(self.near(1))
-        origin, side = jnp.asarray(self.lattice.origin), jnp.asarray(self.lattice.side)
-        last = jnp.asarray(self.lattice.values.shape) - 1
+        inside = ndimage.binary_erosion(self.occupied | self.cavity, np.ones((3, 3, 3)))
+        near = self.near(1)
 
-        def filled(x: Float[Array, "3"]) -> Float[Array, ""]:
-            index = jnp.clip(
-                jnp.round((x - origin.astype(x.dtype)) / side.astype(x.dtype)).astype(int), 0, last
-            )
-            i, j, k = index
-            solid = inside[i, j, k] | (near[i, j, k] & (density(x) >= self.level))
-            return jnp.where(solid, mean, 0).astype(x.dtype)
+        def filled(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+            places = self.lattice.nearest(points)
+            solid = inside[places]
+            # Only there the density tells.
+            asked = ~solid & near[places]
+            solid[asked] = density(points[asked]) >= self.level
+            return np.where(solid, mean, 0.0)
 
         return filled
 
@@ -315,18 +311,13 @@ def contact_samples(
 
 def outward_normals(field: AbstractField, points: np.ndarray, region: Region) -> np.ndarray:
     """−∇φ/|∇φ| at points (n, 3); where the density is flat, away from the region's middle."""
-    normals = np.asarray(_normals(field, jnp.asarray(points)))
+    normals = normal_at(field, points)
     occupied = np.argwhere(region.occupied)
     middle = region.lattice.origin + occupied.mean(axis=0) * region.lattice.side
     away = points - middle
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
     flat = np.linalg.norm(normals, axis=1, keepdims=True) < 0.5
     return np.where(flat, away, normals)
-
-
-@eqx.filter_jit
-def _normals(field, points):
-    return jax.lax.map(field.normal, points, batch_size=4096)
 
 
 def baked(field: AbstractField, resolution: int) -> tuple[GridField, float]:
@@ -348,5 +339,6 @@ def contact_grid(grid: GridField, region: Region) -> GridField:
     near = region.near(2)[region.lattice.nearest(np.asarray(grid.origin) + nodes * spacing)].reshape(
         tuple(count)
     )
-    values = jnp.where(jnp.asarray(near), grid.values, 0)
-    return GridField(values, grid.origin, grid.spacing, interpolation="quadratic")
+    # As a file keeps them, so that a loaded object equals the saved one.
+    values = np.where(near, np.asarray(grid.values), 0).astype(np.float32).astype(np.float64)
+    return GridField(floating(values), grid.origin, grid.spacing, interpolation="quadratic")

@@ -2,8 +2,16 @@
 
 import numpy as np
 
-from dano.fields import AbstractField, AbstractShape, GridField, SignedDistanceGrid, spread_distances
-from dano.objects._mass import host_jet
+from dano.fields import (
+    AbstractField,
+    AbstractShape,
+    density_at,
+    distance_at,
+    GridField,
+    jet_at,
+    SignedDistanceGrid,
+    spread_distances,
+)
 from dano.objects._samples import Lattice, Region
 
 MARGIN = 4
@@ -24,10 +32,11 @@ def field_solid(field: AbstractField, grid: GridField, level: float, *, floaters
         floaters: Whether to keep parts that are not connected to the largest one.
     """
     if isinstance(field, SignedDistanceGrid):
-        solid = SignedDistanceGrid(field.distances, field.origin, field.spacing, field.interpolation)
+        stored = _stored(np.asarray(field.distances))
+        solid = SignedDistanceGrid(stored, field.origin, field.spacing, field.interpolation)
     elif isinstance(field, AbstractShape):
         origin, spacing, nodes = _nodes(grid, MARGIN)
-        distances, _ = host_jet(field.sdf_jet, nodes.reshape(-1, 3))
+        distances = distance_at(field, nodes.reshape(-1, 3))
         if distances.min() >= 0:  # thinner than a cell
             return level_set(grid, level, floaters=floaters)
         solid = SignedDistanceGrid(_stored(distances.reshape(nodes.shape[:3])), origin, spacing)
@@ -57,7 +66,7 @@ def level_set(grid: GridField, level: float, *, floaters: bool) -> SignedDistanc
 
     # Two more, because the density reaches that far beyond its outermost nodes.
     origin, spacing, nodes = _nodes(grid, MARGIN + 2)
-    values = host_jet(grid.jet, nodes.reshape(-1, 3))[0].reshape(nodes.shape[:3])
+    values = density_at(grid, nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
     level = level if np.any(values >= level) else 0.5 * float(values.max())
     region = Region.create(Lattice(values, origin, spacing), level, floaters=floaters)
     inside = region.occupied | region.cavity
@@ -110,7 +119,7 @@ def _crossings(
     share = above / (above - below)
     low, high = np.zeros(len(start)), np.ones(len(start))
     for _ in range(8):
-        value, gradient = host_jet(grid.jet, start + share[:, None] * way)
+        value, gradient = jet_at(grid, start + share[:, None] * way)
         above = value >= level
         low, high = np.where(above, share, low), np.where(above, high, share)
         slope = np.einsum("ij,ij->i", gradient, way)
@@ -125,7 +134,7 @@ def _closest(grid: GridField, level: float, points: np.ndarray, start: np.ndarra
     closest, distance = start.copy(), np.linalg.norm(points - start, axis=1)
     foot, outward = start, None
     for _ in range(6):
-        value, gradient = host_jet(grid.jet, foot)
+        value, gradient = jet_at(grid, foot)
         outward = gradient if outward is None else outward
         slope = np.maximum(np.linalg.norm(gradient, axis=1), np.finfo(np.float32).tiny)
         here = np.linalg.norm(points - foot, axis=1)

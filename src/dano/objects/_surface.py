@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.checks import checked_count, checked_kind, checked_number
-from dano.fields import AbstractShape
+from dano.fields import AbstractShape, distance_at, jet_at
 from dano.maths import checked_array, checked_points, floating, is_traced
-from dano.objects._mass import host_jet, host_random, MassProperties
+from dano.objects._mass import host_random, MassProperties
 
 SKIN = 0.0025
 """Default thickness by which a surface is inflated to weigh its edges and corners, as a share of its size."""
@@ -138,7 +138,7 @@ def _shell(
     _, corners = _shell_cells(shape, bounds, skin, side)
     cell = np.rint((corners - corners.min(axis=0)) / side)
     drawn = corners + side * ((cell @ _WEYL + random.random(3)) % 1)
-    height, gradient = host_jet(shape.sdf_jet, drawn)
+    height, gradient = jet_at(shape, drawn, "sdf_jet")
     inside = (height > 0) & (height < 2 * skin)
     drawn, height, gradient = drawn[inside], height[inside], gradient[inside]
     slope = np.linalg.norm(gradient, axis=1)
@@ -150,7 +150,7 @@ def _shell(
     # Close to the surface, the fan that an edge or corner collects is too thin for that step.
     stretch[height < 0.1 * skin] = 2
     for _ in range(3):
-        height, gradient = host_jet(shape.sdf_jet, points)
+        height, gradient = jet_at(shape, points, "sdf_jet")
         points = _projected(points, height, gradient)
     return _Shell(points, normals, areas, stretch, np.abs(height) < 1e-2 * skin, side)
 
@@ -166,7 +166,7 @@ def _shell_cells(
     corners = bounds[0] - 2 * skin + side * index.reshape(-1, 3)
     halves = np.stack(np.meshgrid(*([0.0, 0.5],) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     while True:
-        height, _ = host_jet(shape.sdf_jet, corners + 0.5 * side)
+        height = distance_at(shape, corners + 0.5 * side)
         # Half a diagonal, and a little for distances that are not exact.
         reach = 1.1 * 0.5 * math.sqrt(3) * side
         corners = corners[np.abs(height - skin) < skin + reach]
@@ -190,7 +190,7 @@ def _stretch(
     total = np.zeros(len(drawn))
     for direction in (tangent, np.cross(normals, tangent)):
         moved = drawn + step * direction
-        total += (((_projected(moved, *host_jet(shape.sdf_jet, moved)) - points) / step) ** 2).sum(axis=1)
+        total += (((_projected(moved, *jet_at(shape, moved, "sdf_jet")) - points) / step) ** 2).sum(axis=1)
     return total
 
 

@@ -20,6 +20,7 @@ from dano.scene_file._objects import (
     load_asset as load_asset,
     load_object as load_object,
     object_look as object_look,
+    object_of_file as object_of_file,
     Progress as Progress,
 )
 from dano.scene_file._pieces import run_piece as run_piece

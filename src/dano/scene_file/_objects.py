@@ -8,7 +8,6 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,9 +15,11 @@ from dano.archive import format_of, TRAJECTORY
 from dano.building import BuildOptions
 from dano.checks import checked_path
 from dano.fields import AbstractField, AbstractShape, FIELD_SUFFIXES, load_field, scaled
+from dano.keys import seed_key
 from dano.names import did_you_mean
 from dano.objects import field_size, NeuralObject
 from dano.scene_file._doubts import border_doubts, mass_doubt, size_doubts
+from dano.scene_file._kept import Built, built_once
 
 if TYPE_CHECKING:
     from dano.vision import LearnedField
@@ -33,6 +34,8 @@ _WATER = 1000.0
 """Density [kg/m³] of what is built of a mesh unasked."""
 
 _built: dict[tuple[object, ...], NeuralObject] = {}
+_said: set[tuple[object, ...]] = set()
+"""Objects of files of which this process has said what was not given."""
 
 
 def build_object(
@@ -61,38 +64,115 @@ def build_object(
             both given, or samples or resolution need too much time or memory.
     """
     chosen = BuildOptions() if options is None else options
-    if chosen.mass is not None and chosen.mass_scale is not None:
+    made = _made(field, chosen, dashes, progress)
+    for text in (*_doubts(made.made, chosen, weighed, dashes), *made.said):
+        warnings.warn(text, stacklevel=2)
+    return made.made
+
+
+def object_of_file(
+    source: str | os.PathLike[str],
+    options: BuildOptions | None = None,
+    *,
+    weighed: bool = False,
+    dashes: str = "",
+    progress: Progress | None = None,
+) -> NeuralObject:
+    """`build_object` of what `load_field` reads; what was built before is kept in the cache folder.
+
+    Args:
+        source: What `load_field` takes: a file, or the name of a shipped field.
+        options: How to build it; None: with defaults, which a UserWarning says.
+        weighed: See `build_object`, as the rest.
+        dashes: See there.
+        progress: See there.
+
+    Raises:
+        ValueError: As `load_field` and `build_object`.
+    """
+    made, solid, _ = _built_of(source, options, dashes, progress)
+    if (key := (os.path.abspath(source), options, dashes)) in _said:
+        return made
+    _said.add(key)
+    chosen = _usual(solid) if options is None else options
+    texts = _doubts(made, chosen, weighed, dashes)
+    if options is None:
+        mass = f", as dense as water: {float(made.mass.mass):.3g} kg" if solid and not weighed else ""
+        texts.append(
+            f"{source}: an object was built of it with defaults{mass};"
+            f" `dano build {source} -o OBJ.dano` takes options"
+        )
+    for text in texts:
+        warnings.warn(text, stacklevel=2)
+    return made
+
+
+def _built_of(
+    source: str | os.PathLike[str], options: BuildOptions | None, dashes: str, progress: Progress | None
+) -> Built:
+    """An object of a file, built or kept; without options with those that are usual for what it holds."""
+
+    def build() -> Built:
+        field = load_field(source, units=None if options is None else options.units)
+        chosen = _usual(isinstance(field, AbstractShape)) if options is None else options
+        return _made(field, chosen, dashes, progress)
+
+    if options is not None:
+        _check_weighed(options, dashes)
+    if is_shipped(source):
+        with as_file(files("dano") / "assets" / f"{source}.npz") as path:
+            return built_once(path, options, build)
+    if not os.path.isfile(source):
+        # A function, or an error.
+        return build()
+    return built_once(Path(source), options, build)
+
+
+def _usual(solid: bool) -> BuildOptions:
+    """How an object is built unasked: what a mesh weighs is nowhere in it, water of its size is likely."""
+    return BuildOptions(mass_scale=_WATER) if solid else BuildOptions()
+
+
+def _check_weighed(options: BuildOptions, dashes: str) -> None:
+    if options.mass is not None and options.mass_scale is not None:
         raise ValueError(
             f"give either {dashes}mass or {dashes}mass{'-' if dashes else '_'}scale,"
-            f" got {chosen.mass} and {chosen.mass_scale}"
+            f" got {options.mass} and {options.mass_scale}"
         )
+
+
+def _made(field: AbstractField, options: BuildOptions, dashes: str, progress: Progress | None) -> Built:
+    """An object of a field, and what is odd about the field."""
+    _check_weighed(options, dashes)
     common: dict[str, Any] = {
-        "density_range": chosen.density_range,
+        "density_range": options.density_range,
         # Parts of a shape are meant, those of a radiance field are seldom.
-        "floaters": chosen.floaters or isinstance(field, AbstractShape),
-        "key": jax.random.key(chosen.seed),
+        "floaters": options.floaters or isinstance(field, AbstractShape),
     }
-    if chosen.length is not None:
-        if not (math.isfinite(chosen.length) and chosen.length > 0):
-            raise ValueError(f"length must be finite and > 0 m, got {chosen.length}")
-        extent = field_size(field, density_range=chosen.density_range, floaters=common["floaters"])
-        field = scaled(field, chosen.length / extent)
+    if options.length is not None:
+        if not (math.isfinite(options.length) and options.length > 0):
+            raise ValueError(f"length must be finite and > 0 m, got {options.length}")
+        field = scaled(field, options.length / field_size(field, **common))
     made = NeuralObject.from_field(
         field,
-        n_samples=chosen.samples,
-        mass_model=chosen.mass_model,
-        mass_scale=1.0 if chosen.mass_scale is None else chosen.mass_scale,
-        mass=chosen.mass,
-        resolution=chosen.resolution,
+        n_samples=options.samples,
+        mass_model=options.mass_model,
+        mass_scale=1.0 if options.mass_scale is None else options.mass_scale,
+        mass=options.mass,
+        resolution=options.resolution,
+        key=seed_key(options.seed),
         progress=progress,
         **common,
     )
-    stated = weighed or chosen.mass is not None or chosen.mass_scale is not None
+    said = border_doubts(field, np.asarray(made.surface.points))
+    return Built(made, isinstance(field, AbstractShape), said)
+
+
+def _doubts(made: NeuralObject, options: BuildOptions, weighed: bool, dashes: str) -> list[str]:
+    """What was not given and matters."""
+    stated = weighed or options.mass is not None or options.mass_scale is not None
     found = [] if stated else [mass_doubt(made, dashes)]
-    found += [] if chosen.length is not None else size_doubts(made.size, f"{dashes}length")
-    for text in (*found, *border_doubts(field, np.asarray(made.surface.points))):
-        warnings.warn(text, stacklevel=2)
-    return made
+    return found + ([] if options.length is not None else size_doubts(made.size, f"{dashes}length"))
 
 
 def load_object(
@@ -128,31 +208,7 @@ def load_object(
         raise ValueError(f"{path} is a run, not an object: `dano view {path}` shows it")
     if path.suffix.lower() == ".dano" or path.suffix.lower() not in FIELD_SUFFIXES:
         return NeuralObject.load(path)
-    return _built_of(path, options, weighed=weighed, progress=progress)
-
-
-def _built_of(
-    path: Path, options: BuildOptions | None, *, weighed: bool, progress: Progress | None
-) -> NeuralObject:
-    """An object of a mesh or field in a file, once in a process for the same file and options."""
-    stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else None
-    key = (str(path.resolve()), stamp, options, jnp.result_type(float).name)
-    if key not in _built:
-        field = load_field(path, units=None if options is None else options.units)
-        if options is not None:
-            _built[key] = build_object(field, options, weighed=weighed, progress=progress)
-            return _built[key]
-        # What a mesh weighs is nowhere in it: as much as water of its size is a likely object.
-        solid = isinstance(field, AbstractShape)
-        usual = BuildOptions(mass_scale=_WATER) if solid else BuildOptions()
-        made = _built[key] = build_object(field, usual, weighed=weighed or solid, progress=progress)
-        mass = f", as dense as water: {float(made.mass.mass):.3g} kg" if solid and not weighed else ""
-        warnings.warn(
-            f"{path}: an object was built of it with defaults{mass}; `dano build {path} -o OBJ.dano` takes"
-            " options, and keeps it",
-            stacklevel=3,
-        )
-    return _built[key]
+    return object_of_file(path, options, weighed=weighed, progress=progress)
 
 
 def is_shipped(source: str | os.PathLike[str]) -> bool:

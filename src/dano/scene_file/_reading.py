@@ -17,7 +17,7 @@ from dano.archive import checked_input
 from dano.building import BuildOptions, Units
 from dano.checks import checked_choice, checked_count, checked_number, shown
 from dano.contact import AbstractContactLaw, CentroidLaw, ContactParams, DistributedLaw
-from dano.fields import AbstractShape, load_field, posed, PRIMITIVES
+from dano.fields import AbstractShape, posed, PRIMITIVES
 from dano.maths import Pose
 from dano.memory import memory_limit
 from dano.names import did_you_mean
@@ -39,11 +39,11 @@ from dano.scene import (
     STATE_SIZES,
 )
 from dano.scene_file._objects import (
-    build_object,
     is_shipped,
     load_asset,
     load_object,
     object_look,
+    object_of_file,
     Progress,
 )
 from dano.scene_file._robots import common_gravity, read_robots, robot_files
@@ -336,8 +336,7 @@ def _object(
             built[key] = load_object(source, options, weighed=weighed, progress=progress)
         else:
             options = _build_options(build)
-            field = load_field(source, units=options.units)
-            built[key] = build_object(field, options, weighed=weighed, progress=progress)
+            built[key] = object_of_file(source, options, weighed=weighed, progress=progress)
     return built[key]
 
 

@@ -15,6 +15,7 @@ from dano.fields._signed_distance import SignedDistanceGrid
 from dano.fields._spline import degree_of
 from dano.fields.meshes._reading import checked_units, read_mesh
 from dano.fields.meshes._repair import Repaired, repaired
+from dano.fields.meshes._winding import mark_nodes, winding_numbers
 from dano.memory import check_nodes
 
 if TYPE_CHECKING:
@@ -40,11 +41,8 @@ _BESIDE = 0.02
 """Cells beside a face at which it is asked on which side the inside is: less than walls are thick."""
 
 
-_ASKED = 20_000
-"""Nodes at which winding numbers are compared with normals, to find out whether these tell the inside."""
-
 _CLEAR = 0.1
-"""Cells from the surface from which on winding numbers are taken as exact."""
+"""Cells from the surface from which on both normals and winding numbers tell the side."""
 
 
 class _Solid(NamedTuple):
@@ -171,7 +169,7 @@ def _parts(closed: Repaired) -> _Solid:
         if k in units:
             continue
         point = vertices[faces[rows[k][0]]].mean(axis=0)
-        around = [o for o in outward if _winding(shells[o], point) > 0.5]
+        around = [o for o in outward if winding_numbers(*_arrays(shells[o]), point[None])[0] > 0]
         if around:
             units[min(around, key=lambda o: shells[o].volume)].append(k)
         else:
@@ -201,13 +199,6 @@ def _parts(closed: Repaired) -> _Solid:
 def _meet(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> bool:
     """Whether two boxes have a point in common."""
     return bool(np.all(a[0] <= b[1]) and np.all(b[0] <= a[1]))
-
-
-def _winding(solid: "trimesh.Trimesh", point: np.ndarray) -> float:
-    """How often a mesh winds around a point: 1 inside a solid, 0 outside."""
-    igl = DISTANCES.load()
-    vertices, faces = _arrays(solid)
-    return float(igl.fast_winding_number(vertices, faces, np.ascontiguousarray(point[None]))[0])
 
 
 def _resolution(solid: _Solid, asked: int | None) -> tuple[int, str | None]:
@@ -244,10 +235,9 @@ def _thinner(solid: _Solid, thickness: np.ndarray) -> list[float]:
     points = np.einsum("nk,nkd->nd", weights, triangles[some])
     inward = -np.asarray(solid.whole.face_normals)[some]
     below = (points[None] + thickness[:, None, None] * inward[None]).reshape(-1, 3)
-    igl = DISTANCES.load()
     outside = np.ones(len(below), bool)
     for part in solid.parts:
-        outside &= igl.fast_winding_number(*_arrays(part), below) < 0.5
+        outside &= winding_numbers(*_arrays(part), below) <= 0
     return outside.reshape(len(thickness), -1).mean(axis=1).tolist()
 
 
@@ -272,32 +262,24 @@ def _mesh_distances(
 
     igl = DISTANCES.load()
     vertices, faces = _arrays(solid)
-    # An exact query costs 12 µs; only nodes near the surface need one. Vertices of a mesh whose edges are
-    # shorter than a cell mark them: no surface point is then further than 1.5 cells from a marked node.
-    fine, small = trimesh.remesh.subdivide_to_size(vertices, faces, max_edge=spacing, max_iter=32)[:2]
-    marked = np.zeros(shape, dtype=bool)
-    marked[tuple(np.rint((fine - origin) / spacing).astype(int).T)] = True
-    near = ndimage.distance_transform_edt(~marked) <= 3
+    # An exact query costs 6 µs; only nodes near the surface need one.
+    near = ndimage.distance_transform_edt(~mark_nodes(vertices, faces, origin, spacing, shape)) <= 3
     points = origin + spacing * np.argwhere(near)
     signed, _, closest, _ = igl.signed_distance(
         points, vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
     )
-    clear, inside, overlaps = np.abs(signed) > _CLEAR * spacing, signed < 0, False
-    # Normals tell the side at once, but not where a mesh is crossed; winding numbers, which cost as much as
-    # the distances, tell it everywhere but on the surface.
-    asked = np.flatnonzero(clear)
-    if not closed.is_smooth:
-        asked = np.arange(len(points))
-    elif len(asked) > _ASKED:
-        asked = np.random.default_rng(0).choice(asked, _ASKED, replace=False)
-    winding = igl.fast_winding_number(vertices, faces, points[asked])
-    if closed.is_smooth and np.any((winding > 0.5) != inside[asked]):
-        asked = np.arange(len(points))
-        winding = igl.fast_winding_number(vertices, faces, points)
-    if len(asked) == len(points):
-        inside = winding > 0.5
-    overlaps = bool(np.any(((winding > 1.5) | (winding < -0.5)) & clear[asked]))
+    # Normals tell the side, but not where a mesh is crossed; winding numbers tell it everywhere but on the
+    # surface.
+    winding, clear, inside = (
+        winding_numbers(vertices, faces, points),
+        np.abs(signed) > _CLEAR * spacing,
+        signed < 0,
+    )
+    if not closed.is_smooth or np.any((winding > 0)[clear] != inside[clear]):
+        inside = winding > 0
+    overlaps = bool(np.any(((winding > 1) | (winding < 0)) & clear))
     if overlaps or closed.is_crossed:
+        fine, small = trimesh.remesh.subdivide_to_size(vertices, faces, max_edge=spacing, max_iter=32)[:2]
         border = _border_faces(vertices, faces, fine, small, spacing)
         if len(border):
             _, _, closest = igl.point_mesh_squared_distance(points, fine, border)
@@ -314,8 +296,6 @@ def _border_faces(
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     beside = _BESIDE * spacing * normal / np.where(length > 0, length, 1)
     middle = corners.mean(axis=1)
-    winding = DISTANCES.load().fast_winding_number(
-        vertices, faces, np.concatenate([middle - beside, middle + beside])
-    )
-    inner, outer = np.split(winding > 0.5, 2)
+    winding = winding_numbers(vertices, faces, np.concatenate([middle - beside, middle + beside]))
+    inner, outer = np.split(winding > 0, 2)
     return np.ascontiguousarray(small[(inner != outer) & (length[:, 0] > 0)], np.int64)

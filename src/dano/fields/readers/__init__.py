@@ -1,5 +1,6 @@
 """Fields from files of many kinds, and files of fields."""
 
+from dano.fields.readers._companions import companion_files as companion_files
 from dano.fields.readers._io import (
     FIELD_FORMATS as FIELD_FORMATS,
     FIELD_SUFFIXES as FIELD_SUFFIXES,

@@ -21,6 +21,9 @@ from dano.fields.readers._checkpoint import read_weights
 from dano.fields.readers._splats import splat_field
 from dano.maths import Numbers, Pose, quat_from_matrix
 
+SETTINGS, TRANSFORMS = "config.yml", "dataparser_transforms.json"
+"""Files that nerfstudio writes for a training."""
+
 
 class HashDensity(eqx.Module):
     """Density of a hash-grid radiance field: factor · exp(first output of a ReLU network of the features).
@@ -138,7 +141,7 @@ def load_checkpoint(
         field = splat_field(_splats(gaussians, path), crop)
     else:
         field = _nerfacto(weights, _settings(path) | stated, crop, path)
-    if undo_transform and (transforms := _beside(path, "dataparser_transforms.json")):
+    if undo_transform and (transforms := _beside(path, TRANSFORMS)):
         return _undone(field, transforms)
     return field
 
@@ -162,15 +165,18 @@ def _splats(parameters: Mapping[str, np.ndarray], path: Path) -> dict[str, np.nd
         raise ValueError(f"{path}: its Gaussians have no {error}, only {sorted(parameters)}") from error
 
 
+def beside(path: Path, name: str) -> tuple[Path, Path]:
+    """Places of a file of nerfstudio in the folder of a run, whose subfolder holds the checkpoints."""
+    return path.absolute().parent / name, path.absolute().parent.parent / name
+
+
 def _beside(path: Path, name: str) -> Path | None:
-    """A file that nerfstudio writes to the folder of a run, whose subfolder holds the checkpoints."""
-    places = (path.absolute().parent / name, path.absolute().parent.parent / name)
-    return next((place for place in places if place.is_file()), None)
+    return next((place for place in beside(path, name) if place.is_file()), None)
 
 
 def _settings(path: Path) -> dict[str, Any]:
     """Plain numbers of the model's block of config.yml, whose Python tags are not acted upon."""
-    config = _beside(path, "config.yml")
+    config = _beside(path, SETTINGS)
     if config is None:
         return {}
     settings, depth = {}, None
