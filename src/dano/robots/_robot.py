@@ -15,7 +15,7 @@ from dano.contact import ContactParams
 from dano.maths import checked_array, checked_floating, is_traced, Numbers, quat_multiply, quat_rotate
 from dano.names import did_you_mean
 from dano.robots.formats import Description, Drive, Keyframe
-from dano.scene import Body, Contact, Control, Joint, Loop, Scene, State
+from dano.scene import Body, Contact, Control, Joint, Loop, Scene, State, unnamed_contacts
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Robot:
         self,
         *,
         bodies: Sequence[Body] = (),
-        contacts: Sequence[Contact] = (),
+        contacts: Sequence[Contact] | None = None,
         joints: Sequence[Joint] = (),
         loops: Sequence[Loop] = (),
         **options: Any,
@@ -77,7 +77,9 @@ class Robot:
 
         Args:
             bodies: Other bodies.
-            contacts: Contacts; `contacts_with` lists those of the robot.
+            contacts: Contacts; `contacts_with` lists those of the robot, and `()` means that nothing touches.
+                Default, unless `others` is among the options: all pairs that may touch, do. Links of the
+                robot touch each other only where a contact says so.
             joints: Other joints.
             loops: Other loops.
             **options: Of `Scene.create`, such as `timestep`. `gravity` is that of the file if it has one.
@@ -90,13 +92,35 @@ class Robot:
         self.check_simulated()
         if self.gravity is not None:
             options = {"gravity": self.gravity, **options}
+        everything, ties = [*self.bodies, *bodies], [*self.joints, *joints, *self.loops, *loops]
+        if contacts is None and options.get("others") is None:
+            contacts, options = self._unnamed(everything, ties, options)
         return Scene.create(
-            [*self.bodies, *bodies],
-            contacts,
-            joints=[*self.joints, *joints],
-            loops=[*self.loops, *loops],
-            **options,
+            everything, contacts, joints=[*self.joints, *joints], loops=[*self.loops, *loops], **options
         )
+
+    def _unnamed(
+        self, bodies: Sequence[Body], ties: Sequence[Joint | Loop], options: dict[str, Any]
+    ) -> tuple[list[Contact] | None, dict[str, Any]]:
+        """Contacts of a scene that names none, and its options; see `scene`."""
+        names = [body.name for body in bodies]
+        apart = [pair for pair in itertools.combinations(names, 2) if not self.may_meet(*pair)]
+        apart = [*options.get("apart", ()), *apart]
+        found = unnamed_contacts(bodies, ties, apart)
+        if found is None:
+            return None, {**options, "apart": apart}
+        known = {body.name for body in self.bodies}
+        listed = [self._contact(c.a, c.b) if {c.a, c.b} <= known else c for c in found]
+        return listed, {**options, "apart": ()}
+
+    def may_meet(self, a: str, b: str) -> bool:
+        """Whether bodies of a scene touch where nobody says so.
+
+        What has no shape does not, nor do links of this robot each other.
+        """
+        own = [body.name for body in self.bodies]
+        linked = a in own and b in own and not {a, b} & set(self.surroundings)
+        return not linked and all(x in self.touching for x in (a, b) if x in own)
 
     def check_simulated(self) -> None:
         """Check that nothing is left in the file that a simulation would do wrong.

@@ -30,7 +30,7 @@ from dano.scene._making import (
     warn_of_long_steps,
 )
 from dano.scene._motors import Motor
-from dano.scene._others import Others, others_of
+from dano.scene._others import Others, others_of, unnamed_contacts
 from dano.scene._states import check_precision, Control, JOINT_QUANTITIES, State, STATE_SIZES
 
 
@@ -64,7 +64,7 @@ class Scene(eqx.Module):
     def create(
         cls,
         bodies: Sequence[Body],
-        contacts: Sequence[Contact] = (),
+        contacts: Sequence[Contact] | None = None,
         *,
         joints: Sequence[Joint] = (),
         loops: Sequence[Loop] = (),
@@ -77,13 +77,15 @@ class Scene(eqx.Module):
 
         Args:
             bodies: The bodies, in the order that states index.
-            contacts: Which pairs may touch, and how.
+            contacts: Which pairs may touch, and how; `()` means that nothing does. Default: all pairs that
+                may touch, do, each by a `Contact` with its defaults; of more than 200 pairs, or where bodies
+                have a `Body.material`, by `others`. What a joint or a loop joins does not touch.
             joints: What hangs on what, in the order of the coordinates q.
             loops: What closes chains of joints.
             others: Lets all other pairs touch, too, by `DistributedLaw`: parameters of bodies that have no
                 `Body.material` of their own. Those of a pair follow from its two bodies, see
                 `Others.pair_params`. What a joint or a loop joins does not touch.
-            apart: Names of pairs that do not touch although `others` is given.
+            apart: Names of pairs that do not touch although `others` is given, or no `contacts` are.
             timestep: h [s].
             gravity: [m/s², W].
 
@@ -93,11 +95,14 @@ class Scene(eqx.Module):
                 pair uses a material, or a number is out of range.
         """
         bodies = checked_items("bodies", bodies, Body)
-        contacts = checked_items("contacts", contacts, Contact)
         joints = checked_items("joints", joints, Joint)
         loops = checked_items("loops", loops, Loop)
         checked_optional("others", others, ContactParams)
         check_names(bodies)
+        if contacts is None and others is None:
+            contacts = unnamed_contacts(bodies, (*joints, *loops), apart)
+            others, apart = (ContactParams(), apart) if contacts is None else (None, ())
+        contacts = checked_items("contacts", () if contacts is None else contacts, Contact)
         timestep = checked_array("timestep", timestep, (), above=0.0)
         check_contacts(bodies, joints, contacts)
         children = layout_of(*structure(bodies, joints)).children

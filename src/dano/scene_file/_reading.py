@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import inspect
-import itertools
 import json
 import math
 import os
@@ -26,7 +25,6 @@ from dano.robots import close_loops, Robot
 from dano.scene import (
     Body,
     Contact,
-    joined,
     Joint,
     JOINT_KINDS,
     JOINT_QUANTITIES,
@@ -37,6 +35,7 @@ from dano.scene import (
     Scene,
     State,
     STATE_SIZES,
+    touching_pairs,
 )
 from dano.scene_file._objects import (
     build_object,
@@ -420,15 +419,10 @@ def _contacts(
     default.where = f"{top.where}: [default_contact]"
     usual = _law_name(default, default_law)
     if top.data.get("contacts", "all") == "all":
-        pairs = itertools.combinations(bodies, 2)
-        apart = joined(joints)
         return [
-            _contact(default, usual, a.name, b.name)
-            for a, b in pairs
-            if a.name != b.name
-            and not apart(a.name, b.name)
-            and _may_meet(a.name, b.name, robots)
-            and _can_touch(a, b, presses=_LAWS[usual]().presses)
+            _contact(default, usual, a, b)
+            for a, b in touching_pairs(bodies, joints, presses=_LAWS[usual]().presses)
+            if all(robot.may_meet(a, b) for robot in robots)
         ]
     if isinstance(top.data["contacts"], str):
         raise top.wrong("contacts", "'all' or written as [[contacts]] tables")
@@ -451,16 +445,6 @@ def _contacts(
     return contacts
 
 
-def _may_meet(a: str, b: str, robots: Sequence[Robot]) -> bool:
-    """Whether bodies have shapes to touch with, and are not links of one robot."""
-    for robot in robots:
-        own = [body.name for body in robot.bodies]
-        linked = a in own and b in own and not {a, b} & set(robot.surroundings)
-        if linked or any(x in own and x not in robot.touching for x in (a, b)):
-            return False
-    return True
-
-
 def _law_name(table: Table, default: str) -> str:
     """The law that a table chooses, whose other keys must belong to it."""
     law = table.word("law", tuple(_LAWS), default)
@@ -473,16 +457,6 @@ def _law_name(table: Table, default: str) -> str:
                 f"{', '.join(_law_keys(law))}{hint}"
             )
     return law
-
-
-def _can_touch(a: Body, b: Body, *, presses: bool) -> bool:
-    """Whether `Scene.create` would accept a contact between two bodies."""
-    if a.fixed and b.fixed:
-        return False
-    if a.object is not None and b.object is not None:
-        met = [x.object.solid if presses else x.object.grid for x in (a, b) if x.object is not None]
-        return any(x is not None for x in met)
-    return math.isfinite(a.size) or math.isfinite(b.size)
 
 
 def _contact(table: Table, law: str, a: str, b: str) -> Contact:
