@@ -14,8 +14,11 @@ from dano.checks import checked_items, checked_kind
 from dano.contact import ContactParams
 from dano.maths import checked_array, checked_floating, is_traced, Numbers, quat_multiply, quat_rotate
 from dano.names import did_you_mean
-from dano.robots.formats import Description, Drive, Keyframe
+from dano.robots.formats import Description, Drive, Keyframe, Meeting
 from dano.scene import Body, Contact, Control, Joint, Loop, Scene, State, unnamed_contacts
+
+PLANE = " plane"
+"""After the name of a link whose plane is a body beside its other shapes."""
 
 
 @dataclass(frozen=True)
@@ -116,11 +119,53 @@ class Robot:
     def may_meet(self, a: str, b: str) -> bool:
         """Whether bodies of a scene touch where nobody says so.
 
-        What has no shape does not, nor do links of this robot each other.
+        What has no shape does not. Of the bodies of a MuJoCo file those do that MuJoCo lets touch, but links
+        of one tree only where the file names their pair; of a URDF none touches another.
         """
-        own = [body.name for body in self.bodies]
-        linked = a in own and b in own and not {a, b} & set(self.surroundings)
-        return not linked and all(x in self.touching for x in (a, b) if x in own)
+        own = {body.name for body in self.bodies}
+        if any(x in own and x not in self.touching for x in (a, b)):
+            return False
+        if not {a, b} <= own:
+            return True
+        meetings = self._meetings(a, b)
+        if any(each.named for each in meetings):
+            return True
+        roots = [{self._root(link) for link in self._links(x)} for x in (a, b)]
+        return bool(meetings) and not roots[0] & roots[1]
+
+    def friction_between(self, a: str, b: str) -> float | None:
+        """Sliding friction that the file gives two of its bodies; None where it says nothing.
+
+        Warns:
+            UserWarning: If their shapes have several: it is the largest.
+        """
+        found = {friction for each in self._meetings(a, b) for friction in each.frictions}
+        if len(found) > 1:
+            warnings.warn(
+                f"{self.description.source}: shapes of {a!r} and {b!r} have frictions {sorted(found)}: their"
+                f" contact has the largest",
+                UserWarning,
+                stacklevel=4,
+            )
+        return max(found, default=None)
+
+    def _links(self, body: str) -> list[str]:
+        """Links of the file that a body is made of."""
+        names = (body, body.removesuffix(PLANE))
+        return [link for link, (name, *_) in self.frames.items() if name in names]
+
+    def _meetings(self, a: str, b: str) -> list[Meeting]:
+        """How the links of two bodies touch each other, by the file."""
+        meets = self.description.meets or {}
+        pairs = (frozenset(pair) for pair in itertools.product(self._links(a), self._links(b)))
+        return [meets[pair] for pair in pairs if pair in meets]
+
+    def _root(self, link: str) -> str:
+        """The link that stands in the world, or moves freely, on which a link hangs."""
+        carriers = {joint.child: joint.parent for joint in self.description.joints}
+        while carriers.get(link, self.description.world) != self.description.world:
+            link = carriers[link]
+        return link
 
     def check_simulated(self) -> None:
         """Check that nothing is left in the file that a simulation would do wrong.
@@ -139,6 +184,8 @@ class Robot:
         What stands still itself, such as the base of an arm, is among them only for a `Body` that moves: two
         bodies that never move have no contact, and of a name alone it is not known.
 
+        Between bodies of a MuJoCo file, masks, exclusions and pairs count as there.
+
         Args:
             *others: Names of bodies, or bodies.
             params: Parameters of all these contacts. Default: between two bodies of the file the friction
@@ -154,36 +201,16 @@ class Robot:
             moves = isinstance(other, Body) and not other.fixed
             name = other.name if isinstance(other, Body) else other
             pairs += [(body, name) for body in self.touching if body != name and (moves or body not in fixed)]
+        if self.description.meets is not None:
+            pairs = [(a, b) for a, b in pairs if b not in known or self._meetings(a, b)]
         if params is not None:
             return [Contact(a, b, params) for a, b in pairs]
         return [self._contact(a, b) if b in known else Contact(a, b) for a, b in pairs]
 
     def _contact(self, a: str, b: str) -> Contact:
         """A contact of two bodies of the file, with the friction that the file gives it."""
-        sides = [
-            [
-                each
-                for link, (body, *_) in self.frames.items()
-                if body == name
-                for each in self.description.frictions.get(link, ())
-            ]
-            for name in (a, b)
-        ]
-        if not all(sides):
-            return Contact(a, b)
-        # As MuJoCo: that of the higher priority, of equal ones the larger.
-        found = {
-            x[0] if x[1] > y[1] else y[0] if y[1] > x[1] else max(x[0], y[0])
-            for x, y in itertools.product(*sides)
-        }
-        if len(found) > 1:
-            warnings.warn(
-                f"{self.description.source}: shapes of {a!r} and {b!r} have frictions {sorted(found)}: their"
-                f" contact has the largest",
-                UserWarning,
-                stacklevel=4,
-            )
-        return Contact(a, b, ContactParams(sliding_friction=max(found)))
+        friction = self.friction_between(a, b)
+        return Contact(a, b) if friction is None else Contact(a, b, ContactParams(sliding_friction=friction))
 
     def start(
         self, q: Mapping[str, Numbers] | str | None = None, v: Mapping[str, Numbers] | None = None

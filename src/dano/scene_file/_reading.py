@@ -420,7 +420,7 @@ def _contacts(
     usual = _law_name(default, default_law)
     if top.data.get("contacts", "all") == "all":
         return [
-            _contact(default, usual, a, b)
+            _contact(_rubbing(default, usual, a, b, robots), usual, a, b)
             for a, b in touching_pairs(bodies, joints, presses=_LAWS[usual]().presses)
             if all(robot.may_meet(a, b) for robot in robots)
         ]
@@ -443,6 +443,14 @@ def _contacts(
         table.data = {**inherited, **row}
         contacts.append(_contact(table, law, a, b))
     return contacts
+
+
+def _rubbing(default: Table, law: str, a: str, b: str, robots: Sequence[Robot]) -> Table:
+    """What all contacts have by default, with the friction of the file of a robot whose bodies these are."""
+    if "sliding_friction" in default or "sliding_friction" not in _LAWS[law]().reads:
+        return default
+    found = [x for robot in robots if (x := robot.friction_between(a, b)) is not None]
+    return Table(default.where, {**default.data, "sliding_friction": found[0]}, None) if found else default
 
 
 def _law_name(table: Table, default: str) -> str:
