@@ -6,6 +6,12 @@ from dano.scene._contacts import (
     Contact as Contact,
     pressing_pairs as pressing_pairs,
 )
+from dano.scene._doubts import (
+    box_volume as box_volume,
+    Doubt as Doubt,
+    say_doubts as say_doubts,
+    SceneWarning as SceneWarning,
+)
 from dano.scene._frames import (
     Chains as Chains,
     filled as filled,

@@ -16,6 +16,7 @@ from dano.objects import checked_inertia
 from dano.scene._bodies import Body
 from dano.scene._by_name import ByName, control_arrays, joint_arrays, merged, state_arrays
 from dano.scene._contacts import Contact, prepared
+from dano.scene._doubts import Doubt, doubts_of_scene, doubts_of_state, say_doubts
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
 from dano.scene._joints import Joint, Layout, layout_of
 from dano.scene._loops import check_loops, Loop, Loops, loops_of
@@ -117,6 +118,7 @@ class Scene(eqx.Module):
         check_materials(bodies, others, apart)
         if contacts or rest is not None:
             warn_of_long_steps(bodies, timestep, gravity)
+        say_doubts(doubts_of_scene(bodies, joints, contacts, gravity), stacklevel=2)
         room = room_for(bodies, timestep, gravity)
         return cls(bodies, contacts, timestep, gravity, twins, joints, rest, room, loops)
 
@@ -350,7 +352,20 @@ class Scene(eqx.Module):
             state = self.filled(dataclasses.replace(state, **of_joints))
         self.check_state(state)
         warn_of_limits(self.layout, self.joints, state.q, self.timestep, joint_names or {})
+        say_doubts(self._doubts_of(state), stacklevel=3)
         return state
+
+    def doubts(self, state: State) -> list[Doubt]:
+        """What is odd about the scene and a state: units, frames, slips; none where numbers are traced."""
+        return [
+            *doubts_of_scene(self.bodies, self.joints, self.contacts, self.gravity),
+            *self._doubts_of(state),
+        ]
+
+    def _doubts_of(self, state: State) -> list[Doubt]:
+        if is_traced(state, self.timestep):
+            return []
+        return doubts_of_state(self.bodies, self.point_pairs, self.layout, state, float(self.timestep))
 
     def filled(self, state: State) -> State:
         """The state with the rows of bodies on joints as `q` and `v` say; for one state.

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import tomllib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,11 +33,14 @@ from dano.scene import (
     LOOP_KINDS,
     Motor,
     MOTOR_KINDS,
+    say_doubts,
     Scene,
+    SceneWarning,
     State,
     STATE_SIZES,
     touching_pairs,
 )
+from dano.scene_file._doubts import file_doubts
 from dano.scene_file._objects import (
     build_object,
     is_shipped,
@@ -232,7 +236,9 @@ def parse_scene(
     loops = [loop for robot, _ in robots for loop in robot.loops]
     loops += _loops(top, [body.name for body in bodies])
     contacts = _contacts(top, bodies, [*joints, *loops], default_law, [robot for robot, _ in robots])
-    with located(str(path)):
+    with located(str(path)), warnings.catch_warnings():
+        # Said together, below.
+        warnings.simplefilter("ignore", SceneWarning)
         scene = Scene.create(bodies, contacts, joints=joints, loops=loops, timestep=h, gravity=gravity)
         given = (*_STATE, *JOINT_QUANTITIES)
         start = {row["name"]: {key: row[key] for key in given if key in row} for row in tables}
@@ -247,7 +253,11 @@ def parse_scene(
         for row in tables
         if "asset" in row or "object" in row
     }
-    return SceneFile(scene, state, int(steps), read_schedule(top, scene), path, text, objects, default_law)
+    schedule = read_schedule(top, scene)
+    made = SceneFile(scene, state, int(steps), schedule, path, text, objects, default_law)
+    asked = top.number("duration") if n_steps is None and "duration" in top else None
+    say_doubts([*scene.doubts(state), *file_doubts(scene, state, schedule, int(steps), asked)], stacklevel=3)
+    return made
 
 
 def _steps(top: Table, timestep: float) -> int | float:
@@ -264,7 +274,9 @@ def _steps(top: Table, timestep: float) -> int | float:
     if duration <= 0:
         raise top.wrong("duration", "> 0 s")
     count = duration / timestep
-    return count if count > 2**62 else max(1, round(count))
+    if count > 2**62:
+        return count
+    return max(1, round(count))
 
 
 def _body(row: Table, folder: Path, built: dict[object, NeuralObject], progress: Progress | None) -> Body:
