@@ -278,6 +278,7 @@ def batches() -> Frames:
     names = [f"soap {i}" for i in range(8)]
     shown = dano.Scene.create(
         [*(dano.Body(name, soap) for name in names), dano.Body("floor", dano.HalfSpace(), fixed=True)],
+        contacts=(),
         timestep=0.005,
     )
     states, n_times = found.states, 201

@@ -39,7 +39,7 @@ def test_the_table_of_a_film_is_the_highest_level_plane_below_the_body():
     bodies = [dano.Body(name, dano.HalfSpace(offset=height), fixed=True) for name, height in planes.items()]
     bodies += [dano.Body("ramp", dano.HalfSpace((0, np.sin(0.4), np.cos(0.4)), 0.2), fixed=True)]
     bodies += [dano.Body("ball", dano.Sphere(0.05), mass=1.0)]
-    scene = dano.Scene.create(bodies, timestep=0.01)
+    scene = dano.Scene.create(bodies, contacts=(), timestep=0.01)
     motion = Motion.create(np.arange(2) / 30, "ball", position=np.array([[[0, 0, 0.2]], [[0.1, 0, 0.16]]]))
     assert _with_table(scene, motion, TrackOptions()).table == pytest.approx(0.1)
     assert _with_table(scene, motion, TrackOptions(table=0.3)).table == 0.3

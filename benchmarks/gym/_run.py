@@ -46,7 +46,7 @@ def _arm() -> tuple[dano.Scene, dano.State, dano.Task]:
         parent = names[k - 1] if k else None
         place = (0, 0, 0.2 if k else 0.1)
         joints.append(dano.Joint(parent, name, axis=axis, anchor=(0, 0, -0.1), position=place, damping=0.1))
-    scene = dano.Scene.create(bodies, joints=joints, timestep=TIMESTEP)
+    scene = dano.Scene.create(bodies, contacts=(), joints=joints, timestep=TIMESTEP)
     drives = [dano.Actuator(name, "effort", limit=10.0) for name in names]
     goal = dano.Goal(names[-1], position=(0.4, 0, 0.6), within=0.02, running=1.0)
     start = scene.initial_state(**{name: {"q": 0.3} for name in names})  # pyright: ignore[reportArgumentType]

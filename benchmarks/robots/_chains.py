@@ -25,7 +25,7 @@ def _floating(group: str, n_steps: int) -> list[Row]:
         dano.Joint(f"link {i}", f"link {i + 1}", axis=axis, anchor=(0, 0, -0.13), position=(0, 0, 0.26))
         for i, axis in enumerate(axes)
     ]
-    scene = dano.Scene.create(bodies, joints=joints, timestep=1e-3, gravity=(0, 0, 0))
+    scene = dano.Scene.create(bodies, contacts=(), joints=joints, timestep=1e-3, gravity=(0, 0, 0))
     given: dict[str, dict] = {f"link {i + 1}": dict(q=0.2, v=(-1) ** i * 1.5) for i in range(LINKS)}
     given["link 0"] = dict(velocity=(0.2, 0, 0.1), omega=(1, 0.5, -1))
     states, h = dano.simulate(scene, scene.initial_state(**given), n_steps).states, float(scene.timestep)
@@ -55,7 +55,7 @@ def _four_bar(group: str, n_steps: int) -> list[Row]:
         for k, (on, x) in places.items()
     ]
     loop = dano.Loop("coupler", "rocker", position=(coupler / 2, 0, 0), anchor=(rocker / 2, 0, 0))
-    scene = dano.Scene.create(bodies, joints=joints, loops=[loop], timestep=1e-3)
+    scene = dano.Scene.create(bodies, contacts=(), joints=joints, loops=[loop], timestep=1e-3)
     open_ = scene.initial_state(crank=dict(q=-0.9), coupler=dict(q=-0.5), rocker=dict(q=-2))
     states = dano.simulate(scene, dano.close_loops(scene, open_, ["crank"]), n_steps).states
     loops = scene.closing

@@ -38,7 +38,7 @@ def payload(path: Path) -> Case:
     load = dano.Body("load", dano.Sphere(0.04), mass=1.0, inertia=np.diag([6.4e-4] * 3))
     hold = dano.Joint(robot.bodies[-1].name, "load", "weld", position=(0, 0, 0.2))
     joints = [dataclasses.replace(joint, limits=None) for joint in robot.joints]
-    scene = dano.Scene.create([*robot.bodies, load], joints=[*joints, hold], timestep=timestep)
+    scene = dano.Scene.create([*robot.bodies, load], contacts=(), joints=[*joints, hold], timestep=timestep)
     true = scene.replace_body("load", mass_scale=PAYLOAD["mass"], com_offset=PAYLOAD["centre"])
     wanted = _swinging(np.array([0.1, 0.4, -0.3, -1.5, 0.2, 1.6, 0.5]), (0.2, 0.4, 0.6), 0.25)
     parameters = (
@@ -53,7 +53,7 @@ def shoulder(path: Path) -> Case:
     """The first three joints of the shipped arm; friction and armature of the second are not known."""
     robot = dano.load_urdf(path, collision=False)
     joints = [dataclasses.replace(joint, limits=None, armature=0.01) for joint in robot.joints[:3]]
-    scene = dano.Scene.create(robot.bodies[:3], joints=joints, timestep=5e-3)
+    scene = dano.Scene.create(robot.bodies[:3], contacts=(), joints=joints, timestep=5e-3)
     true = scene.replace_joint("upper", **JOINT)
     wanted = _swinging(np.array([0.0, 0.5, 0.6]), (0.5, 1.1), 0.4)
     parameters = (

@@ -170,7 +170,7 @@ def _potentials(scene: dano.Scene, states: dano.State) -> np.ndarray:
 
 def _scene(robot: Robot, *, free: bool, timestep: float = TIMESTEP) -> dano.Scene:
     joints = [dataclasses.replace(joint, limits=None) if free else joint for joint in robot.joints]
-    return dano.Scene.create(robot.bodies, joints=joints, timestep=timestep)
+    return dano.Scene.create(robot.bodies, contacts=(), joints=joints, timestep=timestep)
 
 
 def _theirs(path: Path):

@@ -424,16 +424,27 @@ def checked_points(name: str, value: Numbers) -> Float[Array, "n 3"]:
     return checked_array(name, array, array.shape)
 
 
+_LONGEST_QUATERNION = 10.0
+"""Norm beyond which four numbers are rather an axis and an angle in degrees."""
+
+
 def checked_quaternion(name: str, value: Numbers) -> Array:
     """`value` as a unit quaternion wxyz.
 
     Raises:
-        ValueError: If the shape differs, an entry is not finite, or the norm is zero.
+        ValueError: If the shape differs, an entry is not finite, the norm is zero, or so large that it is no
+            quaternion.
     """
     array = checked_array(name, value, (4,))
-    if not is_traced(array) and float(np.linalg.norm(np.asarray(array))) < 1e-12:
+    norm = 1.0 if is_traced(array) else float(np.linalg.norm(np.asarray(array)))
+    if norm < 1e-12:
         raise ValueError(
             f"{name} must be a non-zero quaternion (w, x, y, z), got {np.asarray(array).tolist()}"
+        )
+    if norm > _LONGEST_QUATERNION:
+        raise ValueError(
+            f"{name} must be a quaternion (w, x, y, z), which is normalised, got {np.asarray(array).tolist()}"
+            f" of length {norm:.3g}: an axis and an angle in degrees?"
         )
     return quat_normalize(array)
 

@@ -47,7 +47,7 @@ def tree():
             "base", "pair", axis=(0, 0, 1), position=(0, -0.1, 0), mimics="wheel", ratio=-2.0, shift=0.3
         ),
     ]
-    return dano.Scene.create(bodies, joints=joints, timestep=1e-3, gravity=(0, 0, -1.0))
+    return dano.Scene.create(bodies, contacts=(), joints=joints, timestep=1e-3, gravity=(0, 0, -1.0))
 
 
 @pytest.fixture(scope="module")

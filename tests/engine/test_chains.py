@@ -25,7 +25,7 @@ def double_pendulum(timestep):
         parent = None if i == 0 else "upper"
         place = (0, 0, 0) if i == 0 else (0, 0, -LENGTHS[0])
         joints.append(dano.Joint(parent, name, axis=(0, -1, 0), position=place))
-    return dano.Scene.create(bodies, joints=joints, timestep=timestep)
+    return dano.Scene.create(bodies, contacts=(), joints=joints, timestep=timestep)
 
 
 def swung(_, z):
@@ -71,7 +71,7 @@ def test_energy_of_the_panda_swinging_freely():
     """Over 2 s the energy swings by less than 0.5 % of what the potential does, and has no trend."""
     robot = dano.load_urdf(panda(), collision=False)
     joints = [dataclasses.replace(joint, limits=None) for joint in robot.joints]
-    scene = dano.Scene.create(robot.bodies, joints=joints, timestep=1e-3)
+    scene = dano.Scene.create(robot.bodies, contacts=(), joints=joints, timestep=1e-3)
     start = dict(zip(robot.joint_names, [0.1, 0.4, -0.3, -1.5, 0.2, 1.6, 0.5], strict=True))
     states = dano.simulate(scene, robot.state(scene, start), 2000).states
     mass = jnp.stack([body.mass for body in scene.bodies])

@@ -158,7 +158,7 @@ def test_a_spin_that_a_step_does_not_resolve_is_said_with_its_body():
         dano.Body("top", dano.Box((0.02, 0.05, 0.1)), mass=1.0),
         dano.Body("rest", dano.Sphere(1.0), mass=1.0),
     ]
-    scene = dano.Scene.create(bodies, timestep=0.01, gravity=(0, 0, 0))
+    scene = dano.Scene.create(bodies, contacts=(), timestep=0.01, gravity=(0, 0, 0))
     start = scene.initial_state(top=dict(omega=(0, 0, 95.0)))
     push = scene.control(top=dict(torque=(0.0, 0.0, 10.0)))
     with pytest.warns(RuntimeWarning, match=r"^'top' turns by more than 60° in a step, first in step 0"):

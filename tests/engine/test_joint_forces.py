@@ -192,7 +192,7 @@ def test_planar_and_mimicked_joints():
             "puck", "right", "slide", axis=(0, 1, 0), position=(0, -0.05, 0.1), mimics="left", ratio=-1.0
         ),
     ]
-    scene = dano.Scene.create([puck, *fingers], joints=joints, timestep=2e-3)
+    scene = dano.Scene.create([puck, *fingers], contacts=(), joints=joints, timestep=2e-3)
     assert scene.layout.n_joints == 4
     state = scene.initial_state(puck=dict(q=(0.3, -0.2, 0.5)), left=dict(q=0.01))
     np.testing.assert_allclose(state.position[0], [0.3, -0.2, 1.0], atol=1e-12)
@@ -289,4 +289,4 @@ def test_joint_that_mimics_nothing_is_an_error():
     bodies = [dano.Body(name, dano.Sphere(0.1), mass=1.0) for name in "ab"]
     joints = [dano.Joint(None, "a", "weld"), dano.Joint("a", "b", mimics="a")]
     with pytest.raises(ValueError, match=r"mimics of the joint of 'b' must name one of \[\]"):
-        dano.Scene.create(bodies, joints=joints)
+        dano.Scene.create(bodies, contacts=(), joints=joints)

@@ -34,7 +34,7 @@ def four_bar(timestep=1e-3, **crank):
         dano.Joint(None, "rocker", axis=(0, 1, 0), anchor=near[2], position=(GROUND + ROCKER / 2, 0, 0)),
     ]
     loop = dano.Loop("coupler", "rocker", position=(COUPLER / 2, 0, 0), anchor=(ROCKER / 2, 0, 0))
-    return dano.Scene.create(bodies, joints=joints, loops=[loop], timestep=timestep)
+    return dano.Scene.create(bodies, contacts=(), joints=joints, loops=[loop], timestep=timestep)
 
 
 def directions(crank):
@@ -112,7 +112,7 @@ def test_loops_swing_in_mujoco_as_here(swung, kind):
             dano.Joint("one", "two", "ball", anchor=near, position=(0.2, 0, 0)),
         ]
         loop = dano.Loop("one", "two", "weld", position=(0.1, 0, 0), anchor=near)
-        scene = dano.Scene.create(bodies, joints=joints, loops=[loop], timestep=1e-3)
+        scene = dano.Scene.create(bodies, contacts=(), joints=joints, loops=[loop], timestep=1e-3)
         state = scene.initial_state()
         run = dano.simulate(scene, state, 400)
     theirs = dano.simulate(scene, state, 400, engine=MuJoCoEngine(scene))
@@ -191,6 +191,7 @@ def chain(closed, weld=False):
     loop = dano.Loop("rod", "end", "weld" if weld else "point", position=(half, 0, 0), anchor=(-half, 0, 0))
     scene = dano.Scene.create(
         bodies,
+        contacts=(),
         joints=[hinge, plane if closed else hangs],
         loops=[loop] if closed else [],
         timestep=2e-3,
@@ -275,6 +276,7 @@ def test_open_loops_and_wrong_ones_are_said():
         dano.simulate(scene, scene.initial_state(), 3)
     far = dano.Scene.create(
         scene.bodies,
+        contacts=(),
         joints=scene.joints,
         loops=[dano.Loop("coupler", "rocker", position=(5.0, 0, 0), anchor=(0, 0, 0))],
     )
@@ -285,9 +287,9 @@ def test_open_loops_and_wrong_ones_are_said():
     with pytest.raises(ValueError, match="scene must have loops, got none"):
         dano.close_loops(chain(closed=False), chain(closed=False).initial_state())
     with pytest.raises(ValueError, match="loop must name bodies of the scene .* did you mean 'crank'"):
-        dano.Scene.create(scene.bodies, joints=scene.joints, loops=[dano.Loop("crnk", "rocker")])
+        dano.Scene.create(scene.bodies, contacts=(), joints=scene.joints, loops=[dano.Loop("crnk", "rocker")])
     with pytest.raises(ValueError, match="loop must close a chain of joints, got 'crank' and 'rocker'"):
-        dano.Scene.create(scene.bodies, loops=[dano.Loop("crank", "rocker")])
+        dano.Scene.create(scene.bodies, contacts=(), loops=[dano.Loop("crank", "rocker")])
     with pytest.raises(ValueError, match="kind must be one of point, weld, got 'pin'"):
         dano.Loop("a", "b", "pin")
     with pytest.raises(ValueError, match="loop must join two different bodies, got 'a' twice"):

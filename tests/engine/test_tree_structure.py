@@ -28,7 +28,7 @@ JOINTS = (
 def layout():
     bodies = [dano.Body(name, dano.Sphere(0.1), mass=1.0, fixed=name == "wall") for name in NAMES]
     joints = [dano.Joint(parent, child, kind, mimics=mimics) for parent, child, kind, mimics in JOINTS]
-    return dano.Scene.create(bodies, joints=joints).layout
+    return dano.Scene.create(bodies, contacts=(), joints=joints).layout
 
 
 @pytest.fixture(scope="module")

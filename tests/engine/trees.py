@@ -32,7 +32,7 @@ def robot(timestep=1e-3, gravity=(0.0, 0.0, 0.0)):
         ),
         dano.Joint("arm", "piece", "weld", position=(0.1, 0, 0)),
     ]
-    scene = dano.Scene.create(bodies, joints=joints, timestep=timestep, gravity=gravity)
+    scene = dano.Scene.create(bodies, contacts=(), joints=joints, timestep=timestep, gravity=gravity)
     state = scene.initial_state(
         base=dict(position=(0, 0, 1), velocity=(0.1, 0.2, 0), omega=(1, 2, -1)),
         arm=dict(q=0.3, v=2.0),

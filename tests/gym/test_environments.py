@@ -23,7 +23,7 @@ def pushed():
         dano.Body("rod", dano.Box((0.1, 0.02, 0.02)), mass=0.3),
     ]
     hinge = dano.Joint(None, "rod", axis=(0, 0, 1), anchor=(-0.1, 0, 0), position=(0, 2, 0))
-    scene = dano.Scene.create(bodies, joints=[hinge], timestep=H, gravity=(0, 0, 0))
+    scene = dano.Scene.create(bodies, contacts=(), joints=[hinge], timestep=H, gravity=(0, 0, 0))
     task = dano.Task(
         N_STEPS,
         [

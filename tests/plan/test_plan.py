@@ -383,7 +383,7 @@ def test_what_does_not_need_to_be_touched_is_not_explored(pushing, pushed, drive
     # The derivative is zero; a small force at all times would touch, and the end says what that is worth.
     assert "the derivative along" in never.message and "the force of hand along x it is 0" in never.message
     # Where no pair of the scene may touch, there is nothing to look for.
-    apart = dano.Scene.create(list(scene.bodies), timestep=0.02, gravity=(0, 0, 0))
+    apart = dano.Scene.create(list(scene.bodies), contacts=(), timestep=0.02, gravity=(0, 0, 0))
     made = dano.plan(apart, state, task)
     assert "no contact of the scene lets it" in made.explored and not made.reached
 

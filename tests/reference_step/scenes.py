@@ -241,7 +241,7 @@ def linkage():
         for name, (on, x) in places.items()
     ]
     loop = dano.Loop("coupler", "rocker", position=(0.25, 0, 0), anchor=(0.2, 0, 0))
-    return dano.Scene.create(bodies, joints=joints, loops=[loop], timestep=H)
+    return dano.Scene.create(bodies, contacts=(), joints=joints, loops=[loop], timestep=H)
 
 
 @functools.cache

@@ -82,7 +82,9 @@ def test_free_motion_equals_that_of_mujoco(arm):
     h = 2e-4
     scene = robot.scene(timestep=h)
     chains = [joint for joint in scene.joints if joint.limits is not None]
-    scene = dano.Scene.create(robot.bodies, joints=[_unlimited(joint) for joint in scene.joints], timestep=h)
+    scene = dano.Scene.create(
+        robot.bodies, contacts=(), joints=[_unlimited(joint) for joint in scene.joints], timestep=h
+    )
     assert len(chains) == 7
     start = np.array([0.1, 0.4, -0.3, -1.5, 0.2, 1.6, 0.5])
     names = list(robot.joint_names)
@@ -119,7 +121,7 @@ def test_floating_tree_with_ball_and_planar_joints():
         dano.Joint("a", "b", "ball", anchor=(0, 0.2, 0), position=(0, 0.4, 0)),
         dano.Joint("b", "c", "planar", axis=(0, 1, 0), position=(0, 0, 0.2)),
     ]
-    scene = dano.Scene.create(bodies, joints=joints, timestep=1e-3)
+    scene = dano.Scene.create(bodies, contacts=(), joints=joints, timestep=1e-3)
     state = scene.initial_state(
         a=dict(position=(0, 0, 1), velocity=(1, 2, 3), omega=(1, -1, 0.5)),
         b=dict(q=(0.3, -0.5, 0.2), v=(1.0, 2.0, -1.0)),
@@ -194,7 +196,7 @@ def free_arm():
     """The small arm without friction and limits, whose programs are short."""
     robot = dano.load_urdf(ARM, collision=False)
     joints = [dataclasses.replace(joint, friction=None, limits=None) for joint in robot.joints]
-    return robot, dano.Scene.create(robot.bodies, joints=joints, timestep=2e-3)
+    return robot, dano.Scene.create(robot.bodies, contacts=(), joints=joints, timestep=2e-3)
 
 
 def test_gravity_compensation_holds_the_arm():

@@ -138,6 +138,8 @@ def test_things_of_the_world(tmp_path):
     assert robot.surroundings == ("floor", "table")
     pairs = [(c.a, c.b) for c in robot.contacts_with("floor", "table")]
     assert pairs == [("cube", "floor"), ("arm", "floor"), ("cube", "table"), ("arm", "table")]
+    assert set(robot.scene().pairs) == {(b, a) for a, b in pairs}
+    assert robot.scene(contacts=()).pairs == ()
     scene = robot.scene(contacts=robot.contacts_with("floor"))
     state = robot.state(scene)
     data = mujoco.MjData(model := mujoco.MjModel.from_xml_path(str(path)))

@@ -79,7 +79,7 @@ def test_weight_on_a_cantilever():
         dano.Joint(None, "near", "weld", position=(0.1, 0, 0)),
         dano.Joint("near", "far", "weld", position=(0.2, 0, 0)),
     ]
-    scene = dano.Scene.create(bodies, joints=joints)
+    scene = dano.Scene.create(bodies, contacts=(), joints=joints)
     found = np.asarray(dano.joint_reactions(scene, scene.initial_state(), np.zeros(0)))
     np.testing.assert_allclose(found[0, :3], [0, 0, 3 * 9.81], atol=1e-12)
     np.testing.assert_allclose(found[1], [0, 0, 9.81, 0, 0, 0], atol=1e-12)

@@ -79,6 +79,7 @@ def test_weld_and_anchor():
     knob = dano.Body("knob", dano.Sphere(0.02), mass=0.1)
     scene = dano.Scene.create(
         [plate, knob],
+        contacts=(),
         joints=[
             dano.Joint(None, "plate", axis=(0, 0, 3), anchor=(-0.2, 0, 0), position=(1.2, 0, 0.3)),
             dano.Joint("plate", "knob", "weld", position=(0.15, 0.03, 0.0)),
@@ -119,7 +120,7 @@ def _boxes(*names, **options):
 def test_joints_that_make_no_tree_are_errors(joints, message):
     bodies = [*_boxes("a", "b", "c"), dano.Body("floor", dano.HalfSpace(), fixed=True)]
     with pytest.raises(ValueError, match=message):
-        dano.Scene.create(bodies, joints=joints)
+        dano.Scene.create(bodies, contacts=(), joints=joints)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +139,7 @@ def test_wrong_joints_are_errors(options, message):
 
 
 def test_wrong_states_of_joints_are_errors():
-    scene = dano.Scene.create(_boxes("a", "b"), joints=[dano.Joint("a", "b")])
+    scene = dano.Scene.create(_boxes("a", "b"), contacts=(), joints=[dano.Joint("a", "b")])
     with pytest.raises(ValueError, match=r"'b' must be given by \['q', 'v'\], for it hangs on a joint"):
         scene.initial_state(b=dict(position=(0, 0, 1)))
     with pytest.raises(ValueError, match="q of 'b'"):

@@ -19,7 +19,7 @@ def test_a_loop_over_levels_places_what_levels_one_after_the_other_place(monkeyp
         dano.Joint(parent, str(i), kind, axis=rng.normal(size=3), anchor=rng.normal(size=3))
         for i, (parent, kind) in enumerate(zip(PARENTS, KINDS, strict=True))
     ]
-    scene = dano.Scene.create(bodies, joints=joints)
+    scene = dano.Scene.create(bodies, contacts=(), joints=joints)
     state = scene.initial_state()
     q = jnp.asarray(rng.normal(size=scene.layout.n_joints))
 

@@ -1,5 +1,6 @@
 """Pairs of bodies that no contact names."""
 
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 import dano
+from dano.scene_file import parse_scene
 
 SIDE = 0.1  # [m]
 
@@ -126,7 +128,7 @@ def test_no_friction_has_a_derivative():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"apart": [("cube", "ball")]}, "apart must be empty without others"),
+        ({"apart": [("cube", "ball")], "contacts": ()}, "apart must be empty"),
         ({"others": PARAMS, "apart": [("cube", "bowl")]}, "apart must name bodies of the scene"),
         ({"others": dano.ContactParams(spring=1.0)}, "does not read spring"),
     ],
@@ -138,11 +140,45 @@ def test_wrong_arguments(arguments: dict[str, Any], message: str):
 
 def test_a_material_that_nothing_reads():
     with pytest.raises(ValueError, match="material of body 'cube'"):
-        dano.Scene.create(bodies(cube=PARAMS))
+        dano.Scene.create(bodies(cube=PARAMS), contacts=())
     with pytest.raises(ValueError, match="does not read spring"):
         dano.Scene.create(bodies(cube=dano.ContactParams(spring=1.0)), others=PARAMS)
     scene = dano.Scene.create(bodies(), others=PARAMS)
     with pytest.raises(ValueError, match="material must be changed in"):
         scene.replace_material("cube", damper=1.0)
     with pytest.raises(ValueError, match="others=…"):
-        dano.Scene.create(bodies()).replace_material("cube", restitution=1.0)
+        dano.Scene.create(bodies(), contacts=()).replace_material("cube", restitution=1.0)
+
+
+def test_without_contacts_all_that_may_touch_touches():
+    scene = dano.Scene.create(bodies(), timestep=0.005)
+    assert set(scene.pairs) == {("cube", "ball"), ("cube", "floor"), ("ball", "floor")}
+    assert scene.others is None
+    named = dano.Scene.create(bodies(), [dano.Contact(*pair) for pair in scene.pairs], timestep=0.005)
+    for ours, theirs in zip(jax.tree.leaves(scene), jax.tree.leaves(named), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert dano.Scene.create(bodies(), contacts=()).pairs == ()
+    assert set(dano.Scene.create(bodies(), apart=[("ball", "cube")]).pairs) == {
+        ("cube", "floor"),
+        ("ball", "floor"),
+    }
+    lid = dano.Joint("cube", "ball")
+    assert ("cube", "ball") not in dano.Scene.create(bodies(), joints=[lid]).pairs
+    with pytest.raises(ValueError, match="apart must name bodies"):
+        dano.Scene.create(bodies(), apart=[("cube", "bowl")])
+    made_of = dano.Scene.create(bodies(cube=dano.ContactParams(sliding_friction=0.9)))
+    assert made_of.others is not None and set(made_of.pairs) == set(scene.pairs)
+
+
+def test_many_pairs_are_held_in_arrays():
+    many = [dano.Body(f"ball {i}", dano.Sphere(0.1), mass=1.0) for i in range(25)]
+    scene = dano.Scene.create(many)
+    assert not scene.contacts and len(scene.pairs) == 25 * 24 // 2
+
+
+def test_a_scene_file_and_python_have_one_default():
+    shapes = '[[bodies]]\nname = "{0}"\nshape = "box"\nhalf_extents = [0.1, 0.1, 0.1]\nmass = 1.0\n'
+    text = "timestep = 0.01\nn_steps = 1\n" + shapes.format("a") + shapes.format("b")
+    text += '[[bodies]]\nname = "floor"\nshape = "half_space"\nfixed = true\n'
+    read = parse_scene(text, Path("pile.toml")).scene
+    assert read.pairs == dano.Scene.create(read.bodies).pairs

@@ -20,6 +20,7 @@ from dano.contact._laws import (
     checked_parameter as checked_parameter,
     ContactParams as ContactParams,
     non_negative as non_negative,
+    PARAMETER_RANGES as PARAMETER_RANGES,
     Setting as Setting,
     STANDARD_GRAVITY as STANDARD_GRAVITY,
 )

@@ -101,6 +101,25 @@ class ContactParams(eqx.Module):
         return ContactParams(**{**mine, **missing}) if missing else self
 
 
+class Range(NamedTuple):
+    """Where a parameter may lie: between two numbers, and not at zero where something is divided by it."""
+
+    least: float
+    most: float
+    divides: bool
+
+
+PARAMETER_RANGES = {
+    name: Range(
+        0.0,
+        1.0 if name in ("restitution", "hysteresis", "friction_fading") else float(np.finfo(np.float32).max),
+        name in ("stiffness", "restitution_velocity", "impact_depth", "friction_pressure"),
+    )
+    for name in ContactParams.__dataclass_fields__
+}
+"""Of each field of `ContactParams`."""
+
+
 def checked_parameter(name: str, value: Numbers) -> Float[Array, ""]:
     """A value for a field of `ContactParams`.
 
@@ -114,12 +133,10 @@ def checked_parameter(name: str, value: Numbers) -> Float[Array, ""]:
     array = non_negative(name, value)
     if is_traced(array):
         return array
-    if name in ("restitution", "hysteresis", "friction_fading") and float(array) > 1:
-        raise ValueError(f"{name} must lie in [0, 1], got {float(array)}")
-    if (
-        name in ("stiffness", "restitution_velocity", "impact_depth", "friction_pressure")
-        and float(array) == 0
-    ):
+    limits = PARAMETER_RANGES[name]
+    if float(array) > limits.most:
+        raise ValueError(f"{name} must lie in [0, {limits.most:.0f}], got {float(array)}")
+    if limits.divides and float(array) == 0:
         raise ValueError(f"{name} must be > 0, got {float(array)}")
     return array
 

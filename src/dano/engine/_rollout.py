@@ -17,6 +17,7 @@ from dano.checks import checked_count, checked_kind, checked_number
 from dano.contact import Patch
 from dano.engine import _touching, _variational
 from dano.engine._compiling import compiled
+from dano.engine._finite import unsound
 from dano.engine._reports import Report, SolverOptions
 from dano.engine._rolling import rolled
 from dano.maths import by_numpy, is_traced, Q, quat_conjugate, quat_exp, quat_multiply
@@ -389,6 +390,19 @@ def _say(scene: Scene, following: State, report: Report) -> None:
     converged = np.atleast_1d(np.asarray(report.converged))
     if not converged.all():
         failed = np.flatnonzero(~converged)
+        lost = np.isnan(np.atleast_1d(np.asarray(report.residual)))
+        if lost.any():
+            reason = unsound(scene) or (
+                "a state, a control or a number of the scene that a step depends on is NaN, infinite or out"
+                " of its range"
+            )
+            warnings.warn(
+                f"{lost.sum()} of {converged.size} steps are not finite, first step {np.argmax(lost)}:"
+                f" {reason}; their states are NaN",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+            return
         worst = float(np.nanmax(np.atleast_1d(np.asarray(report.residual))[failed], initial=0.0))
         warnings.warn(
             f"{len(failed)} of {converged.size} steps did not converge, first step {failed[0]}, "

@@ -7,8 +7,10 @@ theorem, are kernels (`dano.engine.kernels`, docs/theory/step.md); here a scene 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from dano.contact import AbstractPatchLaw, CHUNK, DistributedLaw
+from dano.engine._finite import marked, sound
 from dano.engine._reports import Report, SolverOptions
 from dano.engine.launching import rollout as launched, scene_tables, Tables
 from dano.scene import Control, lifted, Scene, State
@@ -19,10 +21,12 @@ class Prepared(eqx.Module):
 
     Attributes:
         tables: Of the scene.
+        sound: Whether the numbers of the scene are in their ranges, see `dano.engine._finite`.
         capacity: Chunks of points that a step has room for (static).
     """
 
     tables: Tables
+    sound: Bool[Array, ""]
     capacity: int = eqx.field(static=True)
 
 
@@ -38,14 +42,14 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
     """
     _check_laws(scene)
     if not scene.point_pairs:
-        return Prepared(scene_tables(scene), 0)
+        return Prepared(scene_tables(scene), sound(scene), 0)
     if capacity is None:
         capacity = scene.room
     if capacity is None:
         # Room for all samples, where it is not known how many can touch at once.
         sampled = [body.surface.points.shape[1] for body in scene.bodies if body.surface is not None]
         capacity = -(-sum(sampled) // CHUNK)
-    return Prepared(scene_tables(scene), capacity)
+    return Prepared(scene_tables(scene), sound(scene), capacity)
 
 
 def _check_laws(scene: Scene) -> None:
@@ -85,4 +89,5 @@ def rollout(
         still = jax.tree.map(lambda x: jnp.broadcast_to(x, (n_steps, *x.shape)), state)
         return still, Report(none, none.astype(int), none == 0, none > 0)
     controls = lifted(scene, controls, n_steps)
-    return launched(prepared.tables, state, controls, n_steps, prepared.capacity, options)
+    found = launched(prepared.tables, state, controls, n_steps, prepared.capacity, options)
+    return marked(prepared.sound, state, controls, *found)

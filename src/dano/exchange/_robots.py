@@ -304,7 +304,7 @@ def _mjcf_joint(
         if joint.limits is not None:
             given["range"] = words(np.array(joint.limits))
         if np.isfinite(joint.effort):
-            given["actuatorfrcrange"] = words(np.array([-joint.effort, joint.effort]))
+            given["actuatorfrcrange"] = words(np.array(joint.efforts))
     given |= {"damping": joint.damping, "frictionloss": joint.friction, "armature": joint.armature}
     ET.SubElement(row, "joint", {key: str(value) for key, value in given.items()})
     if joint.drive is not None:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
-from dano.checks import checked_kind
+from dano.checks import checked_kind, shown
 from dano.gym._rendering import Rendering
 from dano.gym._rules import Rules, Start
 from dano.names import did_you_mean
@@ -26,6 +26,10 @@ class _Roomy:
         self._rules, self._compiled = rules, compiled
         self._step: Callable | None = None
         self._factor = 1
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is compiled, which is compiled again where it is needed."""
+        return {**self.__dict__, "_step": None}
 
     def __call__(self, *arguments: Any) -> tuple[Any, ...]:
         """What `Rules.single` or `Rules.many` say, without whether there was room."""
@@ -69,8 +73,9 @@ class SceneEnv(gymnasium.Env):
 
     def step(self, action):
         """See `gymnasium.Env.step`."""
+        action = _finite(action)
         before, self._step = self.state, self._step + 1
-        found = self._roomy(before, np.asarray(action), self._step - 1)
+        found = self._roomy(before, action, self._step - 1)
         self.state, *numbers = found
         seen, reward, met, lengths, solved = map(np.asarray, numbers)
         self._follow(before)
@@ -132,11 +137,12 @@ class SceneVectorEnv(gymnasium.vector.VectorEnv):
 
     def step(self, actions):
         """See `gymnasium.vector.VectorEnv.step`."""
+        actions = _finite(actions)
         begins = self._ended
         self._begin(begins)
         self._steps = np.where(begins, 0, self._steps)
         made = self._together if jax.local_device_count() == 1 else self._spread
-        seen, rewards, met, lengths, solved = made(np.asarray(actions), begins)
+        seen, rewards, met, lengths, solved = made(actions, begins)
         self._steps = np.where(begins, 0, self._steps + 1)
         over = (self._steps >= self.rules.n_steps) | ~solved
         self._ended = met | over
@@ -209,6 +215,18 @@ def _spaces(rules: Rules) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     dtype = np.dtype(rules.scene.timestep.dtype)
     observation = gymnasium.spaces.Box(-np.inf, np.inf, (seen,), dtype.type)
     return observation, gymnasium.spaces.Box(-1.0, 1.0, (acted,), np.float32)
+
+
+def _finite(action: Any) -> np.ndarray:
+    """An action as an array.
+
+    Raises:
+        ValueError: If a number is not finite.
+    """
+    numbers = np.asarray(action)
+    if not np.all(np.isfinite(numbers)):
+        raise ValueError(f"action must be finite, got {shown(numbers.tolist())}")
+    return numbers
 
 
 def _given(options: Mapping[str, Any] | None) -> State | None:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from dano.callback import host_callback
 from dano.checks import checked_choice, checked_kind, checked_number
 from dano.contact import Patch
-from dano.engine import AbstractEngine, Report, VariationalEngine
+from dano.engine import AbstractEngine, marked, Report, VariationalEngine
 from dano.mujoco._model import library
 from dano.mujoco._spec import TOUCHES
 from dano.mujoco._twin import Constants, Motion, Twin
@@ -172,7 +172,10 @@ class MuJoCoEngine(AbstractEngine):
         after = _filled(scene, State(*rows))
         bad = ~jnp.all(jnp.isfinite(out))
         passes = jax.lax.stop_gradient(passes[0]).astype(int)
-        return after, Report(jnp.where(bad, jnp.inf, 0).astype(dtype), passes, ~bad)
+        report = Report(jnp.where(bad, jnp.inf, 0).astype(dtype), passes, ~bad)
+        # What is no number MuJoCo takes as a reason to begin anew.
+        one = jax.tree.map(lambda x: x[None], (control, after, report))
+        return jax.tree.map(lambda x: x[0], marked(prepared.sound, state, *one))
 
     def touch(self, scene: Scene, prepared: Any, state: State) -> Patch:
         """See `AbstractEngine.touch`: the overlap of the same samples and solids as in our own engine."""

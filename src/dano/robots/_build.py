@@ -20,7 +20,7 @@ from dano.robots._parts import (
     without_lacking,
     without_weightless,
 )
-from dano.robots._robot import Robot
+from dano.robots._robot import PLANE, Robot
 from dano.robots.formats import (
     checked_ignore,
     Connection,
@@ -35,8 +35,6 @@ from dano.scene import Body, Joint, Loop, Motor
 
 # Radius of what stands for a link without a shape, in pictures only [m].
 _MARK = 0.01
-# After the name of a body whose link has planes besides other shapes.
-_PLANE = " plane"
 
 Frames = dict[str, tuple[str | None, np.ndarray, np.ndarray]]
 
@@ -121,7 +119,7 @@ def _bodies(
     if inertial is None:
         made = [] if shape is None else [(name, shape)]
         made += [
-            (name + (_PLANE if made or i else ""), _half_space(*each)) for i, each in enumerate(planes[:1])
+            (name + (PLANE if made or i else ""), _half_space(*each)) for i, each in enumerate(planes[:1])
         ]
         if len(planes) > 1:
             raise ValueError(f"{where}: a link must have one plane, got {len(planes)}")
@@ -166,8 +164,13 @@ def _joint(description: Description, joint: Connection, frames: Frames, prefix: 
     if joint.drive is not None:
         drive = joint.drive
         # What the joint lets through of a motor's effort, at the motor.
-        most = joint.effort / abs(drive.gear)
-        limits = (max(drive.limits[0], -most), min(drive.limits[1], most))
+        least, most = sorted(effort / drive.gear for effort in joint.efforts)
+        limits = (max(drive.limits[0], least), min(drive.limits[1], most))
+        if limits[0] > limits[1]:
+            raise ValueError(
+                f"{where}: efforts {joint.efforts} let nothing through of actuator {drive.name!r}, whose"
+                f" force is between {drive.limits[0]} and {drive.limits[1]}"
+            )
         options["motor"] = Motor(
             drive.kind, stiffness=drive.stiffness, damping=drive.damping, gear=drive.gear, limits=limits
         )

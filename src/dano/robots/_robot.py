@@ -25,8 +25,11 @@ from dano.maths import (
     quat_rotate,
 )
 from dano.names import did_you_mean
-from dano.robots.formats import Description, Drive, Keyframe
-from dano.scene import Body, Contact, Control, Frames, Joint, Loop, Scene, State
+from dano.robots.formats import Description, Drive, Keyframe, Meeting
+from dano.scene import Body, Contact, Control, Frames, Joint, Loop, Scene, State, unnamed_contacts
+
+PLANE = " plane"
+"""After the name of a link whose plane is a body beside its other shapes."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ class Robot:
         self,
         *,
         bodies: Sequence[Body] = (),
-        contacts: Sequence[Contact] = (),
+        contacts: Sequence[Contact] | None = None,
         joints: Sequence[Joint] = (),
         loops: Sequence[Loop] = (),
         **options: Any,
@@ -88,7 +91,9 @@ class Robot:
 
         Args:
             bodies: Other bodies.
-            contacts: Contacts; `contacts_with` lists those of the robot.
+            contacts: Contacts; `contacts_with` lists those of the robot, and `()` means that nothing touches.
+                Default, unless `others` is among the options: all pairs that may touch, do. Links of the
+                robot touch each other only where a contact says so.
             joints: Other joints.
             loops: Other loops.
             **options: Of `Scene.create`, such as `timestep`. `gravity` is that of the file if it has one.
@@ -101,13 +106,77 @@ class Robot:
         self.check_simulated()
         if self.gravity is not None:
             options = {"gravity": self.gravity, **options}
+        everything, ties = [*self.bodies, *bodies], [*self.joints, *joints, *self.loops, *loops]
+        if contacts is None and options.get("others") is None:
+            contacts, options = self._unnamed(everything, ties, options)
         return Scene.create(
-            [*self.bodies, *bodies],
-            contacts,
-            joints=[*self.joints, *joints],
-            loops=[*self.loops, *loops],
-            **options,
+            everything, contacts, joints=[*self.joints, *joints], loops=[*self.loops, *loops], **options
         )
+
+    def _unnamed(
+        self, bodies: Sequence[Body], ties: Sequence[Joint | Loop], options: dict[str, Any]
+    ) -> tuple[list[Contact] | None, dict[str, Any]]:
+        """Contacts of a scene that names none, and its options; see `scene`."""
+        names = [body.name for body in bodies]
+        apart = [pair for pair in itertools.combinations(names, 2) if not self.may_meet(*pair)]
+        apart = [*options.get("apart", ()), *apart]
+        found = unnamed_contacts(bodies, ties, apart)
+        if found is None:
+            return None, {**options, "apart": apart}
+        known = {body.name for body in self.bodies}
+        listed = [self._contact(c.a, c.b) if {c.a, c.b} <= known else c for c in found]
+        return listed, {**options, "apart": ()}
+
+    def may_meet(self, a: str, b: str) -> bool:
+        """Whether bodies of a scene touch where nobody says so.
+
+        What has no shape does not. Of the bodies of a MuJoCo file those do that MuJoCo lets touch, but links
+        of one tree only where the file names their pair; of a URDF none touches another.
+        """
+        own = {body.name for body in self.bodies}
+        if any(x in own and x not in self.touching for x in (a, b)):
+            return False
+        if not {a, b} <= own:
+            return True
+        meetings = self._meetings(a, b)
+        if any(each.named for each in meetings):
+            return True
+        roots = [{self._root(link) for link in self._links(x)} for x in (a, b)]
+        return bool(meetings) and not roots[0] & roots[1]
+
+    def friction_between(self, a: str, b: str) -> float | None:
+        """Sliding friction that the file gives two of its bodies; None where it says nothing.
+
+        Warns:
+            UserWarning: If their shapes have several: it is the largest.
+        """
+        found = {friction for each in self._meetings(a, b) for friction in each.frictions}
+        if len(found) > 1:
+            warnings.warn(
+                f"{self.description.source}: shapes of {a!r} and {b!r} have frictions {sorted(found)}: their"
+                f" contact has the largest",
+                UserWarning,
+                stacklevel=4,
+            )
+        return max(found, default=None)
+
+    def _links(self, body: str) -> list[str]:
+        """Links of the file that a body is made of."""
+        names = (body, body.removesuffix(PLANE))
+        return [link for link, (name, *_) in self.frames.items() if name in names]
+
+    def _meetings(self, a: str, b: str) -> list[Meeting]:
+        """How the links of two bodies touch each other, by the file."""
+        meets = self.description.meets or {}
+        pairs = (frozenset(pair) for pair in itertools.product(self._links(a), self._links(b)))
+        return [meets[pair] for pair in pairs if pair in meets]
+
+    def _root(self, link: str) -> str:
+        """The link that stands in the world, or moves freely, on which a link hangs."""
+        carriers = {joint.child: joint.parent for joint in self.description.joints}
+        while carriers.get(link, self.description.world) != self.description.world:
+            link = carriers[link]
+        return link
 
     def check_simulated(self) -> None:
         """Check that nothing is left in the file that a simulation would do wrong.
@@ -126,6 +195,8 @@ class Robot:
         What stands still itself, such as the base of an arm, is among them only for a `Body` that moves: two
         bodies that never move have no contact, and of a name alone it is not known.
 
+        Between bodies of a MuJoCo file, masks, exclusions and pairs count as there.
+
         Args:
             *others: Names of bodies, or bodies.
             params: Parameters of all these contacts. Default: between two bodies of the file the friction
@@ -141,36 +212,16 @@ class Robot:
             moves = isinstance(other, Body) and not other.fixed
             name = other.name if isinstance(other, Body) else other
             pairs += [(body, name) for body in self.touching if body != name and (moves or body not in fixed)]
+        if self.description.meets is not None:
+            pairs = [(a, b) for a, b in pairs if b not in known or self._meetings(a, b)]
         if params is not None:
             return [Contact(a, b, params) for a, b in pairs]
         return [self._contact(a, b) if b in known else Contact(a, b) for a, b in pairs]
 
     def _contact(self, a: str, b: str) -> Contact:
         """A contact of two bodies of the file, with the friction that the file gives it."""
-        sides = [
-            [
-                each
-                for link, (body, *_) in self.frames.items()
-                if body == name
-                for each in self.description.frictions.get(link, ())
-            ]
-            for name in (a, b)
-        ]
-        if not all(sides):
-            return Contact(a, b)
-        # As MuJoCo: that of the higher priority, of equal ones the larger.
-        found = {
-            x[0] if x[1] > y[1] else y[0] if y[1] > x[1] else max(x[0], y[0])
-            for x, y in itertools.product(*sides)
-        }
-        if len(found) > 1:
-            warnings.warn(
-                f"{self.description.source}: shapes of {a!r} and {b!r} have frictions {sorted(found)}: their"
-                f" contact has the largest",
-                UserWarning,
-                stacklevel=4,
-            )
-        return Contact(a, b, ContactParams(sliding_friction=max(found)))
+        friction = self.friction_between(a, b)
+        return Contact(a, b) if friction is None else Contact(a, b, ContactParams(sliding_friction=friction))
 
     def start(
         self, q: Mapping[str, Numbers] | str | None = None, v: Mapping[str, Numbers] | None = None

@@ -6,6 +6,12 @@ from dano.scene._contacts import (
     Contact as Contact,
     pressing_pairs as pressing_pairs,
 )
+from dano.scene._doubts import (
+    box_volume as box_volume,
+    Doubt as Doubt,
+    say_doubts as say_doubts,
+    SceneWarning as SceneWarning,
+)
 from dano.scene._frames import (
     Chains as Chains,
     filled as filled,
@@ -23,7 +29,11 @@ from dano.scene._joint_laws import JointLaws as JointLaws
 from dano.scene._joints import joined as joined, Joint as Joint, JOINT_KINDS as JOINT_KINDS, Layout as Layout
 from dano.scene._loops import Loop as Loop, LOOP_KINDS as LOOP_KINDS, Loops as Loops
 from dano.scene._motors import Motor as Motor, MOTOR_KINDS as MOTOR_KINDS
-from dano.scene._others import Others as Others
+from dano.scene._others import (
+    Others as Others,
+    touching_pairs as touching_pairs,
+    unnamed_contacts as unnamed_contacts,
+)
 from dano.scene._scene import Scene as Scene
 from dano.scene._states import (
     Control as Control,

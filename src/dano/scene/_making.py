@@ -87,7 +87,7 @@ def check_materials(
     if others is not None:
         return
     if apart:
-        raise ValueError(f"apart must be empty without others, got {list(apart)}")
+        raise ValueError(f"apart must be empty where contacts are listed and others=None, got {list(apart)}")
     for body in bodies:
         if body.material is not None:
             raise ValueError(

@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Iterable, Sequence
 
 import equinox as eqx
@@ -16,6 +17,10 @@ from dano.scene._bodies import Body
 from dano.scene._contacts import check_objects, checked_support, Contact, heaviest, with_surface
 from dano.scene._joints import joined, Joint
 from dano.scene._loops import Loop
+
+MOST_LISTED = 200
+"""Pairs that a scene lists as contacts unasked: those of twenty bodies. A contact takes 8 ms to make, and its
+numbers are leaves of the scene; `Others` holds those of thousands in arrays."""
 
 
 class Others(eqx.Module):
@@ -67,19 +72,11 @@ def others_of(
         ValueError: If `apart` names an unknown body, objects cannot touch, or a material has a parameter that
             the law does not read.
     """
+    _check_apart(bodies, apart)
     law = DistributedLaw()
     for given in (params, *(body.material for body in bodies)):
         if given is not None:
             law.check(given)
-    names = [body.name for body in bodies]
-    if isinstance(apart, str) or not isinstance(apart, Iterable):
-        raise ValueError(f"apart must be pairs of names of bodies, got {shown(apart)}")
-    for pair in apart:
-        if isinstance(pair, str) or not isinstance(pair, Sequence) or len(pair) != 2:
-            raise ValueError(f"apart must hold pairs of names of bodies, got {shown(pair)}")
-        for name in pair:
-            if name not in names:
-                raise ValueError(f"apart must name bodies of the scene {names}, got {name!r}")
     left_out = {frozenset(pair) for pair in apart} | {frozenset((c.a, c.b)) for c in contacts}
     neighbours = joined(joints)
     finite = [bool(np.isfinite(body.size)) for body in bodies]
@@ -96,6 +93,76 @@ def others_of(
     touching = {i for pair in pairs for i in pair}
     bodies = tuple(with_surface(body) if i in touching else body for i, body in enumerate(bodies))
     return bodies, Others(_stacked(bodies, touching, law, params, gravity), law, tuple(pairs))
+
+
+def unnamed_contacts(
+    bodies: Sequence[Body], joints: Sequence[Joint | Loop], apart: Sequence[tuple[str, str]]
+) -> list[Contact] | None:
+    """A contact of each pair of a scene that may touch, for a scene that names none.
+
+    Args:
+        bodies: All bodies of the scene.
+        joints: And loops: what joins needs not touch.
+        apart: Names of pairs that do not touch.
+
+    Returns:
+        The contacts; None where `Others` has to hold them: bodies have materials, or there are more than
+        `MOST_LISTED` pairs.
+
+    Raises:
+        ValueError: If `apart` names an unknown body.
+    """
+    _check_apart(bodies, apart)
+    left_out = {frozenset(pair) for pair in apart}
+    pairs = [pair for pair in touching_pairs(bodies, joints) if frozenset(pair) not in left_out]
+    if len(pairs) > MOST_LISTED or any(body.material is not None for body in bodies):
+        return None
+    return [Contact(a, b) for a, b in pairs]
+
+
+def touching_pairs(
+    bodies: Sequence[Body], joints: Sequence[Joint | Loop], *, presses: bool = True
+) -> list[tuple[str, str]]:
+    """Names of all pairs of bodies between which there can be a contact.
+
+    Args:
+        bodies: All bodies of a scene.
+        joints: And loops: what joins does not touch.
+        presses: Whether the law of the contacts acts at points, see `AbstractContactLaw`.
+    """
+    apart = joined(joints)
+    return [
+        (a.name, b.name)
+        for a, b in itertools.combinations(bodies, 2)
+        if a.name != b.name and not apart(a.name, b.name) and _can_touch(a, b, presses=presses)
+    ]
+
+
+def _can_touch(a: Body, b: Body, *, presses: bool) -> bool:
+    """Whether `Scene.create` would accept a contact between two bodies."""
+    if a.fixed and b.fixed:
+        return False
+    if a.object is not None and b.object is not None:
+        met = [x.object.solid if presses else x.object.grid for x in (a, b) if x.object is not None]
+        return any(x is not None for x in met)
+    return math.isfinite(a.size) or math.isfinite(b.size)
+
+
+def _check_apart(bodies: Sequence[Body], apart: Sequence[tuple[str, str]]) -> None:
+    """Check that pairs that are not to touch are names of bodies.
+
+    Raises:
+        ValueError: If not.
+    """
+    names = [body.name for body in bodies]
+    if isinstance(apart, str) or not isinstance(apart, Iterable):
+        raise ValueError(f"apart must be pairs of names of bodies, got {shown(apart)}")
+    for pair in apart:
+        if isinstance(pair, str) or not isinstance(pair, Sequence) or len(pair) != 2:
+            raise ValueError(f"apart must hold pairs of names of bodies, got {shown(pair)}")
+        for name in pair:
+            if name not in names:
+                raise ValueError(f"apart must name bodies of the scene {names}, got {name!r}")
 
 
 def _stacked(

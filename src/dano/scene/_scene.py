@@ -16,6 +16,7 @@ from dano.objects import checked_inertia
 from dano.scene._bodies import Body
 from dano.scene._by_name import ByName, control_arrays, joint_arrays, merged, state_arrays
 from dano.scene._contacts import Contact, prepared
+from dano.scene._doubts import Doubt, doubts_of_scene, doubts_of_state, say_doubts
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
 from dano.scene._joints import Joint, Layout, layout_of
 from dano.scene._loops import check_loops, Loop, Loops, loops_of
@@ -30,7 +31,7 @@ from dano.scene._making import (
     warn_of_long_steps,
 )
 from dano.scene._motors import Motor
-from dano.scene._others import Others, others_of
+from dano.scene._others import Others, others_of, unnamed_contacts
 from dano.scene._states import check_precision, Control, JOINT_QUANTITIES, State, STATE_SIZES
 
 Parts = TypeVar("Parts", tuple[Joint, ...], tuple[Loop, ...])
@@ -66,7 +67,7 @@ class Scene(eqx.Module):
     def create(
         cls,
         bodies: Sequence[Body],
-        contacts: Sequence[Contact] = (),
+        contacts: Sequence[Contact] | None = None,
         *,
         joints: Sequence[Joint] = (),
         loops: Sequence[Loop] = (),
@@ -79,13 +80,15 @@ class Scene(eqx.Module):
 
         Args:
             bodies: The bodies, in the order that states index.
-            contacts: Which pairs may touch, and how.
+            contacts: Which pairs may touch, and how; `()` means that nothing does. Default: all pairs that
+                may touch, do, each by a `Contact` with its defaults; of more than 200 pairs, or where bodies
+                have a `Body.material`, by `others`. What a joint or a loop joins does not touch.
             joints: What hangs on what, in the order of the coordinates q.
             loops: What closes chains of joints.
             others: Lets all other pairs touch, too, by `DistributedLaw`: parameters of bodies that have no
                 `Body.material` of their own. Those of a pair follow from its two bodies, see
                 `Others.pair_params`. What a joint or a loop joins does not touch.
-            apart: Names of pairs that do not touch although `others` is given.
+            apart: Names of pairs that do not touch although `others` is given, or no `contacts` are.
             timestep: h [s].
             gravity: [m/s², W].
 
@@ -95,11 +98,14 @@ class Scene(eqx.Module):
                 pair uses a material, or a number is out of range.
         """
         bodies = checked_items("bodies", bodies, Body)
-        contacts = checked_items("contacts", contacts, Contact)
         joints = checked_items("joints", joints, Joint)
         loops = checked_items("loops", loops, Loop)
         checked_optional("others", others, ContactParams)
         check_names(bodies)
+        if contacts is None and others is None:
+            contacts = unnamed_contacts(bodies, (*joints, *loops), apart)
+            others, apart = (ContactParams(), apart) if contacts is None else (None, ())
+        contacts = checked_items("contacts", () if contacts is None else contacts, Contact)
         timestep = checked_array("timestep", timestep, (), above=0.0)
         check_contacts(bodies, joints, contacts)
         children = layout_of(*structure(bodies, joints)).children
@@ -114,6 +120,7 @@ class Scene(eqx.Module):
         check_materials(bodies, others, apart)
         if contacts or rest is not None:
             warn_of_long_steps(bodies, timestep, gravity)
+        say_doubts(doubts_of_scene(bodies, joints, contacts, gravity), stacklevel=2)
         room = room_for(bodies, timestep, gravity)
         return cls(bodies, contacts, timestep, gravity, twins, joints, rest, room, loops)
 
@@ -355,7 +362,20 @@ class Scene(eqx.Module):
             state = self.filled(dataclasses.replace(state, **of_joints))
         self.check_state(state)
         warn_of_limits(self.layout, self.joints, state.q, self.timestep, joint_names or {})
+        say_doubts(self._doubts_of(state), stacklevel=3)
         return state
+
+    def doubts(self, state: State) -> list[Doubt]:
+        """What is odd about the scene and a state: units, frames, slips; none where numbers are traced."""
+        return [
+            *doubts_of_scene(self.bodies, self.joints, self.contacts, self.gravity),
+            *self._doubts_of(state),
+        ]
+
+    def _doubts_of(self, state: State) -> list[Doubt]:
+        if is_traced(state, self.timestep):
+            return []
+        return doubts_of_state(self.bodies, self.point_pairs, self.layout, state, float(self.timestep))
 
     def filled(self, state: State) -> State:
         """The state with the rows of bodies on joints as `q` and `v` say; for one state.

@@ -10,7 +10,7 @@ from dano.scene_file._check import (
     Cost as Cost,
     SceneCheck as SceneCheck,
 )
-from dano.scene_file._forecast import Finding as Finding
+from dano.scene_file._forecast import Finding as Finding, too_fast as too_fast
 from dano.scene_file._objects import (
     asset_look as asset_look,
     ASSETS as ASSETS,

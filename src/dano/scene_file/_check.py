@@ -122,7 +122,8 @@ def check_scene(
     h = float(scene.timestep)
     limits = bounds(scene, state, h * loaded.n_steps)
     cost, states = _measured(loaded, seconds, progress)
-    findings = [Finding("file", text) for text in doubts]
+    said = {doubt.text for doubt in scene.doubts(state)}
+    findings = [Finding("file", text) for text in doubts if text not in said]
     patches = contact_patches(scene, jax.tree.map(lambda x: x[None], state))
     findings += [*starts(scene, patches), *forecast(scene, state, limits), *_fast_spins(scene, states)]
     if cost.unsolved:
@@ -214,6 +215,6 @@ def _fast_spins(scene: Scene, pieces: list[State]) -> list[Finding]:
     found = []
     for i, body in enumerate(scene.bodies):
         most = float(spins[:, i].max())
-        if not body.fixed and too_fast(most, h) and not too_fast(float(spins[0, i]), h):
+        if not body.fixed and too_fast(most * h) and not too_fast(float(spins[0, i]) * h):
             found.append(fast_spin(body.name, "comes to turn", most, h))
     return found

@@ -1,9 +1,15 @@
-"""What is odd about an object that was built of a field, and which option mends it, in words."""
+"""What is odd about an object that was built of a field, or about a run that a file asks for, in words."""
 
 import numpy as np
 
 from dano.fields import AbstractField, GridField
 from dano.objects import NeuralObject
+from dano.scene import Doubt, Scene, State
+from dano.scene_file._forecast import bounds, support
+from dano.scene_file._schedule import Schedule
+
+_ROUNDED = 1e-6
+"""Share of a duration by which steps may miss it unsaid: rounding."""
 
 _SHORT, _LONG = 1e-3, 5.0
 """Sizes [m] beyond which an object is rather in other units than so large or small."""
@@ -55,3 +61,33 @@ def border_doubts(field: AbstractField, points: np.ndarray) -> list[str]:
         f"the object is cut off where its grid ends, at {', '.join(sides)}; take a larger part of the field,"
         " as with a larger crop (`dano import --crop`)"
     ]
+
+
+def file_doubts(
+    scene: Scene, state: State, schedule: Schedule | None, n_steps: int, asked: float | None
+) -> list[Doubt]:
+    """What to say of a run: that controls begin too late, that its length is rounded, that bodies fall.
+
+    Args:
+        scene: The scene.
+        state: Where the run begins.
+        schedule: Controls.
+        n_steps: Steps of the run.
+        asked: Its length by the file [s], if that says one.
+    """
+    h, found = float(scene.timestep), []
+    duration = h * n_steps
+    starts = [] if schedule is None else np.asarray(schedule.start, np.float64).tolist()
+    for i, start in enumerate(starts):
+        if start >= duration:
+            text = (
+                f"[[controls]] {i + 1} never acts: it begins at {start:.4g} s, and {duration:.4g} s are run"
+            )
+            found.append(Doubt(2, text))
+    if asked is not None and abs(duration - asked) > _ROUNDED * asked:
+        text = f"duration {asked:.6g} s is no whole number of steps of {h:.6g} s: {duration:.6g} s are run"
+        found.append(Doubt(3, text))
+    if len(scene.bodies) > 1:
+        limits = bounds(scene, scene.filled(state), duration)
+        found += [Doubt(2, finding.text) for finding in support(scene, limits)]
+    return found

@@ -6,13 +6,13 @@ may touch, v = √(v₀² + 2 g H), or for all of the simulated time if there is
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from dano.contact import CentroidLaw, DistributedLaw, Patch
-from dano.scene import Body, Contact, RESOLVED, Scene, State
+from dano.scene import Body, box_volume, Contact, RESOLVED, Scene, State
 
 _STEPS_AN_IMPACT = 20
 """Steps that a spring needs to turn an impact round (see `DistributedLaw`)."""
@@ -22,8 +22,6 @@ _WAY_PER_WALL = 1e3
 """Measured: the distributed law finds walls of a 2000th of the way in a step, and not of a 4000th."""
 _SINKING = 0.005
 """Share of its size by which a body at rest sinks at default stiffness (see `DistributedLaw`)."""
-_LIGHTEST, _HEAVIEST = 1.0, 25e3
-"""Densities [kg/m³] between those of air (1.2) and osmium (22,600), which no body exceeds."""
 _INSIDE = 2e-3
 """Share of its volume by which a body may start in another: ten times what it sinks by at rest, see above."""
 
@@ -109,16 +107,16 @@ def _height(scene: Scene, state: State, i: int, other: int, down: np.ndarray) ->
 def forecast(scene: Scene, state: State, limits: list[Bound]) -> list[Finding]:
     """What will not be resolved, from numbers alone."""
     return [
-        *_support(scene, limits),
-        *_spins(scene, limits),
+        *support(scene, limits),
+        *(Finding("sizes", doubt.text) for doubt in scene.doubts(state)),
         *(finding for contact in scene.contacts for finding in _pair(scene, state, contact, limits)),
         *_masses(scene),
-        *_densities(scene),
         *_samples(scene),
     ]
 
 
-def _support(scene: Scene, limits: list[Bound]) -> list[Finding]:
+def support(scene: Scene, limits: list[Bound]) -> list[Finding]:
+    """Bodies that touch nothing, or have nothing below."""
     touched = {name for pair in scene.pairs for name in pair}
     found = []
     for i in scene.layout.free:
@@ -131,15 +129,9 @@ def _support(scene: Scene, limits: list[Bound]) -> list[Finding]:
     return found
 
 
-def _spins(scene: Scene, limits: list[Bound]) -> list[Finding]:
-    h = float(scene.timestep)
-    pairs = zip(scene.bodies, limits, strict=True)
-    return [fast_spin(body.name, "turns", x.spin, h) for body, x in pairs if too_fast(x.spin, h)]
-
-
-def too_fast(spin: float, h: float) -> bool:
-    """Whether a body of this spin [rad/s] turns by more in a step than is resolved (60°)."""
-    return spin * h > 2 * RESOLVED
+def too_fast(turn: Any) -> Any:
+    """Whether a body that would turn by so much in a step [rad], one or many, turns by more than 60°."""
+    return turn > 2 * RESOLVED
 
 
 def fast_spin(name: str, verb: str, spin: float, h: float) -> Finding:
@@ -265,26 +257,6 @@ def _masses(scene: Scene) -> list[Finding]:
     return found
 
 
-def _densities(scene: Scene) -> list[Finding]:
-    """Bodies lighter than air or heavier than any metal, for the box around them."""
-    found = []
-    for body in scene.bodies:
-        if body.fixed or (body.object is None and body.shape is None):
-            continue
-        mass, volume = float(body.mass * body.mass_scale), _box_volume(body)
-        if not _LIGHTEST <= mass / max(volume, 1e-300) <= _HEAVIEST:
-            than = "more than any metal has" if mass / max(volume, 1e-300) > 1 else "less than air has"
-            found.append(
-                Finding(
-                    "sizes",
-                    f"{body.name!r} is {body.size:.3g} m long and has {mass:.3g} kg,"
-                    f" {mass / volume:.2g} kg/m³ of the box around it, {than}; are its lengths in metres and"
-                    " its mass in kilograms?",
-                )
-            )
-    return found
-
-
 def _samples(scene: Scene) -> list[Finding]:
     """Bodies whose samples are so far apart that a round body sinks deeper between them than it does at rest.
 
@@ -321,17 +293,9 @@ def starts(scene: Scene, patches: Sequence[Patch]) -> list[Finding]:
         moving = [body for body in (scene.body(a), scene.body(b)) if not body.fixed]
         # The distributed law gives a volume, the centroid law a mass.
         volumes = k >= len(scene.contacts) or scene.contacts[k].law.presses
-        whole = min(_box_volume(body) if volumes else float(body.mass * body.mass_scale) for body in moving)
+        whole = min(box_volume(body) if volumes else float(body.mass * body.mass_scale) for body in moving)
         share = float(patch.overlap[0]) / whole
         if share > _INSIDE:
             text = f"{a!r} and {b!r} start inside each other, by {100 * share:.2g} % of the smaller one"
             found.append(Finding("start", f"{text}: they will be pushed apart"))
     return found
-
-
-def _box_volume(body: Body) -> float:
-    """Volume [m³] of the box around a body."""
-    if body.object is not None:
-        return float(np.prod(np.ptp(np.asarray(body.object.surface.points, np.float64), axis=0)))
-    assert body.shape is not None
-    return float(np.prod(np.ptp(np.asarray(body.shape.bounds, np.float64), axis=0)))

@@ -3,11 +3,11 @@
 import dataclasses
 import functools
 import inspect
-import itertools
 import json
 import math
 import os
 import tomllib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +26,6 @@ from dano.robots import close_loops, Robot
 from dano.scene import (
     Body,
     Contact,
-    joined,
     Joint,
     JOINT_KINDS,
     JOINT_QUANTITIES,
@@ -34,10 +33,14 @@ from dano.scene import (
     LOOP_KINDS,
     Motor,
     MOTOR_KINDS,
+    say_doubts,
     Scene,
+    SceneWarning,
     State,
     STATE_SIZES,
+    touching_pairs,
 )
+from dano.scene_file._doubts import file_doubts
 from dano.scene_file._objects import (
     is_shipped,
     load_asset,
@@ -233,7 +236,9 @@ def parse_scene(
     loops = [loop for robot, _ in robots for loop in robot.loops]
     loops += _loops(top, [body.name for body in bodies])
     contacts = _contacts(top, bodies, [*joints, *loops], default_law, [robot for robot, _ in robots])
-    with located(str(path)):
+    with located(str(path)), warnings.catch_warnings():
+        # Said together, below.
+        warnings.simplefilter("ignore", SceneWarning)
         scene = Scene.create(bodies, contacts, joints=joints, loops=loops, timestep=h, gravity=gravity)
         given = (*_STATE, *JOINT_QUANTITIES)
         start = {row["name"]: {key: row[key] for key in given if key in row} for row in tables}
@@ -248,7 +253,11 @@ def parse_scene(
         for row in tables
         if "asset" in row or "object" in row
     }
-    return SceneFile(scene, state, int(steps), read_schedule(top, scene), path, text, objects, default_law)
+    schedule = read_schedule(top, scene)
+    made = SceneFile(scene, state, int(steps), schedule, path, text, objects, default_law)
+    asked = top.number("duration") if n_steps is None and "duration" in top else None
+    say_doubts([*scene.doubts(state), *file_doubts(scene, state, schedule, int(steps), asked)], stacklevel=3)
+    return made
 
 
 def _steps(top: Table, timestep: float) -> int | float:
@@ -265,7 +274,9 @@ def _steps(top: Table, timestep: float) -> int | float:
     if duration <= 0:
         raise top.wrong("duration", "> 0 s")
     count = duration / timestep
-    return count if count > 2**62 else max(1, round(count))
+    if count > 2**62:
+        return count
+    return max(1, round(count))
 
 
 def _body(row: Table, folder: Path, built: dict[object, NeuralObject], progress: Progress | None) -> Body:
@@ -419,15 +430,10 @@ def _contacts(
     default.where = f"{top.where}: [default_contact]"
     usual = _law_name(default, default_law)
     if top.data.get("contacts", "all") == "all":
-        pairs = itertools.combinations(bodies, 2)
-        apart = joined(joints)
         return [
-            _contact(default, usual, a.name, b.name)
-            for a, b in pairs
-            if a.name != b.name
-            and not apart(a.name, b.name)
-            and _may_meet(a.name, b.name, robots)
-            and _can_touch(a, b, presses=_LAWS[usual]().presses)
+            _contact(_rubbing(default, usual, a, b, robots), usual, a, b)
+            for a, b in touching_pairs(bodies, joints, presses=_LAWS[usual]().presses)
+            if all(robot.may_meet(a, b) for robot in robots)
         ]
     if isinstance(top.data["contacts"], str):
         raise top.wrong("contacts", "'all' or written as [[contacts]] tables")
@@ -450,14 +456,12 @@ def _contacts(
     return contacts
 
 
-def _may_meet(a: str, b: str, robots: Sequence[Robot]) -> bool:
-    """Whether bodies have shapes to touch with, and are not links of one robot."""
-    for robot in robots:
-        own = [body.name for body in robot.bodies]
-        linked = a in own and b in own and not {a, b} & set(robot.surroundings)
-        if linked or any(x in own and x not in robot.touching for x in (a, b)):
-            return False
-    return True
+def _rubbing(default: Table, law: str, a: str, b: str, robots: Sequence[Robot]) -> Table:
+    """What all contacts have by default, with the friction of the file of a robot whose bodies these are."""
+    if "sliding_friction" in default or "sliding_friction" not in _LAWS[law]().reads:
+        return default
+    found = [x for robot in robots if (x := robot.friction_between(a, b)) is not None]
+    return Table(default.where, {**default.data, "sliding_friction": found[0]}, None) if found else default
 
 
 def _law_name(table: Table, default: str) -> str:
@@ -472,16 +476,6 @@ def _law_name(table: Table, default: str) -> str:
                 f"{', '.join(_law_keys(law))}{hint}"
             )
     return law
-
-
-def _can_touch(a: Body, b: Body, *, presses: bool) -> bool:
-    """Whether `Scene.create` would accept a contact between two bodies."""
-    if a.fixed and b.fixed:
-        return False
-    if a.object is not None and b.object is not None:
-        met = [x.object.solid if presses else x.object.grid for x in (a, b) if x.object is not None]
-        return any(x is not None for x in met)
-    return math.isfinite(a.size) or math.isfinite(b.size)
 
 
 def _contact(table: Table, law: str, a: str, b: str) -> Contact:

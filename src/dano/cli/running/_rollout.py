@@ -21,7 +21,7 @@ from dano.scene import (
     STATE_SIZES,
     Trajectory,
 )
-from dano.scene_file import run_piece, SceneFile
+from dano.scene_file import run_piece, SceneFile, too_fast
 
 # A rollout is run in so many pieces or more: progress can be shown, and an interrupt is heard, between two.
 PIECES = 20
@@ -127,7 +127,9 @@ def describe(rollout: Rollout, scene: Scene) -> dict[str, Any]:
         "run_seconds": rollout.run_seconds,
         "unconverged_steps": len(failed),
         "first_unconverged_step": int(failed[0]) if len(failed) else None,
-        "largest_residual": float(np.max(np.asarray(trajectory.residuals))),
+        "not_finite_steps": int(np.sum(np.isnan(np.asarray(trajectory.residuals)))),
+        "largest_residual": float(np.nanmax(np.asarray(trajectory.residuals), initial=0.0)),
+        "turning_too_fast": _turning_too_fast(trajectory, scene),
         "bodies": [
             {
                 "name": body.name,
@@ -139,6 +141,13 @@ def describe(rollout: Rollout, scene: Scene) -> dict[str, Any]:
         ],
         "contacts": _contacts(trajectory, scene),
     }
+
+
+def _turning_too_fast(trajectory: Trajectory, scene: Scene) -> list[str]:
+    """Bodies that came to turn by more than 60° in a step; those that began so are said before the run."""
+    turns = np.linalg.norm(np.asarray(trajectory.states.omega), axis=-1) * float(scene.timestep)
+    fast = too_fast(turns)
+    return [name for i, name in enumerate(scene.names) if fast[1:, i].any() and not fast[0, i]]
 
 
 def _joint_numbers(layout: Layout, body: int, last: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -206,6 +215,18 @@ def print_rollout(report: dict[str, Any]) -> None:
 
 def warn_unconverged(report: dict[str, Any]) -> None:
     """Say on stderr that a result is not to be trusted, if so."""
+    if report["turning_too_fast"]:
+        names = ", ".join(map(repr, report["turning_too_fast"]))
+        say(
+            f"warning: {names} came to turn by more than 60° in a step: precession is not resolved;"
+            " try a smaller --timestep"
+        )
+    if report["not_finite_steps"]:
+        say(
+            f"warning: {report['not_finite_steps']} of {report['steps']} steps are not finite, first step"
+            f" {report['first_unconverged_step']}: their states are NaN"
+        )
+        return
     if report["unconverged_steps"]:
         count, first = report["unconverged_steps"], report["first_unconverged_step"]
         say(

@@ -217,7 +217,7 @@ def worse_of(error: real, room: wp.ref[Room], world: int, row: int) -> real:
     worse = real(error)
     for c in range(6):
         missed = wp.abs(scale[c] * residual[c])
-        if not (missed <= worse):
+        if not (missed <= worse) and not wp.isnan(worse):
             worse = missed
     return worse
 

@@ -385,6 +385,9 @@ def solve_island(
         if not hard:
             enough = wp.max(tolerance, _SOFT_TOLERANCE * _STICTION * level.softness)
         small = seen.error <= enough
+        if found.passes == 0 and not (seen.error < INFINITY):
+            # What is no number at the velocities that a solve begins with is none anywhere.
+            number = _LEVELS
         accept = small or not level.searches or accepts(search, seen.work)
         # Where rounding keeps duals from fitting, a second small residual has to do.
         found.converged = small and hard and (fit.unfit <= options.fit * fit.push or before <= enough)

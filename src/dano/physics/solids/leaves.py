@@ -84,3 +84,9 @@ class Distance:
 def inverse_or_zero(x: real) -> real:
     """1 / x, or 0 at 0."""
     return wp.where(x > ZERO, ONE / wp.where(x > ZERO, x, ONE), ZERO)
+
+
+@wp.func
+def root_or_zero(x: real) -> real:
+    """√x, which counts as constant at 0, where it has no derivative."""
+    return wp.where(x > ZERO, wp.sqrt(wp.where(x > ZERO, x, ONE)), ZERO)

@@ -8,7 +8,7 @@ import warp as wp
 from dano.physics.features import KINDS
 from dano.physics.real import ONE, real, TWO, vec3, ZERO
 from dano.physics.solids.kinds import BOX, CAPSULE, CYLINDER, ELLIPSOID, HALF_SPACE, SPHERE
-from dano.physics.solids.leaves import Distance, inverse_or_zero, Leaf
+from dano.physics.solids.leaves import Distance, inverse_or_zero, Leaf, root_or_zero
 
 _HALF_SPACE, _SPHERE, _BOX = wp.constant(HALF_SPACE), wp.constant(SPHERE), wp.constant(BOX)
 _CAPSULE, _CYLINDER, _ELLIPSOID = wp.constant(CAPSULE), wp.constant(CYLINDER), wp.constant(ELLIPSOID)
@@ -37,7 +37,7 @@ def half_space_distance(leaf: Leaf, y: vec3) -> Distance:
 def ball_distance(radius: real, y: vec3) -> Distance:
     """|y| − r."""
     d = Distance()
-    length = wp.sqrt(wp.dot(y, y))
+    length = root_or_zero(wp.dot(y, y))
     d.value = length - radius
     d.gradient = inverse_or_zero(length) * y
     return d
@@ -82,7 +82,7 @@ def box_distance(leaf: Leaf, y: vec3) -> Distance:
 def cylinder_distance(leaf: Leaf, y: vec3) -> Distance:
     """Of a cylinder along z with flat ends."""
     d = Distance()
-    radius = wp.sqrt(y[0] * y[0] + y[1] * y[1])
+    radius = root_or_zero(y[0] * y[0] + y[1] * y[1])
     across = radius - leaf.sizes[0]
     along = wp.abs(y[2]) - leaf.sizes[1]
     by_across = ZERO

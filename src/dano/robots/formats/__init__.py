@@ -10,6 +10,7 @@ from dano.robots.formats._description import (
     Keyframe as Keyframe,
     Lacking as Lacking,
     Link as Link,
+    Meeting as Meeting,
     Placed as Placed,
     Solid as Solid,
     Tie as Tie,

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -97,7 +98,7 @@ class Connection:
         axis: In the child's frame.
         anchor: A point of the axis [m, child's frame].
         limits: Least and largest q [rad or m]; None without.
-        effort: Largest torque or force [N m or N]; infinite without.
+        efforts: Least and largest torque or force [N m or N]; infinite without.
         damping: [N m s/rad or N s/m].
         friction: [N m or N].
         armature: [kg m² or kg].
@@ -116,7 +117,7 @@ class Connection:
     axis: tuple[float, ...] = (0.0, 0.0, 1.0)
     anchor: tuple[float, ...] = (0.0, 0.0, 0.0)
     limits: tuple[float, float] | None = None
-    effort: float = float("inf")
+    efforts: tuple[float, float] = (-np.inf, np.inf)
     damping: float = 0.0
     friction: float = 0.0
     armature: float = 0.0
@@ -125,6 +126,11 @@ class Connection:
     home: float = 0.0
     mimics: tuple[str, float, float] | None = None
     drive: Drive | None = None
+
+    @property
+    def effort(self) -> float:
+        """Largest torque or force in either direction [N m or N]."""
+        return max(map(abs, self.efforts))
 
 
 @dataclass(frozen=True)
@@ -178,6 +184,18 @@ class Lacking:
     text: str
 
 
+class Meeting(NamedTuple):
+    """Two links that touch each other.
+
+    Attributes:
+        frictions: Sliding frictions of their shapes, different ones.
+        named: Whether the file names the pair.
+    """
+
+    frictions: tuple[float, ...]
+    named: bool
+
+
 @dataclass(frozen=True)
 class Description:
     """A robot's file.
@@ -193,8 +211,7 @@ class Description:
         lacking: What must be left out by name.
         notes: What was read in another way than it is written, one line each.
         keyframes: States that the file names.
-        frictions: Sliding friction and priority of each shape that a link touches with, by the link's name;
-            links of which nothing is said have none.
+        meets: Which links touch each other; None where the format does not say.
         silent: What is not read and changes how it is simulated, one line each.
     """
 
@@ -208,7 +225,7 @@ class Description:
     lacking: tuple[Lacking, ...] = ()
     notes: tuple[str, ...] = ()
     keyframes: dict[str, Keyframe] = field(default_factory=dict)
-    frictions: dict[str, tuple[tuple[float, int], ...]] = field(default_factory=dict)
+    meets: dict[frozenset[str], Meeting] | None = None
     silent: tuple[str, ...] = ()
 
     def link(self, name: str) -> Link:

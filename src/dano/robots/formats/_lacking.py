@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from dano.robots.formats._description import Lacking
 
@@ -16,6 +17,8 @@ WEIGHTLESS = "weightless joints"
 """Name of joints that move nothing with mass."""
 
 IGNORABLE = {
+    "adhesion": "surfaces that stick",
+    "surface velocity": "surfaces that move, such as belts",
     "actuators": "all actuators",
     "other actuators": "actuators that are no motor or servo of one joint",
     "crossed limits": "limits whose lower exceeds the upper: Bullet takes that as none",
@@ -70,20 +73,31 @@ def lacking_of(model: Any, mujoco: Any) -> list[Lacking]:
         say("tendons", f"{_listed(acting)}: dano has no tendons")
     if model.nflex:
         say("soft bodies", f"{model.nflex} flexes: dano has rigid bodies only")
-    found += _of_joints(model, mujoco) + _of_geoms(model, mujoco)
+    found += _of_joints(model, mujoco) + _of_geoms(model, mujoco) + _of_surfaces(model)
     return found
 
 
-def silent_of(model: Any, mujoco: Any) -> list[str]:
-    """What is not read although it changes how MuJoCo simulates, one line each."""
+def silent_of(model: Any, mujoco: Any, touching: Bool[np.ndarray, " g"]) -> list[str]:
+    """What is not read although it changes how MuJoCo simulates, one line each.
+
+    Args:
+        model: MuJoCo's model.
+        mujoco: The library.
+        touching: Which geoms can touch something.
+    """
     soft = np.array([0.02, 1.0]), np.array([0.9, 0.95, 0.001, 0.5, 2.0])
-    geoms = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
+    geoms = np.flatnonzero(touching).tolist()
     told = [
         g
         for g in geoms
         if not (np.allclose(model.geom_solref[g], soft[0]) and np.allclose(model.geom_solimp[g], soft[1]))
     ]
     found = []
+    if any(
+        not (np.allclose(model.pair_solref[k], soft[0]) and np.allclose(model.pair_solimp[k], soft[1]))
+        for k in range(model.npair)
+    ):
+        found.append("solref or solimp of pairs: contacts are as soft as dano.ContactParams says")
     if told:
         names = _listed([model.geom(g).name or f"geom {g}" for g in told])
         found.append(f"solref or solimp of {names}: contacts are as soft as dano.ContactParams says")
@@ -91,7 +105,26 @@ def silent_of(model: Any, mujoco: Any) -> list[str]:
     if rolling:
         names = _listed([model.geom(g).name or f"geom {g}" for g in rolling])
         found.append(f"torsional and rolling friction of {names}: in dano they come out of the geometry")
+    wide = [g for g in geoms if model.geom_margin[g] or model.geom_gap[g]]
+    if wide or np.any(model.pair_margin) or np.any(model.pair_gap):
+        names = _listed([model.geom(g).name or f"geom {g}" for g in wide] or ["pairs"])
+        found.append(f"margin and gap of {names}: dano touches at the surface")
+    uneven = [k for k in range(model.npair) if model.pair_friction[k][0] != model.pair_friction[k][1]]
+    if uneven:
+        found.append("friction of pairs that differs along two directions: the first counts")
+    if int(model.opt.enableflags) & int(mujoco.mjtEnableBit.mjENBL_OVERRIDE):
+        found.append("o_margin, o_solref and o_solimp: contacts are as soft as dano.ContactParams says")
+    if np.any(getattr(model, "jnt_margin", 0.0)):
+        found.append("margin of joints: limits act where they are")
+    if np.any(getattr(model, "jnt_actgravcomp", False)):
+        found.append("actuatorgravcomp: what holds the weight is no part of the effort of a motor")
     return found
+
+
+def notes_of(model: Any) -> list[str]:
+    """What is read in another way than it is written, one line each."""
+    moved = [model.body(i).name or f"body {i}" for i in np.flatnonzero(model.body_mocapid >= 0)]
+    return [f"{_listed(moved)} is moved by mocap in MuJoCo: here it stands still"] if moved else []
 
 
 def _acting_tendon(model: Any, t: int) -> str | None:
@@ -130,6 +163,26 @@ def _of_joints(model: Any, mujoco: Any) -> list[Lacking]:
         if any(np.any(x) for x in poly):
             text = f"joint {name!r} has a spring or a damper that is not linear"
             found.append(Lacking("nonlinear springs", text))
+    return found
+
+
+def _of_surfaces(model: Any) -> list[Lacking]:
+    """Belts and glue of geoms and pairs."""
+    found = []
+    kinds = (
+        ("surface velocity", "surfacevel", "a surface that moves"),
+        ("adhesion", "adhesion", "a surface that sticks"),
+    )
+    for feature, key, what in kinds:
+        rows = np.asarray(getattr(model, f"geom_{key}", np.zeros(model.ngeom)))
+        acts = [g for g in range(model.ngeom) if np.any(rows[g])]
+        if acts:
+            names = _listed([model.geom(g).name or f"geom {g}" for g in acts])
+            found.append(Lacking(feature, f"{names} has {what}: dano has none"))
+    if np.any(getattr(model, "pair_adhesion", 0.0)) and not any(x.feature == "adhesion" for x in found):
+        found.append(Lacking("adhesion", "a pair has adhesion: dano has none"))
+    if getattr(model, "nplastic", 0):
+        found.append(Lacking("nonlinear springs", "joints or tendons that yield: dano has none"))
     return found
 
 

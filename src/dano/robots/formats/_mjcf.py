@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +23,11 @@ from dano.robots.formats._description import (
     without_followers,
 )
 from dano.robots.formats._keyframes import keyframes_of
-from dano.robots.formats._lacking import EQUALITIES, lacking_of, silent_of
+from dano.robots.formats._lacking import EQUALITIES, lacking_of, notes_of, silent_of
+from dano.robots.formats._touching import meets_of, touching_geoms
 
 _WORLD = "world"
+_CONSTRAINTS = ("EQUALITY", "FRICTIONLOSS", "LIMIT", "CONTACT")
 
 
 def read_mjcf(path: Path, *, balance_inertia: bool = False) -> Description:
@@ -66,7 +67,8 @@ class _Reader:
         self.bodies = self.unique([model.body(i).name or f"body {i}" for i in range(1, model.nbody)])
         self.joints = self.unique([self.joint_name(j) for j in range(model.njnt)])
         self.lacking = [*lacking_of(model, mujoco), *self.undriven]
-        self.frictions: dict[str, tuple[tuple[float, int], ...]] = {}
+        self.touching = touching_geoms(model)
+        self.owners = [self.name(int(body)) for body in model.geom_bodyid]
 
     def description(self) -> Description:
         model = self.model
@@ -82,16 +84,15 @@ class _Reader:
                 name += " geom"
             taken.add(name)
             links.append(self.shaped(Link(name), [(solid, touches)]))
-            self.frictions |= self.friction(name, [g]) if touches else {}
+            self.owners[g] = name
             joints.append(Connection(f"{name} (fixed)", "weld", _WORLD, name))
         for i in range(1, model.nbody):
             chain = self.chain(i)
             links += [Link(joint.child) for joint in chain[:-1]]
             links.append(self.link(i))
-            first = int(model.body_geomadr[i])
-            self.frictions |= self.friction(self.name(i), range(first, first + int(model.body_geomnum[i])))
             joints += chain
         joints = self.followed(joints)
+        meets, parted = meets_of(model, self.mujoco, self.owners)
         x, y, z = (0.0, 0.0, 0.0) if self.off("GRAVITY") else map(float, model.opt.gravity)
         ties = () if self.off("EQUALITY") else tuple(self.ties())
         return Description(
@@ -103,15 +104,18 @@ class _Reader:
             world=_WORLD,
             gravity=(x, y, z),
             lacking=tuple(self.lacking),
+            notes=tuple(notes_of(model)),
             keyframes=keyframes_of(model, self.mujoco, self.joints, self.bodies),
-            frictions=self.frictions,
-            silent=tuple(silent_of(model, self.mujoco)),
+            meets=meets,
+            silent=(*silent_of(model, self.mujoco, self.touching), *parted),
         ).checked()
 
     def off(self, flag: str) -> bool:
         """Whether the file switches something off."""
-        bit = int(getattr(self.mujoco.mjtDisableBit, f"mjDSBL_{flag}"))
-        return bool(int(self.model.opt.disableflags) & bit)
+        # All constraints go with one flag.
+        flags = [flag, *(["CONSTRAINT"] if flag in _CONSTRAINTS else [])]
+        bits = [int(getattr(self.mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in flags]
+        return any(int(self.model.opt.disableflags) & bit for bit in bits)
 
     def unique(self, names: list[str]) -> list[str]:
         """Names given by us must not be those of the file."""
@@ -140,13 +144,6 @@ class _Reader:
         link = Link(self.name(i), mass, model.body_ipos[i].copy(), inertia, gravcomp=held)
         return self.shaped(link, found)
 
-    def friction(self, name: str, geoms: Iterable[int]) -> dict[str, tuple[tuple[float, int], ...]]:
-        """Sliding friction and priority of those geoms that touch."""
-        model = self.model
-        rows = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
-        found = tuple((float(model.geom_friction[g, 0]), int(model.geom_priority[g])) for g in rows)
-        return {name: found} if found else {}
-
     @staticmethod
     def shaped(link: Link, found: list[tuple[Solid | None, bool]]) -> Link:
         solids = tuple(solid for solid, touches in found if solid is not None and touches)
@@ -158,7 +155,7 @@ class _Reader:
         model, types = self.model, self.mujoco.mjtGeom
         place = Placed(tuple(map(float, model.geom_pos[g])), tuple(map(float, model.geom_quat[g])))
         size, kind = tuple(map(float, model.geom_size[g])), int(model.geom_type[g])
-        touches = bool(model.geom_contype[g] or model.geom_conaffinity[g]) and not self.off("CONTACT")
+        touches = bool(self.touching[g]) and not self.off("CONTACT")
         if kind == int(types.mjGEOM_MESH):
             return Solid(
                 "mesh", (1.0,) * 3, place, triangles=self.triangles(int(model.geom_dataid[g]))
@@ -211,7 +208,8 @@ class _Reader:
             return Connection(self.joints[j], kind, parent, child, place)
         single = kind in ("hinge", "slide")
         limited = single and bool(model.jnt_limited[j]) and not self.off("LIMIT")
-        effort = float(np.abs(model.jnt_actfrcrange[j]).min()) if model.jnt_actfrclimited[j] else math.inf
+        least, most = map(float, model.jnt_actfrcrange[j])
+        efforts = (least, most) if model.jnt_actfrclimited[j] else (-math.inf, math.inf)
         address = int(model.jnt_qposadr[j])
         found = Connection(
             self.joints[j],
@@ -222,7 +220,7 @@ class _Reader:
             tuple(map(float, model.jnt_axis[j])),
             tuple(map(float, model.jnt_pos[j])),
             limits=(float(model.jnt_range[j][0]), float(model.jnt_range[j][1])) if limited else None,
-            effort=effort,
+            efforts=efforts,
             damping=0.0 if self.off("DAMPER") else float(model.dof_damping[dof]),
             friction=0.0 if self.off("FRICTIONLOSS") else float(model.dof_frictionloss[dof]),
             armature=float(model.dof_armature[dof]),

@@ -199,7 +199,7 @@ class _Reader:
             direction if any(direction) else (1.0, 0.0, 0.0),
             limits=limits,
             # Many files say 0 where they mean nothing.
-            effort=effort if effort > 0 else math.inf,
+            efforts=(-effort, effort) if effort > 0 else (-math.inf, math.inf),
             damping=0.0 if dynamics is None else self.number(dynamics, "damping", 0.0),
             friction=0.0 if dynamics is None else self.number(dynamics, "friction", 0.0),
             mimics=follows,

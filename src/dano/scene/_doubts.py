@@ -1,0 +1,279 @@
+"""What is odd about a scene or a state, and hints at other units, another frame or a slip: said once.
+
+Every doubt is a test of numbers that are there anyway. None is made of traced values. Bodies whose inertia is
+that of something larger than their shape, such as links with a mark, are not judged by their shape.
+"""
+
+import math
+import warnings
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from dano.fields import HalfSpace
+from dano.maths import is_traced, quat_rotate
+from dano.scene._bodies import Body
+from dano.scene._contacts import Contact
+from dano.scene._frames import RESOLVED
+from dano.scene._joints import Joint, Layout
+from dano.scene._states import State
+
+MOST_SAID = 3
+"""Doubts of one thing that are said at once, the worst first."""
+LIGHTEST, HEAVIEST = 1.0, 25e3
+"""Densities [kg/m³] between those of air (1.2) and osmium (22,600), which no body exceeds."""
+_LONGEST = 20.0
+"""Size [m] of a body that moves, from which it is rather in millimetres."""
+_THINNEST = 1e-4
+"""Share of its size below which a body is thinner than its samples can tell."""
+_NO_LENGTHS = ("normal", "offset", "rounding")
+_FAR = 3.0
+"""Sizes from a body's middle at which an anchor is rather given in another frame."""
+_TURNS = 10.0
+"""Whole numbers beyond these, as limits of a hinge, are rather degrees [rad]."""
+_LEAPS = 10.0
+"""Sizes that a body goes in a step from which its speed is rather in other units."""
+_ROUGHEST = 5.0
+"""Sliding friction beyond that of rubber on rubber, and of racing tyres."""
+_SOFT = 0.1
+"""Share of its size by which a body sinks that is too soft: twenty times that of the default."""
+_DEEP = 0.1
+"""Share of its thickness by which a body may begin in a fixed one; at rest it is less than a hundredth."""
+
+
+class Doubt(NamedTuple):
+    """Something odd.
+
+    Attributes:
+        rank: The lowest is said first.
+        text: In one line.
+    """
+
+    rank: int
+    text: str
+
+
+class SceneWarning(UserWarning):
+    """Something odd about a scene or a state, which is made all the same."""
+
+
+def say_doubts(doubts: Sequence[Doubt], stacklevel: int) -> None:
+    """Warn of the worst, and of how many more there are."""
+    ordered = sorted(doubts)
+    for place, doubt in enumerate(ordered[:MOST_SAID]):
+        left = len(ordered) - MOST_SAID
+        more = f" (and {left} more: `dano check` lists them)" if left > 0 and place == MOST_SAID - 1 else ""
+        warnings.warn(doubt.text + more, SceneWarning, stacklevel=stacklevel + 1)
+
+
+def doubts_of_scene(
+    bodies: Sequence[Body],
+    joints: Sequence[Joint],
+    contacts: Sequence[Contact],
+    gravity: Float[Array, "3"],
+) -> list[Doubt]:
+    """What is odd about what stays constant."""
+    found = []
+    if len(bodies) > 1 and all(body.fixed for body in bodies):
+        found.append(Doubt(2, "nothing moves: all bodies are fixed"))
+    for contact in contacts:
+        mu = contact.params.sliding_friction
+        if not is_traced(mu) and float(mu) > _ROUGHEST:
+            text = (
+                f"sliding_friction {float(mu):.3g} of {contact.a!r} and {contact.b!r} is more than any pair"
+            )
+            found.append(Doubt(3, f"{text} has: it is a ratio of forces, not an angle"))
+        found += _too_soft(contact, bodies, gravity)
+    for body in bodies:
+        if not body.fixed and not is_traced(body.shape, body.mass, body.mass_scale, body.inertia):
+            found += _of_body(body)
+    by_name = {body.name: body for body in bodies}
+    for joint in joints:
+        if not is_traced(joint):
+            found += _of_joint(joint, by_name)
+    if not is_traced(gravity) and float(gravity[2]) > 0 and float(abs(gravity[:2]).max()) == 0:
+        found.append(Doubt(1, f"gravity points up, {float(gravity[2]):.3g} m/s² along z: z is up"))
+    return found
+
+
+def _too_soft(contact: Contact, bodies: Sequence[Body], gravity: Float[Array, "3"]) -> list[Doubt]:
+    """Whether a body sinks deep into what it rests on, by the stiffness that was given."""
+    stiffness, found = contact.params.stiffness, []
+    if stiffness is None or is_traced(stiffness, gravity):
+        return found
+    for body in bodies:
+        if body.name not in (contact.a, contact.b) or body.fixed or body.surface is None:
+            continue
+        if is_traced(body.surface, body.mass, body.mass_scale, body.scale) or not np.isfinite(body.size):
+            continue
+        weight = float(body.mass * body.mass_scale) * float(np.linalg.norm(np.asarray(gravity)))
+        if float(stiffness) * body.typical_support(_SOFT * body.size) < weight:
+            found.append(
+                Doubt(
+                    3,
+                    f"{body.name!r} sinks by more than {100 * _SOFT:.0f} % of its size where it rests: its"
+                    f" stiffness of {float(stiffness):.3g} Pa/m with {contact.a!r} or {contact.b!r} is small",
+                )
+            )
+    return found
+
+
+def is_homogeneous(body: Body) -> bool:
+    """Whether a body's mass can lie within its shape: its radius of gyration is not larger than that."""
+    mass = float(body.mass)
+    gyration = math.sqrt(max(float(np.trace(np.asarray(body.inertia, np.float64))), 0.0) / (2 * mass))
+    return gyration <= body.size
+
+
+def box_volume(body: Body) -> float:
+    """Volume [m³] of the box around a body."""
+    return float(np.prod(_extents(body)))
+
+
+def density_doubt(body: Body) -> str | None:
+    """What to say of a body that is lighter than air or heavier than any metal, for the box around it."""
+    mass, volume = float(body.mass * body.mass_scale), box_volume(body)
+    density = mass / max(volume, 1e-300)
+    if LIGHTEST <= density <= HEAVIEST or not is_homogeneous(body):
+        return None
+    than = "more than any metal has" if density > 1 else "less than air has"
+    return (
+        f"{body.name!r} is {body.size:.3g} m long and has {mass:.3g} kg, {density:.2g} kg/m³ of the box"
+        f" around it, {than}; are its lengths in metres and its mass in kilograms?"
+    )
+
+
+def _extents(body: Body) -> Float[np.ndarray, "3"]:
+    if body.object is not None:
+        return np.ptp(np.asarray(body.object.surface.points, np.float64), axis=0)
+    assert body.shape is not None
+    return np.ptp(np.asarray(body.shape.bounds, np.float64), axis=0)
+
+
+def _of_body(body: Body) -> list[Doubt]:
+    if is_traced(jax.tree.leaves(body.object)):
+        return []
+    found = []
+    if (text := density_doubt(body)) is not None:
+        found.append(Doubt(0, text))
+    elif _LONGEST < body.size < np.inf:
+        found.append(Doubt(0, f"{body.name!r} is {body.size:.3g} m long: are its lengths in metres?"))
+    thin = _thickness(body)
+    if thin < _THINNEST * body.size:
+        text = f"{body.name!r} is {thin:.2g} m thick and {body.size:.2g} m long: too thin for its samples"
+        found.append(Doubt(5, text))
+    return found
+
+
+def _thickness(body: Body) -> float:
+    """Least extent [m] of a shape, without the width of its edge; infinite of what is no plain shape."""
+    names = [name for name in getattr(body.shape, "takes", ()) if name not in _NO_LENGTHS]
+    return min((2 * float(np.min(np.asarray(getattr(body.shape, name)))) for name in names), default=np.inf)
+
+
+def _of_joint(joint: Joint, bodies: dict[str, Body]) -> list[Doubt]:
+    found, body = [], bodies[joint.child]
+    if joint.kind == "hinge" and joint.limits is not None:
+        ends = np.asarray(joint.limits, np.float64)
+        finite = ends[np.isfinite(ends)]
+        whole = finite.size and np.all(finite == np.round(finite))
+        if whole and np.abs(finite).max() > _TURNS:
+            turns = np.abs(finite).max() / (2 * np.pi)
+            found.append(
+                Doubt(
+                    2,
+                    f"limits of the hinge of {joint.child!r}, {ends[0]:g} to {ends[1]:g} rad, are"
+                    f" {turns:.3g} turns: are they in degrees?",
+                )
+            )
+    shown = body.shape if body.object is None else body.object.solid
+    # A robot's link may hang on an axis far from what it is seen by.
+    if shown is not None and np.isfinite(body.size) and is_homogeneous(body) and not is_traced(body.com):
+        anchor = np.asarray(joint.anchor, np.float64) - np.asarray(body.com, np.float64)
+        away = float(np.linalg.norm(anchor))
+        if joint.kind != "weld" and away > _FAR * body.size:
+            found.append(
+                Doubt(
+                    3,
+                    f"the anchor of the joint of {joint.child!r} lies {away:.3g} m from the body's middle,"
+                    f" {away / body.size:.2g} times its size: it is a point of the body's own frame",
+                )
+            )
+    return found
+
+
+def doubts_of_state(
+    bodies: Sequence[Body],
+    pairs: Sequence[tuple[int, int]],
+    layout: Layout,
+    state: State,
+    timestep: float,
+) -> list[Doubt]:
+    """What is odd about how bodies stand and move.
+
+    Args:
+        bodies: Of the scene.
+        pairs: Indices of the bodies that may touch.
+        layout: Of the scene.
+        state: The state.
+        timestep: [s].
+    """
+    found = []
+    position, speeds = np.asarray(state.position, np.float64), np.asarray(state.velocity, np.float64)
+    for i in layout.free:
+        body = bodies[i]
+        way = float(np.linalg.norm(speeds[i])) * timestep
+        if np.isfinite(body.size) and way > _LEAPS * body.size and way > 0:
+            found.append(
+                Doubt(
+                    1,
+                    f"{body.name!r} goes {way:.3g} m in a step, {way / body.size:.2g} times its size: is its"
+                    " velocity in m/s?",
+                )
+            )
+        spin = float(np.linalg.norm(np.asarray(state.omega[i], np.float64)))
+        if spin * timestep > 2 * RESOLVED:
+            found.append(
+                Doubt(
+                    1,
+                    f"{body.name!r} turns by {math.degrees(spin * timestep):.0f}° in a step, more than 60°:"
+                    " is omega in rad/s?",
+                )
+            )
+        if np.array_equal(np.asarray(state.orientation[i]), (0.0, 0.0, 0.0, 1.0)):
+            found.append(
+                Doubt(
+                    4,
+                    f"orientation [0, 0, 0, 1] of {body.name!r} is a half turn about z: quaternions are"
+                    " wxyz, and no turn is [1, 0, 0, 0]",
+                )
+            )
+    for i, j in pairs:
+        found += _begins_inside(bodies, state, position, i, j)
+    return found
+
+
+def _begins_inside(
+    bodies: Sequence[Body], state: State, position: Float[np.ndarray, "n 3"], i: int, j: int
+) -> list[Doubt]:
+    """Whether a body's lowest point is far below a half-space."""
+    found = []
+    for k, other in ((i, j), (j, i)):
+        body, floor = bodies[k], bodies[other]
+        if not isinstance(floor.shape, HalfSpace) or body.fixed or not np.isfinite(body.size):
+            continue
+        plane = floor.half_space_at(state.position[other], state.orientation[other])
+        if plane is None or body.surface is None or is_traced(body.surface, plane[0], state.orientation):
+            continue
+        normal, offset = plane
+        points = (np.asarray(body.scale)[:, None] * np.asarray(body.surface.points)[:3]).T
+        points = points - np.asarray(body.centre_of_mass)
+        turned = np.asarray(quat_rotate(np.asarray(state.orientation[k])[None], points))
+        depth = offset - float(((position[k] + turned) @ normal).min())
+        if depth > _DEEP * float(_extents(body).min()):
+            text = f"{body.name!r} begins {depth:.3g} m inside {floor.name!r}: it will be pushed out"
+            found.append(Doubt(1, text))
+    return found
