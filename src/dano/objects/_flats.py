@@ -20,9 +20,9 @@ _ALONG, _AT_RIM = np.cos(np.radians(5)), 0.3
 _CORE, _IN_CORE = 0.25, 0.8
 # Least width of a flat region, in cells, and its least share of the surface.
 _WIDTH, _SHARE = 4.0, 0.005
-# Samples that are asked for a plane of their own at once, and planes of one surface.
-_ASKED, _PLANES = 64, 64
-_FITS = 8
+# Samples that are asked for a plane of their own, how many of these planes are fitted, with how many passes,
+# and planes of one surface.
+_ASKED, _TRIED, _FITS, _PLANES = 64, 8, 8, 64
 
 
 class _Plane(NamedTuple):
@@ -70,12 +70,10 @@ def _largest(
     if len(free) < 3:
         return None, none
     seeds = free[np.linspace(0, len(free) - 1, _ASKED).astype(int)]
-    loads = [
-        areas[_within(points, normals, _Plane(normals[s], normals[s] @ points[s]), cell)].sum() for s in seeds
-    ]
-    for k in np.argsort(loads)[::-1][:8]:
-        seed = seeds[k]
-        plane = _fitted(points, normals, areas, _Plane(normals[seed], normals[seed] @ points[seed]), cell)
+    planes = [_Plane(normals[s], float(normals[s] @ points[s])) for s in seeds]
+    loads = [areas[_within(points, normals, plane, cell)].sum() for plane in planes]
+    for k in np.argsort(loads)[::-1][:_TRIED]:
+        plane = _fitted(points, normals, areas, planes[k], cell)
         region = _within(points, normals, plane, cell) & (areas > 0)
         if _is_flat(points[region], areas[region], areas.sum(), plane, cell):
             return plane, region
