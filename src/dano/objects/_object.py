@@ -16,6 +16,7 @@ from dano.keys import folded_words, split_words
 from dano.maths import checked_array, checked_key, checked_points, floating, is_traced, Numbers
 from dano.memory import check_nodes
 from dano.notebook import card, cloud, numbers
+from dano.objects._flats import flattened
 from dano.objects._interior import examine, Interior, sealed
 from dano.objects._mass import (
     check_scale,
@@ -157,7 +158,8 @@ class NeuralObject(eqx.Module):
         say("surface", 0.0)
         grid, error = baked(field, resolution)
         filled = field_solid(field, grid, level, floaters=floaters)
-        surface = draw_surface(filled, n_samples, key=folded_words(key, 2))
+        drawn = draw_surface(filled, n_samples, key=folded_words(key, 2))
+        surface = flattened(drawn, filled.spacing)
         solid = Region.create(lattice, level, floaters=False).solid(density)
         how = (mass_scale, mass, resolution, mass_key, progress)
         properties = (
