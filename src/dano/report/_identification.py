@@ -349,7 +349,7 @@ def _trajectory(fit: Identification, motion: Motion) -> Trajectory:
             places = places + quat_rotate(turns, com[None])
         position[:, row], orientation[:, row] = _filled(places, position[0, row]), turns
     zero = jnp.zeros((n, len(scene.bodies), 3))
-    states = State(jnp.asarray(position), jnp.asarray(orientation), zero, zero)
+    states = State(jnp.asarray(position), jnp.asarray(orientation), zero, zero, names=scene.names)
     none = jnp.zeros(n - 1)
     times = jnp.asarray(motion.times - motion.times[0])
     return Trajectory(times, states, none, none.astype(int), none == 0, scene.names)

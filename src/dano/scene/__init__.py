@@ -26,8 +26,11 @@ from dano.scene._motors import Motor as Motor, MOTOR_KINDS as MOTOR_KINDS
 from dano.scene._others import Others as Others
 from dano.scene._scene import Scene as Scene
 from dano.scene._states import (
+    BodyMotion as BodyMotion,
     Control as Control,
     JOINT_QUANTITIES as JOINT_QUANTITIES,
+    offer as offer,
+    Origin as Origin,
     State as State,
     state_arrays as state_arrays,
     STATE_SIZES as STATE_SIZES,

@@ -17,8 +17,9 @@ from dano.archive import checked_input
 from dano.building import BuildOptions, Units
 from dano.checks import checked_choice, checked_count, checked_number, shown
 from dano.contact import AbstractContactLaw, CentroidLaw, ContactParams, DistributedLaw
+from dano.engine import simulate
 from dano.fields import AbstractShape, load_field, posed, PRIMITIVES
-from dano.maths import Pose
+from dano.maths import is_traced, Pose
 from dano.memory import memory_limit
 from dano.names import did_you_mean
 from dano.objects import MassModel, NeuralObject
@@ -37,6 +38,7 @@ from dano.scene import (
     Scene,
     State,
     STATE_SIZES,
+    Trajectory,
 )
 from dano.scene_file._objects import (
     build_object,
@@ -108,6 +110,21 @@ class SceneFile:
     text: str
     objects: dict[str, Path | str]
     default_law: str = DEFAULT_LAW
+
+    def simulate(self, **options: Any) -> Trajectory:
+        """`dano.simulate` of what the file says, which films then show with what bodies look like.
+
+        Args:
+            **options: Of `dano.simulate`; `n_steps` or `duration`, `state` and `controls` replace the file's.
+
+        Raises:
+            ValueError: As `dano.simulate`.
+        """
+        given = {"state": self.state, "controls": self.controls, **options}
+        if "duration" not in given:
+            given = {"n_steps": self.n_steps, **given}
+        run = simulate(self.scene, **given)
+        return run if is_traced(run) else run.of(self.scene, engine=options.get("engine"), looks=self.looks)
 
     def inputs(self) -> list[Path]:
         """Files that the scene is made of."""

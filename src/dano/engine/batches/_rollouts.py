@@ -104,7 +104,8 @@ class StoredRollouts:
                 "call rollouts with the same arguments to go on"
             )
         names = [*STATE_SIZES, *(name for name in JOINT_QUANTITIES if self._store.has(name))]
-        states = State(**{name: jnp.asarray(self._store.read(name, rows)) for name in names})
+        arrays = {name: jnp.asarray(self._store.read(name, rows)) for name in names}
+        states = State(**arrays, names=self.names)
         kept = Kept(states, *(self._store.read(name, rows) for name in Kept._fields[1:]))
         return _result(kept, self.steps, self.names)
 

@@ -62,7 +62,7 @@ def rollout(
     position, orientation, velocity, omega = jnp.split(states, (3, 7, 10), axis=2)
     residual, passes, solved, overflow, _ = found["launch.reports"].T
     report = Report(residual, passes.astype(int), (solved > 0) & (overflow == 0), overflow > 0)
-    states = State(position, orientation, velocity, omega)
+    states = State(position, orientation, velocity, omega, names=state.names)
     if state.q is not None and state.v is not None:
         none = jnp.zeros((n_steps, state.q.shape[0]), dtype)
         q, v = (found.get(f"launch.{name}", none).reshape(none.shape) for name in ("qs", "vs"))
