@@ -13,8 +13,8 @@ import pytest
 from engine.trees import coordinates
 
 import dano
-from dano.identify._parameters import space_of
-from dano.identify._windows import draw_velocities, plan_windows
+from dano.identification._parameters import space_of
+from dano.identification._windows import draw_velocities, plan_windows
 from dano.maths import quat_multiply
 
 RADIUS, H = 0.05, 0.005

@@ -21,7 +21,7 @@ from dano.engine._controls import asked, check_control, Policy, spread
 from dano.engine._reports import Report, SolverOptions
 from dano.hosted import hosted
 from dano.maths import is_traced, quat_conjugate, quat_exp, quat_multiply
-from dano.scene import Control, RESOLVED, Scene, State, Trajectory
+from dano.scene import coming_from, Control, Origin, RESOLVED, Scene, State, Trajectory
 
 # From here on reverse mode recomputes segments instead of keeping every step's residuals.
 CHECKPOINT_FROM = 2000
@@ -242,7 +242,15 @@ def simulate(
     _say(scene, states, report)
     times = _times(scene.timestep, n_steps)
     run = Trajectory(times, states, report.residual, report.iterations, report.converged, scene.names)
-    return run if is_traced(times, states, scene) else run.of(scene, engine=engine)
+    if is_traced(times, states):
+        return run
+
+    def again(scene: Scene) -> Trajectory:
+        return simulate(
+            scene, state, n_steps, controls=controls, engine=engine, checkpoint_every=checkpoint_every
+        )
+
+    return coming_from(run, Origin(scene, engine, again=again))
 
 
 def _steps(n_steps: int | None, duration: float, timestep: Float[Array, ""]) -> int:

@@ -17,7 +17,7 @@ from dano.engine import AbstractEngine, VariationalEngine
 from dano.extras import optional
 from dano.gym._rendering import MODES, Rendering
 from dano.gym._rules import Rules, Start
-from dano.plan import Task
+from dano.planning import Task
 from dano.scene import Scene, State
 from dano.vision import Camera
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dano.checks import checked_count, checked_items, checked_kind
-from dano.identify import Identification, Motion
+from dano.identification import Identification, Motion
 from dano.maths import quat_rotate
 from dano.pixels import draw_frames, FilmFit
 from dano.report._framing import camera_for

@@ -27,6 +27,7 @@ from dano.scene._others import Others as Others
 from dano.scene._scene import Scene as Scene
 from dano.scene._states import (
     BodyMotion as BodyMotion,
+    coming_from as coming_from,
     Control as Control,
     JOINT_QUANTITIES as JOINT_QUANTITIES,
     offer as offer,

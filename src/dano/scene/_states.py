@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
+from typing import Any, ClassVar, NamedTuple, overload, TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -146,11 +146,13 @@ class Origin(NamedTuple):
         scene: That was simulated.
         engine: That made the steps; None for the default.
         looks: Gives what bodies look like, by name, for films; None for shapes alone.
+        again: Simulates a scene with other parameters in the same way; None if that is not known.
     """
 
     scene: "Scene"
     engine: Any = None
     looks: Callable[[], Any] | None = None
+    again: "Callable[[Scene], Trajectory] | None" = None
 
 
 _VERBS: dict[str, Callable[..., Any]] = {}
@@ -192,6 +194,12 @@ class Trajectory(eqx.Module):
     # No leaf of the tree: a batch of runs would hold as many scenes.
     _origin: ClassVar[Origin | None] = None
 
+    @overload
+    def __getitem__(self, which: str) -> BodyMotion: ...
+
+    @overload
+    def __getitem__(self, which: int) -> State: ...
+
     def __getitem__(self, which: str | int) -> BodyMotion | State:
         """The motion of a body by name, over time; or the state at an index of `times`.
 
@@ -211,9 +219,7 @@ class Trajectory(eqx.Module):
     @property
     def final(self) -> State:
         """The state at the end."""
-        last = self[-1]
-        assert isinstance(last, State)
-        return last
+        return self[-1]
 
     @property
     def scene(self) -> "Scene":
@@ -253,10 +259,7 @@ class Trajectory(eqx.Module):
         """
         if scene.names != self.names:
             raise ValueError(f"scene must have the bodies {list(self.names)}, got {list(scene.names)}")
-        known = replace(self)
-        # Modules are frozen, and this is no part of their value.
-        object.__setattr__(known, "_origin", Origin(scene, engine, looks))
-        return known
+        return coming_from(self, Origin(scene, engine, looks))
 
     def forces(self, a: str, b: str) -> Float[np.ndarray, "steps 3"]:
         """Contact force on body `a` from body `b` in each step [N, W].
@@ -380,3 +383,11 @@ class Trajectory(eqx.Module):
             return cls(states=states, names=names, **arrays), source
         except KeyError as error:
             raise ValueError(f"{path} is not a valid dano trajectory: it lacks {error}") from error
+
+
+def coming_from(run: Trajectory, origin: Origin) -> Trajectory:
+    """The same trajectory, which knows where it comes from."""
+    known = replace(run)
+    # Modules are frozen, and this is no part of their value.
+    object.__setattr__(known, "_origin", origin)
+    return known

@@ -26,6 +26,7 @@ from dano.objects import MassModel, NeuralObject
 from dano.robots import close_loops, Robot
 from dano.scene import (
     Body,
+    coming_from,
     Contact,
     joined,
     Joint,
@@ -124,7 +125,7 @@ class SceneFile:
         if "duration" not in given:
             given = {"n_steps": self.n_steps, **given}
         run = simulate(self.scene, **given)
-        return run if is_traced(run) else run.of(self.scene, engine=options.get("engine"), looks=self.looks)
+        return run if is_traced(run) else coming_from(run, run.origin._replace(looks=self.looks))
 
     def inputs(self) -> list[Path]:
         """Files that the scene is made of."""

@@ -13,7 +13,7 @@ from dano.cli._console import Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import missing_for_pictures
 from dano.cli.identifying._arguments import Identify
-from dano.identify import (
+from dano.identification import (
     Errors,
     Identification,
     identify as fit_parameters,

@@ -13,17 +13,17 @@ import numpy as np
 
 from dano.checks import checked_function, checked_items, checked_kind, checked_optional
 from dano.engine import AbstractEngine, checked_engine, Policy
-from dano.identify._checkpoint import Checkpoint, digest_of
-from dano.identify._parameters import Parameter, space_of, values_at, with_values
-from dano.identify._problem import Problem
-from dano.identify._residuals import Linearized, shifted, Smoothing
-from dano.identify._result import Errors, Identification, Minimum
-from dano.identify._scales import check_scales
-from dano.identify._settings import deviations, estimated, IdentifyOptions, Setup
-from dano.identify._settling import ripple_covariance, worth_of
-from dano.identify._uncertainty import uncertainty
-from dano.identify._windows import Plan
-from dano.identify.motions import joint_table, load_motion, Motion, QUANTITIES
+from dano.identification._checkpoint import Checkpoint, digest_of
+from dano.identification._parameters import Parameter, space_of, values_at, with_values
+from dano.identification._problem import Problem
+from dano.identification._residuals import Linearized, shifted, Smoothing
+from dano.identification._result import Errors, Identification, Minimum
+from dano.identification._scales import check_scales
+from dano.identification._settings import deviations, estimated, IdentifyOptions, Setup
+from dano.identification._settling import ripple_covariance, worth_of
+from dano.identification._uncertainty import uncertainty
+from dano.identification._windows import Plan
+from dano.identification.motions import joint_table, load_motion, Motion, QUANTITIES
 from dano.maths import quat_conjugate, quat_log, quat_multiply
 from dano.scene import Control, Scene, State, Trajectory
 from dano.solvers import Solution, Stop

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.gradients import Check
-from dano.identify._uncertainty import quantile
-from dano.identify.motions import Motion
+from dano.identification._uncertainty import quantile
+from dano.identification.motions import Motion
 from dano.notebook import card, curves, numbers
 from dano.scene import Scene, State, state_arrays
 from dano.solvers import Stop
