@@ -60,11 +60,13 @@ from dano.robots import (
     inverse_kinematics as inverse_kinematics,
     InverseKinematics as InverseKinematics,
     joint_control as joint_control,
+    JointPD as JointPD,
     joint_reactions as joint_reactions,
     load_mjcf as load_mjcf,
     load_urdf as load_urdf,
     mass_matrix as mass_matrix,
     operational_space_torque as operational_space_torque,
+    pd as pd,
     Robot as Robot,
     Target as Target,
 )

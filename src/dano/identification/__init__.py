@@ -1,7 +1,7 @@
 """Identification: from observed motions to the parameters of a scene, with error bars."""
 
 from dano.identification._identify import identify as identify
-from dano.identification._parameters import Parameter as Parameter
+from dano.identification._parameters import Parameter as Parameter, parameter_of as parameter_of
 from dano.identification._result import Errors as Errors, Identification as Identification, Minimum as Minimum
 from dano.identification._settings import IdentifyOptions as IdentifyOptions
 from dano.identification.motions import (

@@ -57,7 +57,7 @@ def identify_in_film(
     look: LearnedField,
     camera: PosedCamera,
     motion: Motion,
-    parameters: Sequence[Parameter],
+    parameters: Sequence[Parameter | str],
     *,
     tracking: TrackOptions | None = None,
     background: str | Path | None = None,

@@ -25,18 +25,29 @@ from dano.maths import (
 from dano.scene import Control, joints_of, place_links, pulls, Scene, State, triples
 
 
-def mass_matrix(scene: Scene, state: State) -> Float[Array, "k k"]:
+def mass_matrix(scene: Scene, state: State, *, joints: bool = False) -> Float[Array, "k k"]:
     """Generalised mass M(q) [kg, kg m, kg m²], armature of joints included.
+
+    Args:
+        scene: The scene.
+        state: Where it is.
+        joints: Only the part of the joints, without the bodies that move freely.
 
     Raises:
         ValueError: If the state does not fit the scene.
     """
     mass, inertia, rows = _masses(scene)
-    return scene.chains.mass_matrix(scene.frames(state).jacobian[rows], mass, inertia)
+    whole = scene.chains.mass_matrix(scene.frames(state).jacobian[rows], mass, inertia)
+    return _of_joints(scene, _of_joints(scene, whole).T).T if joints else whole
 
 
-def bias_forces(scene: Scene, state: State) -> Float[Array, " k"]:
+def bias_forces(scene: Scene, state: State, *, joints: bool = False) -> Float[Array, " k"]:
     """b(q, v) [N, N m]: what it takes to move on without acceleration.
+
+    Args:
+        scene: The scene.
+        state: Where it is and how it moves.
+        joints: Only the part of the joints.
 
     Raises:
         ValueError: If the state does not fit the scene.
@@ -44,11 +55,17 @@ def bias_forces(scene: Scene, state: State) -> Float[Array, " k"]:
     checked_kind("scene", scene, Scene)
     still = jnp.zeros(scene.layout.n_velocities, scene.timestep.dtype)
     force, torque, jacobian, rows = _needed(scene, state, still)
-    return _pulled(jacobian[rows], force, torque)
+    found = _pulled(jacobian[rows], force, torque)
+    return _of_joints(scene, found) if joints else found
 
 
-def gravity_forces(scene: Scene, state: State) -> Float[Array, " k"]:
+def gravity_forces(scene: Scene, state: State, *, joints: bool = False) -> Float[Array, " k"]:
     """What it takes to hold still against gravity [N, N m]: b(q, 0).
+
+    Args:
+        scene: The scene.
+        state: Where it is.
+        joints: Only the part of the joints, as a controller needs it.
 
     Raises:
         ValueError: If the state does not fit the scene.
@@ -56,7 +73,8 @@ def gravity_forces(scene: Scene, state: State) -> Float[Array, " k"]:
     mass, _, rows = _masses(scene)
     jacobian = scene.frames(state).jacobian[rows]
     force = -mass[:, None] * pulls(scene)[rows]
-    return _pulled(jacobian, force, jnp.zeros_like(force))
+    found = _pulled(jacobian, force, jnp.zeros_like(force))
+    return _of_joints(scene, found) if joints else found
 
 
 def computed_torque(scene: Scene, state: State, acceleration: Numbers) -> Float[Array, " k"]:
@@ -158,6 +176,11 @@ def generalised_velocities(scene: Scene, state: State) -> Float[Array, " k"]:
     free = np.array(scene.layout.free, int)
     speeds = jnp.concatenate([state.velocity[free], state.omega[free]], axis=1).ravel()
     return speeds if state.v is None else jnp.concatenate([speeds, state.v])
+
+
+def _of_joints(scene: Scene, rows: Float[Array, "k *n"]) -> Float[Array, "j *n"]:
+    """The rows of joints among those of generalised velocities, in which they are last."""
+    return rows[scene.layout.n_velocities - scene.layout.n_joints :]
 
 
 def _masses(scene: Scene) -> tuple[Float[Array, " m"], Float[Array, "m 3 3"], np.ndarray]:

@@ -119,27 +119,27 @@ class Scene(eqx.Module):
     def __str__(self) -> str:
         """What notebooks show, as text."""
         traced = any(is_traced(body.mass, body.mass_scale) for body in self.bodies) or is_traced(self.timestep)
-        return repr(self) if traced else plain(*self._summary())
+        return repr(self) if traced else plain(*self._summary(drawn=False))
 
     def _repr_html_(self) -> str:
         """What notebooks show: bodies with mass and size, and what may touch."""
-        title, rows, head = self._summary()
+        title, rows, head = self._summary(drawn=True)
         return card(title, rows, head=head)
 
-    def _summary(self) -> tuple[str, list[tuple[str, ...]], tuple[str, ...]]:
+    def _summary(self, *, drawn: bool) -> tuple[str, list[tuple[str, ...]], tuple[str, ...]]:
         """Title, rows and head of the table of a scene."""
         rows: list[tuple[str, ...]] = []
         for body in self.bodies[:12]:
             drawing = ""
-            if body.surface is not None:
+            if drawn and body.surface is not None:
                 points = np.asarray(body.scale)[:, None] * np.asarray(body.surface.points[:3])
                 drawing = cloud(points.T, np.asarray(body.surface.vectors).T, 56, 150)
-            mass = "fixed" if body.fixed else f"{float(body.mass * body.mass_scale):.4g} kg"
+            mass = "fixed" if body.fixed else f"{float(body.mass) * float(body.mass_scale):.4g} kg"
             rows.append((drawing, body.name, mass, f"{body.size:.4g} m"))
         named = ", ".join(f"{a} – {b}" for a, b in self.pairs[:12])
         title = (
-            f"Scene: {len(self.bodies)} bodies, {len(self.pairs)} pairs that may touch ({named});"
-            f" step {float(self.timestep):.4g} s"
+            f"Scene: {len(self.bodies)} bodies, {len(self.pairs)} pair{'s' * (len(self.pairs) != 1)} that may"
+            f" touch{f' ({named})' if named else ''}; step {float(self.timestep):.4g} s"
         )
         return title, rows, ("", "body", "mass", "size")
 
