@@ -23,3 +23,15 @@ def _stop(number: int, frame: FrameType | None) -> None:
     del number, frame
     os.write(2, b"dano: interrupted\n")
     os._exit(130)
+
+
+def register_environments() -> None:
+    """Tell Gymnasium of its environments; it calls this when it is imported, so nothing slow is."""
+    from gymnasium.envs.registration import register, registry
+
+    if "dano/Scene-v0" not in registry:
+        register(
+            "dano/Scene-v0",
+            entry_point="dano.gym:make_env_of_files",
+            vector_entry_point="dano.gym:make_vector_env_of_files",
+        )

@@ -11,7 +11,7 @@ from scipy import ndimage
 from vision.models import learned
 
 import dano
-from dano.identify import Motion
+from dano.identification import Motion
 from dano.pixels import draw_frames, film, identify_in_film
 from dano.pixels._identify import _with_table
 from dano.report import draw_simulated, write_identification_report

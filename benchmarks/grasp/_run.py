@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 import dano
 from benchmarks._measure import load_average, parse_arguments, report, Row
-from dano.plan import Plan, PlanOptions, SamplingOptions, Task
+from dano.planning import Plan, PlanOptions, SamplingOptions, Task
 from dano.scene_file import load_scene, load_task
 
 SCENE, TASK = (Path(__file__).parent / name for name in ("scene.toml", "task.toml"))

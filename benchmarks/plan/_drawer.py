@@ -2,7 +2,7 @@
 
 import dano
 from benchmarks._measure import Row
-from dano.plan import Actuator, Goal, Limit, Plan, Task
+from dano.planning import Actuator, Goal, Limit, Plan, Task
 from dano.scene_file import load_asset
 
 TRAVEL = 0.2  # m

@@ -11,7 +11,7 @@ import numpy as np
 
 import dano
 from dano.maths import Numbers
-from dano.plan import Actuator, Goal, Plan, Task
+from dano.planning import Actuator, Goal, Plan, Task
 from dano.scene_file import load_asset
 
 TIMESTEP, N_STEPS = 0.02, 60

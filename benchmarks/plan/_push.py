@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 import dano
 from benchmarks._subjects import authors_bunny
 from dano.maths import quat_from_axis_angle, quat_multiply
-from dano.plan import Actuator, follow, Goal, Plan, PlanOptions, SamplingOptions, Task
+from dano.planning import Actuator, follow, Goal, Plan, PlanOptions, SamplingOptions, Task
 
 TIMESTEP, N_STEPS, PUSH_STEPS = 0.02, 60, 160
 FRICTION, RADIUS, BALL_MASS = 0.05, 0.25, 10.0

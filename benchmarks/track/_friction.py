@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import dano
-from dano.identify import identify, Motion
+from dano.identification import identify, Motion
 from dano.pixels import FilmFit, identify_in_film
 from dano.scene_file import load_asset
 from dano.vision import Film, LearnedField, PosedCamera, Tracked, TrackOptions

@@ -1,5 +1,8 @@
 """Simulate what robots see: neural density fields as rigid bodies, without a mesh in between."""
 
+import importlib as _importlib
+from typing import Any as _Any
+
 from dano.maths import Pose as Pose  # isort: skip
 from dano.fields import (
     AbstractField as AbstractField,
@@ -37,6 +40,7 @@ from dano.contact import (
 )
 from dano.scene import (
     Body as Body,
+    BodyMotion as BodyMotion,
     Contact as Contact,
     Control as Control,
     Frames as Frames,
@@ -56,11 +60,13 @@ from dano.robots import (
     inverse_kinematics as inverse_kinematics,
     InverseKinematics as InverseKinematics,
     joint_control as joint_control,
+    JointPD as JointPD,
     joint_reactions as joint_reactions,
     load_mjcf as load_mjcf,
     load_urdf as load_urdf,
     mass_matrix as mass_matrix,
     operational_space_torque as operational_space_torque,
+    pd as pd,
     Robot as Robot,
     Target as Target,
 )
@@ -77,9 +83,10 @@ from dano.engine import (
     simulate as simulate,
     step as step,
     StoredRollouts as StoredRollouts,
+    Touch as Touch,
     VariationalEngine as VariationalEngine,
 )
-from dano.identify import (
+from dano.identification import (
     Identification as Identification,
     identify as identify,
     IdentifyOptions as IdentifyOptions,
@@ -89,7 +96,7 @@ from dano.identify import (
     Parameter as Parameter,
     save_motion as save_motion,
 )
-from dano.plan import (
+from dano.planning import (
     Actuator as Actuator,
     Execution as Execution,
     follow as follow,
@@ -104,4 +111,23 @@ from dano.plan import (
 from dano.scene_file import load_object as load_object, load_scene as load_scene
 from dano.exchange import export_object as export_object, export_robot as export_robot
 
+from dano.names import keep_old_name as _keep_old_name
+from dano.scene import offer as _offer
+
 __version__ = "0.1.0"
+
+_PACKAGES = ("cli", "comparison", "gym", "learning", "mujoco", "pixels", "report", "vision")
+"""Packages that `dano.` finds when they are first asked for: what they need is large, or optional."""
+
+
+def __getattr__(name: str) -> _Any:
+    if name in _PACKAGES:
+        return _importlib.import_module(f"dano.{name}")
+    raise AttributeError(f"module 'dano' has no attribute {name!r}")
+
+
+# Scenes do not know reports, which are above them, and importing dano imports none.
+_offer("film", lambda *given, **options: _importlib.import_module("dano.report").film_run(*given, **options))
+_offer("show", lambda *given: _importlib.import_module("dano.report").show_run(*given))
+_keep_old_name("dano.identify", "dano.identification")
+_keep_old_name("dano.plan", "dano.planning")

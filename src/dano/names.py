@@ -1,7 +1,12 @@
-"""Names that were meant, in messages about names that are unknown."""
+"""Names that were meant, in messages about names that are unknown; names that have moved."""
 
 import difflib
+import importlib
+import sys
+import warnings
 from collections.abc import Iterable
+from types import ModuleType
+from typing import Any
 
 _ELSEWHERE = {
     "bodies": ("body", "object", "objects", "link", "geom"),
@@ -41,3 +46,25 @@ def did_you_mean(name: object, valid: Iterable[str]) -> str:
             return f"; did you mean {word!r}?"
     near = difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.7)
     return f"; did you mean {lower[near[0]]!r}?" if near else ""
+
+
+def keep_old_name(old: str, new: str) -> None:
+    """Let imports from a package that was renamed work, with one line that says the new name.
+
+    Args:
+        old: What the package was called, such as "dano.identify".
+        new: What it is called now.
+    """
+
+    def found(name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(f"module {old!r} has no attribute {name!r}")
+        thing = getattr(importlib.import_module(new), name)
+        warnings.warn(
+            f"{old} is a function now; write `from {new} import {name}`", FutureWarning, stacklevel=2
+        )
+        return thing
+
+    module: Any = ModuleType(old, f"Old name of `{new}`.")
+    module.__getattr__ = found
+    sys.modules[old] = module

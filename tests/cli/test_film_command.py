@@ -14,7 +14,7 @@ from dano.cli.film._before import stages_before
 from dano.cli.film._place import place_of
 from dano.cli.film._slide import find_slide
 from dano.cli.film._stages import run_stages, Stage
-from dano.identify import Motion
+from dano.identification import Motion
 
 
 class Kitchen:

@@ -10,7 +10,7 @@ from vision.tabletop import TAG_SIDE
 
 import dano
 from dano.cli.film import STAGES
-from dano.identify import load_motion
+from dano.identification import load_motion
 from dano.scene_file import load_run
 
 

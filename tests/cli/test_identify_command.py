@@ -10,8 +10,8 @@ import pytest
 
 import dano
 from dano.cli.identifying._run import _errors_text
-from dano.identify import Errors
-from dano.identify._problem import Problem
+from dano.identification import Errors
+from dano.identification._problem import Problem
 from dano.solvers import bounded_least_squares
 
 SCENE = """
@@ -197,7 +197,7 @@ KILLED = """
 import os, signal, sys
 from dano.archive import Pace
 from dano.cli import main
-from dano.identify._problem import Problem
+from dano.identification._problem import Problem
 Pace.every, Pace.share = 0.0, 0
 linearize, calls = Problem.linearize, []
 def until(self, x, start):

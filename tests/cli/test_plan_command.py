@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dano.plan import load_controls
+from dano.planning import load_controls
 from dano.scene_file import load_scene, load_task
 
 SCENE = """

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import dano
-from dano.plan import load_controls
+from dano.planning import load_controls
 from dano.scene_file import load_run
 from tests.fuzz.judging import judge, Outcome
 from tests.fuzz.world import World

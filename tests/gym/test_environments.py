@@ -195,3 +195,39 @@ def test_wrong_options_are_said(pushed, options, message):
         make_vector_env(*pushed, n_envs=0)
     with pytest.raises(ValueError, match="render_mode must be one of rgb_array, got 'human'"):
         make_vector_env(*pushed, n_envs=2, render_mode="human")
+
+
+SCENE = """
+timestep = 0.05
+n_steps = 20
+gravity = [0, 0, 0]
+[[bodies]]
+name = "puck"
+shape = "sphere"
+radius = 0.1
+mass = 2.0
+"""
+TASK = """
+n_steps = 20
+[[actuators]]
+body = "puck"
+limit = 4.0
+axes = "xy"
+[[goals]]
+body = "puck"
+position = [1.0, 0.0, 0.0]
+within = 0.05
+"""
+
+
+def test_environments_have_an_id(tmp_path):
+    """x⁺ = x + h v⁺ and v⁺ = v + h f/m: after one step with the largest force."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "task.toml").write_text(TASK)
+    files = dict(scene=tmp_path / "scene.toml", task=tmp_path / "task.toml")
+    env = gymnasium.make("dano.gym:dano/Scene-v0", disable_env_checker=True, **files)
+    env.reset(seed=0)
+    env.step(np.array([1.0, 0.0], np.float32))
+    assert float(env.unwrapped.state["puck"].position[0]) == pytest.approx(H * H * LIMIT / MASS)
+    many = gymnasium.make_vec("dano.gym:dano/Scene-v0", 3, **files)
+    assert many.reset(seed=0)[0].shape[0] == 3

@@ -12,7 +12,7 @@ import pytest
 
 import dano
 from dano.archive import Pace
-from dano.identify._checkpoint import Checkpoint
+from dano.identification._checkpoint import Checkpoint
 
 NOISE = {"position": 1e-4, "orientation": 2e-3}
 

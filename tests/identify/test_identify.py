@@ -13,8 +13,8 @@ import pytest
 from engine.trees import coordinates
 
 import dano
-from dano.identify._parameters import space_of
-from dano.identify._windows import draw_velocities, plan_windows
+from dano.identification._parameters import space_of
+from dano.identification._windows import draw_velocities, plan_windows
 from dano.maths import quat_multiply
 
 RADIUS, H = 0.05, 0.005
@@ -677,3 +677,22 @@ def test_covariances_weigh_as_generalised_least_squares_does():
     plain = dataclasses.replace(seen, covariance=None)
     other = dano.identify(scene, plain, [gravity], **given)
     assert np.any(np.abs(np.asarray(other.values["g"]) - expected) > 0.3 * errors)
+
+
+def test_parameters_are_text_as_on_the_command_line_and_masses_are_kilograms():
+    """A constant force on a free ball: x = f t²/2m, so the scale follows from the way."""
+    ball = dano.Body("ball", dano.Sphere(0.1), mass=0.5)
+    scene = dano.Scene.create([ball], timestep=0.01, gravity=(0, 0, 0))
+    push = scene.control(ball=dict(force=(1.0, 0, 0)))
+    heavier = scene.replace_body("ball", mass_scale=1.6)
+    seen = dano.simulate(heavier, n_steps=20, controls=push)
+    rows = jax.tree.map(lambda x: jnp.repeat(x[None], 20, axis=0), push)
+    fit = dano.identify(scene, seen, ["ball.mass_scale:0.5:5"], controls=rows, noise=dict(position=1e-4))
+    assert fit.values["ball.mass_scale"] == pytest.approx(1.6, rel=1e-6)
+    mass, error = fit.masses["ball"]
+    assert mass == pytest.approx(0.8, rel=1e-6)
+    assert error == pytest.approx(0.5 * fit.standard_errors["ball.mass_scale"])
+    assert "mass of ball [kg]" in str(fit) and fit.to_dict()["masses"]["ball"] == [mass, error]
+    for text, message in (("ball.mas:0:1", "did you mean 'mass'"), ("bal.mass:0:1", "did you mean 'ball'")):
+        with pytest.raises(ValueError, match=message):
+            dano.identify(scene, seen, [text], controls=rows)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import dano
-from dano.identify import Errors
-from dano.identify._identify import _missed
-from dano.identify._scales import check_scales
-from dano.identify._uncertainty import _width
+from dano.identification import Errors
+from dano.identification._identify import _missed
+from dano.identification._scales import check_scales
+from dano.identification._uncertainty import _width
 from dano.maths import quat_exp, quat_rotate
 
 SCENE = dano.Scene.create([dano.Body("ball", dano.Sphere(0.05), mass=1.0)], timestep=0.005)

@@ -9,8 +9,8 @@ import pytest
 
 import dano
 from benchmarks.identify import _cases
-from dano.identify._planes import plane_through, Smoothing
-from dano.identify._settling import _directions
+from dano.identification._planes import plane_through, Smoothing
+from dano.identification._settling import _directions
 from dano.maths import quat_exp, quat_from_axis_angle, quat_multiply
 
 N = 4

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import dano
-from dano.identify import Motion
+from dano.identification import Motion
 from dano.maths import quat_exp, quat_multiply
 
 SIDES = (0.09, 0.06, 0.04)

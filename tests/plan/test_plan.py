@@ -9,7 +9,7 @@ import pytest
 
 import dano
 from benchmarks.grasp._run import Hand
-from dano.plan import load_controls, problem_of, softened
+from dano.planning import load_controls, problem_of, softened
 
 H, N_STEPS, MASS = 0.05, 20, 2.0
 

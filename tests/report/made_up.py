@@ -6,9 +6,9 @@ import numpy as np
 import dano
 from dano.comparison import Comparison, Row, Scenery
 from dano.exchange import convex_hull
-from dano.identify import Errors, Identification, Motion
+from dano.identification import Errors, Identification, Motion
 from dano.pixels import FilmFit
-from dano.plan import GoalError, Plan
+from dano.planning import GoalError, Plan
 from dano.solvers import Stop
 from dano.vision import (
     Capture,

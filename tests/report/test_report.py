@@ -409,3 +409,14 @@ def test_a_picture_of_the_start_shows_where_bodies_are(tmp_path):
     assert abs(orange[:, 1].mean() - blue[:, 1].mean()) > 30
     with pytest.raises(ValueError, match="png"):
         render_start(scene, state, tmp_path / "start.gif")
+
+
+def test_a_run_films_and_shows_itself(tmp_path):
+    ball = dano.Body("ball", dano.Sphere(0.05), mass=0.2, position=(0, 0, 0.5))
+    run = dano.simulate(dano.Scene.create([ball], timestep=0.01), duration=0.2)
+    run.film(tmp_path / "ball.mp4", fps=10, size=(64, 48))
+    run.film(tmp_path / "ball.png", size=(64, 48))
+    run.show(tmp_path / "ball.html")
+    assert all((tmp_path / f"ball.{kind}").stat().st_size > 500 for kind in ("mp4", "png", "html"))
+    with pytest.raises(ValueError, match="film must be given options of .*did you mean 'fps'"):
+        run.film(tmp_path / "ball.mp4", fp=10)

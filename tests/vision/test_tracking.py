@@ -10,7 +10,7 @@ from scipy import ndimage
 from vision.drawn_films import BACK, drawn, errors, film_of, fine_frame, LIGHT, path, ramp, ROUGH, SIZE
 
 from dano.cli import main
-from dano.identify import load_motion
+from dano.identification import load_motion
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply
 from dano.vision import adjust_poses, Light, track, TrackOptions
 from dano.vision.tracking._placement import Placement

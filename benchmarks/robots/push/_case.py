@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 import dano
 from benchmarks._subjects import shipped_bunny
 from dano.maths import quat_conjugate, quat_from_axis_angle, quat_log, quat_multiply
-from dano.plan import Actuator, Goal, Task
+from dano.planning import Actuator, Goal, Task
 
 TIMESTEP, N_STEPS = 0.02, 50
 RADIUS, FRICTION = 0.04, 0.3  # of the tool [m], of bunny and floor

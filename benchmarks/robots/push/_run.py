@@ -16,7 +16,7 @@ from benchmarks._measure import (
     time_in_turn,
 )
 from benchmarks.robots.push import _case, panda
-from dano.plan import follow
+from dano.planning import follow
 
 SPEED = "The Panda pushes the bunny, paper's law"
 PLANS = "Plans with the torques of its joints, random starts and goals"

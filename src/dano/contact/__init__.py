@@ -7,6 +7,7 @@ from dano.contact._colliders import (
     Support as Support,
     SurfaceSet as SurfaceSet,
 )
+from dano.contact._distance import Distance as Distance, distance as distance
 from dano.contact._distributed import (
     CHUNK as CHUNK,
     combined as combined,

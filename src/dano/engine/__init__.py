@@ -1,12 +1,14 @@
 """Engines: from a scene and a state to the next one, and everything built on that."""
 
 from dano.engine._compiling import compiled as compiled, compiler_options as compiler_options
+from dano.engine._controls import Policy as Policy
 from dano.engine._finite import marked as marked
 from dano.engine._history import (
     contact_history as contact_history,
     contact_patches as contact_patches,
     contact_wrenches as contact_wrenches,
     ContactHistory as ContactHistory,
+    Touch as Touch,
 )
 from dano.engine._reports import Report as Report
 from dano.engine._rollout import (
@@ -14,7 +16,6 @@ from dano.engine._rollout import (
     checked_engine as checked_engine,
     difference as difference,
     linearize as linearize,
-    Policy as Policy,
     retract as retract,
     simulate as simulate,
     step as step,

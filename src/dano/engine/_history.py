@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from dano.contact import Patch
 from dano.engine._compiling import compiled
 from dano.engine._rollout import AbstractEngine, check_state, checked_engine
-from dano.scene import Scene, State
+from dano.scene import offer, Scene, State, Trajectory
 
 
 class ContactHistory(NamedTuple):
@@ -25,6 +25,26 @@ class ContactHistory(NamedTuple):
     points: Float[np.ndarray, "steps pairs 3"]
     overlaps: Float[np.ndarray, "steps pairs"]
     forces: Float[np.ndarray, "steps pairs 3"]
+
+
+class Touch(NamedTuple):
+    """One contact of two bodies, from its first step with a force to its last.
+
+    Attributes:
+        a: The one body.
+        b: The other.
+        start: When its first step begins [s].
+        end: When its last step ends [s].
+        peak: Largest force of a step [N].
+        impulse: Sum over its steps on `a` from `b` [N s, W], shape (3,).
+    """
+
+    a: str
+    b: str
+    start: float
+    end: float
+    peak: float
+    impulse: Float[np.ndarray, "3"]
 
 
 def contact_history(scene: Scene, states: State, *, engine: AbstractEngine | None = None) -> ContactHistory:
@@ -118,3 +138,44 @@ def _jitted_steps(engine: AbstractEngine, scene: Scene, states: State):
 def _jitted_patches(engine: AbstractEngine, scene: Scene, states: State):
     prepared = engine.prepare(scene)
     return jax.lax.map(lambda state: engine.touch(scene, prepared, state), states)
+
+
+def _history_of(run: Trajectory) -> ContactHistory:
+    if run.times.ndim != 1:
+        raise ValueError(f"run must be one trajectory, got a batch of shape {run.times.shape}")
+    return contact_history(run.scene, run.states, engine=run.origin.engine)
+
+
+def _forces(run: Trajectory, a: str, b: str) -> Float[np.ndarray, "steps 3"]:
+    """See `Trajectory.forces`."""
+    first, second = (run.scene.body(name).name for name in (a, b))
+    for k, pair in enumerate(run.scene.pairs):
+        if set(pair) == {first, second}:
+            return (1 if pair[0] == first else -1) * _history_of(run).forces[:, k]
+    raise ValueError(f"pair must be one that may touch, {list(run.scene.pairs)}, got {(a, b)}")
+
+
+def _touches(run: Trajectory, a: str | None = None, b: str | None = None) -> list[Touch]:
+    """See `Trajectory.touches`."""
+    asked = {run.scene.body(name).name for name in (a, b) if name is not None}
+    if not run.scene.pairs:
+        return []
+    times, forces = np.asarray(run.times, np.float64), _history_of(run).forces
+    found = []
+    for k, pair in enumerate(run.scene.pairs):
+        if not asked <= set(pair):
+            continue
+        first, second = pair[::-1] if a == pair[1] else pair
+        size = np.linalg.norm(forces[:, k], axis=1)
+        # Between steps with and without a force, one begins or ends.
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], size > 0, [0]]).astype(int)))
+        for begin, end in edges.reshape(-1, 2):
+            pushes = np.diff(times)[begin:end, None] * forces[begin:end, k]
+            impulse = (1 if first == pair[0] else -1) * pushes.sum(axis=0)
+            span = float(times[begin]), float(times[end])
+            found.append(Touch(first, second, *span, float(size[begin:end].max()), impulse))
+    return sorted(found, key=lambda touch: touch.start)
+
+
+offer("forces", _forces)
+offer("touches", _touches)

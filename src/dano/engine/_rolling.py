@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from dano.engine._compiling import by_numpy_on_cpus, compiled, is_enclosed
+from dano.engine._controls import asked
 from dano.engine._reports import Report
 from dano.maths import is_traced, library
 from dano.scene import Control, Scene, State
@@ -92,7 +93,7 @@ def _jitted_rows(
 
     def advance(index: Array, state: State) -> tuple[State, Report]:
         time = scene.timestep * (first + index).astype(scene.timestep.dtype)
-        return engine.step(scene, prepared, state, policy(state, time))
+        return engine.step(scene, prepared, state, asked(policy, scene, state, time))
 
     def add(index: Array, carry: Any) -> Any:
         state, rows = carry
@@ -131,7 +132,7 @@ def _jitted_scan(
     def advance(state: State, inputs: Any) -> Any:
         index, control = inputs
         if callable(controls):
-            control = controls(state, scene.timestep * index)
+            control = asked(controls, scene, state, scene.timestep * index)
         following, report = engine.step(scene, prepared, state, control)
         return following, (following, report)
 

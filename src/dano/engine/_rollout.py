@@ -17,13 +17,12 @@ from dano.checks import checked_count, checked_kind, checked_number
 from dano.contact import Patch
 from dano.engine import _touching, _variational
 from dano.engine._compiling import compiled
+from dano.engine._controls import check_control, Policy, spread
 from dano.engine._finite import unsound
 from dano.engine._reports import Report, SolverOptions
 from dano.engine._rolling import rolled
 from dano.maths import by_numpy, is_traced, Q, quat_conjugate, quat_exp, quat_multiply
-from dano.scene import Control, RESOLVED, Scene, State, Trajectory
-
-Policy = Callable[[State, Float[Array, ""]], Control]
+from dano.scene import coming_from, Control, Origin, RESOLVED, Scene, State, Trajectory
 
 # From here on reverse mode recomputes segments instead of keeping every step's residuals.
 CHECKPOINT_FROM = 2000
@@ -180,7 +179,7 @@ def step(
         ValueError: If the state or control does not fit the scene.
     """
     check_state(scene, state)
-    _check_control(scene, control, ())
+    check_control(scene, control, ())
     following, report = _with_room(engine, scene, lambda engine: _jitted_step(engine, scene, state, control))
     _say(scene, following, report)
     return following
@@ -188,9 +187,10 @@ def step(
 
 def simulate(
     scene: Scene,
-    state: State,
+    state: State | None = None,
     n_steps: int | None = None,
     *,
+    duration: float | None = None,
     controls: Control | Policy | None = None,
     engine: AbstractEngine | None = None,
     checkpoint_every: int | None = None,
@@ -202,31 +202,31 @@ def simulate(
 
     Args:
         scene: The scene.
-        state: Initial state.
-        n_steps: Number of steps; may be left out if `controls` are arrays.
-        controls: Forces and torques for each step, leaves of shape (n_steps, n_bodies, 3), or a function of
-            (state, time [s]) that returns the control of a step. Row t acts on the step from t to t + 1.
+        state: Initial state; default `scene.initial_state()`.
+        n_steps: Number of steps; may be left out if `controls` are arrays of all steps.
+        duration: In its place, how long [s]: the nearest number of steps, at least one.
+        controls: Forces and torques for each step, leaves of shape (n_steps, n_bodies, 3), of which row t
+            acts on the step from t to t + 1; or those of one step, which act in all of them; or a function of
+            (state, time [s]) that returns the control of a step. It is compiled: `jnp.where` in place of
+            `if`.
         engine: Default `VariationalEngine()`.
         checkpoint_every: In reverse mode, keep only every so many states and recompute the steps between;
             default: everything is kept up to 2000 steps (a few hundred numbers each), the square root of
             their number beyond.
 
     Returns:
-        The trajectory. Steps that did not converge are marked in it and raise a RuntimeWarning (outside of
-        `jax.jit`).
+        The trajectory, which knows its scene: `run["ball"]`, `run.final`, `run.forces`, `run.film`. Steps
+        that did not converge are marked in it and raise a RuntimeWarning (outside of `jax.jit`).
 
     Raises:
-        ValueError: If the state or controls do not fit the scene, or `n_steps` is missing, < 1 or contradicts
-            them.
+        ValueError: If the state or controls do not fit the scene, or neither or both of `n_steps` and
+            `duration` are given, or are out of range or contradict the controls.
     """
+    checked_kind("scene", scene, Scene)
+    state = scene.initial_state() if state is None else state
     check_state(scene, state)
-    if controls is not None and not callable(controls):
-        checked_kind("controls", controls, Control)
-        rows = int(controls.force.shape[0]) if controls.force.ndim == 3 else -1
-        if n_steps is None:
-            n_steps = rows
-        _check_control(scene, controls, (n_steps,))
-    n_steps = checked_count("n_steps", n_steps)
+    n_steps = n_steps if duration is None else _steps(n_steps, duration, scene.timestep)
+    controls, n_steps = spread(scene, controls, n_steps)
     if checkpoint_every is not None:
         checkpoint_every = checked_count("checkpoint_every", checkpoint_every)
     elif n_steps > CHECKPOINT_FROM:
@@ -238,7 +238,29 @@ def simulate(
     )
     _say(scene, states, report)
     times = _times(scene.timestep, n_steps)
-    return Trajectory(times, states, report.residual, report.iterations, report.converged, scene.names)
+    run = Trajectory(times, states, report.residual, report.iterations, report.converged, scene.names)
+    if is_traced(times, states):
+        return run
+
+    def again(scene: Scene) -> Trajectory:
+        return simulate(
+            scene, state, n_steps, controls=controls, engine=engine, checkpoint_every=checkpoint_every
+        )
+
+    return coming_from(run, Origin(scene, engine, again=again))
+
+
+def _steps(n_steps: int | None, duration: float, timestep: Float[Array, ""]) -> int:
+    """The number of steps that a duration [s] takes.
+
+    Raises:
+        ValueError: If the number is given, too, the duration is not > 0 s, or the timestep is not known yet.
+    """
+    if n_steps is not None:
+        raise ValueError(f"n_steps and duration say the same, got {n_steps} and {duration}: give one")
+    if is_traced(timestep):
+        raise ValueError("duration must be n_steps where the timestep is itself traced by JAX")
+    return max(1, round(checked_number("duration", duration, above=0, unit="s") / float(timestep)))
 
 
 @by_numpy
@@ -264,7 +286,7 @@ def linearize(
         ValueError: If the state or control does not fit the scene.
     """
     check_state(scene, state)
-    _check_control(scene, control, ())
+    check_control(scene, control, ())
     return _jitted_linearize(checked_engine(engine), scene, state, control)
 
 
@@ -351,26 +373,6 @@ def _with_room(
         if larger is None:
             return states, report
         current = larger
-
-
-def _check_control(scene: Scene, control: Control | None, leading: tuple[int, ...]) -> None:
-    if control is None:
-        return
-    checked_kind("control", control, Control)
-    expected = (*leading, len(scene.bodies), 3)
-    for name in ("force", "torque"):
-        value = getattr(control, name)
-        if value.shape != expected:
-            raise ValueError(f"control.{name} must have shape {expected}, got {value.shape}")
-        if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
-            raise ValueError(f"control.{name} must be finite")
-    expected = (*leading, scene.layout.n_joints)
-    for name in ("effort", "command"):
-        value = getattr(control, name)
-        if value is not None and value.shape != expected:
-            raise ValueError(f"control.{name} must have shape {expected}, got {value.shape}")
-    if control.command is not None and not scene.driven:
-        raise ValueError("control.command must be None in a scene whose joints have no motor")
 
 
 def _way_out(report: Report, failed: np.ndarray) -> str:

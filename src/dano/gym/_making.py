@@ -1,5 +1,6 @@
 """Environments from scenes and tasks."""
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,8 +18,9 @@ from dano.engine import AbstractEngine, VariationalEngine
 from dano.extras import optional
 from dano.gym._rendering import MODES, Rendering
 from dano.gym._rules import Rules, Start
-from dano.plan import Task
+from dano.planning import Task
 from dano.scene import Scene, State
+from dano.scene_file import load_scene, load_task
 from dano.vision import Camera
 
 _NEED = "environments need gymnasium"
@@ -116,6 +118,42 @@ def make_vector_env(
     # A page shows one episode.
     rendering = _rendering(rules, state, render_mode, MODES[:1], size, camera, n_envs)
     return SceneVectorEnv(rules, state, n_envs, start, rendering)
+
+
+def make_env_of_files(scene: str | os.PathLike[str], task: str | os.PathLike[str], **options: Any) -> Any:
+    """What `gymnasium.make("dano/Scene-v0", scene=…, task=…)` makes: `make_env` from two files.
+
+    Args:
+        scene: Scene file (.toml).
+        task: Task file (.toml), as `dano plan` takes.
+        **options: Of `make_env`, such as `render_mode`, `repeat` and `shaping`.
+
+    Raises:
+        ImportError: As `make_env`.
+        ValueError: As `make_env`, or if a file is missing or wrong.
+    """
+    loaded = load_scene(scene)
+    return make_env(loaded.scene, loaded.state, load_task(task, loaded.scene).task, **options)
+
+
+def make_vector_env_of_files(
+    scene: str | os.PathLike[str], task: str | os.PathLike[str], num_envs: int = 1, **options: Any
+) -> Any:
+    """What `gymnasium.make_vec("dano/Scene-v0", n, scene=…, task=…)` makes: `make_vector_env` from two files.
+
+    Args:
+        scene: Scene file (.toml).
+        task: Task file (.toml), as `dano plan` takes.
+        num_envs: How many episodes.
+        **options: Of `make_vector_env`.
+
+    Raises:
+        ImportError: As `make_vector_env`.
+        ValueError: As `make_vector_env`, or if a file is missing or wrong.
+    """
+    loaded = load_scene(scene)
+    asked = load_task(task, loaded.scene).task
+    return make_vector_env(loaded.scene, loaded.state, asked, num_envs, **options)
 
 
 def _checked(

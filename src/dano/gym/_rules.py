@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.engine import AbstractEngine, compiler_options, rollouts
-from dano.plan import Task
+from dano.planning import Task
 from dano.scene import Control, Scene, State
 
 Start = Callable[[np.random.Generator], State]

@@ -135,7 +135,7 @@ class MuJoCoEngine(AbstractEngine):
         empty = scene.initial_state()
         found = self._twin.read(data, Motion(*_doubles(_motion(empty))))
         dtype = scene.timestep.dtype
-        return _filled(scene, State(*(jnp.asarray(x, dtype) for x in found)))
+        return _filled(scene, State(*(jnp.asarray(x, dtype) for x in found), names=scene.names))
 
     def _check(self, scene: Scene) -> None:
         if scene.names != self.names:
@@ -169,7 +169,7 @@ class MuJoCoEngine(AbstractEngine):
         ends = np.cumsum([int(np.prod(shape)) for shape in shapes[: len(Motion._fields)]])
         *parts, passes = jnp.split(out, ends)
         rows = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=False)]
-        after = _filled(scene, State(*rows))
+        after = _filled(scene, State(*rows, names=state.names))
         bad = ~jnp.all(jnp.isfinite(out))
         passes = jax.lax.stop_gradient(passes[0]).astype(int)
         report = Report(jnp.where(bad, jnp.inf, 0).astype(dtype), passes, ~bad)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dano.checks import checked_count, checked_kind, checked_optional
-from dano.identify import Identification, identify, IdentifyOptions, Motion, Parameter
+from dano.identification import Identification, identify, IdentifyOptions, Motion, Parameter
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply
 from dano.progress import Progress
 from dano.scene import Scene
@@ -57,7 +57,7 @@ def identify_in_film(
     look: LearnedField,
     camera: PosedCamera,
     motion: Motion,
-    parameters: Sequence[Parameter],
+    parameters: Sequence[Parameter | str],
     *,
     tracking: TrackOptions | None = None,
     background: str | Path | None = None,

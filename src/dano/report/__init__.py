@@ -31,6 +31,7 @@ from dano.report._training import (
 )
 from dano.report._video import (
     checked_size as checked_size,
+    film_run as film_run,
     render_side_by_side as render_side_by_side,
     render_start as render_start,
     render_trajectory as render_trajectory,
@@ -38,6 +39,7 @@ from dano.report._video import (
 )
 from dano.report.viewing import (
     LiveView as LiveView,
+    show_run as show_run,
     view as view,
     view_capture as view_capture,
     view_field as view_field,

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dano.checks import checked_count, checked_items, checked_kind
-from dano.identify import Identification, Motion
+from dano.identification import Identification, Motion
 from dano.maths import quat_rotate
 from dano.pixels import draw_frames, FilmFit
 from dano.report._framing import camera_for
@@ -349,7 +349,7 @@ def _trajectory(fit: Identification, motion: Motion) -> Trajectory:
             places = places + quat_rotate(turns, com[None])
         position[:, row], orientation[:, row] = _filled(places, position[0, row]), turns
     zero = jnp.zeros((n, len(scene.bodies), 3))
-    states = State(jnp.asarray(position), jnp.asarray(orientation), zero, zero)
+    states = State(jnp.asarray(position), jnp.asarray(orientation), zero, zero, names=scene.names)
     none = jnp.zeros(n - 1)
     times = jnp.asarray(motion.times - motion.times[0])
     return Trajectory(times, states, none, none.astype(int), none == 0, scene.names)

@@ -7,7 +7,7 @@ import numpy as np
 
 from dano.archive import checked_output, replacing
 from dano.checks import checked_kind
-from dano.plan import Plan, Task
+from dano.planning import Plan, Task
 from dano.progress import Progress
 from dano.report._resample import frame_times
 from dano.report._stage import Stage, stage

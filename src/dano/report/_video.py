@@ -3,7 +3,7 @@
 import contextlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ from dano.checks import (
     checked_path,
 )
 from dano.extras import optional
+from dano.names import did_you_mean
 from dano.progress import Progress
 from dano.report._framing import CAMERAS, cameras_for, Seen, seen_of, together
 from dano.report._overlay import draw_clock, draw_label, draw_touches
@@ -145,6 +146,34 @@ def render_trajectory(
     count = len(frame_times(trajectory, options.fps, options.slow_motion))
     take = take_of(scene, trajectory, stage(scene, options.colours, looks), count, options)
     film([take], options, outputs, progress)
+
+
+def film_run(
+    run: Trajectory, path: str | os.PathLike[str], *, progress: Progress | None = None, **options: Any
+) -> None:
+    """Film a trajectory that knows its scene: see `Trajectory.film`.
+
+    Args:
+        run: The trajectory.
+        path: Ends in .mp4, or in .png for a strip of still pictures.
+        progress: Called with a description and the share done.
+        **options: Of `VideoOptions`.
+
+    Raises:
+        ValueError: As `render_trajectory`, or if the trajectory does not know its scene.
+        ImportError: If av or pillow is missing.
+    """
+    names = [field.name for field in fields(VideoOptions)]
+    for name in options:
+        if name not in names:
+            raise ValueError(
+                f"film must be given options of {names}, got {name!r}{did_you_mean(name, names)}"
+            )
+    chosen, origin = VideoOptions(**options), run.origin
+    looks = None if origin.looks is None else origin.looks()
+    still = checked_output(path).suffix.lower() == ".png"
+    video, strip = (None, path) if still else (path, None)
+    render_trajectory(origin.scene, run, video, strip=strip, looks=looks, options=chosen, progress=progress)
 
 
 def render_start(

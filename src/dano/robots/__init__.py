@@ -25,6 +25,7 @@ from dano.robots._loading import (
 )
 from dano.robots._loops import close_loops as close_loops, loop_gaps as loop_gaps
 from dano.robots._operational import operational_space_torque as operational_space_torque
+from dano.robots._pd import JointPD as JointPD, pd as pd
 from dano.robots._robot import Robot as Robot
 from dano.robots.formats import (
     at_home as at_home,

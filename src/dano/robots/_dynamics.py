@@ -30,14 +30,20 @@ from dano.maths import (
 from dano.scene import Chains, Control, joints_of, place_links, pulls, Scene, State, triples
 
 
-def mass_matrix(scene: Scene, state: State) -> Float[Array, "k k"]:
+def mass_matrix(scene: Scene, state: State, *, joints: bool = False) -> Float[Array, "k k"]:
     """Generalised mass M(q) [kg, kg m, kg m²], armature of joints included.
+
+    Args:
+        scene: The scene.
+        state: Where it is.
+        joints: Only the part of the joints, without the bodies that move freely.
 
     Raises:
         ValueError: If the state does not fit the scene.
     """
     mass, inertia, rows = _masses(scene)
-    return _mass_matrix(scene.chains, scene.frames(state).jacobian, mass, inertia, rows)
+    found = _mass_matrix(scene.chains, scene.frames(state).jacobian, mass, inertia, rows)
+    return _of_joints(scene, _of_joints(scene, found).T).T if joints else found
 
 
 @by_numpy
@@ -51,8 +57,13 @@ def _mass_matrix(
     return chains.mass_matrix(jacobian[rows], mass, inertia)
 
 
-def bias_forces(scene: Scene, state: State) -> Float[Array, " k"]:
+def bias_forces(scene: Scene, state: State, *, joints: bool = False) -> Float[Array, " k"]:
     """b(q, v) [N, N m]: what it takes to move on without acceleration.
+
+    Args:
+        scene: The scene.
+        state: Where it is and how it moves.
+        joints: Only the part of the joints.
 
     Raises:
         ValueError: If the state does not fit the scene.
@@ -66,17 +77,24 @@ def bias_forces(scene: Scene, state: State) -> Float[Array, " k"]:
 def _jitted_bias(scene: Scene, state: State) -> Float[Array, " k"]:
     still = jnp.zeros(scene.layout.n_velocities, scene.timestep.dtype)
     force, torque, jacobian, rows = _needed(scene, state, still)
-    return _pulled(jacobian[rows], force, torque)
+    found = _pulled(jacobian[rows], force, torque)
+    return _of_joints(scene, found) if joints else found
 
 
-def gravity_forces(scene: Scene, state: State) -> Float[Array, " k"]:
+def gravity_forces(scene: Scene, state: State, *, joints: bool = False) -> Float[Array, " k"]:
     """What it takes to hold still against gravity [N, N m]: b(q, 0).
+
+    Args:
+        scene: The scene.
+        state: Where it is.
+        joints: Only the part of the joints, as a controller needs it.
 
     Raises:
         ValueError: If the state does not fit the scene.
     """
     mass, _, rows = _masses(scene)
-    return _weights(scene.frames(state).jacobian, mass, pulls(scene), rows)
+    found = _weights(scene.frames(state).jacobian, mass, pulls(scene), rows)
+    return _of_joints(scene, found) if joints else found
 
 
 @by_numpy
@@ -194,6 +212,11 @@ def generalised_velocities(scene: Scene, state: State) -> Float[Array, " k"]:
     free = np.array(scene.layout.free, int)
     speeds = jnp.concatenate([state.velocity[free], state.omega[free]], axis=1).ravel()
     return speeds if state.v is None else jnp.concatenate([speeds, state.v])
+
+
+def _of_joints(scene: Scene, rows: Float[Array, "k *n"]) -> Float[Array, "j *n"]:
+    """The rows of joints among those of generalised velocities, in which they are last."""
+    return rows[scene.layout.n_velocities - scene.layout.n_joints :]
 
 
 def _masses(scene: Scene) -> tuple[Float[Array, " m"], Float[Array, "m 3 3"], np.ndarray]:

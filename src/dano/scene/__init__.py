@@ -36,8 +36,12 @@ from dano.scene._others import (
 )
 from dano.scene._scene import Scene as Scene
 from dano.scene._states import (
+    BodyMotion as BodyMotion,
+    coming_from as coming_from,
     Control as Control,
     JOINT_QUANTITIES as JOINT_QUANTITIES,
+    offer as offer,
+    Origin as Origin,
     State as State,
     state_arrays as state_arrays,
     STATE_SIZES as STATE_SIZES,

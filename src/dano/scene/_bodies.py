@@ -1,5 +1,7 @@
 """Bodies: geometry, mass properties, and a name."""
 
+from collections.abc import Mapping
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,7 @@ from dano.maths import (
     AnyArray,
     by_numpy,
     checked_array,
+    checked_quaternion,
     floating,
     library,
     Numbers,
@@ -19,6 +22,7 @@ from dano.maths import (
     quat_rotate,
     stacked,
 )
+from dano.names import did_you_mean
 from dano.objects import checked_inertia, MassProperties, NeuralObject
 from dano.programs import keep_programs
 
@@ -30,6 +34,10 @@ ORIENTATIONS = 256
 FACES = 256
 # Samples within this share of the size above the lowest may touch: bodies sink by 0.5 %, and edges are round.
 LAYER = 0.02
+
+# Quantities of a start, and how many numbers each has; of joints as many as they have coordinates.
+_START = {"position": 3, "origin": 3, "orientation": 4, "velocity": 3, "omega": 3, "q": None, "v": None}
+_ARGUMENTS = (*_START, "mass", "inertia", "com", "mass_scale", "com_offset", "material", "gravcomp", "fixed")
 
 
 class Body(eqx.Module):
@@ -55,6 +63,8 @@ class Body(eqx.Module):
         material: Contact parameters for pairs that no contact of a scene names; None: the scene's.
         gravcomp: Share of the weight that is held, as by a spring balance [1]; None: none.
         fixed: Whether the body never moves.
+        start: Where `Scene.initial_state` puts it if nothing else is said: some of `position, orientation,
+            velocity, omega, origin, q, v`.
     """
 
     name: str = eqx.field(static=True)
@@ -73,6 +83,7 @@ class Body(eqx.Module):
     material: ContactParams | None
     gravcomp: Float[Array, ""] | None
     fixed: bool = eqx.field(static=True)
+    start: dict[str, Array]
 
     def __init__(
         self,
@@ -87,6 +98,7 @@ class Body(eqx.Module):
         material: ContactParams | None = None,
         gravcomp: Numbers | None = None,
         fixed: bool = False,
+        **start: Numbers | None,
     ):
         """A body from a neural object (which brings its mass) or a shape (homogeneous, of the given mass).
 
@@ -103,10 +115,13 @@ class Body(eqx.Module):
             gravcomp: Share of the weight that is held: 1 and gravity does not pull at the body, more and it
                 rises. As MuJoCo's.
             fixed: Whether the body never moves; then it needs no mass.
+            **start: Where it starts if `Scene.initial_state` is not told otherwise: `position` of the centre
+                of mass, or `origin` of the field frame [m, W], `orientation` (wxyz), `velocity` [m/s, W],
+                `omega` [rad/s, B]; on a joint `q` and `v`.
 
         Raises:
-            ValueError: If the name is empty, the geometry is not a shape or object, or a mass property is
-                missing or out of range.
+            ValueError: If the name is empty, the geometry is not a shape or object, a mass property is
+                missing or out of range, or an argument is unknown.
         """
         keep_programs()
         self.name = checked_text("name", name)
@@ -140,6 +155,7 @@ class Body(eqx.Module):
         self.com = properties.com if com is None else checked_array(f"com of body {name!r}", com, (3,))
         self.mass_scale = checked_array(f"mass_scale of body {name!r}", mass_scale, (), above=0.0)
         self.com_offset = checked_array(f"com_offset of body {name!r}", com_offset, (3,))
+        self.start = _checked_start(name, start)
         self.gravcomp = None
         if gravcomp is not None:
             self.gravcomp = checked_array(f"gravcomp of body {name!r}", gravcomp, ())
@@ -271,6 +287,29 @@ class Body(eqx.Module):
         normal = np.asarray(quat_rotate(orientation, self.shape.normal_direction))
         origin = np.asarray(position - quat_rotate(orientation, self.com))
         return normal, float(self.shape.offset) + float(normal @ origin)
+
+
+def _checked_start(name: str, start: Mapping[str, Numbers | None]) -> dict[str, Array]:
+    """What a body says of its start, as arrays.
+
+    Raises:
+        ValueError: If a quantity is unknown, its shape is wrong, or position and origin are both given.
+    """
+    found = {}
+    for key, value in start.items():
+        if key not in _START:
+            raise ValueError(
+                f"body {name!r} takes no {key!r}: it starts by {list(_START)}{did_you_mean(key, _ARGUMENTS)}"
+            )
+        if value is not None:
+            label = f"{key} of body {name!r}"
+            size = _START[key]
+            shape = np.shape(value) if size is None else (size,)
+            check = checked_quaternion(label, value) if size == 4 else checked_array(label, value, shape)
+            found[key] = check
+    if "position" in found and "origin" in found:
+        raise ValueError(f"body {name!r} must start by position (centre of mass) or by origin, got both")
+    return found
 
 
 @by_numpy

@@ -50,6 +50,20 @@ def merged(what: str, first: ByName | None, named: ByName) -> ByName:
     return {**first, **named}
 
 
+def started(bodies: Sequence[Body], given: ByName) -> ByName:
+    """What a state is given by, filled up with what bodies say of their own start."""
+    found = dict(given)
+    for body in bodies:
+        if not body.start:
+            continue
+        own = dict(body.start)
+        told = _numbers("state", body.name, given)
+        if _ORIGIN in told or "position" in told:
+            own = {key: value for key, value in own.items() if key not in (_ORIGIN, "position")}
+        found[body.name] = {**own, **told}
+    return found
+
+
 def state_arrays(
     bodies: Sequence[Body], layout: Layout, given: ByName, dtype: DTypeLike
 ) -> dict[str, Float[Array, "n _"]]:

@@ -11,10 +11,11 @@ from jaxtyping import Array, Float
 from dano.checks import checked_items, checked_kind, checked_optional, shown
 from dano.contact import checked_parameter, ContactParams
 from dano.maths import AnyArray, by_numpy, checked_array, is_traced, library, Numbers, on_host
-from dano.notebook import card, cloud
+from dano.names import did_you_mean
+from dano.notebook import card, cloud, plain
 from dano.objects import checked_inertia
 from dano.scene._bodies import Body
-from dano.scene._by_name import ByName, control_arrays, joint_arrays, merged, state_arrays
+from dano.scene._by_name import ByName, control_arrays, joint_arrays, merged, started, state_arrays
 from dano.scene._contacts import Contact, prepared
 from dano.scene._doubts import Doubt, doubts_of_scene, doubts_of_state, say_doubts
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
@@ -124,22 +125,34 @@ class Scene(eqx.Module):
         room = room_for(bodies, timestep, gravity)
         return cls(bodies, contacts, timestep, gravity, twins, joints, rest, room, loops)
 
+    def __str__(self) -> str:
+        """What notebooks show, as text."""
+        traced = any(is_traced(body.mass, body.mass_scale) for body in self.bodies) or is_traced(
+            self.timestep
+        )
+        return repr(self) if traced else plain(*self._summary(drawn=False))
+
     def _repr_html_(self) -> str:
         """What notebooks show: bodies with mass and size, and what may touch."""
-        rows = []
+        title, rows, head = self._summary(drawn=True)
+        return card(title, rows, head=head)
+
+    def _summary(self, *, drawn: bool) -> tuple[str, list[tuple[str, ...]], tuple[str, ...]]:
+        """Title, rows and head of the table of a scene."""
+        rows: list[tuple[str, ...]] = []
         for body in self.bodies[:12]:
             drawing = ""
-            if body.surface is not None:
+            if drawn and body.surface is not None:
                 points = np.asarray(body.scale)[:, None] * np.asarray(body.surface.points[:3])
                 drawing = cloud(points.T, np.asarray(body.surface.vectors).T, 56, 150)
-            mass = "fixed" if body.fixed else f"{float(body.mass * body.mass_scale):.4g} kg"
+            mass = "fixed" if body.fixed else f"{float(body.mass) * float(body.mass_scale):.4g} kg"
             rows.append((drawing, body.name, mass, f"{body.size:.4g} m"))
         named = ", ".join(f"{a} – {b}" for a, b in self.pairs[:12])
         title = (
-            f"Scene: {len(self.bodies)} bodies, {len(self.pairs)} pairs that may touch ({named});"
-            f" step {float(self.timestep):.4g} s"
+            f"Scene: {len(self.bodies)} bodies, {len(self.pairs)} pair{'s' * (len(self.pairs) != 1)} that may"
+            f" touch{f' ({named})' if named else ''}; step {float(self.timestep):.4g} s"
         )
-        return card(title, rows, head=("", "body", "mass", "size"))
+        return title, rows, ("", "body", "mass", "size")
 
     @property
     def layout(self) -> Layout:
@@ -197,7 +210,9 @@ class Scene(eqx.Module):
             ValueError: If there is no such body.
         """
         if name not in self.names:
-            raise ValueError(f"body must be one of {list(self.names)}, got {name!r}")
+            raise ValueError(
+                f"body must be one of {list(self.names)}, got {name!r}{did_you_mean(name, self.names)}"
+            )
         return self.names.index(name)
 
     def body(self, name: str) -> Body:
@@ -250,8 +265,9 @@ class Scene(eqx.Module):
         names = list(changes)
         for name in names:
             if name not in self.contacts[i].law.reads:
+                valid = list(self.contacts[i].law.reads)
                 raise ValueError(
-                    f"contact parameter must be one of {list(self.contacts[i].law.reads)}, got {name!r}"
+                    f"contact parameter must be one of {valid}, got {name!r}{did_you_mean(name, valid)}"
                 )
         values = [checked_parameter(name, changes[name]).astype(self.timestep.dtype) for name in names]
         return eqx.tree_at(
@@ -335,8 +351,9 @@ class Scene(eqx.Module):
 
         `position` is that of the centre of mass. In its place `origin` is that of the body's field frame, the
         origin of the file of a mesh or a field. Bodies on joints have `q` and `v` instead: angle [rad] and
-        rate, or length [m] and rate; three numbers of a ball or a planar joint, see `Joint`. Bodies that are
-        not named rest at the origin, or at q = 0. Orientations are normalised.
+        rate, or length [m] and rate; three numbers of a ball or a planar joint, see `Joint`. What is not
+        given is as `Body(…, position=…)` says; else bodies rest at the origin, or at q = 0. Orientations are
+        normalised.
 
         Args:
             states: The same as a dict, for names that are no identifiers: `{"left arm": dict(q=0.1)}`.
@@ -356,9 +373,10 @@ class Scene(eqx.Module):
         for name in bodies:
             self.index(name)
         dtype = self.timestep.dtype
-        state = State(**state_arrays(self.bodies, self.layout, bodies, dtype))
+        given = started(self.bodies, bodies)
+        state = State(**state_arrays(self.bodies, self.layout, given, dtype), names=self.names)
         if self.joints:
-            of_joints = joint_arrays(self.joints, bodies, JOINT_QUANTITIES, dtype)
+            of_joints = joint_arrays(self.joints, given, JOINT_QUANTITIES, dtype)
             state = self.filled(dataclasses.replace(state, **of_joints))
         self.check_state(state)
         warn_of_limits(self.layout, self.joints, state.q, self.timestep, joint_names or {})
@@ -437,6 +455,11 @@ class Scene(eqx.Module):
     def _check_bodies(self, state: State) -> None:
         """Check what a state says of bodies."""
         checked_kind("state", state, State)
+        if state.names is not None and state.names != self.names:
+            raise ValueError(
+                f"state must be of a scene with the bodies {list(self.names)} in this order, got one of"
+                f" {list(state.names)}"
+            )
         check_precision(state, self.timestep.dtype)
         for key, size in STATE_SIZES.items():
             value = getattr(state, key)

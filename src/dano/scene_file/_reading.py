@@ -17,14 +17,16 @@ from dano.archive import checked_input
 from dano.building import BuildOptions, Units
 from dano.checks import checked_choice, checked_count, checked_number, shown
 from dano.contact import AbstractContactLaw, CentroidLaw, ContactParams, DistributedLaw
+from dano.engine import simulate
 from dano.fields import AbstractShape, posed, PRIMITIVES
-from dano.maths import Pose
+from dano.maths import is_traced, Pose
 from dano.memory import memory_limit
 from dano.names import did_you_mean
 from dano.objects import MassModel, NeuralObject
 from dano.robots import close_loops, Robot
 from dano.scene import (
     Body,
+    coming_from,
     Contact,
     Joint,
     JOINT_KINDS,
@@ -39,6 +41,7 @@ from dano.scene import (
     State,
     STATE_SIZES,
     touching_pairs,
+    Trajectory,
 )
 from dano.scene_file._doubts import file_doubts
 from dano.scene_file._objects import (
@@ -111,6 +114,21 @@ class SceneFile:
     text: str
     objects: dict[str, Path | str]
     default_law: str = DEFAULT_LAW
+
+    def simulate(self, **options: Any) -> Trajectory:
+        """`dano.simulate` of what the file says, which films then show with what bodies look like.
+
+        Args:
+            **options: Of `dano.simulate`; `n_steps` or `duration`, `state` and `controls` replace the file's.
+
+        Raises:
+            ValueError: As `dano.simulate`.
+        """
+        given = {"state": self.state, "controls": self.controls, **options}
+        if "duration" not in given:
+            given = {"n_steps": self.n_steps, **given}
+        run = simulate(self.scene, **given)
+        return run if is_traced(run) else coming_from(run, run.origin._replace(looks=self.looks))
 
     def inputs(self) -> list[Path]:
         """Files that the scene is made of."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from dano.archive import checked_input
 from dano.names import did_you_mean
-from dano.plan import (
+from dano.planning import (
     Actuator,
     FIRST_DRAWS,
     Goal,

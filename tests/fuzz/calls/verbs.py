@@ -6,7 +6,7 @@ import numpy as np
 
 import dano
 from dano import robots
-from dano.plan import load_controls
+from dano.planning import load_controls
 from tests.fuzz import kinds
 from tests.fuzz.calls.call import Call
 from tests.fuzz.kinds import (

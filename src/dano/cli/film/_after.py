@@ -16,7 +16,7 @@ from dano.cli.film._stages import AGAIN, Stage
 from dano.cli.identifying import Identify
 from dano.cli.tracking import Track
 from dano.engine import simulate
-from dano.identify import load_motion, Motion, save_motion
+from dano.identification import load_motion, Motion, save_motion
 from dano.scene_file import parse_scene
 from dano.vision import read_film
 

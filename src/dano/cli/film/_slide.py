@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dano.identify import Motion
+from dano.identification import Motion
 
 _FEWEST = 6
 """Frames of a slide below which its slowing down is not known."""

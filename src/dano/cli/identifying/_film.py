@@ -8,7 +8,7 @@ import numpy as np
 from dano.cli._console import Progress, put
 from dano.cli.identifying._arguments import Identify
 from dano.cli.tracking import filming
-from dano.identify import Motion, Parameter
+from dano.identification import Motion, Parameter
 from dano.pixels import FilmFit, identify_in_film
 from dano.scene import Scene
 from dano.vision import Film, LearnedField, PosedCamera

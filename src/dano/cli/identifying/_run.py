@@ -13,23 +13,20 @@ from dano.cli._console import Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import missing_for_pictures
 from dano.cli.identifying._arguments import Identify
-from dano.identify import (
+from dano.identification import (
     Errors,
     Identification,
     identify as fit_parameters,
     IdentifyOptions,
     load_motion,
     Motion,
-    Parameter,
+    parameter_of,
 )
-from dano.names import did_you_mean
 from dano.scene import Scene
 from dano.solvers import Stop
 
 if TYPE_CHECKING:
     from dano.cli.identifying._film import Seen
-
-_OF_BODIES = ("mass_scale", "com_offset", "inertia", "mass", "com")
 
 
 def identify(command: Identify) -> None:
@@ -45,7 +42,7 @@ def identify(command: Identify) -> None:
     # An interrupted search returns its best so far.
     progress = Progress(stops=False)
     loaded = scene_file.load_scene(command.scene, timestep=command.timestep, progress=progress)
-    chosen = [_parameter(text, loaded.scene) for text in command.parameter]
+    chosen = [parameter_of(text, loaded.scene) for text in command.parameter]
     found, others = (
         [_motion(path, command, loaded.scene) for path in paths]
         for paths in (command.motions, command.held_out)
@@ -164,47 +161,6 @@ def _tell(
             put(f"{label:<10}  {file}")
 
 
-def _parameter(text: str, scene: Scene) -> Parameter:
-    """A parameter from PATH:LOWER:UPPER[:START], PATH being BODY.PROPERTY or BODY,BODY.PROPERTY.
-
-    Raises:
-        ValueError: If the text is not of that form or names nothing in the scene.
-    """
-    form = "BODY.PROPERTY:LOWER:UPPER[:START] or BODY,BODY.PROPERTY:LOWER:UPPER[:START]"
-    path, *numbers = text.split(":")
-    owner, _, name = path.rpartition(".")
-    try:
-        bounds = [float(number) for number in numbers]
-    except ValueError as error:
-        raise ValueError(f"parameter must be written {form}, got {text!r}") from error
-    if not owner or len(bounds) not in (0, 2, 3):
-        raise ValueError(f"parameter must be written {form}, got {text!r}")
-    lower, upper = bounds[:2] or (-np.inf, np.inf)
-    start = bounds[2] if len(bounds) == 3 else None
-    bodies = [body.name for body in scene.bodies]
-    for body in map(str.strip, owner.split(",")):
-        if body not in bodies:
-            raise ValueError(
-                f"parameter {text!r} must name bodies of the scene {bodies}, got {body!r}"
-                + did_you_mean(body, bodies)
-            )
-    if "," in owner:
-        a, b = (part.strip() for part in owner.split(",", 1))
-        place = scene.contact_index(a, b)
-        valid = scene.contacts[place].law.reads
-        where = lambda s: getattr(s.contacts[place].params, name)  # noqa: E731
-    else:
-        valid = _OF_BODIES
-        place = scene.index(owner)
-        where = lambda s: getattr(s.bodies[place], name)  # noqa: E731
-    if name not in valid:
-        raise ValueError(
-            f"property in parameter {text!r} must be one of {', '.join(valid)}, got {name!r}"
-            + did_you_mean(name, valid)
-        )
-    return Parameter(path, where, lower, upper, start=start)
-
-
 def _motion(path: Path, command: Identify, scene: Scene) -> Motion:
     """A motion, of the bodies that the file names unless one was asked for."""
     motion = load_motion(
@@ -243,6 +199,8 @@ def _print(fit: Identification) -> None:
             put(f"{name:<32.32} {np.array2string(np.asarray(value), precision=5).replace(chr(10), ' ')}")
             errors = np.asarray(fit.standard_errors[name])
             put(f"{'':<32} ± {np.array2string(errors, precision=2).replace(chr(10), ' ')}")
+    for body, (mass, error) in fit.masses.items():
+        put(f"{'mass of ' + body + ' [kg]':<32.32} {mass:12.6g} {error:15.3g}")
     put()
     for label, errors in (("fit", fit.errors), ("held out", fit.held_out_errors)):
         if errors is not None:

@@ -13,7 +13,7 @@ from dano.cli._arguments import Plan
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
-from dano.plan import Plan as Planned, plan as find_plan
+from dano.planning import Plan as Planned, plan as find_plan
 
 
 def plan(command: Plan) -> None:

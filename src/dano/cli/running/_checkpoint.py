@@ -74,7 +74,8 @@ class Checkpoint:
         return [*STATE_SIZES, *joints, *_REPORTED]
 
     def _piece(self, data: dict[str, np.ndarray]) -> Trajectory:
-        states = State(**{name: jnp.asarray(data[name]) for name in data if name not in _REPORTED})
+        arrays = {name: jnp.asarray(data[name]) for name in data if name not in _REPORTED}
+        states = State(**arrays, names=self._names)
         reported = {name: jnp.asarray(data[name]) for name in _REPORTED}
         # Times are those of the whole run, made when the pieces are joined.
         times = jnp.zeros(len(states.position))

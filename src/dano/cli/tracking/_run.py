@@ -9,7 +9,7 @@ from dano.cli._console import Progress, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
 from dano.cli.tracking._arguments import Track
 from dano.cli.tracking.filming import camera_of, check_camera, filmed, look_of, options_of
-from dano.identify import Motion, save_motion
+from dano.identification import Motion, save_motion
 from dano.vision import track as find_poses, Tracked
 
 

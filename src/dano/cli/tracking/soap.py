@@ -21,7 +21,7 @@ from dano.cli._learn import train
 from dano.cli.tracking._arguments import Filming, Track
 from dano.cli.tracking._run import track
 from dano.cli.tracking.filming import camera_of, filmed, options_of
-from dano.identify import load_motion
+from dano.identification import load_motion
 from dano.objects import NeuralObject
 from dano.pixels import FilmFit, identify_in_film
 from dano.vision import Film, LearnedField, load_capture, PosedCamera, View

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.checks import checked_count
-from dano.engine._rollout import _check_control, AbstractEngine
+from dano.engine._controls import check_control
+from dano.engine._rollout import AbstractEngine
 from dano.engine.batches._kernel import Inputs, Kept, Program
 from dano.maths import is_traced
 from dano.scene import Control, Scene, State
@@ -220,7 +221,7 @@ def _checked_steps(scene: Scene, controls: Any, n_steps: int | None) -> int:
                 f"(r, n_steps, n_bodies, 3), got {jax.tree.map(np.shape, controls)}"
             )
         n_steps = controls.force.shape[-3] if n_steps is None else n_steps
-        _check_control(scene, controls, (*controls.force.shape[:-3], n_steps))
+        check_control(scene, controls, (*controls.force.shape[:-3], n_steps))
     return checked_count("n_steps", n_steps)
 
 

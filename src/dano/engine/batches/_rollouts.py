@@ -14,7 +14,8 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.checks import checked_count, checked_function, checked_path
-from dano.engine._rollout import AbstractEngine, checked_engine, Policy
+from dano.engine._controls import Policy
+from dano.engine._rollout import AbstractEngine, checked_engine
 from dano.engine.batches._devices import device_mesh, gather, meet, put_rows, put_whole, take_rows
 from dano.engine.batches._input import checked_job, Job
 from dano.engine.batches._kernel import Kept, simulate_rows
@@ -104,7 +105,8 @@ class StoredRollouts:
                 "call rollouts with the same arguments to go on"
             )
         names = [*STATE_SIZES, *(name for name in JOINT_QUANTITIES if self._store.has(name))]
-        states = State(**{name: jnp.asarray(self._store.read(name, rows)) for name in names})
+        arrays = {name: jnp.asarray(self._store.read(name, rows)) for name in names}
+        states = State(**arrays, names=self.names)
         kept = Kept(states, *(self._store.read(name, rows) for name in Kept._fields[1:]))
         return _result(kept, self.steps, self.names)
 

@@ -61,6 +61,23 @@ def view(
     return serve(fill, port=port, host=host, block=block)
 
 
+def show_run(run: Trajectory, path: str | os.PathLike[str] | None = None) -> None:
+    """Show a trajectory that knows its scene: see `Trajectory.show`.
+
+    In the browser its frictions and masses have sliders, which simulate again.
+
+    Raises:
+        ValueError: As `view` and `write_view`, or if the trajectory does not know its scene.
+        ImportError: If viser or libigl is missing.
+    """
+    origin = run.origin
+    looks = None if origin.looks is None else origin.looks()
+    if path is not None:
+        write_view(origin.scene, run, path, looks=looks)
+        return
+    view(origin.scene, run, looks=looks, again=origin.again)
+
+
 def write_view(
     scene: Scene,
     trajectory: Trajectory,

@@ -1,13 +1,13 @@
 """Plans: controls that bring bodies to goals, through contact."""
 
-from dano.plan._execution import (
+from dano.planning._execution import (
     Execution as Execution,
     follow as follow,
     NEW_PLANS as NEW_PLANS,
     Replan as Replan,
 )
-from dano.plan._options import PlanOptions as PlanOptions
-from dano.plan._plan import (
+from dano.planning._options import PlanOptions as PlanOptions
+from dano.planning._plan import (
     GoalError as GoalError,
     load_controls as load_controls,
     Method as Method,
@@ -15,10 +15,10 @@ from dano.plan._plan import (
     Plan as Plan,
     plan as plan,
 )
-from dano.plan._problem import problem_of as problem_of
-from dano.plan._sampling import FIRST_DRAWS as FIRST_DRAWS, SamplingOptions as SamplingOptions
-from dano.plan._softening import gradual as gradual, softened as softened
-from dano.plan._task import (
+from dano.planning._problem import problem_of as problem_of
+from dano.planning._sampling import FIRST_DRAWS as FIRST_DRAWS, SamplingOptions as SamplingOptions
+from dano.planning._softening import gradual as gradual, softened as softened
+from dano.planning._task import (
     Actuator as Actuator,
     Goal as Goal,
     KINDS as KINDS,

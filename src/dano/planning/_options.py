@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dano.checks import checked_count, checked_items, checked_kind
-from dano.plan._problem import VIOLATION
-from dano.plan._sampling import SamplingOptions
+from dano.planning._problem import VIOLATION
+from dano.planning._sampling import SamplingOptions
 from dano.solvers import TrajectoryOptions
 
 _ILQR = TrajectoryOptions(

@@ -12,10 +12,10 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.engine import AbstractEngine, compiled, difference, gather, map_rows, retract, simulate
-from dano.identify._parameters import Selection, with_values
-from dano.identify._planes import plane_through, Smoothing
-from dano.identify._windows import Windows
-from dano.identify.motions import joint_table, QUANTITIES
+from dano.identification._parameters import Selection, with_values
+from dano.identification._planes import plane_through, Smoothing
+from dano.identification._windows import Windows
+from dano.identification.motions import joint_table, QUANTITIES
 from dano.maths import einsum, quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate
 from dano.scene import Control, Scene, State
 

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.archive import checked_output, WorkInProgress
-from dano.identify._settings import Setup
-from dano.identify.motions import Motion
+from dano.identification._settings import Setup
+from dano.identification.motions import Motion
 from dano.scene import JOINT_QUANTITIES, State, state_arrays, STATE_SIZES
 from dano.solvers import Iterate, NormalEquations, Solution, Stop
 

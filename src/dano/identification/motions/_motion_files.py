@@ -20,7 +20,7 @@ from dano.archive import (
     write_archive,
 )
 from dano.checks import checked_choice, checked_items, checked_kind, checked_number
-from dano.identify.logs import (
+from dano.identification.logs import (
     in_metres,
     LENGTH_UNITS,
     mended_times,
@@ -29,7 +29,7 @@ from dano.identify.logs import (
     TIME_UNITS,
     understood,
 )
-from dano.identify.motions._motion import Motion, QUANTITIES, UNNAMED
+from dano.identification.motions._motion import Motion, QUANTITIES, UNNAMED
 
 _SYNONYMS = {
     "times": ("times", "time", "t", "timestamp"),

@@ -12,6 +12,11 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_choice, checked_function, checked_text
 from dano.maths import checked_numbers, Numbers
+from dano.names import did_you_mean
+from dano.scene import Scene
+
+_OF_BODIES = ("mass_scale", "com_offset", "inertia", "mass", "com")
+"""Properties of bodies that a parameter may be written as."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -72,6 +77,52 @@ class Parameter:
         start = checked_numbers("start", self.start)
         if start.shape == lower.shape == upper.shape and not np.all((lower <= start) & (start <= upper)):
             raise ValueError(f"start {what} must lie between {self.lower} and {self.upper}, got {self.start}")
+
+
+def parameter_of(text: str, scene: Scene) -> Parameter:
+    """A parameter from PATH:LOWER:UPPER[:START], PATH being BODY.PROPERTY or BODY,BODY.PROPERTY.
+
+    Args:
+        text: Such as "soap,table.sliding_friction:0:1" or "soap.mass_scale:0.2:5:1".
+        scene: That it is of.
+
+    Raises:
+        ValueError: If the text is not of that form or names nothing in the scene.
+    """
+    checked_text("parameter", text)
+    form = "BODY.PROPERTY:LOWER:UPPER[:START] or BODY,BODY.PROPERTY:LOWER:UPPER[:START]"
+    path, *numbers = text.split(":")
+    owner, _, name = path.rpartition(".")
+    try:
+        bounds = [float(number) for number in numbers]
+    except ValueError as error:
+        raise ValueError(f"parameter must be written {form}, got {text!r}") from error
+    if not owner or len(bounds) not in (0, 2, 3):
+        raise ValueError(f"parameter must be written {form}, got {text!r}")
+    lower, upper = bounds[:2] or (-np.inf, np.inf)
+    start = bounds[2] if len(bounds) == 3 else None
+    bodies = [body.name for body in scene.bodies]
+    for body in map(str.strip, owner.split(",")):
+        if body not in bodies:
+            raise ValueError(
+                f"parameter {text!r} must name bodies of the scene {bodies}, got {body!r}"
+                + did_you_mean(body, bodies)
+            )
+    if "," in owner:
+        a, b = (part.strip() for part in owner.split(",", 1))
+        place = scene.contact_index(a, b)
+        valid = scene.contacts[place].law.reads
+        where = lambda s: getattr(s.contacts[place].params, name)  # noqa: E731
+    else:
+        valid = _OF_BODIES
+        place = scene.index(owner)
+        where = lambda s: getattr(s.bodies[place], name)  # noqa: E731
+    if name not in valid:
+        raise ValueError(
+            f"property in parameter {text!r} must be one of {', '.join(valid)}, got {name!r}"
+            + did_you_mean(name, valid)
+        )
+    return Parameter(path, where, lower, upper, start=start)
 
 
 class Selection(NamedTuple):
@@ -296,6 +347,23 @@ def values_at(
         values[selection.name] = float(value) if value.shape == () else value
         errors[selection.name] = float(error) if error.shape == () else error
     return values, errors
+
+
+def masses_of(
+    selections: Sequence[Selection], scene: Scene, values: dict[str, Any], errors: dict[str, Any]
+) -> dict[str, tuple[float, float]]:
+    """Mass [kg] and its standard error of the bodies whose `mass_scale` is a parameter, by name."""
+    tree = jax.tree.structure(scene)
+    numbered = jax.tree.unflatten(tree, range(tree.num_leaves))
+    found = {}
+    for selection in selections:
+        if not isinstance(selection.put, _Leaves) or selection.of != "scene":
+            continue
+        for body, place in zip(scene.bodies, numbered.bodies, strict=True):
+            if place.mass_scale in selection.put.places:
+                scale, error = values[selection.name], errors[selection.name]
+                found[body.name] = float(body.mass) * scale, float(body.mass) * error
+    return found
 
 
 def _inertia(x: Float[Array, "6"]) -> Float[Array, "3 3"]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from dano.identify.motions import Motion
+from dano.identification.motions import Motion
 from dano.maths import quat_to_matrix
 from dano.scene import Scene, State
 

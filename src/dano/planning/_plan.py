@@ -24,12 +24,12 @@ from dano.checks import (
 from dano.engine import AbstractEngine, checked_engine, compiler_options, simulate
 from dano.gradients import Check, check
 from dano.maths import checked_array
-from dano.plan._exploring import explored, to_touch
-from dano.plan._options import PlanOptions
-from dano.plan._problem import problem_of, Scales, VIOLATION
-from dano.plan._sampling import costs, rated, sampled
-from dano.plan._softening import gradual, softened
-from dano.plan._task import Limit, Task
+from dano.planning._exploring import explored, to_touch
+from dano.planning._options import PlanOptions
+from dano.planning._problem import problem_of, Scales, VIOLATION
+from dano.planning._sampling import costs, rated, sampled
+from dano.planning._softening import gradual, softened
+from dano.planning._task import Limit, Task
 from dano.scene import Control, Scene, State, state_arrays, Trajectory
 from dano.solvers import (
     optimal_trajectory,

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dano.identify._parameters import Selection, Space, with_values
+from dano.identification._parameters import Selection, Space, with_values
 from dano.scene import Scene
 from dano.solvers import eliminated, NormalEquations
 

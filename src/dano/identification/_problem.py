@@ -11,15 +11,15 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.engine import device_mesh
-from dano.identify._chains import by_owner, chained, unchained
-from dano.identify._checkpoint import Checkpoint
-from dano.identify._planes import Smoothing
-from dano.identify._residuals import Linearized, linearized, losses, Model, moved, shifted, Start
-from dano.identify._result import Identification
-from dano.identify._settings import Setup
-from dano.identify._settling import settled
-from dano.identify._windows import draw_velocities, plan_windows
-from dano.identify.motions import Motion, QUANTITIES
+from dano.identification._chains import by_owner, chained, unchained
+from dano.identification._checkpoint import Checkpoint
+from dano.identification._planes import Smoothing
+from dano.identification._residuals import Linearized, linearized, losses, Model, moved, shifted, Start
+from dano.identification._result import Identification
+from dano.identification._settings import Setup
+from dano.identification._settling import settled
+from dano.identification._windows import draw_velocities, plan_windows
+from dano.identification.motions import Motion, QUANTITIES
 from dano.scene import Control, Scene, State
 from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
 

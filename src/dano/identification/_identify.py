@@ -13,17 +13,24 @@ import numpy as np
 
 from dano.checks import checked_function, checked_items, checked_kind, checked_optional
 from dano.engine import AbstractEngine, checked_engine, Policy
-from dano.identify._checkpoint import Checkpoint, digest_of
-from dano.identify._parameters import Parameter, space_of, values_at, with_values
-from dano.identify._problem import Problem
-from dano.identify._residuals import Linearized, shifted, Smoothing
-from dano.identify._result import Errors, Identification, Minimum
-from dano.identify._scales import check_scales
-from dano.identify._settings import deviations, estimated, IdentifyOptions, Setup
-from dano.identify._settling import ripple_covariance, worth_of
-from dano.identify._uncertainty import uncertainty
-from dano.identify._windows import Plan
-from dano.identify.motions import joint_table, load_motion, Motion, QUANTITIES
+from dano.identification._checkpoint import Checkpoint, digest_of
+from dano.identification._parameters import (
+    masses_of,
+    Parameter,
+    parameter_of,
+    space_of,
+    values_at,
+    with_values,
+)
+from dano.identification._problem import Problem
+from dano.identification._residuals import Linearized, shifted, Smoothing
+from dano.identification._result import Errors, Identification, Minimum
+from dano.identification._scales import check_scales
+from dano.identification._settings import deviations, estimated, IdentifyOptions, Setup
+from dano.identification._settling import ripple_covariance, worth_of
+from dano.identification._uncertainty import uncertainty
+from dano.identification._windows import Plan
+from dano.identification.motions import joint_table, load_motion, Motion, QUANTITIES
 from dano.maths import quat_conjugate, quat_log, quat_multiply
 from dano.scene import Control, Scene, State, Trajectory
 from dano.solvers import Solution, Stop
@@ -34,7 +41,7 @@ Observed = Motion | Trajectory | str | os.PathLike
 def identify(
     scene: Scene,
     observed: Observed | Sequence[Any],
-    parameters: Sequence[Parameter],
+    parameters: Sequence[Parameter | str],
     *,
     held_out: Observed | Sequence[Any] = (),
     state: State | Sequence[State | None] | None = None,
@@ -55,7 +62,8 @@ def identify(
         scene: The scene, with values for whatever is not a parameter.
         observed: One motion or several, of any bodies, or their files (see `load_motion`). Each begins at its
             own first complete frame. One that names no body is of the only one that moves.
-        parameters: What is unknown.
+        parameters: What is unknown; also as on the command line, "soap,table.sliding_friction:0:1" or
+            "soap.mass_scale:0.2:5".
         held_out: Motions that are not fitted, to measure the error on.
         state: Of bodies that a motion does not hold; one for all motions or one for each. Default for
             the orientation of the only body that moves: as in `Scene.initial_state`, which is said.
@@ -82,7 +90,7 @@ def identify(
     motions = _motions("observed", observed, scene, least=1)
     state = _started_in(scene, motions) if state is None else state
     chosen = estimated(initial, motions)
-    space = space_of(scene, controls, _started(parameters, after))
+    space = space_of(scene, controls, _started(scene, parameters, after))
     if options.gaps and len(chosen) < len(QUANTITIES):
         raise ValueError(f"options.continuity needs initial='states', got initial {list(chosen)}")
     sigmas = deviations(scene, motions, noise)
@@ -130,8 +138,12 @@ def _kept(setup: Setup, motions: tuple[Motion, ...], state: Any, after: Identifi
     return kept
 
 
-def _started(parameters: Sequence[Parameter], after: Identification | None) -> list[Parameter]:
+def _started(
+    scene: Scene, parameters: Sequence[Parameter | str], after: Identification | None
+) -> list[Parameter]:
     """The parameters, with the values of an earlier fit as starts."""
+    if isinstance(parameters, (list, tuple)):
+        parameters = [parameter_of(p, scene) if isinstance(p, str) else p for p in parameters]
     parameters = checked_items("parameters", parameters, Parameter)
     values = {} if after is None else after.values
     return [dataclasses.replace(each, start=values.get(each.name, each.start)) for each in parameters]
@@ -253,6 +265,7 @@ def _identification(
         worth=worth,
         freedom=sure.freedom,
         evaluations=problem.evaluations,
+        masses=masses_of(space.selections, scene, values, errors),
         seconds=time.perf_counter() - began,
     )
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.identify._tracked import add_told, common_of, pose_deviations, told_of, whitening_of
-from dano.identify.motions import (
+from dano.identification._tracked import add_told, common_of, pose_deviations, told_of, whitening_of
+from dano.identification.motions import (
     JOINT_NUMBERS,
     joint_numbers,
     joint_widths,

@@ -1,6 +1,6 @@
 """Observed motions of bodies, and their files."""
 
-from dano.identify.motions._motion import (
+from dano.identification.motions._motion import (
     JOINT_NUMBERS as JOINT_NUMBERS,
     joint_numbers as joint_numbers,
     joint_table as joint_table,
@@ -11,4 +11,4 @@ from dano.identify.motions._motion import (
     SMOOTHING_FRAMES as SMOOTHING_FRAMES,
     UNNAMED as UNNAMED,
 )
-from dano.identify.motions._motion_files import load_motion as load_motion, save_motion as save_motion
+from dano.identification.motions._motion_files import load_motion as load_motion, save_motion as save_motion

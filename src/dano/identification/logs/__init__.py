@@ -1,7 +1,7 @@
 """Logs as they are recorded: tables of text, what their columns mean, and what has to be corrected."""
 
-from dano.identify.logs._columns import Columns as Columns, understood as understood
-from dano.identify.logs._mending import (
+from dano.identification.logs._columns import Columns as Columns, understood as understood
+from dano.identification.logs._mending import (
     in_metres as in_metres,
     LENGTH_UNITS as LENGTH_UNITS,
     mended_times as mended_times,
@@ -9,4 +9,4 @@ from dano.identify.logs._mending import (
     TIME_UNITS as TIME_UNITS,
     unwrapped as unwrapped,
 )
-from dano.identify.logs._table import read_table as read_table, Table as Table
+from dano.identification.logs._table import read_table as read_table, Table as Table

@@ -17,8 +17,8 @@ from dano.checks import (
     shown,
 )
 from dano.engine import AbstractEngine
-from dano.identify._parameters import Space
-from dano.identify.motions import Motion, QUANTITIES
+from dano.identification._parameters import Space
+from dano.identification.motions import Motion, QUANTITIES
 from dano.maths import checked_numbers
 from dano.scene import Scene
 

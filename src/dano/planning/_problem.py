@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dano.engine import AbstractEngine, difference, retract
-from dano.plan._task import Goal, Limit, Task
+from dano.planning._task import Goal, Limit, Task
 from dano.scene import Scene, State
 from dano.solvers import TrajectoryConstraint, TrajectoryProblem
 

@@ -19,9 +19,9 @@ from jaxtyping import Array, Float
 
 from dano.engine import AbstractEngine, contact_history
 from dano.maths import safe_norm
-from dano.plan._problem import VIOLATION
-from dano.plan._sampling import drawn_around, program_of, straight_lines
-from dano.plan._task import Goal, Task
+from dano.planning._problem import VIOLATION
+from dano.planning._sampling import drawn_around, program_of, straight_lines
+from dano.planning._task import Goal, Task
 from dano.scene import Scene, State
 from dano.solvers import TrajectoryProblem
 

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.checks import checked_choice, checked_count, checked_items, checked_kind, checked_number, shown
-from dano.identify.logs import unwrapped
-from dano.identify.motions._slopes import slope, slope_deviation
+from dano.identification.logs import unwrapped
+from dano.identification.motions._slopes import slope, slope_deviation
 from dano.maths import (
     checked_floating,
     checked_numbers,

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.gradients import Check
-from dano.identify._uncertainty import quantile
-from dano.identify.motions import Motion
-from dano.notebook import card, curves, numbers
+from dano.identification._uncertainty import quantile
+from dano.identification.motions import Motion
+from dano.notebook import card, curves, numbers, plain
 from dano.scene import Scene, State, state_arrays
 from dano.solvers import Stop
 
@@ -70,6 +70,7 @@ class Identification:
         freedom: Observed numbers less estimated ones.
         evaluations: How often all windows were simulated, with derivatives.
         seconds: Time it took [s], compilation included.
+        masses: Mass [kg] and its standard error of bodies whose `mass_scale` was found, by name.
     """
 
     values: dict[str, Any]
@@ -94,18 +95,30 @@ class Identification:
     freedom: int
     evaluations: int
     seconds: float
+    masses: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+
+    def __str__(self) -> str:
+        """What notebooks show, as text."""
+        return plain("Identification", self._summary())
 
     def _repr_html_(self) -> str:
         """What notebooks show: values with errors beside the loss."""
+        rows = self._summary()
+        loss = np.log10(np.maximum(np.asarray(self.loss_history, np.float64), 1e-300))
+        steps = np.arange(len(loss), dtype=np.float64)
+        return card("Identification", rows, curves(steps, {"loss": loss}, "log₁₀ of the loss"))
+
+    def _summary(self) -> list[tuple[str, str]]:
+        """Values with errors, and how the search ended."""
         rows = [
             (name, f"{numbers(np.ravel(value))} ± {numbers(np.ravel(self.standard_errors[name]))}")
             for name, value in self.values.items()
         ]
+        rows += [
+            (f"mass of {body} [kg]", f"{m:.4g} ± {error:.2g}") for body, (m, error) in self.masses.items()
+        ]
         rows += [("worth of derivatives", self.worth.summary)] if self.worth is not None else []
-        rows += [("stopped", str(self.stop)), *(("", message) for message in self.messages)]
-        loss = np.log10(np.maximum(np.asarray(self.loss_history, np.float64), 1e-300))
-        steps = np.arange(len(loss), dtype=np.float64)
-        return card("Identification", rows, curves(steps, {"loss": loss}, "log₁₀ of the loss"))
+        return [*rows, ("stopped", self.stop.value), *(("", message) for message in self.messages)]
 
     @property
     def converged(self) -> bool:
@@ -131,6 +144,7 @@ class Identification:
         return {
             "values": _plain(self.values),
             "standard_errors": _plain(self.standard_errors),
+            "masses": {body: _plain(list(both)) for body, both in self.masses.items()},
             "intervals_95": {name: _plain(list(self.interval(name))) for name in self.values},
             "stop": self.stop.value,
             "converged": self.converged,

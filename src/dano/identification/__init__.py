@@ -1,0 +1,12 @@
+"""Identification: from observed motions to the parameters of a scene, with error bars."""
+
+from dano.identification._identify import identify as identify
+from dano.identification._parameters import Parameter as Parameter, parameter_of as parameter_of
+from dano.identification._result import Errors as Errors, Identification as Identification, Minimum as Minimum
+from dano.identification._settings import IdentifyOptions as IdentifyOptions
+from dano.identification.motions import (
+    load_motion as load_motion,
+    Motion as Motion,
+    motion_of_joints as motion_of_joints,
+    save_motion as save_motion,
+)
