@@ -41,7 +41,7 @@ def _bytes(text: str) -> int:
     """A size in words, as 500MB or 2 GB, in bytes.
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If it is not a size.
     """
     word = text.strip().upper().replace("IB", "B")
     unit = next((unit for unit in sorted(_UNITS, key=len, reverse=True) if word.endswith(unit)), "")

@@ -139,7 +139,7 @@ def _of_joints(scene: Scene) -> Iterator[_Numbers]:
 def marked(
     holds: Bool[Array, ""], state: State, controls: Control | None, states: State, report: Report
 ) -> tuple[State, Report]:
-    """States and reports of steps, marked from the first on that depends on what is no number.
+    """States and reports of steps, marked from the first on that depends on what is not finite.
 
     Args:
         holds: `sound` of the scene.

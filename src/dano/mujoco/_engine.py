@@ -173,7 +173,7 @@ class MuJoCoEngine(AbstractEngine):
         bad = ~jnp.all(jnp.isfinite(out))
         passes = jax.lax.stop_gradient(passes[0]).astype(int)
         report = Report(jnp.where(bad, jnp.inf, 0).astype(dtype), passes, ~bad)
-        # What is no number MuJoCo takes as a reason to begin anew.
+        # MuJoCo begins anew where a number is not finite.
         one = jax.tree.map(lambda x: x[None], (control, after, report))
         return jax.tree.map(lambda x: x[0], marked(prepared.sound, state, *one))
 

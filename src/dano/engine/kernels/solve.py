@@ -386,7 +386,7 @@ def solve_island(
             enough = wp.max(tolerance, _SOFT_TOLERANCE * _STICTION * level.softness)
         small = seen.error <= enough
         if found.passes == 0 and not (seen.error < INFINITY):
-            # What is no number at the velocities that a solve begins with is none anywhere.
+            # What is not finite at the velocities that a solve begins with is not finite anywhere.
             number = _LEVELS
         accept = small or not level.searches or accepts(search, seen.work)
         # Where rounding keeps duals from fitting, a second small residual has to do.
