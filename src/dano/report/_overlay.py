@@ -1,5 +1,7 @@
 """Contact points and forces drawn over pictures."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import UInt8
 

@@ -1,7 +1,7 @@
 """From simulation times to picture times."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dano.checks import checked_number
 from dano.maths import quat_slerp
