@@ -115,6 +115,24 @@ def test_a_film_shows_what_an_object_has_learned_to_look_like(cube, tmp_path):
         render_trajectory(loaded.scene, run, None, strip=tmp_path / "no.png", looks={"nobody": field})
 
 
+def test_draft(run: Run, tmp_path):
+    """Half the size, fewer frames, and no shadow that a film has."""
+    path, strips = tmp_path / "run.mp4", []
+    for draft in (True, False):
+        options = VideoOptions(fps=30, size=SIZE, camera="fixed", contact_points=False, clock=False, draft=draft)
+        strips.append(tmp_path / f"{draft}.png")
+        render_trajectory(*run, path if draft else None, strip=strips[-1], options=options)
+    with av.open(path) as container:
+        stream = container.streams.video[0]
+        assert (stream.width, stream.height) == (SIZE[0] // 2, SIZE[1] // 2)
+        assert stream.average_rate == 15
+        count = sum(1 for _ in container.decode(stream))
+    assert count == len(frame_times(run[1], 15, 1.0))
+    quick, whole = (np.asarray(Image.open(strip)).astype(float) for strip in strips)
+    # The last moment, at rest: the floor beside the body is darker in its shadow only.
+    assert np.percentile(quick[..., 0], 5) > np.percentile(whole[..., 0], 5)
+
+
 def test_video_has_every_frame_and_moves(run: Run, tmp_path):
     path, strip, told = tmp_path / "run.mp4", tmp_path / "run.png", []
     render_trajectory(

@@ -283,9 +283,9 @@ class Simulate:
         steps: Number of steps; default: the scene's.
         timestep: Timestep [s]; default: the scene's.
         camera: fixed: sees all bodies all the time; follow: shifts with those that move; auto: follows if
-            bodies would otherwise fill less than a third of the height; scene: the one that the (first) scene
-            file names, whose size pictures have.
+            bodies would otherwise fill less than a third of the height; scene: the scene file's, in its size.
         size: Width and height of pictures [pixels], even numbers.
+        draft: Draw quickly: half the size, at most 15 frames per second, no shadows, rough edges.
         slow_motion: Video seconds per simulated second.
         resume: Go on with a run that was interrupted or killed; the result is the same to the last bit.
         json: Print one JSON object instead of text.
@@ -300,6 +300,7 @@ class Simulate:
     timestep: float | None = None
     camera: Literal["auto", "fixed", "follow", "scene"] = "auto"
     size: tuple[int, int] = (640, 400)
+    draft: bool = False
     slow_motion: float = 1.0
     resume: bool = False
     json: bool = False
@@ -380,8 +381,7 @@ class Export:
     Attributes:
         object: A neural object (.dano), a shipped one (bunny, …), or a mesh or field.
         output: The folder; new, empty, or of an earlier export, which is replaced.
-        to: Formats, one or several: mjcf (MuJoCo), urdf (PyBullet, ROS), usd (Isaac, Newton), obj (meshes
-            only).
+        to: Formats: mjcf (MuJoCo), urdf (PyBullet, ROS), usd (Isaac, Newton), obj (meshes only).
         name: Of the body and the files; default: the object's file's.
         collision: coacd: convex decomposition; hull: convex hull; auto: the first if coacd is installed.
         concavity: How deep a convex piece may cut across, as a share of the size.
@@ -484,11 +484,13 @@ class Demo:
         name: drop: a bunny, a bar of soap and a ball fall. collision: a ball hits two bunnies. all: both.
             soap: from photographs and a film of a bar of soap to its friction, in some minutes.
         output: Folder for everything that is written.
+        draft: As of `dano simulate`.
         json: Print one JSON object instead of text.
     """
 
     name: Positional[Literal["all", "drop", "collision", "soap"]] = "drop"
     output: Output = Path("dano-demo")
+    draft: bool = False
     json: bool = False
 
     def __call__(self) -> None:

@@ -233,7 +233,7 @@ def demo(command: Demo) -> None:
     if missing:
         say(f"warning: numbers only, {missing}")
     reports: dict[str, dict[str, Any]] = {}
-    with _Artist(draws=missing is None, tell=tell) as artist:
+    with _Artist(draws=missing is None, draft=command.draft, tell=tell) as artist:
         for scene in SCENES if command.name == "all" else (command.name,):
             reports[scene] = _demo_scene(scene, folder, artist, tell)
             if not command.json:
@@ -296,8 +296,8 @@ def _demo_scene(name: str, folder: Path, artist: "_Artist", tell: Callable[[str]
 class _Artist:
     """Makes the pictures of the demo in a second thread, while the next scene is simulated in the first."""
 
-    def __init__(self, *, draws: bool, tell: Callable[[str], None]):
-        self._draws, self._say = draws, tell
+    def __init__(self, *, draws: bool, draft: bool, tell: Callable[[str], None]):
+        self._draws, self._draft, self._say = draws, draft, tell
         self._thread = ThreadPoolExecutor(1, "dano artist")
         self._progress = Progress()
         self._orders: list[Future[None]] = []
@@ -339,7 +339,7 @@ class _Artist:
             video,
             strip=strip,
             looks=loaded.looks(),
-            options=VideoOptions(fps=DEMO_FPS, size=DEMO_SIZE),
+            options=VideoOptions(fps=DEMO_FPS, size=DEMO_SIZE, draft=self._draft),
             progress=self._tell,
         )
         self._order(order, video)
@@ -413,6 +413,7 @@ def _draw(loaded: list[scene_file.SceneFile], trajectories: list[Trajectory], co
     progress = Progress()
     film = VideoOptions(
         size=command.size,
+        draft=command.draft,
         slow_motion=command.slow_motion,
         camera=loaded[0].camera() if command.camera == "scene" else command.camera,
     )

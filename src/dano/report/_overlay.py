@@ -1,5 +1,7 @@
 """Contact points and forces drawn over pictures."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import UInt8
 
@@ -132,3 +134,21 @@ def _arrow(draw, tail: np.ndarray, head: np.ndarray, scale: float) -> None:
     draw.polygon(
         [tuple(head), tuple(neck + 0.45 * tip * across), tuple(neck - 0.45 * tip * across)], fill=255
     )
+
+
+def side_by_side(images: Sequence[np.ndarray], per_row: int | None = None) -> np.ndarray:
+    """Pictures from left to right with a thin white line between them; default: three a row."""
+    per_row = per_row or (3 if len(images) > 3 else len(images))
+    height, width, _ = images[0].shape
+    n_rows = -(-len(images) // per_row)
+    gap = _gap(height)
+    sheet = np.full((n_rows * (height + gap) - gap, per_row * (width + gap) - gap, 3), 255, dtype=np.uint8)
+    for i, image in enumerate(images):
+        top, left = (i // per_row) * (height + gap), (i % per_row) * (width + gap)
+        sheet[top : top + height, left : left + width] = image
+    return sheet
+
+
+def _gap(height: int) -> int:
+    """Pixels between pictures: an even number, as codecs want the whole to be."""
+    return 2 * max(1, height // 200)

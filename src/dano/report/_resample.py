@@ -1,7 +1,7 @@
 """From simulation times to picture times."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dano.checks import checked_number
 from dano.maths import quat_slerp
@@ -63,3 +63,12 @@ def poses_at(
     share = np.clip((times - known[first]) / (known[first + 1] - known[first]), 0, 1)[:, None, None]
     moved = (1 - share) * position[first] + share * position[first + 1]
     return moved, quat_slerp(orientation[first], orientation[first + 1], share[..., 0])
+
+
+def moments_of(position: Float[np.ndarray, "frames bodies 3"], n: int) -> Int[np.ndarray, " moments"]:
+    """Frames from the first to the last, closer together where much moves."""
+    travel = np.linalg.norm(np.diff(position, axis=0), axis=-1).sum(axis=1)
+    # A third of the way is time: a strip should say where everything rests, but not in half of its pictures.
+    pace = travel / max(float(travel.sum()) / max(len(travel), 1), 1e-12) + 0.5
+    way = np.concatenate([[0.0], np.cumsum(pace)])
+    return np.unique(np.interp(np.linspace(0, way[-1], n), way, np.arange(len(way))).round().astype(int))

@@ -3,7 +3,7 @@
 import contextlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,8 +24,8 @@ from dano.extras import optional
 from dano.names import did_you_mean
 from dano.progress import Progress
 from dano.report._framing import CAMERAS, cameras_for, Seen, seen_of, together
-from dano.report._overlay import draw_clock, draw_label, draw_touches
-from dano.report._resample import frame_times, poses_at
+from dano.report._overlay import draw_clock, draw_label, draw_touches, side_by_side
+from dano.report._resample import frame_times, moments_of, poses_at
 from dano.report._stage import check_run, Stage, stage, Touches, touches
 from dano.scene import Scene, State, Trajectory
 from dano.vision import AbstractCamera, Item, LearnedField, prepare, render
@@ -34,6 +34,8 @@ MOST_PIXELS = 8192
 """Longest side of a film: what common decoders of H.264 can show."""
 _MOST_OF_HALF = MOST_PIXELS // 2 - 40
 """The same of one of two pictures with a line between them."""
+_DRAFT_FPS = 15
+"""Most frames per second of a draft (convention)."""
 _STRIP_MOMENTS = 6
 """Moments in a picture strip: two rows of three (convention)."""
 _ROW_MOMENTS = 4
@@ -57,6 +59,7 @@ class VideoOptions:
         clock: Whether to draw the time, and a bar that says how long things are in the middle of the motion.
         colours: "#rrggbb" by body name, for those that shall have a certain one, whatever they have learned
             to look like; None for none.
+        draft: Whether to draw quickly: half the size, at most 15 frames per second, no shadows, rough edges.
     """
 
     fps: int = 30
@@ -66,6 +69,7 @@ class VideoOptions:
     contact_points: bool = True
     clock: bool = True
     colours: Mapping[str, str] | None = None
+    draft: bool = False
 
     def __post_init__(self) -> None:
         """Check what can be checked without a scene.
@@ -86,6 +90,13 @@ class VideoOptions:
     def pixels(self) -> tuple[int, int]:
         """Width and height of pictures: those of the camera, if there is one."""
         return self.size if isinstance(self.camera, str) else (self.camera.width, self.camera.height)
+
+    def drafted(self) -> "VideoOptions":
+        """The options with the size and the frames of a draft, if it is one."""
+        if not self.draft:
+            return self
+        half = tuple(max(16, n // 4 * 2) for n in self.size)
+        return replace(self, size=half, fps=min(self.fps, _DRAFT_FPS))
 
 
 class Take(NamedTuple):
@@ -271,12 +282,12 @@ def _two(name: str, values: Any, *kinds: type) -> tuple[Any, ...]:
 
 
 def checked_video(options: VideoOptions | None, usual: VideoOptions | None = None) -> VideoOptions:
-    """`options`, or the usual ones in place of None.
+    """`options`, or the usual ones in place of None; of a draft with its size.
 
     Raises:
         ValueError: If they are something else.
     """
-    return checked_optional("options", options, VideoOptions) or usual or VideoOptions()
+    return (checked_optional("options", options, VideoOptions) or usual or VideoOptions()).drafted()
 
 
 def checked_size(size: Sequence[int], count: int = 1, name: str = "size") -> tuple[int, int]:
@@ -374,24 +385,25 @@ def film(
     moments = moments_of(position, _STRIP_MOMENTS if len(takes) == 1 else _ROW_MOMENTS)
 
     def pictures(frame: int) -> list[np.ndarray]:
-        return [_picture(take, cameras[frame], frame, arrow, options.clock) for take in takes]
+        return [_picture(take, cameras[frame], frame, arrow, options) for take in takes]
 
     _write(pictures, count, moments, outputs, options.fps, progress)
 
 
 def _picture(
-    take: Take, camera: AbstractCamera, frame: int, arrow: float, clock: bool
+    take: Take, camera: AbstractCamera, frame: int, arrow: float, options: VideoOptions
 ) -> UInt8[np.ndarray, "height width 3"]:
     """A frame of a run; `arrow`: length [m] of a usual force."""
     drawn, position = take.drawn, take.position[frame]
     items = drawn.posed(position, take.orientation[frame])
-    image = render(items, camera, floor=False)
+    whole = not options.draft
+    image = render(items, camera, floor=False, antialias=whole, shadows=whole)
     if take.ghosts:
-        both = render([*items, *take.ghosts], camera, floor=False)
+        both = render([*items, *take.ghosts], camera, floor=False, antialias=whole, shadows=whole)
         image = np.round((1 - _GHOST) * image + _GHOST * both.astype(float)).astype(np.uint8)
     if take.touched is not None:
         image = draw_touches(image, camera, take.touched, frame, arrow)
-    if clock:
+    if options.clock:
         bounded = [row for row, item in zip(drawn.rows, drawn.items, strict=True) if item.plane is None]
         middle = position[bounded or drawn.rows].mean(axis=0)
         distance = max(float((middle - camera.position) @ camera.axes[2]), 1e-3)
@@ -457,33 +469,6 @@ def encoder(file: Any, fps: int, width: int, height: int) -> Iterator[Callable[[
         yield add
         for packet in stream.encode():
             container.mux(packet)
-
-
-def moments_of(position: Float[np.ndarray, "frames bodies 3"], n: int) -> Int[np.ndarray, " moments"]:
-    """Frames from the first to the last, closer together where much moves."""
-    travel = np.linalg.norm(np.diff(position, axis=0), axis=-1).sum(axis=1)
-    # A third of the way is time: a strip should say where everything rests, but not in half of its pictures.
-    pace = travel / max(float(travel.sum()) / max(len(travel), 1), 1e-12) + 0.5
-    way = np.concatenate([[0.0], np.cumsum(pace)])
-    return np.unique(np.interp(np.linspace(0, way[-1], n), way, np.arange(len(way))).round().astype(int))
-
-
-def side_by_side(images: Sequence[np.ndarray], per_row: int | None = None) -> np.ndarray:
-    """Pictures from left to right with a thin white line between them; default: three a row."""
-    per_row = per_row or (3 if len(images) > 3 else len(images))
-    height, width, _ = images[0].shape
-    n_rows = -(-len(images) // per_row)
-    gap = _gap(height)
-    sheet = np.full((n_rows * (height + gap) - gap, per_row * (width + gap) - gap, 3), 255, dtype=np.uint8)
-    for i, image in enumerate(images):
-        top, left = (i // per_row) * (height + gap), (i % per_row) * (width + gap)
-        sheet[top : top + height, left : left + width] = image
-    return sheet
-
-
-def _gap(height: int) -> int:
-    """Pixels between pictures: an even number, as codecs want the whole to be."""
-    return 2 * max(1, height // 200)
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:

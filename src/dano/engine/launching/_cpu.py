@@ -14,7 +14,6 @@ from dano.native import Kernel, Launch, n_cores, together
 
 # Arrays that worlds work in begin where a line of a cache does [bytes].
 _ALIGNED = 64
-_numbers = iter(range(10**12))
 # Launchers that are kept, each with the room that its worlds work in.
 _MOST = 256
 
@@ -50,7 +49,7 @@ def _launcher(plan: Plan, batched: tuple[bool, ...], n_worlds: int, dtype: np.dt
 @functools.cache
 def _target(plan: Plan, batched: tuple[bool, ...], n_worlds: int, dtype: np.dtype) -> str:
     """Name for `jax.ffi.ffi_call` of such launches."""
-    name = f"dano_{plan.kernel}_{next(_numbers)}"
+    name = plan.named(batched, n_worlds, dtype.name)
     register(name, _launcher(plan, batched, n_worlds, dtype), "cpu")
     return name
 

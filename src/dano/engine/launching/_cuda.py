@@ -32,7 +32,6 @@ _OF_POINTS = tuple(
 _MORE_POINTS = 16
 # Boundary of each array in the room [bytes].
 _ALIGNED = 16
-_numbers = iter(range(10**12))
 
 
 def call(
@@ -85,7 +84,7 @@ def _layout(plan: Plan, build: Build) -> tuple[dict[str, tuple[int, int, int]], 
 @functools.cache
 def _target(plan: Plan, batched: tuple[bool, ...], n_worlds: int, build: Build, platform: str) -> str:
     """Name for `jax.ffi.ffi_call` of launches of so many worlds."""
-    name = f"dano_{plan.kernel}_{platform}_{next(_numbers)}"
+    name = f"{plan.named(batched, n_worlds, build)}_{platform}"
     for device in _devices(platform):
         # Within a call it would be too late: XLA may be recording.
         plan.compile(build, device)

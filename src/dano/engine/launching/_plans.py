@@ -1,5 +1,6 @@
 """Launches but for their real numbers: which kernel, what it reads and writes, and where."""
 
+import hashlib
 import threading
 from typing import Any, NamedTuple
 
@@ -64,6 +65,17 @@ class Plan:
         self.inputs, self.outputs, self.whole, self.room, self.numbers = inputs, outputs, whole, room, numbers
         self._compiled: set[tuple[Build, str]] = set()
         self._layouts: dict[Build, Layout] = {}
+
+    def named(self, *more: Any) -> str:
+        """A name of launches for XLA, the same in each process, so that it finds what it compiled before.
+
+        Args:
+            *more: What else tells them from others.
+        """
+        told = [self.module, self.features.values, self.inputs, self.outputs, self.room, self.numbers, *more]
+        whole = {name: (values.shape, values.tobytes()) for name, values in self.whole.items()}
+        digest = hashlib.sha256(repr((told, whole)).encode()).hexdigest()[:24]
+        return f"dano_{self.kernel}_{digest}"
 
     @property
     def gradients(self) -> dict[str, str]:

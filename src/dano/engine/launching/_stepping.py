@@ -78,7 +78,7 @@ def _read(found: dict[str, AnyArray], state: State, n_steps: int) -> tuple[dict[
     return moved, (residual, passes.astype(int), (solved > 0) & (overflow == 0), overflow > 0)
 
 
-def given(state: State, controls: Control | None, dtype) -> dict[str, Array]:
+def given(state: State, controls: Control | None, dtype) -> dict[str, Any]:
     """What a launch is given besides a scene: arrays by place."""
     return _given(state, controls, np.zeros((0, _PUSH), dtype))
 

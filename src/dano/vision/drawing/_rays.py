@@ -103,7 +103,8 @@ class Tracer:
         view.things = wp.array(rows, dtype=module.Thing, device="cpu")
         view.planes = wp.array(np.array(planes, np.float32).reshape(-1, 4), dtype=wp.vec4f, device="cpu")
         for name, value in {"origin": origin, **numbers}.items():
-            setattr(view, name, wp.vec3f(*map(float, value)) if np.ndim(value) else float(value))
+            number = int(value) if isinstance(value, bool) else float(value) if np.ndim(value) == 0 else None
+            setattr(view, name, wp.vec3f(*map(float, value)) if number is None else number)
         self._view = view
 
     @staticmethod

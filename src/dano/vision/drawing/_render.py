@@ -46,6 +46,7 @@ class _View:
         camera: AbstractCamera,
         surroundings: Surroundings,
         floor: bool | int | float,
+        shadows: bool,
     ):
         self.origin = camera.position.astype(np.float32)
         self.surroundings = surroundings
@@ -73,6 +74,7 @@ class _View:
             pixel=surroundings.pixel,
             focus=surroundings.focus,
             far=surroundings.fade_end,
+            shaded=shadows,
             floor_reach=0.5 * float(np.median(self.radii)) if len(self.radii) else 1.0,
         )
         painted = [item.colour for item in self.solids + self.media]
@@ -105,6 +107,7 @@ def render(
     light: Numbers | None = None,
     background: str | Numbers | None = None,
     antialias: bool = True,
+    shadows: bool = True,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Draw a picture.
 
@@ -115,6 +118,7 @@ def render(
         light: Direction towards the lamp [W]; default: over the viewer's left shoulder.
         background: sRGB of the horizon, "#rrggbb" or three numbers in [0, 1]; default: a light grey.
         antialias: Whether to smooth edges.
+        shadows: Whether solids take light from what is near; most of a picture's time.
 
     Returns:
         sRGB image, shape (height, width, 3).
@@ -124,7 +128,8 @@ def render(
     """
     items = checked_items("items", items, Item)
     checked_kind("camera", camera, AbstractCamera)
-    view = _View(items, camera, _surroundings(camera, _focus(camera, items), light, background), floor)
+    surroundings = _surroundings(camera, _focus(camera, items), light, background)
+    view = _View(items, camera, surroundings, floor, shadows)
     order, directions = _rays_of(camera)
     drawn, touched = _drawn(view, directions)
     picture = np.empty((len(order), 3), dtype=np.uint8)

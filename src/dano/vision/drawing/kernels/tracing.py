@@ -74,6 +74,7 @@ class View:
         focus: The point looked at [m, W].
         far: Distance from there [m] beyond which nothing casts a shadow.
         floor_reach: Height above a plane up to which that darkens what is above [m].
+        shaded: Whether things take light from each other and from themselves.
     """
 
     solids: Solids
@@ -86,6 +87,7 @@ class View:
     focus: vec3
     far: real
     floor_reach: real
+    shaded: int
 
 
 @wp.struct
@@ -246,7 +248,7 @@ def trace(
         if met > planes:
             normal = normal_of(view, view.things[met - planes - 1], x)
         away = x - view.focus
-        if wp.dot(away, away) < view.far * view.far:
+        if view.shaded == 1 and wp.dot(away, away) < view.far * view.far:
             for k in range(things):
                 thing = view.things[k]
                 reach = _REACH * thing.radius
