@@ -163,7 +163,7 @@ def find(kind: str, name: str) -> Path | None:
     if folder is None or not (path := folder / kind / name).is_file():
         return None
     try:
-        os.utime(path)
+        os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
     except OSError:
         # Somebody else's, or on a system that cannot be written.
         pass
@@ -269,8 +269,10 @@ def _entry(paths: Sequence[Path]) -> Entry | None:
         for path in paths:
             for each in [path, *(path.rglob("*") if path.is_dir() else ())]:
                 state = each.stat()
-                size += state.st_size if each.is_file() else 0
-                used = max(used, state.st_mtime)
+                is_file = each.is_file()
+                size += state.st_size if is_file else 0
+                # Folders are looked into by whoever lists them.
+                used = max(used, state.st_mtime, state.st_atime if is_file else 0)
     except OSError:
         return None
     return Entry(tuple(paths), size, used)
