@@ -241,7 +241,7 @@ def test_two_processes_at_once(tmp_path, cache):
     assert [process.returncode for process in running] == [0, 0]
     assert len(answers) == 1
     assert len(list(cache.rglob("*.dano"))) == 1
-    assert not [path for path in cache.rglob(".*")]
+    assert not list(cache.rglob(".*"))
 
 
 def test_scene_files_share_what_is_kept(tmp_path, built, monkeypatch):

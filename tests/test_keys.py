@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from jax import monitoring
 
-from dano.keys import folded_words, key_words, seed_key, split_words, uniform
+from dano.keys import folded_key, key_words, seed_key, split_key, uniform
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
@@ -19,9 +19,11 @@ def key(request):
 def test_are_those_of_jax(key):
     words = np.asarray(jax.random.key_data(key))
     np.testing.assert_array_equal(key_words(key), words)
-    np.testing.assert_array_equal(np.stack(split_words(key)), jax.random.key_data(jax.random.split(key)))
+    np.testing.assert_array_equal(
+        np.stack([key_words(each) for each in split_key(key)]), jax.random.key_data(jax.random.split(key))
+    )
     for data in (0, 2, 70_000):
-        found = folded_words(key, data)
+        found = key_words(folded_key(key, data))
         np.testing.assert_array_equal(found, jax.random.key_data(jax.random.fold_in(key, data)))
     drawn = np.asarray(jax.random.uniform(key, (3, 41)))
     np.testing.assert_array_equal(uniform(key, (3, 41)), drawn)
@@ -53,6 +55,6 @@ def test_other_order_of_counters():
 def test_compile_nothing():
     seen = []
     monitoring.register_event_duration_secs_listener(lambda event, duration_secs, **_: seen.append(event))
-    first, _ = split_words(seed_key(99))
-    uniform(folded_words(first, 5), (3, 17))
+    first, _ = split_key(seed_key(99))
+    uniform(folded_key(first, 5), (3, 17))
     assert COMPILED not in seen

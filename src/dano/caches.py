@@ -269,10 +269,9 @@ def _entry(paths: Sequence[Path]) -> Entry | None:
         for path in paths:
             for each in [path, *(path.rglob("*") if path.is_dir() else ())]:
                 state = each.stat()
-                is_file = each.is_file()
-                size += state.st_size if is_file else 0
-                # Folders are looked into by whoever lists them.
-                used = max(used, state.st_mtime, state.st_atime if is_file else 0)
+                # Folders count as used by whoever lists them.
+                if each.is_file():
+                    size, used = size + state.st_size, max(used, state.st_mtime, state.st_atime)
     except OSError:
         return None
     return Entry(tuple(paths), size, used)

@@ -1,14 +1,14 @@
-"""Winding numbers of closed meshes against solid angles, and that marked nodes lie close to all of a surface."""
+"""Winding numbers of closed meshes against solid angles; marked nodes lie close to all of a surface."""
 
 import math
 
 import numpy as np
 import pytest
 
-trimesh = pytest.importorskip("trimesh")
-
 from dano.fields.meshes import _winding
 from dano.fields.meshes._winding import mark_nodes, winding_numbers
+
+trimesh = pytest.importorskip("trimesh")
 
 
 def solid_angles(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
