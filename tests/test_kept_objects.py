@@ -265,7 +265,7 @@ fixed = true
     assert len(built) == 1
     forget(monkeypatch)
     with pytest.warns(UserWarning, match="built of it with defaults"):
-        load_object(path)
+        load_object(path, weighed=True)
     assert len(built) == 2
 
 

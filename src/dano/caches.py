@@ -194,8 +194,9 @@ def keep(kind: str, name: str, write: Callable[[Path], object]) -> Path | None:
             os.replace(Path(beside, name), folder / name)
         _limit([kind], LIMIT)
     except (OSError, ValueError) as error:
-        # What writes archives raises ValueErrors where it cannot.
-        return _none(f"{folder} takes no more ({getattr(error, 'strerror', None) or error})")
+        # What writes archives says which file it was, which would be said for each.
+        causes = [each.strerror for each in (error, error.__cause__) if isinstance(each, OSError)]
+        return _none(f"{folder} cannot be written ({next(filter(None, causes), 'it takes no files')})")
     return folder / name
 
 
