@@ -4,7 +4,10 @@ JAX's usual generator is Threefry-2x32 (Salmon et al., 2011): 20 rounds on a cou
 of two words. Keys of other generators go the usual way.
 """
 
+from typing import Any
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray, UInt32
 
@@ -58,7 +61,8 @@ def uniform(key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[np.ndarray, "...
 
 
 def _key(words: Words) -> PRNGKeyArray:
-    return jax.random.wrap_key_data(words, impl=_GENERATOR)
+    data: Any = words
+    return jax.random.wrap_key_data(data, impl=_GENERATOR)
 
 
 def _is_usual() -> bool:
@@ -70,7 +74,7 @@ def _is_threefry(key: PRNGKeyArray) -> bool:
     """Whether a key is Threefry's, in the order of counters that is usual."""
     if not jax.config.jax_threefry_partitionable:  # pyright: ignore[reportAttributeAccessIssue]
         return False
-    if jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key):
+    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         return str(jax.random.key_impl(key)) == _GENERATOR
     return _is_usual() and key.shape == (2,)
 

@@ -16,6 +16,7 @@ from dano.fields import (
     AbstractShape,
     Box,
     Capsule,
+    companion_files,
     convex_pieces,
     Cylinder,
     Ellipsoid,
