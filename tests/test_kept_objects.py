@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 import warnings
+from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 
@@ -25,7 +26,7 @@ QUICK = BuildOptions(samples=100, resolution=12, mass_scale=1000.0)
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch) -> Path:
+def cache(tmp_path, monkeypatch) -> Iterator[Path]:
     """An empty cache, and a process that has built nothing."""
     monkeypatch.setenv("DANO_CACHE_DIR", str(tmp_path / "cache"))
     forget(monkeypatch)

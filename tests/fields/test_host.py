@@ -1,5 +1,7 @@
 """Fields at points of the host: NumPy finds what JAX finds, and compiles nothing for grids."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,7 +51,7 @@ def test_is_what_jax_computes(name):
     field = FIELDS[name]
     columns = jnp.asarray(POINTS.T)
     value, gradient = jax.jit(lambda x: field.jet(x, 1))(columns)
-    exact = {"rtol": 1e-11, "atol": 1e-11 * max(1.0, float(np.abs(gradient).max()))}
+    exact: dict[str, Any] = {"rtol": 1e-11, "atol": 1e-11 * max(1.0, float(np.abs(gradient).max()))}
     np.testing.assert_allclose(density_at(field, POINTS), value, **exact)
     np.testing.assert_allclose(jet_at(field, POINTS)[0], value, **exact)
     np.testing.assert_allclose(jet_at(field, POINTS)[1], gradient.T, **exact)
