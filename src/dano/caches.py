@@ -163,7 +163,7 @@ def find(kind: str, name: str) -> Path | None:
     if folder is None or not (path := folder / kind / name).is_file():
         return None
     try:
-        os.utime(path)
+        os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
     except OSError:
         # Somebody else's, or on a system that cannot be written.
         pass
@@ -194,8 +194,9 @@ def keep(kind: str, name: str, write: Callable[[Path], object]) -> Path | None:
             os.replace(Path(beside, name), folder / name)
         _limit([kind], LIMIT)
     except (OSError, ValueError) as error:
-        # What writes archives raises ValueErrors where it cannot.
-        return _none(f"{folder} takes no more ({getattr(error, 'strerror', None) or error})")
+        # What writes archives says which file it was, which would be said for each.
+        causes = [each.strerror for each in (error, error.__cause__) if isinstance(each, OSError)]
+        return _none(f"{folder} cannot be written ({next(filter(None, causes), 'it takes no files')})")
     return folder / name
 
 
@@ -269,8 +270,9 @@ def _entry(paths: Sequence[Path]) -> Entry | None:
         for path in paths:
             for each in [path, *(path.rglob("*") if path.is_dir() else ())]:
                 state = each.stat()
-                size += state.st_size if each.is_file() else 0
-                used = max(used, state.st_mtime)
+                # Folders count as used by whoever lists them.
+                if each.is_file():
+                    size, used = size + state.st_size, max(used, state.st_mtime, state.st_atime)
     except OSError:
         return None
     return Entry(tuple(paths), size, used)

@@ -4,13 +4,16 @@ JAX's usual generator is Threefry-2x32 (Salmon et al., 2011): 20 rounds on a cou
 of two words. Keys of other generators go the usual way.
 """
 
+from typing import Any
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray, UInt32
 
 Words = UInt32[np.ndarray, " words"]
-"""What a key holds."""
 
+_GENERATOR = "threefry2x32"
 _ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)
 _PARITY = np.uint32(0x1BD11BDA)
 
@@ -19,31 +22,31 @@ def seed_key(seed: int) -> PRNGKeyArray:
     """`jax.random.key` of a seed."""
     if not _is_usual() or not 0 <= seed < 1 << 31:
         return jax.random.key(seed)
-    return jax.random.wrap_key_data(np.array([0, seed], np.uint32))
+    return _key(np.array([0, seed], np.uint32))
 
 
-def key_words(key: PRNGKeyArray | Words) -> Words:
-    """What a key holds."""
-    return key if isinstance(key, np.ndarray) else np.asarray(jax.random.key_data(key))
-
-
-def split_words(key: PRNGKeyArray | Words) -> tuple[Words, Words]:
-    """What the two keys hold that `jax.random.split` makes of one."""
+def split_key(key: PRNGKeyArray) -> tuple[PRNGKeyArray, PRNGKeyArray]:
+    """`jax.random.split` of a key."""
     if not _is_threefry(key):
-        first, second = np.asarray(jax.random.key_data(jax.random.split(key)))
+        first, second = jax.random.split(key)
         return first, second
     first, second = np.stack(_threefry(key_words(key), np.arange(2, dtype=np.uint64)), axis=1)
-    return first, second
+    return _key(first), _key(second)
 
 
-def folded_words(key: PRNGKeyArray | Words, data: int) -> Words:
-    """What the key holds that `jax.random.fold_in` makes of one and a small number."""
+def folded_key(key: PRNGKeyArray, data: int) -> PRNGKeyArray:
+    """`jax.random.fold_in` of a key and a small number."""
     if not _is_threefry(key):
-        return np.asarray(jax.random.key_data(jax.random.fold_in(key, data)))
-    return np.concatenate(_threefry(key_words(key), np.array([data], np.uint64)))
+        return jax.random.fold_in(key, data)
+    return _key(np.concatenate(_threefry(key_words(key), np.array([data], np.uint64))))
 
 
-def uniform(key: PRNGKeyArray | Words, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+def key_words(key: PRNGKeyArray) -> Words:
+    """What a key holds."""
+    return np.asarray(jax.random.key_data(key))
+
+
+def uniform(key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     """`jax.random.uniform` between 0 and 1, in the precision that JAX is set to."""
     if not _is_threefry(key):
         return np.asarray(jax.random.uniform(key, shape))
@@ -57,17 +60,22 @@ def uniform(key: PRNGKeyArray | Words, shape: tuple[int, ...]) -> Float[np.ndarr
     return (numbers - numbers.dtype.type(1)).reshape(shape)
 
 
+def _key(words: Words) -> PRNGKeyArray:
+    data: Any = words
+    return jax.random.wrap_key_data(data, impl=_GENERATOR)
+
+
 def _is_usual() -> bool:
     """Whether keys are those of Threefry unless something else is asked for."""
-    return jax.config.jax_default_prng_impl == "threefry2x32"  # pyright: ignore[reportAttributeAccessIssue]
+    return jax.config.jax_default_prng_impl == _GENERATOR  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _is_threefry(key: PRNGKeyArray | Words) -> bool:
+def _is_threefry(key: PRNGKeyArray) -> bool:
     """Whether a key is Threefry's, in the order of counters that is usual."""
     if not jax.config.jax_threefry_partitionable:  # pyright: ignore[reportAttributeAccessIssue]
         return False
-    if jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key):
-        return str(jax.random.key_impl(key)) == "threefry2x32"
+    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        return str(jax.random.key_impl(key)) == _GENERATOR
     return _is_usual() and key.shape == (2,)
 
 

@@ -67,6 +67,6 @@ def _age(entries: list[Entry]) -> float:
     return max(0.0, (time.time() - min(entry.used for entry in entries)) / _DAY)
 
 
-def _summary(entries: list[Entry]) -> dict[str, float]:
+def _summary(entries: list[Entry]) -> dict[str, int | float]:
     days = _age(entries) if entries else 0.0
     return {"entries": len(entries), "bytes": sum(entry.size for entry in entries), "oldest_days": days}

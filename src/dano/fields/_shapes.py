@@ -7,7 +7,7 @@ indicator.
 """
 
 import abc
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -56,10 +56,10 @@ def occupancy(sdf: Float[Q, "*batch"], edge: ArrayLike) -> Float[Q, "*batch"]:
         edge: Width of the band over which the occupancy falls from 1 to 0 [m]; 0 gives the hard indicator.
     """
     xp = library(sdf, edge)
-    edge = xp.broadcast_to(xp.asarray(edge, sdf.dtype), sdf.shape)
-    smooth = edge > 0
+    width = xp.broadcast_to(xp.asarray(edge, sdf.dtype), sdf.shape)
+    smooth = width > 0
     # The division must be finite in the untaken branch too, or its derivative is NaN.
-    t = xp.clip(0.5 - sdf / xp.where(smooth, edge, 1), 0, 1)
+    t = xp.clip(0.5 - sdf / xp.where(smooth, width, 1), 0, 1)
     return xp.where(smooth, t * t * (3 - 2 * t), (sdf <= 0).astype(sdf.dtype))
 
 
@@ -133,7 +133,8 @@ class AbstractShape(AbstractField):
 
     def jet(self, x: Float[Q, "3 n"], order: int) -> Jet:
         """See `AbstractField.jet`: φ(s) of the signed distance, ∇φ = φ′ ∇s, ∇∇φ = φ″ ∇s ∇sᵀ + φ′ ∇∇s."""
-        distances, edge = self.sdf_jet(x, order), self.edge_width.astype(x.dtype)
+        points: Any = x
+        distances, edge = self.sdf_jet(points, order), self.edge_width.astype(x.dtype)
         on_host = library(*jax.tree.leaves(distances)) is np
         return occupancy_jet(distances, np.asarray(edge) if on_host else edge, order)
 

@@ -1,6 +1,6 @@
 """Shapes from a sampled signed distance."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -130,7 +130,8 @@ class SignedDistanceGrid(AbstractShape):
         check_order(order)
         xp = library(x, self.origin, self.spacing)
         closest, beyond, inside = self._split(x)
-        rows = spline_jet(self.coefficients, closest, degree_of(self.interpolation), order)
+        coefficients: Any = self.coefficients
+        rows = spline_jet(coefficients, closest, degree_of(self.interpolation), order)
         jet = scaled_jet(rows, self.spacing.astype(x.dtype), order)
         distance = column_norm(beyond)
         if order == 0:

@@ -82,7 +82,7 @@ def spline_jet(
     """
     if library(coefficients, u) is jnp:
         return _compiled_jet(coefficients, u, degree, order)
-    found = np.empty((len(multi_indices(order)), u.shape[1]), u.dtype)
+    found: Any = np.empty((len(multi_indices(order)), u.shape[1]), u.dtype)
     with np.errstate(invalid="ignore"):
         for start in range(0, u.shape[1], _HOST_CHUNK):
             part = slice(start, start + _HOST_CHUNK)
@@ -159,9 +159,10 @@ def _rows(
         for c in range(order + 1)
         for b in range(order + 1 - c)
     }
-    return library(u).stack(
+    rows: Any = library(u).stack(
         [_contracted(along_y[b, c], [w[0] for w in weights[a]]) for a, b, c in multi_indices(order)]
     )
+    return rows
 
 
 def _contracted(block: Float[Q, "*axes taps n"], weights: list[Q]) -> Float[Q, "*axes n"]:
@@ -173,7 +174,7 @@ def _contracted(block: Float[Q, "*axes taps n"], weights: list[Q]) -> Float[Q, "
     return _total(block[..., q, :] * weight[alone] for q, weight in enumerate(weights))
 
 
-def _total(terms: Iterable[Q]) -> Q:
+def _total(terms: Iterable[Any]) -> Any:
     return functools.reduce(operator.add, terms)
 
 
@@ -224,7 +225,7 @@ def _gather_blocks(
     if library(coefficients, base) is np:
         _, ny, nz = coefficients.shape
         flat, first = np.ravel(coefficients), (base[0].astype(np.intp) * ny + base[1]) * nz + base[2]
-        block = np.empty((taps, taps, taps, base.shape[1]), flat.dtype)
+        block: Any = np.empty((taps, taps, taps, base.shape[1]), flat.dtype)
         for i, j, k in np.ndindex(taps, taps, taps):
             # One place of the stencil for all points at a time: six times as fast as one array of all places.
             block[i, j, k] = flat[(i * ny + j) * nz + k :][first]
@@ -244,7 +245,7 @@ def node_values(coefficients: Float[Array, "px py pz"], degree: int) -> Float[Ar
     """Values of a spline at the nodes inside its border."""
     weights = {1: (1.0,), 2: (0.125, 0.75, 0.125), 3: (1 / 6, 2 / 3, 1 / 6)}[degree]
     xp = np if not is_traced(coefficients) else jnp
-    values = xp.asarray(coefficients)
+    values: Any = xp.asarray(coefficients)
     for axis, size in enumerate(values.shape):
         # Nodes of the border next to the others count, too.
         reach, inner = len(weights) // 2, size - 2 * border(degree)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dano.archive import LOOK, OBJECT, read_archive, write_archive
 from dano.checks import checked_choice, checked_count, checked_function
 from dano.fields import AbstractField, AbstractShape, GridField, SignedDistanceGrid
-from dano.keys import folded_words, split_words
+from dano.keys import folded_key, split_key
 from dano.maths import checked_array, checked_key, checked_points, floating, is_traced, Numbers
 from dano.memory import check_nodes
 from dano.notebook import card, cloud, numbers
@@ -146,7 +146,7 @@ class NeuralObject(eqx.Module):
         say = progress or (lambda description, share: None)
         n_samples = _checked_samples(n_samples)
         key = checked_key(key)
-        sampling_key, mass_key = split_words(key)
+        sampling_key, mass_key = split_key(key)
         original = field
         field, density, lattice, interior = _closed(original, resolution)
         level = float(interior.level)
@@ -158,7 +158,7 @@ class NeuralObject(eqx.Module):
         say("surface", 0.0)
         grid, error = baked(field, resolution)
         filled = field_solid(field, grid, level, floaters=floaters)
-        drawn = draw_surface(filled, n_samples, key=folded_words(key, 2))
+        drawn = draw_surface(filled, n_samples, key=folded_key(key, 2))
         surface = flattened(drawn, filled.spacing)
         solid = Region.create(lattice, level, floaters=False).solid(density)
         how = (mass_scale, mass, resolution, mass_key, progress)

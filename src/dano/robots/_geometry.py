@@ -2,18 +2,21 @@
 
 import hashlib
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
 
+import jax.numpy as jnp
 import numpy as np
 
-from dano.caches import cache_folder
+from dano.caches import digest, find, keep
 from dano.checks import shown
 from dano.extras import MESHES
 from dano.fields import (
     AbstractShape,
     Box,
     Capsule,
+    companion_files,
     convex_pieces,
     Cylinder,
     Ellipsoid,
@@ -36,7 +39,8 @@ COLLISION = ("hull", "distance", "pieces", "none")
 _RESOLUTION, _HULL_RESOLUTION = 64, 48
 # Largest concavity of a convex piece, as a share of the size: CoACD's own.
 _CONCAVITY = 0.05
-_VERSION = "2"
+_KIND = "meshes"
+"""Where shapes are kept, see `dano.caches`."""
 
 Triangles = tuple[np.ndarray, np.ndarray]
 
@@ -115,44 +119,50 @@ def _of_mesh(solid: Solid, kind: str, where: str) -> AbstractShape:
         )
     if not all(solid.numbers):
         raise ValueError(f"{where}: scale of a mesh must not be 0, got {solid.numbers}")
-    name = "mesh" if solid.path is None else str(solid.path)
+    path = "mesh" if solid.path is None else str(solid.path)
     try:
         if kind == "pieces":
             hulls = [hull_field(points, _HULL_RESOLUTION) for points in _pieces(solid)]
             return hulls[0] if len(hulls) == 1 else union(*hulls)
-        kept = _cache_file(solid, kind)
-        if kept is not None and kept.is_file() and isinstance(found := load_field(kept), SignedDistanceGrid):
+        name = _kept_name(solid, kind)
+        if name is not None and (found := _kept_shape(name)) is not None:
             return found
         mesh = mesh_of(solid)
         made = _distance(mesh) if kind == "distance" else hull_field(mesh[0], _HULL_RESOLUTION)
     except ValueError as error:
         raise ValueError(
-            f"{where}: {name}: {error}; collision=… chooses what stands for meshes, of all links or of one"
+            f"{where}: {path}: {error}; collision=… chooses what stands for meshes, of all links or of one"
         ) from error
-    _keep(kept, lambda path: save_field(made, path))
-    return made
+    if name is None or keep(_KIND, name, lambda file: save_field(made, file)) is None:
+        return made
+    # As it will be found the next time.
+    return _kept_shape(name) or made
+
+
+def _kept_shape(name: str) -> SignedDistanceGrid | None:
+    """What is kept under a name; None if there is nothing, or nothing that can be read."""
+    kept = find(_KIND, name)
+    try:
+        found = None if kept is None else load_field(kept)
+    except ValueError:
+        return None
+    return found if isinstance(found, SignedDistanceGrid) else None
 
 
 def _pieces(solid: Solid) -> list[np.ndarray]:
     """Corners of the convex pieces of a mesh [m]; to find them takes seconds."""
-    kept = _cache_file(solid, "pieces")
-    if kept is not None and kept.is_file():
-        with np.load(kept) as found:
-            return [found[key] for key in found.files]
+    name = _kept_name(solid, "pieces")
+    if name is not None and (kept := find(_KIND, name)) is not None:
+        try:
+            with np.load(kept) as found:
+                return [found[key] for key in found.files]
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
+            # Damaged: it is made anew, and replaced.
+            pass
     pieces = [points for points, _ in convex_pieces(mesh_of(solid), _CONCAVITY)]
-    _keep(kept, lambda path: np.savez(path, *pieces))
+    if name is not None:
+        keep(_KIND, name, lambda file: np.savez(file, *pieces))
     return pieces
-
-
-def _keep(path: Path | None, write: Callable[[Path], None]) -> None:
-    if path is None:
-        return
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(path)
-    except OSError:
-        # A full disk, or no home: the mesh is read again the next time.
-        pass
 
 
 def mesh_of(solid: Solid) -> Triangles:
@@ -198,14 +208,11 @@ def _distance(mesh: Triangles) -> SignedDistanceGrid:
         return mesh_field(trimesh.Trimesh(*mesh, process=False), _RESOLUTION)
 
 
-def _cache_file(solid: Solid, kind: str) -> Path | None:
-    """Where the shape of a mesh is kept; None if there is no folder for caches."""
-    if (folder := cache_folder()) is None:
-        return None
-    digest = hashlib.sha256(f"{kind} {solid.numbers} {_RESOLUTION} {_HULL_RESOLUTION} {_VERSION}".encode())
-    if solid.triangles is not None:
-        for array in solid.triangles:
-            digest.update(np.ascontiguousarray(array).tobytes())
-    elif solid.path is not None:
-        digest.update(solid.path.suffix.encode() + solid.path.read_bytes())
-    return folder / "meshes" / f"{digest.hexdigest()[:32]}.npz"
+def _kept_name(solid: Solid, kind: str) -> str | None:
+    """What the shape of a mesh is kept under; None if it cannot be kept."""
+    words = kind, tuple(solid.numbers), jnp.result_type(float).name
+    files = [] if solid.path is None else [solid.path, *companion_files(solid.path)]
+    arrays = [] if solid.triangles is None else [np.ascontiguousarray(array) for array in solid.triangles]
+    told = [hashlib.sha256(array.tobytes()).hexdigest() for array in arrays]
+    name = digest(files, *words, *told)
+    return None if name is None else f"{name}.npz"

@@ -90,8 +90,8 @@ def _write(name: str, path: Path, built: Built) -> Built:
     """Keep what was built; the same as it will be read."""
     about = {"of_shape": built.of_shape, "said": [text.replace(str(path), _FILE) for text in built.said]}
     # First, since the object is what is looked for.
-    keep(_KIND, f"{name}.json", lambda file: file.write_text(json.dumps(about), encoding="utf-8"))
-    if keep(_KIND, f"{name}.dano", built.made.save) is None:
+    told = keep(_KIND, f"{name}.json", lambda file: file.write_text(json.dumps(about), encoding="utf-8"))
+    if told is None or keep(_KIND, f"{name}.dano", built.made.save) is None:
         return built
     return _read(name, path) or built
 
