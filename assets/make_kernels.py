@@ -26,6 +26,7 @@ from dano.native import (
     shipped_path,
     what_is_shipped,
 )
+from dano.vision.drawing import _rays as drawing
 
 
 def main() -> None:
@@ -48,7 +49,7 @@ def main() -> None:
 
 
 def _for_processors(levels: list[str]) -> list[Callable[[], Path]]:
-    builds = (*launching.kernel_builds(), *bridge.kernel_builds())
+    builds = (*launching.kernel_builds(), *bridge.kernel_builds(), *drawing.kernel_builds())
     return [
         functools.partial(_object, features, module, level)
         for level in levels

@@ -32,8 +32,8 @@ LIMIT = 1 << 30
 """Bytes of what is kept of a kind by `keep`; beyond, what was not used for longest goes (convention)."""
 
 _ABOVE = frozenset(
-    "cli gym report comparison mujoco exchange pixels identify plan engine scene contact assets".split()
-)
+    "cli gym report comparison mujoco exchange pixels identification planning engine scene contact".split()
+) | {"assets", "compiled"}
 """Folders of dano that what is kept cannot depend on: objects and shapes know nothing of them."""
 
 _LIBRARIES = ("numpy", "scipy", "jax", "jaxlib", "trimesh", "libigl", "coacd", "pycollada", "cascadio")
@@ -66,7 +66,7 @@ def cache_folder() -> Path | None:
     and what lies there may be anybody's: they count as none. Where nothing can be kept, a UserWarning says so
     once.
     """
-    folder = _place()
+    folder = cache_place()
     if folder is None:
         return None
     try:
@@ -78,7 +78,7 @@ def cache_folder() -> Path | None:
     return folder
 
 
-def _place() -> Path | None:
+def cache_place() -> Path | None:
     """Where the cache folder is or would be; None if nothing is kept."""
     chosen = os.environ.get(VARIABLE)
     if chosen in ("", "off"):
@@ -159,7 +159,7 @@ def find(kind: str, name: str) -> Path | None:
         kind: One of `KINDS`.
         name: Of the file.
     """
-    folder = _place()
+    folder = cache_place()
     if folder is None or not (path := folder / kind / name).is_file():
         return None
     try:
@@ -202,7 +202,7 @@ def keep(kind: str, name: str, write: Callable[[Path], object]) -> Path | None:
 
 def contents(kinds: Sequence[str] = tuple(KINDS)) -> dict[str, list[Entry]]:
     """What is kept, by kind, what was used last first; nothing is made."""
-    folder = _place()
+    folder = cache_place()
     if folder is None:
         return {kind: [] for kind in kinds}
     return {

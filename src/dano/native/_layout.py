@@ -104,15 +104,15 @@ class Parameters:
         """Where they begin."""
         return ctypes.addressof(self.memory)
 
-    def put(self, place: str, value: int | float | Sequence[float]) -> None:
+    def put(self, place: str, value: int | float | np.generic | np.ndarray | Sequence[float]) -> None:
         """Set a number, or the numbers of a vector.
 
         Raises:
             KeyError: If there is none at that place.
         """
         at, form = self.layout.numbers[place]
-        values = (value,) if isinstance(value, int | float) else value
-        struct.pack_into(form, self.memory, at, *values)
+        kind = float if form[-1] in "fd" else int
+        struct.pack_into(form, self.memory, at, *map(kind, np.ravel(value)))
 
     def array(self, place: str) -> Array:
         """The array at a place, which a launch may point elsewhere.

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dano.caches import cache_folder
+from dano.caches import cache_folder, cache_place
 from dano.native._declared import modules_behind, source_of
 from dano.native._instances import Features, instance
 from dano.native._layout import ArrayField, Layout, layout_of, NumberField, Parameters
@@ -129,9 +129,10 @@ def _loaded(features: Features, module: str, what: str) -> tuple[bytes, dict[str
 def _places(features: Features, module: str) -> Iterator[Path]:
     """Where an object of a module may lie, the best first."""
     yield from (shipped_path(features, module, level) for level in levels())
-    folder = cache_folder()
-    if folder is not None:
-        yield kept_path(features, module, folder / "kernels")
+    # What is there is read, also where nothing can be written.
+    place = cache_place()
+    if place is not None:
+        yield kept_path(features, module, place / "kernels")
 
 
 def shipped_path(features: Features, module: str, level: str) -> Path:

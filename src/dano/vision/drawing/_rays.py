@@ -1,7 +1,7 @@
 """Where rays meet solids and what light arrives there, by kernels; what a medium lets through, by JAX."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -13,13 +13,15 @@ from dano.fields import AbstractShape, GridField
 from dano.hosted import hosted
 from dano.maths import product
 from dano.native import (
-    compiled_kernel,
+    cpu_kernel,
     Features,
-    instance,
+    Kernel,
+    Launch,
     leaf_tables,
     Leaves,
     leaves_of,
     n_cores,
+    Parameters,
     Placed,
     together,
 )
@@ -90,39 +92,21 @@ class Tracer:
             origin: Of rays [m, W].
             numbers: Other fields of `tracing.View`.
         """
-        import warp as wp
-
         self._kernel = _kernel(_TRACING, "trace")
-        module = instance(_FEATURES, _TRACING)
-        view: Any = module.View()
         tables = _tables([thing.shape for thing in things])
-        # What Warp points to has to be kept.
-        self._kept: list[Any] = [tables]
-        view.solids = tables.solids
-        rows = [self._row(module, thing, *part) for thing, part in zip(things, tables.parts, strict=True)]
-        view.things = wp.array(rows, dtype=module.Thing, device="cpu")
-        view.planes = wp.array(np.array(planes, np.float32).reshape(-1, 4), dtype=wp.vec4f, device="cpu")
-        for name, value in {"origin": origin, **numbers}.items():
-            number = int(value) if isinstance(value, bool) else float(value) if np.ndim(value) == 0 else None
-            setattr(view, name, wp.vec3f(*map(float, value)) if number is None else number)
-        self._view = view
-
-    @staticmethod
-    def _row(module: Any, thing: Thing, first: int, count: int, bounds: np.ndarray) -> Any:
-        import warp as wp
-
-        row = module.Thing()
-        row.first, row.count, row.own_shadows = first, count, int(thing.own_shadows)
-        row.rotation = wp.mat33f(*np.asarray(thing.rotation, float).ravel())
-        for name, value in (
-            ("position", thing.position),
-            ("centre", thing.centre),
-            ("low", bounds[0]),
-            ("high", bounds[1]),
-        ):
-            setattr(row, name, wp.vec3f(*map(float, value)))
-        row.radius = float(thing.radius)
-        return row
+        like = Parameters(self._kernel.layout)
+        rows = like.rows("view.things", len(things))
+        for row, thing, (first, count, bounds) in zip(rows, things, tables.parts, strict=True):
+            row["first"], row["count"], row["own_shadows"] = first, count, thing.own_shadows
+            row["rotation"], row["position"] = thing.rotation, thing.position
+            row["centre"], row["radius"] = thing.centre, thing.radius
+            row["low"], row["high"] = bounds
+        self._arrays = {
+            **{f"view.solids.{name}": values for name, values in tables.arrays.items()},
+            "view.things": rows,
+            "view.planes": np.array(planes, np.float32).reshape(-1, 4),
+        }
+        self._numbers = {f"view.{name}": value for name, value in {"origin": origin, **numbers}.items()}
 
     def __call__(self, directions: Float[np.ndarray, "3 n"]) -> Met:
         """What rays of some unit directions [W] meet."""
@@ -134,7 +118,9 @@ class Tracer:
             np.empty(n, np.float32),
             np.empty(n, np.float32),
         )
-        _launch(self._kernel, self._view, (rays, depth, which, normals, lamp, ambient))
+        written = (rays, depth, which, normals, lamp, ambient)
+        names = ("directions", "depths", "which", "normals", "lamp", "ambient")
+        _launch(self._kernel, self._arrays, self._numbers, dict(zip(names, written, strict=True)))
         return Met(depth, which, np.ascontiguousarray(normals.T), lamp, ambient)
 
 
@@ -149,15 +135,10 @@ class Painter:
             n_planes: Number of planes.
             numbers: Other fields of `painting.Scenery`.
         """
-        import warp as wp
-
         self._kernel = _kernel(_PAINTING, "paint")
-        scenery: Any = instance(_FEATURES, _PAINTING).Scenery()
-        scenery.albedos = wp.array(np.array(albedos, np.float32).reshape(-1, 3), dtype=wp.vec3f, device="cpu")
-        scenery.n_planes = n_planes
-        for name, value in numbers.items():
-            setattr(scenery, name, wp.vec3f(*map(float, value)) if np.ndim(value) else float(value))
-        self._scenery = scenery
+        self._arrays = {"scenery.albedos": np.array(albedos, np.float32).reshape(-1, 3)}
+        named = {"n_planes": n_planes, **numbers}
+        self._numbers = {f"scenery.{name}": value for name, value in named.items()}
 
     def __call__(
         self, directions: Float[np.ndarray, "3 n"], met: Met
@@ -167,8 +148,17 @@ class Painter:
         colours, picture = np.empty((n, 3), np.float32), np.empty((n, 3), np.uint8)
         rays = np.ascontiguousarray(directions.T, np.float32)
         normals = np.ascontiguousarray(met.normals.T, np.float32)
-        given = (rays, met.depth, met.which, normals, met.lamp, met.ambient)
-        _launch(self._kernel, self._scenery, (*given, colours, picture))
+        arrays = {
+            "directions": rays,
+            "depths": met.depth,
+            "which": met.which,
+            "normals": normals,
+            "lamp": met.lamp,
+            "ambient": met.ambient,
+            "colours": colours,
+            "picture": picture,
+        }
+        _launch(self._kernel, self._arrays, self._numbers, arrays)
         return np.ascontiguousarray(colours.T), picture
 
 
@@ -178,57 +168,62 @@ def compile_kernels() -> None:
     _kernel(_TRACING, "trace")
 
 
-@functools.cache
-def _kernel(module: str, name: str) -> Any:
-    return compiled_kernel(lambda: getattr(instance(_FEATURES, module), name), what="what draws")
+def kernel_builds() -> list[tuple[Features, str]]:
+    """Features and modules of the kernels that draw."""
+    return [(_FEATURES, _TRACING), (_FEATURES, _PAINTING)]
 
 
-def _launch(kernel: Any, first: Any, arrays: Sequence[np.ndarray]) -> None:
-    """Launch a kernel of a ray a thread on all cores."""
-    n = len(arrays[0])
+def _kernel(module: str, name: str) -> Kernel:
+    return cpu_kernel(_FEATURES, module, name, what="what draws")
+
+
+def _launch(
+    kernel: Kernel,
+    shared: Mapping[str, np.ndarray],
+    numbers: Mapping[str, Any],
+    of_rays: Mapping[str, np.ndarray],
+) -> None:
+    """Launch a kernel of a ray a thread on all cores.
+
+    Args:
+        kernel: The kernel.
+        shared: Arrays that all rays read, by place.
+        numbers: Numbers and vectors by place.
+        of_rays: Arrays with a row for each ray.
+    """
+    n = len(next(iter(of_rays.values())))
     # Neighbouring shares cost different times: several for each core make all end together.
     count = min(max(n // _FEW, 1), 1 if n_cores() == 1 else _SHARES * n_cores())
     ends = [n * (k + 1) // count for k in range(count)]
-    works = [_work(kernel, first, arrays, b, e) for b, e in zip([0, *ends[:-1]], ends, strict=True) if e > b]
+    works = []
+    for begin, end in zip([0, *ends[:-1]], ends, strict=True):
+        if end == begin:
+            continue
+        parameters = Parameters(kernel.layout)
+        for place, values in {**shared, **{name: x[begin:end] for name, x in of_rays.items()}}.items():
+            parameters.show(place, values)
+        for place, value in numbers.items():
+            parameters.put(place, value)
+        works.append(Launch(kernel, parameters, end - begin))
     if works:
         together([functools.partial(_each, works[k :: n_cores()]) for k in range(min(n_cores(), len(works)))])
 
 
-def _work(kernel: Any, first: Any, arrays: Sequence[np.ndarray], begin: int, end: int) -> Any:
-    """A launch for some of the rays."""
-    import warp as wp
-
-    threes = {np.dtype(np.float32): wp.vec3f, np.dtype(np.uint8): wp.types.vector(3, wp.uint8)}
-    given: list[Any] = [
-        wp.array(
-            ptr=x[begin:end].ctypes.data,
-            dtype=threes[x.dtype] if x.ndim == 2 else wp.dtype_from_numpy(x.dtype),
-            shape=(end - begin,),
-            device="cpu",
-            copy=False,
-        )
-        for x in arrays
-    ]
-    return wp.launch(kernel, end - begin, [first, *given], device="cpu", record_cmd=True)
-
-
-def _each(works: Sequence[Any]) -> None:
+def _each(works: Sequence[Launch]) -> None:
     for work in works:
-        work.launch()
+        work()
 
 
 class _Tables(NamedTuple):
     """Leaves of some shapes.
 
     Attributes:
-        solids: As kernels read them.
         parts: First leaf, number of leaves and bounds [m, F] of each shape.
-        arrays: What `solids` points to.
+        arrays: Of `dano.physics.solids.leaves.Solids`, by name.
     """
 
-    solids: Any
     parts: list[tuple[int, int, np.ndarray]]
-    arrays: list[np.ndarray]
+    arrays: dict[str, np.ndarray]
 
 
 _known: dict[tuple[int, ...], tuple[list[Any], _Tables]] = {}
@@ -247,29 +242,14 @@ def _tables(shapes: Sequence[AbstractShape]) -> _Tables:
 
 
 def _made(shapes: Sequence[AbstractShape]) -> _Tables:
-    import warp as wp
-
-    module = instance(_FEATURES, "dano.physics.solids.leaves")
     leaves = [leaves_of(Placed.still(shape, np.float32)) for shape in shapes]
     counts = [len(each) for each in leaves]
     bounds = [np.asarray(shape.bounds, float) for shape in shapes]
     parts = list(zip(np.cumsum([0, *counts])[:-1].tolist(), counts, bounds, strict=True))
     found = _leaf_tables([leaf for each in leaves for leaf in each])
-    arrays = [np.ascontiguousarray(x) for x in (found.rows, found.kinds, found.coefficients, found.bounds)]
-    solids: Any = module.Solids()
-    for name, values, dtype in zip(
-        ("leaves", "kinds", "coefficients", "bounds"),
-        arrays,
-        (module.Leaf, module.LeafKind, wp.float32, wp.float32),
-        strict=True,
-    ):
-        shape = (len(values),) if name == "kinds" else (1, len(values))
-        setattr(
-            solids,
-            name,
-            wp.array(ptr=values.ctypes.data, dtype=dtype, shape=shape, device="cpu", copy=False),
-        )
-    return _Tables(solids, parts, arrays)
+    named = {"leaves": found.rows, "kinds": found.kinds, "coefficients": found.coefficients}
+    named["bounds"] = found.bounds
+    return _Tables(parts, {name: np.ascontiguousarray(x) for name, x in named.items()})
 
 
 @hosted
