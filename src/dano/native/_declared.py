@@ -6,7 +6,7 @@ import importlib.util
 import re
 from pathlib import Path
 
-from dano.native._instances import Features
+from dano.native._instances import Features, making
 
 PACKAGES = ("dano.physics", "dano.engine.kernels", "dano.mujoco.kernels", "dano.vision.drawing.kernels")
 """Packages of modules that are run once for each set of features."""
@@ -45,7 +45,9 @@ def fields_of(features: Features, module: str, structure: str) -> tuple[str, ...
     Raises:
         KeyError: If the module has no such structure.
     """
-    for node in ast.parse(source_of(module)).body:
+    with making:
+        body = ast.parse(source_of(module)).body
+    for node in body:
         if isinstance(node, ast.ClassDef) and node.name == structure:
             return tuple(_fields(node.body, dict(features.values)))
         if isinstance(node, ast.ImportFrom) and node.module is not None:

@@ -57,7 +57,9 @@ def _shown(value: Any) -> str:
 
 
 # One thread makes instances, the others wait for them.
-_lock = threading.RLock()
+# Python 3.11 counts depths of trees of code in one place, and fails where two threads parse at once.
+making = threading.RLock()
+"""Held while modules are made, or their text is parsed."""
 
 
 def instance(features: Features, module: str) -> ModuleType:
@@ -68,7 +70,7 @@ def instance(features: Features, module: str) -> ModuleType:
         module: Its usual name.
     """
     begin()
-    with _lock:
+    with making:
         return _instance(features, module)
 
 
