@@ -1,7 +1,7 @@
 """How rollouts are compiled."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
@@ -70,11 +70,13 @@ def by_numpy_on_cpus(function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def call(*args):
         arrays = [x for x in jax.tree.leaves(args) if isinstance(x, jax.Array)]
-        known = not is_traced(arrays) and all(_is_on_cpu(x) for x in arrays)
+        known = not is_traced(arrays) and are_on_cpus(arrays)
         return numerical(*args) if known else nested(*args)
 
     return call
 
 
-def _is_on_cpu(array: jax.Array) -> bool:
-    return all(device.platform == "cpu" for device in array.devices())
+def are_on_cpus(arrays: Iterable[Any]) -> bool:
+    """Whether arrays, none of which is traced, are in the memory of a CPU, as those of NumPy are."""
+    devices = [device for x in arrays if isinstance(x, jax.Array) for device in x.devices()]
+    return all(device.platform == "cpu" for device in devices)

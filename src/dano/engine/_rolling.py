@@ -16,7 +16,7 @@ from jaxtyping import Array, Int
 from dano.engine._compiling import by_numpy_on_cpus, compiled, is_enclosed
 from dano.engine._controls import asked
 from dano.engine._reports import Report
-from dano.maths import is_traced, library
+from dano.maths import is_traced, library, on_device
 from dano.scene import Control, Scene, State
 
 # Steps that a program makes at most before it is asked again.
@@ -36,6 +36,9 @@ def rolled(
         n_steps: Number of steps.
         segment: Of how many steps reverse mode keeps the first state only; None: all are kept.
     """
+    state = _of_jax(state)
+    if isinstance(controls, Control):
+        controls = _of_jax(controls)
     prepared, state = _prepared(engine, scene), _filled(scene, state)
     if not callable(controls):
         found = engine.rollout(scene, prepared, state, controls, n_steps)
@@ -44,6 +47,11 @@ def rolled(
     elif not is_enclosed() and not is_traced(scene, state):
         return _in_turn(engine, scene, prepared, state, controls, n_steps)
     return _jitted_scan(engine, scene, prepared, state, controls, n_steps, segment)
+
+
+def _of_jax(tree: Any) -> Any:
+    """A tree with JAX's arrays in place of NumPy's."""
+    return jax.tree.map(lambda x: on_device(x) if isinstance(x, np.ndarray) else x, tree)
 
 
 @compiled

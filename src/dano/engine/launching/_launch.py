@@ -15,7 +15,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
-from dano.engine._compiling import by_numpy_on_cpus
+from dano.engine._compiling import are_on_cpus, by_numpy_on_cpus
 from dano.engine.launching import _cpu, _cuda
 from dano.engine.launching._plans import OfWidth as OfWidth, Plan as Plan, plan as plan, Shape as Shape
 
@@ -52,7 +52,7 @@ def _(*inputs, plan, batched, n_worlds):
 
 @launch_p.def_impl
 def _(*inputs, **parameters):
-    if all(device.platform == "cpu" for x in inputs for device in x.devices()):
+    if are_on_cpus(inputs):
         return _cpu.launched(inputs=inputs, **parameters)
     return _program(**parameters)(*inputs)
 
