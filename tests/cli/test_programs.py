@@ -137,6 +137,7 @@ def test_only_the_program_keeps(run, tmp_path: Path, monkeypatch):
     """JAX's settings of a program that calls `main` with arguments stay as they are."""
     asked = []
     monkeypatch.setattr(programs, "_folder", lambda: asked.append(None))
+    programs.keep_programs.cache_clear()
     arguments = ["inspect", str(tmp_path / "missing.dano")]
     assert run(*arguments).code == 2
     assert not asked

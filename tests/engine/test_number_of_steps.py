@@ -98,7 +98,8 @@ def test_gains_that_a_policy_holds(cart):
 def test_states_and_masses_compile_nothing(cart, compilations):
     scene, state = cart
     compilations.clear()
-    other = scene.initial_state(rod=dict(q=-0.2), cart=dict(q=0.1, v=1.0))
+    place = dict(position=(1, 0, 0.1))
+    other = scene.initial_state(box=place, rod=dict(q=-0.2), cart=dict(q=0.1, v=1.0))
     frames, mass = scene.frames(other), dano.mass_matrix(scene, other)
     pull = dano.gravity_forces(scene, other)
     assert not compilations

@@ -5,12 +5,12 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from dano.checks import checked_count, checked_kind, shown
-from dano.maths import is_traced
+from dano.engine._compiling import by_numpy_on_cpus
+from dano.maths import is_traced, library
 from dano.scene import Control, Scene, State
 
 Policy = Callable[[State, Float[Array, ""]], Control]
@@ -62,11 +62,16 @@ def spread(
     if controls.force.ndim == 2:
         check_control(scene, controls, ())
         count = checked_count("n_steps", n_steps)
-        return jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), controls), count
+        return _repeated(controls, count), count
     rows = int(controls.force.shape[0]) if controls.force.ndim == 3 else -1
     count = rows if n_steps is None else n_steps
     check_control(scene, controls, (count,))
     return controls, checked_count("n_steps", count)
+
+
+@by_numpy_on_cpus
+def _repeated(control: Control, count: int) -> Control:
+    return jax.tree.map(lambda x: library(x).broadcast_to(x, (count, *x.shape)), control)
 
 
 def asked(controls: Policy, scene: Scene, state: State, time: Float[Array, ""]) -> Control:

@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from dano.contact import PARAMETER_RANGES
+from dano.engine._compiling import by_numpy_on_cpus
 from dano.engine._reports import Report
 from dano.fields import AbstractShape, PosedShape
-from dano.maths import is_traced
+from dano.maths import AnyArray, is_traced, library
 from dano.scene import Control, Scene, State
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -136,8 +137,9 @@ def _of_joints(scene: Scene) -> Iterator[_Numbers]:
         yield _Numbers("numbers of loops", held)
 
 
+@by_numpy_on_cpus
 def marked(
-    holds: Bool[Array, ""], state: State, controls: Control | None, states: State, report: Report
+    holds: Bool[AnyArray, ""], state: State, controls: Control | None, states: State, report: Report
 ) -> tuple[State, Report]:
     """States and reports of steps, marked from the first on that depends on what is not finite.
 
@@ -148,12 +150,13 @@ def marked(
         states: At their ends, with a leading axis.
         report: Of the steps, with a leading axis.
     """
-    known = jnp.stack([holds, *(jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state))])
+    xp = library(*jax.tree.leaves((holds, state, controls, states, report)))
+    known = xp.stack([holds, *(xp.all(xp.isfinite(x)) for x in jax.tree.leaves(state))])
     rows = [*jax.tree.leaves(states), *jax.tree.leaves(controls)]
-    fine = jnp.stack([jnp.all(jnp.isfinite(x.reshape(x.shape[0], -1)), axis=1) for x in rows])
-    each = jnp.all(known) & (jnp.cumsum(~jnp.all(fine, axis=0)) == 0)
+    fine = xp.stack([xp.all(xp.isfinite(x.reshape(x.shape[0], -1)), axis=1) for x in rows])
+    each = xp.all(known) & (xp.cumsum(~xp.all(fine, axis=0)) == 0)
     # A factor, so that derivatives are lost with the states.
-    factor = jnp.where(each, 1.0, jnp.nan)
+    factor = xp.where(each, 1.0, xp.nan)
     lost = jax.tree.map(lambda x: x * factor.astype(x.dtype).reshape(-1, *(1,) * (x.ndim - 1)), states)
     residual = report.residual * factor.astype(report.residual.dtype)
     return lost, report._replace(residual=residual, converged=report.converged & each)

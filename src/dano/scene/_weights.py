@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dano.maths import by_numpy, library, Q
@@ -33,10 +32,25 @@ def lifted(scene: Scene, control: Control | None, *leading: int) -> Control | No
     """
     if all(body.gravcomp is None for body in scene.bodies):
         return control
-    dtype = scene.timestep.dtype
-    mass = jnp.stack([body.mass * body.mass_scale for body in scene.bodies]).astype(dtype)
-    lift = mass[:, None] * (pulls(scene) - scene.gravity[None])
+    masses = [(body.mass, body.mass_scale) for body in scene.bodies]
+    given = None if control is None else control.force
+    force, still = _lifting(masses, pulls(scene), scene.gravity, given, leading)
     if control is None:
-        still = jnp.zeros((*leading, *lift.shape), dtype)
         control = Control(still, still)
-    return dataclasses.replace(control, force=control.force + jnp.broadcast_to(lift, control.force.shape))
+    return dataclasses.replace(control, force=force)
+
+
+@by_numpy
+def _lifting(
+    masses: Sequence[tuple[Q, Q]],
+    pull: Float[Q, "n 3"],
+    gravity: Float[Q, "3"],
+    force: Float[Q, "*t n 3"] | None,
+    leading: tuple[int, ...],
+) -> tuple[Float[Q, "*t n 3"], Float[Q, "*t n 3"]]:
+    """Forces with those that compensate weights, and none."""
+    xp = library(pull, gravity, *(x for each in masses for x in each), *([] if force is None else [force]))
+    mass = xp.stack([mass * scale for mass, scale in masses]).astype(pull.dtype)
+    lift = mass[:, None] * (pull - gravity[None])
+    still = xp.zeros((*leading, *lift.shape) if force is None else force.shape, pull.dtype)
+    return (still if force is None else force) + xp.broadcast_to(lift, still.shape), still
