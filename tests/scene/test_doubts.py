@@ -36,7 +36,7 @@ ODD = {
     "limits in degrees": (toml(body="", more=HINGE + "limits = [-90, 90]"), "are they in degrees"),
     "anchor in the world": (toml(body="", more=HINGE + "anchor = [0, 0, 0.3]"), "body's own frame"),
     "floor upside down": (toml(floor="normal = [0, 0, -1]"), "begins 0.07 m inside 'floor'"),
-    "half inside": (toml(body=""), "begins 0.02 m inside 'floor'"),
+    "half inside": (toml(body="position = [0, 0, 0]"), "begins 0.02 m inside 'floor'"),
     "below the floor": (toml(body="position = [0, 0, -0.5]"), "begins 0.52 m inside"),
     "a sheet": (toml(half="[0.045, 0.03, 1e-6]", mass=1e-5), "too thin for its samples"),
     "shorter than a step": (toml(top="timestep = 0.005\nduration = 0.001"), "0.005 s are run"),
@@ -78,6 +78,21 @@ def test_the_three_worst_are_said_and_how_many_more():
     lines = said_of(lambda: parse_scene(text, Path("odd.toml")))
     assert len(lines) == 3
     assert "less than air" in lines[0] and "more: `dano check` lists them" in lines[2]
+
+
+def test_bodies_that_nobody_placed_are_not_judged():
+    """A state to be changed later begins with all bodies at the origin."""
+    ball, floor = (
+        dano.Body("ball", dano.Sphere(0.1), mass=1.0),
+        dano.Body("floor", dano.HalfSpace(), fixed=True),
+    )
+    scene = dano.Scene.create([ball, floor])
+    assert said_of(lambda: scene.initial_state(ball=dict(velocity=(1, 0, 0)))) == []
+    assert said_of(lambda: scene.initial_state(ball=dict(position=(0, 0, 0.1)))) == []
+    assert len(said_of(lambda: scene.initial_state(ball=dict(position=(0, 0, 0))))) == 1
+    assert "is fixed" in said_of(lambda: scene.initial_state(floor=dict(velocity=(1, 0, 0))))[0]
+    with pytest.raises(ValueError, match="got 'floor', which is fixed"):
+        scene.control(floor=dict(force=(1, 0, 0)))
 
 
 def test_python_says_it_when_it_is_made():

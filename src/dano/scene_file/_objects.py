@@ -113,10 +113,8 @@ def _built_of(
     """An object of a file, built or kept; without options with those that are usual for what it holds."""
 
     def build() -> Built:
-        field = load_field(
-            source if isinstance(source, str) else Path(source),
-            units=None if options is None else options.units,
-        )
+        file = source if isinstance(source, str) else Path(source)
+        field = load_field(file, **({} if options is None else options.of_file))
         chosen = _usual(isinstance(field, AbstractShape)) if options is None else options
         return _made(field, chosen, dashes, progress)
 
