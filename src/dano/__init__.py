@@ -34,6 +34,8 @@ from dano.contact import (
     CentroidLaw as CentroidLaw,
     Collider as Collider,
     ContactParams as ContactParams,
+    Distance as Distance,
+    distance as distance,
     DistributedLaw as DistributedLaw,
     overlap as overlap,
     Patch as Patch,
