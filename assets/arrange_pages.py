@@ -1,4 +1,4 @@
-"""What MkDocs is told of pages while it builds them (`hooks` in mkdocs.yml): ranks in search, anchors of keys."""
+"""Ranks of pages in search, and anchors of keys, while MkDocs builds them (`hooks` in mkdocs.yml)."""
 
 import re
 from typing import Any

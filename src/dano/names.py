@@ -60,7 +60,9 @@ def keep_old_name(old: str, new: str) -> None:
         if name.startswith("__"):
             raise AttributeError(f"module {old!r} has no attribute {name!r}")
         thing = getattr(importlib.import_module(new), name)
-        warnings.warn(f"{old} is a function now; write `from {new} import {name}`", FutureWarning, stacklevel=2)
+        warnings.warn(
+            f"{old} is a function now; write `from {new} import {name}`", FutureWarning, stacklevel=2
+        )
         return thing
 
     module: Any = ModuleType(old, f"Old name of `{new}`.")

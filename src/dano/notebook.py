@@ -30,7 +30,9 @@ def plain(title: str, rows: Sequence[Sequence[str]], head: Sequence[str] = ()) -
     table = [["" if x.startswith("<svg") else x for x in row] for row in ([head] if head else []) + [*rows]]
     used = [k for k in range(max(map(len, table), default=0)) if any(len(r) > k and r[k] for r in table)]
     widths = [max(len(row[k]) for row in table if len(row) > k) for k in used]
-    lines = ["  ".join(row[k].ljust(w) for k, w in zip(used, widths, strict=True) if len(row) > k) for row in table]
+    lines = [
+        "  ".join(row[k].ljust(w) for k, w in zip(used, widths, strict=True) if len(row) > k) for row in table
+    ]
     return "\n".join([title, *(f"  {line.rstrip()}" for line in lines)])
 
 

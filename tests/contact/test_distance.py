@@ -24,8 +24,20 @@ def at(position, *turn):
 ON_CORNER = ((1.0, -1.0, 0.0), np.arccos(1 / R3))
 ON_EDGE, ACROSS = ((1, 0, 0), np.pi / 4), ((0, 1, 0), np.pi / 4)
 CASES = {
-    "balls apart": (BALL, dano.Sphere(0.2), at((0.5, 0.1, 0)), np.hypot(0.5, 0.1) - 0.3, (0.98058, 0.19612, 0)),
-    "balls overlap": (BALL, dano.Sphere(0.2), at((0.2, 0.1, 0)), np.hypot(0.2, 0.1) - 0.3, (2 / 5**0.5, 0.44721, 0)),
+    "balls apart": (
+        BALL,
+        dano.Sphere(0.2),
+        at((0.5, 0.1, 0)),
+        np.hypot(0.5, 0.1) - 0.3,
+        (0.98058, 0.19612, 0),
+    ),
+    "balls overlap": (
+        BALL,
+        dano.Sphere(0.2),
+        at((0.2, 0.1, 0)),
+        np.hypot(0.2, 0.1) - 0.3,
+        (2 / 5**0.5, 0.44721, 0),
+    ),
     "ball over a face": (BALL, BOX, at((0.05, 0.1, 0.35)), 0.15, (0, 0, 1)),
     "ball in a face": (BALL, BOX, at((0.05, 0.1, 0.15)), -0.05, (0, 0, 1)),
     "ball at an edge": (BALL, BOX, at((0.3, 0.1, 0.3)), np.hypot(0.1, 0.2) - 0.1, (0.44721, 0, 0.89443)),
@@ -36,19 +48,34 @@ CASES = {
     "edge in a face": (CUBE, BOX, at((0, 0, 0.22), *ON_EDGE), 0.12 - 0.1 * R2, (0, 0, 1)),
     "corner in a plane": (CUBE, FLOOR, at((0, 0, 0.17), *ON_CORNER), 0.17 - 0.1 * R3, (0, 0, 1)),
     "capsule over a capsule": (
-        dano.Capsule(0.05, 0.2), dano.Capsule(0.04, 0.3), at((0.03, 0.3, 0.05), (0, 1, 0), np.pi / 2), 0.21, (0, 1, 0)
+        dano.Capsule(0.05, 0.2),
+        dano.Capsule(0.04, 0.3),
+        at((0.03, 0.3, 0.05), (0, 1, 0), np.pi / 2),
+        0.21,
+        (0, 1, 0),
     ),
     "capsules overlap": (
-        dano.Capsule(0.05, 0.2), dano.Capsule(0.04, 0.3), at((0.03, 0.06, 0.05), (0, 1, 0), np.pi / 2), -0.03, (0, 1, 0)
+        dano.Capsule(0.05, 0.2),
+        dano.Capsule(0.04, 0.3),
+        at((0.03, 0.06, 0.05), (0, 1, 0), np.pi / 2),
+        -0.03,
+        (0, 1, 0),
     ),
     "rim of a cylinder over a plane": (
-        dano.Cylinder(0.1, 0.2), FLOOR, at((0, 0, 0.5), (1, 0, 0), 0.3), 0.5 - 0.2 * np.cos(0.3) - 0.1 * np.sin(0.3), (0, 0, 1)
+        dano.Cylinder(0.1, 0.2),
+        FLOOR,
+        at((0, 0, 0.5), (1, 0, 0), 0.3),
+        0.5 - 0.2 * np.cos(0.3) - 0.1 * np.sin(0.3),
+        (0, 0, 1),
     ),
     "ellipsoid over a plane": (
-        dano.Ellipsoid((0.1, 0.2, 0.3)), FLOOR, at((0, 0, 0.5), (1, 0, 0), 0.3),
-        0.5 - np.hypot(0.3 * np.cos(0.3), 0.2 * np.sin(0.3)), (0, 0, 1),
+        dano.Ellipsoid((0.1, 0.2, 0.3)),
+        FLOOR,
+        at((0, 0, 0.5), (1, 0, 0), 0.3),
+        0.5 - np.hypot(0.3 * np.cos(0.3), 0.2 * np.sin(0.3)),
+        (0, 0, 1),
     ),
-}  # fmt: skip
+}
 """Two solids, the pose of the first, their distance and the normal from the second to the first."""
 
 
@@ -90,11 +117,23 @@ def parameters_and_result(a_of, b_of, position):
 
 
 SMOOTH = {
-    "ball at a corner": (dano.Sphere, lambda h: dano.Box(jnp.stack([0.2 + 0 * h, 0.3 + 0 * h, h])), (0.35, 0.5, 0.4)),
-    "ball in a face": (dano.Sphere, lambda h: dano.Box(jnp.stack([0.2 + 0 * h, 0.3 + 0 * h, h])), (0.03, 0.05, 0.2)),
+    "ball at a corner": (
+        dano.Sphere,
+        lambda h: dano.Box(jnp.stack([0.2 + 0 * h, 0.3 + 0 * h, h])),
+        (0.35, 0.5, 0.4),
+    ),
+    "ball in a face": (
+        dano.Sphere,
+        lambda h: dano.Box(jnp.stack([0.2 + 0 * h, 0.3 + 0 * h, h])),
+        (0.03, 0.05, 0.2),
+    ),
     "capsules": (lambda r: dano.Capsule(r, 0.2), lambda r: dano.Capsule(r, 0.25), (0.02, 0.4, 0.05)),
-    "corner in a ball": (lambda h: dano.Box(jnp.stack([h, h, h])), lambda r: dano.Sphere(2 * r), (0.21, 0.2, 0.22)),
-}  # fmt: skip
+    "corner in a ball": (
+        lambda h: dano.Box(jnp.stack([h, h, h])),
+        lambda r: dano.Sphere(2 * r),
+        (0.21, 0.2, 0.22),
+    ),
+}
 
 
 @pytest.mark.parametrize("case", SMOOTH)
@@ -147,9 +186,9 @@ def test_meshes_and_objects_are_as_exact_as_their_grids():
 
 def test_a_hole_is_found_and_not_the_hull():
     """A ball inside a ring of four boxes: the way to the nearest side, which a convex hull would not have."""
-    sides = [
-        dano.fields.posed(dano.Box((0.05, 0.3, 0.1)), dano.Pose((x, 0, 0))) for x in (-0.25, 0.25)
-    ] + [dano.fields.posed(dano.Box((0.3, 0.05, 0.1)), dano.Pose((0, y, 0))) for y in (-0.25, 0.25)]
+    sides = [dano.fields.posed(dano.Box((0.05, 0.3, 0.1)), dano.Pose((x, 0, 0))) for x in (-0.25, 0.25)] + [
+        dano.fields.posed(dano.Box((0.3, 0.05, 0.1)), dano.Pose((0, y, 0))) for y in (-0.25, 0.25)
+    ]
     found = dano.distance(dano.Sphere(0.05), dano.union(*sides), pose_a=at((0.06, 0.0, 0.0)))
     assert float(found.value) == pytest.approx(0.2 - 0.06 - 0.05, abs=1e-9)
     np.testing.assert_allclose(found.normal, (-1, 0, 0), atol=1e-6)

@@ -157,9 +157,7 @@ def test_saved_runs_keep_their_names(scene, run, tmp_path):
     run.save(tmp_path / "run.npz")
     loaded = dano.Trajectory.load(tmp_path / "run.npz")
     np.testing.assert_array_equal(loaded.final["ball"].position, run.final["ball"].position)
-    np.testing.assert_array_equal(
-        loaded.of(scene).forces("ball", "floor"), run.forces("ball", "floor")
-    )
+    np.testing.assert_array_equal(loaded.of(scene).forces("ball", "floor"), run.forces("ball", "floor"))
 
 
 def test_scene_files_simulate_themselves(tmp_path):
@@ -194,4 +192,4 @@ def test_old_names_work_and_say_the_new_one():
         warnings.simplefilter("error")
         assert dano.report.VideoOptions is not None
     with pytest.raises(AttributeError, match="no attribute 'reports'"):
-        dano.reports
+        _ = dano.reports

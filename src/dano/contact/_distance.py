@@ -13,7 +13,7 @@ out; for shapes with edges that is searched among directions instead: d = max_n 
 Minima are searched from points of both surfaces: for solids that are not convex, those of a lattice decide
 which parts are found. Derivatives do not go through the search. That of d is the envelope theorem: a surface
 moves the distance by how fast it moves along the normal. Those of points and normal follow from the implicit
-function theorem at the minimum, where it is unique; between parallel faces it is not, and nearest points stay.
+function theorem at the minimum, where it is unique; between parallel faces it is not, and the points stay.
 Of edges that have crossed only d has derivatives.
 """
 
@@ -102,13 +102,13 @@ def _solid(name: str, given: Any, pose: Pose | None) -> AbstractShape:
     if isinstance(given, NeuralObject):
         if given.solid is None:
             raise ValueError(
-                f"{name} must have a surface, got an object made of samples: from_samples(field=…) gives it one"
+                f"{name} must have a surface, got an object made of samples: from_samples(field=…) has one"
             )
         given = given.solid
     if isinstance(given, AbstractField) and not isinstance(given, AbstractShape):
         raise ValueError(
-            f"{name} must be a shape or an object, got the density {type(given).__name__}, which has no surface:"
-            " NeuralObject.from_field makes an object of it"
+            f"{name} must be a shape or an object, got the density {type(given).__name__}, which has no"
+            " surface: NeuralObject.from_field makes an object of it"
         )
     shape = checked_kind(name, given, AbstractShape, hint=" or NeuralObject")
     if pose is None:
@@ -228,7 +228,14 @@ def _centred(
     p, q = _projected(a, column)[:, 0], _projected(b, column)[:, 0]
     slope_a, slope_b = (solid.sdf_jet(column, 1)[1][:, 0] for solid in (a, b))
     small = _OUTSIDE * size
-    tried = [0.5 * (p + q), x, x + small * slope_a, x + small * slope_b, x - small * slope_a, x - small * slope_b]
+    tried = [
+        0.5 * (p + q),
+        x,
+        x + small * slope_a,
+        x + small * slope_b,
+        x - small * slope_a,
+        x - small * slope_b,
+    ]
     tried += [p - small * slope_b, q - small * slope_a]
     points = jnp.stack(tried, axis=1)
     (value_a, slopes_a), (value_b, slopes_b) = a.sdf_jet(points, 1), b.sdf_jet(points, 1)
@@ -241,7 +248,11 @@ def _centred(
 
 
 def _crossed(
-    a: AbstractShape, b: AbstractShape, x: Float[Array, "3"], normal: Float[Array, "3"], size: Float[Array, ""]
+    a: AbstractShape,
+    b: AbstractShape,
+    x: Float[Array, "3"],
+    normal: Float[Array, "3"],
+    size: Float[Array, ""],
 ) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
     """Points and normal of the shortest way out of two convex shapes whose edges have crossed.
 

@@ -79,13 +79,13 @@ def asked(controls: Policy, scene: Scene, state: State, time: Float[Array, ""]) 
         control: Any = controls(state, time)
     except jax.errors.ConcretizationTypeError as error:
         raise ValueError(
-            "controls(state, time) is compiled, so it cannot branch on the numbers of a state or a time: write"
-            " jnp.where(time < 0.5, a, b) in place of `if`, and jnp in place of np"
+            "controls(state, time) is compiled, so it cannot branch on numbers of the state or the time:"
+            " write jnp.where(time < 0.5, a, b) in place of `if`, and jnp in place of np"
         ) from error
     if not isinstance(control, Control):
         raise ValueError(
-            "controls(state, time) must return a dano.Control, such as scene.control(ball=dict(force=…)) or"
-            f" dano.joint_control(scene, efforts), got {shown(control)}"
+            "controls(state, time) must return a dano.Control, as scene.control(ball=dict(force=…)) or"
+            f" dano.joint_control(scene, efforts) make it, got {shown(control)}"
         )
     try:
         check_control(scene, control, ())

@@ -120,9 +120,7 @@ def make_vector_env(
     return SceneVectorEnv(rules, state, n_envs, start, rendering)
 
 
-def make_env_of_files(
-    scene: str | os.PathLike[str], task: str | os.PathLike[str], **options: Any
-) -> Any:
+def make_env_of_files(scene: str | os.PathLike[str], task: str | os.PathLike[str], **options: Any) -> Any:
     """What `gymnasium.make("dano/Scene-v0", scene=…, task=…)` makes: `make_env` from two files.
 
     Args:

@@ -14,7 +14,14 @@ import numpy as np
 from dano.checks import checked_function, checked_items, checked_kind, checked_optional
 from dano.engine import AbstractEngine, checked_engine, Policy
 from dano.identification._checkpoint import Checkpoint, digest_of
-from dano.identification._parameters import masses_of, Parameter, parameter_of, space_of, values_at, with_values
+from dano.identification._parameters import (
+    masses_of,
+    Parameter,
+    parameter_of,
+    space_of,
+    values_at,
+    with_values,
+)
 from dano.identification._problem import Problem
 from dano.identification._residuals import Linearized, shifted, Smoothing
 from dano.identification._result import Errors, Identification, Minimum

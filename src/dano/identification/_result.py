@@ -114,7 +114,9 @@ class Identification:
             (name, f"{numbers(np.ravel(value))} ± {numbers(np.ravel(self.standard_errors[name]))}")
             for name, value in self.values.items()
         ]
-        rows += [(f"mass of {body} [kg]", f"{m:.4g} ± {error:.2g}") for body, (m, error) in self.masses.items()]
+        rows += [
+            (f"mass of {body} [kg]", f"{m:.4g} ± {error:.2g}") for body, (m, error) in self.masses.items()
+        ]
         rows += [("worth of derivatives", self.worth.summary)] if self.worth is not None else []
         return [*rows, ("stopped", self.stop.value), *(("", message) for message in self.messages)]
 

@@ -166,14 +166,14 @@ def film_run(
     names = [field.name for field in fields(VideoOptions)]
     for name in options:
         if name not in names:
-            raise ValueError(f"film must be given options of {names}, got {name!r}{did_you_mean(name, names)}")
+            raise ValueError(
+                f"film must be given options of {names}, got {name!r}{did_you_mean(name, names)}"
+            )
     chosen, origin = VideoOptions(**options), run.origin
     looks = None if origin.looks is None else origin.looks()
     still = checked_output(path).suffix.lower() == ".png"
     video, strip = (None, path) if still else (path, None)
-    render_trajectory(
-        origin.scene, run, video, strip=strip, looks=looks, options=chosen, progress=progress
-    )
+    render_trajectory(origin.scene, run, video, strip=strip, looks=looks, options=chosen, progress=progress)
 
 
 def render_start(

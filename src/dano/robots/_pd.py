@@ -143,8 +143,8 @@ def _places(robot: Robot, scene: Scene) -> tuple[tuple[str, ...], tuple[int, ...
             raise ValueError(f"robot must have hinges and slides, got joint {name!r} of several coordinates")
         if scene.joints[joint].motor is not None:
             raise ValueError(
-                f"robot must have no motors of its own, got one on joint {name!r}, which would pull, too: give"
-                " it commands by robot.control, or load the file with ignore='actuators'"
+                f"robot must have no motors of its own, got one on joint {name!r}, which would pull, too:"
+                " give it commands by robot.control, or load the file with ignore='actuators'"
             )
         places.append(scene.layout.coordinates[joint])
     if not places:
@@ -186,5 +186,6 @@ def _check_reach(scene: Scene, robot: Robot, names: tuple[str, ...], goal: Float
         low, high = (float(x) for x in limits)
         if not low - 1e-6 <= float(value) <= high + 1e-6:
             raise ValueError(
-                f"goal of joint {name!r} must lie in its limits [{low:.4g}, {high:.4g}], got {float(value):.4g}"
+                f"goal of joint {name!r} must lie in its limits [{low:.4g}, {high:.4g}],"
+                f" got {float(value):.4g}"
             )

@@ -118,7 +118,9 @@ class Scene(eqx.Module):
 
     def __str__(self) -> str:
         """What notebooks show, as text."""
-        traced = any(is_traced(body.mass, body.mass_scale) for body in self.bodies) or is_traced(self.timestep)
+        traced = any(is_traced(body.mass, body.mass_scale) for body in self.bodies) or is_traced(
+            self.timestep
+        )
         return repr(self) if traced else plain(*self._summary(drawn=False))
 
     def _repr_html_(self) -> str:

@@ -87,7 +87,9 @@ class State(eqx.Module):
             [name, *(numbers(np.asarray(getattr(self, key)[i])) for key in STATE_SIZES)]
             for i, name in enumerate(self.names)
         ]
-        return plain("State", rows, ("body", "position [m]", "orientation", "velocity [m/s]", "omega [rad/s]"))
+        return plain(
+            "State", rows, ("body", "position [m]", "orientation", "velocity [m/s]", "omega [rad/s]")
+        )
 
 
 def motion_of(states: State, names: tuple[str, ...], body: str) -> BodyMotion:
