@@ -86,11 +86,11 @@ def distance(
         ValueError: If one is no solid, both are unbounded, or `starts` is not in 2 … 64.
     """
     starts = checked_count("starts", starts, most=64)
-    solids = [_solid(*each) for each in (("a", a, pose_a), ("b", b, pose_b))]
-    bounded = [_is_bounded(solid) for solid in solids]
+    first, second = _solid("a", a, pose_a), _solid("b", b, pose_b)
+    bounded = _is_bounded(first), _is_bounded(second)
     if not any(bounded):
         raise ValueError("one of a and b must be bounded, got two half-spaces")
-    return _distance(*solids, tuple(bounded), starts)
+    return _distance(first, second, bounded, starts)
 
 
 def _solid(name: str, given: Any, pose: Pose | None) -> AbstractShape:

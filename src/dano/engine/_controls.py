@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +15,21 @@ from dano.maths import is_traced
 from dano.scene import Control, Scene, State
 
 Policy = Callable[[State, Float[Array, ""]], Control]
+
+
+class Held(eqx.Module):
+    """A policy that answers with one control at all times."""
+
+    control: Control
+
+    def __call__(self, state: State, time: Float[Array, ""]) -> Control:
+        """The control."""
+        return self.control
+
+
+def held(controls: Any) -> Any:
+    """Controls of which one step is given, as a policy; others as they are."""
+    return Held(controls) if isinstance(controls, Control) and controls.force.ndim == 2 else controls
 
 
 def check_control(scene: Scene, control: Control | None, leading: tuple[int, ...]) -> None:
@@ -69,7 +85,7 @@ def spread(
     return controls, checked_count("n_steps", count)
 
 
-def asked(controls: Policy, scene: Scene, state: State, time: Float[Array, ""]) -> Control:
+def asked(controls: Any, scene: Scene, state: State, time: Float[Array, ""]) -> Control:
     """What a policy answers, while a rollout is traced.
 
     Raises:

@@ -116,17 +116,15 @@ def pd(
     if stiffness is None and not is_traced(scene.timestep) and rate * float(scene.timestep) > _FASTEST:
         most = _FASTEST / (2 * math.pi * float(scene.timestep))
         raise ValueError(f"frequency must be ≤ {most:.3g} Hz with this timestep, got {frequency}")
-    gains = [
-        None if gain is None else _numbers(label, gain, names, None).astype(dtype)
-        for label, gain in (("stiffness", stiffness), ("damping", damping))
-    ]
+    pull = None if stiffness is None else _numbers("stiffness", stiffness, names, None).astype(dtype)
+    brake = None if damping is None else _numbers("damping", damping, names, None).astype(dtype)
     if not callable(goal):
         goal = _numbers("goal", goal, names, [robot.home.get(name, 0.0) for name in names]).astype(dtype)
         _check_reach(scene, robot, names, goal)
     most = [math.inf] * len(names) if limits is False else [robot.efforts.get(n, math.inf) for n in names]
     if isinstance(limits, Mapping):
         most = _numbers("limits", limits, names, most)
-    return JointPD(scene, goal, *gains, rate, jnp.asarray(most, dtype), bool(gravity), places, names)
+    return JointPD(scene, goal, pull, brake, rate, jnp.asarray(most, dtype), bool(gravity), places, names)
 
 
 def _places(robot: Robot, scene: Scene) -> tuple[tuple[str, ...], tuple[int, ...]]:
