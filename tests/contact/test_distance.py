@@ -200,6 +200,7 @@ def test_a_hole_is_found_and_not_the_hull():
         dano.fields.posed(dano.Box((0.3, 0.05, 0.1)), dano.Pose((0, y, 0))) for y in (-0.25, 0.25)
     ]
     ring = dano.union(*sides)
+    assert isinstance(ring, dano.AbstractShape)
     found = dano.distance(dano.Sphere(0.05), ring, pose_a=at((0.06, 0.0, 0.0)))
     assert float(found.value) == pytest.approx(0.2 - 0.06 - 0.05, abs=1e-9)
     np.testing.assert_allclose(found.normal, (-1, 0, 0), atol=1e-6)
